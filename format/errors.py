@@ -1,0 +1,46 @@
+"""Everything KPC raises on purpose.
+
+    KpcError
+     ├─ UsageError      the command line asks for something that makes no sense (exit code 2)
+     ├─ DatasetError    a folder of videos or images cannot be used
+     ├─ MediaError      ffmpeg, an image or a video failed
+     ├─ FormatError     a .kpc file is damaged, hostile or of an unknown version
+     │   └─ BudgetError   it would need more memory than the reader was given
+     ├─ TrainingError   training cannot start or go on
+     └─ DisplayError    no OpenGL, or no window to be had
+
+A message is one line: it names the file (or the option) and the remedy. `kpc.format.cli.run` alone turns it into a line
+on stderr and an exit code; anything else that is raised is a bug and keeps its traceback.
+"""
+
+
+class KpcError(Exception):
+    """Base of every error KPC raises on purpose."""
+
+
+class UsageError(KpcError):
+    """The command line asks for something that makes no sense."""
+
+
+class DatasetError(KpcError):
+    """A folder of videos or images cannot be used."""
+
+
+class MediaError(KpcError):
+    """ffmpeg, an image or a video failed."""
+
+
+class FormatError(KpcError):
+    """A .kpc file is damaged, hostile or of an unknown version."""
+
+
+class BudgetError(FormatError):
+    """A .kpc file would need more memory than the reader was given."""
+
+
+class TrainingError(KpcError):
+    """Training cannot start or go on."""
+
+
+class DisplayError(KpcError):
+    """No OpenGL, or no window to be had."""

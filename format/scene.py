@@ -1,0 +1,104 @@
+"""A decoded scene as plain data: what the encoder hands over, the file stores and every renderer reads.
+
+Feature of a point p at time t (K-Planes, arXiv:2301.10241, eq. 1; multiplication over planes, concatenation over scales):
+
+    f_s(p, t) = prod over planes c of bilinear(P[s][c], project_c(p, t))         f = concat over scales s of f_s
+
+Density and colour (the explicit decoder, section 3.3 of the paper):
+
+    sigma = exp(clip(f . density_weight + density_bias, -20, 20))       per longest edge of the box
+    rgb   = sigmoid(f . basis_{R,G,B}(d))                               basis(d) = direction MLP, once a ray
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from kpc.format.cameras import Camera
+
+SPACE_PLANES = ("xy", "xz", "yz")
+TIME_PLANES = ("xt", "yt", "zt")
+ALL_PLANES = SPACE_PLANES + TIME_PLANES
+
+LOG_DENSITY_LIMIT = 20.0
+"""|log density| is clipped here: exp(20) is opaque within any step, exp(-20) is empty over any box."""
+
+TERMINATION = 1.0 / 1024.0
+"""A ray ends once its transmittance falls below this; a quarter of an 8-bit level."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The time axis: `frame_count` pictures at `fps`; time 0 is the first picture and time 1 the last."""
+
+    frame_count: int
+    fps: float
+
+    @property
+    def duration_s(self) -> float:
+        return (self.frame_count - 1) / self.fps if self.frame_count > 1 else 0.0
+
+
+@dataclass(frozen=True)
+class Decoder:
+    """The explicit decoder. F is the sum of channels over scales, H the hidden width.
+
+    Attributes:
+        density_weight: (F,) float32; density_bias: float32 scalar.
+        w1: (H, 9), b1: (H,), w2: (3, F, H), b2: (3, F) float32, the direction MLP:
+            basis(d) = w2 relu(w1 e(d) + b1) + b2,  e(d) = [x, y, z, xx, yy, zz, xy, yz, zx]
+    """
+
+    density_weight: np.ndarray
+    density_bias: float
+    w1: np.ndarray
+    b1: np.ndarray
+    w2: np.ndarray
+    b2: np.ndarray
+
+    @property
+    def parameter_count(self) -> int:
+        return self.density_weight.size + 1 + self.w1.size + self.b1.size + self.w2.size + self.b2.size
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A radiance field that can be rendered at any time in [0, 1] from anywhere.
+
+    Attributes:
+        aabb: (2, 3) float32, lower and upper corner of the box, world units.
+        clip: its time axis.
+        scales: coarse to fine; each maps plane names to (rows, columns, M) float32. The plane's first letter is the column
+            axis, the second the row axis: "xy" is (Ny, Nx, M), "xt" is (T, Nx, M). Static scenes hold SPACE_PLANES only,
+            others ALL_PLANES. Corner-aligned: u in [0, 1] over the box reads at u * (size - 1).
+        decoder: density and colour from features.
+        occupancy: (slots, Nz, Ny, Nx) bool. A cell that is False holds nothing while its slot of time lasts;
+            slot k of K lasts over [k/K, (k+1)/K) of the clip, the last one includes time 1.
+        background: (3,) float32 in [0, 1], seen where a ray leaves the box with transmittance left.
+        step: distance between samples along a ray, world units.
+        cameras: a few cameras the scene was filmed from, the first a good one to open on.
+    """
+
+    aabb: np.ndarray
+    clip: Clip
+    scales: tuple[Mapping[str, np.ndarray], ...]
+    decoder: Decoder
+    occupancy: np.ndarray
+    background: np.ndarray
+    step: float
+    cameras: tuple[Camera, ...] = field(default=())
+
+    @property
+    def is_dynamic(self) -> bool:
+        return "xt" in self.scales[0]
+
+    @property
+    def extent(self) -> float:
+        """Longest edge of the box, the unit of length in which density is expressed."""
+        return float(np.max(self.aabb[1] - self.aabb[0]))
+
+    @property
+    def parameter_count(self) -> int:
+        """Numbers in the model: every texel of every channel of every plane, and the decoder's weights."""
+        return sum(p.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count

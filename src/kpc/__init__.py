@@ -1,0 +1,1 @@
+"""KPC: 4D scenes in one small file."""
