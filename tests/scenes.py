@@ -1,0 +1,86 @@
+"""Small scenes for tests: every feature of a real one, in a few kilobytes."""
+
+import numpy as np
+
+from kpc.format.cameras import Camera
+from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Clip, Decoder, Scene
+
+
+def tiny_scene(seed: int = 0, dynamic: bool = True, scales: int = 2, channels: int = 8,
+               resolution: tuple[int, int, int] = (24, 20, 16), time: int = 6) -> Scene:
+    """A scene of smooth random planes in a box of unequal edges, seen by two cameras.
+
+    Args:
+        resolution: (Nx, Ny, Nz) of the finest scale; each coarser one halves it.
+        time: rows of every time plane. Time planes are exactly 1 outside one bump, so that most of them is identity.
+    """
+    rng = np.random.default_rng(seed)
+    aabb = np.array([[-1.0, -0.8, -0.6], [1.2, 0.9, 0.7]], np.float32)
+    levels = []
+    for scale in range(scales):
+        size = {axis: max(2, n >> (scales - 1 - scale)) for axis, n in zip("xyz", resolution)} | {"t": time}
+        planes = {}
+        for name in SPACE_PLANES + (TIME_PLANES if dynamic else ()):
+            shape = (size[name[1]], size[name[0]], channels)
+            planes[name] = _bump(rng, *shape) if name in TIME_PLANES else _smooth(rng, *shape)
+        levels.append(planes)
+
+    features = scales * channels
+    slots = min(time, 3) if dynamic else 1
+    decoder = Decoder(
+        density_weight=rng.normal(0.0, 4.0 / np.sqrt(features), features).astype(np.float32),
+        density_bias=2.0,
+        w1=rng.normal(0.0, 0.5, (16, 9)).astype(np.float32),
+        b1=rng.normal(0.0, 0.5, 16).astype(np.float32),
+        w2=rng.normal(0.0, 2.0 / np.sqrt(16 * features), (3, features, 16)).astype(np.float32),
+        b2=rng.normal(0.0, 2.0 / np.sqrt(features), (3, features)).astype(np.float32),
+    )
+    return Scene(
+        aabb=aabb,
+        clip=Clip(11, 10.0) if dynamic else Clip(1, 10.0),
+        scales=tuple(levels),
+        decoder=decoder,
+        occupancy=_blob(slots, 8, 10, 12),
+        background=np.array([0.9, 0.95, 1.0], np.float32),
+        step=0.04,
+        cameras=tuple(look_at(eye, (0.1, 0.05, 0.05), 48, 36, 55.0) for eye in [(2.4, 1.0, 2.2), (-1.8, 1.4, 2.6)]),
+    )
+
+
+def look_at(eye: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int,
+            focal: float) -> Camera:
+    """A camera at `eye` that looks at `target`, +y up."""
+    back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
+    right = np.cross([0.0, 1.0, 0.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, np.asarray(eye, float)], axis=1)
+    return Camera(width, height, focal, focal, width / 2, height / 2, pose)
+
+
+def _smooth(rng: np.random.Generator, rows: int, columns: int, channels: int) -> np.ndarray:
+    """Random knots, 5 an axis, drawn from [0.3, 1.5] and joined bilinearly."""
+    knots = rng.uniform(0.3, 1.5, (5, 5, channels))
+    return np.einsum("rk,cl,klm->rcm", _hats(rows), _hats(columns), knots).astype(np.float32)
+
+
+def _hats(size: int) -> np.ndarray:
+    position = np.linspace(0.0, 4.0, size)[:, None]
+    return np.maximum(0.0, 1.0 - np.abs(position - np.arange(5)))
+
+
+def _bump(rng: np.random.Generator, rows: int, columns: int, channels: int) -> np.ndarray:
+    """Exactly 1, but for the middle third of the columns, which wave in time."""
+    amplitude = rng.uniform(-0.5, 0.5, channels)
+    phase = rng.uniform(0.0, 2.0 * np.pi, channels)
+    t = np.linspace(0.0, 1.0, rows)[:, None, None]
+    middle = np.abs(np.linspace(-1.0, 1.0, columns)) < 1.0 / 3.0
+    wave = 1.0 + amplitude * np.sin(2.0 * np.pi * t + phase)
+    return np.where(middle[None, :, None], wave, 1.0).astype(np.float32)
+
+
+def _blob(slots: int, nz: int, ny: int, nx: int) -> np.ndarray:
+    """An ellipsoid that drifts along x from slot to slot."""
+    z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n - 0.5 for n in (nz, ny, nx)), indexing="ij")
+    centres = np.linspace(-0.1, 0.1, slots) if slots > 1 else [0.0]
+    return np.stack([(x - c) ** 2 + y**2 + z**2 < 0.42**2 for c in centres])
