@@ -1,0 +1,296 @@
+"""The outer shape of a .kpc file: header, chunk index, chunks (spec/kpc-format.md, sections 3 and 4).
+
+    header (64 bytes) | index (chunk_count entries of 40 bytes) | chunk 0 | chunk 1 | ...        little-endian, no gaps
+
+Everything is covered by a CRC32C: the header by its own, the index by one in the header, a chunk by one in its entry.
+This module knows nothing of scenes: a chunk is a kind, a place in the scene, and bytes.
+"""
+
+import io
+import os
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+import google_crc32c
+import zstandard
+
+from kpc.format.errors import BudgetError, FormatError
+
+MAGIC = b"\x89KPC\r\n\x1a\n"
+VERSION = 0
+HEADER = struct.Struct("<8sHHIQIIQQIIII")
+ENTRY = struct.Struct("<4sHBBIIHHIIIQ")
+
+CODEC_RAW, CODEC_ZSTD = 0, 1
+ZSTD_LEVEL = 19
+
+EXPANSION_LIMIT = 32768
+"""Decoded bytes a byte of file may stand for (zstd's own limit): a small file cannot claim a huge scene."""
+CHUNK_LIMIT = 1 << 16
+"""Chunks a file may hold."""
+DEFAULT_BUDGET = 2 << 30
+"""Bytes a reader allows a decoded scene unless told otherwise."""
+
+
+class Source(Protocol):
+    """Where a file's bytes come from: a disk, memory, or HTTP range requests."""
+
+    name: str
+    size: int
+
+    def read_at(self, offset: int, length: int) -> bytes:
+        """`length` bytes from `offset`, fewer only at the end."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """The first 64 bytes.
+
+    Attributes:
+        index_length, chunk_count: of the index that follows.
+        file_length: size of the whole file, bytes.
+        value_count: numbers in all planes together, the limit a reader checks against its memory budget.
+        largest_raw: the largest raw length of any chunk, bytes.
+        index_crc: CRC32C of the index.
+    """
+
+    index_length: int
+    chunk_count: int
+    file_length: int
+    value_count: int
+    largest_raw: int
+    index_crc: int
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One chunk, as the index lists it.
+
+    Attributes:
+        kind: four letters; the first is a capital if no reader may ignore the chunk.
+        group, scale, plane, row_start, row_count: the place in the scene of a plane segment; 0 for other kinds.
+        codec: how the stored bytes become the raw ones.
+        offset, stored_length: where it lies in the file. raw_length: bytes once decoded. crc: of the stored bytes.
+    """
+
+    kind: str
+    group: int
+    scale: int
+    plane: int
+    row_start: int
+    row_count: int
+    codec: int
+    stored_length: int
+    raw_length: int
+    crc: int
+    offset: int
+
+    @property
+    def is_critical(self) -> bool:
+        return self.kind[0].isupper()
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """One chunk to be written: its place and its raw bytes."""
+
+    kind: str
+    raw: bytes
+    scale: int = 0
+    plane: int = 0
+    row_start: int = 0
+    row_count: int = 0
+
+
+def pack(chunks: Sequence[Chunk], value_count: int) -> bytes:
+    """Lay chunks out in the given order; each is stored by whichever codec makes it smaller.
+
+    Raises:
+        FormatError: the result would break a limit that every reader checks.
+    """
+    offset = HEADER.size + ENTRY.size * len(chunks)
+    entries, bodies = [], []
+    for chunk in chunks:
+        body, codec = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(chunk.raw), CODEC_ZSTD
+        if len(body) >= len(chunk.raw):
+            body, codec = chunk.raw, CODEC_RAW
+        entries.append(ENTRY.pack(chunk.kind.encode("ascii"), 0, chunk.scale, chunk.plane, chunk.row_start,
+                                  chunk.row_count, codec, 0, len(body), len(chunk.raw), google_crc32c.value(body),
+                                  offset))
+        bodies.append(body)
+        offset += len(body)
+    index = b"".join(entries)
+    largest = max(len(chunk.raw) for chunk in chunks)
+    if max(value_count, largest) > offset * EXPANSION_LIMIT:
+        raise FormatError(f"the scene is too empty for its size: {value_count:,} values in {offset:,} bytes; "
+                          "choose a lower resolution")
+    header = HEADER.pack(MAGIC, VERSION, 0, HEADER.size, HEADER.size, len(index), len(chunks), offset, value_count,
+                         largest, 0, google_crc32c.value(index), 0)
+    return b"".join([header[:-4], struct.pack("<I", google_crc32c.value(header[:-4])), index, *bodies])
+
+
+class Reader:
+    """Random access to the chunks of a .kpc file.
+
+    Opening reads the header and the index (two reads, at the very start of the file) and nothing else.
+
+    Args:
+        source: a path, the bytes themselves, a binary file object that can seek, or a `Source`.
+        allow_partial: accept a file whose end is missing; `available` tells which chunks are there.
+
+    Attributes:
+        header, index: what the file says of itself, verified.
+        name: of the file, for messages.
+
+    Raises:
+        FormatError: not a .kpc file, of another version, damaged, or with limits its size does not bear out.
+    """
+
+    def __init__(self, source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, allow_partial: bool = False):
+        self.source = _as_source(source)
+        self.name = self.source.name
+        self.header = self._read_header(allow_partial)
+        self.index = self._read_index()
+
+    def _read_header(self, allow_partial: bool) -> Header:
+        head = self.source.read_at(0, HEADER.size)
+        if head[:len(MAGIC)] != MAGIC[:len(head)] or not head:
+            raise FormatError(f"{self.name}: not a .kpc file")
+        if len(head) < HEADER.size:
+            raise FormatError(f"{self.name}: cut off within the header; fetch the file again")
+        (_, version, flags, header_length, index_offset, index_length, chunk_count, file_length, value_count,
+         largest_raw, reserved, index_crc, header_crc) = HEADER.unpack(head)
+        if version != VERSION:
+            raise FormatError(f"{self.name}: format version {version}, this reader knows {VERSION}; update kpc")
+        if google_crc32c.value(head[:-4]) != header_crc:
+            raise FormatError(f"{self.name}: the header is damaged (its CRC32C differs); fetch the file again")
+        if flags or reserved or header_length != HEADER.size or index_offset != HEADER.size:
+            raise FormatError(f"{self.name}: the header uses reserved fields; update kpc")
+        if not 0 < chunk_count <= CHUNK_LIMIT or index_length != chunk_count * ENTRY.size:
+            raise FormatError(f"{self.name}: the header claims {chunk_count} chunks in {index_length} bytes of index")
+        if file_length < HEADER.size + index_length:
+            raise FormatError(f"{self.name}: the header claims a file of {file_length} bytes, less than its index")
+        if self.source.size > file_length:
+            raise FormatError(f"{self.name}: {self.source.size - file_length} bytes follow the end of the file")
+        if self.source.size < file_length and not allow_partial:
+            raise FormatError(f"{self.name}: cut off at {self.source.size} of {file_length} bytes; fetch the file again")
+        if max(value_count, largest_raw) > file_length * EXPANSION_LIMIT:
+            raise FormatError(f"{self.name}: claims {value_count:,} values and chunks of {largest_raw:,} bytes, "
+                              f"more than {file_length:,} bytes can hold")
+        return Header(index_length, chunk_count, file_length, value_count, largest_raw, index_crc)
+
+    def _read_index(self) -> tuple[Entry, ...]:
+        if self.source.size < HEADER.size + self.header.index_length:
+            raise FormatError(f"{self.name}: cut off within the chunk index; fetch the file again")
+        index = self.source.read_at(HEADER.size, self.header.index_length)
+        if google_crc32c.value(index) != self.header.index_crc:
+            raise FormatError(f"{self.name}: the chunk index is damaged (its CRC32C differs); fetch the file again")
+        entries, expected = [], HEADER.size + len(index)
+        for number, fields in enumerate(ENTRY.iter_unpack(index)):
+            kind, group, scale, plane, row_start, row_count, codec, reserved, stored, raw, crc, offset = fields
+            if not (kind.isascii() and kind.isalpha()):
+                raise FormatError(f"{self.name}: chunk {number} has a kind that is not four letters")
+            if reserved:
+                raise FormatError(f"{self.name}: chunk {number} uses reserved fields; update kpc")
+            if offset != expected:
+                raise FormatError(f"{self.name}: chunk {number} starts at byte {offset}, not at {expected}")
+            if raw > self.header.largest_raw:
+                raise FormatError(f"{self.name}: chunk {number} claims {raw:,} bytes, more than the header's limit")
+            entries.append(Entry(kind.decode("ascii"), group, scale, plane, row_start, row_count, codec, stored, raw,
+                                 crc, offset))
+            expected += stored
+        if expected != self.header.file_length:
+            raise FormatError(f"{self.name}: the chunks end at byte {expected} of {self.header.file_length}")
+        return tuple(entries)
+
+    def available(self, number: int) -> bool:
+        """Whether all bytes of a chunk are there; False only in a partial file."""
+        entry = self.index[number]
+        return entry.offset + entry.stored_length <= self.source.size
+
+    def stored(self, number: int) -> bytes:
+        """A chunk as it lies in the file, its CRC32C verified."""
+        entry = self.index[number]
+        body = self.source.read_at(entry.offset, entry.stored_length)
+        if len(body) != entry.stored_length:
+            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is not there; fetch the file again")
+        if google_crc32c.value(body) != entry.crc:
+            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is damaged (its CRC32C differs); "
+                              "fetch the file again")
+        return body
+
+    def chunk(self, number: int, limit: int | None = None) -> bytes:
+        """The raw bytes of a chunk, verified and decoded.
+
+        Args:
+            limit: largest raw length the caller is ready for, bytes; checked before anything is allocated.
+        """
+        entry = self.index[number]
+        if limit is not None and entry.raw_length > limit:
+            raise BudgetError(f"{self.name}: chunk {number} ({entry.kind}) claims {entry.raw_length:,} bytes where at "
+                              f"most {limit:,} make sense")
+        body = self.stored(number)
+        if entry.codec == CODEC_RAW:
+            raw = body
+        elif entry.codec == CODEC_ZSTD:
+            raw = self._decompress(number, body)
+        else:
+            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) uses codec {entry.codec}, "
+                              "unknown to this reader; update kpc")
+        if len(raw) != entry.raw_length:
+            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) holds {len(raw)} bytes, "
+                              f"not the {entry.raw_length} it claims")
+        return raw
+
+    def _decompress(self, number: int, body: bytes) -> bytes:
+        entry = self.index[number]
+        try:
+            frame = zstandard.get_frame_parameters(body)
+            if frame.content_size != entry.raw_length or frame.dict_id:
+                raise FormatError(f"{self.name}: chunk {number} ({entry.kind}): its zstd frame claims another length")
+            return zstandard.ZstdDecompressor().decompress(body, max_output_size=entry.raw_length,
+                                                           allow_extra_data=False)
+        except zstandard.ZstdError as error:
+            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is no valid zstd frame ({error})") from error
+
+
+class _BytesSource:
+    def __init__(self, data: bytes, name: str = "<bytes>"):
+        self.data, self.name, self.size = memoryview(data), name, len(data)
+
+    def read_at(self, offset: int, length: int) -> bytes:
+        return bytes(self.data[offset:offset + length])
+
+
+class _FileSource:
+    """A seekable file object; opened anew for each read when only its path is known."""
+
+    def __init__(self, path: Path | None, file: BinaryIO | None = None):
+        self.path, self.file = path, file
+        self.name = str(path if path is not None else getattr(file, "name", "<file>"))
+        if file is not None:
+            self.size = file.seek(0, io.SEEK_END)
+        else:
+            with open(self.name, "rb") as opened:  # so that an unreadable file is named here, not later
+                self.size = opened.seek(0, io.SEEK_END)
+
+    def read_at(self, offset: int, length: int) -> bytes:
+        if self.file is not None:
+            self.file.seek(offset)
+            return self.file.read(length)
+        with open(self.name, "rb") as opened:
+            opened.seek(offset)
+            return opened.read(length)
+
+
+def _as_source(source: "str | os.PathLike[str] | bytes | BinaryIO | Source") -> Source:
+    if isinstance(source, (str, os.PathLike)):
+        return _FileSource(Path(source))
+    if isinstance(source, (bytes, bytearray, memoryview)):
+        return _BytesSource(bytes(source))
+    if hasattr(source, "read_at"):
+        return source
+    return _FileSource(None, source)

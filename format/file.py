@@ -1,0 +1,445 @@
+"""A scene in a file: what each kind of chunk means (spec/kpc-format.md, sections 5 to 9).
+
+    SCNE  box, clip, sizes, steps and offsets of every plane      needed before anything else
+    DECO  decoder weights                 OCCU  occupancy grid
+    came  cameras (may be ignored)        PLNE  one segment of one plane
+
+The order in the file is the order in which a player wants them: the coarsest picture of the first seconds, then finer
+scales, then later seconds. A plane segment that has not arrived is uncoded: it reads as its offset, and time stands still.
+"""
+
+import math
+import os
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import BinaryIO
+
+import numpy as np
+
+from kpc.format.cameras import Camera
+from kpc.format.cli import written_aside
+from kpc.format.container import DEFAULT_BUDGET, Chunk, Entry, Reader, Source, pack
+from kpc.format.errors import BudgetError, DatasetError, FormatError
+from kpc.format.planes import decode_segment, encode_segment
+from kpc.format.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
+
+SEGMENT_ROWS = 16
+
+SCENE_STRUCT = struct.Struct("<6fIdd3fBB")
+"""aabb, frame_count, fps, step, background, scale_count, dynamic"""
+SCALE_STRUCT = struct.Struct("<5H")
+"""channels, Nx, Ny, Nz, T (0 in a static scene)"""
+DECODER_STRUCT = struct.Struct("<HHf")
+"""features, hidden, density_bias"""
+OCCUPANCY_STRUCT = struct.Struct("<4H")
+"""slots, Nz, Ny, Nx"""
+CAMERA_STRUCT = struct.Struct("<HH16f")
+"""width, height, fl_x, fl_y, cx, cy, the first three rows of camera_to_world"""
+
+SCALE_LIMIT = 16
+CHANNEL_LIMIT = 256
+AXIS_LIMIT = 16384
+HIDDEN_LIMIT = 256
+CAMERA_LIMIT = 4096
+FRAME_LIMIT = 1 << 24
+SAMPLE_LIMIT = 65536
+"""Samples along the box's diagonal, so that no file can make a ray endless."""
+VALUE_LIMIT = 65504.0
+"""Magnitude of any plane value: float16 holds it, and no product of six and no sum of features overflows float32."""
+
+
+@dataclass(frozen=True)
+class PlaneHead:
+    """What is known of a plane before any of its segments: size, and how symbols become values."""
+
+    rows: int
+    columns: int
+    step: np.ndarray
+    offset: np.ndarray
+
+    @property
+    def channels(self) -> int:
+        return len(self.step)
+
+    @property
+    def value_count(self) -> int:
+        return self.rows * self.columns * self.channels
+
+
+@dataclass(frozen=True)
+class SceneHead:
+    """The SCNE chunk: everything but the planes' symbols, the decoder, the occupancy and the cameras."""
+
+    aabb: np.ndarray
+    clip: Clip
+    step: float
+    background: np.ndarray
+    scales: tuple[Mapping[str, PlaneHead], ...]
+
+    @property
+    def is_dynamic(self) -> bool:
+        return "xt" in self.scales[0]
+
+    @property
+    def value_count(self) -> int:
+        return sum(plane.value_count for scale in self.scales for plane in scale.values())
+
+    @property
+    def feature_count(self) -> int:
+        return sum(scale["xy"].channels for scale in self.scales)
+
+
+# --- writing
+
+
+def write(scene: QuantisedScene, path: str | os.PathLike[str], *, segment_rows: int = SEGMENT_ROWS) -> int:
+    """Write a scene; return the size in bytes. On failure `path` is left as it was.
+
+    Args:
+        segment_rows: rows of a time plane in one segment, the unit in which a player fetches time.
+
+    Raises:
+        FormatError: the scene breaks a rule that every reader checks; the message says which.
+    """
+    data = encode(scene, segment_rows=segment_rows)
+    try:
+        with written_aside(path) as aside:
+            aside.write_bytes(data)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from error
+    return len(data)
+
+
+def encode(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> bytes:
+    """The bytes of the file that `write` makes."""
+    if segment_rows < 1:
+        raise FormatError(f"segment_rows {segment_rows} is not positive")
+    head = _pack_head(scene)
+    parsed = _parse_head(head)  # the same rules that a reader applies
+    _check_planes(scene, parsed)
+    chunks = [Chunk("SCNE", head), Chunk("DECO", _pack_decoder(scene.decoder, parsed.feature_count)),
+              Chunk("OCCU", _pack_occupancy(scene.occupancy))]
+    if scene.cameras:
+        chunks.append(Chunk("came", _pack_cameras(scene.cameras)))
+    latest = max(plane.rows for scale in parsed.scales for name, plane in scale.items() if name in TIME_PLANES) \
+        if parsed.is_dynamic else 1
+    for start in range(0, latest, segment_rows):
+        for number, scale in enumerate(scene.scales):
+            for name, plane in scale.items():
+                if name in TIME_PLANES:
+                    stop = min(start + segment_rows, len(plane.symbols))
+                else:
+                    stop = len(plane.symbols) if start == 0 else 0
+                if start < stop:
+                    payload = encode_segment(plane.symbols[start:stop], plane.coded[start:stop])
+                    chunks.append(Chunk("PLNE", payload, number, ALL_PLANES.index(name), start, stop - start))
+    return pack(chunks, parsed.value_count)
+
+
+def _pack_head(scene: QuantisedScene) -> bytes:
+    if np.shape(scene.aabb) != (2, 3) or np.shape(scene.background) != (3,) or not 0 < len(scene.scales) < 256:
+        raise FormatError("scene: the box must be (2, 3), the background (3,), and there must be 1 to 255 scales")
+    parts = [SCENE_STRUCT.pack(*np.ravel(scene.aabb), scene.clip.frame_count, scene.clip.fps, scene.step,
+                               *scene.background, len(scene.scales), scene.is_dynamic)]
+    names = ALL_PLANES if scene.is_dynamic else SPACE_PLANES
+    for number, scale in enumerate(scene.scales):
+        if set(scale) != set(names):
+            raise FormatError(f"scene: scale {number} holds planes {sorted(scale)}, not {sorted(names)}")
+        ny, nx, channels = scale["xy"].symbols.shape
+        nz = scale["xz"].symbols.shape[0]
+        nt = scale["xt"].symbols.shape[0] if scene.is_dynamic else 0
+        parts.append(SCALE_STRUCT.pack(channels, nx, ny, nz, nt))
+        for name in names:
+            parts.append(scale[name].step.astype("<f4").tobytes())
+            if name in SPACE_PLANES:
+                parts.append(scale[name].offset.astype("<f4").tobytes())
+    return b"".join(parts)
+
+
+def _check_planes(scene: QuantisedScene, head: SceneHead) -> None:
+    for number, (scale, heads) in enumerate(zip(scene.scales, head.scales, strict=True)):
+        for name, plane in scale.items():
+            where, expected = f"scale {number}, plane {name}", heads[name]
+            shape = (expected.rows, expected.columns, expected.channels)
+            if plane.symbols.shape != shape or plane.coded.shape != shape[:2] or plane.symbols.dtype != np.int8:
+                raise FormatError(f"{where}: is {plane.symbols.dtype} {plane.symbols.shape}, not int8 {shape}")
+            if not np.array_equal(plane.offset, expected.offset):
+                raise FormatError(f"{where}: the offset of a time plane must be 1")
+            if plane.symbols[~plane.coded].any():
+                raise FormatError(f"{where}: an uncoded texel holds a symbol other than 0")
+
+
+def _pack_decoder(decoder: Decoder, features: int) -> bytes:
+    hidden = len(decoder.b1)
+    shapes = _decoder_shapes(features, hidden)
+    weights = (decoder.density_weight, decoder.w1, decoder.b1, decoder.w2, decoder.b2)
+    if tuple(np.shape(w) for w in weights) != shapes:
+        raise FormatError(f"decoder: weights of shapes {[np.shape(w) for w in weights]}, not {list(shapes)}")
+    if any(not np.array_equal(w, w.astype(np.float16)) for w in weights):
+        raise FormatError("decoder: the weights are not rounded to float16 (kpc.format.quantise.round_decoder)")
+    return b"".join([DECODER_STRUCT.pack(features, hidden, decoder.density_bias),
+                     *(np.asarray(w).astype("<f2").tobytes() for w in weights)])
+
+
+def _pack_occupancy(occupancy: np.ndarray) -> bytes:
+    if occupancy.ndim != 4 or occupancy.dtype != bool or not all(0 < n <= AXIS_LIMIT for n in occupancy.shape):
+        raise FormatError(f"occupancy: is {occupancy.dtype} {occupancy.shape}, not bool (slots, Nz, Ny, Nx)")
+    return OCCUPANCY_STRUCT.pack(*occupancy.shape) + np.packbits(occupancy, bitorder="little").tobytes()
+
+
+def _pack_cameras(cameras: tuple[Camera, ...]) -> bytes:
+    return struct.pack("<H", len(cameras)) + b"".join(
+        CAMERA_STRUCT.pack(c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy, *np.ravel(c.camera_to_world[:3]))
+        for c in cameras)
+
+
+# --- reading
+
+
+def read(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, memory_budget: int = DEFAULT_BUDGET,
+         allow_partial: bool = False) -> QuantisedScene:
+    """Read a whole scene; every byte of the file is verified.
+
+    Args:
+        memory_budget: bytes that the scene may take, its float32 planes included.
+        allow_partial: accept a file whose end is missing, as long as SCNE, DECO and OCCU are there. Segments that are
+            not there are uncoded.
+
+    Raises:
+        FormatError: the file is damaged, hostile or of an unknown version.
+        BudgetError: it needs more than `memory_budget`; raised before the memory is taken.
+    """
+    reader = SceneReader(source, memory_budget=memory_budget, allow_partial=allow_partial)
+    scales = tuple({
+        name: QuantisedPlane(np.zeros((p.rows, p.columns, p.channels), np.int8), p.step, p.offset,
+                             np.zeros((p.rows, p.columns), bool))
+        for name, p in scale.items()
+    } for scale in reader.head.scales)
+    for number, entry in enumerate(reader.index):
+        if not reader.available(number):
+            continue
+        if entry.kind == "PLNE":
+            plane = scales[entry.scale][ALL_PLANES[entry.plane]]
+            rows = slice(entry.row_start, entry.row_start + entry.row_count)
+            plane.symbols[rows], plane.coded[rows] = reader.segment(number)
+        elif entry.kind not in KNOWN_KINDS:
+            reader.stored(number)  # ignored, but never damaged
+    return QuantisedScene(reader.head.aabb, reader.head.clip, scales, reader.decoder(), reader.occupancy(),
+                          reader.head.background, reader.head.step, reader.cameras())
+
+
+class SceneReader(Reader):
+    """A `Reader` that knows what the chunks mean: random access to the parts of a scene.
+
+    Opening reads header, index and SCNE, and checks that the index lists a whole scene that fits the memory budget.
+
+    Attributes:
+        head: the SCNE chunk.
+
+    Raises:
+        FormatError, BudgetError: as `read`.
+    """
+
+    def __init__(self, source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *,
+                 memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False):
+        super().__init__(source, allow_partial=allow_partial)
+        self.memory_budget = memory_budget
+        for number, entry in enumerate(self.index):
+            if entry.is_critical and entry.kind not in KNOWN_KINDS:
+                raise FormatError(f"{self.name}: chunk {number} is of the critical kind {entry.kind}, unknown to this "
+                                  "reader; update kpc")
+        self.head = self._parsed(_parse_head, self.chunk(self._only("SCNE"), HEAD_LIMIT))
+        if self.head.value_count != self.header.value_count:
+            raise FormatError(f"{self.name}: the header claims {self.header.value_count:,} values, "
+                              f"the scene {self.head.value_count:,}")
+        needed = 5 * self.head.value_count  # one int8 symbol and one float32 each
+        if needed > memory_budget:
+            raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory, more than the budget of {memory_budget:,}")
+        self._check_segments()
+        self._only("DECO")
+        self._only("OCCU")
+
+    def segment(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Decode a PLNE chunk: (row_count, W, M) int8 symbols and (row_count, W) bool coded texels."""
+        entry = self.index[number]
+        plane = self.head.scales[entry.scale][ALL_PLANES[entry.plane]]
+        size = entry.row_count * plane.columns, plane.channels
+        payload = self.chunk(number, 1 + size[0] // 8 + 1 + size[1] + size[0] * size[1])
+        return self._parsed(lambda raw: decode_segment(raw, entry.row_count, plane.columns, plane.channels), payload)
+
+    def decoder(self) -> Decoder:
+        """The DECO chunk."""
+        return self._parsed(lambda raw: _parse_decoder(raw, self.head.feature_count), self.chunk(self._only("DECO")))
+
+    def occupancy(self) -> np.ndarray:
+        """The OCCU chunk: (slots, Nz, Ny, Nx) bool."""
+        left = self.memory_budget - 5 * self.head.value_count
+        return self._parsed(_parse_occupancy, self.chunk(self._only("OCCU"), OCCUPANCY_STRUCT.size + left // 8))
+
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras, none if the file has (or has yet) no such chunk."""
+        found = [n for n, entry in enumerate(self.index) if entry.kind == "came"]
+        if len(found) > 1:
+            raise FormatError(f"{self.name}: holds {len(found)} came chunks, not one")
+        if not found or not self.available(found[0]):
+            return ()
+        return self._parsed(_parse_cameras, self.chunk(found[0], 2 + CAMERA_LIMIT * CAMERA_STRUCT.size))
+
+    def _only(self, kind: str) -> int:
+        found = [number for number, entry in enumerate(self.index) if entry.kind == kind]
+        if len(found) != 1:
+            raise FormatError(f"{self.name}: holds {len(found)} {kind} chunks, not one")
+        return found[0]
+
+    def _parsed(self, parse, raw: bytes):
+        try:
+            return parse(raw)
+        except FormatError as error:
+            raise FormatError(f"{self.name}: {error}") from error
+
+    def _check_segments(self) -> None:
+        """Every plane is listed whole: its segments, in order of their rows, neither overlap nor leave a gap."""
+        names = ALL_PLANES if self.head.is_dynamic else SPACE_PLANES
+        runs: dict[tuple[int, int], list[Entry]] = {
+            (scale, plane): [] for scale in range(len(self.head.scales)) for plane in range(len(names))}
+        for number, entry in enumerate(self.index):
+            if entry.kind != "PLNE":
+                if entry.kind in KNOWN_KINDS and any(
+                        (entry.group, entry.scale, entry.plane, entry.row_start, entry.row_count)):
+                    raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) claims a place among the planes")
+                continue
+            if entry.group != 0 or (entry.scale, entry.plane) not in runs:
+                raise FormatError(f"{self.name}: chunk {number} belongs to group {entry.group}, scale {entry.scale}, "
+                                  f"plane {entry.plane}, which the scene does not have")
+            runs[entry.scale, entry.plane].append(entry)
+        for (scale, plane), entries in runs.items():
+            where, head, row = f"scale {scale}, plane {names[plane]}", self.head.scales[scale][names[plane]], 0
+            if names[plane] in SPACE_PLANES and len(entries) > 1:
+                raise FormatError(f"{self.name}: {where}: a space plane is one segment, not {len(entries)}")
+            for entry in sorted(entries, key=lambda e: e.row_start):
+                if entry.row_start != row or entry.row_count < 1:
+                    raise FormatError(f"{self.name}: {where}: no segment starts at row {row}, or two do")
+                row += entry.row_count
+            if row != head.rows:
+                raise FormatError(f"{self.name}: {where}: its segments hold {row} rows, not {head.rows}")
+
+
+KNOWN_KINDS = frozenset({"SCNE", "DECO", "OCCU", "came", "PLNE"})
+HEAD_LIMIT = SCENE_STRUCT.size + SCALE_LIMIT * (SCALE_STRUCT.size + 9 * 4 * CHANNEL_LIMIT)
+
+
+def _parse_head(raw: bytes) -> SceneHead:
+    cursor = _Cursor(raw, "SCNE")
+    fields = cursor.unpack(SCENE_STRUCT)
+    aabb = np.array(fields[:6], np.float32).reshape(2, 3)
+    frame_count, fps, step = fields[6:9]
+    background = np.array(fields[9:12], np.float32)
+    scale_count, dynamic = fields[12:]
+    if not np.isfinite(aabb).all() or not (aabb[0] < aabb[1]).all():
+        raise FormatError("SCNE: the box is empty or not finite")
+    if not (math.isfinite(fps) and fps > 0 and 0 < frame_count <= FRAME_LIMIT):
+        raise FormatError(f"SCNE: a clip of {frame_count} frames at {fps} fps makes no sense")
+    diagonal = float(np.linalg.norm(aabb[1].astype(np.float64) - aabb[0].astype(np.float64)))
+    if not (math.isfinite(step) and step > 0 and diagonal / step <= SAMPLE_LIMIT):
+        raise FormatError(f"SCNE: a ray step of {step} in a box of diagonal {diagonal} makes no sense")
+    if not ((background >= 0) & (background <= 1)).all():
+        raise FormatError("SCNE: the background lies outside [0, 1]")
+    if not 0 < scale_count <= SCALE_LIMIT or dynamic > 1:
+        raise FormatError(f"SCNE: {scale_count} scales (1 to {SCALE_LIMIT} allowed), dynamic flag {dynamic}")
+    scales = tuple(_parse_scale(cursor, number, bool(dynamic)) for number in range(scale_count))
+    cursor.finish()
+    return SceneHead(aabb, Clip(frame_count, fps), step, background, scales)
+
+
+def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, PlaneHead]:
+    channels, nx, ny, nz, nt = cursor.unpack(SCALE_STRUCT)
+    size = {"x": nx, "y": ny, "z": nz, "t": nt}
+    if not 0 < channels <= CHANNEL_LIMIT or not all(0 < n <= AXIS_LIMIT for n in (nx, ny, nz)) \
+            or dynamic != (nt > 0) or nt > AXIS_LIMIT:
+        raise FormatError(f"SCNE: scale {number} claims {channels} channels on a grid of {nx}x{ny}x{nz}, {nt} rows in time")
+    planes = {}
+    for name in ALL_PLANES if dynamic else SPACE_PLANES:
+        step = cursor.array("<f4", channels).astype(np.float32)
+        offset = cursor.array("<f4", channels).astype(np.float32) if name in SPACE_PLANES \
+            else np.ones(channels, np.float32)
+        with np.errstate(over="ignore"):
+            in_range = (step > 0) & (step * np.float32(128) + np.abs(offset) <= VALUE_LIMIT)  # False for NaN, too
+        if not in_range.all():
+            raise FormatError(f"SCNE: scale {number}, plane {name}: a step or an offset lies outside its range")
+        planes[name] = PlaneHead(size[name[1]], size[name[0]], step, offset)
+    return planes
+
+
+def _decoder_shapes(features: int, hidden: int) -> tuple[tuple[int, ...], ...]:
+    return (features,), (hidden, 9), (hidden,), (3, features, hidden), (3, features)
+
+
+def _parse_decoder(raw: bytes, expected_features: int) -> Decoder:
+    cursor = _Cursor(raw, "DECO")
+    features, hidden, bias = cursor.unpack(DECODER_STRUCT)
+    if features != expected_features or not 0 < hidden <= HIDDEN_LIMIT or not math.isfinite(bias):
+        raise FormatError(f"DECO: {features} features (the planes give {expected_features}), {hidden} hidden units "
+                          f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}")
+    weights = [cursor.array("<f2", math.prod(shape)).astype(np.float32).reshape(shape)
+               for shape in _decoder_shapes(features, hidden)]
+    cursor.finish()
+    if not all(np.isfinite(w).all() for w in weights):
+        raise FormatError("DECO: a weight is NaN or infinite")
+    density, w1, b1, w2, b2 = weights
+    return Decoder(density, bias, w1, b1, w2, b2)
+
+
+def _parse_occupancy(raw: bytes) -> np.ndarray:
+    cursor = _Cursor(raw, "OCCU")
+    shape = cursor.unpack(OCCUPANCY_STRUCT)
+    if not all(0 < n <= AXIS_LIMIT for n in shape):
+        raise FormatError(f"OCCU: a grid of {shape} cells makes no sense")
+    cells = math.prod(shape)
+    packed = cursor.array("u1", -(-cells // 8))
+    cursor.finish()
+    if cells % 8 and packed[-1] >> cells % 8:
+        raise FormatError("OCCU: the unused bits of its last byte are not 0")
+    return np.unpackbits(packed, bitorder="little", count=cells).astype(bool).reshape(shape)
+
+
+def _parse_cameras(raw: bytes) -> tuple[Camera, ...]:
+    cursor = _Cursor(raw, "came")
+    count, = cursor.unpack(struct.Struct("<H"))
+    if not 0 < count <= CAMERA_LIMIT:
+        raise FormatError(f"came: {count} cameras (1 to {CAMERA_LIMIT} allowed)")
+    cameras = []
+    for number in range(count):
+        width, height, fl_x, fl_y, cx, cy, *pose = cursor.unpack(CAMERA_STRUCT)
+        matrix = np.vstack([np.reshape(pose, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+        try:
+            cameras.append(Camera(width, height, fl_x, fl_y, cx, cy, matrix))
+        except DatasetError as error:
+            raise FormatError(f"came: camera {number}: {error}") from error
+    cursor.finish()
+    return tuple(cameras)
+
+
+class _Cursor:
+    """Reads a chunk from its start to its end, never beyond."""
+
+    def __init__(self, raw: bytes, kind: str):
+        self.raw, self.kind, self.position = raw, kind, 0
+
+    def take(self, length: int) -> bytes:
+        taken = self.raw[self.position:self.position + length]
+        if len(taken) != length:
+            raise FormatError(f"{self.kind}: ends after {len(self.raw)} bytes, {self.position + length} needed")
+        self.position += length
+        return taken
+
+    def unpack(self, layout: struct.Struct) -> tuple:
+        return layout.unpack(self.take(layout.size))
+
+    def array(self, dtype: str, count: int) -> np.ndarray:
+        return np.frombuffer(self.take(np.dtype(dtype).itemsize * count), dtype)
+
+    def finish(self) -> None:
+        if self.position != len(self.raw):
+            raise FormatError(f"{self.kind}: {len(self.raw) - self.position} bytes too long")

@@ -1,0 +1,198 @@
+"""Planes as 8-bit symbols: what the file stores, and the one multiply-add that turns it back into numbers.
+
+    value = float32(float32(symbol * step) + offset)            spec/kpc-format.md, "Dequantisation"
+
+Both roundings are to nearest even and happen in this order: a decoder must not fuse them. An *uncoded* texel has
+symbol 0 in every channel, hence the value `offset`: exactly 1 on time planes (the multiplicative identity), a default
+of the channel on space planes (read only where nothing is seen).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from kpc.format.cameras import Camera
+from kpc.format.errors import FormatError
+from kpc.format.scene import TIME_PLANES, Clip, Decoder, Scene
+
+SYMBOL_MIN, SYMBOL_MAX = -128, 127
+
+
+@dataclass(frozen=True)
+class QuantisedPlane:
+    """One plane as integers.
+
+    Attributes:
+        symbols: (H, W, M) int8; 0 wherever `coded` is False.
+        step: (M,) float32 > 0; offset: (M,) float32, exactly 1 on time planes.
+        coded: (H, W) bool, the texels whose symbols the file stores.
+    """
+
+    symbols: np.ndarray
+    step: np.ndarray
+    offset: np.ndarray
+    coded: np.ndarray
+
+    def dequantise(self) -> np.ndarray:
+        """(H, W, M) float32: symbol * step + offset, rounded after the product and after the sum."""
+        values = self.symbols.astype(np.float32)
+        values *= self.step
+        values += self.offset
+        return values
+
+
+def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bool, needed: np.ndarray | None = None,
+                   name: str = "plane") -> QuantisedPlane:
+    """Round a plane to symbols: |dequantised - value| <= step / 2 (the plane's own step) at every needed texel.
+
+    Space planes (identity=False): the offset is the mean over the needed texels, moved by as little as brings the
+    whole range into 8 bits; a step too small for the range is enlarged to range / 255. All needed texels are coded.
+    Time planes (identity=True): the offset is 1; a step too small is enlarged until [-128, 127] reaches both ends of
+    the range. Texels whose symbols all come out 0 are not coded.
+
+    Args:
+        values: (H, W, M) float32. step: (M,) or one number for all channels, > 0.
+        needed: (H, W) bool; False where no occupied point projects to. Those texels are not coded. None: all needed.
+        name: of the plane, for messages.
+
+    Raises:
+        FormatError: a needed value is NaN or infinite, or a step is not positive.
+    """
+    rows, columns, channels = values.shape
+    step = np.broadcast_to(np.asarray(step, np.float32), (channels,)).copy()
+    needed = np.ones((rows, columns), bool) if needed is None else needed.astype(bool)
+    wanted = values[needed].astype(np.float64)  # (needed texels, M)
+    if not np.isfinite(wanted).all():
+        raise FormatError(f"{name}: holds NaN or infinity, which no file can store; train with a lower learning rate")
+    if not (np.isfinite(step) & (step > 0)).all():
+        raise FormatError(f"{name}: a quantisation step is not a positive number")
+
+    low, high = (wanted.min(0), wanted.max(0)) if len(wanted) else (np.ones(channels), np.ones(channels))
+    if identity:
+        offset = np.ones(channels, np.float32)
+        step = _at_least(step, np.maximum((high - 1.0) / SYMBOL_MAX, (low - 1.0) / SYMBOL_MIN))
+    else:
+        step = _at_least(step, (high - low) / (SYMBOL_MAX - SYMBOL_MIN))
+        mean = wanted.mean(0) if len(wanted) else np.ones(channels)
+        offset = np.clip(mean, high - SYMBOL_MAX * step.astype(np.float64), low - SYMBOL_MIN * step.astype(np.float64))
+        offset = offset.astype(np.float32)
+
+    symbols = np.zeros(values.shape, np.int8)
+    rounded = np.rint((wanted - offset) / step.astype(np.float64))
+    symbols[needed] = np.clip(rounded, SYMBOL_MIN, SYMBOL_MAX).astype(np.int8)
+    coded = symbols.any(axis=2) if identity else needed
+    return QuantisedPlane(symbols, step, offset, coded)
+
+
+def _at_least(step: np.ndarray, bound: np.ndarray) -> np.ndarray:
+    """`step`, raised to `bound` where it falls short; rounded up, so that the bound still holds in float32."""
+    return np.where(step < bound, np.nextafter(bound.astype(np.float32), np.float32(np.inf)), step)
+
+
+@dataclass(frozen=True)
+class QuantisedScene:
+    """A `Scene` as the file stores it: planes as symbols, decoder weights and cameras rounded. Fields as in `Scene`."""
+
+    aabb: np.ndarray
+    clip: Clip
+    scales: tuple[Mapping[str, QuantisedPlane], ...]
+    decoder: Decoder
+    occupancy: np.ndarray
+    background: np.ndarray
+    step: float
+    cameras: tuple[Camera, ...] = field(default=())
+
+    def dequantise(self) -> Scene:
+        """The scene that every decoder sees."""
+        scales = tuple({name: plane.dequantise() for name, plane in scale.items()} for scale in self.scales)
+        return Scene(self.aabb, self.clip, scales, self.decoder, self.occupancy, self.background, self.step,
+                     self.cameras)
+
+    @property
+    def is_dynamic(self) -> bool:
+        return "xt" in self.scales[0]
+
+    @property
+    def parameter_count(self) -> int:
+        """Numbers in the model, coded or not; the same as the dequantised scene's."""
+        return sum(p.symbols.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count
+
+    @property
+    def identity_share(self) -> float:
+        """Share of the time planes' texels that are exactly 1 in every channel; 1 for a static scene."""
+        coded = [p.coded for scale in self.scales for name, p in scale.items() if name in TIME_PLANES]
+        return 1.0 - sum(int(c.sum()) for c in coded) / sum(c.size for c in coded) if coded else 1.0
+
+
+def quantise_scene(scene: Scene, steps: Sequence[Mapping[str, np.ndarray | float]], *,
+                   skip_unseen: bool = True) -> QuantisedScene:
+    """Quantise every plane and round the rest to what the file stores.
+
+    Args:
+        steps: one mapping a scale, plane name -> step: (M,) or a number.
+        skip_unseen: leave texels that no occupied point projects to uncoded.
+
+    Raises:
+        FormatError: a value is NaN or infinite; the message names the scale and the plane.
+    """
+    scales = []
+    for number, (planes, plane_steps) in enumerate(zip(scene.scales, steps, strict=True)):
+        scales.append({
+            name: quantise_plane(
+                values, plane_steps[name], identity=name in TIME_PLANES, name=f"scale {number}, plane {name}",
+                needed=needed_texels(scene.occupancy, name, *values.shape[:2]) if skip_unseen else None)
+            for name, values in planes.items()
+        })
+    return QuantisedScene(
+        np.asarray(scene.aabb, np.float32), scene.clip, tuple(scales), round_decoder(scene.decoder),
+        np.asarray(scene.occupancy, bool), np.asarray(scene.background, np.float32), float(scene.step),
+        tuple(round_camera(camera) for camera in scene.cameras),
+    )
+
+
+def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) -> np.ndarray:
+    """(rows, columns) bool: the texels of a plane that a bilinear read from inside an occupied cell may touch.
+
+    Args:
+        occupancy: (slots, Nz, Ny, Nx) bool. plane: its name, such as "xy" or "zt".
+    """
+    axes = {"t": 0, "z": 1, "y": 2, "x": 3}
+    across, down = axes[plane[0]], axes[plane[1]]
+    others = tuple(axis for axis in range(4) if axis not in (across, down))
+    seen = occupancy.any(axis=others)  # the kept axes stay in the order t, z, y, x
+    seen = seen if down < across else seen.T
+    reach = _reach(rows, seen.shape[0]) @ seen.astype(np.float32) @ _reach(columns, seen.shape[1]).T
+    return reach > 0
+
+
+def _reach(texels: int, cells: int) -> np.ndarray:
+    """(texels, cells) float32, 1 where the cell [c, c + 1] / cells meets the closed support [i - 1, i + 1] / (texels - 1)."""
+    i, c = np.arange(texels)[:, None], np.arange(cells)[None]
+    return (((i + 1) * cells >= c * (texels - 1)) & ((i - 1) * cells <= (c + 1) * (texels - 1))).astype(np.float32)
+
+
+def round_decoder(decoder: Decoder) -> Decoder:
+    """The decoder with its weights rounded to float16 (the density bias to float32), as float32 arrays.
+
+    Raises:
+        FormatError: a weight is NaN, infinite or beyond float16's 65504.
+    """
+    def half(weights: np.ndarray) -> np.ndarray:
+        if not (np.abs(weights) <= 65504.0).all():
+            raise FormatError("decoder: a weight is NaN or beyond 65504, which no file can store; lower the learning rate")
+        return np.asarray(weights).astype(np.float16).astype(np.float32)
+
+    if not np.isfinite(decoder.density_bias):
+        raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
+    return Decoder(half(decoder.density_weight), float(np.float32(decoder.density_bias)), half(decoder.w1),
+                   half(decoder.b1), half(decoder.w2), half(decoder.b2))
+
+
+def round_camera(camera: Camera) -> Camera:
+    """The camera with its numbers rounded to float32."""
+    def single(value: float) -> float:
+        return float(np.float32(value))
+
+    return replace(camera, fl_x=single(camera.fl_x), fl_y=single(camera.fl_y), cx=single(camera.cx),
+                   cy=single(camera.cy), camera_to_world=camera.camera_to_world.astype(np.float32).astype(np.float64))
