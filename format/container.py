@@ -95,10 +95,10 @@ class Entry:
 
 @dataclass(frozen=True)
 class Chunk:
-    """One chunk to be written: its place and its raw bytes."""
+    """One chunk to be written: its place and its raw bytes, cut where their statistics change."""
 
     kind: str
-    raw: bytes
+    parts: Sequence[bytes]
     scale: int = 0
     plane: int = 0
     row_start: int = 0
@@ -112,24 +112,41 @@ def pack(chunks: Sequence[Chunk], value_count: int) -> bytes:
         FormatError: the result would break a limit that every reader checks.
     """
     offset = HEADER.size + ENTRY.size * len(chunks)
-    entries, bodies = [], []
+    entries, bodies, largest = [], [], 0
     for chunk in chunks:
-        body, codec = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(chunk.raw), CODEC_ZSTD
-        if len(body) >= len(chunk.raw):
-            body, codec = chunk.raw, CODEC_RAW
+        raw = b"".join(chunk.parts)
+        body, codec = min(_zstd_frames(chunk.parts), key=len), CODEC_ZSTD
+        if len(body) >= len(raw):
+            body, codec = raw, CODEC_RAW
         entries.append(ENTRY.pack(chunk.kind.encode("ascii"), 0, chunk.scale, chunk.plane, chunk.row_start,
-                                  chunk.row_count, codec, 0, len(body), len(chunk.raw), google_crc32c.value(body),
-                                  offset))
+                                  chunk.row_count, codec, 0, len(body), len(raw), google_crc32c.value(body), offset))
         bodies.append(body)
         offset += len(body)
+        largest = max(largest, len(raw))
     index = b"".join(entries)
-    largest = max(len(chunk.raw) for chunk in chunks)
     if max(value_count, largest) > offset * EXPANSION_LIMIT:
         raise FormatError(f"the scene is too empty for its size: {value_count:,} values in {offset:,} bytes; "
                           "choose a lower resolution")
     header = HEADER.pack(MAGIC, VERSION, 0, HEADER.size, HEADER.size, len(index), len(chunks), offset, value_count,
                          largest, 0, google_crc32c.value(index), 0)
     return b"".join([header[:-4], struct.pack("<I", google_crc32c.value(header[:-4])), index, *bodies])
+
+
+def _zstd_frames(parts: Sequence[bytes]) -> list[bytes]:
+    """The same bytes as zstd frames of several kinds; which is smallest depends on the data.
+
+    Noise tempts the parser into short matches that cost more than they save, hence the longer minimum; a block boundary
+    after each part gives it a Huffman table of its own.
+    """
+    raw = b"".join(parts)
+    long_matches = zstandard.ZstdCompressionParameters.from_level(ZSTD_LEVEL, source_size=len(raw), min_match=7)
+    stream = zstandard.ZstdCompressor(compression_params=long_matches).compressobj(size=len(raw))
+    blocks = [stream.compress(part) + stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for part in parts]
+    return [
+        zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(raw),
+        zstandard.ZstdCompressor(compression_params=long_matches).compress(raw),
+        b"".join([*blocks, stream.flush()]),
+    ]
 
 
 class Reader:

@@ -11,9 +11,9 @@ scales, then later seconds. A plane segment that has not arrived is uncoded: it 
 import math
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
+
+Parsed = TypeVar("Parsed")
 
 SEGMENT_ROWS = 16
 
@@ -116,13 +118,16 @@ def encode(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> bytes:
     """The bytes of the file that `write` makes."""
     if segment_rows < 1:
         raise FormatError(f"segment_rows {segment_rows} is not positive")
-    head = _pack_head(scene)
-    parsed = _parse_head(head)  # the same rules that a reader applies
-    _check_planes(scene, parsed)
-    chunks = [Chunk("SCNE", head), Chunk("DECO", _pack_decoder(scene.decoder, parsed.feature_count)),
-              Chunk("OCCU", _pack_occupancy(scene.occupancy))]
-    if scene.cameras:
-        chunks.append(Chunk("came", _pack_cameras(scene.cameras)))
+    try:
+        head = _pack_head(scene)
+        parsed = _parse_head(head)  # the same rules that a reader applies
+        _check_planes(scene, parsed)
+        chunks = [Chunk("SCNE", [head]), Chunk("DECO", [_pack_decoder(scene.decoder, parsed.feature_count)]),
+                  Chunk("OCCU", [_pack_occupancy(scene.occupancy)])]
+        if scene.cameras:
+            chunks.append(Chunk("came", [_pack_cameras(scene.cameras)]))
+    except (struct.error, OverflowError) as error:
+        raise FormatError(f"scene: a number does not fit its field ({error})") from error
     latest = max(plane.rows for scale in parsed.scales for name, plane in scale.items() if name in TIME_PLANES) \
         if parsed.is_dynamic else 1
     for start in range(0, latest, segment_rows):
@@ -186,7 +191,8 @@ def _pack_decoder(decoder: Decoder, features: int) -> bytes:
 def _pack_occupancy(occupancy: np.ndarray) -> bytes:
     if occupancy.ndim != 4 or occupancy.dtype != bool or not all(0 < n <= AXIS_LIMIT for n in occupancy.shape):
         raise FormatError(f"occupancy: is {occupancy.dtype} {occupancy.shape}, not bool (slots, Nz, Ny, Nx)")
-    return OCCUPANCY_STRUCT.pack(*occupancy.shape) + np.packbits(occupancy, bitorder="little").tobytes()
+    slots_last = np.moveaxis(occupancy, 0, -1)  # a cell that never changes makes a run of equal bits
+    return OCCUPANCY_STRUCT.pack(*occupancy.shape) + np.packbits(slots_last, bitorder="little").tobytes()
 
 
 def _pack_cameras(cameras: tuple[Camera, ...]) -> bytes:
@@ -265,13 +271,15 @@ class SceneReader(Reader):
         """Decode a PLNE chunk: (row_count, W, M) int8 symbols and (row_count, W) bool coded texels."""
         entry = self.index[number]
         plane = self.head.scales[entry.scale][ALL_PLANES[entry.plane]]
-        size = entry.row_count * plane.columns, plane.channels
-        payload = self.chunk(number, 1 + size[0] // 8 + 1 + size[1] + size[0] * size[1])
+        texels = entry.row_count * plane.columns
+        payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * (1 + texels))
         return self._parsed(lambda raw: decode_segment(raw, entry.row_count, plane.columns, plane.channels), payload)
 
     def decoder(self) -> Decoder:
         """The DECO chunk."""
-        return self._parsed(lambda raw: _parse_decoder(raw, self.head.feature_count), self.chunk(self._only("DECO")))
+        features = self.head.feature_count
+        most = DECODER_STRUCT.size + 2 * sum(map(math.prod, _decoder_shapes(features, HIDDEN_LIMIT)))
+        return self._parsed(lambda raw: _parse_decoder(raw, features), self.chunk(self._only("DECO"), most))
 
     def occupancy(self) -> np.ndarray:
         """The OCCU chunk: (slots, Nz, Ny, Nx) bool."""
@@ -293,7 +301,7 @@ class SceneReader(Reader):
             raise FormatError(f"{self.name}: holds {len(found)} {kind} chunks, not one")
         return found[0]
 
-    def _parsed(self, parse, raw: bytes):
+    def _parsed(self, parse: Callable[[bytes], Parsed], raw: bytes) -> Parsed:
         try:
             return parse(raw)
         except FormatError as error:
@@ -401,7 +409,8 @@ def _parse_occupancy(raw: bytes) -> np.ndarray:
     cursor.finish()
     if cells % 8 and packed[-1] >> cells % 8:
         raise FormatError("OCCU: the unused bits of its last byte are not 0")
-    return np.unpackbits(packed, bitorder="little", count=cells).astype(bool).reshape(shape)
+    slots_last = np.unpackbits(packed, bitorder="little", count=cells).reshape(*shape[1:], shape[0])
+    return np.ascontiguousarray(np.moveaxis(slots_last, -1, 0)).view(bool)
 
 
 def _parse_cameras(raw: bytes) -> tuple[Camera, ...]:

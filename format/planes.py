@@ -17,17 +17,20 @@ FILTER_COUNT = 4
 MAP_ABSENT, MAP_PRESENT = 0, 1
 
 
-def encode_segment(symbols: np.ndarray, coded: np.ndarray) -> bytes:
-    """Pack (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False; each channel gets the filter of least entropy."""
+def encode_segment(symbols: np.ndarray, coded: np.ndarray) -> list[bytes]:
+    """Pack (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False; each channel gets the filter of least entropy.
+
+    Returns:
+        The payload in parts: what precedes the residuals, then the residuals of each channel.
+    """
     channels = symbols.shape[2]
     raster = np.ascontiguousarray(symbols.transpose(2, 0, 1)).view(np.uint8)  # (M, H, W)
     candidates = [residual[:, coded] for residual in _residuals(raster, coded)]
     bits = np.array([[_entropy_bits(residual[m]) for m in range(channels)] for residual in candidates])
     filters = bits.argmin(axis=0).astype(np.uint8)
-    residuals = np.stack([candidates[f][m] for m, f in enumerate(filters)])
     coded_map = b"" if coded.all() else np.packbits(coded, bitorder="little").tobytes()
     flag = MAP_PRESENT if coded_map else MAP_ABSENT
-    return b"".join([bytes([flag]), coded_map, filters.tobytes(), residuals.tobytes()])
+    return [bytes([flag]) + coded_map + filters.tobytes(), *(candidates[f][m].tobytes() for m, f in enumerate(filters))]
 
 
 def decode_segment(payload: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
