@@ -17,7 +17,7 @@ from typing import BinaryIO, Protocol
 import google_crc32c
 import zstandard
 
-from kpc.format.errors import BudgetError, FormatError
+from kpc.format.errors import FormatError
 
 MAGIC = b"\x89KPC\r\n\x1a\n"
 VERSION = 0
@@ -105,8 +105,12 @@ class Chunk:
     row_count: int = 0
 
 
-def pack(chunks: Sequence[Chunk], value_count: int) -> bytes:
-    """Lay chunks out in the given order; each is stored by whichever codec makes it smaller.
+def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
+    """Lay chunks out in the given order; each is stored raw, or as a zstd frame where that is smaller.
+
+    Args:
+        value_count: numbers in all planes together.
+        compress: False stores every chunk raw.
 
     Raises:
         FormatError: the result would break a limit that every reader checks.
@@ -115,9 +119,10 @@ def pack(chunks: Sequence[Chunk], value_count: int) -> bytes:
     entries, bodies, largest = [], [], 0
     for chunk in chunks:
         raw = b"".join(chunk.parts)
-        body, codec = min(_zstd_frames(chunk.parts), key=len), CODEC_ZSTD
-        if len(body) >= len(raw):
-            body, codec = raw, CODEC_RAW
+        body, codec = raw, CODEC_RAW
+        if compress:
+            smallest = min(_zstd_frames(chunk.parts), key=len)
+            body, codec = (smallest, CODEC_ZSTD) if len(smallest) < len(raw) else (raw, CODEC_RAW)
         entries.append(ENTRY.pack(chunk.kind.encode("ascii"), 0, chunk.scale, chunk.plane, chunk.row_start,
                                   chunk.row_count, codec, 0, len(body), len(raw), google_crc32c.value(body), offset))
         bodies.append(body)
@@ -247,7 +252,7 @@ class Reader:
         """
         entry = self.index[number]
         if limit is not None and entry.raw_length > limit:
-            raise BudgetError(f"{self.name}: chunk {number} ({entry.kind}) claims {entry.raw_length:,} bytes where at "
+            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) claims {entry.raw_length:,} bytes where at "
                               f"most {limit:,} make sense")
         body = self.stored(number)
         if entry.codec == CODEC_RAW:

@@ -5,7 +5,7 @@
     came  cameras (may be ignored)        PLNE  one segment of one plane
 
 The order in the file is the order in which a player wants them: the coarsest picture of the first seconds, then finer
-scales, then later seconds. A plane segment that has not arrived is uncoded: it reads as its offset, and time stands still.
+scales, then later seconds. A plane segment that has not arrived is uncoded: it reads as its offset.
 """
 
 import math
@@ -114,8 +114,14 @@ def write(scene: QuantisedScene, path: str | os.PathLike[str], *, segment_rows: 
     return len(data)
 
 
-def encode(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> bytes:
-    """The bytes of the file that `write` makes."""
+def encode(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS, compress: bool = True) -> bytes:
+    """The bytes of the file that `write` makes; without `compress` every chunk is stored raw."""
+    chunks = scene_chunks(scene, segment_rows=segment_rows)
+    return pack(chunks, sum(p.symbols.size for scale in scene.scales for p in scale.values()), compress=compress)
+
+
+def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> list[Chunk]:
+    """The chunks of a scene's file, in their order."""
     if segment_rows < 1:
         raise FormatError(f"segment_rows {segment_rows} is not positive")
     try:
@@ -140,7 +146,7 @@ def encode(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> bytes:
                 if start < stop:
                     payload = encode_segment(plane.symbols[start:stop], plane.coded[start:stop])
                     chunks.append(Chunk("PLNE", payload, number, ALL_PLANES.index(name), start, stop - start))
-    return pack(chunks, parsed.value_count)
+    return chunks
 
 
 def _pack_head(scene: QuantisedScene) -> bytes:
@@ -283,8 +289,12 @@ class SceneReader(Reader):
 
     def occupancy(self) -> np.ndarray:
         """The OCCU chunk: (slots, Nz, Ny, Nx) bool."""
-        left = self.memory_budget - 5 * self.head.value_count
-        return self._parsed(_parse_occupancy, self.chunk(self._only("OCCU"), OCCUPANCY_STRUCT.size + left // 8))
+        number = self._only("OCCU")
+        needed = 5 * self.head.value_count + 8 * self.index[number].raw_length  # a byte for each bit
+        if needed > self.memory_budget:
+            raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory with its occupancy grid, more than the "
+                              f"budget of {self.memory_budget:,}")
+        return self._parsed(_parse_occupancy, self.chunk(number))
 
     def cameras(self) -> tuple[Camera, ...]:
         """The cameras, none if the file has (or has yet) no such chunk."""

@@ -1,0 +1,179 @@
+"""kpinfo: what is inside a .kpc file.
+
+    kpinfo scene.kpc             a page on the clip, the box, the planes and the chunks
+    kpinfo scene.kpc --json      the same for programs
+    kpinfo scene.kpc --verify    check every CRC32C and decode everything; exit code 1 if anything is wrong
+
+Without --verify a file whose end is missing is described as far as it goes.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from kpc.format import cli
+from kpc.format.container import CODEC_RAW, CODEC_ZSTD, DEFAULT_BUDGET, VERSION, Entry
+from kpc.format.errors import FormatError, UsageError
+from kpc.format.file import SceneReader, read
+from kpc.format.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.scene import ALL_PLANES, SPACE_PLANES
+
+CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd"}
+
+
+def main(argv: list[str] | None = None) -> int:
+    return cli.run(_command, "kpinfo", argv)
+
+
+def _command(argv: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="kpinfo", description="Show what is inside a .kpc file.")
+    parser.add_argument("scene", help="a .kpc file")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--verify", action="store_true", help="check every CRC32C and decode everything")
+    parser.add_argument("--memory-budget", type=int, default=DEFAULT_BUDGET, metavar="BYTES",
+                        help="memory the scene may take (default: %(default)s)")
+    options = parser.parse_args(argv)
+    if options.memory_budget < 1:
+        raise UsageError(f"--memory-budget {options.memory_budget} is not positive")
+
+    reader = SceneReader(options.scene, memory_budget=options.memory_budget, allow_partial=not options.verify)
+    if options.verify:
+        verify(reader)
+    info = describe(reader, read(options.scene, memory_budget=options.memory_budget, allow_partial=True))
+    info["verified"] = options.verify
+    print(json.dumps(info, indent=2) if options.json else _page(info))
+
+
+def verify(reader: SceneReader) -> None:
+    """Check the CRC32C of every chunk and decode everything that is known.
+
+    Raises:
+        FormatError: one line that names all damaged chunks.
+    """
+    damaged = []
+    for number, entry in enumerate(reader.index):
+        try:
+            reader.segment(number) if entry.kind == "PLNE" else reader.stored(number)
+        except FormatError as error:
+            damaged.append((number, entry.kind, error))
+    if len(damaged) > 1:
+        listed = ", ".join(f"{number} ({kind})" for number, kind, _ in damaged)
+        raise FormatError(f"{reader.name}: {len(damaged)} of {len(reader.index)} chunks are damaged: {listed}; "
+                          "fetch the file again")
+    if damaged:
+        raise damaged[0][2]
+    reader.decoder(), reader.occupancy(), reader.cameras()
+
+
+def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
+    """Everything kpinfo prints, as plain data. Shares lie in [0, 1], sizes are bytes unless named otherwise."""
+    size = reader.header.file_length
+    missing = [not reader.available(number) for number in range(len(reader.index))]
+    return {
+        "file": reader.name,
+        "version": VERSION,
+        "size_bytes": size,
+        "missing_chunks": sum(missing),
+        "clip": {"frame_count": scene.clip.frame_count, "fps": scene.clip.fps, "duration_s": scene.clip.duration_s,
+                 "is_dynamic": scene.is_dynamic},
+        "aabb": scene.aabb.tolist(),
+        "step": scene.step,
+        "background": scene.background.tolist(),
+        "scales": [_describe_scale(scale) for scale in scene.scales],
+        "decoder": {"features": len(scene.decoder.density_weight), "hidden": len(scene.decoder.b1)},
+        "occupancy": {"slots": scene.occupancy.shape[0], "cells_zyx": list(scene.occupancy.shape[1:]),
+                      "share": float(scene.occupancy.mean())},
+        "cameras": len(scene.cameras),
+        "camera_box": _camera_box(scene),
+        "parameter_count": scene.parameter_count,
+        "bits_per_parameter": 8 * size / scene.parameter_count,
+        "identity_share": scene.identity_share,
+        "dont_care_share": _uncoded_share([scale[name] for scale in scene.scales for name in SPACE_PLANES]),
+        "overhead_bytes": size - sum(entry.stored_length for entry in reader.index),
+        "chunks": [_describe_chunk(entry, gone, size) for entry, gone in zip(reader.index, missing, strict=True)],
+    }
+
+
+def _describe_scale(scale: dict[str, QuantisedPlane]) -> dict[str, Any]:
+    return {
+        "channels": scale["xy"].symbols.shape[2],
+        "planes": {
+            name: {"rows": plane.symbols.shape[0], "columns": plane.symbols.shape[1],
+                   "coded_share": float(plane.coded.mean()), "mean_step": float(plane.step.mean())}
+            for name, plane in scale.items()
+        },
+    }
+
+
+def _describe_chunk(entry: Entry, missing: bool, size: int) -> dict[str, Any]:
+    is_plane = entry.kind == "PLNE"
+    return {
+        "kind": entry.kind,
+        "critical": entry.is_critical,
+        "scale": entry.scale if is_plane else None,
+        "plane": ALL_PLANES[entry.plane] if is_plane else None,
+        "rows": [entry.row_start, entry.row_start + entry.row_count] if is_plane else None,
+        "codec": CODEC_NAMES.get(entry.codec, str(entry.codec)),
+        "offset": entry.offset,
+        "stored_bytes": entry.stored_length,
+        "raw_bytes": entry.raw_length,
+        "share": entry.stored_length / size,
+        "missing": missing,
+    }
+
+
+def _camera_box(scene: QuantisedScene) -> list[list[float]] | None:
+    if not scene.cameras:
+        return None
+    positions = np.array([camera.camera_to_world[:3, 3] for camera in scene.cameras])
+    return [positions.min(0).tolist(), positions.max(0).tolist()]
+
+
+def _uncoded_share(planes: Sequence[QuantisedPlane]) -> float:
+    return 1.0 - sum(int(p.coded.sum()) for p in planes) / sum(p.coded.size for p in planes)
+
+
+def _page(info: dict[str, Any]) -> str:
+    clip, occupancy = info["clip"], info["occupancy"]
+    kind = "dynamic" if clip["is_dynamic"] else "static"
+    lines = [
+        f"{info['file']}: {info['size_bytes']:,} bytes, format version {info['version']}"
+        + (", verified" if info["verified"] else ""),
+        f"  clip        {clip['frame_count']} frames at {clip['fps']:g} fps, {clip['duration_s']:.2f} s, {kind}",
+        f"  box         {_corner(info['aabb'][0])} to {_corner(info['aabb'][1])}, ray step {info['step']:.4g}",
+        f"  cameras     {info['cameras']}"
+        + (f" within {_corner(info['camera_box'][0])} to {_corner(info['camera_box'][1])}" if info["cameras"] else ""),
+        f"  occupancy   {occupancy['slots']} x {'x'.join(map(str, reversed(occupancy['cells_zyx'])))} cells, "
+        f"{occupancy['share']:.1%} occupied",
+        f"  decoder     {info['decoder']['features']} features, {info['decoder']['hidden']} hidden units",
+    ]
+    for number, scale in enumerate(info["scales"]):
+        planes = ", ".join(f"{name} {p['columns']}x{p['rows']}" for name, p in scale["planes"].items())
+        lines.append(f"  scale {number}     {scale['channels']} channels; {planes}")
+    lines += [
+        f"  model       {info['parameter_count']:,} parameters, {info['bits_per_parameter']:.3f} bits each",
+        f"  identity    {info['identity_share']:.1%} of the time-plane texels are exactly 1",
+        f"  don't care  {info['dont_care_share']:.1%} of the space-plane texels are not stored",
+    ]
+    if info["missing_chunks"]:
+        lines.append(f"  cut off     {info['missing_chunks']} of {len(info['chunks'])} chunks are missing and count as not stored")
+    lines += ["", "  chunk  kind  scale  plane  rows        codec      stored         raw   share"]
+    for number, chunk in enumerate(info["chunks"]):
+        place = f"{'-':>5}  {'-':<5}  {'-':<10}" if chunk["plane"] is None else \
+            f"{chunk['scale']:>5}  {chunk['plane']:<5}  {chunk['rows'][0]:>4}-{chunk['rows'][1]:<5}"
+        lines.append(f"  {number:>5}  {chunk['kind']}  {place}  {chunk['codec']:<5}  {chunk['stored_bytes']:>10,}  "
+                     f"{chunk['raw_bytes']:>10,}  {chunk['share']:>6.1%}" + ("  missing" if chunk["missing"] else ""))
+    lines.append(f"  header and index {info['overhead_bytes']:>37,} {'':>12} {info['overhead_bytes'] / info['size_bytes']:>6.1%}")
+    return "\n".join(lines)
+
+
+def _corner(point: Sequence[float]) -> str:
+    return f"({', '.join(f'{x:.4g}' for x in point)})"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,284 @@
+"""Writes the conformance vectors that lie beside the spec: `python -m kpc.tools.specvectors spec/vectors`.
+
+    valid/NAME.kpc     decodes to what valid/NAME.json says, bit by bit
+    invalid/NAME.kpc   is refused; invalid/NAME.json names the kind of error and a part of its message
+
+Every vector is computed from integers, so that it comes out the same everywhere; only vectors that hold zstd frames
+depend on the version of that library, and only in how they are packed (valid/NAME.json says which version packed them).
+"""
+
+import hashlib
+import json
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import zstandard
+
+from kpc.format import cli
+from kpc.format.cameras import Camera
+from kpc.format.container import ENTRY, HEADER, Chunk, Reader, pack
+from kpc.format.errors import UsageError
+from kpc.format.file import encode, read, scene_chunks
+from kpc.format.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
+
+ZSTD_VERSION = ".".join(map(str, zstandard.ZSTD_VERSION))
+
+
+def main(argv: list[str] | None = None) -> int:
+    return cli.run(_command, "specvectors", argv)
+
+
+def _command(argv: list[str]) -> None:
+    if len(argv) != 1:
+        raise UsageError("give the folder to write, as in: python -m kpc.tools.specvectors spec/vectors")
+    for path, data in vectors().items():
+        target = Path(argv[0]) / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with cli.written_aside(target) as aside:
+            aside.write_bytes(data)
+
+
+def vectors() -> dict[str, bytes]:
+    """All files of the vector set: path -> content."""
+    files = {}
+    for name, (data, partial) in _valid().items():
+        files[f"valid/{name}.kpc"] = data
+        files[f"valid/{name}.json"] = _json(described(data, partial))
+    for name, (data, error, message) in _invalid().items():
+        files[f"invalid/{name}.kpc"] = data
+        files[f"invalid/{name}.json"] = _json({"error": error, "message": message})
+    return files
+
+
+def described(data: bytes, partial: bool) -> dict[str, Any]:
+    """What a decoder must find in a file: SHA-256 of every array, in the order that the spec's last section gives."""
+    scene = read(data, allow_partial=partial)
+    decoder = scene.decoder
+    weights = [decoder.density_weight, np.float32(decoder.density_bias), decoder.w1, decoder.b1, decoder.w2, decoder.b2]
+    return {
+        "partial": partial,
+        "zstd": ZSTD_VERSION if any(entry.codec for entry in Reader(data, allow_partial=partial).index) else None,
+        "frame_count": scene.clip.frame_count,
+        "fps": scene.clip.fps,
+        "step": scene.step,
+        "aabb": scene.aabb.tolist(),
+        "background": scene.background.tolist(),
+        "cameras": [_camera(camera) for camera in scene.cameras],
+        "occupancy": {"shape": list(scene.occupancy.shape), "sha256": _sha256(scene.occupancy.astype(np.uint8))},
+        "decoder": {"features": len(decoder.density_weight), "hidden": len(decoder.b1),
+                    "sha256": _sha256(*(np.asarray(w, "<f4") for w in weights))},
+        "planes": [
+            {"scale": number, "plane": name, "shape": list(plane.symbols.shape),
+             "symbols_sha256": _sha256(plane.symbols), "coded_sha256": _sha256(plane.coded.astype(np.uint8)),
+             "values_sha256": _sha256(plane.dequantise().astype("<f4"))}
+            for number, scale in enumerate(scene.scales) for name, plane in scale.items()
+        ],
+    }
+
+
+def resealed(data: bytes) -> bytes:
+    """The same file with all its checksums made right again, so that what else is wrong with it shows."""
+    out = bytearray(data)
+    count = struct.unpack_from("<I", out, 28)[0]
+    for start in range(HEADER.size, HEADER.size + ENTRY.size * count, ENTRY.size):
+        stored, offset = struct.unpack_from("<I", out, start + 20)[0], struct.unpack_from("<Q", out, start + 32)[0]
+        struct.pack_into("<I", out, start + 28, google_crc32c.value(bytes(out[offset:offset + stored])))
+    struct.pack_into("<I", out, 56, google_crc32c.value(bytes(out[HEADER.size:HEADER.size + ENTRY.size * count])))
+    struct.pack_into("<I", out, 60, google_crc32c.value(bytes(out[:60])))
+    return bytes(out)
+
+
+def patched(data: bytes, offset: int, layout: str, *values: int | float | bytes) -> bytes:
+    """A copy with `values` at a byte offset; checksums stay as they were."""
+    out = bytearray(data)
+    struct.pack_into(layout, out, offset, *values)
+    return bytes(out)
+
+
+def _valid() -> dict[str, tuple[bytes, bool]]:
+    dynamic = _scene(dynamic=True, sizes=[(2, 5, 4, 3, 3), (4, 9, 8, 7, 6)], cameras=2)
+    packed = encode(dynamic, segment_rows=4)
+    minimal = minimal_scene()
+    note = Chunk("note", [b"readers skip what they need not know"])
+    chunks = scene_chunks(minimal)
+    index = Reader(packed).index
+    coarse_ends = next(entry.offset for entry in index if entry.scale == 1)
+    return {
+        "minimal": (encode(minimal, compress=False), False),
+        "static": (encode(_scene(dynamic=False, sizes=[(3, 17, 13, 11, 0)])), False),
+        "dynamic": (packed, False),
+        "dynamic-raw": (encode(dynamic, segment_rows=4, compress=False), False),
+        "dynamic-prefix": (packed[:coarse_ends], True),
+        "one-texel": (encode(_scene(dynamic=True, sizes=[(1, 1, 1, 1, 1)]), compress=False), False),
+        "wrap": (encode(_scene(dynamic=False, sizes=[(8, 12, 10, 6, 0)], amplitude=400), compress=False), False),
+        "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
+    }
+
+
+def _invalid() -> dict[str, tuple[bytes, str, str]]:
+    scene = _scene(dynamic=True, sizes=[(2, 5, 4, 3, 3)], cameras=1)
+    good = encode(scene, segment_rows=2, compress=False)
+    chunks = scene_chunks(scene, segment_rows=2)
+    values = Reader(good).header.value_count
+    entry = [HEADER.size + ENTRY.size * number for number in range(len(chunks))]
+    body = [e.offset for e in Reader(good).index]
+    scne, deco, occu, came, xy = range(5)  # the order in which the writer lays chunks out
+    xt = next(number for number, chunk in enumerate(chunks) if chunk.plane == ALL_PLANES.index("xt"))
+
+    def repacked(number: int, change: Callable[[bytes], bytes]) -> bytes:
+        """The file with the raw bytes of one chunk changed, everything around it in order."""
+        raw = b"".join(chunks[number].parts)
+        old = chunks[number]
+        new = Chunk(old.kind, [change(raw)], old.scale, old.plane, old.row_start, old.row_count)
+        return pack([*chunks[:number], new, *chunks[number + 1:]], values, compress=False)
+
+    def set_at(offset: int, layout: str, *numbers: int | float) -> Callable[[bytes], bytes]:
+        return lambda raw: patched(raw, offset, layout, *numbers)
+
+    def without(number: int) -> bytes:
+        return pack(chunks[:number] + chunks[number + 1:], values, compress=False)
+
+    bomb = zstandard.ZstdCompressor(level=19).compress(bytes(1 << 20))
+    bomb_file = pack([*chunks[:xy], Chunk("PLNE", [bomb], 0, 0, 0, 4), *chunks[xy + 1:]], values, compress=False)
+    nan = float("nan")
+    broken = "FormatError"
+    return {
+        "empty": (b"", broken, "not a .kpc file"),
+        "magic": (patched(good, 1, "4s", b"JPEG"), broken, "not a .kpc file"),
+        "version": (resealed(patched(good, 8, "<H", 1)), broken, "format version 1"),
+        "header-crc": (patched(good, 40, "<Q", values + 1), broken, "header is damaged"),
+        "header-flags": (resealed(patched(good, 10, "<H", 1)), broken, "reserved"),
+        "header-reserved": (resealed(patched(good, 52, "<I", 1)), broken, "reserved"),
+        "header-cut": (good[:63], broken, "cut off within the header"),
+        "index-cut": (good[:HEADER.size + 1], broken, "cut off"),
+        "chunk-cut": (good[:-1], broken, "cut off"),
+        "trailing-byte": (good + b"\0", broken, "follow the end"),
+        "no-chunks": (resealed(patched(good, 24, "<II", 0, 0)), broken, "0 chunks"),
+        "huge-value-count": (resealed(patched(good, 40, "<Q", 1 << 50)), broken, "more than"),
+        "huge-chunk-limit": (resealed(patched(good, 48, "<I", 0xFFFFFFFF)), broken, "more than"),
+        "value-count": (resealed(patched(good, 40, "<Q", values + 1)), broken, "the header claims"),
+        "index-crc": (patched(good, entry[2] + 4, "<H", 1), broken, "index is damaged"),
+        "index-reserved": (resealed(patched(good, entry[2] + 18, "<H", 1)), broken, "reserved"),
+        "index-kind": (resealed(patched(good, entry[3], "4s", b"c\0me")), broken, "four letters"),
+        "index-gap": (resealed(patched(good, entry[1] + 32, "<Q", body[1] + 1)), broken, "starts at byte"),
+        "index-raw-length": (resealed(patched(good, entry[1] + 24, "<I", 1 << 24)), broken, "more than the header's"),
+        "unknown-critical": (resealed(patched(good, entry[3], "4s", b"Came")), broken, "critical kind Came"),
+        "unknown-codec": (resealed(patched(good, entry[1] + 16, "<H", 9)), broken, "codec 9"),
+        "group": (resealed(patched(good, entry[xy] + 4, "<H", 1)), broken, "group 1"),
+        "place": (resealed(patched(good, entry[deco] + 6, "<B", 1)), broken, "among the planes"),
+        "chunk-crc": (patched(good, body[xy] + 9, "<B", good[body[xy] + 9] ^ 1), broken, "is damaged"),
+        "raw-length": (resealed(patched(good, entry[deco] + 24, "<I", 1)), broken, "not the 1 it claims"),
+        "zstd-length": (resealed(patched(patched(bomb_file, entry[xy] + 16, "<H", 1), entry[xy] + 24, "<I", 40)),
+                        broken, "claims another length"),
+        "zstd-garbage": (resealed(patched(good, entry[xy] + 16, "<H", 1)), broken, "zstd frame"),
+        "no-decoder": (without(deco), broken, "0 DECO chunks"),
+        "no-segment": (without(len(chunks) - 1), broken, "its segments hold 2 rows, not 3"),
+        "two-occupancies": (pack([*chunks, chunks[occu]], values, compress=False), broken, "2 OCCU chunks"),
+        "two-cameras": (pack([*chunks, chunks[came]], values, compress=False), broken, "2 came chunks"),
+        "segment-twice": (pack([*chunks, chunks[xt]], values, compress=False), broken, "or two do"),
+        "segment-start": (resealed(patched(good, entry[xt] + 8, "<I", 1)), broken, "no segment starts at row 0"),
+        "segment-plane": (resealed(patched(good, entry[xt] + 7, "<B", 6)), broken, "plane 6"),
+        "segment-map-flag": (repacked(xy, set_at(0, "<B", 2)), broken, "unknown map flag"),
+        "segment-map-bits": (repacked(xy, set_at(3, "<B", 0xFF)), broken, "unused bits"),
+        "segment-filter": (repacked(xy, set_at(4, "<B", 4)), broken, "unknown filter 4"),
+        "segment-short": (repacked(xy, lambda raw: raw[:-1]), broken, "its map implies"),
+        "segment-long": (repacked(xt, lambda raw: raw + bytes(1)), broken, "its map implies"),
+        "scene-box": (repacked(scne, set_at(0, "<f", 1e9)), broken, "the box is empty"),
+        "scene-clip": (repacked(scne, set_at(24, "<I", 0)), broken, "a clip of 0 frames"),
+        "scene-fps": (repacked(scne, set_at(28, "<d", nan)), broken, "makes no sense"),
+        "scene-step": (repacked(scne, set_at(36, "<d", 1e-12)), broken, "a ray step"),
+        "scene-background": (repacked(scne, set_at(44, "<f", -1.0)), broken, "background"),
+        "scene-scales": (repacked(scne, set_at(56, "<B", 0)), broken, "0 scales"),
+        "scene-static": (repacked(scne, set_at(57, "<B", 0)), broken, "3 rows in time"),
+        "scene-axis": (repacked(scne, set_at(60, "<H", 65535)), broken, "65535"),
+        "scene-plane-step": (repacked(scne, set_at(68, "<f", 0.0)), broken, "plane xy: a step or an offset"),
+        "scene-plane-nan": (repacked(scne, set_at(68, "<f", nan)), broken, "plane xy: a step or an offset"),
+        "scene-long": (repacked(scne, lambda raw: raw + bytes(1)), broken, "1 bytes too long"),
+        "decoder-features": (repacked(deco, set_at(0, "<H", 3)), broken, "3 features"),
+        "decoder-nan": (repacked(deco, set_at(8, "<H", 0x7E00)), broken, "NaN or infinite"),
+        "decoder-short": (repacked(deco, lambda raw: raw[:-1]), broken, "ends after"),
+        "occupancy-bits": (repacked(occu, lambda raw: raw[:-1] + b"\xff"), broken, "unused bits"),
+        "occupancy-zero": (repacked(occu, set_at(0, "<H", 0)), broken, "makes no sense"),
+        "camera-focal": (repacked(came, set_at(6, "<f", 0.0)), broken, "focal length"),
+        "camera-nan": (repacked(came, set_at(22, "<f", nan)), broken, "NaN or infinity"),
+    }
+
+
+def minimal_scene() -> QuantisedScene:
+    """The smallest scene worth a look: one channel, two texels an axis, a fog that is denser towards +x."""
+    planes = {name: QuantisedPlane(np.array([[[0], [4]], [[0], [4]]], np.int8), np.array([0.25], np.float32),
+                                   np.array([1.0], np.float32), np.ones((2, 2), bool))
+              for name in SPACE_PLANES}
+    decoder = Decoder(np.array([1.0], np.float32), 0.0, np.zeros((1, 9), np.float32), np.zeros(1, np.float32),
+                      np.zeros((3, 1, 1), np.float32), np.array([[1.0], [0.5], [0.0]], np.float32))
+    return QuantisedScene(np.array([[0, 0, 0], [1, 1, 1]], np.float32), Clip(1, 1.0), (planes,), decoder,
+                          np.ones((1, 1, 1, 1), bool), np.zeros(3, np.float32), 0.125)
+
+
+def _scene(dynamic: bool, sizes: list[tuple[int, int, int, int, int]], amplitude: int = 60,
+           cameras: int = 0) -> QuantisedScene:
+    """A scene made of integers alone. `sizes`: channels, Nx, Ny, Nz, T of each scale."""
+    scales = []
+    for number, (channels, nx, ny, nz, nt) in enumerate(sizes):
+        size = {"x": nx, "y": ny, "z": nz, "t": nt}
+        scales.append({
+            name: _plane(size[name[1]], size[name[0]], channels, amplitude, ALL_PLANES.index(name) + 7 * number,
+                         name in TIME_PLANES)
+            for name in (ALL_PLANES if dynamic else SPACE_PLANES)
+        })
+    features, hidden = sum(size[0] for size in sizes), 3
+    shapes = [(features,), (hidden, 9), (hidden,), (3, features, hidden), (3, features)]
+    density, w1, b1, w2, b2 = (_noise(shape, 17 + k) / np.float32(64) for k, shape in enumerate(shapes))
+    occupancy = _noise((2 if dynamic else 1, 3, 3, 5), 99) > 0
+    pose = np.array([[1, 0, 0, 0.5], [0, 1, 0, -0.25], [0, 0, 1, 3], [0, 0, 0, 1]], np.float64)
+    return QuantisedScene(
+        np.array([[-1, -0.75, -0.5], [1, 0.75, 0.5]], np.float32), Clip(12, 24.0) if dynamic else Clip(1, 24.0),
+        tuple(scales), Decoder(density, 0.5, w1, b1, w2, b2), occupancy, np.array([0.25, 0.5, 1], np.float32), 0.0625,
+        tuple(Camera(64 + k, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(cameras)))
+
+
+def _plane(rows: int, columns: int, channels: int, amplitude: int, seed: int, is_time: bool) -> QuantisedPlane:
+    """Ramps of several slopes, some flat, plus noise; a quarter of the texels uncoded. Wraps where it leaves 8 bits."""
+    y, x, m = np.meshgrid(np.arange(rows), np.arange(columns), np.arange(channels), indexing="ij")
+    ramp = amplitude * ((m % 3) * x // columns + (m % 2) * y * y // (rows * rows))
+    noise = _noise((rows, columns, channels), seed) % np.array([1, 2, 5, 256])[m % 4]
+    symbols = (ramp + noise).astype(np.int64).astype(np.int8)  # the low 8 bits
+    coded = (x[..., 0] * 3 + y[..., 0] * 5 + seed) % 16 >= 4
+    symbols[~coded] = 0
+    steps = ((1 + np.arange(channels)) / 128).astype(np.float32)
+    offsets = np.ones(channels) if is_time else (seed + np.arange(channels)) / 8 - 1
+    return QuantisedPlane(symbols, steps, offsets.astype(np.float32), symbols.any(2) if is_time else coded)
+
+
+def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
+    """Integers in [-128, 127] from a multiplicative hash of their position, as float32."""
+    index = np.arange(int(np.prod(shape)), dtype=np.uint32) + np.uint32(seed * 7919)
+    mixed = (index * np.uint32(2654435761)) ^ (index * np.uint32(2654435761) >> np.uint32(15))
+    mixed = mixed * np.uint32(2246822519)
+    return ((mixed >> np.uint32(13)) & np.uint32(255)).astype(np.float32).reshape(shape) - np.float32(128)
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    return {"w": camera.width, "h": camera.height, "fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx,
+            "cy": camera.cy, "transform_matrix": camera.camera_to_world.tolist()}
+
+
+def _sha256(*arrays: np.ndarray) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _json(document: dict[str, Any]) -> bytes:
+    return (json.dumps(document, indent=1) + "\n").encode()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
