@@ -1,0 +1,109 @@
+// The picture of a scene. SCALES, LAYERS (of four channels), HIDDEN: its shape; ROWS: 1 where rows of time planes are multiplied in.
+// Normative text and a readable twin: kpc.player.reference.
+
+#include "ray.glsl"
+#include "occupancy.glsl"
+#include "planes.glsl"
+#include "decoder.glsl"
+
+#define FEATURES (SCALES * LAYERS)
+const float TERMINATION = 1.0 / 1024.0;
+
+uniform sampler2D planes;
+uniform sampler2D rows;
+uniform usampler3D cells;
+uniform vec2 planes_texel;          // 1 / size of the texture
+uniform vec2 rows_texel;
+uniform vec2 origins[SCALES * 3];   // of the blocks xy, xz, yz of each scale
+uniform vec3 resolution[SCALES];    // texels along x, y, z
+uniform ivec3 cell_count;
+uniform vec3 box_low;
+uniform vec3 box_high;
+uniform vec3 background;
+uniform float stride;
+uniform float tau;                  // stride / longest edge of the box
+
+uniform float height;
+uniform vec4 lens;
+uniform mat3 axes;
+uniform vec3 eye;
+
+layout(std140) uniform Decoder {
+    vec4 density[FEATURES];         // weights of the log density
+    vec4 w1[HIDDEN * 3];            // (H, 9), padded to 12 columns; the tenth is b1
+    vec4 w2[HIDDEN * 3 * FEATURES]; // (H, 3, F)
+    vec4 b2[3 * FEATURES];
+    vec4 density_bias;              // in x
+};
+
+layout(location = 0) out vec4 seen;     // rgb and opacity
+layout(location = 1) out vec4 met;      // sum of weight t, samples
+
+vec4 basis[3 * FEATURES];
+
+void find_basis(vec3 d) {
+    for (int i = 0; i < 3 * FEATURES; ++i) basis[i] = b2[i];
+    vec4 e0 = vec4(d, d.x * d.x);
+    vec4 e1 = vec4(d.y * d.y, d.z * d.z, d.x * d.y, d.y * d.z);
+    vec4 e2 = vec4(d.z * d.x, 1.0, 0.0, 0.0);
+    for (int h = 0; h < HIDDEN; ++h) {
+        float on = max(dot(w1[3 * h], e0) + dot(w1[3 * h + 1], e1) + dot(w1[3 * h + 2], e2), 0.0);
+        for (int i = 0; i < 3 * FEATURES; ++i) basis[i] += on * w2[h * 3 * FEATURES + i];
+    }
+}
+
+vec4 feature(vec3 u, int scale, int layer) {
+    vec3 p = u * (resolution[scale] - 1.0);
+    vec4 f = plane_layer(planes, planes_texel, origins[3 * scale], resolution[scale].x, p.xy, layer)
+           * plane_layer(planes, planes_texel, origins[3 * scale + 1], resolution[scale].x, p.xz, layer)
+           * plane_layer(planes, planes_texel, origins[3 * scale + 2], resolution[scale].y, p.yz, layer);
+#if ROWS
+    f *= row_layer(rows, rows_texel, p.x, 0, scale, layer)
+       * row_layer(rows, rows_texel, p.y, 1, scale, layer)
+       * row_layer(rows, rows_texel, p.z, 2, scale, layer);
+#endif
+    return f;
+}
+
+void main() {
+    vec3 d = camera_direction(gl_FragCoord.xy, height, lens, axes);
+    vec2 range = box_range(eye, d, box_low, box_high);
+    vec3 box = box_high - box_low;
+    vec3 rate = slanted(d) / box * vec3(cell_count);
+    Walk walk = Walk((eye - box_low) / box * vec3(cell_count), rate, 1.0 / rate, range.x, range.y, stride, 0.0);
+    find_basis(d);
+
+    vec3 rgb = vec3(0.0);
+    float trans = 1.0;
+    float depth = 0.0;
+    float samples = 0.0;
+    bool more = to_occupied(walk, cells, cell_count);
+    // Tested at its end: on a software renderer a loop costs its body once more than the longest of neighbouring rays needs otherwise.
+    do {
+        if (more) {
+            float t = sample_t(walk);
+            vec3 u = clamp((eye + t * d - box_low) / box, 0.0, 1.0);
+            float log_density = density_bias.x;
+            vec3 shade = vec3(0.0);
+            for (int scale = 0; scale < SCALES; ++scale) {
+                for (int layer = 0; layer < LAYERS; ++layer) {
+                    int i = scale * LAYERS + layer;
+                    vec4 f = feature(u, scale, layer);
+                    log_density += dot(f, density[i]);
+                    shade += vec3(dot(f, basis[i]), dot(f, basis[FEATURES + i]), dot(f, basis[2 * FEATURES + i]));
+                }
+            }
+            float weight = trans * alpha_of(log_density, tau);
+            rgb += weight * sigmoid(shade);
+            depth += weight * t;
+            trans -= weight;
+            samples += 1.0;
+            walk.k += 1.0;
+            more = trans >= TERMINATION;
+        }
+        more = more && to_occupied(walk, cells, cell_count);
+    } while (more);
+
+    seen = vec4(rgb + trans * background, 1.0 - trans);
+    met = vec4(depth, samples, 0.0, 0.0);
+}

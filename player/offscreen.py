@@ -1,0 +1,27 @@
+"""OpenGL without a window."""
+
+import moderngl
+
+from kpc.format.errors import DisplayError
+
+REMEDY = "apt install libegl1 libgl1-mesa-dri (Debian, Ubuntu), or kprender --backend reference"
+
+
+def open_context() -> moderngl.Context:
+    """An OpenGL 3.3 context that draws to textures: through EGL where there is one, else what the system offers.
+
+    Raises:
+        DisplayError: there is none; the message says how to get one.
+    """
+    complaints = []
+    for backend in ({"backend": "egl"}, {}):
+        try:
+            return moderngl.create_context(require=330, standalone=True, **backend)
+        except Exception as error:  # glcontext raises bare Exception, ImportError or ValueError, whatever failed
+            complaints.append(str(error))
+    raise DisplayError(f"no OpenGL 3.3 to be had ({'; '.join(complaints)}): {REMEDY}")
+
+
+def describe(ctx: moderngl.Context) -> str:
+    """The renderer and its version, in one line."""
+    return f"{ctx.info['GL_RENDERER']}, OpenGL {ctx.info['GL_VERSION']}"

@@ -1,0 +1,232 @@
+"""The picture a scene must give, in readable numpy: the oracle of the OpenGL renderer and its stand-in on bare servers.
+
+A ray o + t d with |d| = 1 enters the box at t_near and leaves it at t_far. Its samples lie at
+
+    t_k = t_near + (k + 1/2) step,   k = 0, 1, ... while t_k < t_far,
+
+and count where the occupancy grid is set. With sigma per longest edge of the box ("extent"), front to back from trans = 1:
+
+    alpha = 1 - exp(-sigma step / extent)      weight = trans alpha      trans <- trans - weight
+
+A ray ends once trans < TERMINATION. Then rgb = sum weight rgb_k + trans background, opacity = 1 - trans and
+depth = sum weight t_k / sum weight. K-Planes, arXiv:2301.10241; the quadrature is NeRF's, arXiv:2003.08934, eq. 3.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from kpc.format.cameras import Camera
+from kpc.format.scene import LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Decoder, Scene
+
+RAYS_AT_ONCE = 8192
+STEPS_AT_ONCE = 16
+PARALLEL = 1e-12
+"""A direction's component is kept at least this far from 0, so that no slab test divides by it."""
+
+
+class Part(Enum):
+    """What of a scene to show."""
+
+    FULL = "full"
+    STATIC = "static"
+    """Every time plane set to 1."""
+    DYNAMIC = "dynamic"
+    """|full - static|: what moves, and what it hides or lays bare. Depth, opacity and samples are the full scene's."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """A picture, float32, and what rays met: (H, W, ...) from `render`, (N, ...) from `render_rays`.
+
+    Attributes:
+        rgb: (H, W, 3) in [0, 1].
+        depth: (H, W) mean distance along the ray, world units; inf where opacity is 0.
+        opacity: (H, W) in [0, 1].
+        samples: (H, W) int32, samples at which the field was evaluated.
+    """
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    opacity: np.ndarray
+    samples: np.ndarray
+
+
+def render(scene: Scene, camera: Camera, time: float, *, part: Part = Part.FULL) -> Rendering:
+    """Render `scene` as `camera` sees it at `time` in [0, 1] over the clip."""
+    origins, directions = camera.rays()
+    flat = render_rays(scene, origins, directions, time, part=part)
+    shape = (camera.height, camera.width)
+    return Rendering(flat.rgb.reshape(*shape, 3), *(a.reshape(shape) for a in (flat.depth, flat.opacity, flat.samples)))
+
+
+def render_rays(
+    scene: Scene, origins: np.ndarray, directions: np.ndarray, time: float, *, part: Part = Part.FULL
+) -> Rendering:
+    """Render rays, (N, 3) float32 origins and unit directions in world coordinates. Memory does not grow with N but for
+    the result."""
+    if not 0.0 <= time <= 1.0:
+        raise ValueError(f"time {time} lies outside [0, 1]")
+    if part is Part.DYNAMIC:
+        full = render_rays(scene, origins, directions, time)
+        static = render_rays(scene, origins, directions, time, part=Part.STATIC)
+        return Rendering(np.abs(full.rgb - static.rgb), full.depth, full.opacity, full.samples)
+    moment = Moment.of(scene, time, with_motion=part is Part.FULL)
+    n = len(origins)
+    out = Rendering(np.empty((n, 3), np.float32), *(np.empty(n, t) for t in (np.float32, np.float32, np.int32)))
+    for start in range(0, n, RAYS_AT_ONCE):
+        block = slice(start, start + RAYS_AT_ONCE)
+        piece = _march(scene, moment, origins[block], directions[block])
+        out.rgb[block], out.depth[block] = piece.rgb, piece.depth
+        out.opacity[block], out.samples[block] = piece.opacity, piece.samples
+    return out
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What of a scene depends on the time alone.
+
+    Attributes:
+        rows: one mapping a scale, "x" | "y" | "z" -> (size, M) float32: the time planes cut at this time. Bilinear
+            interpolation is separable, so this loses nothing. Empty where nothing moves.
+        occupied: (Nz, Ny, Nx) bool.
+    """
+
+    rows: tuple[Mapping[str, np.ndarray], ...]
+    occupied: np.ndarray
+
+    @staticmethod
+    def of(scene: Scene, time: float, with_motion: bool = True) -> "Moment":
+        """Cut `scene` at `time`; without motion every time plane counts as 1."""
+        rows: list[dict[str, np.ndarray]] = [
+            {name[0]: linear(scale[name], time) for name in TIME_PLANES}
+            if with_motion and scene.is_dynamic else {} for scale in scene.scales
+        ]
+        return Moment(tuple(rows), scene.occupancy[slot_at(scene, time)])
+
+
+def slot_at(scene: Scene, time: float) -> int:
+    """The slot of the occupancy grid that holds at `time`: floor(time slots), the last one at time 1."""
+    slots = len(scene.occupancy)
+    return min(int(time * slots), slots - 1)
+
+
+def box_range(aabb: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays are inside the box: (t_near, t_far), (N,) each, t_near >= 0. t_far <= t_near where they miss it."""
+    away = np.where(directions < 0, np.float32(-PARALLEL), np.float32(PARALLEL))
+    inverse = np.float32(1) / np.where(np.abs(directions) < PARALLEL, away, directions)
+    t0, t1 = (aabb[0] - origins) * inverse, (aabb[1] - origins) * inverse
+    return np.maximum(np.minimum(t0, t1).max(axis=1), np.float32(0)), np.maximum(t0, t1).min(axis=1)
+
+
+def tap(u: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corner-aligned position u (size - 1), u in [0, 1], as a lower texel and the fraction towards the next."""
+    position = np.clip(u, 0, 1) * np.float32(size - 1)
+    lower = np.minimum(position.astype(np.int32), max(size - 2, 0))
+    return lower, (position - lower).astype(np.float32)
+
+
+def linear(row: np.ndarray, u: np.ndarray | float) -> np.ndarray:
+    """Sample a (size, ..., M) row at u in [0, 1], shape (N,) or a scalar: (1 - f) row[i] + f row[i + 1]."""
+    i, f = tap(np.asarray(u, np.float32), len(row))
+    f = f.reshape(f.shape + (1,) * (row.ndim - 1))
+    return row[i] * (1 - f) + row[np.minimum(i + 1, len(row) - 1)] * f
+
+
+def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Sample a (rows, columns, M) plane at (N,) positions, u along columns and v along rows, both in [0, 1]: (N, M)."""
+    rows, columns, channels = plane.shape
+    (i, f), (j, g) = tap(u, columns), tap(v, rows)
+    flat = plane.reshape(-1, channels)
+    corner = j * columns + i
+    right, up = np.int32(columns > 1), np.int32(columns if rows > 1 else 0)
+    out = flat[corner] * ((1 - f) * (1 - g))[:, None]
+    out += flat[corner + right] * (f * (1 - g))[:, None]
+    out += flat[corner + up] * ((1 - f) * g)[:, None]
+    out += flat[corner + up + right] * (f * g)[:, None]
+    return out
+
+
+def features(scene: Scene, moment: Moment, u: np.ndarray) -> np.ndarray:
+    """f at (N, 3) points in [0, 1]^3: (N, F), the product over planes, concatenated over scales (eq. 1 of K-Planes)."""
+    axis = {"x": u[:, 0], "y": u[:, 1], "z": u[:, 2]}
+    out = []
+    for scale, rows in zip(scene.scales, moment.rows):
+        product = np.ones(1, np.float32)
+        for name in SPACE_PLANES:
+            product = product * bilinear(scale[name], axis[name[0]], axis[name[1]])
+        for letter, row in rows.items():
+            product *= linear(row, axis[letter])
+        out.append(product)
+    return np.concatenate(out, axis=1)
+
+
+def density(decoder: Decoder, f: np.ndarray) -> np.ndarray:
+    """sigma = exp(clip(f . w + b, -20, 20)) per longest edge of the box: (N, F) -> (N,)."""
+    return np.exp(np.clip(f @ decoder.density_weight + decoder.density_bias, -LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT))
+
+
+def direction_basis(decoder: Decoder, directions: np.ndarray) -> np.ndarray:
+    """basis(d) = w2 relu(w1 e(d) + b1) + b2 of unit directions (N, 3): (N, 3, F)."""
+    x, y, z = directions.T
+    encoded = np.stack([x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
+    hidden = np.maximum(encoded @ decoder.w1.T + decoder.b1, 0)
+    return np.einsum("cfh,nh->ncf", decoder.w2, hidden, optimize=True) + decoder.b2
+
+
+def colour(f: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """rgb = sigmoid(f . basis_{R,G,B}): (N, F), (N, 3, F) -> (N, 3)."""
+    return 1 / (1 + np.exp(-np.einsum("nf,ncf->nc", f, basis)))
+
+
+def composite(alphas: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Spend the transmittance `trans` (N,) of rays on their next samples, (N, K) alphas, front to back.
+
+    Returns (N, K) weights, (N,) what is left, and (N, K) bool: samples that were reached before the ray ended.
+    """
+    through = np.cumprod(np.concatenate([trans[:, None], 1 - alphas], axis=1), axis=1)
+    reached = through[:, :-1] >= TERMINATION
+    weights = np.where(reached, through[:, :-1] * alphas, np.float32(0))
+    return weights, through[np.arange(len(trans)), reached.sum(axis=1)], reached
+
+
+def _march(scene: Scene, moment: Moment, origins: np.ndarray, directions: np.ndarray) -> Rendering:
+    n = len(origins)
+    near, far = box_range(scene.aabb, origins, directions)
+    basis = direction_basis(scene.decoder, directions).astype(np.float32)
+    rgb, depth = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
+    trans, samples = np.ones(n, np.float32), np.zeros(n, np.int32)
+    step, size = np.float32(scene.step), (scene.aabb[1] - scene.aabb[0]).astype(np.float32)
+    cells = np.array(moment.occupied.shape[::-1])
+
+    rays, first = np.flatnonzero(near < far), 0
+    while len(rays):
+        t = near[rays, None] + (np.arange(first, first + STEPS_AT_ONCE, dtype=np.float32) + np.float32(0.5)) * step
+        u = (origins[rays, None] + t[..., None] * directions[rays, None] - scene.aabb[0]) / size
+        x, y, z = np.clip((u * cells).astype(np.int32), 0, cells - 1).transpose(2, 0, 1)
+        row, column = np.nonzero(moment.occupied[z, y, x] & (t < far[rays, None]))
+
+        f = features(scene, moment, u[row, column])
+        alphas = np.zeros_like(t)
+        alphas[row, column] = 1 - np.exp(-density(scene.decoder, f) * np.float32(scene.step / scene.extent))
+        weights, trans[rays], reached = composite(alphas, trans[rays])
+        shown = reached[row, column]
+        row, column, f = row[shown], column[shown], f[shown]
+
+        weight, ray = weights[row, column], rays[row]
+        seen = weight[:, None] * colour(f, basis[ray])
+        for channel in range(3):
+            rgb[:, channel] += np.bincount(ray, seen[:, channel], n).astype(np.float32)
+        depth += np.bincount(ray, weight * t[row, column], n).astype(np.float32)
+        samples += np.bincount(ray, minlength=n).astype(np.int32)
+
+        first += STEPS_AT_ONCE
+        on = (trans[rays] >= TERMINATION) & (near[rays] + (np.float32(first) + np.float32(0.5)) * step < far[rays])
+        rays = rays[on]
+
+    rgb += trans[:, None] * scene.background
+    opacity = 1 - trans
+    depth = np.divide(depth, opacity, out=np.full(n, np.inf, np.float32), where=opacity > 0)
+    return Rendering(rgb, depth, opacity, samples)

@@ -1,0 +1,218 @@
+"""Rendering with OpenGL 3.3: a scene becomes textures once, then each picture is one pass of `glsl/march.glsl`."""
+
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+
+from kpc.format.cameras import Camera
+from kpc.format.errors import DisplayError
+from kpc.format.scene import SPACE_PLANES, Scene
+from kpc.player import shader
+from kpc.player.reference import Part, Rendering, slot_at
+from kpc.player.textures import Layout, Rows, decoder_block, distances
+
+FOLDED_AXIS = {"xy": 0, "xz": 2, "yz": 1}
+"""Which axis' row is folded into which plane."""
+PLANES_UNIT, ROWS_UNIT, CELLS_UNIT = 0, 1, 2
+DECODER_BINDING = 0
+
+
+@dataclass
+class Target:
+    """What a march draws into: rgb and opacity; sum of weight t, and samples. Row 0 is the bottom of the picture."""
+
+    seen: moderngl.Texture
+    met: moderngl.Texture
+    framebuffer: moderngl.Framebuffer
+
+    @staticmethod
+    def of(ctx: moderngl.Context, size: tuple[int, int]) -> "Target":
+        seen, met = ctx.texture(size, 4, dtype="f4"), ctx.texture(size, 2, dtype="f4")
+        return Target(seen, met, ctx.framebuffer([seen, met]))
+
+    def release(self) -> None:
+        for thing in (self.framebuffer, self.seen, self.met):
+            thing.release()
+
+
+class Renderer:
+    """A scene on the graphics card.
+
+    `folded`: multiply the rows of the time planes into the space planes once a frame, instead of sampling them beside the
+    planes at every sample. Half the fetches, and a second-order error where something moves.
+
+    Raises:
+        DisplayError: the scene does not fit the card, or a shader does not compile.
+    """
+
+    def __init__(self, ctx: moderngl.Context, scene: Scene, *, folded: bool = False) -> None:
+        self.ctx = ctx
+        self.scene = scene
+        self.folded = folded
+        self.layout = Layout.of(scene)
+        self._check_limits()
+        self._planes = _texture(ctx, self.layout.atlas(scene))
+        self._folded_planes: moderngl.Texture | None = None
+        self._rows: Rows | None = None
+        self._row_texture = _texture(ctx, np.ones((1, 1, 4), np.float32))
+        if scene.is_dynamic:
+            self._rows = Rows(scene, self.layout)
+            self._row_texture = _texture(ctx, np.ones((self.layout.row_count(), self._rows.width, 4), np.float32))
+        nz, ny, nx = scene.occupancy.shape[1:]
+        self._cells = ctx.texture3d((nx, ny, nz), 1, alignment=1, dtype="u1")
+        self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        self._distances: dict[int, bytes] = {}
+        self._decoder = ctx.buffer(decoder_block(scene.decoder, scene, self.layout).tobytes())
+        self._rows_time: float | None = None
+        self._folded_time: float | None = None
+        self._slot: int | None = None
+        self._programs: dict[tuple[str, bool], tuple[moderngl.Program, moderngl.VertexArray]] = {}
+        self._targets: dict[str, Target] = {}
+        self.check()
+
+    def _check_limits(self) -> None:
+        most = self.ctx.info["GL_MAX_TEXTURE_SIZE"]
+        if max(self.layout.size) > most:
+            width, height = self.layout.size
+            raise DisplayError(f"the planes need a texture of {width}x{height}, this card takes {most}; kprender --backend reference")
+
+    def check(self) -> None:
+        """Raise a DisplayError if the card has reported an error since the last look."""
+        error = self.ctx.error
+        if error != "GL_NO_ERROR":
+            remedy = "close other programs or use a smaller size" if error == "GL_OUT_OF_MEMORY" else "update the graphics driver"
+            raise DisplayError(f"OpenGL reports {error} on {self.ctx.info['GL_RENDERER']}; {remedy}")
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the textures and buffers that hold the scene and its pictures."""
+        textures = [self._planes, self._row_texture] + [self._folded_planes] * (self._folded_planes is not None)
+        pictures = [t for target in self._targets.values() for t in (target.seen, target.met)]
+        return sum(t.width * t.height * t.components * 4 for t in textures + pictures) + self.scene.occupancy[0].size
+
+    def render(self, camera: Camera, time: float, *, part: Part = Part.FULL) -> Rendering:
+        """What `kpc.player.reference.render` gives, by OpenGL."""
+        target = self.march(camera, time, part=Part.STATIC if part is Part.STATIC else Part.FULL)
+        rgb, depth, opacity, samples = _read(target)
+        if part is Part.DYNAMIC:
+            rgb = np.abs(rgb - _read(self.march(camera, time, part=Part.STATIC))[0])
+        self.check()
+        return Rendering(rgb, depth, opacity, samples)
+
+    def march(self, camera: Camera, time: float, *, part: Part = Part.FULL, program: str = "march.glsl") -> Target:
+        """Draw into a target of the camera's size, which stays valid until the next march of the same part.
+
+        `part` is FULL or STATIC. `program` is march.glsl or another that takes a subset of its uniforms.
+        """
+        moving = part is Part.FULL and self._rows is not None
+        self._occupy(slot_at(self.scene, time))
+        planes = self._planes
+        if moving:
+            self._cut(time)
+            if self.folded:
+                planes = self._fold(time)
+        target = self._target(part.value, (camera.width, camera.height))
+        march, vertices = self._program(program, moving and not self.folded)
+        _set(march, height=float(camera.height), lens=(camera.fl_x, camera.fl_y, camera.cx, camera.cy),
+             axes=tuple(camera.camera_to_world[:3, :3].T.ravel()), eye=tuple(camera.camera_to_world[:3, 3]))
+        planes.use(PLANES_UNIT)
+        self._row_texture.use(ROWS_UNIT)
+        self._cells.use(CELLS_UNIT)
+        self._decoder.bind_to_uniform_block(DECODER_BINDING)
+        self._draw(target.framebuffer, vertices)
+        return target
+
+    def _draw(self, framebuffer: moderngl.Framebuffer, vertices: moderngl.VertexArray,
+              viewport: tuple[int, int, int, int] | None = None) -> None:
+        self.ctx.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+        framebuffer.use()
+        framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
+        vertices.render(moderngl.TRIANGLES, vertices=3)
+
+    def _target(self, name: str, size: tuple[int, int]) -> Target:
+        target = self._targets.get(name)
+        if target is None or target.framebuffer.size != size:
+            if target is not None:
+                target.release()
+            target = self._targets[name] = Target.of(self.ctx, size)
+        return target
+
+    def _program(self, name: str, with_rows: bool) -> tuple[moderngl.Program, moderngl.VertexArray]:
+        """Compiled when first needed, with everything set that does not change."""
+        if (name, with_rows) in self._programs:
+            return self._programs[name, with_rows]
+        scene, layout = self.scene, self.layout
+        program = shader.build(self.ctx, name, {
+            "SCALES": layout.scales, "LAYERS": layout.layers, "HIDDEN": len(scene.decoder.b1), "ROWS": int(with_rows),
+        })
+        sizes = [(s["xy"].shape[1], s["xy"].shape[0], s["xz"].shape[0]) for s in scene.scales]
+        _set(
+            program, planes=PLANES_UNIT, rows=ROWS_UNIT, cells=CELLS_UNIT, Decoder=DECODER_BINDING,
+            planes_texel=(1 / layout.size[0], 1 / layout.size[1]),
+            rows_texel=(1 / self._row_texture.width, 1 / self._row_texture.height),
+            origins=[(block.x, block.y) for block in layout.blocks],
+            resolution=sizes if len(sizes) > 1 else sizes[0],
+            cell_count=scene.occupancy.shape[:0:-1],
+            box_low=tuple(scene.aabb[0]), box_high=tuple(scene.aabb[1]), background=tuple(scene.background),
+            stride=scene.step, tau=scene.step / scene.extent,
+        )
+        entry = self._programs[name, with_rows] = program, self.ctx.vertex_array(program, [])
+        return entry
+
+    def _occupy(self, slot: int) -> None:
+        if slot == self._slot:
+            return
+        if slot not in self._distances:
+            self._distances[slot] = distances(self.scene.occupancy[slot]).tobytes()
+        self._cells.write(self._distances[slot])
+        self._slot = slot
+
+    def _cut(self, time: float) -> None:
+        if time != self._rows_time and self._rows is not None:
+            self._row_texture.write(self._rows.at(time))
+            self._rows_time = time
+
+    def _fold(self, time: float) -> moderngl.Texture:
+        if self._folded_planes is None:
+            self._folded_planes = self.ctx.texture(self.layout.size, 4, dtype="f4")
+            self._fold_into = self.ctx.framebuffer([self._folded_planes])
+        if time != self._folded_time:
+            fold, vertices = self._program("fold.glsl", False)
+            self._planes.use(PLANES_UNIT)
+            self._row_texture.use(ROWS_UNIT)
+            for block in self.layout.blocks:
+                axis = FOLDED_AXIS[block.plane]
+                _set(fold, origin=(block.x, block.y), width=block.width, first_row=self.layout.first_row(axis, block.scale),
+                     upright=int("xyz"[axis] == block.plane[1]))
+                self._draw(self._fold_into, vertices, (block.x, block.y, self.layout.layers * block.width, block.height))
+            self._folded_time = time
+        return self._folded_planes
+
+
+def _texture(ctx: moderngl.Context, texels: np.ndarray) -> moderngl.Texture:
+    """A float32 texture of (height, width, 4), filtered, clamped at its edges."""
+    texture = ctx.texture((texels.shape[1], texels.shape[0]), 4, np.ascontiguousarray(texels, np.float32), dtype="f4")
+    texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+    texture.repeat_x = texture.repeat_y = False
+    return texture
+
+
+def _set(program: moderngl.Program, **values: object) -> None:
+    """Set the uniforms and blocks that a program has; compilers drop those it does not use."""
+    for name, value in values.items():
+        member = program.get(name, None)
+        if isinstance(member, moderngl.UniformBlock):
+            member.binding = value
+        elif member is not None:
+            member.value = value
+
+
+def _read(target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """rgb, depth, opacity and samples of a finished march, top row first."""
+    width, height = target.framebuffer.size
+    seen = np.frombuffer(target.seen.read(), np.float32).reshape(height, width, 4)[::-1]
+    met = np.frombuffer(target.met.read(), np.float32).reshape(height, width, 2)[::-1]
+    opacity = seen[..., 3].copy()
+    depth = np.divide(met[..., 0], opacity, out=np.full_like(opacity, np.inf), where=opacity > 0)
+    return seen[..., :3].copy(), depth, opacity, met[..., 1].astype(np.int32)

@@ -1,0 +1,149 @@
+"""A scene's arrays as the shaders want them: one atlas of planes, rows at a time, distances to occupied cells."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
+
+FARTHEST = 255
+"""Distances are stored in a byte."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Where a plane of a scale lies in the atlas: its layers of four channels side by side, each `width` texels wide."""
+
+    scale: int
+    plane: str
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a scene's planes share one texture.
+
+    Attributes:
+        layers: texels of four channels that a scale's features fill; the widest scale decides, others are padded with 0.
+        size: (width, height) of the atlas, texels.
+        blocks: scale by scale, "xy", "xz", "yz".
+    """
+
+    scales: int
+    layers: int
+    size: tuple[int, int]
+    blocks: tuple[Block, ...]
+
+    @staticmethod
+    def of(scene: Scene) -> "Layout":
+        """Shelves, tallest block first, in a texture about as wide as it is high."""
+        layers = max(-(-plane.shape[2] // 4) for scale in scene.scales for plane in scale.values())
+        shapes = [(s, name, *scale[name].shape[:2]) for s, scale in enumerate(scene.scales) for name in SPACE_PLANES]
+        area = sum(rows * columns * layers for *_, rows, columns in shapes)
+        width = max(int(np.ceil(np.sqrt(area))), max(columns * layers for *_, columns in shapes))
+        placed, x, y, shelf = {}, 0, 0, 0
+        for scale, name, rows, columns in sorted(shapes, key=lambda shape: -shape[2]):
+            if x + columns * layers > width:
+                x, y, shelf = 0, y + shelf, 0
+            placed[scale, name] = Block(scale, name, x, y, columns, rows)
+            x, shelf = x + columns * layers, max(shelf, rows)
+        blocks = tuple(placed[scale, name] for scale, name, *_ in shapes)
+        return Layout(len(scene.scales), layers, (width, y + shelf), blocks)
+
+    def atlas(self, scene: Scene) -> np.ndarray:
+        """(height, width, 4) float32 of all space planes."""
+        out = np.zeros((self.size[1], self.size[0], 4), np.float32)
+        for block in self.blocks:
+            plane = scene.scales[block.scale][block.plane]
+            view = out[block.y : block.y + block.height, block.x : block.x + self.layers * block.width]
+            padded = np.zeros((*plane.shape[:2], self.layers * 4), np.float32)
+            padded[..., : plane.shape[2]] = plane
+            view[:] = padded.reshape(block.height, block.width, self.layers, 4).swapaxes(1, 2).reshape(view.shape)
+        return out
+
+    def row_count(self) -> int:
+        return 3 * self.scales * self.layers
+
+    def first_row(self, axis: int, scale: int) -> int:
+        """The line of the rows' texture that holds layer 0 of an axis (0, 1, 2 for x, y, z) at a scale."""
+        return (axis * self.scales + scale) * self.layers
+
+
+class Rows:
+    """The time planes of a scene, ready to be cut: at a time, each is one row along x, y or z.
+
+    Bilinear interpolation is separable, so that interpolating in time first, once a frame, loses nothing.
+    """
+
+    def __init__(self, scene: Scene, layout: Layout) -> None:
+        self._layout = layout
+        self._planes = [(axis, s, scale[name]) for s, scale in enumerate(scene.scales) for axis, name in enumerate(TIME_PLANES)]
+        self.width = max(plane.shape[1] for *_, plane in self._planes)
+
+    def at(self, time: float) -> np.ndarray:
+        """(lines, width, 4) float32 at `time` in [0, 1]; 1 beyond a row's end."""
+        layers = self._layout.layers
+        out = np.ones((self._layout.row_count(), self.width, 4), np.float32)
+        for axis, scale, plane in self._planes:
+            position = np.float32(time) * np.float32(len(plane) - 1)
+            lower = min(int(position), max(len(plane) - 2, 0))
+            f = position - np.float32(lower)
+            row = plane[lower] * (1 - f) + plane[min(lower + 1, len(plane) - 1)] * f
+            padded = np.ones((len(row), layers * 4), np.float32)
+            padded[:, : row.shape[1]] = row
+            first = self._layout.first_row(axis, scale)
+            out[first : first + layers, : len(row)] = padded.reshape(len(row), layers, 4).swapaxes(0, 1)
+        return out
+
+
+def distances(occupied: np.ndarray) -> np.ndarray:
+    """Chebyshev distance of each cell of a (Nz, Ny, Nx) bool grid to the nearest that is set: uint8, at most 255.
+
+    A cell at distance D is the middle of a block of 2 D - 1 cells a side in which none is set.
+    """
+    out = np.where(occupied, 0, FARTHEST).astype(np.uint8)
+    reached = occupied
+    for distance in range(1, FARTHEST):
+        wider = _dilate(reached)
+        fresh = wider & ~reached
+        if not fresh.any():
+            break
+        out[fresh] = distance
+        reached = wider
+    return out
+
+
+def _dilate(grid: np.ndarray) -> np.ndarray:
+    """Cells that are set or share a face, an edge or a corner with one that is."""
+    for axis in range(grid.ndim):
+        low, high = [slice(None)] * grid.ndim, [slice(None)] * grid.ndim
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        wide = grid.copy()
+        wide[tuple(low)] |= grid[tuple(high)]
+        wide[tuple(high)] |= grid[tuple(low)]
+        grid = wide
+    return grid
+
+
+def decoder_block(decoder: Decoder, scene: Scene, layout: Layout) -> np.ndarray:
+    """The uniform block `Decoder` of march.glsl (std140, all vec4): (N, 4) float32."""
+    hidden, features = len(decoder.b1), layout.scales * layout.layers * 4
+    channels = [scale["xy"].shape[2] for scale in scene.scales]
+    place = np.concatenate([s * layout.layers * 4 + np.arange(m) for s, m in enumerate(channels)])
+
+    def spread(weights: np.ndarray) -> np.ndarray:
+        """Give the last axis, the scene's features, the places they have in the padded layout."""
+        out = np.zeros((*weights.shape[:-1], features), np.float32)
+        out[..., place] = weights
+        return out
+
+    w1 = np.zeros((hidden, 12), np.float32)
+    w1[:, :9], w1[:, 9] = decoder.w1, decoder.b1
+    parts = [
+        spread(decoder.density_weight), w1, spread(np.moveaxis(decoder.w2, 2, 0)), spread(decoder.b2),
+        np.array([decoder.density_bias, 0, 0, 0], np.float32),
+    ]
+    return np.concatenate([part.reshape(-1, 4) for part in parts])
