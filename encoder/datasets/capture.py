@@ -1,0 +1,130 @@
+"""What every layout is read into: a list of views, each an image or the video of a camera that stands still."""
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kpc.format.errors import DatasetError
+from kpc.format.media import VideoInfo, image_size
+
+HOLD_OUT_EVERY = 8
+"""Where neither the dataset nor the user names test images, every eighth is one (the custom of LLFF, arXiv:1905.00889)."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One file seen through one camera.
+
+    Attributes:
+        file: an image, or a video if `video` is given.
+        time: as the dataset tells it, in any unit; None for videos and where nothing is told.
+        width, height, has_alpha: of the file as it is.
+        intrinsics: fl_x fl_y cx cy, pixels of that raster; distortion: k1 k2 p1 p2 (OpenCV's model).
+        camera_to_world: (4, 4) float64, OpenGL convention.
+        near, far: depth along the optical axis, NaN where unknown.
+    """
+
+    file: Path
+    video: VideoInfo | None
+    time: float | None
+    is_test: bool
+    width: int
+    height: int
+    has_alpha: bool
+    intrinsics: tuple[float, float, float, float]
+    distortion: tuple[float, float, float, float]
+    camera_to_world: np.ndarray
+    near: float = math.nan
+    far: float = math.nan
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A dataset before its pixels are read. `fps` is None where nothing tells it."""
+
+    layout: str
+    views: tuple[View, ...]
+    fps: float | None
+
+
+def image_view(
+    file: Path, *, where: str, time: float | None, is_test: bool, declared: tuple[float, float] | None,
+    intrinsics: tuple[float, float, float, float], distortion: tuple[float, float, float, float],
+    camera_to_world: np.ndarray, near: float, far: float,
+) -> View:
+    """A view of an image. `declared` is the raster that the intrinsics belong to, None for the image's own."""
+    width, height, has_alpha = image_size(file)
+    intrinsics = fit_intrinsics(where, file, intrinsics, declared or (width, height), (width, height))
+    pose = check_pose(where, camera_to_world)
+    return View(file, None, time, is_test, width, height, has_alpha, intrinsics, distortion, pose, near, far)
+
+
+def fit_intrinsics(
+    where: str, file: Path, intrinsics: tuple[float, float, float, float], declared: tuple[float, float],
+    actual: tuple[int, int],
+) -> tuple[float, float, float, float]:
+    """Scale fl_x fl_y cx cy from the declared raster to the actual one, each axis on its own.
+
+    Raises:
+        DatasetError: the focal length is not a positive number, or the two rasters differ in shape by more than 1 %
+            and a pixel's rounding: then the picture was cropped, and nobody says where.
+    """
+    fl_x, fl_y, cx, cy = intrinsics
+    if not (all(map(math.isfinite, intrinsics)) and fl_x > 0 and fl_y > 0):
+        raise DatasetError(f"{where}: focal length {fl_x:g} x {fl_y:g} must be positive; correct the calibration")
+    if not (declared[0] >= 1 and declared[1] >= 1):
+        raise DatasetError(f"{where}: picture size {declared[0]:g}x{declared[1]:g} is empty; correct the calibration")
+    sx, sy = actual[0] / declared[0], actual[1] / declared[1]
+    if abs(sx / sy - 1) > 0.01 + 1 / min(actual):
+        raise DatasetError(
+            f"{file}: is {actual[0]}x{actual[1]}, but {where} is for {declared[0]:g}x{declared[1]:g}, another shape; "
+            "undo the crop or correct the size there"
+        )
+    return fl_x * sx, fl_y * sy, cx * sx, cy * sy
+
+
+def check_pose(where: str, pose: np.ndarray) -> np.ndarray:
+    """The pose as (4, 4) float64 with a scale taken out of its axes.
+
+    Raises:
+        DatasetError: not 3x4 or 4x4, NaN or infinity, or axes that are not at right angles or left-handed.
+    """
+    if pose.shape not in ((3, 4), (4, 4)):
+        raise DatasetError(f"{where}: pose has shape {pose.shape}, not 4x4")
+    if not np.isfinite(pose).all():
+        raise DatasetError(f"{where}: pose holds NaN or infinity; remove the camera or calibrate it anew")
+    lengths = np.linalg.norm(pose[:3, :3], axis=0)
+    axes = pose[:3, :3] / np.where(lengths > 0, lengths, 1)
+    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-2 or np.linalg.det(axes) < 0:
+        raise DatasetError(f"{where}: pose is not a rotation and a position; calibrate the camera anew")
+    checked = np.eye(4)
+    checked[:3, :3], checked[:3, 3] = axes, pose[:3, 3]
+    return checked
+
+
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """Sorts cam2 before cam10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def held_out(path: Path, names: Sequence[str], holdout: str | None, default: Iterable[bool]) -> list[bool]:
+    """Which of the files named (relative to `path`) are for testing.
+
+    `holdout`: None for the layout's own custom, "none", or a file's name with or without folder and suffix.
+
+    Raises:
+        DatasetError: no file has that name.
+    """
+    if holdout is None:
+        return list(default)
+    if holdout == "none":
+        return [False] * len(names)
+    chosen = [holdout in (name, Path(name).name, Path(name).stem) for name in names]
+    if not any(chosen):
+        some = ", ".join(Path(name).stem for name in names[:4])
+        raise DatasetError(f"{path}: nothing is named {holdout!r} to hold out; there are {some}{' ...' if len(names) > 4 else ''}")
+    return chosen

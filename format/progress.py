@@ -1,0 +1,70 @@
+"""Progress on stderr: a bar on a terminal, a line every ten seconds elsewhere."""
+
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from types import TracebackType
+from typing import Self, TypeVar
+
+from tqdm import tqdm
+
+T = TypeVar("T")
+
+LINE_EVERY_S = 10.0
+
+
+class Progress:
+    """Shows how far a task of `total` units is; used as a context manager, fed by `advance`.
+
+        with Progress("decode", total=300, unit="frame") as progress:
+            progress.advance()
+            progress.note("psnr 27.1")
+    """
+
+    def __init__(self, label: str, total: float | None = None, unit: str = "", *, shown: bool = True) -> None:
+        self.label, self.total, self.unit, self.shown = label, total, unit, shown
+        self.done, self.text = 0.0, ""
+        self.started = self.said = time.monotonic()
+        self.bar = tqdm(total=total, desc=label, unit=unit or "it", leave=False, file=sys.stderr,
+                        bar_format="{l_bar}{bar}| {n:.0f}/{total:.0f} [{elapsed}<{remaining}]{postfix}" if total else None,
+                        ) if shown and sys.stderr.isatty() else None
+
+    def advance(self, count: float = 1) -> None:
+        """`count` more units are done."""
+        self.done += count
+        if self.bar is not None:
+            self.bar.update(count)
+        elif self.shown and time.monotonic() - self.said >= LINE_EVERY_S:
+            self._say()
+
+    def note(self, text: str) -> None:
+        """Words to show behind the bar, or at the end of the next line."""
+        self.text = text
+        if self.bar is not None:
+            self.bar.set_postfix_str(text, refresh=False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+    def _say(self) -> None:
+        self.said = time.monotonic()
+        elapsed = self.said - self.started
+        parts = [f"{self.label}: {self.done:.0f}"]
+        if self.total:
+            left = elapsed * (self.total - self.done) / self.done if self.done else float("nan")
+            parts = [f"{self.label}: {self.done:.0f}/{self.total:.0f} {self.unit}".rstrip(), f"{left:.0f} s left"]
+        print(", ".join(parts + ([self.text] if self.text else [])), file=sys.stderr, flush=True)
+
+
+def progress(items: Iterable[T], label: str, total: int | None = None, unit: str = "", *, shown: bool = True) -> Iterator[T]:
+    """Pass `items` on and show how many have been used."""
+    if total is None and hasattr(items, "__len__"):
+        total = len(items)
+    with Progress(label, total, unit, shown=shown) as bar:
+        for item in items:
+            yield item
+            bar.advance()
