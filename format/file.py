@@ -48,8 +48,8 @@ CAMERA_LIMIT = 4096
 FRAME_LIMIT = 1 << 24
 SAMPLE_LIMIT = 65536
 """Samples along the box's diagonal, so that no file can make a ray endless."""
-VALUE_LIMIT = 65504.0
-"""Magnitude of any plane value: float16 holds it, and no product of six and no sum of features overflows float32."""
+VALUE_LIMIT = 2048.0
+"""Magnitude of any plane value: float16 holds it, and with float16 weights no feature, density or colour overflows."""
 
 
 @dataclass(frozen=True)

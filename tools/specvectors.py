@@ -3,8 +3,8 @@
     valid/NAME.kpc     decodes to what valid/NAME.json says, bit by bit
     invalid/NAME.kpc   is refused; invalid/NAME.json names the kind of error and a part of its message
 
-Every vector is computed from integers, so that it comes out the same everywhere; only vectors that hold zstd frames
-depend on the version of that library, and only in how they are packed (valid/NAME.json says which version packed them).
+Every file is computed from integers, so that it comes out the same everywhere; only files that hold zstd frames depend
+on the version of that library, and only in how they are packed (valid/NAME.json says which version packed them).
 """
 
 import hashlib
@@ -26,6 +26,7 @@ from kpc.format.errors import UsageError
 from kpc.format.file import encode, read, scene_chunks
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
+from kpc.player import reference
 
 ZSTD_VERSION = ".".join(map(str, zstandard.ZSTD_VERSION))
 
@@ -79,6 +80,7 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
              "values_sha256": _sha256(plane.dequantise().astype("<f4"))}
             for number, scale in enumerate(scene.scales) for name, plane in scale.items()
         ],
+        "rays": _rays(scene),
     }
 
 
@@ -144,7 +146,9 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     def without(number: int) -> bytes:
         return pack(chunks[:number] + chunks[number + 1:], values, compress=False)
 
-    bomb = zstandard.ZstdCompressor(level=19).compress(bytes(1 << 20))
+    run = 1 << 17  # RFC 8878: a frame of one segment that claims 1 MiB, then eight blocks of 128 KiB of zeros each
+    bomb = b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", 8 * run) + b"".join(
+        struct.pack("<I", (block == 7) | 1 << 1 | run << 3)[:3] + b"\0" for block in range(8))
     bomb_file = pack([*chunks[:xy], Chunk("PLNE", [bomb], 0, 0, 0, 4), *chunks[xy + 1:]], values, compress=False)
     nan = float("nan")
     broken = "FormatError"
@@ -262,6 +266,27 @@ def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
     mixed = (index * np.uint32(2654435761)) ^ (index * np.uint32(2654435761) >> np.uint32(15))
     mixed = mixed * np.uint32(2246822519)
     return ((mixed >> np.uint32(13)) & np.uint32(255)).astype(np.float32).reshape(shape) - np.float32(128)
+
+
+def _rays(scene: QuantisedScene) -> list[dict[str, Any]]:
+    """What four rays see: through the box's centre at the clip's start, across it, from inside it, and past it."""
+    centre, size = scene.aabb.mean(0), scene.aabb[1] - scene.aabb[0]
+    starts = np.array([[0.0, 0.1, 1.5], [-1.5, -0.75, 1.25], [0.1, -0.2, 0.05], [2.0, 2.0, 2.0]], np.float32)
+    towards = np.array([[0.05, 0.0, -1.0], [1.5, 0.75, -1.25], [0.75, 0.5, 0.25], [1.0, 0.0, 0.0]], np.float32)
+    origins = (centre + starts * size).astype(np.float32)
+    directions = towards * size
+    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    rays = []
+    for origin, direction, time in zip(origins, directions, (0.0, 0.375, 0.8125, 1.0), strict=True):
+        with np.errstate(over="ignore"):  # a vector may saturate colours
+            seen = reference.render_rays(scene.dequantise(), origin[None], direction[None], time)
+        depth = float(seen.depth[0])
+        rays.append({
+            "origin": origin.tolist(), "direction": direction.tolist(), "time": time,
+            "rgb": [round(float(c), 6) for c in seen.rgb[0]], "opacity": round(float(seen.opacity[0]), 6),
+            "depth": round(depth, 6) if np.isfinite(depth) else None,
+        })
+    return rays
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

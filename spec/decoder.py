@@ -1,0 +1,322 @@
+"""A .kpc decoder in plain Python, written from kpc-format.md alone: slow, short, and independent of the real one.
+
+    python decoder.py scene.kpc        prints what is in the file and the SHA-256 of every plane
+
+It shares no code with the kpc package, so that the two, the page and the vectors check one another. Section numbers are
+those of the page. Only Zstandard comes from a library.
+"""
+
+import hashlib
+import math
+import struct
+import sys
+
+import zstandard
+
+PLANES = ["xy", "xz", "yz", "xt", "yt", "zt"]
+
+
+class Refused(Exception):
+    """The file breaks a rule of the page."""
+
+
+def require(condition, what):
+    if not condition:
+        raise Refused(what)
+
+
+def crc32c(data):  # section 2
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0x82F63B78 if crc & 1 else 0)  # 0x1EDC6F41 with its bits reversed
+    return crc ^ 0xFFFFFFFF
+
+
+def f32(x):
+    """Round to the nearest float32."""
+    return struct.unpack("<f", struct.pack("<f", x))[0]
+
+
+def bits(data, count):  # section 2
+    require(len(data) == -(-count // 8), "bit string of another length")
+    unpacked = [data[i // 8] >> i % 8 & 1 for i in range(8 * len(data))]
+    require(not any(unpacked[count:]), "unused bits are not 0")
+    return unpacked[:count]
+
+
+class Bytes:
+    """Reads a chunk from front to back."""
+
+    def __init__(self, data):
+        self.data, self.at = data, 0
+
+    def take(self, length):
+        require(self.at + length <= len(self.data), "chunk too short")
+        self.at += length
+        return self.data[self.at - length:self.at]
+
+    def unpack(self, layout):
+        return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
+
+    def rest(self):
+        return self.take(len(self.data) - self.at)
+
+    def end(self):
+        require(self.at == len(self.data), "chunk too long")
+
+
+def chunks(data, partial):  # sections 3, 4 and 10
+    """Yield (kind, scale, plane, row_start, row_count, raw) of all chunks; raw is None where a prefix lacks it."""
+    require(len(data) >= 64 and data[:8] == b"\x89KPC\r\n\x1a\n", "not a .kpc file")
+    (version, flags, header_length, index_offset, index_length, count, file_length, value_count, largest_raw, reserved,
+     index_crc, header_crc) = struct.unpack("<HHIQIIQQIIII", data[8:64])
+    require(version == 0, "unknown version")
+    require(crc32c(data[:60]) == header_crc, "header damaged")
+    require(flags == reserved == 0 and header_length == index_offset == 64, "reserved field")
+    require(1 <= count <= 65536 and index_length == 40 * count, "chunk count")
+    require(len(data) <= file_length if partial else len(data) == file_length, "file length")
+    require(max(value_count, largest_raw) <= file_length * 32768, "limits")
+    index = data[64:64 + index_length]
+    require(len(index) == index_length and crc32c(index) == index_crc, "index damaged")
+    expected = 64 + index_length
+    for at in range(0, index_length, 40):
+        kind, group, scale, plane, start, rows, codec, reserved, stored, raw, crc, offset = \
+            struct.unpack("<4sHBBIIHHIIIQ", index[at:at + 40])
+        require(kind.isalpha() and reserved == 0 and offset == expected and raw <= largest_raw, "index entry")
+        expected += stored
+        body = data[offset:offset + stored]
+        known = kind in (b"SCNE", b"DECO", b"OCCU", b"PLNE", b"came")
+        require(known or not kind[:1].isupper(), "unknown critical chunk")
+        require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
+        if len(body) < stored:
+            body = None
+        else:
+            require(crc32c(body) == crc, "chunk damaged")
+        if known:
+            yield kind.decode(), scale, plane, start, rows, body if body is None else decoded(body, codec, raw), value_count
+    require(expected == file_length, "chunks do not fill the file")
+
+
+def decoded(body, codec, raw_length):  # section 4
+    require(codec in (0, 1), "unknown codec")
+    if codec == 1:
+        try:
+            require(zstandard.get_frame_parameters(body).content_size == raw_length, "zstd content size")
+            body = zstandard.ZstdDecompressor().decompress(body, max_output_size=raw_length, allow_extra_data=False)
+        except zstandard.ZstdError as error:
+            raise Refused("zstd") from error
+    require(len(body) == raw_length, "raw length")
+    return body
+
+
+def decode(data, partial=False):
+    """The scene as a dict of plain numbers and lists."""
+    parts, segments, value_count = {}, [], 0
+    for kind, scale, plane, start, rows, raw, value_count in chunks(data, partial):
+        if kind == "PLNE":
+            segments.append((scale, plane, start, rows, raw))
+        else:
+            require(kind not in parts, f"two {kind} chunks")
+            parts[kind] = raw
+    for kind in ("SCNE", "DECO", "OCCU"):
+        require(parts.get(kind) is not None, f"no {kind} chunk")
+    scene = scene_chunk(Bytes(parts["SCNE"]))
+    values = sum(p["rows"] * p["columns"] * s["channels"] for s in scene["scales"] for p in s["planes"].values())
+    require(values == value_count, "value count")
+    scene |= decoder_chunk(Bytes(parts["DECO"]), sum(s["channels"] for s in scene["scales"]))
+    scene |= occupancy_chunk(Bytes(parts["OCCU"]))
+    scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") else []
+
+    for scale in scene["scales"]:
+        for plane in scale["planes"].values():  # uncoded until a segment says otherwise
+            texels = plane["rows"] * plane["columns"]
+            plane["coded"], plane["symbols"], plane["next_row"], plane["segments"] = [0] * texels, \
+                [0] * (texels * scale["channels"]), 0, 0
+    for scale, number, start, rows, raw in sorted(segments, key=lambda s: s[:3]):
+        require(scale < len(scene["scales"]) and number < 6, "place")
+        planes, name = scene["scales"][scale]["planes"], PLANES[number]
+        require(name in planes and rows > 0 and planes[name]["next_row"] == start, "segments")
+        plane, channels = planes[name], scene["scales"][scale]["channels"]
+        plane["next_row"] += rows
+        plane["segments"] += 1
+        if raw is not None:
+            coded, symbols = segment(Bytes(raw), rows, plane["columns"], channels)
+            first = start * plane["columns"]
+            plane["coded"][first:first + len(coded)] = coded
+            plane["symbols"][first * channels:first * channels + len(symbols)] = symbols
+    for scale in scene["scales"]:
+        channels = scale["channels"]
+        for name, plane in scale["planes"].items():
+            require(plane["next_row"] == plane["rows"], "rows left out")
+            require(name in PLANES[3:] or plane["segments"] == 1, "a space plane in pieces")
+            plane["values"] = [f32(f32(s * plane["step"][i % channels]) + plane["offset"][i % channels])
+                               for i, s in enumerate(plane["symbols"])]
+    return scene
+
+
+def scene_chunk(chunk):  # section 5
+    *aabb, frame_count, fps, step, r, g, b, scale_count, dynamic = chunk.unpack("6fIdd3fBB")
+    low, high = aabb[:3], aabb[3:]
+    require(all(map(math.isfinite, aabb)) and all(a < b for a, b in zip(low, high)), "box")
+    require(1 <= frame_count <= 1 << 24 and math.isfinite(fps) and fps > 0, "clip")
+    require(math.isfinite(step) and step > 0 and math.dist(low, high) / step <= 65536, "step")
+    require(all(0 <= c <= 1 for c in (r, g, b)) and 1 <= scale_count <= 16 and dynamic <= 1, "background or scales")
+    scales = []
+    for _ in range(scale_count):
+        channels, *size = chunk.unpack("5H")
+        size = dict(zip("xyzt", size))
+        require(1 <= channels <= 256 and all(1 <= size[a] <= 16384 for a in "xyz") and size["t"] <= 16384, "size")
+        require((size["t"] > 0) == bool(dynamic), "rows in time")
+        planes = {}
+        for name in PLANES[:6 if dynamic else 3]:
+            step_of = chunk.unpack(f"{channels}f")
+            offset_of = chunk.unpack(f"{channels}f") if "t" not in name else (1.0,) * channels
+            require(all(s > 0 and 128 * s + abs(o) <= 2048 for s, o in zip(step_of, offset_of)), "step or offset")
+            planes[name] = {"columns": size[name[0]], "rows": size[name[1]], "step": step_of, "offset": offset_of}
+        scales.append({"channels": channels, "planes": planes})
+    chunk.end()
+    return {"aabb": [low, high], "frame_count": frame_count, "fps": fps, "step": step, "background": [r, g, b],
+            "scales": scales}
+
+
+def segment(chunk, rows, columns, channels):  # section 6
+    """(coded, symbols): a flat list of 0 or 1 for each texel, and of symbols by row, column, channel."""
+    flag, = chunk.unpack("B")
+    require(flag <= 1, "map flag")
+    texels = rows * columns
+    coded = bits(chunk.take(-(-texels // 8)), texels) if flag else [1] * texels
+    filters = chunk.take(channels)
+    symbols = [0] * (texels * channels)
+    for c in range(channels):
+        require(filters[c] <= 3, "filter")
+        residuals = iter(chunk.take(sum(coded)))
+        v = [[0] * (columns + 1) for _ in range(rows + 1)]  # a row and a column of zeros around it
+        for y in range(rows):
+            for x in range(columns):
+                left, up, corner = v[y + 1][x], v[y][x + 1], v[y][x]
+                predicted = (0, left, up, left + up - corner)[filters[c]]
+                residual = next(residuals) if coded[y * columns + x] else 0
+                v[y + 1][x + 1] = value = (residual + predicted) % 256
+                if coded[y * columns + x]:
+                    symbols[(y * columns + x) * channels + c] = value - 256 if value > 127 else value
+    chunk.end()
+    return coded, symbols
+
+
+def decoder_chunk(chunk, expected):  # section 7
+    features, hidden, bias = chunk.unpack("HHf")
+    require(features == expected and 1 <= hidden <= 256 and math.isfinite(bias), "decoder sizes")
+    weights = {"density_weight": features, "w1": hidden * 9, "b1": hidden, "w2": 3 * features * hidden, "b2": 3 * features}
+    scene = {name: chunk.unpack(f"{count}e") for name, count in weights.items()}
+    require(all(math.isfinite(w) for array in scene.values() for w in array), "weights")
+    chunk.end()
+    return scene | {"density_bias": bias, "hidden": hidden}
+
+
+def occupancy_chunk(chunk):  # section 8
+    slots, nz, ny, nx = chunk.unpack("4H")
+    require(all(1 <= n <= 16384 for n in (slots, nz, ny, nx)), "grid")
+    return {"cells": (nx, ny, nz), "slots": slots, "occupancy": bits(chunk.rest(), slots * nz * ny * nx)}
+
+
+def cameras_chunk(chunk):  # section 9
+    count, = chunk.unpack("H")
+    require(1 <= count <= 4096, "number of cameras")
+    cameras = []
+    for _ in range(count):
+        width, height, *numbers = chunk.unpack("HH16f")
+        require(width and height and all(map(math.isfinite, numbers)) and min(numbers[:2]) > 0, "camera")
+        cameras.append((width, height, *numbers))
+    chunk.end()
+    return cameras
+
+
+def render_ray(scene, origin, direction, time):  # section 11
+    """(rgb, opacity, depth) that a ray sees."""
+    low, high = scene["aabb"]
+    extent = max(h - w for w, h in zip(low, high))
+    t_in, t_out = -math.inf, math.inf
+    for o, d, a, b in zip(origin, direction, low, high):
+        if d == 0:
+            t_in, t_out = (t_in, t_out) if a <= o <= b else (math.inf, -math.inf)
+        else:
+            t_in, t_out = max(t_in, min((a - o) / d, (b - o) / d)), min(t_out, max((a - o) / d, (b - o) / d))
+    t_near = max(t_in, 0.0)
+
+    basis = direction_basis(scene, direction)
+    slot = min(math.floor(time * scene["slots"]), scene["slots"] - 1)
+    colour, depth, T, k = [0.0, 0.0, 0.0], 0.0, 1.0, 0
+    while T >= 1 / 1024 and t_near + (k + 0.5) * scene["step"] < t_out:
+        t_k = t_near + (k + 0.5) * scene["step"]
+        k += 1
+        u = [(o + t_k * d - a) / (b - a) for o, d, a, b in zip(origin, direction, low, high)]
+        i, j, m = (min(max(math.floor(x * n), 0), n - 1) for x, n in zip(u, scene["cells"]))
+        nx, ny, _ = scene["cells"]
+        if not scene["occupancy"][((m * ny + j) * nx + i) * scene["slots"] + slot]:
+            continue
+        f = features(scene, dict(zip("xyzt", [*u, time])))
+        log_density = sum(a * b for a, b in zip(f, scene["density_weight"])) + scene["density_bias"]
+        alpha = 1 - math.exp(-math.exp(min(max(log_density, -20.0), 20.0)) * scene["step"] / extent)
+        w = T * alpha
+        for c in range(3):
+            logit = sum(a * b for a, b in zip(f, basis[c]))
+            colour[c] += w / (1 + math.exp(-logit)) if logit > -700 else 0.0
+        depth += w * t_k
+        T *= 1 - alpha
+    opacity = 1 - T
+    return [c + T * b for c, b in zip(colour, scene["background"])], opacity, depth / opacity if opacity else math.inf
+
+
+def features(scene, place):
+    out = []
+    for scale in scene["scales"]:
+        product = [1.0] * scale["channels"]
+        for name, plane in scale["planes"].items():
+            product = [a * b for a, b in zip(product, bilinear(plane, scale["channels"], place[name[0]], place[name[1]]))]
+        out += product
+    return out
+
+
+def bilinear(plane, channels, u, v):
+    def corners(position, size):
+        position = min(max(position, 0.0), 1.0) * (size - 1)
+        low = min(math.floor(position), size - 1)
+        return low, min(low + 1, size - 1), position - low
+
+    x0, x1, fx = corners(u, plane["columns"])
+    y0, y1, fy = corners(v, plane["rows"])
+    sample = [0.0] * channels
+    for y, x, weight in [(y0, x0, (1 - fy) * (1 - fx)), (y0, x1, (1 - fy) * fx), (y1, x0, fy * (1 - fx)), (y1, x1, fy * fx)]:
+        first = (y * plane["columns"] + x) * channels
+        for c in range(channels):
+            sample[c] += weight * plane["values"][first + c]
+    return sample
+
+
+def direction_basis(scene, direction):
+    x, y, z = direction
+    e = [x, y, z, x * x, y * y, z * z, x * y, y * z, z * x]
+    H, F = scene["hidden"], len(scene["density_weight"])
+    h = [max(sum(w * a for w, a in zip(scene["w1"][9 * n:9 * n + 9], e)) + scene["b1"][n], 0.0) for n in range(H)]
+    return [[sum(w * a for w, a in zip(scene["w2"][(c * F + i) * H:(c * F + i + 1) * H], h)) + scene["b2"][c * F + i]
+             for i in range(F)] for c in range(3)]
+
+
+def hashes(scene):  # section 16
+    """{(scale, plane): (symbols, coded, values)}, each a SHA-256 in hexadecimal."""
+    return {
+        (number, name): tuple(hashlib.sha256(data).hexdigest() for data in (
+            struct.pack(f"{len(plane['symbols'])}b", *plane["symbols"]), bytes(plane["coded"]),
+            struct.pack(f"<{len(plane['values'])}f", *plane["values"])))
+        for number, scale in enumerate(scene["scales"]) for name, plane in scale["planes"].items()
+    }
+
+
+if __name__ == "__main__":
+    with open(sys.argv[1], "rb") as file:
+        found = decode(file.read())
+    print({key: found[key] for key in ("aabb", "frame_count", "fps", "step", "background", "cells", "slots")})
+    for (number, name), (symbols, _, _) in hashes(found).items():
+        print(f"scale {number} {name}: symbols {symbols}")

@@ -1,0 +1,124 @@
+import io
+import struct
+
+import google_crc32c
+import numpy as np
+import pytest
+
+from kpc.format.container import CODEC_RAW, CODEC_ZSTD, ENTRY, HEADER, Chunk, Reader, pack
+from kpc.format.errors import FormatError
+
+NOISE = np.random.default_rng(0).integers(0, 256, 300).astype(np.uint8).tobytes()
+CHUNKS = [Chunk("ABCD", [b"head"]), Chunk("PLNE", [b"x" * 500, NOISE], 1, 3, 16, 8), Chunk("none", [b""]),
+          Chunk("long", [bytes(100_000)])]
+
+
+def test_chunks_come_back_with_their_places():
+    reader = Reader(pack(CHUNKS, 7))
+    assert [reader.chunk(n) for n in range(4)] == [b"".join(c.parts) for c in CHUNKS]
+    assert [e.kind for e in reader.index] == ["ABCD", "PLNE", "none", "long"]
+    entry = reader.index[1]
+    assert (entry.group, entry.scale, entry.plane, entry.row_start, entry.row_count) == (0, 1, 3, 16, 8)
+    assert [e.is_critical for e in reader.index] == [True, True, False, False]
+    assert [e.codec for e in reader.index] == [CODEC_RAW, CODEC_ZSTD, CODEC_RAW, CODEC_ZSTD]
+    assert reader.header.value_count == 7 and reader.header.largest_raw == 100_000
+    assert all(reader.available(n) for n in range(4))
+
+
+def test_without_compression_everything_is_stored_raw():
+    data = pack(CHUNKS, 7, compress=False)
+    assert all(e.codec == CODEC_RAW for e in Reader(data).index)
+    assert len(data) == HEADER.size + 4 * ENTRY.size + sum(len(b"".join(c.parts)) for c in CHUNKS)
+
+
+def test_packing_is_deterministic():
+    assert pack(CHUNKS, 7) == pack(CHUNKS, 7)
+
+
+def test_the_zstd_frame_of_parts_is_no_larger_than_the_plain_one():
+    import zstandard
+
+    rng = np.random.default_rng(1)
+    parts = [rng.normal(0, scale, 20_000).astype(np.int8).tobytes() for scale in (1, 20, 2, 40)]
+    plain = len(zstandard.ZstdCompressor(level=19).compress(b"".join(parts)))
+    assert Reader(pack([Chunk("PLNE", parts)], 1)).index[0].stored_length < plain
+
+
+def test_crc32c_is_the_one_the_spec_names():
+    assert google_crc32c.value(b"123456789") == 0xE3069283
+
+
+class Recorded:
+    """A source that notes what is asked of it, as HTTP range requests would be."""
+
+    name = "recorded"
+
+    def __init__(self, data: bytes):
+        self.data, self.size, self.asked = data, len(data), []
+
+    def read_at(self, offset: int, length: int) -> bytes:
+        self.asked.append((offset, length))
+        return self.data[offset:offset + length]
+
+
+def test_opening_takes_two_requests_and_a_chunk_one():
+    source = Recorded(pack(CHUNKS, 7))
+    reader = Reader(source)
+    assert source.asked == [(0, HEADER.size), (HEADER.size, 4 * ENTRY.size)]
+    source.asked.clear()
+    assert reader.chunk(1) == b"x" * 500 + NOISE
+    assert source.asked == [(reader.index[1].offset, reader.index[1].stored_length)]
+
+
+def test_sources_of_every_kind(tmp_path):
+    data = pack(CHUNKS, 7)
+    path = tmp_path / "a.kpc"
+    path.write_bytes(data)
+    with open(path, "rb") as opened:
+        for source in (path, str(path), data, bytearray(data), io.BytesIO(data), opened):
+            assert Reader(source).chunk(1) == b"x" * 500 + NOISE
+    assert str(path) in Reader(path).name
+
+
+def test_a_partial_file_gives_what_is_there():
+    data = pack(CHUNKS, 7)
+    cut = Reader(data).index[2].offset
+    with pytest.raises(FormatError, match="cut off"):
+        Reader(data[:cut])
+    reader = Reader(data[:cut], allow_partial=True)
+    assert [reader.available(n) for n in range(4)] == [True, True, True, False]  # the third is empty
+    assert reader.chunk(0) == b"head"
+    with pytest.raises(FormatError, match="chunk 3 .long. is not there"):
+        reader.chunk(3)
+
+
+def test_limits_hold_for_the_writer_too():
+    with pytest.raises(FormatError, match="too empty"):
+        pack([Chunk("ABCD", [b"x"])], 1 << 40)
+
+
+def test_a_chunk_larger_than_makes_sense_is_refused_before_it_is_read():
+    source = Recorded(pack(CHUNKS, 7))
+    reader = Reader(source)
+    source.asked.clear()
+    with pytest.raises(FormatError, match="at most 99,999"):
+        reader.chunk(3, limit=99_999)
+    assert not source.asked
+
+
+def test_a_file_that_claims_huge_sizes_is_refused_after_its_header():
+    data = bytearray(pack(CHUNKS, 7))
+    for offset, layout, value in [(40, "<Q", 1 << 60), (48, "<I", 0xFFFFFFFF), (28, "<I", 0xFFFFFFFF)]:
+        hostile = bytearray(data)
+        struct.pack_into(layout, hostile, offset, value)
+        struct.pack_into("<I", hostile, 60, google_crc32c.value(bytes(hostile[:60])))
+        source = Recorded(bytes(hostile))
+        with pytest.raises(FormatError):
+            Reader(source)
+        assert source.asked == [(0, HEADER.size)]
+
+
+def test_missing_files_keep_their_names(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught:
+        Reader(tmp_path / "none.kpc")
+    assert caught.value.filename == str(tmp_path / "none.kpc")

@@ -1,0 +1,189 @@
+"""The page, the decoder written from it, the vectors and the package must all say the same."""
+
+import importlib.util
+import json
+import re
+import struct
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from scenes import tiny_scene
+
+from kpc.format import container, errors, file, planes
+from kpc.format.scene import ALL_PLANES, LOG_DENSITY_LIMIT, TERMINATION
+from kpc.player import reference
+from kpc.tools import specvectors
+
+SPEC = Path(__file__).parent.parent / "spec"
+PAGE = (SPEC / "kpc-format.md").read_text()
+VALID = sorted((SPEC / "vectors" / "valid").glob("*.kpc"))
+INVALID = sorted((SPEC / "vectors" / "invalid").glob("*.kpc"))
+
+RAY_TOLERANCE = 1e-4  # section 16
+TYPES = {"char": "s", "u8": "B", "u16": "H", "u32": "I", "u64": "Q", "f32": "f", "f64": "d"}
+
+
+@pytest.fixture(scope="module")
+def twin() -> ModuleType:
+    """spec/decoder.py, which knows the page but not the package."""
+    loader = importlib.util.spec_from_file_location("kpc_spec_decoder", SPEC / "decoder.py")
+    module = importlib.util.module_from_spec(loader)
+    loader.loader.exec_module(module)
+    return module
+
+
+def section(number: int) -> str:
+    return re.search(rf"^## {number}\. .*?(?=^## |\Z)", PAGE, re.M | re.S)[0]
+
+
+def layouts(text: str) -> list[str]:
+    """The struct format of every byte table in a section; offsets must add up."""
+    found = []
+    for table in re.findall(r"(?:^\|.*\n)+", text, re.M):
+        rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+        if rows[0][:2] != ["offset", "type"]:
+            continue
+        layout = "<"
+        for offset, kind, *_ in rows[2:]:
+            assert struct.calcsize(layout) == int(offset), (kind, offset)
+            name, count = re.fullmatch(r"(\w+?)(?:\[(\d+)\])?", kind).groups()
+            layout += (count or "") + TYPES[name]
+        found.append(layout)
+    return found
+
+
+def same(layout: str, expected: struct.Struct) -> bool:
+    """Equal but for how repeats are written: "ff" and "2f"."""
+    def spelled(text: str) -> str:
+        return re.sub(r"(\d+)([a-rt-zA-Z])", lambda m: m[2] * int(m[1]), text)
+
+    return spelled(layout) == spelled(expected.format)
+
+
+@pytest.mark.parametrize("number, structures", [
+    (3, [container.HEADER]), (4, [container.ENTRY]), (5, [file.SCENE_STRUCT, file.SCALE_STRUCT]),
+    (7, [file.DECODER_STRUCT]), (8, [file.OCCUPANCY_STRUCT]), (9, [file.CAMERA_STRUCT]),
+])
+def test_byte_tables_are_the_code_s_structures(number, structures):
+    tables = layouts(section(number))
+    assert len(tables) == len(structures)
+    for table, structure in zip(tables, structures, strict=True):
+        assert same(table, structure), (table, structure.format)
+
+
+def test_sizes_in_the_text():
+    assert f"{container.HEADER.size} bytes." in section(3)
+    assert f"One entry of {container.ENTRY.size} bytes" in section(4)
+    assert f"begins with {file.SCENE_STRUCT.size} bytes" in section(5)
+    assert f"coarse to fine, {file.SCALE_STRUCT.size} bytes" in section(5)
+    assert f"each camera {file.CAMERA_STRUCT.size} bytes" in section(9)
+
+
+def test_limits_are_the_code_s():
+    rows = dict(re.findall(r"^\| ([A-Z_]+) \| (\d+) \|", section(12), re.M))
+    code = {name: int(value) for module in (container, file) for name, value in vars(module).items()
+            if name.endswith("_LIMIT") and name != "HEAD_LIMIT"}
+    assert {name: int(value) for name, value in rows.items()} == code
+
+
+def test_names_and_numbers_are_the_code_s():
+    assert container.MAGIC.hex(" ").upper() in section(3)
+    assert f"version {container.VERSION}" in PAGE.splitlines()[0]
+    assert set(re.findall(r"^\| ([A-Za-z]{4}) \| [01]", section(4), re.M)) == file.KNOWN_KINDS
+    numbered = ", ".join(f"{number} `{name}`" for number, name in enumerate(ALL_PLANES))
+    assert numbered in section(4)
+    filters = re.findall(r"^\| (\d) \| r\[y, x\]", section(6), re.M)
+    assert [int(f) for f in filters] == list(range(planes.FILTER_COUNT))
+    assert f"T < 1/{1 / TERMINATION:.0f}" in section(11)
+    assert f"-{LOG_DENSITY_LIMIT:.0f}, {LOG_DENSITY_LIMIT:.0f}" in section(11)
+
+
+def test_the_hex_dump_is_the_minimal_vector():
+    rows = re.findall(r"^    ([0-9a-f]{4})  ((?:[0-9a-f]{2} ?)+)$", section(15), re.M)
+    data = b"".join(bytes.fromhex(row) for _, row in rows)
+    assert [int(at, 16) for at, _ in rows] == list(range(0, len(data), 16))
+    assert data == (SPEC / "vectors" / "valid" / "minimal.kpc").read_bytes()
+    assert f"{len(data)} bytes" in section(15)
+    for entry in container.Reader(data).index:
+        assert f"0x{entry.offset:x}" in section(15)
+
+
+@pytest.mark.parametrize("path", VALID, ids=lambda p: p.stem)
+def test_valid_vectors_decode_to_what_is_written(path):
+    expected = json.loads(path.with_suffix(".json").read_text())
+    found = specvectors.described(path.read_bytes(), expected["partial"])
+    assert_described(found, expected)
+
+
+@pytest.mark.parametrize("path", VALID, ids=lambda p: p.stem)
+def test_the_decoder_written_from_the_page_agrees(path, twin):
+    expected = json.loads(path.with_suffix(".json").read_text())
+    scene = twin.decode(path.read_bytes(), expected["partial"])
+    for plane in expected["planes"]:
+        assert twin.hashes(scene)[plane["scale"], plane["plane"]] == (
+            plane["symbols_sha256"], plane["coded_sha256"], plane["values_sha256"])
+    for ray in expected["rays"]:
+        rgb, opacity, depth = twin.render_ray(scene, ray["origin"], ray["direction"], ray["time"])
+        assert rgb == pytest.approx(ray["rgb"], abs=RAY_TOLERANCE)
+        assert opacity == pytest.approx(ray["opacity"], abs=RAY_TOLERANCE)
+        if ray["depth"] is None:
+            assert depth == float("inf")
+        else:
+            assert depth == pytest.approx(ray["depth"], abs=RAY_TOLERANCE)
+
+
+@pytest.mark.parametrize("path", INVALID, ids=lambda p: p.stem)
+def test_invalid_vectors_are_refused_as_is_written(path, twin):
+    expected = json.loads(path.with_suffix(".json").read_text())
+    with pytest.raises(getattr(errors, expected["error"])) as caught:
+        file.read(path)
+    assert type(caught.value).__name__ == expected["error"]
+    assert expected["message"] in str(caught.value)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    with pytest.raises(twin.Refused):
+        twin.decode(path.read_bytes())
+
+
+def test_vectors_are_what_their_maker_makes():
+    made = specvectors.vectors()
+    on_disk = {str(p.relative_to(SPEC / "vectors")) for p in (SPEC / "vectors").rglob("*") if p.is_file()}
+    assert on_disk == set(made)
+    for name, content in made.items():
+        committed = (SPEC / "vectors" / name).read_bytes()
+        if name.startswith("valid/") and name.endswith(".json"):
+            assert_described(json.loads(content), json.loads(committed))
+        elif name.startswith("invalid/") or packed_here(name):
+            assert content == committed, name
+    assert sum(len(content) for content in made.values()) < 200_000
+
+
+def packed_here(name: str) -> bool:
+    """Whether a vector's bytes do not depend on the version of zstd, or this is that version."""
+    written = json.loads((SPEC / "vectors" / name).with_suffix(".json").read_text())["zstd"]
+    return written in (None, specvectors.ZSTD_VERSION)
+
+
+def assert_described(found: dict, expected: dict) -> None:
+    """Equal but for the version of zstd; rays within their tolerance."""
+    assert {**found, "rays": 0, "zstd": 0} == {**expected, "rays": 0, "zstd": 0}
+    for one, other in zip(found["rays"], expected["rays"], strict=True):
+        for key in ("rgb", "opacity", "depth"):
+            assert one[key] == pytest.approx(other[key], abs=RAY_TOLERANCE), key
+
+
+def test_the_twin_renders_a_scene_as_the_reference_does(twin):
+    from kpc.format.quantise import quantise_scene
+
+    scene = tiny_scene(scales=1, channels=4, resolution=(10, 8, 6), time=4)
+    data = file.encode(quantise_scene(scene, [{name: 0.01 for name in scene.scales[0]}]))
+    decoded = file.read(data).dequantise()
+    slow = twin.decode(data)
+    camera = scene.cameras[0].resized(8, 6)
+    origins, directions = camera.rays()
+    fast = reference.render_rays(decoded, origins, directions, 0.3)
+    for number, (origin, direction) in enumerate(zip(origins.tolist(), directions.tolist(), strict=True)):
+        rgb, opacity, _ = twin.render_ray(slow, origin, direction, 0.3)
+        assert np.abs(fast.rgb[number] - rgb).max() < 1 / 255
+        assert abs(fast.opacity[number] - opacity) < 1 / 255
