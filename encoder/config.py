@@ -1,0 +1,86 @@
+"""What a training run is told to do: one frozen record, every number with its meaning and where it comes from."""
+
+from dataclasses import dataclass, replace
+
+from kpc.format.errors import UsageError
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """All that decides the outcome of a run besides the dataset. "K-Planes" stands for arXiv:2301.10241."""
+
+    # --- the model
+    resolutions: tuple[int, ...] = (64, 128, 256)
+    """Texels along the longest edge of the box, one number a scale, coarse to fine (K-Planes, section 3.1)."""
+    channels: int = 8
+    """Features a plane holds at each scale, M. The paper's knee is 32 on a GPU; the file and the player pay for each."""
+    frames_per_row: float = 2.0
+    """Frames of the clip to one row of a space-time plane (K-Planes trains 300 frames on 150 rows)."""
+    hidden: int = 16
+    """Width of the MLP that maps a view direction to the colour basis."""
+    samples_across: int = 320
+    """Steps along the longest edge of the box; a little finer than the finest plane is enough."""
+    cells_across: int = 96
+    """Cells of the occupancy grid along the longest edge of the box."""
+
+    # --- the optimiser
+    steps: int = 6000
+    """Optimiser steps when no time budget is given."""
+    rays: int = 4096
+    """Rays a step at most (K-Planes uses 4,096); fewer while the occupancy grid still lets many samples through."""
+    samples: int = 98304
+    """Samples a step at most, on average. It bounds the time of a step before the occupancy grid has formed."""
+    learning_rate: float = 4e-2
+    """Of the planes at its peak. K-Planes uses 1e-2 with 30,000 steps."""
+    decoder_learning_rate: float = 1e-2
+    """Of the density weights and the direction MLP."""
+    warmup: int = 50
+    """Steps over which the learning rate rises from 0; then it falls along half a cosine to 1 % of its peak."""
+    seed: int = 0
+
+    # --- the priors; each is a weight on a mean over the texels of a plane, summed over planes and scales
+    space_variation: float = 2e-4
+    """Total variation in space, on space planes (both axes) and space-time planes (space only)."""
+    time_smoothness: float = 1e-2
+    """Squared second difference in time. K-Planes finds the best near 0.01."""
+    sparse_transients: float = 1e-4
+    """L1 distance of the space-time planes from 1. K-Planes uses 1e-4."""
+    regularise_every: int = 4
+    """The priors enter every so many steps, multiplied by that number: unbiased, and a fraction of the cost."""
+
+    # --- the occupancy grid
+    occupancy_start: int = 128
+    """Steps with every visible cell occupied."""
+    warmup_stride: float = 3.0
+    """Length of a sample step until then, in steps of the march that follows."""
+    occupancy_every: int = 16
+    """Steps between updates of the grid (Instant-NGP, arXiv:2201.05989, appendix E)."""
+    occupancy_alpha: float = 1e-2
+    """A cell is empty if a step through it absorbs less than this."""
+
+    # --- the file
+    max_coding_loss_db: float = 0.15
+    """What quantisation may cost on training views; the coarsest steps within it are taken."""
+
+    def __post_init__(self) -> None:
+        positive = ("channels", "steps", "rays", "samples", "hidden", "samples_across", "cells_across", "warmup",
+                    "regularise_every", "occupancy_every")
+        for name in positive:
+            if getattr(self, name) < 1:
+                raise UsageError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not self.resolutions or min(self.resolutions) < 2:
+            raise UsageError(f"resolutions {self.resolutions}: every scale needs at least 2 texels")
+
+
+PRESETS = {
+    "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500, warmup=50,
+                         occupancy_start=64),
+    "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=4000),
+    "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=16000),
+    "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000),
+}
+
+
+def preset(name: str, **changes: int | float | tuple[int, ...]) -> TrainConfig:
+    """A preset with some fields changed."""
+    return replace(PRESETS[name], **changes)

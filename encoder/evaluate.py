@@ -1,0 +1,110 @@
+"""How good a scene is: pictures rendered on the CPU, PSNR and SSIM against the held-out ones."""
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import torch
+from torch.nn.functional import conv2d
+
+from kpc.encoder import kernels
+from kpc.encoder.datasets import Dataset, rays
+from kpc.encoder.field import Field
+from kpc.encoder.train import sample_capacity
+from kpc.format.scene import Scene
+
+WHITE = np.ones(3, np.float32)
+
+
+class SceneRenderer:
+    """Renders rays of a scene with the fused kernel; the same pictures as `kpc.player.reference`, much faster."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.field = scene, Field.from_scene(scene)
+
+    def rgb(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """(N, 3) float32 colours of (N, 3) origins, (N, 3) unit directions and (N,) times."""
+        scene, field, layout = self.scene, self.field, self.field.layout
+        out = []
+        for start in range(0, len(origins), 1 << 16):
+            o, d, t = (np.ascontiguousarray(a[start : start + (1 << 16)], np.float32) for a in (origins, directions, times))
+            with torch.no_grad():
+                basis = field.basis(torch.from_numpy(d)).numpy()
+            rgb, _, _, _ = kernels.render(
+                field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
+                (0,) * layout.channels, scene.aabb, scene.occupancy.view(np.uint8), np.float32(scene.step),
+                np.float32(scene.extent), o, d, t, basis, np.arange(len(o)), scene.background,
+                sample_capacity(scene.aabb, scene.step), 8 * numba.get_num_threads(),
+            )
+            out.append(rgb)
+        return np.concatenate(out)
+
+    def picture(self, dataset: Dataset, number: int) -> np.ndarray:
+        """The scene as a picture of the dataset shows it, its lens included: (H, W, 3) float32."""
+        pictures = dataset.pictures
+        w, h = int(pictures.width[number]), int(pictures.height[number])
+        row, column = np.divmod(np.arange(w * h), w)
+        origins, directions = rays(pictures, np.full(w * h, number), column, row)
+        return self.rgb(origins, directions, np.full(w * h, pictures.time[number], np.float32)).reshape(h, w, 3)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Means over the pictures that were compared."""
+
+    psnr: float
+    ssim: float
+    pictures: int
+
+
+def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None) -> Quality | None:
+    """PSNR and SSIM over the held-out pictures, or over `most` of them evenly spaced; None where none are held out.
+
+    Pictures with alpha are composited on white, the background such scenes are stored with.
+    """
+    held_out = np.flatnonzero(dataset.pictures.is_test)
+    if len(held_out) == 0:
+        return None
+    if most is not None and len(held_out) > most:
+        held_out = held_out[np.linspace(0, len(held_out) - 1, most).round().astype(int)]
+    renderer = SceneRenderer(scene)
+    scores = []
+    for number in held_out:
+        picture, truth = np.clip(renderer.picture(dataset, int(number)), 0, 1), true_picture(dataset, int(number))
+        scores.append((psnr(picture, truth), ssim(picture, truth)))
+    return Quality(*(float(np.mean(s)) for s in zip(*scores)), len(scores))
+
+
+def true_picture(dataset: Dataset, number: int) -> np.ndarray:
+    """A picture of the dataset as (H, W, 3) float32 in [0, 1], on white where it is transparent."""
+    picture = dataset.pixels.picture(number).astype(np.float32) / np.float32(255)
+    if dataset.has_alpha:
+        return picture[..., :3] * picture[..., 3:] + WHITE * (1 - picture[..., 3:])
+    return picture[..., :3]
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    """-10 log10 of the mean squared difference, dB; both in [0, 1]. 100 dB at most."""
+    return -10 * math.log10(max(float(np.mean(np.square(a - b), dtype=np.float64)), 1e-10))
+
+
+def ssim(a: np.ndarray, b: np.ndarray) -> float:
+    """Structural similarity of (H, W, 3) pictures in [0, 1], the mean over pixels and channels.
+
+    Wang et al. 2004, eq. 13: Gaussian window of 11 x 11 with sigma 1.5, K1 = 0.01, K2 = 0.03; only windows that lie inside the picture count (smaller
+    pictures take a smaller window).
+    """
+    size = min(11, *a.shape[:2])
+    x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
+    g = torch.exp(-x.square() / (2 * 1.5**2))
+    g = g / g.sum()
+
+    def blur(image: torch.Tensor) -> torch.Tensor:
+        return conv2d(conv2d(image, g.view(1, 1, 1, -1)), g.view(1, 1, -1, 1))
+
+    p, q = (torch.from_numpy(np.ascontiguousarray(i.transpose(2, 0, 1)[:, None], np.float64)) for i in (a, b))
+    mu_p, mu_q = blur(p), blur(q)
+    var_p, var_q, cov = blur(p * p) - mu_p**2, blur(q * q) - mu_q**2, blur(p * q) - mu_p * mu_q
+    c1, c2 = 0.01**2, 0.03**2
+    return float((((2 * mu_p * mu_q + c1) * (2 * cov + c2)) / ((mu_p**2 + mu_q**2 + c1) * (var_p + var_q + c2))).mean())

@@ -1,0 +1,253 @@
+"""The radiance field that is trained: K-Planes with the explicit decoder (arXiv:2301.10241), parameters and plain PyTorch.
+
+The planes live in one flat vector `theta`, channel-last, so that the fused kernels (`kpc.encoder.kernels`), the optimiser and
+the priors see one array. `render_reference` is the readable twin of the kernels: it runs on any device, with autograd.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from kpc.encoder.config import TrainConfig
+from kpc.format.scene import (
+    ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Clip, Decoder, Scene,
+)
+
+AXES = "xyzt"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each plane lies in `theta`.
+
+    Attributes:
+        resolution: (S, 4) int64, texels along x, y, z and t; t is 0 in a static scene.
+        channels: M, the same for all scales.
+        table: (S, 6) int64, first element of each plane in the order of ALL_PLANES, -1 where there is none.
+        size: number of elements.
+    """
+
+    resolution: np.ndarray
+    channels: int
+    table: np.ndarray
+    size: int
+
+    @staticmethod
+    def of(resolution: np.ndarray, channels: int) -> "Layout":
+        resolution = np.asarray(resolution, np.int64)
+        names = ALL_PLANES if resolution[0, 3] else SPACE_PLANES
+        table = np.full((len(resolution), 6), -1, np.int64)
+        size = 0
+        for s, axes in enumerate(resolution):
+            for c, name in enumerate(names):
+                table[s, c] = size
+                size += int(axes[AXES.index(name[0])] * axes[AXES.index(name[1])]) * channels
+        return Layout(resolution, channels, table, size)
+
+    @property
+    def is_dynamic(self) -> bool:
+        return bool(self.resolution[0, 3])
+
+    @property
+    def features(self) -> int:
+        return len(self.resolution) * self.channels
+
+    def planes(self) -> Iterator[tuple[int, str, int, int, int]]:
+        """(scale, name, start, rows, columns) of every plane."""
+        for s, axes in enumerate(self.resolution):
+            for c, name in enumerate(ALL_PLANES):
+                if self.table[s, c] >= 0:
+                    yield s, name, int(self.table[s, c]), int(axes[AXES.index(name[1])]), int(axes[AXES.index(name[0])])
+
+
+def plan_layout(config: TrainConfig, aabb: np.ndarray, clip: Clip, is_dynamic: bool) -> Layout:
+    """Texels in proportion to the box: `resolutions` along its longest edge, as many a unit length along the others.
+
+    The number of rows in time is the same at every scale (K-Planes, section 3.1). No axis has fewer than two texels.
+    """
+    edges = np.asarray(aabb[1] - aabb[0], np.float64)
+    rows = max(2, math.ceil(clip.frame_count / config.frames_per_row)) if is_dynamic else 0
+    resolution = [[max(2, round(n * e / edges.max())) for e in edges] + [rows] for n in config.resolutions]
+    return Layout.of(np.array(resolution), config.channels)
+
+
+class Field(nn.Module):
+    """Planes and explicit decoder.
+
+    Attributes:
+        theta: (layout.size,) the planes. Space planes start uniform in [0.3, 0.9], time planes at 1, the identity.
+        density: (F + 1,) weights of the log density, its bias last.
+        w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.Decoder`.
+    """
+
+    def __init__(self, layout: Layout, hidden: int, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.layout = layout
+        F = layout.features
+
+        def uniform(low: float, high: float, *shape: int) -> Tensor:
+            return torch.rand(shape, generator=generator) * (high - low) + low
+
+        theta = torch.ones(layout.size)
+        for _, name, start, rows, columns in layout.planes():
+            if name in SPACE_PLANES:
+                theta[start : start + rows * columns * layout.channels] = uniform(0.3, 0.9, rows * columns * layout.channels)
+        self.theta = nn.Parameter(theta)
+        self.density = nn.Parameter(torch.cat([uniform(-3, 3, F), torch.tensor([-1.0])]))
+        self.w1 = nn.Parameter(uniform(-1, 1, hidden, 9))
+        self.b1 = nn.Parameter(torch.zeros(hidden))
+        self.w2 = nn.Parameter(uniform(-1, 1, 3, F, hidden) / hidden)
+        self.b2 = nn.Parameter(uniform(-1, 1, 3, F))
+
+    def plane(self, scale: int, name: str) -> Tensor:
+        """A view of one plane: (rows, columns, M)."""
+        axes = self.layout.resolution[scale]
+        rows, columns = int(axes[AXES.index(name[1])]), int(axes[AXES.index(name[0])])
+        start = int(self.layout.table[scale, ALL_PLANES.index(name)])
+        M = self.layout.channels
+        return self.theta[start : start + rows * columns * M].view(rows, columns, M)
+
+    def basis(self, directions: Tensor) -> Tensor:
+        """Colour basis of unit directions (N, 3): (N, 3, F). basis(d) = w2 relu(w1 e(d) + b1) + b2."""
+        x, y, z = directions.unbind(-1)
+        encoded = torch.stack([x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], dim=-1)
+        h = torch.relu(encoded @ self.w1.T + self.b1)
+        F, H = self.w2.shape[1:]
+        return (h @ self.w2.reshape(3 * F, H).T).view(-1, 3, F) + self.b2
+
+    def features(self, points: Tensor, times: Tensor) -> Tensor:
+        """Features at (N, 3) points in [0, 1]^3 and (N,) times in [0, 1]: (N, F). Product over planes, concatenated over scales."""
+        coordinate = {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2], "t": times}
+        scales = []
+        for s in range(len(self.layout.resolution)):
+            product: Tensor | None = None
+            for name in ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES:
+                sample = bilinear(self.plane(s, name), coordinate[name[0]], coordinate[name[1]])
+                product = sample if product is None else product * sample
+            assert product is not None
+            scales.append(product)
+        return torch.cat(scales, dim=-1)
+
+    def log_density(self, features: Tensor) -> Tensor:
+        """Clipped log density, per longest edge of the box: (N,)."""
+        return (features @ self.density[:-1] + self.density[-1]).clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)
+
+    def to_scene(self, aabb: np.ndarray, clip: Clip, occupancy: np.ndarray, background: np.ndarray, step: float) -> Scene:
+        """The field as data; the planes are copied."""
+        names = ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES
+        with torch.no_grad():
+            scales = tuple(
+                {name: self.plane(s, name).cpu().numpy().copy() for name in names}
+                for s in range(len(self.layout.resolution))
+            )
+            arrays = [p.detach().cpu().numpy().copy() for p in (self.w1, self.b1, self.w2, self.b2)]
+            density = self.density.detach().cpu().numpy()
+        return Scene(
+            aabb=np.asarray(aabb, np.float32), clip=clip, scales=scales,
+            decoder=Decoder(density[:-1].copy(), float(density[-1]), *arrays),
+            occupancy=np.asarray(occupancy, bool), background=np.asarray(background, np.float32), step=float(step),
+        )
+
+    @staticmethod
+    def from_scene(scene: Scene) -> "Field":
+        """The field whose planes and decoder a scene holds."""
+        shape = {name: scene.scales[0][name].shape for name in scene.scales[0]}
+        resolution = []
+        for scale in scene.scales:
+            rows_t = scale["xt"].shape[0] if scene.is_dynamic else 0
+            resolution.append([scale["xy"].shape[1], scale["xy"].shape[0], scale["xz"].shape[0], rows_t])
+        layout = Layout.of(np.array(resolution), shape["xy"][2])
+        field = Field(layout, scene.decoder.b1.size)
+        with torch.no_grad():
+            for s, scale in enumerate(scene.scales):
+                for name, plane in scale.items():
+                    field.plane(s, name).copy_(torch.from_numpy(np.asarray(plane, np.float32)))
+            d = scene.decoder
+            field.density.copy_(torch.from_numpy(np.append(d.density_weight, np.float32(d.density_bias)).astype(np.float32)))
+            for parameter, value in ((field.w1, d.w1), (field.b1, d.b1), (field.w2, d.w2), (field.b2, d.b2)):
+                parameter.copy_(torch.from_numpy(np.asarray(value, np.float32)))
+        return field
+
+
+def bilinear(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Sample a (rows, columns, M) plane, corner-aligned: u in [0, 1] along columns, v along rows. Returns (N, M)."""
+    rows, columns, M = plane.shape
+
+    def tap(x: Tensor, size: int) -> tuple[Tensor, Tensor]:
+        position = x * (size - 1)
+        lower = position.detach().floor().clamp(0, max(size - 2, 0))
+        return lower.long(), (position - lower).clamp(0, 1)[:, None]
+
+    (i, fu), (j, fv) = tap(u, columns), tap(v, rows)
+    flat = plane.reshape(-1, M)
+    k = j * columns + i
+    low = flat[k] * (1 - fu) + flat[k + 1] * fu
+    high = flat[k + columns] * (1 - fu) + flat[k + columns + 1] * fu
+    return low * (1 - fv) + high * fv
+
+
+@dataclass(frozen=True)
+class Rays:
+    """A batch of rays; every member has N rows. Directions are unit vectors, times and jitters lie in [0, 1)."""
+
+    origins: Tensor
+    directions: Tensor
+    times: Tensor
+    jitters: Tensor
+    backgrounds: Tensor
+
+
+def render_reference(
+    field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float
+) -> tuple[Tensor, int]:
+    """Colours (N, 3) of a batch of rays and the samples taken, in plain PyTorch: the reference of `kernels.backpropagate`.
+
+    Sample k of a ray lies at near + (k + jitter) * step and counts where the occupancy grid (slots, Nz, Ny, Nx) is set;
+    alpha = 1 - exp(-sigma step / extent); a ray ends once its transmittance falls below TERMINATION.
+    """
+    extent = (aabb[1] - aabb[0]).max()
+    inverse = 1 / rays.directions
+    t0, t1 = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse
+    near = torch.minimum(t0, t1).nan_to_num(-torch.inf).amax(1).clamp(min=0)
+    far = torch.maximum(t0, t1).nan_to_num(torch.inf).amin(1)
+    longest = float((far - near).clamp(min=0).max())
+    k = torch.arange(max(1, math.ceil(longest / step)), device=near.device)
+    t = near[:, None] + (k + rays.jitters[:, None]) * step
+
+    u = (rays.origins[:, None] + t[..., None] * rays.directions[:, None] - aabb[0]) / (aabb[1] - aabb[0])
+    size = torch.tensor(occupancy.shape[:0:-1], device=u.device)
+    cell = (u.detach() * size).long().clamp(min=0).minimum(size - 1)
+    slot = (rays.times * occupancy.shape[0]).long().clamp(max=occupancy.shape[0] - 1)[:, None]
+    taken = occupancy[slot, cell[..., 2], cell[..., 1], cell[..., 0]].bool() & (t < far[:, None])
+    ray, _ = index = taken.nonzero(as_tuple=True)
+
+    features = field.features(u[index], rays.times[ray])
+    tau = torch.zeros_like(t).index_put(index, field.log_density(features).exp() * (step / extent))
+    trans = torch.exp(-torch.cumsum(torch.nn.functional.pad(tau, (1, 0)), dim=1))
+    weights = torch.where(trans[:, :-1] >= TERMINATION, trans[:, :-1] * (1 - torch.exp(-tau)), 0)
+    basis = field.basis(rays.directions)
+    colours = torch.sigmoid(torch.einsum("nf,ncf->nc", features, basis[ray]))
+    rgb = torch.zeros_like(rays.backgrounds).index_add(0, ray, weights[index][:, None] * colours)
+    return rgb + (1 - weights.sum(1, keepdim=True)) * rays.backgrounds, len(ray)
+
+
+def priors(field: Field, config: TrainConfig) -> Tensor:
+    """The weighted priors of the planes, in plain PyTorch: the reference of the `add_*` kernels.
+
+    space_variation * mean of squared neighbour differences + time_smoothness * mean (P[t-1] - 2 P[t] + P[t+1])^2
+    + sparse_transients * mean |1 - P|, each summed over the planes it concerns.
+    """
+    total = field.theta.new_zeros(())
+    for s, name, _, rows, columns in field.layout.planes():
+        p = field.plane(s, name)
+        total = total + config.space_variation * (p[:, 1:] - p[:, :-1]).square().sum() / p.numel()
+        if name in SPACE_PLANES:
+            total = total + config.space_variation * (p[1:] - p[:-1]).square().sum() / p.numel()
+        if name in TIME_PLANES:
+            total = total + config.time_smoothness * (p[:-2] - 2 * p[1:-1] + p[2:]).square().sum() / p.numel()
+            total = total + config.sparse_transients * (1 - p).abs().mean()
+    return total

@@ -1,0 +1,482 @@
+"""Fused CPU kernels of the K-Planes field: march, look up, composite and back-propagate a ray in one go.
+
+A batch of rays never becomes a batch of samples: each worker marches its rays one by one, keeps the few occupied samples of
+the present ray in a scratch that fits the cache, and adds the gradient to a buffer of its own, so there is nothing to lock.
+`kpc.encoder.field` holds the same mathematics in plain PyTorch; the tests hold the two together.
+
+Naming, throughout this module
+    M   channels of a plane; passed as a tuple of that length, so that it is a constant when the kernel is compiled
+    S   scales;  F = S * M features
+    theta      (n,) float32, all planes one after the other, each (rows, columns, M)
+    table      (S, 6) int64, where in theta a plane starts, in the order xy xz yz xt yt zt; -1 where there is none
+    resolution (S, 4) int64, texels along x, y, z and t
+    density    (F + 1,) float32, the weights of the density and its bias
+    basis      (rays, 3, F) float32, the colour basis of each ray's direction
+    occupancy  (slots, Nz, Ny, Nx) uint8
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION
+
+_LIMIT = np.float32(LOG_DENSITY_LIMIT)
+_TERMINATION = np.float32(TERMINATION)
+_NEGLIGIBLE = np.float32(1e-4)
+"""A sample of less weight gets no colour; 4096 of them could not make up an 8-bit level and a half."""
+
+_jit = njit(fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, error_model="numpy", cache=True, nogil=True)
+_parallel = njit(fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, error_model="numpy", cache=True, parallel=True)
+
+
+@_jit
+def _box_span(origin, direction, aabb):
+    """Distances at which a ray enters (at least 0) and leaves the box; leaves <= enters where it misses."""
+    near, far = np.float32(0.0), np.float32(np.inf)
+    for axis in range(3):
+        d = direction[axis]
+        if d == 0.0:
+            if origin[axis] < aabb[0, axis] or origin[axis] > aabb[1, axis]:
+                return np.float32(0.0), np.float32(0.0)
+            continue
+        t0 = (aabb[0, axis] - origin[axis]) / d
+        t1 = (aabb[1, axis] - origin[axis]) / d
+        near = max(near, min(t0, t1))
+        far = min(far, max(t0, t1))
+    return near, far
+
+
+@_jit
+def _tap(u, size):
+    """Lower texel and fraction of a corner-aligned coordinate u in [0, 1]."""
+    position = u * np.float32(size - 1)
+    lower = min(max(int(position), 0), max(size - 2, 0))
+    return lower, min(max(position - np.float32(lower), np.float32(0.0)), np.float32(1.0))
+
+
+@_jit
+def _bilinear(theta, start, columns, column, row, fc, fr, channels, out):
+    """out[m] = bilinear sample of the plane that starts at `start`; it has at least two rows and columns."""
+    M = len(channels)
+    a = start + (row * columns + column) * M
+    low = theta[a : a + 2 * M]
+    high = theta[a + columns * M : a + (columns + 2) * M]
+    w11 = fc * fr
+    w01 = fc - w11
+    w10 = fr - w11
+    w00 = np.float32(1.0) - fc - w10
+    for m in range(M):
+        out[m] = w00 * low[m] + w01 * low[M + m] + w10 * high[m] + w11 * high[M + m]
+
+
+@_jit
+def _scatter(grad, start, columns, column, row, fc, fr, channels, g):
+    """The transpose of `_bilinear`."""
+    M = len(channels)
+    a = start + (row * columns + column) * M
+    low = grad[a : a + 2 * M]
+    high = grad[a + columns * M : a + (columns + 2) * M]
+    w11 = fc * fr
+    w01 = fc - w11
+    w10 = fr - w11
+    w00 = np.float32(1.0) - fc - w10
+    for m in range(M):
+        low[m] += w00 * g[m]
+        low[M + m] += w01 * g[m]
+        high[m] += w10 * g[m]
+        high[M + m] += w11 * g[m]
+
+
+@_jit
+def _sample_planes(theta, table, resolution, u, v, w, time, channels, values):
+    """values[s * 6 + c] = sample of plane c at scale s; planes that do not exist leave their row as it is."""
+    for s in range(table.shape[0]):
+        nx, ny, nz, nt = resolution[s, 0], resolution[s, 1], resolution[s, 2], resolution[s, 3]
+        ix, fx = _tap(u, nx)
+        iy, fy = _tap(v, ny)
+        iz, fz = _tap(w, nz)
+        k = s * 6
+        _bilinear(theta, table[s, 0], nx, ix, iy, fx, fy, channels, values[k])
+        _bilinear(theta, table[s, 1], nx, ix, iz, fx, fz, channels, values[k + 1])
+        _bilinear(theta, table[s, 2], ny, iy, iz, fy, fz, channels, values[k + 2])
+        if table[s, 3] >= 0:
+            it, ft = _tap(time, nt)
+            _bilinear(theta, table[s, 3], nx, ix, it, fx, ft, channels, values[k + 3])
+            _bilinear(theta, table[s, 4], ny, iy, it, fy, ft, channels, values[k + 4])
+            _bilinear(theta, table[s, 5], nz, iz, it, fz, ft, channels, values[k + 5])
+
+
+@_jit
+def _scatter_planes(grad, table, resolution, u, v, w, time, channels, values, g, scratch):
+    """Add d loss / d theta, given g = d loss / d features and the plane samples of the forward pass."""
+    M = len(channels)
+    for s in range(table.shape[0]):
+        nx, ny, nz, nt = resolution[s, 0], resolution[s, 1], resolution[s, 2], resolution[s, 3]
+        ix, fx = _tap(u, nx)
+        iy, fy = _tap(v, ny)
+        iz, fz = _tap(w, nz)
+        k = s * 6
+        xy, xz, yz = values[k], values[k + 1], values[k + 2]
+        xt, yt, zt = values[k + 3], values[k + 4], values[k + 5]
+        g_xy, g_xz, g_yz = scratch[0], scratch[1], scratch[2]
+        g_xt, g_yt, g_zt = scratch[3], scratch[4], scratch[5]
+        dynamic = table[s, 3] >= 0
+        f0 = s * M
+        for m in range(M):
+            d = g[f0 + m]
+            in_time = xt[m] * yt[m] * zt[m]
+            in_space = xy[m] * xz[m]
+            d_time = d * in_time
+            g_xy[m] = d_time * xz[m] * yz[m]
+            g_xz[m] = d_time * xy[m] * yz[m]
+            g_yz[m] = d_time * in_space
+            d_space = d * in_space * yz[m]
+            g_xt[m] = d_space * yt[m] * zt[m]
+            g_yt[m] = d_space * xt[m] * zt[m]
+            g_zt[m] = d_space * xt[m] * yt[m]
+        _scatter(grad, table[s, 0], nx, ix, iy, fx, fy, channels, g_xy)
+        _scatter(grad, table[s, 1], nx, ix, iz, fx, fz, channels, g_xz)
+        _scatter(grad, table[s, 2], ny, iy, iz, fy, fz, channels, g_yz)
+        if dynamic:
+            it, ft = _tap(time, nt)
+            _scatter(grad, table[s, 3], nx, ix, it, fx, ft, channels, g_xt)
+            _scatter(grad, table[s, 4], ny, iy, it, fy, ft, channels, g_yt)
+            _scatter(grad, table[s, 5], nz, iz, it, fz, ft, channels, g_zt)
+
+
+@_jit
+def _features(values, scales, channels, out):
+    """out = the product over planes, scale by scale."""
+    M = len(channels)
+    for s in range(scales):
+        k = s * 6
+        a, b, c = values[k], values[k + 1], values[k + 2]
+        d, e, f = values[k + 3], values[k + 4], values[k + 5]
+        f0 = s * M
+        for m in range(M):
+            out[f0 + m] = a[m] * b[m] * c[m] * d[m] * e[m] * f[m]
+
+
+@_jit
+def _dot(a, b, n):
+    total = np.float32(0.0)
+    for i in range(n):
+        total += a[i] * b[i]
+    return total
+
+
+@_jit
+def _sigmoid(x):
+    return np.float32(1.0) / (np.float32(1.0) + math.exp(-x))
+
+
+@_jit
+def _cell(grid, u, v, w):
+    """Index (z, y, x) of the cell of an (Nz, Ny, Nx) grid that holds a point in [0, 1]^3."""
+    nz, ny, nx = grid.shape
+    x = min(max(int(u * nx), 0), nx - 1)
+    y = min(max(int(v * ny), 0), ny - 1)
+    z = min(max(int(w * nz), 0), nz - 1)
+    return z, y, x
+
+
+@_jit
+def _march(
+    theta, table, resolution, density, channels, aabb, occupancy, origin, direction, time, jitter, step, extent,
+    values, features, points, weights, logs, distances,
+):
+    """March one ray; fill the scratch for each occupied sample.
+
+    Returns (samples, transmittance left). weights[k] = transmittance before sample k times alpha k; logs[k] = log density.
+    """
+    near, far = _box_span(origin, direction, aabb)
+    slots = occupancy.shape[0]
+    slot = min(int(time * slots), slots - 1)
+    inv = np.float32(1.0) / (aabb[1] - aabb[0])
+    F = density.size - 1
+    trans = np.float32(1.0)
+    count = 0
+    k = 0
+    while count < weights.size:
+        t = near + (np.float32(k) + jitter) * step
+        k += 1
+        if not t < far:
+            break
+        u = (origin[0] + t * direction[0] - aabb[0, 0]) * inv[0]
+        v = (origin[1] + t * direction[1] - aabb[0, 1]) * inv[1]
+        w = (origin[2] + t * direction[2] - aabb[0, 2]) * inv[2]
+        if occupancy[slot][_cell(occupancy[slot], u, v, w)] == 0:
+            continue
+        _sample_planes(theta, table, resolution, u, v, w, time, channels, values[count])
+        _features(values[count], table.shape[0], channels, features[count])
+        log_density = min(max(_dot(features[count], density, F) + density[F], -_LIMIT), _LIMIT)
+        alpha = np.float32(1.0) - math.exp(-math.exp(log_density) * step / extent)
+        points[count, 0], points[count, 1], points[count, 2] = u, v, w
+        logs[count] = log_density
+        weights[count] = trans * alpha
+        distances[count] = t
+        trans *= np.float32(1.0) - alpha
+        count += 1
+        if trans < _TERMINATION:
+            break
+    return count, trans
+
+
+@_jit
+def _scratch(table, channels, capacity):
+    M, S = len(channels), table.shape[0]
+    values = np.ones((capacity, S * 6, M), np.float32)  # ones: the planes a static scene does not have
+    features = np.empty((capacity, S * M), np.float32)
+    points = np.empty((capacity, 3), np.float32)
+    weights = np.empty(capacity, np.float32)
+    logs = np.empty(capacity, np.float32)
+    distances = np.empty(capacity, np.float32)
+    return values, features, points, weights, logs, distances
+
+
+@_parallel
+def render(
+    theta, table, resolution, density, channels, aabb, occupancy, step, extent,
+    origins, directions, times, basis, basis_index, background, capacity, workers,
+):
+    """Colour, opacity and depth of rays: (N, 3), (N,), (N,) float32, and the samples each of them took.
+
+    `basis[basis_index[i]]` is the colour basis of ray i. Samples lie at (k + 1/2) * step from where the ray enters the box.
+    """
+    N = origins.shape[0]
+    rgbs = np.empty((N, 3), np.float32)
+    opacities = np.empty(N, np.float32)
+    depths = np.empty(N, np.float32)
+    counts = np.empty(N, np.int32)
+    F = density.size - 1
+    for worker in prange(workers):
+        values, features, points, weights, logs, distances = _scratch(table, channels, capacity)
+        for ray in range(worker, N, workers):
+            count, trans = _march(
+                theta, table, resolution, density, channels, aabb, occupancy, origins[ray], directions[ray],
+                times[ray], np.float32(0.5), step, extent, values, features, points, weights, logs, distances,
+            )
+            b = basis[basis_index[ray]]
+            red, green, blue, depth = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+            for k in range(count):
+                depth += weights[k] * distances[k]
+                if weights[k] > _NEGLIGIBLE:
+                    red += weights[k] * _sigmoid(_dot(features[k], b[0], F))
+                    green += weights[k] * _sigmoid(_dot(features[k], b[1], F))
+                    blue += weights[k] * _sigmoid(_dot(features[k], b[2], F))
+            rgbs[ray, 0] = red + trans * background[0]
+            rgbs[ray, 1] = green + trans * background[1]
+            rgbs[ray, 2] = blue + trans * background[2]
+            opacities[ray] = np.float32(1.0) - trans
+            depths[ray] = depth / max(np.float32(1.0) - trans, np.float32(1e-6))
+            counts[ray] = count
+    return rgbs, opacities, depths, counts
+
+
+@_parallel
+def backpropagate(
+    theta, grad, table, resolution, density, grad_density, channels, aabb, occupancy, step, extent,
+    origins, directions, times, jitters, basis, grad_basis, targets, backgrounds, peaks, capacity,
+):
+    """Render a batch, and add the gradient of its mean squared error to grad, grad_density and grad_basis.
+
+    loss = mean over rays and colour channels of (C - target)^2,   C = sum_k w_k c_k + trans * background
+    d C / d tau_k = trans_{k+1} c_k - sum_{j>k} w_j c_j - trans_end * background,   tau = sigma * step / extent
+
+    Args:
+        grad: (workers, n) float32, one buffer a worker; grad_density: (workers, F + 1); grad_basis: (rays, 3, F), overwritten.
+        jitters: (rays,) float32 in [0, 1), where in each step the samples of a ray lie.
+        targets, backgrounds: (rays, 3) float32.
+        peaks: (workers, Nz, Ny, Nx) float32, raised to the largest weight that a sample in a cell has had.
+
+    Returns:
+        squared errors (rays,) float32, summed over colour, and samples taken (rays,) int32.
+    """
+    N = origins.shape[0]
+    workers = grad.shape[0]
+    F = density.size - 1
+    M = len(channels)
+    errors = np.empty(N, np.float32)
+    counts = np.empty(N, np.int32)
+    scale = np.float32(2.0 / (3.0 * N))
+    for worker in prange(workers):
+        values, features, points, weights, logs, distances = _scratch(table, channels, capacity)
+        colours = np.empty((capacity, 3), np.float32)
+        g_features = np.empty(F, np.float32)
+        plane_scratch = np.empty((6, M), np.float32)
+        g_theta = grad[worker]
+        g_density = grad_density[worker]
+        for ray in range(worker, N, workers):
+            count, trans = _march(
+                theta, table, resolution, density, channels, aabb, occupancy, origins[ray], directions[ray],
+                times[ray], jitters[ray], step, extent, values, features, points, weights, logs, distances,
+            )
+            b = basis[ray]
+            g_b = grad_basis[ray]
+            g_b[:] = np.float32(0.0)
+            rgb0 = trans * backgrounds[ray, 0]
+            rgb1 = trans * backgrounds[ray, 1]
+            rgb2 = trans * backgrounds[ray, 2]
+            for k in range(count):
+                if weights[k] > _NEGLIGIBLE:
+                    for c in range(3):
+                        colours[k, c] = _sigmoid(_dot(features[k], b[c], F))
+                else:
+                    colours[k] = np.float32(0.0)
+                rgb0 += weights[k] * colours[k, 0]
+                rgb1 += weights[k] * colours[k, 1]
+                rgb2 += weights[k] * colours[k, 2]
+            e0, e1, e2 = rgb0 - targets[ray, 0], rgb1 - targets[ray, 1], rgb2 - targets[ray, 2]
+            errors[ray] = e0 * e0 + e1 * e1 + e2 * e2
+            counts[ray] = count
+            g0, g1, g2 = scale * e0, scale * e1, scale * e2
+
+            after = trans * (g0 * backgrounds[ray, 0] + g1 * backgrounds[ray, 1] + g2 * backgrounds[ray, 2])
+            beyond = trans  # transmittance after sample k, walking backwards
+            for k in range(count - 1, -1, -1):
+                weight = weights[k]
+                seen = g0 * colours[k, 0] + g1 * colours[k, 1] + g2 * colours[k, 2]
+                tau = math.exp(logs[k]) * step / extent
+                g_log = (beyond * seen - after) * tau
+                if logs[k] >= _LIMIT or logs[k] <= -_LIMIT:
+                    g_log = np.float32(0.0)
+                cell = _cell(peaks[worker], points[k, 0], points[k, 1], points[k, 2])
+                peaks[worker][cell] = max(peaks[worker][cell], weight)
+                after += weight * seen
+                beyond += weight
+                feature = features[k]
+                for i in range(F):
+                    g_features[i] = g_log * density[i]
+                    g_density[i] += g_log * feature[i]
+                g_density[F] += g_log
+                if weight > _NEGLIGIBLE:
+                    for c in range(3):
+                        colour = colours[k, c]
+                        g_c = g0 if c == 0 else (g1 if c == 1 else g2)
+                        g_c *= weight * colour * (np.float32(1.0) - colour)
+                        for i in range(F):
+                            g_features[i] += g_c * b[c, i]
+                            g_b[c, i] += g_c * feature[i]
+                _scatter_planes(
+                    g_theta, table, resolution, points[k, 0], points[k, 1], points[k, 2], times[ray], channels,
+                    values[k], g_features, plane_scratch,
+                )
+    return errors, counts
+
+
+@_parallel
+def log_densities(theta, table, resolution, density, channels, points, times, workers):
+    """Log density at (N, 3) points in [0, 1]^3 and (N,) times: (N,) float32."""
+    N = points.shape[0]
+    out = np.empty(N, np.float32)
+    F = density.size - 1
+    for worker in prange(workers):
+        values, features, _, _, _, _ = _scratch(table, channels, 1)
+        for i in range(worker, N, workers):
+            _sample_planes(
+                theta, table, resolution, points[i, 0], points[i, 1], points[i, 2], times[i], channels, values[0]
+            )
+            _features(values[0], table.shape[0], channels, features[0])
+            out[i] = min(max(_dot(features[0], density, F) + density[F], -_LIMIT), _LIMIT)
+    return out
+
+
+@_parallel
+def adam(theta, grad, mean, square, lr, beta1, beta2, epsilon, step_number):
+    """One step of Adam (arXiv:1412.6980, algorithm 1) on theta with the sum over workers of grad, which is cleared."""
+    n = theta.size
+    workers = grad.shape[0]
+    correction1 = np.float32(1.0 - beta1**step_number)
+    correction2 = np.float32(1.0 - beta2**step_number)
+    b1, b2, rate, eps = np.float32(beta1), np.float32(beta2), np.float32(lr), np.float32(epsilon)
+    blocks = (n + 16383) // 16384
+    for block in prange(blocks):
+        lo, hi = block * 16384, min((block + 1) * 16384, n)
+        p, m, v = theta[lo:hi], mean[lo:hi], square[lo:hi]
+        total = grad[0, lo:hi]
+        for worker in range(1, workers):
+            other = grad[worker, lo:hi]
+            for i in range(hi - lo):
+                total[i] += other[i]
+                other[i] = np.float32(0.0)
+        for i in range(hi - lo):
+            g = total[i]
+            total[i] = np.float32(0.0)
+            m[i] = b1 * m[i] + (np.float32(1.0) - b1) * g
+            v[i] = b2 * v[i] + (np.float32(1.0) - b2) * g * g
+            p[i] -= rate * (m[i] / correction1) / (math.sqrt(v[i] / correction2) + eps)
+
+
+@_parallel
+def add_space_variation(theta, grad, start, rows, columns, channels, weight):
+    """Add the gradient of weight * mean over (i, j, m) of the squared differences to both neighbours (total variation).
+
+    For a space plane both axes are smoothed; `add_row_variation` smooths a space-time plane along space alone.
+    """
+    M = len(channels)
+    k = np.float32(2.0 * weight / (rows * columns * M))
+    width = columns * M
+    for row in prange(rows):
+        a = start + row * width
+        here = theta[a : a + width]
+        out = grad[a : a + width]
+        for i in range(M, width):
+            out[i] += k * (here[i] - here[i - M])
+        for i in range(width - M):
+            out[i] += k * (here[i] - here[i + M])
+        if row > 0:
+            above = theta[a - width : a]
+            for i in range(width):
+                out[i] += k * (here[i] - above[i])
+        if row < rows - 1:
+            below = theta[a + width : a + 2 * width]
+            for i in range(width):
+                out[i] += k * (here[i] - below[i])
+
+
+@_parallel
+def add_row_variation(theta, grad, start, rows, columns, channels, weight):
+    """Add the gradient of weight * mean of squared differences between neighbours in a row (total variation along space)."""
+    M = len(channels)
+    k = np.float32(2.0 * weight / (rows * columns * M))
+    width = columns * M
+    for row in prange(rows):
+        a = start + row * width
+        here = theta[a : a + width]
+        out = grad[a : a + width]
+        for i in range(M, width):
+            out[i] += k * (here[i] - here[i - M])
+        for i in range(width - M):
+            out[i] += k * (here[i] - here[i + M])
+
+
+@_parallel
+def add_time_smoothness(theta, grad, start, rows, columns, channels, weight):
+    """Add the gradient of weight * mean of (P[t-1] - 2 P[t] + P[t+1])^2 (K-Planes, section 3.2)."""
+    M = len(channels)
+    width = columns * M
+    k = np.float32(2.0 * weight / (rows * columns * M))
+    for row in prange(rows):
+        out = grad[start + row * width : start + (row + 1) * width]
+        for centre in range(max(row - 1, 1), min(row + 2, rows - 1)):
+            c = start + centre * width
+            before, here, after = theta[c - width : c], theta[c : c + width], theta[c + width : c + 2 * width]
+            factor = k * np.float32(-2.0) if centre == row else k
+            for i in range(width):
+                out[i] += factor * (before[i] - np.float32(2.0) * here[i] + after[i])
+
+
+@_parallel
+def add_sparse_transients(theta, grad, start, size, weight):
+    """Add the gradient of weight * mean |1 - P| (K-Planes, section 3.2); it is 0 at the kink, P = 1."""
+    k = np.float32(weight / size)
+    for block in prange((size + 16383) // 16384):
+        lo, hi = start + block * 16384, start + min((block + 1) * 16384, size)
+        here, out = theta[lo:hi], grad[lo:hi]
+        for i in range(hi - lo):
+            if here[i] > np.float32(1.0):
+                out[i] += k
+            elif here[i] < np.float32(1.0):
+                out[i] -= k

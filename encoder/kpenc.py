@@ -1,0 +1,276 @@
+"""`kpenc`: a folder of posed videos or images becomes a .kpc file."""
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from kpc.encoder.box import find_box
+from kpc.encoder.compress import compress, relative_steps
+from kpc.encoder.config import PRESETS, TrainConfig
+from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr
+from kpc.encoder.train import Report, Trainer
+from kpc.format import cli, file
+from kpc.format.errors import DatasetError, TrainingError, UsageError
+from kpc.format.progress import Progress
+from kpc.format.quantise import QuantisedScene
+from kpc.format.scene import Scene
+
+PROBE_RAYS = 1 << 15
+"""Training rays on which the loss of quantisation is measured."""
+
+MOST_CAMERAS = 32
+"""Cameras of the dataset that the file names."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What one run of kpenc is told; the fields are the command line's options."""
+
+    source: Path
+    output: Path
+    preset: str = "balanced"
+    steps: int | None = None
+    time_budget_s: float | None = None
+    seed: int = 0
+    device: str = "auto"
+    downscale: int = 1
+    holdout: str | None = None
+    box: tuple[float, ...] | None = None
+    work: Path | None = None
+    keep: bool = False
+    resume: bool = False
+    most_tests: int | None = None
+
+    @property
+    def work_dir(self) -> Path:
+        return self.work or self.output.with_name(self.output.name + ".work")
+
+    def config(self) -> TrainConfig:
+        config = replace(PRESETS[self.preset], seed=self.seed)
+        return config if self.steps is None else replace(config, steps=self.steps)
+
+
+def main(argv: list[str] | None = None) -> int:
+    return cli.run(_command, "kpenc", argv)
+
+
+def _command(argv: list[str]) -> None:
+    options, as_json = _parse(argv)
+    result = encode(options)
+    if as_json:
+        print(json.dumps(result, indent=1))
+        return
+    quality = "no view held out"
+    if result["test_psnr"] is not None:
+        quality = f"held-out PSNR {result['test_psnr']:.2f} dB, SSIM {result['test_ssim']:.4f} over {result['test_pictures']} pictures"
+    print(f"{options.output}: {quality} (rendered from the decoded file)")
+    print(f"{result['size_bytes']:,} bytes, {result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}; "
+          f"coding loss {result['coding_loss_db']:.3f} dB" + (" on held-out views" if result["test_psnr"] is not None else ""))
+    if result["identity_share"] is not None:
+        print(f"time-plane texels exactly at identity: {result['identity_share']:.1%}")
+    print(f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps)")
+
+
+def encode(options: Options) -> dict[str, Any]:
+    """Train on a dataset and write the .kpc file; what was measured, as a dictionary that JSON can hold.
+
+    Raises:
+        DatasetError, MediaError: the dataset cannot be used. TrainingError: training failed.
+        KeyboardInterrupt: stopped by the user; the checkpoint is kept.
+    """
+    started = time.monotonic()
+    _check_output(options.output)
+    config, device = options.config(), _device(options.device)
+    work = options.work_dir
+    work.mkdir(parents=True, exist_ok=True)
+    dataset = load_dataset(options.source, work, holdout=options.holdout, downscale=options.downscale)
+    _check_views(dataset, options.source)
+    aabb = find_box(dataset.pictures, dataset.has_alpha) if options.box is None else np.float32(options.box).reshape(2, 3)
+    trainer = Trainer(dataset, config, aabb, device)
+    _say(dataset.describe())
+    _say(_plan(trainer))
+    checkpoint = work / "checkpoint.kpck"
+    if options.resume and checkpoint.exists():
+        trainer.resume(checkpoint)
+        _say(f"resumed at step {trainer.step}")
+
+    try:
+        _train(trainer, checkpoint, options.time_budget_s)
+    except KeyboardInterrupt:
+        trainer.save(checkpoint)
+        if not _wants_partial(trainer, checkpoint):
+            raise
+
+    _say("writing: choosing quantisation steps, rendering held-out views")
+    scene = to_scene(trainer)
+    quantised, probe_loss = quantise(trainer, scene)
+    size = file.write(quantised, options.output)
+    decoded = file.read(options.output).dequantise()
+    test, before = evaluate(decoded, dataset, most=options.most_tests), evaluate(scene, dataset, most=options.most_tests)
+    if not options.keep:
+        shutil.rmtree(work, ignore_errors=True)
+    return {
+        "file": str(options.output), "layout": dataset.layout, "dynamic": dataset.is_dynamic, "preset": options.preset,
+        "seed": options.seed, "device": device, "box": trainer.aabb.tolist(),
+        "test_psnr": test and test.psnr, "test_ssim": test and test.ssim, "test_pictures": test.pictures if test else 0,
+        "coding_loss_db": before.psnr - test.psnr if test and before else probe_loss,
+        "size_bytes": size, "parameters": quantised.parameter_count,
+        "bits_per_parameter": 8 * size / quantised.parameter_count,
+        "identity_share": quantised.identity_share if quantised.is_dynamic else None,
+        "steps": trainer.step, "train_s": trainer.elapsed_s, "encode_s": time.monotonic() - started,
+        "rays_per_s": trainer.rays_per_second,
+    }
+
+
+def to_scene(trainer: Trainer) -> Scene:
+    """The trained field with its final occupancy and a few of the cameras, the most central first."""
+    dataset = trainer.dataset
+    slots = min(8, dataset.clip.frame_count) if dataset.is_dynamic else 1
+    occupancy = trainer.grid.over_time(trainer.density_at, np.random.default_rng(trainer.config.seed), slots)
+    scene = trainer.field.to_scene(trainer.aabb, dataset.clip, occupancy, trainer.background, trainer.step_length)
+    return replace(scene, cameras=tuple(dataset.camera(p) for p in _spread_of_cameras(dataset)))
+
+
+def quantise(trainer: Trainer, scene: Scene) -> tuple[QuantisedScene, float]:
+    """Symbols as coarse as `max_coding_loss_db` on training rays allows, and that loss in dB."""
+    batch, targets = trainer.sampler.draw(np.random.default_rng(1), PROBE_RAYS, scene.background)
+    origins, directions, times = (a.numpy() for a in (batch.origins, batch.directions, batch.times))
+    steps = relative_steps(trainer.field, trainer.optimiser.curvature())
+    return compress(
+        scene, steps, lambda s: psnr(SceneRenderer(s).rgb(origins, directions, times), targets.numpy()),
+        trainer.config.max_coding_loss_db,
+    )
+
+
+def _train(trainer: Trainer, checkpoint: Path, time_budget_s: float | None) -> None:
+    """Train to the end, showing step, train PSNR, rays/s, samples/ray; the bar runs in per mille of the work."""
+    with Progress("train", total=1000, unit="‰") as progress:
+
+        def report(r: Report) -> None:
+            progress.note(f"step {r.step}, psnr {r.psnr:.2f}, {r.rays_per_second:,.0f} rays/s, "
+                          f"{r.samples_per_ray:.1f} samples/ray, {r.occupied:.1%} occupied")
+            progress.advance(1000 * min(r.fraction, 1.0) - progress.done)
+
+        trainer.run(report, checkpoint, time_budget_s=time_budget_s)
+
+
+def _wants_partial(trainer: Trainer, checkpoint: Path) -> bool:
+    """After Ctrl-C: on a terminal ask whether to write the scene as it stands; elsewhere only say how to go on."""
+    where = f"stopped at step {trainer.step}; {checkpoint} is kept, go on with --resume"
+    _say(where)
+    if not (sys.stdin.isatty() and sys.stderr.isatty()) or trainer.step < 2:
+        return False
+    print("write the scene as trained so far? [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def _plan(trainer: Trainer) -> str:
+    lo, hi = trainer.aabb
+    res = ", ".join("x".join(str(n) for n in row if n) for row in trainer.field.layout.resolution)
+    corner = " ".join
+    return (f"box {corner(f'{v:.4g}' for v in lo)} to {corner(f'{v:.4g}' for v in hi)}; planes {res} (xyz{'t' if trainer.field.layout.is_dynamic else ''}) "
+            f"of {trainer.field.layout.channels} channels, {trainer.field.layout.size / 1e6:.2f} M parameters; on {trainer.device}")
+
+
+def _spread_of_cameras(dataset: Dataset) -> list[int]:
+    """Pictures of distinct cameras, at most MOST_CAMERAS, the one nearest to their mean position first."""
+    _, first = np.unique(dataset.pictures.camera, return_index=True)
+    first = np.sort(first)
+    if len(first) > MOST_CAMERAS:
+        first = first[np.linspace(0, len(first) - 1, MOST_CAMERAS).round().astype(int)]
+    centres = dataset.pictures.camera_to_world[first, :3, 3]
+    central = int(np.argmin(np.linalg.norm(centres - centres.mean(0), axis=1)))
+    return [int(first[central])] + [int(p) for i, p in enumerate(first) if i != central]
+
+
+def _check_views(dataset: Dataset, source: Path) -> None:
+    if not (~dataset.pictures.is_test).any():
+        raise DatasetError(f"{source}: every picture is held out, none is left to train on; give --holdout none")
+
+
+def _check_output(output: Path) -> None:
+    """Find out before hours of training whether the file can be written after them."""
+    if output.is_dir():
+        raise UsageError(f"{output}: is a folder; name a file such as {output / 'scene.kpc'}")
+    if not output.parent.is_dir():
+        raise UsageError(f"{output.parent}: no such folder; make it first")
+    if not os.access(output.parent, os.W_OK):
+        raise TrainingError(f"{output.parent}: no permission to write there; choose another place with -o")
+
+
+def _device(name: str) -> str:
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UsageError("--device cuda: this PyTorch sees no CUDA device; use --device cpu, or install a CUDA build of PyTorch")
+    return name
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _parse(argv: list[str]) -> tuple[Options, bool]:
+    parser = argparse.ArgumentParser("kpenc", description=__doc__.split(": ", 1)[1])
+    parser.add_argument("source", type=Path, help="folder: videos with poses_bounds.npy, or images with transforms*.json")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="the .kpc file to write")
+    parser.add_argument("--preset", choices=sorted(PRESETS), default="balanced", help="how much to spend (default: balanced)")
+    parser.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
+    parser.add_argument("--time-budget", type=duration_s, metavar="10m", help="train for so long instead of a number of steps")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first (default: 1)")
+    parser.add_argument("--holdout", metavar="NAME", help="camera or file to test on, or 'none'")
+    parser.add_argument("--box", type=_box, metavar="x0,y0,z0,x1,y1,z1", help="corners of the scene instead of those found from the cameras")
+    parser.add_argument("--work", type=Path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)")
+    parser.add_argument("--keep", action="store_true", help="keep that folder when done")
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
+    parser.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
+    a = parser.parse_args(argv)
+    options = Options(a.source, a.output, a.preset, a.steps, a.time_budget, a.seed, a.device, a.downscale, a.holdout, a.box,
+                      a.work, a.keep, a.resume, a.test_views)
+    return options, a.json
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def duration_s(text: str) -> float:
+    """Seconds of "90", "90s", "10m" or "1.5h"."""
+    unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:], None)
+    try:
+        value = float(text[:-1]) * unit if unit else float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"{text!r} is no duration; write 90s, 10m or 1.5h")
+    return value
+
+
+def _box(text: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(n) for n in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 6 or not np.all(np.isfinite(numbers)) or not all(a < b for a, b in zip(numbers[:3], numbers[3:])):
+        raise argparse.ArgumentTypeError(f"{text!r} is not x0,y0,z0,x1,y1,z1 with each lower bound below the upper")
+    return numbers
+
+
+if __name__ == "__main__":
+    sys.exit(main())

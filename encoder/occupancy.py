@@ -1,0 +1,94 @@
+"""The occupancy grid: which cells of the box hold anything, so that rays take samples nowhere else."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+DensityAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""(N, 3) float32 points in [0, 1]^3 and (N,) float32 times -> (N,) log densities."""
+
+
+def grid_shape(aabb: np.ndarray, cells_across: int) -> tuple[int, int, int]:
+    """(Nz, Ny, Nx): `cells_across` along the longest edge, cubes as nearly as whole numbers allow."""
+    edges = np.asarray(aabb[1] - aabb[0], np.float64)
+    nx, ny, nz = (max(1, round(cells_across * e / edges.max())) for e in edges)
+    return nz, ny, nx
+
+
+class OccupancyGrid:
+    """Where density is (Instant-NGP, arXiv:2201.05989, appendix E), cut down to where it has been seen to matter.
+
+    A cell is occupied while its density could absorb something and it, or a neighbour, has lately given a ray some of its
+    colour. The second condition empties what lies hidden behind surfaces, where the planes' products are arbitrary.
+
+    Attributes:
+        log_density: (Nz, Ny, Nx) float32, decaying maximum of the samples taken in a cell.
+        peak: (Nz, Ny, Nx) float32, decaying maximum of the weights that training rays have found in a cell.
+        occupied: (Nz, Ny, Nx) bool; cells that too few cameras see are never occupied.
+    """
+
+    DENSITY_DECAY = 0.1
+    """Subtracted from the log density at each update."""
+    PEAK_DECAY = 0.85
+    """Factor on the peak at each update."""
+    PEAK_LEAST = 2e-3
+    """A cell whose peak is below gives less than half an 8-bit level to any ray."""
+
+    def __init__(self, seen: np.ndarray, threshold: float) -> None:
+        """`threshold`: log density, per longest edge of the box, below which a cell counts as empty."""
+        self.seen = seen
+        self.threshold = threshold
+        self.log_density = np.full(seen.shape, -np.inf, np.float32)
+        self.peak = np.ones(seen.shape, np.float32)
+        self.occupied = seen.copy()
+        self._known = False
+
+    def update(self, density_at: DensityAt, peaks: np.ndarray, rng: np.random.Generator) -> None:
+        """Take in the peaks since the last update, look at the density anew, and decide what is occupied.
+
+        Looked at: at first all that is seen, then what is occupied and a random sixteenth of the rest, at one random
+        point and time a cell.
+        """
+        np.maximum(self.peak * np.float32(self.PEAK_DECAY), peaks, out=self.peak)
+        matters = dilate(self.peak > self.PEAK_LEAST) & self.seen
+        chosen = matters
+        if self._known:
+            chosen = matters & (self.occupied | (rng.random(self.seen.shape, dtype=np.float32) < 1 / 16))
+        self._known = True
+        self.log_density -= self.DENSITY_DECAY
+        self.log_density[chosen] = np.maximum(self.log_density[chosen], self._look(density_at, np.argwhere(chosen), rng, 0.0, 1.0))
+        self.occupied = matters & (self.log_density > self.threshold)
+
+    def _look(self, density_at: DensityAt, cells: np.ndarray, rng: np.random.Generator, start: float, end: float) -> np.ndarray:
+        """Log density at a random point of each cell and a random time in [start, end]."""
+        points = (cells + rng.random(cells.shape, dtype=np.float32)) / np.array(self.seen.shape, np.float32)
+        times = start + (end - start) * rng.random(len(cells), dtype=np.float32)
+        return density_at(np.ascontiguousarray(points[:, ::-1], np.float32), times.astype(np.float32))
+
+    def over_time(self, density_at: DensityAt, rng: np.random.Generator, slots: int, samples: int = 16) -> np.ndarray:
+        """The grid to store: (slots, Nz, Ny, Nx) bool, what is occupied while each slot of the clip lasts.
+
+        Each cell that is occupied or touches one that is, is looked at `samples` times in every slot.
+        """
+        near = dilate(self.occupied) & self.seen & dilate(self.peak > self.PEAK_LEAST)
+        cells = np.argwhere(near)
+        out = np.zeros((slots, *self.seen.shape), bool)
+        for slot in range(slots):
+            best = np.full(len(cells), -np.inf, np.float32)
+            for _ in range(samples):
+                best = np.maximum(best, self._look(density_at, cells, rng, slot / slots, (slot + 1) / slots))
+            out[slot][near] = best > self.threshold
+        return out
+
+
+def dilate(grid: np.ndarray) -> np.ndarray:
+    """Cells that are set or share a face, an edge or a corner with one that is; over the last three axes."""
+    for axis in (-3, -2, -1):
+        low, high = [slice(None)] * grid.ndim, [slice(None)] * grid.ndim
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        wide = grid.copy()
+        wide[tuple(low)] |= grid[tuple(high)]
+        wide[tuple(high)] |= grid[tuple(low)]
+        grid = wide
+    return grid
+

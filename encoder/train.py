@@ -1,0 +1,347 @@
+"""The training loop: draw rays, render them, step the planes, keep the occupancy grid current."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+
+from kpc.encoder import kernels
+from kpc.encoder.config import TrainConfig
+from kpc.encoder.box import seen_cells
+from kpc.encoder.datasets import Dataset, rays
+from kpc.encoder.field import Field, Rays, plan_layout, priors, render_reference
+from kpc.encoder.occupancy import OccupancyGrid, grid_shape
+from kpc.format.cli import written_aside
+from kpc.format.errors import TrainingError
+from kpc.format.scene import SPACE_PLANES
+
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+"""Adam's constants as Instant-NGP sets them for grids (arXiv:2201.05989, section 4)."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """How training stands after a step."""
+
+    step: int
+    fraction: float
+    psnr: float
+    rays_per_second: float
+    samples_per_ray: float
+    occupied: float
+    elapsed_s: float
+
+
+class Trainer:
+    """One run: a dataset, a field, the optimiser's state. `run` trains to the end or until told to stop."""
+
+    def __init__(self, dataset: Dataset, config: TrainConfig, aabb: np.ndarray, device: str) -> None:
+        self.dataset, self.config, self.device = dataset, config, torch.device(device)
+        self.aabb = np.asarray(aabb, np.float32)
+        self.extent = float(np.max(self.aabb[1] - self.aabb[0]))
+        self.step_length = self.extent / config.samples_across
+        self.rng = np.random.default_rng(config.seed)
+        layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
+        self.field = Field(layout, config.hidden, torch.Generator().manual_seed(config.seed)).to(self.device)
+        shape = grid_shape(self.aabb, config.cells_across)
+        threshold = math.log(-math.log(1 - config.occupancy_alpha) * config.samples_across)
+        self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape), threshold)
+        if not self.grid.seen.any():
+            raise TrainingError("the box lies outside every camera's view; correct --box")
+        self.optimiser: FusedOptimiser | PlainOptimiser = (
+            FusedOptimiser(self.field, config, shape) if self.device.type == "cpu" else PlainOptimiser(self.field, config)
+        )
+        self.step = 0
+        self.elapsed_s = 0.0
+        self.samples_per_ray = float(config.samples_across)
+        self.sampler = RaySampler(dataset)
+        # Objects with alpha are shown on white. Elsewhere what the box leaves open is grey: the least wrong guess.
+        self.background = np.full(3, 1.0 if dataset.has_alpha else 0.5, np.float32)
+        self._steady_rays, self._steady_s = 0, 0.0
+
+    def run(
+        self, report: Callable[[Report], None], checkpoint: Path | None = None, *,
+        time_budget_s: float | None = None, checkpoint_every_s: float = 60.0,
+    ) -> None:
+        """Train until `config.steps`, or for `time_budget_s` seconds of training where given.
+
+        Raises:
+            TrainingError: the loss is not finite.
+            KeyboardInterrupt: passed on; the state is that after the last whole step.
+        """
+        config = self.config
+        saved, error, drawn, since = time.monotonic(), 0.0, 0, time.monotonic()
+        while (fraction := self._fraction(time_budget_s)) < 1:
+            started = time.monotonic()
+            if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
+                self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
+            count = int(np.clip(config.samples / max(self.samples_per_ray, 1e-3), 256, config.rays))
+            batch, targets = self.sampler.draw(self.rng, count, None if self.dataset.has_alpha else self.background)
+            rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
+            squared_error, samples = self.optimiser.step(
+                self.step, rate, batch, targets, self.aabb, self.grid.occupied[None],
+                self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1), self.extent,
+            )
+            if not math.isfinite(squared_error):
+                raise TrainingError(f"step {self.step}: the colour loss is not finite; lower the learning rate")
+            self.samples_per_ray += 0.1 * (samples - self.samples_per_ray)
+            self.step += 1
+            error, drawn = error + squared_error * count, drawn + count
+            now = time.monotonic()
+            self.elapsed_s += now - started
+            if self.step > 2 * config.occupancy_start:
+                self._steady_rays, self._steady_s = self._steady_rays + count, self._steady_s + now - started
+            if now - since > 0.5:
+                psnr = -10 * math.log10(max(error / drawn, 1e-10))
+                report(Report(self.step, self._fraction(time_budget_s), psnr, drawn / (now - since),
+                              self.samples_per_ray, float(self.grid.occupied.mean()), self.elapsed_s))
+                error, drawn, since = 0.0, 0, now
+            if checkpoint is not None and now - saved > checkpoint_every_s:
+                self.save(checkpoint)
+                saved = since = time.monotonic()
+        if checkpoint is not None:
+            self.save(checkpoint)
+
+    @property
+    def rays_per_second(self) -> float:
+        """Rays trained in a second, all that a step takes included, once the occupancy grid has formed."""
+        return self._steady_rays / self._steady_s if self._steady_s else 0.0
+
+    def _fraction(self, time_budget_s: float | None) -> float:
+        if time_budget_s is not None:
+            return self.elapsed_s / time_budget_s
+        return self.step / self.config.steps
+
+    def density_at(self, points: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Log densities at (N, 3) points in [0, 1]^3 and (N,) times."""
+        if self.device.type == "cpu":
+            return log_densities(self.field, points, times)
+        out = []
+        with torch.no_grad():
+            for p, t in zip(np.array_split(points, len(points) // 2**18 + 1), np.array_split(times, len(times) // 2**18 + 1)):
+                features = self.field.features(torch.from_numpy(p).to(self.device), torch.from_numpy(t).to(self.device))
+                out.append(self.field.log_density(features).cpu().numpy())
+        return np.concatenate(out)
+
+    def save(self, path: Path) -> None:
+        """Write everything a later `resume` needs. The file is plain tensors and numbers; it is read without unpickling code."""
+        state = {
+            "config": asdict(self.config), "aabb": torch.from_numpy(self.aabb), "step": self.step, "elapsed_s": self.elapsed_s,
+            "samples_per_ray": self.samples_per_ray, "field": self.field.state_dict(), "optimiser": self.optimiser.state(),
+            "log_density": torch.from_numpy(self.grid.log_density), "occupied": torch.from_numpy(self.grid.occupied),
+            "rng": _rng_to_plain(self.rng),
+        }
+        with written_aside(path) as aside:
+            torch.save(state, aside)
+
+    def resume(self, path: Path) -> None:
+        """Go on from a checkpoint of the same dataset and config.
+
+        Raises:
+            TrainingError: it cannot be read, or belongs to another run.
+        """
+        try:
+            state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
+            same = _comparable(state["config"]) == _comparable(asdict(self.config))
+            if not same or not np.array_equal(state["aabb"].cpu().numpy(), self.aabb):
+                raise TrainingError(f"{path}: belongs to a run with other settings; give the same ones or drop --resume")
+            self.field.load_state_dict(state["field"])
+            self.optimiser.load(state["optimiser"])
+            self.grid.log_density = state["log_density"].cpu().numpy()
+            self.grid.occupied = state["occupied"].cpu().numpy()
+            self.rng.bit_generator.state = _rng_from_plain(state["rng"])
+            self.step, self.elapsed_s = state["step"], state["elapsed_s"]
+            self.samples_per_ray = state["samples_per_ray"]
+        except TrainingError:
+            raise
+        except Exception as error:  # torch.load raises a dozen kinds for a damaged file
+            raise TrainingError(f"{path}: not a usable checkpoint ({type(error).__name__}); delete it to start afresh") from error
+
+
+class RaySampler:
+    """Draws pixels of the training pictures, each as likely as any other, and makes their rays."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self.dataset = dataset
+        pictures = dataset.pictures
+        self.train = np.flatnonzero(~pictures.is_test)
+        self.ends = np.cumsum(pictures.width[self.train].astype(np.int64) * pictures.height[self.train])
+
+    def draw(
+        self, rng: np.random.Generator, count: int, background: np.ndarray | None = None
+    ) -> tuple[Rays, torch.Tensor]:
+        """`count` rays and the (count, 3) colours they should have, over one background or one drawn for each ray."""
+        pictures = self.dataset.pictures
+        pixel = rng.integers(self.ends[-1], size=count)
+        which = np.searchsorted(self.ends, pixel, side="right")
+        inside = pixel - np.where(which > 0, self.ends[which - 1], 0)
+        picture = self.train[which]
+        row, column = np.divmod(inside, pictures.width[picture])
+        origins, directions = rays(pictures, picture, column, row)
+        colours = self.dataset.pixels.read(pictures.offset[picture] + inside).astype(np.float32) / np.float32(255)
+        if background is None:
+            backgrounds = rng.random((count, 3), dtype=np.float32)
+        else:
+            backgrounds = np.broadcast_to(background, (count, 3))
+        targets = colours[:, :3]
+        if self.dataset.has_alpha:
+            targets = targets * colours[:, 3:] + backgrounds * (1 - colours[:, 3:])
+        jitters = rng.random(count, dtype=np.float32)
+        arrays = (origins, directions, pictures.time[picture], jitters, backgrounds)
+        return Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays)), torch.from_numpy(targets)
+
+
+class FusedOptimiser:
+    """A step on the CPU: fused kernels for the planes, PyTorch for the small decoder."""
+
+    def __init__(self, field: Field, config: TrainConfig, cells: tuple[int, int, int]) -> None:
+        self.field, self.config = field, config
+        self.workers = numba.get_num_threads()
+        self.theta = field.theta.detach().numpy()
+        self.grad = np.zeros((self.workers, self.theta.size), np.float32)
+        self.mean, self.square = np.zeros_like(self.theta), np.zeros_like(self.theta)
+        self._peaks = np.zeros((self.workers, *cells), np.float32)
+        self.decoder = _decoder_optimiser(field, config)
+
+    def peaks(self) -> np.ndarray:
+        """The largest weight in each cell since the last call: (Nz, Ny, Nx) float32."""
+        peaks = self._peaks.max(0)
+        self._peaks[:] = 0
+        return peaks
+
+    def step(
+        self, number: int, rate: float, batch: Rays, targets: torch.Tensor,
+        aabb: np.ndarray, occupancy: np.ndarray, step_length: float, extent: float,
+    ) -> tuple[float, float]:
+        """Mean squared error a colour channel, and samples a ray."""
+        layout, config = self.field.layout, self.config
+        basis = self.field.basis(batch.directions)
+        grad_basis = np.empty(basis.shape, np.float32)
+        grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
+        errors, counts = kernels.backpropagate(
+            self.theta, self.grad, layout.table, layout.resolution, self.field.density.detach().numpy(), grad_density,
+            (0,) * layout.channels, aabb, occupancy.view(np.uint8), np.float32(step_length), np.float32(extent),
+            batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(), batch.jitters.numpy(),
+            basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(), self._peaks,
+            sample_capacity(aabb, step_length),
+        )
+        if number % config.regularise_every == 0:
+            add_priors(self.field, self.theta, self.grad[0], config, config.regularise_every)
+        self.decoder.zero_grad()
+        basis.backward(torch.from_numpy(grad_basis))
+        self.field.density.grad = torch.from_numpy(grad_density.sum(0))
+        for group in self.decoder.param_groups:
+            group["lr"] = config.decoder_learning_rate * rate
+        self.decoder.step()
+        kernels.adam(self.theta, self.grad, self.mean, self.square, config.learning_rate * rate, BETA1, BETA2, EPSILON, number + 1)
+        return float(errors.mean(dtype=np.float64)) / 3, float(counts.mean())
+
+    def state(self) -> dict[str, Any]:
+        return {"mean": torch.from_numpy(self.mean), "square": torch.from_numpy(self.square), "decoder": self.decoder.state_dict()}
+
+    def load(self, state: dict[str, Any]) -> None:
+        self.mean[:], self.square[:] = state["mean"].numpy(), state["square"].numpy()
+        self.decoder.load_state_dict(state["decoder"])
+
+    def curvature(self) -> np.ndarray:
+        """Running mean of the squared gradient of each element of theta, a diagonal estimate of how much an error there costs."""
+        return self.square
+
+
+class PlainOptimiser:
+    """A step in plain PyTorch, on any device that PyTorch knows."""
+
+    def __init__(self, field: Field, config: TrainConfig) -> None:
+        self.field, self.config = field, config
+        self.planes = torch.optim.Adam([field.theta], lr=config.learning_rate, betas=(BETA1, BETA2), eps=EPSILON)
+        self.decoder = _decoder_optimiser(field, config)
+
+    def step(
+        self, number: int, rate: float, batch: Rays, targets: torch.Tensor,
+        aabb: np.ndarray, occupancy: np.ndarray, step_length: float, extent: float,
+    ) -> tuple[float, float]:
+        """Mean squared error a colour channel, and samples a ray."""
+        config, device = self.config, self.field.theta.device
+        batch = Rays(*(value.to(device) for value in vars(batch).values()))
+        occupancy_there = torch.from_numpy(occupancy).to(device)
+        rgb, samples = render_reference(self.field, batch, torch.from_numpy(aabb).to(device), occupancy_there, step_length)
+        loss = error = (rgb - targets.to(device)).square().mean()
+        if number % config.regularise_every == 0:
+            loss = loss + config.regularise_every * priors(self.field, config)
+        for optimiser, peak in ((self.planes, config.learning_rate), (self.decoder, config.decoder_learning_rate)):
+            optimiser.zero_grad()
+            for group in optimiser.param_groups:
+                group["lr"] = peak * rate
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.planes.step()
+        self.decoder.step()
+        return float(error), samples / len(targets)
+
+    def state(self) -> dict[str, Any]:
+        return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict()}
+
+    def load(self, state: dict[str, Any]) -> None:
+        self.planes.load_state_dict(state["planes"])
+        self.decoder.load_state_dict(state["decoder"])
+
+    def curvature(self) -> np.ndarray:
+        """As `FusedOptimiser.curvature`."""
+        state = self.planes.state[self.field.theta]
+        if "exp_avg_sq" not in state:
+            return np.zeros(self.field.theta.numel(), np.float32)
+        return state["exp_avg_sq"].cpu().numpy()
+
+
+def add_priors(field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, times: float) -> None:
+    """Add `times` the gradient of `kpc.encoder.field.priors` to grad."""
+    channels = (0,) * field.layout.channels
+    for _, name, start, rows, columns in field.layout.planes():
+        if name in SPACE_PLANES:
+            kernels.add_space_variation(theta, grad, start, rows, columns, channels, times * config.space_variation)
+            continue
+        kernels.add_row_variation(theta, grad, start, rows, columns, channels, times * config.space_variation)
+        kernels.add_time_smoothness(theta, grad, start, rows, columns, channels, times * config.time_smoothness)
+        size = rows * columns * field.layout.channels
+        kernels.add_sparse_transients(theta, grad, start, size, times * config.sparse_transients)
+
+
+def log_densities(field: Field, points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Log densities at (N, 3) points in [0, 1]^3 and (N,) times, on the CPU."""
+    layout = field.layout
+    return kernels.log_densities(
+        field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
+        (0,) * layout.channels, np.asarray(points, np.float32), np.asarray(times, np.float32), 8 * numba.get_num_threads(),
+    )
+
+
+def sample_capacity(aabb: np.ndarray, step_length: float) -> int:
+    """Samples a ray can take at most: the box's diagonal in steps."""
+    return int(np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64)) / step_length) + 2
+
+
+def _decoder_optimiser(field: Field, config: TrainConfig) -> torch.optim.Adam:
+    parameters = [field.density, field.w1, field.b1, field.w2, field.b2]
+    return torch.optim.Adam(parameters, lr=config.decoder_learning_rate, betas=(BETA1, BETA2), eps=EPSILON)
+
+
+def _comparable(config: dict[str, Any]) -> dict[str, Any]:
+    """A config without what may differ between a run and its continuation."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in config.items()
+            if key not in ("steps", "max_coding_loss_db")}
+
+
+def _rng_to_plain(rng: np.random.Generator) -> dict[str, str]:
+    state = rng.bit_generator.state
+    return {"state": hex(state["state"]["state"]), "inc": hex(state["state"]["inc"]),
+            "has_uint32": str(state["has_uint32"]), "uinteger": str(state["uinteger"])}
+
+
+def _rng_from_plain(plain: dict[str, str]) -> dict[str, Any]:
+    return {"bit_generator": "PCG64", "state": {"state": int(plain["state"], 16), "inc": int(plain["inc"], 16)},
+            "has_uint32": int(plain["has_uint32"]), "uinteger": int(plain["uinteger"])}
