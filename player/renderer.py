@@ -10,12 +10,11 @@ from kpc.format.errors import DisplayError
 from kpc.format.scene import SPACE_PLANES, Scene
 from kpc.player import shader
 from kpc.player.reference import Part, Rendering, slot_at
-from kpc.player.textures import Layout, Rows, decoder_block, distances
+from kpc.player.textures import Layout, Rows, decoder_arrays, distances
 
 FOLDED_AXIS = {"xy": 0, "xz": 2, "yz": 1}
 """Which axis' row is folded into which plane."""
 PLANES_UNIT, ROWS_UNIT, CELLS_UNIT = 0, 1, 2
-DECODER_BINDING = 0
 
 
 @dataclass
@@ -63,7 +62,7 @@ class Renderer:
         self._cells = ctx.texture3d((nx, ny, nz), 1, alignment=1, dtype="u1")
         self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._distances: dict[int, bytes] = {}
-        self._decoder = ctx.buffer(decoder_block(scene.decoder, scene, self.layout).tobytes())
+        self._decoder = shader.constants(decoder_arrays(scene.decoder, scene, self.layout))
         self._rows_time: float | None = None
         self._folded_time: float | None = None
         self._slot: int | None = None
@@ -119,7 +118,6 @@ class Renderer:
         planes.use(PLANES_UNIT)
         self._row_texture.use(ROWS_UNIT)
         self._cells.use(CELLS_UNIT)
-        self._decoder.bind_to_uniform_block(DECODER_BINDING)
         self._draw(target.framebuffer, vertices)
         return target
 
@@ -145,10 +143,10 @@ class Renderer:
         scene, layout = self.scene, self.layout
         program = shader.build(self.ctx, name, {
             "SCALES": layout.scales, "LAYERS": layout.layers, "HIDDEN": len(scene.decoder.b1), "ROWS": int(with_rows),
-        })
+        }, {"decoder_weights": self._decoder})
         sizes = [(s["xy"].shape[1], s["xy"].shape[0], s["xz"].shape[0]) for s in scene.scales]
         _set(
-            program, planes=PLANES_UNIT, rows=ROWS_UNIT, cells=CELLS_UNIT, Decoder=DECODER_BINDING,
+            program, planes=PLANES_UNIT, rows=ROWS_UNIT, cells=CELLS_UNIT,
             planes_texel=(1 / layout.size[0], 1 / layout.size[1]),
             rows_texel=(1 / self._row_texture.width, 1 / self._row_texture.height),
             origins=[(block.x, block.y) for block in layout.blocks],
@@ -199,12 +197,10 @@ def _texture(ctx: moderngl.Context, texels: np.ndarray) -> moderngl.Texture:
 
 
 def _set(program: moderngl.Program, **values: object) -> None:
-    """Set the uniforms and blocks that a program has; compilers drop those it does not use."""
+    """Set the uniforms that a program has; compilers drop those it does not use."""
     for name, value in values.items():
         member = program.get(name, None)
-        if isinstance(member, moderngl.UniformBlock):
-            member.binding = value
-        elif member is not None:
+        if member is not None:
             member.value = value
 
 

@@ -9,48 +9,48 @@ from collections.abc import Mapping
 from importlib import resources
 
 import moderngl
+import numpy as np
 
 from kpc.format.errors import DisplayError
 
 GL33 = "#version 330 core"
 ES30 = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\nprecision highp usampler3D;"
 
-_INCLUDE = re.compile(r'^\s*#include\s+"([\w./-]+)"\s*$')
+_INCLUDE = re.compile(r'^\s*#include\s+"([\w./-]+)"\s*(?://.*)?$')
 _WHERE = re.compile(r"(?:ERROR:\s*)?\b(\d+)[:(](\d+)\)?(?:\(\d+\))?\s*:\s*(?:error\b\s*:?)?\s*(.*)", re.IGNORECASE)
 
 
 def compose(name: str, defines: Mapping[str, int] | None = None, preamble: str = GL33,
-            sources: Mapping[str, str] | None = None) -> tuple[str, list[str]]:
+            written: Mapping[str, str] | None = None) -> tuple[str, list[str]]:
     """The whole text of the shader `name`, and the names of the files in it, in the order of their `#line` numbers.
 
-    Each file is included once. `defines` become macros. `sources` replaces the files of `player/glsl`, by name.
+    Each file is included once. `defines` become macros. `written` holds files that are made for one scene, by name; the
+    others lie in `player/glsl`.
 
     Raises:
         ValueError: an included file does not exist.
     """
     files: list[str] = []
     macros = "".join(f"#define {key} {value}\n" for key, value in (defines or {}).items())
-    return f"{preamble}\n{macros}" + _expand(name, files, sources), files
+    return f"{preamble}\n{macros}" + _expand(name, files, written or {}), files
 
 
-def _expand(name: str, files: list[str], sources: Mapping[str, str] | None) -> str:
+def _expand(name: str, files: list[str], written: Mapping[str, str]) -> str:
     number = len(files)
     files.append(name)
     out = [f"#line 1 {number}"]
-    for line_number, line in enumerate(_source(name, sources).splitlines(), 1):
+    for line_number, line in enumerate(_source(name, written).splitlines(), 1):
         include = _INCLUDE.match(line)
         if include is None:
             out.append(line)
         elif include[1] not in files:
-            out += [_expand(include[1], files, sources), f"#line {line_number + 1} {number}"]
+            out += [_expand(include[1], files, written), f"#line {line_number + 1} {number}"]
     return "\n".join(out) + "\n"
 
 
-def _source(name: str, sources: Mapping[str, str] | None) -> str:
-    if sources is not None:
-        if name not in sources:
-            raise ValueError(f"shader file {name} does not exist")
-        return sources[name]
+def _source(name: str, written: Mapping[str, str]) -> str:
+    if name in written:
+        return written[name]
     file = resources.files("kpc.player.glsl").joinpath(name)
     if not file.is_file():
         raise ValueError(f"shader file {name} does not exist")
@@ -58,19 +58,28 @@ def _source(name: str, sources: Mapping[str, str] | None) -> str:
 
 
 def build(ctx: moderngl.Context, fragment: str, defines: Mapping[str, int] | None = None,
-          sources: Mapping[str, str] | None = None) -> moderngl.Program:
+          written: Mapping[str, str] | None = None) -> moderngl.Program:
     """Compile a fragment shader that is drawn over the whole viewport.
 
     Raises:
         DisplayError: the driver refuses it; the message names file, line and driver.
     """
     vertex_text, _ = compose("fullscreen.glsl", defines)
-    text, files = compose(fragment, defines, sources=sources)
+    text, files = compose(fragment, defines, written=written)
     try:
         return ctx.program(vertex_shader=vertex_text, fragment_shader=text)
     except moderngl.Error as error:
         message = first_complaint(str(error), files)
         raise DisplayError(f"{message} (driver: {ctx.info['GL_RENDERER']}); update the driver, or kprender --backend reference") from error
+
+
+def constants(arrays: Mapping[str, np.ndarray]) -> str:
+    """GLSL that declares each (N, 4) float32 array as `const vec4 name[N]`, to the last bit."""
+    lines = []
+    for name, array in arrays.items():
+        values = ", ".join("vec4(" + ", ".join(f"{x:.9e}" for x in row) + ")" for row in np.asarray(array, np.float32))
+        lines.append(f"const vec4 {name}[{len(array)}] = vec4[{len(array)}]({values});")
+    return "\n".join(lines) + "\n"
 
 
 def first_complaint(log: str, files: list[str]) -> str:

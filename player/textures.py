@@ -128,22 +128,28 @@ def _dilate(grid: np.ndarray) -> np.ndarray:
     return grid
 
 
-def decoder_block(decoder: Decoder, scene: Scene, layout: Layout) -> np.ndarray:
-    """The uniform block `Decoder` of march.glsl (std140, all vec4): (N, 4) float32."""
-    hidden, features = len(decoder.b1), layout.scales * layout.layers * 4
-    channels = [scale["xy"].shape[2] for scale in scene.scales]
-    place = np.concatenate([s * layout.layers * 4 + np.arange(m) for s, m in enumerate(channels)])
+def decoder_arrays(decoder: Decoder, scene: Scene, layout: Layout) -> dict[str, np.ndarray]:
+    """The decoder's weights as march.glsl wants them, (N, 4) float32 each, features in the padded layout of the planes.
+
+    density_weight (F / 4), w1 (H x 3: nine columns, then b1, then zeros), w2 (3 x F / 4 x H), b2 (3 x F / 4), density_bias (1, in x).
+    """
+    features = layout.scales * layout.layers * 4
+    place = np.concatenate([
+        s * layout.layers * 4 + np.arange(scale["xy"].shape[2]) for s, scale in enumerate(scene.scales)
+    ])
 
     def spread(weights: np.ndarray) -> np.ndarray:
-        """Give the last axis, the scene's features, the places they have in the padded layout."""
         out = np.zeros((*weights.shape[:-1], features), np.float32)
         out[..., place] = weights
-        return out
+        return out.reshape(*weights.shape[:-1], features // 4, 4)
 
-    w1 = np.zeros((hidden, 12), np.float32)
+    w1 = np.zeros((len(decoder.b1), 12), np.float32)
     w1[:, :9], w1[:, 9] = decoder.w1, decoder.b1
-    parts = [
-        spread(decoder.density_weight), w1, spread(np.moveaxis(decoder.w2, 2, 0)), spread(decoder.b2),
-        np.array([decoder.density_bias, 0, 0, 0], np.float32),
-    ]
-    return np.concatenate([part.reshape(-1, 4) for part in parts])
+    arrays = {
+        "density_weight": spread(decoder.density_weight),
+        "density_bias": np.array([decoder.density_bias, 0, 0, 0]),
+        "w1": w1,
+        "w2": np.moveaxis(spread(np.moveaxis(decoder.w2, 2, 0)), 0, 2),
+        "b2": spread(decoder.b2),
+    }
+    return {name: np.ascontiguousarray(array, np.float32).reshape(-1, 4) for name, array in arrays.items()}

@@ -5,6 +5,7 @@
 #include "occupancy.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
+#include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2 (kpc.player.textures)
 
 #define FEATURES (SCALES * LAYERS)
 const float TERMINATION = 1.0 / 1024.0;
@@ -28,27 +29,23 @@ uniform vec4 lens;
 uniform mat3 axes;
 uniform vec3 eye;
 
-layout(std140) uniform Decoder {
-    vec4 density[FEATURES];         // weights of the log density
-    vec4 w1[HIDDEN * 3];            // (H, 9), padded to 12 columns; the tenth is b1
-    vec4 w2[HIDDEN * 3 * FEATURES]; // (H, 3, F)
-    vec4 b2[3 * FEATURES];
-    vec4 density_bias;              // in x
-};
-
 layout(location = 0) out vec4 seen;     // rgb and opacity
 layout(location = 1) out vec4 met;      // sum of weight t, samples
 
 vec4 basis[3 * FEATURES];
 
 void find_basis(vec3 d) {
-    for (int i = 0; i < 3 * FEATURES; ++i) basis[i] = b2[i];
     vec4 e0 = vec4(d, d.x * d.x);
     vec4 e1 = vec4(d.y * d.y, d.z * d.z, d.x * d.y, d.y * d.z);
     vec4 e2 = vec4(d.z * d.x, 1.0, 0.0, 0.0);
+    float hidden[HIDDEN];
     for (int h = 0; h < HIDDEN; ++h) {
-        float on = max(dot(w1[3 * h], e0) + dot(w1[3 * h + 1], e1) + dot(w1[3 * h + 2], e2), 0.0);
-        for (int i = 0; i < 3 * FEATURES; ++i) basis[i] += on * w2[h * 3 * FEATURES + i];
+        hidden[h] = max(dot(w1[3 * h], e0) + dot(w1[3 * h + 1], e1) + dot(w1[3 * h + 2], e2), 0.0);
+    }
+    for (int i = 0; i < 3 * FEATURES; ++i) {
+        vec4 sum = b2[i];
+        for (int h = 0; h < HIDDEN; ++h) sum += hidden[h] * w2[i * HIDDEN + h];
+        basis[i] = sum;
     }
 }
 
@@ -83,13 +80,13 @@ void main() {
         if (more) {
             float t = sample_t(walk);
             vec3 u = clamp((eye + t * d - box_low) / box, 0.0, 1.0);
-            float log_density = density_bias.x;
+            float log_density = density_bias[0].x;
             vec3 shade = vec3(0.0);
             for (int scale = 0; scale < SCALES; ++scale) {
                 for (int layer = 0; layer < LAYERS; ++layer) {
                     int i = scale * LAYERS + layer;
                     vec4 f = feature(u, scale, layer);
-                    log_density += dot(f, density[i]);
+                    log_density += dot(f, density_weight[i]);
                     shade += vec3(dot(f, basis[i]), dot(f, basis[FEATURES + i]), dot(f, basis[2 * FEATURES + i]));
                 }
             }
