@@ -198,7 +198,8 @@ class Reader:
         if self.source.size > file_length:
             raise FormatError(f"{self.name}: {self.source.size - file_length} bytes follow the end of the file")
         if self.source.size < file_length and not allow_partial:
-            raise FormatError(f"{self.name}: cut off at {self.source.size} of {file_length} bytes; fetch the file again")
+            raise FormatError(f"{self.name}: cut off at {self.source.size} of {file_length} bytes; "
+                              "fetch the file again")
         if max(value_count, largest_raw) > file_length * EXPANSION_LIMIT:
             raise FormatError(f"{self.name}: claims {value_count:,} values and chunks of {largest_raw:,} bytes, "
                               f"more than {file_length:,} bytes can hold")

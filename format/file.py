@@ -48,6 +48,8 @@ CAMERA_LIMIT = 4096
 FRAME_LIMIT = 1 << 24
 SAMPLE_LIMIT = 65536
 """Samples along the box's diagonal, so that no file can make a ray endless."""
+BOX_LIMIT = 1 << 30
+"""Magnitude of a corner of the box or a number of a camera, world units; a 1 over it bounds the box's edges below."""
 VALUE_LIMIT = 2048.0
 """Magnitude of any plane value: float16 holds it, and with float16 weights no feature, density or colour overflows."""
 
@@ -268,7 +270,8 @@ class SceneReader(Reader):
                               f"the scene {self.head.value_count:,}")
         needed = 5 * self.head.value_count  # one int8 symbol and one float32 each
         if needed > memory_budget:
-            raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory, more than the budget of {memory_budget:,}")
+            raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory, more than the budget of "
+                              f"{memory_budget:,}")
         self._check_segments()
         self._only("DECO")
         self._only("OCCU")
@@ -355,11 +358,12 @@ def _parse_head(raw: bytes) -> SceneHead:
     frame_count, fps, step = fields[6:9]
     background = np.array(fields[9:12], np.float32)
     scale_count, dynamic = fields[12:]
-    if not np.isfinite(aabb).all() or not (aabb[0] < aabb[1]).all():
-        raise FormatError("SCNE: the box is empty or not finite")
+    edges = aabb[1].astype(np.float64) - aabb[0]
+    if not (np.abs(aabb) <= BOX_LIMIT).all() or not (edges >= 1 / BOX_LIMIT).all():  # False for NaN, too
+        raise FormatError("SCNE: the box is empty, not finite or absurdly large")
     if not (math.isfinite(fps) and fps > 0 and 0 < frame_count <= FRAME_LIMIT):
         raise FormatError(f"SCNE: a clip of {frame_count} frames at {fps} fps makes no sense")
-    diagonal = float(np.linalg.norm(aabb[1].astype(np.float64) - aabb[0].astype(np.float64)))
+    diagonal = float(np.linalg.norm(edges))
     if not (math.isfinite(step) and step > 0 and diagonal / step <= SAMPLE_LIMIT):
         raise FormatError(f"SCNE: a ray step of {step} in a box of diagonal {diagonal} makes no sense")
     if not ((background >= 0) & (background <= 1)).all():
@@ -376,14 +380,15 @@ def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, Pla
     size = {"x": nx, "y": ny, "z": nz, "t": nt}
     if not 0 < channels <= CHANNEL_LIMIT or not all(0 < n <= AXIS_LIMIT for n in (nx, ny, nz)) \
             or dynamic != (nt > 0) or nt > AXIS_LIMIT:
-        raise FormatError(f"SCNE: scale {number} claims {channels} channels on a grid of {nx}x{ny}x{nz}, {nt} rows in time")
+        raise FormatError(f"SCNE: scale {number} claims {channels} channels on a grid of {nx}x{ny}x{nz}, "
+                          f"{nt} rows in time")
     planes = {}
     for name in ALL_PLANES if dynamic else SPACE_PLANES:
         step = cursor.array("<f4", channels).astype(np.float32)
         offset = cursor.array("<f4", channels).astype(np.float32) if name in SPACE_PLANES \
             else np.ones(channels, np.float32)
-        with np.errstate(over="ignore"):
-            in_range = (step > 0) & (step * np.float32(128) + np.abs(offset) <= VALUE_LIMIT)  # False for NaN, too
+        with np.errstate(over="ignore", invalid="ignore"):
+            in_range = (step > 0) & (step * np.float32(128) + np.abs(offset) <= VALUE_LIMIT)
         if not in_range.all():
             raise FormatError(f"SCNE: scale {number}, plane {name}: a step or an offset lies outside its range")
         planes[name] = PlaneHead(size[name[1]], size[name[0]], step, offset)
@@ -400,8 +405,9 @@ def _parse_decoder(raw: bytes, expected_features: int) -> Decoder:
     if features != expected_features or not 0 < hidden <= HIDDEN_LIMIT or not math.isfinite(bias):
         raise FormatError(f"DECO: {features} features (the planes give {expected_features}), {hidden} hidden units "
                           f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}")
-    weights = [cursor.array("<f2", math.prod(shape)).astype(np.float32).reshape(shape)
-               for shape in _decoder_shapes(features, hidden)]
+    with np.errstate(invalid="ignore"):  # a signalling NaN says so when it is cast
+        weights = [cursor.array("<f2", math.prod(shape)).astype(np.float32).reshape(shape)
+                   for shape in _decoder_shapes(features, hidden)]
     cursor.finish()
     if not all(np.isfinite(w).all() for w in weights):
         raise FormatError("DECO: a weight is NaN or infinite")
@@ -432,6 +438,9 @@ def _parse_cameras(raw: bytes) -> tuple[Camera, ...]:
     for number in range(count):
         width, height, fl_x, fl_y, cx, cy, *pose = cursor.unpack(CAMERA_STRUCT)
         matrix = np.vstack([np.reshape(pose, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+        lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+        if max(map(abs, (fl_x, fl_y, cx, cy, *pose))) > BOX_LIMIT or lengths.min() < 0.5 or lengths.max() > 2.0:
+            raise FormatError(f"came: camera {number} lies absurdly far, or its axes are not of length 1")
         try:
             cameras.append(Camera(width, height, fl_x, fl_y, cx, cy, matrix))
         except DatasetError as error:

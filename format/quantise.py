@@ -167,7 +167,7 @@ def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) ->
 
 
 def _reach(texels: int, cells: int) -> np.ndarray:
-    """(texels, cells) float32, 1 where the cell [c, c + 1] / cells meets the closed support [i - 1, i + 1] / (texels - 1)."""
+    """(texels, cells) float32, 1 where cell [c, c + 1] / cells meets the closed support [i - 1, i + 1] / (texels - 1)."""
     i, c = np.arange(texels)[:, None], np.arange(cells)[None]
     return (((i + 1) * cells >= c * (texels - 1)) & ((i - 1) * cells <= (c + 1) * (texels - 1))).astype(np.float32)
 
@@ -180,7 +180,8 @@ def round_decoder(decoder: Decoder) -> Decoder:
     """
     def half(weights: np.ndarray) -> np.ndarray:
         if not (np.abs(weights) <= 65504.0).all():
-            raise FormatError("decoder: a weight is NaN or beyond 65504, which no file can store; lower the learning rate")
+            raise FormatError("decoder: a weight is NaN or beyond 65504, which no file can store; "
+                              "lower the learning rate")
         return np.asarray(weights).astype(np.float16).astype(np.float32)
 
     if not np.isfinite(decoder.density_bias):

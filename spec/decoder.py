@@ -95,7 +95,8 @@ def chunks(data, partial):  # sections 3, 4 and 10
         else:
             require(crc32c(body) == crc, "chunk damaged")
         if known:
-            yield kind.decode(), scale, plane, start, rows, body if body is None else decoded(body, codec, raw), value_count
+            raw_bytes = None if body is None else decoded(body, codec, raw)
+            yield kind.decode(), scale, plane, start, rows, raw_bytes, value_count
     require(expected == file_length, "chunks do not fill the file")
 
 
@@ -159,7 +160,7 @@ def decode(data, partial=False):
 def scene_chunk(chunk):  # section 5
     *aabb, frame_count, fps, step, r, g, b, scale_count, dynamic = chunk.unpack("6fIdd3fBB")
     low, high = aabb[:3], aabb[3:]
-    require(all(map(math.isfinite, aabb)) and all(a < b for a, b in zip(low, high)), "box")
+    require(all(abs(a) <= 2**30 for a in aabb) and all(b - a >= 2**-30 for a, b in zip(low, high)), "box")
     require(1 <= frame_count <= 1 << 24 and math.isfinite(fps) and fps > 0, "clip")
     require(math.isfinite(step) and step > 0 and math.dist(low, high) / step <= 65536, "step")
     require(all(0 <= c <= 1 for c in (r, g, b)) and 1 <= scale_count <= 16 and dynamic <= 1, "background or scales")
@@ -208,7 +209,8 @@ def segment(chunk, rows, columns, channels):  # section 6
 def decoder_chunk(chunk, expected):  # section 7
     features, hidden, bias = chunk.unpack("HHf")
     require(features == expected and 1 <= hidden <= 256 and math.isfinite(bias), "decoder sizes")
-    weights = {"density_weight": features, "w1": hidden * 9, "b1": hidden, "w2": 3 * features * hidden, "b2": 3 * features}
+    weights = {"density_weight": features, "w1": hidden * 9, "b1": hidden, "w2": 3 * features * hidden,
+               "b2": 3 * features}
     scene = {name: chunk.unpack(f"{count}e") for name, count in weights.items()}
     require(all(math.isfinite(w) for array in scene.values() for w in array), "weights")
     chunk.end()
@@ -227,7 +229,9 @@ def cameras_chunk(chunk):  # section 9
     cameras = []
     for _ in range(count):
         width, height, *numbers = chunk.unpack("HH16f")
-        require(width and height and all(map(math.isfinite, numbers)) and min(numbers[:2]) > 0, "camera")
+        require(width and height and all(abs(n) <= 2**30 for n in numbers) and min(numbers[:2]) > 0, "camera")
+        axes = [[numbers[4 + 4 * row + column] for row in range(3)] for column in range(3)]
+        require(all(0.5 <= math.hypot(*axis) <= 2 for axis in axes), "camera axes")
         cameras.append((width, height, *numbers))
     chunk.end()
     return cameras
@@ -274,7 +278,8 @@ def features(scene, place):
     for scale in scene["scales"]:
         product = [1.0] * scale["channels"]
         for name, plane in scale["planes"].items():
-            product = [a * b for a, b in zip(product, bilinear(plane, scale["channels"], place[name[0]], place[name[1]]))]
+            sample = bilinear(plane, scale["channels"], place[name[0]], place[name[1]])
+            product = [a * b for a, b in zip(product, sample)]
         out += product
     return out
 
@@ -288,7 +293,8 @@ def bilinear(plane, channels, u, v):
     x0, x1, fx = corners(u, plane["columns"])
     y0, y1, fy = corners(v, plane["rows"])
     sample = [0.0] * channels
-    for y, x, weight in [(y0, x0, (1 - fy) * (1 - fx)), (y0, x1, (1 - fy) * fx), (y1, x0, fy * (1 - fx)), (y1, x1, fy * fx)]:
+    for y, x, weight in [(y0, x0, (1 - fy) * (1 - fx)), (y0, x1, (1 - fy) * fx),
+                         (y1, x0, fy * (1 - fx)), (y1, x1, fy * fx)]:
         first = (y * plane["columns"] + x) * channels
         for c in range(channels):
             sample[c] += weight * plane["values"][first + c]

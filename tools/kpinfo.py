@@ -167,7 +167,8 @@ def _page(info: dict[str, Any]) -> str:
             f"{chunk['scale']:>5}  {chunk['plane']:<5}  {chunk['rows'][0]:>4}-{chunk['rows'][1]:<5}"
         lines.append(f"  {number:>5}  {chunk['kind']}  {place}  {chunk['codec']:<5}  {chunk['stored_bytes']:>10,}  "
                      f"{chunk['raw_bytes']:>10,}  {chunk['share']:>6.1%}" + ("  missing" if chunk["missing"] else ""))
-    lines.append(f"  header and index {info['overhead_bytes']:>37,} {'':>12} {info['overhead_bytes'] / info['size_bytes']:>6.1%}")
+    overhead = info["overhead_bytes"]
+    lines.append(f"  header and index {overhead:>37,} {'':>12} {overhead / info['size_bytes']:>6.1%}")
     return "\n".join(lines)
 
 

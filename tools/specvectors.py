@@ -194,6 +194,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "segment-short": (repacked(xy, lambda raw: raw[:-1]), broken, "its map implies"),
         "segment-long": (repacked(xt, lambda raw: raw + bytes(1)), broken, "its map implies"),
         "scene-box": (repacked(scne, set_at(0, "<f", 1e9)), broken, "the box is empty"),
+        "scene-box-large": (repacked(scne, set_at(12, "<f", 1e30)), broken, "absurdly large"),
         "scene-clip": (repacked(scne, set_at(24, "<I", 0)), broken, "a clip of 0 frames"),
         "scene-fps": (repacked(scne, set_at(28, "<d", nan)), broken, "makes no sense"),
         "scene-step": (repacked(scne, set_at(36, "<d", 1e-12)), broken, "a ray step"),
@@ -203,6 +204,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "scene-axis": (repacked(scne, set_at(60, "<H", 65535)), broken, "65535"),
         "scene-plane-step": (repacked(scne, set_at(68, "<f", 0.0)), broken, "plane xy: a step or an offset"),
         "scene-plane-nan": (repacked(scne, set_at(68, "<f", nan)), broken, "plane xy: a step or an offset"),
+        "scene-plane-snan": (repacked(scne, set_at(68, "<I", 0x7F800001)), broken, "plane xy: a step or an offset"),
         "scene-long": (repacked(scne, lambda raw: raw + bytes(1)), broken, "1 bytes too long"),
         "decoder-features": (repacked(deco, set_at(0, "<H", 3)), broken, "3 features"),
         "decoder-nan": (repacked(deco, set_at(8, "<H", 0x7E00)), broken, "NaN or infinite"),
@@ -210,6 +212,8 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "occupancy-bits": (repacked(occu, lambda raw: raw[:-1] + b"\xff"), broken, "unused bits"),
         "occupancy-zero": (repacked(occu, set_at(0, "<H", 0)), broken, "makes no sense"),
         "camera-focal": (repacked(came, set_at(6, "<f", 0.0)), broken, "focal length"),
+        "camera-far": (repacked(came, set_at(34, "<f", 1e30)), broken, "absurdly far"),
+        "camera-axes": (repacked(came, set_at(22, "<f", 0.0)), broken, "not of length 1"),
         "camera-nan": (repacked(came, set_at(22, "<f", nan)), broken, "NaN or infinity"),
     }
 
