@@ -12,7 +12,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, Protocol, runtime_checkable
 
 import google_crc32c
 import zstandard
@@ -35,6 +35,7 @@ DEFAULT_BUDGET = 2 << 30
 """Bytes a reader allows a decoded scene unless told otherwise."""
 
 
+@runtime_checkable
 class Source(Protocol):
     """Where a file's bytes come from: a disk, memory, or HTTP range requests."""
 
@@ -314,6 +315,6 @@ def _as_source(source: "str | os.PathLike[str] | bytes | BinaryIO | Source") -> 
         return _FileSource(Path(source))
     if isinstance(source, (bytes, bytearray, memoryview)):
         return _BytesSource(bytes(source))
-    if hasattr(source, "read_at"):
+    if isinstance(source, Source):
         return source
     return _FileSource(None, source)

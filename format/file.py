@@ -13,7 +13,7 @@ import os
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import BinaryIO, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from kpc.format.cli import written_aside
 from kpc.format.container import DEFAULT_BUDGET, Chunk, Entry, Reader, Source, pack
 from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.planes import decode_segment, encode_segment
-from kpc.format.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
 
 Parsed = TypeVar("Parsed")
@@ -50,8 +50,6 @@ SAMPLE_LIMIT = 65536
 """Samples along the box's diagonal, so that no file can make a ray endless."""
 BOX_LIMIT = 1 << 30
 """Magnitude of a corner of the box or a number of a camera, world units; a 1 over it bounds the box's edges below."""
-VALUE_LIMIT = 2048.0
-"""Magnitude of any plane value: float16 holds it, and with float16 weights no feature, density or colour overflows."""
 
 
 @dataclass(frozen=True)
@@ -462,7 +460,7 @@ class _Cursor:
         self.position += length
         return taken
 
-    def unpack(self, layout: struct.Struct) -> tuple:
+    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
         return layout.unpack(self.take(layout.size))
 
     def array(self, dtype: str, count: int) -> np.ndarray:

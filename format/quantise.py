@@ -18,6 +18,11 @@ from kpc.format.scene import TIME_PLANES, Clip, Decoder, Scene
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
 
+VALUE_LIMIT = 2048.0
+"""Magnitude of any plane value: float16 holds it, and with float16 weights no feature, density or colour overflows."""
+COARSEST_STEP = 8.0
+"""A step beyond this is taken for this: what it rounds away is already gone, and 128 of it keep well below the limit."""
+
 
 @dataclass(frozen=True)
 class QuantisedPlane:
@@ -51,22 +56,26 @@ def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bo
     Time planes (identity=True): the offset is 1; a step too small is enlarged until [-128, 127] reaches both ends of
     the range. Texels whose symbols all come out 0 are not coded.
 
+    Steps above COARSEST_STEP count as that.
+
     Args:
         values: (H, W, M) float32. step: (M,) or one number for all channels, > 0.
         needed: (H, W) bool; False where no occupied point projects to. Those texels are not coded. None: all needed.
         name: of the plane, for messages.
 
     Raises:
-        FormatError: a needed value is NaN or infinite, or a step is not positive.
+        FormatError: a needed value is NaN or beyond half of VALUE_LIMIT, or a step is not positive.
     """
     rows, columns, channels = values.shape
     step = np.broadcast_to(np.asarray(step, np.float32), (channels,)).copy()
     needed = np.ones((rows, columns), bool) if needed is None else needed.astype(bool)
     wanted = values[needed].astype(np.float64)  # (needed texels, M)
-    if not np.isfinite(wanted).all():
-        raise FormatError(f"{name}: holds NaN or infinity, which no file can store; train with a lower learning rate")
-    if not (np.isfinite(step) & (step > 0)).all():
+    if not (np.abs(wanted) <= VALUE_LIMIT / 2).all():
+        raise FormatError(f"{name}: holds NaN, infinity or a number beyond {VALUE_LIMIT / 2:g}, which no file can store; "
+                          "train with a lower learning rate")
+    if not (step > 0).all():
         raise FormatError(f"{name}: a quantisation step is not a positive number")
+    step = np.minimum(step, np.float32(COARSEST_STEP))
 
     low, high = (wanted.min(0), wanted.max(0)) if len(wanted) else (np.ones(channels), np.ones(channels))
     if identity:
@@ -81,7 +90,7 @@ def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bo
     symbols = np.zeros(values.shape, np.int8)
     rounded = np.rint((wanted - offset) / step.astype(np.float64))
     symbols[needed] = np.clip(rounded, SYMBOL_MIN, SYMBOL_MAX).astype(np.int8)
-    coded = symbols.any(axis=2) if identity else needed
+    coded: np.ndarray = symbols.any(axis=2) if identity else needed
     return QuantisedPlane(symbols, step, offset, coded)
 
 
@@ -162,8 +171,8 @@ def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) ->
     others = tuple(axis for axis in range(4) if axis not in (across, down))
     seen = occupancy.any(axis=others)  # the kept axes stay in the order t, z, y, x
     seen = seen if down < across else seen.T
-    reach = _reach(rows, seen.shape[0]) @ seen.astype(np.float32) @ _reach(columns, seen.shape[1]).T
-    return reach > 0
+    reach: np.ndarray = _reach(rows, seen.shape[0]) @ seen.astype(np.float32) @ _reach(columns, seen.shape[1]).T
+    return np.greater(reach, 0)
 
 
 def _reach(texels: int, cells: int) -> np.ndarray:

@@ -6,13 +6,13 @@ from scenes import tiny_scene
 
 from kpc.format.cameras import Camera
 from kpc.format.errors import FormatError
-from kpc.format.quantise import (QuantisedPlane, needed_texels, quantise_plane, quantise_scene, round_camera,
-                                 round_decoder)
+from kpc.format.quantise import (VALUE_LIMIT, QuantisedPlane, needed_texels, quantise_plane, quantise_scene,
+                                 round_camera, round_decoder)
 from kpc.format.scene import TIME_PLANES, Decoder
 
 
 def tolerance(values: np.ndarray, plane: QuantisedPlane) -> np.ndarray:
-    """Half a step, and what float32 rounds: the offset when it is chosen, the product and the sum when it is applied."""
+    """Half a step, and what float32 rounds: offset and step when chosen, product and sum when applied."""
     largest = np.abs(values).max(initial=0) + 2 * np.abs(plane.offset).max() + 128 * plane.step
     return plane.step * 0.5 + 4 * largest * 2.0**-24
 
@@ -71,12 +71,12 @@ def test_two_roundings_in_the_stated_order():
     assert plane.dequantise().dtype == np.float32
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1025.0])
 def test_a_value_that_is_no_number_is_refused_by_name(bad):
     scene = tiny_scene()
     scene.scales[1]["xt"][2, 3, 4] = bad
     steps = [{name: 0.02 for name in scale} for scale in scene.scales]
-    with pytest.raises(FormatError, match="scale 1, plane xt: holds NaN or infinity"):
+    with pytest.raises(FormatError, match="scale 1, plane xt: holds NaN, infinity"):
         quantise_scene(scene, steps, skip_unseen=False)
 
 
@@ -89,10 +89,19 @@ def test_a_value_that_is_no_number_does_not_matter_where_nothing_is_seen():
     assert not plane.coded[0, 0] and np.isfinite(plane.dequantise()).all()
 
 
-@pytest.mark.parametrize("step", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("step", [0.0, -1.0, np.nan])
 def test_a_step_that_is_not_positive_is_refused(step):
     with pytest.raises(FormatError, match="step"):
         quantise_plane(np.ones((2, 2, 1), np.float32), step, identity=False)
+
+
+def test_any_step_however_coarse_makes_a_plane_that_a_file_can_hold():
+    values = np.linspace(-1024.0, 1024.0, 64, dtype=np.float32).reshape(8, 8, 1)
+    for step in (8.0, 1e4, np.inf):
+        for identity in (True, False):
+            plane = quantise_plane(values, step, identity=identity)
+            assert (plane.step * 128 + np.abs(plane.offset) <= VALUE_LIMIT).all()
+            assert (np.abs(plane.dequantise() - values) <= tolerance(values, plane)).all()
 
 
 def test_a_plane_nobody_sees_costs_nothing():

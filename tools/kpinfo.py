@@ -10,7 +10,7 @@ Without --verify a file whose end is missing is described as far as it goes.
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -98,7 +98,7 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
     }
 
 
-def _describe_scale(scale: dict[str, QuantisedPlane]) -> dict[str, Any]:
+def _describe_scale(scale: Mapping[str, QuantisedPlane]) -> dict[str, Any]:
     return {
         "channels": scale["xy"].symbols.shape[2],
         "planes": {
