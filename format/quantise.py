@@ -21,7 +21,7 @@ SYMBOL_MIN, SYMBOL_MAX = -128, 127
 VALUE_LIMIT = 2048.0
 """Magnitude of any plane value: float16 holds it, and with float16 weights no feature, density or colour overflows."""
 COARSEST_STEP = 8.0
-"""A step beyond this is taken for this: what it rounds away is already gone, and 128 of it keep well below the limit."""
+"""A coarser step is taken for this one; 128 of it stay within the limit."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bo
     needed = np.ones((rows, columns), bool) if needed is None else needed.astype(bool)
     wanted = values[needed].astype(np.float64)  # (needed texels, M)
     if not (np.abs(wanted) <= VALUE_LIMIT / 2).all():
-        raise FormatError(f"{name}: holds NaN, infinity or a number beyond {VALUE_LIMIT / 2:g}, which no file can store; "
-                          "train with a lower learning rate")
+        raise FormatError(f"{name}: holds NaN, infinity or a number beyond {VALUE_LIMIT / 2:g}, which no file can "
+                          "store; train with a lower learning rate")
     if not (step > 0).all():
         raise FormatError(f"{name}: a quantisation step is not a positive number")
     step = np.minimum(step, np.float32(COARSEST_STEP))
@@ -176,7 +176,7 @@ def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) ->
 
 
 def _reach(texels: int, cells: int) -> np.ndarray:
-    """(texels, cells) float32, 1 where cell [c, c + 1] / cells meets the closed support [i - 1, i + 1] / (texels - 1)."""
+    """(texels, cells) float32, 1 where cell [c, c+1] / cells meets the closed support [i-1, i+1] / (texels-1)."""
     i, c = np.arange(texels)[:, None], np.arange(cells)[None]
     return (((i + 1) * cells >= c * (texels - 1)) & ((i - 1) * cells <= (c + 1) * (texels - 1))).astype(np.float32)
 

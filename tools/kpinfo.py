@@ -160,7 +160,8 @@ def _page(info: dict[str, Any]) -> str:
         f"  don't care  {info['dont_care_share']:.1%} of the space-plane texels are not stored",
     ]
     if info["missing_chunks"]:
-        lines.append(f"  cut off     {info['missing_chunks']} of {len(info['chunks'])} chunks are missing and count as not stored")
+        lines.append(f"  cut off     {info['missing_chunks']} of {len(info['chunks'])} chunks are missing and count as "
+                     "not stored")
     lines += ["", "  chunk  kind  scale  plane  rows        codec      stored         raw   share"]
     for number, chunk in enumerate(info["chunks"]):
         place = f"{'-':>5}  {'-':<5}  {'-':<10}" if chunk["plane"] is None else \

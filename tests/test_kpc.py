@@ -1,0 +1,27 @@
+import subprocess
+import sys
+
+import numpy as np
+from scenes import tiny_scene
+
+import kpc
+from kpc.format.file import write
+from kpc.format.quantise import quantise_scene
+
+
+def test_the_example_of_the_docstring(tmp_path):
+    scene = tiny_scene()
+    path = tmp_path / "scene.kpc"
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    loaded = kpc.load(path)
+    assert loaded.scales[0]["xy"].dtype == np.float32
+    picture = kpc.render(loaded, loaded.cameras[0], time=0.5)
+    assert picture.rgb.shape == (36, 48, 3) and picture.rgb.dtype == np.float32
+    assert 0.0 <= picture.rgb.min() and picture.rgb.max() <= 1.0 and picture.opacity.max() > 0.5
+
+
+def test_playing_needs_no_torch_and_reading_no_opengl():
+    program = ("import sys, kpc, kpc.format.file; "
+               "print([m for m in ('torch', 'numba', 'moderngl', 'glfw') if m in sys.modules])")
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
