@@ -143,7 +143,7 @@ def write_video(
     even = 1 if pix_fmt.startswith("yuv444") else 2
     pad = ((0, -height % even), (0, -width % even), (0, 0))
     raw = ffmpeg.input("pipe:", format="rawvideo", pix_fmt="rgb24", framerate=fps,
-                       video_size=f"{width + pad[1][1]}x{height + pad[0][1]}")
+                       video_size=(width + pad[1][1], height + pad[0][1]))
     scaled = raw.filter("scale", flags=_SCALE_FLAGS, out_color_matrix="bt709", out_range="limited")
     tags = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
     count = 0

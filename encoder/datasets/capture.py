@@ -79,7 +79,7 @@ def fit_intrinsics(
     if not (declared[0] >= 1 and declared[1] >= 1):
         raise DatasetError(f"{where}: picture size {declared[0]:g}x{declared[1]:g} is empty; correct the calibration")
     sx, sy = actual[0] / declared[0], actual[1] / declared[1]
-    if abs(sx / sy - 1) > 0.01 + 1 / min(actual):
+    if abs(declared[0] * sy - actual[0]) > 1 + 0.01 * actual[0]:
         raise DatasetError(
             f"{file}: is {actual[0]}x{actual[1]}, but {where} is for {declared[0]:g}x{declared[1]:g}, another shape; "
             "undo the crop or correct the size there"
