@@ -1,6 +1,7 @@
 """Rendering with OpenGL 3.3: a scene becomes textures once, then each picture is one pass of `glsl/march.glsl`."""
 
 from dataclasses import dataclass
+from enum import Enum
 
 import moderngl
 import numpy as np
@@ -15,6 +16,18 @@ from kpc.player.textures import Layout, Rows, decoder_arrays, distances
 FOLDED_AXIS = {"xy": 0, "xz": 2, "yz": 1}
 """Which axis' row is folded into which plane."""
 PLANES_UNIT, ROWS_UNIT, CELLS_UNIT = 0, 1, 2
+SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
+TARGETS_KEPT = 4
+
+
+class Look(Enum):
+    """What to put on the screen."""
+
+    COLOUR = 0
+    DEPTH = 2
+    SAMPLES = 3
+    OCCUPANCY = 4
+
 
 
 @dataclass
@@ -28,6 +41,8 @@ class Target:
     @staticmethod
     def of(ctx: moderngl.Context, size: tuple[int, int]) -> "Target":
         seen, met = ctx.texture(size, 4, dtype="f4"), ctx.texture(size, 2, dtype="f4")
+        for texture in (seen, met):
+            texture.repeat_x = texture.repeat_y = False
         return Target(seen, met, ctx.framebuffer([seen, met]))
 
     def release(self) -> None:
@@ -67,7 +82,7 @@ class Renderer:
         self._folded_time: float | None = None
         self._slot: int | None = None
         self._programs: dict[tuple[str, bool], tuple[moderngl.Program, moderngl.VertexArray]] = {}
-        self._targets: dict[str, Target] = {}
+        self._targets: dict[tuple[Part, tuple[int, int]], Target] = {}
         self.check()
 
     def _check_limits(self) -> None:
@@ -99,8 +114,29 @@ class Renderer:
         self.check()
         return Rendering(rgb, depth, opacity, samples)
 
+    def show(self, screen: moderngl.Framebuffer, camera: Camera, time: float, *, part: Part = Part.FULL, look: Look = Look.COLOUR,
+             depths: tuple[float, float] = (0.0, 1.0), most_samples: float = 64.0) -> None:
+        """Draw what `camera` sees over the whole of `screen`, stretched to its size.
+
+        Depth goes from bright to dark over `depths`, world units; samples up to `most_samples`.
+        """
+        if look is Look.OCCUPANCY:
+            target = self.march(camera, time, part=Part.STATIC, program="cells.glsl")
+        else:
+            target = self.march(camera, time, part=Part.STATIC if part is Part.STATIC else Part.FULL)
+        without, view = target, Look.COLOUR.value if look is Look.OCCUPANCY else look.value
+        if part is Part.DYNAMIC and look is Look.COLOUR:
+            without, view = self.march(camera, time, part=Part.STATIC), 1
+        present, vertices = self._program("present.glsl", False)
+        _set(present, seen=SEEN_UNIT, met=MET_UNIT, without=WITHOUT_UNIT, view=view,
+             viewport=tuple(map(float, screen.size)), depths=depths, most_samples=most_samples)
+        target.seen.use(SEEN_UNIT)
+        target.met.use(MET_UNIT)
+        without.seen.use(WITHOUT_UNIT)
+        self._draw(screen, vertices)
+
     def march(self, camera: Camera, time: float, *, part: Part = Part.FULL, program: str = "march.glsl") -> Target:
-        """Draw into a target of the camera's size, which stays valid until the next march of the same part.
+        """Draw into a target of the camera's size, which stays valid until the next march of the same part and size.
 
         `part` is FULL or STATIC. `program` is march.glsl or another that takes a subset of its uniforms.
         """
@@ -111,7 +147,7 @@ class Renderer:
             self._cut(time)
             if self.folded:
                 planes = self._fold(time)
-        target = self._target(part.value, (camera.width, camera.height))
+        target = self._target(part, (camera.width, camera.height))
         march, vertices = self._program(program, moving and not self.folded)
         _set(march, height=float(camera.height), lens=(camera.fl_x, camera.fl_y, camera.cx, camera.cy),
              axes=tuple(camera.camera_to_world[:3, :3].T.ravel()), eye=tuple(camera.camera_to_world[:3, 3]))
@@ -128,12 +164,12 @@ class Renderer:
         framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
         vertices.render(moderngl.TRIANGLES, vertices=3)
 
-    def _target(self, name: str, size: tuple[int, int]) -> Target:
-        target = self._targets.get(name)
-        if target is None or target.framebuffer.size != size:
-            if target is not None:
-                target.release()
-            target = self._targets[name] = Target.of(self.ctx, size)
+    def _target(self, part: Part, size: tuple[int, int]) -> Target:
+        """A target of this size; the few last used are kept."""
+        target = self._targets.pop((part, size), None) or Target.of(self.ctx, size)
+        self._targets[part, size] = target
+        if len(self._targets) > TARGETS_KEPT:
+            self._targets.pop(next(iter(self._targets))).release()
         return target
 
     def _program(self, name: str, with_rows: bool) -> tuple[moderngl.Program, moderngl.VertexArray]:

@@ -1,0 +1,27 @@
+// Puts what a march gave on the screen: its colours, or one of the other things it met.
+
+uniform sampler2D seen;
+uniform sampler2D met;
+uniform sampler2D without;  // what a march of the static part has seen
+uniform int view;           // 0 colour, 1 |colour - without|, 2 depth, 3 samples
+uniform vec2 viewport;      // pixels
+uniform vec2 depths;        // shown from bright to dark
+uniform float most_samples;
+
+layout(location = 0) out vec4 shown;
+
+// Black, violet, orange, white.
+vec3 heat(float x) {
+    return clamp(vec3(1.6 * x, 1.9 * x * x - 0.25 * x, 1.3 * x * (1.0 - 1.6 * x) + 1.3 * x * x * x * x), 0.0, 1.0);
+}
+
+void main() {
+    vec2 at = gl_FragCoord.xy / viewport;
+    vec4 colour = texture(seen, at);
+    vec2 sums = texture(met, at).xy;
+    vec3 rgb = colour.rgb;
+    if (view == 1) rgb = abs(rgb - texture(without, at).rgb);
+    if (view == 2) rgb = heat(1.0 - clamp((sums.x / max(colour.a, 1e-6) - depths.x) / (depths.y - depths.x), 0.0, 1.0)) * colour.a;
+    if (view == 3) rgb = heat(sums.y / most_samples);
+    shown = vec4(rgb, 1.0);
+}
