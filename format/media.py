@@ -5,6 +5,7 @@ tags are silent, players' custom is followed: limited range, BT.601 below 720 li
 are refused rather than shown wrong.
 """
 
+import contextlib
 import functools
 import itertools
 import os
@@ -165,6 +166,8 @@ def write_video(
         finally:
             process.kill()
             process.wait()
+            with contextlib.suppress(BrokenPipeError):
+                process.stdin.close()
         if code != 0:
             raise MediaError(f"{path}: ffmpeg cannot write it ({_last_words(_read_log(log))}); it needs libx264 and free disk space")
     return count

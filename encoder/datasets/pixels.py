@@ -6,6 +6,7 @@ import mmap
 import os
 import shutil
 import time
+import weakref
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -44,18 +45,19 @@ class PixelCache:
     def __init__(self, path: Path, tiles: tuple[Tile, ...], stored_channels: int, channels: int) -> None:
         self.path, self.tiles, self.channels = path, tiles, channels
         self._stored = stored_channels
-        self._file = open(path, "rb", buffering=0)
-        size = os.fstat(self._file.fileno()).st_size
+        self._fd = os.open(path, os.O_RDONLY)
+        weakref.finalize(self, os.close, self._fd)
+        size = os.fstat(self._fd).st_size
         self._mapped: np.ndarray | None = None
-        if 0 < size <= MAPPED_BYTES:
-            mapping = mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ)
+        if 0 < size <= MAPPED_BYTES and size % stored_channels == 0:
+            mapping = mmap.mmap(self._fd, size, access=mmap.ACCESS_READ)
             self._mapped = np.frombuffer(mapping, np.uint8).reshape(-1, stored_channels)
 
     def read(self, indices: np.ndarray) -> np.ndarray:
         """Pixels by their index in the cache: (N,) int64 to (N, channels) uint8."""
         if self._mapped is not None:
             return self._mapped[indices][:, : self.channels]
-        fd, stored = self._file.fileno(), self._stored
+        fd, stored = self._fd, self._stored
         data = b"".join([os.pread(fd, stored, offset) for offset in (indices * stored).tolist()])
         if len(data) != len(indices) * stored:
             raise DatasetError(f"{self.path}: shorter than it was; delete it to have it rebuilt")
@@ -68,7 +70,7 @@ class PixelCache:
     def _raw(self, number: int) -> np.ndarray:
         tile = self.tiles[number]
         size = tile.width * tile.height * self._stored
-        data = os.pread(self._file.fileno(), size, tile.offset * self._stored)
+        data = os.pread(self._fd, size, tile.offset * self._stored)
         if len(data) != size:
             raise DatasetError(f"{self.path}: shorter than it was; delete it to have it rebuilt")
         return np.frombuffer(data, np.uint8).reshape(tile.height, tile.width, self._stored)
@@ -77,7 +79,7 @@ class PixelCache:
         """Whether the file has its length and the pictures checked have their CRCs."""
         stored = self._stored
         end = max((t.offset + t.width * t.height for t in self.tiles), default=0) * stored
-        if os.fstat(self._file.fileno()).st_size != end:
+        if os.fstat(self._fd).st_size != end:
             return False
         every = max(1, -(-end // VERIFIED_BYTES))
         return all(_crc(self._raw(n)) == self.tiles[n].crc32c for n in range(0, len(self.tiles), every))

@@ -1,0 +1,103 @@
+"""Tiny datasets in each layout, for tests: a shaded sphere seen from a few cameras, a few frames long."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kpc.format.cameras import Camera
+from kpc.format.media import write_image, write_video
+
+FPS = 8.0
+
+
+def look_at(eye: tuple[float, float, float], width: int = 32, height: int = 24) -> Camera:
+    """A camera that looks at the origin, z up, 45 degrees wide or so."""
+    back = np.asarray(eye, float) / np.linalg.norm(eye)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, np.asarray(eye, float)], axis=1)
+    return Camera(width, height, 1.2 * width, 1.2 * width, width / 2, height / 2, pose)
+
+
+def ring(count: int, **size: int) -> list[Camera]:
+    angles = np.linspace(-0.5, 0.5, count)
+    return [look_at((3 * np.sin(a), -3 * np.cos(a), 0.8), **size) for a in angles]
+
+
+def picture(camera: Camera, time: float = 0.0, alpha: bool = False) -> np.ndarray:
+    """uint8 (height, width, 3 or 4): a sphere whose radius grows with time, on a shaded ground or on nothing."""
+    origins, directions = camera.rays()
+    along = -(origins * directions).sum(1)
+    beside = np.linalg.norm(origins + directions * along[:, None], axis=1)
+    inside = beside < 0.5 + 0.3 * time
+    colours = np.where(inside[:, None], 128 + 100 * directions, 60 + 40 * directions[:, 2:])
+    pixels = np.concatenate([colours, 255.0 * inside[:, None]], axis=1)[:, : 4 if alpha else 3]
+    return np.rint(pixels).astype(np.uint8).reshape(camera.height, camera.width, -1)
+
+
+def poses_bounds(cameras: list[Camera], near: float = 1.0, far: float = 6.0) -> np.ndarray:
+    """LLFF rows: [down right backwards centre | (h w f)], near, far."""
+    rows = []
+    for c in cameras:
+        right, up, back, centre = c.camera_to_world[:3].T
+        rows.append([*np.stack([-up, right, back, centre, [c.height, c.width, c.fl_x]], axis=1).ravel(), near, far])
+    return np.array(rows)
+
+
+def write_n3dv(folder: Path, cameras: int = 3, frames: int = 4, **size: int) -> list[Camera]:
+    folder.mkdir(parents=True, exist_ok=True)
+    rig = ring(cameras, **size)
+    for k, camera in enumerate(rig):
+        times = [f / max(frames - 1, 1) for f in range(frames)]
+        write_video(folder / f"cam{k:02d}.mp4", (picture(camera, t) for t in times), FPS, crf=1, pix_fmt="yuv444p")
+    np.save(folder / "poses_bounds.npy", poses_bounds(rig))
+    return rig
+
+
+def write_llff(folder: Path, images: int = 9) -> list[Camera]:
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    rig = ring(images)
+    for k, camera in enumerate(rig):
+        write_image(folder / "images" / f"view{k}.png", picture(camera))
+    np.save(folder / "poses_bounds.npy", poses_bounds(rig))
+    return rig
+
+
+def write_blender(folder: Path, dynamic: bool = True, alpha: bool = True) -> None:
+    for split, count in (("train", 5), ("val", 2), ("test", 3)):
+        (folder / split).mkdir(parents=True, exist_ok=True)
+        frames = []
+        for k, camera in enumerate(ring(count, width=20, height=20)):
+            time = k / (count - 1)
+            write_image(folder / split / f"r_{k:03d}.png", picture(camera, time if dynamic else 0.0, alpha))
+            frames.append({"file_path": f"./{split}/r_{k:03d}", "rotation": 0.0, "transform_matrix": camera.camera_to_world.tolist()})
+            if dynamic:
+                frames[-1]["time"] = time
+        angle = 2 * np.arctan(20 / 2 / camera.fl_x)
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+
+
+def write_nerfstudio(folder: Path, images: int = 10, times: list[float] | None = None, **document: Any) -> list[Camera]:
+    """`document` adds to or replaces keys of transforms.json."""
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    rig = ring(images)
+    frames = []
+    for k, camera in enumerate(rig):
+        write_image(folder / "images" / f"{k:04d}.png", picture(camera, times[k] if times else 0.0))
+        frames.append({"file_path": f"images/{k:04d}.png", "transform_matrix": camera.camera_to_world.tolist()})
+        if times:
+            frames[-1]["time"] = times[k]
+    c = rig[0]
+    head = {"w": c.width, "h": c.height, "fl_x": c.fl_x, "fl_y": c.fl_y, "cx": c.cx, "cy": c.cy, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(head | document))
+    return rig
+
+
+def edit_json(file: Path, change: Any) -> None:
+    """Load, let `change(document)` alter it in place, save."""
+    document = json.loads(file.read_text())
+    change(document)
+    file.write_text(json.dumps(document))
