@@ -562,7 +562,7 @@ def generate(target: str | os.PathLike[str], options: Options) -> None:
     filmed, extra = rig(options), unseen(options)
     stills = sorted({0, options.frames // 4, options.frames // 2, 3 * options.frames // 4, options.frames - 1})
     jobs = [(camera, options, folder, f"cam{k:02d}", times, stills if k == 0 else []) for k, camera in enumerate(filmed)]
-    jobs += [(camera, options, folder, f"novel{k:02d}", [], stills[1:-1:1] or stills) for k, camera in enumerate(extra)]
+    jobs += [(camera, options, folder, f"novel{k:02d}", [], stills[1:-1] or stills) for k, camera in enumerate(extra)]
     with ProcessPoolExecutor(min(os.cpu_count() or 1, len(jobs)), multiprocessing.get_context("spawn")) as pool:
         depths = list(progress(pool.map(_film, jobs), "filming", len(jobs), "camera"))
     rows = [_poses_bounds(camera, *bounds) for camera, bounds in zip(filmed, depths)]
