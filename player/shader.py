@@ -16,13 +16,18 @@ from kpc.format.errors import DisplayError
 GL33 = "#version 330 core"
 ES30 = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\nprecision highp usampler3D;"
 
+LINES_A_FILE = 10000
+
 _INCLUDE = re.compile(r'^\s*#include\s+"([\w./-]+)"\s*(?://.*)?$')
-_WHERE = re.compile(r"(?:ERROR:\s*)?\b(\d+)[:(](\d+)\)?(?:\(\d+\))?\s*:\s*(?:error\b\s*:?)?\s*(.*)", re.IGNORECASE)
+_WHERE = re.compile(r"(?:ERROR:\s*)?\b\d+[:(](\d+)\)?(?:\(\d+\))?\s*:\s*(?:error\b\s*:?)?\s*(.*)", re.IGNORECASE)
 
 
 def compose(name: str, defines: Mapping[str, int] | None = None, preamble: str = GL33,
             written: Mapping[str, str] | None = None) -> tuple[str, list[str]]:
-    """The whole text of the shader `name`, and the names of the files in it, in the order of their `#line` numbers.
+    """The whole text of the shader `name`, and the names of the files in it.
+
+    A `#line` gives line L of file F the number F * LINES_A_FILE + L. (The language has a second number for the file, but Mesa
+    reports some complaints under the file before.)
 
     Each file is included once. `defines` become macros. `written` holds files that are made for one scene, by name; the
     others lie in `player/glsl`.
@@ -38,13 +43,16 @@ def compose(name: str, defines: Mapping[str, int] | None = None, preamble: str =
 def _expand(name: str, files: list[str], written: Mapping[str, str]) -> str:
     number = len(files)
     files.append(name)
-    out = [f"#line 1 {number}"]
+    base = number * LINES_A_FILE
+    out = [f"#line {base + 1}"]
     for line_number, line in enumerate(_source(name, written).splitlines(), 1):
         include = _INCLUDE.match(line)
         if include is None:
             out.append(line)
-        elif include[1] not in files:
-            out += [_expand(include[1], files, written), f"#line {line_number + 1} {number}"]
+        elif include[1] in files:
+            out.append("")
+        else:
+            out += [_expand(include[1], files, written), f"#line {base + line_number + 1}"]
     return "\n".join(out) + "\n"
 
 
@@ -86,6 +94,7 @@ def first_complaint(log: str, files: list[str]) -> str:
     """The first message of a driver's log that names a place, as "shader file:line: message"."""
     for line in log.splitlines():
         where = _WHERE.search(line)
-        if where is not None and int(where[1]) < len(files):
-            return f"shader {files[int(where[1])]}:{where[2]}: {where[3].strip()}"
+        if where is not None and int(where[1]) // LINES_A_FILE < len(files):
+            file, number = divmod(int(where[1]), LINES_A_FILE)
+            return f"shader {files[file]}:{number}: {where[2].strip()}"
     return f"shader {files[0]}: {' '.join(log.split())}"

@@ -1,0 +1,121 @@
+"""OpenGL against the numpy reference."""
+
+from dataclasses import replace
+
+import gl
+import numpy as np
+import pytest
+from scenes import look_at, tiny_scene
+
+from kpc.format.cameras import Camera
+from kpc.format.errors import DisplayError
+from kpc.format.scene import Scene
+from kpc.player.reference import Part, Rendering, render
+from kpc.player.renderer import Look, Renderer
+
+CENTRE = (0.1, 0.05, 0.05)
+CAMERAS = {
+    "outside": look_at((2.4, 1.0, 2.2), CENTRE, 64, 48, 70.0),
+    "inside": look_at((0.1, 0.3, 0.4), (0.4, -0.2, 0.0), 64, 48, 40.0),
+    "along an axis": look_at((0.1, 0.05, 3.0), CENTRE, 65, 49, 90.0),
+    "off centre": Camera(64, 48, 80.0, 60.0, 20.0, 40.0, look_at((-2.4, 0.3, 1.8), CENTRE, 1, 1, 1).camera_to_world),
+    "looking away": look_at((3.0, 0.0, 0.0), (9.0, 1.0, 0.0), 16, 12, 20.0),
+}
+
+
+def check(got: Rendering, wanted: Rendering) -> None:
+    """Within 1/255 at 99.9 % of the pixels, PSNR at least 50 dB; depth and samples go with them."""
+    error = np.abs(got.rgb - wanted.rgb)
+    assert np.mean(error.max(axis=-1) <= 1 / 255) >= 0.999
+    assert np.mean(error**2) <= 1e-5
+    assert np.mean(np.abs(got.opacity - wanted.opacity) <= 1 / 255) >= 0.999
+    assert np.mean(got.samples == wanted.samples) >= 0.99
+    assert np.array_equal(np.isinf(got.depth), got.opacity == 0)
+    solid = (wanted.opacity > 0.5) & (got.opacity > 0.5)
+    assert np.mean(np.abs(got.depth[solid] - wanted.depth[solid]) < 2e-3) >= 0.999 if solid.any() else True
+
+
+@pytest.mark.parametrize("view", CAMERAS)
+@pytest.mark.parametrize("part", Part)
+def test_gives_the_reference_picture(view: str, part: Part) -> None:
+    scene = tiny_scene(4)
+    wanted = render(scene, CAMERAS[view], 0.62, part=part)
+    check(Renderer(gl.context(), scene).render(CAMERAS[view], 0.62, part=part), wanted)
+    if view not in ("looking away",) and part is Part.FULL:
+        assert wanted.opacity.max() > 0.9
+
+
+@pytest.mark.parametrize("scene", [
+    tiny_scene(6, dynamic=False),
+    tiny_scene(7, scales=3, channels=5, resolution=(40, 12, 28), time=2),
+    tiny_scene(8, scales=1, channels=3, resolution=(2, 3, 2), time=1),
+    replace(tiny_scene(9), occupancy=np.ones((1, 1, 1, 1), bool)),
+    replace(tiny_scene(9), occupancy=np.zeros((2, 300, 2, 3), bool)),
+], ids=["static", "uneven", "few texels", "one cell", "nothing"])
+def test_scenes_of_all_shapes(scene: Scene) -> None:
+    renderer = Renderer(gl.context(), scene)
+    for time in (0.0, 0.5, 1.0):
+        check(renderer.render(CAMERAS["outside"], time), render(scene, CAMERAS["outside"], time))
+
+
+def test_sparse_occupancy_loses_no_sample() -> None:
+    """Long empty stretches are crossed in a few jumps; the lattice must stay where it is."""
+    rng = np.random.default_rng(0)
+    occupancy = rng.random((1, 40, 50, 60)) < 0.002
+    scene = replace(tiny_scene(3), occupancy=occupancy, step=0.007)
+    check(Renderer(gl.context(), scene).render(CAMERAS["outside"], 0.3), render(scene, CAMERAS["outside"], 0.3))
+
+
+def test_one_renderer_serves_many_sizes_and_times() -> None:
+    scene = tiny_scene(4)
+    renderer = Renderer(gl.context(), scene)
+    for width, height, time in [(40, 30, 0.1), (31, 17, 0.9), (1, 1, 0.4), (40, 30, 0.1), (8, 9, 0), (10, 9, 0), (11, 9, 0)]:
+        camera = CAMERAS["outside"].resized(width, height)
+        got = renderer.render(camera, time)
+        assert got.rgb.shape == (height, width, 3)
+        check(got, render(scene, camera, time))
+    assert renderer.memory_bytes > 1000
+
+
+def test_folding_is_exact_where_nothing_moves_and_close_where_it_does() -> None:
+    still, moving = tiny_scene(6, dynamic=False), tiny_scene(4)
+    check(Renderer(gl.context(), still, folded=True).render(CAMERAS["outside"], 0.0), render(still, CAMERAS["outside"], 0.0))
+    renderer = Renderer(gl.context(), moving, folded=True)
+    for time in (0.2, 0.7):
+        error = renderer.render(CAMERAS["outside"], time).rgb - render(moving, CAMERAS["outside"], time).rgb
+        assert -10 * np.log10(np.mean(error**2)) > 40
+    renderer.folded = False
+    check(renderer.render(CAMERAS["outside"], 0.7), render(moving, CAMERAS["outside"], 0.7))
+
+
+def test_shows_every_look_and_part_on_a_screen_of_another_size() -> None:
+    ctx, scene = gl.context(), tiny_scene(4)
+    screen = ctx.framebuffer([ctx.texture((70, 50), 4)])
+    renderer, pictures = Renderer(ctx, scene), {}
+    for look in Look:
+        for part in Part:
+            renderer.show(screen, CAMERAS["outside"], 0.62, part=part, look=look, depths=(2.0, 4.0), most_samples=20.0)
+            pictures[look, part] = np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(50, 70, 3)[::-1]
+    renderer.check()
+    for (look, part), picture in pictures.items():
+        assert picture.std() > 3, (look, part)
+    whole = np.frombuffer((render(scene, CAMERAS["outside"].resized(70, 50), 0.62).rgb * 255).astype(np.uint8), np.uint8)
+    assert np.mean(np.abs(pictures[Look.COLOUR, Part.FULL].astype(float).ravel() - whole)) < 6  # a stretched, filtered copy
+
+
+def test_a_scene_too_large_for_the_card_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    ctx = gl.context()
+    monkeypatch.setitem(ctx.info, "GL_MAX_TEXTURE_SIZE", 64)
+    with pytest.raises(DisplayError, match="--backend reference"):
+        Renderer(ctx, tiny_scene(4, resolution=(200, 200, 200)))
+
+
+def test_an_error_of_the_card_is_told() -> None:
+    class Card:
+        error = "GL_OUT_OF_MEMORY"
+        info = {"GL_RENDERER": "some card"}
+
+    renderer = Renderer(gl.context(), tiny_scene(4))
+    renderer.ctx = Card()
+    with pytest.raises(DisplayError, match=r"GL_OUT_OF_MEMORY on some card; .*smaller size"):
+        renderer.check()

@@ -1,0 +1,60 @@
+import re
+
+import gl
+import numpy as np
+import pytest
+
+from kpc.format.errors import DisplayError
+from kpc.player import shader
+
+
+def test_includes_come_once_and_lines_keep_their_numbers() -> None:
+    written = {"a": '#include "b"\nint a;\n#include "c"  // why\nint bad;\n', "b": "int b;\n", "c": '#include "b"\nint c;\n'}
+    text, files = shader.compose("a", {"N": 3}, written=written)
+    assert files == ["a", "b", "c"]
+    assert text.count("int b;") == 1 and "#define N 3\n" in text and "#include" not in text
+    assert text.index("#version") == 0
+    where, number = {}, 0
+    for line in text.splitlines():
+        if found := re.match(r"#line (\d+)$", line):
+            number = int(found[1])
+        else:
+            where[line] = files[number // shader.LINES_A_FILE], number % shader.LINES_A_FILE
+            number += 1
+    assert where["int b;"] == ("b", 1) and where["int a;"] == ("a", 2) and where["int c;"] == ("c", 2)
+    assert where["int bad;"] == ("a", 4)
+
+
+def test_a_missing_file_is_named() -> None:
+    with pytest.raises(ValueError, match="nowhere"):
+        shader.compose("a", written={"a": '#include "nowhere.glsl"'})
+
+
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "fullscreen.glsl"])
+def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
+    text, files = shader.compose(name, written={"decoder_weights": ""}, preamble=shader.ES30)
+    assert text.startswith("#version 300 es\n") and text.count("#version") == 1
+    assert len(set(files)) == len(files)
+
+
+@pytest.mark.parametrize("log", [
+    "0:10012(5): error: `x' undeclared",                # Mesa
+    "0(10012) : error C1503: undefined variable \"x\"",  # NVIDIA
+    "ERROR: 0:10012: 'x' : undeclared identifier",      # Intel, Apple, ANGLE
+])
+def test_compiler_messages_name_the_file(log: str) -> None:
+    assert re.match(r"shader march\.glsl:12: .*(undeclared|undefined)", shader.first_complaint(f"\nFragment\n{log}\n", ["a.glsl", "march.glsl"]))
+
+
+def test_a_broken_shader_is_one_error_with_its_place() -> None:
+    written = {"main": '#include "part"\nout vec4 o;\nvoid main() { o = vec4(part()); }\n', "part": "\nfloat part() { return wrong; }\n"}
+    with pytest.raises(DisplayError, match=r"shader part:2: .*wrong.*driver"):
+        shader.build(gl.context(), "main", written=written)
+
+
+def test_constants_are_exact() -> None:
+    values = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32)
+    text = shader.constants({"w": values})
+    assert text.startswith("const vec4 w[3] = vec4[3](vec4(")
+    numbers = re.findall(r"-?\d\.\d+e[+-]\d+", text)
+    assert np.array_equal(np.array(numbers, np.float32).reshape(3, 4), values)
