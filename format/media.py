@@ -1,8 +1,8 @@
 """Videos through ffmpeg, pictures through Pillow and OpenEXR.
 
-Colour. Whatever a file's tags say about matrix, range and chroma layout, `read_video` gives R'G'B' in [0, 255]. Where the
-tags are silent, players' custom is followed: limited range, BT.601 below 720 lines and BT.709 from there on. HDR transfer curves (PQ, HLG)
-are refused rather than shown wrong.
+Colour. Whatever a file's tags say about matrix, range and chroma layout, `read_video` gives R'G'B' in [0, 255]. Where
+the tags are silent, players' custom is followed: limited range, BT.601 below 720 lines and BT.709 from there on. HDR
+transfer curves (PQ, HLG) are refused rather than shown wrong.
 """
 
 import contextlib
@@ -64,7 +64,9 @@ def ffmpeg_binary() -> str:
     try:
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except RuntimeError as error:
-        raise MediaError("ffmpeg: no binary on PATH nor in imageio-ffmpeg; install ffmpeg (Debian: apt install ffmpeg)") from error
+        raise MediaError(
+            "ffmpeg: no binary on PATH nor in imageio-ffmpeg; install ffmpeg (Debian: apt install ffmpeg)"
+        ) from error
 
 
 def probe(path: str | os.PathLike[str]) -> VideoInfo:
@@ -75,7 +77,9 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
     """
     _require_file(path)
     stream = ffmpeg.input(_url(path)).output("pipe:", format="null", codec="copy", map="0:V:0")
-    command = stream.global_args("-nostdin", "-hide_banner", "-nostats", "-progress", "pipe:1").compile(cmd=ffmpeg_binary())
+    command = stream.global_args("-nostdin", "-hide_banner", "-nostats", "-progress", "pipe:1").compile(
+        cmd=ffmpeg_binary()
+    )
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
     said = done.stderr.decode(errors="replace")
     found = _STREAM.search(said)
@@ -88,12 +92,21 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
     turned = re.search(r"rotation of (-?\d+)", said[found.end() : _end_of_stream(said, found.end())])
     if turned and int(turned[1]) % 180 == 90:
         width, height = height, width
-    return VideoInfo(width, height, int(counts[-1]), _fps(found["rest"]), pix_fmt, _matrix(pix_fmt, tags, height),
-                     "pc" in re.split(r"[,\s]+", tags) or pix_fmt.startswith("yuvj"))
+    return VideoInfo(
+        width,
+        height,
+        int(counts[-1]),
+        _fps(found["rest"]),
+        pix_fmt,
+        _matrix(pix_fmt, tags, height),
+        "pc" in re.split(r"[,\s]+", tags) or pix_fmt.startswith("yuvj"),
+    )
 
 
-def read_video(path: str | os.PathLike[str], info: VideoInfo | None = None, limit: int | None = None) -> Iterator[np.ndarray]:
-    """Decode a video: uint8 (height, width, 3) frames, the first `limit` of them, each coded frame once whatever its time stamp.
+def read_video(
+    path: str | os.PathLike[str], info: VideoInfo | None = None, limit: int | None = None
+) -> Iterator[np.ndarray]:
+    """Decode a video: its first `limit` frames, uint8 (height, width, 3), each coded one once whatever its time stamp.
 
     Raises:
         MediaError: ffmpeg fails or complains, or the file ends inside a frame.
@@ -101,7 +114,11 @@ def read_video(path: str | os.PathLike[str], info: VideoInfo | None = None, limi
     info = info or probe(path)
     rgb = info.matrix == "rgb"
     video = ffmpeg.input(_url(path))["V:0"].filter(
-        "scale", info.width, info.height, flags=_SCALE_FLAGS, out_range="full",
+        "scale",
+        info.width,
+        info.height,
+        flags=_SCALE_FLAGS,
+        out_range="full",
         **({} if rgb else {"in_color_matrix": info.matrix, "in_range": "full" if info.full_range else "limited"}),
     )
     size = {} if limit is None else {"vframes": limit}
@@ -127,7 +144,7 @@ def read_video(path: str | os.PathLike[str], info: VideoInfo | None = None, limi
 
 
 def write_video(
-    path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float, *, crf: int = 18, pix_fmt: str = "yuv420p",
+    path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float, *, crf: int = 18, pix_fmt: str = "yuv420p"
 ) -> int:
     """Code uint8 (height, width, 3) frames as H.264, tagged BT.709 limited range; the number of frames written.
 
@@ -143,8 +160,9 @@ def write_video(
     height, width = first.shape[:2]
     even = 1 if pix_fmt.startswith("yuv444") else 2
     pad = ((0, -height % even), (0, -width % even), (0, 0))
-    raw = ffmpeg.input("pipe:", format="rawvideo", pix_fmt="rgb24", framerate=fps,
-                       video_size=(width + pad[1][1], height + pad[0][1]))
+    raw = ffmpeg.input(
+        "pipe:", format="rawvideo", pix_fmt="rgb24", framerate=fps, video_size=(width + pad[1][1], height + pad[0][1])
+    )
     scaled = raw.filter("scale", flags=_SCALE_FLAGS, out_color_matrix="bt709", out_range="limited")
     tags = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
     count = 0
@@ -156,8 +174,10 @@ def write_video(
         try:
             for frame in itertools.chain([first], frames):
                 if frame.shape != first.shape or frame.dtype != np.uint8:
-                    raise MediaError(f"{path}: frame {count} is {frame.dtype} {frame.shape}, the first uint8 {first.shape}")
-                process.stdin.write(np.ascontiguousarray(np.pad(frame, pad, mode="edge")))
+                    raise MediaError(
+                        f"{path}: frame {count} is {frame.dtype} {frame.shape}, the first uint8 {first.shape}"
+                    )
+                process.stdin.write(np.pad(frame, pad, mode="edge").tobytes())
                 count += 1
             process.stdin.close()
             code = process.wait()
@@ -169,7 +189,9 @@ def write_video(
             with contextlib.suppress(BrokenPipeError):
                 process.stdin.close()
         if code != 0:
-            raise MediaError(f"{path}: ffmpeg cannot write it ({_last_words(_read_log(log))}); it needs libx264 and free disk space")
+            raise MediaError(
+                f"{path}: ffmpeg cannot write it ({_last_words(_read_log(log))}); it needs libx264 and free disk space"
+            )
     return count
 
 
@@ -189,8 +211,8 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int, bool]:
 def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """A PNG, JPEG or EXR as uint8 (height, width, 3), or 4 channels with straight alpha where the file has it.
 
-    An EXIF orientation is not applied: poses and intrinsics belong to the pixels as stored. An EXR holds linear light with
-    associated alpha: its colours are divided by alpha and sent through the sRGB curve, [0, 1] onto [0, 255], and clipped there.
+    An EXIF orientation is not applied: poses and intrinsics belong to the pixels as stored. An EXR holds linear light
+    with associated alpha: its colours are divided by alpha, clipped to [0, 1] and sent through the sRGB curve.
 
     Raises:
         MediaError: the file is missing, damaged or of another kind.
@@ -205,11 +227,14 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
 def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> None:
     """Write uint8 (height, width, 3 or 4) as PNG or JPEG, by the suffix."""
     with written_aside(path) as aside:
-        Image.fromarray(pixels).save(aside, **({"quality": 95} if aside.suffix.lower() in (".jpg", ".jpeg") else {}))
+        Image.fromarray(pixels).save(aside, quality=95)  # of JPEG; PNG knows no such thing
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
-    """The sRGB transfer curve (IEC 61966-2-1) on values clipped to [0, 1]: 12.92 x, then 1.055 x^(1/2.4) - 0.055 from 0.0031308 on."""
+    """The sRGB transfer curve (IEC 61966-2-1) on values clipped to [0, 1]; NaN counts as 0.
+
+    12.92 x up to 0.0031308, from there on 1.055 x^(1/2.4) - 0.055
+    """
     clipped = np.clip(np.nan_to_num(linear), 0.0, 1.0)
     return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * np.power(clipped, 1 / 2.4) - 0.055)
 
@@ -224,7 +249,9 @@ _STREAM = re.compile(
 @functools.cache
 def _each_frame_once() -> dict[str, str]:
     """The option that keeps ffmpeg from dropping or doubling frames to hold a rate; it was renamed in version 5.1."""
-    said = subprocess.run([ffmpeg_binary(), "-hide_banner", "-h", "long"], stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    said = subprocess.run(
+        [ffmpeg_binary(), "-hide_banner", "-h", "long"], stdin=subprocess.DEVNULL, capture_output=True, check=False
+    )
     return {"fps_mode" if b"-fps_mode" in said.stdout else "vsync": "passthrough"}
 
 
@@ -270,24 +297,26 @@ def _read_exr(path: str | os.PathLike[str]) -> np.ndarray:
     return np.rint(np.concatenate([srgb_from_linear(straight), alpha], axis=-1) * 255).astype(np.uint8)
 
 
-class _image_errors(warnings.catch_warnings):
-    """Turns what Pillow and OpenEXR raise about `path` into a MediaError."""
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        super().__init__(action="ignore")  # a large picture is not worth a warning
-        self.path = path
-
-    def __enter__(self) -> None:
-        _require_file(self.path)
-        super().__enter__()
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: object) -> None:
-        super().__exit__(kind, value, trace)
-        if isinstance(value, PermissionError):
-            raise MediaError(f"{self.path}: no permission to read it; chmod it or run as its owner") from value
-        damaged = (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, KeyError, RuntimeError, TypeError)
-        if isinstance(value, damaged):
-            raise MediaError(f"{self.path}: not a picture that can be read ({value}); export or copy it anew") from value
+@contextlib.contextmanager
+def _image_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what Pillow and OpenEXR raise about `path` into a MediaError."""
+    _require_file(path)
+    try:
+        with warnings.catch_warnings(action="ignore"):  # a large picture is not worth a warning
+            yield
+    except PermissionError as error:
+        raise MediaError(f"{path}: no permission to read it; chmod it or run as its owner") from error
+    except (
+        UnidentifiedImageError,
+        Image.DecompressionBombError,
+        OSError,
+        SyntaxError,
+        ValueError,
+        KeyError,
+        RuntimeError,
+        TypeError,
+    ) as error:
+        raise MediaError(f"{path}: not a picture that can be read ({error}); export or copy it anew") from error
 
 
 def _is_exr(path: str | os.PathLike[str]) -> bool:
@@ -312,5 +341,7 @@ def _read_log(log: IO[bytes]) -> str:
 
 def _last_words(said: str) -> str:
     lines = [line.strip() for line in said.splitlines() if line.strip()]
-    errors = [line for line in lines if re.search(r"error|invalid|denied|no such|not found|partial|corrupt|fail", line, re.I)]
+    errors = [
+        line for line in lines if re.search(r"error|invalid|denied|no such|not found|partial|corrupt|fail", line, re.I)
+    ]
     return re.sub(r"^\[[^]]*\]\s*", "", (errors or lines or ["it ends early"])[0])[:160]

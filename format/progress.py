@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -16,18 +16,19 @@ LINE_EVERY_S = 10.0
 class Progress:
     """Shows how far a task of `total` units is; used as a context manager, fed by `advance`.
 
-        with Progress("decode", total=300, unit="frame") as progress:
-            progress.advance()
-            progress.note("psnr 27.1")
+    with Progress("decode", total=300, unit="frame") as progress:
+        progress.advance()
+        progress.note("psnr 27.1")
     """
 
     def __init__(self, label: str, total: float | None = None, unit: str = "", *, shown: bool = True) -> None:
         self.label, self.total, self.unit, self.shown = label, total, unit, shown
         self.done, self.text = 0.0, ""
         self.started = self.said = time.monotonic()
-        self.bar = tqdm(total=total, desc=label, unit=unit or "it", leave=False, file=sys.stderr,
-                        bar_format="{l_bar}{bar}| {n:.0f}/{total:.0f} [{elapsed}<{remaining}]{postfix}" if total else None,
-                        ) if shown and sys.stderr.isatty() else None
+        self.bar = None
+        if shown and sys.stderr.isatty():
+            layout = "{l_bar}{bar}| {n:.0f}/{total:.0f} [{elapsed}<{remaining}]{postfix}" if total else None
+            self.bar = tqdm(total=total, desc=label, unit=unit or "it", leave=False, file=sys.stderr, bar_format=layout)
 
     def advance(self, count: float = 1) -> None:
         """`count` more units are done."""
@@ -46,7 +47,9 @@ class Progress:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self.bar is not None:
             self.bar.close()
 
@@ -60,9 +63,11 @@ class Progress:
         print(", ".join(parts + ([self.text] if self.text else [])), file=sys.stderr, flush=True)
 
 
-def progress(items: Iterable[T], label: str, total: int | None = None, unit: str = "", *, shown: bool = True) -> Iterator[T]:
+def progress(
+    items: Iterable[T], label: str, total: int | None = None, unit: str = "", *, shown: bool = True
+) -> Iterator[T]:
     """Pass `items` on and show how many have been used."""
-    if total is None and hasattr(items, "__len__"):
+    if total is None and isinstance(items, Sized):
         total = len(items)
     with Progress(label, total, unit, shown=shown) as bar:
         for item in items:

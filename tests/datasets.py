@@ -73,7 +73,13 @@ def write_blender(folder: Path, dynamic: bool = True, alpha: bool = True) -> Non
         for k, camera in enumerate(ring(count, width=20, height=20)):
             time = k / (count - 1)
             write_image(folder / split / f"r_{k:03d}.png", picture(camera, time if dynamic else 0.0, alpha))
-            frames.append({"file_path": f"./{split}/r_{k:03d}", "rotation": 0.0, "transform_matrix": camera.camera_to_world.tolist()})
+            frames.append(
+                {
+                    "file_path": f"./{split}/r_{k:03d}",
+                    "rotation": 0.0,
+                    "transform_matrix": camera.camera_to_world.tolist(),
+                }
+            )
             if dynamic:
                 frames[-1]["time"] = time
         angle = 2 * np.arctan(20 / 2 / camera.fl_x)

@@ -1,4 +1,4 @@
-"""Every layout is recognised by its content and read to the cameras and pixels that wrote it; every fault is one line."""
+"""Every layout is recognised by its content and read to the cameras and pixels it is of; every fault is one line."""
 
 import errno
 import json
@@ -59,7 +59,9 @@ def test_n3dv(tmp_path: Path) -> None:
         error = dataset.pixels.picture(n).astype(float) - make.picture(camera, float(p.time[n]))
         assert np.abs(error).mean() < 2  # crf 1, and half a step of each of Y, Cb, Cr
     said = dataset.describe()
-    assert all(word in said for word in ("N3DV", "3 cameras", "12 pictures of 32x24", "cam00", "dynamic, 4 frames at 8 fps")), said
+    assert all(
+        word in said for word in ("N3DV", "3 cameras", "12 pictures of 32x24", "cam00", "dynamic, 4 frames at 8 fps")
+    ), said
 
 
 def test_rays_are_those_of_the_pinhole_camera(tmp_path: Path) -> None:
@@ -72,7 +74,9 @@ def test_rays_are_those_of_the_pinhole_camera(tmp_path: Path) -> None:
         np.testing.assert_allclose(directions, expected_directions, atol=1e-6)
 
 
-@pytest.mark.parametrize("holdout, tests", [(None, {"cam00"}), ("none", set()), ("cam02", {"cam02"}), ("cam01.mp4", {"cam01"})])
+@pytest.mark.parametrize(
+    "holdout, tests", [(None, {"cam00"}), ("none", set()), ("cam02", {"cam02"}), ("cam01.mp4", {"cam01"})]
+)
 def test_holdout_of_videos(tmp_path: Path, holdout: str | None, tests: set[str]) -> None:
     make.write_n3dv(tmp_path / "set")
     dataset = load(tmp_path / "set", holdout=holdout)
@@ -146,8 +150,15 @@ def test_nerfstudio_holds_out_every_eighth(tmp_path: Path) -> None:
 
 def test_nerfstudio_split_time_and_depths(tmp_path: Path) -> None:
     names = [f"images/{k:04d}.png" for k in range(10)]
-    make.write_nerfstudio(tmp_path / "set", times=[k / 9 for k in range(10)], near=0.5, far=4.5, fps=12,
-                          train_filenames=names[:7], test_filenames=["./" + names[8]])
+    make.write_nerfstudio(
+        tmp_path / "set",
+        times=[k / 9 for k in range(10)],
+        near=0.5,
+        far=4.5,
+        fps=12,
+        train_filenames=names[:7],
+        test_filenames=["./" + names[8]],
+    )
     dataset = load(tmp_path / "set")
     p = dataset.pictures
     assert p.file == (*names[:7], names[8])  # 7 and 9 are in neither list
@@ -198,7 +209,13 @@ def test_equal_times_are_a_static_scene(tmp_path: Path) -> None:
 
 def test_fewer_frames_in_one_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = make.write_n3dv(tmp_path / "set")
-    write_video(tmp_path / "set" / "cam01.mp4", (make.picture(rig[1], t) for t in (0, 1 / 3)), make.FPS, crf=1, pix_fmt="yuv444p")
+    write_video(
+        tmp_path / "set" / "cam01.mp4",
+        (make.picture(rig[1], t) for t in (0, 1 / 3)),
+        make.FPS,
+        crf=1,
+        pix_fmt="yuv444p",
+    )
     dataset = load(tmp_path / "set")
     assert dataset.clip.frame_count == 2 and len(dataset.pictures) == 6
     assert dataset.pictures.time.tolist() == [0, 1] * 3
@@ -301,10 +318,20 @@ def test_videos_at_different_rates(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "key, value, words",
     [
-        ("fl_x", 0.0, "focal length"), ("fl_x", None, "fl_x"), ("fl_x", "long", "fl_x"), ("w", 0, "empty"), ("h", 99, "another shape"),
-        ("frames", [], "no frames"), ("frames", "none", "no frames"), ("camera_model", "OPENCV_FISHEYE", "OPENCV_FISHEYE"),
-        ("k3", 0.5, "k3" ), ("train_filenames", 3, "train_filenames"), ("test_filenames", [1], "test_filenames"), ("fps", 0, "fps"),
-        ("frames", [{"file_path": "images/0000.png"}], "transform_matrix"), ("frames", [7], "frame 0"),
+        ("fl_x", 0.0, "focal length"),
+        ("fl_x", None, "fl_x"),
+        ("fl_x", "long", "fl_x"),
+        ("w", 0, "empty"),
+        ("h", 99, "another shape"),
+        ("frames", [], "no frames"),
+        ("frames", "none", "no frames"),
+        ("camera_model", "OPENCV_FISHEYE", "OPENCV_FISHEYE"),
+        ("k3", 0.5, "k3"),
+        ("train_filenames", 3, "train_filenames"),
+        ("test_filenames", [1], "test_filenames"),
+        ("fps", 0, "fps"),
+        ("frames", [{"file_path": "images/0000.png"}], "transform_matrix"),
+        ("frames", [7], "frame 0"),
     ],
 )
 def test_malformed_transforms(tmp_path: Path, key: str, value: object, words: str) -> None:
@@ -312,8 +339,17 @@ def test_malformed_transforms(tmp_path: Path, key: str, value: object, words: st
     fails(tmp_path / "set", "transforms.json", *([words] if words != "k3" else ["beyond k1 k2 p1 p2"]))
 
 
-@pytest.mark.parametrize("pose", [[[1, 2], [3, 4]], "text", np.zeros((4, 4)).tolist(), (np.eye(4) * np.nan).tolist(), [[1], [2, 3]],
-                                  np.diag([-1.0, 1, 1, 1]).tolist()])
+@pytest.mark.parametrize(
+    "pose",
+    [
+        [[1, 2], [3, 4]],
+        "text",
+        np.zeros((4, 4)).tolist(),
+        (np.eye(4) * np.nan).tolist(),
+        [[1], [2, 3]],
+        np.diag([-1.0, 1, 1, 1]).tolist(),
+    ],
+)
 def test_malformed_pose(tmp_path: Path, pose: object) -> None:
     make.write_nerfstudio(tmp_path / "set", images=3)
     make.edit_json(tmp_path / "set" / "transforms.json", lambda d: d["frames"][1].update(transform_matrix=pose))
@@ -327,7 +363,9 @@ def test_broken_json(tmp_path: Path, text: str) -> None:
     fails(tmp_path / "set", "transforms.json")
 
 
-@pytest.mark.parametrize("name", ["../secret.png", "/etc/secret.png", "images/../../secret.png", "..\\secret.png", "a\0b"])
+@pytest.mark.parametrize(
+    "name", ["../secret.png", "/etc/secret.png", "images/../../secret.png", "..\\secret.png", "a\0b"]
+)
 def test_file_path_must_not_leave_the_folder(tmp_path: Path, name: str) -> None:
     make.write_nerfstudio(tmp_path / "set", images=3)
     write_image(tmp_path / "secret.png", make.picture(make.ring(1)[0]))
@@ -499,7 +537,9 @@ def test_shrinking_weighs_colours_by_alpha() -> None:
     blocks = picture.reshape(4, 2, 4, 2, 4).astype(float)
     alpha = blocks[..., 3:].sum((1, 3))
     with np.errstate(invalid="ignore"):
-        exact = np.where(alpha > 0, (blocks[..., :3] * blocks[..., 3:]).sum((1, 3)) / alpha, blocks[..., :3].mean((1, 3)))
+        exact = np.where(
+            alpha > 0, (blocks[..., :3] * blocks[..., 3:]).sum((1, 3)) / alpha, blocks[..., :3].mean((1, 3))
+        )
     small = shrunk(picture, 2)
     assert np.abs(small[..., :3] - exact).max() <= 0.5
     assert np.abs(small[..., 3:] - alpha / 4).max() <= 0.5

@@ -22,7 +22,7 @@ PATCH = 16
 
 
 def patches(rng: np.random.Generator) -> np.ndarray:
-    """8 x 4 patches of flat colour, uint8 (64, 128, 3); flat, so that subsampled chroma keeps them but for the seams."""
+    """8 x 4 patches of flat colour, uint8 (64, 128, 3): subsampled chroma keeps flat ones but for the seams."""
     colours = rng.integers(0, 256, (4, 8, 3), dtype=np.uint8)
     colours[0, :5] = [(0, 0, 0), (255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255)]
     return colours.repeat(PATCH, 0).repeat(PATCH, 1)
@@ -47,11 +47,28 @@ def yuv(rgb: np.ndarray, matrix: str, full: bool, bits: int, subsampled: bool) -
     return b"".join(np.clip(np.rint(p), 0, top).astype(kind).tobytes() for p in (luma, *chroma))
 
 
-def encode(path: Path, raw: bytes, pix_fmt: str, *, matrix: str | None, full: bool | None, codec: str = "ffv1", frames: int = 1) -> None:
+def encode(
+    path: Path, raw: bytes, pix_fmt: str, *, matrix: str | None, full: bool | None, codec: str = "ffv1", frames: int = 1
+) -> None:
     """A lossless video of raw planes, tagged as told and not converted."""
     tags = [f"colorspace={'smpte170m' if matrix == 'bt601' else matrix}"] if matrix else []
     tags += [f"range={'pc' if full else 'tv'}"] if full is not None else []
-    command = [ffmpeg_binary(), "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", pix_fmt, "-s", "128x64", "-r", "10", "-i", "pipe:"]
+    command = [
+        ffmpeg_binary(),
+        "-v",
+        "error",
+        "-y",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        pix_fmt,
+        "-s",
+        "128x64",
+        "-r",
+        "10",
+        "-i",
+        "pipe:",
+    ]
     command += ["-vf", "setparams=" + ":".join(tags)] if tags else []
     command += ["-color_range", "pc" if full else "tv"] if full is not None else []
     command += ["-c:v", codec, *(["-qp", "0"] if codec == "libx264" else []), str(path)]
@@ -59,8 +76,8 @@ def encode(path: Path, raw: bytes, pix_fmt: str, *, matrix: str | None, full: bo
 
 
 def tolerance(matrix: str, full: bool, bits: int) -> float:
-    """Half a step of each of Y, Cb, Cr carried through the inverse matrix to the channel that feels it most, half a level for
-    rounding the result, and one for the fixed-point arithmetic of swscale."""
+    """Half a step of each of Y, Cb, Cr carried through the inverse matrix to the channel that feels it most, half a
+    level for rounding the result, and one for the fixed-point arithmetic of swscale."""
     kr, kb = LUMA[matrix]
     fine = 2 ** (bits - 8)
     luma, chroma = (1.0, 1.0) if full else (255 / 219, 255 / 224)
@@ -85,7 +102,15 @@ def test_tags_are_honoured(tmp_path: Path, matrix: str, full: bool, pix_fmt: str
 @pytest.mark.parametrize("matrix, full", [("bt601", True), ("bt709", False), ("bt601", False), ("bt709", True)])
 def test_tags_of_h264_are_honoured(tmp_path: Path, matrix: str, full: bool) -> None:
     rgb = patches(np.random.default_rng(2))
-    encode(tmp_path / "x.mp4", yuv(rgb, matrix, full, 8, True), "yuv420p", matrix=matrix, full=full, codec="libx264", frames=3)
+    encode(
+        tmp_path / "x.mp4",
+        yuv(rgb, matrix, full, 8, True),
+        "yuv420p",
+        matrix=matrix,
+        full=full,
+        codec="libx264",
+        frames=3,
+    )
     frames = list(read_video(tmp_path / "x.mp4"))
     assert len(frames) == 3
     for frame in frames:
@@ -104,14 +129,68 @@ def test_untagged_small_video_is_limited_bt601(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "pix_fmt, tags, height, matrix",
     [
-        ("yuv420p", "progressive", 719, "bt601"), ("yuv420p", "progressive", 720, "bt709"), ("yuv420p", "", 1080, "bt709"),
-        ("yuv420p", "tv, smpte170m/unknown/unknown, progressive", 1080, "bt601"), ("yuv420p", "tv, bt709, progressive", 100, "bt709"),
-        ("yuvj420p", "pc, bt470bg/unknown/unknown", 1080, "bt601"), ("yuv420p10le", "tv, bt2020nc/bt2020/bt709", 100, "bt2020"),
-        ("gbrp", "pc, gbr/unknown/unknown", 100, "rgb"), ("rgb24", "", 100, "rgb"),
+        ("yuv420p", "progressive", 719, "bt601"),
+        ("yuv420p", "progressive", 720, "bt709"),
+        ("yuv420p", "", 1080, "bt709"),
+        ("yuv420p", "tv, smpte170m/unknown/unknown, progressive", 1080, "bt601"),
+        ("yuv420p", "tv, bt709, progressive", 100, "bt709"),
+        ("yuvj420p", "pc, bt470bg/unknown/unknown", 1080, "bt601"),
+        ("yuv420p10le", "tv, bt2020nc/bt2020/bt709", 100, "bt2020"),
+        ("gbrp", "pc, gbr/unknown/unknown", 100, "rgb"),
+        ("rgb24", "", 100, "rgb"),
     ],
 )
 def test_matrix_from_ffmpegs_words(pix_fmt: str, tags: str, height: int, matrix: str) -> None:
     assert media._matrix(pix_fmt, tags, height) == matrix
+
+
+def test_hdr_is_refused(tmp_path: Path) -> None:
+    raw = yuv(patches(np.random.default_rng(3)), "bt709", False, 10, True)
+    command = [
+        ffmpeg_binary(),
+        "-v",
+        "error",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "yuv420p10le",
+        "-s",
+        "128x64",
+        "-i",
+        "pipe:",
+        "-vf",
+        "setparams=color_trc=smpte2084:colorspace=bt2020nc:color_primaries=bt2020",
+        "-c:v",
+        "ffv1",
+        str(tmp_path / "x.mkv"),
+    ]
+    subprocess.run(command, input=raw, check=True, capture_output=True)
+    with pytest.raises(MediaError, match="HDR"):
+        probe(tmp_path / "x.mkv")
+
+
+def test_display_rotation_is_applied(tmp_path: Path) -> None:
+    rgb = np.zeros((32, 64, 3), np.uint8)
+    rgb[:, :16] = 255
+    write_video(tmp_path / "x.mp4", [rgb] * 2, 10, crf=1)
+    turn = [
+        ffmpeg_binary(),
+        "-v",
+        "error",
+        "-display_rotation",
+        "90",
+        "-i",
+        str(tmp_path / "x.mp4"),
+        "-c",
+        "copy",
+        str(tmp_path / "y.mp4"),
+    ]
+    if subprocess.run(turn, check=False, capture_output=True).returncode != 0:
+        pytest.skip("this ffmpeg cannot write a rotation")
+    info = probe(tmp_path / "y.mp4")
+    assert (info.width, info.height) == (32, 64)
+    frame = next(read_video(tmp_path / "y.mp4"))
+    assert {frame[:12].mean() > 200, frame[-12:].mean() > 200} == {True, False}
 
 
 def test_rgb_video_is_exact(tmp_path: Path) -> None:
@@ -121,8 +200,16 @@ def test_rgb_video_is_exact(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame, rgb)
 
 
-@pytest.mark.parametrize("rest, fps", [(", 29.97 fps, 30 tbr", 30000 / 1001), (", 23.98 fps", 24000 / 1001), (", 25 fps", 25), (", 12.5 fps", 12.5),
-                                       (", 15 tbr", 15)])
+@pytest.mark.parametrize(
+    "rest, fps",
+    [
+        (", 29.97 fps, 30 tbr", 30000 / 1001),
+        (", 23.98 fps", 24000 / 1001),
+        (", 25 fps", 25),
+        (", 12.5 fps", 12.5),
+        (", 15 tbr", 15),
+    ],
+)
 def test_frame_rate(rest: str, fps: float) -> None:
     assert media._fps(rest) == pytest.approx(fps, rel=1e-12)
 
@@ -156,7 +243,10 @@ def test_damaged_videos_are_media_errors(tmp_path: Path) -> None:
     write_video(good, [rng.integers(0, 256, (64, 64, 3), dtype=np.uint8) for _ in range(12)], 10)
     data = good.read_bytes()
     for name, damaged in {
-        "empty.mp4": b"", "text.mp4": b"no video at all\n" * 50, "head.mp4": data[:200], "cut.mp4": data[: len(data) * 6 // 10],
+        "empty.mp4": b"",
+        "text.mp4": b"no video at all\n" * 50,
+        "head.mp4": data[:200],
+        "cut.mp4": data[: len(data) * 6 // 10],
         "hole.mp4": data[: len(data) // 2] + bytes(8000) + data[len(data) // 2 + 8000 :],
     }.items():
         path = tmp_path / name
@@ -231,7 +321,9 @@ def test_exr_goes_through_the_srgb_curve(tmp_path: Path) -> None:
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"RGB": OpenEXR.Channel(linear.copy())}) as exr:
         exr.write(str(tmp_path / "x.exr"))
-    with OpenEXR.File(header, {"RGBA": OpenEXR.Channel(np.concatenate([linear * alpha[..., None], alpha[..., None]], axis=2))}) as exr:
+    with OpenEXR.File(
+        header, {"RGBA": OpenEXR.Channel(np.concatenate([linear * alpha[..., None], alpha[..., None]], axis=2))}
+    ) as exr:
         exr.write(str(tmp_path / "a.exr"))
     expected = np.rint(255 * srgb_from_linear(linear))
     np.testing.assert_array_equal(read_image(tmp_path / "x.exr"), expected)
@@ -243,7 +335,11 @@ def test_exr_goes_through_the_srgb_curve(tmp_path: Path) -> None:
 
 
 def test_srgb_curve_at_known_points() -> None:
-    np.testing.assert_allclose(srgb_from_linear(np.array([-1, 0, 0.0031308, 0.2140411, 1, 5, np.nan])), [0, 0, 0.0404499, 0.5, 1, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(
+        srgb_from_linear(np.array([-1, 0, 0.0031308, 0.2140411, 1, 5, np.nan])),
+        [0, 0, 0.0404499, 0.5, 1, 1, 0],
+        atol=1e-6,
+    )
 
 
 @pytest.mark.parametrize("name", ["x.png", "x.jpg", "x.exr"])
@@ -251,7 +347,9 @@ def test_damaged_images_are_media_errors(tmp_path: Path, name: str) -> None:
     with pytest.raises(MediaError, match="no such file"):
         read_image(tmp_path / name)
     if name == "x.exr":
-        with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": OpenEXR.Channel(np.ones((40, 40, 3), np.float32))}) as exr:
+        with OpenEXR.File(
+            {"type": OpenEXR.scanlineimage}, {"RGB": OpenEXR.Channel(np.ones((40, 40, 3), np.float32))}
+        ) as exr:
             exr.write(str(tmp_path / name))
     else:
         write_image(tmp_path / name, np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8))

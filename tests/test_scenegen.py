@@ -1,4 +1,4 @@
-"""The default scene: its files load, its cameras see what they should, shortcuts change nothing, the seed decides all."""
+"""The default scene: its files load, its cameras see what they should, shortcuts change nothing, the seed rules."""
 
 import hashlib
 import json
@@ -52,14 +52,18 @@ def test_the_ball_is_where_the_poses_say(folder: Path, tmp_path: Path) -> None:
     for n in range(len(p)):
         picture = dataset.pixels.picture(n).astype(float)
         column, row = project(dataset.camera(n), movers(float(p.time[n]))[0].centre)
-        coral = (picture[..., 0] > 120) & (picture[..., 0] > 1.6 * picture[..., 1]) & (picture[..., 0] > 1.6 * picture[..., 2])
+        coral = (
+            (picture[..., 0] > 120)
+            & (picture[..., 0] > 1.6 * picture[..., 1])
+            & (picture[..., 0] > 1.6 * picture[..., 2])
+        )
         j, i = np.nonzero(coral)
         assert len(i) >= 4
         assert np.hypot(i.mean() + 0.5 - column, j.mean() + 0.5 - row) < 1.5
 
 
 def test_surfaces_lie_between_near_and_far(folder: Path, tmp_path: Path) -> None:
-    """March the loader's own rays: depth along the axis stays inside poses_bounds' near and far, which are not slack."""
+    """March the loader's own rays: depth along the axis stays inside near and far, and far is not slack."""
     dataset = load_dataset(folder, tmp_path, progress=False)
     p = dataset.pictures
     for n in range(0, len(p), 3):
@@ -94,11 +98,12 @@ def test_distance_functions_never_overstep() -> None:
 
 @pytest.mark.parametrize("time", [0.0, 0.4])
 def test_shortcuts_change_nothing(monkeypatch: pytest.MonkeyPatch, time: float) -> None:
-    """Giving every thing a bounding sphere as large as the room turns culling off; at most the sampling of penumbras differs."""
+    """Bounding spheres as large as the room turn culling off; at most the sampling of penumbras differs."""
     quick = Film(rig(TINY)[0], TINY).picture(time)
     small = movers
-    monkeypatch.setattr(scenegen, "movers", lambda t: tuple(
-        scenegen.Mover(m.centre, 6.0, m.distance, m.materials) for m in small(t)))
+    monkeypatch.setattr(
+        scenegen, "movers", lambda t: tuple(scenegen.Mover(m.centre, 6.0, m.distance, m.materials) for m in small(t))
+    )
     slow = Film(rig(TINY)[0], TINY).picture(time)
     difference = np.abs(quick.astype(int) - slow)
     assert difference.max() <= 12 and (difference > 2).mean() < 0.01
@@ -117,17 +122,28 @@ def test_both_things_move_and_the_rest_stands_still() -> None:
 
 
 def test_the_seed_decides_everything(folder: Path, tmp_path: Path) -> None:
-    assert scenegen.main([str(tmp_path / "again"), "--cameras", "3", "--frames", "3", "--size", "40x30", "--samples", "1"]) == 0
+    assert (
+        scenegen.main([str(tmp_path / "again"), "--cameras", "3", "--frames", "3", "--size", "40x30", "--samples", "1"])
+        == 0
+    )
     assert digests(tmp_path / "again") == digests(folder)
-    first, second = (Film(rig(o)[1], o).picture(0.0) for o in (TINY, Options(seed=1, cameras=3, width=40, height=30, samples=1)))
+    first, second = (
+        Film(rig(o)[1], o).picture(0.0) for o in (TINY, Options(seed=1, cameras=3, width=40, height=30, samples=1))
+    )
     assert (first != second).any()
 
 
 def digests(folder: Path) -> dict[str, str]:
-    return {str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest() for f in sorted(folder.rglob("*")) if f.is_file()}
+    return {
+        str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest()
+        for f in sorted(folder.rglob("*"))
+        if f.is_file()
+    }
 
 
-@pytest.mark.parametrize("arguments", [["--size", "big"], ["--size", "4x4"], ["--cameras", "1"], ["--frames", "0"], ["--fps", "0"]])
+@pytest.mark.parametrize(
+    "arguments", [["--size", "big"], ["--size", "4x4"], ["--cameras", "1"], ["--frames", "0"], ["--fps", "0"]]
+)
 def test_usage_errors(tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert scenegen.main([str(tmp_path / "x"), *arguments]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -7,8 +7,9 @@ cameras the rig does not have:
     poses_bounds.npy      N x 17, the LLFF convention
     gt/cameras.json       unseen cameras (and cam00), OpenGL camera-to-world, with times; gt/*.png what they see
 
-The scene is given by distance functions and ray marched in numpy: no download, no OpenGL. World: metres, z up. What stands
-still is marched once a camera; a frame then touches only rays, shadows and reflections that something moving can reach.
+The scene is given by distance functions and ray marched in numpy: no download, no OpenGL. World: metres, z up. What
+stands still is marched once a camera; a frame then touches only rays, shadows and reflections that something moving can
+reach.
 """
 
 import argparse
@@ -108,14 +109,23 @@ def movers(time: float) -> tuple[Mover, ...]:
     """The ball (two bounces a clip) and the ring (half a turn a clip, so that the clip loops)."""
     radius = 0.2
     bounce = (2 * time) % 1.0
-    ball = np.array([0.1 + 0.3 * math.sin(2 * math.pi * time), -0.38 + 0.12 * math.cos(2 * math.pi * time),
-                     radius + 4 * 0.5 * bounce * (1 - bounce)], np.float32)
+    ball = np.array(
+        [
+            0.1 + 0.3 * math.sin(2 * math.pi * time),
+            -0.38 + 0.12 * math.cos(2 * math.pi * time),
+            radius + 4 * 0.5 * bounce * (1 - bounce),
+        ],
+        np.float32,
+    )
     ring, angle = np.array([0.28, 0.92, 0.82], np.float32), math.pi * time
     bead = ring + np.array([0, 0, 0.09 * math.sin(2 * math.pi * time)], np.float32)
 
     def ring_distance(p: np.ndarray) -> np.ndarray:
         x, y, z = p - ring[:, None]
-        u, v = x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)), y * np.float32(math.cos(angle)) - x * np.float32(math.sin(angle))
+        u, v = (
+            x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)),
+            y * np.float32(math.cos(angle)) - x * np.float32(math.sin(angle)),
+        )
         across = np.maximum(np.abs(np.hypot(u, z) - 0.31) - 0.03, 0)
         along = np.maximum(np.abs(v) - 0.06, 0)
         return np.hypot(across, along) - 0.025
@@ -128,11 +138,18 @@ def movers(time: float) -> tuple[Mover, ...]:
 
     return (
         Mover(ball, radius, ball_distance, ((BALL, ball_distance),)),
-        Mover(ring, 0.4, lambda p: np.minimum(ring_distance(p), bead_distance(p)), ((RING, ring_distance), (BEAD, bead_distance))),
+        Mover(
+            ring,
+            0.4,
+            lambda p: np.minimum(ring_distance(p), bead_distance(p)),
+            ((RING, ring_distance), (BEAD, bead_distance)),
+        ),
     )
 
 
-def _rounded_cylinder(x: np.ndarray, y: np.ndarray, z: np.ndarray, radius: float, half_height: float, edge: float) -> np.ndarray:
+def _rounded_cylinder(
+    x: np.ndarray, y: np.ndarray, z: np.ndarray, radius: float, half_height: float, edge: float
+) -> np.ndarray:
     across, along = np.hypot(x, y) - (radius - edge), np.abs(z) - (half_height - edge)
     outside = np.hypot(np.maximum(across, 0), np.maximum(along, 0))
     return outside + np.minimum(np.maximum(across, along), 0) - edge
@@ -192,7 +209,12 @@ class Paint:
             return self._ball(p, time)
         if material == RING:
             return np.broadcast_to(np.array([[0.80], [0.47], [0.06]], np.float32), p.shape)
-        colour = {VASE: (0.012, 0.10, 0.115), STAND: (0.09, 0.09, 0.10), BEAD: (0.07, 0.30, 0.42), BOARD: (0.80, 0.77, 0.70)}[material]
+        colour = {
+            VASE: (0.012, 0.10, 0.115),
+            STAND: (0.09, 0.09, 0.10),
+            BEAD: (0.07, 0.30, 0.42),
+            BOARD: (0.80, 0.77, 0.70),
+        }[material]
         return np.broadcast_to(np.array(colour, np.float32)[:, None], p.shape)
 
     def _floor(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -214,7 +236,11 @@ class Paint:
         wall = _mix((0.24, 0.37, 0.40), (0.29, 0.43, 0.46), _smooth(z, 0.6, 2.0))
         sun = _smooth(np.hypot(x - 0.72, z - 1.28), 0.33, 0.35)
         wall = _mix_arrays(np.array([[0.80], [0.33], [0.13]], np.float32), wall, sun)
-        hills = ((0.92, 0.20, 1.9, 0.3, (0.58, 0.40, 0.20)), (0.66, 0.16, 2.6, 1.9, (0.25, 0.32, 0.17)), (0.38, 0.12, 2.1, 4.0, (0.06, 0.15, 0.15)))
+        hills = (
+            (0.92, 0.20, 1.9, 0.3, (0.58, 0.40, 0.20)),
+            (0.66, 0.16, 2.6, 1.9, (0.25, 0.32, 0.17)),
+            (0.38, 0.12, 2.1, 4.0, (0.06, 0.15, 0.15)),
+        )
         for height, swing, rate, phase, colour in hills:
             line = height + swing * np.sin(rate * x + phase + 0.7 * self.seed)
             wall = _mix_arrays(np.array(colour, np.float32)[:, None], wall, _smooth(z - line, -0.012, 0.012))
@@ -228,7 +254,9 @@ class Paint:
         u = x * math.cos(turn) + y * math.sin(turn)
         height = (0.85 * z + 0.52 * u).astype(np.float32)
         bands = _smooth(np.abs(np.abs(height) - 0.36), 0.10, 0.16)
-        return _mix_arrays(np.array([[0.82], [0.75], [0.60]], np.float32), np.array([[0.78], [0.13], [0.075]], np.float32), bands)
+        return _mix_arrays(
+            np.array([[0.82], [0.75], [0.60]], np.float32), np.array([[0.78], [0.13], [0.075]], np.float32), bands
+        )
 
     def noise(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Value noise in [-1, 1], smooth, one feature a unit."""
@@ -243,7 +271,12 @@ class Paint:
 
     def _hash(self, i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
         """A number in [0, 1) for each triple of whole numbers."""
-        h = i.astype(np.int64) * 73856093 ^ j.astype(np.int64) * 19349663 ^ k.astype(np.int64) * 83492791 ^ (self.seed + 1) * 2654435761
+        h = (
+            i.astype(np.int64) * 73856093
+            ^ j.astype(np.int64) * 19349663
+            ^ k.astype(np.int64) * 83492791
+            ^ (self.seed + 1) * 2654435761
+        )
         h = (h ^ h >> 13) * 1274126177 & 0xFFFFFFFF
         return ((h ^ h >> 16) & 0xFFFF).astype(np.float32) / np.float32(65536)
 
@@ -273,7 +306,9 @@ GLOSS = {VASE: (0.05, 1.0), BALL: (0.035, 0.0), RING: (0.05, 0.0), BEAD: (0.05, 
 """Materials that shine: reflectance head-on, and whether they mirror the room too."""
 
 
-def march(distance: Distance, origins: np.ndarray, directions: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def march(
+    distance: Distance, origins: np.ndarray, directions: np.ndarray, start: np.ndarray, end: np.ndarray
+) -> np.ndarray:
     """Walk along rays (3, N) from `start` to the first surface before `end`: (N,), infinite where there is none."""
     t = start.astype(np.float32)
     found = np.full(t.shape, np.inf, np.float32)
@@ -361,7 +396,11 @@ class Buffer:
             return None
         n, d = self.n[:, which], self.directions[:, which]
         on = d - 2 * n * (n * d).sum(0)
-        return which, _fresnel(GLOSS[VASE][0], n, d), Buffer(self.paint, self.p[:, which] + n * np.float32(0.01), on, mirrors=False)
+        return (
+            which,
+            _fresnel(GLOSS[VASE][0], n, d),
+            Buffer(self.paint, self.p[:, which] + n * np.float32(0.01), on, mirrors=False),
+        )
 
     def frame(self, time: float) -> np.ndarray:
         """Linear colours (3, N) at a time in [0, 1]."""
@@ -369,8 +408,15 @@ class Buffer:
         lit = self.plain.copy()
         touched, seen, open_ = _moving_light(things, self.p, self.n)
         if touched.size:
-            lit[:, touched] = shade(self.material[touched], self.p[:, touched], self.n[:, touched], self.albedo[:, touched],
-                                    self.directions[:, touched], self.seen[touched] * seen, self.open[touched] * open_)
+            lit[:, touched] = shade(
+                self.material[touched],
+                self.p[:, touched],
+                self.n[:, touched],
+                self.albedo[:, touched],
+                self.directions[:, touched],
+                self.seen[touched] * seen,
+                self.open[touched] * open_,
+            )
         if self.mirror is not None:
             which, share, beyond = self.mirror
             lit[:, which] += share * beyond.frame(time)
@@ -378,14 +424,22 @@ class Buffer:
         for thing in things:
             start, end = _span(thing, self.origins, self.directions)
             rays = np.flatnonzero(start < np.minimum(end, nearest))
-            t = march(thing.distance, self.origins[:, rays], self.directions[:, rays], start[rays], np.minimum(end, nearest)[rays])
+            t = march(
+                thing.distance,
+                self.origins[:, rays],
+                self.directions[:, rays],
+                start[rays],
+                np.minimum(end, nearest)[rays],
+            )
             rays, t = rays[np.isfinite(t)], t[np.isfinite(t)]
             if rays.size:
                 nearest[rays] = t
                 lit[:, rays] = self._thing(things, thing, time, rays, t)
         return lit
 
-    def _thing(self, things: tuple[Mover, ...], thing: Mover, time: float, rays: np.ndarray, t: np.ndarray) -> np.ndarray:
+    def _thing(
+        self, things: tuple[Mover, ...], thing: Mover, time: float, rays: np.ndarray, t: np.ndarray
+    ) -> np.ndarray:
         """Colours of a moving thing where rays meet it."""
         d = self.directions[:, rays]
         p = self.origins[:, rays] + d * t
@@ -404,7 +458,12 @@ class Buffer:
 
 
 def shade(
-    material: np.ndarray, p: np.ndarray, n: np.ndarray, albedo: np.ndarray, directions: np.ndarray, seen: np.ndarray,
+    material: np.ndarray,
+    p: np.ndarray,
+    n: np.ndarray,
+    albedo: np.ndarray,
+    directions: np.ndarray,
+    seen: np.ndarray,
     open_: np.ndarray,
 ) -> np.ndarray:
     """Linear colour (3, N): a warm lamp with shadows, a cool sky, light thrown back by the floor, and highlights."""
@@ -427,7 +486,11 @@ def shade(
 
 def _fresnel(head_on: float, n: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Schlick's approximation."""
-    return head_on + (0.75 - head_on) * (1 - np.clip(-(n * d).sum(0), 0, 1)) ** 5 + np.float32(0.12 if head_on == GLOSS[VASE][0] else 0)
+    return (
+        head_on
+        + (0.75 - head_on) * (1 - np.clip(-(n * d).sum(0), 0, 1)) ** 5
+        + np.float32(0.12 if head_on == GLOSS[VASE][0] else 0)
+    )
 
 
 def _to_light(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -442,7 +505,9 @@ def _still_shadow(p: np.ndarray, n: np.ndarray) -> np.ndarray:
     lit = np.flatnonzero((n * to_light).sum(0) > 0)
     seen = np.zeros(p.shape[1], np.float32)
     start = p[:, lit] + n[:, lit] * np.float32(0.01)
-    seen[lit] = shadow(still_furniture, start, to_light[:, lit], np.minimum(length[lit], 4.0), np.zeros(lit.size, np.float32))
+    seen[lit] = shadow(
+        still_furniture, start, to_light[:, lit], np.minimum(length[lit], 4.0), np.zeros(lit.size, np.float32)
+    )
     return seen
 
 
@@ -516,13 +581,18 @@ def rig(options: Options) -> list[Camera]:
         across = -11 + 22 * k / max(others - 1, 1)
         up = 5.5 if k % 2 else -5.5
         azimuth, elevation = (across, up) + rng.uniform(-0.5, 0.5, 2)
-        cameras.append(_at(CENTRAL[0] + azimuth, CENTRAL[1] + elevation, CENTRAL[2] + rng.uniform(-0.05, 0.05), options))
+        cameras.append(
+            _at(CENTRAL[0] + azimuth, CENTRAL[1] + elevation, CENTRAL[2] + rng.uniform(-0.05, 0.05), options)
+        )
     return cameras
 
 
 def unseen(options: Options) -> list[Camera]:
     """Four cameras between those of the rig."""
-    return [_at(CENTRAL[0] + a, CENTRAL[1] + e, CENTRAL[2], options) for a, e in ((-6.3, 1.5), (5.1, 2.8), (8.0, -1.2), (-2.2, -3.4))]
+    return [
+        _at(CENTRAL[0] + a, CENTRAL[1] + e, CENTRAL[2], options)
+        for a, e in ((-6.3, 1.5), (5.1, 2.8), (8.0, -1.2), (-2.2, -3.4))
+    ]
 
 
 class Film:
@@ -542,11 +612,15 @@ class Film:
         return np.rint(255 * shown.reshape(3, h, s, w, s).mean((2, 4))).astype(np.uint8).transpose(1, 2, 0)
 
     def depths(self) -> tuple[float, float]:
-        """Least and greatest depth along the optical axis, over the clip: the ball comes nearest in the middle of the room."""
+        """Least and greatest depth along the optical axis, over the clip."""
         forward = -self.camera.camera_to_world[:3, 2]
         depth = self.buffer.t * (self.buffer.directions.T @ forward.astype(np.float32))
         centre = self.camera.camera_to_world[:3, 3]
-        near = min(float((thing.centre - centre) @ forward) - thing.radius for t in np.linspace(0, 1, 64) for thing in movers(t))
+        near = min(
+            float((thing.centre - centre) @ forward) - thing.radius
+            for t in np.linspace(0, 1, 64)
+            for thing in movers(t)
+        )
         return min(near, float(depth.min())), float(depth.max())
 
 
@@ -561,7 +635,9 @@ def generate(target: str | os.PathLike[str], options: Options) -> None:
     times = [k / max(options.frames - 1, 1) for k in range(options.frames)]
     filmed, extra = rig(options), unseen(options)
     stills = sorted({0, options.frames // 4, options.frames // 2, 3 * options.frames // 4, options.frames - 1})
-    jobs = [(camera, options, folder, f"cam{k:02d}", times, stills if k == 0 else []) for k, camera in enumerate(filmed)]
+    jobs = [
+        (camera, options, folder, f"cam{k:02d}", times, stills if k == 0 else []) for k, camera in enumerate(filmed)
+    ]
     jobs += [(camera, options, folder, f"novel{k:02d}", [], stills[1:-1] or stills) for k, camera in enumerate(extra)]
     with ProcessPoolExecutor(min(os.cpu_count() or 1, len(jobs)), multiprocessing.get_context("spawn")) as pool:
         depths = list(progress(pool.map(_film, jobs), "filming", len(jobs), "camera"))
@@ -569,9 +645,15 @@ def generate(target: str | os.PathLike[str], options: Options) -> None:
     with cli.written_aside(folder / "poses_bounds.npy") as aside:
         np.save(aside, np.array(rows))
     frames = [
-        {"file": f"{name}_f{k:03d}.png", "time": k / max(options.frames - 1, 1), "frame": k, "camera": name,
-         "transform_matrix": camera.camera_to_world.tolist()}
-        for camera, _, _, name, _, pictures in jobs for k in pictures
+        {
+            "file": f"{name}_f{k:03d}.png",
+            "time": k / max(options.frames - 1, 1),
+            "frame": k,
+            "camera": name,
+            "transform_matrix": camera.camera_to_world.tolist(),
+        }
+        for camera, _, _, name, _, pictures in jobs
+        for k in pictures
     ]
     c = filmed[0]
     document = {"w": c.width, "h": c.height, "fl_x": c.fl_x, "fl_y": c.fl_y, "cx": c.cx, "cy": c.cy, "frames": frames}
@@ -592,7 +674,7 @@ def _film(job: tuple[Camera, Options, Path, str, list[float], list[int]]) -> tup
 
 
 def _poses_bounds(camera: Camera, least: float, greatest: float) -> np.ndarray:
-    """LLFF's 17 numbers: [down right backwards centre | (h w f)] by rows, then 0.9 of the least and 1.1 of the greatest depth."""
+    """LLFF's 17 numbers: [down right backwards centre | (h w f)] by rows, 0.9 of the least, 1.1 of the largest depth."""
     right, up, back, centre = camera.camera_to_world[:3].T
     columns = np.stack([-up, right, back, centre, [camera.height, camera.width, camera.fl_x]], axis=1)
     return np.concatenate([columns.ravel(), [0.9 * least, 1.1 * greatest]])
@@ -604,21 +686,38 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     default = Options()
-    parser = argparse.ArgumentParser("scenegen", description="Write the embedded default scene: posed videos and ground truth.")
+    parser = argparse.ArgumentParser(
+        "scenegen", description="Write the embedded default scene: posed videos and ground truth."
+    )
     parser.add_argument("folder", metavar="DIR", help="where to write; made if need be")
-    parser.add_argument("--seed", type=int, default=default.seed, help="of textures and of the rig's jitter (default %(default)s)")
+    parser.add_argument(
+        "--seed", type=int, default=default.seed, help="of textures and of the rig's jitter (default %(default)s)"
+    )
     parser.add_argument("--cameras", type=int, default=default.cameras, help="in the rig (default %(default)s)")
     parser.add_argument("--frames", type=int, default=default.frames, help="of the clip (default %(default)s)")
-    parser.add_argument("--size", default=f"{default.width}x{default.height}", help="of a picture, WxH (default %(default)s)")
+    parser.add_argument(
+        "--size", default=f"{default.width}x{default.height}", help="of a picture, WxH (default %(default)s)"
+    )
     parser.add_argument("--fps", type=float, default=default.fps, help="frames a second (default %(default)s)")
-    parser.add_argument("--samples", type=int, default=default.samples, help="rays across a pixel (default %(default)s)")
+    parser.add_argument(
+        "--samples", type=int, default=default.samples, help="rays across a pixel (default %(default)s)"
+    )
     given = parser.parse_args(argv)
     try:
         width, height = (int(n) for n in given.size.lower().split("x"))
     except ValueError as error:
         raise UsageError(f"--size {given.size}: write it as 192x144") from error
-    if given.cameras < 2 or given.frames < 1 or given.samples < 1 or min(width, height) < 8 or not given.fps > 0 or given.seed < 0:
-        raise UsageError("at least 2 cameras, 1 frame, 1 sample, 8x8 pixels, a positive fps and a seed from 0 are needed")
+    if (
+        given.cameras < 2
+        or given.frames < 1
+        or given.samples < 1
+        or min(width, height) < 8
+        or not given.fps > 0
+        or given.seed < 0
+    ):
+        raise UsageError(
+            "at least 2 cameras, 1 frame, 1 sample, 8x8 pixels, a positive fps and a seed from 0 are needed"
+        )
     generate(given.folder, Options(given.seed, given.cameras, given.frames, width, height, given.fps, given.samples))
     print(given.folder)
 

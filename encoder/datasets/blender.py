@@ -15,7 +15,7 @@ def recognise(path: Path) -> bool:
 
 
 def read(path: Path, holdout: str | None) -> Capture:
-    """Trained on the train split, tested on the test split (val where there is no other); all train with holdout "none".
+    """Trains on the train split, tests on the test split (val where there is no other); holdout "none" trains on all.
 
     Raises:
         DatasetError, MediaError: a split or an image cannot be used.

@@ -12,7 +12,7 @@ from kpc.format.errors import DatasetError
 from kpc.format.media import VideoInfo, image_size
 
 HOLD_OUT_EVERY = 8
-"""Where neither the dataset nor the user names test images, every eighth is one (the custom of LLFF, arXiv:1905.00889)."""
+"""Where neither the dataset nor the user names test images, every eighth is one (LLFF's custom, arXiv:1905.00889)."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,17 @@ class Capture:
 
 
 def image_view(
-    file: Path, *, where: str, time: float | None, is_test: bool, declared: tuple[float, float] | None,
-    intrinsics: tuple[float, float, float, float], distortion: tuple[float, float, float, float],
-    camera_to_world: np.ndarray, near: float, far: float,
+    file: Path,
+    *,
+    where: str,
+    time: float | None,
+    is_test: bool,
+    declared: tuple[float, float] | None,
+    intrinsics: tuple[float, float, float, float],
+    distortion: tuple[float, float, float, float],
+    camera_to_world: np.ndarray,
+    near: float,
+    far: float,
 ) -> View:
     """A view of an image. `declared` is the raster that the intrinsics belong to, None for the image's own."""
     width, height, has_alpha = image_size(file)
@@ -64,7 +72,10 @@ def image_view(
 
 
 def fit_intrinsics(
-    where: str, file: Path, intrinsics: tuple[float, float, float, float], declared: tuple[float, float],
+    where: str,
+    file: Path,
+    intrinsics: tuple[float, float, float, float],
+    declared: tuple[float, float],
     actual: tuple[int, int],
 ) -> tuple[float, float, float, float]:
     """Scale fl_x fl_y cx cy from the declared raster to the actual one, each axis on its own.
@@ -126,5 +137,7 @@ def held_out(path: Path, names: Sequence[str], holdout: str | None, default: Ite
     chosen = [holdout in (name, Path(name).name, Path(name).stem) for name in names]
     if not any(chosen):
         some = ", ".join(Path(name).stem for name in names[:4])
-        raise DatasetError(f"{path}: nothing is named {holdout!r} to hold out; there are {some}{' ...' if len(names) > 4 else ''}")
+        raise DatasetError(
+            f"{path}: nothing is named {holdout!r} to hold out; there are {some}{' ...' if len(names) > 4 else ''}"
+        )
     return chosen

@@ -8,7 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import HOLD_OUT_EVERY, Capture, View, check_pose, fit_intrinsics, held_out, natural_key
+from kpc.encoder.datasets.capture import (
+    HOLD_OUT_EVERY,
+    Capture,
+    View,
+    check_pose,
+    fit_intrinsics,
+    held_out,
+    natural_key,
+)
 from kpc.format.errors import DatasetError
 from kpc.format.media import IMAGE_SUFFIXES, VIDEO_SUFFIXES, image_size, probe
 

@@ -17,7 +17,7 @@ def recognise(path: Path) -> bool:
 
 
 def read(path: Path, holdout: str | None) -> Capture:
-    """Split by `train_filenames` and `test_filenames` (or `val_filenames`); else every eighth image that exists is for testing.
+    """Split by `train_filenames` and `test_filenames` (or `val_filenames`); else every eighth existing image tests.
 
     Raises:
         DatasetError, MediaError: the JSON or an image cannot be used.

@@ -21,7 +21,7 @@ MAPPED_BYTES = 1 << 30
 """Up to this size the cache is mapped into memory, and may all become resident; a larger one is read pixel by pixel."""
 
 VERIFIED_BYTES = 256 << 20
-"""How much of a cache is checked against its CRCs when it is opened: all of a small one, an even sample of a large one."""
+"""How much of a cache is held against its CRCs as it is opened: all of a small one, an even sample of a large one."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Tile:
 class PixelCache:
     """A flat file of uint8 pixels, `stored_channels` bytes each, picture after picture, row by row.
 
-    A mapping that is read at random drags whole pages in, up to 2 MB for three bytes (kernels with large folios), and all of them
-    count as resident. A file larger than `MAPPED_BYTES` is therefore read with pread, which keeps nothing: about 1 us a
-    pixel, where the mapping takes 0.1.
+    A mapping that is read at random drags whole pages in, up to 2 MB for three bytes (kernels with large folios), and
+    all of them count as resident. A file larger than `MAPPED_BYTES` is therefore read with pread, which keeps nothing:
+    about 1 us a pixel, where the mapping takes 0.1.
     """
 
     def __init__(self, path: Path, tiles: tuple[Tile, ...], stored_channels: int, channels: int) -> None:
@@ -99,7 +99,7 @@ def open_cache(path: Path, fingerprint: str) -> PixelCache | None:
 
 
 def build_cache(
-    path: Path, fingerprint: str, pictures: Iterable[np.ndarray], channels: int, size_bytes: int,
+    path: Path, fingerprint: str, pictures: Iterable[np.ndarray], channels: int, size_bytes: int
 ) -> PixelCache:
     """Write uint8 (height, width, 3 or 4) pictures to `path`, and what is in it to a JSON beside it.
 
@@ -114,7 +114,7 @@ def build_cache(
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _sweep(path)
-    too_small = f"{path.parent}: the disk is full: decoded pictures need {size_bytes / 1e9:.1f} GB; free some, or give --downscale 2"
+    too_small = f"{path.parent}: the disk is full: decoded pictures need {size_bytes / 1e9:.1f} GB; give --downscale 2"
     if shutil.disk_usage(path.parent).free < size_bytes:
         raise DatasetError(too_small)
     tiles: list[Tile] = []
@@ -124,12 +124,15 @@ def build_cache(
             for picture in pictures:
                 pixels = _with_channels(picture, channels)
                 is_opaque = is_opaque and (channels == 3 or bool((pixels[..., 3] == 255).all()))
-                _write_all(file.fileno(), memoryview(pixels).cast("B"))
+                _write_all(file.fileno(), pixels.data.cast("B"))
                 height, width = pixels.shape[:2]
                 tiles.append(Tile(offset, width, height, _crc(pixels)))
                 offset += width * height
+        shown = 3 if is_opaque else 4
         about = {
-            "fingerprint": fingerprint, "stored_channels": channels, "channels": 3 if is_opaque else 4,
+            "fingerprint": fingerprint,
+            "stored_channels": channels,
+            "channels": shown,
             "tiles": [asdict(tile) for tile in tiles],
         }
         with written_aside(path.with_suffix(".json")) as aside:
@@ -138,7 +141,7 @@ def build_cache(
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise DatasetError(too_small) from error
         raise
-    return PixelCache(path, tuple(tiles), channels, about["channels"])
+    return PixelCache(path, tuple(tiles), channels, shown)
 
 
 def _with_channels(picture: np.ndarray, channels: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What Blender's and nerfstudio's `transforms*.json` have in common: a camera and a list of frames that may override it."""
+"""What Blender's and nerfstudio's `transforms*.json` share: a camera and a list of frames that may override it."""
 
 import json
 import math
@@ -13,7 +13,14 @@ from kpc.encoder.datasets.capture import View, image_view
 from kpc.format.errors import DatasetError
 from kpc.format.media import IMAGE_SUFFIXES, image_size
 
-_UNSUPPORTED = {"OPENCV_FISHEYE", "EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "FISHEYE624", "ORTHOPHOTO"}
+_UNSUPPORTED = {
+    "OPENCV_FISHEYE",
+    "EQUIRECTANGULAR",
+    "OMNIDIRECTIONALSTEREO_L",
+    "OMNIDIRECTIONALSTEREO_R",
+    "FISHEYE624",
+    "ORTHOPHOTO",
+}
 
 
 def load_transforms(file: Path) -> dict[str, Any]:
@@ -43,7 +50,9 @@ def find_image(root: Path, file: Path, file_path: str) -> Path | None:
     """
     relative = os.path.normpath(file_path.replace("\\", "/"))
     if os.path.isabs(relative) or relative.split(os.sep)[0] == os.pardir or "\0" in relative:
-        raise DatasetError(f"{file}: file_path {file_path!r} leads out of the dataset's folder; make it relative to the folder")
+        raise DatasetError(
+            f"{file}: file_path {file_path!r} leads out of the dataset's folder; make it relative to the folder"
+        )
     bare = root / relative
     for candidate in (bare, *(bare.with_name(bare.name + suffix) for suffix in (*IMAGE_SUFFIXES, ".JPG", ".PNG"))):
         if candidate.suffix.lower() in IMAGE_SUFFIXES and candidate.is_file():
@@ -60,23 +69,35 @@ def frame_view(file: Path, number: int, document: dict[str, Any], image: Path, i
     where = f"{file} frame {number}"
     keys = {**{k: v for k, v in document.items() if k != "frames"}, **document["frames"][number]}
     if keys.get("camera_model") in _UNSUPPORTED or keys.get("is_fisheye"):
-        raise DatasetError(f"{where}: camera model {keys.get('camera_model', 'fisheye')} is not supported; undistort the images to a pinhole")
+        model = keys.get("camera_model", "fisheye")
+        raise DatasetError(f"{where}: camera model {model} is not supported; undistort the images to a pinhole")
     if any(_number(where, keys, k, 0.0) != 0 for k in ("k3", "k4", "k5", "k6")):
         raise DatasetError(f"{where}: distortion beyond k1 k2 p1 p2 is not supported; undistort the images")
     declared = (_number(where, keys, "w"), _number(where, keys, "h")) if "w" in keys and "h" in keys else None
     width, height = declared or image_size(image)[:2]
     fl_x = _focal(where, keys, width)
-    intrinsics = (fl_x, _number(where, keys, "fl_y", fl_x),
-                  _number(where, keys, "cx", width / 2), _number(where, keys, "cy", height / 2))
+    intrinsics = (
+        fl_x,
+        _number(where, keys, "fl_y", fl_x),
+        _number(where, keys, "cx", width / 2),
+        _number(where, keys, "cy", height / 2),
+    )
     k1, k2, p1, p2 = (_number(where, keys, k, 0.0) for k in ("k1", "k2", "p1", "p2"))
     try:
         pose = np.array(keys["transform_matrix"], np.float64)
     except (TypeError, ValueError) as error:
         raise DatasetError(f"{where}: transform_matrix is not 4x4 numbers; export it anew") from error
     return image_view(
-        image, where=where, is_test=is_test, declared=declared, intrinsics=intrinsics, distortion=(k1, k2, p1, p2),
-        camera_to_world=pose, time=_number(where, keys, "time") if keys.get("time") is not None else None,
-        near=_number(where, keys, "near", math.nan), far=_number(where, keys, "far", math.nan),
+        image,
+        where=where,
+        is_test=is_test,
+        declared=declared,
+        intrinsics=intrinsics,
+        distortion=(k1, k2, p1, p2),
+        camera_to_world=pose,
+        time=_number(where, keys, "time") if keys.get("time") is not None else None,
+        near=_number(where, keys, "near", math.nan),
+        far=_number(where, keys, "far", math.nan),
     )
 
 
