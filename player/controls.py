@@ -53,7 +53,7 @@ class View:
     def orbit(self, sideways: float, upwards: float) -> "View":
         """Drag the scene by these angles, radians: the eye goes the other way around the focus."""
         turned = _rotation(self.up, -sideways) @ self.axes
-        pitched = _rotation(turned[:, 0], -upwards) @ turned
+        pitched = _rotation(turned[:, 0], upwards) @ turned
         old, new = (math.acos(np.clip(axes[:, 2] @ self.up, -1.0, 1.0)) for axes in (turned, pitched))
         steep = min(new, math.pi - new) < STEEPEST and min(new, math.pi - new) < min(old, math.pi - old)
         overturned = pitched[:, 1] @ self.up < 0.0 < turned[:, 1] @ self.up
@@ -66,7 +66,7 @@ class View:
 
     def zoom(self, notches: float) -> "View":
         """Come nearer by a tenth for each notch of the wheel."""
-        return replace(self, distance=float(np.clip(self.distance * 0.9**notches, 1e-4, 1e6)))
+        return replace(self, distance=float(np.clip(self.distance * 0.9 ** np.clip(notches, -100, 100), 1e-4, 1e6)))
 
     def fly(self, right: float, up: float, forward: float) -> "View":
         """Move eye and focus along the camera's own axes, world units."""

@@ -7,6 +7,8 @@
 """
 
 import argparse
+import errno
+import os
 import re
 import sys
 import time as clock
@@ -31,6 +33,7 @@ from kpc.player.reference import Part, Rendering
 
 Render = Callable[[Camera, float], Rendering]
 
+FILES = (".mp4", ".png", ".exr")
 FASTEST = 240.0
 LARGEST = 16384
 NOTHING = 65535
@@ -44,6 +47,8 @@ def main(argv: list[str] | None = None) -> int:
 def _command(argv: list[str]) -> None:
     options = _parser().parse_args(argv)
     out = Path(options.output)
+    if out.suffix.lower() in FILES and not out.absolute().parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(out.absolute().parent))
     scene = kpc.load(options.scene)
     shots = _shots(scene, options)
     if out.suffix.lower() in (".png", ".exr") and len(shots) != 1:

@@ -1,0 +1,116 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import tiny_scene
+
+from kpc.format.scene import Clip
+from kpc.player.controls import SPEEDS, Pace, Playback, View
+from kpc.player.orbit import Rig
+
+SCENE = tiny_scene(0)
+RIG = Rig.of(SCENE)
+
+
+def opening() -> View:
+    return View.of(RIG, SCENE.cameras[0])
+
+
+def project(view: View, point: np.ndarray) -> tuple[float, float]:
+    """Where a point is in the picture, in heights of it, from its middle, upwards."""
+    camera = view.camera(480, 360)
+    x, y, z = camera.camera_to_world[:3, :3].T @ (point - camera.camera_to_world[:3, 3])
+    return x / -z * camera.fl_x / 360, y / -z * camera.fl_y / 360
+
+
+def test_opens_on_exactly_what_the_camera_sees() -> None:
+    for camera in SCENE.cameras:
+        got = View.of(RIG, camera).camera(camera.width, camera.height)
+        assert got.camera_to_world == pytest.approx(camera.camera_to_world, abs=1e-12)
+        assert (got.fl_x, got.fl_y, got.cx, got.cy) == (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.floats(-4, 4), st.floats(-4, 4)), max_size=12))
+def test_orbiting_keeps_focus_distance_and_right_way_up(drags: list[tuple[float, float]]) -> None:
+    view = opening()
+    for drag in drags:
+        view = view.orbit(*drag)
+    assert view.axes.T @ view.axes == pytest.approx(np.eye(3), abs=1e-9)
+    assert np.linalg.norm(view.eye - view.focus) == pytest.approx(opening().distance)
+    assert view.axes[:, 1] @ view.up >= -1e-9
+    assert project(view, view.focus) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_orbiting_drags_the_near_side_along() -> None:
+    view = opening()
+    near = view.focus + 0.3 * view.axes[:, 2]
+    right = project(view.orbit(0.1, 0.0), near)
+    up = project(view.orbit(0.0, 0.1), near)
+    assert right[0] > 0.005 and abs(right[1]) < right[0]
+    assert up[1] > 0.005 and abs(up[0]) < 1e-9
+
+
+def test_panning_keeps_the_focus_plane_under_the_pointer() -> None:
+    view = opening()
+    assert project(view.pan(0.2, -0.1), view.focus) == pytest.approx((0.2, -0.1), abs=1e-9)
+
+
+def test_zooming_and_flying() -> None:
+    view = opening()
+    assert view.zoom(1).distance == pytest.approx(0.9 * view.distance)
+    assert view.zoom(1e6).distance > 0 and math.isfinite(view.zoom(-1e6).distance)
+    ahead = view.fly(0.0, 0.0, 0.5)
+    assert ahead.eye - view.eye == pytest.approx(-0.5 * view.axes[:, 2])
+    assert view.fly(0.2, 0.0, 0.0).eye - view.eye == pytest.approx(0.2 * view.axes[:, 0])
+
+
+def test_playing_loops_or_stops() -> None:
+    clip = Clip(21, 10.0)
+    playback = Playback(clip)
+    playback.advance(0.5)
+    assert playback.time == pytest.approx(0.25)
+    playback.speed = 2.0
+    playback.advance(1.0)
+    assert playback.time == pytest.approx(0.25)  # round once
+    playback.loop = False
+    playback.advance(100.0)
+    assert playback.time == 1.0 and not playback.playing
+    playback.toggle()
+    assert playback.playing and playback.time == 0.0
+
+
+def test_stepping_goes_to_whole_frames_and_pauses() -> None:
+    playback = Playback(Clip(11, 10.0), time=0.33)
+    playback.step(1)
+    assert playback.time == pytest.approx(0.4) and not playback.playing
+    playback.step(-100)
+    assert playback.time == 0.0
+    playback.step(100)
+    assert playback.time == 1.0
+
+
+def test_a_still_scene_has_nothing_to_play() -> None:
+    playback = Playback(Clip(1, 10.0))
+    playback.advance(5.0)
+    playback.step(1)
+    assert playback.time == 0.0
+
+
+def test_speeds() -> None:
+    playback = Playback(Clip(11, 10.0))
+    for _ in range(10):
+        playback.faster(1)
+    assert playback.speed == SPEEDS[-1]
+    playback.faster(-1)
+    assert playback.speed == SPEEDS[-2]
+
+
+@pytest.mark.parametrize(("full_s", "low", "high"), [(1.0, 0.2, 0.32), (0.001, 1.0, 1.0), (100.0, 0.125, 0.15)])
+def test_the_pace_settles_where_pictures_come_in_time(full_s: float, low: float, high: float) -> None:
+    pace = Pace(budget_s=1 / 15)
+    for _ in range(40):
+        pace.saw(full_s * pace.scale**2)
+    assert low <= pace.scale <= high

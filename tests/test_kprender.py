@@ -1,0 +1,191 @@
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import gl
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+from scenes import tiny_scene
+
+import kpc
+from kpc.format.errors import DisplayError
+from kpc.format.file import write
+from kpc.format.media import read_image, read_video
+from kpc.format.quantise import quantise_scene
+from kpc.player import offscreen, reference
+from kpc.tools import kprender
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "tiny.kpc"
+    scene = tiny_scene(4)
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    return path
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Iterator[object]:
+    def call(*arguments: object) -> tuple[int, str, str]:
+        try:
+            code = kprender.main([str(a) for a in arguments])
+        except SystemExit as error:  # argparse
+            code = int(error.code or 0)
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    yield call
+
+
+def cameras_json(path: Path, files: list[str]) -> Path:
+    scene = tiny_scene(4)
+    frames = [
+        {"file": name, "time": n / max(len(files) - 1, 1), "transform_matrix": scene.cameras[n % 2].camera_to_world.tolist()}
+        for n, name in enumerate(files)
+    ]
+    path.write_text(json.dumps({"w": 48, "h": 36, "fl_x": 55, "fl_y": 55, "cx": 24, "cy": 18, "frames": frames}))
+    return path
+
+
+@pytest.mark.parametrize("backend", ["gl", "reference"])
+def test_pictures_from_a_camera_file(run, scene_file: Path, tmp_path: Path, backend: str) -> None:
+    if backend == "gl":
+        gl.context()
+    listed = cameras_json(tmp_path / "cameras.json", ["a/one.png", "two.jpg"])
+    out = tmp_path / "new" / "out"
+    code, said, _ = run(scene_file, "--cameras", listed, "-o", out, "--backend", backend)
+    assert code == 0 and said.startswith(f"{out}: 2 pictures, 48x36")
+    assert sorted(p.name for p in out.iterdir()) == ["one.png", "two.png"]
+    scene = kpc.load(scene_file)
+    for n, name in enumerate(("one.png", "two.png")):
+        wanted = reference.render(scene, tiny_scene(4).cameras[n], float(n)).rgb
+        assert np.abs(read_image(out / name) / 255 - wanted).max() < 1.5 / 255
+
+
+def test_names_from_a_camera_file_stay_in_the_directory(run, scene_file: Path, tmp_path: Path) -> None:
+    names = ["../../escape.png", "/etc/passwd", "..\\..\\win.png", "", "..", ".hidden", "x.png", "y/x.png", "nul\0l\n.png", "n" * 400]
+    listed = cameras_json(tmp_path / "cameras.json", names)
+    out = tmp_path / "out"
+    code, _, _ = run(scene_file, "--cameras", listed, "-o", out, "--backend", "reference", "--size", "8x6")
+    assert code == 0
+    found = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()} - {"cameras.json"}
+    assert len(found) == len(names) and all(name.startswith("out/") and name.count("/") == 1 for name in found)
+    assert {"out/escape.png", "out/passwd.png", "out/win.png", "out/x.png"} <= found
+
+
+def test_exr_holds_linear_colour_and_depth(run, scene_file: Path, tmp_path: Path) -> None:
+    code, _, _ = run(scene_file, "--time", 0.4, "--backend", "reference", "-o", tmp_path / "x.exr")
+    assert code == 0
+    scene = kpc.load(scene_file)
+    wanted = reference.render(scene, scene.cameras[0], 0.4)
+    with OpenEXR.File(str(tmp_path / "x.exr"), separate_channels=True) as exr:
+        depth = np.array(exr.channels()["Z"].pixels)
+    assert np.array_equal(depth, wanted.depth) and depth.dtype == np.float32
+    assert np.abs(read_image(tmp_path / "x.exr") / 255 - wanted.rgb).max() < 1 / 255
+
+
+def test_depth_beside_a_png(run, scene_file: Path, tmp_path: Path) -> None:
+    code, _, _ = run(scene_file, "--time", 0.4, "--backend", "reference", "--depth", "-o", tmp_path / "x.png")
+    assert code == 0
+    scene = kpc.load(scene_file)
+    wanted = reference.render(scene, scene.cameras[0], 0.4).depth
+    with Image.open(tmp_path / "x_depth.png") as image:
+        unit, levels = float(image.text["depth_unit"]), np.asarray(image)
+    assert np.array_equal(levels == kprender.NOTHING, np.isinf(wanted))
+    seen = np.isfinite(wanted)
+    assert np.abs(levels[seen] * unit - wanted[seen]).max() <= unit / 2 * 1.01
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_an_orbit_becomes_a_video(run, scene_file: Path, tmp_path: Path, depth: bool) -> None:
+    out = tmp_path / "orbit.mp4"
+    code, said, _ = run(scene_file, "--orbit", 7, "--size", "64x48", "--backend", "reference", "-o", out, *["--depth"] * depth)
+    assert code == 0 and "7 frames at 10 fps" in said
+    frames = list(read_video(out))
+    assert len(frames) == 7 and frames[0].shape == (48, 64, 3)
+    assert np.abs(frames[0].astype(int) - frames[3]).mean() > 1  # it moves
+
+
+def test_the_clip_from_the_first_camera(run, scene_file: Path, tmp_path: Path) -> None:
+    code, said, _ = run(scene_file, "--backend", "reference", "-o", tmp_path / "clip.mp4", "--fps", 5)
+    assert code == 0 and "11 frames at 5 fps" in said
+
+
+def test_static_and_dynamic_only(run, scene_file: Path, tmp_path: Path) -> None:
+    pictures = {}
+    for flag in ("", "--static-only", "--dynamic-only"):
+        path = tmp_path / f"x{flag}.png"
+        assert run(scene_file, "--time", 0.4, "--backend", "reference", "-o", path, *[flag] * bool(flag))[0] == 0
+        pictures[flag] = read_image(path).astype(int)
+    difference = np.abs(pictures[""] - pictures["--static-only"])
+    assert difference.max() > 5
+    assert np.abs(difference - pictures["--dynamic-only"]).max() <= 1
+
+
+@pytest.mark.parametrize(("arguments", "code", "words"), [
+    (["{missing}", "-o", "{dir}"], 1, "missing.kpc"),
+    (["{text}", "-o", "{dir}"], 1, "text.kpc"),
+    (["{scene}", "--cameras", "{missing}", "-o", "{dir}"], 1, "missing.kpc"),
+    (["{scene}", "--cameras", "{text}", "-o", "{dir}"], 1, "not JSON"),
+    (["{scene}", "--cameras", "{empty}", "-o", "{dir}"], 1, "frames"),
+    (["{scene}", "--cameras", "{nan}", "-o", "{dir}"], 1, "NaN"),
+    (["{scene}", "--orbit", "2", "-o", "{text}/inside"], 1, "text.kpc"),
+    (["{scene}", "--orbit", "2", "-o", "{dir}/no/such/a.mp4"], 1, "no/such"),
+    (["{scene}", "--orbit", "2", "-o", "{dir}/a.png"], 2, "2 pictures do not go into one"),
+    (["{scene}", "--orbit", "0", "-o", "{dir}"], 2, "--orbit"),
+    (["{scene}", "--orbit", "x", "-o", "{dir}"], 2, "--orbit"),
+    (["{scene}", "--time", "1.5", "-o", "{dir}"], 2, "--time"),
+    (["{scene}", "--size", "0x5", "-o", "{dir}"], 2, "--size"),
+    (["{scene}", "--size", "640", "-o", "{dir}"], 2, "--size"),
+    (["{scene}", "--fps", "-1", "-o", "{dir}"], 2, "--fps"),
+    (["{scene}", "--orbit", "2", "--cameras", "x", "-o", "{dir}"], 2, "not allowed"),
+    (["{scene}"], 2, "--output"),
+])
+def test_bad_input_is_one_line(run, scene_file: Path, tmp_path: Path, arguments: list[str], code: int, words: str) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (tmp_path / "text.kpc").write_text("not a scene")
+    (tmp_path / "empty.json").write_text("{}")
+    pose = np.eye(4).tolist()
+    pose[0][3] = float("nan")
+    (tmp_path / "nan.json").write_text(json.dumps({"w": 4, "h": 4, "fl_x": 4, "frames": [{"transform_matrix": pose}]}))
+    names = {"scene": scene_file, "missing": tmp_path / "missing.kpc", "text": tmp_path / "text.kpc", "dir": out,
+             "empty": tmp_path / "empty.json", "nan": tmp_path / "nan.json"}
+    got, said, complaint = run(*[a.format(**names) for a in arguments], "--backend", "reference")
+    assert got == code and said == "" and words in complaint
+    assert "Traceback" not in complaint
+    last = [line for line in complaint.splitlines() if line.startswith("kprender:")]
+    assert len(last) >= 1 and words in last[-1]
+    assert list(out.iterdir()) == []
+
+
+def test_a_directory_that_cannot_be_written(run, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", str(tmp_path / "x.png"))
+
+    monkeypatch.setattr("kpc.format.cli.tempfile.mkstemp", refuse)
+    code, _, complaint = run(scene_file, "--time", 0, "-o", tmp_path / "x.png", "--backend", "reference")
+    assert code == 1 and complaint.splitlines()[-1] == f"kprender: {tmp_path / 'x.png'}: Permission denied"
+
+
+def test_without_opengl_the_reference_backend_is_offered(run, scene_file: Path, tmp_path: Path, monkeypatch) -> None:
+    def refuse() -> None:
+        raise DisplayError(f"no OpenGL 3.3 to be had: {offscreen.REMEDY}")
+
+    monkeypatch.setattr(offscreen, "open_context", refuse)
+    code, _, complaint = run(scene_file, "--time", 0, "-o", tmp_path / "x.png")
+    assert code == 1 and "--backend reference" in complaint and "libegl1" in complaint and complaint.count("\n") == 1
+
+
+def test_the_reference_backend_needs_no_opengl_module(scene_file: Path, tmp_path: Path) -> None:
+    program = ("import sys; sys.modules.update(moderngl=None, glfw=None, imgui_bundle=None, torch=None); "
+               "from kpc.tools.kprender import main; sys.exit(main())")
+    arguments = [str(scene_file), "--time", "0", "-o", str(tmp_path / "x.png"), "--backend", "reference"]
+    done = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, env=dict(os.environ), check=False)
+    assert done.returncode == 0, done.stderr
+    assert read_image(tmp_path / "x.png").shape == (36, 48, 3)
