@@ -674,7 +674,7 @@ def _film(job: tuple[Camera, Options, Path, str, list[float], list[int]]) -> tup
 
 
 def _poses_bounds(camera: Camera, least: float, greatest: float) -> np.ndarray:
-    """LLFF's 17 numbers: [down right backwards centre | (h w f)] by rows, 0.9 of the least, 1.1 of the largest depth."""
+    """LLFF's 17 numbers: [down right backwards centre | (h w f)], 0.9 of the least depth, 1.1 of the largest."""
     right, up, back, centre = camera.camera_to_world[:3].T
     columns = np.stack([-up, right, back, centre, [camera.height, camera.width, camera.fl_x]], axis=1)
     return np.concatenate([columns.ravel(), [0.9 * least, 1.1 * greatest]])
