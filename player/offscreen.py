@@ -1,5 +1,7 @@
 """OpenGL without a window."""
 
+from typing import Any
+
 import moderngl
 
 from kpc.format.errors import DisplayError
@@ -14,7 +16,8 @@ def open_context() -> moderngl.Context:
         DisplayError: there is none; the message says how to get one.
     """
     complaints = []
-    for backend in ({"backend": "egl"}, {}):
+    backends: tuple[dict[str, Any], ...] = ({"backend": "egl"}, {})
+    for backend in backends:
         try:
             return moderngl.create_context(require=330, standalone=True, **backend)
         except Exception as error:  # glcontext raises bare Exception, ImportError or ValueError, whatever failed

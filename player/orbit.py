@@ -51,7 +51,7 @@ class Rig:
         pose = self.cameras[0].camera_to_world
         for towards in (pose[:3, 3] - self.focus, pose[:3, 1], pose[:3, 0]):
             ahead = towards - (towards @ self.up) * self.up
-            if np.linalg.norm(ahead) > 1e-6 * max(np.linalg.norm(towards), 1e-9):
+            if np.linalg.norm(ahead) > 1e-6 * float(np.linalg.norm(towards)) + 1e-12:
                 ahead = ahead / np.linalg.norm(ahead)
                 break
         return ahead, np.cross(self.up, ahead)

@@ -67,7 +67,9 @@ class Overlay:
         width, height = framebuffer.size
         framebuffer.use()
         framebuffer.viewport = (0, 0, width, height)
-        self._program["display"].value = (data.display_size.x, data.display_size.y)
+        display = self._program["display"]
+        assert isinstance(display, moderngl.Uniform)  # for the type checker: the shader above declares it
+        display.value = (data.display_size.x, data.display_size.y)
         self.ctx.enable_only(moderngl.BLEND)
         self.ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
         scale = data.framebuffer_scale
@@ -82,7 +84,7 @@ class Overlay:
                 framebuffer.scissor = (max(x, 0), max(y, 0), w, h)
                 self._textures[command.tex_ref.get_tex_id()].use(0)
                 self._array.render(moderngl.TRIANGLES, vertices=command.elem_count, first=command.idx_offset)
-        framebuffer.scissor = None
+        framebuffer.scissor = (0, 0, width, height)
         self.ctx.enable_only(moderngl.NOTHING)
 
     def close(self) -> None:

@@ -101,9 +101,9 @@ class Renderer:
     @property
     def memory_bytes(self) -> int:
         """Bytes of the textures and buffers that hold the scene and its pictures."""
-        textures = [self._planes, self._row_texture] + [self._folded_planes] * (self._folded_planes is not None)
-        pictures = [t for target in self._targets.values() for t in (target.seen, target.met)]
-        return sum(t.width * t.height * t.components * 4 for t in textures + pictures) + self.scene.occupancy[0].size
+        textures = [self._planes, self._row_texture, *([self._folded_planes] if self._folded_planes else [])]
+        textures += [texture for target in self._targets.values() for texture in (target.seen, target.met)]
+        return sum(4 * t.width * t.height * t.components for t in textures) + int(self.scene.occupancy[0].size)
 
     def render(self, camera: Camera, time: float, *, part: Part = Part.FULL) -> Rendering:
         """What `kpc.player.reference.render` gives, by OpenGL."""
@@ -236,7 +236,7 @@ def _set(program: moderngl.Program, **values: object) -> None:
     """Set the uniforms that a program has; compilers drop those it does not use."""
     for name, value in values.items():
         member = program.get(name, None)
-        if member is not None:
+        if isinstance(member, moderngl.Uniform):
             member.value = value
 
 

@@ -4,6 +4,7 @@ import contextlib
 import time as clock
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import glfw
 import moderngl
@@ -85,7 +86,8 @@ class Window:
 
     def _context(self) -> moderngl.Context:
         failures = []
-        for backend in ({}, {"backend": "egl"}):  # glfw talks GLX to an X server and EGL to Wayland
+        backends: tuple[dict[str, Any], ...] = ({}, {"backend": "egl"})  # glfw talks GLX to an X server and EGL to Wayland
+        for backend in backends:
             try:
                 return moderngl.create_context(require=330, **backend)
             except Exception as error:  # glcontext raises bare Exception, ImportError or ValueError, whatever failed
@@ -115,11 +117,13 @@ class Window:
     @property
     def size(self) -> tuple[int, int]:
         """In the system's screen units, those of the pointer."""
-        return tuple(glfw.get_window_size(self.handle))
+        width, height = glfw.get_window_size(self.handle)
+        return width, height
 
     @property
     def pixels(self) -> tuple[int, int]:
-        return tuple(glfw.get_framebuffer_size(self.handle))
+        width, height = glfw.get_framebuffer_size(self.handle)
+        return width, height
 
     def held(self, *keys: int) -> bool:
         return any(glfw.get_key(self.handle, key) == glfw.PRESS for key in keys)
@@ -137,7 +141,7 @@ class Player:
         self.ctx = window.ctx
         self.device = self.ctx.info["GL_RENDERER"]
         software = any(word in self.device.lower() for word in SOFTWARE)
-        self.renderer = Renderer(self.ctx, scene, folded=software and scene.is_dynamic)
+        self.renderer = Renderer(self.ctx, scene)
         self.overlay = Overlay(self.ctx)
         window.io = self.overlay.io
         self.rig = Rig.of(scene)
