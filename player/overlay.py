@@ -141,6 +141,8 @@ def _style() -> None:
     style.font_size_base = 15.0
     accent = imgui.ImVec4(0.95, 0.62, 0.25, 1.0)
     style.set_color_(imgui.Col_.window_bg, imgui.ImVec4(0.06, 0.07, 0.09, 0.72))
+    style.set_color_(imgui.Col_.text_disabled, imgui.ImVec4(0.74, 0.76, 0.80, 1.0))
+    style.cell_padding = imgui.ImVec2(8, 2)
     style.set_color_(imgui.Col_.frame_bg, imgui.ImVec4(1.0, 1.0, 1.0, 0.10))
     style.set_color_(imgui.Col_.frame_bg_hovered, imgui.ImVec4(1.0, 1.0, 1.0, 0.16))
     style.set_color_(imgui.Col_.frame_bg_active, imgui.ImVec4(1.0, 1.0, 1.0, 0.20))

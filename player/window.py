@@ -402,6 +402,7 @@ class Player:
     def _key_list(self) -> None:
         width, height = self.window.size
         _place(width / 2, height / 2, 0.5, 0.5)
+        imgui.set_next_window_bg_alpha(0.95)
         with _panel("keys"):
             if imgui.begin_table("keys", 2, imgui.TableFlags_.sizing_fixed_fit):
                 for key, meaning in KEYS:
