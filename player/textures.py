@@ -6,13 +6,15 @@ import numpy as np
 
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 
+FOLDED_AXIS = {"xy": "x", "xz": "z", "yz": "y"}
+"""Along which axis of a plane a row is folded into it: each axis once."""
 FARTHEST = 255
 """Distances are stored in a byte."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Where a plane of a scale lies in the atlas: its layers of four channels side by side, each `width` texels wide."""
+    """Where a plane of a scale lies in an atlas: its layers of four channels side by side, each `width` texels wide."""
 
     scale: int
     plane: str
@@ -30,18 +32,25 @@ class Layout:
         layers: texels of four channels that a scale's features fill; the widest scale decides, others are padded with 0.
         size: (width, height) of the atlas, texels.
         blocks: scale by scale, "xy", "xz", "yz".
+        refined: texels to one of the plane's, along FOLDED_AXIS; 1 but for planes that rows are to be multiplied into.
     """
 
     scales: int
     layers: int
     size: tuple[int, int]
     blocks: tuple[Block, ...]
+    refined: int
 
     @staticmethod
-    def of(scene: Scene) -> "Layout":
+    def of(scene: Scene, refined: int = 1) -> "Layout":
         """Shelves, tallest block first, in a texture about as wide as it is high."""
         layers = max(-(-plane.shape[2] // 4) for scale in scene.scales for plane in scale.values())
-        shapes = [(s, name, *scale[name].shape[:2]) for s, scale in enumerate(scene.scales) for name in SPACE_PLANES]
+        shapes = []
+        for s, scale in enumerate(scene.scales):
+            for name in SPACE_PLANES:
+                size = {name[1]: scale[name].shape[0], name[0]: scale[name].shape[1]}
+                size[FOLDED_AXIS[name]] = refined * (size[FOLDED_AXIS[name]] - 1) + 1
+                shapes.append((s, name, size[name[1]], size[name[0]]))
         area = sum(rows * columns * layers for *_, rows, columns in shapes)
         width = max(int(np.ceil(np.sqrt(area))), max(columns * layers for *_, columns in shapes))
         placed, x, y, shelf = {}, 0, 0, 0
@@ -51,10 +60,10 @@ class Layout:
             placed[scale, name] = Block(scale, name, x, y, columns, rows)
             x, shelf = x + columns * layers, max(shelf, rows)
         blocks = tuple(placed[scale, name] for scale, name, *_ in shapes)
-        return Layout(len(scene.scales), layers, (width, y + shelf), blocks)
+        return Layout(len(scene.scales), layers, (width, y + shelf), blocks, refined)
 
     def atlas(self, scene: Scene) -> np.ndarray:
-        """(height, width, 4) float32 of all space planes."""
+        """(height, width, 4) float32 of all space planes; for a layout that is not refined."""
         out = np.zeros((self.size[1], self.size[0], 4), np.float32)
         for block in self.blocks:
             plane = scene.scales[block.scale][block.plane]

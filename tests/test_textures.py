@@ -27,6 +27,14 @@ def test_the_atlas_holds_every_plane(channels: int, scales: int) -> None:
     assert claimed.max() == 1
 
 
+def test_a_refined_layout_has_room_between_texels_along_the_folded_axis() -> None:
+    scene = tiny_scene(0)
+    coarse, fine = Layout.of(scene), Layout.of(scene, 2)
+    for a, b in zip(coarse.blocks, fine.blocks):
+        widened = a.plane in ("xy", "yz")  # x and y run along columns, z in xz along rows
+        assert (b.width, b.height) == ((2 * a.width - 1, a.height) if widened else (a.width, 2 * a.height - 1))
+
+
 def test_rows_are_the_time_planes_cut() -> None:
     scene = tiny_scene(1, channels=6)
     layout, at = Layout.of(scene), 0.43

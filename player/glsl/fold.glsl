@@ -1,19 +1,29 @@
 // Multiplies a row of a time plane into one plane of space, for a march that then needs the planes alone.
-// Exact at texels; between them the product of two interpolations becomes the interpolation of a product.
+//
+// Exact at the texels of what is written. Between them the product of two interpolations becomes the interpolation of a product; its
+// error falls with the square of the distance between texels, so that the result is written finer along the row.
+
+#include "planes.glsl"
 
 uniform sampler2D planes;
 uniform sampler2D rows;
-uniform ivec2 origin;   // of the plane's block
-uniform int width;      // of one layer
-uniform int first_row;  // line of layer 0 in `rows`
-uniform int upright;    // 1: the row runs along the plane's rows, 0: along its columns
+uniform vec2 planes_texel;
+uniform vec2 rows_texel;
+uniform vec2 source;         // the plane's block in `planes`
+uniform float source_width;  // of one layer there
+uniform vec2 origin;         // its block in what is written
+uniform float width;
+uniform vec2 shrink;         // texels of the plane to one that is written
+uniform bool upright;        // the row runs along the plane's rows, else along its columns
+uniform int axis;
+uniform int scale;
 
 layout(location = 0) out vec4 folded;
 
 void main() {
-    ivec2 at = ivec2(gl_FragCoord.xy);
-    ivec2 local = at - origin;
-    int layer = local.x / width;
-    int along = upright == 1 ? local.y : local.x - layer * width;
-    folded = texelFetch(planes, at, 0) * texelFetch(rows, ivec2(along, first_row + layer), 0);
+    vec2 local = gl_FragCoord.xy - origin;
+    float layer = floor(local.x / width);
+    vec2 position = (vec2(local.x - layer * width, local.y) - 0.5) * shrink;
+    folded = plane_layer(planes, planes_texel, source, source_width, position, int(layer))
+           * row_layer(rows, rows_texel, upright ? position.y : position.x, axis, scale, int(layer));
 }

@@ -15,7 +15,7 @@ uniform sampler2D rows;
 uniform usampler3D cells;
 uniform vec2 planes_texel;          // 1 / size of the texture
 uniform vec2 rows_texel;
-uniform vec2 origins[SCALES * 3];   // of the blocks xy, xz, yz of each scale
+uniform vec3 blocks[SCALES * 3];    // xy, xz, yz of each scale: where they begin, and the width of a layer
 uniform vec3 resolution[SCALES];    // texels along x, y, z
 uniform ivec3 cell_count;
 uniform vec3 box_low;
@@ -51,9 +51,11 @@ void find_basis(vec3 d) {
 
 vec4 feature(vec3 u, int scale, int layer) {
     vec3 p = u * (resolution[scale] - 1.0);
-    vec4 f = plane_layer(planes, planes_texel, origins[3 * scale], resolution[scale].x, p.xy, layer)
-           * plane_layer(planes, planes_texel, origins[3 * scale + 1], resolution[scale].x, p.xz, layer)
-           * plane_layer(planes, planes_texel, origins[3 * scale + 2], resolution[scale].y, p.yz, layer);
+    vec3 q = float(REFINED) * p;  // folded planes are finer along x, z and y
+    vec3 xy = blocks[3 * scale], xz = blocks[3 * scale + 1], yz = blocks[3 * scale + 2];
+    vec4 f = plane_layer(planes, planes_texel, xy.xy, xy.z, vec2(q.x, p.y), layer)
+           * plane_layer(planes, planes_texel, xz.xy, xz.z, vec2(p.x, q.z), layer)
+           * plane_layer(planes, planes_texel, yz.xy, yz.z, vec2(q.y, p.z), layer);
 #if ROWS
     f *= row_layer(rows, rows_texel, p.x, 0, scale, layer)
        * row_layer(rows, rows_texel, p.y, 1, scale, layer)
