@@ -1,0 +1,47 @@
+# Sourced by demo.sh and test.sh: makes .venv/ at the repository's root, or reuses it, and installs KPC there.
+# Bash 3.2, as macOS has it. PYTHON=... chooses the interpreter; pip's own settings choose where packages come from.
+
+cd "$(dirname "${BASH_SOURCE[0]}")/.." || exit 1
+
+fail() { echo "$(basename "$0"): $*" >&2; exit 1; }
+
+new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; }
+
+make_environment() {
+    local python="" candidate
+    for candidate in ${PYTHON:-python3.11 python3.12 python3.13 python3.14 python3}; do
+        if new_enough "$candidate"; then python=$candidate; break; fi
+    done
+    [ -n "$python" ] || fail "Python 3.11 or newer is needed: apt install python3 python3-venv (Debian 12, Ubuntu 24.04 or newer), or brew install python@3.12"
+    "$python" -c 'import ensurepip, venv' 2>/dev/null || fail "this Python lacks venv: apt install python3-venv"
+    echo "making .venv with $("$python" --version)" >&2
+    rm -rf .venv
+    "$python" -m venv .venv || fail ".venv: could not be made; is the disk full, or the folder read-only?"
+}
+
+# install EXTRAS: kpc with these extras, unless the last run installed the same. "encoder" lies within "encoder,test".
+install() {
+    local extras=$1 wanted stamp
+    new_enough .venv/bin/python || make_environment
+    wanted=$(cat pyproject.toml constraints.txt | cksum)
+    for stamp in .venv/.installed-*; do
+        case "$stamp" in *"-$extras"*) [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ] || return 0 ;; esac
+    done
+    echo "installing kpc[$extras] into .venv (the first time takes minutes: PyTorch is large)" >&2
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$extras]" >&2 ||
+        fail "pip could not install kpc[$extras]; its message above says why (no network? run this again once there is one)"
+    printf '%s\n' "$wanted" > ".venv/.installed-$extras"
+}
+
+# Whether OpenGL can be had; says in one line how to get it where not.
+has_opengl() {
+    .venv/bin/python - <<'PYTHON'
+import sys
+from kpc.format.errors import DisplayError
+from kpc.player.offscreen import open_context
+try:
+    open_context()
+except DisplayError as error:
+    sys.exit(f"{error}")
+PYTHON
+}
