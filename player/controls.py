@@ -78,7 +78,9 @@ class Playback:
     """Where a clip is.
 
     Attributes:
-        time: [0, 1] over the clip. speed: clip seconds to one real second. loop: begin again at the end, else stop there.
+        time: [0, 1] over the clip.
+        speed: clip seconds to one real second.
+        loop: begin again at the end, else stop there.
     """
 
     clip: Clip

@@ -1,8 +1,8 @@
 """kpplay: fly through a scene in a window.
 
-    kpplay scene.kpc
-    kpplay scene.kpc --size 1280x720
-    kpplay scene.kpc --frames 30 --screenshot out.png      draw so many frames, save the window, leave
+kpplay scene.kpc
+kpplay scene.kpc --size 1280x720
+kpplay scene.kpc --frames 30 --screenshot out.png      draw so many frames, save the window, leave
 """
 
 import argparse
@@ -26,7 +26,9 @@ def main(argv: list[str] | None = None) -> int:
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="kpplay", description="Fly through a .kpc scene. Press H for the keys.")
     parser.add_argument("scene", help="a .kpc file")
-    parser.add_argument("--size", type=_size, metavar="WxH", help=f"of the window (default: {HEIGHT} high, as wide as the camera)")
+    parser.add_argument(
+        "--size", type=_size, metavar="WxH", help=f"of the window (default: {HEIGHT} high, as wide as the camera)"
+    )
     parser.add_argument("--frames", type=int, metavar="N", help="leave after N frames")
     parser.add_argument("--screenshot", metavar="PNG", help="save the window when leaving")
     options = parser.parse_args(argv)

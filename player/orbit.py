@@ -1,7 +1,6 @@
 """Where to look from: what the cameras a scene was filmed with have in common, and paths that stay near them."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +37,7 @@ class Rig:
         return Rig(_focus(poses, scene.aabb.astype(np.float64)), _up(poses), cameras)
 
     def angles(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Azimuth and elevation in radians and distance of each camera, seen from the focus; the first has azimuth 0."""
+        """Azimuth, elevation (radians) and distance of each camera, seen from the focus; the first has azimuth 0."""
         offsets = np.stack([camera.camera_to_world[:3, 3] for camera in self.cameras]) - self.focus
         distance = np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
         elevation = np.arcsin(np.clip(offsets @ self.up / distance, -1, 1))
@@ -47,7 +46,7 @@ class Rig:
         return azimuth, elevation, distance
 
     def compass(self) -> tuple[np.ndarray, np.ndarray]:
-        """Two unit vectors level with the focus: towards the first camera, and to the right of that as the camera sees it."""
+        """Two level unit vectors: from the focus towards the first camera, and to the right as that camera sees it."""
         pose = self.cameras[0].camera_to_world
         for towards in (pose[:3, 3] - self.focus, pose[:3, 1], pose[:3, 0]):
             ahead = towards - (towards @ self.up) * self.up
@@ -104,8 +103,15 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 def fitted(camera: Camera, width: int, height: int) -> Camera:
     """The same view on a raster of another shape: the vertical field of view stays, square pixels stay square."""
     scale = height / camera.height
-    return Camera(width, height, camera.fl_x * scale, camera.fl_y * scale,
-                  width / 2 + (camera.cx - camera.width / 2) * scale, camera.cy * scale, camera.camera_to_world)
+    return Camera(
+        width,
+        height,
+        camera.fl_x * scale,
+        camera.fl_y * scale,
+        width / 2 + (camera.cx - camera.width / 2) * scale,
+        camera.cy * scale,
+        camera.camera_to_world,
+    )
 
 
 def _made_up(aabb: np.ndarray) -> Camera:
@@ -116,8 +122,8 @@ def _made_up(aabb: np.ndarray) -> Camera:
 
 
 def _focus(poses: np.ndarray, aabb: np.ndarray) -> np.ndarray:
-    """The point of least squared distance to the optical axes; where they meet nowhere in front of the cameras, the point of
-    the first one's axis nearest to the middle of the box."""
+    """The point of least squared distance to the optical axes; where they meet nowhere in front of the cameras, the
+    point of the first one's axis nearest to the middle of the box."""
     eyes, forward = poses[:, :3, 3], -poses[:, :3, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     total = across.sum(axis=0)
@@ -135,7 +141,7 @@ def _in_front(point: np.ndarray, eyes: np.ndarray, forward: np.ndarray) -> bool:
 
 
 def _up(poses: np.ndarray) -> np.ndarray:
-    """The direction that all cameras' right axes are level with, if they single one out; else their mean upward axis."""
+    """The direction to which all right axes are perpendicular, if they single one out; else the mean upward axis."""
     rights, mean = poses[:, :3, 0], poses[:, :3, 1].mean(axis=0)
     values, vectors = np.linalg.eigh(rights.T @ rights / len(rights))
     up = vectors[:, 0]

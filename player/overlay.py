@@ -8,25 +8,25 @@ from imgui_bundle import imgui
 
 from kpc.player import shader
 
-_VERTEX = """
+_VERTEX = f"""{shader.GL33}
 uniform vec2 display;
 in vec2 position;
 in vec2 uv;
 in vec4 colour;
 out vec2 at;
 out vec4 tint;
-void main() {
+void main() {{
     at = uv;
     tint = colour;
     gl_Position = vec4(position.x / display.x * 2.0 - 1.0, 1.0 - position.y / display.y * 2.0, 0.0, 1.0);
-}
+}}
 """
-_FRAGMENT = """
+_FRAGMENT = f"""{shader.GL33}
 uniform sampler2D sheet;
 in vec2 at;
 in vec4 tint;
 out vec4 shown;
-void main() { shown = tint * texture(sheet, at); }
+void main() {{ shown = tint * texture(sheet, at); }}
 """
 
 
@@ -44,14 +44,19 @@ class Overlay:
         imgui.get_platform_io().renderer_texture_max_height = most
         self.io.fonts.add_font_default_vector()
         _style()
-        self._program = ctx.program(vertex_shader=f"{shader.GL33}\n{_VERTEX}", fragment_shader=f"{shader.GL33}\n{_FRAGMENT}")
+        self._program = ctx.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
         self._vertices = ctx.buffer(reserve=1 << 16, dynamic=True)
         self._indices = ctx.buffer(reserve=1 << 16, dynamic=True)
         self._textures: dict[int, moderngl.Texture] = {}
         self._array = self._bind()
 
-    def begin(self, window: tuple[int, int], framebuffer: tuple[int, int], content_scale: float, seconds: float) -> None:
-        """Start a frame. Sizes in screen units and in pixels; `content_scale` is how large the system draws its text."""
+    def begin(
+        self, window: tuple[int, int], framebuffer: tuple[int, int], content_scale: float, seconds: float
+    ) -> None:
+        """Start a frame.
+
+        Sizes are in screen units and in pixels; `content_scale` is how large the system draws its text.
+        """
         ratio = framebuffer[0] / max(window[0], 1), framebuffer[1] / max(window[1], 1)
         self.io.display_size = imgui.ImVec2(*window)
         self.io.display_framebuffer_scale = imgui.ImVec2(*ratio)
@@ -96,7 +101,9 @@ class Overlay:
 
     def _bind(self) -> moderngl.VertexArray:
         layout = [(self._vertices, "2f 2f 4f1", "position", "uv", "colour")]
-        return self.ctx.vertex_array(self._program, layout, index_buffer=self._indices, index_element_size=imgui.INDEX_SIZE)
+        return self.ctx.vertex_array(
+            self._program, layout, index_buffer=self._indices, index_element_size=imgui.INDEX_SIZE
+        )
 
     def _upload(self, commands: imgui.ImDrawList) -> None:
         vertices, indices = commands.vtx_buffer, commands.idx_buffer

@@ -4,7 +4,7 @@ A ray o + t d with |d| = 1 enters the box at t_near and leaves it at t_far. Its 
 
     t_k = t_near + (k + 1/2) step,   k = 0, 1, ... while t_k < t_far,
 
-and count where the occupancy grid is set. With sigma per longest edge of the box ("extent"), front to back from trans = 1:
+and count where the occupancy grid is set. With sigma per longest edge of the box ("extent"), from trans = 1 on:
 
     alpha = 1 - exp(-sigma step / extent)      weight = trans alpha      trans <- trans - weight
 
@@ -101,8 +101,8 @@ class Moment:
     def of(scene: Scene, time: float, with_motion: bool = True) -> "Moment":
         """Cut `scene` at `time`; without motion every time plane counts as 1."""
         rows: list[dict[str, np.ndarray]] = [
-            {name[0]: linear(scale[name], time) for name in TIME_PLANES}
-            if with_motion and scene.is_dynamic else {} for scale in scene.scales
+            {name[0]: linear(scale[name], time) for name in TIME_PLANES} if with_motion and scene.is_dynamic else {}
+            for scale in scene.scales
         ]
         return Moment(tuple(rows), scene.occupancy[slot_at(scene, time)])
 

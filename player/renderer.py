@@ -1,5 +1,7 @@
 """Rendering with OpenGL 3.3: a scene becomes textures once, then each picture is one pass of `glsl/march.glsl`."""
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
@@ -18,6 +20,8 @@ REFINED = 2
 PLANES_UNIT, ROWS_UNIT, CELLS_UNIT = 0, 1, 2
 SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
 TARGETS_KEPT = 4
+CONSTANTS = 8192
+"""vec4s of decoder weights that a shader may hold, ten times what the largest preset needs; compilers choke on more."""
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
 
 
@@ -30,7 +34,6 @@ class Look(Enum):
     OCCUPANCY = 4
 
 
-
 @dataclass
 class Target:
     """What a march draws into: rgb and opacity; sum of weight t, and samples. Row 0 is the bottom of the picture."""
@@ -41,14 +44,27 @@ class Target:
 
     @staticmethod
     def of(ctx: moderngl.Context, size: tuple[int, int]) -> "Target":
-        seen, met = ctx.texture(size, 4, dtype="f4"), ctx.texture(size, 2, dtype="f4")
-        for texture in (seen, met):
-            texture.repeat_x = texture.repeat_y = False
-        return Target(seen, met, ctx.framebuffer([seen, met]))
+        with room_on(ctx, f"a picture of {size[0]}x{size[1]}"):
+            seen, met = ctx.texture(size, 4, dtype="f4"), ctx.texture(size, 2, dtype="f4")
+            for texture in (seen, met):
+                texture.repeat_x = texture.repeat_y = False
+            return Target(seen, met, ctx.framebuffer([seen, met]))
 
     def release(self) -> None:
         for thing in (self.framebuffer, self.seen, self.met):
             thing.release()
+
+
+@contextlib.contextmanager
+def room_on(ctx: moderngl.Context, what: str) -> Iterator[None]:
+    """Turns what moderngl raises while `what` is made into a DisplayError."""
+    try:
+        yield
+    except moderngl.Error as error:
+        name = ctx.info["GL_RENDERER"]
+        raise DisplayError(
+            f"{name} has no room for {what} ({error}); close other programs or use a smaller size"
+        ) from error
 
 
 def is_software(ctx: moderngl.Context) -> bool:
@@ -59,8 +75,9 @@ def is_software(ctx: moderngl.Context) -> bool:
 class Renderer:
     """A scene on the graphics card.
 
-    `folded`: multiply the rows of the time planes into the space planes once a frame, instead of sampling them beside the
-    planes at every sample. Half the fetches, and a second-order error where something moves: 54 dB from exact on real clips.
+    `folded`: multiply the rows of the time planes into the space planes once a frame, instead of sampling them beside
+    the planes at every sample. Half the fetches, and a second-order error where something moves: 54 dB from exact on
+    real clips.
 
     Raises:
         DisplayError: the scene does not fit the card, or a shader does not compile.
@@ -73,22 +90,31 @@ class Renderer:
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
         if max(self.layout.size) > most:
-            raise DisplayError("the planes need a texture of {}x{}, ".format(*self.layout.size) +
-                               f"{ctx.info['GL_RENDERER']} takes {most}; kprender --backend reference")
+            raise DisplayError(
+                "the planes need a texture of {}x{}, ".format(*self.layout.size)
+                + f"{ctx.info['GL_RENDERER']} takes {most}; kprender --backend reference"
+            )
         finer = Layout.of(scene, REFINED)
         self.folded_layout = finer if max(finer.size) <= most else self.layout
-        self._planes = _texture(ctx, self.layout.atlas(scene))
-        self._folded_planes: moderngl.Texture | None = None
-        self._rows: Rows | None = None
-        self._row_texture = _texture(ctx, np.ones((1, 1, 4), np.float32))
-        if scene.is_dynamic:
-            self._rows = Rows(scene, self.layout)
-            self._row_texture = _texture(ctx, np.ones((self.layout.row_count(), self._rows.width, 4), np.float32))
-        nz, ny, nx = scene.occupancy.shape[1:]
-        self._cells = ctx.texture3d((nx, ny, nz), 1, alignment=1, dtype="u1")
-        self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        with room_on(ctx, "the scene"):
+            self._planes = _texture(ctx, self.layout.atlas(scene))
+            self._folded_planes: moderngl.Texture | None = None
+            self._rows: Rows | None = None
+            self._row_texture = _texture(ctx, np.ones((1, 1, 4), np.float32))
+            if scene.is_dynamic:
+                self._rows = Rows(scene, self.layout)
+                self._row_texture = _texture(ctx, np.ones((self.layout.row_count(), self._rows.width, 4), np.float32))
+            nz, ny, nx = scene.occupancy.shape[1:]
+            self._cells = ctx.texture3d((nx, ny, nz), 1, alignment=1, dtype="u1")
+            self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._distances: dict[int, bytes] = {}
-        self._decoder = shader.constants(decoder_arrays(scene.decoder, scene, self.layout))
+        weights = decoder_arrays(scene.decoder, scene, self.layout)
+        if sum(map(len, weights.values())) > CONSTANTS:
+            raise DisplayError(
+                f"the decoder has {4 * sum(map(len, weights.values()))} weights, a shader takes "
+                f"{4 * CONSTANTS}; kprender --backend reference"
+            )
+        self._decoder = shader.constants(weights)
         self._rows_time: float | None = None
         self._folded_time: float | None = None
         self._slot: int | None = None
@@ -100,7 +126,8 @@ class Renderer:
         """Raise a DisplayError if the card has reported an error since the last look."""
         error = self.ctx.error
         if error != "GL_NO_ERROR":
-            remedy = "close other programs or use a smaller size" if error == "GL_OUT_OF_MEMORY" else "update the graphics driver"
+            full = error == "GL_OUT_OF_MEMORY"
+            remedy = "close other programs or use a smaller size" if full else "update the graphics driver"
             raise DisplayError(f"OpenGL reports {error} on {self.ctx.info['GL_RENDERER']}; {remedy}")
 
     @property
@@ -119,8 +146,17 @@ class Renderer:
         self.check()
         return Rendering(rgb, depth, opacity, samples)
 
-    def show(self, screen: moderngl.Framebuffer, camera: Camera, time: float, *, part: Part = Part.FULL, look: Look = Look.COLOUR,
-             depths: tuple[float, float] = (0.0, 1.0), most_samples: float = 64.0) -> None:
+    def show(
+        self,
+        screen: moderngl.Framebuffer,
+        camera: Camera,
+        time: float,
+        *,
+        part: Part = Part.FULL,
+        look: Look = Look.COLOUR,
+        depths: tuple[float, float] = (0.0, 1.0),
+        most_samples: float = 64.0,
+    ) -> None:
         """Draw what `camera` sees over the whole of `screen`, stretched to its size.
 
         Depth goes from bright to dark over `depths`, world units; samples up to `most_samples`.
@@ -133,8 +169,16 @@ class Renderer:
         if part is Part.DYNAMIC and look is Look.COLOUR:
             without, view = self.march(camera, time, part=Part.STATIC), 1
         present, vertices = self._program("present.glsl", self.layout)
-        _set(present, seen=SEEN_UNIT, met=MET_UNIT, without=WITHOUT_UNIT, view=view,
-             viewport=tuple(map(float, screen.size)), depths=depths, most_samples=most_samples)
+        _set(
+            present,
+            seen=SEEN_UNIT,
+            met=MET_UNIT,
+            without=WITHOUT_UNIT,
+            view=view,
+            viewport=tuple(map(float, screen.size)),
+            depths=depths,
+            most_samples=most_samples,
+        )
         target.seen.use(SEEN_UNIT)
         target.met.use(MET_UNIT)
         without.seen.use(WITHOUT_UNIT)
@@ -153,16 +197,25 @@ class Renderer:
         planes = self._fold(time) if folded else self._planes
         target = self._target(part, (camera.width, camera.height))
         march, vertices = self._program(program, self.folded_layout if folded else self.layout, moving and not folded)
-        _set(march, height=float(camera.height), lens=(camera.fl_x, camera.fl_y, camera.cx, camera.cy),
-             axes=tuple(camera.camera_to_world[:3, :3].T.ravel()), eye=tuple(camera.camera_to_world[:3, 3]))
+        _set(
+            march,
+            height=float(camera.height),
+            lens=(camera.fl_x, camera.fl_y, camera.cx, camera.cy),
+            axes=tuple(camera.camera_to_world[:3, :3].T.ravel()),
+            eye=tuple(camera.camera_to_world[:3, 3]),
+        )
         planes.use(PLANES_UNIT)
         self._row_texture.use(ROWS_UNIT)
         self._cells.use(CELLS_UNIT)
         self._draw(target.framebuffer, vertices)
         return target
 
-    def _draw(self, framebuffer: moderngl.Framebuffer, vertices: moderngl.VertexArray,
-              viewport: tuple[int, int, int, int] | None = None) -> None:
+    def _draw(
+        self,
+        framebuffer: moderngl.Framebuffer,
+        vertices: moderngl.VertexArray,
+        viewport: tuple[int, int, int, int] | None = None,
+    ) -> None:
         self.ctx.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         framebuffer.use()
         framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
@@ -176,26 +229,42 @@ class Renderer:
             self._targets.pop(next(iter(self._targets))).release()
         return target
 
-    def _program(self, name: str, layout: Layout, with_rows: bool = False) -> tuple[moderngl.Program, moderngl.VertexArray]:
+    def _program(
+        self, name: str, layout: Layout, with_rows: bool = False
+    ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
         key = name, layout.refined, with_rows
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
-        program = shader.build(self.ctx, name, {
-            "SCALES": layout.scales, "LAYERS": layout.layers, "HIDDEN": len(scene.decoder.b1), "ROWS": int(with_rows),
-            "REFINED": layout.refined,
-        }, {"decoder_weights": self._decoder})
+        program = shader.build(
+            self.ctx,
+            name,
+            {
+                "SCALES": layout.scales,
+                "LAYERS": layout.layers,
+                "HIDDEN": len(scene.decoder.b1),
+                "ROWS": int(with_rows),
+                "REFINED": layout.refined,
+            },
+            {"decoder_weights": self._decoder},
+        )
         sizes = [(s["xy"].shape[1], s["xy"].shape[0], s["xz"].shape[0]) for s in scene.scales]
         _set(
-            program, planes=PLANES_UNIT, rows=ROWS_UNIT, cells=CELLS_UNIT,
+            program,
+            planes=PLANES_UNIT,
+            rows=ROWS_UNIT,
+            cells=CELLS_UNIT,
             planes_texel=(1 / layout.size[0], 1 / layout.size[1]),
             rows_texel=(1 / self._row_texture.width, 1 / self._row_texture.height),
             blocks=[(block.x, block.y, block.width) for block in layout.blocks],
             resolution=sizes if len(sizes) > 1 else sizes[0],
             cell_count=scene.occupancy.shape[:0:-1],
-            box_low=tuple(scene.aabb[0]), box_high=tuple(scene.aabb[1]), background=tuple(scene.background),
-            stride=scene.step, tau=scene.step / scene.extent,
+            box_low=tuple(scene.aabb[0]),
+            box_high=tuple(scene.aabb[1]),
+            background=tuple(scene.background),
+            stride=scene.step,
+            tau=scene.step / scene.extent,
         )
         entry = self._programs[key] = program, self.ctx.vertex_array(program, [])
         return entry
@@ -226,10 +295,20 @@ class Renderer:
                 axis = FOLDED_AXIS[block.plane]
                 upright = axis == block.plane[1]
                 finest = 1 / self.folded_layout.refined
-                _set(fold, source=(source.x, source.y), source_width=source.width, origin=(block.x, block.y), width=block.width,
-                     shrink=(1.0, finest) if upright else (finest, 1.0), upright=upright,
-                     axis="xyz".index(axis), scale=block.scale)
-                self._draw(self._fold_into, vertices, (block.x, block.y, self.layout.layers * block.width, block.height))
+                _set(
+                    fold,
+                    source=(source.x, source.y),
+                    source_width=source.width,
+                    origin=(block.x, block.y),
+                    width=block.width,
+                    shrink=(1.0, finest) if upright else (finest, 1.0),
+                    upright=upright,
+                    axis="xyz".index(axis),
+                    scale=block.scale,
+                )
+                self._draw(
+                    self._fold_into, vertices, (block.x, block.y, self.layout.layers * block.width, block.height)
+                )
             self._folded_time = time
         return self._folded_planes
 

@@ -14,7 +14,11 @@ import numpy as np
 from kpc.format.errors import DisplayError
 
 GL33 = "#version 330 core"
-ES30 = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\nprecision highp usampler3D;"
+ES30 = """#version 300 es
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+precision highp usampler3D;"""
 
 LINES_A_FILE = 10000
 
@@ -22,12 +26,13 @@ _INCLUDE = re.compile(r'^\s*#include\s+"([\w./-]+)"\s*(?://.*)?$')
 _WHERE = re.compile(r"(?:ERROR:\s*)?\b\d+[:(](\d+)\)?(?:\(\d+\))?\s*:\s*(?:error\b\s*:?)?\s*(.*)", re.IGNORECASE)
 
 
-def compose(name: str, defines: Mapping[str, int] | None = None, preamble: str = GL33,
-            written: Mapping[str, str] | None = None) -> tuple[str, list[str]]:
+def compose(
+    name: str, defines: Mapping[str, int] | None = None, preamble: str = GL33, written: Mapping[str, str] | None = None
+) -> tuple[str, list[str]]:
     """The whole text of the shader `name`, and the names of the files in it.
 
-    A `#line` gives line L of file F the number F * LINES_A_FILE + L. (The language has a second number for the file, but Mesa
-    reports some complaints under the file before.)
+    A `#line` gives line L of file F the number F * LINES_A_FILE + L. (The language has a second number for the file,
+    but Mesa reports some complaints under the file before.)
 
     Each file is included once. `defines` become macros. `written` holds files that are made for one scene, by name; the
     others lie in `player/glsl`.
@@ -65,8 +70,12 @@ def _source(name: str, written: Mapping[str, str]) -> str:
     return file.read_text()
 
 
-def build(ctx: moderngl.Context, fragment: str, defines: Mapping[str, int] | None = None,
-          written: Mapping[str, str] | None = None) -> moderngl.Program:
+def build(
+    ctx: moderngl.Context,
+    fragment: str,
+    defines: Mapping[str, int] | None = None,
+    written: Mapping[str, str] | None = None,
+) -> moderngl.Program:
     """Compile a fragment shader that is drawn over the whole viewport.
 
     Raises:
@@ -77,8 +86,8 @@ def build(ctx: moderngl.Context, fragment: str, defines: Mapping[str, int] | Non
     try:
         return ctx.program(vertex_shader=vertex_text, fragment_shader=text)
     except moderngl.Error as error:
-        message = first_complaint(str(error), files)
-        raise DisplayError(f"{message} (driver: {ctx.info['GL_RENDERER']}); update the driver, or kprender --backend reference") from error
+        message, driver = first_complaint(str(error), files), ctx.info["GL_RENDERER"]
+        raise DisplayError(f"{message} (driver: {driver}); update it, or kprender --backend reference") from error
 
 
 def constants(arrays: Mapping[str, np.ndarray]) -> str:

@@ -29,7 +29,7 @@ class Layout:
     """How a scene's planes share one texture.
 
     Attributes:
-        layers: texels of four channels that a scale's features fill; the widest scale decides, others are padded with 0.
+        layers: texels of four channels that a scale's features fill. The widest scale decides; others are padded.
         size: (width, height) of the atlas, texels.
         blocks: scale by scale, "xy", "xz", "yz".
         refined: texels to one of the plane's, along FOLDED_AXIS; 1 but for planes that rows are to be multiplied into.
@@ -45,7 +45,7 @@ class Layout:
     def of(scene: Scene, refined: int = 1) -> "Layout":
         """Shelves, tallest block first, in a texture about as wide as it is high."""
         layers = max(-(-plane.shape[2] // 4) for scale in scene.scales for plane in scale.values())
-        shapes = []
+        shapes: list[tuple[int, str, int, int]] = []
         for s, scale in enumerate(scene.scales):
             for name in SPACE_PLANES:
                 size = {name[1]: scale[name].shape[0], name[0]: scale[name].shape[1]}
@@ -53,13 +53,14 @@ class Layout:
                 shapes.append((s, name, size[name[1]], size[name[0]]))
         area = sum(rows * columns * layers for *_, rows, columns in shapes)
         width = max(int(np.ceil(np.sqrt(area))), max(columns * layers for *_, columns in shapes))
-        placed, x, y, shelf = {}, 0, 0, 0
-        for scale, name, rows, columns in sorted(shapes, key=lambda shape: -shape[2]):
+        placed: dict[tuple[int, str], Block] = {}
+        x, y, shelf = 0, 0, 0
+        for s, name, rows, columns in sorted(shapes, key=lambda shape: -shape[2]):
             if x + columns * layers > width:
                 x, y, shelf = 0, y + shelf, 0
-            placed[scale, name] = Block(scale, name, x, y, columns, rows)
+            placed[s, name] = Block(s, name, x, y, columns, rows)
             x, shelf = x + columns * layers, max(shelf, rows)
-        blocks = tuple(placed[scale, name] for scale, name, *_ in shapes)
+        blocks = tuple(placed[s, name] for s, name, *_ in shapes)
         return Layout(len(scene.scales), layers, (width, y + shelf), blocks, refined)
 
     def atlas(self, scene: Scene) -> np.ndarray:
@@ -89,7 +90,9 @@ class Rows:
 
     def __init__(self, scene: Scene, layout: Layout) -> None:
         self._layout = layout
-        self._planes = [(axis, s, scale[name]) for s, scale in enumerate(scene.scales) for axis, name in enumerate(TIME_PLANES)]
+        self._planes = [
+            (axis, s, scale[name]) for s, scale in enumerate(scene.scales) for axis, name in enumerate(TIME_PLANES)
+        ]
         self.width = max(plane.shape[1] for *_, plane in self._planes)
 
     def at(self, time: float) -> np.ndarray:
@@ -140,12 +143,13 @@ def _dilate(grid: np.ndarray) -> np.ndarray:
 def decoder_arrays(decoder: Decoder, scene: Scene, layout: Layout) -> dict[str, np.ndarray]:
     """The decoder's weights as march.glsl wants them, (N, 4) float32 each, features in the padded layout of the planes.
 
-    density_weight (F / 4), w1 (H x 3: nine columns, then b1, then zeros), w2 (3 x F / 4 x H), b2 (3 x F / 4), density_bias (1, in x).
+    density_weight (F / 4), w1 (H x 3: nine columns, then b1, then zeros), w2 (3 x F / 4 x H), b2 (3 x F / 4),
+    density_bias (1, in x).
     """
     features = layout.scales * layout.layers * 4
-    place = np.concatenate([
-        s * layout.layers * 4 + np.arange(scale["xy"].shape[2]) for s, scale in enumerate(scene.scales)
-    ])
+    place = np.concatenate(
+        [s * layout.layers * 4 + np.arange(scale["xy"].shape[2]) for s, scale in enumerate(scene.scales)]
+    )
 
     def spread(weights: np.ndarray) -> np.ndarray:
         out = np.zeros((*weights.shape[:-1], features), np.float32)

@@ -64,15 +64,18 @@ class Window:
         if not glfw.init():
             raise DisplayError(f"no window to be had ({self._complaint}); {REMEDY}")
         hints = {
-            glfw.CONTEXT_VERSION_MAJOR: 3, glfw.CONTEXT_VERSION_MINOR: 3, glfw.OPENGL_PROFILE: glfw.OPENGL_CORE_PROFILE,
-            glfw.OPENGL_FORWARD_COMPAT: True, glfw.SCALE_TO_MONITOR: True,
+            glfw.CONTEXT_VERSION_MAJOR: 3,
+            glfw.CONTEXT_VERSION_MINOR: 3,
+            glfw.OPENGL_PROFILE: glfw.OPENGL_CORE_PROFILE,
+            glfw.OPENGL_FORWARD_COMPAT: True,
+            glfw.SCALE_TO_MONITOR: True,
         }
         for hint, value in hints.items():
             glfw.window_hint(hint, value)
         self.handle = glfw.create_window(*size, title, None, None)
         if not self.handle:
             glfw.terminate()
-            raise DisplayError(f"no window with OpenGL 3.3 to be had ({self._complaint}); update the graphics driver, or {REMEDY}")
+            raise DisplayError(f"no window with OpenGL 3.3 to be had ({self._complaint}): {REMEDY}")
         glfw.make_context_current(self.handle)
         glfw.swap_interval(1)
         self.ctx = self._context()
@@ -85,14 +88,17 @@ class Window:
 
     def _context(self) -> moderngl.Context:
         failures = []
-        backends: tuple[dict[str, Any], ...] = ({}, {"backend": "egl"})  # glfw talks GLX to an X server and EGL to Wayland
+        # glfw talks GLX to an X server and EGL to Wayland
+        backends: tuple[dict[str, Any], ...] = ({}, {"backend": "egl"})
         for backend in backends:
             try:
                 return moderngl.create_context(require=330, **backend)
             except Exception as error:  # glcontext raises bare Exception, ImportError or ValueError, whatever failed
                 failures.append(str(error))
         glfw.terminate()
-        raise DisplayError(f"no OpenGL 3.3 in the window ({'; '.join(failures)}); update the graphics driver, or {REMEDY}")
+        raise DisplayError(
+            f"no OpenGL 3.3 in the window ({'; '.join(failures)}); update the graphics driver, or {REMEDY}"
+        )
 
     def _complain(self, code: int, message: bytes | str) -> None:
         self._complaint = message.decode(errors="replace") if isinstance(message, bytes) else message
@@ -233,15 +239,25 @@ class Player:
         started = clock.monotonic()
         width, height = (max(1, round(side * scale)) for side in self.canvas.size)
         self.raster = (width, height)
-        self.renderer.show(self.canvas, self.view.camera(width, height), self.playback.time, part=self.part, look=self.look,
-                           depths=self.depths, most_samples=self.most_samples)
+        self.renderer.show(
+            self.canvas,
+            self.view.camera(width, height),
+            self.playback.time,
+            part=self.part,
+            look=self.look,
+            depths=self.depths,
+            most_samples=self.most_samples,
+        )
         self.ctx.finish()
         self.draw_s = clock.monotonic() - started
 
     def _measure(self) -> None:
         """Samples a ray, and how far things are, from a very small picture."""
-        small = self.renderer.render(self.view.camera(*STATS_SIZE), self.playback.time,
-                                     part=Part.STATIC if self.part is Part.STATIC else Part.FULL)
+        small = self.renderer.render(
+            self.view.camera(*STATS_SIZE),
+            self.playback.time,
+            part=Part.STATIC if self.part is Part.STATIC else Part.FULL,
+        )
         self.samples = float(small.samples.mean())
         self.most_samples = max(2.0 * float(np.percentile(small.samples, 95)), 8.0)
         seen = small.depth[small.opacity > 0.5]
@@ -264,7 +280,8 @@ class Player:
             return
         width, height = self.window.size
         across, down = io.mouse_delta.x / max(height, 1), io.mouse_delta.y / max(height, 1)
-        moving = self.window.held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT) or imgui.is_mouse_down(1) or imgui.is_mouse_down(2)
+        shift = self.window.held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT)
+        moving = shift or imgui.is_mouse_down(1) or imgui.is_mouse_down(2)
         if (across or down) and moving and any(imgui.is_mouse_down(button) for button in range(3)):
             self.view = self.view.pan(across, -down)
         elif (across or down) and imgui.is_mouse_down(0):
@@ -279,7 +296,8 @@ class Player:
             for plus, minus in ((glfw.KEY_D, glfw.KEY_A), (glfw.KEY_E, glfw.KEY_Q), (glfw.KEY_W, glfw.KEY_S))
         )
         if right or up or forward:
-            way = self.scene.extent / CROSSING_S * seconds * (4 if held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT) else 1)
+            hurry = 4 if held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT) else 1
+            way = hurry * seconds * self.scene.extent / CROSSING_S
             self.view = self.view.fly(way * right, way * up, way * forward)
 
     def _type(self, key: int, mods: int) -> None:

@@ -1,4 +1,4 @@
-"""Feeds the player every key and drag it knows and looks at what they do: `press_every_key.py scene.kpc`, for test_kpplay."""
+"""Feeds the player every key and drag it knows, and looks at what they do: `press_every_key.py scene.kpc`."""
 
 import sys
 import time
@@ -16,6 +16,7 @@ from kpc.player.window import Player, Window
 def main(scene_file: str) -> None:
     window = Window("test", (320, 240))
     player = Player(window, kpc.load(scene_file), scene_file)
+
     def press(*keys: int) -> None:
         for key in keys:
             window._key(None, key, 0, glfw.PRESS, 0)
@@ -41,7 +42,9 @@ def main(scene_file: str) -> None:
     assert player.playback.time == 1.0
     press(glfw.KEY_RIGHT_BRACKET, glfw.KEY_L)
     assert player.playback.speed == 2.0 and not player.playback.loop
-    for key, look in zip((glfw.KEY_2, glfw.KEY_3, glfw.KEY_4, glfw.KEY_1), (Look.DEPTH, Look.SAMPLES, Look.OCCUPANCY, Look.COLOUR)):
+    for key, look in zip(
+        (glfw.KEY_2, glfw.KEY_3, glfw.KEY_4, glfw.KEY_1), (Look.DEPTH, Look.SAMPLES, Look.OCCUPANCY, Look.COLOUR)
+    ):
         press(key)
         assert player.look is look
     for part in (Part.STATIC, Part.DYNAMIC, Part.FULL):

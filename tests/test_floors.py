@@ -1,4 +1,4 @@
-"""Who may import whom: format <- encoder, player <- tools; encoder and player never each other. Read from the source."""
+"""Who may import whom: format <- encoder, player <- tools; encoder and player never each other."""
 
 import ast
 from pathlib import Path
@@ -7,7 +7,17 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 FORBIDDEN = {
-    "format": {"kpc.encoder", "kpc.player", "kpc.tools", "torch", "numba", "moderngl", "glfw", "imgui_bundle", "OpenGL"},
+    "format": {
+        "kpc.encoder",
+        "kpc.player",
+        "kpc.tools",
+        "torch",
+        "numba",
+        "moderngl",
+        "glfw",
+        "imgui_bundle",
+        "OpenGL",
+    },
     "encoder": {"kpc.player", "kpc.tools", "moderngl", "glfw", "imgui_bundle", "OpenGL"},
     "player": {"kpc.encoder", "kpc.tools", "torch", "numba"},
     "tools": set(),
@@ -43,4 +53,6 @@ def test_floors_hold(floor: str) -> None:
 
 
 def test_the_package_itself_needs_no_torch() -> None:
-    assert not any(is_within(m, p) for m in imports(ROOT / "src/kpc/__init__.py") for p in ("torch", "numba", "kpc.encoder"))
+    assert not any(
+        is_within(m, p) for m in imports(ROOT / "src/kpc/__init__.py") for p in ("torch", "numba", "kpc.encoder")
+    )

@@ -31,8 +31,12 @@ def display() -> Iterator[str]:
     if shutil.which("Xvfb") is None:
         pytest.skip("no display and no Xvfb (Debian: apt install xvfb)")
     reader, writer = os.pipe()
-    server = subprocess.Popen(["Xvfb", "-displayfd", str(writer), "-screen", "0", "1024x768x24"], pass_fds=[writer],
-                              stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(writer), "-screen", "0", "1024x768x24"],
+        pass_fds=[writer],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     os.close(writer)
     with os.fdopen(reader) as said:
         number = said.readline().strip()
@@ -46,7 +50,9 @@ def display() -> Iterator[str]:
 
 
 def kpplay(*arguments: object, display: str | None = None) -> subprocess.CompletedProcess[str]:
-    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")} | ({"DISPLAY": display} if display else {})
+    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")} | (
+        {"DISPLAY": display} if display else {}
+    )
     command = [sys.executable, "-W", "error", "-m", "kpc.player.kpplay", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, env=env, timeout=60, check=False)
 
@@ -58,9 +64,9 @@ def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> No
     picture = read_image(shot).astype(int)
     assert picture.shape == (300, 400, 3)
     background = np.rint(tiny_scene(4).background * 255)
-    assert np.abs(picture[:20, -20:] - background).max() <= 1     # the corner is empty
+    assert np.abs(picture[:20, -20:] - background).max() <= 1  # the corner is empty
     assert np.abs(picture[150:170, 260:280] - background).max() > 20  # the scene
-    assert picture[12:100, 12:100].mean() < 180                   # the HUD
+    assert picture[12:100, 12:100].mean() < 180  # the HUD
 
 
 def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
@@ -69,17 +75,22 @@ def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
     assert done.stderr.startswith("kpplay: no window to be had") and "kprender" in done.stderr
 
 
-@pytest.mark.parametrize(("arguments", "code", "words"), [
-    (["nowhere.kpc"], 1, "nowhere.kpc"), (["{scene}", "--size", "7x7"], 2, "--size"), (["{scene}", "--frames", "0"], 2, "--frames"),
-    (["{scene}", "--screenshot", "x.bmp"], 2, "x.bmp"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["nowhere.kpc"], 1, "nowhere.kpc"),
+        (["{scene}", "--size", "7x7"], 2, "--size"),
+        (["{scene}", "--frames", "0"], 2, "--frames"),
+        (["{scene}", "--screenshot", "x.bmp"], 2, "x.bmp"),
+    ],
+)
 def test_bad_input_is_told_before_a_window_opens(scene_file: Path, arguments: list[str], code: int, words: str) -> None:
     done = kpplay(*[a.format(scene=scene_file) for a in arguments])
     assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr
 
 
 def test_every_key_and_drag(scene_file: Path, display: str, tmp_path: Path) -> None:
-    """In a process of its own: Mesa lets no process hold a GLX and an EGL context at once, and other tests hold the latter."""
+    """In a process of its own: Mesa lets none hold both a GLX and an EGL context, and other tests do the latter."""
     command = [sys.executable, "-W", "error", str(Path(__file__).with_name("press_every_key.py")), str(scene_file)]
     env = {**os.environ, "DISPLAY": display}
     done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, timeout=60, check=False)

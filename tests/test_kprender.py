@@ -45,7 +45,11 @@ def run(capsys: pytest.CaptureFixture[str]) -> Iterator[object]:
 def cameras_json(path: Path, files: list[str]) -> Path:
     scene = tiny_scene(4)
     frames = [
-        {"file": name, "time": n / max(len(files) - 1, 1), "transform_matrix": scene.cameras[n % 2].camera_to_world.tolist()}
+        {
+            "file": name,
+            "time": n / max(len(files) - 1, 1),
+            "transform_matrix": scene.cameras[n % 2].camera_to_world.tolist(),
+        }
         for n, name in enumerate(files)
     ]
     path.write_text(json.dumps({"w": 48, "h": 36, "fl_x": 55, "fl_y": 55, "cx": 24, "cy": 18, "frames": frames}))
@@ -68,7 +72,18 @@ def test_pictures_from_a_camera_file(run, scene_file: Path, tmp_path: Path, back
 
 
 def test_names_from_a_camera_file_stay_in_the_directory(run, scene_file: Path, tmp_path: Path) -> None:
-    names = ["../../escape.png", "/etc/passwd", "..\\..\\win.png", "", "..", ".hidden", "x.png", "y/x.png", "nul\0l\n.png", "n" * 400]
+    names = [
+        "../../escape.png",
+        "/etc/passwd",
+        "..\\..\\win.png",
+        "",
+        "..",
+        ".hidden",
+        "x.png",
+        "y/x.png",
+        "nul\0l\n.png",
+        "n" * 400,
+    ]
     listed = cameras_json(tmp_path / "cameras.json", names)
     out = tmp_path / "out"
     code, _, _ = run(scene_file, "--cameras", listed, "-o", out, "--backend", "reference", "--size", "8x6")
@@ -104,7 +119,9 @@ def test_depth_beside_a_png(run, scene_file: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("depth", [False, True])
 def test_an_orbit_becomes_a_video(run, scene_file: Path, tmp_path: Path, depth: bool) -> None:
     out = tmp_path / "orbit.mp4"
-    code, said, _ = run(scene_file, "--orbit", 7, "--size", "64x48", "--backend", "reference", "-o", out, *["--depth"] * depth)
+    code, said, _ = run(
+        scene_file, "--orbit", 7, "--size", "64x48", "--backend", "reference", "-o", out, *["--depth"] * depth
+    )
     assert code == 0 and "7 frames at 10 fps" in said
     frames = list(read_video(out))
     assert len(frames) == 7 and frames[0].shape == (48, 64, 3)
@@ -127,26 +144,31 @@ def test_static_and_dynamic_only(run, scene_file: Path, tmp_path: Path) -> None:
     assert np.abs(difference - pictures["--dynamic-only"]).max() <= 1
 
 
-@pytest.mark.parametrize(("arguments", "code", "words"), [
-    (["{missing}", "-o", "{dir}"], 1, "missing.kpc"),
-    (["{text}", "-o", "{dir}"], 1, "text.kpc"),
-    (["{scene}", "--cameras", "{missing}", "-o", "{dir}"], 1, "missing.kpc"),
-    (["{scene}", "--cameras", "{text}", "-o", "{dir}"], 1, "not JSON"),
-    (["{scene}", "--cameras", "{empty}", "-o", "{dir}"], 1, "frames"),
-    (["{scene}", "--cameras", "{nan}", "-o", "{dir}"], 1, "NaN"),
-    (["{scene}", "--orbit", "2", "-o", "{text}/inside"], 1, "text.kpc"),
-    (["{scene}", "--orbit", "2", "-o", "{dir}/no/such/a.mp4"], 1, "no/such"),
-    (["{scene}", "--orbit", "2", "-o", "{dir}/a.png"], 2, "2 pictures do not go into one"),
-    (["{scene}", "--orbit", "0", "-o", "{dir}"], 2, "--orbit"),
-    (["{scene}", "--orbit", "x", "-o", "{dir}"], 2, "--orbit"),
-    (["{scene}", "--time", "1.5", "-o", "{dir}"], 2, "--time"),
-    (["{scene}", "--size", "0x5", "-o", "{dir}"], 2, "--size"),
-    (["{scene}", "--size", "640", "-o", "{dir}"], 2, "--size"),
-    (["{scene}", "--fps", "-1", "-o", "{dir}"], 2, "--fps"),
-    (["{scene}", "--orbit", "2", "--cameras", "x", "-o", "{dir}"], 2, "not allowed"),
-    (["{scene}"], 2, "--output"),
-])
-def test_bad_input_is_one_line(run, scene_file: Path, tmp_path: Path, arguments: list[str], code: int, words: str) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["{missing}", "-o", "{dir}"], 1, "missing.kpc"),
+        (["{text}", "-o", "{dir}"], 1, "text.kpc"),
+        (["{scene}", "--cameras", "{missing}", "-o", "{dir}"], 1, "missing.kpc"),
+        (["{scene}", "--cameras", "{text}", "-o", "{dir}"], 1, "not JSON"),
+        (["{scene}", "--cameras", "{empty}", "-o", "{dir}"], 1, "frames"),
+        (["{scene}", "--cameras", "{nan}", "-o", "{dir}"], 1, "NaN"),
+        (["{scene}", "--orbit", "2", "-o", "{text}/inside"], 1, "text.kpc"),
+        (["{scene}", "--orbit", "2", "-o", "{dir}/no/such/a.mp4"], 1, "no/such"),
+        (["{scene}", "--orbit", "2", "-o", "{dir}/a.png"], 2, "2 pictures do not go into one"),
+        (["{scene}", "--orbit", "0", "-o", "{dir}"], 2, "--orbit"),
+        (["{scene}", "--orbit", "x", "-o", "{dir}"], 2, "--orbit"),
+        (["{scene}", "--time", "1.5", "-o", "{dir}"], 2, "--time"),
+        (["{scene}", "--size", "0x5", "-o", "{dir}"], 2, "--size"),
+        (["{scene}", "--size", "640", "-o", "{dir}"], 2, "--size"),
+        (["{scene}", "--fps", "-1", "-o", "{dir}"], 2, "--fps"),
+        (["{scene}", "--orbit", "2", "--cameras", "x", "-o", "{dir}"], 2, "not allowed"),
+        (["{scene}"], 2, "--output"),
+    ],
+)
+def test_bad_input_is_one_line(
+    run, scene_file: Path, tmp_path: Path, arguments: list[str], code: int, words: str
+) -> None:
     out = tmp_path / "out"
     out.mkdir()
     (tmp_path / "text.kpc").write_text("not a scene")
@@ -154,8 +176,14 @@ def test_bad_input_is_one_line(run, scene_file: Path, tmp_path: Path, arguments:
     pose = np.eye(4).tolist()
     pose[0][3] = float("nan")
     (tmp_path / "nan.json").write_text(json.dumps({"w": 4, "h": 4, "fl_x": 4, "frames": [{"transform_matrix": pose}]}))
-    names = {"scene": scene_file, "missing": tmp_path / "missing.kpc", "text": tmp_path / "text.kpc", "dir": out,
-             "empty": tmp_path / "empty.json", "nan": tmp_path / "nan.json"}
+    names = {
+        "scene": scene_file,
+        "missing": tmp_path / "missing.kpc",
+        "text": tmp_path / "text.kpc",
+        "dir": out,
+        "empty": tmp_path / "empty.json",
+        "nan": tmp_path / "nan.json",
+    }
     got, said, complaint = run(*[a.format(**names) for a in arguments], "--backend", "reference")
     assert got == code and said == "" and words in complaint
     assert "Traceback" not in complaint
@@ -164,7 +192,9 @@ def test_bad_input_is_one_line(run, scene_file: Path, tmp_path: Path, arguments:
     assert list(out.iterdir()) == []
 
 
-def test_a_directory_that_cannot_be_written(run, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_directory_that_cannot_be_written(
+    run, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied", str(tmp_path / "x.png"))
 
@@ -183,9 +213,13 @@ def test_without_opengl_the_reference_backend_is_offered(run, scene_file: Path, 
 
 
 def test_the_reference_backend_needs_no_opengl_module(scene_file: Path, tmp_path: Path) -> None:
-    program = ("import sys; sys.modules.update(moderngl=None, glfw=None, imgui_bundle=None, torch=None); "
-               "from kpc.tools.kprender import main; sys.exit(main())")
+    program = (
+        "import sys; sys.modules.update(moderngl=None, glfw=None, imgui_bundle=None, torch=None); "
+        "from kpc.tools.kprender import main; sys.exit(main())"
+    )
     arguments = [str(scene_file), "--time", "0", "-o", str(tmp_path / "x.png"), "--backend", "reference"]
-    done = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, env=dict(os.environ), check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, env=dict(os.environ), check=False
+    )
     assert done.returncode == 0, done.stderr
     assert read_image(tmp_path / "x.png").shape == (36, 48, 3)

@@ -13,7 +13,9 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def scene_of(eyes: list[tuple[float, float, float]], target: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Scene:
-    cameras = tuple(Camera(64, 48, 60, 60, 32, 24, look_at(np.array(eye, float), np.array(target, float), UP)) for eye in eyes)
+    cameras = tuple(
+        Camera(64, 48, 60, 60, 32, 24, look_at(np.array(eye, float), np.array(target, float), UP)) for eye in eyes
+    )
     return replace(tiny_scene(0), cameras=cameras)
 
 

@@ -22,7 +22,9 @@ def plain_bilinear(plane: np.ndarray, u: float, v: float) -> np.ndarray:
     return (1 - g) * ((1 - f) * p[j, i] + f * p[j, i1]) + g * ((1 - f) * p[j1, i] + f * p[j1, i1])
 
 
-def plain_ray(scene: Scene, o: np.ndarray, d: np.ndarray, time: float, static: bool) -> tuple[np.ndarray, float, float, int]:
+def plain_ray(
+    scene: Scene, o: np.ndarray, d: np.ndarray, time: float, static: bool
+) -> tuple[np.ndarray, float, float, int]:
     o, d, aabb = o.astype(float), d.astype(float), scene.aabb.astype(float)
     near, far = 0.0, math.inf
     for a in range(3):
@@ -50,9 +52,12 @@ def plain_ray(scene: Scene, o: np.ndarray, d: np.ndarray, time: float, static: b
             continue
         at = {"x": u[0], "y": u[1], "z": u[2], "t": time}
         names = SPACE_PLANES if static or not scene.is_dynamic else ALL_PLANES
-        f = np.concatenate([
-            np.prod([plain_bilinear(scale[name], at[name[0]], at[name[1]]) for name in names], axis=0) for scale in scene.scales
-        ])
+        f = np.concatenate(
+            [
+                np.prod([plain_bilinear(scale[name], at[name[0]], at[name[1]]) for name in names], axis=0)
+                for scale in scene.scales
+            ]
+        )
         sigma = math.exp(min(max(f @ scene.decoder.density_weight + scene.decoder.density_bias, -20), 20))
         weight = trans * (1 - math.exp(-sigma * scene.step / scene.extent))
         rgb += weight / (1 + np.exp(-basis @ f))
@@ -62,9 +67,15 @@ def plain_ray(scene: Scene, o: np.ndarray, d: np.ndarray, time: float, static: b
     return rgb + trans * scene.background, depth / (1 - trans) if trans < 1 else math.inf, 1 - trans, count
 
 
-@pytest.mark.parametrize(("dynamic", "part", "time"), [
-    (True, Part.FULL, 0.37), (True, Part.FULL, 1.0), (True, Part.STATIC, 0.37), (False, Part.FULL, 0.0),
-])
+@pytest.mark.parametrize(
+    ("dynamic", "part", "time"),
+    [
+        (True, Part.FULL, 0.37),
+        (True, Part.FULL, 1.0),
+        (True, Part.STATIC, 0.37),
+        (False, Part.FULL, 0.0),
+    ],
+)
 def test_renders_as_the_normative_text_says(dynamic: bool, part: Part, time: float) -> None:
     scene = tiny_scene(3, dynamic=dynamic)
     origins, directions = scene.cameras[0].rays()

@@ -45,13 +45,17 @@ def test_gives_the_reference_picture(view: str, part: Part) -> None:
         assert wanted.opacity.max() > 0.9
 
 
-@pytest.mark.parametrize("scene", [
-    tiny_scene(6, dynamic=False),
-    tiny_scene(7, scales=3, channels=5, resolution=(40, 12, 28), time=2),
-    tiny_scene(8, scales=1, channels=3, resolution=(2, 3, 2), time=1),
-    replace(tiny_scene(9), occupancy=np.ones((1, 1, 1, 1), bool)),
-    replace(tiny_scene(9), occupancy=np.zeros((2, 300, 2, 3), bool)),
-], ids=["static", "uneven", "few texels", "one cell", "nothing"])
+@pytest.mark.parametrize(
+    "scene",
+    [
+        tiny_scene(6, dynamic=False),
+        tiny_scene(7, scales=3, channels=5, resolution=(40, 12, 28), time=2),
+        tiny_scene(8, scales=1, channels=3, resolution=(2, 3, 2), time=1),
+        replace(tiny_scene(9), occupancy=np.ones((1, 1, 1, 1), bool)),
+        replace(tiny_scene(9), occupancy=np.zeros((2, 300, 2, 3), bool)),
+    ],
+    ids=["static", "uneven", "few texels", "one cell", "nothing"],
+)
 def test_scenes_of_all_shapes(scene: Scene) -> None:
     renderer = Renderer(gl.context(), scene)
     for time in (0.0, 0.5, 1.0):
@@ -69,7 +73,15 @@ def test_sparse_occupancy_loses_no_sample() -> None:
 def test_one_renderer_serves_many_sizes_and_times() -> None:
     scene = tiny_scene(4)
     renderer = Renderer(gl.context(), scene)
-    for width, height, time in [(40, 30, 0.1), (31, 17, 0.9), (1, 1, 0.4), (40, 30, 0.1), (8, 9, 0), (10, 9, 0), (11, 9, 0)]:
+    for width, height, time in [
+        (40, 30, 0.1),
+        (31, 17, 0.9),
+        (1, 1, 0.4),
+        (40, 30, 0.1),
+        (8, 9, 0),
+        (10, 9, 0),
+        (11, 9, 0),
+    ]:
         camera = CAMERAS["outside"].resized(width, height)
         got = renderer.render(camera, time)
         assert got.rgb.shape == (height, width, 3)
@@ -79,7 +91,10 @@ def test_one_renderer_serves_many_sizes_and_times() -> None:
 
 def test_folding_is_exact_where_nothing_moves_and_close_where_it_does() -> None:
     still, moving = tiny_scene(6, dynamic=False), tiny_scene(4)
-    check(Renderer(gl.context(), still, folded=True).render(CAMERAS["outside"], 0.0), render(still, CAMERAS["outside"], 0.0))
+    check(
+        Renderer(gl.context(), still, folded=True).render(CAMERAS["outside"], 0.0),
+        render(still, CAMERAS["outside"], 0.0),
+    )
     renderer = Renderer(gl.context(), moving, folded=True)
     for time in (0.2, 0.7):
         error = renderer.render(CAMERAS["outside"], time).rgb - render(moving, CAMERAS["outside"], time).rgb
@@ -95,12 +110,18 @@ def test_shows_every_look_and_part_on_a_screen_of_another_size() -> None:
     for look in Look:
         for part in Part:
             renderer.show(screen, CAMERAS["outside"], 0.62, part=part, look=look, depths=(2.0, 4.0), most_samples=20.0)
-            pictures[look, part] = np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(50, 70, 3)[::-1]
+            pictures[look, part] = np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(50, 70, 3)[
+                ::-1
+            ]
     renderer.check()
     for (look, part), picture in pictures.items():
         assert picture.std() > 3, (look, part)
-    whole = np.frombuffer((render(scene, CAMERAS["outside"].resized(70, 50), 0.62).rgb * 255).astype(np.uint8), np.uint8)
-    assert np.mean(np.abs(pictures[Look.COLOUR, Part.FULL].astype(float).ravel() - whole)) < 6  # a stretched, filtered copy
+    whole = np.frombuffer(
+        (render(scene, CAMERAS["outside"].resized(70, 50), 0.62).rgb * 255).astype(np.uint8), np.uint8
+    )
+    assert (
+        np.mean(np.abs(pictures[Look.COLOUR, Part.FULL].astype(float).ravel() - whole)) < 6
+    )  # a stretched, filtered copy
 
 
 def test_a_scene_too_large_for_the_card_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,6 +131,13 @@ def test_a_scene_too_large_for_the_card_is_refused(monkeypatch: pytest.MonkeyPat
         Renderer(ctx, tiny_scene(4, resolution=(200, 200, 200)))
 
 
+def test_a_decoder_too_large_for_a_shader_is_refused() -> None:
+    scene = tiny_scene(4)
+    wide = replace(scene.decoder, w1=np.zeros((2000, 9)), b1=np.zeros(2000), w2=np.zeros((3, 16, 2000)))
+    with pytest.raises(DisplayError, match="weights"):
+        Renderer(gl.context(), replace(scene, decoder=wide))
+
+
 def test_planes_that_fit_only_unrefined_are_folded_so(monkeypatch: pytest.MonkeyPatch) -> None:
     ctx, scene = gl.context(), tiny_scene(4)
     monkeypatch.setitem(ctx.info, "GL_MAX_TEXTURE_SIZE", max(Renderer(ctx, scene).layout.size))
@@ -117,6 +145,13 @@ def test_planes_that_fit_only_unrefined_are_folded_so(monkeypatch: pytest.Monkey
     assert renderer.folded_layout is renderer.layout
     error = renderer.render(CAMERAS["outside"], 0.7).rgb - render(scene, CAMERAS["outside"], 0.7).rgb
     assert -10 * np.log10(np.mean(error**2)) > 40
+
+
+def test_a_picture_too_large_for_the_card_is_refused() -> None:
+    renderer = Renderer(gl.context(), tiny_scene(4))
+    with pytest.raises(DisplayError, match=r"no room for a picture of 99999x2 .*smaller size"):
+        renderer.render(CAMERAS["outside"].resized(99999, 2), 0.0)
+    renderer.ctx.error  # the card's own note of it is read, and with that forgotten
 
 
 def test_an_error_of_the_card_is_told() -> None:

@@ -9,7 +9,11 @@ from kpc.player import shader
 
 
 def test_includes_come_once_and_lines_keep_their_numbers() -> None:
-    written = {"a": '#include "b"\nint a;\n#include "c"  // why\nint bad;\n', "b": "int b;\n", "c": '#include "b"\nint c;\n'}
+    written = {
+        "a": '#include "b"\nint a;\n#include "c"  // why\nint bad;\n',
+        "b": "int b;\n",
+        "c": '#include "b"\nint c;\n',
+    }
     text, files = shader.compose("a", {"N": 3}, written=written)
     assert files == ["a", "b", "c"]
     assert text.count("int b;") == 1 and "#define N 3\n" in text and "#include" not in text
@@ -37,17 +41,26 @@ def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
     assert len(set(files)) == len(files)
 
 
-@pytest.mark.parametrize("log", [
-    "0:10012(5): error: `x' undeclared",                # Mesa
-    "0(10012) : error C1503: undefined variable \"x\"",  # NVIDIA
-    "ERROR: 0:10012: 'x' : undeclared identifier",      # Intel, Apple, ANGLE
-])
+@pytest.mark.parametrize(
+    "log",
+    [
+        "0:10012(5): error: `x' undeclared",  # Mesa
+        '0(10012) : error C1503: undefined variable "x"',  # NVIDIA
+        "ERROR: 0:10012: 'x' : undeclared identifier",  # Intel, Apple, ANGLE
+    ],
+)
 def test_compiler_messages_name_the_file(log: str) -> None:
-    assert re.match(r"shader march\.glsl:12: .*(undeclared|undefined)", shader.first_complaint(f"\nFragment\n{log}\n", ["a.glsl", "march.glsl"]))
+    assert re.match(
+        r"shader march\.glsl:12: .*(undeclared|undefined)",
+        shader.first_complaint(f"\nFragment\n{log}\n", ["a.glsl", "march.glsl"]),
+    )
 
 
 def test_a_broken_shader_is_one_error_with_its_place() -> None:
-    written = {"main": '#include "part"\nout vec4 o;\nvoid main() { o = vec4(part()); }\n', "part": "\nfloat part() { return wrong; }\n"}
+    written = {
+        "main": '#include "part"\nout vec4 o;\nvoid main() { o = vec4(part()); }\n',
+        "part": "\nfloat part() { return wrong; }\n",
+    }
     with pytest.raises(DisplayError, match=r"shader part:2: .*wrong.*driver"):
         shader.build(gl.context(), "main", written=written)
 

@@ -17,7 +17,9 @@ def test_the_atlas_holds_every_plane(channels: int, scales: int) -> None:
     atlas = layout.atlas(scene)
     assert layout.layers == -(-channels // 4) and atlas.shape == (layout.size[1], layout.size[0], 4)
     claimed = np.zeros(atlas.shape[:2], int)
-    for block, (s, name) in zip(layout.blocks, [(s, name) for s in range(scales) for name in SPACE_PLANES], strict=True):
+    for block, (s, name) in zip(
+        layout.blocks, [(s, name) for s in range(scales) for name in SPACE_PLANES], strict=True
+    ):
         assert (block.scale, block.plane) == (s, name)
         claimed[block.y : block.y + block.height, block.x : block.x + layout.layers * block.width] += 1
         for m in range(channels):

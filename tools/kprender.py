@@ -1,13 +1,14 @@
 """kprender: pictures and videos of a scene, without a window.
 
-    kprender scene.kpc -o clip.mp4                            the clip, from the scene's first camera
-    kprender scene.kpc --orbit 96 -o orbit.mp4                a path around it while the clip plays
-    kprender scene.kpc --cameras cameras.json -o DIR          one picture for each frame the file lists
-    kprender scene.kpc --time 0.5 --size 960x720 -o still.png
+kprender scene.kpc -o clip.mp4                            the clip, from the scene's first camera
+kprender scene.kpc --orbit 96 -o orbit.mp4                a path around it while the clip plays
+kprender scene.kpc --cameras cameras.json -o DIR          one picture for each frame the file lists
+kprender scene.kpc --time 0.5 --size 960x720 -o still.png
 """
 
 import argparse
 import errno
+import itertools
 import os
 import re
 import sys
@@ -72,26 +73,65 @@ def _command(argv: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="kprender", description="Render a .kpc scene to pictures or a video, without a window.")
+    parser = argparse.ArgumentParser(
+        prog="kprender", description="Render a .kpc scene to pictures or a video, without a window."
+    )
     parser.add_argument("scene", help="a .kpc file")
-    parser.add_argument("-o", "--output", required=True, metavar="DIR|FILE",
-                        help="a directory for pictures, or an .mp4; for a single picture also a .png or .exr")
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="DIR|FILE",
+        help="a directory for pictures, or an .mp4; for a single picture also a .png or .exr",
+    )
     views = parser.add_mutually_exclusive_group()
-    views.add_argument("--cameras", metavar="JSON", help="cameras and times: w h fl_x fl_y cx cy frames[file time transform_matrix]")
+    views.add_argument(
+        "--cameras", metavar="JSON", help="cameras and times: w h fl_x fl_y cx cy frames[file time transform_matrix]"
+    )
     views.add_argument("--orbit", type=_count, metavar="N", help="N pictures along a path around the scene")
-    parser.add_argument("--time", type=_moment, metavar="T", help="in [0, 1] over the clip, for every picture "
-                        "(default: the times in --cameras, else from the clip's start to its end)")
+    parser.add_argument(
+        "--time",
+        type=_moment,
+        metavar="T",
+        help="in [0, 1] over the clip, for every picture "
+        "(default: the times in --cameras, else from the clip's start to its end)",
+    )
     parser.add_argument("--size", type=_size, metavar="WxH", help="of the pictures; the vertical field of view stays")
-    parser.add_argument("--depth", action="store_true", help="mp4: depth in grey instead of colour; png: a 16-bit NAME_depth.png "
-                        "beside each picture; exr: always holds depth, as Z")
+    parser.add_argument(
+        "--depth",
+        action="store_true",
+        help="mp4: depth in grey instead of colour; png: a 16-bit "
+        "NAME_depth.png beside each picture; exr: always holds depth, as Z",
+    )
     part = parser.add_mutually_exclusive_group()
-    part.add_argument("--static-only", action="store_const", dest="part", const=Part.STATIC, help="what never moves: time planes set to 1")
-    part.add_argument("--dynamic-only", action="store_const", dest="part", const=Part.DYNAMIC, help="|all of it - what never moves|")
-    parser.add_argument("--format", choices=("png", "exr"), default="png", help="of pictures in a directory: 8-bit, or linear "
-                        "float colour and depth (default: %(default)s)")
+    part.add_argument(
+        "--static-only",
+        action="store_const",
+        dest="part",
+        const=Part.STATIC,
+        help="what never moves: time planes set to 1",
+    )
+    part.add_argument(
+        "--dynamic-only", action="store_const", dest="part", const=Part.DYNAMIC, help="|all of it - what never moves|"
+    )
+    parser.add_argument(
+        "--format",
+        choices=("png", "exr"),
+        default="png",
+        help="of pictures in a directory: 8-bit, or linear float colour and depth (default: %(default)s)",
+    )
     parser.add_argument("--fps", type=_rate, metavar="F", help="of an mp4 (default: the clip's)")
-    parser.add_argument("--backend", choices=("gl", "reference"), default="gl", help="OpenGL, or numpy where there is none (default: %(default)s)")
-    parser.add_argument("--folded", action="store_true", help="gl: multiply time into the space planes once a frame: faster, 54 dB from exact")
+    parser.add_argument(
+        "--backend",
+        choices=("gl", "reference"),
+        default="gl",
+        help="OpenGL, or numpy where there is none (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--folded",
+        action="store_true",
+        help="gl: multiply time into the space planes once a frame: faster, 54 dB from exact",
+    )
     parser.set_defaults(part=Part.FULL)
     return parser
 
@@ -134,8 +174,11 @@ def _shots(scene: Scene, options: argparse.Namespace) -> list[Shot]:
     if options.cameras is not None:
         shots = load_shots(options.cameras)
     else:
-        views = orbit(scene, options.orbit) if options.orbit else [Rig.of(scene).cameras[0]] * (
-            1 if options.time is not None else scene.clip.frame_count)
+        views = (
+            orbit(scene, options.orbit)
+            if options.orbit
+            else [Rig.of(scene).cameras[0]] * (1 if options.time is not None else scene.clip.frame_count)
+        )
         times = np.linspace(0.0, 1.0, len(views))
         shots = [Shot(camera, float(time), f"{number:04d}") for number, (camera, time) in enumerate(zip(views, times))]
     if options.time is not None:
@@ -151,7 +194,9 @@ def _shots(scene: Scene, options: argparse.Namespace) -> list[Shot]:
 def _backend(scene: Scene, options: argparse.Namespace) -> tuple[Render, str]:
     """How to render, and its name. OpenGL is looked for only where it is wanted."""
     if options.backend == "reference":
-        return lambda camera, time: reference.render(scene, camera, time, part=options.part), "reference renderer (numpy)"
+        return lambda camera, time: reference.render(
+            scene, camera, time, part=options.part
+        ), "reference renderer (numpy)"
     from kpc.player import offscreen
     from kpc.player.renderer import Renderer
 
@@ -161,7 +206,10 @@ def _backend(scene: Scene, options: argparse.Namespace) -> tuple[Render, str]:
 
 
 def _paths(out: Path, shots: list[Shot], suffix: str) -> Iterator[Path]:
-    """Where each picture goes. A camera file comes from anywhere: of its names only the last part is used, and none twice."""
+    """Where each picture goes.
+
+    A camera file may come from anywhere: of its names only the last part is used, and none twice.
+    """
     if out.suffix.lower() in (".png", ".exr"):
         yield out
         return
@@ -190,13 +238,14 @@ def _write(path: Path, rendering: Rendering, depth_unit: float | None) -> None:
 
 
 def _write_exr(path: Path, rendering: Rendering) -> None:
-    """R, G, B in linear light (the inverse sRGB curve of the colours), Z in world units along the ray, inf where nothing is."""
+    """R, G, B in linear light (the inverse sRGB curve), Z in world units along the ray, inf where nothing is."""
     rgb = np.clip(rendering.rgb, 0, 1).astype(np.float64)
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
     channels = {"RGB": linear, "Z": np.ascontiguousarray(rendering.depth, np.float32)}
-    with cli.written_aside(path) as aside, OpenEXR.File(
-        {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels
-    ) as exr:
+    with (
+        cli.written_aside(path) as aside,
+        OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as exr,
+    ):
         exr.write(str(aside))
 
 
@@ -206,7 +255,7 @@ def _colour_pixels(rendering: Rendering) -> np.ndarray:
 
 def _farthest(scene: Scene, shots: list[Shot]) -> float:
     """The greatest distance from a camera to a corner of the box: no depth exceeds it."""
-    corners = np.array([[scene.aabb[i, 0], scene.aabb[j, 1], scene.aabb[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    corners = np.array(list(itertools.product(*scene.aabb.T)))
     eyes = np.unique([shot.camera.camera_to_world[:3, 3] for shot in shots], axis=0)
     return float(np.linalg.norm(eyes[:, None] - corners, axis=2).max())
 

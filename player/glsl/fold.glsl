@@ -1,7 +1,7 @@
 // Multiplies a row of a time plane into one plane of space, for a march that then needs the planes alone.
 //
-// Exact at the texels of what is written. Between them the product of two interpolations becomes the interpolation of a product; its
-// error falls with the square of the distance between texels, so that the result is written finer along the row.
+// Exact at the texels of what is written. Between them the product of two interpolations becomes the interpolation of a
+// product. That error falls with the square of the distance between texels: the result is written finer along the row.
 
 #include "planes.glsl"
 

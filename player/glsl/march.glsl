@@ -1,5 +1,7 @@
-// The picture of a scene. SCALES, LAYERS (of four channels), HIDDEN: its shape; ROWS: 1 where rows of time planes are multiplied in.
-// Normative text and a readable twin: kpc.player.reference.
+// The picture of a scene; normative text and a readable twin: kpc.player.reference.
+//
+// SCALES, LAYERS (of four channels), HIDDEN: its shape. ROWS: 1 where rows of time planes are multiplied in at every
+// sample. REFINED: how much finer than the scene's the planes are along the row folded into them; 1 where none is.
 
 #include "ray.glsl"
 #include "occupancy.glsl"
@@ -77,7 +79,7 @@ void main() {
     float depth = 0.0;
     float samples = 0.0;
     bool more = to_occupied(walk, cells, cell_count);
-    // Tested at its end: on a software renderer a loop costs its body once more than the longest of neighbouring rays needs otherwise.
+    // Tested at its end: neighbouring rays run as one, and a test up front would cost them all one more body.
     do {
         if (more) {
             float t = sample_t(walk);

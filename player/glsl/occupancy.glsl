@@ -1,7 +1,7 @@
 // Walking the sampling lattice t_k = near + (k + 1/2) stride through occupied cells only.
 //
-// A cell of the grid holds 0 where it is occupied, else the Chebyshev distance in cells to the nearest one that is (at most 255).
-// All cells nearer than that are empty, so that a ray crosses a whole block of them in one step. The lattice stays the same.
+// A cell of the grid holds 0 where it is occupied, else the Chebyshev distance in cells to the nearest one that is (at
+// most 255). All cells nearer than that are empty: a ray crosses a whole block of them in one step. The lattice stays.
 
 struct Walk {
     vec3 start;    // where the ray begins, in cells

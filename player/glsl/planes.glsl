@@ -1,7 +1,7 @@
 // Features of a point: the product over planes of bilinear samples, four channels a texel, corner-aligned.
 //
-// All planes lie in one texture. The block of one plane of one scale begins at `origin` (in texels) and holds its layers of four
-// channels side by side. Positions never leave [0, size - 1], so that no filter reaches into a neighbour.
+// All planes lie in one texture. The block of a plane at a scale begins at `origin` (in texels) and holds its layers
+// of four channels side by side. Positions never leave [0, size - 1], so that no filter reaches into a neighbour.
 // Rows are the time planes cut at one time: one line of the `rows` texture for each axis, scale and layer.
 
 vec4 plane_layer(sampler2D planes, vec2 texel, vec2 origin, float width, vec2 position, int layer) {

@@ -21,7 +21,10 @@ void main() {
     vec2 sums = texture(met, at).xy;
     vec3 rgb = colour.rgb;
     if (view == 1) rgb = abs(rgb - texture(without, at).rgb);
-    if (view == 2) rgb = heat(1.0 - clamp((sums.x / max(colour.a, 1e-6) - depths.x) / (depths.y - depths.x), 0.0, 1.0)) * colour.a;
+    if (view == 2) {
+        float depth = sums.x / max(colour.a, 1e-6);
+        rgb = colour.a * heat(1.0 - clamp((depth - depths.x) / (depths.y - depths.x), 0.0, 1.0));
+    }
     if (view == 3) rgb = heat(sums.y / most_samples);
     shown = vec4(rgb, 1.0);
 }

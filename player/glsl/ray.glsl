@@ -9,10 +9,13 @@ vec3 camera_direction(vec2 fragment, float height, vec4 lens, mat3 axes) {
     return normalize(axes * vec3((pixel.x - lens.z) / lens.x, (lens.w - pixel.y) / lens.y, -1.0));
 }
 
+float slanted(float x) {
+    return abs(x) >= PARALLEL ? x : x < 0.0 ? -PARALLEL : PARALLEL;
+}
+
 // A direction none of whose components is 0.
 vec3 slanted(vec3 d) {
-    vec3 away = vec3(d.x < 0.0 ? -PARALLEL : PARALLEL, d.y < 0.0 ? -PARALLEL : PARALLEL, d.z < 0.0 ? -PARALLEL : PARALLEL);
-    return vec3(abs(d.x) < PARALLEL ? away.x : d.x, abs(d.y) < PARALLEL ? away.y : d.y, abs(d.z) < PARALLEL ? away.z : d.z);
+    return vec3(slanted(d.x), slanted(d.y), slanted(d.z));
 }
 
 // Where o + t d is inside the box: (near, far), near >= 0; far <= near where it misses.
