@@ -3,9 +3,11 @@ import re
 import gl
 import numpy as np
 import pytest
+from scenes import tiny_scene
 
 from kpc.format.errors import DisplayError
 from kpc.player import shader
+from kpc.player.textures import Layout, decoder_arrays
 
 
 def test_includes_come_once_and_lines_keep_their_numbers() -> None:
@@ -71,3 +73,18 @@ def test_constants_are_exact() -> None:
     assert text.startswith("const vec4 w[3] = vec4[3](vec4(")
     numbers = re.findall(r"-?\d\.\d+e[+-]\d+", text)
     assert np.array_equal(np.array(numbers, np.float32).reshape(3, 4), values)
+
+
+@pytest.mark.parametrize("rows", [0, 1])
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl"])
+def test_shaders_keep_to_the_subset_that_browsers_take(name: str, rows: int) -> None:
+    ctx = gl.context()
+    if "GL_ARB_ES3_compatibility" not in ctx.extensions:
+        pytest.skip("this OpenGL compiles no GLSL ES 3.00")
+    scene = tiny_scene(0, scales=3, channels=5)
+    layout = Layout.of(scene)
+    weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
+    defines = {"SCALES": 3, "LAYERS": layout.layers, "HIDDEN": len(scene.decoder.b1), "ROWS": rows, "REFINED": 1}
+    fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights})
+    vertex, _ = shader.compose("fullscreen.glsl", preamble=shader.ES30)
+    ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()
