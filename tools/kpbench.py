@@ -1,0 +1,321 @@
+"""kpbench: how good, how small and how fast, as records that can be checked.
+
+kpbench encode room liam --preset balanced --out docs/bench/balanced.json
+kpbench player room.kpc liam.kpc --out docs/bench/player.json
+
+Every record says what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
+data) and what came of it, each repeat on its own. Output is one JSON list, a record a line: with --out written after every
+run, else to stdout at the end. Every repeat is a process of its own, so that none inherits another's memory or caches.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import re
+import shlex
+import sys
+import tempfile
+import time as clock
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+import numpy as np
+
+import kpc
+from kpc.format import cli
+from kpc.format.errors import KpcError, UsageError
+from kpc.tools import results
+from kpc.tools.provenance import commit, data_hash, machine, peak_memory_bytes, versions
+
+T = TypeVar("T")
+
+WARM_UP = 3
+"""Frames drawn before those that are timed."""
+MIDDLE = 0.5
+"""The time in the clip at which pictures are compared."""
+
+
+@dataclass(frozen=True)
+class Play:
+    """What one run of the player is told."""
+
+    scene: Path
+    size: tuple[int, int]
+    frames: int
+    folded: bool
+
+
+def main(argv: list[str] | None = None) -> int:
+    return cli.run(_command, "kpbench", argv)
+
+
+def _command(argv: list[str]) -> None:
+    options = _parser().parse_args(argv)
+    origin = {
+        "commit": commit(),
+        "command": shlex.join(["kpbench", *argv]),
+        "machine": machine(),
+        "versions": versions(),
+    }
+    out: Path | None = options.out
+    if out is not None and not out.absolute().parent.is_dir():
+        raise UsageError(f"--out {out}: no such folder; make it first")
+    records: list[results.Record] = []
+    try:
+        for record in options.measure(options, origin):
+            records.append(record)
+            if out is not None:
+                with cli.written_aside(out) as aside:
+                    aside.write_text(_as_json(records))
+    finally:  # a failure or Ctrl-C later on takes away nothing that was measured
+        if records:
+            print(results.aligned(results.cells(options.kind, records)), file=sys.stderr)
+            if out is None:
+                print(_as_json(records), end="")
+
+
+def _as_json(records: Sequence[results.Record]) -> str:
+    return "[\n" + ",\n".join(json.dumps(record) for record in records) + "\n]\n"
+
+
+def _record(kind: str, source: Path, origin: results.Record, settings: dict[str, Any]) -> results.Record:
+    """What a record says before anything is measured."""
+    return {
+        "kind": kind,
+        "name": source.resolve().stem if kind == "player" else source.resolve().name,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        **origin,
+        "load_average": os.getloadavg()[0],
+        "data_sha256": data_hash(source),
+        "settings": settings,
+    }
+
+
+# --- encoding
+
+
+def _encode(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """One record a dataset. Repeat k runs with seed + k, so that repeats show the spread of quality, too."""
+    kpenc = _encoder()
+    with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
+        kept: Path = options.keep_scenes or Path(scratch)
+        kept.mkdir(parents=True, exist_ok=True)
+        for source in options.datasets:
+            if not source.is_dir():
+                raise UsageError(f"{source}: no such folder")
+            settings = {
+                "preset": options.preset,
+                "steps": options.steps,
+                "time_budget_s": options.time_budget,
+                "downscale": options.downscale,
+                "box": options.box,
+                "test_views": options.test_views,
+            }
+            record = _record("encode", source, origin, settings) | {"seed": options.seed, "repeats": []}
+            for seed in range(options.seed, options.seed + options.repeats):
+                suffix = f"-{seed}" if options.repeats > 1 else ""
+                job = kpenc.Options(
+                    source=source,
+                    output=kept / f"{record['name']}-{options.preset}{suffix}.kpc",
+                    preset=options.preset,
+                    steps=options.steps,
+                    time_budget_s=options.time_budget,
+                    seed=seed,
+                    device=options.device,
+                    downscale=options.downscale,
+                    box=options.box,
+                    work=Path(scratch) / f"{record['name']}-{seed}.work",
+                    most_tests=options.test_views,
+                )
+                print(f"kpbench: {record['name']}, {options.preset}, seed {seed}", file=sys.stderr)
+                device, outcome = _alone(_encode_once, job)
+                record["repeats"].append(outcome)
+            yield record | {"renderer": device}
+
+
+def _encode_once(job: Any) -> tuple[str, results.Record]:
+    """Where it was trained, and what kpenc says of its run."""
+    import torch
+
+    outcome = _encoder().encode(job)
+    device = outcome.pop("device")
+    outcome["file"] = Path(outcome["file"]).name  # where it lay is nobody's business
+    outcome["peak_memory_bytes"] = peak_memory_bytes()
+    return device if device == "cpu" else torch.cuda.get_device_name(), outcome
+
+
+def _encoder() -> ModuleType:
+    try:
+        from kpc.encoder import kpenc
+    except ModuleNotFoundError as error:
+        raise UsageError(f'encode needs {error.name}, which is not installed; pip install "kpc[encoder]"') from error
+    return kpenc
+
+
+# --- playing
+
+
+def _player(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """A record for each scene and path: exact, and folded where the scene moves."""
+    for source in options.scenes:
+        paths = (False, True) if kpc.load(source).is_dynamic else (False,)
+        for folded in paths:
+            settings = {
+                "path": "folded" if folded else "exact",
+                "size": "{}x{}".format(*options.size),
+                "frames": options.frames,
+                "warm_up": WARM_UP,
+            }
+            record = _record("player", source, origin, settings)
+            job = Play(source, options.size, options.frames, folded)
+            print(f"kpbench: {record['name']}, {settings['path']}", file=sys.stderr)
+            repeats = [_alone(_play_once, job) for _ in range(options.repeats)]  # first: drivers keep compiled shaders
+            renderer, accuracy = _alone(_compare, job)
+            yield record | {"seed": None, "renderer": renderer, "accuracy": accuracy, "repeats": repeats}
+
+
+def _play_once(job: Play) -> results.Record:
+    """Open the file, draw the first frame, then `job.frames` more with the clip's time moving on with each."""
+    from kpc.player import offscreen
+    from kpc.player.orbit import Rig, fitted
+    from kpc.player.renderer import Renderer
+
+    begun = clock.perf_counter()
+    ctx = offscreen.open_context()
+    screen = ctx.simple_framebuffer(job.size, components=4)
+    opened = clock.perf_counter()
+    scene = kpc.load(job.scene)
+    loaded = clock.perf_counter()
+    renderer = Renderer(ctx, scene, folded=job.folded)
+    ctx.finish()
+    uploaded = clock.perf_counter()
+    camera = fitted(Rig.of(scene).cameras[0], *job.size)
+
+    def draw(time: float) -> float:
+        """Seconds until the picture is there."""
+        started = clock.perf_counter()
+        renderer.show(screen, camera, time)
+        ctx.finish()
+        return clock.perf_counter() - started
+
+    draw(0.0)
+    shown = clock.perf_counter()
+    for time in np.linspace(0.0, 1.0, WARM_UP + 1)[1:]:
+        draw(float(time))
+    frame_ms = [1e3 * draw(float(time)) for time in np.linspace(0.0, 1.0, job.frames)]
+    renderer.check()
+    return {
+        "context_ms": 1e3 * (opened - begun),
+        "load_ms": 1e3 * (loaded - opened),
+        "upload_ms": 1e3 * (uploaded - loaded),
+        "first_render_ms": 1e3 * (shown - uploaded),
+        "first_frame_ms": 1e3 * (shown - opened),
+        "frame_ms": [round(ms, 3) for ms in frame_ms],
+        "frame_ms_median": float(np.median(frame_ms)),
+        "frame_ms_p95": float(np.percentile(frame_ms, 95)),
+        "fps": 1e3 / float(np.median(frame_ms)),
+        "gpu_memory_bytes": renderer.memory_bytes,
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+
+
+def _compare(job: Play) -> tuple[str, results.Record]:
+    """The renderer's name, and how near its picture is to the reference's, in the middle of the clip."""
+    from kpc.player import offscreen, reference
+    from kpc.player.orbit import Rig, fitted
+    from kpc.player.renderer import Renderer
+
+    ctx = offscreen.open_context()
+    scene = kpc.load(job.scene)
+    camera = fitted(Rig.of(scene).cameras[0], *job.size)
+    drawn = Renderer(ctx, scene, folded=job.folded).render(camera, MIDDLE)
+    wanted = reference.render(scene, camera, MIDDLE)
+    difference = np.abs(np.clip(drawn.rgb, 0, 1) - np.clip(wanted.rgb, 0, 1))
+    return offscreen.describe(ctx), {
+        "time": MIDDLE,
+        "psnr": float(-10 * np.log10(max(np.mean(np.square(difference), dtype=np.float64), 1e-10))),
+        "within_one_level": float(np.mean(difference.max(axis=2) <= 1 / 255)),
+        "samples_per_ray": float(drawn.samples.mean()),
+    }
+
+
+def _alone(function: Callable[[Any], T], job: Any) -> T:
+    """`function(job)` in a fresh process."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        try:
+            return pool.submit(function, job).result()
+        except BrokenProcessPool as error:
+            raise KpcError(f"{function.__name__.strip('_')}: its process was killed; is there enough memory?") from error
+
+
+# --- the command line
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
+    )
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|player")
+
+    encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
+    encode.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
+    encode.add_argument("--preset", choices=("draft", "fast", "balanced", "best"), default="balanced")
+    encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
+    encode.add_argument("--time-budget", type=_duration, metavar="10m", help="of training, instead of a number of steps")
+    encode.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
+    encode.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    encode.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
+    encode.add_argument("--box", type=_box, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
+    encode.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
+    encode.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there")
+    encode.set_defaults(measure=_encode)
+
+    player = kinds.add_parser("player", help="draw each scene, headless", description="Draw each scene, headless.")
+    player.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
+    player.add_argument("--size", type=_size, default=(320, 240), metavar="WxH", help="of a frame (default: 320x240)")
+    player.add_argument("--frames", type=_positive, default=60, help="timed frames, spread over the clip (default: 60)")
+    player.set_defaults(measure=_player)
+
+    for kind in (encode, player):
+        kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
+        kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
+    return parser
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
+    return int(text)
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size like 320x240")
+    return int(match[1]), int(match[2])
+
+
+def _duration(text: str) -> float:
+    seconds: float = _encoder().duration_s(text)
+    return seconds
+
+
+def _box(text: str) -> tuple[float, ...]:
+    try:
+        corners = tuple(float(number) for number in text.split(","))
+    except ValueError:
+        corners = ()
+    if len(corners) != 6 or not all(-np.inf < low < high < np.inf for low, high in zip(corners[:3], corners[3:])):
+        raise argparse.ArgumentTypeError(f"{text!r} is not x0,y0,z0,x1,y1,z1 with each lower bound below the upper")
+    return corners
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""Where a measurement comes from: code, machine, software, data."""
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import kpc
+
+BLOCK = 1 << 20
+
+
+def commit() -> str:
+    """The git commit of the checkout that `kpc` was imported from, "+dirty" where it was changed since; else "unknown"."""
+    source = Path(kpc.__file__).resolve()
+    tracked = _git(source.parent, "ls-files", "--error-unmatch", source.name)  # an installed copy may lie in some checkout
+    head = _git(source.parent, "rev-parse", "HEAD") if tracked else None
+    if not head:
+        return "unknown"
+    return head + ("+dirty" if _git(source.parent, "status", "--porcelain", "--untracked-files=no", ":/") else "")
+
+
+def machine() -> dict[str, str | int]:
+    """Processor, cores this process may use, memory in bytes, operating system, Python."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return {
+        "cpu": _cpu(),
+        "cores": cores,
+        "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "os": platform.platform(),
+        "python": platform.python_version(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Installed versions of kpc and of everything it asks for, extras included."""
+    wanted = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in importlib.metadata.requires("kpc") or ()]
+    found = {}
+    for name in ["kpc", *sorted(wanted, key=str.lower)]:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue  # an extra that is not installed
+    return found
+
+
+def data_hash(path: Path) -> str:
+    """SHA-256, in hex, of a file; or of a folder: of each file in it, by sorted relative name, the name (UTF-8), NUL,
+    the length (8 bytes, little endian), the content. Hidden files and folders are left out."""
+    digest = hashlib.sha256()
+    if path.is_file():
+        _feed(digest, path)
+        return digest.hexdigest()
+    names = sorted(file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file())
+    for name in names:
+        if any(part.startswith(".") for part in name.split("/")):
+            continue
+        digest.update(name.encode() + b"\0" + (path / name).stat().st_size.to_bytes(8, "little"))
+        _feed(digest, path / name)
+    return digest.hexdigest()
+
+
+def peak_memory_bytes() -> int:
+    """The most memory this process has had resident so far."""
+    try:  # unlike ru_maxrss, not inherited from the process that started this one
+        status = Path("/proc/self/status").read_text()
+        return 1024 * int(re.findall(r"^VmHWM:\s*(\d+) kB", status, re.MULTILINE)[0])
+    except (OSError, IndexError):
+        import resource  # Unix only
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def _feed(digest: "hashlib._Hash", path: Path) -> None:
+    with path.open("rb") as file:
+        while block := file.read(BLOCK):
+            digest.update(block)
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """What git says, or None where there is no git, no checkout or an error."""
+    try:
+        done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=False)
+    except OSError:
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _cpu() -> str:
+    try:
+        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        found = None
+    if found:
+        return found[1].strip()
+    if sys.platform == "darwin":
+        done = subprocess.run(["sysctl", "-n", "machdep.cpu.brand_string"], capture_output=True, text=True, check=False)
+        return done.stdout.strip() or platform.machine()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,178 @@
+"""Tables of benchmark records, and the block of README.md that holds them.
+
+python -m kpc.tools.results docs/bench/*.json                       print the tables as Markdown
+python -m kpc.tools.results docs/bench/*.json --readme README.md    rewrite the block between the markers
+
+Numbers in documents come from here, never from a keyboard. A cell is the median over the repeats of a run.
+"""
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from kpc.format import cli
+from kpc.format.errors import FormatError
+
+Record = dict[str, Any]
+Column = tuple[str, Callable[[Record], str]]
+
+BEGIN = "<!-- results: begin; written by `python -m kpc.tools.results docs/bench/*.json --readme README.md` -->"
+END = "<!-- results: end -->"
+
+
+def median(record: Record, key: str) -> float | None:
+    """Over the repeats that have `key`; None where none has."""
+    values = [repeat[key] for repeat in record["repeats"] if repeat.get(key) is not None]
+    return statistics.median(values) if values else None
+
+
+def _number(key: str, text: str, unit: float = 1.0) -> Callable[[Record], str]:
+    """The median of `key` in multiples of `unit`, as `text` formats it."""
+
+    def cell(record: Record) -> str:
+        value = median(record, key)
+        return "-" if value is None else text.format(value / unit)
+
+    return cell
+
+
+def _accuracy(key: str, text: str) -> Callable[[Record], str]:
+    return lambda record: text.format(record["accuracy"][key])
+
+
+COLUMNS: dict[str, list[Column]] = {
+    "encode": [
+        ("dataset", lambda r: r["name"]),
+        ("preset", lambda r: r["settings"]["preset"]),
+        ("PSNR dB", _number("test_psnr", "{:.2f}")),
+        ("SSIM", _number("test_ssim", "{:.3f}")),
+        ("file KB", _number("size_bytes", "{:.0f}", 1e3)),
+        ("bits/param", _number("bits_per_parameter", "{:.2f}")),
+        ("identity", _number("identity_share", "{:.0%}")),
+        ("coding loss dB", _number("coding_loss_db", "{:.2f}")),
+        ("training", _number("train_s", "{:.0f} s")),
+        ("all", _number("encode_s", "{:.0f} s")),
+        ("rays/s", _number("rays_per_s", "{:,.0f}")),
+        ("peak MB", _number("peak_memory_bytes", "{:.0f}", 1e6)),
+    ],
+    "player": [
+        ("scene", lambda r: r["name"]),
+        ("path", lambda r: r["settings"]["path"]),
+        ("size", lambda r: r["settings"]["size"]),
+        ("first frame ms", _number("first_frame_ms", "{:.0f}")),
+        ("median ms", _number("frame_ms_median", "{:.1f}")),
+        ("p95 ms", _number("frame_ms_p95", "{:.1f}")),
+        ("fps", _number("fps", "{:.1f}")),
+        ("samples/ray", _accuracy("samples_per_ray", "{:.1f}")),
+        ("textures MB", _number("gpu_memory_bytes", "{:.1f}", 1e6)),
+        ("peak MB", _number("peak_memory_bytes", "{:.0f}", 1e6)),
+        ("PSNR to reference dB", _accuracy("psnr", "{:.1f}")),
+        ("within 1/255", _accuracy("within_one_level", "{:.2%}")),
+    ],
+}
+TITLES = {"encode": "Encoding", "player": "Playing"}
+
+
+def cells(kind: str, records: Iterable[Record]) -> list[list[str]]:
+    """Heading and rows of the table of one kind of record."""
+    columns = COLUMNS[kind]
+    return [[name for name, _ in columns]] + [[cell(record) for _, cell in columns] for record in records]
+
+
+def aligned(table: Sequence[Sequence[str]]) -> str:
+    """A table for a terminal."""
+    widths = [max(map(len, column)) for column in zip(*table)]
+    return "\n".join("  ".join(text.ljust(width) for text, width in zip(row, widths)).rstrip() for row in table)
+
+
+def markdown(records: Sequence[Record]) -> str:
+    """Tables of all records, one for each kind and machine, and below each where its numbers come from."""
+    parts = []
+    for kind, title in TITLES.items():
+        ours = [record for record in records if record["kind"] == kind]
+        for place in dict.fromkeys(map(_place, ours)):
+            here = [record for record in ours if _place(record) == place]
+            head, *rows = cells(kind, here)
+            lines = [head, ["---"] * len(head), *rows]
+            runs = sorted({len(record["repeats"]) for record in here})
+            commits = ", ".join(dict.fromkeys(_short(record["commit"]) for record in here))
+            parts.append(f"**{title}** on {place}:")
+            parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
+            parts.append(
+                f"Commit {commits}; median of {' or '.join(map(str, runs))} run{'s' * (runs != [1])}; "
+                + "; ".join(dict.fromkeys(f"`{record['command']}`" for record in here))
+                + "."
+            )
+    return "\n\n".join(parts)
+
+
+def _place(record: Record) -> str:
+    machine = record["machine"]
+    processor = f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB"
+    return processor if record["renderer"] == "cpu" else f"{record['renderer']} ({processor})"
+
+
+def _short(commit: str) -> str:
+    digits, plus, dirty = commit.partition("+")
+    return digits[:9] + plus + dirty
+
+
+def load(paths: Iterable[Path]) -> list[Record]:
+    """The records of files that kpbench wrote, in order.
+
+    Raises:
+        FormatError: a file holds something else.
+    """
+    records: list[Record] = []
+    for path in paths:
+        try:
+            found = json.loads(path.read_text())
+            if not isinstance(found, list):
+                raise ValueError("not a list")
+            for record in found:
+                cells(record["kind"], [record])
+                _place(record), record["commit"], record["command"]
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise FormatError(f"{path}: not records of kpbench ({error!r}); write it with kpbench --out") from error
+        records += found
+    return records
+
+
+def rewrite(readme: Path, block: str) -> None:
+    """Put `block` between the markers of `readme`.
+
+    Raises:
+        FormatError: the markers are not there, once each and in order.
+    """
+    text = readme.read_text()
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end or BEGIN in after or END in after:
+        raise FormatError(f"{readme}: needs the lines {BEGIN} and {END}, once each and in this order")
+    with cli.written_aside(readme) as aside:
+        aside.write_text(f"{before}{BEGIN}\n\n{block}\n\n{END}{after}")
+
+
+def main(argv: list[str] | None = None) -> int:
+    return cli.run(_command, "results", argv)
+
+
+def _command(argv: list[str]) -> None:
+    parser = argparse.ArgumentParser("results", description="Tables of benchmark records, as Markdown.")
+    parser.add_argument("records", type=Path, nargs="+", help="files that kpbench --out wrote")
+    parser.add_argument("--readme", type=Path, help="rewrite the block between this file's markers instead of printing")
+    options = parser.parse_args(argv)
+    block = markdown(load(options.records))
+    if options.readme is None:
+        print(block)
+    else:
+        rewrite(options.readme, block)
+        print(options.readme)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
