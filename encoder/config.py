@@ -1,6 +1,6 @@
 """What a training run is told to do: one frozen record, every number with its meaning and where it comes from."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from kpc.format.errors import UsageError
 
@@ -79,8 +79,3 @@ PRESETS = {
     "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=16000),
     "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000),
 }
-
-
-def preset(name: str, **changes: int | float | tuple[int, ...]) -> TrainConfig:
-    """A preset with some fields changed."""
-    return replace(PRESETS[name], **changes)

@@ -73,7 +73,8 @@ def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None) -> Qual
     for number in held_out:
         picture, truth = np.clip(renderer.picture(dataset, int(number)), 0, 1), true_picture(dataset, int(number))
         scores.append((psnr(picture, truth), ssim(picture, truth)))
-    return Quality(*(float(np.mean(s)) for s in zip(*scores)), len(scores))
+    mean_psnr, mean_ssim = np.mean(scores, axis=0)
+    return Quality(float(mean_psnr), float(mean_ssim), len(scores))
 
 
 def true_picture(dataset: Dataset, number: int) -> np.ndarray:

@@ -203,11 +203,14 @@ class Rays:
 
 def render_reference(
     field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float
-) -> tuple[Tensor, int]:
-    """Colours (N, 3) of a batch of rays and the samples taken, in plain PyTorch: the reference of `kernels.backpropagate`.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours of a batch of rays, in plain PyTorch: the reference of `kernels.backpropagate`.
 
     Sample k of a ray lies at near + (k + jitter) * step and counts where the occupancy grid (slots, Nz, Ny, Nx) is set;
     alpha = 1 - exp(-sigma step / extent); a ray ends once its transmittance falls below TERMINATION.
+
+    Returns:
+        Colours (N, 3); of the n samples taken their weights (n,), and their cells (n, 3) int64 in the order z, y, x.
     """
     extent = (aabb[1] - aabb[0]).max()
     inverse = 1 / rays.directions
@@ -222,7 +225,8 @@ def render_reference(
     size = torch.tensor(occupancy.shape[:0:-1], device=u.device)
     cell = (u.detach() * size).long().clamp(min=0).minimum(size - 1)
     slot = (rays.times * occupancy.shape[0]).long().clamp(max=occupancy.shape[0] - 1)[:, None]
-    taken = occupancy[slot, cell[..., 2], cell[..., 1], cell[..., 0]].bool() & (t < far[:, None])
+    cell = cell.flip(-1)
+    taken = occupancy[slot, cell[..., 0], cell[..., 1], cell[..., 2]].bool() & (t < far[:, None])
     ray, _ = index = taken.nonzero(as_tuple=True)
 
     features = field.features(u[index], rays.times[ray])
@@ -232,7 +236,8 @@ def render_reference(
     basis = field.basis(rays.directions)
     colours = torch.sigmoid(torch.einsum("nf,ncf->nc", features, basis[ray]))
     rgb = torch.zeros_like(rays.backgrounds).index_add(0, ray, weights[index][:, None] * colours)
-    return rgb + (1 - weights.sum(1, keepdim=True)) * rays.backgrounds, len(ray)
+    reached = trans[:, :-1][index] >= TERMINATION
+    return rgb + (1 - weights.sum(1, keepdim=True)) * rays.backgrounds, weights[index][reached], cell[index][reached]
 
 
 def priors(field: Field, config: TrainConfig) -> Tensor:

@@ -1,11 +1,14 @@
 """`kpenc`: a folder of posed videos or images becomes a .kpc file."""
 
 import argparse
+import contextlib
 import json
 import os
-import shutil
+import signal
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +33,8 @@ PROBE_RAYS = 1 << 15
 
 MOST_CAMERAS = 32
 """Cameras of the dataset that the file names."""
+
+CHECKPOINT = "checkpoint.kpck"
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,8 @@ class Options:
 
 
 def main(argv: list[str] | None = None) -> int:
-    return cli.run(_command, "kpenc", argv)
+    with _on_signals(signal.default_int_handler):
+        return cli.run(_command, "kpenc", argv)
 
 
 def _command(argv: list[str]) -> None:
@@ -92,17 +98,20 @@ def encode(options: Options) -> dict[str, Any]:
     _check_output(options.output)
     config, device = options.config(), _device(options.device)
     work = options.work_dir
-    work.mkdir(parents=True, exist_ok=True)
-    dataset = load_dataset(options.source, work, holdout=options.holdout, downscale=options.downscale)
-    _check_views(dataset, options.source)
-    aabb = find_box(dataset.pictures, dataset.has_alpha) if options.box is None else np.float32(options.box).reshape(2, 3)
-    trainer = Trainer(dataset, config, aabb, device)
+    _make_work_dir(work)
+    try:
+        dataset = load_dataset(options.source, work, holdout=options.holdout, downscale=options.downscale)
+        trainer = Trainer(dataset, config, _box_of(dataset, options), device)
+    except BaseException:
+        _remove_if_empty(work)
+        raise
     _say(dataset.describe())
     _say(_plan(trainer))
-    checkpoint = work / "checkpoint.kpck"
-    if options.resume and checkpoint.exists():
-        trainer.resume(checkpoint)
-        _say(f"resumed at step {trainer.step}")
+    checkpoint = work / CHECKPOINT
+    if options.resume:
+        if checkpoint.exists():
+            trainer.resume(checkpoint)
+        _say(f"resumed at step {trainer.step}" if trainer.step else f"{checkpoint}: no checkpoint yet; starting afresh")
 
     try:
         _train(trainer, checkpoint, options.time_budget_s)
@@ -114,11 +123,11 @@ def encode(options: Options) -> dict[str, Any]:
     _say("writing: choosing quantisation steps, rendering held-out views")
     scene = to_scene(trainer)
     quantised, probe_loss = quantise(trainer, scene)
-    size = file.write(quantised, options.output)
+    size = _write(quantised, options.output, work)
     decoded = file.read(options.output).dequantise()
     test, before = evaluate(decoded, dataset, most=options.most_tests), evaluate(scene, dataset, most=options.most_tests)
     if not options.keep:
-        shutil.rmtree(work, ignore_errors=True)
+        _clear(work)
     return {
         "file": str(options.output), "layout": dataset.layout, "dynamic": dataset.is_dynamic, "preset": options.preset,
         "seed": options.seed, "device": device, "box": trainer.aabb.tolist(),
@@ -161,7 +170,31 @@ def _train(trainer: Trainer, checkpoint: Path, time_budget_s: float | None) -> N
                           f"{r.samples_per_ray:.1f} samples/ray, {r.occupied:.1%} occupied")
             progress.advance(1000 * min(r.fraction, 1.0) - progress.done)
 
-        trainer.run(report, checkpoint, time_budget_s=time_budget_s)
+        requests: list[int] = []
+        with _on_signals(lambda number, _: requests.append(number)):
+            trainer.run(report, checkpoint, time_budget_s=time_budget_s, interrupted=lambda: bool(requests))
+
+
+@contextlib.contextmanager
+def _on_signals(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Ctrl-C and SIGTERM alike go to `handler`, unless they are ignored. Only the main thread may decide that."""
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is not signal.SIG_IGN]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
+
+
+def _write(scene: QuantisedScene, output: Path, work: Path) -> int:
+    try:
+        return file.write(scene, output)
+    except OSError as error:
+        kept = f", or give another -o with --work {work} --resume to keep what is trained"
+        raise TrainingError(f"{output}: {error.strerror}; make room there{kept}") from error
 
 
 def _wants_partial(trainer: Trainer, checkpoint: Path) -> bool:
@@ -193,9 +226,39 @@ def _spread_of_cameras(dataset: Dataset) -> list[int]:
     return [int(first[central])] + [int(p) for i, p in enumerate(first) if i != central]
 
 
-def _check_views(dataset: Dataset, source: Path) -> None:
-    if not (~dataset.pictures.is_test).any():
-        raise DatasetError(f"{source}: every picture is held out, none is left to train on; give --holdout none")
+def _box_of(dataset: Dataset, options: Options) -> np.ndarray:
+    """The box asked for, or the one found: (2, 3) float32, within what a file can hold."""
+    if options.box is not None:
+        aabb = np.array(options.box, np.float32).reshape(2, 3)
+    else:
+        try:
+            aabb = find_box(dataset.pictures, dataset.has_alpha)
+        except DatasetError as error:
+            raise DatasetError(f"{options.source}: {error}") from error
+    if not (np.abs(aabb) <= file.BOX_LIMIT).all() or not (aabb[1] - aabb[0] >= 1 / file.BOX_LIMIT).all():
+        raise DatasetError(f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; "
+                           "give another with --box x0,y0,z0,x1,y1,z1")
+    return aabb
+
+
+def _make_work_dir(work: Path) -> None:
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrainingError(f"{work}: {error.strerror}; name another folder for decoded pixels with --work") from error
+
+
+def _clear(work: Path) -> None:
+    """Remove what kpenc has put there, and the folder if that was all."""
+    for pattern in ("pixels-*.bin", "pixels-*.json", CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"):
+        for leftover in work.glob(pattern):
+            leftover.unlink(missing_ok=True)
+    _remove_if_empty(work)
+
+
+def _remove_if_empty(work: Path) -> None:
+    with contextlib.suppress(OSError):
+        work.rmdir()
 
 
 def _check_output(output: Path) -> None:
@@ -227,7 +290,7 @@ def _parse(argv: list[str]) -> tuple[Options, bool]:
     parser.add_argument("--preset", choices=sorted(PRESETS), default="balanced", help="how much to spend (default: balanced)")
     parser.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
     parser.add_argument("--time-budget", type=duration_s, metavar="10m", help="train for so long instead of a number of steps")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
+    parser.add_argument("--seed", type=_seed, default=0, help="of everything random (default: 0)")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first (default: 1)")
     parser.add_argument("--holdout", metavar="NAME", help="camera or file to test on, or 'none'")
@@ -237,7 +300,7 @@ def _parse(argv: list[str]) -> tuple[Options, bool]:
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
     parser.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
-    a = parser.parse_args(argv)
+    a = parser.parse_args(_box_joined(argv))
     options = Options(a.source, a.output, a.preset, a.steps, a.time_budget, a.seed, a.device, a.downscale, a.holdout, a.box,
                       a.work, a.keep, a.resume, a.test_views)
     return options, a.json
@@ -248,6 +311,24 @@ def _positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if not 0 <= value < 1 << 63:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 0 to 2^63 - 1")
+    return value
+
+
+def _box_joined(argv: list[str]) -> list[str]:
+    """`--box -1,...` as `--box=-1,...`: argparse would take a value that starts with a minus for an option."""
+    joined: list[str] = []
+    for word in argv:
+        if joined and joined[-1] == "--box":
+            joined[-1] = f"--box={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def duration_s(text: str) -> float:

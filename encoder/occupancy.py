@@ -1,8 +1,10 @@
 """The occupancy grid: which cells of the box hold anything, so that rays take samples nowhere else."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import torch
 
 DensityAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(N, 3) float32 points in [0, 1]^3 and (N,) float32 times -> (N,) log densities."""
@@ -58,6 +60,14 @@ class OccupancyGrid:
         self.log_density -= self.DENSITY_DECAY
         self.log_density[chosen] = np.maximum(self.log_density[chosen], self._look(density_at, np.argwhere(chosen), rng, 0.0, 1.0))
         self.occupied = matters & (self.log_density > self.threshold)
+
+    def state(self) -> dict[str, Any]:
+        return {"log_density": torch.from_numpy(self.log_density), "peak": torch.from_numpy(self.peak),
+                "occupied": torch.from_numpy(self.occupied), "known": self._known}
+
+    def load(self, state: dict[str, Any]) -> None:
+        self.log_density, self.peak, self.occupied = (state[k].cpu().numpy() for k in ("log_density", "peak", "occupied"))
+        self._known = bool(state["known"])
 
     def _look(self, density_at: DensityAt, cells: np.ndarray, rng: np.random.Generator, start: float, end: float) -> np.ndarray:
         """Log density at a random point of each cell and a random time in [start, end]."""

@@ -1,6 +1,8 @@
 """The training loop: draw rays, render them, step the planes, keep the occupancy grid current."""
 
+import hashlib
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -55,7 +57,8 @@ class Trainer:
         if not self.grid.seen.any():
             raise TrainingError("the box lies outside every camera's view; correct --box")
         self.optimiser: FusedOptimiser | PlainOptimiser = (
-            FusedOptimiser(self.field, config, shape) if self.device.type == "cpu" else PlainOptimiser(self.field, config)
+            FusedOptimiser(self.field, config, shape) if self.device.type == "cpu" else
+            PlainOptimiser(self.field, config, shape)
         )
         self.step = 0
         self.elapsed_s = 0.0
@@ -68,16 +71,21 @@ class Trainer:
     def run(
         self, report: Callable[[Report], None], checkpoint: Path | None = None, *,
         time_budget_s: float | None = None, checkpoint_every_s: float = 60.0,
+        interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
         """Train until `config.steps`, or for `time_budget_s` seconds of training where given.
 
+        A checkpoint that cannot be written on the way is said on stderr and tried again: it is no reason to stop.
+
         Raises:
             TrainingError: the loss is not finite.
-            KeyboardInterrupt: passed on; the state is that after the last whole step.
+            KeyboardInterrupt: `interrupted()`, asked between steps, was true.
         """
         config = self.config
         saved, error, drawn, since = time.monotonic(), 0.0, 0, time.monotonic()
         while (fraction := self._fraction(time_budget_s)) < 1:
+            if interrupted():
+                raise KeyboardInterrupt
             started = time.monotonic()
             if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
                 self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
@@ -89,7 +97,7 @@ class Trainer:
                 self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1), self.extent,
             )
             if not math.isfinite(squared_error):
-                raise TrainingError(f"step {self.step}: the colour loss is not finite; lower the learning rate")
+                raise TrainingError(f"step {self.step}: the colour loss is not finite; try another --seed or --preset")
             self.samples_per_ray += 0.1 * (samples - self.samples_per_ray)
             self.step += 1
             error, drawn = error + squared_error * count, drawn + count
@@ -103,10 +111,10 @@ class Trainer:
                               self.samples_per_ray, float(self.grid.occupied.mean()), self.elapsed_s))
                 error, drawn, since = 0.0, 0, now
             if checkpoint is not None and now - saved > checkpoint_every_s:
-                self.save(checkpoint)
+                self._try_to_save(checkpoint)
                 saved = since = time.monotonic()
         if checkpoint is not None:
-            self.save(checkpoint)
+            self._try_to_save(checkpoint)
 
     @property
     def rays_per_second(self) -> float:
@@ -130,18 +138,32 @@ class Trainer:
         return np.concatenate(out)
 
     def save(self, path: Path) -> None:
-        """Write everything a later `resume` needs. The file is plain tensors and numbers; it is read without unpickling code."""
+        """Write everything a later `resume` needs. The file is plain tensors and numbers; it is read without unpickling code.
+
+        Raises:
+            TrainingError: it cannot be written; an earlier checkpoint is left as it was.
+        """
         state = {
             "config": asdict(self.config), "aabb": torch.from_numpy(self.aabb), "step": self.step, "elapsed_s": self.elapsed_s,
             "samples_per_ray": self.samples_per_ray, "field": self.field.state_dict(), "optimiser": self.optimiser.state(),
-            "log_density": torch.from_numpy(self.grid.log_density), "occupied": torch.from_numpy(self.grid.occupied),
-            "rng": _rng_to_plain(self.rng),
+            "grid": self.grid.state(), "rng": _rng_to_plain(self.rng), "dataset": _fingerprint(self.dataset),
         }
-        with written_aside(path) as aside:
-            torch.save(state, aside)
+        try:
+            with written_aside(path) as aside:
+                torch.save(state, aside)
+        except (OSError, RuntimeError) as error:  # PyTorch reports a full disk as RuntimeError
+            reason = error.strerror if isinstance(error, OSError) else str(error).partition("\n")[0]
+            raise TrainingError(f"{path}: the checkpoint cannot be written ({reason}); free space there, or give another "
+                                "folder with --work") from error
+
+    def _try_to_save(self, path: Path) -> None:
+        try:
+            self.save(path)
+        except TrainingError as error:
+            print(f"{error}; training goes on", file=sys.stderr, flush=True)
 
     def resume(self, path: Path) -> None:
-        """Go on from a checkpoint of the same dataset and config.
+        """Go on from a checkpoint of the same dataset and config, to bitwise the same end.
 
         Raises:
             TrainingError: it cannot be read, or belongs to another run.
@@ -151,10 +173,12 @@ class Trainer:
             same = _comparable(state["config"]) == _comparable(asdict(self.config))
             if not same or not np.array_equal(state["aabb"].cpu().numpy(), self.aabb):
                 raise TrainingError(f"{path}: belongs to a run with other settings; give the same ones or drop --resume")
+            if state["dataset"] != _fingerprint(self.dataset):
+                raise TrainingError(f"{path}: belongs to a run on other pictures; give the same dataset, --holdout and "
+                                    "--downscale, or drop --resume")
             self.field.load_state_dict(state["field"])
             self.optimiser.load(state["optimiser"])
-            self.grid.log_density = state["log_density"].cpu().numpy()
-            self.grid.occupied = state["occupied"].cpu().numpy()
+            self.grid.load(state["grid"])
             self.rng.bit_generator.state = _rng_from_plain(state["rng"])
             self.step, self.elapsed_s = state["step"], state["elapsed_s"]
             self.samples_per_ray = state["samples_per_ray"]
@@ -243,10 +267,12 @@ class FusedOptimiser:
         return float(errors.mean(dtype=np.float64)) / 3, float(counts.mean())
 
     def state(self) -> dict[str, Any]:
-        return {"mean": torch.from_numpy(self.mean), "square": torch.from_numpy(self.square), "decoder": self.decoder.state_dict()}
+        return {"mean": torch.from_numpy(self.mean), "square": torch.from_numpy(self.square),
+                "peaks": torch.from_numpy(self._peaks.max(0)), "decoder": self.decoder.state_dict()}
 
     def load(self, state: dict[str, Any]) -> None:
         self.mean[:], self.square[:] = state["mean"].numpy(), state["square"].numpy()
+        self._peaks[:] = state["peaks"].numpy()
         self.decoder.load_state_dict(state["decoder"])
 
     def curvature(self) -> np.ndarray:
@@ -257,10 +283,17 @@ class FusedOptimiser:
 class PlainOptimiser:
     """A step in plain PyTorch, on any device that PyTorch knows."""
 
-    def __init__(self, field: Field, config: TrainConfig) -> None:
+    def __init__(self, field: Field, config: TrainConfig, cells: tuple[int, int, int]) -> None:
         self.field, self.config = field, config
+        self._peaks = torch.zeros(cells, device=field.theta.device)
         self.planes = torch.optim.Adam([field.theta], lr=config.learning_rate, betas=(BETA1, BETA2), eps=EPSILON)
         self.decoder = _decoder_optimiser(field, config)
+
+    def peaks(self) -> np.ndarray:
+        """As `FusedOptimiser.peaks`."""
+        peaks = self._peaks.cpu().numpy().copy()
+        self._peaks.zero_()
+        return peaks
 
     def step(
         self, number: int, rate: float, batch: Rays, targets: torch.Tensor,
@@ -270,7 +303,12 @@ class PlainOptimiser:
         config, device = self.config, self.field.theta.device
         batch = Rays(*(value.to(device) for value in vars(batch).values()))
         occupancy_there = torch.from_numpy(occupancy).to(device)
-        rgb, samples = render_reference(self.field, batch, torch.from_numpy(aabb).to(device), occupancy_there, step_length)
+        rgb, weights, cells = render_reference(
+            self.field, batch, torch.from_numpy(aabb).to(device), occupancy_there, step_length
+        )
+        _, ny, nx = self._peaks.shape
+        flat = (cells[:, 0] * ny + cells[:, 1]) * nx + cells[:, 2]
+        self._peaks.view(-1).scatter_reduce_(0, flat, weights.detach(), "amax")
         loss = error = (rgb - targets.to(device)).square().mean()
         if number % config.regularise_every == 0:
             loss = loss + config.regularise_every * priors(self.field, config)
@@ -281,12 +319,13 @@ class PlainOptimiser:
         loss.backward()  # type: ignore[no-untyped-call]
         self.planes.step()
         self.decoder.step()
-        return float(error), samples / len(targets)
+        return float(error), len(weights) / len(targets)
 
     def state(self) -> dict[str, Any]:
-        return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict()}
+        return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict(), "peaks": self._peaks}
 
     def load(self, state: dict[str, Any]) -> None:
+        self._peaks.copy_(state["peaks"])
         self.planes.load_state_dict(state["planes"])
         self.decoder.load_state_dict(state["decoder"])
 
@@ -334,6 +373,15 @@ def _comparable(config: dict[str, Any]) -> dict[str, Any]:
     """A config without what may differ between a run and its continuation."""
     return {key: tuple(value) if isinstance(value, list) else value for key, value in config.items()
             if key not in ("steps", "max_coding_loss_db")}
+
+
+def _fingerprint(dataset: Dataset) -> str:
+    """Of what the rays of a training run depend on, the pixels' checksums included."""
+    digest = hashlib.sha256(repr([(tile.offset, tile.crc32c) for tile in dataset.pixels.tiles]).encode())
+    p = dataset.pictures
+    for array in (p.time, p.is_test, p.width, p.height, p.intrinsics, p.distortion, p.camera_to_world):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def _rng_to_plain(rng: np.random.Generator) -> dict[str, str]:

@@ -1,0 +1,125 @@
+"""The field: where its planes lie, how they are sampled, and that a scene goes in and comes out unchanged."""
+
+import numpy as np
+import pytest
+import torch
+from scenes import tiny_scene
+
+from kpc.encoder.config import PRESETS, TrainConfig
+from kpc.encoder.field import Field, Layout, bilinear, plan_layout
+from kpc.format.errors import UsageError
+from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip
+from kpc.player import reference
+
+BOX = np.array([[0, 0, 0], [4, 2, 1]], np.float32)
+
+
+def test_layout_is_gapless_and_in_order() -> None:
+    layout = Layout.of(np.array([[8, 6, 4, 3], [16, 12, 8, 3]]), 5)
+    assert layout.is_dynamic and layout.features == 10
+    end = 0
+    for s, name, start, rows, columns in layout.planes():
+        axes = dict(zip("xyzt", layout.resolution[s]))
+        assert start == end and (rows, columns) == (axes[name[1]], axes[name[0]])
+        end += rows * columns * 5
+    assert end == layout.size
+    assert [name for _, name, *_ in layout.planes()] == [*ALL_PLANES] * 2
+
+
+def test_a_static_scene_has_three_planes() -> None:
+    layout = Layout.of(np.array([[8, 6, 4, 0]]), 4)
+    assert not layout.is_dynamic and layout.size == 4 * (8 * 6 + 8 * 4 + 6 * 4)
+    assert [name for _, name, *_ in layout.planes()] == [*SPACE_PLANES]
+    assert (layout.table[0, 3:] == -1).all()
+    assert set(Field(layout, 4).to_scene(BOX, Clip(1, 30.0), np.ones((1, 2, 2, 2)), np.ones(3), 0.1).scales[0]) == set(SPACE_PLANES)
+
+
+def test_resolution_follows_the_box_and_the_clip() -> None:
+    config = TrainConfig(resolutions=(32, 64), frames_per_row=2.0)
+    np.testing.assert_array_equal(plan_layout(config, BOX, Clip(31, 30.0), True).resolution, [[32, 16, 8, 16], [64, 32, 16, 16]])
+    assert not plan_layout(config, BOX, Clip(1, 30.0), False).resolution[:, 3].any()
+    thin = np.array([[0, 0, 0], [1, 1, 1e-6]], np.float32)
+    assert plan_layout(config, thin, Clip(2, 30.0), True).resolution.min() == 2
+
+
+def test_time_planes_start_as_the_identity_and_a_seed_repeats() -> None:
+    layout = Layout.of(np.array([[8, 6, 4, 3]]), 4)
+    one, two, other = (Field(layout, 4, torch.Generator().manual_seed(seed)) for seed in (5, 5, 6))
+    for name in ALL_PLANES:
+        plane = one.plane(0, name)
+        assert bool((plane == 1).all()) == (name in TIME_PLANES)
+    for parameter, same, different in zip(one.parameters(), two.parameters(), other.parameters()):
+        assert torch.equal(parameter, same)
+        assert parameter is one.b1 or not torch.equal(parameter, different)
+
+
+@pytest.mark.parametrize("dynamic", [True, False])
+def test_scene_to_field_and_back(dynamic: bool) -> None:
+    scene = tiny_scene(dynamic=dynamic)
+    back = Field.from_scene(scene).to_scene(scene.aabb, scene.clip, scene.occupancy, scene.background, scene.step)
+    assert back.parameter_count == scene.parameter_count and back.is_dynamic == dynamic
+    for ours, theirs in zip(back.scales, scene.scales):
+        assert set(ours) == set(theirs)
+        for name in theirs:
+            np.testing.assert_array_equal(ours[name], theirs[name])
+    for name, value in vars(scene.decoder).items():
+        np.testing.assert_array_equal(getattr(back.decoder, name), np.float32(value), err_msg=name)
+    for name in ("aabb", "occupancy", "background", "step", "clip"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(scene, name))
+
+
+def test_the_scene_is_a_copy() -> None:
+    field = Field.from_scene(tiny_scene())
+    scene = field.to_scene(BOX, Clip(2, 30.0), np.ones((1, 2, 2, 2)), np.ones(3), 0.1)
+    kept = scene.scales[0]["xy"].copy()
+    with torch.no_grad():
+        field.theta.zero_()
+    np.testing.assert_array_equal(scene.scales[0]["xy"], kept)
+
+
+def test_bilinear_at_texels_between_them_and_on_the_border() -> None:
+    plane = torch.arange(12, dtype=torch.float64).reshape(3, 4, 1)  # value = 4 row + column
+    u = torch.tensor([0, 1 / 3, 1, 1, 0.5, 1 / 6], dtype=torch.float64)
+    v = torch.tensor([0, 0.5, 1, 0, 0.5, 0.25], dtype=torch.float64)
+    expected = 4 * v * 2 + u * 3
+    torch.testing.assert_close(bilinear(plane, u, v)[:, 0], expected, rtol=0, atol=1e-12)
+
+
+def test_bilinear_clamps_beyond_the_border() -> None:
+    plane = torch.arange(12, dtype=torch.float64).reshape(3, 4, 1)
+    u, v = torch.tensor([-0.2, 1.2], dtype=torch.float64), torch.tensor([-1.0, 7.0], dtype=torch.float64)
+    torch.testing.assert_close(bilinear(plane, u, v)[:, 0], torch.tensor([0, 11], dtype=torch.float64))
+
+
+def test_bilinear_is_the_players() -> None:
+    rng = np.random.default_rng(0)
+    for rows, columns in ((2, 2), (5, 9)):
+        plane, u, v = rng.random((rows, columns, 3), np.float32), rng.random(64, np.float32), rng.random(64, np.float32)
+        ours = bilinear(*map(torch.from_numpy, (plane, u, v))).numpy()
+        # A position of up to 8 texels is rounded to 2^-21.
+        np.testing.assert_allclose(ours, reference.bilinear(plane, u, v), atol=4 * 2.0**-21)
+
+
+def test_features_multiply_planes_and_concatenate_scales() -> None:
+    scene = tiny_scene()
+    field = Field.from_scene(scene)
+    features = field.features(torch.tensor([[0.0, 1.0, 0.0]]), torch.tensor([1.0]))[0].detach().numpy()
+    corners = {"x": 0, "y": -1, "z": 0, "t": -1}
+    expected = np.concatenate([
+        np.prod([scale[name][corners[name[1]], corners[name[0]]] for name in ALL_PLANES], axis=0) for scale in scene.scales
+    ])
+    np.testing.assert_allclose(features, expected, rtol=6 * 2.0**-23)
+
+
+@pytest.mark.parametrize("change", [{"channels": 0}, {"steps": 0}, {"rays": -1}, {"resolutions": ()}, {"resolutions": (64, 1)}])
+def test_a_config_that_makes_no_sense_is_refused(change: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match=next(iter(change))):
+        TrainConfig(**change)  # type: ignore[arg-type]
+
+
+def test_presets_grow() -> None:
+    names = ("draft", "fast", "balanced", "best")
+    assert set(names) == set(PRESETS)
+    for smaller, larger in zip(names, names[1:]):
+        assert PRESETS[smaller].steps < PRESETS[larger].steps
+        assert max(PRESETS[smaller].resolutions) < max(PRESETS[larger].resolutions)

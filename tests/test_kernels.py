@@ -1,0 +1,251 @@
+"""The fused kernels meet their readable twins: `kpc.encoder.field` in float64, torch.optim.Adam, the numpy renderer.
+
+Tolerances. Float32 places a sample at 4 units from the eye to 2^-22 or so, 5e-7 of the box; planes of 24 texels that change by 1
+a texel turn that into 1e-5 of a feature, and six factors, 16 features and a march of 60 samples into some 1e-4 at worst.
+Colours must agree to 1e-4, a fortieth of an 8-bit level; a gradient to 1e-3 of the largest element of its array.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scenes import tiny_scene
+
+from kpc.encoder import kernels
+from kpc.encoder.config import TrainConfig
+from kpc.encoder.evaluate import SceneRenderer
+from kpc.encoder.field import Field, Layout, Rays, priors, render_reference
+from kpc.encoder.train import BETA1, BETA2, EPSILON, add_priors, log_densities, sample_capacity
+from kpc.format.scene import Scene
+from kpc.player import reference
+
+COLOUR = 1e-4
+GRADIENT = 1e-3
+
+
+def misty(dynamic: bool = True) -> Scene:
+    """A scene of which every step absorbs a tenth or more: no sample before termination is so faint that it gets no colour."""
+    scene = tiny_scene(dynamic=dynamic, time=6)
+    weight = scene.decoder.density_weight
+    return replace(scene, decoder=replace(scene.decoder, density_weight=np.abs(weight) / 16, density_bias=2.0))
+
+
+def rays_at(scene: Scene, count: int, seed: int = 0) -> Rays:
+    """Rays from the scene's cameras through random pixels at random times, and one along each axis, its direction exact."""
+    rng = np.random.default_rng(seed)
+    origins, directions = (np.concatenate(a) for a in zip(*(c.rays() for c in scene.cameras)))
+    chosen = rng.choice(len(origins), count - 3, replace=False)
+    centre = scene.aabb.mean(0) + 0.03  # not on the faces of cells
+    origins = np.concatenate([origins[chosen], centre - 3 * np.eye(3)])
+    directions = np.concatenate([directions[chosen], np.eye(3)])
+    arrays = (origins, directions, rng.random(count), rng.random(count), rng.random((count, 3)))
+    return Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
+
+
+def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int = 2) -> dict[str, np.ndarray]:
+    field = Field.from_scene(scene)
+    layout, n = field.layout, len(targets)
+    grad = np.zeros((workers, layout.size), np.float32)
+    grad_density = np.zeros((workers, layout.features + 1), np.float32)
+    basis = field.basis(rays.directions).detach().numpy()
+    grad_basis = np.full((n, 3, layout.features), np.nan, np.float32)
+    peaks = np.zeros((workers, *scene.occupancy.shape[1:]), np.float32)
+    errors, counts = kernels.backpropagate(
+        field.theta.detach().numpy(), grad, layout.table, layout.resolution, field.density.detach().numpy(), grad_density,
+        (0,) * layout.channels, scene.aabb, scene.occupancy.view(np.uint8), np.float32(scene.step), np.float32(scene.extent),
+        rays.origins.numpy(), rays.directions.numpy(), rays.times.numpy(), rays.jitters.numpy(), basis, grad_basis,
+        targets.numpy(), rays.backgrounds.numpy(), peaks, sample_capacity(scene.aabb, scene.step),
+    )
+    return {"theta": grad.sum(0), "density": grad_density.sum(0), "basis": grad_basis, "errors": errors, "counts": counts,
+            "peaks": peaks.max(0)}
+
+
+def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict[str, np.ndarray]:
+    """The same by autograd through `render_reference`, in float64."""
+    field = Field.from_scene(scene).double()
+    rays = Rays(*(a.double() for a in vars(rays).values()))
+    basis = field.basis(rays.directions).detach().requires_grad_()
+    field.basis = lambda directions: basis  # type: ignore[method-assign]
+    aabb, occupancy = torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy)
+    rgb, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step)
+    squared = (rgb - targets.double()).square()
+    squared.mean().backward()
+    peaks = torch.zeros(scene.occupancy.shape[1:], dtype=torch.float64)
+    peaks.index_put_(tuple(cells.T), torch.zeros(len(cells), dtype=torch.float64))
+    for cell, weight in zip(cells.tolist(), weights.tolist()):
+        peaks[tuple(cell)] = max(float(peaks[tuple(cell)]), weight)
+    return {"theta": field.theta.grad.numpy(), "density": field.density.grad.numpy(), "basis": basis.grad.numpy(),
+            "errors": squared.sum(1).detach().numpy(), "samples": len(weights), "peaks": peaks.numpy()}
+
+
+@pytest.mark.parametrize("dynamic", [True, False])
+def test_backpropagate_is_autograd_through_the_reference(dynamic: bool) -> None:
+    scene = misty(dynamic)
+    rays = rays_at(scene, 403)
+    targets = torch.rand(403, 3, generator=torch.Generator().manual_seed(1))
+    ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
+    assert ours["counts"].sum() == theirs["samples"] > 403
+    np.testing.assert_allclose(ours["errors"], theirs["errors"], atol=6 * COLOUR)  # d e^2 = 2 e de, three channels
+    np.testing.assert_allclose(ours["peaks"], theirs["peaks"], atol=COLOUR)
+    for name in ("theta", "density", "basis"):
+        largest = np.abs(theirs[name]).max()
+        assert largest > 0
+        np.testing.assert_allclose(ours[name], theirs[name], atol=GRADIENT * largest, err_msg=name)
+
+
+def test_backpropagate_gives_faint_samples_no_colour_and_hardly_errs() -> None:
+    """A sample of weight below 1e-4 gets no colour: off by less than that each, over at most `sample_capacity` samples."""
+    scene = tiny_scene()
+    rays = rays_at(scene, 203)
+    targets = torch.rand(203, 3, generator=torch.Generator().manual_seed(1))
+    ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
+    colour = 1e-4 * sample_capacity(scene.aabb, scene.step)
+    np.testing.assert_allclose(ours["errors"], theirs["errors"], atol=6 * colour)
+    for name in ("theta", "density"):
+        difference = np.linalg.norm(ours[name] - theirs[name]) / np.linalg.norm(theirs[name])
+        assert difference < colour, (name, difference)
+
+
+def test_workers_share_the_rays_and_change_nothing_but_rounding() -> None:
+    scene = misty()
+    rays, targets = rays_at(scene, 103), torch.zeros(103, 3)
+    one, three = backpropagate(scene, rays, targets, workers=1), backpropagate(scene, rays, targets, workers=3)
+    np.testing.assert_array_equal(one["errors"], three["errors"])
+    np.testing.assert_array_equal(one["basis"], three["basis"])
+    np.testing.assert_array_equal(one["peaks"], three["peaks"])
+    # A sum of at most 103 * 60 float32 terms in another order.
+    np.testing.assert_allclose(one["theta"], three["theta"], atol=1e-5 * np.abs(one["theta"]).max())
+
+
+def test_rays_that_miss_the_box_show_the_background() -> None:
+    scene = misty()
+    rays = rays_at(scene, 13)
+    away = replace(rays, origins=rays.origins + 100)
+    ours = backpropagate(scene, away, away.backgrounds)
+    assert not ours["counts"].any() and not ours["errors"].any() and not ours["theta"].any() and not ours["basis"].any()
+
+
+def test_the_reference_has_the_gradient_of_finite_differences() -> None:
+    generator = torch.Generator().manual_seed(3)
+    field = Field(Layout.of(np.array([[3, 3, 2, 2]]), 2), 2, generator).double()
+    aabb = torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]], dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(4, 3, generator=generator, dtype=torch.float64), dim=1)
+    rays = Rays(-2 * directions, directions, *(torch.rand(4, generator=generator).double() for _ in range(2)),
+                torch.rand(4, 3, generator=generator).double())
+    theta = (0.5 + torch.rand(field.layout.size, generator=generator, dtype=torch.float64)).requires_grad_()
+    density = torch.randn(3, generator=generator, dtype=torch.float64).requires_grad_()
+
+    def colours(theta: torch.Tensor, density: torch.Tensor) -> torch.Tensor:
+        def rendered(*_: object) -> torch.Tensor:
+            return render_reference(field, rays, aabb, torch.ones(1, 2, 2, 2), 0.3)[0]
+
+        return torch.func.functional_call(_Calling(field, rendered), {"field.theta": theta, "field.density": density}, ())
+
+    assert torch.autograd.gradcheck(colours, (theta, density))
+
+
+class _Calling(torch.nn.Module):
+    """Makes a function of a field's parameters out of one that uses the field."""
+
+    def __init__(self, field: Field, call: object) -> None:
+        super().__init__()
+        self.field, self.forward = field, call
+
+
+@pytest.mark.parametrize("dynamic", [True, False])
+def test_render_is_the_players_reference(dynamic: bool) -> None:
+    scene = misty(dynamic)
+    renderer = SceneRenderer(scene)
+    for time in (0.0, 0.3, 0.5, 1.0):
+        for camera in scene.cameras:
+            origins, directions = camera.rays()
+            theirs = reference.render_rays(scene, origins, directions, time)
+            ours = renderer.rgb(origins, directions, np.full(len(origins), time))
+            # A sample within rounding of a cell's face may count here and not there; few rays have one.
+            assert np.mean(np.abs(ours - theirs.rgb).max(1) > COLOUR) < 0.002
+            assert np.abs(ours - theirs.rgb).max() < 0.3
+
+
+def test_render_gives_opacity_depth_and_counts() -> None:
+    scene = misty()
+    field, camera = Field.from_scene(scene), scene.cameras[0]
+    origins, directions = camera.rays()
+    n = len(origins)
+    _, opacity, depth, counts = kernels.render(
+        field.theta.detach().numpy(), field.layout.table, field.layout.resolution, field.density.detach().numpy(),
+        (0,) * field.layout.channels, scene.aabb, scene.occupancy.view(np.uint8), np.float32(scene.step),
+        np.float32(scene.extent), origins, directions, np.full(n, 0.4, np.float32),
+        field.basis(torch.from_numpy(directions)).detach().numpy(), np.arange(n), scene.background,
+        sample_capacity(scene.aabb, scene.step), 4,
+    )
+    theirs = reference.render_rays(scene, origins, directions, 0.4)
+    seen = theirs.opacity > 0.05
+    assert 0.1 < seen.mean() < 0.9
+    assert np.mean(np.abs(opacity - theirs.opacity) > COLOUR) < 0.002
+    assert np.mean(np.abs(depth - theirs.depth)[seen] > 4 * COLOUR) < 0.002  # depth reaches 4 units
+    assert np.mean(counts != theirs.samples) < 0.002
+
+
+def test_log_densities() -> None:
+    scene = tiny_scene()
+    field = Field.from_scene(scene)
+    rng = np.random.default_rng(0)
+    points, times = rng.random((500, 3), np.float32), rng.random(500, np.float32)
+    points[:4], times[:4] = [[0, 0, 0], [1, 1, 1], [0, 1, 0], [1, 0, 1]], [0, 1, 1, 0]
+    twin = field.double()
+    features = twin.features(torch.from_numpy(points).double(), torch.from_numpy(times).double())
+    expected = twin.log_density(features).detach().numpy()
+    np.testing.assert_allclose(log_densities(Field.from_scene(scene), points, times), expected, atol=COLOUR)
+
+
+def test_log_densities_are_clipped() -> None:
+    scene = tiny_scene()
+    for bias, limit in ((1e6, 20.0), (-1e6, -20.0)):
+        field = Field.from_scene(replace(scene, decoder=replace(scene.decoder, density_bias=bias)))
+        assert (log_densities(field, np.full((3, 3), 0.5), np.zeros(3)) == limit).all()
+
+
+@pytest.mark.parametrize("dynamic", [True, False])
+def test_priors_are_the_gradient_of_their_twin(dynamic: bool) -> None:
+    field = Field.from_scene(tiny_scene(dynamic=dynamic))
+    with torch.no_grad():
+        field.theta += 0.1 * torch.randn(field.layout.size, generator=torch.Generator().manual_seed(0))
+        field.theta[-50:] = 1.0  # the kink of |1 - P|, where the gradient is 0 by agreement
+    config = TrainConfig(space_variation=0.3, time_smoothness=0.7, sparse_transients=0.2)
+    grad = np.ones(field.layout.size, np.float32)
+    add_priors(field, field.theta.detach().numpy(), grad, config, 4.0)
+    field = field.double()
+    (4 * priors(field, config)).backward()
+    expected = field.theta.grad.numpy()
+    # `grad` held 1 before: what is added is rounded to 2^-24 of that, a few times.
+    np.testing.assert_allclose(grad - 1, expected, atol=8 * 2.0**-24 + 1e-6 * np.abs(expected).max())
+
+
+def test_adam_is_pytorchs() -> None:
+    n, workers = 40_000, 3
+    rng = np.random.default_rng(0)
+    theta = rng.normal(size=n).astype(np.float32)
+    twin = torch.nn.Parameter(torch.from_numpy(theta.copy()).double())
+    optimiser = torch.optim.Adam([twin], lr=1.0, betas=(BETA1, BETA2), eps=EPSILON)
+    mean, square = np.zeros(n, np.float32), np.zeros(n, np.float32)
+    for number in range(1, 6):
+        rate = 0.05 / number
+        grad = rng.normal(size=(workers, n)).astype(np.float32)
+        grad[:, :100] = 0  # never reached: 0 / eps must not move them
+        twin.grad = torch.from_numpy(grad.sum(0, dtype=np.float64))
+        optimiser.param_groups[0]["lr"] = rate
+        optimiser.step()
+        kernels.adam(theta, grad, mean, square, rate, BETA1, BETA2, EPSILON, number)
+        assert not grad.any()
+    # Each step moves by at most `rate` times 1e-5 or so of rounding; where gradients cancel, the ratio is the less certain.
+    expected = twin.detach().numpy()
+    assert (theta[:100] == expected[:100].astype(np.float32)).all()
+    np.testing.assert_allclose(theta, expected, atol=1e-5)
+    np.testing.assert_allclose(square, optimiser.state[twin]["exp_avg_sq"].numpy(), rtol=1e-4, atol=1e-9)
+
+
+def test_sample_capacity_is_never_reached() -> None:
+    aabb = np.array([[0, 0, 0], [1, 2, 3]], np.float32)
+    assert sample_capacity(aabb, 0.1) >= math.sqrt(14) / 0.1 + 1
