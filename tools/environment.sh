@@ -12,7 +12,7 @@ make_environment() {
     for candidate in ${PYTHON:-python3.11 python3.12 python3.13 python3.14 python3}; do
         if new_enough "$candidate"; then python=$candidate; break; fi
     done
-    [ -n "$python" ] || fail "Python 3.11 or newer is needed: apt install python3 python3-venv (Debian 12, Ubuntu 24.04 or newer), or brew install python@3.12"
+    [ -n "$python" ] || fail "Python 3.11 or newer is needed: apt install python3 python3-venv, or brew install python@3.12"
     "$python" -c 'import ensurepip, venv' 2>/dev/null || fail "this Python lacks venv: apt install python3-venv"
     echo "making .venv with $("$python" --version)" >&2
     rm -rf .venv

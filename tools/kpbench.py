@@ -4,8 +4,8 @@ kpbench encode room liam --preset balanced --out docs/bench/balanced.json
 kpbench player room.kpc liam.kpc --out docs/bench/player.json
 
 Every record says what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
-data) and what came of it, each repeat on its own. Output is one JSON list, a record a line: with --out written after every
-run, else to stdout at the end. Every repeat is a process of its own, so that none inherits another's memory or caches.
+data) and what came of it, each repeat on its own. Output is one JSON list, a record a line: with --out written after
+every run, else to stdout at the end. Every repeat is a process of its own, so that none inherits another's memory.
 """
 
 import argparse
@@ -252,7 +252,7 @@ def _alone(function: Callable[[Any], T], job: Any) -> T:
         try:
             return pool.submit(function, job).result()
         except BrokenProcessPool as error:
-            raise KpcError(f"{function.__name__.strip('_')}: its process was killed; is there enough memory?") from error
+            raise KpcError(f"{function.__name__.strip('_')}: the process was killed; free some memory") from error
 
 
 # --- the command line
@@ -268,7 +268,7 @@ def _parser() -> argparse.ArgumentParser:
     encode.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
     encode.add_argument("--preset", choices=("draft", "fast", "balanced", "best"), default="balanced")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
-    encode.add_argument("--time-budget", type=_duration, metavar="10m", help="of training, instead of a number of steps")
+    encode.add_argument("--time-budget", type=_duration, metavar="10m", help="of training, instead of steps")
     encode.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
     encode.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     encode.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")

@@ -15,9 +15,10 @@ BLOCK = 1 << 20
 
 
 def commit() -> str:
-    """The git commit of the checkout that `kpc` was imported from, "+dirty" where it was changed since; else "unknown"."""
+    """The git commit of the checkout that `kpc` was imported from, "+dirty" if changed since; "unknown" without one."""
     source = Path(kpc.__file__).resolve()
-    tracked = _git(source.parent, "ls-files", "--error-unmatch", source.name)  # an installed copy may lie in some checkout
+    # An installed copy, too, may lie in a folder of some checkout; only a tracked file is part of it.
+    tracked = _git(source.parent, "ls-files", "--error-unmatch", source.name)
     head = _git(source.parent, "rev-parse", "HEAD") if tracked else None
     if not head:
         return "unknown"
