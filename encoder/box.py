@@ -10,7 +10,7 @@ def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
     """The (2, 3) float32 box the scene lies in.
 
     * Near and far known: the bounds of all frustums between them.
-    * Cameras that look at a common point: a cube around it, as large as the narrowest view contains (pictures with alpha,
+    * Cameras that look at a common point: a cube around it, as large as the widest view contains (pictures with alpha,
       an object on its own), or out to twice the cameras' distance (a subject in its surroundings).
 
     Raises:

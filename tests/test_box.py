@@ -1,0 +1,104 @@
+"""Where the scene is: each way to find its box, each way that fails, and what the cameras see of it."""
+
+import datasets as make
+import numpy as np
+import pytest
+
+from kpc.encoder.box import find_box, seen_cells
+from kpc.encoder.datasets import Pictures
+from kpc.format.cameras import Camera
+from kpc.format.errors import DatasetError
+
+
+def pictures_of(cameras: list[Camera], near: float = np.nan, far: float = np.nan, tests: tuple[int, ...] = ()) -> Pictures:
+    n = len(cameras)
+    return Pictures(
+        file=tuple(f"{k}.png" for k in range(n)), camera=np.arange(n, dtype=np.int32), time=np.zeros(n, np.float32),
+        is_test=np.isin(np.arange(n), tests), offset=np.zeros(n, np.int64),
+        width=np.array([c.width for c in cameras], np.int32), height=np.array([c.height for c in cameras], np.int32),
+        intrinsics=np.array([[c.fl_x, c.fl_y, c.cx, c.cy] for c in cameras]), distortion=np.zeros((n, 4)),
+        camera_to_world=np.stack([c.camera_to_world for c in cameras]),
+        near=np.full(n, near, np.float32), far=np.full(n, far, np.float32),
+    )
+
+
+def straight(x: float = 0.0, turned: bool = False) -> Camera:
+    """A camera at (x, 0, 0) that looks along -z, or along +z: 90 degrees wide, 53 high."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    if turned:
+        pose[[0, 2], [0, 2]] = -1.0
+    return Camera(40, 20, 20.0, 20.0, 20.0, 10.0, pose)
+
+
+def test_near_and_far_give_the_bounds_of_the_frustums() -> None:
+    box = find_box(pictures_of([straight(), straight(1.0)], near=1.0, far=4.0), has_alpha=False)
+    assert box.dtype == np.float32
+    # 90 degrees wide and 53 high: at depth 4, 4 to each side and 2 up and down; the second camera one to the right.
+    np.testing.assert_allclose(box, [[-4, -2, -4], [5, 2, -1]], atol=1e-6)
+
+
+def test_pictures_held_out_do_not_count() -> None:
+    far_off = pictures_of([straight(), straight(1.0), straight(50.0)], near=1.0, far=4.0, tests=(2,))
+    np.testing.assert_allclose(find_box(far_off, has_alpha=False), [[-4, -2, -4], [5, 2, -1]], atol=1e-6)
+
+
+def test_an_object_on_its_own_fits_the_view() -> None:
+    rig = make.ring(5, width=20, height=20)
+    box = find_box(pictures_of(rig), has_alpha=True)
+    distance = np.linalg.norm(rig[0].camera_to_world[:3, 3])
+    half = distance * np.sin(np.arctan(0.5 / 1.2))  # the sphere that touches the sides of a view 1 / 1.2 wide
+    np.testing.assert_allclose(box, [[-half] * 3, [half] * 3], atol=1e-5)
+
+
+def test_a_subject_in_its_surroundings_reaches_behind_the_cameras() -> None:
+    rig = make.ring(5)
+    half = 2 * np.linalg.norm(rig[0].camera_to_world[:3, 3])
+    np.testing.assert_allclose(find_box(pictures_of(rig), has_alpha=False), [[-half] * 3, [half] * 3], atol=1e-5)
+
+
+@pytest.mark.parametrize("has_alpha", [True, False])
+def test_parallel_cameras_share_no_point(has_alpha: bool) -> None:
+    with pytest.raises(DatasetError, match="--box"):
+        find_box(pictures_of([straight(), straight(1.0)]), has_alpha)
+
+
+def test_cameras_that_look_away_from_each_other_share_no_point() -> None:
+    rig = [make.look_at((3 * np.sin(a), -3 * np.cos(a), 0.5)) for a in (0.0, 2.0, 4.0)]
+    flipped = [Camera(c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy, c.camera_to_world @ np.diag([-1.0, 1, -1, 1])) for c in rig]
+    find_box(pictures_of(rig), False)
+    with pytest.raises(DatasetError, match="no point they look at"):
+        find_box(pictures_of(flipped), False)
+
+
+def test_near_without_far_is_not_enough() -> None:
+    with pytest.raises(DatasetError, match="--box"):
+        find_box(pictures_of([straight(), straight(1.0)], near=1.0), False)
+
+
+def test_cells_count_as_seen_from_two_cameras() -> None:
+    box = np.array([[-2, -0.1, -2.2], [3, 0.1, -1.8]], np.float32)  # a bar 2 in front, in cells of 0.5
+    shape = (1, 1, 10)
+    x = -2 + 0.5 * (np.arange(10) + 0.5)
+    both = seen_cells(pictures_of([straight(), straight(1.0)]), box, shape)
+    assert both.shape == shape and both.dtype == bool
+    margin = 0.02 * 2 * 2  # of the picture's width, 2 away
+    np.testing.assert_array_equal(both[0, 0], (np.abs(x) < 2 + margin) & (np.abs(x - 1) < 2 + margin))
+    either = seen_cells(pictures_of([straight(), straight(1.0)]), box, shape, at_least=1)
+    assert either.all()
+    alone = seen_cells(pictures_of([straight(), straight(1.0)], tests=(1,)), box, shape)
+    np.testing.assert_array_equal(alone[0, 0], np.abs(x) < 2 + margin)
+
+
+def test_cells_behind_and_nearer_than_near_are_not_seen() -> None:
+    box = np.array([[-0.1, -0.1, -4], [0.1, 0.1, 4]], np.float32)
+    rig = pictures_of([straight(), straight(0.05)], near=2.0, far=9.0)
+    z = -4 + 0.5 * (np.arange(16) + 0.5)
+    np.testing.assert_array_equal(seen_cells(rig, box, (16, 1, 1))[:, 0, 0], -z > 1.8)
+
+
+def test_the_same_camera_twice_is_one() -> None:
+    box = np.array([[-0.1, -0.1, -4], [0.1, 0.1, -1]], np.float32)
+    twice_and_turned = pictures_of([straight(), straight(), straight(turned=True)])
+    assert not seen_cells(twice_and_turned, box, (2, 2, 2)).any()
+    assert seen_cells(pictures_of([straight(), straight()]), box, (2, 2, 2)).all()
