@@ -319,7 +319,7 @@ class PlainOptimiser:
         loss.backward()  # type: ignore[no-untyped-call]
         self.planes.step()
         self.decoder.step()
-        return float(error), len(weights) / len(targets)
+        return float(error.detach()), len(weights) / len(targets)
 
     def state(self) -> dict[str, Any]:
         return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict(), "peaks": self._peaks}
