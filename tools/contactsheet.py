@@ -26,7 +26,7 @@ NOTHING = 65535
 
 @dataclass(frozen=True)
 class Pair:
-    """A true picture and the same view rendered, uint8 (H, W, 3); levels of depth, uint16 (H, W), where there are any."""
+    """A true picture and the same view rendered, uint8 (H, W, 3); its depth, uint16 (H, W), where kprender wrote it."""
 
     name: str
     truth: np.ndarray
@@ -53,10 +53,11 @@ def pairs(truth: Path, rendered: Path) -> list[Pair]:
             continue
         wanted, given = _on_white(read_image(true_files[file.stem])), _on_white(read_image(file))
         if wanted.shape != given.shape:
-            raise MediaError(f"{file}: is {_size(given)}, {true_files[file.stem]} is {_size(wanted)}; render without --size")
+            sizes = f"is {_size(given)}, {true_files[file.stem]} is {_size(wanted)}"
+            raise MediaError(f"{file}: {sizes}; render without --size")
         found.append(Pair(file.stem, wanted, given, _depth(file.with_name(f"{file.stem}_depth.png"))))
     if not found:
-        raise MediaError(f"{rendered}: no picture has the name of one in {truth}; render with --cameras {truth}/cameras.json")
+        raise MediaError(f"{rendered}: no picture has the name of one in {truth}; render with --cameras of {truth}")
     return found
 
 

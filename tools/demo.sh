@@ -3,7 +3,7 @@
 set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 
-install encoder
+install_kpc encoder
 bin=.venv/bin
 clip=out/default scene=out/default.kpc
 

@@ -12,23 +12,23 @@ make_environment() {
     for candidate in ${PYTHON:-python3.11 python3.12 python3.13 python3.14 python3}; do
         if new_enough "$candidate"; then python=$candidate; break; fi
     done
-    [ -n "$python" ] || fail "Python 3.11 or newer is needed: apt install python3 python3-venv, or brew install python@3.12"
+    [ -n "$python" ] || fail "needs Python 3.11 or newer: apt install python3-venv, or brew install python@3.12"
     "$python" -c 'import ensurepip, venv' 2>/dev/null || fail "this Python lacks venv: apt install python3-venv"
     echo "making .venv with $("$python" --version)" >&2
     rm -rf .venv
     "$python" -m venv .venv || fail ".venv: could not be made; is the disk full, or the folder read-only?"
 }
 
-# install EXTRAS: kpc with these extras, unless the last run installed the same. "encoder" lies within "encoder,test".
-install() {
+# install_kpc EXTRAS: kpc with these extras, unless the last run installed the same.
+install_kpc() {
     local extras=$1 wanted stamp
     new_enough .venv/bin/python || make_environment
     wanted=$(cat pyproject.toml constraints.txt | cksum)
-    for stamp in .venv/.installed-*; do
+    for stamp in .venv/.installed-*; do  # "encoder,test" holds "encoder"
         case "$stamp" in *"-$extras"*) [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ] || return 0 ;; esac
     done
     echo "installing kpc[$extras] into .venv (the first time takes minutes: PyTorch is large)" >&2
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$extras]" >&2 ||
+    .venv/bin/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$extras]" >&2 ||
         fail "pip could not install kpc[$extras]; its message above says why (no network? run this again once there is one)"
     printf '%s\n' "$wanted" > ".venv/.installed-$extras"
 }

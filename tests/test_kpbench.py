@@ -1,0 +1,95 @@
+import json
+import shlex
+from pathlib import Path
+
+import gl
+import pytest
+from datasets import write_n3dv
+from scenes import tiny_scene
+
+import kpc
+from kpc.encoder.config import PRESETS
+from kpc.format.file import write
+from kpc.format.quantise import quantise_scene
+from kpc.tools import kpbench, results
+from kpc.tools.provenance import data_hash
+
+
+def tiny_file(path: Path, dynamic: bool) -> Path:
+    scene = tiny_scene(1, dynamic=dynamic)
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    return path
+
+
+def test_encode_records_every_repeat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_n3dv(tmp_path / "tiny", frames=2)
+    command = ["encode", str(tmp_path / "tiny"), "--preset", "draft", "--steps", "3", "--repeats", "2", "--seed", "5",
+               "--test-views", "1", "--box=-1,-1,-1,1,1,1", "--keep-scenes", str(tmp_path / "kept")]  # fmt: skip
+    assert kpbench.main(command) == 0
+    said = capsys.readouterr()
+    (record,) = json.loads(said.out)
+    assert record["kind"] == "encode" and record["name"] == "tiny" and record["renderer"] == "cpu"
+    assert record["command"] == shlex.join(["kpbench", *command]) and record["seed"] == 5
+    assert record["data_sha256"] == data_hash(tmp_path / "tiny")
+    assert record["settings"] == {"preset": "draft", "steps": 3, "time_budget_s": None, "downscale": 1, "test_views": 1,
+                                  "box": [-1, -1, -1, 1, 1, 1]}  # fmt: skip
+    assert [run["seed"] for run in record["repeats"]] == [5, 6]
+    for run in record["repeats"]:
+        kept = tmp_path / "kept" / run["file"]
+        assert run["size_bytes"] == kept.stat().st_size and kpc.load(kept).is_dynamic
+        assert run["test_pictures"] == 1 and run["test_psnr"] > 3 and run["peak_memory_bytes"] > 1 << 26
+    assert sorted(p.name for p in (tmp_path / "kept").iterdir()) == ["tiny-draft-5.kpc", "tiny-draft-6.kpc"]
+    assert "PSNR dB" in said.err and results.markdown([record])
+
+
+def test_player_measures_both_paths_of_a_moving_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gl.context()
+    moving, still = tiny_file(tmp_path / "moving.kpc", True), tiny_file(tmp_path / "still.kpc", False)
+    out = tmp_path / "out.json"
+    assert kpbench.main(["player", str(moving), str(still), "--size", "48x36", "--frames", "4", "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    records = results.load([out])
+    assert said.out == "" and "within 1/255" in said.err
+    assert [(r["name"], r["settings"]["path"]) for r in records] == [
+        ("moving", "exact"), ("moving", "folded"), ("still", "exact"),
+    ]  # fmt: skip
+    for record in records:
+        (run,) = record["repeats"]
+        assert len(run["frame_ms"]) == 4 and min(run["frame_ms"]) <= run["frame_ms_median"] <= run["frame_ms_p95"]
+        parts = run["load_ms"] + run["upload_ms"] + run["first_render_ms"]
+        assert run["first_frame_ms"] == pytest.approx(parts)
+        assert run["gpu_memory_bytes"] > 0 and record["accuracy"]["samples_per_ray"] > 0 and record["renderer"]
+        if record["settings"]["path"] == "exact":
+            assert record["accuracy"]["psnr"] > 50 and record["accuracy"]["within_one_level"] > 0.999
+
+
+def test_what_was_measured_survives_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gl.context()
+    good, bad = tiny_file(tmp_path / "good.kpc", False), tmp_path / "bad.kpc"
+    bad.write_bytes(b"nonsense")
+    assert kpbench.main(["player", str(good), str(bad), "--size", "8x6", "--frames", "1"]) == 1
+    said = capsys.readouterr()
+    assert [record["name"] for record in json.loads(said.out)] == ["good"]
+    assert said.err.splitlines()[-1].startswith(f"kpbench: {bad}: ")
+
+
+@pytest.mark.parametrize("command", [["encode", "missing"], ["player", "missing.kpc"], ["player", "x.kpc", "--out", "no/x"]])
+def test_errors_are_one_line(command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                             capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert kpbench.main(command) in (1, 2)
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("kpbench: ") and said.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("option", ["--box=1,1,1,0,0,0", "--box=nan,0,0,1,1,1", "--time-budget=soon", "--repeats=0"])
+def test_senseless_options_are_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        kpbench.main(["encode", ".", option])
+    assert option.split("=")[0] in capsys.readouterr().err
+
+
+def test_presets_are_those_of_kpenc(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        kpbench.main(["encode", "--help"])
+    assert "{" + ",".join(PRESETS) + "}" in capsys.readouterr().out

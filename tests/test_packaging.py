@@ -1,0 +1,84 @@
+"""What the wheel must hold, and what a viewer's install must do without."""
+
+import importlib
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+FLOORS = ("encoder", "format", "player", "tools")
+
+
+def test_every_package_is_listed() -> None:
+    inits = [init for floor in FLOORS for init in (ROOT / floor).rglob("__init__.py")]
+    found = {"kpc", *("kpc." + ".".join(init.parent.relative_to(ROOT).parts) for init in inits)}
+    assert set(PROJECT["tool"]["setuptools"]["packages"]) == found
+    folders = {file.parent for floor in FLOORS for file in (ROOT / floor).rglob("*.py")}
+    assert folders <= {init.parent for init in inits}, "a folder of modules lacks __init__.py"
+
+
+def test_every_file_that_is_no_module_is_package_data() -> None:
+    data = PROJECT["tool"]["setuptools"]["package-data"]
+    for floor in FLOORS:
+        for file in (ROOT / floor).rglob("*"):
+            if file.is_dir() or file.suffix in (".py", ".sh") or "__pycache__" in file.parts:
+                continue
+            package = "kpc." + ".".join(file.parent.relative_to(ROOT).parts)
+            assert any(file.match(pattern) for pattern in data.get(package, ())), file.relative_to(ROOT)
+
+
+def test_floors_are_links_inside_the_repository() -> None:
+    for floor in FLOORS:
+        link = ROOT / "src" / "kpc" / floor
+        assert link.is_symlink() and not link.readlink().is_absolute() and link.resolve() == (ROOT / floor).resolve()
+
+
+@pytest.mark.parametrize("command", PROJECT["project"]["scripts"])
+def test_commands_exist(command: str) -> None:
+    module, _, function = PROJECT["project"]["scripts"][command].partition(":")
+    assert callable(getattr(importlib.import_module(module), function))
+
+
+def test_constraints_pin_all_that_is_asked_for_and_no_build_of_it() -> None:
+    pins = dict(re.findall(r"^([\w.-]+)==(\S+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE))
+    project = PROJECT["project"]
+    asked = project["dependencies"] + [line for extra in project["optional-dependencies"].values() for line in extra]
+    canonical = {re.sub(r"[-_.]+", "-", name).lower() for name in pins}
+    for line in asked:
+        assert re.sub(r"[-_.]+", "-", re.split(r"[^\w.-]", line)[0]).lower() in canonical, line
+    assert not [pin for pin in pins.values() if "+" in pin]
+
+
+WITHOUT_TORCH = """
+import sys
+class Nowhere:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("torch", "numba"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Nowhere())
+"""
+
+
+@pytest.mark.parametrize("module", ["player.renderer", "player.kpplay", "player.window", "tools.kprender", "tools.kpinfo",
+                                    "tools.kpbench", "tools.scenegen", "tools.results", "tools.contactsheet"])  # fmt: skip
+def test_viewers_need_no_torch(module: str) -> None:
+    subprocess.run([sys.executable, "-c", f"{WITHOUT_TORCH}\nimport kpc.{module}"], check=True)
+
+
+@pytest.mark.parametrize(
+    ("call", "code"), [("kpc.encoder", 1), ("kpc.tools.kpbench", 2)], ids=["kpenc", "kpbench encode"]
+)
+def test_encoding_without_torch_is_one_line(call: str, code: int, tmp_path: Path) -> None:
+    program = f"{WITHOUT_TORCH}\nimport {call} as c; sys.exit(c.main(['encode', {str(tmp_path)!r}]))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == code and done.stderr.count("\n") == 1 and 'pip install "kpc[encoder]"' in done.stderr
+
+
+def test_scripts_are_sound_shell() -> None:
+    for script in [*sorted((ROOT / "tools").glob("*.sh")), ROOT / ".ci" / "run"]:
+        subprocess.run(["bash", "-n", str(script)], check=True)
