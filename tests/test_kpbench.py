@@ -73,7 +73,9 @@ def test_what_was_measured_survives_a_failure(tmp_path: Path, capsys: pytest.Cap
     assert said.err.splitlines()[-1].startswith(f"kpbench: {bad}: ")
 
 
-@pytest.mark.parametrize("command", [["encode", "missing"], ["player", "missing.kpc"], ["player", "x.kpc", "--out", "no/x"]])
+@pytest.mark.parametrize(
+    "command", [["encode", "missing"], ["player", "missing.kpc"], ["player", "x.kpc", "--out", "no/x"]]
+)
 def test_errors_are_one_line(command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                              capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)

@@ -64,8 +64,13 @@ sys.meta_path.insert(0, Nowhere())
 """
 
 
-@pytest.mark.parametrize("module", ["player.renderer", "player.kpplay", "player.window", "tools.kprender", "tools.kpinfo",
-                                    "tools.kpbench", "tools.scenegen", "tools.results", "tools.contactsheet"])  # fmt: skip
+VIEWERS = (
+    *("player.renderer", "player.kpplay", "player.window"),
+    *("tools.kprender", "tools.kpinfo", "tools.kpbench", "tools.scenegen", "tools.results", "tools.contactsheet"),
+)
+
+
+@pytest.mark.parametrize("module", VIEWERS)
 def test_viewers_need_no_torch(module: str) -> None:
     subprocess.run([sys.executable, "-c", f"{WITHOUT_TORCH}\nimport kpc.{module}"], check=True)
 

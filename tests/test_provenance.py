@@ -18,7 +18,11 @@ def test_the_hash_of_a_folder_is_of_names_and_contents(tmp_path: Path) -> None:
 
     first = write("a", {"x.txt": "one", "sub/y.txt": "two"})
     assert write("b", {"sub/y.txt": "two", "x.txt": "one", ".hidden": "!", ".git/z": "!"}) == first
-    others = [{"x.txt": "one", "sub/y.txt": "2"}, {"x.txt": "one", "y.txt": "two"}, {"x.txt": "onesub/y.txt", "z": "two"}]
+    others = [
+        {"x.txt": "one", "sub/y.txt": "2"},
+        {"x.txt": "one", "y.txt": "two"},
+        {"x.txt": "onesub/y.txt", "z": "two"},
+    ]
     assert len({first, *(write(f"c{n}", files) for n, files in enumerate(others))}) == 4
 
 
@@ -27,13 +31,17 @@ def test_the_hash_of_a_file_is_its_sha256(tmp_path: Path) -> None:
     assert provenance.data_hash(tmp_path / "f").startswith("ba7816bf8f01cfea414140de5dae2223")
 
 
-def test_the_commit_is_that_of_a_checkout_that_tracks_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_commit_is_that_of_a_checkout_that_tracks_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if shutil.which("git") is None:
         pytest.skip("no git")
 
     def git(*arguments: str) -> str:
         identity = ["-c", "user.name=t", "-c", "user.email=t@example.org", "-c", "commit.gpgsign=false"]
-        done = subprocess.run(["git", "-C", str(tmp_path), *identity, *arguments], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            ["git", "-C", str(tmp_path), *identity, *arguments], capture_output=True, text=True, check=True
+        )
         return done.stdout.strip()
 
     source = tmp_path / "src" / "__init__.py"

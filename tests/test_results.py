@@ -10,14 +10,15 @@ MACHINE = {"cpu": "Test CPU", "cores": 2, "memory_bytes": 8 << 30, "os": "Linux"
 
 
 def encode_record(name: str, psnrs: list[float | None], **changes: object) -> results.Record:
-    run = {
-        "test_ssim": 0.9, "size_bytes": 345678, "bits_per_parameter": 1.25, "identity_share": None, "coding_loss_db": 0.1,
-        "train_s": 100.0, "encode_s": 120.0, "rays_per_s": 23456.0, "peak_memory_bytes": 9e8,
-    }  # fmt: skip
-    return {
-        "kind": "encode", "name": name, "commit": "0123456789abcdef", "command": f"kpbench encode {name}", "machine": MACHINE,
-        "renderer": "cpu", "settings": {"preset": "fast"}, "repeats": [run | {"test_psnr": psnr} for psnr in psnrs],
-    } | changes  # fmt: skip
+    run: results.Record = dict(
+        test_ssim=0.9, size_bytes=345678, bits_per_parameter=1.25, identity_share=None, coding_loss_db=0.1
+    )
+    run |= dict(train_s=100.0, encode_s=120.0, rays_per_s=23456.0, peak_memory_bytes=9e8)
+    record: results.Record = dict(
+        kind="encode", name=name, commit="0123456789abcdef", command=f"kpbench encode {name}", renderer="cpu"
+    )
+    record |= dict(machine=MACHINE, settings={"preset": "fast"}, repeats=[run | {"test_psnr": psnr} for psnr in psnrs])
+    return record | changes
 
 
 def test_a_cell_is_the_median_of_the_repeats_that_have_it() -> None:
@@ -38,14 +39,18 @@ def test_tables_are_split_by_machine_and_say_where_they_come_from() -> None:
     assert "64 cores" in second and "Commit fffffffff+dirty; median of 1 run;" in second
 
 
-def test_the_block_of_a_readme_is_rewritten_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_block_of_a_readme_is_rewritten_and_nothing_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     readme, records = tmp_path / "README.md", tmp_path / "a.json"
     readme.write_text(f"before\n\n{results.BEGIN}\nold\n{results.END}\n\nafter\n")
     records.write_text(json.dumps([encode_record("room", [30.0])]))
     for _ in range(2):
         assert results.main([str(records), "--readme", str(readme)]) == 0
     text = readme.read_text()
-    assert text.startswith(f"before\n\n{results.BEGIN}\n\n**Encoding**") and text.endswith(f"\n\n{results.END}\n\nafter\n")
+    assert text.startswith(f"before\n\n{results.BEGIN}\n\n**Encoding**") and text.endswith(
+        f"\n\n{results.END}\n\nafter\n"
+    )
     assert "old" not in text and text.count("| room |") == 1
 
 
