@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import datasets as make
+import numba
 import numpy as np
 import pytest
 import torch
@@ -21,6 +22,7 @@ CONFIG = TrainConfig(
     resolutions=(12, 24), samples_across=48, cells_across=16, steps=60, rays=256, samples=12288, warmup=5, occupancy_start=16,
     occupancy_every=8,
 )
+pytestmark = pytest.mark.usefixtures("one_thread")
 BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
 
 
@@ -81,6 +83,7 @@ def test_it_learns_what_stands_still_with_three_planes(still: Dataset) -> None:
 
 
 def test_a_seed_repeats_bitwise(moving: Dataset) -> None:
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     one, two, other = trained(moving, steps=30), trained(moving, steps=30), trained(moving, steps=30, seed=1)
     assert_same(one, two)
     assert not torch.equal(one.field.theta, other.field.theta)
