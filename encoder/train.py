@@ -226,7 +226,8 @@ class FusedOptimiser:
 
     def __init__(self, field: Field, config: TrainConfig, cells: tuple[int, int, int]) -> None:
         self.field, self.config = field, config
-        self.workers = numba.get_num_threads()
+        self.workers = numba.get_num_threads()  # starts numba's threads, which would undo the next line
+        torch.set_num_threads(1)  # the decoder is so small that sharing it out costs more, a hundredfold on a busy machine
         self.theta = field.theta.detach().numpy()
         self.grad = np.zeros((self.workers, self.theta.size), np.float32)
         self.mean, self.square = np.zeros_like(self.theta), np.zeros_like(self.theta)

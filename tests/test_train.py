@@ -84,7 +84,7 @@ def test_it_learns_what_stands_still_with_three_planes(still: Dataset) -> None:
 
 def test_a_seed_repeats_bitwise(moving: Dataset) -> None:
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    one, two, other = trained(moving, steps=30), trained(moving, steps=30), trained(moving, steps=30, seed=1)
+    one, two, other = trained(moving, steps=20), trained(moving, steps=20), trained(moving, steps=20, seed=1)
     assert_same(one, two)
     assert not torch.equal(one.field.theta, other.field.theta)
 
@@ -195,6 +195,12 @@ def test_a_loss_that_is_not_finite_stops_the_run(moving: Dataset, tmp_path: Path
     with pytest.raises(TrainingError, match="step 0.*not finite.*--seed"):
         run.run(ignore, tmp_path / "c.kpck")
     assert not any(tmp_path.iterdir())
+
+
+def test_pytorch_does_not_compete_with_the_kernels_for_the_cores(moving: Dataset) -> None:
+    torch.set_num_threads(2)
+    trained(moving, steps=1)
+    assert torch.get_num_threads() == 1
 
 
 def test_a_box_that_no_camera_sees_is_refused(moving: Dataset) -> None:
