@@ -90,7 +90,7 @@ def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bo
     symbols = np.zeros(values.shape, np.int8)
     rounded = np.rint((wanted - offset) / step.astype(np.float64))
     symbols[needed] = np.clip(rounded, SYMBOL_MIN, SYMBOL_MAX).astype(np.int8)
-    coded: np.ndarray = symbols.any(axis=2) if identity else needed
+    coded = np.asarray(symbols.any(axis=2)) if identity else needed
     return QuantisedPlane(symbols, step, offset, coded)
 
 

@@ -1,4 +1,4 @@
-"""Tests work on tiny arrays: on a busy machine threads only wait for each other, a hundredfold longer than they compute."""
+"""Tests work on tiny arrays: on a busy machine threads wait for each other far longer than they compute."""
 
 import os
 

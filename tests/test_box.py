@@ -10,15 +10,23 @@ from kpc.format.cameras import Camera
 from kpc.format.errors import DatasetError
 
 
-def pictures_of(cameras: list[Camera], near: float = np.nan, far: float = np.nan, tests: tuple[int, ...] = ()) -> Pictures:
+def pictures_of(
+    cameras: list[Camera], near: float = np.nan, far: float = np.nan, tests: tuple[int, ...] = ()
+) -> Pictures:
     n = len(cameras)
     return Pictures(
-        file=tuple(f"{k}.png" for k in range(n)), camera=np.arange(n, dtype=np.int32), time=np.zeros(n, np.float32),
-        is_test=np.isin(np.arange(n), tests), offset=np.zeros(n, np.int64),
-        width=np.array([c.width for c in cameras], np.int32), height=np.array([c.height for c in cameras], np.int32),
-        intrinsics=np.array([[c.fl_x, c.fl_y, c.cx, c.cy] for c in cameras]), distortion=np.zeros((n, 4)),
+        file=tuple(f"{k}.png" for k in range(n)),
+        camera=np.arange(n, dtype=np.int32),
+        time=np.zeros(n, np.float32),
+        is_test=np.isin(np.arange(n), tests),
+        offset=np.zeros(n, np.int64),
+        width=np.array([c.width for c in cameras], np.int32),
+        height=np.array([c.height for c in cameras], np.int32),
+        intrinsics=np.array([[c.fl_x, c.fl_y, c.cx, c.cy] for c in cameras]),
+        distortion=np.zeros((n, 4)),
         camera_to_world=np.stack([c.camera_to_world for c in cameras]),
-        near=np.full(n, near, np.float32), far=np.full(n, far, np.float32),
+        near=np.full(n, near, np.float32),
+        far=np.full(n, far, np.float32),
     )
 
 
@@ -65,7 +73,10 @@ def test_parallel_cameras_share_no_point(has_alpha: bool) -> None:
 
 def test_cameras_that_look_away_from_each_other_share_no_point() -> None:
     rig = [make.look_at((3 * np.sin(a), -3 * np.cos(a), 0.5)) for a in (0.0, 2.0, 4.0)]
-    flipped = [Camera(c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy, c.camera_to_world @ np.diag([-1.0, 1, -1, 1])) for c in rig]
+    flipped = [
+        Camera(c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy, c.camera_to_world @ np.diag([-1.0, 1, -1, 1]))
+        for c in rig
+    ]
     find_box(pictures_of(rig), False)
     with pytest.raises(DatasetError, match="no point they look at"):
         find_box(pictures_of(flipped), False)

@@ -19,7 +19,13 @@ EQUAL = [{name: np.ones(plane.shape[2]) for name, plane in scale.items()} for sc
 
 def fidelity(scene: Scene) -> float:
     """A stand-in for the PSNR of pictures: noise of 1e-3, and what the planes err."""
-    error = np.mean([np.square(ours[name] - theirs[name]).mean() for ours, theirs in zip(scene.scales, SCENE.scales) for name in ours])
+    error = np.mean(
+        [
+            np.square(ours[name] - theirs[name]).mean()
+            for ours, theirs in zip(scene.scales, SCENE.scales)
+            for name in ours
+        ]
+    )
     return -10 * math.log10(1e-3 + float(error))
 
 

@@ -27,7 +27,11 @@ def plain_ssim(a: np.ndarray, b: np.ndarray) -> float:
             for i in range(a.shape[1] - size + 1):
                 p, q = (im[j : j + size, i : i + size, c].astype(np.float64) for im in (a, b))
                 mp, mq = (window * p).sum(), (window * q).sum()
-                vp, vq, cov = (window * (p - mp) ** 2).sum(), (window * (q - mq) ** 2).sum(), (window * (p - mp) * (q - mq)).sum()
+                vp, vq, cov = (
+                    (window * (p - mp) ** 2).sum(),
+                    (window * (q - mq) ** 2).sum(),
+                    (window * (p - mp) * (q - mq)).sum(),
+                )
                 values.append((2 * mp * mq + 1e-4) * (2 * cov + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4)))
     return float(np.mean(values))
 
@@ -48,7 +52,9 @@ def test_ssim_is_its_twin(shape: tuple[int, int, int]) -> None:
 def test_psnr() -> None:
     a = noise(8, 9, 3)
     b = noise(8, 9, 3, seed=1)
-    assert psnr(a, b) == pytest.approx(-10 * math.log10(sum((float(x) - float(y)) ** 2 for x, y in zip(a.flat, b.flat)) / a.size), abs=1e-4)
+    assert psnr(a, b) == pytest.approx(
+        -10 * math.log10(sum((float(x) - float(y)) ** 2 for x, y in zip(a.flat, b.flat)) / a.size), abs=1e-4
+    )
     assert psnr(a, a) == 100
     assert psnr(np.zeros((4, 4, 3), np.float32), np.full((4, 4, 3), 0.1, np.float32)) == pytest.approx(20, abs=1e-5)
 
@@ -86,8 +92,13 @@ def test_true_pictures_are_on_white(blender: Dataset) -> None:
 def test_true_pictures_without_alpha(tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "set", frames=1)
     dataset = load_dataset(tmp_path / "set", tmp_path / "cache", progress=False)
-    np.testing.assert_array_equal(true_picture(dataset, 1), dataset.pixels.picture(1).astype(np.float32) / np.float32(255))
-    assert evaluate(tiny_scene(), load_dataset(tmp_path / "set", tmp_path / "cache", holdout="none", progress=False)) is None
+    np.testing.assert_array_equal(
+        true_picture(dataset, 1), dataset.pixels.picture(1).astype(np.float32) / np.float32(255)
+    )
+    assert (
+        evaluate(tiny_scene(), load_dataset(tmp_path / "set", tmp_path / "cache", holdout="none", progress=False))
+        is None
+    )
 
 
 def test_evaluate_is_the_mean_over_held_out_pictures(blender: Dataset) -> None:

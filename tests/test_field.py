@@ -31,12 +31,16 @@ def test_a_static_scene_has_three_planes() -> None:
     assert not layout.is_dynamic and layout.size == 4 * (8 * 6 + 8 * 4 + 6 * 4)
     assert [name for _, name, *_ in layout.planes()] == [*SPACE_PLANES]
     assert (layout.table[0, 3:] == -1).all()
-    assert set(Field(layout, 4).to_scene(BOX, Clip(1, 30.0), np.ones((1, 2, 2, 2)), np.ones(3), 0.1).scales[0]) == set(SPACE_PLANES)
+    assert set(Field(layout, 4).to_scene(BOX, Clip(1, 30.0), np.ones((1, 2, 2, 2)), np.ones(3), 0.1).scales[0]) == set(
+        SPACE_PLANES
+    )
 
 
 def test_resolution_follows_the_box_and_the_clip() -> None:
     config = TrainConfig(resolutions=(32, 64), frames_per_row=2.0)
-    np.testing.assert_array_equal(plan_layout(config, BOX, Clip(31, 30.0), True).resolution, [[32, 16, 8, 16], [64, 32, 16, 16]])
+    np.testing.assert_array_equal(
+        plan_layout(config, BOX, Clip(31, 30.0), True).resolution, [[32, 16, 8, 16], [64, 32, 16, 16]]
+    )
     assert not plan_layout(config, BOX, Clip(1, 30.0), False).resolution[:, 3].any()
     thin = np.array([[0, 0, 0], [1, 1, 1e-6]], np.float32)
     assert plan_layout(config, thin, Clip(2, 30.0), True).resolution.min() == 2
@@ -105,13 +109,18 @@ def test_features_multiply_planes_and_concatenate_scales() -> None:
     field = Field.from_scene(scene)
     features = field.features(torch.tensor([[0.0, 1.0, 0.0]]), torch.tensor([1.0]))[0].detach().numpy()
     corners = {"x": 0, "y": -1, "z": 0, "t": -1}
-    expected = np.concatenate([
-        np.prod([scale[name][corners[name[1]], corners[name[0]]] for name in ALL_PLANES], axis=0) for scale in scene.scales
-    ])
+    expected = np.concatenate(
+        [
+            np.prod([scale[name][corners[name[1]], corners[name[0]]] for name in ALL_PLANES], axis=0)
+            for scale in scene.scales
+        ]
+    )
     np.testing.assert_allclose(features, expected, rtol=6 * 2.0**-23)
 
 
-@pytest.mark.parametrize("change", [{"channels": 0}, {"steps": 0}, {"rays": -1}, {"resolutions": ()}, {"resolutions": (64, 1)}])
+@pytest.mark.parametrize(
+    "change", [{"channels": 0}, {"steps": 0}, {"rays": -1}, {"resolutions": ()}, {"resolutions": (64, 1)}]
+)
 def test_a_config_that_makes_no_sense_is_refused(change: dict[str, object]) -> None:
     with pytest.raises(UsageError, match=next(iter(change))):
         TrainConfig(**change)  # type: ignore[arg-type]

@@ -1,7 +1,8 @@
 """The fused kernels meet their readable twins: `kpc.encoder.field` in float64, torch.optim.Adam, the numpy renderer.
 
-Tolerances. Float32 places a sample at 4 units from the eye to 2^-22 or so, 5e-7 of the box; planes of 24 texels that change by 1
-a texel turn that into 1e-5 of a feature, and six factors, 16 features and a march of 60 samples into some 1e-4 at worst.
+Tolerances. Float32 places a sample at 4 units from the eye to 2^-22 or so, 5e-7 of the box; planes of 24 texels that
+change by 1 a texel turn that into 1e-5 of a feature, and six factors, 16 features and a march of 60 samples into some
+1e-4 at worst.
 Colours must agree to 1e-4, a fortieth of an 8-bit level; a gradient to 1e-3 of the largest element of its array.
 """
 
@@ -26,14 +27,14 @@ GRADIENT = 1e-3
 
 
 def misty(dynamic: bool = True) -> Scene:
-    """A scene of which every step absorbs a tenth or more: no sample before termination is so faint that it gets no colour."""
+    """Every step absorbs a tenth or more: no sample before termination is so faint that it gets no colour."""
     scene = tiny_scene(dynamic=dynamic, time=6)
     weight = scene.decoder.density_weight
     return replace(scene, decoder=replace(scene.decoder, density_weight=np.abs(weight) / 16, density_bias=2.0))
 
 
 def rays_at(scene: Scene, count: int, seed: int = 0) -> Rays:
-    """Rays from the scene's cameras through random pixels at random times, and one along each axis, its direction exact."""
+    """Rays through random pixels of the scene's cameras at random times, and one exactly along each axis."""
     rng = np.random.default_rng(seed)
     origins, directions = (np.concatenate(a) for a in zip(*(c.rays() for c in scene.cameras)))
     chosen = rng.choice(len(origins), count - 3, replace=False)
@@ -53,13 +54,36 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
     grad_basis = np.full((n, 3, layout.features), np.nan, np.float32)
     peaks = np.zeros((workers, *scene.occupancy.shape[1:]), np.float32)
     errors, counts = kernels.backpropagate(
-        field.theta.detach().numpy(), grad, layout.table, layout.resolution, field.density.detach().numpy(), grad_density,
-        (0,) * layout.channels, scene.aabb, scene.occupancy.view(np.uint8), np.float32(scene.step), np.float32(scene.extent),
-        rays.origins.numpy(), rays.directions.numpy(), rays.times.numpy(), rays.jitters.numpy(), basis, grad_basis,
-        targets.numpy(), rays.backgrounds.numpy(), peaks, sample_capacity(scene.aabb, scene.step),
+        field.theta.detach().numpy(),
+        grad,
+        layout.table,
+        layout.resolution,
+        field.density.detach().numpy(),
+        grad_density,
+        (0,) * layout.channels,
+        scene.aabb,
+        scene.occupancy.view(np.uint8),
+        np.float32(scene.step),
+        np.float32(scene.extent),
+        rays.origins.numpy(),
+        rays.directions.numpy(),
+        rays.times.numpy(),
+        rays.jitters.numpy(),
+        basis,
+        grad_basis,
+        targets.numpy(),
+        rays.backgrounds.numpy(),
+        peaks,
+        sample_capacity(scene.aabb, scene.step),
     )
-    return {"theta": grad.sum(0), "density": grad_density.sum(0), "basis": grad_basis, "errors": errors, "counts": counts,
-            "peaks": peaks.max(0)}
+    return {
+        "theta": grad.sum(0),
+        "density": grad_density.sum(0),
+        "basis": grad_basis,
+        "errors": errors,
+        "counts": counts,
+        "peaks": peaks.max(0),
+    }
 
 
 def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict[str, np.ndarray]:
@@ -76,8 +100,14 @@ def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict
     peaks.index_put_(tuple(cells.T), torch.zeros(len(cells), dtype=torch.float64))
     for cell, weight in zip(cells.tolist(), weights.tolist()):
         peaks[tuple(cell)] = max(float(peaks[tuple(cell)]), weight)
-    return {"theta": field.theta.grad.numpy(), "density": field.density.grad.numpy(), "basis": basis.grad.numpy(),
-            "errors": squared.sum(1).detach().numpy(), "samples": len(weights), "peaks": peaks.numpy()}
+    return {
+        "theta": field.theta.grad.numpy(),
+        "density": field.density.grad.numpy(),
+        "basis": basis.grad.numpy(),
+        "errors": squared.sum(1).detach().numpy(),
+        "samples": len(weights),
+        "peaks": peaks.numpy(),
+    }
 
 
 @pytest.mark.parametrize("dynamic", [True, False])
@@ -96,7 +126,7 @@ def test_backpropagate_is_autograd_through_the_reference(dynamic: bool) -> None:
 
 
 def test_backpropagate_gives_faint_samples_no_colour_and_hardly_errs() -> None:
-    """A sample of weight below 1e-4 gets no colour: off by less than that each, over at most `sample_capacity` samples."""
+    """A sample of weight below 1e-4 gets no colour: off by less than that, `sample_capacity` times at most."""
     scene = tiny_scene()
     rays = rays_at(scene, 203)
     targets = torch.rand(203, 3, generator=torch.Generator().manual_seed(1))
@@ -132,8 +162,12 @@ def test_the_reference_has_the_gradient_of_finite_differences() -> None:
     field = Field(Layout.of(np.array([[3, 3, 2, 2]]), 2), 2, generator).double()
     aabb = torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]], dtype=torch.float64)
     directions = torch.nn.functional.normalize(torch.randn(4, 3, generator=generator, dtype=torch.float64), dim=1)
-    rays = Rays(-2 * directions, directions, *(torch.rand(4, generator=generator).double() for _ in range(2)),
-                torch.rand(4, 3, generator=generator).double())
+    rays = Rays(
+        -2 * directions,
+        directions,
+        *(torch.rand(4, generator=generator).double() for _ in range(2)),
+        torch.rand(4, 3, generator=generator).double(),
+    )
     theta = (0.5 + torch.rand(field.layout.size, generator=generator, dtype=torch.float64)).requires_grad_()
     density = torch.randn(3, generator=generator, dtype=torch.float64).requires_grad_()
 
@@ -141,7 +175,9 @@ def test_the_reference_has_the_gradient_of_finite_differences() -> None:
         def rendered(*_: object) -> torch.Tensor:
             return render_reference(field, rays, aabb, torch.ones(1, 2, 2, 2), 0.3)[0]
 
-        return torch.func.functional_call(_Calling(field, rendered), {"field.theta": theta, "field.density": density}, ())
+        return torch.func.functional_call(
+            _Calling(field, rendered), {"field.theta": theta, "field.density": density}, ()
+        )
 
     assert torch.autograd.gradcheck(colours, (theta, density))
 
@@ -174,11 +210,23 @@ def test_render_gives_opacity_depth_and_counts() -> None:
     origins, directions = camera.rays()
     n = len(origins)
     _, opacity, depth, counts = kernels.render(
-        field.theta.detach().numpy(), field.layout.table, field.layout.resolution, field.density.detach().numpy(),
-        (0,) * field.layout.channels, scene.aabb, scene.occupancy.view(np.uint8), np.float32(scene.step),
-        np.float32(scene.extent), origins, directions, np.full(n, 0.4, np.float32),
-        field.basis(torch.from_numpy(directions)).detach().numpy(), np.arange(n), scene.background,
-        sample_capacity(scene.aabb, scene.step), 4,
+        field.theta.detach().numpy(),
+        field.layout.table,
+        field.layout.resolution,
+        field.density.detach().numpy(),
+        (0,) * field.layout.channels,
+        scene.aabb,
+        scene.occupancy.view(np.uint8),
+        np.float32(scene.step),
+        np.float32(scene.extent),
+        origins,
+        directions,
+        np.full(n, 0.4, np.float32),
+        field.basis(torch.from_numpy(directions)).detach().numpy(),
+        np.arange(n),
+        scene.background,
+        sample_capacity(scene.aabb, scene.step),
+        4,
     )
     theirs = reference.render_rays(scene, origins, directions, 0.4)
     seen = theirs.opacity > 0.05
@@ -239,7 +287,7 @@ def test_adam_is_pytorchs() -> None:
         optimiser.step()
         kernels.adam(theta, grad, mean, square, rate, BETA1, BETA2, EPSILON, number)
         assert not grad.any()
-    # Each step moves by at most `rate` times 1e-5 or so of rounding; where gradients cancel, the ratio is the less certain.
+    # Five steps of at most 0.05, each rounded to 1e-5 of itself or so; where gradients cancel, a little worse.
     expected = twin.detach().numpy()
     assert (theta[:100] == expected[:100].astype(np.float32)).all()
     np.testing.assert_allclose(theta, expected, atol=1e-5)

@@ -25,8 +25,17 @@ from kpc.encoder.train import Trainer
 from kpc.format import cli, file
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny")
-TINY = dict(resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
-            occupancy_start=8, occupancy_every=4)
+TINY = dict(
+    resolutions=(8, 16),
+    samples_across=32,
+    cells_across=12,
+    steps=24,
+    rays=256,
+    samples=8192,
+    warmup=5,
+    occupancy_start=8,
+    occupancy_every=4,
+)
 
 
 @pytest.fixture
@@ -59,8 +68,16 @@ def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Kpenc:
     return call
 
 
-def fails(run: Kpenc, tmp_path: Path, source: Path, *words: str, options: tuple[str, ...] = (), output: Path | None = None,
-          code: int = 1, lines: int = 1) -> None:
+def fails(
+    run: Kpenc,
+    tmp_path: Path,
+    source: Path,
+    *words: str,
+    options: tuple[str, ...] = (),
+    output: Path | None = None,
+    code: int = 1,
+    lines: int = 1,
+) -> None:
     """One line with all these words, the exit code, and nothing left; an output file that was there stays as it was."""
     output = output or tmp_path / "out.kpc"
     there = output.is_dir() or output.exists()
@@ -82,7 +99,9 @@ def fails(run: Kpenc, tmp_path: Path, source: Path, *words: str, options: tuple[
 # --- it works
 
 
-@pytest.mark.parametrize("name, layout, dynamic", [("n3dv", "N3DV", True), ("blender", "Blender", True), ("nerfstudio", "nerfstudio", False)])
+@pytest.mark.parametrize(
+    "name, layout, dynamic", [("n3dv", "N3DV", True), ("blender", "Blender", True), ("nerfstudio", "nerfstudio", False)]
+)
 def test_a_folder_becomes_a_file(run: Kpenc, sets: Path, tmp_path: Path, name: str, layout: str, dynamic: bool) -> None:
     code, out, err = run(sets / name, "--json")
     assert code == 0
@@ -102,13 +121,41 @@ def test_a_folder_becomes_a_file(run: Kpenc, sets: Path, tmp_path: Path, name: s
 def test_what_is_printed(run: Kpenc, sets: Path) -> None:
     code, out, _ = run(sets / "blender")
     assert code == 0
-    assert all(words in out for words in ("out.kpc: held-out PSNR ", " dB, SSIM ", "over 3 pictures", " bytes, ", "bits per parameter",
-                                          "exactly at identity: ", "encoded in ", "24 steps"))
+    assert all(
+        words in out
+        for words in (
+            "out.kpc: held-out PSNR ",
+            " dB, SSIM ",
+            "over 3 pictures",
+            " bytes, ",
+            "bits per parameter",
+            "exactly at identity: ",
+            "encoded in ",
+            "24 steps",
+        )
+    )
 
 
 def test_options(run: Kpenc, sets: Path, tmp_path: Path) -> None:
-    code, out, err = run(sets / "n3dv", "--json", "--holdout", "none", "--steps", "9", "--downscale", "2", "--seed", "3",
-                         "--box", "-1,-1,-0.5,1,1,0.5", "--device", "cpu", "--work", str(tmp_path / "w"), "--keep")
+    code, out, err = run(
+        sets / "n3dv",
+        "--json",
+        "--holdout",
+        "none",
+        "--steps",
+        "9",
+        "--downscale",
+        "2",
+        "--seed",
+        "3",
+        "--box",
+        "-1,-1,-0.5,1,1,0.5",
+        "--device",
+        "cpu",
+        "--work",
+        str(tmp_path / "w"),
+        "--keep",
+    )
     result = json.loads(out)
     assert code == 0 and result["test_psnr"] is None and result["test_pictures"] == 0
     assert (result["steps"], result["seed"], result["device"]) == (9, 3, "cpu")
@@ -149,14 +196,22 @@ def test_durations() -> None:
 # --- interruption
 
 
-def test_an_interrupted_run_resumes_to_the_same_file(run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run_resumes_to_the_same_file(
+    run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert run(sets / "blender")[0] == 0
     output = tmp_path / "out.kpc"
     whole = output.read_bytes()
     output.write_bytes(b"an earlier scene")
     _signal_at_step(monkeypatch, 13, signal.SIGINT)
     code, out, err = run(sets / "blender")
-    assert code == 130 and out == "" and err.endswith("kpenc: interrupted\n") and "--resume" in err and "Traceback" not in err
+    assert (
+        code == 130
+        and out == ""
+        and err.endswith("kpenc: interrupted\n")
+        and "--resume" in err
+        and "Traceback" not in err
+    )
     assert output.read_bytes() == b"an earlier scene"
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc", "out.kpc.work"}
     monkeypatch.undo()
@@ -221,9 +276,11 @@ def test_resume_with_other_settings(run: Kpenc, sets: Path, tmp_path: Path) -> N
 def test_a_killed_process_resumes(sets: Path, tmp_path: Path, run: Kpenc) -> None:
     """SIGKILL after the first checkpoint, as when memory runs out or power fails."""
     output = tmp_path / "out.kpc"
-    process = _subprocess([str(sets / "blender"), "-o", str(output), "--preset", "draft", "--steps", "1000000"],
-                          "import functools; from kpc.encoder.train import Trainer\n"
-                          "Trainer.run = functools.partialmethod(Trainer.run, checkpoint_every_s=0.2)")
+    process = _subprocess(
+        [str(sets / "blender"), "-o", str(output), "--preset", "draft", "--steps", "1000000"],
+        "import functools; from kpc.encoder.train import Trainer\n"
+        "Trainer.run = functools.partialmethod(Trainer.run, checkpoint_every_s=0.2)",
+    )
     checkpoint = tmp_path / "out.kpc.work" / kpenc.CHECKPOINT
     deadline = time.monotonic() + 60
     while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
@@ -291,13 +348,23 @@ def test_zero_focal_length_and_nan_poses_in_json(run: Kpenc, sets: Path, tmp_pat
     make.edit_json(folder / "transforms.json", lambda d: d.update(fl_x=0.0))
     fails(run, tmp_path, folder, "transforms.json", "focal length")
     make.edit_json(folder / "transforms.json", lambda d: d.update(fl_x=30.0))
-    make.edit_json(folder / "transforms.json", lambda d: d["frames"][2]["transform_matrix"][0].__setitem__(3, float("nan")))
+    make.edit_json(
+        folder / "transforms.json", lambda d: d["frames"][2]["transform_matrix"][0].__setitem__(3, float("nan"))
+    )
     fails(run, tmp_path, folder, "transforms.json", "NaN")
 
 
 def test_a_single_camera_that_stands_still(run: Kpenc, tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "one", cameras=1)
-    fails(run, tmp_path, tmp_path / "one", str(tmp_path / "one"), "single camera", "add cameras", options=("--holdout", "none"))
+    fails(
+        run,
+        tmp_path,
+        tmp_path / "one",
+        str(tmp_path / "one"),
+        "single camera",
+        "add cameras",
+        options=("--holdout", "none"),
+    )
     fails(run, tmp_path, tmp_path / "one", str(tmp_path / "one"), "--holdout none")
 
 
@@ -347,12 +414,28 @@ def test_outputs_that_cannot_be(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     fails(run, tmp_path, sets / "n3dv", str(tmp_path / "plain"), "--work", options=("--work", str(tmp_path / "plain")))
 
 
-@pytest.mark.parametrize("options", [
-    ("--steps", "0"), ("--steps", "x"), ("--time-budget", "soon"), ("--time-budget", "-3"), ("--time-budget", "nan"), ("--seed", "-1"),
-    ("--seed", str(1 << 70)), ("--downscale", "0"), ("--box", "1,2,3"), ("--box", "0,0,0,1,1,nan"), ("--box", "1,0,0,0,1,1"),
-    ("--preset", "huge"), ("--device", "tpu"), ("--nonsense",),
-])
-def test_options_that_make_no_sense(run: Kpenc, sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--steps", "0"),
+        ("--steps", "x"),
+        ("--time-budget", "soon"),
+        ("--time-budget", "-3"),
+        ("--time-budget", "nan"),
+        ("--seed", "-1"),
+        ("--seed", str(1 << 70)),
+        ("--downscale", "0"),
+        ("--box", "1,2,3"),
+        ("--box", "0,0,0,1,1,nan"),
+        ("--box", "1,0,0,0,1,1"),
+        ("--preset", "huge"),
+        ("--device", "tpu"),
+        ("--nonsense",),
+    ],
+)
+def test_options_that_make_no_sense(
+    run: Kpenc, sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...]
+) -> None:
     with pytest.raises(SystemExit) as stopped:
         run(sets / "n3dv", *options)
     assert stopped.value.code == 2
@@ -379,6 +462,7 @@ def test_disk_full_while_decoding(run: Kpenc, sets: Path, tmp_path: Path, monkey
 
 def test_disk_full_at_a_checkpoint(run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Said in one line; the run goes on and the scene, which is far smaller, may well find room."""
+
     def full(_: object, path: Path) -> None:
         Path(path).write_bytes(b"half")
         raise RuntimeError("[enforce fail at inline_container.cc:672] . unexpected pos 704 vs 598")
@@ -390,7 +474,9 @@ def test_disk_full_at_a_checkpoint(run: Kpenc, sets: Path, tmp_path: Path, monke
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
 
 
-def test_disk_full_as_an_interrupted_run_saves(run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disk_full_as_an_interrupted_run_saves(
+    run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(_: object, path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
@@ -401,8 +487,12 @@ def test_disk_full_as_an_interrupted_run_saves(run: Kpenc, sets: Path, tmp_path:
     assert code == 1 and kpenc.CHECKPOINT in last and "No space left" in last and "free space" in last
 
 
-def test_disk_full_as_the_file_is_written(run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli.os, "replace", _failing_for(tmp_path / "out.kpc", OSError(errno.ENOSPC, "No space left on device")))
+def test_disk_full_as_the_file_is_written(
+    run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        cli.os, "replace", _failing_for(tmp_path / "out.kpc", OSError(errno.ENOSPC, "No space left on device"))
+    )
     (tmp_path / "out.kpc").write_bytes(b"an earlier scene")
     code, out, err = run(sets / "n3dv", "--steps", "2")
     last = err.splitlines()[-1]
@@ -411,7 +501,9 @@ def test_disk_full_as_the_file_is_written(run: Kpenc, sets: Path, tmp_path: Path
     assert (tmp_path / "out.kpc").read_bytes() == b"an earlier scene"
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc", "out.kpc.work"}
     monkeypatch.setattr(cli.os, "replace", os.rename)
-    code, _, err = run(sets / "n3dv", "--steps", "2", "--resume", "--work", str(tmp_path / "out.kpc.work"), output=tmp_path / "b.kpc")
+    code, _, err = run(
+        sets / "n3dv", "--steps", "2", "--resume", "--work", str(tmp_path / "out.kpc.work"), output=tmp_path / "b.kpc"
+    )
     assert code == 0 and "resumed at step 2" in err
 
 
@@ -420,7 +512,9 @@ def test_disk_full_as_the_file_is_written(run: Kpenc, sets: Path, tmp_path: Path
 
 def test_no_opengl_and_no_window(sets: Path, tmp_path: Path) -> None:
     blocked = "for name in ('moderngl', 'glfw', 'imgui_bundle', 'OpenGL', 'kpc.player'): sys.modules[name] = None"
-    process = _subprocess([str(sets / "blender"), "-o", str(tmp_path / "out.kpc"), "--preset", "draft", "--steps", "3"], blocked)
+    process = _subprocess(
+        [str(sets / "blender"), "-o", str(tmp_path / "out.kpc"), "--preset", "draft", "--steps", "3"], blocked
+    )
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
     assert "held-out PSNR" in out and (tmp_path / "out.kpc").exists()
@@ -463,7 +557,15 @@ def _failing_for(target: Path, error: BaseException) -> Callable[[Path, Path], N
 
 
 def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
-    script = (f"import sys\n{preparation}\nfrom kpc.encoder import kpenc\nfrom kpc.encoder.config import PRESETS, TrainConfig\n"
-              f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nkpenc.PROBE_RAYS = 512\nsys.exit(kpenc.main({argv!r}))")
-    return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE if "moderngl" in preparation else subprocess.DEVNULL,
-                            stderr=subprocess.PIPE, text=True, env={**os.environ, "NUMBA_NUM_THREADS": "1"})
+    script = (
+        f"import sys\n{preparation}\n"
+        "from kpc.encoder import kpenc\nfrom kpc.encoder.config import PRESETS, TrainConfig\n"
+        f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nkpenc.PROBE_RAYS = 512\nsys.exit(kpenc.main({argv!r}))"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE if "moderngl" in preparation else subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "NUMBA_NUM_THREADS": "1"},
+    )

@@ -60,7 +60,9 @@ def test_it_settles_on_where_density_is() -> None:
 def test_density_that_vanishes_is_forgotten() -> None:
     g = settled(grid(), ball, np.ones(SHAPE, np.float32))
     assert g.occupied.any()
-    settled(g, lambda p, t: np.full(len(p), -5.0, np.float32), np.ones(SHAPE, np.float32), updates=101)  # 10 units of 0.1
+    settled(
+        g, lambda p, t: np.full(len(p), -5.0, np.float32), np.ones(SHAPE, np.float32), updates=101
+    )  # 10 units of 0.1
     assert not g.occupied.any()
 
 

@@ -19,7 +19,14 @@ from kpc.encoder.train import PlainOptimiser, RaySampler, Report, Trainer
 from kpc.format.errors import TrainingError
 
 CONFIG = TrainConfig(
-    resolutions=(12, 24), samples_across=48, cells_across=16, steps=60, rays=256, samples=12288, warmup=5, occupancy_start=16,
+    resolutions=(12, 24),
+    samples_across=48,
+    cells_across=16,
+    steps=60,
+    rays=256,
+    samples=12288,
+    warmup=5,
+    occupancy_start=16,
     occupancy_every=8,
 )
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -107,7 +114,12 @@ def test_checkpoints_are_written_on_the_way_and_at_the_end(moving: Dataset, tmp_
     file = tmp_path / "checkpoint.kpck"
     run = trainer(moving, steps=3)
     found = []
-    run.run(ignore, file, checkpoint_every_s=0.0, interrupted=lambda: found.append(file.exists()))  # type: ignore[func-returns-value, arg-type]
+
+    def look() -> bool:
+        found.append(file.exists())
+        return False
+
+    run.run(ignore, file, checkpoint_every_s=0.0, interrupted=look)
     assert found == [False, True, True]
     again = trainer(moving, steps=3)
     again.resume(file)
@@ -133,7 +145,13 @@ def test_a_damaged_checkpoint_is_one_line(moving: Dataset, tmp_path: Path, damag
     data = bytearray(file.read_bytes())
     if damage == "flipped":
         data[data.index(b"data.pkl") + 60] ^= 0xFF
-    made = {"empty": b"", "noise": bytes(range(256)) * 8, "cut": data[: len(data) // 2], "flipped": data, "pickle": b"cos\nsystem\n(S'id'\ntR."}
+    made = {
+        "empty": b"",
+        "noise": bytes(range(256)) * 8,
+        "cut": data[: len(data) // 2],
+        "flipped": data,
+        "pickle": b"cos\nsystem\n(S'id'\ntR.",
+    }
     if damage == "foreign":
         torch.save({"weights": torch.zeros(3)}, file)
     else:
@@ -156,10 +174,16 @@ def test_a_checkpoint_of_another_run_is_refused(moving: Dataset, still: Dataset,
             trainer(dataset).resume(file)
 
 
-@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"),
-                                   RuntimeError("PytorchStreamWriter failed writing file\nmore")])
+@pytest.mark.parametrize(
+    "error",
+    [OSError(errno.ENOSPC, "No space left on device"), RuntimeError("PytorchStreamWriter failed writing file\nmore")],
+)
 def test_a_full_disk_spares_the_earlier_checkpoint_and_the_run(
-    moving: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception
+    moving: Dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: Exception,
 ) -> None:
     file = tmp_path / "c.kpck"
     run = trainer(moving, steps=2)
@@ -257,7 +281,7 @@ def plain_twin(fused: Trainer) -> PlainOptimiser:
 
 
 def test_plain_pytorch_takes_the_same_steps(moving: Dataset) -> None:
-    """Adam moves by the sign of a gradient at first, so that elements whose gradient is all rounding may go either way."""
+    """Adam moves by the sign of a gradient at first; where that is all rounding, either way."""
     run = trainer(moving)
     plain = plain_twin(run)
     for number in range(3):
@@ -278,6 +302,7 @@ def test_plain_pytorch_takes_the_same_steps(moving: Dataset) -> None:
 
 def test_the_whole_loop_runs_on_plain_pytorch(moving: Dataset, tmp_path: Path) -> None:
     """As on CUDA, which the machine that tests may not have."""
+
     def make_plain() -> Trainer:
         run = trainer(moving, steps=24)
         run.optimiser = plain_twin(run)
