@@ -1,0 +1,71 @@
+"""What README.md shows must work."""
+
+import importlib
+import re
+import shlex
+import tomllib
+from pathlib import Path
+
+import gl
+import pytest
+from scenes import tiny_scene
+
+from kpc.format.cameras import load_shots
+from kpc.format.file import write
+from kpc.format.media import read_image
+from kpc.format.quantise import quantise_scene
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+PICTURE_LIMIT = 200_000
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("example", blocks("python"))
+def test_python_examples_run(example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "offscreen" in example:
+        gl.context()
+    scene = tiny_scene()
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "README.md", "exec"), {"__name__": "example"})
+    if "still.png" in example:
+        assert read_image(tmp_path / "still.png").shape == (72, 96, 3)
+
+
+def test_every_option_of_every_command_exists(capsys: pytest.CaptureFixture[str]) -> None:
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    lines = [shlex.split(line) for block in blocks("sh") for line in block.splitlines()]
+    commands = [line for line in lines if line[0] in scripts or line[:2] == ["python", "-m"]]
+    assert {line[0] for line in commands} == {*scripts, "python"}
+    for name, *arguments in commands:
+        module = arguments[1] if name == "python" else scripts[name].split(":")[0]
+        about = arguments[:1] if name == "kpbench" else []
+        with pytest.raises(SystemExit):
+            importlib.import_module(module).main([*about, "--help"])
+        known = set(re.findall(r"--?[a-z][a-z-]*", capsys.readouterr().out))
+        used = {argument.split("=")[0] for argument in arguments[2 * (name == "python") :] if argument.startswith("-")}
+        assert used <= known, f"{name} {shlex.join(arguments)}"
+
+
+def test_the_camera_file_shown_can_be_read(tmp_path: Path) -> None:
+    (example,) = blocks("json")
+    (tmp_path / "cameras.json").write_text(example)
+    assert load_shots(tmp_path / "cameras.json")[0].time == 0.5
+
+
+def test_keys_are_those_of_the_player() -> None:
+    from kpc.player.window import KEYS
+
+    assert "".join(f"| {key} | {meaning} |\n" for key, meaning in KEYS) in README
+
+
+def test_links_lead_somewhere_and_pictures_are_small() -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", README):
+        if not target.startswith("https://"):
+            assert (ROOT / target).is_file(), target
+    for target in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README):
+        assert (ROOT / target).stat().st_size < PICTURE_LIMIT
