@@ -39,8 +39,9 @@ class TrainConfig:
     seed: int = 0
 
     # --- the priors; each is a weight on a mean over the texels of a plane, summed over planes and scales
-    space_variation: float = 2e-4
-    """Total variation in space, on space planes (both axes) and space-time planes (space only)."""
+    space_variation: float = 5e-3
+    """Total variation in space, on space planes (both axes) and space-time planes (space only). K-Planes uses 1e-4 to 1e-3
+    with 30,000 steps; on a few thousand, soldier and room are both better at 5e-3 (held-out PSNR +0.6 and +0.3 dB)."""
     time_smoothness: float = 1e-2
     """Squared second difference in time. K-Planes finds the best near 0.01."""
     sparse_transients: float = 1e-4
@@ -75,7 +76,7 @@ class TrainConfig:
 PRESETS = {
     "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500, warmup=50,
                          occupancy_start=64),
-    "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=4000),
-    "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=16000),
+    "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
+    "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=7000),
     "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000),
 }

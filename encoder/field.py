@@ -79,9 +79,10 @@ class Field(nn.Module):
     """Planes and explicit decoder.
 
     Attributes:
-        theta: (layout.size,) the planes. Space planes start uniform in [0.3, 0.9], time planes at 1, the identity.
+        theta: (layout.size,) the planes. Space planes start uniform in [0.1, 0.5], time planes at 1 (K-Planes).
         density: (F + 1,) weights of the log density, its bias last.
-        w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.Decoder`.
+        w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.Decoder`. w2 starts at 0: colour depends on the
+            direction only as far as the pictures insist.
     """
 
     def __init__(self, layout: Layout, hidden: int, generator: torch.Generator | None = None) -> None:
@@ -95,12 +96,14 @@ class Field(nn.Module):
         theta = torch.ones(layout.size)
         for _, name, start, rows, columns in layout.planes():
             if name in SPACE_PLANES:
-                theta[start : start + rows * columns * layout.channels] = uniform(0.3, 0.9, rows * columns * layout.channels)
+                theta[start : start + rows * columns * layout.channels] = uniform(0.1, 0.5, rows * columns * layout.channels)
         self.theta = nn.Parameter(theta)
-        self.density = nn.Parameter(torch.cat([uniform(-3, 3, F), torch.tensor([-1.0])]))
+        # Weights of zero mean: the box starts evenly thin, whatever the seed, with log density -1 on average.
+        weights = uniform(-3, 3, F)
+        self.density = nn.Parameter(torch.cat([weights - weights.mean(), torch.tensor([-1.0])]))
         self.w1 = nn.Parameter(uniform(-1, 1, hidden, 9))
         self.b1 = nn.Parameter(torch.zeros(hidden))
-        self.w2 = nn.Parameter(uniform(-1, 1, 3, F, hidden) / hidden)
+        self.w2 = nn.Parameter(torch.zeros(3, F, hidden))
         self.b2 = nn.Parameter(uniform(-1, 1, 3, F))
 
     def plane(self, scale: int, name: str) -> Tensor:

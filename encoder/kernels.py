@@ -27,6 +27,8 @@ _TERMINATION = np.float32(TERMINATION)
 _NEGLIGIBLE = np.float32(1e-4)
 """A sample of less weight gets no colour; 4096 of them could not make up an 8-bit level and a half."""
 
+_TINY = np.float32(1e-30)
+
 _jit = njit(fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, error_model="numpy", cache=True, nogil=True)
 _parallel = njit(fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, error_model="numpy", cache=True, parallel=True)
 
@@ -404,8 +406,11 @@ def adam(theta, grad, mean, square, lr, beta1, beta2, epsilon, step_number):
         for i in range(hi - lo):
             g = total[i]
             total[i] = np.float32(0.0)
-            m[i] = b1 * m[i] + (np.float32(1.0) - b1) * g
-            v[i] = b2 * v[i] + (np.float32(1.0) - b2) * g * g
+            m_i = b1 * m[i] + (np.float32(1.0) - b1) * g
+            v_i = b2 * v[i] + (np.float32(1.0) - b2) * g * g
+            # Texels that no ray visits decay into denormal numbers, which are some hundred times slower to compute with.
+            m[i] = m_i if abs(m_i) > _TINY else np.float32(0.0)
+            v[i] = v_i if v_i > _TINY else np.float32(0.0)
             p[i] -= rate * (m[i] / correction1) / (math.sqrt(v[i] / correction2) + eps)
 
 

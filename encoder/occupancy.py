@@ -1,5 +1,6 @@
 """The occupancy grid: which cells of the box hold anything, so that rays take samples nowhere else."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -59,7 +60,10 @@ class OccupancyGrid:
         self._known = True
         self.log_density -= self.DENSITY_DECAY
         self.log_density[chosen] = np.maximum(self.log_density[chosen], self._look(density_at, np.argwhere(chosen), rng, 0.0, 1.0))
-        self.occupied = matters & (self.log_density > self.threshold)
+        # While all is thin, what is thicker than the average stays: an empty grid could never be filled again.
+        known = self.log_density[self.seen]
+        mean = math.log(max(float(np.exp(known.astype(np.float64)).mean()), 1e-30))
+        self.occupied = matters & (self.log_density > min(self.threshold, mean))
 
     def state(self) -> dict[str, Any]:
         return {"log_density": torch.from_numpy(self.log_density), "peak": torch.from_numpy(self.peak),
@@ -78,9 +82,9 @@ class OccupancyGrid:
     def over_time(self, density_at: DensityAt, rng: np.random.Generator, slots: int, samples: int = 16) -> np.ndarray:
         """The grid to store: (slots, Nz, Ny, Nx) bool, what is occupied while each slot of the clip lasts.
 
-        Each cell that is occupied or touches one that is, is looked at `samples` times in every slot.
+        Each cell that is occupied is looked at `samples` times in every slot.
         """
-        near = dilate(self.occupied) & self.seen & dilate(self.peak > self.PEAK_LEAST)
+        near = self.occupied
         cells = np.argwhere(near)
         out = np.zeros((slots, *self.seen.shape), bool)
         for slot in range(slots):

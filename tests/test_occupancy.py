@@ -57,20 +57,28 @@ def test_it_settles_on_where_density_is() -> None:
     assert g.occupied[centre].mean() > 0.95 and not g.occupied[far].any()
 
 
+def corner(points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    return np.where((points < 0.2).all(1), 5.0, -5.0).astype(np.float32)
+
+
 def test_density_that_vanishes_is_forgotten() -> None:
-    g = settled(grid(), ball, np.ones(SHAPE, np.float32))
-    assert g.occupied.any()
-    settled(
-        g, lambda p, t: np.full(len(p), -5.0, np.float32), np.ones(SHAPE, np.float32), updates=101
-    )  # 10 units of 0.1
-    assert not g.occupied.any()
+    g = settled(grid(), lambda p, t: np.maximum(ball(p, t), corner(p, t)), np.ones(SHAPE, np.float32))
+    assert g.occupied[3, 2, 4] and g.occupied[0, 0, 0]
+    settled(g, corner, np.ones(SHAPE, np.float32), updates=101)  # 10 units of 0.1
+    assert g.occupied[0, 0, 0] and not g.occupied[3, 2, 4]
 
 
 def test_density_that_appears_is_found() -> None:
-    g = settled(grid(), lambda p, t: np.full(len(p), -5.0, np.float32), np.ones(SHAPE, np.float32), updates=5)
-    assert not g.occupied.any()
+    g = settled(grid(), corner, np.ones(SHAPE, np.float32), updates=5)
+    assert not g.occupied[3, 2, 4]
     settled(g, ball, np.ones(SHAPE, np.float32))
-    assert g.occupied.any()
+    assert g.occupied[3, 2, 4]
+
+
+def test_while_all_is_thin_the_thicker_half_stays() -> None:
+    """Everything below the threshold of 0: emptying it all would leave nothing to learn from."""
+    g = settled(grid(), lambda p, t: np.where(p[:, 0] < 0.5, -1.0, -3.0).astype(np.float32), np.ones(SHAPE, np.float32), 3)
+    assert g.occupied[:, :, :4].all() and not g.occupied[:, :, 4:].any()
 
 
 def test_what_gives_no_ray_colour_is_emptied() -> None:

@@ -296,7 +296,7 @@ def test_plain_pytorch_takes_the_same_steps(moving: Dataset) -> None:
     assert float((run.field.density - plain.field.density).detach().abs().max()) < 1e-3
     ours, theirs = run.optimiser.peaks(), plain.peaks()
     np.testing.assert_allclose(ours, theirs, atol=0.02)
-    assert ours.max() > 0.01 and not plain.peaks().any()
+    assert ours.max() > 0.005 and not plain.peaks().any()
     assert run.optimiser.curvature().shape == plain.curvature().shape
 
 
