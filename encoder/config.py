@@ -46,6 +46,8 @@ class TrainConfig:
     """Squared second difference in time. K-Planes finds the best near 0.01."""
     sparse_transients: float = 1e-4
     """L1 distance of the space-time planes from 1. K-Planes uses 1e-4."""
+    distortion: float = 1e-3
+    """Distortion loss (arXiv:2111.12077, eq. 15): pulls the weights of a ray together, against fog. K-Planes uses 1e-3."""
     regularise_every: int = 4
     """The priors enter every so many steps, multiplied by that number: unbiased, and a fraction of the cost."""
 
@@ -76,7 +78,7 @@ class TrainConfig:
 PRESETS = {
     "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500, warmup=50,
                          occupancy_start=64),
-    "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
+    "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3400),
     "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=7000),
     "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000),
 }

@@ -206,14 +206,15 @@ class Rays:
 
 def render_reference(
     field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Colours of a batch of rays, in plain PyTorch: the reference of `kernels.backpropagate`.
 
     Sample k of a ray lies at near + (k + jitter) * step and counts where the occupancy grid (slots, Nz, Ny, Nx) is set;
     alpha = 1 - exp(-sigma step / extent); a ray ends once its transmittance falls below TERMINATION.
 
     Returns:
-        Colours (N, 3); of the n samples taken their weights (n,), and their cells (n, 3) int64 in the order z, y, x.
+        Colours (N, 3); the mean over rays of the distortion D that `kernels.backpropagate` states; of the n samples taken
+        their weights (n,), and their cells (n, 3) int64 in the order z, y, x.
     """
     extent = (aabb[1] - aabb[0]).max()
     inverse = 1 / rays.directions
@@ -240,7 +241,11 @@ def render_reference(
     colours = torch.sigmoid(torch.einsum("nf,ncf->nc", features, basis[ray]))
     rgb = torch.zeros_like(rays.backgrounds).index_add(0, ray, weights[index][:, None] * colours)
     reached = trans[:, :-1][index] >= TERMINATION
-    return rgb + (1 - weights.sum(1, keepdim=True)) * rays.backgrounds, weights[index][reached], cell[index][reached]
+    rgb = rgb + (1 - weights.sum(1, keepdim=True)) * rays.backgrounds
+    s = (k + rays.jitters[:, None]) * (step / extent)
+    before, before_s = (torch.cumsum(x, 1) - x for x in (weights, weights * s))
+    distortion = (2 * weights * (s * before - before_s) + weights.square() * (step / extent / 3)).sum(1).mean()
+    return rgb, distortion, weights[index][reached], cell[index][reached]
 
 
 def priors(field: Field, config: TrainConfig) -> Tensor:

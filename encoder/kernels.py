@@ -277,14 +277,34 @@ def render(
     return rgbs, opacities, depths, counts
 
 
+@_jit
+def _distortion_gradient(weights, distances, count, step, extent, factor, out):
+    """out[k] = factor * d D / d w_k of `backpropagate`, in one pass each way over the sums of w and w s before sample k."""
+    total, total_s = np.float32(0.0), np.float32(0.0)
+    for k in range(count):
+        total += weights[k]
+        total_s += weights[k] * (distances[k] - distances[0]) / extent
+    before, before_s = np.float32(0.0), np.float32(0.0)
+    for k in range(count):
+        s = (distances[k] - distances[0]) / extent
+        apart = s * (np.float32(2.0) * before - total) + total_s - np.float32(2.0) * before_s
+        out[k] = factor * (np.float32(2.0) * apart + np.float32(2.0 / 3.0) * weights[k] * step / extent)
+        before += weights[k]
+        before_s += weights[k] * s
+
+
 @_parallel
 def backpropagate(
     theta, grad, table, resolution, density, grad_density, channels, aabb, occupancy, step, extent,
-    origins, directions, times, jitters, basis, grad_basis, targets, backgrounds, peaks, capacity,
+    origins, directions, times, jitters, basis, grad_basis, targets, backgrounds, peaks, distortion,
+    capacity,
 ):
-    """Render a batch, and add the gradient of its mean squared error to grad, grad_density and grad_basis.
+    """Render a batch, and add the gradient of its loss to grad, grad_density and grad_basis.
 
-    loss = mean over rays and colour channels of (C - target)^2,   C = sum_k w_k c_k + trans * background
+    loss = mean over rays and colour channels of (C - target)^2 + distortion * mean over rays of D
+    C = sum_k w_k c_k + trans * background
+    D = sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 d,   s = t / extent, d = step / extent (arXiv:2111.12077, eq. 15)
+    d D / d w_k = 2 sum_j w_j |s_k - s_j| + 2/3 w_k d
     d C / d tau_k = trans_{k+1} c_k - sum_{j>k} w_j c_j - trans_end * background,   tau = sigma * step / extent
 
     Args:
@@ -306,6 +326,7 @@ def backpropagate(
     for worker in prange(workers):
         values, features, points, weights, logs, distances = _scratch(table, channels, capacity)
         colours = np.empty((capacity, 3), np.float32)
+        spread = np.empty(capacity, np.float32)
         g_features = np.empty(F, np.float32)
         plane_scratch = np.empty((6, M), np.float32)
         g_theta = grad[worker]
@@ -335,11 +356,12 @@ def backpropagate(
             counts[ray] = count
             g0, g1, g2 = scale * e0, scale * e1, scale * e2
 
+            _distortion_gradient(weights, distances, count, step, extent, np.float32(distortion / N), spread)
             after = trans * (g0 * backgrounds[ray, 0] + g1 * backgrounds[ray, 1] + g2 * backgrounds[ray, 2])
             beyond = trans  # transmittance after sample k, walking backwards
             for k in range(count - 1, -1, -1):
                 weight = weights[k]
-                seen = g0 * colours[k, 0] + g1 * colours[k, 1] + g2 * colours[k, 2]
+                seen = g0 * colours[k, 0] + g1 * colours[k, 1] + g2 * colours[k, 2] + spread[k]  # d loss / d w_k
                 tau = math.exp(logs[k]) * step / extent
                 g_log = (beyond * seen - after) * tau
                 if logs[k] >= _LIMIT or logs[k] <= -_LIMIT:

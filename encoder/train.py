@@ -254,6 +254,7 @@ class FusedOptimiser:
             (0,) * layout.channels, aabb, occupancy.view(np.uint8), np.float32(step_length), np.float32(extent),
             batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(), batch.jitters.numpy(),
             basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(), self._peaks,
+            np.float32(config.distortion),
             sample_capacity(aabb, step_length),
         )
         if number % config.regularise_every == 0:
@@ -304,13 +305,14 @@ class PlainOptimiser:
         config, device = self.config, self.field.theta.device
         batch = Rays(*(value.to(device) for value in vars(batch).values()))
         occupancy_there = torch.from_numpy(occupancy).to(device)
-        rgb, weights, cells = render_reference(
+        rgb, distortion, weights, cells = render_reference(
             self.field, batch, torch.from_numpy(aabb).to(device), occupancy_there, step_length
         )
         _, ny, nx = self._peaks.shape
         flat = (cells[:, 0] * ny + cells[:, 1]) * nx + cells[:, 2]
         self._peaks.view(-1).scatter_reduce_(0, flat, weights.detach(), "amax")
-        loss = error = (rgb - targets.to(device)).square().mean()
+        error = (rgb - targets.to(device)).square().mean()
+        loss = error + config.distortion * distortion
         if number % config.regularise_every == 0:
             loss = loss + config.regularise_every * priors(self.field, config)
         for optimiser, peak in ((self.planes, config.learning_rate), (self.decoder, config.decoder_learning_rate)):

@@ -45,6 +45,10 @@ def rays_at(scene: Scene, count: int, seed: int = 0) -> Rays:
     return Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
 
 
+DISTORTION = 0.3
+"""Weight of the distortion loss in these tests: large enough to count beside the colours."""
+
+
 def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int = 2) -> dict[str, np.ndarray]:
     field = Field.from_scene(scene)
     layout, n = field.layout, len(targets)
@@ -74,6 +78,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         targets.numpy(),
         rays.backgrounds.numpy(),
         peaks,
+        np.float32(DISTORTION),
         sample_capacity(scene.aabb, scene.step),
     )
     return {
@@ -93,9 +98,9 @@ def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict
     basis = field.basis(rays.directions).detach().requires_grad_()
     field.basis = lambda directions: basis  # type: ignore[method-assign]
     aabb, occupancy = torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy)
-    rgb, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step)
+    rgb, distortion, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step)
     squared = (rgb - targets.double()).square()
-    squared.mean().backward()
+    (squared.mean() + DISTORTION * distortion).backward()
     peaks = torch.zeros(scene.occupancy.shape[1:], dtype=torch.float64)
     peaks.index_put_(tuple(cells.T), torch.zeros(len(cells), dtype=torch.float64))
     for cell, weight in zip(cells.tolist(), weights.tolist()):
