@@ -64,7 +64,7 @@ def corner(points: np.ndarray, times: np.ndarray) -> np.ndarray:
 def test_density_that_vanishes_is_forgotten() -> None:
     g = settled(grid(), lambda p, t: np.maximum(ball(p, t), corner(p, t)), np.ones(SHAPE, np.float32))
     assert g.occupied[3, 2, 4] and g.occupied[0, 0, 0]
-    settled(g, corner, np.ones(SHAPE, np.float32), updates=101)  # 10 units of 0.1
+    settled(g, corner, np.ones(SHAPE, np.float32), updates=201)  # 10 units of 0.05
     assert g.occupied[0, 0, 0] and not g.occupied[3, 2, 4]
 
 
