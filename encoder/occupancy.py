@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from kpc.format.grid import dilate
+
 DensityAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(N, 3) float32 points in [0, 1]^3 and (N,) float32 times -> (N,) log densities."""
 
@@ -98,16 +100,3 @@ class OccupancyGrid:
                 best = np.maximum(best, self._look(density_at, cells, rng, slot / slots, (slot + 1) / slots))
             out[slot][near] = best > self.threshold
         return out
-
-
-def dilate(grid: np.ndarray) -> np.ndarray:
-    """Cells that are set or share a face, an edge or a corner with one that is; over the last three axes."""
-    for axis in (-3, -2, -1):
-        low, high = [slice(None)] * grid.ndim, [slice(None)] * grid.ndim
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        wide = grid.copy()
-        wide[tuple(low)] |= grid[tuple(high)]
-        wide[tuple(high)] |= grid[tuple(low)]
-        grid = wide
-    return grid
-

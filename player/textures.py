@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kpc.format.grid import dilate
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 
 FOLDED_AXIS = {"xy": "x", "xz": "z", "yz": "y"}
@@ -119,25 +120,13 @@ def distances(occupied: np.ndarray) -> np.ndarray:
     out = np.where(occupied, 0, FARTHEST).astype(np.uint8)
     reached = occupied
     for distance in range(1, FARTHEST):
-        wider = _dilate(reached)
+        wider = dilate(reached)
         fresh = wider & ~reached
         if not fresh.any():
             break
         out[fresh] = distance
         reached = wider
     return out
-
-
-def _dilate(grid: np.ndarray) -> np.ndarray:
-    """Cells that are set or share a face, an edge or a corner with one that is."""
-    for axis in range(grid.ndim):
-        low, high = [slice(None)] * grid.ndim, [slice(None)] * grid.ndim
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        wide = grid.copy()
-        wide[tuple(low)] |= grid[tuple(high)]
-        wide[tuple(high)] |= grid[tuple(low)]
-        grid = wide
-    return grid
 
 
 def decoder_arrays(decoder: Decoder, scene: Scene, layout: Layout) -> dict[str, np.ndarray]:

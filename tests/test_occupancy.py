@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from kpc.encoder.occupancy import OccupancyGrid, dilate, grid_shape
+from kpc.encoder.occupancy import OccupancyGrid, grid_shape
+from kpc.format.grid import dilate
 
 SHAPE = (6, 5, 8)
 

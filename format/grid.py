@@ -1,0 +1,15 @@
+"""Grids of cells over the box."""
+
+import numpy as np
+
+
+def dilate(grid: np.ndarray) -> np.ndarray:
+    """Cells that are set or share a face, an edge or a corner with one that is; over the last three axes."""
+    for axis in (-3, -2, -1):
+        low, high = [slice(None)] * grid.ndim, [slice(None)] * grid.ndim
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        wide = grid.copy()
+        wide[tuple(low)] |= grid[tuple(high)]
+        wide[tuple(high)] |= grid[tuple(low)]
+        grid = wide
+    return grid
