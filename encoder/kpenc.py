@@ -294,7 +294,7 @@ def _parse(argv: list[str]) -> tuple[Options, bool]:
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first (default: 1)")
     parser.add_argument("--holdout", metavar="NAME", help="camera or file to test on, or 'none'")
-    parser.add_argument("--box", type=_box, metavar="x0,y0,z0,x1,y1,z1", help="corners of the scene instead of those found from the cameras")
+    parser.add_argument("--box", type=box_corners, metavar="x0,y0,z0,x1,y1,z1", help="corners of the scene instead of those found from the cameras")
     parser.add_argument("--work", type=Path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)")
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
@@ -343,7 +343,8 @@ def duration_s(text: str) -> float:
     return value
 
 
-def _box(text: str) -> tuple[float, ...]:
+def box_corners(text: str) -> tuple[float, ...]:
+    """The six numbers of "x0,y0,z0,x1,y1,z1"."""
     try:
         numbers = tuple(float(n) for n in text.split(","))
     except ValueError:

@@ -308,12 +308,7 @@ def _duration(text: str) -> float:
 
 
 def _box(text: str) -> tuple[float, ...]:
-    try:
-        corners = tuple(float(number) for number in text.split(","))
-    except ValueError:
-        corners = ()
-    if len(corners) != 6 or not all(-np.inf < low < high < np.inf for low, high in zip(corners[:3], corners[3:])):
-        raise argparse.ArgumentTypeError(f"{text!r} is not x0,y0,z0,x1,y1,z1 with each lower bound below the upper")
+    corners: tuple[float, ...] = _encoder().box_corners(text)
     return corners
 
 
