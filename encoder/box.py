@@ -5,6 +5,9 @@ import numpy as np
 from kpc.encoder.datasets.dataset import Pictures
 from kpc.format.errors import DatasetError
 
+CLEAR = 0.3
+"""Share of a camera's distance to the scene's middle, around it, where nothing is."""
+
 
 def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
     """The (2, 3) float32 box the scene lies in.
@@ -39,14 +42,17 @@ def seen_cells(pictures: Pictures, aabb: np.ndarray, shape: tuple[int, int, int]
     """Cells of an (Nz, Ny, Nx) grid over the box whose centre lies in view of at least so many distinct cameras: bool.
 
     What a single camera sees cannot be placed in depth; leaving it empty keeps floaters from growing in front of lenses.
-    Where fewer cameras than that exist, all of them must see a cell.
+    Where fewer cameras than that exist, all of them must see a cell. Nothing is within CLEAR of the way from a camera to the
+    point all of them look at, in any direction: a camera that moves would else carry each of its pictures before it.
     """
     nz, ny, nx = shape
     axes = [aabb[0, a] + (np.arange(n) + 0.5) / n * (aabb[1, a] - aabb[0, a]) for a, n in enumerate((nx, ny, nz))]
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     centres = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     cameras = _distinct_cameras(pictures)
-    count = np.zeros(len(centres), np.int32)
+    poses = pictures.camera_to_world[cameras]
+    focus = _common_point(poses[:, :3, 3], -poses[:, :3, 2])
+    count, blocked = np.zeros(len(centres), np.int32), np.zeros(len(centres), bool)
     for p in cameras:
         pose = pictures.camera_to_world[p]
         local = (centres - pose[:3, 3]) @ pose[:3, :3]
@@ -59,7 +65,9 @@ def seen_cells(pictures: Pictures, aabb: np.ndarray, shape: tuple[int, int, int]
         margin = 0.02 * pictures.width[p]  # a cell whose centre is just outside still shows an edge
         inside = (i > -margin) & (i < pictures.width[p] + margin) & (j > -margin) & (j < pictures.height[p] + margin)
         count += (depth > 0.9 * near) & (depth > 0) & inside
-    return (count >= min(at_least, len(cameras))).reshape(shape)
+        if focus is not None:
+            blocked |= np.linalg.norm(local, axis=1) < CLEAR * np.linalg.norm(focus - pose[:3, 3])
+    return ((count >= min(at_least, len(cameras))) & ~blocked).reshape(shape)
 
 
 def _distinct_cameras(pictures: Pictures) -> np.ndarray:

@@ -25,20 +25,27 @@ class SceneRenderer:
 
     def rgb(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
         """(N, 3) float32 colours of (N, 3) origins, (N, 3) unit directions and (N,) times."""
+        return self.render(origins, directions, times)[0]
+
+    def render(
+        self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Colours (N, 3), opacities (N,) and mean depths (N,) of the same rays, float32."""
         scene, field, layout = self.scene, self.field, self.field.layout
         out = []
         for start in range(0, len(origins), 1 << 16):
             o, d, t = (np.ascontiguousarray(a[start : start + (1 << 16)], np.float32) for a in (origins, directions, times))
             with torch.no_grad():
                 basis = field.basis(torch.from_numpy(d)).numpy()
-            rgb, _, _, _ = kernels.render(
+            colours, opacities, depths, _ = kernels.render(
                 field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
                 (0,) * layout.channels, scene.aabb, scene.occupancy.view(np.uint8), np.float32(scene.step),
                 np.float32(scene.extent), o, d, t, basis, np.arange(len(o)), scene.background,
                 sample_capacity(scene.aabb, scene.step), 8 * numba.get_num_threads(),
             )
-            out.append(rgb)
-        return np.concatenate(out)
+            out.append((colours, opacities, depths))
+        colours, opacities, depths = (np.concatenate(parts) for parts in zip(*out, strict=True))
+        return colours, opacities, depths
 
     def picture(self, dataset: Dataset, number: int) -> np.ndarray:
         """The scene as a picture of the dataset shows it, its lens included: (H, W, 3) float32."""

@@ -251,16 +251,18 @@ def render_reference(
 def priors(field: Field, config: TrainConfig) -> Tensor:
     """The weighted priors of the planes, in plain PyTorch: the reference of the `add_*` kernels.
 
-    space_variation * mean of squared neighbour differences + time_smoothness * mean (P[t-1] - 2 P[t] + P[t+1])^2
-    + sparse_transients * mean |1 - P|, each summed over the planes it concerns.
+    space_variation * mean of squared neighbour differences, on space planes; on space-time planes
+    transient_variation * the same along space alone + time_smoothness * mean (P[t-1] - 2 P[t] + P[t+1])^2
+    + sparse_transients * mean |1 - P|; each summed over the planes it concerns.
     """
     total = field.theta.new_zeros(())
     for s, name, _, rows, columns in field.layout.planes():
         p = field.plane(s, name)
-        total = total + config.space_variation * (p[:, 1:] - p[:, :-1]).square().sum() / p.numel()
+        along_rows, along_columns = (p[:, 1:] - p[:, :-1]).square().sum() / p.numel(), (p[1:] - p[:-1]).square().sum() / p.numel()
         if name in SPACE_PLANES:
-            total = total + config.space_variation * (p[1:] - p[:-1]).square().sum() / p.numel()
+            total = total + config.space_variation * (along_rows + along_columns)
         if name in TIME_PLANES:
+            total = total + config.transient_variation * along_rows
             total = total + config.time_smoothness * (p[:-2] - 2 * p[1:-1] + p[2:]).square().sum() / p.numel()
             total = total + config.sparse_transients * (1 - p).abs().mean()
     return total

@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from kpc.encoder.box import find_box
+from kpc.encoder.box import find_box, seen_cells
 from kpc.encoder.compress import compress, relative_steps
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr
-from kpc.encoder.train import Report, Trainer
+from kpc.encoder.occupancy import grid_shape
+from kpc.encoder.train import Report, Trainer, box_of_checkpoint
+from kpc.encoder.trim import trim_box
 from kpc.format import cli, file
 from kpc.format.errors import DatasetError, TrainingError, UsageError
 from kpc.format.progress import Progress
@@ -60,9 +62,11 @@ class Options:
     def work_dir(self) -> Path:
         return self.work or self.output.with_name(self.output.name + ".work")
 
-    def config(self) -> TrainConfig:
-        config = replace(PRESETS[self.preset], seed=self.seed)
-        return config if self.steps is None else replace(config, steps=self.steps)
+    def config(self, dataset: Dataset) -> TrainConfig:
+        config = PRESETS[self.preset]
+        if dataset.has_alpha and dataset.one_view_at_a_time:
+            config = config.for_lone_object()
+        return replace(config, seed=self.seed, steps=self.steps or config.steps)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -96,21 +100,27 @@ def encode(options: Options) -> dict[str, Any]:
     """
     started = time.monotonic()
     _check_output(options.output)
-    config, device = options.config(), _device(options.device)
-    work = options.work_dir
+    device = _device(options.device)
+    work, checkpoint = options.work_dir, options.work_dir / CHECKPOINT
     _make_work_dir(work)
     try:
         dataset = load_dataset(options.source, work, holdout=options.holdout, downscale=options.downscale)
-        trainer = Trainer(dataset, config, _box_of(dataset, options), device)
+        aabb = _box_of(dataset, options)
     except BaseException:
         _remove_if_empty(work)
         raise
     _say(dataset.describe())
+    config, resumes, survey_s = options.config(dataset), options.resume and checkpoint.exists(), 0.0
+    if resumes and options.box is None:
+        aabb = box_of_checkpoint(checkpoint)
+    elif options.box is None:
+        aabb, survey_s = _trimmed(dataset, config, aabb, options.time_budget_s)
+    trainer = Trainer(dataset, config, aabb, device)
+    trainer.elapsed_s = survey_s
     _say(_plan(trainer))
-    checkpoint = work / CHECKPOINT
+    if resumes:
+        trainer.resume(checkpoint)
     if options.resume:
-        if checkpoint.exists():
-            trainer.resume(checkpoint)
         _say(f"resumed at step {trainer.step}" if trainer.step else f"{checkpoint}: no checkpoint yet; starting afresh")
 
     try:
@@ -161,18 +171,24 @@ def quantise(trainer: Trainer, scene: Scene) -> tuple[QuantisedScene, float]:
     )
 
 
+def _trimmed(dataset: Dataset, config: TrainConfig, aabb: np.ndarray, time_budget_s: float | None) -> tuple[np.ndarray, float]:
+    """The box cut down to where something is, and the seconds that took; the files of the dataset's cache stay."""
+    with Progress("survey", total=1000, unit="‰") as progress:
+        return trim_box(dataset, config, aabb, lambda r: _show(progress, r), time_budget_s=time_budget_s)
+
+
 def _train(trainer: Trainer, checkpoint: Path, time_budget_s: float | None) -> None:
-    """Train to the end, showing step, train PSNR, rays/s, samples/ray; the bar runs in per mille of the work."""
-    with Progress("train", total=1000, unit="‰") as progress:
+    """Train to the end, or until Ctrl-C, which waits for the step to be done."""
+    requests: list[int] = []
+    with Progress("train", total=1000, unit="‰") as progress, _on_signals(lambda number, _: requests.append(number)):
+        trainer.run(lambda r: _show(progress, r), checkpoint, time_budget_s=time_budget_s, interrupted=lambda: bool(requests))
 
-        def report(r: Report) -> None:
-            progress.note(f"step {r.step}, psnr {r.psnr:.2f}, {r.rays_per_second:,.0f} rays/s, "
-                          f"{r.samples_per_ray:.1f} samples/ray, {r.occupied:.1%} occupied")
-            progress.advance(1000 * min(r.fraction, 1.0) - progress.done)
 
-        requests: list[int] = []
-        with _on_signals(lambda number, _: requests.append(number)):
-            trainer.run(report, checkpoint, time_budget_s=time_budget_s, interrupted=lambda: bool(requests))
+def _show(progress: Progress, r: Report) -> None:
+    """Step, train PSNR, rays/s and samples/ray; the bar runs in per mille of the work."""
+    progress.note(f"step {r.step}, psnr {r.psnr:.2f}, {r.rays_per_second:,.0f} rays/s, "
+                  f"{r.samples_per_ray:.1f} samples/ray, {r.occupied:.1%} occupied")
+    progress.advance(1000 * min(r.fraction, 1.0) - progress.done)
 
 
 @contextlib.contextmanager
@@ -238,6 +254,8 @@ def _box_of(dataset: Dataset, options: Options) -> np.ndarray:
     if not (np.abs(aabb) <= file.BOX_LIMIT).all() or not (aabb[1] - aabb[0] >= 1 / file.BOX_LIMIT).all():
         raise DatasetError(f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; "
                            "give another with --box x0,y0,z0,x1,y1,z1")
+    if not seen_cells(dataset.pictures, aabb, grid_shape(aabb, 64)).any():
+        raise DatasetError(f"{options.source}: the box lies outside every camera's view; give another with --box x0,y0,z0,x1,y1,z1")
     return aabb
 
 

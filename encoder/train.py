@@ -54,8 +54,6 @@ class Trainer:
         shape = grid_shape(self.aabb, config.cells_across)
         threshold = math.log(-math.log(1 - config.occupancy_alpha) * config.samples_across)
         self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape), threshold)
-        if not self.grid.seen.any():
-            raise TrainingError("the box lies outside every camera's view; correct --box")
         self.optimiser: FusedOptimiser | PlainOptimiser = (
             FusedOptimiser(self.field, config, shape) if self.device.type == "cpu" else
             PlainOptimiser(self.field, config, shape)
@@ -169,7 +167,7 @@ class Trainer:
             TrainingError: it cannot be read, or belongs to another run.
         """
         try:
-            state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
+            state = _load(path, self.device)
             same = _comparable(state["config"]) == _comparable(asdict(self.config))
             if not same or not np.array_equal(state["aabb"].cpu().numpy(), self.aabb):
                 raise TrainingError(f"{path}: belongs to a run with other settings; give the same ones or drop --resume")
@@ -184,8 +182,8 @@ class Trainer:
             self.samples_per_ray = state["samples_per_ray"]
         except TrainingError:
             raise
-        except Exception as error:  # torch.load raises a dozen kinds for a damaged file
-            raise TrainingError(f"{path}: not a usable checkpoint ({type(error).__name__}); delete it to start afresh") from error
+        except Exception as error:  # what a damaged file holds may be of any kind
+            raise _unusable(path, error) from error
 
 
 class RaySampler:
@@ -347,7 +345,7 @@ def add_priors(field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainC
         if name in SPACE_PLANES:
             kernels.add_space_variation(theta, grad, start, rows, columns, channels, times * config.space_variation)
             continue
-        kernels.add_row_variation(theta, grad, start, rows, columns, channels, times * config.space_variation)
+        kernels.add_row_variation(theta, grad, start, rows, columns, channels, times * config.transient_variation)
         kernels.add_time_smoothness(theta, grad, start, rows, columns, channels, times * config.time_smoothness)
         size = rows * columns * field.layout.channels
         kernels.add_sparse_transients(theta, grad, start, size, times * config.sparse_transients)
@@ -367,8 +365,32 @@ def sample_capacity(aabb: np.ndarray, step_length: float) -> int:
     return int(np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64)) / step_length) + 2
 
 
+def box_of_checkpoint(path: Path) -> np.ndarray:
+    """The (2, 3) box of the run that wrote a checkpoint.
+
+    Raises:
+        TrainingError: it cannot be read.
+    """
+    try:
+        aabb = _load(path, torch.device("cpu"))["aabb"].numpy()
+        if aabb.shape != (2, 3) or not np.isfinite(aabb).all() or not (aabb[0] < aabb[1]).all():
+            raise ValueError("aabb")
+    except Exception as error:
+        raise _unusable(path, error) from error
+    return aabb
+
+
+def _load(path: Path, device: torch.device) -> dict[str, Any]:
+    state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+    return state
+
+
+def _unusable(path: Path, error: Exception) -> TrainingError:
+    return TrainingError(f"{path}: not a usable checkpoint ({type(error).__name__}); delete it to start afresh")
+
+
 def _decoder_optimiser(field: Field, config: TrainConfig) -> torch.optim.Adam:
-    parameters = [field.density, field.w1, field.b1, field.w2, field.b2]
+    parameters = [field.density, field.b2] + ([field.w1, field.b1, field.w2] if config.view_dependent else [])
     return torch.optim.Adam(parameters, lr=config.decoder_learning_rate, betas=(BETA1, BETA2), eps=EPSILON)
 
 

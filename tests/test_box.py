@@ -4,7 +4,7 @@ import datasets as make
 import numpy as np
 import pytest
 
-from kpc.encoder.box import find_box, seen_cells
+from kpc.encoder.box import CLEAR, find_box, seen_cells
 from kpc.encoder.datasets import Pictures
 from kpc.format.cameras import Camera
 from kpc.format.errors import DatasetError
@@ -113,3 +113,15 @@ def test_the_same_camera_twice_is_one() -> None:
     twice_and_turned = pictures_of([straight(), straight(), straight(turned=True)])
     assert not seen_cells(twice_and_turned, box, (2, 2, 2)).any()
     assert seen_cells(pictures_of([straight(), straight()]), box, (2, 2, 2)).all()
+
+
+def test_nothing_is_right_before_a_camera() -> None:
+    rig = make.ring(6, width=20, height=20)
+    distance = np.linalg.norm(rig[0].camera_to_world[:3, 3])
+    aabb = np.array([[-distance] * 3, [distance] * 3], np.float32)
+    shape = (40, 40, 40)
+    seen = seen_cells(pictures_of(rig), aabb, shape)
+    z, y, x = (np.argwhere(seen).T + 0.5) / 40
+    centres = aabb[0] + np.stack([x, y, z], axis=1) * (aabb[1] - aabb[0])
+    nearest = min(np.linalg.norm(centres - c.camera_to_world[:3, 3], axis=1).min() for c in rig)
+    assert seen.any() and CLEAR * distance <= nearest < (CLEAR + 0.1) * distance

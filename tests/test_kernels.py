@@ -266,7 +266,7 @@ def test_priors_are_the_gradient_of_their_twin(dynamic: bool) -> None:
     with torch.no_grad():
         field.theta += 0.1 * torch.randn(field.layout.size, generator=torch.Generator().manual_seed(0))
         field.theta[-50:] = 1.0  # the kink of |1 - P|, where the gradient is 0 by agreement
-    config = TrainConfig(space_variation=0.3, time_smoothness=0.7, sparse_transients=0.2)
+    config = TrainConfig(space_variation=0.3, transient_variation=0.4, time_smoothness=0.7, sparse_transients=0.2)
     grad = np.ones(field.layout.size, np.float32)
     add_priors(field, field.theta.detach().numpy(), grad, config, 4.0)
     field = field.double()

@@ -100,13 +100,16 @@ def fails(
 
 
 @pytest.mark.parametrize(
-    "name, layout, dynamic", [("n3dv", "N3DV", True), ("blender", "Blender", True), ("nerfstudio", "nerfstudio", False)]
+    "name, layout, dynamic, steps",
+    [("n3dv", "N3DV", True, 24), ("blender", "Blender", True, 48), ("nerfstudio", "nerfstudio", False, 24)],
 )
-def test_a_folder_becomes_a_file(run: Kpenc, sets: Path, tmp_path: Path, name: str, layout: str, dynamic: bool) -> None:
+def test_a_folder_becomes_a_file(
+    run: Kpenc, sets: Path, tmp_path: Path, name: str, layout: str, dynamic: bool, steps: int
+) -> None:
     code, out, err = run(sets / name, "--json")
     assert code == 0
     result, output = json.loads(out), tmp_path / "out.kpc"
-    assert (result["layout"], result["dynamic"], result["steps"], result["file"]) == (layout, dynamic, 24, str(output))
+    assert (result["layout"], result["dynamic"], result["steps"], result["file"]) == (layout, dynamic, steps, str(output))
     assert result["size_bytes"] == output.stat().st_size
     assert 5 < result["test_psnr"] < 60 and -1 < result["test_ssim"] <= 1 and result["test_pictures"] > 0
     assert (result["identity_share"] is not None) == dynamic
@@ -131,7 +134,7 @@ def test_what_is_printed(run: Kpenc, sets: Path) -> None:
             "bits per parameter",
             "exactly at identity: ",
             "encoded in ",
-            "24 steps",
+            "48 steps",
         )
     )
 

@@ -81,6 +81,12 @@ class Dataset:
     has_alpha: bool
     camera_names: tuple[str, ...]
 
+    @property
+    def one_view_at_a_time(self) -> bool:
+        """Whether no two pictures to train on show the same instant of a clip."""
+        times = self.pictures.time[~self.pictures.is_test]
+        return self.is_dynamic and len(np.unique(times)) == len(times)
+
     def describe(self) -> str:
         """What was found, in one line."""
         p = self.pictures
@@ -95,6 +101,8 @@ class Dataset:
             clip = self.clip
             frames = _count(clip.frame_count, "frame")
             parts.append(f"dynamic, {frames} at {clip.fps:.5g} fps ({clip.duration_s:.4g} s)")
+            if self.one_view_at_a_time:
+                parts.append("one view at a time")
         else:
             parts.append("static")
         return ", ".join(parts + (["alpha"] if self.has_alpha else []) + (["distortion"] if p.distortion.any() else []))
