@@ -23,12 +23,10 @@ def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
     if np.all(np.isfinite(pictures.near[cameras])) and np.all(np.isfinite(pictures.far[cameras])):
         corners = np.concatenate([_frustum(pictures, p) for p in cameras])
         return np.stack([corners.min(0), corners.max(0)]).astype(np.float32)
-    pose = pictures.camera_to_world[cameras]
-    centres, forward = pose[:, :3, 3], -pose[:, :3, 2]
-    focus = _common_point(centres, forward)
-    if focus is None or np.mean(np.sum((focus - centres) * forward, axis=1) > 0) < 0.9:
+    focus = _focus(pictures, cameras)
+    if focus is None:
         raise DatasetError("the cameras share no point they look at and have no near and far; give --box x0,y0,z0,x1,y1,z1")
-    distance = np.linalg.norm(focus - centres, axis=1)
+    distance = np.linalg.norm(focus - pictures.camera_to_world[cameras, :3, 3], axis=1)
     if has_alpha:
         size = np.maximum(pictures.width[cameras] / pictures.intrinsics[cameras, 0],
                           pictures.height[cameras] / pictures.intrinsics[cameras, 1])
@@ -50,8 +48,7 @@ def seen_cells(pictures: Pictures, aabb: np.ndarray, shape: tuple[int, int, int]
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     centres = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     cameras = _distinct_cameras(pictures)
-    poses = pictures.camera_to_world[cameras]
-    focus = _common_point(poses[:, :3, 3], -poses[:, :3, 2])
+    focus = _focus(pictures, cameras)
     count, blocked = np.zeros(len(centres), np.int32), np.zeros(len(centres), bool)
     for p in cameras:
         pose = pictures.camera_to_world[p]
@@ -90,10 +87,16 @@ def _frustum(pictures: Pictures, p: int) -> np.ndarray:
     return local @ pose[:3, :3].T + pose[:3, 3]
 
 
-def _common_point(centres: np.ndarray, forward: np.ndarray) -> np.ndarray | None:
-    """Point of least squared distance to all optical axes; None where they are parallel."""
+def _focus(pictures: Pictures, cameras: np.ndarray) -> np.ndarray | None:
+    """What the cameras look at: the point of least squared distance to all optical axes.
+
+    None where the axes are parallel, or the point lies behind more than a tenth of the cameras.
+    """
+    pose = pictures.camera_to_world[cameras]
+    centres, forward = pose[:, :3, 3], -pose[:, :3, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     A = across.sum(0)
     if np.linalg.cond(A) > 1e6:
         return None
-    return np.linalg.solve(A, np.einsum("nij,nj->i", across, centres))
+    focus = np.linalg.solve(A, np.einsum("nij,nj->i", across, centres))
+    return focus if np.mean(np.sum((focus - centres) * forward, axis=1) > 0) >= 0.9 else None

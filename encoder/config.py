@@ -93,7 +93,7 @@ class TrainConfig:
 PRESETS = {
     "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500, warmup=50,
                          occupancy_start=64),
-    "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3400),
+    "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
     "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=5000),
     "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000),
 }

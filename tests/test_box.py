@@ -1,5 +1,7 @@
 """Where the scene is: each way to find its box, each way that fails, and what the cameras see of it."""
 
+from dataclasses import replace
+
 import datasets as make
 import numpy as np
 import pytest
@@ -125,3 +127,13 @@ def test_nothing_is_right_before_a_camera() -> None:
     centres = aabb[0] + np.stack([x, y, z], axis=1) * (aabb[1] - aabb[0])
     nearest = min(np.linalg.norm(centres - c.camera_to_world[:3, 3], axis=1).min() for c in rig)
     assert seen.any() and CLEAR * distance <= nearest < (CLEAR + 0.1) * distance
+
+
+def test_cameras_that_look_apart_have_no_clearance() -> None:
+    apart = [replace(c, camera_to_world=c.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])) for c in make.ring(6, width=20, height=20)]
+    distance = np.linalg.norm(apart[0].camera_to_world[:3, 3])
+    aabb = np.array([[-2 * distance] * 3, [2 * distance] * 3], np.float32)
+    seen = seen_cells(pictures_of(apart), aabb, (40, 40, 40), at_least=1)
+    z, y, x = (np.argwhere(seen).T + 0.5) / 40
+    centres = aabb[0] + np.stack([x, y, z], axis=1) * (aabb[1] - aabb[0])
+    assert np.linalg.norm(centres - apart[0].camera_to_world[:3, 3], axis=1).min() < CLEAR * distance / 2
