@@ -100,8 +100,8 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
     """Structural similarity of (H, W, 3) pictures in [0, 1], the mean over pixels and channels.
 
-    Wang et al. 2004, eq. 13: Gaussian window of 11 x 11 with sigma 1.5, K1 = 0.01, K2 = 0.03; only windows that lie inside the picture count (smaller
-    pictures take a smaller window).
+    Wang et al. 2004, eq. 13: Gaussian window of 11 x 11 with sigma 1.5, K1 = 0.01, K2 = 0.03; only windows that lie inside
+    the picture count (smaller pictures take a smaller window).
     """
     size = min(11, *a.shape[:2])
     x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2

@@ -123,7 +123,10 @@ class Field(nn.Module):
         return (h @ self.w2.reshape(3 * F, H).T).view(-1, 3, F) + self.b2
 
     def features(self, points: Tensor, times: Tensor) -> Tensor:
-        """Features at (N, 3) points in [0, 1]^3 and (N,) times in [0, 1]: (N, F). Product over planes, concatenated over scales."""
+        """Features at (N, 3) points in [0, 1]^3 and (N,) times in [0, 1]: (N, F).
+
+        The product over planes, concatenated over scales.
+        """
         coordinate = {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2], "t": times}
         scales = []
         for s in range(len(self.layout.resolution)):

@@ -82,7 +82,8 @@ def _command(argv: list[str]) -> None:
         return
     quality = "no view held out"
     if result["test_psnr"] is not None:
-        quality = f"held-out PSNR {result['test_psnr']:.2f} dB, SSIM {result['test_ssim']:.4f} over {result['test_pictures']} pictures"
+        quality = (f"held-out PSNR {result['test_psnr']:.2f} dB, SSIM {result['test_ssim']:.4f} "
+                   f"over {result['test_pictures']} pictures")
     print(f"{options.output}: {quality} (rendered from the decoded file)")
     print(f"{result['size_bytes']:,} bytes, {result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}; "
           f"coding loss {result['coding_loss_db']:.3f} dB" + (" on held-out views" if result["test_psnr"] is not None else ""))
@@ -172,7 +173,7 @@ def quantise(trainer: Trainer, scene: Scene) -> tuple[QuantisedScene, float]:
 
 
 def _trimmed(dataset: Dataset, config: TrainConfig, aabb: np.ndarray, time_budget_s: float | None) -> tuple[np.ndarray, float]:
-    """The box cut down to where something is, and the seconds that took; the files of the dataset's cache stay."""
+    """The box cut down to where something is, and the seconds that took."""
     with Progress("survey", total=1000, unit="‰") as progress:
         return trim_box(dataset, config, aabb, lambda r: _show(progress, r), time_budget_s=time_budget_s)
 
@@ -224,11 +225,11 @@ def _wants_partial(trainer: Trainer, checkpoint: Path) -> bool:
 
 
 def _plan(trainer: Trainer) -> str:
-    lo, hi = trainer.aabb
-    res = ", ".join("x".join(str(n) for n in row if n) for row in trainer.field.layout.resolution)
-    corner = " ".join
-    return (f"box {corner(f'{v:.4g}' for v in lo)} to {corner(f'{v:.4g}' for v in hi)}; planes {res} (xyz{'t' if trainer.field.layout.is_dynamic else ''}) "
-            f"of {trainer.field.layout.channels} channels, {trainer.field.layout.size / 1e6:.2f} M parameters; on {trainer.device}")
+    layout, (lo, hi) = trainer.field.layout, trainer.aabb
+    corners = " to ".join(" ".join(f"{v:.4g}" for v in corner) for corner in (lo, hi))
+    planes = ", ".join("x".join(str(n) for n in row if n) for row in layout.resolution)
+    return (f"box {corners}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
+            f"{layout.size / 1e6:.2f} M parameters; on {trainer.device}")
 
 
 def _spread_of_cameras(dataset: Dataset) -> list[int]:
@@ -255,7 +256,8 @@ def _box_of(dataset: Dataset, options: Options) -> np.ndarray:
         raise DatasetError(f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; "
                            "give another with --box x0,y0,z0,x1,y1,z1")
     if not seen_cells(dataset.pictures, aabb, grid_shape(aabb, 64)).any():
-        raise DatasetError(f"{options.source}: the box lies outside every camera's view; give another with --box x0,y0,z0,x1,y1,z1")
+        raise DatasetError(f"{options.source}: the box lies outside every camera's view; give another with "
+                           "--box x0,y0,z0,x1,y1,z1")
     return aabb
 
 
@@ -312,7 +314,8 @@ def _parse(argv: list[str]) -> tuple[Options, bool]:
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first (default: 1)")
     parser.add_argument("--holdout", metavar="NAME", help="camera or file to test on, or 'none'")
-    parser.add_argument("--box", type=box_corners, metavar="x0,y0,z0,x1,y1,z1", help="corners of the scene instead of those found from the cameras")
+    parser.add_argument("--box", type=box_corners, metavar="x0,y0,z0,x1,y1,z1",
+                        help="corners of the scene, taken as they are, instead of those found from cameras and a survey")
     parser.add_argument("--work", type=Path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)")
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")

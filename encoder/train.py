@@ -263,7 +263,8 @@ class FusedOptimiser:
         for group in self.decoder.param_groups:
             group["lr"] = config.decoder_learning_rate * rate
         self.decoder.step()
-        kernels.adam(self.theta, self.grad, self.mean, self.square, config.learning_rate * rate, BETA1, BETA2, EPSILON, number + 1)
+        kernels.adam(self.theta, self.grad, self.mean, self.square, config.learning_rate * rate, BETA1, BETA2, EPSILON,
+                     number + 1)
         return float(errors.mean(dtype=np.float64)) / 3, float(counts.mean())
 
     def state(self) -> dict[str, Any]:

@@ -26,23 +26,24 @@ MARGIN = 0.04
 
 def trim_box(
     dataset: Dataset, config: TrainConfig, aabb: np.ndarray, report: Callable[[Report], None], *,
-    time_budget_s: float | None = None, interrupted: Callable[[], bool] = lambda: False,
+    time_budget_s: float | None = None,
 ) -> tuple[np.ndarray, float]:
     """The part of a (2, 3) box that holds what the pictures show, and the seconds it took to find out.
 
-    A coarse field is trained on the CPU for a tenth of `config.steps`, at most MOST_STEPS, or of the time budget where given. The
-    box then goes from the OUTLIERS quantile to the 1 - OUTLIERS quantile of the points where rays end in something, and MARGIN
-    further; never beyond `aabb`. After fewer than LEAST_STEPS, or where nearly all rays end in nothing, it is `aabb`.
+    A coarse field is trained on the CPU for a tenth of `config.steps`, at most MOST_STEPS, or of the time budget where given.
+    The box then goes from the OUTLIERS quantile to the 1 - OUTLIERS quantile of the points where rays end in something, and
+    MARGIN further; never beyond `aabb`. After fewer than LEAST_STEPS, or where nearly all rays end in nothing, it is `aabb`.
 
     Raises:
-        TrainingError, KeyboardInterrupt: as `Trainer.run`.
+        TrainingError: as `Trainer.run`.
     """
     steps = min(MOST_STEPS, config.steps // 10)
     if time_budget_s is None and steps < LEAST_STEPS:
         return aabb, 0.0
-    coarse = replace(config, resolutions=(32, 64), channels=8, samples_across=160, cells_across=64, steps=steps, occupancy_start=64)
+    coarse = replace(config, resolutions=(32, 64), channels=8, samples_across=160, cells_across=64, steps=steps,
+                     occupancy_start=64)
     trainer = Trainer(dataset, coarse, aabb, "cpu")
-    trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10, interrupted=interrupted)
+    trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10)
     if trainer.step < LEAST_STEPS:
         return aabb, trainer.elapsed_s
     scene = trainer.field.to_scene(aabb, dataset.clip, trainer.grid.occupied[None], trainer.background, trainer.step_length)
