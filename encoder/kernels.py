@@ -29,8 +29,11 @@ _NEGLIGIBLE = np.float32(1e-4)
 
 _TINY = np.float32(1e-30)
 
-_jit = njit(fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, error_model="numpy", cache=True, nogil=True)
-_parallel = njit(fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, error_model="numpy", cache=True, parallel=True)
+# Not "reassoc": the order of sums would differ between code compiled in this process and the same code from numba's cache,
+# and the first training run on a machine would end elsewhere than the second.
+_FASTMATH = {"nsz", "arcp", "contract", "afn"}
+_jit = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True)
+_parallel = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, parallel=True)
 
 
 @_jit
