@@ -91,7 +91,7 @@ class TrainConfig:
 
 
 PRESETS = {
-    "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500, warmup=50,
+    "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500,
                          occupancy_start=64),
     "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
     "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=5000),

@@ -261,9 +261,10 @@ def priors(field: Field, config: TrainConfig) -> Tensor:
     total = field.theta.new_zeros(())
     for s, name, _, rows, columns in field.layout.planes():
         p = field.plane(s, name)
-        along_rows, along_columns = (p[:, 1:] - p[:, :-1]).square().sum() / p.numel(), (p[1:] - p[:-1]).square().sum() / p.numel()
+        along_rows = (p[:, 1:] - p[:, :-1]).square().sum() / p.numel()
         if name in SPACE_PLANES:
-            total = total + config.space_variation * (along_rows + along_columns)
+            across_rows = (p[1:] - p[:-1]).square().sum() / p.numel()
+            total = total + config.space_variation * (along_rows + across_rows)
         if name in TIME_PLANES:
             total = total + config.transient_variation * along_rows
             total = total + config.time_smoothness * (p[:-2] - 2 * p[1:-1] + p[2:]).square().sum() / p.numel()

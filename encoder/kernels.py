@@ -28,6 +28,7 @@ _NEGLIGIBLE = np.float32(1e-4)
 """A sample of less weight gets no colour; 4096 of them could not make up an 8-bit level and a half."""
 
 _TINY = np.float32(1e-30)
+"""Adam's means below this are 0."""
 
 # Not "reassoc": the order of sums would differ between code compiled in this process and the same code from numba's cache,
 # and the first training run on a machine would end elsewhere than the second.
@@ -299,8 +300,7 @@ def _distortion_gradient(weights, distances, count, step, extent, factor, out):
 @_parallel
 def backpropagate(
     theta, grad, table, resolution, density, grad_density, channels, aabb, occupancy, step, extent,
-    origins, directions, times, jitters, basis, grad_basis, targets, backgrounds, peaks, distortion,
-    capacity,
+    origins, directions, times, jitters, basis, grad_basis, targets, backgrounds, peaks, distortion, capacity,
 ):
     """Render a batch, and add the gradient of its loss to grad, grad_density and grad_basis.
 
@@ -440,46 +440,33 @@ def adam(theta, grad, mean, square, lr, beta1, beta2, epsilon, step_number):
 
 
 @_parallel
-def add_space_variation(theta, grad, start, rows, columns, channels, weight):
-    """Add the gradient of weight * mean over (i, j, m) of the squared differences to both neighbours (total variation).
+def add_variation(theta, grad, start, rows, columns, channels, along_rows, across_rows):
+    """Add the gradient of the mean over (i, j, m) of squared differences between neighbours (total variation).
 
-    For a space plane both axes are smoothed; `add_row_variation` smooths a space-time plane along space alone.
+    Those in the same row count `along_rows`, those in the same column `across_rows`: a space-time plane is smoothed along
+    space alone, its rows.
     """
     M = len(channels)
-    k = np.float32(2.0 * weight / (rows * columns * M))
     width = columns * M
+    along, across = np.float32(2.0 * along_rows / (rows * width)), np.float32(2.0 * across_rows / (rows * width))
     for row in prange(rows):
         a = start + row * width
         here = theta[a : a + width]
         out = grad[a : a + width]
         for i in range(M, width):
-            out[i] += k * (here[i] - here[i - M])
+            out[i] += along * (here[i] - here[i - M])
         for i in range(width - M):
-            out[i] += k * (here[i] - here[i + M])
+            out[i] += along * (here[i] - here[i + M])
+        if across == 0:
+            continue
         if row > 0:
             above = theta[a - width : a]
             for i in range(width):
-                out[i] += k * (here[i] - above[i])
+                out[i] += across * (here[i] - above[i])
         if row < rows - 1:
             below = theta[a + width : a + 2 * width]
             for i in range(width):
-                out[i] += k * (here[i] - below[i])
-
-
-@_parallel
-def add_row_variation(theta, grad, start, rows, columns, channels, weight):
-    """Add the gradient of weight * mean of squared differences between neighbours in a row (total variation along space)."""
-    M = len(channels)
-    k = np.float32(2.0 * weight / (rows * columns * M))
-    width = columns * M
-    for row in prange(rows):
-        a = start + row * width
-        here = theta[a : a + width]
-        out = grad[a : a + width]
-        for i in range(M, width):
-            out[i] += k * (here[i] - here[i - M])
-        for i in range(width - M):
-            out[i] += k * (here[i] - here[i + M])
+                out[i] += across * (here[i] - below[i])
 
 
 @_parallel

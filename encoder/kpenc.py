@@ -112,12 +112,12 @@ def encode(options: Options) -> dict[str, Any]:
         raise
     _say(dataset.describe())
     config, resumes, survey_s = options.config(dataset), options.resume and checkpoint.exists(), 0.0
-    if resumes and options.box is None:
-        aabb = box_of_checkpoint(checkpoint)
-    elif options.box is None:
-        aabb, survey_s = _trimmed(dataset, config, aabb, options.time_budget_s)
-    trainer = Trainer(dataset, config, aabb, device)
-    trainer.elapsed_s = survey_s
+    if options.box is None:
+        if resumes:
+            aabb = box_of_checkpoint(checkpoint)
+        else:
+            aabb, survey_s = _trimmed(dataset, config, aabb, options.time_budget_s)
+    trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s)
     _say(_plan(trainer))
     if resumes:
         trainer.resume(checkpoint)

@@ -91,12 +91,11 @@ class OccupancyGrid:
 
         Each cell that is occupied is looked at `samples` times in every slot.
         """
-        near = self.occupied
-        cells = np.argwhere(near)
+        cells = np.argwhere(self.occupied)
         out = np.zeros((slots, *self.seen.shape), bool)
         for slot in range(slots):
             best = np.full(len(cells), -np.inf, np.float32)
             for _ in range(samples):
                 best = np.maximum(best, self._look(density_at, cells, rng, slot / slots, (slot + 1) / slots))
-            out[slot][near] = best > self.threshold
+            out[slot][self.occupied] = best > self.threshold
         return out

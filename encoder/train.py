@@ -41,9 +41,14 @@ class Report:
 
 
 class Trainer:
-    """One run: a dataset, a field, the optimiser's state. `run` trains to the end or until told to stop."""
+    """One run: a dataset, a field, the optimiser's state. `run` trains to the end or until told to stop.
 
-    def __init__(self, dataset: Dataset, config: TrainConfig, aabb: np.ndarray, device: str) -> None:
+    `elapsed_s` counts the seconds of training, those spent before, on a survey, included.
+    """
+
+    def __init__(
+        self, dataset: Dataset, config: TrainConfig, aabb: np.ndarray, device: str, elapsed_s: float = 0.0
+    ) -> None:
         self.dataset, self.config, self.device = dataset, config, torch.device(device)
         self.aabb = np.asarray(aabb, np.float32)
         self.extent = float(np.max(self.aabb[1] - self.aabb[0]))
@@ -59,7 +64,7 @@ class Trainer:
             PlainOptimiser(self.field, config, shape)
         )
         self.step = 0
-        self.elapsed_s = 0.0
+        self.elapsed_s = elapsed_s
         self.samples_per_ray = float(config.samples_across)
         self.sampler = RaySampler(dataset)
         # Objects with alpha are shown on white. Elsewhere what the box leaves open is grey: the least wrong guess.
@@ -252,8 +257,7 @@ class FusedOptimiser:
             (0,) * layout.channels, aabb, occupancy.view(np.uint8), np.float32(step_length), np.float32(extent),
             batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(), batch.jitters.numpy(),
             basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(), self._peaks,
-            np.float32(config.distortion),
-            sample_capacity(aabb, step_length),
+            np.float32(config.distortion), sample_capacity(aabb, step_length),
         )
         if number % config.regularise_every == 0:
             add_priors(self.field, self.theta, self.grad[0], config, config.regularise_every)
@@ -342,11 +346,12 @@ class PlainOptimiser:
 def add_priors(field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, times: float) -> None:
     """Add `times` the gradient of `kpc.encoder.field.priors` to grad."""
     channels = (0,) * field.layout.channels
+    space, transient = times * config.space_variation, times * config.transient_variation
     for _, name, start, rows, columns in field.layout.planes():
         if name in SPACE_PLANES:
-            kernels.add_space_variation(theta, grad, start, rows, columns, channels, times * config.space_variation)
+            kernels.add_variation(theta, grad, start, rows, columns, channels, space, space)
             continue
-        kernels.add_row_variation(theta, grad, start, rows, columns, channels, times * config.transient_variation)
+        kernels.add_variation(theta, grad, start, rows, columns, channels, transient, 0.0)
         kernels.add_time_smoothness(theta, grad, start, rows, columns, channels, times * config.time_smoothness)
         size = rows * columns * field.layout.channels
         kernels.add_sparse_transients(theta, grad, start, size, times * config.sparse_transients)

@@ -1,8 +1,12 @@
 """Tests work on tiny arrays: on a busy machine threads wait for each other far longer than they compute."""
 
 import os
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from kpc.encoder.datasets import Dataset
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -16,3 +20,15 @@ def one_thread():
     numba.set_num_threads(1)
     yield
     numba.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> "Dataset":
+    """A moving object with alpha, seen once an instant."""
+    import datasets as make
+
+    from kpc.encoder.datasets import load_dataset
+
+    folder = tmp_path_factory.mktemp("moving")
+    make.write_blender(folder / "set")
+    return load_dataset(folder / "set", folder / "cache", progress=False)

@@ -130,7 +130,8 @@ def test_nothing_is_right_before_a_camera() -> None:
 
 
 def test_cameras_that_look_apart_have_no_clearance() -> None:
-    apart = [replace(c, camera_to_world=c.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])) for c in make.ring(6, width=20, height=20)]
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
+    apart = [replace(c, camera_to_world=c.camera_to_world @ turned) for c in make.ring(6, width=20, height=20)]
     distance = np.linalg.norm(apart[0].camera_to_world[:3, 3])
     aabb = np.array([[-2 * distance] * 3, [2 * distance] * 3], np.float32)
     seen = seen_cells(pictures_of(apart), aabb, (40, 40, 40), at_least=1)

@@ -536,8 +536,8 @@ def _signal_at_step(monkeypatch: pytest.MonkeyPatch, step: int, number: int) -> 
     """Send this process a signal from within a step of training: it must take effect between steps."""
     draw = Trainer.__init__
 
-    def init(self: Trainer, *args: object) -> None:
-        draw(self, *args)  # type: ignore[arg-type]
+    def init(self: Trainer, *args: object, **named: object) -> None:
+        draw(self, *args, **named)  # type: ignore[arg-type]
         whole = self.optimiser.step
 
         def stepping(count: int, *rest: object) -> tuple[float, float]:

@@ -34,13 +34,6 @@ BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
 
 
 @pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    folder = tmp_path_factory.mktemp("moving")
-    make.write_blender(folder / "set")
-    return load_dataset(folder / "set", folder / "cache", progress=False)
-
-
-@pytest.fixture(scope="module")
 def still(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("still")
     make.write_llff(folder / "set", images=5)

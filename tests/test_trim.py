@@ -3,25 +3,17 @@
 from dataclasses import replace
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
 
 from kpc.encoder.config import PRESETS, TrainConfig
-from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.datasets import Dataset
 from kpc.encoder.kpenc import Options
 from kpc.encoder.trim import trim_box
 
 CONFIG = TrainConfig(steps=1500, rays=256, samples=12288, warmup=5)
 LARGE = np.array([[-3, -3, -3], [3, 3, 3]], np.float32)
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    folder = tmp_path_factory.mktemp("moving")
-    make.write_blender(folder / "set")
-    return load_dataset(folder / "set", folder / "cache", progress=False)
 
 
 def test_a_large_box_is_cut_down_to_the_object(moving: Dataset) -> None:
