@@ -1,0 +1,101 @@
+"""The fused kernels and their float64 twin on the same scene and rays, for tests that hold them together."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scenes import tiny_scene
+
+from kpc.encoder import kernels
+from kpc.encoder.field import Field, Rays, render_reference
+from kpc.encoder.train import sample_capacity
+from kpc.format.scene import Scene
+
+
+def misty(dynamic: bool = True) -> Scene:
+    """Every step absorbs a tenth or more: no sample before termination is so faint that it gets no colour."""
+    scene = tiny_scene(dynamic=dynamic, time=6)
+    weight = scene.decoder.density_weight
+    return replace(scene, decoder=replace(scene.decoder, density_weight=np.abs(weight) / 16, density_bias=2.0))
+
+
+def rays_at(scene: Scene, count: int, seed: int = 0) -> Rays:
+    """Rays through random pixels of the scene's cameras at random times, and one exactly along each axis."""
+    rng = np.random.default_rng(seed)
+    origins, directions = (np.concatenate(a) for a in zip(*(c.rays() for c in scene.cameras)))
+    chosen = rng.choice(len(origins), count - 3, replace=False)
+    centre = scene.aabb.mean(0) + 0.03  # not on the faces of cells
+    origins = np.concatenate([origins[chosen], centre - 3 * np.eye(3)])
+    directions = np.concatenate([directions[chosen], np.eye(3)])
+    arrays = (origins, directions, rng.random(count), rng.random(count), rng.random((count, 3)))
+    return Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
+
+
+DISTORTION = 0.3
+"""Weight of the distortion loss in these tests: large enough to count beside the colours."""
+
+
+def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int = 2) -> dict[str, np.ndarray]:
+    field = Field.from_scene(scene)
+    layout, n = field.layout, len(targets)
+    grad = np.zeros((workers, layout.size), np.float32)
+    grad_density = np.zeros((workers, layout.features + 1), np.float32)
+    basis = field.basis(rays.directions).detach().numpy()
+    grad_basis = np.full((n, 3, layout.features), np.nan, np.float32)
+    peaks = np.zeros((workers, *scene.occupancy.shape[1:]), np.float32)
+    errors, counts = kernels.backpropagate(
+        field.theta.detach().numpy(),
+        grad,
+        layout.table,
+        layout.resolution,
+        field.density.detach().numpy(),
+        grad_density,
+        (0,) * layout.channels,
+        scene.aabb,
+        scene.occupancy.view(np.uint8),
+        np.float32(scene.step),
+        np.float32(scene.extent),
+        rays.origins.numpy(),
+        rays.directions.numpy(),
+        rays.times.numpy(),
+        rays.jitters.numpy(),
+        basis,
+        grad_basis,
+        targets.numpy(),
+        rays.backgrounds.numpy(),
+        peaks,
+        np.float32(DISTORTION),
+        sample_capacity(scene.aabb, scene.step),
+    )
+    return {
+        "theta": grad.sum(0),
+        "density": grad_density.sum(0),
+        "basis": grad_basis,
+        "errors": errors,
+        "counts": counts,
+        "peaks": peaks.max(0),
+    }
+
+
+def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict[str, np.ndarray]:
+    """The same by autograd through `render_reference`, in float64."""
+    field = Field.from_scene(scene).double()
+    rays = Rays(*(a.double() for a in vars(rays).values()))
+    basis = field.basis(rays.directions).detach().requires_grad_()
+    field.basis = lambda directions: basis  # type: ignore[method-assign]
+    aabb, occupancy = torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy)
+    rgb, distortion, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step)
+    squared = (rgb - targets.double()).square()
+    (squared.mean() + DISTORTION * distortion).backward()
+    peaks = torch.zeros(scene.occupancy.shape[1:], dtype=torch.float64)
+    peaks.index_put_(tuple(cells.T), torch.zeros(len(cells), dtype=torch.float64))
+    for cell, weight in zip(cells.tolist(), weights.tolist()):
+        peaks[tuple(cell)] = max(float(peaks[tuple(cell)]), weight)
+    return {
+        "theta": field.theta.grad.numpy(),
+        "density": field.density.grad.numpy(),
+        "basis": basis.grad.numpy(),
+        "errors": squared.sum(1).detach().numpy(),
+        "samples": len(weights),
+        "peaks": peaks.numpy(),
+    }
