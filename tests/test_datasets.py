@@ -563,7 +563,7 @@ def test_downscaled_intrinsics_keep_directions(tmp_path: Path) -> None:
 def test_undistortion_inverts_distortion(seed: int) -> None:
     rng = np.random.default_rng(seed)
     coefficients = rng.uniform(-1, 1, (40, 4)) * [0.15, 0.08, 0.01, 0.01]
-    x, y = rng.uniform(-0.8, 0.8, (2, 40))
+    x, y = rng.uniform(-0.7, 0.7, (2, 40))  # at 0.8 the strongest of these lenses fold over
     u, v = undistort(*distorted(x, y, coefficients), coefficients)
     np.testing.assert_allclose(np.stack([u, v]), np.stack([x, y]), atol=1e-9)
 
