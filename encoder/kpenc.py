@@ -305,7 +305,7 @@ def _say(text: str) -> None:
 
 def _parse(argv: list[str]) -> tuple[Options, bool]:
     parser = argparse.ArgumentParser("kpenc", description=__doc__.split(": ", 1)[1])
-    parser.add_argument("source", type=Path, help="folder: videos with poses_bounds.npy, or images with transforms*.json")
+    parser.add_argument("source", type=Path, help="folder: videos or images, and poses_bounds.npy, transforms*.json or sparse/0")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .kpc file to write")
     parser.add_argument("--preset", choices=sorted(PRESETS), default="balanced", help="how much to spend (default: balanced)")
     parser.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")

@@ -1,6 +1,8 @@
 """Tiny datasets in each layout, for tests: a shaded sphere seen from a few cameras, a few frames long."""
 
 import json
+import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +102,85 @@ def write_nerfstudio(folder: Path, images: int = 10, times: list[float] | None =
     head = {"w": c.width, "h": c.height, "fl_x": c.fl_x, "fl_y": c.fl_y, "cx": c.cx, "cy": c.cy, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(head | document))
     return rig
+
+
+COLMAP_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """w x y z of a (3, 3) rotation: the eigenvector of Bar-Itzhack's symmetric matrix (2000) for its largest eigenvalue."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    matrix = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    return np.linalg.eigh(matrix)[1][:, -1]
+
+
+def colmap_pose(camera_to_world: np.ndarray) -> tuple[float, ...]:
+    """Quaternion and translation of x_camera = R x_world + t, y down and z forward, from an OpenGL pose."""
+    rotation = (camera_to_world[:3, :3] * [1, -1, -1]).T
+    return (*quaternion(rotation).tolist(), *(-rotation @ camera_to_world[:3, 3]).tolist())
+
+
+ColmapCamera = tuple[int, str, int, int, Sequence[float]]
+"""Number, model, width, height and parameters."""
+
+ColmapImage = tuple[int, Sequence[float], int, str, int]
+"""Number, quaternion and translation, number of the camera, name, and how many points it sees."""
+
+
+def write_colmap_model(
+    folder: Path, cameras: Sequence[ColmapCamera], images: Sequence[ColmapImage], binary: bool = True
+) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    if not binary:
+        lines = ["# Camera list", *(f"{n} {model} {w} {h} {_words(params)}" for n, model, w, h, params in cameras)]
+        (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
+        lines = ["# Image list with two lines of data per image"]
+        for n, pose, camera, name, points in images:
+            lines += [f"{n} {_words(pose)} {camera} {name}", " ".join(["1.5 2.5 -1"] * points)]
+        (folder / "images.txt").write_text("\n".join(lines) + "\n")
+        return
+    data = struct.pack("<Q", len(cameras))
+    for n, model, w, h, params in cameras:
+        data += struct.pack(f"<IiQQ{len(params)}d", n, COLMAP_MODELS[model], w, h, *params)
+    (folder / "cameras.bin").write_bytes(data)
+    data = struct.pack("<Q", len(images))
+    for n, pose, camera, name, points in images:
+        data += struct.pack("<I7dI", n, *pose, camera) + name.encode() + b"\0" + struct.pack("<Q", points)
+        data += struct.pack("<ddQ", 1.5, 2.5, 2**64 - 1) * points
+    (folder / "images.bin").write_bytes(data)
+
+
+def write_colmap(
+    folder: Path, images: int = 10, binary: bool = True, model: str = "PINHOLE", lens: Sequence[float] = ()
+) -> list[Camera]:
+    """`lens`: what `model` has beyond focal length and centre. Images are numbered against their order."""
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    rig = ring(images)
+    for k, camera in enumerate(rig):
+        write_image(folder / "images" / f"{k:04d}.png", picture(camera))
+    c = rig[0]
+    focal = (c.fl_x, c.fl_y) if model in ("PINHOLE", "OPENCV") else (c.fl_x,)
+    camera = (7, model, c.width, c.height, (*focal, c.cx, c.cy, *lens))
+    posed = [(images - k, colmap_pose(c.camera_to_world), 7, f"{k:04d}.png", k % 3) for k, c in enumerate(rig)]
+    write_colmap_model(folder / "sparse" / "0", [camera], posed, binary)
+    return rig
+
+
+def _words(numbers: Sequence[float]) -> str:
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+def write_mask(file: Path, usable: np.ndarray) -> None:
+    """8-bit grey, 255 where an (H, W) bool says usable."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_image(file, np.where(usable, 255, 0).astype(np.uint8))
 
 
 def edit_json(file: Path, change: Any) -> None:

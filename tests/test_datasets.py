@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kpc.encoder.datasets import Dataset, PixelCache, load_dataset, pixels, rays
+from kpc.encoder.datasets.capture import natural_key
 from kpc.encoder.datasets.dataset import shrunk, undistort
 from kpc.format.errors import DatasetError, KpcError, MediaError
 from kpc.format.media import write_image, write_video
@@ -99,6 +100,11 @@ def test_videos_in_natural_order(tmp_path: Path) -> None:
     dataset = load(tmp_path / "set")
     assert dataset.camera_names == ("cam00", "cam9", "cam10")
     np.testing.assert_allclose(dataset.camera(8).camera_to_world, rig[2].camera_to_world)
+
+
+def test_natural_order() -> None:
+    names = ["", "2", "10", "a", "a0", "a1", "a01b", "a2", "a10", "a10b2", "a10b10", "a" + "9" * 5000, "b", "x\u00b21"]
+    assert sorted(reversed(names), key=natural_key) == names
 
 
 def test_llff_images(tmp_path: Path) -> None:

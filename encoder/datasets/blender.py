@@ -6,8 +6,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from kpc.encoder.datasets.capture import Capture, held_out
-from kpc.encoder.datasets.transforms import find_image, frame_rate, frame_view, load_transforms, say_missing
+from kpc.encoder.datasets.capture import Capture, find_image, held_out, say_missing
+from kpc.encoder.datasets.transforms import frame_rate, frame_view, load_transforms
 
 
 def recognise(path: Path) -> bool:

@@ -1,7 +1,10 @@
 """What every layout is read into: a list of views, each an image or the video of a camera that stands still."""
 
+import errno
 import math
+import os
 import re
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from kpc.format.errors import DatasetError
-from kpc.format.media import VideoInfo, image_size
+from kpc.format.media import IMAGE_SUFFIXES, VideoInfo, image_size
 
 HOLD_OUT_EVERY = 8
 """Where neither the dataset nor the user names test images, every eighth is one (LLFF's custom, arXiv:1905.00889)."""
@@ -118,8 +121,10 @@ def check_pose(where: str, pose: np.ndarray) -> np.ndarray:
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """Sorts cam2 before cam10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+    """Sorts cam2 before cam10. A number goes by its length, then by its digits: no name is too long or too odd for that."""
+    parts = re.split(r"(\d+)", name)
+    numbers = [part.lstrip("0") for part in parts[1::2]]
+    return [(len(numbers[k // 2]), numbers[k // 2]) if k % 2 else (-1, part) for k, part in enumerate(parts)]
 
 
 def held_out(path: Path, names: Sequence[str], holdout: str | None, default: Iterable[bool]) -> list[bool]:
@@ -141,3 +146,47 @@ def held_out(path: Path, names: Sequence[str], holdout: str | None, default: Ite
             f"{path}: nothing is named {holdout!r} to hold out; there are {some}{' ...' if len(names) > 4 else ''}"
         )
     return chosen
+
+
+def find_image(root: Path, file: Path, name: str) -> Path | None:
+    """The image that `file` knows by a name relative to `root`, with or without its suffix; None if there is none.
+
+    Raises:
+        DatasetError: it leads out of `root`. (A link inside the folder may: who put it there meant it.)
+    """
+    relative = os.path.normpath(name.replace("\\", "/"))
+    if os.path.isabs(relative) or relative.split(os.sep)[0] in (os.curdir, os.pardir) or "\0" in relative:
+        raise DatasetError(f"{file}: {name!r} leads out of {root} or names no file; make it relative to that folder")
+    bare = root / relative
+    for candidate in (bare, *(bare.with_name(bare.name + suffix) for suffix in (*IMAGE_SUFFIXES, ".JPG", ".PNG"))):
+        if candidate.suffix.lower() in IMAGE_SUFFIXES and is_file(candidate):
+            return candidate
+    return None
+
+
+def is_file(path: Path) -> bool:
+    """As `Path.is_file`; what no file system could hold is not there."""
+    try:
+        return path.is_file()
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            return False
+        raise
+
+
+def say_missing(file: Path, missing: list[str], total: int) -> None:
+    """One line for all frames whose image is not there.
+
+    Raises:
+        DatasetError: none is there.
+    """
+    if len(missing) == total:
+        raise DatasetError(f"{file}: none of its {total} images exists ({plain(missing[0])} ...); copy them beside it")
+    if missing:
+        names = ", ".join(map(plain, missing[:6])) + (" ..." if len(missing) > 6 else "")
+        print(f"{file}: {len(missing)} of {total} frames have no image and are skipped: {names}", file=sys.stderr)
+
+
+def plain(text: str) -> str:
+    """On one line and not endless, whatever a file holds."""
+    return (text if text.isprintable() else repr(text))[:160]

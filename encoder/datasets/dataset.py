@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets import blender, llff, nerfstudio
+from kpc.encoder.datasets import blender, colmap, llff, nerfstudio
 from kpc.encoder.datasets.capture import Capture, View
 from kpc.encoder.datasets.pixels import PixelCache, build_cache, open_cache
 from kpc.format.cameras import Camera
@@ -20,7 +20,8 @@ from kpc.format.media import read_image, read_video
 from kpc.format.progress import Progress
 from kpc.format.scene import Clip
 
-LAYOUTS = (llff, blender, nerfstudio)
+LAYOUTS = (llff, blender, nerfstudio, colmap)
+"""The first that recognises a folder reads it: what a sparse model was exported to goes before the model."""
 
 ASSUMED_FPS = 30.0
 """Of images with times, where the dataset does not tell."""
@@ -67,7 +68,7 @@ class Dataset:
     """What `load_dataset` found.
 
     Attributes:
-        layout: "N3DV", "LLFF", "Blender" or "nerfstudio".
+        layout: "N3DV", "LLFF", "Blender", "nerfstudio" or "COLMAP".
         has_alpha: pixels have four channels, the last a straight alpha; else three.
         camera_names: by the number in `pictures.camera`.
     """
@@ -210,7 +211,8 @@ def _recognise(root: Path, holdout: str | None) -> Capture:
             return layout.read(root, holdout)
     raise DatasetError(
         f"{root}: no dataset layout recognised: there is no poses_bounds.npy (N3DV, LLFF), "
-        "no transforms_train.json (Blender, D-NeRF) and no transforms.json (nerfstudio, instant-ngp)"
+        "no transforms_train.json (Blender, D-NeRF), no transforms.json (nerfstudio, instant-ngp) "
+        "and no sparse/0 with cameras and images (COLMAP)"
     )
 
 

@@ -7,8 +7,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from kpc.encoder.datasets.capture import HOLD_OUT_EVERY, Capture, held_out, natural_key
-from kpc.encoder.datasets.transforms import find_image, frame_rate, frame_view, load_transforms, say_missing
+from kpc.encoder.datasets.capture import HOLD_OUT_EVERY, Capture, find_image, held_out, natural_key, say_missing
+from kpc.encoder.datasets.transforms import frame_rate, frame_view, load_transforms
 from kpc.format.errors import DatasetError
 
 

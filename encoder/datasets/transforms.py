@@ -2,8 +2,6 @@
 
 import json
 import math
-import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,7 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import View, image_view
 from kpc.format.errors import DatasetError
-from kpc.format.media import IMAGE_SUFFIXES, image_size
+from kpc.format.media import image_size
 
 _UNSUPPORTED = {
     "OPENCV_FISHEYE",
@@ -40,24 +38,6 @@ def load_transforms(file: Path) -> dict[str, Any]:
         if not (isinstance(frame, dict) and isinstance(frame.get("file_path"), str) and "transform_matrix" in frame):
             raise DatasetError(f"{file}: frame {number} lacks file_path or transform_matrix; export it anew")
     return document
-
-
-def find_image(root: Path, file: Path, file_path: str) -> Path | None:
-    """The image that `file_path` names, with or without its suffix; None if there is none.
-
-    Raises:
-        DatasetError: it leads out of the dataset's folder. (A link inside the folder may: who put it there meant it.)
-    """
-    relative = os.path.normpath(file_path.replace("\\", "/"))
-    if os.path.isabs(relative) or relative.split(os.sep)[0] == os.pardir or "\0" in relative:
-        raise DatasetError(
-            f"{file}: file_path {file_path!r} leads out of the dataset's folder; make it relative to the folder"
-        )
-    bare = root / relative
-    for candidate in (bare, *(bare.with_name(bare.name + suffix) for suffix in (*IMAGE_SUFFIXES, ".JPG", ".PNG"))):
-        if candidate.suffix.lower() in IMAGE_SUFFIXES and candidate.is_file():
-            return candidate
-    return None
 
 
 def frame_view(file: Path, number: int, document: dict[str, Any], image: Path, is_test: bool) -> View:
@@ -109,19 +89,6 @@ def frame_rate(file: Path, document: dict[str, Any]) -> float | None:
     if not (math.isfinite(fps) and fps > 0):
         raise DatasetError(f"{file}: fps {fps:g} must be positive; correct it")
     return fps
-
-
-def say_missing(file: Path, missing: list[str], total: int) -> None:
-    """One line for all frames whose image is not there.
-
-    Raises:
-        DatasetError: none is there.
-    """
-    if len(missing) == total:
-        raise DatasetError(f"{file}: none of its {total} images exists ({missing[0]} ...); copy them beside it")
-    if missing:
-        names = ", ".join(missing[:6]) + (" ..." if len(missing) > 6 else "")
-        print(f"{file}: {len(missing)} of {total} frames have no image and are skipped: {names}", file=sys.stderr)
 
 
 def _focal(where: str, keys: dict[str, Any], width: float) -> float:
