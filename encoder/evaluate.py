@@ -68,9 +68,12 @@ class Quality:
 def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None) -> Quality | None:
     """PSNR and SSIM over the held-out pictures, or over `most` of them evenly spaced; None where none are held out.
 
-    Pictures with alpha are composited on white, the background such scenes are stored with.
+    Pictures with alpha are composited on white, the background such scenes are stored with. What a mask ignores does not
+    count, and a picture not at all where its mask leaves no window of SSIM.
     """
     held_out = np.flatnonzero(dataset.pictures.is_test)
+    if dataset.masks is not None:
+        held_out = held_out[[bool(_centres(dataset.usable(int(number))).any()) for number in held_out]]
     if len(held_out) == 0:
         return None
     if most is not None and len(held_out) > most:
@@ -79,7 +82,11 @@ def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None) -> Qual
     scores = []
     for number in held_out:
         picture, truth = np.clip(renderer.picture(dataset, int(number)), 0, 1), true_picture(dataset, int(number))
-        scores.append((psnr(picture, truth), ssim(picture, truth)))
+        if dataset.masks is None:
+            scores.append((psnr(picture, truth), ssim(picture, truth)))
+        else:
+            usable = dataset.usable(int(number))
+            scores.append((psnr(picture[usable], truth[usable]), ssim(picture, truth, usable)))
     mean_psnr, mean_ssim = np.mean(scores, axis=0)
     return Quality(float(mean_psnr), float(mean_ssim), len(scores))
 
@@ -97,13 +104,15 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return -10 * math.log10(max(float(np.mean(np.square(a - b), dtype=np.float64)), 1e-10))
 
 
-def ssim(a: np.ndarray, b: np.ndarray) -> float:
+def ssim(a: np.ndarray, b: np.ndarray, usable: np.ndarray | None = None) -> float:
     """Structural similarity of (H, W, 3) pictures in [0, 1], the mean over pixels and channels.
+
+    With (H, W) bool `usable`, the mean over windows whose central pixel is. They may reach over others.
 
     Wang et al. 2004, eq. 13: Gaussian window of 11 x 11 with sigma 1.5, K1 = 0.01, K2 = 0.03; only windows that lie inside
     the picture count (smaller pictures take a smaller window).
     """
-    size = min(11, *a.shape[:2])
+    size = _window(*a.shape[:2])
     x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
     g = torch.exp(-x.square() / (2 * 1.5**2))
     g = g / g.sum()
@@ -115,4 +124,18 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     mu_p, mu_q = blur(p), blur(q)
     var_p, var_q, cov = blur(p * p) - mu_p**2, blur(q * q) - mu_q**2, blur(p * q) - mu_p * mu_q
     c1, c2 = 0.01**2, 0.03**2
-    return float((((2 * mu_p * mu_q + c1) * (2 * cov + c2)) / ((mu_p**2 + mu_q**2 + c1) * (var_p + var_q + c2))).mean())
+    values = ((2 * mu_p * mu_q + c1) * (2 * cov + c2)) / ((mu_p**2 + mu_q**2 + c1) * (var_p + var_q + c2))
+    if usable is not None:
+        values = values[:, 0, torch.from_numpy(_centres(usable))]
+    return float(values.mean())
+
+
+def _window(height: int, width: int) -> int:
+    return min(11, height, width)
+
+
+def _centres(usable: np.ndarray) -> np.ndarray:
+    """The part of an (H, W) array that the central pixels of SSIM's windows lie in, row by row of windows."""
+    height, width = usable.shape
+    size = _window(height, width)
+    return usable[size // 2 : size // 2 + height - size + 1, size // 2 : size // 2 + width - size + 1]

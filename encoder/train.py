@@ -192,13 +192,12 @@ class Trainer:
 
 
 class RaySampler:
-    """Draws pixels of the training pictures, each as likely as any other, and makes their rays."""
+    """Draws usable pixels of the training pictures, each as likely as any other, and makes their rays."""
 
     def __init__(self, dataset: Dataset) -> None:
         self.dataset = dataset
-        pictures = dataset.pictures
-        self.train = np.flatnonzero(~pictures.is_test)
-        self.ends = np.cumsum(pictures.width[self.train].astype(np.int64) * pictures.height[self.train])
+        self.train = np.flatnonzero(~dataset.pictures.is_test)
+        self.ends = np.cumsum(dataset.usable_counts[self.train])
 
     def draw(
         self, rng: np.random.Generator, count: int, background: np.ndarray | None = None
@@ -207,8 +206,8 @@ class RaySampler:
         pictures = self.dataset.pictures
         pixel = rng.integers(self.ends[-1], size=count)
         which = np.searchsorted(self.ends, pixel, side="right")
-        inside = pixel - np.where(which > 0, self.ends[which - 1], 0)
         picture = self.train[which]
+        inside = self.dataset.nth_usable(picture, pixel - np.where(which > 0, self.ends[which - 1], 0))
         row, column = np.divmod(inside, pictures.width[picture])
         origins, directions = rays(pictures, picture, column, row)
         colours = self.dataset.pixels.read(pictures.offset[picture] + inside).astype(np.float32) / np.float32(255)
@@ -407,11 +406,13 @@ def _comparable(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fingerprint(dataset: Dataset) -> str:
-    """Of what the rays of a training run depend on, the pixels' checksums included."""
+    """Of what the rays of a training run depend on, the checksums of pixels and masks included."""
     digest = hashlib.sha256(repr([(tile.offset, tile.crc32c) for tile in dataset.pixels.tiles]).encode())
     p = dataset.pictures
     for array in (p.time, p.is_test, p.width, p.height, p.intrinsics, p.distortion, p.camera_to_world):
         digest.update(np.ascontiguousarray(array).tobytes())
+    if dataset.masks is not None:
+        digest.update(repr(dataset.masks.crc32c).encode())
     return digest.hexdigest()
 
 

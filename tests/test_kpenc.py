@@ -50,6 +50,9 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make.write_n3dv(folder / "n3dv", cameras=4)
     make.write_blender(folder / "blender")
     make.write_nerfstudio(folder / "nerfstudio")
+    make.write_colmap(folder / "colmap", model="OPENCV", lens=(0.06, -0.08, -0.001, 0.0002))
+    for k in range(10):
+        make.write_mask(folder / f"colmap/masks/{k:04d}.png.png", np.arange(32) + np.zeros((24, 1)) > k)
     return folder
 
 
@@ -101,7 +104,12 @@ def fails(
 
 @pytest.mark.parametrize(
     "name, layout, dynamic, steps",
-    [("n3dv", "N3DV", True, 24), ("blender", "Blender", True, 48), ("nerfstudio", "nerfstudio", False, 24)],
+    [
+        ("n3dv", "N3DV", True, 24),
+        ("blender", "Blender", True, 48),
+        ("nerfstudio", "nerfstudio", False, 24),
+        ("colmap", "COLMAP", False, 24),
+    ],
 )
 def test_a_folder_becomes_a_file(
     run: Kpenc, sets: Path, tmp_path: Path, name: str, layout: str, dynamic: bool, steps: int
@@ -169,6 +177,24 @@ def test_options(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     assert code == 0 and "over 2 pictures" in out
     code, out, _ = run(sets / "n3dv", "--holdout", "none", "--steps", "1")
     assert code == 0 and "no view held out" in out
+
+
+def test_masks_and_what_a_damaged_model_says(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+    code, _, err = run(sets / "colmap", "--steps", "2", "--keep")
+    assert code == 0 and "distortion, masks (17.2% ignored)" in err
+    assert len(list((tmp_path / "out.kpc.work").glob("pixels-*-masks.bin"))) == 1
+    code, _, err = run(sets / "colmap", "--steps", "4", "--resume")
+    assert code == 0 and "resumed at step 2" in err
+    assert {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
+    (tmp_path / "out.kpc").unlink()
+    folder = copied(sets, tmp_path, "colmap")
+    make.write_mask(folder / "masks/0003.png.png", np.ones((9, 9), bool))
+    fails(run, tmp_path, folder, "0003.png.png", "is 9x9, but 0003.png is 32x24")
+    for k in range(10):
+        make.write_mask(folder / f"masks/{k:04d}.png.png", np.zeros((24, 32), bool))
+    fails(run, tmp_path, folder, "every pixel to train on")
+    (folder / "sparse/0/images.bin").write_bytes((folder / "sparse/0/images.bin").read_bytes()[:-9])
+    fails(run, tmp_path, folder, "images.bin", "it ends early")
 
 
 def test_a_time_budget(run: Kpenc, sets: Path) -> None:

@@ -17,6 +17,7 @@ from kpc.encoder.field import Field
 from kpc.encoder.kpenc import to_scene
 from kpc.encoder.train import PlainOptimiser, RaySampler, Report, Trainer
 from kpc.format.errors import TrainingError
+from kpc.format.media import read_image, write_image
 
 CONFIG = TrainConfig(
     resolutions=(12, 24),
@@ -120,6 +121,38 @@ def test_checkpoints_are_written_on_the_way_and_at_the_end(moving: Dataset, tmp_
     again.run(ignore, file)  # nothing is left to do
     assert_same(run, again)
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_what_a_mask_ignores_has_no_influence_and_other_masks_are_another_run(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    make.write_llff(folder, images=5)
+    masks = np.random.default_rng(0).random((5, 24, 32)) < 0.6
+    for k, usable in enumerate(masks):
+        make.write_mask(folder / f"masks/view{k}.png", usable)
+
+    def load() -> Dataset:
+        return load_dataset(folder, tmp_path / "cache", progress=False)
+
+    before = trained(load(), steps=20)
+    for k, usable in enumerate(masks):
+        image = folder / f"images/view{k}.png"
+        write_image(image, np.where(usable[..., None], read_image(image), np.uint8(255 * (k % 2))))
+    changed = load()
+    assert changed.pixels.tiles != before.dataset.pixels.tiles
+    assert_same(before, trained(changed, steps=20))
+
+    first = trainer(changed, steps=20)
+    with pytest.raises(KeyboardInterrupt):
+        first.run(ignore, interrupted=lambda: first.step == 11)
+    first.save(tmp_path / "c.kpck")
+    second = trainer(load(), steps=20)
+    second.resume(tmp_path / "c.kpck")
+    second.run(ignore)
+    assert_same(before, second)
+    make.write_mask(folder / "masks/view3.png", ~masks[3])
+    for dataset in (load(), replace(changed, masks=None)):
+        with pytest.raises(TrainingError, match="other pictures"):
+            trainer(dataset, steps=20).resume(tmp_path / "c.kpck")
 
 
 def test_more_steps_go_on_from_a_checkpoint(moving: Dataset, tmp_path: Path) -> None:

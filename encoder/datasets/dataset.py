@@ -1,7 +1,6 @@
 """A dataset as training sees it: pictures as a struct of arrays, pixels by index, rays made when they are drawn."""
 
 import hashlib
-import json
 import math
 import os
 import sys
@@ -13,7 +12,8 @@ import numpy as np
 
 from kpc.encoder.datasets import blender, colmap, llff, nerfstudio
 from kpc.encoder.datasets.capture import Capture, View
-from kpc.encoder.datasets.pixels import PixelCache, build_cache, open_cache
+from kpc.encoder.datasets.masks import FOLDER, Masks, find_masks, load_masks
+from kpc.encoder.datasets.pixels import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.format.cameras import Camera
 from kpc.format.errors import DatasetError, MediaError
 from kpc.format.media import read_image, read_video
@@ -25,8 +25,6 @@ LAYOUTS = (llff, blender, nerfstudio, colmap)
 
 ASSUMED_FPS = 30.0
 """Of images with times, where the dataset does not tell."""
-
-CACHE_VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -71,6 +69,7 @@ class Dataset:
         layout: "N3DV", "LLFF", "Blender", "nerfstudio" or "COLMAP".
         has_alpha: pixels have four channels, the last a straight alpha; else three.
         camera_names: by the number in `pictures.camera`.
+        masks: which pixels may be used, None where all may.
     """
 
     layout: str
@@ -81,6 +80,7 @@ class Dataset:
     is_dynamic: bool
     has_alpha: bool
     camera_names: tuple[str, ...]
+    masks: Masks | None = None
 
     @property
     def one_view_at_a_time(self) -> bool:
@@ -106,7 +106,31 @@ class Dataset:
                 parts.append("one view at a time")
         else:
             parts.append("static")
-        return ", ".join(parts + (["alpha"] if self.has_alpha else []) + (["distortion"] if p.distortion.any() else []))
+        if self.has_alpha:
+            parts.append("alpha")
+        if p.distortion.any():
+            parts.append("distortion")
+        if self.masks is not None:
+            area = (p.width.astype(np.int64) * p.height).sum()
+            parts.append(f"masks ({1 - self.usable_counts.sum() / area:.1%} ignored)")
+        return ", ".join(parts)
+
+    @property
+    def usable_counts(self) -> np.ndarray:
+        """(P,) int64, how many pixels of each picture may be used."""
+        if self.masks is not None:
+            return self.masks.counts
+        return self.pictures.width.astype(np.int64) * self.pictures.height
+
+    def nth_usable(self, picture: np.ndarray, rank: np.ndarray) -> np.ndarray:
+        """Pixels, counted row by row, that are usable number `rank` of their pictures: both (N,), as the result, int64."""
+        return rank if self.masks is None else self.masks.nth_usable(picture, rank)
+
+    def usable(self, picture: int) -> np.ndarray:
+        """Which pixels of a picture may be used: (height, width) bool."""
+        if self.masks is not None:
+            return self.masks.usable(picture)
+        return np.ones((self.pictures.height[picture], self.pictures.width[picture]), bool)
 
     def camera(self, picture: int) -> Camera:
         """The pinhole camera with a picture's intrinsics and without its distortion."""
@@ -141,16 +165,18 @@ def load_dataset(
         cache_dir: made if need be; holds one pixels-*.bin a dataset and downscale.
         holdout: a file to hold out, "none", or None for what is the layout's custom.
         downscale: every block of downscale^2 pixels is averaged to one; what is left over right and below is cut off.
+            One pixel that is masked out masks its block out.
 
     Raises:
-        DatasetError: the folder is none, is of no known layout, contradicts itself, or the cache's disk is full.
-        MediaError: a video or image cannot be read.
+        DatasetError: the folder is none, is of no known layout, contradicts itself, its masks leave nothing to train on,
+            or the cache's disk is full.
+        MediaError: a video, image or mask cannot be read.
     """
     root = Path(path)
     try:
         capture = _recognise(root, holdout)
         _check(root, capture, downscale)
-        return _load(root, capture, Path(cache_dir), downscale, progress)
+        return _load(root, capture, find_masks(root, capture.views), Path(cache_dir), downscale, progress)
     except PermissionError as error:
         raise DatasetError(f"{error.filename or root}: no permission; chmod it or run as its owner") from error
 
@@ -235,12 +261,16 @@ def _check(root: Path, capture: Capture, downscale: int) -> None:
             )
 
 
-def _load(root: Path, capture: Capture, cache_dir: Path, downscale: int, progress: bool) -> Dataset:
+def _load(
+    root: Path, capture: Capture, mask_files: list[Path | None], cache_dir: Path, downscale: int, progress: bool
+) -> Dataset:
     views, frame_count = capture.views, _common_frames(root, capture.views)
     lengths = [frame_count if view.video else 1 for view in views]
     of_view = np.repeat(np.arange(len(views)), lengths)  # the view of each picture
     frame = np.concatenate([np.arange(n) for n in lengths])
-    cache = _cached_pixels(root, views, frame_count, cache_dir, downscale, progress)
+    place = hashlib.sha256(f"{root.resolve()} {downscale}".encode()).hexdigest()[:12]
+    cache = _cached_pixels(root, views, frame_count, cache_dir / f"pixels-{place}.bin", downscale, progress)
+    masks = load_masks(root, views, mask_files, cache_dir / f"pixels-{place}-masks.bin", downscale, progress)
     times, clip = _times(root, capture, of_view, frame, frame_count)
     intrinsics = np.array([v.intrinsics for v in views])[of_view] / downscale
     distortion = np.array([v.distortion for v in views])[of_view]
@@ -262,7 +292,12 @@ def _load(root: Path, capture: Capture, cache_dir: Path, downscale: int, progres
         far=np.array([v.far for v in views], np.float32)[of_view],
     )
     names = tuple(Path(files[p]).stem for p in first)
-    return Dataset(capture.layout, root, pictures, cache, clip, clip.frame_count > 1, cache.channels == 4, names)
+    if masks is not None and not masks.counts[~pictures.is_test].any():
+        raise DatasetError(
+            f"{root / FOLDER}: 0 stands for ignored, and that is every pixel to train on; invert the masks or move them away"
+        )
+    is_dynamic = clip.frame_count > 1
+    return Dataset(capture.layout, root, pictures, cache, clip, is_dynamic, cache.channels == 4, names, masks)
 
 
 def _common_frames(root: Path, views: tuple[View, ...]) -> int:
@@ -321,15 +356,13 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cached_pixels(
-    root: Path, views: tuple[View, ...], frame_count: int, cache_dir: Path, downscale: int, progress: bool
+    root: Path, views: tuple[View, ...], frame_count: int, file: Path, downscale: int, progress: bool
 ) -> PixelCache:
-    place = hashlib.sha256(f"{root.resolve()} {downscale}".encode()).hexdigest()[:12]
-    file = cache_dir / f"pixels-{place}.bin"
     sources = [
         (view.file.relative_to(root).as_posix(), view.file.stat().st_size, view.file.stat().st_mtime_ns)
         for view in views
     ]
-    fingerprint = hashlib.sha256(json.dumps([CACHE_VERSION, sources, frame_count, downscale]).encode()).hexdigest()
+    fingerprint = fingerprint_of(sources, frame_count, downscale)
     cache = open_cache(file, fingerprint)
     if cache is not None:
         return cache

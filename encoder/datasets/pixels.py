@@ -1,6 +1,7 @@
-"""All pictures of a dataset, decoded once into one flat file that outlasts the run."""
+"""All pictures of a dataset, or their masks, decoded once into one flat file that outlasts the run."""
 
 import errno
+import hashlib
 import json
 import mmap
 import os
@@ -10,12 +11,15 @@ import weakref
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import google_crc32c
 import numpy as np
 
 from kpc.format.cli import written_aside
 from kpc.format.errors import DatasetError
+
+CACHE_VERSION = 2
 
 MAPPED_BYTES = 1 << 30
 """Up to this size the cache is mapped into memory, and may all become resident; a larger one is read pixel by pixel."""
@@ -85,6 +89,11 @@ class PixelCache:
         return all(_crc(self._raw(n)) == self.tiles[n].crc32c for n in range(0, len(self.tiles), every))
 
 
+def fingerprint_of(*what: Any) -> str:
+    """Of what a cache is built from, as far as JSON can hold it, and of how it is built."""
+    return hashlib.sha256(json.dumps([CACHE_VERSION, *what]).encode()).hexdigest()
+
+
 def open_cache(path: Path, fingerprint: str) -> PixelCache | None:
     """The cache at `path`, if it was built from what `fingerprint` stands for and is whole."""
     try:
@@ -101,7 +110,7 @@ def open_cache(path: Path, fingerprint: str) -> PixelCache | None:
 def build_cache(
     path: Path, fingerprint: str, pictures: Iterable[np.ndarray], channels: int, size_bytes: int
 ) -> PixelCache:
-    """Write uint8 (height, width, 3 or 4) pictures to `path`, and what is in it to a JSON beside it.
+    """Write uint8 (height, width, any number of channels) to `path`, and what is in it to a JSON beside it.
 
     Pictures without alpha get an opaque one where `channels` is 4; if all prove opaque, the cache gives 3 channels.
 
@@ -118,17 +127,17 @@ def build_cache(
     if shutil.disk_usage(path.parent).free < size_bytes:
         raise DatasetError(too_small)
     tiles: list[Tile] = []
-    offset, is_opaque = 0, True
+    offset, is_opaque = 0, channels == 4
     try:
         with written_aside(path) as aside, open(aside, "wb", buffering=0) as file:
             for picture in pictures:
                 pixels = _with_channels(picture, channels)
-                is_opaque = is_opaque and (channels == 3 or bool((pixels[..., 3] == 255).all()))
+                is_opaque = is_opaque and bool((pixels[..., 3] == 255).all())
                 _write_all(file.fileno(), pixels.data.cast("B"))
                 height, width = pixels.shape[:2]
                 tiles.append(Tile(offset, width, height, _crc(pixels)))
                 offset += width * height
-        shown = 3 if is_opaque else 4
+        shown = 3 if is_opaque else channels
         about = {
             "fingerprint": fingerprint,
             "stored_channels": channels,
