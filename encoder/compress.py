@@ -9,6 +9,10 @@ from kpc.encoder.field import Field
 from kpc.format.quantise import QuantisedScene, quantise_scene
 from kpc.format.scene import Scene
 
+BISECTIONS = 7
+PROBES = BISECTIONS + 2
+"""Scenes that `compress` renders."""
+
 Steps = list[dict[str, np.ndarray]]
 """One mapping a scale, plane name -> (M,) quantisation steps."""
 
@@ -37,7 +41,7 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
 
 
 def compress(
-    scene: Scene, steps: Steps, psnr: Callable[[Scene], float], max_loss_db: float, *, bisections: int = 7
+    scene: Scene, steps: Steps, psnr: Callable[[Scene], float], max_loss_db: float
 ) -> tuple[QuantisedScene, float]:
     """The coarsest quantisation that costs at most `max_loss_db` of `psnr`, and what it costs.
 
@@ -52,7 +56,7 @@ def compress(
 
     low, high = -12.0, 2.0
     best = attempt(low)
-    for _ in range(bisections):
+    for _ in range(BISECTIONS):
         middle = (low + high) / 2
         candidate, loss = attempt(middle)
         if loss <= max_loss_db and math.isfinite(loss):

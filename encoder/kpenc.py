@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from kpc.encoder.box import find_box, seen_cells
 from kpc.encoder.compress import compress, relative_steps
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.estimate import Estimate, estimate
 from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr
 from kpc.encoder.occupancy import grid_shape
 from kpc.encoder.train import Report, Trainer, box_of_checkpoint
@@ -64,7 +65,9 @@ class Options:
 
     def config(self, dataset: Dataset) -> TrainConfig:
         config = PRESETS[self.preset]
-        if dataset.has_alpha and dataset.one_view_at_a_time:
+        if not dataset.one_view_at_a_time:
+            config = config.for_many_views()
+        elif dataset.has_alpha:
             config = config.for_lone_object()
         return replace(config, seed=self.seed, steps=self.steps or config.steps)
 
@@ -75,7 +78,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    options, as_json = _parse(argv)
+    options, only_plan, as_json = _parse(argv)
+    if only_plan:
+        _print_estimate(dry_run(options), options, as_json)
+        return
     result = encode(options)
     if as_json:
         print(json.dumps(result, indent=1))
@@ -92,6 +98,15 @@ def _command(argv: list[str]) -> None:
     print(f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps)")
 
 
+def _print_estimate(expected: Estimate, options: Options, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(asdict(expected), indent=1))
+        return
+    total = expected.train_s + expected.rest_s
+    print(f"{options.output} would take {total:.0f} s, of which training {expected.train_s:.0f} s, and "
+          f"{expected.memory_bytes / 1e6:.0f} MB of memory; decoded pixels wait in {options.work_dir}")
+
+
 def encode(options: Options) -> dict[str, Any]:
     """Train on a dataset and write the .kpc file; what was measured, as a dictionary that JSON can hold.
 
@@ -100,6 +115,54 @@ def encode(options: Options) -> dict[str, Any]:
         KeyboardInterrupt: stopped by the user; the checkpoint is kept.
     """
     started = time.monotonic()
+    trainer = _trainer(options)
+    dataset, work, checkpoint = trainer.dataset, options.work_dir, options.work_dir / CHECKPOINT
+    try:
+        _train(trainer, checkpoint, options.time_budget_s)
+    except KeyboardInterrupt:
+        trainer.save(checkpoint)
+        if not _wants_partial(trainer, checkpoint):
+            raise
+
+    _say("writing: choosing quantisation steps, rendering held-out views")
+    scene = to_scene(trainer)
+    quantised, probe_loss = quantise(trainer, scene)
+    size = _write(quantised, options.output, work)
+    decoded = file.read(options.output).dequantise()
+    test, before = evaluate(decoded, dataset, most=options.most_tests), evaluate(scene, dataset, most=options.most_tests)
+    if not options.keep:
+        _clear(work)
+    return {
+        "file": str(options.output), "layout": dataset.layout, "dynamic": dataset.is_dynamic, "preset": options.preset,
+        "seed": options.seed, "device": str(trainer.device), "box": trainer.aabb.tolist(),
+        "test_psnr": test and test.psnr, "test_ssim": test and test.ssim, "test_pictures": test.pictures if test else 0,
+        "coding_loss_db": before.psnr - test.psnr if test and before else probe_loss,
+        "size_bytes": size, "parameters": quantised.parameter_count,
+        "bits_per_parameter": 8 * size / quantised.parameter_count,
+        "identity_share": quantised.identity_share if quantised.is_dynamic else None,
+        "steps": trainer.step, "train_s": trainer.elapsed_s, "encode_s": time.monotonic() - started,
+        "rays_per_s": trainer.rays_per_second,
+    }
+
+
+def dry_run(options: Options) -> Estimate:
+    """All that `encode` would do up to the first few hundred steps, what it found said on stderr; nothing is written but
+    decoded pixels, which wait in the work folder for the run itself.
+
+    Raises:
+        As `encode`.
+    """
+    started = time.monotonic()
+    trainer = _trainer(options)
+    tested = int(trainer.dataset.pictures.is_test.sum())
+    return estimate(
+        trainer, PROBE_RAYS, min(tested, options.most_tests or tested), time.monotonic() - started - trainer.elapsed_s,
+        options.time_budget_s,
+    )
+
+
+def _trainer(options: Options) -> Trainer:
+    """The dataset decoded, the box found, the model laid out, an interrupted run taken up: ready for the next step."""
     _check_output(options.output)
     device = _device(options.device)
     work, checkpoint = options.work_dir, options.work_dir / CHECKPOINT
@@ -123,33 +186,7 @@ def encode(options: Options) -> dict[str, Any]:
         trainer.resume(checkpoint)
     if options.resume:
         _say(f"resumed at step {trainer.step}" if trainer.step else f"{checkpoint}: no checkpoint yet; starting afresh")
-
-    try:
-        _train(trainer, checkpoint, options.time_budget_s)
-    except KeyboardInterrupt:
-        trainer.save(checkpoint)
-        if not _wants_partial(trainer, checkpoint):
-            raise
-
-    _say("writing: choosing quantisation steps, rendering held-out views")
-    scene = to_scene(trainer)
-    quantised, probe_loss = quantise(trainer, scene)
-    size = _write(quantised, options.output, work)
-    decoded = file.read(options.output).dequantise()
-    test, before = evaluate(decoded, dataset, most=options.most_tests), evaluate(scene, dataset, most=options.most_tests)
-    if not options.keep:
-        _clear(work)
-    return {
-        "file": str(options.output), "layout": dataset.layout, "dynamic": dataset.is_dynamic, "preset": options.preset,
-        "seed": options.seed, "device": device, "box": trainer.aabb.tolist(),
-        "test_psnr": test and test.psnr, "test_ssim": test and test.ssim, "test_pictures": test.pictures if test else 0,
-        "coding_loss_db": before.psnr - test.psnr if test and before else probe_loss,
-        "size_bytes": size, "parameters": quantised.parameter_count,
-        "bits_per_parameter": 8 * size / quantised.parameter_count,
-        "identity_share": quantised.identity_share if quantised.is_dynamic else None,
-        "steps": trainer.step, "train_s": trainer.elapsed_s, "encode_s": time.monotonic() - started,
-        "rays_per_s": trainer.rays_per_second,
-    }
+    return trainer
 
 
 def to_scene(trainer: Trainer) -> Scene:
@@ -303,7 +340,7 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _parse(argv: list[str]) -> tuple[Options, bool]:
+def _parse(argv: list[str]) -> tuple[Options, bool, bool]:
     parser = argparse.ArgumentParser("kpenc", description=__doc__.split(": ", 1)[1])
     parser.add_argument("source", type=Path, help="folder: videos or images, and poses_bounds.npy, transforms*.json or sparse/0")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .kpc file to write")
@@ -320,11 +357,15 @@ def _parse(argv: list[str]) -> tuple[Options, bool]:
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
     parser.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
+    parser.add_argument("--dry-run", action="store_true",
+                        help="only say what would be done, how long it would take and how much memory")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     a = parser.parse_args(_box_joined(argv))
     options = Options(a.source, a.output, a.preset, a.steps, a.time_budget, a.seed, a.device, a.downscale, a.holdout, a.box,
                       a.work, a.keep, a.resume, a.test_views)
-    return options, a.json
+    if a.dry_run and a.resume:
+        parser.error("--dry-run tells what a whole run takes; drop --resume")
+    return options, a.dry_run, a.json
 
 
 def _positive(text: str) -> int:

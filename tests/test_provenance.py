@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import kpc
+from kpc.format.memory import peak_memory_bytes
 from kpc.tools import provenance
 
 
@@ -65,4 +66,4 @@ def test_machine_and_versions_say_something() -> None:
     machine = provenance.machine()
     assert machine["cpu"] and machine["os"] and machine["cores"] >= 1 and machine["memory_bytes"] > 1 << 28
     assert {"kpc", "numpy", "moderngl"} <= set(provenance.versions())
-    assert 1 << 20 < provenance.peak_memory_bytes() < machine["memory_bytes"]
+    assert 1 << 20 < peak_memory_bytes() < machine["memory_bytes"]

@@ -37,5 +37,6 @@ def test_a_lone_object_seen_once_gets_a_model_of_its_own(moving: Dataset, tmp_pa
     surrounded = options.config(replace(moving, has_alpha=False))
     assert surrounded == replace(plain, steps=7, seed=3)
     twice = replace(moving.pictures, time=np.zeros(len(moving.pictures), np.float32))
-    assert options.config(replace(moving, pictures=twice)).view_dependent
+    many = options.config(replace(moving, pictures=twice))
+    assert many.view_dependent and many.frames_per_row == 1.0 < plain.frames_per_row
     assert replace(options, steps=None).config(moving).steps == 2 * plain.steps

@@ -31,8 +31,9 @@ import numpy as np
 import kpc
 from kpc.format import cli
 from kpc.format.errors import KpcError, UsageError
+from kpc.format.memory import peak_memory_bytes
 from kpc.tools import results
-from kpc.tools.provenance import commit, data_hash, machine, peak_memory_bytes, versions
+from kpc.tools.provenance import commit, data_hash, machine, versions
 
 T = TypeVar("T")
 
