@@ -251,22 +251,24 @@ def render_reference(
     return rgb, distortion, weights[index][reached], cell[index][reached]
 
 
-def priors(field: Field, config: TrainConfig) -> Tensor:
-    """The weighted priors of the planes, in plain PyTorch: the reference of the `add_*` kernels.
+def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
+    """The weighted priors of the planes by the name of their weight, in plain PyTorch: the reference of the `add_*` kernels.
 
     space_variation * mean of squared neighbour differences, on space planes; on space-time planes
-    transient_variation * the same along space alone + time_smoothness * mean (P[t-1] - 2 P[t] + P[t+1])^2
-    + sparse_transients * mean |1 - P|; each summed over the planes it concerns.
+    transient_variation * the same along space alone, time_smoothness * mean (P[t-1] - 2 P[t] + P[t+1])^2, and
+    sparse_transients * mean |1 - P|; each summed over the planes it concerns.
     """
-    total = field.theta.new_zeros(())
+    names = ("space_variation", "transient_variation", "time_smoothness", "sparse_transients")
+    total = {name: field.theta.new_zeros(()) for name in names}
     for s, name, _, rows, columns in field.layout.planes():
         p = field.plane(s, name)
         along_rows = (p[:, 1:] - p[:, :-1]).square().sum() / p.numel()
         if name in SPACE_PLANES:
             across_rows = (p[1:] - p[:-1]).square().sum() / p.numel()
-            total = total + config.space_variation * (along_rows + across_rows)
+            total["space_variation"] = total["space_variation"] + along_rows + across_rows
         if name in TIME_PLANES:
-            total = total + config.transient_variation * along_rows
-            total = total + config.time_smoothness * (p[:-2] - 2 * p[1:-1] + p[2:]).square().sum() / p.numel()
-            total = total + config.sparse_transients * (1 - p).abs().mean()
-    return total
+            second_difference = (p[:-2] - 2 * p[1:-1] + p[2:]).square().sum() / p.numel()
+            total["transient_variation"] = total["transient_variation"] + along_rows
+            total["time_smoothness"] = total["time_smoothness"] + second_difference
+            total["sparse_transients"] = total["sparse_transients"] + (1 - p).abs().mean()
+    return {name: getattr(config, name) * value for name, value in total.items()}

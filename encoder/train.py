@@ -100,7 +100,7 @@ class Trainer:
                 self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1), self.extent,
             )
             if not math.isfinite(squared_error):
-                raise TrainingError(f"step {self.step}: the colour loss is not finite; try another --seed or --preset")
+                raise TrainingError(f"step {self.step}: {self._not_finite()}; try another --seed or --preset")
             self.samples_per_ray += 0.1 * (samples - self.samples_per_ray)
             self.step += 1
             error, drawn = error + squared_error * count, drawn + count
@@ -128,6 +128,15 @@ class Trainer:
         if time_budget_s is not None:
             return self.elapsed_s / time_budget_s
         return self.step / self.config.steps
+
+    def _not_finite(self) -> str:
+        """Which terms of the loss hold NaN or infinity, the colours being one of them, and which parameters they come from."""
+        terms = ["colour"] + [name for name, value in priors(self.field, self.config).items() if not torch.isfinite(value)]
+        planes = [f"{name} at scale {s}" for s, name, *_ in self.field.layout.planes()
+                  if not torch.isfinite(self.field.plane(s, name)).all()]
+        decoder = [name for name, value in self.field.named_parameters() if name != "theta" and not torch.isfinite(value).all()]
+        found = ", ".join((planes + decoder)[:6])
+        return f"the loss is not finite ({', '.join(terms)})" + (f", nor are all values of {found}" if found else "")
 
     def density_at(self, points: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Log densities at (N, 3) points in [0, 1]^3 and (N,) times."""
@@ -316,7 +325,7 @@ class PlainOptimiser:
         error = (rgb - targets.to(device)).square().mean()
         loss = error + config.distortion * distortion
         if number % config.regularise_every == 0:
-            loss = loss + config.regularise_every * priors(self.field, config)
+            loss = loss + config.regularise_every * torch.stack(list(priors(self.field, config).values())).sum()
         for optimiser, peak in ((self.planes, config.learning_rate), (self.decoder, config.decoder_learning_rate)):
             optimiser.zero_grad()
             for group in optimiser.param_groups:

@@ -128,7 +128,7 @@ def test_learning_from_planes_exactly_at_identity() -> None:
     field = Field.from_scene(scene)
     prior = np.zeros(field.layout.size, np.float32)
     add_priors(field, field.theta.detach().numpy(), prior, TrainConfig(), 1.0)
-    priors(field, TrainConfig()).backward()
+    sum(priors(field, TrainConfig()).values()).backward()
     for _, name, start, rows, columns in field.layout.planes():
         part = slice(start, start + rows * columns * field.layout.channels)
         if "t" in name:

@@ -171,17 +171,22 @@ def test_log_densities_are_clipped() -> None:
         assert (log_densities(field, np.full((3, 3), 0.5), np.zeros(3)) == limit).all()
 
 
+WEIGHTS = dict(space_variation=0.3, transient_variation=0.4, time_smoothness=0.7, sparse_transients=0.2)
+
+
+@pytest.mark.parametrize("alone", [None, *WEIGHTS])
 @pytest.mark.parametrize("dynamic", [True, False])
-def test_priors_are_the_gradient_of_their_twin(dynamic: bool) -> None:
+def test_priors_are_the_gradient_of_their_twin(dynamic: bool, alone: str | None) -> None:
+    """All of them together, and each on its own."""
     field = Field.from_scene(tiny_scene(dynamic=dynamic))
     with torch.no_grad():
         field.theta += 0.1 * torch.randn(field.layout.size, generator=torch.Generator().manual_seed(0))
         field.theta[-50:] = 1.0  # the kink of |1 - P|, where the gradient is 0 by agreement
-    config = TrainConfig(space_variation=0.3, transient_variation=0.4, time_smoothness=0.7, sparse_transients=0.2)
+    config = TrainConfig(**{name: weight if alone in (None, name) else 0.0 for name, weight in WEIGHTS.items()})
     grad = np.ones(field.layout.size, np.float32)
     add_priors(field, field.theta.detach().numpy(), grad, config, 4.0)
     field = field.double()
-    (4 * priors(field, config)).backward()
+    (4 * sum(priors(field, config).values())).backward()
     expected = field.theta.grad.numpy()
     # `grad` held 1 before: what is added is rounded to 2^-24 of that, a few times.
     np.testing.assert_allclose(grad - 1, expected, atol=8 * 2.0**-24 + 1e-6 * np.abs(expected).max())

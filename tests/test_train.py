@@ -247,6 +247,16 @@ def test_a_loss_that_is_not_finite_stops_the_run(moving: Dataset, tmp_path: Path
     assert not any(tmp_path.iterdir())
 
 
+def test_what_is_not_finite_is_named(moving: Dataset) -> None:
+    run = trainer(moving)
+    run.field.plane(1, "xt").data[0] = float("inf")
+    with pytest.raises(TrainingError) as caught:
+        run.run(ignore)
+    message = str(caught.value)
+    assert all(term in message for term in ("colour", "time_smoothness", "sparse_transients", "xt at scale 1"))
+    assert "space_variation" not in message and "xy" not in message and "\n" not in message
+
+
 def test_pytorch_does_not_compete_with_the_kernels_for_the_cores(moving: Dataset) -> None:
     torch.set_num_threads(2)
     trained(moving, steps=1)
