@@ -208,12 +208,13 @@ class Rays:
 
 
 def render_reference(
-    field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float
+    field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, kept: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Colours of a batch of rays, in plain PyTorch: the reference of `kernels.backpropagate`.
 
     Sample k of a ray lies at near + (k + jitter) * step and counts where the occupancy grid (slots, Nz, Ny, Nx) is set;
-    alpha = 1 - exp(-sigma step / extent); a ray ends once its transmittance falls below TERMINATION.
+    alpha = 1 - exp(-sigma step / extent); a ray ends once its transmittance falls below TERMINATION. `kept` (F,), where
+    given, multiplies the features.
 
     Returns:
         Colours (N, 3); the mean over rays of the distortion D that `kernels.backpropagate` states; of the n samples taken
@@ -237,6 +238,8 @@ def render_reference(
     ray, _ = index = taken.nonzero(as_tuple=True)
 
     features = field.features(u[index], rays.times[ray])
+    if kept is not None:
+        features = features * kept
     tau = torch.zeros_like(t).index_put(index, field.log_density(features).exp() * (step / extent))
     trans = torch.exp(-torch.cumsum(torch.nn.functional.pad(tau, (1, 0)), dim=1))
     weights = torch.where(trans[:, :-1] >= TERMINATION, trans[:, :-1] * (1 - torch.exp(-tau)), 0)

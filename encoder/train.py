@@ -93,7 +93,8 @@ class Trainer:
             if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
                 self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
             count = int(np.clip(config.samples / max(self.samples_per_ray, 1e-3), 256, config.rays))
-            batch, targets = self.sampler.draw(self.rng, count, None if self.dataset.has_alpha else self.background)
+            background = None if self.dataset.has_alpha else self.background
+            batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays)
             rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
             squared_error, samples = self.optimiser.step(
                 self.step, rate, batch, targets, self.aabb, self.grid.occupied[None],
@@ -201,23 +202,46 @@ class Trainer:
 
 
 class RaySampler:
-    """Draws usable pixels of the training pictures, each as likely as any other, and makes their rays."""
+    """Draws usable pixels of the training pictures, each as likely as any other, and makes their rays.
+
+    Attributes:
+        frames: (P, 4) int64, columns from and to, rows from and to, of what is not transparent in each training picture;
+            None without alpha, and with masks, which need not agree with it.
+    """
+
+    MARGIN = 0.03
+    """Of a picture's longer side, about what is not transparent: the outline wants to be learnt from both sides."""
 
     def __init__(self, dataset: Dataset) -> None:
         self.dataset = dataset
         self.train = np.flatnonzero(~dataset.pictures.is_test)
         self.ends = np.cumsum(dataset.usable_counts[self.train])
+        self.frames: np.ndarray | None = None
+        if dataset.has_alpha and dataset.masks is None:
+            self.frames = np.array([self._frame(dataset.pixels.picture(int(p))[..., 3]) for p in self.train], np.int64)
+            sizes = (self.frames[:, 1] - self.frames[:, 0]) * (self.frames[:, 3] - self.frames[:, 2])
+            self.frame_ends = np.cumsum(sizes)
 
     def draw(
-        self, rng: np.random.Generator, count: int, background: np.ndarray | None = None
+        self, rng: np.random.Generator, count: int, background: np.ndarray | None = None, object_rays: float = 0.0
     ) -> tuple[Rays, torch.Tensor]:
-        """`count` rays and the (count, 3) colours they should have, over one background or one drawn for each ray."""
+        """`count` rays and the (count, 3) colours they should have, over one background or one drawn for each ray.
+
+        `object_rays` is the share of them that is drawn from `frames`, where there are any.
+        """
         pictures = self.dataset.pictures
-        pixel = rng.integers(self.ends[-1], size=count)
-        which = np.searchsorted(self.ends, pixel, side="right")
+        within = 0 if self.frames is None or not self.frame_ends[-1] else round(object_rays * count)
+        which, rank = _pick(rng, self.ends, count - within)
         picture = self.train[which]
-        inside = self.dataset.nth_usable(picture, pixel - np.where(which > 0, self.ends[which - 1], 0))
+        inside = self.dataset.nth_usable(picture, rank)
         row, column = np.divmod(inside, pictures.width[picture])
+        if within:
+            which, rank = _pick(rng, self.frame_ends, within)
+            left, right, top, _ = self.frames[which].T
+            below, beside = np.divmod(rank, right - left)
+            picture = np.concatenate([self.train[which], picture])
+            row, column = np.concatenate([top + below, row]), np.concatenate([left + beside, column])
+            inside = row * pictures.width[picture] + column
         origins, directions = rays(pictures, picture, column, row)
         colours = self.dataset.pixels.read(pictures.offset[picture] + inside).astype(np.float32) / np.float32(255)
         if background is None:
@@ -230,6 +254,34 @@ class RaySampler:
         jitters = rng.random(count, dtype=np.float32)
         arrays = (origins, directions, pictures.time[picture], jitters, backgrounds)
         return Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays)), torch.from_numpy(targets)
+
+
+    def _frame(self, alpha: np.ndarray) -> tuple[int, int, int, int]:
+        rows, columns = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))
+        if not len(rows):
+            return 0, 0, 0, 0
+        (height, width), margin = alpha.shape, math.ceil(self.MARGIN * max(alpha.shape))
+        return (max(columns[0] - margin, 0), min(columns[-1] + 1 + margin, width),
+                max(rows[0] - margin, 0), min(rows[-1] + 1 + margin, height))
+
+
+def _pick(rng: np.random.Generator, ends: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """`count` of the ends[-1] pixels of several ranges laid end to end: which range each is in, and its number there."""
+    pixel = rng.integers(ends[-1], size=count)
+    which = np.searchsorted(ends, pixel, side="right")
+    return which, pixel - np.where(which > 0, ends[which - 1], 0)
+
+
+def kept_channels(field: Field, config: TrainConfig, step: int) -> torch.Tensor:
+    """Factors on the features for one step, (F,) float32: 0 where `channel_dropout` leaves a channel out, at all scales alike.
+
+    The others carry its weight: the mean over steps is 1.
+    """
+    M = field.layout.channels
+    dropped = min(round(config.channel_dropout * M), M - 1)
+    factors = np.full(M, M / (M - dropped), np.float32)
+    factors[np.random.default_rng((config.seed, step)).permutation(M)[:dropped]] = 0
+    return torch.from_numpy(np.tile(factors, len(field.layout.resolution))).to(field.theta.device)
 
 
 class FusedOptimiser:
@@ -257,11 +309,13 @@ class FusedOptimiser:
     ) -> tuple[float, float]:
         """Mean squared error a colour channel, and samples a ray."""
         layout, config = self.field.layout, self.config
-        basis = self.field.basis(batch.directions)
+        kept = kept_channels(self.field, config, number)
+        basis = self.field.basis(batch.directions) * kept
+        density = torch.cat([self.field.density.detach()[:-1] * kept, self.field.density.detach()[-1:]])
         grad_basis = np.empty(basis.shape, np.float32)
         grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
         errors, counts = kernels.backpropagate(
-            self.theta, self.grad, layout.table, layout.resolution, self.field.density.detach().numpy(), grad_density,
+            self.theta, self.grad, layout.table, layout.resolution, density.numpy(), grad_density,
             (0,) * layout.channels, aabb, occupancy.view(np.uint8), np.float32(step_length), np.float32(extent),
             batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(), batch.jitters.numpy(),
             basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(), self._peaks,
@@ -272,6 +326,7 @@ class FusedOptimiser:
         self.decoder.zero_grad()
         basis.backward(torch.from_numpy(grad_basis))
         self.field.density.grad = torch.from_numpy(grad_density.sum(0))
+        self.field.density.grad[:-1] *= kept
         for group in self.decoder.param_groups:
             group["lr"] = config.decoder_learning_rate * rate
         self.decoder.step()
@@ -317,7 +372,8 @@ class PlainOptimiser:
         batch = Rays(*(value.to(device) for value in vars(batch).values()))
         occupancy_there = torch.from_numpy(occupancy).to(device)
         rgb, distortion, weights, cells = render_reference(
-            self.field, batch, torch.from_numpy(aabb).to(device), occupancy_there, step_length
+            self.field, batch, torch.from_numpy(aabb).to(device), occupancy_there, step_length,
+            kept_channels(self.field, config, number),
         )
         _, ny, nx = self._peaks.shape
         flat = (cells[:, 0] * ny + cells[:, 1]) * nx + cells[:, 2]

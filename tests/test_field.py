@@ -119,7 +119,11 @@ def test_features_multiply_planes_and_concatenate_scales() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"channels": 0}, {"steps": 0}, {"rays": -1}, {"resolutions": ()}, {"resolutions": (64, 1)}]
+    "change",
+    [
+        {"channels": 0}, {"steps": 0}, {"rays": -1}, {"resolutions": ()}, {"resolutions": (64, 1)}, {"object_rays": 1.0},
+        {"channel_dropout": -0.1}, {"channel_dropout": 1.0},
+    ],
 )
 def test_a_config_that_makes_no_sense_is_refused(change: dict[str, object]) -> None:
     with pytest.raises(UsageError, match=next(iter(change))):

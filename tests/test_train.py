@@ -13,9 +13,9 @@ import torch
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluate import evaluate, psnr
-from kpc.encoder.field import Field
+from kpc.encoder.field import Field, Rays
 from kpc.encoder.kpenc import to_scene
-from kpc.encoder.train import PlainOptimiser, RaySampler, Report, Trainer
+from kpc.encoder.train import PlainOptimiser, RaySampler, Report, Trainer, kept_channels
 from kpc.format.errors import TrainingError
 from kpc.format.media import read_image, write_image
 
@@ -92,12 +92,12 @@ def test_a_seed_repeats_bitwise(moving: Dataset) -> None:
 
 @pytest.mark.parametrize("stop_at", [5, 21])  # before the occupancy grid forms, and between two updates of it
 def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(moving: Dataset, tmp_path: Path, stop_at: int) -> None:
-    whole = trained(moving, steps=40)
-    first = trainer(moving, steps=40)
+    whole = trained(moving, steps=40, channel_dropout=0.25)
+    first = trainer(moving, steps=40, channel_dropout=0.25)
     with pytest.raises(KeyboardInterrupt):
         first.run(ignore, interrupted=lambda: first.step == stop_at)
     first.save(tmp_path / "checkpoint.kpck")
-    second = trainer(moving, steps=40)
+    second = trainer(moving, steps=40, channel_dropout=0.25)
     second.resume(tmp_path / "checkpoint.kpck")
     assert_same(first, second)
     second.run(ignore)
@@ -278,9 +278,10 @@ def test_reports_come_twice_a_second(moving: Dataset) -> None:
     assert 0.5 < last.fraction < 1.5 and 0 < last.psnr < 60 and last.rays_per_second > 0 and 0 <= last.occupied <= 1
 
 
-def test_drawn_rays_are_those_of_training_pixels(moving: Dataset) -> None:
+@pytest.mark.parametrize("object_rays", [0.0, 0.5])
+def test_drawn_rays_are_those_of_training_pixels(moving: Dataset, object_rays: float) -> None:
     sampler = RaySampler(moving)
-    batch, targets = sampler.draw(np.random.default_rng(0), 2000, np.ones(3, np.float32))
+    batch, targets = sampler.draw(np.random.default_rng(0), 2000, np.ones(3, np.float32), object_rays)
     assert (batch.backgrounds == 1).all() and 0 <= float(batch.jitters.min()) and float(batch.jitters.max()) < 1
     torch.testing.assert_close(batch.directions.norm(dim=1), torch.ones(2000), atol=1e-6, rtol=0)
     shown = set()
@@ -298,6 +299,68 @@ def test_drawn_rays_are_those_of_training_pixels(moving: Dataset) -> None:
     assert len(shown) == 2000
 
 
+def test_frames_hold_what_is_not_transparent(moving: Dataset) -> None:
+    sampler = RaySampler(moving)
+    train = np.flatnonzero(~moving.pictures.is_test)
+    assert sampler.frames is not None and len(sampler.frames) == len(train)
+    for number, (left, right, top, bottom) in zip(train, sampler.frames):
+        alpha = moving.pixels.picture(int(number))[..., 3]
+        outside = alpha.copy()
+        outside[top:bottom, left:right] = 0
+        assert alpha.any() and not outside.any()
+        assert (bottom - top) * (right - left) < alpha.size
+    whole, _ = sampler.draw(np.random.default_rng(0), 4000, np.ones(3, np.float32))
+    half, _ = sampler.draw(np.random.default_rng(0), 4000, np.ones(3, np.float32), 0.5)
+    assert len(half.times) == 4000
+    # Half of them, and of the others as many as of all before.
+    share = float(sampler.frame_ends[-1] / sampler.ends[-1])
+    assert within_frames(moving, sampler, whole) == pytest.approx(share, abs=0.04)
+    assert within_frames(moving, sampler, half) == pytest.approx(0.5 + 0.5 * share, abs=0.04)
+
+
+def within_frames(dataset: Dataset, sampler: RaySampler, batch: Rays) -> float:
+    """Share of the rays that pass through `sampler.frames`."""
+    count = 0
+    assert sampler.frames is not None
+    for number, (left, right, top, bottom) in zip(sampler.train, sampler.frames):
+        camera = dataset.camera(int(number))
+        local = batch.directions.numpy() @ camera.camera_to_world[:3, :3]
+        i = camera.cx - camera.fl_x * local[:, 0] / local[:, 2]
+        j = camera.cy + camera.fl_y * local[:, 1] / local[:, 2]
+        mine = np.abs(batch.origins.numpy() - camera.camera_to_world[:3, 3]).max(1) < 1e-5
+        count += int((mine & (i > left) & (i < right) & (j > top) & (j < bottom)).sum())
+    return count / len(batch.times)
+
+
+def test_transparent_pictures_have_no_frame(moving: Dataset) -> None:
+    class Clear:
+        def picture(self, number: int) -> np.ndarray:
+            return 0 * moving.pixels.picture(number)
+
+        read = moving.pixels.read
+
+    sampler = RaySampler(replace(moving, pixels=Clear()))  # type: ignore[arg-type]
+    batch, _ = sampler.draw(np.random.default_rng(0), 100, None, 0.5)
+    assert len(batch.times) == 100
+
+
+def test_dropped_channels_take_no_part(moving: Dataset) -> None:
+    """Every scale leaves out the same ones, each step others, and the mean over steps is 1."""
+    run = trainer(moving, channel_dropout=0.25)
+    kept = torch.stack([kept_channels(run.field, run.config, step) for step in range(400)])
+    M = run.field.layout.channels
+    assert kept.shape == (400, 2 * M) and torch.equal(kept[:, :M], kept[:, M:])
+    assert ((kept == 0).sum(1) == 2 * M // 4).all() and len(torch.unique(kept, dim=0)) > 10
+    torch.testing.assert_close(kept.mean(0), torch.ones(2 * M), atol=0.15, rtol=0)
+    assert torch.equal(kept_channels(run.field, CONFIG, 3), torch.ones(2 * M))
+    before = run.field.theta.detach().clone()
+    batch, targets = run.sampler.draw(run.rng, 256)
+    run.optimiser.field, run.optimiser.config = run.field, replace(run.config, regularise_every=1000)
+    run.optimiser.step(1, 1.0, batch, targets, run.aabb, run.grid.occupied[None], run.step_length, run.extent)
+    moved = (run.field.theta != before).view(-1, M).any(0)
+    assert torch.equal(moved, kept[1, :M] != 0)
+
+
 def test_random_backgrounds_are_what_shines_through(moving: Dataset) -> None:
     batch, targets = RaySampler(moving).draw(np.random.default_rng(0), 500)
     assert len(torch.unique(batch.backgrounds)) > 1000
@@ -311,9 +374,10 @@ def plain_twin(fused: Trainer) -> PlainOptimiser:
     return PlainOptimiser(field, fused.config, fused.grid.seen.shape)  # type: ignore[arg-type]
 
 
-def test_plain_pytorch_takes_the_same_steps(moving: Dataset) -> None:
+@pytest.mark.parametrize("channel_dropout", [0.0, 0.5])
+def test_plain_pytorch_takes_the_same_steps(moving: Dataset, channel_dropout: float) -> None:
     """Adam moves by the sign of a gradient at first; where that is all rounding, either way."""
-    run = trainer(moving)
+    run = trainer(moving, channel_dropout=channel_dropout)
     plain = plain_twin(run)
     for number in range(3):
         batch, targets = run.sampler.draw(run.rng, 256)
