@@ -9,6 +9,8 @@ from kpc.encoder.field import Field
 from kpc.format.quantise import QuantisedScene, quantise_scene
 from kpc.format.scene import Scene
 
+FINEST, COARSEST = -12.0, 2.0
+"""Base-two logarithms of the factors on all steps, between which one is sought."""
 BISECTIONS = 7
 PROBES = BISECTIONS + 2
 """Scenes that `compress` renders."""
@@ -45,8 +47,8 @@ def compress(
 ) -> tuple[QuantisedScene, float]:
     """The coarsest quantisation that costs at most `max_loss_db` of `psnr`, and what it costs.
 
-    Bisects the common factor of the steps on a logarithmic scale from 2^-12 to 2^2; the finest is taken where even that
-    costs more.
+    Bisects the common factor of the steps on a logarithmic scale from FINEST to COARSEST; the finest is taken where even
+    that costs more.
     """
     reference = psnr(scene)
 
@@ -54,7 +56,7 @@ def compress(
         candidate = quantise_scene(scene, scaled(steps, 2.0**exponent))
         return candidate, reference - psnr(candidate.dequantise())
 
-    low, high = -12.0, 2.0
+    low, high = FINEST, COARSEST
     best = attempt(low)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
@@ -63,4 +65,27 @@ def compress(
             low, best = middle, (candidate, loss)
         else:
             high = middle
+    return best
+
+
+def compress_to_size(
+    scene: Scene, steps: Steps, target_bytes: int, size: Callable[[QuantisedScene], int]
+) -> QuantisedScene:
+    """The finest quantisation of at most `target_bytes` as `size` counts them; the coarsest where even that takes more.
+
+    Bisects as `compress` does.
+    """
+
+    def attempt(exponent: float) -> QuantisedScene:
+        return quantise_scene(scene, scaled(steps, 2.0**exponent))
+
+    low, high = FINEST, COARSEST
+    best = attempt(high)
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        candidate = attempt(middle)
+        if size(candidate) <= target_bytes:
+            high, best = middle, candidate
+        else:
+            low = middle
     return best

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import json
+import math
 import os
 import signal
 import sys
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 
 from kpc.encoder.box import find_box, seen_cells
-from kpc.encoder.compress import compress, relative_steps
+from kpc.encoder.compress import compress, compress_to_size, relative_steps
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.estimate import Estimate, estimate
@@ -58,6 +59,8 @@ class Options:
     keep: bool = False
     resume: bool = False
     most_tests: int | None = None
+    max_loss_db: float | None = None
+    target_bytes: int | None = None
 
     @property
     def work_dir(self) -> Path:
@@ -69,7 +72,8 @@ class Options:
             config = config.for_many_views()
         elif dataset.has_alpha:
             config = config.for_lone_object()
-        return replace(config, seed=self.seed, steps=self.steps or config.steps)
+        most = config.max_coding_loss_db if self.max_loss_db is None else self.max_loss_db
+        return replace(config, seed=self.seed, steps=self.steps or config.steps, max_coding_loss_db=most)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -126,7 +130,7 @@ def encode(options: Options) -> dict[str, Any]:
 
     _say("writing: choosing quantisation steps, rendering held-out views")
     scene = to_scene(trainer)
-    quantised, probe_loss = quantise(trainer, scene)
+    quantised, probe_loss = quantise(trainer, scene, options.target_bytes)
     size = _write(quantised, options.output, work)
     decoded = file.read(options.output).dequantise()
     test, before = evaluate(decoded, dataset, most=options.most_tests), evaluate(scene, dataset, most=options.most_tests)
@@ -198,15 +202,27 @@ def to_scene(trainer: Trainer) -> Scene:
     return replace(scene, cameras=tuple(dataset.camera(p) for p in _spread_of_cameras(dataset)))
 
 
-def quantise(trainer: Trainer, scene: Scene) -> tuple[QuantisedScene, float]:
-    """Symbols as coarse as `max_coding_loss_db` on training rays allows, and that loss in dB."""
+def quantise(trainer: Trainer, scene: Scene, target_bytes: int | None = None) -> tuple[QuantisedScene, float]:
+    """Symbols as coarse as `max_coding_loss_db` on training rays allows, or as fine as a file of `target_bytes` can hold;
+    and that loss in dB.
+
+    Raises:
+        TrainingError: no file of this model is so small.
+    """
     batch, targets = trainer.sampler.draw(np.random.default_rng(1), PROBE_RAYS, scene.background)
-    origins, directions, times = (a.numpy() for a in (batch.origins, batch.directions, batch.times))
+    rays = [a.numpy() for a in (batch.origins, batch.directions, batch.times)]
+
+    def fidelity(candidate: Scene) -> float:
+        return psnr(SceneRenderer(candidate).rgb(*rays), targets.numpy())
+
     steps = relative_steps(trainer.field, trainer.optimiser.curvature())
-    return compress(
-        scene, steps, lambda s: psnr(SceneRenderer(s).rgb(origins, directions, times), targets.numpy()),
-        trainer.config.max_coding_loss_db,
-    )
+    if target_bytes is None:
+        return compress(scene, steps, fidelity, trainer.config.max_coding_loss_db)
+    quantised = compress_to_size(scene, steps, target_bytes, lambda candidate: len(file.encode(candidate)))
+    if (least := len(file.encode(quantised))) > target_bytes:
+        raise TrainingError(f"{least:,} bytes is the least that this model takes, not {target_bytes:,}; give another "
+                            "--target-size with --resume, or train anew with a smaller --preset")
+    return quantised, fidelity(scene) - fidelity(quantised.dequantise())
 
 
 def _trimmed(dataset: Dataset, config: TrainConfig, aabb: np.ndarray, time_budget_s: float | None) -> tuple[np.ndarray, float]:
@@ -357,12 +373,16 @@ def _parse(argv: list[str]) -> tuple[Options, bool, bool]:
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
     parser.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
+    trade = parser.add_mutually_exclusive_group()
+    trade.add_argument("--max-loss", type=decibels, metavar="0.1dB",
+                       help="PSNR that coding may cost on training views (default: 0.15dB)")
+    trade.add_argument("--target-size", type=byte_count, metavar="2MB", help="the best file of at most this size instead")
     parser.add_argument("--dry-run", action="store_true",
                         help="only say what would be done, how long it would take and how much memory")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     a = parser.parse_args(_box_joined(argv))
     options = Options(a.source, a.output, a.preset, a.steps, a.time_budget, a.seed, a.device, a.downscale, a.holdout, a.box,
-                      a.work, a.keep, a.resume, a.test_views)
+                      a.work, a.keep, a.resume, a.test_views, a.max_loss, a.target_size)
     if a.dry_run and a.resume:
         parser.error("--dry-run tells what a whole run takes; drop --resume")
     return options, a.dry_run, a.json
@@ -403,6 +423,30 @@ def duration_s(text: str) -> float:
     if not 0 < value < 1e9:
         raise argparse.ArgumentTypeError(f"{text!r} is no duration; write 90s, 10m or 1.5h")
     return value
+
+
+def decibels(text: str) -> float:
+    """The number of "0.1" or "0.1dB"."""
+    try:
+        value = float(text.lower().removesuffix("db"))
+    except ValueError:
+        value = math.nan
+    if not 0 < value < 100:
+        raise argparse.ArgumentTypeError(f"{text!r} is no loss; write 0.1dB")
+    return value
+
+
+def byte_count(text: str) -> int:
+    """Bytes of "300000", "300KB" or "2MB", of 1000 and 1000,000 bytes."""
+    number = text.upper().removesuffix("B")
+    unit = {"K": 10**3, "M": 10**6}.get(number[-1:], 1)
+    try:
+        value = float(number[:-1] if unit > 1 else number) * unit
+    except ValueError:
+        value = math.nan
+    if not 1 <= value < 1e12:
+        raise argparse.ArgumentTypeError(f"{text!r} is no size; write 300KB or 2MB")
+    return int(value)
 
 
 def box_corners(text: str) -> tuple[float, ...]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import tiny_scene
 
-from kpc.encoder.compress import compress, relative_steps, scaled
+from kpc.encoder.compress import compress, compress_to_size, relative_steps, scaled
 from kpc.encoder.field import Field
 from kpc.format import file
 from kpc.format.quantise import QuantisedScene
@@ -56,6 +56,20 @@ def test_where_nothing_is_good_enough_the_finest_is_taken() -> None:
     assert -1.0 < loss < 0.1
     fine, _ = compress(SCENE, EQUAL, fidelity, 0.02)
     assert size(finest) >= size(fine)
+
+
+def test_a_target_is_met_from_below_and_nearly() -> None:
+    """Steps 2^0.11 apart, the last of seven bisections, change the size by some tenths of a bit a symbol at most."""
+    largest, smallest = (size(compress(SCENE, EQUAL, fidelity, most)[0]) for most in (-1.0, 1e9))
+    for share in (0.1, 0.5, 0.9):
+        target = int(smallest + share * (largest - smallest))
+        found = size(compress_to_size(SCENE, EQUAL, target, size))
+        assert 0.85 * target < found <= target, (share, target, found)
+
+
+def test_a_target_that_is_too_small_gets_the_coarsest() -> None:
+    smallest = size(compress(SCENE, EQUAL, fidelity, 1e9)[0])
+    assert size(compress_to_size(SCENE, EQUAL, 10, size)) == pytest.approx(smallest, rel=0.02)
 
 
 def test_a_psnr_that_is_not_a_number_does_not_pass() -> None:

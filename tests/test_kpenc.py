@@ -610,3 +610,43 @@ def test_a_machine_s_first_encode_equals_its_second(sets: Path, tmp_path: Path) 
         subprocess.run([*words, "--preset", "draft", "--steps", "20"], env=env, check=True, capture_output=True)
         scenes.append(output.read_bytes())
     assert scenes[0] == scenes[1]
+
+
+def test_the_trade_between_size_and_loss(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+    """Coded again from the checkpoint that --keep leaves, without a step of training."""
+    _, out, _ = run(sets / "n3dv", "--keep", "--json")
+    usual = json.loads(out)
+    sizes = []
+    for trade in ("--max-loss=0.01dB", "--max-loss=2", f"--target-size={usual['size_bytes'] - 500}"):
+        code, out, err = run(sets / "n3dv", "--keep", "--resume", "--json", trade)
+        assert code == 0 and "resumed at step 24" in err
+        sizes.append(json.loads(out)["size_bytes"])
+    assert sizes[0] > usual["size_bytes"] > sizes[1] and sizes[2] <= usual["size_bytes"] - 500
+    last = (tmp_path / "out.kpc").read_bytes()
+    code, out, err = run(sets / "n3dv", "--resume", "--target-size", "1KB")
+    assert code == 1 and out == "" and "is the least that this model takes" in err.splitlines()[-1]
+    assert (tmp_path / "out.kpc").read_bytes() == last
+    assert run(sets / "n3dv", "--resume")[0] == 0 and {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
+
+
+@pytest.mark.parametrize(
+    "words, named",
+    [
+        (("--max-loss", "much"), "0.1dB"),
+        (("--max-loss", "-1dB"), "0.1dB"),
+        (("--target-size", "nanMB"), "2MB"),
+        (("--target-size", "K"), "2MB"),
+        (("--target-size", "2MB", "--max-loss", "1dB"), "not allowed"),
+    ],
+)
+def test_a_trade_that_makes_no_sense(
+    words: tuple[str, ...], named: str, sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        kpenc.main([str(sets / "n3dv"), "-o", str(tmp_path / "out.kpc"), *words])
+    assert named in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text, count", [("300000", 300_000), ("300KB", 300_000), ("2mb", 2_000_000), ("1.5M", 1_500_000)])
+def test_sizes(text: str, count: int) -> None:
+    assert kpenc.byte_count(text) == count
