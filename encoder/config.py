@@ -15,7 +15,8 @@ class TrainConfig:
     channels: int = 8
     """Features a plane holds at each scale, M. The paper's knee is 32 on a GPU; the file and the player pay for each."""
     frames_per_row: float = 2.0
-    """Frames of the clip to one row of a space-time plane (K-Planes trains 300 frames on 150 rows)."""
+    """Frames of the clip to one row of a space-time plane (K-Planes trains 300 frames on 150 rows). A row for every frame costs
+    room 0.2 dB and a fifth of its size, and the default scene time, for no gain in held-out PSNR."""
     hidden: int = 16
     """Width of the MLP that maps a view direction to the colour basis."""
     view_dependent: bool = True
@@ -85,13 +86,6 @@ class TrainConfig:
                 raise UsageError(f"{name} must be at least 0 and less than 1, not {getattr(self, name)}")
         if not self.resolutions or min(self.resolutions) < 2:
             raise UsageError(f"resolutions {self.resolutions}: every scale needs at least 2 texels")
-
-    def for_many_views(self) -> "TrainConfig":
-        """For clips whose instants several cameras see: each frame can be told from its neighbours and gets a row of its own.
-
-        The default scene gains 0.7 dB after 1,300 steps of `fast`: a fast ball keeps its shape.
-        """
-        return replace(self, frames_per_row=1.0)
 
     def for_lone_object(self) -> "TrainConfig":
         """For an object without surroundings that one moving camera has seen: soldier, and D-NeRF's scenes.

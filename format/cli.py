@@ -1,7 +1,9 @@
-"""What every command shares: errors as one line, Ctrl-C, files written aside and renamed."""
+"""What every command shares: errors as one line, Ctrl-C, files written aside and renamed, quantities as words."""
 
+import argparse
 import contextlib
 import errno
+import math
 import os
 import sys
 import tempfile
@@ -61,3 +63,50 @@ def written_aside(path: str | os.PathLike[str]) -> Iterator[Path]:
     except BaseException:
         aside.unlink(missing_ok=True)
         raise
+
+
+def duration_s(text: str) -> float:
+    """Seconds of "90", "90s", "10m" or "1.5h"."""
+    unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:], None)
+    try:
+        value = float(text[:-1]) * unit if unit else float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"{text!r} is no duration; write 90s, 10m or 1.5h")
+    return value
+
+
+def decibels(text: str) -> float:
+    """The number of "0.1" or "0.1dB"."""
+    try:
+        value = float(text.lower().removesuffix("db"))
+    except ValueError:
+        value = math.nan
+    if not 0 < value < 100:
+        raise argparse.ArgumentTypeError(f"{text!r} is no loss; write 0.1dB")
+    return value
+
+
+def byte_count(text: str) -> int:
+    """Bytes of "300000", "300KB" or "2MB", of 1,000 and 1,000,000 bytes."""
+    number = text.upper().removesuffix("B")
+    unit = {"K": 10**3, "M": 10**6}.get(number[-1:], 1)
+    try:
+        value = float(number[:-1] if unit > 1 else number) * unit
+    except ValueError:
+        value = math.nan
+    if not 1 <= value < 1e12:
+        raise argparse.ArgumentTypeError(f"{text!r} is no size; write 300KB or 2MB")
+    return int(value)
+
+
+def box_corners(text: str) -> tuple[float, ...]:
+    """The six numbers of "x0,y0,z0,x1,y1,z1"."""
+    try:
+        numbers = tuple(float(n) for n in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 6 or not all(map(math.isfinite, numbers)) or not all(a < b for a, b in zip(numbers[:3], numbers[3:])):
+        raise argparse.ArgumentTypeError(f"{text!r} is not x0,y0,z0,x1,y1,z1 with each lower bound below the upper")
+    return numbers

@@ -219,7 +219,7 @@ def test_the_work_folder_keeps_what_is_not_ours(run: Kpenc, sets: Path, tmp_path
 
 
 def test_durations() -> None:
-    assert [kpenc.duration_s(t) for t in ("90", "90s", "10m", "1.5h")] == [90, 90, 600, 5400]
+    assert [cli.duration_s(t) for t in ("90", "90s", "10m", "1.5h")] == [90, 90, 600, 5400]
 
 
 # --- interruption
@@ -649,4 +649,4 @@ def test_a_trade_that_makes_no_sense(
 
 @pytest.mark.parametrize("text, count", [("300000", 300_000), ("300KB", 300_000), ("2mb", 2_000_000), ("1.5M", 1_500_000)])
 def test_sizes(text: str, count: int) -> None:
-    assert kpenc.byte_count(text) == count
+    assert cli.byte_count(text) == count

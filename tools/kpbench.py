@@ -269,11 +269,11 @@ def _parser() -> argparse.ArgumentParser:
     encode.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
     encode.add_argument("--preset", choices=("draft", "fast", "balanced", "best"), default="balanced")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
-    encode.add_argument("--time-budget", type=_duration, metavar="10m", help="of training, instead of steps")
+    encode.add_argument("--time-budget", type=cli.duration_s, metavar="10m", help="of training, instead of steps")
     encode.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
     encode.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     encode.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
-    encode.add_argument("--box", type=_box, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
+    encode.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
     encode.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
     encode.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there")
     encode.set_defaults(measure=_encode)
@@ -301,16 +301,6 @@ def _size(text: str) -> tuple[int, int]:
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a size like 320x240")
     return int(match[1]), int(match[2])
-
-
-def _duration(text: str) -> float:
-    seconds: float = _encoder().duration_s(text)
-    return seconds
-
-
-def _box(text: str) -> tuple[float, ...]:
-    corners: tuple[float, ...] = _encoder().box_corners(text)
-    return corners
 
 
 if __name__ == "__main__":

@@ -1,0 +1,100 @@
+"""What kpenc can be told, and how its command line says it."""
+
+import argparse
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from kpc.encoder.config import PRESETS, TrainConfig
+from kpc.encoder.datasets import Dataset
+from kpc.format import cli
+
+
+@dataclass(frozen=True)
+class Options:
+    """What one run of kpenc is told; the fields are the command line's options."""
+
+    source: Path
+    output: Path
+    preset: str = "balanced"
+    steps: int | None = None
+    time_budget_s: float | None = None
+    seed: int = 0
+    device: str = "auto"
+    downscale: int = 1
+    holdout: str | None = None
+    box: tuple[float, ...] | None = None
+    work: Path | None = None
+    keep: bool = False
+    resume: bool = False
+    most_tests: int | None = None
+    max_loss_db: float | None = None
+    target_bytes: int | None = None
+
+    @property
+    def work_dir(self) -> Path:
+        return self.work or self.output.with_name(self.output.name + ".work")
+
+    def config(self, dataset: Dataset) -> TrainConfig:
+        config = PRESETS[self.preset]
+        if dataset.has_alpha and dataset.one_view_at_a_time:
+            config = config.for_lone_object()
+        most = config.max_coding_loss_db if self.max_loss_db is None else self.max_loss_db
+        return replace(config, seed=self.seed, steps=self.steps or config.steps, max_coding_loss_db=most)
+
+
+def parse(argv: list[str]) -> tuple[Options, bool, bool]:
+    """The options, whether only to plan (--dry-run), and whether to answer in JSON; argparse exits on anything else."""
+    parser = argparse.ArgumentParser("kpenc", description="a folder of posed videos or images becomes a .kpc file")
+    parser.add_argument("source", type=Path, help="folder: videos or images, and poses_bounds.npy, transforms*.json or sparse/0")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="the .kpc file to write")
+    parser.add_argument("--preset", choices=sorted(PRESETS), default="balanced", help="how much to spend (default: balanced)")
+    parser.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
+    parser.add_argument("--time-budget", type=cli.duration_s, metavar="10m", help="train for so long instead of a number of steps")
+    parser.add_argument("--seed", type=_seed, default=0, help="of everything random (default: 0)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first (default: 1)")
+    parser.add_argument("--holdout", metavar="NAME", help="camera or file to test on, or 'none'")
+    parser.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1",
+                        help="corners of the scene, taken as they are, instead of those found from cameras and a survey")
+    parser.add_argument("--work", type=Path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)")
+    parser.add_argument("--keep", action="store_true", help="keep that folder when done")
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
+    parser.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
+    trade = parser.add_mutually_exclusive_group()
+    trade.add_argument("--max-loss", type=cli.decibels, metavar="0.1dB",
+                       help="PSNR that coding may cost on training views (default: 0.15dB)")
+    trade.add_argument("--target-size", type=cli.byte_count, metavar="2MB", help="the best file of at most this size instead")
+    parser.add_argument("--dry-run", action="store_true",
+                        help="only say what would be done, how long it would take and how much memory")
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
+    a = parser.parse_args(_box_joined(argv))
+    options = Options(a.source, a.output, a.preset, a.steps, a.time_budget, a.seed, a.device, a.downscale, a.holdout, a.box,
+                      a.work, a.keep, a.resume, a.test_views, a.max_loss, a.target_size)
+    if a.dry_run and a.resume:
+        parser.error("--dry-run tells what a whole run takes; drop --resume")
+    return options, a.dry_run, a.json
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if not 0 <= value < 1 << 63:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 0 to 2^63 - 1")
+    return value
+
+
+def _box_joined(argv: list[str]) -> list[str]:
+    """`--box -1,...` as `--box=-1,...`: argparse would take a value that starts with a minus for an option."""
+    joined: list[str] = []
+    for word in argv:
+        if joined and joined[-1] == "--box":
+            joined[-1] = f"--box={word}"
+        else:
+            joined.append(word)
+    return joined
