@@ -2,12 +2,15 @@
 
 import math
 from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import numpy as np
 
 from kpc.encoder.field import Field
 from kpc.format.quantise import QuantisedScene, quantise_scene
 from kpc.format.scene import Scene
+
+T = TypeVar("T")
 
 FINEST, COARSEST = -12.0, 2.0
 """Base-two logarithms of the factors on all steps, between which one is sought."""
@@ -56,16 +59,7 @@ def compress(
         candidate = quantise_scene(scene, scaled(steps, 2.0**exponent))
         return candidate, reference - psnr(candidate.dequantise())
 
-    low, high = FINEST, COARSEST
-    best = attempt(low)
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        candidate, loss = attempt(middle)
-        if loss <= max_loss_db and math.isfinite(loss):
-            low, best = middle, (candidate, loss)
-        else:
-            high = middle
-    return best
+    return _farthest(FINEST, COARSEST, attempt, lambda found: found[1] <= max_loss_db and math.isfinite(found[1]))
 
 
 def compress_to_size(
@@ -75,17 +69,20 @@ def compress_to_size(
 
     Bisects as `compress` does.
     """
+    return _farthest(
+        COARSEST, FINEST, lambda exponent: quantise_scene(scene, scaled(steps, 2.0**exponent)),
+        lambda found: size(found) <= target_bytes,
+    )
 
-    def attempt(exponent: float) -> QuantisedScene:
-        return quantise_scene(scene, scaled(steps, 2.0**exponent))
 
-    low, high = FINEST, COARSEST
-    best = attempt(high)
+def _farthest(start: float, end: float, attempt: Callable[[float], T], accepts: Callable[[T], bool]) -> T:
+    """What `attempt` makes of the exponent farthest from `start` towards `end` that `accepts`; of `start` where none does."""
+    best = attempt(start)
     for _ in range(BISECTIONS):
-        middle = (low + high) / 2
+        middle = (start + end) / 2
         candidate = attempt(middle)
-        if size(candidate) <= target_bytes:
-            high, best = middle, candidate
+        if accepts(candidate):
+            start, best = middle, candidate
         else:
-            low = middle
+            end = middle
     return best

@@ -62,11 +62,8 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
 
 def _seconds_a_ray(trainer: Trainer, count: int = 1 << 14) -> float:
     """Rendering, once compiled."""
-    scene = trainer.field.to_scene(
-        trainer.aabb, trainer.dataset.clip, trainer.grid.occupied[None], trainer.background, trainer.step_length
-    )
     batch, _ = trainer.sampler.draw(np.random.default_rng(0), count, trainer.background)
-    renderer = SceneRenderer(scene)
+    renderer = SceneRenderer(trainer.scene())
     rays = [a.numpy() for a in (batch.origins, batch.directions, batch.times)]
     renderer.rgb(*(a[:16] for a in rays))
     started = time.perf_counter()

@@ -162,8 +162,7 @@ def to_scene(trainer: Trainer) -> Scene:
     dataset = trainer.dataset
     slots = min(8, dataset.clip.frame_count) if dataset.is_dynamic else 1
     occupancy = trainer.grid.over_time(trainer.density_at, np.random.default_rng(trainer.config.seed), slots)
-    scene = trainer.field.to_scene(trainer.aabb, dataset.clip, occupancy, trainer.background, trainer.step_length)
-    return replace(scene, cameras=tuple(dataset.camera(p) for p in _spread_of_cameras(dataset)))
+    return replace(trainer.scene(occupancy), cameras=tuple(dataset.camera(p) for p in _spread_of_cameras(dataset)))
 
 
 def quantise(trainer: Trainer, scene: Scene, target_bytes: int | None = None) -> tuple[QuantisedScene, float]:

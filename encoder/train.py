@@ -21,7 +21,7 @@ from kpc.encoder.field import Field, Rays, plan_layout, priors, render_reference
 from kpc.encoder.occupancy import OccupancyGrid, grid_shape
 from kpc.format.cli import written_aside
 from kpc.format.errors import TrainingError
-from kpc.format.scene import SPACE_PLANES
+from kpc.format.scene import SPACE_PLANES, Scene
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 """Adam's constants as Instant-NGP sets them for grids (arXiv:2201.05989, section 4)."""
@@ -124,6 +124,12 @@ class Trainer:
     def rays_per_second(self) -> float:
         """Rays trained in a second, all that a step takes included, once the occupancy grid has formed."""
         return self._steady_rays / self._steady_s if self._steady_s else 0.0
+
+    def scene(self, occupancy: np.ndarray | None = None) -> Scene:
+        """The field as it stands, with an occupancy (slots, Nz, Ny, Nx), or with that of training; the planes are copied."""
+        if occupancy is None:
+            occupancy = self.grid.occupied[None]
+        return self.field.to_scene(self.aabb, self.dataset.clip, occupancy, self.background, self.step_length)
 
     def _fraction(self, time_budget_s: float | None) -> float:
         if time_budget_s is not None:
@@ -254,7 +260,6 @@ class RaySampler:
         jitters = rng.random(count, dtype=np.float32)
         arrays = (origins, directions, pictures.time[picture], jitters, backgrounds)
         return Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays)), torch.from_numpy(targets)
-
 
     def _frame(self, alpha: np.ndarray) -> tuple[int, int, int, int]:
         rows, columns = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))

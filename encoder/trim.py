@@ -46,10 +46,9 @@ def trim_box(
     trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10)
     if trainer.step < LEAST_STEPS:
         return aabb, trainer.elapsed_s
-    scene = trainer.field.to_scene(aabb, dataset.clip, trainer.grid.occupied[None], trainer.background, trainer.step_length)
     rays, _ = trainer.sampler.draw(np.random.default_rng(config.seed), RAYS, trainer.background)
     origins, directions, times = (a.numpy() for a in (rays.origins, rays.directions, rays.times))
-    _, opacities, depths = SceneRenderer(scene).render(origins, directions, times)
+    _, opacities, depths = SceneRenderer(trainer.scene()).render(origins, directions, times)
     ends = (origins + depths[:, None] * directions)[opacities > 0.5]
     if len(ends) < RAYS // 100:
         return aabb, trainer.elapsed_s

@@ -183,8 +183,12 @@ def say_missing(file: Path, missing: list[str], total: int) -> None:
     if len(missing) == total:
         raise DatasetError(f"{file}: none of its {total} images exists ({plain(missing[0])} ...); copy them beside it")
     if missing:
-        names = ", ".join(map(plain, missing[:6])) + (" ..." if len(missing) > 6 else "")
-        print(f"{file}: {len(missing)} of {total} frames have no image and are skipped: {names}", file=sys.stderr)
+        print(f"{file}: {len(missing)} of {total} frames have no image and are skipped: {some(missing)}", file=sys.stderr)
+
+
+def some(names: Sequence[str]) -> str:
+    """The first few of them, for a message."""
+    return ", ".join(map(plain, names[:6])) + (" ..." if len(names) > 6 else "")
 
 
 def plain(text: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import View, is_file, plain
+from kpc.encoder.datasets.capture import View, is_file, some
 from kpc.encoder.datasets.pixels import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.format.errors import DatasetError
 from kpc.format.media import image_size, read_image
@@ -78,11 +78,10 @@ def find_masks(root: Path, views: Sequence[View]) -> list[Path | None]:
                 f"{mask}: is {size[0]}x{size[1]}, but {view.file.name} is {view.width}x{view.height}; "
                 "make the mask anew in that size"
             )
-    bare = [view.file for view, mask in zip(views, masks) if mask is None and not view.video]
+    bare = [view.file.name for view, mask in zip(views, masks) if mask is None and not view.video]
     if bare:
-        names = ", ".join(plain(file.name) for file in bare[:6]) + (" ..." if len(bare) > 6 else "")
         total = sum(not view.video for view in views)
-        print(f"{folder}: {len(bare)} of {total} images have no mask and are used whole: {names}", file=sys.stderr)
+        print(f"{folder}: {len(bare)} of {total} images have no mask and are used whole: {some(bare)}", file=sys.stderr)
     return masks
 
 
