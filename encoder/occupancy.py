@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kpc.format.grid import dilate
+from kpc.format.grid import SPACE_AND_TIME, dilate
 
 DensityAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(N, 3) float32 points in [0, 1]^3 and (N,) float32 times -> (N,) log densities."""
@@ -30,6 +30,8 @@ class OccupancyGrid:
         log_density: (Nz, Ny, Nx) float32, decaying maximum of the samples taken in a cell.
         peak: (Nz, Ny, Nx) float32, decaying maximum of the weights that training rays have found in a cell.
         occupied: (Nz, Ny, Nx) bool; cells that too few cameras see are never occupied.
+        marched: (slots, Nz, Ny, Nx) bool, of the occupied cells those in which rays take samples while each slot of the clip
+            lasts: one slot until `split`.
     """
 
     DENSITY_DECAY = 0.05
@@ -49,6 +51,8 @@ class OccupancyGrid:
         self.log_density = np.full(seen.shape, -np.inf, np.float32)
         self.peak = np.ones(seen.shape, np.float32)
         self.occupied = seen.copy()
+        self.marched = self.occupied[None]
+        self._dense = np.ones((1, *seen.shape), bool)
         self._known = False
 
     def update(self, density_at: DensityAt, peaks: np.ndarray, rng: np.random.Generator) -> None:
@@ -67,18 +71,32 @@ class OccupancyGrid:
         cells = np.argwhere(chosen)
         for _ in range(self.LOOKS):
             self.log_density[chosen] = np.maximum(self.log_density[chosen], self._look(density_at, cells, rng, 0.0, 1.0))
-        # While all is thin, what is thicker than the average stays: an empty grid could never be filled again.
-        known = self.log_density[self.seen]
-        mean = math.log(max(float(np.exp(known.astype(np.float64)).mean()), 1e-30))
-        self.occupied = matters & (self.log_density > min(self.threshold, mean))
+        self.occupied = matters & (self.log_density > self._least())
+        self.marched = self._dense & self.occupied
+
+    def split(self, density_at: DensityAt, slots: int, rng: np.random.Generator) -> None:
+        """From now on march, in each of `slots` equal parts of the clip, only where density is or was close by.
+
+        What moves fills at each instant a small part of the cells that it ever fills. Close by is a cell's own slot or one
+        beside it, the cell or a neighbour: what is learnt can go on moving until the next split.
+        """
+        self._dense = dilate(self.over_time(density_at, rng, slots, self.LOOKS), SPACE_AND_TIME)
+        self.marched = self._dense & self.occupied
 
     def state(self) -> dict[str, Any]:
         return {"log_density": torch.from_numpy(self.log_density), "peak": torch.from_numpy(self.peak),
-                "occupied": torch.from_numpy(self.occupied), "known": self._known}
+                "occupied": torch.from_numpy(self.occupied), "dense": torch.from_numpy(self._dense), "known": self._known}
 
     def load(self, state: dict[str, Any]) -> None:
-        self.log_density, self.peak, self.occupied = (state[k].cpu().numpy() for k in ("log_density", "peak", "occupied"))
+        names = ("log_density", "peak", "occupied", "dense")
+        self.log_density, self.peak, self.occupied, self._dense = (state[name].cpu().numpy() for name in names)
+        self.marched = self._dense & self.occupied
         self._known = bool(state["known"])
+
+    def _least(self) -> float:
+        """The log density that fills a cell. While all is thin it is the average: an empty grid could never be filled again."""
+        known = self.log_density[self.seen]
+        return min(self.threshold, math.log(max(float(np.exp(known.astype(np.float64)).mean()), 1e-30)))
 
     def _look(self, density_at: DensityAt, cells: np.ndarray, rng: np.random.Generator, start: float, end: float) -> np.ndarray:
         """Log density at a random point of each cell and a random time in [start, end]."""
@@ -91,11 +109,11 @@ class OccupancyGrid:
 
         Each cell that is occupied is looked at `samples` times in every slot.
         """
-        cells = np.argwhere(self.occupied)
+        cells, least = np.argwhere(self.occupied), self._least()
         out = np.zeros((slots, *self.seen.shape), bool)
         for slot in range(slots):
             best = np.full(len(cells), -np.inf, np.float32)
             for _ in range(samples):
                 best = np.maximum(best, self._look(density_at, cells, rng, slot / slots, (slot + 1) / slots))
-            out[slot][self.occupied] = best > self.threshold
+            out[slot][self.occupied] = best > least
         return out

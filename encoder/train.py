@@ -59,6 +59,7 @@ class Trainer:
         shape = grid_shape(self.aabb, config.cells_across)
         threshold = math.log(-math.log(1 - config.occupancy_alpha) * config.samples_across)
         self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape), threshold)
+        self.slots = min(config.occupancy_slots, dataset.clip.frame_count) if dataset.is_dynamic else 1
         self.optimiser: FusedOptimiser | PlainOptimiser = (
             FusedOptimiser(self.field, config, shape) if self.device.type == "cpu" else
             PlainOptimiser(self.field, config, shape)
@@ -92,12 +93,14 @@ class Trainer:
             started = time.monotonic()
             if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
                 self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
+            if self.slots > 1 and self.step >= 4 * config.occupancy_start and self.step % config.occupancy_split_every == 0:
+                self.grid.split(self.density_at, self.slots, self.rng)
             count = int(np.clip(config.samples / max(self.samples_per_ray, 1e-3), 256, config.rays))
             background = None if self.dataset.has_alpha else self.background
             batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays)
             rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
             squared_error, samples = self.optimiser.step(
-                self.step, rate, batch, targets, self.aabb, self.grid.occupied[None],
+                self.step, rate, batch, targets, self.aabb, self.grid.marched,
                 self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1), self.extent,
             )
             if not math.isfinite(squared_error):
@@ -128,7 +131,7 @@ class Trainer:
     def scene(self, occupancy: np.ndarray | None = None) -> Scene:
         """The field as it stands, with an occupancy (slots, Nz, Ny, Nx), or with that of training; the planes are copied."""
         if occupancy is None:
-            occupancy = self.grid.occupied[None]
+            occupancy = self.grid.marched
         return self.field.to_scene(self.aabb, self.dataset.clip, occupancy, self.background, self.step_length)
 
     def _fraction(self, time_budget_s: float | None) -> float:

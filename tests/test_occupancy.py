@@ -3,7 +3,7 @@
 import numpy as np
 
 from kpc.encoder.occupancy import OccupancyGrid, grid_shape
-from kpc.format.grid import dilate
+from kpc.format.grid import SPACE_AND_TIME, dilate
 
 SHAPE = (6, 5, 8)
 
@@ -42,6 +42,13 @@ def test_dilation_reaches_all_26_neighbours_and_no_farther() -> None:
     corner = np.zeros((2, 3, 4, 5), bool)
     corner[1, 0, 0, 0] = True
     assert dilate(corner).sum() == 8 and not dilate(corner)[0].any()
+
+
+def test_dilation_along_time_too() -> None:
+    one = np.zeros((5, 3, 3, 3), bool)
+    one[2, 1, 1, 1] = True
+    np.testing.assert_array_equal(dilate(one, SPACE_AND_TIME).all((1, 2, 3)), [False, True, True, True, False])
+    assert dilate(one, SPACE_AND_TIME).sum() == 81
 
 
 def test_all_that_is_seen_is_occupied_at_first() -> None:
@@ -107,6 +114,35 @@ def test_over_time_follows_what_moves() -> None:
         assert (slots[slot, :, :, :4] == first_half).all() and (slots[slot, :, :, 4:] != first_half).all()
 
 
+def test_a_split_grid_is_marched_where_density_is_or_was_close_by() -> None:
+    """Of what moves at half time, the slots beside it hold both places; what no slot holds is not marched at all."""
+    g = settled(grid(), moving, np.ones(SHAPE, np.float32))
+    np.testing.assert_array_equal(g.marched, g.occupied[None])
+    g.split(moving, 6, np.random.default_rng(0))
+    lower, upper = g.marched[..., :3].all((1, 2, 3)), g.marched[..., 5:].all((1, 2, 3))  # 4 is a neighbour of both
+    np.testing.assert_array_equal(lower, [True, True, True, True, False, False])
+    np.testing.assert_array_equal(upper, [False, False, True, True, True, True])
+    assert not g.marched[4:, ..., :3].any() and not g.marched[:2, ..., 5:].any()
+
+
+def test_an_update_empties_cells_in_every_slot() -> None:
+    g = settled(grid(), lambda p, t: np.maximum(ball(p, t), corner(p, t)), np.ones(SHAPE, np.float32))
+    g.split(ball, 4, np.random.default_rng(0))
+    assert g.marched[:, 3, 2, 4].all()
+    settled(g, corner, np.ones(SHAPE, np.float32), updates=201)
+    assert not g.marched[:, 3, 2, 4].any()
+
+
+def test_while_all_is_thin_a_split_leaves_the_thicker_half() -> None:
+    def thin(points: np.ndarray, times: np.ndarray) -> np.ndarray:
+        return np.where(points[:, 0] < 0.5, -1.0, -3.0).astype(np.float32)
+
+    g = settled(grid(), thin, np.ones(SHAPE, np.float32), 3)
+    g.split(thin, 3, np.random.default_rng(0))
+    assert g.marched[..., :4].all() and not g.marched[..., 4:].any()
+    assert g.over_time(thin, np.random.default_rng(0), 2)[..., :4].all()
+
+
 def test_points_lie_in_their_cells_and_times_in_their_slot() -> None:
     seen = np.zeros(SHAPE, bool)
     seen[1, 4, 6] = True
@@ -124,9 +160,10 @@ def test_points_lie_in_their_cells_and_times_in_their_slot() -> None:
 
 
 def test_state_goes_into_another_grid() -> None:
-    one, two = settled(grid(), ball, np.ones(SHAPE, np.float32), updates=7), grid()
+    one, two = settled(grid(), moving, np.ones(SHAPE, np.float32), updates=7), grid()
+    one.split(moving, 4, np.random.default_rng(0))
     two.load(one.state())
-    settled(one, ball, np.ones(SHAPE, np.float32), updates=3)
-    settled(two, ball, np.ones(SHAPE, np.float32), updates=3)
-    for name in ("log_density", "peak", "occupied"):
+    settled(one, moving, np.ones(SHAPE, np.float32), updates=3)
+    settled(two, moving, np.ones(SHAPE, np.float32), updates=3)
+    for name in ("log_density", "peak", "occupied", "marched"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))

@@ -59,7 +59,7 @@ def assert_same(one: Trainer, two: Trainer) -> None:
     assert one.step == two.step
     for (name, a), b in zip(one.field.named_parameters(), two.field.parameters()):
         assert torch.equal(a, b), name
-    np.testing.assert_array_equal(one.grid.occupied, two.grid.occupied)
+    np.testing.assert_array_equal(one.grid.marched, two.grid.marched)
     np.testing.assert_array_equal(one.grid.log_density, two.grid.log_density)
     assert one.rng.bit_generator.state == two.rng.bit_generator.state
 
@@ -90,14 +90,17 @@ def test_a_seed_repeats_bitwise(moving: Dataset) -> None:
     assert not torch.equal(one.field.theta, other.field.theta)
 
 
-@pytest.mark.parametrize("stop_at", [5, 21])  # before the occupancy grid forms, and between two updates of it
+# before the occupancy grid forms, between two updates of it, and after it has been split
+@pytest.mark.parametrize("stop_at", [5, 21, 68])
 def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(moving: Dataset, tmp_path: Path, stop_at: int) -> None:
-    whole = trained(moving, steps=40, channel_dropout=0.25)
-    first = trainer(moving, steps=40, channel_dropout=0.25)
+    changes = {"steps": 80, "channel_dropout": 0.25, "occupancy_split_every": 64}
+    whole = trained(moving, **changes)
+    assert len(whole.grid.marched) == whole.slots > 1
+    first = trainer(moving, **changes)
     with pytest.raises(KeyboardInterrupt):
         first.run(ignore, interrupted=lambda: first.step == stop_at)
     first.save(tmp_path / "checkpoint.kpck")
-    second = trainer(moving, steps=40, channel_dropout=0.25)
+    second = trainer(moving, **changes)
     second.resume(tmp_path / "checkpoint.kpck")
     assert_same(first, second)
     second.run(ignore)
@@ -356,7 +359,7 @@ def test_dropped_channels_take_no_part(moving: Dataset) -> None:
     before = run.field.theta.detach().clone()
     batch, targets = run.sampler.draw(run.rng, 256)
     run.optimiser.field, run.optimiser.config = run.field, replace(run.config, regularise_every=1000)
-    run.optimiser.step(1, 1.0, batch, targets, run.aabb, run.grid.occupied[None], run.step_length, run.extent)
+    run.optimiser.step(1, 1.0, batch, targets, run.aabb, run.grid.marched, run.step_length, run.extent)
     moved = (run.field.theta != before).view(-1, M).any(0)
     assert torch.equal(moved, kept[1, :M] != 0)
 
@@ -381,7 +384,7 @@ def test_plain_pytorch_takes_the_same_steps(moving: Dataset, channel_dropout: fl
     plain = plain_twin(run)
     for number in range(3):
         batch, targets = run.sampler.draw(run.rng, 256)
-        args = (number, 0.1, batch, targets, run.aabb, run.grid.occupied[None], run.step_length, run.extent)
+        args = (number, 0.1, batch, targets, run.aabb, run.grid.marched, run.step_length, run.extent)
         (ours, samples), (theirs, their_samples) = run.optimiser.step(*args), plain.step(*args)
         # Samples below 1e-4 go without colour in the kernels, 83 a ray at most; and what the steps before have left.
         assert ours == pytest.approx(theirs, rel=0.02) and samples == pytest.approx(their_samples, rel=0.01)
