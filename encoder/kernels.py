@@ -5,7 +5,7 @@ the present ray in a scratch that fits the cache, and adds the gradient to a buf
 `kpc.encoder.field` holds the same mathematics in plain PyTorch; the tests hold the two together.
 
 Naming, throughout this module
-    M   channels of a plane; passed as a tuple of that length, so that it is a constant when the kernel is compiled
+    M   channels of a plane
     S   scales;  F = S * M features
     theta      (n,) float32, all planes one after the other, each (rows, columns, M)
     table      (S, 6) int64, where in theta a plane starts, in the order xy xz yz xt yt zt; -1 where there is none
@@ -30,10 +30,17 @@ _NEGLIGIBLE = np.float32(1e-4)
 _TINY = np.float32(1e-30)
 """Adam's means below this are 0."""
 
+_ALONG_COLUMNS, _ALONG_ROWS = (0, 0, 1, 0, 1, 2), (1, 2, 2, 3, 3, 3)
+"""Axes of the planes xy xz yz xt yt zt, as numbers of x y z t."""
+
 # Not "reassoc": the order of sums would differ between code compiled in this process and the same code from numba's cache,
 # and the first training run on a machine would end elsewhere than the second.
 _FASTMATH = {"nsz", "arcp", "contract", "afn"}
 _jit = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True)
+_inlined = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True, forceinline=True)
+"""For what runs many times a sample: an array is some eight arguments, and passing them costs as much as the work."""
+# The innermost loops run over the channels of one plane. Their number is no constant: LLVM would unroll a loop of eight before
+# it could turn it into one of vectors. And they read and write few arrays: it gives up on telling apart more than a handful.
 _parallel = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, parallel=True)
 
 
@@ -54,7 +61,7 @@ def _box_span(origin, direction, aabb):
     return near, far
 
 
-@_jit
+@_inlined
 def _tap(u, size):
     """Lower texel and fraction of a corner-aligned coordinate u in [0, 1]."""
     position = u * np.float32(size - 1)
@@ -62,32 +69,25 @@ def _tap(u, size):
     return lower, min(max(position - np.float32(lower), np.float32(0.0)), np.float32(1.0))
 
 
-@_jit
-def _bilinear(theta, start, columns, column, row, fc, fr, channels, out):
-    """out[m] = bilinear sample of the plane that starts at `start`; it has at least two rows and columns."""
-    M = len(channels)
-    a = start + (row * columns + column) * M
-    low = theta[a : a + 2 * M]
-    high = theta[a + columns * M : a + (columns + 2) * M]
+@_inlined
+def _weights(fc, fr):
+    """Of the four texels about a sample, at fractions fc along columns and fr along rows."""
     w11 = fc * fr
-    w01 = fc - w11
-    w10 = fr - w11
-    w00 = np.float32(1.0) - fc - w10
+    return np.float32(1.0) - fc - fr + w11, fc - w11, fr - w11, w11
+
+
+@_inlined
+def _blend(low, high, w00, w01, w10, w11, out):
+    """out = the weighted sum of four texels, low and high holding two each."""
+    M = out.size
     for m in range(M):
         out[m] = w00 * low[m] + w01 * low[M + m] + w10 * high[m] + w11 * high[M + m]
 
 
-@_jit
-def _scatter(grad, start, columns, column, row, fc, fr, channels, g):
-    """The transpose of `_bilinear`."""
-    M = len(channels)
-    a = start + (row * columns + column) * M
-    low = grad[a : a + 2 * M]
-    high = grad[a + columns * M : a + (columns + 2) * M]
-    w11 = fc * fr
-    w01 = fc - w11
-    w10 = fr - w11
-    w00 = np.float32(1.0) - fc - w10
+@_inlined
+def _spread(low, high, w00, w01, w10, w11, g):
+    """The transpose of `_blend`."""
+    M = g.size
     for m in range(M):
         low[m] += w00 * g[m]
         low[M + m] += w01 * g[m]
@@ -95,90 +95,107 @@ def _scatter(grad, start, columns, column, row, fc, fr, channels, g):
         high[M + m] += w11 * g[m]
 
 
-@_jit
-def _sample_planes(theta, table, resolution, u, v, w, time, channels, values):
-    """values[s * 6 + c] = sample of plane c at scale s; planes that do not exist leave their row as it is."""
+@_inlined
+def _product(values, out):
+    """out = the product of six planes' values, which lie one after the other."""
+    M = out.size
+    for m in range(M):
+        in_space = values[m] * values[M + m] * values[2 * M + m]
+        out[m] = in_space * values[3 * M + m] * values[4 * M + m] * values[5 * M + m]
+
+
+@_inlined
+def _product_gradient(values, g, out):
+    """The transpose of `_product`: for each plane, g times the product of the five others."""
+    M = g.size
+    for m in range(M):
+        xy, xz, yz = values[m], values[M + m], values[2 * M + m]
+        xt, yt, zt = values[3 * M + m], values[4 * M + m], values[5 * M + m]
+        in_space = xy * xz
+        g_time = g[m] * (xt * yt * zt)
+        g_space = g[m] * in_space * yz
+        out[m] = g_time * xz * yz
+        out[M + m] = g_time * xy * yz
+        out[2 * M + m] = g_time * in_space
+        out[3 * M + m] = g_space * yt * zt
+        out[4 * M + m] = g_space * xt * zt
+        out[5 * M + m] = g_space * xt * yt
+
+
+@_inlined
+def _sample_planes(theta, table, resolution, point, M, corners, fractions, values):
+    """Sample every plane at a point (u, v, w, time) in [0, 1]^4.
+
+    values[(6 s + c) M :][:M] = bilinear sample of plane c at scale s, which has at least two rows and columns; planes that do
+    not exist leave their part as it is. For `_scatter_planes` corners[6 s + c] = where in theta its lower left texel starts,
+    and fractions[4 s + axis] = how far beyond it the point lies.
+    """
     for s in range(table.shape[0]):
-        nx, ny, nz, nt = resolution[s, 0], resolution[s, 1], resolution[s, 2], resolution[s, 3]
-        ix, fx = _tap(u, nx)
-        iy, fy = _tap(v, ny)
-        iz, fz = _tap(w, nz)
-        k = s * 6
-        _bilinear(theta, table[s, 0], nx, ix, iy, fx, fy, channels, values[k])
-        _bilinear(theta, table[s, 1], nx, ix, iz, fx, fz, channels, values[k + 1])
-        _bilinear(theta, table[s, 2], ny, iy, iz, fy, fz, channels, values[k + 2])
-        if table[s, 3] >= 0:
-            it, ft = _tap(time, nt)
-            _bilinear(theta, table[s, 3], nx, ix, it, fx, ft, channels, values[k + 3])
-            _bilinear(theta, table[s, 4], ny, iy, it, fy, ft, channels, values[k + 4])
-            _bilinear(theta, table[s, 5], nz, iz, it, fz, ft, channels, values[k + 5])
+        x, fractions[4 * s] = _tap(point[0], resolution[s, 0])
+        y, fractions[4 * s + 1] = _tap(point[1], resolution[s, 1])
+        z, fractions[4 * s + 2] = _tap(point[2], resolution[s, 2])
+        t, fractions[4 * s + 3] = _tap(point[3], resolution[s, 3])
+        texel = (x, y, z, t)
+        for c in range(_planes(table)):
+            columns = resolution[s, _ALONG_COLUMNS[c]]
+            corner = table[s, c] + (texel[_ALONG_ROWS[c]] * columns + texel[_ALONG_COLUMNS[c]]) * M
+            corners[6 * s + c] = corner
+            w00, w01, w10, w11 = _weights(fractions[4 * s + _ALONG_COLUMNS[c]], fractions[4 * s + _ALONG_ROWS[c]])
+            low, high = theta[corner : corner + 2 * M], theta[corner + columns * M : corner + (columns + 2) * M]
+            _blend(low, high, w00, w01, w10, w11, values[(6 * s + c) * M : (6 * s + c + 1) * M])
 
 
-@_jit
-def _scatter_planes(grad, table, resolution, u, v, w, time, channels, values, g, scratch):
-    """Add d loss / d theta, given g = d loss / d features and the plane samples of the forward pass."""
-    M = len(channels)
+@_inlined
+def _scatter_planes(grad, table, resolution, M, corners, fractions, values, g, scratch):
+    """Add d loss / d theta, given g = d loss / d features and what `_sample_planes` has left."""
     for s in range(table.shape[0]):
-        nx, ny, nz, nt = resolution[s, 0], resolution[s, 1], resolution[s, 2], resolution[s, 3]
-        ix, fx = _tap(u, nx)
-        iy, fy = _tap(v, ny)
-        iz, fz = _tap(w, nz)
-        k = s * 6
-        xy, xz, yz = values[k], values[k + 1], values[k + 2]
-        xt, yt, zt = values[k + 3], values[k + 4], values[k + 5]
-        g_xy, g_xz, g_yz = scratch[0], scratch[1], scratch[2]
-        g_xt, g_yt, g_zt = scratch[3], scratch[4], scratch[5]
-        dynamic = table[s, 3] >= 0
-        f0 = s * M
-        for m in range(M):
-            d = g[f0 + m]
-            in_time = xt[m] * yt[m] * zt[m]
-            in_space = xy[m] * xz[m]
-            d_time = d * in_time
-            g_xy[m] = d_time * xz[m] * yz[m]
-            g_xz[m] = d_time * xy[m] * yz[m]
-            g_yz[m] = d_time * in_space
-            d_space = d * in_space * yz[m]
-            g_xt[m] = d_space * yt[m] * zt[m]
-            g_yt[m] = d_space * xt[m] * zt[m]
-            g_zt[m] = d_space * xt[m] * yt[m]
-        _scatter(grad, table[s, 0], nx, ix, iy, fx, fy, channels, g_xy)
-        _scatter(grad, table[s, 1], nx, ix, iz, fx, fz, channels, g_xz)
-        _scatter(grad, table[s, 2], ny, iy, iz, fy, fz, channels, g_yz)
-        if dynamic:
-            it, ft = _tap(time, nt)
-            _scatter(grad, table[s, 3], nx, ix, it, fx, ft, channels, g_xt)
-            _scatter(grad, table[s, 4], ny, iy, it, fy, ft, channels, g_yt)
-            _scatter(grad, table[s, 5], nz, iz, it, fz, ft, channels, g_zt)
+        _product_gradient(values[6 * s * M : 6 * (s + 1) * M], g[s * M : (s + 1) * M], scratch)
+        for c in range(_planes(table)):
+            columns, corner = resolution[s, _ALONG_COLUMNS[c]], corners[6 * s + c]
+            w00, w01, w10, w11 = _weights(fractions[4 * s + _ALONG_COLUMNS[c]], fractions[4 * s + _ALONG_ROWS[c]])
+            low, high = grad[corner : corner + 2 * M], grad[corner + columns * M : corner + (columns + 2) * M]
+            _spread(low, high, w00, w01, w10, w11, scratch[c * M : (c + 1) * M])
 
 
-@_jit
-def _features(values, scales, channels, out):
+@_inlined
+def _planes(table):
+    """Planes of each scale: six, or three where nothing moves."""
+    return 6 if table[0, 3] >= 0 else 3
+
+
+@_inlined
+def _features(values, scales, M, out):
     """out = the product over planes, scale by scale."""
-    M = len(channels)
     for s in range(scales):
-        k = s * 6
-        a, b, c = values[k], values[k + 1], values[k + 2]
-        d, e, f = values[k + 3], values[k + 4], values[k + 5]
-        f0 = s * M
-        for m in range(M):
-            out[f0 + m] = a[m] * b[m] * c[m] * d[m] * e[m] * f[m]
+        _product(values[6 * s * M : 6 * (s + 1) * M], out[s * M : (s + 1) * M])
 
 
-@_jit
+@_inlined
 def _dot(a, b, n):
-    total = np.float32(0.0)
-    for i in range(n):
-        total += a[i] * b[i]
-    return total
+    """Eight sums side by side: one alone would wait for each addition to end, since their order may not be changed."""
+    s0, s1, s2, s3 = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    s4, s5, s6, s7 = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    whole = n - n % 8
+    for i in range(0, whole, 8):
+        s0 += a[i] * b[i]
+        s1 += a[i + 1] * b[i + 1]
+        s2 += a[i + 2] * b[i + 2]
+        s3 += a[i + 3] * b[i + 3]
+        s4 += a[i + 4] * b[i + 4]
+        s5 += a[i + 5] * b[i + 5]
+        s6 += a[i + 6] * b[i + 6]
+        s7 += a[i + 7] * b[i + 7]
+    for i in range(whole, n):
+        s0 += a[i] * b[i]
+    return ((s0 + s1) + (s2 + s3)) + ((s4 + s5) + (s6 + s7))
 
 
-@_jit
+@_inlined
 def _sigmoid(x):
     return np.float32(1.0) / (np.float32(1.0) + math.exp(-x))
 
 
-@_jit
+@_inlined
 def _cell(grid, u, v, w):
     """Index (z, y, x) of the cell of an (Nz, Ny, Nx) grid that holds a point in [0, 1]^3."""
     nz, ny, nx = grid.shape
@@ -190,8 +207,8 @@ def _cell(grid, u, v, w):
 
 @_jit
 def _march(
-    theta, table, resolution, density, channels, aabb, occupancy, origin, direction, time, jitter, step, extent,
-    values, features, points, weights, logs, distances,
+    theta, table, resolution, density, M, aabb, occupancy, origin, direction, time, jitter, step, extent,
+    values, features, points, corners, fractions, weights, logs, distances,
 ):
     """March one ray; fill the scratch for each occupied sample.
 
@@ -215,11 +232,12 @@ def _march(
         w = (origin[2] + t * direction[2] - aabb[0, 2]) * inv[2]
         if occupancy[slot][_cell(occupancy[slot], u, v, w)] == 0:
             continue
-        _sample_planes(theta, table, resolution, u, v, w, time, channels, values[count])
-        _features(values[count], table.shape[0], channels, features[count])
+        point = points[count]
+        point[0], point[1], point[2], point[3] = u, v, w, time
+        _sample_planes(theta, table, resolution, point, M, corners[count], fractions[count], values[count])
+        _features(values[count], table.shape[0], M, features[count])
         log_density = min(max(_dot(features[count], density, F) + density[F], -_LIMIT), _LIMIT)
         alpha = np.float32(1.0) - math.exp(-math.exp(log_density) * step / extent)
-        points[count, 0], points[count, 1], points[count, 2] = u, v, w
         logs[count] = log_density
         weights[count] = trans * alpha
         distances[count] = t
@@ -231,20 +249,22 @@ def _march(
 
 
 @_jit
-def _scratch(table, channels, capacity):
-    M, S = len(channels), table.shape[0]
-    values = np.ones((capacity, S * 6, M), np.float32)  # ones: the planes a static scene does not have
+def _scratch(table, M, capacity):
+    S = table.shape[0]
+    values = np.ones((capacity, S * 6 * M), np.float32)  # ones: the planes a static scene does not have
     features = np.empty((capacity, S * M), np.float32)
-    points = np.empty((capacity, 3), np.float32)
+    points = np.empty((capacity, 4), np.float32)
+    corners = np.empty((capacity, S * 6), np.int64)
+    fractions = np.empty((capacity, S * 4), np.float32)
     weights = np.empty(capacity, np.float32)
     logs = np.empty(capacity, np.float32)
     distances = np.empty(capacity, np.float32)
-    return values, features, points, weights, logs, distances
+    return values, features, points, corners, fractions, weights, logs, distances
 
 
 @_parallel
 def render(
-    theta, table, resolution, density, channels, aabb, occupancy, step, extent,
+    theta, table, resolution, density, M, aabb, occupancy, step, extent,
     origins, directions, times, basis, basis_index, background, capacity, workers,
 ):
     """Colour, opacity and depth of rays: (N, 3), (N,), (N,) float32, and the samples each of them took.
@@ -258,11 +278,12 @@ def render(
     counts = np.empty(N, np.int32)
     F = density.size - 1
     for worker in prange(workers):
-        values, features, points, weights, logs, distances = _scratch(table, channels, capacity)
+        values, features, points, corners, fractions, weights, logs, distances = _scratch(table, M, capacity)
         for ray in range(worker, N, workers):
             count, trans = _march(
-                theta, table, resolution, density, channels, aabb, occupancy, origins[ray], directions[ray],
-                times[ray], np.float32(0.5), step, extent, values, features, points, weights, logs, distances,
+                theta, table, resolution, density, M, aabb, occupancy, origins[ray], directions[ray],
+                times[ray], np.float32(0.5), step, extent,
+                values, features, points, corners, fractions, weights, logs, distances,
             )
             b = basis[basis_index[ray]]
             red, green, blue, depth = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
@@ -299,7 +320,7 @@ def _distortion_gradient(weights, distances, count, step, extent, factor, out):
 
 @_parallel
 def backpropagate(
-    theta, grad, table, resolution, density, grad_density, channels, aabb, occupancy, step, extent,
+    theta, grad, table, resolution, density, grad_density, M, aabb, occupancy, step, extent,
     origins, directions, times, jitters, basis, grad_basis, targets, backgrounds, peaks, distortion, capacity,
 ):
     """Render a batch, and add the gradient of its loss to grad, grad_density and grad_basis.
@@ -311,7 +332,8 @@ def backpropagate(
     d C / d tau_k = trans_{k+1} c_k - sum_{j>k} w_j c_j - trans_end * background,   tau = sigma * step / extent
 
     Args:
-        grad: (workers, n) float32, one buffer a worker; grad_density: (workers, F + 1); grad_basis: (rays, 3, F), overwritten.
+        grad: (workers, n) float32, one buffer a worker; grad_density: (workers, F + 1).
+        basis, grad_basis: (rays, 3, F); or, where colour is the same from everywhere, (1, 3, F) and (workers, 3, F).
         jitters: (rays,) float32 in [0, 1), where in each step the samples of a ray lie.
         targets, backgrounds: (rays, 3) float32.
         peaks: (workers, Nz, Ny, Nx) float32, raised to the largest weight that a sample in a cell has had.
@@ -322,26 +344,26 @@ def backpropagate(
     N = origins.shape[0]
     workers = grad.shape[0]
     F = density.size - 1
-    M = len(channels)
     errors = np.empty(N, np.float32)
     counts = np.empty(N, np.int32)
     scale = np.float32(2.0 / (3.0 * N))
+    shared = basis.shape[0] == 1
     for worker in prange(workers):
-        values, features, points, weights, logs, distances = _scratch(table, channels, capacity)
+        values, features, points, corners, fractions, weights, logs, distances = _scratch(table, M, capacity)
         colours = np.empty((capacity, 3), np.float32)
         spread = np.empty(capacity, np.float32)
         g_features = np.empty(F, np.float32)
-        plane_scratch = np.empty((6, M), np.float32)
+        plane_scratch = np.empty(6 * M, np.float32)
         g_theta = grad[worker]
         g_density = grad_density[worker]
         for ray in range(worker, N, workers):
             count, trans = _march(
-                theta, table, resolution, density, channels, aabb, occupancy, origins[ray], directions[ray],
-                times[ray], jitters[ray], step, extent, values, features, points, weights, logs, distances,
+                theta, table, resolution, density, M, aabb, occupancy, origins[ray], directions[ray],
+                times[ray], jitters[ray], step, extent,
+                values, features, points, corners, fractions, weights, logs, distances,
             )
-            b = basis[ray]
-            g_b = grad_basis[ray]
-            g_b[:] = np.float32(0.0)
+            b = basis[0] if shared else basis[ray]
+            g_b = grad_basis[worker] if shared else grad_basis[ray]
             rgb0 = trans * backgrounds[ray, 0]
             rgb1 = trans * backgrounds[ray, 1]
             rgb2 = trans * backgrounds[ray, 2]
@@ -387,25 +409,24 @@ def backpropagate(
                             g_features[i] += g_c * b[c, i]
                             g_b[c, i] += g_c * feature[i]
                 _scatter_planes(
-                    g_theta, table, resolution, points[k, 0], points[k, 1], points[k, 2], times[ray], channels,
-                    values[k], g_features, plane_scratch,
+                    g_theta, table, resolution, M, corners[k], fractions[k], values[k], g_features, plane_scratch
                 )
     return errors, counts
 
 
 @_parallel
-def log_densities(theta, table, resolution, density, channels, points, times, workers):
+def log_densities(theta, table, resolution, density, M, points, times, workers):
     """Log density at (N, 3) points in [0, 1]^3 and (N,) times: (N,) float32."""
     N = points.shape[0]
     out = np.empty(N, np.float32)
     F = density.size - 1
     for worker in prange(workers):
-        values, features, _, _, _, _ = _scratch(table, channels, 1)
+        values, features, at, corners, fractions, _, _, _ = _scratch(table, M, 1)
+        point = at[0]
         for i in range(worker, N, workers):
-            _sample_planes(
-                theta, table, resolution, points[i, 0], points[i, 1], points[i, 2], times[i], channels, values[0]
-            )
-            _features(values[0], table.shape[0], channels, features[0])
+            point[0], point[1], point[2], point[3] = points[i, 0], points[i, 1], points[i, 2], times[i]
+            _sample_planes(theta, table, resolution, point, M, corners[0], fractions[0], values[0])
+            _features(values[0], table.shape[0], M, features[0])
             out[i] = min(max(_dot(features[0], density, F) + density[F], -_LIMIT), _LIMIT)
     return out
 
@@ -440,13 +461,12 @@ def adam(theta, grad, mean, square, lr, beta1, beta2, epsilon, step_number):
 
 
 @_parallel
-def add_variation(theta, grad, start, rows, columns, channels, along_rows, across_rows):
+def add_variation(theta, grad, start, rows, columns, M, along_rows, across_rows):
     """Add the gradient of the mean over (i, j, m) of squared differences between neighbours (total variation).
 
     Those in the same row count `along_rows`, those in the same column `across_rows`: a space-time plane is smoothed along
     space alone, its rows.
     """
-    M = len(channels)
     width = columns * M
     along, across = np.float32(2.0 * along_rows / (rows * width)), np.float32(2.0 * across_rows / (rows * width))
     for row in prange(rows):
@@ -470,9 +490,8 @@ def add_variation(theta, grad, start, rows, columns, channels, along_rows, acros
 
 
 @_parallel
-def add_time_smoothness(theta, grad, start, rows, columns, channels, weight):
+def add_time_smoothness(theta, grad, start, rows, columns, M, weight):
     """Add the gradient of weight * mean of (P[t-1] - 2 P[t] + P[t+1])^2 (K-Planes, section 3.2)."""
-    M = len(channels)
     width = columns * M
     k = np.float32(2.0 * weight / (rows * columns * M))
     for row in prange(rows):

@@ -251,6 +251,9 @@ class RaySampler:
             picture = np.concatenate([self.train[which], picture])
             row, column = np.concatenate([top + below, row]), np.concatenate([left + beside, column])
             inside = row * pictures.width[picture] + column
+        # Rays of one instant read the same rows of the space-time planes: side by side, they find them in the cache.
+        order = np.argsort(pictures.time[picture], kind="stable")
+        picture, row, column, inside = picture[order], row[order], column[order], inside[order]
         origins, directions = rays(pictures, picture, column, row)
         colours = self.dataset.pixels.read(pictures.offset[picture] + inside).astype(np.float32) / np.float32(255)
         if background is None:
@@ -318,13 +321,13 @@ class FusedOptimiser:
         """Mean squared error a colour channel, and samples a ray."""
         layout, config = self.field.layout, self.config
         kept = kept_channels(self.field, config, number)
-        basis = self.field.basis(batch.directions) * kept
+        basis = (self.field.basis(batch.directions) if config.view_dependent else self.field.b2[None]) * kept
         density = torch.cat([self.field.density.detach()[:-1] * kept, self.field.density.detach()[-1:]])
-        grad_basis = np.empty(basis.shape, np.float32)
+        grad_basis = np.zeros((len(basis) if config.view_dependent else self.workers, *basis.shape[1:]), np.float32)
         grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
         errors, counts = kernels.backpropagate(
             self.theta, self.grad, layout.table, layout.resolution, density.numpy(), grad_density,
-            (0,) * layout.channels, aabb, occupancy.view(np.uint8), np.float32(step_length), np.float32(extent),
+            layout.channels, aabb, occupancy.view(np.uint8), np.float32(step_length), np.float32(extent),
             batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(), batch.jitters.numpy(),
             basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(), self._peaks,
             np.float32(config.distortion), sample_capacity(aabb, step_length),
@@ -332,7 +335,7 @@ class FusedOptimiser:
         if number % config.regularise_every == 0:
             add_priors(self.field, self.theta, self.grad[0], config, config.regularise_every)
         self.decoder.zero_grad()
-        basis.backward(torch.from_numpy(grad_basis))
+        basis.backward(torch.from_numpy(grad_basis if config.view_dependent else grad_basis.sum(0, keepdims=True)))
         self.field.density.grad = torch.from_numpy(grad_density.sum(0))
         self.field.density.grad[:-1] *= kept
         for group in self.decoder.param_groups:
@@ -417,14 +420,14 @@ class PlainOptimiser:
 
 def add_priors(field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, times: float) -> None:
     """Add `times` the gradient of `kpc.encoder.field.priors` to grad."""
-    channels = (0,) * field.layout.channels
+    M = field.layout.channels
     space, transient = times * config.space_variation, times * config.transient_variation
     for _, name, start, rows, columns in field.layout.planes():
         if name in SPACE_PLANES:
-            kernels.add_variation(theta, grad, start, rows, columns, channels, space, space)
+            kernels.add_variation(theta, grad, start, rows, columns, M, space, space)
             continue
-        kernels.add_variation(theta, grad, start, rows, columns, channels, transient, 0.0)
-        kernels.add_time_smoothness(theta, grad, start, rows, columns, channels, times * config.time_smoothness)
+        kernels.add_variation(theta, grad, start, rows, columns, M, transient, 0.0)
+        kernels.add_time_smoothness(theta, grad, start, rows, columns, M, times * config.time_smoothness)
         size = rows * columns * field.layout.channels
         kernels.add_sparse_transients(theta, grad, start, size, times * config.sparse_transients)
 
@@ -434,7 +437,7 @@ def log_densities(field: Field, points: np.ndarray, times: np.ndarray) -> np.nda
     layout = field.layout
     return kernels.log_densities(
         field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
-        (0,) * layout.channels, np.asarray(points, np.float32), np.asarray(times, np.float32), 8 * numba.get_num_threads(),
+        layout.channels, np.asarray(points, np.float32), np.asarray(times, np.float32), 8 * numba.get_num_threads(),
     )
 
 

@@ -41,7 +41,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
     grad = np.zeros((workers, layout.size), np.float32)
     grad_density = np.zeros((workers, layout.features + 1), np.float32)
     basis = field.basis(rays.directions).detach().numpy()
-    grad_basis = np.full((n, 3, layout.features), np.nan, np.float32)
+    grad_basis = np.zeros((n, 3, layout.features), np.float32)
     peaks = np.zeros((workers, *scene.occupancy.shape[1:]), np.float32)
     errors, counts = kernels.backpropagate(
         field.theta.detach().numpy(),
@@ -50,7 +50,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         layout.resolution,
         field.density.detach().numpy(),
         grad_density,
-        (0,) * layout.channels,
+        layout.channels,
         scene.aabb,
         scene.occupancy.view(np.uint8),
         np.float32(scene.step),

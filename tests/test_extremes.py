@@ -76,14 +76,16 @@ def test_products_of_six_values_at_1e_minus_6_and_1e6(large: int, order: int) ->
         for (_, name, *_), value in zip(field.layout.planes(), values, strict=True):
             field.plane(0, name).fill_(float(value))
     theta, layout = field.theta.detach().numpy(), field.layout
-    samples, features = np.ones((6, 1), np.float32), np.zeros(1, np.float32)
-    kernels._sample_planes(theta, layout.table, layout.resolution, 0.5, 0.5, 0.5, 0.5, (0,), samples)
-    kernels._features(samples, 1, (0,), features)
+    samples, features = np.ones(6, np.float32), np.zeros(1, np.float32)
+    corners, fractions = np.empty(6, np.int64), np.empty(4, np.float32)
+    corner = np.zeros(4, np.float32)
+    kernels._sample_planes(theta, layout.table, layout.resolution, corner, 1, corners, fractions, samples)
+    kernels._features(samples, 1, 1, features)
     exact = np.prod(values.astype(np.float32).astype(np.float64))
     assert features[0] == pytest.approx(exact, rel=1e-6)
     grad = np.zeros_like(theta)
-    kernels._scatter_planes(grad, layout.table, layout.resolution, 0.0, 0.0, 0.0, 0.0, (0,), samples, np.ones(1, np.float32),
-                            np.empty((6, 1), np.float32))
+    one, scratch = np.ones(1, np.float32), np.empty(6, np.float32)
+    kernels._scatter_planes(grad, layout.table, layout.resolution, 1, corners, fractions, samples, one, scratch)
     for (_, name, start, *_), value in zip(layout.planes(), values, strict=True):
         assert grad[start] == pytest.approx(exact / float(np.float32(value)), rel=1e-5), name
 

@@ -130,7 +130,7 @@ def test_render_gives_opacity_depth_and_counts() -> None:
         field.layout.table,
         field.layout.resolution,
         field.density.detach().numpy(),
-        (0,) * field.layout.channels,
+        field.layout.channels,
         scene.aabb,
         scene.occupancy.view(np.uint8),
         np.float32(scene.step),
