@@ -102,7 +102,7 @@ class TrainConfig:
         than 32 gain nothing. Surroundings change the matter: shelf_hand loses 3.3 dB without the direction.
         """
         return replace(self, resolutions=tuple(max(16, n // 2) for n in self.resolutions), channels=8 * self.channels,
-                       channel_dropout=0.25, view_dependent=False, steps=8 * self.steps // 5)
+                       channel_dropout=0.25, view_dependent=False, steps=4 * self.steps)
 
 
 PRESETS = {
