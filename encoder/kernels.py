@@ -25,8 +25,7 @@ from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION
 _LIMIT = np.float32(LOG_DENSITY_LIMIT)
 _TERMINATION = np.float32(TERMINATION)
 _NEGLIGIBLE = np.float32(1e-4)
-"""A sample of less weight gets no colour: 4096 of them could not make up an 8-bit level and a half. It gets no gradient either,
-which would take as long as any other's; the occupancy grid empties a cell where none has more."""
+"""A sample of less weight gets no colour; 4096 of them could not make up an 8-bit level and a half."""
 
 _TINY = np.float32(1e-30)
 """Adam's means below this are 0."""
@@ -396,20 +395,19 @@ def backpropagate(
                 peaks[worker][cell] = max(peaks[worker][cell], weight)
                 after += weight * seen
                 beyond += weight
-                if weight <= _NEGLIGIBLE:
-                    continue
                 feature = features[k]
                 for i in range(F):
                     g_features[i] = g_log * density[i]
                     g_density[i] += g_log * feature[i]
                 g_density[F] += g_log
-                for c in range(3):
-                    colour = colours[k, c]
-                    g_c = g0 if c == 0 else (g1 if c == 1 else g2)
-                    g_c *= weight * colour * (np.float32(1.0) - colour)
-                    for i in range(F):
-                        g_features[i] += g_c * b[c, i]
-                        g_b[c, i] += g_c * feature[i]
+                if weight > _NEGLIGIBLE:
+                    for c in range(3):
+                        colour = colours[k, c]
+                        g_c = g0 if c == 0 else (g1 if c == 1 else g2)
+                        g_c *= weight * colour * (np.float32(1.0) - colour)
+                        for i in range(F):
+                            g_features[i] += g_c * b[c, i]
+                            g_b[c, i] += g_c * feature[i]
                 _scatter_planes(
                     g_theta, table, resolution, M, corners[k], fractions[k], values[k], g_features, plane_scratch
                 )

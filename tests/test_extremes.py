@@ -114,25 +114,10 @@ def test_transmittance_over_4096_samples(optical_depth: float) -> None:
             break
         left *= math.exp(-tau)
     assert 1 - float(opacity[0]) == pytest.approx(left, rel=3e-4)
-    ours, theirs = (f(scene, ray, torch.zeros(1, 3)) for f in (backpropagate, reference_gradients))
-    assert ours["counts"][0] == theirs["samples"] >= min(4096, math.floor(-math.log(TERMINATION) / tau))
-
-
-@pytest.mark.parametrize("optical_depth", [0.05, 1.0, 5.0])
-def test_gradients_reach_every_sample_of_a_fog(optical_depth: float) -> None:
-    """256 samples of weights from 1.3e-4 to 2e-2; all the background that comes through should be black."""
-    scene, ray = fog(256, optical_depth)
     black = replace(scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2, b2=np.full_like(scene.decoder.b2, -40.0)))
     ours, theirs = (f(black, ray, torch.zeros(1, 3)) for f in (backpropagate, reference_gradients))
+    assert ours["counts"][0] == theirs["samples"] >= min(4096, math.floor(-math.log(TERMINATION) / tau))
     assert ours["density"][-1] == pytest.approx(theirs["density"][-1], rel=5e-3)
-
-
-def test_what_no_picture_could_show_has_no_gradient() -> None:
-    """Weights of 4e-6: the occupancy grid empties such cells."""
-    scene, ray = fog(256, 1e-3)
-    ours = backpropagate(scene, ray, torch.zeros(1, 3))
-    assert ours["counts"][0] == 256 and 0 < ours["peaks"].max() < 1e-5
-    assert not ours["density"].any() and not ours["theta"].any() and not ours["basis"].any()
 
 
 def test_learning_from_planes_exactly_at_identity() -> None:
