@@ -11,7 +11,7 @@ import kpc
 from kpc.encoder.config import PRESETS
 from kpc.format.file import write
 from kpc.format.quantise import quantise_scene
-from kpc.tools import kpbench, results
+from kpc.tools import kpbench, plot, results
 from kpc.tools.provenance import data_hash
 
 
@@ -40,6 +40,28 @@ def test_encode_records_every_repeat(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert run["test_pictures"] == 1 and run["test_psnr"] > 3 and run["peak_memory_bytes"] > 1 << 26
     assert sorted(p.name for p in (tmp_path / "kept").iterdir()) == ["tiny-draft-5.kpc", "tiny-draft-6.kpc"]
     assert "PSNR dB" in said.err and results.markdown([record])
+
+
+def test_curve_encodes_anew_for_each_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_n3dv(tmp_path / "tiny", frames=2)
+    out = tmp_path / "curve.json"
+    command = ["curve", str(tmp_path / "tiny"), "--preset", "draft", "--minutes", "0.005,0.05", "--repeats", "2",
+               "--box=-1,-1,-1,1,1,1", "--out", str(out), "--keep-scenes", str(tmp_path / "kept")]  # fmt: skip
+    assert kpbench.main(command) == 0
+    said = capsys.readouterr()
+    records = results.load([out])
+    assert [record["settings"]["time_budget_s"] for record in records] == pytest.approx([0.3, 3.0])
+    for record in records:
+        assert record["kind"] == "curve" and record["name"] == "tiny" and len(record["repeats"]) == 2
+        for run in record["repeats"]:
+            assert run["train_s"] >= record["settings"]["time_budget_s"] and run["steps"] > 0
+            assert run["test_psnr"] > 3 and -1 < run["test_ssim"] <= 1
+            assert run["size_bytes"] == (tmp_path / "kept" / run["file"]).stat().st_size
+    assert len(list((tmp_path / "kept").iterdir())) == 4
+    assert records[0]["repeats"][0]["steps"] < records[1]["repeats"][0]["steps"]
+    assert said.out == "" and "training" in said.err and "against time" in results.markdown(records)
+    assert plot.main([str(out), "-o", str(tmp_path / "curve.svg")]) == 0
+    assert (tmp_path / "curve.svg").read_text() == plot.svg(records)
 
 
 def test_player_measures_both_paths_of_a_moving_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -73,8 +95,15 @@ def test_what_was_measured_survives_a_failure(tmp_path: Path, capsys: pytest.Cap
     assert said.err.splitlines()[-1].startswith(f"kpbench: {bad}: ")
 
 
+@pytest.mark.parametrize("minutes", ["", "0", "-1", "nan", "inf", "1,,2", "soon"])
+def test_senseless_minutes_are_refused(minutes: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        kpbench.main(["curve", ".", f"--minutes={minutes}"])
+    assert "--minutes" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
-    "command", [["encode", "missing"], ["player", "missing.kpc"], ["player", "x.kpc", "--out", "no/x"]]
+    "command", [["encode", "missing"], ["curve", "missing"], ["player", "missing.kpc"], ["player", "x.kpc", "--out", "no/x"]]
 )
 def test_errors_are_one_line(command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                              capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
@@ -92,6 +121,7 @@ def test_senseless_options_are_refused(option: str, capsys: pytest.CaptureFixtur
 
 
 def test_presets_are_those_of_kpenc(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        kpbench.main(["encode", "--help"])
-    assert "{" + ",".join(PRESETS) + "}" in capsys.readouterr().out
+    for kind in ("encode", "curve"):
+        with pytest.raises(SystemExit):
+            kpbench.main([kind, "--help"])
+        assert "{" + ",".join(PRESETS) + "}" in capsys.readouterr().out

@@ -1,6 +1,7 @@
 """kpbench: how good, how small and how fast, as records that can be checked.
 
 kpbench encode room liam --preset balanced --out docs/bench/balanced.json
+kpbench curve room liam --minutes 1,2,5,10,20 --out docs/bench/curve.json
 kpbench player room.kpc liam.kpc --out docs/bench/player.json
 
 Every record says what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
@@ -103,39 +104,54 @@ def _record(kind: str, source: Path, origin: results.Record, settings: dict[str,
 
 
 def _encode(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
-    """One record a dataset. Repeat k runs with seed + k, so that repeats show the spread of quality, too."""
+    """One record a dataset."""
+    yield from _encodes("encode", options, origin, [(source, options.time_budget) for source in options.datasets])
+
+
+def _curve(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """One record a dataset and time: an encode of its own, since the learning rate falls as the time runs out."""
+    runs = [(source, 60 * minutes) for source in options.datasets for minutes in options.minutes]
+    yield from _encodes("curve", options, origin, runs)
+
+
+def _encodes(
+    kind: str, options: argparse.Namespace, origin: results.Record, runs: list[tuple[Path, float | None]]
+) -> Iterator[results.Record]:
+    """A record for each dataset and time budget. Repeat k runs with seed + k, so that repeats show the spread of quality, too."""
     kpenc = _encoder()
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         kept: Path = options.keep_scenes or Path(scratch)
         kept.mkdir(parents=True, exist_ok=True)
-        for source in options.datasets:
+        for source, time_budget_s in runs:
             if not source.is_dir():
                 raise UsageError(f"{source}: no such folder")
             settings = {
                 "preset": options.preset,
                 "steps": options.steps,
-                "time_budget_s": options.time_budget,
+                "time_budget_s": time_budget_s,
                 "downscale": options.downscale,
                 "box": options.box,
                 "test_views": options.test_views,
             }
-            record = _record("encode", source, origin, settings) | {"seed": options.seed, "repeats": []}
+            record = _record(kind, source, origin, settings) | {"seed": options.seed, "repeats": []}
+            label = f"{record['name']}-{options.preset}" + (f"-{time_budget_s:g}s" if kind == "curve" else "")
             for seed in range(options.seed, options.seed + options.repeats):
                 suffix = f"-{seed}" if options.repeats > 1 else ""
                 job = kpenc.Options(
                     source=source,
-                    output=kept / f"{record['name']}-{options.preset}{suffix}.kpc",
+                    output=kept / f"{label}{suffix}.kpc",
                     preset=options.preset,
                     steps=options.steps,
-                    time_budget_s=options.time_budget,
+                    time_budget_s=time_budget_s,
                     seed=seed,
                     device=options.device,
                     downscale=options.downscale,
                     box=options.box,
-                    work=Path(scratch) / f"{record['name']}-{seed}.work",
+                    work=Path(scratch) / f"{label}-{seed}.work",
                     most_tests=options.test_views,
                 )
-                print(f"kpbench: {record['name']}, {options.preset}, seed {seed}", file=sys.stderr)
+                length = "" if time_budget_s is None else f"{time_budget_s:g} s, "
+                print(f"kpbench: {record['name']}, {options.preset}, {length}seed {seed}", file=sys.stderr)
                 device, outcome = _alone(_encode_once, job)
                 record["repeats"].append(outcome)
             yield record | {"renderer": device}
@@ -263,20 +279,27 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|player")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|player")
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
-    encode.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
-    encode.add_argument("--preset", choices=("draft", "fast", "balanced", "best"), default="balanced")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
     encode.add_argument("--time-budget", type=cli.duration_s, metavar="10m", help="of training, instead of steps")
-    encode.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
-    encode.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    encode.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
-    encode.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
-    encode.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
-    encode.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there")
     encode.set_defaults(measure=_encode)
+
+    curve = kinds.add_parser("curve", help="quality against time", description="Run kpenc on each dataset for each time.")
+    curve.add_argument("--minutes", type=_minutes, default=(1.0, 2.0, 5.0, 10.0, 20.0), metavar="1,2,5,10,20",
+                       help="of training, a run of its own for each (default: 1,2,5,10,20)")  # fmt: skip
+    curve.set_defaults(measure=_curve, steps=None)
+
+    for kind in (encode, curve):
+        kind.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
+        kind.add_argument("--preset", choices=("draft", "fast", "balanced", "best"), default="balanced")
+        kind.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
+        kind.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+        kind.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
+        kind.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
+        kind.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
+        kind.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there")
 
     player = kinds.add_parser("player", help="draw each scene, headless", description="Draw each scene, headless.")
     player.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
@@ -284,7 +307,7 @@ def _parser() -> argparse.ArgumentParser:
     player.add_argument("--frames", type=_positive, default=60, help="timed frames, spread over the clip (default: 60)")
     player.set_defaults(measure=_player)
 
-    for kind in (encode, player):
+    for kind in (encode, curve, player):
         kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
         kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
     return parser
@@ -294,6 +317,16 @@ def _positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
     return int(text)
+
+
+def _minutes(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        values = ()
+    if not values or not all(0 < value < 1e6 for value in values):
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of minutes; write 1,2,5")
+    return values
 
 
 def _size(text: str) -> tuple[int, int]:

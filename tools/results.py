@@ -44,13 +44,17 @@ def _accuracy(key: str, text: str) -> Callable[[Record], str]:
     return lambda record: text.format(record["accuracy"][key])
 
 
+_ENCODED: list[Column] = [
+    ("dataset", lambda r: r["name"]),
+    ("preset", lambda r: r["settings"]["preset"]),
+    ("PSNR dB", _number("test_psnr", "{:.2f}")),
+    ("SSIM", _number("test_ssim", "{:.3f}")),
+    ("file KB", _number("size_bytes", "{:.0f}", 1e3)),
+]
+
 COLUMNS: dict[str, list[Column]] = {
     "encode": [
-        ("dataset", lambda r: r["name"]),
-        ("preset", lambda r: r["settings"]["preset"]),
-        ("PSNR dB", _number("test_psnr", "{:.2f}")),
-        ("SSIM", _number("test_ssim", "{:.3f}")),
-        ("file KB", _number("size_bytes", "{:.0f}", 1e3)),
+        *_ENCODED,
         ("bits/param", _number("bits_per_parameter", "{:.2f}")),
         ("identity", _number("identity_share", "{:.0%}")),
         ("coding loss dB", _number("coding_loss_db", "{:.2f}")),
@@ -58,6 +62,12 @@ COLUMNS: dict[str, list[Column]] = {
         ("all", _number("encode_s", "{:.0f} s")),
         ("rays/s", _number("rays_per_s", "{:,.0f}")),
         ("peak MB", _number("peak_memory_bytes", "{:.0f}", 1e6)),
+    ],
+    "curve": [
+        *_ENCODED,
+        ("training", _number("train_s", "{:.0f} s")),
+        ("all", _number("encode_s", "{:.0f} s")),
+        ("steps", _number("steps", "{:,.0f}")),
     ],
     "player": [
         ("scene", lambda r: r["name"]),
@@ -74,7 +84,7 @@ COLUMNS: dict[str, list[Column]] = {
         ("within 1/255", _accuracy("within_one_level", "{:.2%}")),
     ],
 }
-TITLES = {"encode": "Encoding", "player": "Playing"}
+TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "player": "Playing"}
 
 
 def cells(kind: str, records: Iterable[Record]) -> list[list[str]]:
