@@ -36,6 +36,14 @@ class TrainConfig:
     object_rays: float = 0.5
     """Share of the rays drawn from about what is not transparent, where pictures have alpha: most of a picture is empty and
     soon right. Soldier gains 0.3 dB after 2,500 steps of `fast`; 0.8 gains less."""
+    temporal_start: float = 0.5
+    """Share of the run, in steps or time, from which on rays are drawn by how much their pixels change, where cameras stand
+    still (IST: DyNeRF, arXiv:2103.02597; K-Planes, section 3.4); 1 for never. Gain in held-out PSNR, and of that where something
+    moves alone: default scene 1.2 and 2.1 dB (2,000 steps of `fast`); liam 0.1 and 0.9 dB, room 0.0 and 0.9 dB (the last 500 of
+    1,500 steps of `balanced`). A step takes 4 to 8 % longer: what moves has more samples."""
+    temporal_floor: float = 0.1
+    """Least change that counts, as a share of the full range: what rests is still drawn. The default scene gains 0.7 dB at 0.3,
+    and 1.3 dB at 0.03, where what rests loses 0.8 dB; at 0.1 it loses 0.1 dB, room 0.6 dB."""
     channel_dropout: float = 0.0
     """Share of the channels that a step leaves out, others each step, so that none relies on another."""
     learning_rate: float = 4e-2
@@ -89,6 +97,9 @@ class TrainConfig:
         for name in ("object_rays", "channel_dropout"):
             if not 0 <= getattr(self, name) < 1:
                 raise UsageError(f"{name} must be at least 0 and less than 1, not {getattr(self, name)}")
+        for name in ("temporal_start", "temporal_floor"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"{name} must be from 0 to 1, not {getattr(self, name)}")
         if not self.resolutions or min(self.resolutions) < 2:
             raise UsageError(f"resolutions {self.resolutions}: every scale needs at least 2 texels")
 

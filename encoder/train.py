@@ -18,6 +18,7 @@ from kpc.encoder.config import TrainConfig
 from kpc.encoder.box import seen_cells
 from kpc.encoder.datasets import Dataset, rays
 from kpc.encoder.field import Field, Rays, plan_layout, priors, render_reference
+from kpc.encoder.importance import TileWeights, cameras_stand_still
 from kpc.encoder.occupancy import OccupancyGrid, grid_shape
 from kpc.format.cli import written_aside
 from kpc.format.errors import TrainingError
@@ -70,6 +71,8 @@ class Trainer:
         self.sampler = RaySampler(dataset)
         # Objects with alpha are shown on white. Elsewhere what the box leaves open is grey: the least wrong guess.
         self.background = np.full(3, 1.0 if dataset.has_alpha else 0.5, np.float32)
+        self._weights: TileWeights | None = None
+        self._can_weigh = cameras_stand_still(dataset)
         self._steady_rays, self._steady_s = 0, 0.0
 
     def run(
@@ -97,7 +100,8 @@ class Trainer:
                 self.grid.split(self.density_at, self.slots, self.rng)
             count = int(np.clip(config.samples / max(self.samples_per_ray, 1e-3), 256, config.rays))
             background = None if self.dataset.has_alpha else self.background
-            batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays)
+            weights = self._weights_at(fraction)
+            batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays, weights)
             rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
             squared_error, samples = self.optimiser.step(
                 self.step, rate, batch, targets, self.aabb, self.grid.marched,
@@ -133,6 +137,14 @@ class Trainer:
         if occupancy is None:
             occupancy = self.grid.marched
         return self.field.to_scene(self.aabb, self.dataset.clip, occupancy, self.background, self.step_length)
+
+    def _weights_at(self, fraction: float) -> TileWeights | None:
+        """What decides which rays are drawn at this share of the run; it follows from the dataset, so no checkpoint holds it."""
+        if fraction < self.config.temporal_start or not self._can_weigh:
+            return None
+        if self._weights is None:
+            self._weights = TileWeights(self.dataset, self.config.temporal_floor)
+        return self._weights
 
     def _fraction(self, time_budget_s: float | None) -> float:
         if time_budget_s is not None:
@@ -211,7 +223,7 @@ class Trainer:
 
 
 class RaySampler:
-    """Draws usable pixels of the training pictures, each as likely as any other, and makes their rays.
+    """Draws usable pixels of the training pictures, each as likely as any other unless told otherwise, and makes their rays.
 
     Attributes:
         frames: (P, 4) int64, columns from and to, rows from and to, of what is not transparent in each training picture;
@@ -232,28 +244,31 @@ class RaySampler:
             self.frame_ends = np.cumsum(sizes)
 
     def draw(
-        self, rng: np.random.Generator, count: int, background: np.ndarray | None = None, object_rays: float = 0.0
+        self, rng: np.random.Generator, count: int, background: np.ndarray | None = None, object_rays: float = 0.0,
+        weights: TileWeights | None = None,
     ) -> tuple[Rays, torch.Tensor]:
         """`count` rays and the (count, 3) colours they should have, over one background or one drawn for each ray.
 
-        `object_rays` is the share of them that is drawn from `frames`, where there are any.
+        `object_rays` is the share of them that is drawn from `frames`, where there are any; the others go by `weights`.
         """
         pictures = self.dataset.pictures
         within = 0 if self.frames is None or not self.frame_ends[-1] else round(object_rays * count)
-        which, rank = _pick(rng, self.ends, count - within)
-        picture = self.train[which]
-        inside = self.dataset.nth_usable(picture, rank)
-        row, column = np.divmod(inside, pictures.width[picture])
+        if weights is not None:
+            picture, row, column = weights.draw(rng, count - within)
+        else:
+            which, rank = _pick(rng, self.ends, count - within)
+            picture = self.train[which]
+            row, column = np.divmod(self.dataset.nth_usable(picture, rank), pictures.width[picture])
         if within:
             which, rank = _pick(rng, self.frame_ends, within)
             left, right, top, _ = self.frames[which].T
             below, beside = np.divmod(rank, right - left)
             picture = np.concatenate([self.train[which], picture])
             row, column = np.concatenate([top + below, row]), np.concatenate([left + beside, column])
-            inside = row * pictures.width[picture] + column
         # Rays of one instant read the same rows of the space-time planes: side by side, they find them in the cache.
         order = np.argsort(pictures.time[picture], kind="stable")
-        picture, row, column, inside = picture[order], row[order], column[order], inside[order]
+        picture, row, column = picture[order], row[order], column[order]
+        inside = row * pictures.width[picture] + column
         origins, directions = rays(pictures, picture, column, row)
         colours = self.dataset.pixels.read(pictures.offset[picture] + inside).astype(np.float32) / np.float32(255)
         if background is None:

@@ -66,7 +66,9 @@ def test_names_are_escaped() -> None:
     assert "<b>&, fast" in {text.text for text in root.iter(f"{SVG}text")}
 
 
-@pytest.mark.parametrize("values", [[0.93], [25.0, 25.0], [0.0, 0.0], [20.1, 33.7], [0.931, 0.967], [110.0, 4000.0], [-3.0, 2.0]])
+@pytest.mark.parametrize(
+    "values", [[0.93], [25.0, 25.0], [0.0, 0.0], [20.1, 33.7], [0.931, 0.967], [110.0, 4000.0], [-3.0, 2.0]]
+)
 def test_ticks_are_round_and_hold_all_values(values: list[float]) -> None:
     axis = plot.linear_axis(values)
     assert 2 <= len(axis.ticks) <= 8 and axis.ticks[0] == axis.low and axis.ticks[-1] == axis.high

@@ -41,6 +41,14 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return load_dataset(folder / "set", folder / "cache", progress=False)
 
 
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Cameras that stand still."""
+    folder = tmp_path_factory.mktemp("rig")
+    make.write_n3dv(folder / "set", frames=6)
+    return load_dataset(folder / "set", folder / "cache", progress=False)
+
+
 def trainer(dataset: Dataset, **changes: object) -> Trainer:
     return Trainer(dataset, replace(CONFIG, **changes), BOX, "cpu")  # type: ignore[arg-type]
 
@@ -105,6 +113,38 @@ def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(moving: Dataset, 
     assert_same(first, second)
     second.run(ignore)
     assert_same(whole, second)
+
+
+# before rays go by what changes, at the last step before, at the first one, and after
+@pytest.mark.parametrize("stop_at", [5, 20, 21, 30])
+def test_resuming_across_the_change_of_weights_is_bitwise(rig: Dataset, tmp_path: Path, stop_at: int) -> None:
+    changes = {"steps": 40, "temporal_start": 0.5}
+    whole = trained(rig, **changes)
+    first, second = trainer(rig, **changes), trainer(rig, **changes)
+    with pytest.raises(KeyboardInterrupt):
+        first.run(ignore, interrupted=lambda: first.step == stop_at)
+    first.save(tmp_path / "checkpoint.kpck")
+    second.resume(tmp_path / "checkpoint.kpck")
+    second.run(ignore)
+    assert_same(whole, second)
+
+
+def test_rays_go_by_what_changes_from_the_stated_share_on(rig: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, seen = trainer(rig, steps=40, temporal_start=0.6), []
+    draw = RaySampler.draw
+
+    def recorded(sampler: RaySampler, *args: object) -> object:
+        seen.append((run.step, args[-1]))
+        return draw(sampler, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(RaySampler, "draw", recorded)
+    run.run(ignore)
+    assert [step for step, weights in seen if weights is not None] == list(range(24, 40))
+    assert len({id(weights) for _, weights in seen}) == 2  # computed once
+
+
+def test_cameras_that_move_train_as_if_there_were_no_weights(moving: Dataset) -> None:
+    assert_same(trained(moving, steps=12, temporal_start=0.0), trained(moving, steps=12, temporal_start=1.0))
 
 
 def test_checkpoints_are_written_on_the_way_and_at_the_end(moving: Dataset, tmp_path: Path) -> None:

@@ -117,7 +117,7 @@ def _curve(options: argparse.Namespace, origin: results.Record) -> Iterator[resu
 def _encodes(
     kind: str, options: argparse.Namespace, origin: results.Record, runs: list[tuple[Path, float | None]]
 ) -> Iterator[results.Record]:
-    """A record for each dataset and time budget. Repeat k runs with seed + k, so that repeats show the spread of quality, too."""
+    """A record a dataset and time budget. Repeat k runs with seed + k, so that repeats show the spread of quality, too."""
     kpenc = _encoder()
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         kept: Path = options.keep_scenes or Path(scratch)

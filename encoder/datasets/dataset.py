@@ -126,6 +126,10 @@ class Dataset:
         """Pixels, counted row by row, that are usable number `rank` of their pictures: both (N,), as the result, int64."""
         return rank if self.masks is None else self.masks.nth_usable(picture, rank)
 
+    def is_usable(self, picture: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        """Of pixels counted row by row, (N,) as their pictures, whether they may be used: (N,) bool."""
+        return np.ones(len(pixel), bool) if self.masks is None else self.masks.is_usable(picture, pixel)
+
     def usable(self, picture: int) -> np.ndarray:
         """Which pixels of a picture may be used: (height, width) bool."""
         if self.masks is not None:

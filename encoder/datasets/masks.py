@@ -45,6 +45,13 @@ class Masks:
         bits = np.unpackbits(self._bits.picture(picture), count=width * height)
         return bits.astype(bool).reshape(height, width)
 
+    def is_usable(self, picture: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        """Of pixels counted row by row, (N,) as their pictures: (N,) bool."""
+        block, bit = np.divmod(pixel, BLOCK)
+        data = self._bits.read(self._first_block[picture] + block)
+        value = np.take_along_axis(data, bit[:, None] // 8, axis=1)[:, 0]
+        return _BITS[value, bit % 8].astype(bool)
+
     def nth_usable(self, picture: np.ndarray, rank: np.ndarray) -> np.ndarray:
         """Pixels, counted row by row, that are usable number `rank` of their pictures: both (N,), as the result, int64.
 

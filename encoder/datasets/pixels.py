@@ -67,17 +67,18 @@ class PixelCache:
             raise DatasetError(f"{self.path}: shorter than it was; delete it to have it rebuilt")
         return np.frombuffer(data, np.uint8).reshape(-1, stored)[:, : self.channels]
 
-    def picture(self, number: int) -> np.ndarray:
-        """A whole picture: (height, width, channels) uint8."""
-        return self._raw(number)[..., : self.channels]
+    def picture(self, number: int, top: int = 0, bottom: int | None = None) -> np.ndarray:
+        """A picture, or its rows from `top` up to `bottom`: (rows, width, channels) uint8."""
+        return self._raw(number, top, bottom)[..., : self.channels]
 
-    def _raw(self, number: int) -> np.ndarray:
+    def _raw(self, number: int, top: int = 0, bottom: int | None = None) -> np.ndarray:
         tile = self.tiles[number]
-        size = tile.width * tile.height * self._stored
-        data = os.pread(self._fd, size, tile.offset * self._stored)
+        rows = (tile.height if bottom is None else bottom) - top
+        size = rows * tile.width * self._stored
+        data = os.pread(self._fd, size, (tile.offset + top * tile.width) * self._stored)
         if len(data) != size:
             raise DatasetError(f"{self.path}: shorter than it was; delete it to have it rebuilt")
-        return np.frombuffer(data, np.uint8).reshape(tile.height, tile.width, self._stored)
+        return np.frombuffer(data, np.uint8).reshape(rows, tile.width, self._stored)
 
     def is_intact(self) -> bool:
         """Whether the file has its length and the pictures checked have their CRCs."""
