@@ -106,7 +106,7 @@ def fails(
     "name, layout, dynamic, steps",
     [
         ("n3dv", "N3DV", True, 24),
-        ("blender", "Blender", True, 38),
+        ("blender", "Blender", True, 96),
         ("nerfstudio", "nerfstudio", False, 24),
         ("colmap", "COLMAP", False, 24),
     ],
@@ -142,7 +142,7 @@ def test_what_is_printed(run: Kpenc, sets: Path) -> None:
             "bits per parameter",
             "exactly at identity: ",
             "encoded in ",
-            "38 steps",
+            "96 steps",
         )
     )
 
