@@ -4,9 +4,14 @@ import numpy as np
 
 from kpc.encoder.datasets.dataset import Pictures
 from kpc.format.errors import DatasetError
+from kpc.format.space import Contraction, expand
 
 CLEAR = 0.3
 """Share of a camera's distance to the scene's middle, around it, where nothing is."""
+
+INNER = 0.5
+"""Half the edge of a contracted scene's box over the cameras' distance from what they look at. Held-out PSNR of fox at a
+quarter of its size after 1,500 steps of `fast`: 26.2 dB with 1, 27.3 with 0.5, 27.1 with 0.35."""
 
 
 def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
@@ -36,17 +41,66 @@ def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
     return np.stack([focus - half, focus + half]).astype(np.float32)
 
 
-def seen_cells(pictures: Pictures, aabb: np.ndarray, shape: tuple[int, int, int], at_least: int = 2) -> np.ndarray:
-    """Cells of an (Nz, Ny, Nx) grid over the box whose centre lies in view of at least so many distinct cameras: bool.
+def reaches_beyond(pictures: Pictures, has_alpha: bool) -> tuple[bool, str]:
+    """Whether the pictures show more than a box can hold, and why, in words for the log.
+
+    They do, but where
+
+    * they have alpha: what was filmed is an object on its own;
+    * every camera's near and far are known: they bound what it sees.
+    """
+    if has_alpha:
+        return False, "the pictures have alpha: an object on its own"
+    cameras = _distinct_cameras(pictures)
+    if np.all(np.isfinite(pictures.near[cameras])) and np.all(np.isfinite(pictures.far[cameras])):
+        return False, "the cameras' near and far are known"
+    return True, "nothing bounds what the cameras see"
+
+
+def find_inner_box(pictures: Pictures) -> np.ndarray:
+    """The (2, 3) float32 box of a contracted scene, a cube.
+
+    * Cameras that look at a common point: around it, out to INNER of their median distance.
+    * Others: around their mean position, out to twice the farthest of them.
+
+    Raises:
+        DatasetError: all cameras are in one place.
+    """
+    cameras = _distinct_cameras(pictures)
+    eyes, focus = pictures.camera_to_world[cameras, :3, 3], _focus(pictures, cameras)
+    if focus is not None:
+        centre, half = focus, INNER * np.median(np.linalg.norm(eyes - focus, axis=1))
+    else:
+        centre = eyes.mean(0)
+        half = 2 * np.max(np.linalg.norm(eyes - centre, axis=1))
+    if not half > 0:
+        raise DatasetError("all cameras are in one place; give --box x0,y0,z0,x1,y1,z1")
+    return np.stack([centre - half, centre + half]).astype(np.float32)
+
+
+def contraction_of(pictures: Pictures, aabb: np.ndarray) -> Contraction:
+    """The contraction around a box whose even steps reach its farthest corner from nine cameras of ten."""
+    eyes = pictures.camera_to_world[_distinct_cameras(pictures), :3, 3]
+    corners = np.abs(eyes - aabb.mean(0)) + (aabb[1] - aabb[0]) / 2
+    return Contraction(float(np.quantile(np.linalg.norm(corners, axis=1), 0.9)))
+
+
+def seen_cells(
+    pictures: Pictures, aabb: np.ndarray, shape: tuple[int, int, int], mapping: Contraction | None = None, at_least: int = 2
+) -> np.ndarray:
+    """Cells of an (Nz, Ny, Nx) grid over what the planes cover whose centre at least so many distinct cameras see: bool.
 
     What a single camera sees cannot be placed in depth; leaving it empty keeps floaters from growing in front of lenses.
     Where fewer cameras than that exist, all of them must see a cell. Nothing is within CLEAR of the way from a camera to the
     point all of them look at, in any direction: a camera that moves would else carry each of its pictures before it.
     """
     nz, ny, nx = shape
-    axes = [aabb[0, a] + (np.arange(n) + 0.5) / n * (aabb[1, a] - aabb[0, a]) for a, n in enumerate((nx, ny, nz))]
+    low, edges = (aabb[0], aabb[1] - aabb[0]) if mapping is None else (np.zeros(3), np.ones(3))
+    axes = [low[a] + (np.arange(n) + 0.5) / n * edges[a] for a, n in enumerate((nx, ny, nz))]
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     centres = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    if mapping is not None:
+        centres = expand(centres, aabb)
     cameras = _distinct_cameras(pictures)
     focus = _focus(pictures, cameras)
     count, blocked = np.zeros(len(centres), np.int32), np.zeros(len(centres), bool)

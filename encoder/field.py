@@ -16,6 +16,7 @@ from kpc.encoder.config import TrainConfig
 from kpc.format.scene import (
     ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Clip, Decoder, Scene,
 )
+from kpc.format.space import Contraction
 
 AXES = "xyzt"
 
@@ -142,7 +143,10 @@ class Field(nn.Module):
         """Clipped log density, per longest edge of the box: (N,)."""
         return (features @ self.density[:-1] + self.density[-1]).clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)
 
-    def to_scene(self, aabb: np.ndarray, clip: Clip, occupancy: np.ndarray, background: np.ndarray, step: float) -> Scene:
+    def to_scene(
+        self, aabb: np.ndarray, clip: Clip, occupancy: np.ndarray, background: np.ndarray, step: float,
+        mapping: Contraction | None = None,
+    ) -> Scene:
         """The field as data; the planes are copied."""
         names = ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES
         with torch.no_grad():
@@ -156,6 +160,7 @@ class Field(nn.Module):
             aabb=np.asarray(aabb, np.float32), clip=clip, scales=scales,
             decoder=Decoder(density[:-1].copy(), float(density[-1]), *arrays),
             occupancy=np.asarray(occupancy, bool), background=np.asarray(background, np.float32), step=float(step),
+            mapping=mapping,
         )
 
     @staticmethod
@@ -207,14 +212,29 @@ class Rays:
     backgrounds: Tensor
 
 
+def place(points: Tensor, t: Tensor, aabb: Tensor, mapping: Contraction | None) -> tuple[Tensor, Tensor]:
+    """Places (..., 3) of world points in [0, 1]^3, and what a step there counts, `kpc.format.space.Contraction.stretch`.
+
+    `t` (...): how far along their rays they lie.
+    """
+    u = (points - aabb[0]) / (aabb[1] - aabb[0])
+    if mapping is None:
+        return u, torch.ones_like(t)
+    y = 2 * u - 1
+    radius = y.abs().amax(-1).clamp(min=1)
+    stretch = ((t / mapping.even).clamp(min=1) / radius).square()
+    return y * ((2 - 1 / radius) / radius / 4)[..., None] + 0.5, stretch
+
+
 def render_reference(
-    field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, kept: Tensor | None = None
+    field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, kept: Tensor | None = None,
+    mapping: Contraction | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Colours of a batch of rays, in plain PyTorch: the reference of `kernels.backpropagate`.
 
-    Sample k of a ray lies at near + (k + jitter) * step and counts where the occupancy grid (slots, Nz, Ny, Nx) is set;
-    alpha = 1 - exp(-sigma step / extent); a ray ends once its transmittance falls below TERMINATION. `kept` (F,), where
-    given, multiplies the features.
+    Sample k of a ray lies at s = near + (k + jitter) * step, which is its distance unless there is a mapping, and counts where
+    the occupancy grid (slots, Nz, Ny, Nx) is set; alpha = 1 - exp(-sigma stretch step / extent), stretch = 1 in a box; a ray
+    ends once its transmittance falls below TERMINATION. `kept` (F,), where given, multiplies the features.
 
     Returns:
         Colours (N, 3); the mean over rays of the distortion D that `kernels.backpropagate` states; of the n samples taken
@@ -225,22 +245,26 @@ def render_reference(
     t0, t1 = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse
     near = torch.minimum(t0, t1).nan_to_num(-torch.inf).amax(1).clamp(min=0)
     far = torch.maximum(t0, t1).nan_to_num(torch.inf).amin(1)
+    if mapping is not None:
+        near, far = torch.zeros_like(near), torch.full_like(far, mapping.end)
     longest = float((far - near).clamp(min=0).max())
     k = torch.arange(max(1, math.ceil(longest / step)), device=near.device)
-    t = near[:, None] + (k + rays.jitters[:, None]) * step
-
-    u = (rays.origins[:, None] + t[..., None] * rays.directions[:, None] - aabb[0]) / (aabb[1] - aabb[0])
+    s = near[:, None] + (k + rays.jitters[:, None]) * step
+    t = s
+    if mapping is not None:
+        t = torch.where(s <= mapping.even, s, mapping.even / (2 - s.clamp(max=mapping.end) / mapping.even))
+    u, stretch = place(rays.origins[:, None] + t[..., None] * rays.directions[:, None], t, aabb, mapping)
     size = torch.tensor(occupancy.shape[:0:-1], device=u.device)
     cell = (u.detach() * size).long().clamp(min=0).minimum(size - 1)
     slot = (rays.times * occupancy.shape[0]).long().clamp(max=occupancy.shape[0] - 1)[:, None]
     cell = cell.flip(-1)
-    taken = occupancy[slot, cell[..., 0], cell[..., 1], cell[..., 2]].bool() & (t < far[:, None])
+    taken = occupancy[slot, cell[..., 0], cell[..., 1], cell[..., 2]].bool() & (s < far[:, None])
     ray, _ = index = taken.nonzero(as_tuple=True)
 
     features = field.features(u[index], rays.times[ray])
     if kept is not None:
         features = features * kept
-    tau = torch.zeros_like(t).index_put(index, field.log_density(features).exp() * (step / extent))
+    tau = torch.zeros_like(s).index_put(index, field.log_density(features).exp() * (step / extent) * stretch[index])
     trans = torch.exp(-torch.cumsum(torch.nn.functional.pad(tau, (1, 0)), dim=1))
     weights = torch.where(trans[:, :-1] >= TERMINATION, trans[:, :-1] * (1 - torch.exp(-tau)), 0)
     basis = field.basis(rays.directions)
@@ -248,9 +272,9 @@ def render_reference(
     rgb = torch.zeros_like(rays.backgrounds).index_add(0, ray, weights[index][:, None] * colours)
     reached = trans[:, :-1][index] >= TERMINATION
     rgb = rgb + (1 - weights.sum(1, keepdim=True)) * rays.backgrounds
-    s = (k + rays.jitters[:, None]) * (step / extent)
-    before, before_s = (torch.cumsum(x, 1) - x for x in (weights, weights * s))
-    distortion = (2 * weights * (s * before - before_s) + weights.square() * (step / extent / 3)).sum(1).mean()
+    along = (k + rays.jitters[:, None]) * (step / extent)
+    before, before_s = (torch.cumsum(x, 1) - x for x in (weights, weights * along))
+    distortion = (2 * weights * (along * before - before_s) + weights.square() * (step / extent / 3)).sum(1).mean()
     return rgb, distortion, weights[index][reached], cell[index][reached]
 
 

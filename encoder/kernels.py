@@ -13,6 +13,8 @@ Naming, throughout this module
     density    (F + 1,) float32, the weights of the density and its bias
     basis      (rays, 3, F) float32, the colour basis of each ray's direction
     occupancy  (slots, Nz, Ny, Nx) uint8
+    even       float32, of `kpc.format.space.Contraction`; or None: the scene is its box, and code for that alone is compiled
+    s          where a sample lies on its ray: its distance, contracted as space is
 """
 
 import math
@@ -21,6 +23,7 @@ import numpy as np
 from numba import njit, prange
 
 from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION
+from kpc.format.space import FAR, Contraction
 
 _LIMIT = np.float32(LOG_DENSITY_LIMIT)
 _TERMINATION = np.float32(TERMINATION)
@@ -44,6 +47,11 @@ _inlined = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True,
 _parallel = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, parallel=True)
 
 
+def even_of(mapping: Contraction | None) -> np.float32 | None:
+    """`even`, as the kernels take it."""
+    return None if mapping is None else np.float32(mapping.even)
+
+
 @_jit
 def _box_span(origin, direction, aabb):
     """Distances at which a ray enters (at least 0) and leaves the box; leaves <= enters where it misses."""
@@ -59,6 +67,39 @@ def _box_span(origin, direction, aabb):
         near = max(near, min(t0, t1))
         far = min(far, max(t0, t1))
     return near, far
+
+
+@_inlined
+def _span(origin, direction, aabb, even):
+    """Where the samples of a ray begin and end, in s."""
+    if even is None:
+        return _box_span(origin, direction, aabb)
+    return np.float32(0.0), np.float32(2.0 - 1.0 / FAR) * even
+
+
+@_inlined
+def _distance(s, even):
+    """Distance along the ray, `Contraction.distance`."""
+    if even is None:
+        return s
+    return s if s <= even else even / (np.float32(2.0) - s / even)
+
+
+@_inlined
+def _place(origin, direction, t, aabb, inv, even):
+    """Where in the planes' [0, 1]^3 a point of a ray lies, and what a step there counts, `Contraction.stretch`."""
+    u = (origin[0] + t * direction[0] - aabb[0, 0]) * inv[0]
+    v = (origin[1] + t * direction[1] - aabb[0, 1]) * inv[1]
+    w = (origin[2] + t * direction[2] - aabb[0, 2]) * inv[2]
+    one = np.float32(1.0)
+    if even is None:
+        return u, v, w, one
+    x, y, z = np.float32(2.0) * u - one, np.float32(2.0) * v - one, np.float32(2.0) * w - one
+    radius = max(max(abs(x), abs(y), abs(z)), one)
+    scale = np.float32(0.25) * (np.float32(2.0) - one / radius) / radius
+    stretch = max(t / even, one) / radius
+    half = np.float32(0.5)
+    return x * scale + half, y * scale + half, z * scale + half, stretch * stretch
 
 
 @_inlined
@@ -207,14 +248,15 @@ def _cell(grid, u, v, w):
 
 @_jit
 def _march(
-    theta, table, resolution, density, M, aabb, occupancy, origin, direction, time, jitter, step, extent,
-    values, features, points, corners, fractions, weights, logs, distances,
+    theta, table, resolution, density, M, aabb, even, occupancy, origin, direction, time, jitter, step, extent,
+    values, features, points, corners, fractions, weights, logs, places,
 ):
     """March one ray; fill the scratch for each occupied sample.
 
-    Returns (samples, transmittance left). weights[k] = transmittance before sample k times alpha k; logs[k] = log density.
+    Returns (samples, transmittance left). weights[k] = transmittance before sample k times alpha k; logs[k] = log density;
+    places[k] = s; points[k] = u, v, w, time and, unless `even` is None, what the step counts.
     """
-    near, far = _box_span(origin, direction, aabb)
+    near, far = _span(origin, direction, aabb, even)
     slots = occupancy.shape[0]
     slot = min(int(time * slots), slots - 1)
     inv = np.float32(1.0) / (aabb[1] - aabb[0])
@@ -223,24 +265,24 @@ def _march(
     count = 0
     k = 0
     while count < weights.size:
-        t = near + (np.float32(k) + jitter) * step
+        s = near + (np.float32(k) + jitter) * step
         k += 1
-        if not t < far:
+        if not s < far:
             break
-        u = (origin[0] + t * direction[0] - aabb[0, 0]) * inv[0]
-        v = (origin[1] + t * direction[1] - aabb[0, 1]) * inv[1]
-        w = (origin[2] + t * direction[2] - aabb[0, 2]) * inv[2]
+        u, v, w, stretch = _place(origin, direction, _distance(s, even), aabb, inv, even)
         if occupancy[slot][_cell(occupancy[slot], u, v, w)] == 0:
             continue
         point = points[count]
         point[0], point[1], point[2], point[3] = u, v, w, time
+        if even is not None:
+            point[4] = stretch
         _sample_planes(theta, table, resolution, point, M, corners[count], fractions[count], values[count])
         _features(values[count], table.shape[0], M, features[count])
         log_density = min(max(_dot(features[count], density, F) + density[F], -_LIMIT), _LIMIT)
-        alpha = np.float32(1.0) - math.exp(-math.exp(log_density) * step / extent)
+        alpha = np.float32(1.0) - math.exp(-math.exp(log_density) * (step * stretch) / extent)
         logs[count] = log_density
         weights[count] = trans * alpha
-        distances[count] = t
+        places[count] = s
         trans *= np.float32(1.0) - alpha
         count += 1
         if trans < _TERMINATION:
@@ -253,23 +295,24 @@ def _scratch(table, M, capacity):
     S = table.shape[0]
     values = np.ones((capacity, S * 6 * M), np.float32)  # ones: the planes a static scene does not have
     features = np.empty((capacity, S * M), np.float32)
-    points = np.empty((capacity, 4), np.float32)
+    points = np.empty((capacity, 5), np.float32)
     corners = np.empty((capacity, S * 6), np.int64)
     fractions = np.empty((capacity, S * 4), np.float32)
     weights = np.empty(capacity, np.float32)
     logs = np.empty(capacity, np.float32)
-    distances = np.empty(capacity, np.float32)
-    return values, features, points, corners, fractions, weights, logs, distances
+    places = np.empty(capacity, np.float32)
+    return values, features, points, corners, fractions, weights, logs, places
 
 
 @_parallel
 def render(
-    theta, table, resolution, density, M, aabb, occupancy, step, extent,
+    theta, table, resolution, density, M, aabb, even, occupancy, step, extent,
     origins, directions, times, basis, basis_index, background, capacity, workers,
 ):
     """Colour, opacity and depth of rays: (N, 3), (N,), (N,) float32, and the samples each of them took.
 
-    `basis[basis_index[i]]` is the colour basis of ray i. Samples lie at (k + 1/2) * step from where the ray enters the box.
+    `basis[basis_index[i]]` is the colour basis of ray i. Samples lie at (k + 1/2) * step from where the ray enters the box; in
+    contracted space in s, from its origin.
     """
     N = origins.shape[0]
     rgbs = np.empty((N, 3), np.float32)
@@ -278,17 +321,17 @@ def render(
     counts = np.empty(N, np.int32)
     F = density.size - 1
     for worker in prange(workers):
-        values, features, points, corners, fractions, weights, logs, distances = _scratch(table, M, capacity)
+        values, features, points, corners, fractions, weights, logs, places = _scratch(table, M, capacity)
         for ray in range(worker, N, workers):
             count, trans = _march(
-                theta, table, resolution, density, M, aabb, occupancy, origins[ray], directions[ray],
+                theta, table, resolution, density, M, aabb, even, occupancy, origins[ray], directions[ray],
                 times[ray], np.float32(0.5), step, extent,
-                values, features, points, corners, fractions, weights, logs, distances,
+                values, features, points, corners, fractions, weights, logs, places,
             )
             b = basis[basis_index[ray]]
             red, green, blue, depth = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
             for k in range(count):
-                depth += weights[k] * distances[k]
+                depth += weights[k] * _distance(places[k], even)
                 if weights[k] > _NEGLIGIBLE:
                     red += weights[k] * _sigmoid(_dot(features[k], b[0], F))
                     green += weights[k] * _sigmoid(_dot(features[k], b[1], F))
@@ -303,15 +346,15 @@ def render(
 
 
 @_jit
-def _distortion_gradient(weights, distances, count, step, extent, factor, out):
+def _distortion_gradient(weights, places, count, step, extent, factor, out):
     """out[k] = factor * d D / d w_k of `backpropagate`, in one pass each way over the sums of w and w s before sample k."""
     total, total_s = np.float32(0.0), np.float32(0.0)
     for k in range(count):
         total += weights[k]
-        total_s += weights[k] * (distances[k] - distances[0]) / extent
+        total_s += weights[k] * (places[k] - places[0]) / extent
     before, before_s = np.float32(0.0), np.float32(0.0)
     for k in range(count):
-        s = (distances[k] - distances[0]) / extent
+        s = (places[k] - places[0]) / extent
         apart = s * (np.float32(2.0) * before - total) + total_s - np.float32(2.0) * before_s
         out[k] = factor * (np.float32(2.0) * apart + np.float32(2.0 / 3.0) * weights[k] * step / extent)
         before += weights[k]
@@ -320,16 +363,16 @@ def _distortion_gradient(weights, distances, count, step, extent, factor, out):
 
 @_parallel
 def backpropagate(
-    theta, grad, table, resolution, density, grad_density, M, aabb, occupancy, step, extent,
+    theta, grad, table, resolution, density, grad_density, M, aabb, even, occupancy, step, extent,
     origins, directions, times, jitters, basis, grad_basis, targets, backgrounds, peaks, distortion, capacity,
 ):
     """Render a batch, and add the gradient of its loss to grad, grad_density and grad_basis.
 
     loss = mean over rays and colour channels of (C - target)^2 + distortion * mean over rays of D
     C = sum_k w_k c_k + trans * background
-    D = sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 d,   s = t / extent, d = step / extent (arXiv:2111.12077, eq. 15)
+    D = sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 d,   s over the extent, d = step / extent (arXiv:2111.12077, eq. 15)
     d D / d w_k = 2 sum_j w_j |s_k - s_j| + 2/3 w_k d
-    d C / d tau_k = trans_{k+1} c_k - sum_{j>k} w_j c_j - trans_end * background,   tau = sigma * step / extent
+    d C / d tau_k = trans_{k+1} c_k - sum_{j>k} w_j c_j - trans_end * background,   tau = sigma * stretch * step / extent
 
     Args:
         grad: (workers, n) float32, one buffer a worker; grad_density: (workers, F + 1).
@@ -349,7 +392,7 @@ def backpropagate(
     scale = np.float32(2.0 / (3.0 * N))
     shared = basis.shape[0] == 1
     for worker in prange(workers):
-        values, features, points, corners, fractions, weights, logs, distances = _scratch(table, M, capacity)
+        values, features, points, corners, fractions, weights, logs, places = _scratch(table, M, capacity)
         colours = np.empty((capacity, 3), np.float32)
         spread = np.empty(capacity, np.float32)
         g_features = np.empty(F, np.float32)
@@ -358,9 +401,9 @@ def backpropagate(
         g_density = grad_density[worker]
         for ray in range(worker, N, workers):
             count, trans = _march(
-                theta, table, resolution, density, M, aabb, occupancy, origins[ray], directions[ray],
+                theta, table, resolution, density, M, aabb, even, occupancy, origins[ray], directions[ray],
                 times[ray], jitters[ray], step, extent,
-                values, features, points, corners, fractions, weights, logs, distances,
+                values, features, points, corners, fractions, weights, logs, places,
             )
             b = basis[0] if shared else basis[ray]
             g_b = grad_basis[worker] if shared else grad_basis[ray]
@@ -381,13 +424,13 @@ def backpropagate(
             counts[ray] = count
             g0, g1, g2 = scale * e0, scale * e1, scale * e2
 
-            _distortion_gradient(weights, distances, count, step, extent, np.float32(distortion / N), spread)
+            _distortion_gradient(weights, places, count, step, extent, np.float32(distortion / N), spread)
             after = trans * (g0 * backgrounds[ray, 0] + g1 * backgrounds[ray, 1] + g2 * backgrounds[ray, 2])
             beyond = trans  # transmittance after sample k, walking backwards
             for k in range(count - 1, -1, -1):
                 weight = weights[k]
                 seen = g0 * colours[k, 0] + g1 * colours[k, 1] + g2 * colours[k, 2] + spread[k]  # d loss / d w_k
-                tau = math.exp(logs[k]) * step / extent
+                tau = math.exp(logs[k]) * (step if even is None else step * points[k, 4]) / extent
                 g_log = (beyond * seen - after) * tau
                 if logs[k] >= _LIMIT or logs[k] <= -_LIMIT:
                     g_log = np.float32(0.0)

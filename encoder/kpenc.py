@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kpc.encoder.box import find_box, seen_cells
+from kpc.encoder.box import contraction_of, find_box, find_inner_box, reaches_beyond, seen_cells
 from kpc.encoder.compress import compress, compress_to_size, relative_steps
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
@@ -30,6 +30,7 @@ from kpc.format.errors import DatasetError, TrainingError, UsageError
 from kpc.format.progress import Progress
 from kpc.format.quantise import QuantisedScene
 from kpc.format.scene import Scene
+from kpc.format.space import FAR, Contraction
 
 PROBE_RAYS = 1 << 15
 """Training rays on which the loss of quantisation is measured."""
@@ -103,6 +104,7 @@ def encode(options: Options) -> dict[str, Any]:
     return {
         "file": str(options.output), "layout": dataset.layout, "dynamic": dataset.is_dynamic, "preset": options.preset,
         "seed": options.seed, "device": str(trainer.device), "box": trainer.aabb.tolist(),
+        "space": "box" if trainer.mapping is None else "contracted",
         "test_psnr": test and test.psnr, "test_ssim": test and test.ssim, "test_pictures": test.pictures if test else 0,
         "coding_loss_db": before.psnr - test.psnr if test and before else probe_loss,
         "size_bytes": size, "parameters": quantised.parameter_count,
@@ -137,18 +139,19 @@ def _trainer(options: Options) -> Trainer:
     _make_work_dir(work)
     try:
         dataset = load_dataset(options.source, work, holdout=options.holdout, downscale=options.downscale)
-        aabb = _box_of(dataset, options)
+        aabb, mapping, why = _space_of(dataset, options)
     except BaseException:
         _remove_if_empty(work)
         raise
     _say(dataset.describe())
+    _say(f"space: {'a box, nothing outside it' if mapping is None else 'contracted beyond a box'} ({why})")
     config, resumes, survey_s = options.config(dataset), options.resume and checkpoint.exists(), 0.0
-    if options.box is None:
+    if options.box is None and mapping is None:
         if resumes:
             aabb = box_of_checkpoint(checkpoint)
         else:
             aabb, survey_s = _trimmed(dataset, config, aabb, options.time_budget_s)
-    trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s)
+    trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping)
     _say(_plan(trainer))
     if resumes:
         trainer.resume(checkpoint)
@@ -244,7 +247,9 @@ def _plan(trainer: Trainer) -> str:
     layout, (lo, hi) = trainer.field.layout, trainer.aabb
     corners = " to ".join(" ".join(f"{v:.4g}" for v in corner) for corner in (lo, hi))
     planes = ", ".join("x".join(str(n) for n in row if n) for row in layout.resolution)
-    return (f"box {corners}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
+    beyond = "" if trainer.mapping is None else (
+        f" and all around it, even steps up to {trainer.mapping.even:.4g}, rays to {FAR * trainer.mapping.even:.4g}")
+    return (f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
             f"{layout.size / 1e6:.2f} M parameters; on {trainer.device}")
 
 
@@ -259,22 +264,29 @@ def _spread_of_cameras(dataset: Dataset) -> list[int]:
     return [int(first[central])] + [int(p) for i, p in enumerate(first) if i != central]
 
 
-def _box_of(dataset: Dataset, options: Options) -> np.ndarray:
-    """The box asked for, or the one found: (2, 3) float32, within what a file can hold."""
+def _space_of(dataset: Dataset, options: Options) -> tuple[np.ndarray, Contraction | None, str]:
+    """The box asked for or found, (2, 3) float32, within what a file can hold; how space beyond it is held; and why so."""
+    beyond, why = reaches_beyond(dataset.pictures, dataset.has_alpha)
+    contracted = beyond if options.space == "auto" else options.space == "contracted"
     if options.box is not None:
         aabb = np.array(options.box, np.float32).reshape(2, 3)
     else:
         try:
-            aabb = find_box(dataset.pictures, dataset.has_alpha)
+            aabb = find_inner_box(dataset.pictures) if contracted else find_box(dataset.pictures, dataset.has_alpha)
         except DatasetError as error:
             raise DatasetError(f"{options.source}: {error}") from error
+    mapping = contraction_of(dataset.pictures, aabb) if contracted else None
     if not (np.abs(aabb) <= file.BOX_LIMIT).all() or not (aabb[1] - aabb[0] >= 1 / file.BOX_LIMIT).all():
         raise DatasetError(f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; "
                            "give another with --box x0,y0,z0,x1,y1,z1")
-    if not seen_cells(dataset.pictures, aabb, grid_shape(aabb, 64)).any():
+    samples = mapping.even * options.config(dataset).samples_across / (aabb[1] - aabb[0]).max() if mapping else 0.0
+    if samples > file.SAMPLE_LIMIT:
+        raise DatasetError(f"{options.source}: the box is too small for cameras that lie {mapping.even:.4g} from its far side; "
+                           "give a larger one with --box x0,y0,z0,x1,y1,z1, or --space box")
+    if not seen_cells(dataset.pictures, aabb, grid_shape(aabb, 64), mapping).any():
         raise DatasetError(f"{options.source}: the box lies outside every camera's view; give another with "
                            "--box x0,y0,z0,x1,y1,z1")
-    return aabb
+    return aabb, mapping, f"{why}; --space overrides" if options.space == "auto" else "as told"
 
 
 def _make_work_dir(work: Path) -> None:

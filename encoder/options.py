@@ -22,6 +22,7 @@ class Options:
     device: str = "auto"
     downscale: int = 1
     holdout: str | None = None
+    space: str = "auto"
     box: tuple[float, ...] | None = None
     work: Path | None = None
     keep: bool = False
@@ -54,8 +55,10 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first (default: 1)")
     parser.add_argument("--holdout", metavar="NAME", help="camera or file to test on, or 'none'")
+    parser.add_argument("--space", choices=("auto", "box", "contracted"), default="auto",
+                        help="box: nothing lies outside it; contracted: the surroundings are held, too (default: auto)")
     parser.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1",
-                        help="corners of the scene, taken as they are, instead of those found from cameras and a survey")
+                        help="corners of the scene, or of its undistorted part, taken as they are, instead of those found")
     parser.add_argument("--work", type=Path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)")
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
@@ -68,8 +71,8 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
                         help="only say what would be done, how long it would take and how much memory")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     a = parser.parse_args(_box_joined(argv))
-    options = Options(a.source, a.output, a.preset, a.steps, a.time_budget, a.seed, a.device, a.downscale, a.holdout, a.box,
-                      a.work, a.keep, a.resume, a.test_views, a.max_loss, a.target_size)
+    options = Options(a.source, a.output, a.preset, a.steps, a.time_budget, a.seed, a.device, a.downscale, a.holdout,
+                      a.space, a.box, a.work, a.keep, a.resume, a.test_views, a.max_loss, a.target_size)
     if a.dry_run and a.resume:
         parser.error("--dry-run tells what a whole run takes; drop --resume")
     return options, a.dry_run, a.json

@@ -23,6 +23,7 @@ from kpc.encoder.occupancy import OccupancyGrid, grid_shape
 from kpc.format.cli import written_aside
 from kpc.format.errors import TrainingError
 from kpc.format.scene import SPACE_PLANES, Scene
+from kpc.format.space import Contraction
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 """Adam's constants as Instant-NGP sets them for grids (arXiv:2201.05989, section 4)."""
@@ -48,22 +49,24 @@ class Trainer:
     """
 
     def __init__(
-        self, dataset: Dataset, config: TrainConfig, aabb: np.ndarray, device: str, elapsed_s: float = 0.0
+        self, dataset: Dataset, config: TrainConfig, aabb: np.ndarray, device: str, elapsed_s: float = 0.0,
+        mapping: Contraction | None = None,
     ) -> None:
-        self.dataset, self.config, self.device = dataset, config, torch.device(device)
+        self.dataset, self.config, self.device, self.mapping = dataset, config, torch.device(device), mapping
         self.aabb = np.asarray(aabb, np.float32)
         self.extent = float(np.max(self.aabb[1] - self.aabb[0]))
-        self.step_length = self.extent / config.samples_across
+        steps_across = config.samples_across / (1 if mapping is None else 2)  # a box is half of contracted space
+        self.step_length = self.extent / steps_across
         self.rng = np.random.default_rng(config.seed)
         layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
         self.field = Field(layout, config.hidden, torch.Generator().manual_seed(config.seed)).to(self.device)
         shape = grid_shape(self.aabb, config.cells_across)
-        threshold = math.log(-math.log(1 - config.occupancy_alpha) * config.samples_across)
-        self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape), threshold)
+        threshold = math.log(-math.log(1 - config.occupancy_alpha) * steps_across)
+        self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape, mapping), threshold)
         self.slots = min(config.occupancy_slots, dataset.clip.frame_count) if dataset.is_dynamic else 1
         self.optimiser: FusedOptimiser | PlainOptimiser = (
-            FusedOptimiser(self.field, config, shape) if self.device.type == "cpu" else
-            PlainOptimiser(self.field, config, shape)
+            FusedOptimiser(self.field, config, shape, mapping) if self.device.type == "cpu" else
+            PlainOptimiser(self.field, config, shape, mapping)
         )
         self.step = 0
         self.elapsed_s = elapsed_s
@@ -136,7 +139,7 @@ class Trainer:
         """The field as it stands, with an occupancy (slots, Nz, Ny, Nx), or with that of training; the planes are copied."""
         if occupancy is None:
             occupancy = self.grid.marched
-        return self.field.to_scene(self.aabb, self.dataset.clip, occupancy, self.background, self.step_length)
+        return self.field.to_scene(self.aabb, self.dataset.clip, occupancy, self.background, self.step_length, self.mapping)
 
     def _weights_at(self, fraction: float) -> TileWeights | None:
         """What decides which rays are drawn at this share of the run; it follows from the dataset, so no checkpoint holds it."""
@@ -179,6 +182,7 @@ class Trainer:
         """
         state = {
             "config": asdict(self.config), "aabb": torch.from_numpy(self.aabb), "step": self.step, "elapsed_s": self.elapsed_s,
+            "even": self.mapping and self.mapping.even,
             "samples_per_ray": self.samples_per_ray, "field": self.field.state_dict(), "optimiser": self.optimiser.state(),
             "grid": self.grid.state(), "rng": _rng_to_plain(self.rng), "dataset": _fingerprint(self.dataset),
         }
@@ -205,7 +209,8 @@ class Trainer:
         try:
             state = _load(path, self.device)
             same = _comparable(state["config"]) == _comparable(asdict(self.config))
-            if not same or not np.array_equal(state["aabb"].cpu().numpy(), self.aabb):
+            even = self.mapping and self.mapping.even
+            if not same or not np.array_equal(state["aabb"].cpu().numpy(), self.aabb) or state.get("even") != even:
                 raise TrainingError(f"{path}: belongs to a run with other settings; give the same ones or drop --resume")
             if state["dataset"] != _fingerprint(self.dataset):
                 raise TrainingError(f"{path}: belongs to a run on other pictures; give the same dataset, --holdout and "
@@ -313,8 +318,10 @@ def kept_channels(field: Field, config: TrainConfig, step: int) -> torch.Tensor:
 class FusedOptimiser:
     """A step on the CPU: fused kernels for the planes, PyTorch for the small decoder."""
 
-    def __init__(self, field: Field, config: TrainConfig, cells: tuple[int, int, int]) -> None:
-        self.field, self.config = field, config
+    def __init__(
+        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: Contraction | None = None
+    ) -> None:
+        self.field, self.config, self.mapping = field, config, mapping
         self.workers = numba.get_num_threads()  # starts numba's threads, which would undo the next line
         torch.set_num_threads(1)  # the decoder is so small that sharing it out costs more, a hundredfold on a busy machine
         self.theta = field.theta.detach().numpy()
@@ -342,10 +349,11 @@ class FusedOptimiser:
         grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
         errors, counts = kernels.backpropagate(
             self.theta, self.grad, layout.table, layout.resolution, density.numpy(), grad_density,
-            layout.channels, aabb, occupancy.view(np.uint8), np.float32(step_length), np.float32(extent),
+            layout.channels, aabb, kernels.even_of(self.mapping), occupancy.view(np.uint8), np.float32(step_length),
+            np.float32(extent),
             batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(), batch.jitters.numpy(),
             basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(), self._peaks,
-            np.float32(config.distortion), sample_capacity(aabb, step_length),
+            np.float32(config.distortion), sample_capacity(aabb, step_length, self.mapping),
         )
         if number % config.regularise_every == 0:
             add_priors(self.field, self.theta, self.grad[0], config, config.regularise_every)
@@ -377,8 +385,10 @@ class FusedOptimiser:
 class PlainOptimiser:
     """A step in plain PyTorch, on any device that PyTorch knows."""
 
-    def __init__(self, field: Field, config: TrainConfig, cells: tuple[int, int, int]) -> None:
-        self.field, self.config = field, config
+    def __init__(
+        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: Contraction | None = None
+    ) -> None:
+        self.field, self.config, self.mapping = field, config, mapping
         self._peaks = torch.zeros(cells, device=field.theta.device)
         self.planes = torch.optim.Adam([field.theta], lr=config.learning_rate, betas=(BETA1, BETA2), eps=EPSILON)
         self.decoder = _decoder_optimiser(field, config)
@@ -399,7 +409,7 @@ class PlainOptimiser:
         occupancy_there = torch.from_numpy(occupancy).to(device)
         rgb, distortion, weights, cells = render_reference(
             self.field, batch, torch.from_numpy(aabb).to(device), occupancy_there, step_length,
-            kept_channels(self.field, config, number),
+            kept_channels(self.field, config, number), self.mapping,
         )
         _, ny, nx = self._peaks.shape
         flat = (cells[:, 0] * ny + cells[:, 1]) * nx + cells[:, 2]
@@ -456,9 +466,10 @@ def log_densities(field: Field, points: np.ndarray, times: np.ndarray) -> np.nda
     )
 
 
-def sample_capacity(aabb: np.ndarray, step_length: float) -> int:
-    """Samples a ray can take at most: the box's diagonal in steps."""
-    return int(np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64)) / step_length) + 2
+def sample_capacity(aabb: np.ndarray, step_length: float, mapping: Contraction | None = None) -> int:
+    """Samples a ray can take at most: the box's diagonal in steps, or all of a ray through contracted space."""
+    longest = np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64)) if mapping is None else mapping.end
+    return int(longest / step_length) + 2
 
 
 def box_of_checkpoint(path: Path) -> np.ndarray:

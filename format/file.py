@@ -1,6 +1,7 @@
 """A scene in a file: what each kind of chunk means (spec/kpc-format.md, sections 5 to 9).
 
     SCNE  box, clip, sizes, steps and offsets of every plane      needed before anything else
+    WARP  how space beyond the box is held; absent where it is not
     DECO  decoder weights                 OCCU  occupancy grid
     came  cameras (may be ignored)        PLNE  one segment of one plane
 
@@ -24,6 +25,7 @@ from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
+from kpc.format.space import Contraction
 
 Parsed = TypeVar("Parsed")
 
@@ -33,12 +35,16 @@ SCENE_STRUCT = struct.Struct("<6fIdd3fBB")
 """aabb, frame_count, fps, step, background, scale_count, dynamic"""
 SCALE_STRUCT = struct.Struct("<5H")
 """channels, Nx, Ny, Nz, T (0 in a static scene)"""
+WARP_STRUCT = struct.Struct("<Id")
+"""which mapping (CONTRACTED), even"""
 DECODER_STRUCT = struct.Struct("<HHf")
 """features, hidden, density_bias"""
 OCCUPANCY_STRUCT = struct.Struct("<4H")
 """slots, Nz, Ny, Nx"""
 CAMERA_STRUCT = struct.Struct("<HH16f")
 """width, height, fl_x, fl_y, cx, cy, the first three rows of camera_to_world"""
+
+CONTRACTED = 1
 
 SCALE_LIMIT = 16
 CHANNEL_LIMIT = 256
@@ -47,7 +53,7 @@ HIDDEN_LIMIT = 256
 CAMERA_LIMIT = 4096
 FRAME_LIMIT = 1 << 24
 SAMPLE_LIMIT = 65536
-"""Samples along the box's diagonal, so that no file can make a ray endless."""
+"""Samples along the box's diagonal, or along a ray through contracted space, so that no file can make a ray endless."""
 BOX_LIMIT = 1 << 30
 """Magnitude of a corner of the box or a number of a camera, world units; a 1 over it bounds the box's edges below."""
 
@@ -128,8 +134,13 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
         head = _pack_head(scene)
         parsed = _parse_head(head)  # the same rules that a reader applies
         _check_planes(scene, parsed)
-        chunks = [Chunk("SCNE", [head]), Chunk("DECO", [_pack_decoder(scene.decoder, parsed.feature_count)]),
-                  Chunk("OCCU", [_pack_occupancy(scene.occupancy)])]
+        chunks = [Chunk("SCNE", [head])]
+        if scene.mapping is not None:
+            warp = WARP_STRUCT.pack(CONTRACTED, scene.mapping.even)
+            _parse_mapping(warp, parsed.step)
+            chunks.append(Chunk("WARP", [warp]))
+        chunks += [Chunk("DECO", [_pack_decoder(scene.decoder, parsed.feature_count)]),
+                   Chunk("OCCU", [_pack_occupancy(scene.occupancy)])]
         if scene.cameras:
             chunks.append(Chunk("came", [_pack_cameras(scene.cameras)]))
     except (struct.error, OverflowError) as error:
@@ -239,7 +250,7 @@ def read(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, memory
         elif entry.kind not in KNOWN_KINDS:
             reader.stored(number)  # ignored, but never damaged
     return QuantisedScene(reader.head.aabb, reader.head.clip, scales, reader.decoder(), reader.occupancy(),
-                          reader.head.background, reader.head.step, reader.cameras())
+                          reader.head.background, reader.head.step, reader.cameras(), reader.mapping())
 
 
 class SceneReader(Reader):
@@ -281,6 +292,15 @@ class SceneReader(Reader):
         texels = entry.row_count * plane.columns
         payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * (1 + texels))
         return self._parsed(lambda raw: decode_segment(raw, entry.row_count, plane.columns, plane.channels), payload)
+
+    def mapping(self) -> Contraction | None:
+        """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""
+        found = [n for n, entry in enumerate(self.index) if entry.kind == "WARP"]
+        if len(found) > 1:
+            raise FormatError(f"{self.name}: holds {len(found)} WARP chunks, not one")
+        if not found:
+            return None
+        return self._parsed(lambda raw: _parse_mapping(raw, self.head.step), self.chunk(found[0], WARP_STRUCT.size))
 
     def decoder(self) -> Decoder:
         """The DECO chunk."""
@@ -345,7 +365,7 @@ class SceneReader(Reader):
                 raise FormatError(f"{self.name}: {where}: its segments hold {row} rows, not {head.rows}")
 
 
-KNOWN_KINDS = frozenset({"SCNE", "DECO", "OCCU", "came", "PLNE"})
+KNOWN_KINDS = frozenset({"SCNE", "WARP", "DECO", "OCCU", "came", "PLNE"})
 HEAD_LIMIT = SCENE_STRUCT.size + SCALE_LIMIT * (SCALE_STRUCT.size + 9 * 4 * CHANNEL_LIMIT)
 
 
@@ -371,6 +391,17 @@ def _parse_head(raw: bytes) -> SceneHead:
     scales = tuple(_parse_scale(cursor, number, bool(dynamic)) for number in range(scale_count))
     cursor.finish()
     return SceneHead(aabb, Clip(frame_count, fps), step, background, scales)
+
+
+def _parse_mapping(raw: bytes, step: float) -> Contraction:
+    cursor = _Cursor(raw, "WARP")
+    mapping, even = cursor.unpack(WARP_STRUCT)
+    cursor.finish()
+    if mapping != CONTRACTED:
+        raise FormatError(f"WARP: mapping {mapping} of space, unknown to this reader; update kpc")
+    if not (1 / BOX_LIMIT <= even <= BOX_LIMIT and 2 * even / step <= SAMPLE_LIMIT):  # False for NaN, too
+        raise FormatError(f"WARP: even steps of {step} up to a distance of {even} make no sense")
+    return Contraction(even)
 
 
 def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, PlaneHead]:

@@ -15,6 +15,7 @@ import numpy as np
 from kpc.format.cameras import Camera
 from kpc.format.errors import FormatError
 from kpc.format.scene import TIME_PLANES, Clip, Decoder, Scene
+from kpc.format.space import Contraction
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
 
@@ -111,12 +112,13 @@ class QuantisedScene:
     background: np.ndarray
     step: float
     cameras: tuple[Camera, ...] = field(default=())
+    mapping: Contraction | None = None
 
     def dequantise(self) -> Scene:
         """The scene that every decoder sees."""
         scales = tuple({name: plane.dequantise() for name, plane in scale.items()} for scale in self.scales)
         return Scene(self.aabb, self.clip, scales, self.decoder, self.occupancy, self.background, self.step,
-                     self.cameras)
+                     self.cameras, self.mapping)
 
     @property
     def is_dynamic(self) -> bool:
@@ -156,7 +158,7 @@ def quantise_scene(scene: Scene, steps: Sequence[Mapping[str, np.ndarray | float
     return QuantisedScene(
         np.asarray(scene.aabb, np.float32), scene.clip, tuple(scales), round_decoder(scene.decoder),
         np.asarray(scene.occupancy, bool), np.asarray(scene.background, np.float32), float(scene.step),
-        tuple(round_camera(camera) for camera in scene.cameras),
+        tuple(round_camera(camera) for camera in scene.cameras), scene.mapping,
     )
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from kpc.format.cameras import Camera
+from kpc.format.space import Contraction
 
 SPACE_PLANES = ("xy", "xz", "yz")
 TIME_PLANES = ("xt", "yt", "zt")
@@ -67,17 +68,19 @@ class Scene:
     """A radiance field that can be rendered at any time in [0, 1] from anywhere.
 
     Attributes:
-        aabb: (2, 3) float32, lower and upper corner of the box, world units.
+        aabb: (2, 3) float32, lower and upper corner of the box, world units; with a mapping, of what it leaves undistorted.
         clip: its time axis.
         scales: coarse to fine; each maps plane names to (rows, columns, M) float32. The plane's first letter is the column
             axis, the second the row axis: "xy" is (Ny, Nx, M), "xt" is (T, Nx, M). Static scenes hold SPACE_PLANES only,
-            others ALL_PLANES. Corner-aligned: u in [0, 1] over the box reads at u * (size - 1).
+            others ALL_PLANES. Corner-aligned: u in [0, 1] over the box, or where `mapping` puts a point, reads at
+            u * (size - 1).
         decoder: density and colour from features.
         occupancy: (slots, Nz, Ny, Nx) bool. A cell that is False holds nothing while its slot of time lasts;
             slot k of K lasts over [k/K, (k+1)/K) of the clip, the last one includes time 1.
-        background: (3,) float32 in [0, 1], seen where a ray leaves the box with transmittance left.
-        step: distance between samples along a ray, world units.
+        background: (3,) float32 in [0, 1], seen where a ray ends with transmittance left.
+        step: distance between samples along a ray, world units; where there is a mapping, in its s.
         cameras: a few cameras the scene was filmed from, the first a good one to open on.
+        mapping: how what lies outside the box is held, too; None: nothing does.
     """
 
     aabb: np.ndarray
@@ -88,6 +91,7 @@ class Scene:
     background: np.ndarray
     step: float
     cameras: tuple[Camera, ...] = field(default=())
+    mapping: Contraction | None = None
 
     @property
     def is_dynamic(self) -> bool:

@@ -4,7 +4,8 @@ A ray o + t d with |d| = 1 enters the box at t_near and leaves it at t_far. Its 
 
     t_k = t_near + (k + 1/2) step,   k = 0, 1, ... while t_k < t_far,
 
-and count where the occupancy grid is set. With sigma per longest edge of the box ("extent"), from trans = 1 on:
+and count where the occupancy grid is set. (In contracted space `kpc.format.space.Contraction` says where they lie, and what
+a step counts in the next line.) With sigma per longest edge of the box ("extent"), from trans = 1 on:
 
     alpha = 1 - exp(-sigma step / extent)      weight = trans alpha      trans <- trans - weight
 
@@ -20,6 +21,7 @@ import numpy as np
 
 from kpc.format.cameras import Camera
 from kpc.format.scene import LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Decoder, Scene
+from kpc.format.space import contract
 
 RAYS_AT_ONCE = 8192
 STEPS_AT_ONCE = 16
@@ -121,6 +123,23 @@ def box_range(aabb: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> 
     return np.maximum(np.minimum(t0, t1).max(axis=1), np.float32(0)), np.maximum(t0, t1).min(axis=1)
 
 
+def sample_range(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the samples of rays begin and end, (N,) each: as `box_range`; in contracted space in its s."""
+    if scene.mapping is None:
+        return box_range(scene.aabb, origins, directions)
+    return np.zeros(len(origins), np.float32), np.full(len(origins), scene.mapping.end, np.float32)
+
+
+def places(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of samples at s (N, K) on N rays: distance t (N, K), place u (N, K, 3) in the planes, what a step counts (N, K)."""
+    if scene.mapping is None:
+        size = (scene.aabb[1] - scene.aabb[0]).astype(np.float32)
+        return s, (origins[:, None] + s[..., None] * directions[:, None] - scene.aabb[0]) / size, np.ones_like(s)
+    t = scene.mapping.distance(s)
+    u, radius = contract(origins[:, None] + t[..., None] * directions[:, None], scene.aabb)
+    return t, u, scene.mapping.stretch(t, radius)
+
+
 def tap(u: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Corner-aligned position u (size - 1), u in [0, 1], as a lower texel and the fraction towards the next."""
     position = np.clip(u, 0, 1) * np.float32(size - 1)
@@ -194,23 +213,24 @@ def composite(alphas: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _march(scene: Scene, moment: Moment, origins: np.ndarray, directions: np.ndarray) -> Rendering:
     n = len(origins)
-    near, far = box_range(scene.aabb, origins, directions)
+    near, far = sample_range(scene, origins, directions)
     basis = direction_basis(scene.decoder, directions).astype(np.float32)
     rgb, depth = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
     trans, samples = np.ones(n, np.float32), np.zeros(n, np.int32)
-    step, size = np.float32(scene.step), (scene.aabb[1] - scene.aabb[0]).astype(np.float32)
+    step = np.float32(scene.step)
     cells = np.array(moment.occupied.shape[::-1])
 
     rays, first = np.flatnonzero(near < far), 0
     while len(rays):
-        t = near[rays, None] + (np.arange(first, first + STEPS_AT_ONCE, dtype=np.float32) + np.float32(0.5)) * step
-        u = (origins[rays, None] + t[..., None] * directions[rays, None] - scene.aabb[0]) / size
+        s = near[rays, None] + (np.arange(first, first + STEPS_AT_ONCE, dtype=np.float32) + np.float32(0.5)) * step
+        t, u, stretch = places(scene, origins[rays], directions[rays], s)
         x, y, z = np.clip((u * cells).astype(np.int32), 0, cells - 1).transpose(2, 0, 1)
-        row, column = np.nonzero(moment.occupied[z, y, x] & (t < far[rays, None]))
+        row, column = np.nonzero(moment.occupied[z, y, x] & (s < far[rays, None]))
 
         f = features(scene, moment, u[row, column])
-        alphas = np.zeros_like(t)
-        alphas[row, column] = 1 - np.exp(-density(scene.decoder, f) * np.float32(scene.step / scene.extent))
+        alphas = np.zeros_like(s)
+        thickness = np.float32(scene.step / scene.extent) * stretch[row, column]
+        alphas[row, column] = 1 - np.exp(-density(scene.decoder, f) * thickness)
         weights, trans[rays], reached = composite(alphas, trans[rays])
         shown = reached[row, column]
         row, column, f = row[shown], column[shown], f[shown]

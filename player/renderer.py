@@ -245,6 +245,7 @@ class Renderer:
                 "LAYERS": layout.layers,
                 "HIDDEN": len(scene.decoder.b1),
                 "ROWS": int(with_rows),
+                "CONTRACTED": int(scene.mapping is not None),
                 "REFINED": layout.refined,
             },
             {"decoder_weights": self._decoder},
@@ -264,6 +265,7 @@ class Renderer:
             box_high=tuple(scene.aabb[1]),
             background=tuple(scene.background),
             stride=scene.step,
+            even=scene.mapping.even if scene.mapping else 0.0,
             tau=scene.step / scene.extent,
         )
         entry = self._programs[key] = program, self.ctx.vertex_array(program, [])

@@ -87,7 +87,7 @@ def chunks(data, partial):  # sections 3, 4 and 10
         require(kind.isalpha() and reserved == 0 and offset == expected and raw <= largest_raw, "index entry")
         expected += stored
         body = data[offset:offset + stored]
-        known = kind in (b"SCNE", b"DECO", b"OCCU", b"PLNE", b"came")
+        known = kind in (b"SCNE", b"DECO", b"OCCU", b"PLNE", b"WARP", b"came")
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
         if len(body) < stored:
@@ -126,6 +126,8 @@ def decode(data, partial=False):
     scene = scene_chunk(Bytes(parts["SCNE"]))
     values = sum(p["rows"] * p["columns"] * s["channels"] for s in scene["scales"] for p in s["planes"].values())
     require(values == value_count, "value count")
+    require("WARP" not in parts or parts["WARP"] is not None, "no WARP chunk")
+    scene["even"] = warp_chunk(Bytes(parts["WARP"]), scene["step"]) if "WARP" in parts else None
     scene |= decoder_chunk(Bytes(parts["DECO"]), sum(s["channels"] for s in scene["scales"]))
     scene |= occupancy_chunk(Bytes(parts["OCCU"]))
     scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") else []
@@ -180,6 +182,13 @@ def scene_chunk(chunk):  # section 5
     chunk.end()
     return {"aabb": [low, high], "frame_count": frame_count, "fps": fps, "step": step, "background": [r, g, b],
             "scales": scales}
+
+
+def warp_chunk(chunk, step):  # section 5
+    mapping, even = chunk.unpack("Id")
+    require(mapping == 1 and 2**-30 <= even <= 2**30 and 2 * even / step <= 65536, "mapping")
+    chunk.end()
+    return even
 
 
 def segment(chunk, rows, columns, channels):  # section 6
@@ -247,22 +256,30 @@ def render_ray(scene, origin, direction, time):  # section 11
             t_in, t_out = (t_in, t_out) if a <= o <= b else (math.inf, -math.inf)
         else:
             t_in, t_out = max(t_in, min((a - o) / d, (b - o) / d)), min(t_out, max((a - o) / d, (b - o) / d))
-    t_near = max(t_in, 0.0)
+    t_near, even = max(t_in, 0.0), scene["even"]
+    if even:
+        t_near, t_out = 0.0, (2 - 1 / 256) * even  # of s
 
     basis = direction_basis(scene, direction)
     slot = min(math.floor(time * scene["slots"]), scene["slots"] - 1)
     colour, depth, T, k = [0.0, 0.0, 0.0], 0.0, 1.0, 0
     while T >= 1 / 1024 and t_near + (k + 0.5) * scene["step"] < t_out:
-        t_k = t_near + (k + 0.5) * scene["step"]
+        t_k, length = t_near + (k + 0.5) * scene["step"], scene["step"]
         k += 1
+        if even and t_k > even:
+            t_k = even / (2 - t_k / even)
         u = [(o + t_k * d - a) / (b - a) for o, d, a, b in zip(origin, direction, low, high)]
+        if even:
+            q = max(1.0, *(abs(2 * x - 1) for x in u))
+            u = [0.5 + (2 * x - 1) * (2 - 1 / q) / (4 * q) for x in u]
+            length *= (max(1.0, t_k / even) / q) ** 2
         i, j, m = (min(max(math.floor(x * n), 0), n - 1) for x, n in zip(u, scene["cells"]))
         nx, ny, _ = scene["cells"]
         if not scene["occupancy"][((m * ny + j) * nx + i) * scene["slots"] + slot]:
             continue
         f = features(scene, dict(zip("xyzt", [*u, time])))
         log_density = sum(a * b for a, b in zip(f, scene["density_weight"])) + scene["density_bias"]
-        alpha = 1 - math.exp(-math.exp(min(max(log_density, -20.0), 20.0)) * scene["step"] / extent)
+        alpha = 1 - math.exp(-math.exp(min(max(log_density, -20.0), 20.0)) * length / extent)
         w = T * alpha
         for c in range(3):
             logit = sum(a * b for a, b in zip(f, basis[c]))

@@ -104,6 +104,27 @@ def write_nerfstudio(folder: Path, images: int = 10, times: list[float] | None =
     return rig
 
 
+def write_surrounded(folder: Path, images: int = 40) -> list[Camera]:
+    """A ball of radius 0.7 before a sky without end, from all around and several heights. Every eighth image tests."""
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    rig, frames = [], []
+    for k in range(images):
+        angle, height = 2 * np.pi * k / images, (0.4, 1.2, -0.3)[k % 3]
+        rig.append(look_at((3 * np.sin(angle), -3 * np.cos(angle), height), width=40, height=30))
+        origins, directions = rig[-1].rays()
+        along = -(origins * directions).sum(1)
+        beside = np.linalg.norm(origins + directions * along[:, None], axis=1)
+        met = origins + directions * (along - np.sqrt(np.maximum(0.49 - beside**2, 0)))[:, None]
+        sky = 128 + 100 * np.sin(6 * directions @ np.array([[1, 0.3, 0], [0, 1, 0.5], [0.6, -0.8, 1]]))
+        pixels = np.where(beside[:, None] < 0.7, 128 + 170 * met, sky)
+        write_image(folder / "images" / f"{k:04d}.png", np.rint(pixels).astype(np.uint8).reshape(30, 40, 3))
+        frames.append({"file_path": f"images/{k:04d}.png", "transform_matrix": rig[-1].camera_to_world.tolist()})
+    c = rig[0]
+    head = {"w": c.width, "h": c.height, "fl_x": c.fl_x, "fl_y": c.fl_y, "cx": c.cx, "cy": c.cy, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(head))
+    return rig
+
+
 COLMAP_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scenes import tiny_scene
+from scenes import surrounded, tiny_scene
 
 from kpc.encoder import kernels
 from kpc.encoder.field import Field, Rays, render_reference
@@ -12,11 +12,14 @@ from kpc.encoder.train import sample_capacity
 from kpc.format.scene import Scene
 
 
-def misty(dynamic: bool = True) -> Scene:
+def misty(dynamic: bool = True, contracted: bool = False) -> Scene:
     """Every step absorbs a tenth or more: no sample before termination is so faint that it gets no colour."""
     scene = tiny_scene(dynamic=dynamic, time=6)
     weight = scene.decoder.density_weight
-    return replace(scene, decoder=replace(scene.decoder, density_weight=np.abs(weight) / 16, density_bias=2.0))
+    # Before the cameras' even distance, steps outside the box count for less: 1 / r^2, a tenth.
+    bias = 4.5 if contracted else 2.0
+    scene = replace(scene, decoder=replace(scene.decoder, density_weight=np.abs(weight) / 16, density_bias=bias))
+    return surrounded(scene) if contracted else scene
 
 
 def rays_at(scene: Scene, count: int, seed: int = 0) -> Rays:
@@ -52,6 +55,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         grad_density,
         layout.channels,
         scene.aabb,
+        kernels.even_of(scene.mapping),
         scene.occupancy.view(np.uint8),
         np.float32(scene.step),
         np.float32(scene.extent),
@@ -65,7 +69,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         rays.backgrounds.numpy(),
         peaks,
         np.float32(DISTORTION),
-        sample_capacity(scene.aabb, scene.step),
+        sample_capacity(scene.aabb, scene.step, scene.mapping),
     )
     return {
         "theta": grad.sum(0),
@@ -84,7 +88,7 @@ def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict
     basis = field.basis(rays.directions).detach().requires_grad_()
     field.basis = lambda directions: basis  # type: ignore[method-assign]
     aabb, occupancy = torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy)
-    rgb, distortion, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step)
+    rgb, distortion, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step, mapping=scene.mapping)
     squared = (rgb - targets.double()).square()
     (squared.mean() + DISTORTION * distortion).backward()
     peaks = torch.zeros(scene.occupancy.shape[1:], dtype=torch.float64)

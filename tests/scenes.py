@@ -1,9 +1,12 @@
 """Small scenes for tests: every feature of a real one, in a few kilobytes."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from kpc.format.cameras import Camera
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Clip, Decoder, Scene
+from kpc.format.space import Contraction
 
 
 def tiny_scene(seed: int = 0, dynamic: bool = True, scales: int = 2, channels: int = 8,
@@ -45,6 +48,20 @@ def tiny_scene(seed: int = 0, dynamic: bool = True, scales: int = 2, channels: i
         step=0.04,
         cameras=tuple(look_at(eye, (0.1, 0.05, 0.05), 48, 36, 55.0) for eye in [(2.4, 1.0, 2.2), (-1.8, 1.4, 2.6)]),
     )
+
+
+def surrounded(scene: Scene) -> Scene:
+    """A scene in contracted space: what was in its box, now small in the middle, and a wall all around, out to infinity.
+
+    Its even steps end within the wall's nearer part, so that samples of both kinds count.
+    """
+    slots = len(scene.occupancy)
+    occupancy = np.zeros((slots, 16, 20, 24), bool)
+    occupancy[:, 4:12, 5:15, 6:18] = scene.occupancy
+    shell = np.ones(occupancy.shape[1:], bool)
+    shell[2:-1, 2:-2, 1:-3] = False
+    shell[2:6, 3:7, 18] = True  # something in the open, too
+    return replace(scene, occupancy=occupancy | shell, mapping=Contraction(5.0), step=0.08)
 
 
 def look_at(eye: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int,

@@ -6,10 +6,11 @@ import datasets as make
 import numpy as np
 import pytest
 
-from kpc.encoder.box import CLEAR, find_box, seen_cells
+from kpc.encoder.box import CLEAR, INNER, contraction_of, find_box, find_inner_box, reaches_beyond, seen_cells
 from kpc.encoder.datasets import Pictures
 from kpc.format.cameras import Camera
 from kpc.format.errors import DatasetError
+from kpc.format.space import Contraction, expand
 
 
 def pictures_of(
@@ -82,6 +83,52 @@ def test_cameras_that_look_away_from_each_other_share_no_point() -> None:
     find_box(pictures_of(rig), False)
     with pytest.raises(DatasetError, match="no point they look at"):
         find_box(pictures_of(flipped), False)
+
+
+def test_pictures_reach_beyond_a_box_where_nothing_bounds_them() -> None:
+    rig = make.ring(5)
+    assert reaches_beyond(pictures_of(rig), has_alpha=False)[0]
+    assert not reaches_beyond(pictures_of(rig), has_alpha=True)[0]
+    assert not reaches_beyond(pictures_of(rig, near=1.0, far=4.0), has_alpha=False)[0]
+    assert reaches_beyond(pictures_of(rig, near=1.0), has_alpha=False)[0]
+    words = {reaches_beyond(pictures_of(rig, near), alpha)[1] for near in (np.nan, 1.0) for alpha in (False, True)}
+    assert len(words) == 2 and all(words)
+
+
+def test_an_inner_box_is_about_what_the_cameras_look_at() -> None:
+    rig = make.ring(5)
+    half = INNER * np.linalg.norm(rig[0].camera_to_world[:3, 3])
+    np.testing.assert_allclose(find_inner_box(pictures_of(rig)), [[-half] * 3, [half] * 3], atol=1e-5)
+    # Parallel ones look at nothing in common: then it is about them.
+    apart = pictures_of([straight(), straight(1.0)])
+    np.testing.assert_allclose(find_inner_box(apart), [[-0.5, -1, -1], [1.5, 1, 1]], atol=1e-6)
+    with pytest.raises(DatasetError, match="--box"):
+        find_inner_box(pictures_of([straight()]))
+
+
+def test_even_steps_reach_the_far_corner_of_the_box() -> None:
+    rig = pictures_of(make.ring(5))
+    aabb = np.array([[-1, -2, -1], [1, 2, 3]], np.float32)
+    corners = np.stack(np.meshgrid(*aabb.T, indexing="ij"), -1).reshape(-1, 3)
+    farthest = np.linalg.norm(rig.camera_to_world[:, None, :3, 3] - corners, axis=2).max(1)
+    even = contraction_of(rig, aabb).even
+    assert farthest.min() <= even <= farthest.max() and even == pytest.approx(np.quantile(farthest, 0.9))
+
+
+def test_cells_of_contracted_space_are_seen_where_they_lie() -> None:
+    """A row of cells ahead of the cameras, out to infinity, and one behind them."""
+    aabb = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
+    cameras = pictures_of([straight(), straight(0.1)])
+    seen = seen_cells(cameras, aabb, (32, 32, 32), Contraction(2.0))
+    z, y, x = (np.argwhere(np.ones_like(seen)).T + 0.5) / 32
+    centres = expand(np.stack([x, y, z], axis=1), aabb)
+    assert np.abs(centres).max() == pytest.approx(16)
+    depth, clear = -centres[:, 2], 0.02 * 2  # the margin of a view 90 degrees wide and 53 high
+    in_view = (depth > 0) & (np.abs(centres[:, 1]) < (0.5 + clear) * depth)
+    for shift in (0.0, 0.1):
+        in_view &= np.abs(centres[:, 0] - shift) < (1 + clear) * depth
+    np.testing.assert_array_equal(seen.ravel(), in_view)
+    assert seen[0].any() and not seen[16:].any()
 
 
 def test_near_without_far_is_not_enough() -> None:

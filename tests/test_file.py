@@ -17,6 +17,7 @@ from kpc.format.errors import BudgetError, FormatError
 from kpc.format.file import SceneReader, encode, read, write
 from kpc.format.quantise import QuantisedScene, quantise_scene
 from kpc.format.scene import TIME_PLANES
+from kpc.format.space import Contraction
 
 
 def quantised(step: float = 0.02, **options) -> QuantisedScene:
@@ -25,7 +26,7 @@ def quantised(step: float = 0.02, **options) -> QuantisedScene:
 
 
 def assert_same(a: QuantisedScene, b: QuantisedScene) -> None:
-    assert np.array_equal(a.aabb, b.aabb) and a.clip == b.clip and a.step == b.step
+    assert np.array_equal(a.aabb, b.aabb) and a.clip == b.clip and a.step == b.step and a.mapping == b.mapping
     assert np.array_equal(a.background, b.background)
     assert a.occupancy.dtype == b.occupancy.dtype and np.array_equal(a.occupancy, b.occupancy)
     for name in ("density_weight", "density_bias", "w1", "b1", "w2", "b2"):
@@ -51,6 +52,32 @@ def test_a_scene_comes_back(seed, dynamic, scales, channels, resolution, time, s
     scene = quantised(step, seed=seed, dynamic=dynamic, scales=scales, channels=channels, resolution=resolution,
                       time=time)
     assert_same(read(encode(scene, segment_rows=segment_rows)), scene)
+
+
+def test_a_contracted_scene_comes_back_and_says_so_in_a_chunk_of_its_own():
+    scene = quantised()
+    around = replace(scene, mapping=Contraction(1 / 3))
+    data = encode(around)
+    assert_same(read(data), around)
+    assert read(data).dequantise().mapping == around.mapping
+    assert [e.kind for e in Reader(data).index][:3] == ["SCNE", "WARP", "DECO"]
+    assert [e.kind for e in Reader(encode(scene)).index][:2] == ["SCNE", "DECO"]
+    assert read(encode(scene)).mapping is None
+
+
+def test_a_prefix_without_the_mapping_shows_nothing():
+    data = encode(replace(quantised(), mapping=Contraction(2.0)))
+    index = Reader(data).index
+    assert read(data[:index[4].offset], allow_partial=True).mapping == Contraction(2.0)
+    # A writer may put it last; then what came before it is of no use.
+    from kpc.format.container import Chunk, pack
+    from kpc.format.file import WARP_STRUCT, scene_chunks
+
+    chunks = [*scene_chunks(quantised()), Chunk("WARP", [WARP_STRUCT.pack(1, 2.0)])]
+    late = pack(chunks, Reader(data).header.value_count)
+    assert read(late).mapping == Contraction(2.0)
+    with pytest.raises(FormatError, match="WARP.*is not there"):
+        read(late[:-1], allow_partial=True)
 
 
 def test_rows_in_time_may_differ_from_scale_to_scale():
@@ -242,6 +269,11 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 
 @pytest.mark.parametrize("change, complaint", [
     (lambda s: {"aabb": s.aabb[::-1]}, "box"),
+    (lambda s: {"mapping": Contraction(0.0)}, "WARP"),
+    (lambda s: {"mapping": Contraction(-1.0)}, "WARP"),
+    (lambda s: {"mapping": Contraction(float("nan"))}, "WARP"),
+    (lambda s: {"mapping": Contraction(float("inf"))}, "WARP"),
+    (lambda s: {"mapping": Contraction(40000 * s.step)}, "WARP"),
     (lambda s: {"aabb": np.full((2, 3), np.nan, np.float32)}, "box"),
     (lambda s: {"step": 0.0}, "ray step"),
     (lambda s: {"step": 1e-9}, "ray step"),

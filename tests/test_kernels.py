@@ -26,9 +26,10 @@ COLOUR = 1e-4
 GRADIENT = 1e-3
 
 
+@pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("dynamic", [True, False])
-def test_backpropagate_is_autograd_through_the_reference(dynamic: bool) -> None:
-    scene = misty(dynamic)
+def test_backpropagate_is_autograd_through_the_reference(dynamic: bool, contracted: bool) -> None:
+    scene = misty(dynamic, contracted)
     rays = rays_at(scene, 403)
     targets = torch.rand(403, 3, generator=torch.Generator().manual_seed(1))
     ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
@@ -106,9 +107,10 @@ class _Calling(torch.nn.Module):
         self.field, self.forward = field, call
 
 
+@pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("dynamic", [True, False])
-def test_render_is_the_players_reference(dynamic: bool) -> None:
-    scene = misty(dynamic)
+def test_render_is_the_players_reference(dynamic: bool, contracted: bool) -> None:
+    scene = misty(dynamic, contracted)
     renderer = SceneRenderer(scene)
     for time in (0.0, 0.3, 0.5, 1.0):
         for camera in scene.cameras:
@@ -132,6 +134,7 @@ def test_render_gives_opacity_depth_and_counts() -> None:
         field.density.detach().numpy(),
         field.layout.channels,
         scene.aabb,
+        kernels.even_of(scene.mapping),
         scene.occupancy.view(np.uint8),
         np.float32(scene.step),
         np.float32(scene.extent),

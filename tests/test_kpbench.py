@@ -32,7 +32,7 @@ def test_encode_records_every_repeat(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert record["command"] == shlex.join(["kpbench", *command]) and record["seed"] == 5
     assert record["data_sha256"] == data_hash(tmp_path / "tiny")
     assert record["settings"] == {"preset": "draft", "steps": 3, "time_budget_s": None, "downscale": 1, "test_views": 1,
-                                  "box": [-1, -1, -1, 1, 1, 1]}  # fmt: skip
+                                  "space": "auto", "box": [-1, -1, -1, 1, 1, 1]}  # fmt: skip
     assert [run["seed"] for run in record["repeats"]] == [5, 6]
     for run in record["repeats"]:
         kept = tmp_path / "kept" / run["file"]

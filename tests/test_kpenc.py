@@ -409,13 +409,40 @@ def test_cameras_without_a_common_point(run: Kpenc, sets: Path, tmp_path: Path) 
             frame["transform_matrix"] = [[1, 0, 0, 0.1 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
     make.edit_json(folder / "transforms.json", parallel)
-    fails(run, tmp_path, folder, str(folder), "--box")
+    fails(run, tmp_path, folder, str(folder), "--box", options=("--space", "box"))
+    assert run(folder, "--steps", "2")[0] == 0  # contracted, the box is about the cameras
+
+
+@pytest.mark.parametrize("space, found", [("auto", "contracted"), ("box", "box"), ("contracted", "contracted")])
+def test_space_is_chosen_said_and_overridden(run: Kpenc, sets: Path, tmp_path: Path, space: str, found: str) -> None:
+    code, out, err = run(sets / "colmap", "--json", "--space", space)
+    assert code == 0
+    result, scene = json.loads(out), file.read(tmp_path / "out.kpc")
+    assert result["space"] == found and (scene.mapping is not None) == (found == "contracted")
+    assert ("all around it" in err) == (found == "contracted")
+    assert ("space: contracted beyond" if found == "contracted" else "space: a box") in err
+    assert ("nothing bounds what the cameras see" if space == "auto" else "as told") in err
+
+
+@pytest.mark.parametrize("name, why", [("n3dv", "near and far are known"), ("blender", "have alpha")])
+def test_space_is_a_box_where_something_bounds_it(run: Kpenc, sets: Path, name: str, why: str) -> None:
+    code, out, err = run(sets / name, "--json", "--steps", "2")
+    assert code == 0 and json.loads(out)["space"] == "box" and why in err
+
+
+def test_a_box_in_contracted_space_is_taken_as_it_is(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+    code, out, _ = run(sets / "n3dv", "--json", "--space", "contracted", "--box", "-1,-1,-1,1,1,0.5")
+    scene = file.read(tmp_path / "out.kpc")
+    assert code == 0 and json.loads(out)["box"] == scene.aabb.tolist() == [[-1, -1, -1], [1, 1, 0.5]]
+    assert scene.mapping is not None and scene.mapping.even > 3  # the cameras' distance
 
 
 def test_a_box_where_nothing_is(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     fails(run, tmp_path, sets / "n3dv", "outside every camera's view", "--box", options=("--box", "90,90,90,91,91,91"))
     fails(run, tmp_path, sets / "n3dv", "too large or too thin", "--box", options=("--box", "0,0,0,1,1,1e12"))
     fails(run, tmp_path, sets / "n3dv", "too large or too thin", "--box", options=("--box", "1e8,0,0,100000001,1,1"))
+    tiny = ("--space", "contracted", "--box", "0,0,0,1e-4,1e-4,1e-4")
+    fails(run, tmp_path, sets / "n3dv", "too small for cameras", "--box", options=tiny)
 
 
 def test_no_permission(run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,7 @@
 import json
 
 import pytest
-from scenes import tiny_scene
+from scenes import surrounded, tiny_scene
 
 from kpc.format.container import Reader
 from kpc.format.file import write
@@ -33,7 +33,7 @@ def test_json_adds_up(scene_file, capsys):
     size = scene_file.stat().st_size
     assert info["size_bytes"] == size == info["overhead_bytes"] + sum(c["stored_bytes"] for c in info["chunks"])
     assert info["bits_per_parameter"] == pytest.approx(8 * size / info["parameter_count"])
-    assert info["verified"] and info["missing_chunks"] == 0
+    assert info["verified"] and info["missing_chunks"] == 0 and info["space"] == {"mapping": "box"}
     assert info["scales"][0]["planes"]["xt"]["rows"] == 6
     assert 0 < info["dont_care_share"] < 1 and 0.5 < info["identity_share"] < 1
     assert info["cameras"] == 2 and info["camera_box"] == [pytest.approx([-1.8, 1.0, 2.2]),
@@ -49,6 +49,17 @@ def test_a_static_scene(tmp_path, capsys):
     assert kpinfo.main([str(path), "--verify"]) == 0
     page = capsys.readouterr().out
     assert "static" in page and "verified" in page and "xt" not in page
+
+
+def test_a_contracted_scene(tmp_path, capsys):
+    scene = surrounded(tiny_scene())
+    path = tmp_path / "around.kpc"
+    write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), path)
+    assert kpinfo.main([str(path), "--verify"]) == 0
+    page = capsys.readouterr().out
+    assert "contracted beyond the box; even steps up to 5, rays end at 1280" in page and "WARP" in page
+    assert kpinfo.main([str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["space"] == {"mapping": "contracted", "even": 5.0, "far": 1280.0}
 
 
 def test_verify_lists_every_damaged_chunk(scene_file, capsys):

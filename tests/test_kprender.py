@@ -10,9 +10,10 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
-from scenes import tiny_scene
+from scenes import surrounded, tiny_scene
 
 import kpc
+from kpc.format.cameras import load_shots
 from kpc.format.errors import DisplayError
 from kpc.format.file import write
 from kpc.format.media import read_image, read_video
@@ -114,6 +115,30 @@ def test_depth_beside_a_png(run, scene_file: Path, tmp_path: Path) -> None:
     assert np.array_equal(levels == kprender.NOTHING, np.isinf(wanted))
     seen = np.isfinite(wanted)
     assert np.abs(levels[seen] * unit - wanted[seen]).max() <= unit / 2 * 1.01
+
+
+def test_depth_in_contracted_space_reaches_far_and_says_where_it_stops(run, tmp_path: Path) -> None:
+    path, camera = tmp_path / "around.kpc", tmp_path / "c.json"
+    scene = surrounded(tiny_scene(4))
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales], skip_unseen=False), path)
+    pose = scene.cameras[0].camera_to_world.copy()
+    pose[:3, 3] = [0.1, 0.05, 1.4]  # in the open, the wall behind it all
+    camera.write_text(json.dumps({"w": 40, "h": 30, "fl_x": 12, "fl_y": 12, "cx": 20, "cy": 15, "frames": [
+        {"file": "a.png", "time": 0.4, "transform_matrix": pose.tolist()}]}))
+    assert run(path, "--cameras", camera, "--backend", "reference", "--depth", "-o", tmp_path)[0] == 0
+    scene = kpc.load(path)
+    wanted = reference.render(scene, load_shots(camera)[0].camera, 0.4).depth
+    with Image.open(tmp_path / "a_depth.png") as image:
+        unit, levels = float(image.text["depth_unit"]), np.asarray(image)
+    there = np.isfinite(wanted)
+    limit = kprender.FARTHEST_EVEN * scene.mapping.even
+    assert wanted[there].max() > 2 * scene.mapping.even and unit == pytest.approx(limit / 65534)
+    np.testing.assert_allclose(levels[there] * unit, np.minimum(wanted, limit)[there], atol=0.51 * unit)
+    assert (levels[~there] == kprender.NOTHING).all()
+    assert run(path, "--cameras", camera, "--backend", "reference", "--depth", "-o", tmp_path / "a.mp4")[0] == 0
+    (frame,) = read_video(tmp_path / "a.mp4")
+    grey = 255 * (1 - scene.mapping.progress(wanted) / (2 * scene.mapping.even))
+    assert np.abs(frame[..., 1].astype(float) - grey).mean() < 6 and grey.std() > 10
 
 
 @pytest.mark.parametrize("depth", [False, True])

@@ -9,10 +9,11 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from scenes import tiny_scene
+from scenes import surrounded, tiny_scene
 
 from kpc.format import container, errors, file, planes
 from kpc.format.scene import ALL_PLANES, LOG_DENSITY_LIMIT, TERMINATION
+from kpc.format.space import FAR
 from kpc.player import reference
 from kpc.tools import specvectors
 
@@ -63,7 +64,7 @@ def same(layout: str, expected: struct.Struct) -> bool:
 
 
 @pytest.mark.parametrize("number, structures", [
-    (3, [container.HEADER]), (4, [container.ENTRY]), (5, [file.SCENE_STRUCT, file.SCALE_STRUCT]),
+    (3, [container.HEADER]), (4, [container.ENTRY]), (5, [file.SCENE_STRUCT, file.SCALE_STRUCT, file.WARP_STRUCT]),
     (7, [file.DECODER_STRUCT]), (8, [file.OCCUPANCY_STRUCT]), (9, [file.CAMERA_STRUCT]),
 ])
 def test_byte_tables_are_the_code_s_structures(number, structures):
@@ -78,6 +79,7 @@ def test_sizes_in_the_text():
     assert f"One entry of {container.ENTRY.size} bytes" in section(4)
     assert f"begins with {file.SCENE_STRUCT.size} bytes" in section(5)
     assert f"coarse to fine, {file.SCALE_STRUCT.size} bytes" in section(5)
+    assert f"keeps its shape. {file.WARP_STRUCT.size} bytes" in section(5)
     assert f"each camera {file.CAMERA_STRUCT.size} bytes" in section(9)
 
 
@@ -97,6 +99,8 @@ def test_names_and_numbers_are_the_code_s():
     filters = re.findall(r"^\| (\d) \| r\[y, x\]", section(6), re.M)
     assert [int(f) for f in filters] == list(range(planes.FILTER_COUNT))
     assert f"T < 1/{1 / TERMINATION:.0f}" in section(11)
+    assert f"(2 - 1/{FAR:.0f}) even" in section(11) and f"farther than {FAR:.0f} even" in section(11)
+    assert f"| mapping | {file.CONTRACTED};" in section(5)
     assert f"-{LOG_DENSITY_LIMIT:.0f}, {LOG_DENSITY_LIMIT:.0f}" in section(11)
 
 
@@ -173,10 +177,12 @@ def assert_described(found: dict, expected: dict) -> None:
             assert one[key] == pytest.approx(other[key], abs=RAY_TOLERANCE), key
 
 
-def test_the_twin_renders_a_scene_as_the_reference_does(twin):
+@pytest.mark.parametrize("space", ["box", "contracted"])
+def test_the_twin_renders_a_scene_as_the_reference_does(twin, space):
     from kpc.format.quantise import quantise_scene
 
     scene = tiny_scene(scales=1, channels=4, resolution=(10, 8, 6), time=4)
+    scene = scene if space == "box" else surrounded(scene)
     data = file.encode(quantise_scene(scene, [{name: 0.01 for name in scene.scales[0]}]))
     decoded = file.read(data).dequantise()
     slow = twin.decode(data)

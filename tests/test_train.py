@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from kpc.encoder.box import contraction_of, find_box
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluate import evaluate, psnr
@@ -18,6 +19,7 @@ from kpc.encoder.kpenc import to_scene
 from kpc.encoder.train import PlainOptimiser, RaySampler, Report, Trainer, kept_channels
 from kpc.format.errors import TrainingError
 from kpc.format.media import read_image, write_image
+from kpc.format.space import Contraction
 
 CONFIG = TrainConfig(
     resolutions=(12, 24),
@@ -49,16 +51,23 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return load_dataset(folder / "set", folder / "cache", progress=False)
 
 
-def trainer(dataset: Dataset, **changes: object) -> Trainer:
-    return Trainer(dataset, replace(CONFIG, **changes), BOX, "cpu")  # type: ignore[arg-type]
+@pytest.fixture(scope="module")
+def surrounded(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("surrounded")
+    make.write_surrounded(folder / "set")
+    return load_dataset(folder / "set", folder / "cache", progress=False)
+
+
+def trainer(dataset: Dataset, mapping: Contraction | None = None, **changes: object) -> Trainer:
+    return Trainer(dataset, replace(CONFIG, **changes), BOX, "cpu", mapping=mapping)  # type: ignore[arg-type]
 
 
 def ignore(_: Report) -> None:
     pass
 
 
-def trained(dataset: Dataset, **changes: object) -> Trainer:
-    run = trainer(dataset, **changes)
+def trained(dataset: Dataset, mapping: Contraction | None = None, **changes: object) -> Trainer:
+    run = trainer(dataset, mapping, **changes)
     run.run(ignore)
     return run
 
@@ -145,6 +154,37 @@ def test_rays_go_by_what_changes_from_the_stated_share_on(rig: Dataset, monkeypa
 
 def test_cameras_that_move_train_as_if_there_were_no_weights(moving: Dataset) -> None:
     assert_same(trained(moving, steps=12, temporal_start=0.0), trained(moving, steps=12, temporal_start=1.0))
+
+
+def test_a_contracted_run_repeats_and_resumes_bitwise_but_not_as_another(surrounded: Dataset, tmp_path: Path) -> None:
+    mapping = Contraction(5.0)
+    whole, first, second = trained(surrounded, mapping), trainer(surrounded, mapping), trainer(surrounded, mapping)
+    assert_same(whole, trained(surrounded, mapping))
+    with pytest.raises(KeyboardInterrupt):
+        first.run(ignore, interrupted=lambda: first.step == 30)
+    first.save(tmp_path / "checkpoint.kpck")
+    second.resume(tmp_path / "checkpoint.kpck")
+    second.run(ignore)
+    assert_same(whole, second)
+    for other in (None, Contraction(6.0)):
+        with pytest.raises(TrainingError, match="other settings"):
+            trainer(surrounded, other).resume(tmp_path / "checkpoint.kpck")
+
+
+def test_contraction_holds_a_background_that_a_box_cannot(surrounded: Dataset) -> None:
+    """A ball before a sky at infinity, filmed from all around: the walls of a box are near, and shift against the sky."""
+    changes = dict(steps=250, resolutions=(16, 48), cells_across=24)
+    config, inner, large = replace(CONFIG, **changes), 1.5 * BOX, find_box(surrounded.pictures, False)  # type: ignore[arg-type]
+    contracted = Trainer(surrounded, config, inner, "cpu", mapping=contraction_of(surrounded.pictures, inner))
+    boxed = Trainer(surrounded, config, large, "cpu")
+    psnrs = []
+    for run in (contracted, boxed):
+        run.run(ignore)
+        quality = evaluate(to_scene(run), surrounded)
+        assert quality is not None
+        psnrs.append(quality.psnr)
+    assert psnrs[0] > psnrs[1] + 3, psnrs
+    assert psnrs[0] > 18, psnrs
 
 
 def test_checkpoints_are_written_on_the_way_and_at_the_end(moving: Dataset, tmp_path: Path) -> None:
@@ -414,13 +454,16 @@ def plain_twin(fused: Trainer) -> PlainOptimiser:
     """The optimiser of other devices, on a copy of a trainer's field."""
     field = Field(fused.field.layout, fused.config.hidden)
     field.load_state_dict(fused.field.state_dict())
-    return PlainOptimiser(field, fused.config, fused.grid.seen.shape)  # type: ignore[arg-type]
+    return PlainOptimiser(field, fused.config, fused.grid.seen.shape, fused.mapping)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("mapping", [None, Contraction(4.0)])
 @pytest.mark.parametrize(("channel_dropout", "view_dependent"), [(0.0, True), (0.5, True), (0.5, False)])
-def test_plain_pytorch_takes_the_same_steps(moving: Dataset, channel_dropout: float, view_dependent: bool) -> None:
+def test_plain_pytorch_takes_the_same_steps(
+    moving: Dataset, channel_dropout: float, view_dependent: bool, mapping: Contraction | None
+) -> None:
     """Adam moves by the sign of a gradient at first; where that is all rounding, either way."""
-    run = trainer(moving, channel_dropout=channel_dropout, view_dependent=view_dependent)
+    run = trainer(moving, mapping, channel_dropout=channel_dropout, view_dependent=view_dependent)
     plain = plain_twin(run)
     for number in range(3):
         batch, targets = run.sampler.draw(run.rng, 256)

@@ -130,6 +130,7 @@ def _encodes(
                 "steps": options.steps,
                 "time_budget_s": time_budget_s,
                 "downscale": options.downscale,
+                "space": options.space,
                 "box": options.box,
                 "test_views": options.test_views,
             }
@@ -146,6 +147,7 @@ def _encodes(
                     seed=seed,
                     device=options.device,
                     downscale=options.downscale,
+                    space=options.space,
                     box=options.box,
                     work=Path(scratch) / f"{label}-{seed}.work",
                     most_tests=options.test_views,
@@ -297,6 +299,7 @@ def _parser() -> argparse.ArgumentParser:
         kind.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
         kind.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
         kind.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
+        kind.add_argument("--space", choices=("auto", "box", "contracted"), default="auto", help="of every dataset")
         kind.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
         kind.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
         kind.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there")

@@ -21,6 +21,7 @@ from kpc.format.errors import FormatError, UsageError
 from kpc.format.file import SceneReader, read
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES
+from kpc.format.space import FAR
 
 CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd"}
 
@@ -66,7 +67,7 @@ def verify(reader: SceneReader) -> None:
                           "fetch the file again")
     if damaged:
         raise damaged[0][2]
-    reader.decoder(), reader.occupancy(), reader.cameras()
+    reader.mapping(), reader.decoder(), reader.occupancy(), reader.cameras()
 
 
 def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
@@ -82,6 +83,8 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
                  "is_dynamic": scene.is_dynamic},
         "aabb": scene.aabb.tolist(),
         "step": scene.step,
+        "space": {"mapping": "box"} if scene.mapping is None else
+                 {"mapping": "contracted", "even": scene.mapping.even, "far": FAR * scene.mapping.even},
         "background": scene.background.tolist(),
         "scales": [_describe_scale(scale) for scale in scene.scales],
         "decoder": {"features": len(scene.decoder.density_weight), "hidden": len(scene.decoder.b1)},
@@ -145,6 +148,7 @@ def _page(info: dict[str, Any]) -> str:
         + (", verified" if info["verified"] else ""),
         f"  clip        {clip['frame_count']} frames at {clip['fps']:g} fps, {clip['duration_s']:.2f} s, {kind}",
         f"  box         {_corner(info['aabb'][0])} to {_corner(info['aabb'][1])}, ray step {info['step']:.4g}",
+        *_space(info["space"]),
         f"  cameras     {info['cameras']}"
         + (f" within {_corner(info['camera_box'][0])} to {_corner(info['camera_box'][1])}" if info["cameras"] else ""),
         f"  occupancy   {occupancy['slots']} x {'x'.join(map(str, reversed(occupancy['cells_zyx'])))} cells, "
@@ -171,6 +175,13 @@ def _page(info: dict[str, Any]) -> str:
     overhead = info["overhead_bytes"]
     lines.append(f"  header and index {overhead:>37,} {'':>12} {overhead / info['size_bytes']:>6.1%}")
     return "\n".join(lines)
+
+
+def _space(space: Mapping[str, Any]) -> list[str]:
+    """Nothing for a box, which says it all."""
+    if space["mapping"] == "box":
+        return []
+    return [f"  space       contracted beyond the box; even steps up to {space['even']:.4g}, rays end at {space['far']:.4g}"]
 
 
 def _corner(point: Sequence[float]) -> str:

@@ -39,6 +39,8 @@ FASTEST = 240.0
 LARGEST = 16384
 NOTHING = 65535
 """In a depth PNG: no surface."""
+FARTHEST_EVEN = 16.0
+"""Depth PNGs of contracted scenes reach so many times `even`; levels are too few to tell near things apart out to infinity."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -254,7 +256,10 @@ def _colour_pixels(rendering: Rendering) -> np.ndarray:
 
 
 def _farthest(scene: Scene, shots: list[Shot]) -> float:
-    """The greatest distance from a camera to a corner of the box: no depth exceeds it."""
+    """The greatest distance from a camera to a corner of the box: no depth exceeds it. In contracted space, where all that is
+    farther counts as that far."""
+    if scene.mapping is not None:
+        return FARTHEST_EVEN * scene.mapping.even
     corners = np.array(list(itertools.product(*scene.aabb.T)))
     eyes = np.unique([shot.camera.camera_to_world[:3, 3] for shot in shots], axis=0)
     return float(np.linalg.norm(eyes[:, None] - corners, axis=2).max())
@@ -266,11 +271,14 @@ def _depth_unit(scene: Scene, shots: list[Shot]) -> float:
 
 
 def _depth_pixels(scene: Scene, shots: list[Shot]) -> Callable[[Rendering], np.ndarray]:
-    """Near is white, far is black, and so is nothing."""
-    farthest = _farthest(scene, shots)
+    """Near is white, far is black, and so is nothing; in contracted space evenly by how far along the samples it is."""
+    mapping, farthest = scene.mapping, _farthest(scene, shots)
 
     def pixels(rendering: Rendering) -> np.ndarray:
-        near = np.where(np.isfinite(rendering.depth), 1 - np.minimum(rendering.depth / farthest, 1), 0)
+        if mapping is None:
+            near = np.where(np.isfinite(rendering.depth), 1 - np.minimum(rendering.depth / farthest, 1), 0)
+        else:
+            near = 1 - mapping.progress(rendering.depth) / (2 * mapping.even)
         return np.repeat(np.rint(near * 255).astype(np.uint8)[..., None], 3, axis=2)
 
     return pixels

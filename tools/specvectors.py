@@ -12,6 +12,7 @@ import json
 import struct
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from kpc.format.errors import UsageError
 from kpc.format.file import encode, read, scene_chunks
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
+from kpc.format.space import Contraction
 from kpc.player import reference
 
 ZSTD_VERSION = ".".join(map(str, zstandard.ZSTD_VERSION))
@@ -68,6 +70,7 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
         "frame_count": scene.clip.frame_count,
         "fps": scene.clip.fps,
         "step": scene.step,
+        **({"even": scene.mapping.even} if scene.mapping else {}),
         "aabb": scene.aabb.tolist(),
         "background": scene.background.tolist(),
         "cameras": [_camera(camera) for camera in scene.cameras],
@@ -107,6 +110,8 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
     dynamic = _scene(dynamic=True, sizes=[(2, 5, 4, 3, 3), (4, 9, 8, 7, 6)], cameras=2)
     packed = encode(dynamic, segment_rows=4)
     minimal = minimal_scene()
+    contracted = replace(_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), mapping=Contraction(3.5),
+                         occupancy=_noise((2, 3, 3, 5), 98) > -64)
     note = Chunk("note", [b"readers skip what they need not know"])
     chunks = scene_chunks(minimal)
     index = Reader(packed).index
@@ -119,6 +124,8 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "dynamic-prefix": (packed[:coarse_ends], True),
         "one-texel": (encode(_scene(dynamic=True, sizes=[(1, 1, 1, 1, 1)]), compress=False), False),
         "wrap": (encode(_scene(dynamic=False, sizes=[(8, 12, 10, 6, 0)], amplitude=400), compress=False), False),
+        "contracted": (encode(contracted), False),
+        "contracted-prefix": (encode(contracted)[:Reader(encode(contracted)).index[4].offset], True),
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
     }
 
@@ -142,6 +149,10 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
 
     def set_at(offset: int, layout: str, *numbers: int | float) -> Callable[[bytes], bytes]:
         return lambda raw: patched(raw, offset, layout, *numbers)
+
+    def warped(*parts: bytes) -> bytes:
+        """The file with WARP chunks."""
+        return pack([chunks[scne], *(Chunk("WARP", [part]) for part in parts), *chunks[deco:]], values, compress=False)
 
     def without(number: int) -> bytes:
         return pack(chunks[:number] + chunks[number + 1:], values, compress=False)
@@ -206,6 +217,13 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "scene-plane-nan": (repacked(scne, set_at(68, "<f", nan)), broken, "plane xy: a step or an offset"),
         "scene-plane-snan": (repacked(scne, set_at(68, "<I", 0x7F800001)), broken, "plane xy: a step or an offset"),
         "scene-long": (repacked(scne, lambda raw: raw + bytes(1)), broken, "1 bytes too long"),
+        "warp-mapping": (warped(struct.pack("<Id", 2, 3.5)), broken, "mapping 2"),
+        "warp-negative": (warped(struct.pack("<Id", 1, -3.5)), broken, "make no sense"),
+        "warp-nan": (warped(struct.pack("<Id", 1, nan)), broken, "make no sense"),
+        "warp-far": (warped(struct.pack("<Id", 1, 1e6)), broken, "make no sense"),
+        "warp-short": (warped(struct.pack("<Id", 1, 3.5)[:-1]), broken, "ends after"),
+        "warp-long": (warped(struct.pack("<Id", 1, 3.5) + bytes(1)), broken, "12 make sense"),
+        "warp-twice": (warped(*2 * [struct.pack("<Id", 1, 3.5)]), broken, "2 WARP chunks"),
         "decoder-features": (repacked(deco, set_at(0, "<H", 3)), broken, "3 features"),
         "decoder-nan": (repacked(deco, set_at(8, "<H", 0x7E00)), broken, "NaN or infinite"),
         "decoder-short": (repacked(deco, lambda raw: raw[:-1]), broken, "ends after"),
@@ -273,7 +291,10 @@ def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 
 def _rays(scene: QuantisedScene) -> list[dict[str, Any]]:
-    """What four rays see: through the box's centre at the clip's start, across it, from inside it, and past it."""
+    """What four rays see: through the box's centre at the clip's start, across it, from inside it, and past it.
+
+    In contracted space some of it lies outside.
+    """
     centre, size = scene.aabb.mean(0), scene.aabb[1] - scene.aabb[0]
     starts = np.array([[0.0, 0.1, 1.5], [-1.5, -0.75, 1.25], [0.1, -0.2, 0.05], [2.0, 2.0, 2.0]], np.float32)
     towards = np.array([[0.05, 0.0, -1.0], [1.5, 0.75, -1.25], [0.75, 0.5, 0.25], [1.0, 0.0, 0.0]], np.float32)

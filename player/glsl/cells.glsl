@@ -1,6 +1,7 @@
 // The occupied cells themselves, as boxes with a pattern of grid lines: where a march takes samples.
 
 #include "ray.glsl"
+#include "space.glsl"
 #include "occupancy.glsl"
 
 uniform usampler3D cells;
@@ -8,6 +9,7 @@ uniform ivec3 cell_count;
 uniform vec3 box_low;
 uniform vec3 box_high;
 uniform float stride;
+uniform float even;
 uniform vec3 background;
 
 uniform float height;
@@ -20,21 +22,25 @@ layout(location = 1) out vec4 met;
 
 void main() {
     vec3 d = camera_direction(gl_FragCoord.xy, height, lens, axes);
-    vec2 range = box_range(eye, d, box_low, box_high);
-    vec3 to_cells = vec3(cell_count) / (box_high - box_low);
-    vec3 rate = slanted(d) * to_cells;
-    Walk walk = Walk((eye - box_low) * to_cells, rate, 1.0 / rate, range.x, range.y, stride, 0.0);
+    Walk walk = walk_of(eye, d, box_low, box_high, cell_count, stride, even);
     seen = vec4(background, 0.0);
     met = vec4(0.0);
     if (!to_occupied(walk, cells, cell_count)) return;
 
-    // Back from the sample to the face through which the ray came in.
-    vec3 inside = walk.start + sample_t(walk) * rate;
+    float t = distance_of(sample_s(walk), even);
+    vec3 inside = position_at(walk, t, cell_count);
     vec3 cell = floor(inside);
-    vec3 enter = (cell + vec3(lessThan(rate, vec3(0.0))) - walk.start) * walk.inverse;
-    float t = max(max(enter.x, max(enter.y, enter.z)), range.x);
-    vec3 local = abs(walk.start + t * rate - cell - 0.5);
+#if CONTRACTED
+    // The way is bent: take the face that the sample is nearest to for the one through which the ray came in.
+    vec3 local = abs(inside - cell - 0.5);
+    vec3 face = vec3(greaterThanEqual(local, vec3(largest(local))));
+#else
+    // Back from the sample to the face through which the ray came in.
+    vec3 enter = (cell + vec3(lessThan(walk.rate, vec3(0.0))) - walk.start) * walk.inverse;
+    t = max(largest(enter), walk.near);
+    vec3 local = abs(walk.start + t * walk.rate - cell - 0.5);
     vec3 face = vec3(greaterThanEqual(enter, vec3(t)));
+#endif
     vec3 across = mix(local, vec3(0.0), face);
     float line = smoothstep(0.40, 0.46, max(across.x, max(across.y, across.z)));
     float lit = dot(face, vec3(0.72, 0.84, 1.0));

@@ -2,8 +2,10 @@
 //
 // SCALES, LAYERS (of four channels), HIDDEN: its shape. ROWS: 1 where rows of time planes are multiplied in at every
 // sample. REFINED: how much finer than the scene's the planes are along the row folded into them; 1 where none is.
+// CONTRACTED: 1 where the planes hold what lies outside the box, too.
 
 #include "ray.glsl"
+#include "space.glsl"
 #include "occupancy.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
@@ -24,6 +26,7 @@ uniform vec3 box_low;
 uniform vec3 box_high;
 uniform vec3 background;
 uniform float stride;
+uniform float even;                 // CONTRACTED: how far steps are even
 uniform float tau;                  // stride / longest edge of the box
 
 uniform float height;
@@ -68,10 +71,7 @@ vec4 feature(vec3 u, int scale, int layer) {
 
 void main() {
     vec3 d = camera_direction(gl_FragCoord.xy, height, lens, axes);
-    vec2 range = box_range(eye, d, box_low, box_high);
-    vec3 box = box_high - box_low;
-    vec3 rate = slanted(d) / box * vec3(cell_count);
-    Walk walk = Walk((eye - box_low) / box * vec3(cell_count), rate, 1.0 / rate, range.x, range.y, stride, 0.0);
+    Walk walk = walk_of(eye, d, box_low, box_high, cell_count, stride, even);
     find_basis(d);
 
     vec3 rgb = vec3(0.0);
@@ -82,8 +82,15 @@ void main() {
     // Tested at its end: neighbouring rays run as one, and a test up front would cost them all one more body.
     do {
         if (more) {
-            float t = sample_t(walk);
-            vec3 u = clamp((eye + t * d - box_low) / box, 0.0, 1.0);
+            float t = distance_of(sample_s(walk), even);
+#if CONTRACTED
+            vec3 y = walk.start + t * walk.rate;
+            vec3 u = 0.25 * contracted(y) + 0.5;
+            float thickness = tau * stretch_of(y, t, even);
+#else
+            vec3 u = clamp((eye + t * d - box_low) / (box_high - box_low), 0.0, 1.0);
+            float thickness = tau;
+#endif
             float log_density = density_bias[0].x;
             vec3 shade = vec3(0.0);
             for (int scale = 0; scale < SCALES; ++scale) {
@@ -94,7 +101,7 @@ void main() {
                     shade += vec3(dot(f, basis[i]), dot(f, basis[FEATURES + i]), dot(f, basis[2 * FEATURES + i]));
                 }
             }
-            float weight = trans * alpha_of(log_density, tau);
+            float weight = trans * alpha_of(log_density, thickness);
             rgb += weight * sigmoid(shade);
             depth += weight * t;
             trans -= weight;

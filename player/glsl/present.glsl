@@ -1,11 +1,14 @@
 // Puts what a march gave on the screen: its colours, or one of the other things it met.
 
+#include "space.glsl"
+
 uniform sampler2D seen;
 uniform sampler2D met;
 uniform sampler2D without;  // what a march of the static part has seen
 uniform int view;           // 0 colour, 1 |colour - without|, 2 depth, 3 samples
 uniform vec2 viewport;      // pixels
 uniform vec2 depths;        // shown from bright to dark
+uniform float even;         // CONTRACTED: how far steps are even
 uniform float most_samples;
 
 layout(location = 0) out vec4 shown;
@@ -22,8 +25,9 @@ void main() {
     vec3 rgb = colour.rgb;
     if (view == 1) rgb = abs(rgb - texture(without, at).rgb);
     if (view == 2) {
-        float depth = sums.x / max(colour.a, 1e-6);
-        rgb = colour.a * heat(1.0 - clamp((depth - depths.x) / (depths.y - depths.x), 0.0, 1.0));
+        float depth = progress_of(sums.x / max(colour.a, 1e-6), even);
+        float near = progress_of(depths.x, even), far = progress_of(depths.y, even);
+        rgb = colour.a * heat(1.0 - clamp((depth - near) / (far - near), 0.0, 1.0));
     }
     if (view == 3) rgb = heat(sums.y / most_samples);
     shown = vec4(rgb, 1.0);
