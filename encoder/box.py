@@ -1,6 +1,7 @@
 """Where the scene is: its axis-aligned box, and which parts of it the cameras see."""
 
 import numpy as np
+from numba import njit, prange
 
 from kpc.encoder.datasets.dataset import Pictures
 from kpc.format.errors import DatasetError
@@ -103,22 +104,36 @@ def seen_cells(
         centres = expand(centres, aabb)
     cameras = _distinct_cameras(pictures)
     focus = _focus(pictures, cameras)
-    count, blocked = np.zeros(len(centres), np.int32), np.zeros(len(centres), bool)
-    for p in cameras:
-        pose = pictures.camera_to_world[p]
-        local = (centres - pose[:3, 3]) @ pose[:3, :3]
-        depth = -local[:, 2]
-        fx, fy, cx, cy = pictures.intrinsics[p]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            i = cx + fx * local[:, 0] / depth
-            j = cy - fy * local[:, 1] / depth
-        near = pictures.near[p] if np.isfinite(pictures.near[p]) else 0.0
-        margin = 0.02 * pictures.width[p]  # a cell whose centre is just outside still shows an edge
-        inside = (i > -margin) & (i < pictures.width[p] + margin) & (j > -margin) & (j < pictures.height[p] + margin)
-        count += (depth > 0.9 * near) & (depth > 0) & inside
-        if focus is not None:
-            blocked |= np.linalg.norm(local, axis=1) < CLEAR * np.linalg.norm(focus - pose[:3, 3])
+    poses = pictures.camera_to_world[cameras, :3].astype(np.float64)
+    near = np.where(np.isfinite(pictures.near[cameras]), pictures.near[cameras], 0.0)
+    clear = np.zeros(len(cameras)) if focus is None else CLEAR * np.linalg.norm(focus - poses[:, :, 3], axis=1)
+    sizes = np.stack([pictures.width[cameras], pictures.height[cameras]], axis=1)
+    intrinsics = pictures.intrinsics[cameras].astype(np.float64)
+    count, blocked = _views(centres.astype(np.float64), poses, intrinsics, sizes, 0.9 * near, clear)
     return ((count >= min(at_least, len(cameras))) & ~blocked).reshape(shape)
+
+
+@njit(parallel=True, cache=True)
+def _views(points, poses, intrinsics, sizes, near, clear):
+    """How many cameras see each of (N, 3) points at a depth beyond `near` (C,), and whether it is nearer than `clear` (C,) to
+    any: (N,) int32 and (N,) bool. `poses` (C, 3, 4) are camera-to-world."""
+    count, blocked = np.zeros(len(points), np.int32), np.zeros(len(points), np.bool_)
+    for n in prange(len(points)):
+        for c in range(len(poses)):
+            pose = poses[c]
+            x, y, z = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
+            if x * x + y * y + z * z < clear[c] * clear[c]:
+                blocked[n] = True
+            depth = -(x * pose[0, 2] + y * pose[1, 2] + z * pose[2, 2])
+            if not depth > max(near[c], 0.0):
+                continue
+            fx, fy, cx, cy = intrinsics[c]
+            i = cx + fx * (x * pose[0, 0] + y * pose[1, 0] + z * pose[2, 0]) / depth
+            j = cy - fy * (x * pose[0, 1] + y * pose[1, 1] + z * pose[2, 1]) / depth
+            width, height = sizes[c]
+            margin = 0.02 * width  # a cell whose centre is just outside still shows an edge
+            count[n] += -margin < i < width + margin and -margin < j < height + margin
+    return count, blocked
 
 
 def _distinct_cameras(pictures: Pictures) -> np.ndarray:

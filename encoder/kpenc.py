@@ -23,6 +23,7 @@ from kpc.encoder.estimate import Estimate, estimate
 from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr
 from kpc.encoder.occupancy import grid_shape
 from kpc.encoder.options import Options, parse
+from kpc.encoder.profile import profile
 from kpc.encoder.train import Report, Trainer, box_of_checkpoint
 from kpc.encoder.trim import trim_box
 from kpc.format import cli, file
@@ -129,6 +130,15 @@ def dry_run(options: Options) -> Estimate:
         trainer, PROBE_RAYS, min(tested, options.most_tests or tested), time.monotonic() - started - trainer.elapsed_s,
         options.time_budget_s,
     )
+
+
+def profile_steps(options: Options) -> dict[str, Any]:
+    """Where the time of a training step goes: `kpc.encoder.profile`. Nothing is written but decoded pixels.
+
+    Raises:
+        As `encode`.
+    """
+    return profile(_trainer(options))
 
 
 def _trainer(options: Options) -> Trainer:

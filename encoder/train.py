@@ -1,10 +1,11 @@
 """The training loop: draw rays, render them, step the planes, keep the occupancy grid current."""
 
+import contextlib
 import hashlib
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,19 @@ class Report:
     elapsed_s: float
 
 
+class Stopwatch:
+    """Seconds of wall clock by what they went to: `with watch("name"): ...`."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+
 class Trainer:
     """One run: a dataset, a field, the optimiser's state. `run` trains to the end or until told to stop.
 
@@ -68,6 +82,7 @@ class Trainer:
             FusedOptimiser(self.field, config, shape, mapping) if self.device.type == "cpu" else
             PlainOptimiser(self.field, config, shape, mapping)
         )
+        self.watch = self.optimiser.watch
         self.step = 0
         self.elapsed_s = elapsed_s
         self.samples_per_ray = float(config.samples_across)
@@ -97,14 +112,16 @@ class Trainer:
             if interrupted():
                 raise KeyboardInterrupt
             started = time.monotonic()
-            if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
-                self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
-            if self.slots > 1 and self.step >= 4 * config.occupancy_start and self.step % config.occupancy_split_every == 0:
-                self.grid.split(self.density_at, self.slots, self.rng)
-            count = int(np.clip(config.samples / max(self.samples_per_ray, 1e-3), 256, config.rays))
+            with self.watch("occupancy"):
+                if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
+                    self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
+                if self.slots > 1 and self.step >= 4 * config.occupancy_start and self.step % config.occupancy_split_every == 0:
+                    self.grid.split(self.density_at, self.slots, self.rng)
+            count = self.rays_a_step
             background = None if self.dataset.has_alpha else self.background
-            weights = self._weights_at(fraction)
-            batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays, weights)
+            with self.watch("rays"):
+                weights = self._weights_at(fraction)
+                batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays, weights)
             rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
             squared_error, samples = self.optimiser.step(
                 self.step, rate, batch, targets, self.aabb, self.grid.marched,
@@ -129,6 +146,11 @@ class Trainer:
                 saved = since = time.monotonic()
         if checkpoint is not None:
             self._try_to_save(checkpoint)
+
+    @property
+    def rays_a_step(self) -> int:
+        """As many as keep a step's samples within bounds, now."""
+        return int(np.clip(self.config.samples / max(self.samples_per_ray, 1e-3), 256, self.config.rays))
 
     @property
     def rays_per_second(self) -> float:
@@ -322,6 +344,7 @@ class FusedOptimiser:
         self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: Contraction | None = None
     ) -> None:
         self.field, self.config, self.mapping = field, config, mapping
+        self.watch = Stopwatch()
         self.workers = numba.get_num_threads()  # starts numba's threads, which would undo the next line
         torch.set_num_threads(1)  # the decoder is so small that sharing it out costs more, a hundredfold on a busy machine
         self.theta = field.theta.detach().numpy()
@@ -342,30 +365,34 @@ class FusedOptimiser:
     ) -> tuple[float, float]:
         """Mean squared error a colour channel, and samples a ray."""
         layout, config = self.field.layout, self.config
-        kept = kept_channels(self.field, config, number)
-        basis = (self.field.basis(batch.directions) if config.view_dependent else self.field.b2[None]) * kept
-        density = torch.cat([self.field.density.detach()[:-1] * kept, self.field.density.detach()[-1:]])
-        grad_basis = np.zeros((len(basis) if config.view_dependent else self.workers, *basis.shape[1:]), np.float32)
-        grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
-        errors, counts = kernels.backpropagate(
-            self.theta, self.grad, layout.table, layout.resolution, density.numpy(), grad_density,
-            layout.channels, aabb, kernels.even_of(self.mapping), occupancy.view(np.uint8), np.float32(step_length),
-            np.float32(extent),
-            batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(), batch.jitters.numpy(),
-            basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(), self._peaks,
-            np.float32(config.distortion), sample_capacity(aabb, step_length, self.mapping),
-        )
-        if number % config.regularise_every == 0:
-            add_priors(self.field, self.theta, self.grad[0], config, config.regularise_every)
-        self.decoder.zero_grad()
-        basis.backward(torch.from_numpy(grad_basis if config.view_dependent else grad_basis.sum(0, keepdims=True)))
-        self.field.density.grad = torch.from_numpy(grad_density.sum(0))
-        self.field.density.grad[:-1] *= kept
-        for group in self.decoder.param_groups:
-            group["lr"] = config.decoder_learning_rate * rate
-        self.decoder.step()
-        kernels.adam(self.theta, self.grad, self.mean, self.square, config.learning_rate * rate, BETA1, BETA2, EPSILON,
-                     number + 1)
+        with self.watch("decoder"):
+            kept = kept_channels(self.field, config, number)
+            basis = (self.field.basis(batch.directions) if config.view_dependent else self.field.b2[None]) * kept
+            density = torch.cat([self.field.density.detach()[:-1] * kept, self.field.density.detach()[-1:]])
+            grad_basis = np.zeros((len(basis) if config.view_dependent else self.workers, *basis.shape[1:]), np.float32)
+            grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
+        with self.watch("kernel"):
+            errors, counts = kernels.backpropagate(
+                self.theta, self.grad, layout.table, layout.resolution, density.numpy(), grad_density,
+                layout.channels, aabb, kernels.even_of(self.mapping), occupancy.view(np.uint8), np.float32(step_length),
+                np.float32(extent), batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(),
+                batch.jitters.numpy(), basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(),
+                self._peaks, np.float32(config.distortion), sample_capacity(aabb, step_length, self.mapping),
+            )
+        with self.watch("priors"):
+            if number % config.regularise_every == 0:
+                add_priors(self.field, self.theta, self.grad[0], config, config.regularise_every)
+        with self.watch("decoder"):
+            self.decoder.zero_grad()
+            basis.backward(torch.from_numpy(grad_basis if config.view_dependent else grad_basis.sum(0, keepdims=True)))
+            self.field.density.grad = torch.from_numpy(grad_density.sum(0))
+            self.field.density.grad[:-1] *= kept
+            for group in self.decoder.param_groups:
+                group["lr"] = config.decoder_learning_rate * rate
+            self.decoder.step()
+        with self.watch("adam"):
+            kernels.adam(self.theta, self.grad, self.mean, self.square, config.learning_rate * rate, BETA1, BETA2, EPSILON,
+                         number + 1)
         return float(errors.mean(dtype=np.float64)) / 3, float(counts.mean())
 
     def state(self) -> dict[str, Any]:
@@ -389,6 +416,7 @@ class PlainOptimiser:
         self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: Contraction | None = None
     ) -> None:
         self.field, self.config, self.mapping = field, config, mapping
+        self.watch = Stopwatch()
         self._peaks = torch.zeros(cells, device=field.theta.device)
         self.planes = torch.optim.Adam([field.theta], lr=config.learning_rate, betas=(BETA1, BETA2), eps=EPSILON)
         self.decoder = _decoder_optimiser(field, config)

@@ -2,6 +2,7 @@
 
 kpbench encode room liam --preset balanced --out docs/bench/balanced.json
 kpbench curve room liam --minutes 1,2,5,10,20 --out docs/bench/curve.json
+kpbench step room soldier --preset balanced --out docs/bench/step.json
 kpbench player room.kpc liam.kpc --out docs/bench/player.json
 
 Every record says what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
@@ -21,7 +22,7 @@ import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from types import ModuleType
@@ -159,6 +160,39 @@ def _encodes(
             yield record | {"renderer": device}
 
 
+def _step(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """One record a dataset: where a training step's time goes, beside plain PyTorch and the machine's limits."""
+    kpenc = _encoder()
+    with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
+        for source in options.datasets:
+            if not source.is_dir():
+                raise UsageError(f"{source}: no such folder")
+            settings = {"preset": options.preset, "downscale": options.downscale, "space": options.space, "box": options.box}
+            record = _record("step", source, origin, settings) | {"seed": options.seed, "renderer": "cpu", "repeats": []}
+            job = kpenc.Options(
+                source=source,
+                output=Path(scratch) / "none.kpc",
+                preset=options.preset,
+                seed=options.seed,
+                device="cpu",
+                downscale=options.downscale,
+                space=options.space,
+                box=options.box,
+                work=Path(scratch) / f"{record['name']}.work",
+            )
+            for _ in range(options.repeats):
+                print(f"kpbench: {record['name']}, {options.preset}, a step", file=sys.stderr)
+                record["repeats"].append(_alone(_step_once, job))
+            yield record
+
+
+def _step_once(job: Any) -> results.Record:
+    from kpc.tools.limits import measure
+
+    found: results.Record = _encoder().profile_steps(job)
+    return found | {"limits": asdict(measure()), "peak_memory_bytes": peak_memory_bytes()}
+
+
 def _encode_once(job: Any) -> tuple[str, results.Record]:
     """Where it was trained, and what kpenc says of its run."""
     import torch
@@ -281,7 +315,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|player")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|step|player")
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
@@ -293,14 +327,18 @@ def _parser() -> argparse.ArgumentParser:
                        help="of training, a run of its own for each (default: 1,2,5,10,20)")  # fmt: skip
     curve.set_defaults(measure=_curve, steps=None)
 
-    for kind in (encode, curve):
+    step = kinds.add_parser("step", help="where the time of training goes", description="Profile a training step, on the CPU.")
+    step.set_defaults(measure=_step)
+
+    for kind in (encode, curve, step):
         kind.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
         kind.add_argument("--preset", choices=("draft", "fast", "balanced", "best"), default="balanced")
         kind.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
-        kind.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
         kind.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
         kind.add_argument("--space", choices=("auto", "box", "contracted"), default="auto", help="of every dataset")
         kind.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
+    for kind in (encode, curve):
+        kind.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
         kind.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
         kind.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there")
 
@@ -310,7 +348,7 @@ def _parser() -> argparse.ArgumentParser:
     player.add_argument("--frames", type=_positive, default=60, help="timed frames, spread over the clip (default: 60)")
     player.set_defaults(measure=_player)
 
-    for kind in (encode, curve, player):
+    for kind in (encode, curve, step, player):
         kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
         kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
     return parser

@@ -44,6 +44,32 @@ def _accuracy(key: str, text: str) -> Callable[[Record], str]:
     return lambda record: text.format(record["accuracy"][key])
 
 
+def _ratio(key: str, other: str, text: str) -> Callable[[Record], str]:
+    def cell(record: Record) -> str:
+        value, against = median(record, key), median(record, other)
+        return "-" if value is None or not against else text.format(value / against)
+
+    return cell
+
+
+def _of(record: Record, group: str, key: str) -> float:
+    return statistics.median(repeat[group][key] for repeat in record["repeats"])
+
+
+def _part(name: str) -> Callable[[Record], str]:
+    """Milliseconds of a step."""
+    return lambda record: f"{1e3 * _of(record, 'parts_s', name):.1f}"
+
+
+def _limit(name: str) -> Callable[[Record], str]:
+    return lambda record: f"{_of(record, 'limits', name):.0f}"
+
+
+def _against(key: str, limit: str) -> Callable[[Record], str]:
+    """What was reached, and what the machine can reach."""
+    return lambda record: f"{median(record, key):.0f} of {_of(record, 'limits', limit):.0f}"
+
+
 _ENCODED: list[Column] = [
     ("dataset", lambda r: r["name"]),
     ("preset", lambda r: r["settings"]["preset"]),
@@ -69,6 +95,21 @@ COLUMNS: dict[str, list[Column]] = {
         ("all", _number("encode_s", "{:.0f} s")),
         ("steps", _number("steps", "{:,.0f}")),
     ],
+    "step": [
+        ("dataset", lambda r: r["name"]),
+        ("preset", lambda r: r["settings"]["preset"]),
+        ("M param", _number("parameters", "{:.2f}", 1e6)),
+        ("samples/ray", _number("samples_per_ray", "{:.1f}")),
+        ("rays/s", _number("rays_per_s", "{:,.0f}")),
+        ("plain PyTorch", _number("plain_rays_per_s", "{:,.0f}")),
+        ("faster", _ratio("rays_per_s", "plain_rays_per_s", "{:.0f}x")),
+        ("ms a step", _number("step_s", "{:.1f}", 1e-3)),
+        *((name, _part(name)) for name in ("kernel", "adam", "priors", "decoder", "rays", "occupancy")),
+        ("kernel GFLOP/s", _against("kernel_gflops", "gflops")),
+        ("kernel GB/s", _against("kernel_gb_s", "cache_gb_s")),
+        ("memory GB/s", _limit("memory_gb_s")),
+        ("peak MB", _number("peak_memory_bytes", "{:.0f}", 1e6)),
+    ],
     "player": [
         ("scene", lambda r: r["name"]),
         ("path", lambda r: r["settings"]["path"]),
@@ -84,7 +125,7 @@ COLUMNS: dict[str, list[Column]] = {
         ("within 1/255", _accuracy("within_one_level", "{:.2%}")),
     ],
 }
-TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "player": "Playing"}
+TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "step": "A step of training", "player": "Playing"}
 
 
 def cells(kind: str, records: Iterable[Record]) -> list[list[str]]:
