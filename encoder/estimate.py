@@ -40,16 +40,7 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
     config = trainer.config
     watched = min(config.steps, STEPS * config.occupancy_start)
     ticks: list[float] = []
-
-    def enough() -> bool:
-        ticks.append(trainer.elapsed_s)
-        return trainer.step >= watched
-
-    try:
-        trainer.run(lambda report: None, interrupted=enough)
-    except KeyboardInterrupt:
-        if trainer.step < watched:
-            raise
+    trainer.run_to(watched, lambda: ticks.append(trainer.elapsed_s))
     half = len(ticks) // 2
     a_step = (trainer.elapsed_s - ticks[half]) / max(1, len(ticks) - 1 - half)
     train_s = time_budget_s or trainer.elapsed_s + a_step * (config.steps - trainer.step)

@@ -29,13 +29,13 @@ def profile(trainer: Trainer) -> dict[str, Any]:
     config = trainer.config
     if config.steps < STEPS * config.occupancy_start + ROUNDS * FUSED_STEPS:
         raise ValueError(f"{config.steps} steps are too few to profile one")
-    _train(trainer, STEPS * config.occupancy_start)
+    trainer.run_to(STEPS * config.occupancy_start)
     plain = PlainOptimiser(copy.deepcopy(trainer.field), config, trainer.grid.seen.shape, trainer.mapping)
     fused_s, plain_s, parts, samples, rays = [], [], [], [], 0
     for _ in range(ROUNDS):
         before = dict(trainer.watch.seconds)
         started = trainer.elapsed_s
-        _train(trainer, trainer.step + FUSED_STEPS)
+        trainer.run_to(trainer.step + FUSED_STEPS)
         fused_s.append((trainer.elapsed_s - started) / FUSED_STEPS)
         parts.append({name: (s - before.get(name, 0.0)) / FUSED_STEPS for name, s in trainer.watch.seconds.items()})
         rays = trainer.rays_a_step
@@ -61,14 +61,6 @@ def work(layout: Layout, samples: float) -> tuple[float, float]:
     """
     planes, F = (6 if layout.is_dynamic else 3), layout.features
     return samples * F * (17 * planes + 38), samples * 48 * planes * F
-
-
-def _train(trainer: Trainer, until: int) -> None:
-    try:
-        trainer.run(lambda report: None, interrupted=lambda: trainer.step >= until)
-    except KeyboardInterrupt:
-        if trainer.step < until:  # the user's
-            raise
 
 
 def _plain_step(trainer: Trainer, plain: PlainOptimiser, count: int) -> float:

@@ -147,6 +147,23 @@ class Trainer:
         if checkpoint is not None:
             self._try_to_save(checkpoint)
 
+    def run_to(self, step: int, watch: Callable[[], None] = lambda: None) -> None:
+        """Train as `run` does, without a report, but only to a step on the way; `watch` is called before each.
+
+        Raises:
+            As `run`.
+        """
+
+        def there() -> bool:
+            watch()
+            return self.step >= step
+
+        try:
+            self.run(lambda report: None, interrupted=there)
+        except KeyboardInterrupt:
+            if self.step < step:  # the user's
+                raise
+
     @property
     def rays_a_step(self) -> int:
         """As many as keep a step's samples within bounds, now."""

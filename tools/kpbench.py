@@ -22,7 +22,7 @@ import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import ModuleType
@@ -119,13 +119,11 @@ def _encodes(
     kind: str, options: argparse.Namespace, origin: results.Record, runs: list[tuple[Path, float | None]]
 ) -> Iterator[results.Record]:
     """A record a dataset and time budget. Repeat k runs with seed + k, so that repeats show the spread of quality, too."""
-    kpenc = _encoder()
+    _encoder()  # what is missing is said before anything is read
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         kept: Path = options.keep_scenes or Path(scratch)
         kept.mkdir(parents=True, exist_ok=True)
         for source, time_budget_s in runs:
-            if not source.is_dir():
-                raise UsageError(f"{source}: no such folder")
             settings = {
                 "preset": options.preset,
                 "steps": options.steps,
@@ -135,22 +133,15 @@ def _encodes(
                 "box": options.box,
                 "test_views": options.test_views,
             }
-            record = _record(kind, source, origin, settings) | {"seed": options.seed, "repeats": []}
+            record = _record(kind, _folder(source), origin, settings) | {"seed": options.seed, "repeats": []}
             label = f"{record['name']}-{options.preset}" + (f"-{time_budget_s:g}s" if kind == "curve" else "")
             for seed in range(options.seed, options.seed + options.repeats):
                 suffix = f"-{seed}" if options.repeats > 1 else ""
-                job = kpenc.Options(
-                    source=source,
-                    output=kept / f"{label}{suffix}.kpc",
-                    preset=options.preset,
+                work = Path(scratch) / f"{label}-{seed}.work"
+                job = replace(
+                    _job(options, source, seed, kept / f"{label}{suffix}.kpc", work),
                     steps=options.steps,
                     time_budget_s=time_budget_s,
-                    seed=seed,
-                    device=options.device,
-                    downscale=options.downscale,
-                    space=options.space,
-                    box=options.box,
-                    work=Path(scratch) / f"{label}-{seed}.work",
                     most_tests=options.test_views,
                 )
                 length = "" if time_budget_s is None else f"{time_budget_s:g} s, "
@@ -162,28 +153,38 @@ def _encodes(
 
 def _step(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
     """One record a dataset: where a training step's time goes, beside plain PyTorch and the machine's limits."""
-    kpenc = _encoder()
+    _encoder()  # what is missing is said before anything is read
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         for source in options.datasets:
-            if not source.is_dir():
-                raise UsageError(f"{source}: no such folder")
             settings = {"preset": options.preset, "downscale": options.downscale, "space": options.space, "box": options.box}
-            record = _record("step", source, origin, settings) | {"seed": options.seed, "renderer": "cpu", "repeats": []}
-            job = kpenc.Options(
-                source=source,
-                output=Path(scratch) / "none.kpc",
-                preset=options.preset,
-                seed=options.seed,
-                device="cpu",
-                downscale=options.downscale,
-                space=options.space,
-                box=options.box,
-                work=Path(scratch) / f"{record['name']}.work",
-            )
+            record = _record("step", _folder(source), origin, settings) | {"seed": options.seed, "renderer": "cpu", "repeats": []}
+            work = Path(scratch) / f"{record['name']}.work"
+            job = _job(options, source, options.seed, Path(scratch) / "none.kpc", work)
             for _ in range(options.repeats):
                 print(f"kpbench: {record['name']}, {options.preset}, a step", file=sys.stderr)
                 record["repeats"].append(_alone(_step_once, job))
             yield record
+
+
+def _folder(source: Path) -> Path:
+    if not source.is_dir():
+        raise UsageError(f"{source}: no such folder")
+    return source
+
+
+def _job(options: argparse.Namespace, source: Path, seed: int, output: Path, work: Path) -> Any:
+    """kpenc.Options of what all kinds that train have in common."""
+    return _encoder().Options(
+        source=source,
+        output=output,
+        preset=options.preset,
+        seed=seed,
+        device=options.device,
+        downscale=options.downscale,
+        space=options.space,
+        box=options.box,
+        work=work,
+    )
 
 
 def _step_once(job: Any) -> results.Record:
@@ -328,7 +329,7 @@ def _parser() -> argparse.ArgumentParser:
     curve.set_defaults(measure=_curve, steps=None)
 
     step = kinds.add_parser("step", help="where the time of training goes", description="Profile a training step, on the CPU.")
-    step.set_defaults(measure=_step)
+    step.set_defaults(measure=_step, device="cpu")
 
     for kind in (encode, curve, step):
         kind.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
