@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 
 from kpc.encoder.field import Field
-from kpc.format.quantise import QuantisedScene, quantise_scene
+from kpc.format.quantise import QuantisedScene, quantise_scene, reached_by
 from kpc.format.scene import Scene
 
 T = TypeVar("T")
@@ -53,10 +53,10 @@ def compress(
     Bisects the common factor of the steps on a logarithmic scale from FINEST to COARSEST; the finest is taken where even
     that costs more.
     """
-    reference = psnr(scene)
+    reference, reached = psnr(scene), reached_by(scene)
 
     def attempt(exponent: float) -> tuple[QuantisedScene, float]:
-        candidate = quantise_scene(scene, scaled(steps, 2.0**exponent))
+        candidate = quantise_scene(scene, scaled(steps, 2.0**exponent), reached=reached)
         return candidate, reference - psnr(candidate.dequantise())
 
     return _farthest(FINEST, COARSEST, attempt, lambda found: found[1] <= max_loss_db and math.isfinite(found[1]))
@@ -69,8 +69,9 @@ def compress_to_size(
 
     Bisects as `compress` does.
     """
+    reached = reached_by(scene)
     return _farthest(
-        COARSEST, FINEST, lambda exponent: quantise_scene(scene, scaled(steps, 2.0**exponent)),
+        COARSEST, FINEST, lambda exponent: quantise_scene(scene, scaled(steps, 2.0**exponent), reached=reached),
         lambda found: size(found) <= target_bytes,
     )
 

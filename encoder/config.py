@@ -17,6 +17,8 @@ class TrainConfig:
     frames_per_row: float = 2.0
     """Frames of the clip to one row of a space-time plane (K-Planes trains 300 frames on 150 rows). A row for every frame costs
     room 0.2 dB and a fifth of its size, and the default scene time, for no gain in held-out PSNR."""
+    motion_cells: int = 0
+    """Cells of the motion grid (`kpc.format.motion`) along the longest edge of the box; 0 for none. Rows as the time planes."""
     hidden: int = 16
     """Width of the MLP that maps a view direction to the colour basis."""
     view_dependent: bool = True
@@ -50,6 +52,8 @@ class TrainConfig:
     """Of the planes at its peak. K-Planes uses 1e-2 with 30,000 steps."""
     decoder_learning_rate: float = 1e-2
     """Of the density weights and the direction MLP."""
+    motion_learning_rate: float = 5e-3
+    """Of the motion grid."""
     warmup: int = 50
     """Steps over which the learning rate rises from 0; then it falls along half a cosine to 1 % of its peak."""
     seed: int = 0
@@ -64,6 +68,10 @@ class TrainConfig:
     """Squared second difference in time. K-Planes finds the best near 0.01."""
     sparse_transients: float = 1e-4
     """L1 distance of the space-time planes from 1. K-Planes uses 1e-4."""
+    motion_smoothness: float = 1.0
+    """Squared second difference of the motion grid in time."""
+    motion_bending: float = 0.1
+    """The same in space."""
     distortion: float = 1e-3
     """Distortion loss (arXiv:2111.12077, eq. 15): pulls the weights of a ray together, against fog. K-Planes uses 1e-3."""
     regularise_every: int = 4
@@ -113,7 +121,7 @@ class TrainConfig:
         than 32 gain nothing. Half the resolution needs half the samples: 25.0 dB in 69 s, 24.9 in 92 s with all of them.
         Twice the steps give 25.4 dB. Surroundings change the matter: shelf_hand loses 3.3 dB without the direction.
         """
-        return replace(self, resolutions=tuple(max(16, n // 2) for n in self.resolutions), channels=8 * self.channels,
+        return replace(self, resolutions=tuple(max(16, n // 2) for n in self.resolutions), channels=8 * self.channels, motion_cells=6,
                        channel_dropout=0.25, view_dependent=False, samples_across=max(32, self.samples_across // 2),
                        steps=24 * self.steps // 5)
 

@@ -39,7 +39,7 @@ class SceneRenderer:
                 basis = field.basis(torch.from_numpy(d)).numpy()
             colours, opacities, depths, _ = kernels.render(
                 field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
-                layout.channels, scene.aabb, kernels.even_of(scene.mapping), scene.occupancy.view(np.uint8),
+                layout.channels, scene.motion, scene.aabb, kernels.even_of(scene.mapping), scene.occupancy.view(np.uint8),
                 np.float32(scene.step), np.float32(scene.extent), o, d, t, basis, np.arange(len(o)), scene.background,
                 sample_capacity(scene.aabb, scene.step, scene.mapping), 8 * numba.get_num_threads(),
             )

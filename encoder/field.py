@@ -5,7 +5,7 @@ the priors see one array. `render_reference` is the readable twin of the kernels
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,19 +76,33 @@ def plan_layout(config: TrainConfig, aabb: np.ndarray, clip: Clip, is_dynamic: b
     return Layout.of(np.array(resolution), config.channels)
 
 
+def motion_nodes(config: TrainConfig, aabb: np.ndarray, layout: Layout) -> tuple[int, int, int, int] | None:
+    """Nodes of the motion grid along t, z, y and x: a row for each of the time planes, cells as near to cubes as may be."""
+    if not config.motion_cells or not layout.is_dynamic:
+        return None
+    edges = np.asarray(aabb[1] - aabb[0], np.float64)
+    x, y, z = (max(1, round(config.motion_cells * e / edges.max())) + 1 for e in edges)
+    return int(layout.resolution[0, 3]), z, y, x
+
+
 class Field(nn.Module):
     """Planes and explicit decoder.
 
     Attributes:
         theta: (layout.size,) the planes. Space planes start uniform in [0.1, 0.5], time planes at 1 (K-Planes).
         density: (F + 1,) weights of the log density, its bias last.
+        motion: (T, Nz, Ny, Nx, 3) displacements, `kpc.format.motion`, at first 0; or None.
         w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.Decoder`. w2 starts at 0: colour depends on the
             direction only as far as the pictures insist.
     """
 
-    def __init__(self, layout: Layout, hidden: int, generator: torch.Generator | None = None) -> None:
+    def __init__(
+        self, layout: Layout, hidden: int, generator: torch.Generator | None = None, motion_nodes: Sequence[int] | None = None
+    ) -> None:
+        """`motion_nodes`: of the motion grid along t, z, y and x; None for a field without one."""
         super().__init__()
         self.layout = layout
+        self.motion = None if motion_nodes is None else nn.Parameter(torch.zeros(*motion_nodes, 3))
         F = layout.features
 
         def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -126,8 +140,10 @@ class Field(nn.Module):
     def features(self, points: Tensor, times: Tensor) -> Tensor:
         """Features at (N, 3) points in [0, 1]^3 and (N,) times in [0, 1]: (N, F).
 
-        The product over planes, concatenated over scales.
+        The product over planes, concatenated over scales, of what they hold where the motion grid leads.
         """
+        if self.motion is not None:
+            points = moved(points, times, self.motion)
         coordinate = {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2], "t": times}
         scales = []
         for s in range(len(self.layout.resolution)):
@@ -160,7 +176,7 @@ class Field(nn.Module):
             aabb=np.asarray(aabb, np.float32), clip=clip, scales=scales,
             decoder=Decoder(density[:-1].copy(), float(density[-1]), *arrays),
             occupancy=np.asarray(occupancy, bool), background=np.asarray(background, np.float32), step=float(step),
-            mapping=mapping,
+            mapping=mapping, motion=None if self.motion is None else self.motion.detach().cpu().numpy().copy(),
         )
 
     @staticmethod
@@ -172,11 +188,13 @@ class Field(nn.Module):
             rows_t = scale["xt"].shape[0] if scene.is_dynamic else 0
             resolution.append([scale["xy"].shape[1], scale["xy"].shape[0], scale["xz"].shape[0], rows_t])
         layout = Layout.of(np.array(resolution), shape["xy"][2])
-        field = Field(layout, scene.decoder.b1.size)
+        field = Field(layout, scene.decoder.b1.size, motion_nodes=None if scene.motion is None else scene.motion.shape[:4])
         with torch.no_grad():
             for s, scale in enumerate(scene.scales):
                 for name, plane in scale.items():
                     field.plane(s, name).copy_(torch.from_numpy(np.asarray(plane, np.float32)))
+            if field.motion is not None:
+                field.motion.copy_(torch.from_numpy(np.asarray(scene.motion, np.float32)))
             d = scene.decoder
             field.density.copy_(torch.from_numpy(np.append(d.density_weight, np.float32(d.density_bias)).astype(np.float32)))
             for parameter, value in ((field.w1, d.w1), (field.b1, d.b1), (field.w2, d.w2), (field.b2, d.b2)):
@@ -184,15 +202,28 @@ class Field(nn.Module):
         return field
 
 
+def tap(x: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Corner-aligned position x (size - 1), x in [0, 1], as a lower node and the fraction (N, 1) towards the next."""
+    position = x * (size - 1)
+    lower = position.detach().floor().clamp(0, max(size - 2, 0))
+    return lower.long(), (position - lower).clamp(0, 1)[:, None]
+
+
+def moved(points: Tensor, times: Tensor, motion: Tensor) -> Tensor:
+    """Places in the planes of (N, 3) points in [0, 1]^3 at (N,) times: `kpc.format.motion.moved`, differentiable."""
+    rows, nz, ny, nx, _ = motion.shape
+    (h, fh), (i, fi), (j, fj), (k, fk) = (
+        tap(x, size) for x, size in zip((times, points[:, 2], points[:, 1], points[:, 0]), (rows, nz, ny, nx), strict=True))
+    out = points
+    for dh, di, dj, dk in np.ndindex(2, 2, 2, 2):
+        weight = (fh if dh else 1 - fh) * (fi if di else 1 - fi) * (fj if dj else 1 - fj) * (fk if dk else 1 - fk)
+        out = out + weight * motion[h + dh, i + di, j + dj, k + dk]
+    return out.clamp(0, 1)
+
+
 def bilinear(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Sample a (rows, columns, M) plane, corner-aligned: u in [0, 1] along columns, v along rows. Returns (N, M)."""
     rows, columns, M = plane.shape
-
-    def tap(x: Tensor, size: int) -> tuple[Tensor, Tensor]:
-        position = x * (size - 1)
-        lower = position.detach().floor().clamp(0, max(size - 2, 0))
-        return lower.long(), (position - lower).clamp(0, 1)[:, None]
-
     (i, fu), (j, fv) = tap(u, columns), tap(v, rows)
     flat = plane.reshape(-1, M)
     k = j * columns + i
@@ -279,11 +310,11 @@ def render_reference(
 
 
 def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
-    """The weighted priors of the planes by the name of their weight, in plain PyTorch: the reference of the `add_*` kernels.
+    """The weighted priors by the name of their weight, in plain PyTorch: the reference of the `add_*` kernels.
 
     space_variation * mean of squared neighbour differences, on space planes; on space-time planes
     transient_variation * the same along space alone, time_smoothness * mean (P[t-1] - 2 P[t] + P[t+1])^2, and
-    sparse_transients * mean |1 - P|; each summed over the planes it concerns.
+    sparse_transients * mean |1 - P|; each summed over the planes it concerns. With a motion grid also `motion_priors`.
     """
     names = ("space_variation", "transient_variation", "time_smoothness", "sparse_transients")
     total = {name: field.theta.new_zeros(()) for name in names}
@@ -298,4 +329,17 @@ def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
             total["transient_variation"] = total["transient_variation"] + along_rows
             total["time_smoothness"] = total["time_smoothness"] + second_difference
             total["sparse_transients"] = total["sparse_transients"] + (1 - p).abs().mean()
-    return {name: getattr(config, name) * value for name, value in total.items()}
+    return {name: getattr(config, name) * value for name, value in total.items()} | motion_priors(field, config)
+
+
+def motion_priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
+    """The weighted priors of the motion grid D, none where there is none.
+
+    motion_smoothness * sum (D[t-1] - 2 D[t] + D[t+1])^2 / n, motion_bending * the same along x, y and z; n numbers in D. Neither
+    minds what moves, turns or stretches evenly.
+    """
+    if field.motion is None:
+        return {}
+    n = field.motion.numel()
+    in_time, *in_space = (field.motion.diff(n=2, dim=dim).square().sum() / n for dim in range(4))
+    return {"motion_smoothness": config.motion_smoothness * in_time, "motion_bending": config.motion_bending * sum(in_space)}

@@ -14,6 +14,7 @@ Naming, throughout this module
     basis      (rays, 3, F) float32, the colour basis of each ray's direction
     occupancy  (slots, Nz, Ny, Nx) uint8
     even       float32, of `kpc.format.space.Contraction`; or None: the scene is its box, and code for that alone is compiled
+    motion     (T, Nz, Ny, Nx, 3) float32, the displacements of `kpc.format.motion`; or None: nothing is displaced
     s          where a sample lies on its ray: its distance, contracted as space is
 """
 
@@ -111,6 +112,64 @@ def _tap(u, size):
 
 
 @_inlined
+def _node(motion, u, v, w, time):
+    """Of the motion grid about a place: lower nodes along t, z, y, x, and the fractions towards the next."""
+    rows, nz, ny, nx, _ = motion.shape
+    t, ft = _tap(time, rows)
+    z, fz = _tap(w, nz)
+    y, fy = _tap(v, ny)
+    x, fx = _tap(u, nx)
+    return t, z, y, x, ft, fz, fy, fx
+
+
+@_inlined
+def _corner(i, ft, fz, fy, fx):
+    """The corner i of 0 to 15 of a cell of the motion grid: its steps along t, z, y, x, and its weight."""
+    dt, dz, dy, dx = i >> 3, i >> 2 & 1, i >> 1 & 1, i & 1
+    one = np.float32(1.0)
+    weight = (ft if dt else one - ft) * (fz if dz else one - fz) * (fy if dy else one - fy) * (fx if dx else one - fx)
+    return dt, dz, dy, dx, weight
+
+
+@_inlined
+def _moved(motion, u, v, w, time):
+    """Where in the planes to look for what is at a place, `kpc.format.motion.moved`; `_tap` keeps it within [0, 1]."""
+    if motion is None:
+        return u, v, w
+    t, z, y, x, ft, fz, fy, fx = _node(motion, u, v, w, time)
+    for i in range(16):
+        dt, dz, dy, dx, weight = _corner(i, ft, fz, fy, fx)
+        offset = motion[t + dt, z + dz, y + dy, x + dx]
+        u += weight * offset[0]
+        v += weight * offset[1]
+        w += weight * offset[2]
+    return u, v, w
+
+
+@_inlined
+def _spread_motion(grad_motion, place, time, g):
+    """The transpose of `_moved`: g = d loss / d (u, v, w) of the moved place."""
+    t, z, y, x, ft, fz, fy, fx = _node(grad_motion, place[0], place[1], place[2], time)
+    for i in range(16):
+        dt, dz, dy, dx, weight = _corner(i, ft, fz, fy, fx)
+        out = grad_motion[t + dt, z + dz, y + dy, x + dx]
+        out[0] += weight * g[0]
+        out[1] += weight * g[1]
+        out[2] += weight * g[2]
+
+
+@_inlined
+def _slopes(low, high, fc, fr, per_column, per_row, g, along, across):
+    """Add g times what a sample between four texels, low and high holding two each, grows along columns and along rows."""
+    M = g.size
+    ec, er = np.float32(1.0) - fc, np.float32(1.0) - fr
+    for m in range(M):
+        a, b, c, d = low[m], low[M + m], high[m], high[M + m]
+        along[m] += g[m] * (per_column * (er * (b - a) + fr * (d - c)))
+        across[m] += g[m] * (per_row * (ec * (c - a) + fc * (d - b)))
+
+
+@_inlined
 def _weights(fc, fr):
     """Of the four texels about a sample, at fractions fc along columns and fr along rows."""
     w11 = fc * fr
@@ -199,6 +258,24 @@ def _scatter_planes(grad, table, resolution, M, corners, fractions, values, g, s
 
 
 @_inlined
+def _move_planes(theta, table, resolution, M, corners, fractions, values, g, scratch, slopes, ones, point, out):
+    """out = d loss / d (u, v, w), given g = d loss / d features and what `_sample_planes` has left; 0 where a place is clamped."""
+    slopes[:] = np.float32(0.0)
+    for s in range(table.shape[0]):
+        _product_gradient(values[6 * s * M : 6 * (s + 1) * M], g[s * M : (s + 1) * M], scratch)
+        for c in range(_planes(table)):
+            across, down = _ALONG_COLUMNS[c], _ALONG_ROWS[c]
+            columns, corner = resolution[s, across], corners[6 * s + c]
+            low, high = theta[corner : corner + 2 * M], theta[corner + columns * M : corner + (columns + 2) * M]
+            _slopes(low, high, fractions[4 * s + across], fractions[4 * s + down],
+                    np.float32(columns - 1), np.float32(resolution[s, down] - 1), scratch[c * M : (c + 1) * M],
+                    slopes[across * M : (across + 1) * M], slopes[down * M : (down + 1) * M])
+    for axis in range(3):
+        inside = np.float32(0.0) <= point[axis] <= np.float32(1.0)
+        out[axis] = _dot(slopes[axis * M : (axis + 1) * M], ones, M) if inside else np.float32(0.0)
+
+
+@_inlined
 def _planes(table):
     """Planes of each scale: six, or three where nothing moves."""
     return 6 if table[0, 3] >= 0 else 3
@@ -248,13 +325,13 @@ def _cell(grid, u, v, w):
 
 @_jit
 def _march(
-    theta, table, resolution, density, M, aabb, even, occupancy, origin, direction, time, jitter, step, extent,
+    theta, table, resolution, density, M, motion, aabb, even, occupancy, origin, direction, time, jitter, step, extent,
     values, features, points, corners, fractions, weights, logs, places,
 ):
     """March one ray; fill the scratch for each occupied sample.
 
     Returns (samples, transmittance left). weights[k] = transmittance before sample k times alpha k; logs[k] = log density;
-    places[k] = s; points[k] = u, v, w, time and, unless `even` is None, what the step counts.
+    places[k] = s; points[k] = u, v, w (moved) and time; unless `even` is None, what the step counts; u, v, w.
     """
     near, far = _span(origin, direction, aabb, even)
     slots = occupancy.shape[0]
@@ -273,7 +350,8 @@ def _march(
         if occupancy[slot][_cell(occupancy[slot], u, v, w)] == 0:
             continue
         point = points[count]
-        point[0], point[1], point[2], point[3] = u, v, w, time
+        point[0], point[1], point[2] = _moved(motion, u, v, w, time)
+        point[3], point[5], point[6], point[7] = time, u, v, w
         if even is not None:
             point[4] = stretch
         _sample_planes(theta, table, resolution, point, M, corners[count], fractions[count], values[count])
@@ -295,7 +373,7 @@ def _scratch(table, M, capacity):
     S = table.shape[0]
     values = np.ones((capacity, S * 6 * M), np.float32)  # ones: the planes a static scene does not have
     features = np.empty((capacity, S * M), np.float32)
-    points = np.empty((capacity, 5), np.float32)
+    points = np.empty((capacity, 8), np.float32)
     corners = np.empty((capacity, S * 6), np.int64)
     fractions = np.empty((capacity, S * 4), np.float32)
     weights = np.empty(capacity, np.float32)
@@ -306,7 +384,7 @@ def _scratch(table, M, capacity):
 
 @_parallel
 def render(
-    theta, table, resolution, density, M, aabb, even, occupancy, step, extent,
+    theta, table, resolution, density, M, motion, aabb, even, occupancy, step, extent,
     origins, directions, times, basis, basis_index, background, capacity, workers,
 ):
     """Colour, opacity and depth of rays: (N, 3), (N,), (N,) float32, and the samples each of them took.
@@ -324,7 +402,7 @@ def render(
         values, features, points, corners, fractions, weights, logs, places = _scratch(table, M, capacity)
         for ray in range(worker, N, workers):
             count, trans = _march(
-                theta, table, resolution, density, M, aabb, even, occupancy, origins[ray], directions[ray],
+                theta, table, resolution, density, M, motion, aabb, even, occupancy, origins[ray], directions[ray],
                 times[ray], np.float32(0.5), step, extent,
                 values, features, points, corners, fractions, weights, logs, places,
             )
@@ -363,10 +441,10 @@ def _distortion_gradient(weights, places, count, step, extent, factor, out):
 
 @_parallel
 def backpropagate(
-    theta, grad, table, resolution, density, grad_density, M, aabb, even, occupancy, step, extent,
+    theta, grad, table, resolution, density, grad_density, M, motion, grad_motion, aabb, even, occupancy, step, extent,
     origins, directions, times, jitters, basis, grad_basis, targets, backgrounds, peaks, distortion, capacity,
 ):
-    """Render a batch, and add the gradient of its loss to grad, grad_density and grad_basis.
+    """Render a batch, and add the gradient of its loss to grad, grad_density, grad_motion and grad_basis.
 
     loss = mean over rays and colour channels of (C - target)^2 + distortion * mean over rays of D
     C = sum_k w_k c_k + trans * background
@@ -375,7 +453,7 @@ def backpropagate(
     d C / d tau_k = trans_{k+1} c_k - sum_{j>k} w_j c_j - trans_end * background,   tau = sigma * stretch * step / extent
 
     Args:
-        grad: (workers, n) float32, one buffer a worker; grad_density: (workers, F + 1).
+        grad: (workers, n) float32, one buffer a worker; grad_density: (workers, F + 1); grad_motion: (workers, as motion).
         basis, grad_basis: (rays, 3, F); or, where colour is the same from everywhere, (1, 3, F) and (workers, 3, F).
         jitters: (rays,) float32 in [0, 1), where in each step the samples of a ray lie.
         targets, backgrounds: (rays, 3) float32.
@@ -397,11 +475,12 @@ def backpropagate(
         spread = np.empty(capacity, np.float32)
         g_features = np.empty(F, np.float32)
         plane_scratch = np.empty(6 * M, np.float32)
+        slopes, ones, g_point = np.empty(4 * M, np.float32), np.ones(M, np.float32), np.empty(3, np.float32)
         g_theta = grad[worker]
         g_density = grad_density[worker]
         for ray in range(worker, N, workers):
             count, trans = _march(
-                theta, table, resolution, density, M, aabb, even, occupancy, origins[ray], directions[ray],
+                theta, table, resolution, density, M, motion, aabb, even, occupancy, origins[ray], directions[ray],
                 times[ray], jitters[ray], step, extent,
                 values, features, points, corners, fractions, weights, logs, places,
             )
@@ -434,7 +513,7 @@ def backpropagate(
                 g_log = (beyond * seen - after) * tau
                 if logs[k] >= _LIMIT or logs[k] <= -_LIMIT:
                     g_log = np.float32(0.0)
-                cell = _cell(peaks[worker], points[k, 0], points[k, 1], points[k, 2])
+                cell = _cell(peaks[worker], points[k, 5], points[k, 6], points[k, 7])
                 peaks[worker][cell] = max(peaks[worker][cell], weight)
                 after += weight * seen
                 beyond += weight
@@ -454,11 +533,15 @@ def backpropagate(
                 _scatter_planes(
                     g_theta, table, resolution, M, corners[k], fractions[k], values[k], g_features, plane_scratch
                 )
+                if motion is not None:
+                    _move_planes(theta, table, resolution, M, corners[k], fractions[k], values[k], g_features, plane_scratch,
+                                 slopes, ones, points[k], g_point)
+                    _spread_motion(grad_motion[worker], points[k, 5:], times[ray], g_point)
     return errors, counts
 
 
 @_parallel
-def log_densities(theta, table, resolution, density, M, points, times, workers):
+def log_densities(theta, table, resolution, density, M, motion, points, times, workers):
     """Log density at (N, 3) points in [0, 1]^3 and (N,) times: (N,) float32."""
     N = points.shape[0]
     out = np.empty(N, np.float32)
@@ -467,7 +550,8 @@ def log_densities(theta, table, resolution, density, M, points, times, workers):
         values, features, at, corners, fractions, _, _, _ = _scratch(table, M, 1)
         point = at[0]
         for i in range(worker, N, workers):
-            point[0], point[1], point[2], point[3] = points[i, 0], points[i, 1], points[i, 2], times[i]
+            point[0], point[1], point[2] = _moved(motion, points[i, 0], points[i, 1], points[i, 2], times[i])
+            point[3] = times[i]
             _sample_planes(theta, table, resolution, point, M, corners[0], fractions[0], values[0])
             _features(values[0], table.shape[0], M, features[0])
             out[i] = min(max(_dot(features[0], density, F) + density[F], -_LIMIT), _LIMIT)

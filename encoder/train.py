@@ -18,7 +18,7 @@ from kpc.encoder import kernels
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.box import seen_cells
 from kpc.encoder.datasets import Dataset, rays
-from kpc.encoder.field import Field, Rays, plan_layout, priors, render_reference
+from kpc.encoder.field import Field, Rays, motion_nodes, motion_priors, plan_layout, priors, render_reference
 from kpc.encoder.importance import TileWeights, cameras_stand_still
 from kpc.encoder.occupancy import OccupancyGrid, grid_shape
 from kpc.format.cli import written_aside
@@ -73,7 +73,8 @@ class Trainer:
         self.step_length = self.extent / steps_across
         self.rng = np.random.default_rng(config.seed)
         layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
-        self.field = Field(layout, config.hidden, torch.Generator().manual_seed(config.seed)).to(self.device)
+        nodes = motion_nodes(config, self.aabb, layout)
+        self.field = Field(layout, config.hidden, torch.Generator().manual_seed(config.seed), nodes).to(self.device)
         shape = grid_shape(self.aabb, config.cells_across)
         threshold = math.log(-math.log(1 - config.occupancy_alpha) * steps_across)
         self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape, mapping), threshold)
@@ -388,11 +389,13 @@ class FusedOptimiser:
             density = torch.cat([self.field.density.detach()[:-1] * kept, self.field.density.detach()[-1:]])
             grad_basis = np.zeros((len(basis) if config.view_dependent else self.workers, *basis.shape[1:]), np.float32)
             grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
+            motion = motion_of(self.field)
+            grad_motion = None if motion is None else np.zeros((self.workers, *motion.shape), np.float32)
         with self.watch("kernel"):
             errors, counts = kernels.backpropagate(
                 self.theta, self.grad, layout.table, layout.resolution, density.numpy(), grad_density,
-                layout.channels, aabb, kernels.even_of(self.mapping), occupancy.view(np.uint8), np.float32(step_length),
-                np.float32(extent), batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(),
+                layout.channels, motion, grad_motion, aabb, kernels.even_of(self.mapping), occupancy.view(np.uint8),
+                np.float32(step_length), np.float32(extent), batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(),
                 batch.jitters.numpy(), basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(),
                 self._peaks, np.float32(config.distortion), sample_capacity(aabb, step_length, self.mapping),
             )
@@ -401,11 +404,15 @@ class FusedOptimiser:
                 add_priors(self.field, self.theta, self.grad[0], config, config.regularise_every)
         with self.watch("decoder"):
             self.decoder.zero_grad()
+            if number % config.regularise_every == 0 and self.field.motion is not None:
+                (config.regularise_every * torch.stack(list(motion_priors(self.field, config).values())).sum()).backward()
             basis.backward(torch.from_numpy(grad_basis if config.view_dependent else grad_basis.sum(0, keepdims=True)))
             self.field.density.grad = torch.from_numpy(grad_density.sum(0))
             self.field.density.grad[:-1] *= kept
-            for group in self.decoder.param_groups:
-                group["lr"] = config.decoder_learning_rate * rate
+            if grad_motion is not None:
+                grad = torch.from_numpy(grad_motion.sum(0))
+                self.field.motion.grad = grad if self.field.motion.grad is None else grad + self.field.motion.grad
+            _set_rate(self.decoder, rate)
             self.decoder.step()
         with self.watch("adam"):
             kernels.adam(self.theta, self.grad, self.mean, self.square, config.learning_rate * rate, BETA1, BETA2, EPSILON,
@@ -435,7 +442,7 @@ class PlainOptimiser:
         self.field, self.config, self.mapping = field, config, mapping
         self.watch = Stopwatch()
         self._peaks = torch.zeros(cells, device=field.theta.device)
-        self.planes = torch.optim.Adam([field.theta], lr=config.learning_rate, betas=(BETA1, BETA2), eps=EPSILON)
+        self.planes = _adam([([field.theta], config.learning_rate)])
         self.decoder = _decoder_optimiser(field, config)
 
     def peaks(self) -> np.ndarray:
@@ -463,10 +470,9 @@ class PlainOptimiser:
         loss = error + config.distortion * distortion
         if number % config.regularise_every == 0:
             loss = loss + config.regularise_every * torch.stack(list(priors(self.field, config).values())).sum()
-        for optimiser, peak in ((self.planes, config.learning_rate), (self.decoder, config.decoder_learning_rate)):
+        for optimiser in (self.planes, self.decoder):
             optimiser.zero_grad()
-            for group in optimiser.param_groups:
-                group["lr"] = peak * rate
+            _set_rate(optimiser, rate)
         loss.backward()  # type: ignore[no-untyped-call]
         self.planes.step()
         self.decoder.step()
@@ -507,8 +513,13 @@ def log_densities(field: Field, points: np.ndarray, times: np.ndarray) -> np.nda
     layout = field.layout
     return kernels.log_densities(
         field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
-        layout.channels, np.asarray(points, np.float32), np.asarray(times, np.float32), 8 * numba.get_num_threads(),
+        layout.channels, motion_of(field), np.asarray(points, np.float32), np.asarray(times, np.float32), 8 * numba.get_num_threads(),
     )
+
+
+def motion_of(field: Field) -> np.ndarray | None:
+    """The motion grid as the kernels take it."""
+    return None if field.motion is None else field.motion.detach().numpy()
 
 
 def sample_capacity(aabb: np.ndarray, step_length: float, mapping: Contraction | None = None) -> int:
@@ -542,8 +553,22 @@ def _unusable(path: Path, error: Exception) -> TrainingError:
 
 
 def _decoder_optimiser(field: Field, config: TrainConfig) -> torch.optim.Adam:
-    parameters = [field.density, field.b2] + ([field.w1, field.b1, field.w2] if config.view_dependent else [])
-    return torch.optim.Adam(parameters, lr=config.decoder_learning_rate, betas=(BETA1, BETA2), eps=EPSILON)
+    """Of all but the planes."""
+    decoder = [field.density, field.b2] + ([field.w1, field.b1, field.w2] if config.view_dependent else [])
+    motion = [] if field.motion is None else [([field.motion], config.motion_learning_rate)]
+    return _adam([(decoder, config.decoder_learning_rate), *motion])
+
+
+def _adam(groups: list[tuple[list[torch.nn.Parameter], float]]) -> torch.optim.Adam:
+    """For groups of parameters and the peak of the learning rate of each."""
+    return torch.optim.Adam([{"params": parameters, "peak": peak, "lr": peak} for parameters, peak in groups],
+                            betas=(BETA1, BETA2), eps=EPSILON)
+
+
+def _set_rate(optimiser: torch.optim.Adam, rate: float) -> None:
+    """`rate`: a share of the peaks."""
+    for group in optimiser.param_groups:
+        group["lr"] = group["peak"] * rate
 
 
 def _comparable(config: dict[str, Any]) -> dict[str, Any]:

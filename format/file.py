@@ -2,6 +2,7 @@
 
     SCNE  box, clip, sizes, steps and offsets of every plane      needed before anything else
     WARP  how space beyond the box is held; absent where it is not
+    MOVE  the motion grid; absent where nothing is displaced
     DECO  decoder weights                 OCCU  occupancy grid
     came  cameras (may be ignored)        PLNE  one segment of one plane
 
@@ -22,6 +23,7 @@ from kpc.format.cameras import Camera
 from kpc.format.cli import written_aside
 from kpc.format.container import DEFAULT_BUDGET, Chunk, Entry, Reader, Source, pack
 from kpc.format.errors import BudgetError, DatasetError, FormatError
+from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
@@ -37,6 +39,8 @@ SCALE_STRUCT = struct.Struct("<5H")
 """channels, Nx, Ny, Nz, T (0 in a static scene)"""
 WARP_STRUCT = struct.Struct("<Id")
 """which mapping (CONTRACTED), even"""
+MOTION_STRUCT = struct.Struct("<4Hf")
+"""T, Nz, Ny, Nx, step"""
 DECODER_STRUCT = struct.Struct("<HHf")
 """features, hidden, density_bias"""
 OCCUPANCY_STRUCT = struct.Struct("<4H")
@@ -49,6 +53,8 @@ CONTRACTED = 1
 SCALE_LIMIT = 16
 CHANNEL_LIMIT = 256
 AXIS_LIMIT = 16384
+MOTION_LIMIT = 256
+"""Nodes of the motion grid along an axis of space."""
 HIDDEN_LIMIT = 256
 CAMERA_LIMIT = 4096
 FRAME_LIMIT = 1 << 24
@@ -139,6 +145,10 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
             warp = WARP_STRUCT.pack(CONTRACTED, scene.mapping.even)
             _parse_mapping(warp, parsed.step)
             chunks.append(Chunk("WARP", [warp]))
+        if scene.motion is not None:
+            move = _pack_motion(scene.motion)
+            _parse_motion(move, parsed.is_dynamic)
+            chunks.append(Chunk("MOVE", [move]))
         chunks += [Chunk("DECO", [_pack_decoder(scene.decoder, parsed.feature_count)]),
                    Chunk("OCCU", [_pack_occupancy(scene.occupancy)])]
         if scene.cameras:
@@ -205,6 +215,15 @@ def _pack_decoder(decoder: Decoder, features: int) -> bytes:
                      *(np.asarray(w).astype("<f2").tobytes() for w in weights)])
 
 
+def _pack_motion(motion: QuantisedMotion) -> bytes:
+    symbols = motion.symbols
+    if symbols.ndim != 5 or symbols.shape[4] != 3 or symbols.dtype != np.int16:
+        raise FormatError(f"motion: is {symbols.dtype} {symbols.shape}, not int16 (T, Nz, Ny, Nx, 3)")
+    differences = np.diff(symbols.astype("<i2").view("<u2"), axis=0, prepend=np.uint16(0))  # modulo 2^16
+    low_bytes_first = np.ascontiguousarray(differences.reshape(-1, 1).view(np.uint8).T)
+    return MOTION_STRUCT.pack(*symbols.shape[:4], motion.step) + low_bytes_first.tobytes()
+
+
 def _pack_occupancy(occupancy: np.ndarray) -> bytes:
     if occupancy.ndim != 4 or occupancy.dtype != bool or not all(0 < n <= AXIS_LIMIT for n in occupancy.shape):
         raise FormatError(f"occupancy: is {occupancy.dtype} {occupancy.shape}, not bool (slots, Nz, Ny, Nx)")
@@ -250,7 +269,7 @@ def read(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, memory
         elif entry.kind not in KNOWN_KINDS:
             reader.stored(number)  # ignored, but never damaged
     return QuantisedScene(reader.head.aabb, reader.head.clip, scales, reader.decoder(), reader.occupancy(),
-                          reader.head.background, reader.head.step, reader.cameras(), reader.mapping())
+                          reader.head.background, reader.head.step, reader.cameras(), reader.mapping(), reader.motion())
 
 
 class SceneReader(Reader):
@@ -295,12 +314,18 @@ class SceneReader(Reader):
 
     def mapping(self) -> Contraction | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""
-        found = [n for n, entry in enumerate(self.index) if entry.kind == "WARP"]
-        if len(found) > 1:
-            raise FormatError(f"{self.name}: holds {len(found)} WARP chunks, not one")
-        if not found:
+        number = self._at_most_one("WARP")
+        if number is None:
             return None
-        return self._parsed(lambda raw: _parse_mapping(raw, self.head.step), self.chunk(found[0], WARP_STRUCT.size))
+        return self._parsed(lambda raw: _parse_mapping(raw, self.head.step), self.chunk(number, WARP_STRUCT.size))
+
+    def motion(self) -> QuantisedMotion | None:
+        """The MOVE chunk; None, a scene in which nothing is displaced, if the file has no such chunk."""
+        number = self._at_most_one("MOVE")
+        if number is None:
+            return None
+        self._afford(8 * self.index[number].raw_length, "its motion grid")  # int16 and float32, and their making
+        return self._parsed(lambda raw: _parse_motion(raw, self.head.is_dynamic), self.chunk(number))
 
     def decoder(self) -> Decoder:
         """The DECO chunk."""
@@ -311,26 +336,30 @@ class SceneReader(Reader):
     def occupancy(self) -> np.ndarray:
         """The OCCU chunk: (slots, Nz, Ny, Nx) bool."""
         number = self._only("OCCU")
-        needed = 5 * self.head.value_count + 8 * self.index[number].raw_length  # a byte for each bit
-        if needed > self.memory_budget:
-            raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory with its occupancy grid, more than the "
-                              f"budget of {self.memory_budget:,}")
+        self._afford(8 * self.index[number].raw_length, "its occupancy grid")  # a byte for each bit
         return self._parsed(_parse_occupancy, self.chunk(number))
 
     def cameras(self) -> tuple[Camera, ...]:
         """The cameras, none if the file has (or has yet) no such chunk."""
-        found = [n for n, entry in enumerate(self.index) if entry.kind == "came"]
-        if len(found) > 1:
-            raise FormatError(f"{self.name}: holds {len(found)} came chunks, not one")
-        if not found or not self.available(found[0]):
+        number = self._at_most_one("came")
+        if number is None or not self.available(number):
             return ()
-        return self._parsed(_parse_cameras, self.chunk(found[0], 2 + CAMERA_LIMIT * CAMERA_STRUCT.size))
+        return self._parsed(_parse_cameras, self.chunk(number, 2 + CAMERA_LIMIT * CAMERA_STRUCT.size))
 
     def _only(self, kind: str) -> int:
         found = [number for number, entry in enumerate(self.index) if entry.kind == kind]
         if len(found) != 1:
             raise FormatError(f"{self.name}: holds {len(found)} {kind} chunks, not one")
         return found[0]
+
+    def _at_most_one(self, kind: str) -> int | None:
+        return self._only(kind) if any(entry.kind == kind for entry in self.index) else None
+
+    def _afford(self, more_bytes: int, what: str) -> None:
+        needed = 5 * self.head.value_count + more_bytes
+        if needed > self.memory_budget:
+            raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory with {what}, more than the budget of "
+                              f"{self.memory_budget:,}")
 
     def _parsed(self, parse: Callable[[bytes], Parsed], raw: bytes) -> Parsed:
         try:
@@ -365,7 +394,7 @@ class SceneReader(Reader):
                 raise FormatError(f"{self.name}: {where}: its segments hold {row} rows, not {head.rows}")
 
 
-KNOWN_KINDS = frozenset({"SCNE", "WARP", "DECO", "OCCU", "came", "PLNE"})
+KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "OCCU", "came", "PLNE"})
 HEAD_LIMIT = SCENE_STRUCT.size + SCALE_LIMIT * (SCALE_STRUCT.size + 9 * 4 * CHANNEL_LIMIT)
 
 
@@ -402,6 +431,22 @@ def _parse_mapping(raw: bytes, step: float) -> Contraction:
     if not (1 / BOX_LIMIT <= even <= BOX_LIMIT and 2 * even / step <= SAMPLE_LIMIT):  # False for NaN, too
         raise FormatError(f"WARP: even steps of {step} up to a distance of {even} make no sense")
     return Contraction(even)
+
+
+def _parse_motion(raw: bytes, dynamic: bool) -> QuantisedMotion:
+    cursor = _Cursor(raw, "MOVE")
+    *sizes, step = cursor.unpack(MOTION_STRUCT)
+    rows, *nodes = sizes
+    if not dynamic or not 2 <= rows <= AXIS_LIMIT or not all(2 <= n <= MOTION_LIMIT for n in nodes):
+        raise FormatError(f"MOVE: a motion grid of {rows} rows of {nodes} nodes in a {'moving' if dynamic else 'static'} scene "
+                          "makes no sense")
+    if not (step > 0 and 32768 * step <= DISPLACEMENT_LIMIT):  # False for NaN, too
+        raise FormatError(f"MOVE: a step of {step} lies outside its range")
+    count = 3 * math.prod(sizes)
+    low, high = cursor.array("u1", count).astype(np.uint16), cursor.array("u1", count).astype(np.uint16)
+    cursor.finish()
+    differences = (low | high << np.uint16(8)).reshape(*sizes, 3)
+    return QuantisedMotion(differences.cumsum(axis=0, dtype=np.uint16).view(np.int16), step)
 
 
 def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, PlaneHead]:

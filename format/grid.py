@@ -1,4 +1,4 @@
-"""Grids of cells over the box."""
+"""Grids over the box: cells, and the places between corner-aligned nodes."""
 
 import numpy as np
 
@@ -17,3 +17,17 @@ def dilate(grid: np.ndarray, axes: tuple[int, ...] = SPACE) -> np.ndarray:
         wide[tuple(high)] |= grid[tuple(low)]
         grid = wide
     return grid
+
+
+def tap(u: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corner-aligned position u (size - 1), u in [0, 1], as a lower texel and the fraction towards the next."""
+    position = np.clip(u, 0, 1) * np.float32(size - 1)
+    lower = np.minimum(position.astype(np.int32), max(size - 2, 0))
+    return lower, (position - lower).astype(np.float32)
+
+
+def linear(row: np.ndarray, u: np.ndarray | float) -> np.ndarray:
+    """Sample a (size, ..., M) row at u in [0, 1], shape (N,) or a scalar: (1 - f) row[i] + f row[i + 1]."""
+    i, f = tap(np.asarray(u, np.float32), len(row))
+    f = f.reshape(f.shape + (1,) * (row.ndim - 1))
+    return row[i] * (1 - f) + row[np.minimum(i + 1, len(row) - 1)] * f

@@ -14,6 +14,7 @@ import numpy as np
 
 from kpc.format.cameras import Camera
 from kpc.format.errors import FormatError
+from kpc.format.motion import QuantisedMotion, places_reached, quantise_motion
 from kpc.format.scene import TIME_PLANES, Clip, Decoder, Scene
 from kpc.format.space import Contraction
 
@@ -113,12 +114,13 @@ class QuantisedScene:
     step: float
     cameras: tuple[Camera, ...] = field(default=())
     mapping: Contraction | None = None
+    motion: QuantisedMotion | None = None
 
     def dequantise(self) -> Scene:
         """The scene that every decoder sees."""
         scales = tuple({name: plane.dequantise() for name, plane in scale.items()} for scale in self.scales)
         return Scene(self.aabb, self.clip, scales, self.decoder, self.occupancy, self.background, self.step,
-                     self.cameras, self.mapping)
+                     self.cameras, self.mapping, None if self.motion is None else self.motion.dequantise())
 
     @property
     def is_dynamic(self) -> bool:
@@ -127,7 +129,8 @@ class QuantisedScene:
     @property
     def parameter_count(self) -> int:
         """Numbers in the model, coded or not; the same as the dequantised scene's."""
-        return sum(p.symbols.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count
+        motion = 0 if self.motion is None else self.motion.symbols.size
+        return sum(p.symbols.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count + motion
 
     @property
     def identity_share(self) -> float:
@@ -137,29 +140,39 @@ class QuantisedScene:
 
 
 def quantise_scene(scene: Scene, steps: Sequence[Mapping[str, np.ndarray | float]], *,
-                   skip_unseen: bool = True) -> QuantisedScene:
+                   skip_unseen: bool = True, reached: np.ndarray | None = None) -> QuantisedScene:
     """Quantise every plane and round the rest to what the file stores.
 
     Args:
         steps: one mapping a scale, plane name -> step: (M,) or a number.
         skip_unseen: leave texels that no occupied point projects to uncoded.
+        reached: `reached_by(scene)`, where it is at hand.
 
     Raises:
         FormatError: a value is NaN or infinite; the message names the scale and the plane.
     """
+    if skip_unseen and reached is None:
+        reached = reached_by(scene)
     scales = []
     for number, (planes, plane_steps) in enumerate(zip(scene.scales, steps, strict=True)):
         scales.append({
             name: quantise_plane(
                 values, plane_steps[name], identity=name in TIME_PLANES, name=f"scale {number}, plane {name}",
-                needed=needed_texels(scene.occupancy, name, *values.shape[:2]) if skip_unseen else None)
+                needed=None if reached is None or not skip_unseen else needed_texels(reached, name, *values.shape[:2]))
             for name, values in planes.items()
         })
     return QuantisedScene(
         np.asarray(scene.aabb, np.float32), scene.clip, tuple(scales), round_decoder(scene.decoder),
         np.asarray(scene.occupancy, bool), np.asarray(scene.background, np.float32), float(scene.step),
         tuple(round_camera(camera) for camera in scene.cameras), scene.mapping,
+        None if scene.motion is None else quantise_motion(scene.motion),
     )
+
+
+def reached_by(scene: Scene) -> np.ndarray:
+    """(slots, Nz, Ny, Nx) bool: the cells of the planes' [0, 1]^3 in which what is occupied is looked up."""
+    occupancy = np.asarray(scene.occupancy, bool)
+    return occupancy if scene.motion is None else places_reached(occupancy, scene.motion)
 
 
 def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) -> np.ndarray:

@@ -4,7 +4,7 @@ Feature of a point p at time t (K-Planes, arXiv:2301.10241, eq. 1; multiplicatio
 
     f_s(p, t) = prod over planes c of bilinear(P[s][c], project_c(p, t))         f = concat over scales s of f_s
 
-Density and colour (the explicit decoder, section 3.3 of the paper):
+With a motion grid the planes are read elsewhere, `kpc.format.motion`. Density and colour (the explicit decoder, section 3.3 of the paper):
 
     sigma = exp(clip(f . density_weight + density_bias, -20, 20))       per longest edge of the box
     rgb   = sigmoid(f . basis_{R,G,B}(d))                               basis(d) = direction MLP, once a ray
@@ -81,6 +81,8 @@ class Scene:
         step: distance between samples along a ray, world units; where there is a mapping, in its s.
         cameras: a few cameras the scene was filmed from, the first a good one to open on.
         mapping: how what lies outside the box is held, too; None: nothing does.
+        motion: (T, Nz, Ny, Nx, 3) float32, displacements at the nodes of a grid over time and space, in box edges (of what the
+            planes cover, with a mapping), `kpc.format.motion`; None: nothing is displaced. Dynamic scenes only.
     """
 
     aabb: np.ndarray
@@ -92,6 +94,7 @@ class Scene:
     step: float
     cameras: tuple[Camera, ...] = field(default=())
     mapping: Contraction | None = None
+    motion: np.ndarray | None = None
 
     @property
     def is_dynamic(self) -> bool:
@@ -104,5 +107,6 @@ class Scene:
 
     @property
     def parameter_count(self) -> int:
-        """Numbers in the model: every texel of every channel of every plane, and the decoder's weights."""
-        return sum(p.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count
+        """Numbers in the model: every texel of every channel of every plane, the decoder's weights, the displacements."""
+        motion = 0 if self.motion is None else self.motion.size
+        return sum(p.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count + motion

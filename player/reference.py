@@ -20,6 +20,8 @@ from enum import Enum
 import numpy as np
 
 from kpc.format.cameras import Camera
+from kpc.format.grid import linear, tap
+from kpc.format.motion import moved
 from kpc.format.scene import LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Decoder, Scene
 from kpc.format.space import contract
 
@@ -34,7 +36,7 @@ class Part(Enum):
 
     FULL = "full"
     STATIC = "static"
-    """Every time plane set to 1."""
+    """Every time plane set to 1, every displacement to 0."""
     DYNAMIC = "dynamic"
     """|full - static|: what moves, and what it hides or lays bare. Depth, opacity and samples are the full scene's."""
 
@@ -94,19 +96,22 @@ class Moment:
         rows: one mapping a scale, "x" | "y" | "z" -> (size, M) float32: the time planes cut at this time. Bilinear
             interpolation is separable, so this loses nothing. Empty where nothing moves.
         occupied: (Nz, Ny, Nx) bool.
+        offsets: (Nz, Ny, Nx, 3) float32, the motion grid cut at this time; None where there is none.
     """
 
     rows: tuple[Mapping[str, np.ndarray], ...]
     occupied: np.ndarray
+    offsets: np.ndarray | None
 
     @staticmethod
     def of(scene: Scene, time: float, with_motion: bool = True) -> "Moment":
-        """Cut `scene` at `time`; without motion every time plane counts as 1."""
+        """Cut `scene` at `time`; without motion every time plane counts as 1, every displacement as 0."""
         rows: list[dict[str, np.ndarray]] = [
             {name[0]: linear(scale[name], time) for name in TIME_PLANES} if with_motion and scene.is_dynamic else {}
             for scale in scene.scales
         ]
-        return Moment(tuple(rows), scene.occupancy[slot_at(scene, time)])
+        offsets = None if scene.motion is None or not with_motion else linear(scene.motion, time)
+        return Moment(tuple(rows), scene.occupancy[slot_at(scene, time)], offsets)
 
 
 def slot_at(scene: Scene, time: float) -> int:
@@ -140,20 +145,6 @@ def places(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndar
     return t, u, scene.mapping.stretch(t, radius)
 
 
-def tap(u: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Corner-aligned position u (size - 1), u in [0, 1], as a lower texel and the fraction towards the next."""
-    position = np.clip(u, 0, 1) * np.float32(size - 1)
-    lower = np.minimum(position.astype(np.int32), max(size - 2, 0))
-    return lower, (position - lower).astype(np.float32)
-
-
-def linear(row: np.ndarray, u: np.ndarray | float) -> np.ndarray:
-    """Sample a (size, ..., M) row at u in [0, 1], shape (N,) or a scalar: (1 - f) row[i] + f row[i + 1]."""
-    i, f = tap(np.asarray(u, np.float32), len(row))
-    f = f.reshape(f.shape + (1,) * (row.ndim - 1))
-    return row[i] * (1 - f) + row[np.minimum(i + 1, len(row) - 1)] * f
-
-
 def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Sample a (rows, columns, M) plane at (N,) positions, u along columns and v along rows, both in [0, 1]: (N, M)."""
     rows, columns, channels = plane.shape
@@ -170,6 +161,8 @@ def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def features(scene: Scene, moment: Moment, u: np.ndarray) -> np.ndarray:
     """f at (N, 3) points in [0, 1]^3: (N, F), the product over planes, concatenated over scales (eq. 1 of K-Planes)."""
+    if moment.offsets is not None:
+        u = moved(u, moment.offsets)
     axis = {"x": u[:, 0], "y": u[:, 1], "z": u[:, 2]}
     out = []
     for scale, rows in zip(scene.scales, moment.rows):

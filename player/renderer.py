@@ -10,6 +10,7 @@ import numpy as np
 
 from kpc.format.cameras import Camera
 from kpc.format.errors import DisplayError
+from kpc.format.grid import linear
 from kpc.format.scene import Scene
 from kpc.player import shader
 from kpc.player.reference import Part, Rendering, slot_at
@@ -17,7 +18,7 @@ from kpc.player.textures import FOLDED_AXIS, Layout, Rows, decoder_arrays, dista
 
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
-PLANES_UNIT, ROWS_UNIT, CELLS_UNIT = 0, 1, 2
+PLANES_UNIT, ROWS_UNIT, CELLS_UNIT, MOTION_UNIT = 0, 1, 2, 3
 SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
 TARGETS_KEPT = 4
 CONSTANTS = 8192
@@ -104,6 +105,11 @@ class Renderer:
             if scene.is_dynamic:
                 self._rows = Rows(scene, self.layout)
                 self._row_texture = _texture(ctx, np.ones((self.layout.row_count(), self._rows.width, 4), np.float32))
+            self._motion_texture: moderngl.Texture3D | None = None
+            if scene.motion is not None:
+                self._motion_texture = ctx.texture3d(scene.motion.shape[3:0:-1], 4, dtype="f4")
+                self._motion_texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+                self._motion_texture.repeat_x = self._motion_texture.repeat_y = self._motion_texture.repeat_z = False
             nz, ny, nx = scene.occupancy.shape[1:]
             self._cells = ctx.texture3d((nx, ny, nz), 1, alignment=1, dtype="u1")
             self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
@@ -118,7 +124,7 @@ class Renderer:
         self._rows_time: float | None = None
         self._folded_time: float | None = None
         self._slot: int | None = None
-        self._programs: dict[tuple[str, int, bool], tuple[moderngl.Program, moderngl.VertexArray]] = {}
+        self._programs: dict[tuple[str, int, bool, bool], tuple[moderngl.Program, moderngl.VertexArray]] = {}
         self._targets: dict[tuple[Part, tuple[int, int]], Target] = {}
         self.check()
 
@@ -135,7 +141,8 @@ class Renderer:
         """Bytes of the textures and buffers that hold the scene and its pictures."""
         textures = [self._planes, self._row_texture, *([self._folded_planes] if self._folded_planes else [])]
         textures += [texture for target in self._targets.values() for texture in (target.seen, target.met)]
-        return sum(4 * t.width * t.height * t.components for t in textures) + int(self.scene.occupancy[0].size)
+        return sum(4 * t.width * t.height * t.components for t in textures) + int(self.scene.occupancy[0].size) + (
+            0 if self._motion_texture is None else 16 * int(np.prod(self._motion_texture.size)))
 
     def render(self, camera: Camera, time: float, *, part: Part = Part.FULL) -> Rendering:
         """What `kpc.player.reference.render` gives, by OpenGL."""
@@ -196,7 +203,9 @@ class Renderer:
             self._cut(time)
         planes = self._fold(time) if folded else self._planes
         target = self._target(part, (camera.width, camera.height))
-        march, vertices = self._program(program, self.folded_layout if folded else self.layout, moving and not folded)
+        displaced = moving and self._motion_texture is not None
+        layout = self.folded_layout if folded else self.layout
+        march, vertices = self._program(program, layout, moving and not folded, displaced)
         _set(
             march,
             height=float(camera.height),
@@ -206,6 +215,8 @@ class Renderer:
         )
         planes.use(PLANES_UNIT)
         self._row_texture.use(ROWS_UNIT)
+        if self._motion_texture is not None:
+            self._motion_texture.use(MOTION_UNIT)
         self._cells.use(CELLS_UNIT)
         self._draw(target.framebuffer, vertices)
         return target
@@ -230,10 +241,10 @@ class Renderer:
         return target
 
     def _program(
-        self, name: str, layout: Layout, with_rows: bool = False
+        self, name: str, layout: Layout, with_rows: bool = False, displaced: bool = False
     ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
-        key = name, layout.refined, with_rows
+        key = name, layout.refined, with_rows, displaced
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
@@ -246,6 +257,7 @@ class Renderer:
                 "HIDDEN": len(scene.decoder.b1),
                 "ROWS": int(with_rows),
                 "CONTRACTED": int(scene.mapping is not None),
+                "MOTION": int(displaced),
                 "REFINED": layout.refined,
             },
             {"decoder_weights": self._decoder},
@@ -256,6 +268,8 @@ class Renderer:
             planes=PLANES_UNIT,
             rows=ROWS_UNIT,
             cells=CELLS_UNIT,
+            motion=MOTION_UNIT,
+            nodes=(1.0, 1.0, 1.0) if self._motion_texture is None else tuple(map(float, self._motion_texture.size)),
             planes_texel=(1 / layout.size[0], 1 / layout.size[1]),
             rows_texel=(1 / self._row_texture.width, 1 / self._row_texture.height),
             blocks=[(block.x, block.y, block.width) for block in layout.blocks],
@@ -282,6 +296,9 @@ class Renderer:
     def _cut(self, time: float) -> None:
         if time != self._rows_time and self._rows is not None:
             self._row_texture.write(self._rows.at(time))
+            if self._motion_texture is not None and self.scene.motion is not None:
+                offsets = linear(self.scene.motion, time)
+                self._motion_texture.write(np.concatenate([offsets, offsets[..., :1]], axis=-1))  # RGBA: RGB is seldom native
             self._rows_time = time
 
     def _fold(self, time: float) -> moderngl.Texture:

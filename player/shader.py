@@ -18,6 +18,7 @@ ES30 = """#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2D;
+precision highp sampler3D;
 precision highp usampler3D;"""
 
 LINES_A_FILE = 10000

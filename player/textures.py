@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kpc.format.grid import dilate
+from kpc.format.grid import dilate, linear
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 
 FOLDED_AXIS = {"xy": "x", "xz": "z", "yz": "y"}
@@ -101,10 +101,7 @@ class Rows:
         layers = self._layout.layers
         out = np.ones((self._layout.row_count(), self.width, 4), np.float32)
         for axis, scale, plane in self._planes:
-            position = np.float32(time) * np.float32(len(plane) - 1)
-            lower = min(int(position), max(len(plane) - 2, 0))
-            f = position - np.float32(lower)
-            row = plane[lower] * (1 - f) + plane[min(lower + 1, len(plane) - 1)] * f
+            row = linear(plane, time)
             padded = np.ones((len(row), layers * 4), np.float32)
             padded[:, : row.shape[1]] = row
             first = self._layout.first_row(axis, scale)

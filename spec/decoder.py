@@ -87,7 +87,7 @@ def chunks(data, partial):  # sections 3, 4 and 10
         require(kind.isalpha() and reserved == 0 and offset == expected and raw <= largest_raw, "index entry")
         expected += stored
         body = data[offset:offset + stored]
-        known = kind in (b"SCNE", b"DECO", b"OCCU", b"PLNE", b"WARP", b"came")
+        known = kind in (b"SCNE", b"DECO", b"OCCU", b"PLNE", b"WARP", b"MOVE", b"came")
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
         if len(body) < stored:
@@ -128,6 +128,8 @@ def decode(data, partial=False):
     require(values == value_count, "value count")
     require("WARP" not in parts or parts["WARP"] is not None, "no WARP chunk")
     scene["even"] = warp_chunk(Bytes(parts["WARP"]), scene["step"]) if "WARP" in parts else None
+    require("MOVE" not in parts or parts["MOVE"] is not None, "no MOVE chunk")
+    scene["motion"] = motion_chunk(Bytes(parts["MOVE"]), scene["scales"]) if "MOVE" in parts else None
     scene |= decoder_chunk(Bytes(parts["DECO"]), sum(s["channels"] for s in scene["scales"]))
     scene |= occupancy_chunk(Bytes(parts["OCCU"]))
     scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") else []
@@ -189,6 +191,20 @@ def warp_chunk(chunk, step):  # section 5
     require(mapping == 1 and 2**-30 <= even <= 2**30 and 2 * even / step <= 65536, "mapping")
     chunk.end()
     return even
+
+
+def motion_chunk(chunk, scales):  # section 5
+    rows, *nodes, step = chunk.unpack("4Hf")
+    require("xt" in scales[0]["planes"] and 2 <= rows <= 16384 and all(2 <= n <= 256 for n in nodes), "motion grid")
+    require(step > 0 and 32768 * step <= 1024, "motion step")
+    a_row = 3 * math.prod(nodes)
+    low, high = chunk.take(rows * a_row), chunk.take(rows * a_row)
+    chunk.end()
+    symbols = []
+    for i in range(rows * a_row):
+        symbols.append((low[i] + 256 * high[i] + (symbols[i - a_row] if i >= a_row else 0)) % 65536)
+    signed = (s - 65536 if s > 32767 else s for s in symbols)
+    return {"size": (rows, *nodes), "values": [f32(s * step) for s in signed]}
 
 
 def segment(chunk, rows, columns, channels):  # section 6
@@ -277,7 +293,7 @@ def render_ray(scene, origin, direction, time):  # section 11
         nx, ny, _ = scene["cells"]
         if not scene["occupancy"][((m * ny + j) * nx + i) * scene["slots"] + slot]:
             continue
-        f = features(scene, dict(zip("xyzt", [*u, time])))
+        f = features(scene, dict(zip("xyzt", [*moved(scene["motion"], u, time), time])))
         log_density = sum(a * b for a, b in zip(f, scene["density_weight"])) + scene["density_bias"]
         alpha = 1 - math.exp(-math.exp(min(max(log_density, -20.0), 20.0)) * length / extent)
         w = T * alpha
@@ -288,6 +304,28 @@ def render_ray(scene, origin, direction, time):  # section 11
         T *= 1 - alpha
     opacity = 1 - T
     return [c + T * b for c, b in zip(colour, scene["background"])], opacity, depth / opacity if opacity else math.inf
+
+
+def between(position, size):
+    """(node, weight) of the two nodes around a position in [0, 1]."""
+    position = min(max(position, 0.0), 1.0) * (size - 1)
+    low = min(math.floor(position), max(size - 2, 0))
+    return (low, 1 - (position - low)), (min(low + 1, size - 1), position - low)
+
+
+def moved(motion, u, time):
+    if motion is None:
+        return u
+    rows, nz, ny, nx = motion["size"]
+    out = list(u)
+    for t, wt in between(time, rows):
+        for k, wz in between(u[2], nz):
+            for j, wy in between(u[1], ny):
+                for i, wx in between(u[0], nx):
+                    first = 3 * (((t * nz + k) * ny + j) * nx + i)
+                    for axis in range(3):
+                        out[axis] += wt * wz * wy * wx * motion["values"][first + axis]
+    return [min(max(x, 0.0), 1.0) for x in out]
 
 
 def features(scene, place):
@@ -302,19 +340,12 @@ def features(scene, place):
 
 
 def bilinear(plane, channels, u, v):
-    def corners(position, size):
-        position = min(max(position, 0.0), 1.0) * (size - 1)
-        low = min(math.floor(position), size - 1)
-        return low, min(low + 1, size - 1), position - low
-
-    x0, x1, fx = corners(u, plane["columns"])
-    y0, y1, fy = corners(v, plane["rows"])
     sample = [0.0] * channels
-    for y, x, weight in [(y0, x0, (1 - fy) * (1 - fx)), (y0, x1, (1 - fy) * fx),
-                         (y1, x0, fy * (1 - fx)), (y1, x1, fy * fx)]:
-        first = (y * plane["columns"] + x) * channels
-        for c in range(channels):
-            sample[c] += weight * plane["values"][first + c]
+    for y, wy in between(v, plane["rows"]):
+        for x, wx in between(u, plane["columns"]):
+            first = (y * plane["columns"] + x) * channels
+            for c in range(channels):
+                sample[c] += wy * wx * plane["values"][first + c]
     return sample
 
 

@@ -4,22 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scenes import surrounded, tiny_scene
+from scenes import displaced, surrounded, tiny_scene
 
 from kpc.encoder import kernels
 from kpc.encoder.field import Field, Rays, render_reference
-from kpc.encoder.train import sample_capacity
+from kpc.encoder.train import motion_of, sample_capacity
 from kpc.format.scene import Scene
 
 
-def misty(dynamic: bool = True, contracted: bool = False) -> Scene:
+def misty(dynamic: bool = True, contracted: bool = False, moved: bool = False) -> Scene:
     """Every step absorbs a tenth or more: no sample before termination is so faint that it gets no colour."""
     scene = tiny_scene(dynamic=dynamic, time=6)
     weight = scene.decoder.density_weight
     # Before the cameras' even distance, steps outside the box count for less: 1 / r^2, a tenth.
     bias = 4.5 if contracted else 2.0
     scene = replace(scene, decoder=replace(scene.decoder, density_weight=np.abs(weight) / 16, density_bias=bias))
-    return surrounded(scene) if contracted else scene
+    scene = surrounded(scene) if contracted else scene
+    return displaced(scene) if moved else scene
 
 
 def rays_at(scene: Scene, count: int, seed: int = 0) -> Rays:
@@ -45,6 +46,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
     grad_density = np.zeros((workers, layout.features + 1), np.float32)
     basis = field.basis(rays.directions).detach().numpy()
     grad_basis = np.zeros((n, 3, layout.features), np.float32)
+    grad_motion = None if scene.motion is None else np.zeros((workers, *scene.motion.shape), np.float32)
     peaks = np.zeros((workers, *scene.occupancy.shape[1:]), np.float32)
     errors, counts = kernels.backpropagate(
         field.theta.detach().numpy(),
@@ -54,6 +56,8 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         field.density.detach().numpy(),
         grad_density,
         layout.channels,
+        motion_of(field),
+        grad_motion,
         scene.aabb,
         kernels.even_of(scene.mapping),
         scene.occupancy.view(np.uint8),
@@ -75,6 +79,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         "theta": grad.sum(0),
         "density": grad_density.sum(0),
         "basis": grad_basis,
+        "motion": None if grad_motion is None else grad_motion.sum(0),
         "errors": errors,
         "counts": counts,
         "peaks": peaks.max(0),
@@ -99,6 +104,7 @@ def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict
         "theta": field.theta.grad.numpy(),
         "density": field.density.grad.numpy(),
         "basis": basis.grad.numpy(),
+        "motion": None if field.motion is None else field.motion.grad.numpy(),
         "errors": squared.sum(1).detach().numpy(),
         "samples": len(weights),
         "peaks": peaks.numpy(),

@@ -1,5 +1,6 @@
 """Small scenes for tests: every feature of a real one, in a few kilobytes."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -62,6 +63,16 @@ def surrounded(scene: Scene) -> Scene:
     shell[2:-1, 2:-2, 1:-3] = False
     shell[2:6, 3:7, 18] = True  # something in the open, too
     return replace(scene, occupancy=occupancy | shell, mapping=Contraction(5.0), step=0.08)
+
+
+def displaced(scene: Scene, seed: int = 5, most: float = 0.06) -> Scene:
+    """A dynamic scene whose places wander: random displacements of up to `most` at 3 x 2 x 4 nodes, in as many rows as it has."""
+    shape = len(scene.scales[0]["xt"]), 3, 2, 4, 3
+    return replace(scene, motion=np.random.default_rng(seed).uniform(-most, most, shape).astype(np.float32))
+
+
+SPACES: dict[str, Callable[[Scene], Scene]] = {"box": lambda scene: scene, "contracted": surrounded, "displaced": displaced}
+"""What there is besides a plain box."""
 
 
 def look_at(eye: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int,

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import tiny_scene
+from scenes import displaced, tiny_scene
 
 import kpc
 from kpc.format.cameras import Camera
 from kpc.format.container import HEADER, Reader
 from kpc.format.errors import BudgetError, FormatError
 from kpc.format.file import SceneReader, encode, read, write
+from kpc.format.motion import STEP, QuantisedMotion
 from kpc.format.quantise import QuantisedScene, quantise_scene
 from kpc.format.scene import TIME_PLANES
 from kpc.format.space import Contraction
@@ -27,7 +28,10 @@ def quantised(step: float = 0.02, **options) -> QuantisedScene:
 
 def assert_same(a: QuantisedScene, b: QuantisedScene) -> None:
     assert np.array_equal(a.aabb, b.aabb) and a.clip == b.clip and a.step == b.step and a.mapping == b.mapping
-    assert np.array_equal(a.background, b.background)
+    assert np.array_equal(a.background, b.background) and (a.motion is None) == (b.motion is None)
+    if a.motion is not None:
+        assert a.motion.step == b.motion.step and np.array_equal(a.motion.symbols, b.motion.symbols)
+        assert a.motion.symbols.dtype == b.motion.symbols.dtype
     assert a.occupancy.dtype == b.occupancy.dtype and np.array_equal(a.occupancy, b.occupancy)
     for name in ("density_weight", "density_bias", "w1", "b1", "w2", "b2"):
         assert np.array_equal(getattr(a.decoder, name), getattr(b.decoder, name))
@@ -78,6 +82,26 @@ def test_a_prefix_without_the_mapping_shows_nothing():
     assert read(late).mapping == Contraction(2.0)
     with pytest.raises(FormatError, match="WARP.*is not there"):
         read(late[:-1], allow_partial=True)
+
+
+def test_a_motion_grid_comes_back_and_says_so_in_a_chunk_of_its_own():
+    scene = displaced(tiny_scene(), most=3.0)
+    coded = quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
+    data = encode(coded)
+    assert_same(read(data), coded)
+    assert [e.kind for e in Reader(data).index][:3] == ["SCNE", "MOVE", "DECO"]
+    back = read(data).dequantise().motion
+    assert back is not None and np.abs(back - scene.motion).max() <= STEP / 2 + 1e-7
+    index = Reader(data).index
+    assert np.array_equal(read(data[:index[4].offset], allow_partial=True).dequantise().motion, back)
+
+
+def test_a_motion_grid_counts_against_the_budget():
+    data = encode(replace(quantised(), motion=QuantisedMotion(np.zeros((40, 9, 9, 9, 3), np.int16), STEP)))
+    least = 5 * Reader(data).header.value_count
+    assert len(data) < least
+    with pytest.raises(BudgetError, match="motion grid"):
+        read(data, memory_budget=least + 10_000)
 
 
 def test_rows_in_time_may_differ_from_scale_to_scale():
@@ -274,6 +298,11 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
     (lambda s: {"mapping": Contraction(float("nan"))}, "WARP"),
     (lambda s: {"mapping": Contraction(float("inf"))}, "WARP"),
     (lambda s: {"mapping": Contraction(40000 * s.step)}, "WARP"),
+    (lambda s: {"motion": QuantisedMotion(np.zeros((1, 2, 2, 2, 3), np.int16), STEP)}, "MOVE"),
+    (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 1, 3), np.int16), STEP)}, "MOVE"),
+    (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int16), 0.0)}, "MOVE"),
+    (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int16), 1.0)}, "MOVE"),
+    (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int32), STEP)}, "motion"),
     (lambda s: {"aabb": np.full((2, 3), np.nan, np.float32)}, "box"),
     (lambda s: {"step": 0.0}, "ray step"),
     (lambda s: {"step": 1e-9}, "ray step"),

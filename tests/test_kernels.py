@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from gradients import backpropagate, misty, rays_at, reference_gradients
-from scenes import tiny_scene
+from scenes import displaced, tiny_scene
 
 from kpc.encoder import kernels
 from kpc.encoder.config import TrainConfig
@@ -26,17 +26,21 @@ COLOUR = 1e-4
 GRADIENT = 1e-3
 
 
-@pytest.mark.parametrize("contracted", [False, True])
-@pytest.mark.parametrize("dynamic", [True, False])
-def test_backpropagate_is_autograd_through_the_reference(dynamic: bool, contracted: bool) -> None:
-    scene = misty(dynamic, contracted)
+KINDS = [(True, False, False), (True, False, True), (False, False, False), (True, True, False), (True, True, True),
+         (False, True, False)]
+"""Whether it moves, lies in contracted space, has a motion grid."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_backpropagate_is_autograd_through_the_reference(kind: tuple[bool, bool, bool]) -> None:
+    scene = misty(*kind)
     rays = rays_at(scene, 403)
     targets = torch.rand(403, 3, generator=torch.Generator().manual_seed(1))
     ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
     assert ours["counts"].sum() == theirs["samples"] > 403
     np.testing.assert_allclose(ours["errors"], theirs["errors"], atol=6 * COLOUR)  # d e^2 = 2 e de, three channels
     np.testing.assert_allclose(ours["peaks"], theirs["peaks"], atol=COLOUR)
-    for name in ("theta", "density", "basis"):
+    for name in ("theta", "density", "basis", *(["motion"] if scene.motion is not None else [])):
         largest = np.abs(theirs[name]).max()
         assert largest > 0
         np.testing.assert_allclose(ours[name], theirs[name], atol=GRADIENT * largest, err_msg=name)
@@ -107,10 +111,9 @@ class _Calling(torch.nn.Module):
         self.field, self.forward = field, call
 
 
-@pytest.mark.parametrize("contracted", [False, True])
-@pytest.mark.parametrize("dynamic", [True, False])
-def test_render_is_the_players_reference(dynamic: bool, contracted: bool) -> None:
-    scene = misty(dynamic, contracted)
+@pytest.mark.parametrize("kind", KINDS)
+def test_render_is_the_players_reference(kind: tuple[bool, bool, bool]) -> None:
+    scene = misty(*kind)
     renderer = SceneRenderer(scene)
     for time in (0.0, 0.3, 0.5, 1.0):
         for camera in scene.cameras:
@@ -133,6 +136,7 @@ def test_render_gives_opacity_depth_and_counts() -> None:
         field.layout.resolution,
         field.density.detach().numpy(),
         field.layout.channels,
+        None,
         scene.aabb,
         kernels.even_of(scene.mapping),
         scene.occupancy.view(np.uint8),
@@ -155,8 +159,9 @@ def test_render_gives_opacity_depth_and_counts() -> None:
     assert np.mean(counts != theirs.samples) < 0.002
 
 
-def test_log_densities() -> None:
-    scene = tiny_scene()
+@pytest.mark.parametrize("moved", [False, True])
+def test_log_densities(moved: bool) -> None:
+    scene = displaced(tiny_scene()) if moved else tiny_scene()
     field = Field.from_scene(scene)
     rng = np.random.default_rng(0)
     points, times = rng.random((500, 3), np.float32), rng.random(500, np.float32)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import gl
 import numpy as np
 import pytest
-from scenes import look_at, surrounded, tiny_scene
+from scenes import SPACES, displaced, look_at, surrounded, tiny_scene
 
 from kpc.format.cameras import Camera
 from kpc.format.errors import DisplayError
@@ -37,9 +37,9 @@ def check(got: Rendering, wanted: Rendering) -> None:
 
 @pytest.mark.parametrize("view", CAMERAS)
 @pytest.mark.parametrize("part", Part)
-@pytest.mark.parametrize("space", ["box", "contracted"])
+@pytest.mark.parametrize("space", SPACES)
 def test_gives_the_reference_picture(view: str, part: Part, space: str) -> None:
-    scene = tiny_scene(4) if space == "box" else surrounded(tiny_scene(4))
+    scene = SPACES[space](tiny_scene(4))
     wanted = render(scene, CAMERAS[view], 0.62, part=part)
     check(Renderer(gl.context(), scene).render(CAMERAS[view], 0.62, part=part), wanted)
     if view not in ("looking away",) and part is Part.FULL:
@@ -56,8 +56,9 @@ def test_gives_the_reference_picture(view: str, part: Part, space: str) -> None:
         replace(tiny_scene(9), occupancy=np.zeros((2, 300, 2, 3), bool)),
         surrounded(tiny_scene(6, dynamic=False)),
         replace(surrounded(tiny_scene(9)), occupancy=np.zeros((2, 300, 2, 3), bool)),
+        displaced(surrounded(tiny_scene(6)), most=0.5),
     ],
-    ids=["static", "uneven", "few texels", "one cell", "nothing", "contracted", "nothing anywhere"],
+    ids=["static", "uneven", "few texels", "one cell", "nothing", "contracted", "nothing anywhere", "thrown about"],
 )
 def test_scenes_of_all_shapes(scene: Scene) -> None:
     renderer = Renderer(gl.context(), scene)
@@ -92,11 +93,10 @@ def test_one_renderer_serves_many_sizes_and_times() -> None:
     assert renderer.memory_bytes > 1000
 
 
-@pytest.mark.parametrize("space", ["box", "contracted"])
+@pytest.mark.parametrize("space", SPACES)
 def test_folding_is_exact_where_nothing_moves_and_close_where_it_does(space: str) -> None:
-    still, moving = tiny_scene(6, dynamic=False), tiny_scene(4)
-    if space == "contracted":
-        still, moving = surrounded(still), surrounded(moving)
+    still, moving = tiny_scene(6, dynamic=False), SPACES[space](tiny_scene(4))
+    still = surrounded(still) if space == "contracted" else still
     check(
         Renderer(gl.context(), still, folded=True).render(CAMERAS["outside"], 0.0),
         render(still, CAMERAS["outside"], 0.0),
@@ -109,10 +109,9 @@ def test_folding_is_exact_where_nothing_moves_and_close_where_it_does(space: str
     check(renderer.render(CAMERAS["outside"], 0.7), render(moving, CAMERAS["outside"], 0.7))
 
 
-@pytest.mark.parametrize("space", ["box", "contracted"])
+@pytest.mark.parametrize("space", SPACES)
 def test_shows_every_look_and_part_on_a_screen_of_another_size(space: str) -> None:
-    ctx, scene = gl.context(), tiny_scene(4)
-    scene = scene if space == "box" else surrounded(scene)
+    ctx, scene = gl.context(), SPACES[space](tiny_scene(4))
     screen = ctx.framebuffer([ctx.texture((70, 50), 4)])
     renderer, pictures = Renderer(ctx, scene), {}
     for look in Look:

@@ -1,6 +1,7 @@
 """The page, the decoder written from it, the vectors and the package must all say the same."""
 
 import importlib.util
+import hashlib
 import json
 import re
 import struct
@@ -9,7 +10,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from scenes import surrounded, tiny_scene
+from scenes import SPACES, tiny_scene
 
 from kpc.format import container, errors, file, planes
 from kpc.format.scene import ALL_PLANES, LOG_DENSITY_LIMIT, TERMINATION
@@ -64,7 +65,7 @@ def same(layout: str, expected: struct.Struct) -> bool:
 
 
 @pytest.mark.parametrize("number, structures", [
-    (3, [container.HEADER]), (4, [container.ENTRY]), (5, [file.SCENE_STRUCT, file.SCALE_STRUCT, file.WARP_STRUCT]),
+    (3, [container.HEADER]), (4, [container.ENTRY]), (5, [file.SCENE_STRUCT, file.SCALE_STRUCT, file.WARP_STRUCT, file.MOTION_STRUCT]),
     (7, [file.DECODER_STRUCT]), (8, [file.OCCUPANCY_STRUCT]), (9, [file.CAMERA_STRUCT]),
 ])
 def test_byte_tables_are_the_code_s_structures(number, structures):
@@ -80,6 +81,7 @@ def test_sizes_in_the_text():
     assert f"begins with {file.SCENE_STRUCT.size} bytes" in section(5)
     assert f"coarse to fine, {file.SCALE_STRUCT.size} bytes" in section(5)
     assert f"keeps its shape. {file.WARP_STRUCT.size} bytes" in section(5)
+    assert f"may have one. It begins with {file.MOTION_STRUCT.size} bytes" in section(5)
     assert f"each camera {file.CAMERA_STRUCT.size} bytes" in section(9)
 
 
@@ -128,6 +130,12 @@ def test_the_decoder_written_from_the_page_agrees(path, twin):
     for plane in expected["planes"]:
         assert twin.hashes(scene)[plane["scale"], plane["plane"]] == (
             plane["symbols_sha256"], plane["coded_sha256"], plane["values_sha256"])
+    if "motion" in expected:
+        values = np.array(scene["motion"]["values"], "<f4")
+        assert [*scene["motion"]["size"], 3] == expected["motion"]["shape"]
+        assert hashlib.sha256(values.tobytes()).hexdigest() == expected["motion"]["sha256"]
+    else:
+        assert scene["motion"] is None
     for ray in expected["rays"]:
         rgb, opacity, depth = twin.render_ray(scene, ray["origin"], ray["direction"], ray["time"])
         assert rgb == pytest.approx(ray["rgb"], abs=RAY_TOLERANCE)
@@ -177,12 +185,11 @@ def assert_described(found: dict, expected: dict) -> None:
             assert one[key] == pytest.approx(other[key], abs=RAY_TOLERANCE), key
 
 
-@pytest.mark.parametrize("space", ["box", "contracted"])
+@pytest.mark.parametrize("space", SPACES)
 def test_the_twin_renders_a_scene_as_the_reference_does(twin, space):
     from kpc.format.quantise import quantise_scene
 
-    scene = tiny_scene(scales=1, channels=4, resolution=(10, 8, 6), time=4)
-    scene = scene if space == "box" else surrounded(scene)
+    scene = SPACES[space](tiny_scene(scales=1, channels=4, resolution=(10, 8, 6), time=4))
     data = file.encode(quantise_scene(scene, [{name: 0.01 for name in scene.scales[0]}]))
     decoded = file.read(data).dequantise()
     slow = twin.decode(data)

@@ -25,6 +25,7 @@ from kpc.format.cameras import Camera
 from kpc.format.container import ENTRY, HEADER, Chunk, Reader, pack
 from kpc.format.errors import UsageError
 from kpc.format.file import encode, read, scene_chunks
+from kpc.format.motion import QuantisedMotion
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
 from kpc.format.space import Contraction
@@ -71,6 +72,8 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
         "fps": scene.clip.fps,
         "step": scene.step,
         **({"even": scene.mapping.even} if scene.mapping else {}),
+        **({"motion": {"shape": list(scene.motion.symbols.shape), "sha256": _sha256(scene.motion.dequantise().astype("<f4"))}}
+           if scene.motion else {}),
         "aabb": scene.aabb.tolist(),
         "background": scene.background.tolist(),
         "cameras": [_camera(camera) for camera in scene.cameras],
@@ -112,6 +115,8 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
     minimal = minimal_scene()
     contracted = replace(_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), mapping=Contraction(3.5),
                          occupancy=_noise((2, 3, 3, 5), 98) > -64)
+    moved = replace(_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), occupancy=_noise((2, 3, 3, 5), 98) > -64,
+                    motion=_motion(4, 3, 2, 5))
     note = Chunk("note", [b"readers skip what they need not know"])
     chunks = scene_chunks(minimal)
     index = Reader(packed).index
@@ -126,6 +131,9 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "wrap": (encode(_scene(dynamic=False, sizes=[(8, 12, 10, 6, 0)], amplitude=400), compress=False), False),
         "contracted": (encode(contracted), False),
         "contracted-prefix": (encode(contracted)[:Reader(encode(contracted)).index[4].offset], True),
+        "moved": (encode(moved), False),
+        "moved-prefix": (encode(moved)[:Reader(encode(moved)).index[4].offset], True),
+        "moved-contracted": (encode(replace(contracted, motion=_motion(2, 2, 2, 2, 32.0)), compress=False), False),
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
     }
 
@@ -153,6 +161,16 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     def warped(*parts: bytes) -> bytes:
         """The file with WARP chunks."""
         return pack([chunks[scne], *(Chunk("WARP", [part]) for part in parts), *chunks[deco:]], values, compress=False)
+
+    still = _scene(dynamic=False, sizes=[(1, 2, 2, 2, 0)])
+    still_values = Reader(encode(still)).header.value_count
+
+    def displaced(*parts: bytes) -> bytes:
+        """The file with MOVE chunks."""
+        return pack([chunks[scne], *(Chunk("MOVE", [part]) for part in parts), *chunks[deco:]], values, compress=False)
+
+    def move(rows: int, nz: int, ny: int, nx: int, step: float) -> bytes:
+        return struct.pack("<4Hf", rows, nz, ny, nx, step) + bytes(6 * 16)
 
     def without(number: int) -> bytes:
         return pack(chunks[:number] + chunks[number + 1:], values, compress=False)
@@ -224,6 +242,16 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "warp-short": (warped(struct.pack("<Id", 1, 3.5)[:-1]), broken, "ends after"),
         "warp-long": (warped(struct.pack("<Id", 1, 3.5) + bytes(1)), broken, "12 make sense"),
         "warp-twice": (warped(*2 * [struct.pack("<Id", 1, 3.5)]), broken, "2 WARP chunks"),
+        "move-rows": (displaced(move(1, 2, 2, 2, 0.5**13)), broken, "makes no sense"),
+        "move-nodes": (displaced(move(2, 2, 257, 2, 0.5**13)), broken, "makes no sense"),
+        "move-step": (displaced(move(2, 2, 2, 2, 0.0)), broken, "outside its range"),
+        "move-nan": (displaced(move(2, 2, 2, 2, nan)), broken, "outside its range"),
+        "move-far": (displaced(move(2, 2, 2, 2, 1.0)), broken, "outside its range"),
+        "move-short": (displaced(move(2, 2, 2, 2, 0.5**13)[:-1]), broken, "ends after"),
+        "move-long": (displaced(move(2, 2, 2, 2, 0.5**13) + bytes(1)), broken, "1 bytes too long"),
+        "move-twice": (displaced(*2 * [move(2, 2, 2, 2, 0.5**13)]), broken, "2 MOVE chunks"),
+        "move-static": (pack([*scene_chunks(still), Chunk("MOVE", [move(2, 2, 2, 2, 0.5**13)])], still_values, compress=False),
+                        broken, "static scene"),
         "decoder-features": (repacked(deco, set_at(0, "<H", 3)), broken, "3 features"),
         "decoder-nan": (repacked(deco, set_at(8, "<H", 0x7E00)), broken, "NaN or infinite"),
         "decoder-short": (repacked(deco, lambda raw: raw[:-1]), broken, "ends after"),
@@ -267,6 +295,13 @@ def _scene(dynamic: bool, sizes: list[tuple[int, int, int, int, int]], amplitude
         np.array([[-1, -0.75, -0.5], [1, 0.75, 0.5]], np.float32), Clip(12, 24.0) if dynamic else Clip(1, 24.0),
         tuple(scales), Decoder(density, 0.5, w1, b1, w2, b2), occupancy, np.array([0.25, 0.5, 1], np.float32), 0.0625,
         tuple(Camera(64 + k, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(cameras)))
+
+
+def _motion(rows: int, nz: int, ny: int, nx: int, step: float = 8.0) -> QuantisedMotion:
+    """Displacements that jump from row to row, the largest and the smallest symbol among them; `step` in 1 / 8192."""
+    symbols = _noise((rows, nz, ny, nx, 3), 41).astype(np.int16)
+    symbols[0, 0, 0, 0], symbols[1, 0, 0, 0] = (32767, -32768, 0), (-32768, 32767, 1)
+    return QuantisedMotion(symbols, step / 8192)
 
 
 def _plane(rows: int, columns: int, channels: int, amplitude: int, seed: int, is_time: bool) -> QuantisedPlane:

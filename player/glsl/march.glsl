@@ -2,11 +2,12 @@
 //
 // SCALES, LAYERS (of four channels), HIDDEN: its shape. ROWS: 1 where rows of time planes are multiplied in at every
 // sample. REFINED: how much finer than the scene's the planes are along the row folded into them; 1 where none is.
-// CONTRACTED: 1 where the planes hold what lies outside the box, too.
+// CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
 
 #include "ray.glsl"
 #include "space.glsl"
 #include "occupancy.glsl"
+#include "motion.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
 #include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2 (kpc.player.textures)
@@ -17,11 +18,13 @@ const float TERMINATION = 1.0 / 1024.0;
 uniform sampler2D planes;
 uniform sampler2D rows;
 uniform usampler3D cells;
+uniform sampler3D motion;
 uniform vec2 planes_texel;          // 1 / size of the texture
 uniform vec2 rows_texel;
 uniform vec3 blocks[SCALES * 3];    // xy, xz, yz of each scale: where they begin, and the width of a layer
 uniform vec3 resolution[SCALES];    // texels along x, y, z
 uniform ivec3 cell_count;
+uniform vec3 nodes;                 // MOTION: of its grid along x, y, z
 uniform vec3 box_low;
 uniform vec3 box_high;
 uniform vec3 background;
@@ -90,6 +93,9 @@ void main() {
 #else
             vec3 u = clamp((eye + t * d - box_low) / (box_high - box_low), 0.0, 1.0);
             float thickness = tau;
+#endif
+#if MOTION
+            u = moved(motion, nodes, u);
 #endif
             float log_density = density_bias[0].x;
             vec3 shade = vec3(0.0);
