@@ -259,8 +259,10 @@ def _plan(trainer: Trainer) -> str:
     planes = ", ".join("x".join(str(n) for n in row if n) for row in layout.resolution)
     beyond = "" if trainer.mapping is None else (
         f" and all around it, even steps up to {trainer.mapping.even:.4g}, rays to {FAR * trainer.mapping.even:.4g}")
+    nodes = "" if trainer.field.motion is None else (
+        f", read where a motion grid of {'x'.join(str(n) for n in trainer.field.motion.shape[2::-1])} nodes leads")
     return (f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
-            f"{layout.size / 1e6:.2f} M parameters; on {trainer.device}")
+            f"{layout.size / 1e6:.2f} M parameters{nodes}; on {trainer.device}")
 
 
 def _spread_of_cameras(dataset: Dataset) -> list[int]:

@@ -1,12 +1,14 @@
 """The field: where its planes lie, how they are sampled, and that a scene goes in and comes out unchanged."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from scenes import tiny_scene
+from scenes import displaced, tiny_scene
 
 from kpc.encoder.config import PRESETS, TrainConfig
-from kpc.encoder.field import Field, Layout, bilinear, plan_layout
+from kpc.encoder.field import Field, Layout, bilinear, motion_nodes, motion_priors, plan_layout, priors
 from kpc.format.errors import UsageError
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip
 from kpc.player import reference
@@ -57,9 +59,11 @@ def test_time_planes_start_as_the_identity_and_a_seed_repeats() -> None:
         assert parameter is one.b1 or parameter is one.w2 or not torch.equal(parameter, different)
 
 
-@pytest.mark.parametrize("dynamic", [True, False])
-def test_scene_to_field_and_back(dynamic: bool) -> None:
+@pytest.mark.parametrize("kind", ["static", "dynamic", "displaced"])
+def test_scene_to_field_and_back(kind: str) -> None:
+    dynamic = kind != "static"
     scene = tiny_scene(dynamic=dynamic)
+    scene = displaced(scene) if kind == "displaced" else scene
     back = Field.from_scene(scene).to_scene(scene.aabb, scene.clip, scene.occupancy, scene.background, scene.step)
     assert back.parameter_count == scene.parameter_count and back.is_dynamic == dynamic
     for ours, theirs in zip(back.scales, scene.scales):
@@ -68,8 +72,35 @@ def test_scene_to_field_and_back(dynamic: bool) -> None:
             np.testing.assert_array_equal(ours[name], theirs[name])
     for name, value in vars(scene.decoder).items():
         np.testing.assert_array_equal(getattr(back.decoder, name), np.float32(value), err_msg=name)
-    for name in ("aabb", "occupancy", "background", "step", "clip"):
+    for name in ("aabb", "occupancy", "background", "step", "clip", "motion"):
         np.testing.assert_array_equal(getattr(back, name), getattr(scene, name))
+
+
+def test_the_motion_grid_starts_at_rest_with_cells_as_near_to_cubes_as_may_be() -> None:
+    box, clip, config = np.array([[0, 0, 0], [1.2, 0.5, 2.4]]), Clip(30, 30.0), replace(PRESETS["draft"], motion_cells=6)
+    layout = plan_layout(config, box, clip, is_dynamic=True)
+    assert motion_nodes(config, box, layout) == (15, 7, 2, 4)
+    field = Field(layout, 4, motion_nodes=(15, 7, 2, 4))
+    assert field.motion is not None and not field.motion.any() and field.motion.shape == (15, 7, 2, 4, 3)
+    assert motion_nodes(replace(config, motion_cells=0), box, layout) is None
+    assert motion_nodes(config, box, plan_layout(config, box, clip, is_dynamic=False)) is None
+
+
+def test_motion_priors_do_not_mind_even_motion_and_measure_the_rest() -> None:
+    config = replace(PRESETS["draft"], motion_smoothness=3.0, motion_bending=0.5)
+    field = Field(Layout.of(np.array([[3, 3, 3, 5]]), 2), 4, motion_nodes=(5, 4, 3, 3))
+    t, z, y, x = torch.meshgrid(*(torch.arange(float(n)) for n in (5, 4, 3, 3)), indexing="ij")
+    even = torch.stack([2 * t - x, 0.5 * z + y, x + y + z - t], -1)
+    with torch.no_grad():
+        field.motion.copy_(even)
+    assert all(value.item() < 1e-9 for value in motion_priors(field, config).values())
+    with torch.no_grad():
+        field.motion[2, 1, 1, 1, 0] += 1.0  # in time 1 - 2 1; the same along z, but along y and x one difference each
+    n = field.motion.numel()
+    found = motion_priors(field, config)
+    assert found["motion_smoothness"].item() == pytest.approx(3.0 * 6 / n, rel=1e-4)
+    assert found["motion_bending"].item() == pytest.approx(0.5 * (5 + 4 + 4) / n, rel=1e-4)
+    assert set(found) < set(priors(field, config))
 
 
 def test_the_scene_is_a_copy() -> None:

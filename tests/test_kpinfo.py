@@ -1,7 +1,8 @@
 import json
 
+import numpy as np
 import pytest
-from scenes import surrounded, tiny_scene
+from scenes import displaced, surrounded, tiny_scene
 
 from kpc.format.container import Reader
 from kpc.format.file import write
@@ -60,6 +61,19 @@ def test_a_contracted_scene(tmp_path, capsys):
     assert "contracted beyond the box; even steps up to 5, rays end at 1280" in page and "WARP" in page
     assert kpinfo.main([str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["space"] == {"mapping": "contracted", "even": 5.0, "far": 1280.0}
+
+
+def test_a_scene_with_a_motion_grid(tmp_path, capsys):
+    scene = displaced(tiny_scene(), most=0.25)
+    path = tmp_path / "moved.kpc"
+    write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), path)
+    assert kpinfo.main([str(path), "--verify"]) == 0
+    page = capsys.readouterr().out
+    assert "6 x 4x2x3 nodes, displacements up to 0.25 of the box"[:30] in page and "MOVE" in page
+    assert kpinfo.main([str(path), "--json"]) == 0
+    motion = json.loads(capsys.readouterr().out)["motion"]
+    assert motion["rows"] == 6 and motion["nodes_zyx"] == [3, 2, 4]
+    assert motion["largest"] == pytest.approx(np.abs(scene.motion).max(), abs=1e-4)
 
 
 def test_verify_lists_every_damaged_chunk(scene_file, capsys):

@@ -67,7 +67,7 @@ def verify(reader: SceneReader) -> None:
                           "fetch the file again")
     if damaged:
         raise damaged[0][2]
-    reader.mapping(), reader.decoder(), reader.occupancy(), reader.cameras()
+    reader.mapping(), reader.motion(), reader.decoder(), reader.occupancy(), reader.cameras()
 
 
 def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
@@ -85,6 +85,9 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
         "step": scene.step,
         "space": {"mapping": "box"} if scene.mapping is None else
                  {"mapping": "contracted", "even": scene.mapping.even, "far": FAR * scene.mapping.even},
+        "motion": None if scene.motion is None else
+                  {"rows": scene.motion.symbols.shape[0], "nodes_zyx": list(scene.motion.symbols.shape[1:4]),
+                   "largest": float(np.abs(scene.motion.dequantise()).max())},
         "background": scene.background.tolist(),
         "scales": [_describe_scale(scale) for scale in scene.scales],
         "decoder": {"features": len(scene.decoder.density_weight), "hidden": len(scene.decoder.b1)},
@@ -149,6 +152,7 @@ def _page(info: dict[str, Any]) -> str:
         f"  clip        {clip['frame_count']} frames at {clip['fps']:g} fps, {clip['duration_s']:.2f} s, {kind}",
         f"  box         {_corner(info['aabb'][0])} to {_corner(info['aabb'][1])}, ray step {info['step']:.4g}",
         *_space(info["space"]),
+        *_motion(info["motion"]),
         f"  cameras     {info['cameras']}"
         + (f" within {_corner(info['camera_box'][0])} to {_corner(info['camera_box'][1])}" if info["cameras"] else ""),
         f"  occupancy   {occupancy['slots']} x {'x'.join(map(str, reversed(occupancy['cells_zyx'])))} cells, "
@@ -182,6 +186,13 @@ def _space(space: Mapping[str, Any]) -> list[str]:
     if space["mapping"] == "box":
         return []
     return [f"  space       contracted beyond the box; even steps up to {space['even']:.4g}, rays end at {space['far']:.4g}"]
+
+
+def _motion(motion: Mapping[str, Any] | None) -> list[str]:
+    if motion is None:
+        return []
+    nodes = "x".join(map(str, reversed(motion["nodes_zyx"])))
+    return [f"  motion      {motion['rows']} x {nodes} nodes, displacements up to {motion['largest']:.3f} of the box"]
 
 
 def _corner(point: Sequence[float]) -> str:
