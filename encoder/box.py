@@ -5,7 +5,7 @@ from numba import njit, prange
 
 from kpc.encoder.datasets.dataset import Pictures
 from kpc.format.errors import DatasetError
-from kpc.format.space import Contraction, expand
+from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping, expand
 
 CLEAR = 0.3
 """Share of a camera's distance to the scene's middle, around it, where nothing is."""
@@ -86,8 +86,39 @@ def contraction_of(pictures: Pictures, aabb: np.ndarray) -> Contraction:
     return Contraction(float(np.quantile(np.linalg.norm(corners, axis=1), 0.9)))
 
 
+def device_coordinates_of(pictures: Pictures) -> tuple[DeviceCoordinates, np.ndarray]:
+    """Device coordinates for a rig that faces one way, and the (2, 3) float32 box there of all that lies between near and far.
+
+    They are those of a camera that looks as all cameras look on average, from the middle of the rig as far forward as the
+    foremost. The baseline is twice the distance of the outermost camera from the middle; near is the least depth of any
+    camera's near plane.
+
+    Raises:
+        DatasetError: a camera's near or far is not known, or the cameras do not face one way: what one of them sees from near on
+            lies less than a tenth of that depth before the foremost camera.
+    """
+    cameras = _distinct_cameras(pictures)
+    if not (np.all(np.isfinite(pictures.near[cameras])) and np.all(np.isfinite(pictures.far[cameras]))):
+        raise DatasetError("device coordinates need each camera's near and far; try --space contracted")
+    poses = pictures.camera_to_world[cameras, :3]
+    eyes, back = poses[:, :, 3], poses[:, :, 2].mean(0)
+    back = back / max(np.linalg.norm(back), 1e-9)
+    right = np.cross(poses[:, :, 1].mean(0), back)
+    right = right / max(np.linalg.norm(right), 1e-9)
+    middle = eyes.mean(0)
+    eye = middle + back * ((eyes - middle) @ back).min()
+    corners = np.concatenate([_frustum(pictures, p) for p in cameras])
+    near, typical = float(((eye - corners) @ back).min()), float(np.median(pictures.near[cameras]))
+    baseline = 2 * float(np.linalg.norm(eyes - middle, axis=1).max())
+    if not (near > typical / 10 and baseline > 0):
+        raise DatasetError("the cameras do not face one way; try --space box or contracted")
+    mapping = DeviceCoordinates(np.stack([right, np.cross(back, right), back, eye], axis=1), near, baseline)
+    places = mapping.place(corners)
+    return mapping, np.stack([places.min(0), places.max(0)]).astype(np.float32)
+
+
 def seen_cells(
-    pictures: Pictures, aabb: np.ndarray, shape: tuple[int, int, int], mapping: Contraction | None = None, at_least: int = 2
+    pictures: Pictures, aabb: np.ndarray, shape: tuple[int, int, int], mapping: SpaceMapping | None = None, at_least: int = 2
 ) -> np.ndarray:
     """Cells of an (Nz, Ny, Nx) grid over what the planes cover whose centre at least so many distinct cameras see: bool.
 
@@ -96,12 +127,14 @@ def seen_cells(
     point all of them look at, in any direction: a camera that moves would else carry each of its pictures before it.
     """
     nz, ny, nx = shape
-    low, edges = (aabb[0], aabb[1] - aabb[0]) if mapping is None else (np.zeros(3), np.ones(3))
+    low, edges = (np.zeros(3), np.ones(3)) if isinstance(mapping, Contraction) else (aabb[0], aabb[1] - aabb[0])
     axes = [low[a] + (np.arange(n) + 0.5) / n * edges[a] for a, n in enumerate((nx, ny, nz))]
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     centres = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    if mapping is not None:
+    if isinstance(mapping, Contraction):
         centres = expand(centres, aabb)
+    elif mapping is not None:
+        centres = mapping.expand(centres)
     cameras = _distinct_cameras(pictures)
     focus = _focus(pictures, cameras)
     poses = pictures.camera_to_world[cameras, :3].astype(np.float64)

@@ -24,7 +24,7 @@ class SceneRenderer:
         self.scene, self.field = scene, Field.from_scene(scene)
 
     def rgb(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """(N, 3) float32 colours of (N, 3) origins, (N, 3) unit directions and (N,) times."""
+        """(N, 3) float32 colours of (N, 3) origins, (N, 3) unit directions and (N,) times; rays as `datasets.rays` makes them."""
         return self.render(origins, directions, times)[0]
 
     def render(
@@ -52,7 +52,7 @@ class SceneRenderer:
         pictures = dataset.pictures
         w, h = int(pictures.width[number]), int(pictures.height[number])
         row, column = np.divmod(np.arange(w * h), w)
-        origins, directions = rays(pictures, np.full(w * h, number), column, row)
+        origins, directions = rays(pictures, np.full(w * h, number), column, row, self.scene.mapping)
         return self.rgb(origins, directions, np.full(w * h, pictures.time[number], np.float32)).reshape(h, w, 3)
 
 

@@ -16,7 +16,7 @@ from kpc.encoder.config import TrainConfig
 from kpc.format.scene import (
     ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Clip, Decoder, Scene,
 )
-from kpc.format.space import Contraction
+from kpc.format.space import Contraction, SpaceMapping
 
 AXES = "xyzt"
 
@@ -161,7 +161,7 @@ class Field(nn.Module):
 
     def to_scene(
         self, aabb: np.ndarray, clip: Clip, occupancy: np.ndarray, background: np.ndarray, step: float,
-        mapping: Contraction | None = None,
+        mapping: SpaceMapping | None = None,
     ) -> Scene:
         """The field as data; the planes are copied."""
         names = ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES
@@ -243,13 +243,13 @@ class Rays:
     backgrounds: Tensor
 
 
-def place(points: Tensor, t: Tensor, aabb: Tensor, mapping: Contraction | None) -> tuple[Tensor, Tensor]:
+def place(points: Tensor, t: Tensor, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
     """Places (..., 3) of world points in [0, 1]^3, and what a step there counts, `kpc.format.space.Contraction.stretch`.
 
     `t` (...): how far along their rays they lie.
     """
     u = (points - aabb[0]) / (aabb[1] - aabb[0])
-    if mapping is None:
+    if not isinstance(mapping, Contraction):
         return u, torch.ones_like(t)
     y = 2 * u - 1
     radius = y.abs().amax(-1).clamp(min=1)
@@ -259,7 +259,7 @@ def place(points: Tensor, t: Tensor, aabb: Tensor, mapping: Contraction | None) 
 
 def render_reference(
     field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, kept: Tensor | None = None,
-    mapping: Contraction | None = None,
+    mapping: SpaceMapping | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Colours of a batch of rays, in plain PyTorch: the reference of `kernels.backpropagate`.
 
@@ -276,13 +276,13 @@ def render_reference(
     t0, t1 = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse
     near = torch.minimum(t0, t1).nan_to_num(-torch.inf).amax(1).clamp(min=0)
     far = torch.maximum(t0, t1).nan_to_num(torch.inf).amin(1)
-    if mapping is not None:
+    if isinstance(mapping, Contraction):
         near, far = torch.zeros_like(near), torch.full_like(far, mapping.end)
     longest = float((far - near).clamp(min=0).max())
     k = torch.arange(max(1, math.ceil(longest / step)), device=near.device)
     s = near[:, None] + (k + rays.jitters[:, None]) * step
     t = s
-    if mapping is not None:
+    if isinstance(mapping, Contraction):
         t = torch.where(s <= mapping.even, s, mapping.even / (2 - s.clamp(max=mapping.end) / mapping.even))
     u, stretch = place(rays.origins[:, None] + t[..., None] * rays.directions[:, None], t, aabb, mapping)
     size = torch.tensor(occupancy.shape[:0:-1], device=u.device)

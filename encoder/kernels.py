@@ -24,7 +24,7 @@ import numpy as np
 from numba import njit, prange
 
 from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION
-from kpc.format.space import FAR, Contraction
+from kpc.format.space import FAR, Contraction, SpaceMapping
 
 _LIMIT = np.float32(LOG_DENSITY_LIMIT)
 _TERMINATION = np.float32(TERMINATION)
@@ -48,9 +48,9 @@ _inlined = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True,
 _parallel = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, parallel=True)
 
 
-def even_of(mapping: Contraction | None) -> np.float32 | None:
-    """`even`, as the kernels take it."""
-    return None if mapping is None else np.float32(mapping.even)
+def even_of(mapping: SpaceMapping | None) -> np.float32 | None:
+    """`even`, as the kernels take it. Rays in device coordinates come as such: to the kernels those are a box."""
+    return np.float32(mapping.even) if isinstance(mapping, Contraction) else None
 
 
 @_jit

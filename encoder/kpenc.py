@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kpc.encoder.box import contraction_of, find_box, find_inner_box, reaches_beyond, seen_cells
+from kpc.encoder.box import contraction_of, device_coordinates_of, find_box, find_inner_box, reaches_beyond, seen_cells
 from kpc.encoder.compress import compress, compress_to_size, relative_steps
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
@@ -31,7 +31,7 @@ from kpc.format.errors import DatasetError, TrainingError, UsageError
 from kpc.format.progress import Progress
 from kpc.format.quantise import QuantisedScene
 from kpc.format.scene import Scene
-from kpc.format.space import FAR, Contraction
+from kpc.format.space import FAR, Contraction, DeviceCoordinates, SpaceMapping
 
 PROBE_RAYS = 1 << 15
 """Training rays on which the loss of quantisation is measured."""
@@ -40,6 +40,13 @@ MOST_CAMERAS = 32
 """Cameras of the dataset that the file names."""
 
 CHECKPOINT = "checkpoint.kpck"
+
+SPACES = {
+    type(None): ("box", "a box, nothing outside it"),
+    Contraction: ("contracted", "contracted beyond a box"),
+    DeviceCoordinates: ("ndc", "device coordinates of a rig that faces one way"),
+}
+"""How --space calls a mapping, and what the log says of it."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -105,7 +112,7 @@ def encode(options: Options) -> dict[str, Any]:
     return {
         "file": str(options.output), "layout": dataset.layout, "dynamic": dataset.is_dynamic, "preset": options.preset,
         "seed": options.seed, "device": str(trainer.device), "box": trainer.aabb.tolist(),
-        "space": "box" if trainer.mapping is None else "contracted",
+        "space": SPACES[type(trainer.mapping)][0],
         "test_psnr": test and test.psnr, "test_ssim": test and test.ssim, "test_pictures": test.pictures if test else 0,
         "coding_loss_db": before.psnr - test.psnr if test and before else probe_loss,
         "size_bytes": size, "parameters": quantised.parameter_count,
@@ -154,13 +161,13 @@ def _trainer(options: Options) -> Trainer:
         _remove_if_empty(work)
         raise
     _say(dataset.describe())
-    _say(f"space: {'a box, nothing outside it' if mapping is None else 'contracted beyond a box'} ({why})")
+    _say(f"space: {SPACES[type(mapping)][1]} ({why})")
     config, resumes, survey_s = options.config(dataset), options.resume and checkpoint.exists(), 0.0
-    if options.box is None and mapping is None:
+    if options.box is None and not isinstance(mapping, Contraction):
         if resumes:
             aabb = box_of_checkpoint(checkpoint)
         else:
-            aabb, survey_s = _trimmed(dataset, config, aabb, options.time_budget_s)
+            aabb, survey_s = _trimmed(dataset, config, aabb, options.time_budget_s, mapping)
     trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping)
     _say(_plan(trainer))
     if resumes:
@@ -201,10 +208,12 @@ def quantise(trainer: Trainer, scene: Scene, target_bytes: int | None = None) ->
     return quantised, fidelity(scene) - fidelity(quantised.dequantise())
 
 
-def _trimmed(dataset: Dataset, config: TrainConfig, aabb: np.ndarray, time_budget_s: float | None) -> tuple[np.ndarray, float]:
+def _trimmed(
+    dataset: Dataset, config: TrainConfig, aabb: np.ndarray, time_budget_s: float | None, mapping: DeviceCoordinates | None
+) -> tuple[np.ndarray, float]:
     """The box cut down to where something is, and the seconds that took."""
     with Progress("survey", total=1000, unit="‰") as progress:
-        return trim_box(dataset, config, aabb, lambda r: _show(progress, r), time_budget_s=time_budget_s)
+        return trim_box(dataset, config, aabb, lambda r: _show(progress, r), time_budget_s=time_budget_s, mapping=mapping)
 
 
 def _train(trainer: Trainer, checkpoint: Path, time_budget_s: float | None) -> None:
@@ -257,8 +266,11 @@ def _plan(trainer: Trainer) -> str:
     layout, (lo, hi) = trainer.field.layout, trainer.aabb
     corners = " to ".join(" ".join(f"{v:.4g}" for v in corner) for corner in (lo, hi))
     planes = ", ".join("x".join(str(n) for n in row if n) for row in layout.resolution)
-    beyond = "" if trainer.mapping is None else (
-        f" and all around it, even steps up to {trainer.mapping.even:.4g}, rays to {FAR * trainer.mapping.even:.4g}")
+    beyond, mapping = "", trainer.mapping
+    if isinstance(mapping, Contraction):
+        beyond = f" and all around it, even steps up to {mapping.even:.4g}, rays to {FAR * mapping.even:.4g}"
+    elif mapping is not None:
+        beyond = f" of device coordinates, near {mapping.near:.4g}, baseline {mapping.baseline:.4g}"
     nodes = "" if trainer.field.motion is None else (
         f", read where a motion grid of {'x'.join(str(n) for n in trainer.field.motion.shape[2::-1])} nodes leads")
     return (f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
@@ -276,10 +288,18 @@ def _spread_of_cameras(dataset: Dataset) -> list[int]:
     return [int(first[central])] + [int(p) for i, p in enumerate(first) if i != central]
 
 
-def _space_of(dataset: Dataset, options: Options) -> tuple[np.ndarray, Contraction | None, str]:
+def _space_of(dataset: Dataset, options: Options) -> tuple[np.ndarray, SpaceMapping | None, str]:
     """The box asked for or found, (2, 3) float32, within what a file can hold; how space beyond it is held; and why so."""
     beyond, why = reaches_beyond(dataset.pictures, dataset.has_alpha)
     contracted = beyond if options.space == "auto" else options.space == "contracted"
+    if options.space == "ndc":
+        if options.box is not None:
+            raise UsageError("--box is in world units, device coordinates have a box of their own: drop --box or --space ndc")
+        try:
+            mapping, aabb = device_coordinates_of(dataset.pictures)
+        except DatasetError as error:
+            raise DatasetError(f"{options.source}: {error}") from error
+        return aabb, mapping, "as told"
     if options.box is not None:
         aabb = np.array(options.box, np.float32).reshape(2, 3)
     else:

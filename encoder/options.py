@@ -55,8 +55,9 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first (default: 1)")
     parser.add_argument("--holdout", metavar="NAME", help="camera or file to test on, or 'none'")
-    parser.add_argument("--space", choices=("auto", "box", "contracted"), default="auto",
-                        help="box: nothing lies outside it; contracted: the surroundings are held, too (default: auto)")
+    parser.add_argument("--space", choices=("auto", "box", "contracted", "ndc"), default="auto",
+                        help="box: nothing lies outside it; contracted: the surroundings are held, too; ndc: device coordinates, "
+                             "for cameras that face one way (default: auto)")
     parser.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1",
                         help="corners of the scene, or of its undistorted part, taken as they are, instead of those found")
     parser.add_argument("--work", type=Path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)")

@@ -24,7 +24,7 @@ from kpc.encoder.occupancy import OccupancyGrid, grid_shape
 from kpc.format.cli import written_aside
 from kpc.format.errors import TrainingError
 from kpc.format.scene import SPACE_PLANES, Scene
-from kpc.format.space import Contraction
+from kpc.format.space import Contraction, SpaceMapping
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 """Adam's constants as Instant-NGP sets them for grids (arXiv:2201.05989, section 4)."""
@@ -64,12 +64,12 @@ class Trainer:
 
     def __init__(
         self, dataset: Dataset, config: TrainConfig, aabb: np.ndarray, device: str, elapsed_s: float = 0.0,
-        mapping: Contraction | None = None,
+        mapping: SpaceMapping | None = None,
     ) -> None:
         self.dataset, self.config, self.device, self.mapping = dataset, config, torch.device(device), mapping
         self.aabb = np.asarray(aabb, np.float32)
         self.extent = float(np.max(self.aabb[1] - self.aabb[0]))
-        steps_across = config.samples_across / (1 if mapping is None else 2)  # a box is half of contracted space
+        steps_across = config.samples_across / (2 if isinstance(mapping, Contraction) else 1)  # a box is half of contracted space
         self.step_length = self.extent / steps_across
         self.rng = np.random.default_rng(config.seed)
         layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
@@ -87,7 +87,7 @@ class Trainer:
         self.step = 0
         self.elapsed_s = elapsed_s
         self.samples_per_ray = float(config.samples_across)
-        self.sampler = RaySampler(dataset)
+        self.sampler = RaySampler(dataset, mapping)
         # Objects with alpha are shown on white. Elsewhere what the box leaves open is grey: the least wrong guess.
         self.background = np.full(3, 1.0 if dataset.has_alpha else 0.5, np.float32)
         self._weights: TileWeights | None = None
@@ -222,7 +222,7 @@ class Trainer:
         """
         state = {
             "config": asdict(self.config), "aabb": torch.from_numpy(self.aabb), "step": self.step, "elapsed_s": self.elapsed_s,
-            "even": self.mapping and self.mapping.even,
+            "mapping": repr(self.mapping),
             "samples_per_ray": self.samples_per_ray, "field": self.field.state_dict(), "optimiser": self.optimiser.state(),
             "grid": self.grid.state(), "rng": _rng_to_plain(self.rng), "dataset": _fingerprint(self.dataset),
         }
@@ -249,8 +249,8 @@ class Trainer:
         try:
             state = _load(path, self.device)
             same = _comparable(state["config"]) == _comparable(asdict(self.config))
-            even = self.mapping and self.mapping.even
-            if not same or not np.array_equal(state["aabb"].cpu().numpy(), self.aabb) or state.get("even") != even:
+            here = np.array_equal(state["aabb"].cpu().numpy(), self.aabb) and state.get("mapping") == repr(self.mapping)
+            if not same or not here:
                 raise TrainingError(f"{path}: belongs to a run with other settings; give the same ones or drop --resume")
             if state["dataset"] != _fingerprint(self.dataset):
                 raise TrainingError(f"{path}: belongs to a run on other pictures; give the same dataset, --holdout and "
@@ -278,8 +278,8 @@ class RaySampler:
     MARGIN = 0.03
     """Of a picture's longer side, about what is not transparent: the outline wants to be learnt from both sides."""
 
-    def __init__(self, dataset: Dataset) -> None:
-        self.dataset = dataset
+    def __init__(self, dataset: Dataset, mapping: SpaceMapping | None = None) -> None:
+        self.dataset, self.mapping = dataset, mapping
         self.train = np.flatnonzero(~dataset.pictures.is_test)
         self.ends = np.cumsum(dataset.usable_counts[self.train])
         self.frames: np.ndarray | None = None
@@ -314,7 +314,7 @@ class RaySampler:
         order = np.argsort(pictures.time[picture], kind="stable")
         picture, row, column = picture[order], row[order], column[order]
         inside = row * pictures.width[picture] + column
-        origins, directions = rays(pictures, picture, column, row)
+        origins, directions = rays(pictures, picture, column, row, self.mapping)
         colours = self.dataset.pixels.read(pictures.offset[picture] + inside).astype(np.float32) / np.float32(255)
         if background is None:
             backgrounds = rng.random((count, 3), dtype=np.float32)
@@ -359,7 +359,7 @@ class FusedOptimiser:
     """A step on the CPU: fused kernels for the planes, PyTorch for the small decoder."""
 
     def __init__(
-        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: Contraction | None = None
+        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: SpaceMapping | None = None
     ) -> None:
         self.field, self.config, self.mapping = field, config, mapping
         self.watch = Stopwatch()
@@ -437,7 +437,7 @@ class PlainOptimiser:
     """A step in plain PyTorch, on any device that PyTorch knows."""
 
     def __init__(
-        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: Contraction | None = None
+        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: SpaceMapping | None = None
     ) -> None:
         self.field, self.config, self.mapping = field, config, mapping
         self.watch = Stopwatch()
@@ -522,9 +522,9 @@ def motion_of(field: Field) -> np.ndarray | None:
     return None if field.motion is None else field.motion.detach().numpy()
 
 
-def sample_capacity(aabb: np.ndarray, step_length: float, mapping: Contraction | None = None) -> int:
+def sample_capacity(aabb: np.ndarray, step_length: float, mapping: SpaceMapping | None = None) -> int:
     """Samples a ray can take at most: the box's diagonal in steps, or all of a ray through contracted space."""
-    longest = np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64)) if mapping is None else mapping.end
+    longest = np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64)) if not isinstance(mapping, Contraction) else mapping.end
     return int(longest / step_length) + 2
 
 

@@ -9,6 +9,7 @@ from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.train import Report, Trainer
+from kpc.format.space import DeviceCoordinates
 
 MOST_STEPS = 300
 LEAST_STEPS = 100
@@ -26,7 +27,7 @@ MARGIN = 0.04
 
 def trim_box(
     dataset: Dataset, config: TrainConfig, aabb: np.ndarray, report: Callable[[Report], None], *,
-    time_budget_s: float | None = None,
+    time_budget_s: float | None = None, mapping: DeviceCoordinates | None = None,
 ) -> tuple[np.ndarray, float]:
     """The part of a (2, 3) box that holds what the pictures show, and the seconds it took to find out.
 
@@ -42,7 +43,7 @@ def trim_box(
         return aabb, 0.0
     coarse = replace(config, resolutions=(32, 64), channels=8, motion_cells=0, channel_dropout=0.0, temporal_start=1.0,
                      samples_across=160, cells_across=64, steps=steps, occupancy_start=64)
-    trainer = Trainer(dataset, coarse, aabb, "cpu")
+    trainer = Trainer(dataset, coarse, aabb, "cpu", mapping=mapping)
     trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10)
     if trainer.step < LEAST_STEPS:
         return aabb, trainer.elapsed_s

@@ -27,7 +27,7 @@ from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
-from kpc.format.space import Contraction
+from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 
 Parsed = TypeVar("Parsed")
 
@@ -39,6 +39,8 @@ SCALE_STRUCT = struct.Struct("<5H")
 """channels, Nx, Ny, Nz, T (0 in a static scene)"""
 WARP_STRUCT = struct.Struct("<Id")
 """which mapping (CONTRACTED), even"""
+NDC_STRUCT = struct.Struct("<I12ddd")
+"""which mapping (DEVICE_COORDINATES), rows of the frame, near, baseline"""
 MOTION_STRUCT = struct.Struct("<4Hf")
 """T, Nz, Ny, Nx, step"""
 DECODER_STRUCT = struct.Struct("<HHf")
@@ -48,7 +50,7 @@ OCCUPANCY_STRUCT = struct.Struct("<4H")
 CAMERA_STRUCT = struct.Struct("<HH16f")
 """width, height, fl_x, fl_y, cx, cy, the first three rows of camera_to_world"""
 
-CONTRACTED = 1
+CONTRACTED, DEVICE_COORDINATES = 1, 2
 
 SCALE_LIMIT = 16
 CHANNEL_LIMIT = 256
@@ -60,6 +62,8 @@ CAMERA_LIMIT = 4096
 FRAME_LIMIT = 1 << 24
 SAMPLE_LIMIT = 65536
 """Samples along the box's diagonal, or along a ray through contracted space, so that no file can make a ray endless."""
+FRAME_TOLERANCE = 1e-4
+"""Of the products of the axes of a frame that should be 0 or 1."""
 BOX_LIMIT = 1 << 30
 """Magnitude of a corner of the box or a number of a camera, world units; a 1 over it bounds the box's edges below."""
 
@@ -142,8 +146,8 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
         _check_planes(scene, parsed)
         chunks = [Chunk("SCNE", [head])]
         if scene.mapping is not None:
-            warp = WARP_STRUCT.pack(CONTRACTED, scene.mapping.even)
-            _parse_mapping(warp, parsed.step)
+            warp = _pack_mapping(scene.mapping)
+            _parse_mapping(warp, parsed)
             chunks.append(Chunk("WARP", [warp]))
         if scene.motion is not None:
             move = _pack_motion(scene.motion)
@@ -213,6 +217,12 @@ def _pack_decoder(decoder: Decoder, features: int) -> bytes:
         raise FormatError("decoder: the weights are not rounded to float16 (kpc.format.quantise.round_decoder)")
     return b"".join([DECODER_STRUCT.pack(features, hidden, decoder.density_bias),
                      *(np.asarray(w).astype("<f2").tobytes() for w in weights)])
+
+
+def _pack_mapping(mapping: SpaceMapping) -> bytes:
+    if isinstance(mapping, Contraction):
+        return WARP_STRUCT.pack(CONTRACTED, mapping.even)
+    return NDC_STRUCT.pack(DEVICE_COORDINATES, *np.ravel(mapping.frame), mapping.near, mapping.baseline)
 
 
 def _pack_motion(motion: QuantisedMotion) -> bytes:
@@ -312,12 +322,12 @@ class SceneReader(Reader):
         payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * (1 + texels))
         return self._parsed(lambda raw: decode_segment(raw, entry.row_count, plane.columns, plane.channels), payload)
 
-    def mapping(self) -> Contraction | None:
+    def mapping(self) -> SpaceMapping | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""
         number = self._at_most_one("WARP")
         if number is None:
             return None
-        return self._parsed(lambda raw: _parse_mapping(raw, self.head.step), self.chunk(number, WARP_STRUCT.size))
+        return self._parsed(lambda raw: _parse_mapping(raw, self.head), self.chunk(number, NDC_STRUCT.size))
 
     def motion(self) -> QuantisedMotion | None:
         """The MOVE chunk; None, a scene in which nothing is displaced, if the file has no such chunk."""
@@ -422,12 +432,24 @@ def _parse_head(raw: bytes) -> SceneHead:
     return SceneHead(aabb, Clip(frame_count, fps), step, background, scales)
 
 
-def _parse_mapping(raw: bytes, step: float) -> Contraction:
-    cursor = _Cursor(raw, "WARP")
-    mapping, even = cursor.unpack(WARP_STRUCT)
+def _parse_mapping(raw: bytes, head: SceneHead) -> SpaceMapping:
+    cursor, step = _Cursor(raw, "WARP"), head.step
+    kind = int.from_bytes(raw[:4], "little")
+    if kind == DEVICE_COORDINATES:
+        _, *frame, near, baseline = cursor.unpack(NDC_STRUCT)
+        cursor.finish()
+        mapping = DeviceCoordinates(np.reshape(frame, (3, 4)), near, baseline)
+        turned = mapping.frame[:, :3].T @ mapping.frame[:, :3] - np.eye(3)
+        within = [1 / BOX_LIMIT <= x <= BOX_LIMIT for x in (near, baseline)]
+        if not all(within) or not (np.abs(mapping.frame) <= BOX_LIMIT).all() or not (np.abs(turned) < FRAME_TOLERANCE).all() \
+                or not head.aabb[1, 2] < baseline / near:  # False for NaN, too
+            raise FormatError(f"WARP: device coordinates of near {near} and baseline {baseline}, their frame or the box in them "
+                              "make no sense")
+        return mapping
+    if kind != CONTRACTED:
+        raise FormatError(f"WARP: mapping {kind} of space, unknown to this reader; update kpc")
+    _, even = cursor.unpack(WARP_STRUCT)
     cursor.finish()
-    if mapping != CONTRACTED:
-        raise FormatError(f"WARP: mapping {mapping} of space, unknown to this reader; update kpc")
     if not (1 / BOX_LIMIT <= even <= BOX_LIMIT and 2 * even / step <= SAMPLE_LIMIT):  # False for NaN, too
         raise FormatError(f"WARP: even steps of {step} up to a distance of {even} make no sense")
     return Contraction(even)

@@ -16,7 +16,7 @@ from kpc.format.cameras import Camera
 from kpc.format.errors import FormatError
 from kpc.format.motion import QuantisedMotion, places_reached, quantise_motion
 from kpc.format.scene import TIME_PLANES, Clip, Decoder, Scene
-from kpc.format.space import Contraction
+from kpc.format.space import SpaceMapping
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
 
@@ -113,7 +113,7 @@ class QuantisedScene:
     background: np.ndarray
     step: float
     cameras: tuple[Camera, ...] = field(default=())
-    mapping: Contraction | None = None
+    mapping: SpaceMapping | None = None
     motion: QuantisedMotion | None = None
 
     def dequantise(self) -> Scene:

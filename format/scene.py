@@ -10,13 +10,14 @@ With a motion grid the planes are read elsewhere, `kpc.format.motion`. Density a
     rgb   = sigmoid(f . basis_{R,G,B}(d))                               basis(d) = direction MLP, once a ray
 """
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from kpc.format.cameras import Camera
-from kpc.format.space import Contraction
+from kpc.format.space import DeviceCoordinates, SpaceMapping
 
 SPACE_PLANES = ("xy", "xz", "yz")
 TIME_PLANES = ("xt", "yt", "zt")
@@ -68,7 +69,8 @@ class Scene:
     """A radiance field that can be rendered at any time in [0, 1] from anywhere.
 
     Attributes:
-        aabb: (2, 3) float32, lower and upper corner of the box, world units; with a mapping, of what it leaves undistorted.
+        aabb: (2, 3) float32, lower and upper corner of the box, world units. With a contraction, of what it leaves undistorted;
+            with device coordinates, in those.
         clip: its time axis.
         scales: coarse to fine; each maps plane names to (rows, columns, M) float32. The plane's first letter is the column
             axis, the second the row axis: "xy" is (Ny, Nx, M), "xt" is (T, Nx, M). Static scenes hold SPACE_PLANES only,
@@ -78,7 +80,7 @@ class Scene:
         occupancy: (slots, Nz, Ny, Nx) bool. A cell that is False holds nothing while its slot of time lasts;
             slot k of K lasts over [k/K, (k+1)/K) of the clip, the last one includes time 1.
         background: (3,) float32 in [0, 1], seen where a ray ends with transmittance left.
-        step: distance between samples along a ray, world units; where there is a mapping, in its s.
+        step: distance between samples along a ray, world units; with a contraction in its s, in device coordinates in those.
         cameras: a few cameras the scene was filmed from, the first a good one to open on.
         mapping: how what lies outside the box is held, too; None: nothing does.
         motion: (T, Nz, Ny, Nx, 3) float32, displacements at the nodes of a grid over time and space, in box edges (of what the
@@ -93,7 +95,7 @@ class Scene:
     background: np.ndarray
     step: float
     cameras: tuple[Camera, ...] = field(default=())
-    mapping: Contraction | None = None
+    mapping: SpaceMapping | None = None
     motion: np.ndarray | None = None
 
     @property
@@ -104,6 +106,15 @@ class Scene:
     def extent(self) -> float:
         """Longest edge of the box, the unit of length in which density is expressed."""
         return float(np.max(self.aabb[1] - self.aabb[0]))
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """(2, 3) float64, world units: the box, or the smallest one around what it is in the world."""
+        aabb = self.aabb.astype(np.float64)
+        if not isinstance(self.mapping, DeviceCoordinates):
+            return aabb
+        corners = self.mapping.expand(np.array(list(itertools.product(*aabb.T))))
+        return np.stack([corners.min(0), corners.max(0)])
 
     @property
     def parameter_count(self) -> int:

@@ -32,9 +32,9 @@ class Rig:
 
     @staticmethod
     def of(scene: Scene) -> "Rig":
-        cameras = scene.cameras or (_made_up(scene.aabb),)
+        cameras = scene.cameras or (_made_up(scene.bounds),)
         poses = np.stack([camera.camera_to_world for camera in cameras])
-        return Rig(_focus(poses, scene.aabb.astype(np.float64)), _up(poses), cameras)
+        return Rig(_focus(poses, scene.bounds), _up(poses), cameras)
 
     def angles(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Azimuth, elevation (radians) and distance of each camera, seen from the focus; the first has azimuth 0."""

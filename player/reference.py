@@ -5,7 +5,8 @@ A ray o + t d with |d| = 1 enters the box at t_near and leaves it at t_far. Its 
     t_k = t_near + (k + 1/2) step,   k = 0, 1, ... while t_k < t_far,
 
 and count where the occupancy grid is set. (In contracted space `kpc.format.space.Contraction` says where they lie, and what
-a step counts in the next line.) With sigma per longest edge of the box ("extent"), from trans = 1 on:
+a step counts in the next line. In device coordinates o, d and t are those of `kpc.format.space.Path`, all but the depth's t.)
+With sigma per longest edge of the box ("extent"), from trans = 1 on:
 
     alpha = 1 - exp(-sigma step / extent)      weight = trans alpha      trans <- trans - weight
 
@@ -23,7 +24,7 @@ from kpc.format.cameras import Camera
 from kpc.format.grid import linear, tap
 from kpc.format.motion import moved
 from kpc.format.scene import LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Decoder, Scene
-from kpc.format.space import contract
+from kpc.format.space import Contraction, DeviceCoordinates, contract
 
 RAYS_AT_ONCE = 8192
 STEPS_AT_ONCE = 16
@@ -130,14 +131,14 @@ def box_range(aabb: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> 
 
 def sample_range(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where the samples of rays begin and end, (N,) each: as `box_range`; in contracted space in its s."""
-    if scene.mapping is None:
+    if not isinstance(scene.mapping, Contraction):
         return box_range(scene.aabb, origins, directions)
     return np.zeros(len(origins), np.float32), np.full(len(origins), scene.mapping.end, np.float32)
 
 
 def places(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
     """Of samples at s (N, K) on N rays: distance t (N, K), place u (N, K, 3) in the planes, what a step counts (N, K)."""
-    if scene.mapping is None:
+    if not isinstance(scene.mapping, Contraction):
         size = (scene.aabb[1] - scene.aabb[0]).astype(np.float32)
         return s, (origins[:, None] + s[..., None] * directions[:, None] - scene.aabb[0]) / size, np.ones_like(s)
     t = scene.mapping.distance(s)
@@ -205,7 +206,10 @@ def composite(alphas: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _march(scene: Scene, moment: Moment, origins: np.ndarray, directions: np.ndarray) -> Rendering:
-    n = len(origins)
+    n, path = len(origins), None
+    if isinstance(scene.mapping, DeviceCoordinates):
+        path = scene.mapping.path(origins, directions)
+        origins, directions = path.begin, path.way
     near, far = sample_range(scene, origins, directions)
     basis = direction_basis(scene.decoder, directions).astype(np.float32)
     rgb, depth = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
@@ -232,7 +236,8 @@ def _march(scene: Scene, moment: Moment, origins: np.ndarray, directions: np.nda
         seen = weight[:, None] * colour(f, basis[ray])
         for channel in range(3):
             rgb[:, channel] += np.bincount(ray, seen[:, channel], n).astype(np.float32)
-        depth += np.bincount(ray, weight * t[row, column], n).astype(np.float32)
+        distance = t if path is None else path.distance(s, rays)
+        depth += np.bincount(ray, weight * distance[row, column], n).astype(np.float32)
         samples += np.bincount(ray, minlength=n).astype(np.int32)
 
         first += STEPS_AT_ONCE

@@ -12,6 +12,7 @@ from kpc.format.cameras import Camera
 from kpc.format.errors import DisplayError
 from kpc.format.grid import linear
 from kpc.format.scene import Scene
+from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
 from kpc.player.reference import Part, Rendering, slot_at
 from kpc.player.textures import FOLDED_AXIS, Layout, Rows, decoder_arrays, distances
@@ -256,7 +257,8 @@ class Renderer:
                 "LAYERS": layout.layers,
                 "HIDDEN": len(scene.decoder.b1),
                 "ROWS": int(with_rows),
-                "CONTRACTED": int(scene.mapping is not None),
+                "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
+                "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
                 "MOTION": int(displaced),
                 "REFINED": layout.refined,
             },
@@ -279,7 +281,8 @@ class Renderer:
             box_high=tuple(scene.aabb[1]),
             background=tuple(scene.background),
             stride=scene.step,
-            even=scene.mapping.even if scene.mapping else 0.0,
+            even=scene.mapping.even if isinstance(scene.mapping, Contraction) else 0.0,
+            **_frame_of(scene.mapping),
             tau=scene.step / scene.extent,
         )
         entry = self._programs[key] = program, self.ctx.vertex_array(program, [])
@@ -346,6 +349,13 @@ def _set(program: moderngl.Program, **values: object) -> None:
         member = program.get(name, None)
         if isinstance(member, moderngl.Uniform):
             member.value = value
+
+
+def _frame_of(mapping: SpaceMapping | None) -> dict[str, object]:
+    """The uniforms of device coordinates."""
+    if not isinstance(mapping, DeviceCoordinates):
+        return {}
+    return {"frame": tuple(mapping.frame.T.ravel()), "near": mapping.near, "baseline": mapping.baseline}
 
 
 def _read(target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -127,7 +127,9 @@ def decode(data, partial=False):
     values = sum(p["rows"] * p["columns"] * s["channels"] for s in scene["scales"] for p in s["planes"].values())
     require(values == value_count, "value count")
     require("WARP" not in parts or parts["WARP"] is not None, "no WARP chunk")
-    scene["even"] = warp_chunk(Bytes(parts["WARP"]), scene["step"]) if "WARP" in parts else None
+    scene |= {"even": None, "frame": None}
+    if "WARP" in parts:
+        scene |= warp_chunk(Bytes(parts["WARP"]), scene)
     require("MOVE" not in parts or parts["MOVE"] is not None, "no MOVE chunk")
     scene["motion"] = motion_chunk(Bytes(parts["MOVE"]), scene["scales"]) if "MOVE" in parts else None
     scene |= decoder_chunk(Bytes(parts["DECO"]), sum(s["channels"] for s in scene["scales"]))
@@ -186,11 +188,23 @@ def scene_chunk(chunk):  # section 5
             "scales": scales}
 
 
-def warp_chunk(chunk, step):  # section 5
-    mapping, even = chunk.unpack("Id")
-    require(mapping == 1 and 2**-30 <= even <= 2**30 and 2 * even / step <= 65536, "mapping")
+def warp_chunk(chunk, scene):  # section 5
+    mapping, = chunk.unpack("I")
+    require(mapping in (1, 2), "mapping")
+    if mapping == 1:
+        even, = chunk.unpack("d")
+        require(2**-30 <= even <= 2**30 and 2 * even / scene["step"] <= 65536, "even")
+        chunk.end()
+        return {"even": even}
+    *frame, near, baseline = chunk.unpack("12ddd")
     chunk.end()
-    return even
+    require(all(2**-30 <= x <= 2**30 for x in (near, baseline)) and all(abs(x) <= 2**30 for x in frame), "device coordinates")
+    axes = [frame[column::4] for column in range(4)]  # right, up, backward, eye
+    for i in range(3):
+        for j in range(3):
+            require(abs(sum(a * b for a, b in zip(axes[i], axes[j])) - (i == j)) < 1e-4, "frame")
+    require(scene["aabb"][1][2] < baseline / near, "box")
+    return {"frame": axes, "near": near, "baseline": baseline}
 
 
 def motion_chunk(chunk, scales):  # section 5
@@ -265,6 +279,12 @@ def cameras_chunk(chunk):  # section 9
 def render_ray(scene, origin, direction, time):  # section 11
     """(rgb, opacity, depth) that a ray sees."""
     low, high = scene["aabb"]
+    world = float  # the distance in the world of one along the ray
+    if scene["frame"]:
+        path = device_path(scene, origin, direction)
+        if path is None:
+            return scene["background"], 0.0, math.inf
+        origin, direction, world = path
     extent = max(h - w for w, h in zip(low, high))
     t_in, t_out = -math.inf, math.inf
     for o, d, a, b in zip(origin, direction, low, high):
@@ -300,10 +320,31 @@ def render_ray(scene, origin, direction, time):  # section 11
         for c in range(3):
             logit = sum(a * b for a, b in zip(f, basis[c]))
             colour[c] += w / (1 + math.exp(-logit)) if logit > -700 else 0.0
-        depth += w * t_k
+        depth += w * world(t_k)
         T *= 1 - alpha
     opacity = 1 - T
     return [c + T * b for c, b in zip(colour, scene["background"])], opacity, depth / opacity if opacity else math.inf
+
+
+def device_path(scene, origin, direction):
+    """(origin, direction, distance in the world of one along it) in device coordinates; None for a ray that sees nothing."""
+    *axes, eye = scene["frame"]
+    x, y, z = (sum(a * (o - e) for a, o, e in zip(axis, origin, eye)) for axis in axes)
+    a, b, c = (sum(a * d for a, d in zip(axis, direction)) for axis in axes)
+    z, c = -z, -c
+    if c <= 0.0001:
+        return None
+    s_0 = max(0.0, (scene["near"] - z) / c)
+    x, y, z = x + s_0 * a, y + s_0 * b, z + s_0 * c
+    start = [x / z, y / z, scene["baseline"] * (1 / scene["near"] - 1 / z)]
+    v = [a / c - x / z, b / c - y / z, scene["baseline"] / z]
+    length = math.hypot(*v)
+
+    def world(r):
+        h = min(r / length, 0.999999)
+        return s_0 + z / c * h / (1 - h)
+
+    return start, [e / length for e in v], world
 
 
 def between(position, size):

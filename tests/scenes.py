@@ -7,7 +7,7 @@ import numpy as np
 
 from kpc.format.cameras import Camera
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Clip, Decoder, Scene
-from kpc.format.space import Contraction
+from kpc.format.space import Contraction, DeviceCoordinates
 
 
 def tiny_scene(seed: int = 0, dynamic: bool = True, scales: int = 2, channels: int = 8,
@@ -71,7 +71,17 @@ def displaced(scene: Scene, seed: int = 5, most: float = 0.06) -> Scene:
     return replace(scene, motion=np.random.default_rng(seed).uniform(-most, most, shape).astype(np.float32))
 
 
-SPACES: dict[str, Callable[[Scene], Scene]] = {"box": lambda scene: scene, "contracted": surrounded, "displaced": displaced}
+def faced(scene: Scene) -> Scene:
+    """A scene in device coordinates of a camera between its cameras and before them, so that some rays begin behind its near
+    plane and some beyond. It reaches to a depth of 50."""
+    frame = look_at((0.3, 0.9, 2.1), (0.1, 0.05, 0.05), 1, 1, 1.0).camera_to_world[:3]
+    aabb = np.array([[-0.8, -0.7, 0.1], [0.9, 0.6, 2 * (1 / 0.8 - 1 / 50)]], np.float32)
+    return replace(scene, mapping=DeviceCoordinates(frame, 0.8, 2.0), aabb=aabb)
+
+
+SPACES: dict[str, Callable[[Scene], Scene]] = {
+    "box": lambda scene: scene, "contracted": surrounded, "displaced": displaced, "ndc": faced,
+}
 """What there is besides a plain box."""
 
 

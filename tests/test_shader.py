@@ -75,11 +75,11 @@ def test_constants_are_exact() -> None:
     assert np.array_equal(np.array(numbers, np.float32).reshape(3, 4), values)
 
 
-@pytest.mark.parametrize("contracted", [0, 1])
+@pytest.mark.parametrize("space", ["box", "contracted", "ndc"])
 @pytest.mark.parametrize("rows", [0, 1])
 @pytest.mark.parametrize("motion", [0, 1])
 @pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl"])
-def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, rows: int, contracted: int) -> None:
+def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, rows: int, space: str) -> None:
     ctx = gl.context()
     if "GL_ARB_ES3_compatibility" not in ctx.extensions:
         pytest.skip("this OpenGL compiles no GLSL ES 3.00")
@@ -87,7 +87,7 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     defines = {"SCALES": 3, "LAYERS": layout.layers, "HIDDEN": len(scene.decoder.b1), "ROWS": rows, "REFINED": 1,
-               "CONTRACTED": contracted, "MOTION": motion}  # fmt: skip
+               "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion}  # fmt: skip
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights})
     vertex, _ = shader.compose("fullscreen.glsl", preamble=shader.ES30)
     ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()

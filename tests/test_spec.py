@@ -14,7 +14,7 @@ from scenes import SPACES, tiny_scene
 
 from kpc.format import container, errors, file, planes
 from kpc.format.scene import ALL_PLANES, LOG_DENSITY_LIMIT, TERMINATION
-from kpc.format.space import FAR
+from kpc.format.space import FAR, FORWARD, LEAST_DISPARITY
 from kpc.player import reference
 from kpc.tools import specvectors
 
@@ -65,7 +65,7 @@ def same(layout: str, expected: struct.Struct) -> bool:
 
 
 @pytest.mark.parametrize("number, structures", [
-    (3, [container.HEADER]), (4, [container.ENTRY]), (5, [file.SCENE_STRUCT, file.SCALE_STRUCT, file.WARP_STRUCT, file.MOTION_STRUCT]),
+    (3, [container.HEADER]), (4, [container.ENTRY]), (5, [file.SCENE_STRUCT, file.SCALE_STRUCT, file.WARP_STRUCT, file.NDC_STRUCT, file.MOTION_STRUCT]),
     (7, [file.DECODER_STRUCT]), (8, [file.OCCUPANCY_STRUCT]), (9, [file.CAMERA_STRUCT]),
 ])
 def test_byte_tables_are_the_code_s_structures(number, structures):
@@ -80,7 +80,8 @@ def test_sizes_in_the_text():
     assert f"One entry of {container.ENTRY.size} bytes" in section(4)
     assert f"begins with {file.SCENE_STRUCT.size} bytes" in section(5)
     assert f"coarse to fine, {file.SCALE_STRUCT.size} bytes" in section(5)
-    assert f"keeps its shape. {file.WARP_STRUCT.size} bytes" in section(5)
+    assert f"the part that\nkeeps its shape. {file.WARP_STRUCT.size} bytes" in section(5)
+    assert f"from these {file.NDC_STRUCT.size} bytes" in section(5)
     assert f"may have one. It begins with {file.MOTION_STRUCT.size} bytes" in section(5)
     assert f"each camera {file.CAMERA_STRUCT.size} bytes" in section(9)
 
@@ -102,7 +103,10 @@ def test_names_and_numbers_are_the_code_s():
     assert [int(f) for f in filters] == list(range(planes.FILTER_COUNT))
     assert f"T < 1/{1 / TERMINATION:.0f}" in section(11)
     assert f"(2 - 1/{FAR:.0f}) even" in section(11) and f"farther than {FAR:.0f} even" in section(11)
-    assert f"| mapping | {file.CONTRACTED};" in section(5)
+    assert f"**Mapping {file.CONTRACTED}, contraction:" in section(5)
+    assert f"**Mapping {file.DEVICE_COORDINATES}, device coordinates:" in section(5)
+    assert f"less than {file.FRAME_TOLERANCE:.4f}" in section(5)
+    assert f"if c <= {FORWARD:.4f}" in section(11) and f"{1 - LEAST_DISPARITY}" in section(11)
     assert f"-{LOG_DENSITY_LIMIT:.0f}, {LOG_DENSITY_LIMIT:.0f}" in section(11)
 
 

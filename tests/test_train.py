@@ -481,7 +481,7 @@ def test_plain_pytorch_takes_the_same_steps(
         assert float((ours - theirs).detach().abs().max()) < 1e-3
     if motion_cells:
         off, far = (run.field.motion - plain.field.motion).abs(), run.config.motion_learning_rate * 0.1 * 3
-        assert float((off > 0.1 * far).float().mean()) < 0.05 and float(run.field.motion.abs().max()) > 0.5 * far
+        assert float((off > 0.1 * far).float().mean()) < 0.05 and run.field.motion.abs().max().item() > 0.5 * far
     ours, theirs = run.optimiser.peaks(), plain.peaks()
     np.testing.assert_allclose(ours, theirs, atol=0.02)
     assert ours.max() > 0.005 and not plain.peaks().any()

@@ -21,7 +21,7 @@ from kpc.format.errors import FormatError, UsageError
 from kpc.format.file import SceneReader, read
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES
-from kpc.format.space import FAR
+from kpc.format.space import FAR, Contraction, SpaceMapping
 
 CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd"}
 
@@ -83,8 +83,7 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
                  "is_dynamic": scene.is_dynamic},
         "aabb": scene.aabb.tolist(),
         "step": scene.step,
-        "space": {"mapping": "box"} if scene.mapping is None else
-                 {"mapping": "contracted", "even": scene.mapping.even, "far": FAR * scene.mapping.even},
+        "space": _describe_space(scene.mapping),
         "motion": None if scene.motion is None else
                   {"rows": scene.motion.symbols.shape[0], "nodes_zyx": list(scene.motion.symbols.shape[1:4]),
                    "largest": float(np.abs(scene.motion.dequantise()).max())},
@@ -102,6 +101,14 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
         "overhead_bytes": size - sum(entry.stored_length for entry in reader.index),
         "chunks": [_describe_chunk(entry, gone, size) for entry, gone in zip(reader.index, missing, strict=True)],
     }
+
+
+def _describe_space(mapping: SpaceMapping | None) -> dict[str, Any]:
+    if isinstance(mapping, Contraction):
+        return {"mapping": "contracted", "even": mapping.even, "far": FAR * mapping.even}
+    if mapping is not None:
+        return {"mapping": "ndc", "frame": mapping.frame.tolist(), "near": mapping.near, "baseline": mapping.baseline}
+    return {"mapping": "box"}
 
 
 def _describe_scale(scale: Mapping[str, QuantisedPlane]) -> dict[str, Any]:
@@ -185,6 +192,8 @@ def _space(space: Mapping[str, Any]) -> list[str]:
     """Nothing for a box, which says it all."""
     if space["mapping"] == "box":
         return []
+    if space["mapping"] == "ndc":
+        return [f"  space       device coordinates, the box being in those; near {space['near']:.4g}, baseline {space['baseline']:.4g}"]
     return [f"  space       contracted beyond the box; even steps up to {space['even']:.4g}, rays end at {space['far']:.4g}"]
 
 

@@ -28,6 +28,7 @@ from kpc.format.errors import UsageError
 from kpc.format.media import write_image, write_video
 from kpc.format.progress import progress
 from kpc.format.scene import Scene
+from kpc.format.space import Contraction
 from kpc.player import reference
 from kpc.player.orbit import Rig, fitted, orbit
 from kpc.player.reference import Part, Rendering
@@ -256,11 +257,11 @@ def _colour_pixels(rendering: Rendering) -> np.ndarray:
 
 
 def _farthest(scene: Scene, shots: list[Shot]) -> float:
-    """The greatest distance from a camera to a corner of the box: no depth exceeds it. In contracted space, where all that is
-    farther counts as that far."""
-    if scene.mapping is not None:
+    """The greatest distance from a camera to a corner of the scene's bounds: no depth exceeds it. In contracted space, where
+    all that is farther counts as that far."""
+    if isinstance(scene.mapping, Contraction):
         return FARTHEST_EVEN * scene.mapping.even
-    corners = np.array(list(itertools.product(*scene.aabb.T)))
+    corners = np.array(list(itertools.product(*scene.bounds.T)))
     eyes = np.unique([shot.camera.camera_to_world[:3, 3] for shot in shots], axis=0)
     return float(np.linalg.norm(eyes[:, None] - corners, axis=2).max())
 
@@ -275,7 +276,7 @@ def _depth_pixels(scene: Scene, shots: list[Shot]) -> Callable[[Rendering], np.n
     mapping, farthest = scene.mapping, _farthest(scene, shots)
 
     def pixels(rendering: Rendering) -> np.ndarray:
-        if mapping is None:
+        if not isinstance(mapping, Contraction):
             near = np.where(np.isfinite(rendering.depth), 1 - np.minimum(rendering.depth / farthest, 1), 0)
         else:
             near = 1 - mapping.progress(rendering.depth) / (2 * mapping.even)

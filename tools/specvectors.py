@@ -28,7 +28,7 @@ from kpc.format.file import encode, read, scene_chunks
 from kpc.format.motion import QuantisedMotion
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
-from kpc.format.space import Contraction
+from kpc.format.space import Contraction, DeviceCoordinates
 from kpc.player import reference
 
 ZSTD_VERSION = ".".join(map(str, zstandard.ZSTD_VERSION))
@@ -71,7 +71,9 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
         "frame_count": scene.clip.frame_count,
         "fps": scene.clip.fps,
         "step": scene.step,
-        **({"even": scene.mapping.even} if scene.mapping else {}),
+        **({"even": scene.mapping.even} if isinstance(scene.mapping, Contraction) else {}),
+        **({"frame": scene.mapping.frame.tolist(), "near": scene.mapping.near, "baseline": scene.mapping.baseline}
+           if isinstance(scene.mapping, DeviceCoordinates) else {}),
         **({"motion": {"shape": list(scene.motion.symbols.shape), "sha256": _sha256(scene.motion.dequantise().astype("<f4"))}}
            if scene.motion else {}),
         "aabb": scene.aabb.tolist(),
@@ -117,6 +119,9 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
                          occupancy=_noise((2, 3, 3, 5), 98) > -64)
     moved = replace(_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), occupancy=_noise((2, 3, 3, 5), 98) > -64,
                     motion=_motion(4, 3, 2, 5))
+    frame = np.array([[0.96, 0, 0.28, 0.5], [0, 1, 0, -0.25], [-0.28, 0, 0.96, 3]])
+    faced = replace(_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), occupancy=_noise((2, 3, 3, 5), 98) > -64,
+                    mapping=DeviceCoordinates(frame, 1.5, 2.0), aabb=np.array([[-0.5, -0.5, 0.125], [0.5, 0.5, 1.25]], np.float32))
     note = Chunk("note", [b"readers skip what they need not know"])
     chunks = scene_chunks(minimal)
     index = Reader(packed).index
@@ -134,6 +139,7 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "moved": (encode(moved), False),
         "moved-prefix": (encode(moved)[:Reader(encode(moved)).index[4].offset], True),
         "moved-contracted": (encode(replace(contracted, motion=_motion(2, 2, 2, 2, 32.0)), compress=False), False),
+        "device-coordinates": (encode(faced), False),
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
     }
 
@@ -164,6 +170,9 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
 
     still = _scene(dynamic=False, sizes=[(1, 2, 2, 2, 0)])
     still_values = Reader(encode(still)).header.value_count
+
+    def ndc(near: float = 0.5, skew: float = 0.0) -> bytes:
+        return struct.pack("<I12ddd", 2, 1, 0, 0, 0.5, skew, 1, 0, -0.25, 0, 0, 1, 3, near, 2.0)
 
     def displaced(*parts: bytes) -> bytes:
         """The file with MOVE chunks."""
@@ -235,12 +244,17 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "scene-plane-nan": (repacked(scne, set_at(68, "<f", nan)), broken, "plane xy: a step or an offset"),
         "scene-plane-snan": (repacked(scne, set_at(68, "<I", 0x7F800001)), broken, "plane xy: a step or an offset"),
         "scene-long": (repacked(scne, lambda raw: raw + bytes(1)), broken, "1 bytes too long"),
-        "warp-mapping": (warped(struct.pack("<Id", 2, 3.5)), broken, "mapping 2"),
+        "warp-mapping": (warped(struct.pack("<Id", 3, 3.5)), broken, "mapping 3"),
         "warp-negative": (warped(struct.pack("<Id", 1, -3.5)), broken, "make no sense"),
         "warp-nan": (warped(struct.pack("<Id", 1, nan)), broken, "make no sense"),
         "warp-far": (warped(struct.pack("<Id", 1, 1e6)), broken, "make no sense"),
         "warp-short": (warped(struct.pack("<Id", 1, 3.5)[:-1]), broken, "ends after"),
-        "warp-long": (warped(struct.pack("<Id", 1, 3.5) + bytes(1)), broken, "12 make sense"),
+        "warp-long": (warped(struct.pack("<Id", 1, 3.5) + bytes(1)), broken, "1 bytes too long"),
+        "ndc-short": (warped(ndc()[:-1]), broken, "ends after"),
+        "ndc-near": (warped(ndc(near=-1.0)), broken, "make no sense"),
+        "ndc-nan": (warped(ndc(near=nan)), broken, "make no sense"),
+        "ndc-frame": (warped(ndc(skew=0.01)), broken, "make no sense"),
+        "ndc-box": (warped(ndc(near=16.0)), broken, "make no sense"),
         "warp-twice": (warped(*2 * [struct.pack("<Id", 1, 3.5)]), broken, "2 WARP chunks"),
         "move-rows": (displaced(move(1, 2, 2, 2, 0.5**13)), broken, "makes no sense"),
         "move-nodes": (displaced(move(2, 2, 257, 2, 0.5**13)), broken, "makes no sense"),
@@ -330,7 +344,8 @@ def _rays(scene: QuantisedScene) -> list[dict[str, Any]]:
 
     In contracted space some of it lies outside.
     """
-    centre, size = scene.aabb.mean(0), scene.aabb[1] - scene.aabb[0]
+    bounds = scene.dequantise().bounds.astype(np.float32)
+    centre, size = bounds.mean(0), bounds[1] - bounds[0]
     starts = np.array([[0.0, 0.1, 1.5], [-1.5, -0.75, 1.25], [0.1, -0.2, 0.05], [2.0, 2.0, 2.0]], np.float32)
     towards = np.array([[0.05, 0.0, -1.0], [1.5, 0.75, -1.25], [0.75, 0.5, 0.25], [1.0, 0.0, 0.0]], np.float32)
     origins = (centre + starts * size).astype(np.float32)

@@ -19,6 +19,7 @@ from kpc.format.errors import DatasetError, MediaError
 from kpc.format.media import read_image, read_video
 from kpc.format.progress import Progress
 from kpc.format.scene import Clip
+from kpc.format.space import DeviceCoordinates, SpaceMapping
 
 LAYOUTS = (llff, blender, nerfstudio, colmap)
 """The first that recognises a folder reads it: what a sparse model was exported to goes before the model."""
@@ -185,10 +186,14 @@ def load_dataset(
         raise DatasetError(f"{error.filename or root}: no permission; chmod it or run as its owner") from error
 
 
-def rays(pictures: Pictures, picture: np.ndarray, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rays(
+    pictures: Pictures, picture: np.ndarray, column: np.ndarray, row: np.ndarray, mapping: SpaceMapping | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Rays through pixel centres: (N,) picture, column and row to origins and unit directions, both (N, 3) float32.
 
     d = normalise(R [x, -y, -1]),  (x, y) = undistort((column + 0.5 - cx) / fl_x, (row + 0.5 - cy) / fl_y)
+
+    In world coordinates, or in device coordinates where that is the mapping.
     """
     fl_x, fl_y, cx, cy = pictures.intrinsics[picture].T
     x, y = (column + 0.5 - cx) / fl_x, (row + 0.5 - cy) / fl_y
@@ -198,7 +203,11 @@ def rays(pictures: Pictures, picture: np.ndarray, column: np.ndarray, row: np.nd
     pose = pictures.camera_to_world[picture]
     directions = pose[:, :3, 0] * x[:, None] - pose[:, :3, 1] * y[:, None] - pose[:, :3, 2]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return pose[:, :3, 3].astype(np.float32), directions.astype(np.float32)
+    origins = pose[:, :3, 3]
+    if isinstance(mapping, DeviceCoordinates):
+        path = mapping.path(origins, directions)
+        origins, directions = path.begin, path.way
+    return origins.astype(np.float32), directions.astype(np.float32)
 
 
 def undistort(x: np.ndarray, y: np.ndarray, distortion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,9 @@ uniform vec3 box_high;
 uniform float stride;
 uniform float even;
 uniform vec3 background;
+uniform mat4x3 frame;
+uniform float near;
+uniform float baseline;
 
 uniform float height;
 uniform vec4 lens;
@@ -21,8 +24,8 @@ layout(location = 0) out vec4 seen;
 layout(location = 1) out vec4 met;
 
 void main() {
-    vec3 d = camera_direction(gl_FragCoord.xy, height, lens, axes);
-    Walk walk = walk_of(eye, d, box_low, box_high, cell_count, stride, even);
+    Path path = path_of(eye, camera_direction(gl_FragCoord.xy, height, lens, axes), frame, near, baseline);
+    Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
     seen = vec4(background, 0.0);
     met = vec4(0.0);
     if (!to_occupied(walk, cells, cell_count)) return;
@@ -47,5 +50,5 @@ void main() {
     vec3 place = cell / vec3(cell_count);
     vec3 tint = mix(vec3(0.30, 0.46, 0.62), vec3(0.90, 0.74, 0.46), place);
     seen = vec4(tint * max(lit, 0.6) * mix(1.0, 0.6, line), 1.0);
-    met = vec4(t, 1.0, 0.0, 0.0);
+    met = vec4(world_distance(path, t), 1.0, 0.0, 0.0);
 }

@@ -3,6 +3,7 @@
 // SCALES, LAYERS (of four channels), HIDDEN: its shape. ROWS: 1 where rows of time planes are multiplied in at every
 // sample. REFINED: how much finer than the scene's the planes are along the row folded into them; 1 where none is.
 // CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
+// NDC: 1 where all this is in device coordinates.
 
 #include "ray.glsl"
 #include "space.glsl"
@@ -30,6 +31,9 @@ uniform vec3 box_high;
 uniform vec3 background;
 uniform float stride;
 uniform float even;                 // CONTRACTED: how far steps are even
+uniform mat4x3 frame;               // NDC: of its camera
+uniform float near;                 // NDC
+uniform float baseline;             // NDC
 uniform float tau;                  // stride / longest edge of the box
 
 uniform float height;
@@ -73,9 +77,9 @@ vec4 feature(vec3 u, int scale, int layer) {
 }
 
 void main() {
-    vec3 d = camera_direction(gl_FragCoord.xy, height, lens, axes);
-    Walk walk = walk_of(eye, d, box_low, box_high, cell_count, stride, even);
-    find_basis(d);
+    Path path = path_of(eye, camera_direction(gl_FragCoord.xy, height, lens, axes), frame, near, baseline);
+    Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
+    find_basis(path.way);
 
     vec3 rgb = vec3(0.0);
     float trans = 1.0;
@@ -91,7 +95,7 @@ void main() {
             vec3 u = 0.25 * contracted(y) + 0.5;
             float thickness = tau * stretch_of(y, t, even);
 #else
-            vec3 u = clamp((eye + t * d - box_low) / (box_high - box_low), 0.0, 1.0);
+            vec3 u = clamp((path.begin + t * path.way - box_low) / (box_high - box_low), 0.0, 1.0);
             float thickness = tau;
 #endif
 #if MOTION
@@ -109,7 +113,7 @@ void main() {
             }
             float weight = trans * alpha_of(log_density, thickness);
             rgb += weight * sigmoid(shade);
-            depth += weight * t;
+            depth += weight * world_distance(path, t);
             trans -= weight;
             samples += 1.0;
             walk.k += 1.0;
