@@ -310,11 +310,11 @@ def render_reference(
 
 
 def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
-    """The weighted priors by the name of their weight, in plain PyTorch: the reference of the `add_*` kernels.
+    """The weighted priors of the planes by the name of their weight, in plain PyTorch: the reference of the `add_*` kernels.
 
     space_variation * mean of squared neighbour differences, on space planes; on space-time planes
     transient_variation * the same along space alone, time_smoothness * mean (P[t-1] - 2 P[t] + P[t+1])^2, and
-    sparse_transients * mean |1 - P|; each summed over the planes it concerns. With a motion grid also `motion_priors`.
+    sparse_transients * mean |1 - P|; each summed over the planes it concerns.
     """
     names = ("space_variation", "transient_variation", "time_smoothness", "sparse_transients")
     total = {name: field.theta.new_zeros(()) for name in names}
@@ -329,7 +329,7 @@ def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
             total["transient_variation"] = total["transient_variation"] + along_rows
             total["time_smoothness"] = total["time_smoothness"] + second_difference
             total["sparse_transients"] = total["sparse_transients"] + (1 - p).abs().mean()
-    return {name: getattr(config, name) * value for name, value in total.items()} | motion_priors(field, config)
+    return {name: getattr(config, name) * value for name, value in total.items()}
 
 
 def motion_priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:

@@ -159,14 +159,25 @@ def _spread_motion(grad_motion, place, time, g):
 
 
 @_inlined
-def _slopes(low, high, fc, fr, per_column, per_row, g, along, across):
-    """Add g times what a sample between four texels, low and high holding two each, grows along columns and along rows."""
+def _slope(low, high, fr, per_column, g, along):
+    """Add g times what a sample between four texels, low and high holding two each, grows along columns, at fr between rows."""
     M = g.size
-    ec, er = np.float32(1.0) - fc, np.float32(1.0) - fr
+    er = per_column * (np.float32(1.0) - fr)
+    fr = per_column * fr
+    for m in range(M):
+        along[m] += g[m] * (er * (low[M + m] - low[m]) + fr * (high[M + m] - high[m]))
+
+
+@_inlined
+def _slopes(low, high, fc, fr, per_column, per_row, g, along, across):
+    """As `_slope`, and the same along rows, at fc between columns."""
+    M = g.size
+    er, ec = per_column * (np.float32(1.0) - fr), per_row * (np.float32(1.0) - fc)
+    fr, fc = per_column * fr, per_row * fc
     for m in range(M):
         a, b, c, d = low[m], low[M + m], high[m], high[M + m]
-        along[m] += g[m] * (per_column * (er * (b - a) + fr * (d - c)))
-        across[m] += g[m] * (per_row * (ec * (c - a) + fc * (d - b)))
+        along[m] += g[m] * (er * (b - a) + fr * (d - c))
+        across[m] += g[m] * (ec * (c - a) + fc * (d - b))
 
 
 @_inlined
@@ -246,33 +257,29 @@ def _sample_planes(theta, table, resolution, point, M, corners, fractions, value
 
 
 @_inlined
-def _scatter_planes(grad, table, resolution, M, corners, fractions, values, g, scratch):
-    """Add d loss / d theta, given g = d loss / d features and what `_sample_planes` has left."""
-    for s in range(table.shape[0]):
-        _product_gradient(values[6 * s * M : 6 * (s + 1) * M], g[s * M : (s + 1) * M], scratch)
-        for c in range(_planes(table)):
-            columns, corner = resolution[s, _ALONG_COLUMNS[c]], corners[6 * s + c]
-            w00, w01, w10, w11 = _weights(fractions[4 * s + _ALONG_COLUMNS[c]], fractions[4 * s + _ALONG_ROWS[c]])
-            low, high = grad[corner : corner + 2 * M], grad[corner + columns * M : corner + (columns + 2) * M]
-            _spread(low, high, w00, w01, w10, w11, scratch[c * M : (c + 1) * M])
+def _scatter_planes(grad, table, resolution, M, corners, fractions, values, g, scratch, theta, slopes, sloping):
+    """Add d loss / d theta, given g = d loss / d features and what `_sample_planes` has left.
 
-
-@_inlined
-def _move_planes(theta, table, resolution, M, corners, fractions, values, g, scratch, slopes, ones, point, out):
-    """out = d loss / d (u, v, w), given g = d loss / d features and what `_sample_planes` has left; 0 where a place is clamped."""
-    slopes[:] = np.float32(0.0)
+    slopes[M axis :][:M], if `sloping` and slopes is not None, gains d loss / d place by axis (x, y, z) and channel.
+    """
     for s in range(table.shape[0]):
         _product_gradient(values[6 * s * M : 6 * (s + 1) * M], g[s * M : (s + 1) * M], scratch)
         for c in range(_planes(table)):
             across, down = _ALONG_COLUMNS[c], _ALONG_ROWS[c]
             columns, corner = resolution[s, across], corners[6 * s + c]
-            low, high = theta[corner : corner + 2 * M], theta[corner + columns * M : corner + (columns + 2) * M]
-            _slopes(low, high, fractions[4 * s + across], fractions[4 * s + down],
-                    np.float32(columns - 1), np.float32(resolution[s, down] - 1), scratch[c * M : (c + 1) * M],
-                    slopes[across * M : (across + 1) * M], slopes[down * M : (down + 1) * M])
-    for axis in range(3):
-        inside = np.float32(0.0) <= point[axis] <= np.float32(1.0)
-        out[axis] = _dot(slopes[axis * M : (axis + 1) * M], ones, M) if inside else np.float32(0.0)
+            fc, fr = fractions[4 * s + across], fractions[4 * s + down]
+            w00, w01, w10, w11 = _weights(fc, fr)
+            low, high = grad[corner : corner + 2 * M], grad[corner + columns * M : corner + (columns + 2) * M]
+            _spread(low, high, w00, w01, w10, w11, scratch[c * M : (c + 1) * M])
+            if slopes is not None:
+                if sloping:
+                    low, high = theta[corner : corner + 2 * M], theta[corner + columns * M : corner + (columns + 2) * M]
+                    along, per_column = slopes[across * M : (across + 1) * M], np.float32(columns - 1)
+                    if c < 3:
+                        _slopes(low, high, fc, fr, per_column, np.float32(resolution[s, down] - 1),
+                                scratch[c * M : (c + 1) * M], along, slopes[down * M : (down + 1) * M])
+                    else:
+                        _slope(low, high, fr, per_column, scratch[c * M : (c + 1) * M], along)
 
 
 @_inlined
@@ -441,7 +448,7 @@ def _distortion_gradient(weights, places, count, step, extent, factor, out):
 
 @_parallel
 def backpropagate(
-    theta, grad, table, resolution, density, grad_density, M, motion, grad_motion, aabb, even, occupancy, step, extent,
+    theta, grad, table, resolution, density, grad_density, M, motion, grad_motion, moving, aabb, even, occupancy, step, extent,
     origins, directions, times, jitters, basis, grad_basis, targets, backgrounds, peaks, distortion, capacity,
 ):
     """Render a batch, and add the gradient of its loss to grad, grad_density, grad_motion and grad_basis.
@@ -455,6 +462,7 @@ def backpropagate(
     Args:
         grad: (workers, n) float32, one buffer a worker; grad_density: (workers, F + 1); grad_motion: (workers, as motion).
         basis, grad_basis: (rays, 3, F); or, where colour is the same from everywhere, (1, 3, F) and (workers, 3, F).
+        moving: whether grad_motion is wanted in this step; it takes a fifth of the time.
         jitters: (rays,) float32 in [0, 1), where in each step the samples of a ray lie.
         targets, backgrounds: (rays, 3) float32.
         peaks: (workers, Nz, Ny, Nx) float32, raised to the largest weight that a sample in a cell has had.
@@ -475,7 +483,8 @@ def backpropagate(
         spread = np.empty(capacity, np.float32)
         g_features = np.empty(F, np.float32)
         plane_scratch = np.empty(6 * M, np.float32)
-        slopes, ones, g_point = np.empty(4 * M, np.float32), np.ones(M, np.float32), np.empty(3, np.float32)
+        slopes = None if motion is None else np.empty(3 * M, np.float32)
+        ones, g_place = np.ones(M, np.float32), np.empty(3, np.float32)
         g_theta = grad[worker]
         g_density = grad_density[worker]
         for ray in range(worker, N, workers):
@@ -530,13 +539,16 @@ def backpropagate(
                         for i in range(F):
                             g_features[i] += g_c * b[c, i]
                             g_b[c, i] += g_c * feature[i]
-                _scatter_planes(
-                    g_theta, table, resolution, M, corners[k], fractions[k], values[k], g_features, plane_scratch
-                )
                 if motion is not None:
-                    _move_planes(theta, table, resolution, M, corners[k], fractions[k], values[k], g_features, plane_scratch,
-                                 slopes, ones, points[k], g_point)
-                    _spread_motion(grad_motion[worker], points[k, 5:], times[ray], g_point)
+                    slopes[:] = np.float32(0.0)
+                _scatter_planes(
+                    g_theta, table, resolution, M, corners[k], fractions[k], values[k], g_features, plane_scratch, theta, slopes, moving
+                )
+                if motion is not None and moving:
+                    for axis in range(3):
+                        clamped = points[k, axis] < np.float32(0.0) or points[k, axis] > np.float32(1.0)
+                        g_place[axis] = np.float32(0.0) if clamped else _dot(slopes[axis * M : (axis + 1) * M], ones, M)
+                    _spread_motion(grad_motion[worker], points[k, 5:], times[ray], g_place)
     return errors, counts
 
 

@@ -196,7 +196,8 @@ class Trainer:
 
     def _not_finite(self) -> str:
         """Which terms of the loss hold NaN or infinity, the colours being one of them, and which parameters they come from."""
-        terms = ["colour"] + [name for name, value in priors(self.field, self.config).items() if not torch.isfinite(value)]
+        weighed = priors(self.field, self.config) | motion_priors(self.field, self.config)
+        terms = ["colour"] + [name for name, value in weighed.items() if not torch.isfinite(value)]
         planes = [f"{name} at scale {s}" for s, name, *_ in self.field.layout.planes()
                   if not torch.isfinite(self.field.plane(s, name)).all()]
         decoder = [name for name, value in self.field.named_parameters() if name != "theta" and not torch.isfinite(value).all()]
@@ -391,10 +392,11 @@ class FusedOptimiser:
             grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
             motion = motion_of(self.field)
             grad_motion = None if motion is None else np.zeros((self.workers, *motion.shape), np.float32)
+            moving = motion is not None and number % config.motion_every == 0
         with self.watch("kernel"):
             errors, counts = kernels.backpropagate(
                 self.theta, self.grad, layout.table, layout.resolution, density.numpy(), grad_density,
-                layout.channels, motion, grad_motion, aabb, kernels.even_of(self.mapping), occupancy.view(np.uint8),
+                layout.channels, motion, grad_motion, moving, aabb, kernels.even_of(self.mapping), occupancy.view(np.uint8),
                 np.float32(step_length), np.float32(extent), batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(),
                 batch.jitters.numpy(), basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(),
                 self._peaks, np.float32(config.distortion), sample_capacity(aabb, step_length, self.mapping),
@@ -404,14 +406,12 @@ class FusedOptimiser:
                 add_priors(self.field, self.theta, self.grad[0], config, config.regularise_every)
         with self.watch("decoder"):
             self.decoder.zero_grad()
-            if number % config.regularise_every == 0 and self.field.motion is not None:
-                (config.regularise_every * torch.stack(list(motion_priors(self.field, config).values())).sum()).backward()
             basis.backward(torch.from_numpy(grad_basis if config.view_dependent else grad_basis.sum(0, keepdims=True)))
             self.field.density.grad = torch.from_numpy(grad_density.sum(0))
             self.field.density.grad[:-1] *= kept
-            if grad_motion is not None:
-                grad = torch.from_numpy(grad_motion.sum(0))
-                self.field.motion.grad = grad if self.field.motion.grad is None else grad + self.field.motion.grad
+            if moving:
+                torch.stack(list(motion_priors(self.field, config).values())).sum().backward()
+                self.field.motion.grad += torch.from_numpy(grad_motion.sum(0))
             _set_rate(self.decoder, rate)
             self.decoder.step()
         with self.watch("adam"):
@@ -470,10 +470,15 @@ class PlainOptimiser:
         loss = error + config.distortion * distortion
         if number % config.regularise_every == 0:
             loss = loss + config.regularise_every * torch.stack(list(priors(self.field, config).values())).sum()
+        moving = self.field.motion is not None and number % config.motion_every == 0
+        if moving:
+            loss = loss + torch.stack(list(motion_priors(self.field, config).values())).sum()
         for optimiser in (self.planes, self.decoder):
             optimiser.zero_grad()
             _set_rate(optimiser, rate)
         loss.backward()  # type: ignore[no-untyped-call]
+        if self.field.motion is not None and not moving:
+            self.field.motion.grad = None
         self.planes.step()
         self.decoder.step()
         return float(error.detach()), len(weights) / len(targets)

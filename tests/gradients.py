@@ -58,6 +58,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         layout.channels,
         motion_of(field),
         grad_motion,
+        True,
         scene.aabb,
         kernels.even_of(scene.mapping),
         scene.occupancy.view(np.uint8),

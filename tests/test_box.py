@@ -6,7 +6,9 @@ import datasets as make
 import numpy as np
 import pytest
 
-from kpc.encoder.box import CLEAR, INNER, contraction_of, find_box, find_inner_box, reaches_beyond, seen_cells
+from kpc.encoder.box import (
+    CLEAR, INNER, contraction_of, device_coordinates_of, find_box, find_inner_box, reaches_beyond, seen_cells,
+)
 from kpc.encoder.datasets import Pictures
 from kpc.format.cameras import Camera
 from kpc.format.errors import DatasetError
@@ -129,6 +131,33 @@ def test_cells_of_contracted_space_are_seen_where_they_lie() -> None:
         in_view &= np.abs(centres[:, 0] - shift) < (1 + clear) * depth
     np.testing.assert_array_equal(seen.ravel(), in_view)
     assert seen[0].any() and not seen[16:].any()
+
+
+def test_device_coordinates_of_a_row_of_cameras() -> None:
+    mapping, box = device_coordinates_of(pictures_of([straight(-0.5), straight(0.5)], near=1.0, far=4.0))
+    np.testing.assert_allclose(mapping.frame, np.eye(4)[:3], atol=1e-12)
+    assert mapping.near == pytest.approx(1) and mapping.baseline == pytest.approx(1)
+    # x / z from -0.5 - 1 at the near plane to 0.5 + 1, y / z half as wide as one camera sees, 1 / 1 - 1 / 4 deep.
+    np.testing.assert_allclose(box, [[-1.5, -0.5, 0], [1.5, 0.5, 0.75]], atol=1e-6)
+    shape = (3, 4, 6)
+    seen = seen_cells(pictures_of([straight(-0.5), straight(0.5)], near=1.0, far=4.0), box, shape, mapping)
+    assert seen[-1, :, 1:-1].all() and not seen[0, :, 0].any()  # at the far end both see nearly all, at the near end not the sides
+
+
+def test_device_coordinates_stand_as_far_forward_as_the_foremost_camera() -> None:
+    ahead = straight()
+    ahead.camera_to_world[2, 3] = -0.4
+    mapping, box = device_coordinates_of(pictures_of([straight(-0.5), straight(0.5), ahead], near=1.0, far=4.0))
+    assert mapping.frame[2, 3] == pytest.approx(-0.4) and mapping.near == pytest.approx(0.6)
+    assert box[1, 2] < mapping.baseline / mapping.near
+
+
+@pytest.mark.parametrize("rig", [[straight(), straight(turned=True)], [straight(), straight()]], ids=["apart", "one place"])
+def test_rigs_without_device_coordinates(rig: list[Camera]) -> None:
+    with pytest.raises(DatasetError, match="do not face one way"):
+        device_coordinates_of(pictures_of(rig, near=1.0, far=4.0))
+    with pytest.raises(DatasetError, match="near and far"):
+        device_coordinates_of(pictures_of([straight(), straight(1.0)]))
 
 
 def test_near_without_far_is_not_enough() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import displaced, tiny_scene
+from scenes import displaced, faced, tiny_scene
 
 import kpc
 from kpc.format.cameras import Camera
@@ -18,7 +18,7 @@ from kpc.format.file import SceneReader, encode, read, write
 from kpc.format.motion import STEP, QuantisedMotion
 from kpc.format.quantise import QuantisedScene, quantise_scene
 from kpc.format.scene import TIME_PLANES
-from kpc.format.space import Contraction
+from kpc.format.space import Contraction, DeviceCoordinates
 
 
 def quantised(step: float = 0.02, **options) -> QuantisedScene:
@@ -67,6 +67,25 @@ def test_a_contracted_scene_comes_back_and_says_so_in_a_chunk_of_its_own():
     assert [e.kind for e in Reader(data).index][:3] == ["SCNE", "WARP", "DECO"]
     assert [e.kind for e in Reader(encode(scene)).index][:2] == ["SCNE", "DECO"]
     assert read(encode(scene)).mapping is None
+
+
+def test_device_coordinates_come_back():
+    scene = faced(tiny_scene())
+    coded = quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
+    back = read(encode(coded)).mapping
+    assert isinstance(back, DeviceCoordinates) and np.array_equal(back.frame, scene.mapping.frame)
+    assert (back.near, back.baseline) == (scene.mapping.near, scene.mapping.baseline)
+
+
+@pytest.mark.parametrize("change", [
+    {"near": 0.0}, {"near": float("nan")}, {"baseline": -1.0}, {"baseline": 1e12}, {"near": 5.0}, {"frame": np.eye(4)[:3] * 1.01},
+    {"frame": np.full((3, 4), np.nan)}, {"frame": np.eye(3, 4, 3) * 2.0**31 + np.eye(3, 4)},
+])
+def test_device_coordinates_that_make_no_sense_are_not_written(change):
+    scene = faced(tiny_scene())
+    broken = replace(scene, mapping=replace(scene.mapping, **change))
+    with pytest.raises(FormatError, match="WARP"):
+        encode(quantise_scene(broken, [{name: 0.02 for name in scale} for scale in scene.scales]))
 
 
 def test_a_prefix_without_the_mapping_shows_nothing():

@@ -23,6 +23,7 @@ from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import pixels
 from kpc.encoder.train import Trainer
 from kpc.format import cli, file
+from kpc.format.space import DeviceCoordinates
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny")
 TINY = dict(
@@ -428,6 +429,22 @@ def test_space_is_chosen_said_and_overridden(run: Kpenc, sets: Path, tmp_path: P
 def test_space_is_a_box_where_something_bounds_it(run: Kpenc, sets: Path, name: str, why: str) -> None:
     code, out, err = run(sets / name, "--json", "--steps", "2")
     assert code == 0 and json.loads(out)["space"] == "box" and why in err
+
+
+def test_device_coordinates_for_cameras_that_face_one_way(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+    code, out, err = run(sets / "n3dv", "--json", "--space", "ndc")
+    scene = file.read(tmp_path / "out.kpc")
+    assert code == 0 and json.loads(out)["space"] == "ndc" and isinstance(scene.mapping, DeviceCoordinates)
+    assert "space: device coordinates of a rig that faces one way (as told)" in err and "baseline" in err
+    assert scene.aabb[1, 2] < scene.mapping.baseline / scene.mapping.near
+    # The sphere at the origin is within, and what is seen of it lies about there.
+    assert (scene.dequantise().bounds[0] < 0).all() and (scene.dequantise().bounds[1] > 0).all()
+
+
+def test_rigs_that_have_no_device_coordinates(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+    fails(run, tmp_path, sets / "nerfstudio", "near and far", "--space contracted", options=("--space", "ndc"))
+    code, _, err = run(sets / "n3dv", "--space", "ndc", "--box", "-1,-1,-1,1,1,1")
+    assert code == 2 and "--box" in err
 
 
 def test_a_box_in_contracted_space_is_taken_as_it_is(run: Kpenc, sets: Path, tmp_path: Path) -> None:

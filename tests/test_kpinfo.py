@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from scenes import displaced, surrounded, tiny_scene
+from scenes import displaced, faced, surrounded, tiny_scene
 
 from kpc.format.container import Reader
 from kpc.format.file import write
@@ -61,6 +61,16 @@ def test_a_contracted_scene(tmp_path, capsys):
     assert "contracted beyond the box; even steps up to 5, rays end at 1280" in page and "WARP" in page
     assert kpinfo.main([str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["space"] == {"mapping": "contracted", "even": 5.0, "far": 1280.0}
+
+
+def test_a_scene_in_device_coordinates(tmp_path, capsys):
+    scene = faced(tiny_scene())
+    path = tmp_path / "faced.kpc"
+    write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), path)
+    assert kpinfo.main([str(path), "--verify"]) == 0
+    assert "device coordinates, the box being in those; near 0.8, baseline 2" in capsys.readouterr().out
+    assert kpinfo.main([str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["space"]["near"] == 0.8
 
 
 def test_a_scene_with_a_motion_grid(tmp_path, capsys):

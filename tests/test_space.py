@@ -1,4 +1,4 @@
-"""Contracted space against float64 and against itself, in each language; its bounds, at the extremes."""
+"""Contracted space and device coordinates against float64 and against themselves, in each language; at the extremes."""
 
 from dataclasses import replace
 
@@ -6,13 +6,13 @@ import gl
 import numpy as np
 import pytest
 import torch
-from scenes import surrounded, tiny_scene
+from scenes import faced, look_at, surrounded, tiny_scene
 
 from kpc.encoder import kernels
 from kpc.encoder.field import place
 from kpc.format.scene import Scene
-from kpc.format.space import FAR, Contraction, contract, expand
-from kpc.player.reference import places
+from kpc.format.space import FAR, LEAST_DISPARITY, Contraction, DeviceCoordinates, contract, expand
+from kpc.player.reference import places, render
 
 AABB = np.array([[-1.0, -0.5, 2.0], [3.0, 1.5, 2.5]])
 RNG = np.random.default_rng(0)
@@ -140,7 +140,6 @@ def test_glsl_skips_empty_space_but_never_a_sample() -> None:
     """Few cells are set, near and far: all samples in them must be found, from inside and outside, near and very far."""
     from scenes import look_at
 
-    from kpc.player.reference import render
     from kpc.player.renderer import Renderer
 
     scene = surrounded(tiny_scene(3))
@@ -153,3 +152,93 @@ def test_glsl_skips_empty_space_but_never_a_sample() -> None:
         assert wanted.samples.max() > 3
         assert np.mean(got.samples == wanted.samples) > 0.99  # a sample on the face of a cell may round to either side
         assert abs(int(got.samples.sum()) - int(wanted.samples.sum())) < 2e-3 * wanted.samples.sum() + 2
+
+
+def coordinates(near: float = 0.5, baseline: float = 1.5) -> DeviceCoordinates:
+    return DeviceCoordinates(look_at((0.5, -1.0, 2.0), (0.0, 0.2, -1.0), 1, 1, 1.0).camera_to_world[:3], near, baseline)
+
+
+def before(ndc: DeviceCoordinates, count: int) -> np.ndarray:
+    """World points at all depths, from `near` to 1e4 times that."""
+    depth = ndc.near * 10 ** RNG.uniform(0, 4, count)
+    local = np.stack([*(depth * RNG.uniform(-1, 1, (2, count))), -depth], axis=1)
+    return local @ ndc.frame[:, :3].T + ndc.frame[:, 3]
+
+
+def test_device_coordinates_are_what_a_pinhole_and_a_pair_of_them_see() -> None:
+    ndc = coordinates()
+    points = before(ndc, 300)
+    right, up, back, eye = ndc.frame.T
+    for point, place in zip(points, ndc.place(points), strict=True):
+        depth = -(point - eye) @ back
+        assert place[:2] == pytest.approx([(point - eye) @ right / depth, (point - eye) @ up / depth])
+        # A pinhole a baseline to the right sees it moved by baseline / depth.
+        moved = (point - eye - ndc.baseline * right) @ right / depth
+        assert place[2] == pytest.approx(ndc.baseline / ndc.near - (place[0] - moved), abs=1e-9)
+    np.testing.assert_allclose(ndc.expand(ndc.place(points)), points, rtol=1e-9, atol=1e-9)
+
+
+def test_rays_stay_straight_and_distances_come_back() -> None:
+    ndc = coordinates()
+    eyes = ndc.frame[:, 3] + RNG.uniform(-0.7, 0.7, (200, 3))  # before, on and behind the near plane
+    directions = before(ndc, 200) - eyes
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = directions[(forward := -(directions @ ndc.frame[:, 2]) > 0.05)]
+    eyes = eyes[forward]
+    path = ndc.path(eyes, directions)
+    np.testing.assert_allclose(np.linalg.norm(path.way, axis=1), 1)
+    s = path.length[:, None] * np.array([0.0, 0.1, 0.5, 0.9, 0.999])
+    t = path.distance(s)
+    world = eyes[:, None] + t[..., None] * directions[:, None]
+    np.testing.assert_allclose(ndc.place(world), path.begin[:, None] + s[..., None] * path.way[:, None], atol=1e-9)
+    depths = (ndc.frame[:, 3] - world) @ ndc.frame[:, 2]
+    own = (ndc.frame[:, 3] - eyes) @ ndc.frame[:, 2]
+    np.testing.assert_allclose(depths[:, 0], np.maximum(own, ndc.near))
+    assert (own > ndc.near).any() and (own < 0).any()
+    assert (path.distance(path.length[:, None] * 2) < np.inf).all()  # capped
+    assert np.allclose(path.distance(path.length[:, None]), path.start[:, None] + path.pace[:, None] * (1 / LEAST_DISPARITY - 1))
+
+
+def test_rays_in_single_precision() -> None:
+    ndc = coordinates()
+    eyes = ndc.frame[:, 3] + RNG.uniform(-0.4, 0.4, (500, 3))
+    directions = before(ndc, 500) - eyes
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    exact, single = ndc.path(eyes, directions), ndc.path(eyes.astype(np.float32), directions.astype(np.float32))
+    far = -(directions @ ndc.frame[:, 2]) > 0.1
+    np.testing.assert_allclose(single.begin[far], exact.begin[far], atol=2e-5)
+    np.testing.assert_allclose(single.way[far], exact.way[far], atol=2e-4)
+    assert single.begin.dtype == single.way.dtype == np.float32
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rays_that_do_not_go_forward_see_the_background(dtype: type) -> None:
+    scene = faced(tiny_scene(0))
+    assert isinstance(scene.mapping, DeviceCoordinates)
+    right, _, back, eye = scene.mapping.frame.T
+    directions = np.array([back, right, right - 1e-5 * back]).astype(dtype)
+    path = scene.mapping.path(np.tile(eye, (3, 1)).astype(dtype), directions)
+    assert np.isfinite(path.begin).all() and np.isfinite(path.way).all() and np.isfinite(path.distance(np.ones((3, 1), dtype))).all()
+    behind = look_at(tuple(eye), tuple(eye + back), 8, 6, 5.0)
+    seen = render(scene, behind, 0.5)
+    assert not seen.opacity.any() and not seen.samples.any() and np.isinf(seen.depth).all()
+
+
+def test_depth_is_in_the_world() -> None:
+    scene = faced(tiny_scene(4))
+    camera = scene.cameras[0]
+    seen = render(scene, camera, 0.5)
+    origins, directions = camera.rays()
+    solid = (seen.opacity > 0.99).ravel()
+    ends = (origins + seen.depth.ravel()[:, None] * directions)[solid]
+    places_of_ends = scene.mapping.place(ends.astype(np.float64))
+    assert solid.sum() > 20
+    assert (places_of_ends >= scene.aabb[0] - 0.1).all() and (places_of_ends <= scene.aabb[1] + 0.1).all()
+
+
+def test_bounds_hold_the_box() -> None:
+    scene = faced(tiny_scene(4))
+    inside = scene.aabb[0] + RNG.random((500, 3)) * (scene.aabb[1] - scene.aabb[0])
+    world, bounds = scene.mapping.expand(inside), scene.bounds
+    assert (world >= bounds[0]).all() and (world <= bounds[1]).all()
+    assert np.array_equal(tiny_scene(4).bounds, tiny_scene(4).aabb)
