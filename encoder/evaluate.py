@@ -30,7 +30,7 @@ class SceneRenderer:
     def render(
         self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Colours (N, 3), opacities (N,) and mean depths (N,) of the same rays, float32."""
+        """Colours (N, 3), opacities (N,) and mean depths (N,) along the same rays, as those measure, float32."""
         scene, field, layout = self.scene, self.field, self.field.layout
         out = []
         for start in range(0, len(origins), 1 << 16):

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from kpc.encoder.ablations import changed_by
 from kpc.encoder.box import contraction_of, device_coordinates_of, find_box, find_inner_box, reaches_beyond, seen_cells
 from kpc.encoder.compress import compress, compress_to_size, relative_steps
 from kpc.encoder.config import TrainConfig
@@ -146,6 +147,17 @@ def profile_steps(options: Options) -> dict[str, Any]:
         As `encode`.
     """
     return profile(_trainer(options))
+
+
+def ablations(options: Options) -> list[str]:
+    """The names of the ablations (`kpc.encoder.ablations`) that make a difference to a run. Nothing is written but pixels.
+
+    Raises:
+        As `encode`.
+    """
+    _make_work_dir(options.work_dir)
+    dataset = load_dataset(options.source, options.work_dir, holdout=options.holdout, downscale=options.downscale)
+    return changed_by(options.config(dataset))
 
 
 def _trainer(options: Options) -> Trainer:

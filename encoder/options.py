@@ -4,6 +4,7 @@ import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from kpc.encoder.ablations import ABLATIONS
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import Dataset
 from kpc.format import cli
@@ -30,6 +31,8 @@ class Options:
     most_tests: int | None = None
     max_loss_db: float | None = None
     target_bytes: int | None = None
+    ablation: str = "as it is"
+    """Of `kpc.encoder.ablations`; no option of the command line."""
 
     @property
     def work_dir(self) -> Path:
@@ -40,7 +43,8 @@ class Options:
         if dataset.has_alpha and dataset.one_view_at_a_time:
             config = config.for_lone_object()
         most = config.max_coding_loss_db if self.max_loss_db is None else self.max_loss_db
-        return replace(config, seed=self.seed, steps=self.steps or config.steps, max_coding_loss_db=most)
+        config = replace(config, seed=self.seed, steps=self.steps or config.steps, max_coding_loss_db=most)
+        return ABLATIONS[self.ablation](config)
 
 
 def parse(argv: list[str]) -> tuple[Options, bool, bool]:

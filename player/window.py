@@ -385,7 +385,7 @@ class Player:
                 changed, folded = imgui.checkbox("folded time planes", self.renderer.folded)
                 if changed:
                     self.renderer.folded = folded
-                imgui.set_item_tooltip("Multiplies time into the space planes once a frame: faster; 54 dB from exact.")
+                imgui.set_item_tooltip("Multiplies time into the space planes once a frame: faster; some 43 dB from exact.")
 
     def _transport(self) -> None:
         """Play, pause, scrub, speed, loop."""

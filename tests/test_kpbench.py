@@ -9,6 +9,7 @@ from scenes import tiny_scene
 
 import kpc
 from kpc.encoder import profile
+from kpc.encoder.ablations import ABLATIONS, changed_by
 from kpc.encoder.config import PRESETS
 from kpc.format.file import write
 from kpc.format.quantise import quantise_scene
@@ -82,6 +83,33 @@ def test_curve_encodes_anew_for_each_time(tmp_path: Path, capsys: pytest.Capture
     assert "held-out PSNR, dB" in (tmp_path / "curve.svg").read_text()
 
 
+def test_ablate_changes_one_thing_at_a_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kpbench, "_alone", lambda work, job: work(job))
+    for name in set(ABLATIONS) - {"as it is", "half the channels", "no motion grid"}:
+        monkeypatch.delitem(ABLATIONS, name)
+    write_n3dv(tmp_path / "tiny", frames=2)
+    out = tmp_path / "ablate.json"
+    command = ["ablate", str(tmp_path / "tiny"), "--preset", "draft", "--steps", "3", "--box=-1,-1,-1,1,1,1", "--out", str(out)]
+    assert kpbench.main(command) == 0
+    records = results.load([out])  # there is no motion grid to leave out
+    assert [record["settings"]["ablation"] for record in records] == ["as it is", "half the channels"]
+    whole, half = (record["repeats"][0] for record in records)
+    assert whole["parameters"] > 1.8 * half["parameters"] and whole["steps"] == half["steps"] == 3
+    assert "changed" in capsys.readouterr().err and "half the channels" in results.markdown(records)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ablate.json", "tiny"]
+
+
+def test_every_ablation_changes_something_somewhere() -> None:
+    plain = PRESETS["balanced"]
+    lone = plain.for_lone_object()
+    assert set(changed_by(plain)) | set(changed_by(lone)) == set(ABLATIONS)
+    assert "no motion grid" in changed_by(lone) and "no motion grid" not in changed_by(plain)
+    assert "one colour from all sides" not in changed_by(lone) and changed_by(plain)[0] == "as it is"
+    assert ABLATIONS["as it is"](plain) is plain
+
+
 def test_player_measures_both_paths_of_a_moving_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gl.context()
     moving, still = tiny_file(tmp_path / "moving.kpc", True), tiny_file(tmp_path / "still.kpc", False)
@@ -121,7 +149,7 @@ def test_senseless_minutes_are_refused(minutes: str, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(
-    "command", [["encode", "missing"], ["curve", "missing"], ["player", "missing.kpc"], ["player", "x.kpc", "--out", "no/x"]]
+    "command", [["encode", "missing"], ["curve", "missing"], ["ablate", "missing"], ["player", "missing.kpc"], ["player", "x.kpc", "--out", "no/x"]]
 )
 def test_errors_are_one_line(command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                              capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip

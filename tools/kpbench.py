@@ -2,6 +2,7 @@
 
 kpbench encode room liam --preset balanced --out docs/bench/balanced.json
 kpbench curve room liam --minutes 1,2,5,10,20 --out docs/bench/curve.json
+kpbench ablate default --preset fast --steps 2000 --out docs/bench/ablate.json
 kpbench step room soldier --preset balanced --out docs/bench/step.json
 kpbench player room.kpc liam.kpc --out docs/bench/player.json
 
@@ -38,6 +39,9 @@ from kpc.tools import results
 from kpc.tools.provenance import commit, data_hash, machine, versions
 
 T = TypeVar("T")
+
+Run = tuple[Path, dict[str, Any]]
+"""A dataset, and what `kpenc.Options` differs in from the other runs."""
 
 WARM_UP = 3
 """Frames drawn before those that are timed."""
@@ -106,46 +110,59 @@ def _record(kind: str, source: Path, origin: results.Record, settings: dict[str,
 
 def _encode(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
     """One record a dataset."""
-    yield from _encodes("encode", options, origin, [(source, options.time_budget) for source in options.datasets])
+    runs: list[Run] = [(source, {"time_budget_s": options.time_budget}) for source in options.datasets]
+    yield from _encodes("encode", options, origin, runs)
 
 
 def _curve(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
     """One record a dataset and time: an encode of its own, since the learning rate falls as the time runs out."""
-    runs = [(source, 60 * minutes) for source in options.datasets for minutes in options.minutes]
+    runs: list[Run] = [(source, {"time_budget_s": 60 * m}) for source in options.datasets for m in options.minutes]
     yield from _encodes("curve", options, origin, runs)
 
 
+def _ablate(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """One record a dataset and ablation that makes a difference to it, the unchanged run first."""
+    _encoder()
+    runs: list[Run] = []
+    with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
+        for source in options.datasets:
+            job = _job(options, _folder(source), options.seed, Path(scratch) / "none.kpc", Path(scratch) / f"{len(runs)}.work")
+            runs += [(source, {"ablation": name}) for name in _alone(_ablations, job)]
+    yield from _encodes("ablate", options, origin, runs)
+
+
 def _encodes(
-    kind: str, options: argparse.Namespace, origin: results.Record, runs: list[tuple[Path, float | None]]
+    kind: str, options: argparse.Namespace, origin: results.Record, runs: Sequence[Run]
 ) -> Iterator[results.Record]:
-    """A record a dataset and time budget. Repeat k runs with seed + k, so that repeats show the spread of quality, too."""
+    """A record a run. Repeat k has seed + k, so that repeats show the spread of quality, too."""
     _encoder()  # what is missing is said before anything is read
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         kept: Path = options.keep_scenes or Path(scratch)
         kept.mkdir(parents=True, exist_ok=True)
-        for source, time_budget_s in runs:
+        for source, changes in runs:
             settings = {
                 "preset": options.preset,
                 "steps": options.steps,
-                "time_budget_s": time_budget_s,
+                **changes,
                 "downscale": options.downscale,
                 "space": options.space,
                 "box": options.box,
                 "test_views": options.test_views,
             }
             record = _record(kind, _folder(source), origin, settings) | {"seed": options.seed, "repeats": []}
-            label = f"{record['name']}-{options.preset}" + (f"-{time_budget_s:g}s" if kind == "curve" else "")
+            told = "" if kind == "encode" else "-" + "-".join(str(value) for value in changes.values()).replace(" ", "-")
+            label = f"{record['name']}-{options.preset}{told}"
             for seed in range(options.seed, options.seed + options.repeats):
                 suffix = f"-{seed}" if options.repeats > 1 else ""
                 work = Path(scratch) / f"{label}-{seed}.work"
                 job = replace(
                     _job(options, source, seed, kept / f"{label}{suffix}.kpc", work),
                     steps=options.steps,
-                    time_budget_s=time_budget_s,
                     most_tests=options.test_views,
+                    **changes,
                 )
-                length = "" if time_budget_s is None else f"{time_budget_s:g} s, "
-                print(f"kpbench: {record['name']}, {options.preset}, {length}seed {seed}", file=sys.stderr)
+                said = ", ".join(f"{key} {value}" for key, value in changes.items() if value is not None)
+                print(f"kpbench: {record['name']}, {options.preset}, {said + ', ' if said else ''}seed {seed}", file=sys.stderr)
                 device, outcome = _alone(_encode_once, job)
                 record["repeats"].append(outcome)
             yield record | {"renderer": device}
@@ -185,6 +202,11 @@ def _job(options: argparse.Namespace, source: Path, seed: int, output: Path, wor
         box=options.box,
         work=work,
     )
+
+
+def _ablations(job: Any) -> list[str]:
+    names: list[str] = _encoder().ablations(job)
+    return names
 
 
 def _step_once(job: Any) -> results.Record:
@@ -316,7 +338,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|step|player")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|player")
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
@@ -328,17 +350,22 @@ def _parser() -> argparse.ArgumentParser:
                        help="of training, a run of its own for each (default: 1,2,5,10,20)")  # fmt: skip
     curve.set_defaults(measure=_curve, steps=None)
 
+    ablate = kinds.add_parser("ablate", help="what each part is worth", description="Run kpenc on each dataset, with one thing "
+                              "changed at a time: kpc.encoder.ablations.")  # fmt: skip
+    ablate.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
+    ablate.set_defaults(measure=_ablate)
+
     step = kinds.add_parser("step", help="where the time of training goes", description="Profile a training step, on the CPU.")
     step.set_defaults(measure=_step, device="cpu")
 
-    for kind in (encode, curve, step):
+    for kind in (encode, curve, ablate, step):
         kind.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
         kind.add_argument("--preset", choices=("draft", "fast", "balanced", "best"), default="balanced")
         kind.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
         kind.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
-        kind.add_argument("--space", choices=("auto", "box", "contracted"), default="auto", help="of every dataset")
+        kind.add_argument("--space", choices=("auto", "box", "contracted", "ndc"), default="auto", help="of every dataset")
         kind.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
-    for kind in (encode, curve):
+    for kind in (encode, curve, ablate):
         kind.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
         kind.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
         kind.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there")
@@ -349,7 +376,7 @@ def _parser() -> argparse.ArgumentParser:
     player.add_argument("--frames", type=_positive, default=60, help="timed frames, spread over the clip (default: 60)")
     player.set_defaults(measure=_player)
 
-    for kind in (encode, curve, step, player):
+    for kind in (encode, curve, ablate, step, player):
         kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
         kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
     return parser

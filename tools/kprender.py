@@ -133,7 +133,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--folded",
         action="store_true",
-        help="gl: multiply time into the space planes once a frame: faster, 54 dB from exact",
+        help="gl: multiply time into the space planes once a frame: faster, some 43 dB from exact",
     )
     parser.set_defaults(part=Part.FULL)
     return parser

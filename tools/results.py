@@ -95,6 +95,13 @@ COLUMNS: dict[str, list[Column]] = {
         ("all", _number("encode_s", "{:.0f} s")),
         ("steps", _number("steps", "{:,.0f}")),
     ],
+    "ablate": [
+        ("dataset", lambda r: r["name"]),
+        ("changed", lambda r: r["settings"]["ablation"]),
+        *_ENCODED[2:],
+        ("identity", _number("identity_share", "{:.0%}")),
+        ("training", _number("train_s", "{:.0f} s")),
+    ],
     "step": [
         ("dataset", lambda r: r["name"]),
         ("preset", lambda r: r["settings"]["preset"]),
@@ -125,7 +132,8 @@ COLUMNS: dict[str, list[Column]] = {
         ("within 1/255", _accuracy("within_one_level", "{:.2%}")),
     ],
 }
-TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "step": "A step of training", "player": "Playing"}
+TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
+          "step": "A step of training", "player": "Playing"}
 
 
 def cells(kind: str, records: Iterable[Record]) -> list[list[str]]:
