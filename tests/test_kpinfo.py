@@ -6,6 +6,7 @@ from scenes import displaced, faced, surrounded, tiny_scene
 
 from kpc.format.container import Reader
 from kpc.format.file import write
+from kpc.format.motion import STEP
 from kpc.format.quantise import quantise_scene
 from kpc.tools import kpinfo
 
@@ -83,7 +84,7 @@ def test_a_scene_with_a_motion_grid(tmp_path, capsys):
     assert kpinfo.main([str(path), "--json"]) == 0
     motion = json.loads(capsys.readouterr().out)["motion"]
     assert motion["rows"] == 6 and motion["nodes_zyx"] == [3, 2, 4]
-    assert motion["largest"] == pytest.approx(np.abs(scene.motion).max(), abs=1e-4)
+    assert motion["largest"] == pytest.approx(np.abs(scene.motion).max(), abs=STEP / 2 + 1e-7)
 
 
 def test_verify_lists_every_damaged_chunk(scene_file, capsys):
