@@ -85,7 +85,8 @@ def test_products_of_six_values_at_1e_minus_6_and_1e6(large: int, order: int) ->
     assert features[0] == pytest.approx(exact, rel=1e-6)
     grad = np.zeros_like(theta)
     one, scratch = np.ones(1, np.float32), np.empty(6, np.float32)
-    kernels._scatter_planes(grad, layout.table, layout.resolution, 1, corners, fractions, samples, one, scratch)
+    at = (layout.table, layout.resolution, 1, corners, fractions, samples)
+    kernels._scatter_planes(grad, *at, one, scratch, theta, None, False)
     for (_, name, start, *_), value in zip(layout.planes(), values, strict=True):
         assert grad[start] == pytest.approx(exact / float(np.float32(value)), rel=1e-5), name
 

@@ -107,7 +107,7 @@ def fails(
     "name, layout, dynamic, steps",
     [
         ("n3dv", "N3DV", True, 24),
-        ("blender", "Blender", True, 115),
+        ("blender", "Blender", True, 96),
         ("nerfstudio", "nerfstudio", False, 24),
         ("colmap", "COLMAP", False, 24),
     ],
@@ -143,7 +143,7 @@ def test_what_is_printed(run: Kpenc, sets: Path) -> None:
             "bits per parameter",
             "exactly at identity: ",
             "encoded in ",
-            "115 steps",
+            "96 steps",
         )
     )
 
