@@ -255,7 +255,7 @@ class Renderer:
             {
                 "SCALES": layout.scales,
                 "LAYERS": layout.layers,
-                "HIDDEN": len(scene.decoder.b1),
+                "HIDDEN": len(scene.decoder.b1) if scene.decoder.w2.any() else 0,
                 "ROWS": int(rows),
                 "EARLY": int(early),
                 "CONTRACTED": int(isinstance(scene.mapping, Contraction)),

@@ -130,7 +130,7 @@ def decoder_arrays(decoder: Decoder, scene: Scene, layout: Layout) -> dict[str, 
     """The decoder's weights as march.glsl wants them, (N, 4) float32 each, features in the padded layout of the planes.
 
     density_weight (F / 4), w1 (H x 3: nine columns, then b1, then zeros), w2 (3 x F / 4 x H), b2 (3 x F / 4),
-    density_bias (1, in x).
+    density_bias (1, in x). Without w1 and w2 where colour is the same from all sides, w2 being 0.
     """
     features = layout.scales * layout.layers * 4
     place = np.concatenate(
@@ -142,13 +142,13 @@ def decoder_arrays(decoder: Decoder, scene: Scene, layout: Layout) -> dict[str, 
         out[..., place] = weights
         return out.reshape(*weights.shape[:-1], features // 4, 4)
 
-    w1 = np.zeros((len(decoder.b1), 12), np.float32)
-    w1[:, :9], w1[:, 9] = decoder.w1, decoder.b1
     arrays = {
         "density_weight": spread(decoder.density_weight),
         "density_bias": np.array([decoder.density_bias, 0, 0, 0]),
-        "w1": w1,
-        "w2": np.moveaxis(spread(np.moveaxis(decoder.w2, 2, 0)), 0, 2),
         "b2": spread(decoder.b2),
     }
+    if decoder.w2.any():
+        arrays["w1"] = np.zeros((len(decoder.b1), 12), np.float32)
+        arrays["w1"][:, :9], arrays["w1"][:, 9] = decoder.w1, decoder.b1
+        arrays["w2"] = np.moveaxis(spread(np.moveaxis(decoder.w2, 2, 0)), 0, 2)
     return {name: np.ascontiguousarray(array, np.float32).reshape(-1, 4) for name, array in arrays.items()}

@@ -35,6 +35,10 @@ def check(got: Rendering, wanted: Rendering) -> None:
     assert np.mean(np.abs(got.depth[solid] - wanted.depth[solid]) < 2e-3) >= 0.999 if solid.any() else True
 
 
+def undirected(scene: Scene) -> Scene:
+    return replace(scene, decoder=replace(scene.decoder, w2=np.zeros_like(scene.decoder.w2)))
+
+
 @pytest.mark.parametrize("view", CAMERAS)
 @pytest.mark.parametrize("part", Part)
 @pytest.mark.parametrize("space", SPACES)
@@ -57,8 +61,9 @@ def test_gives_the_reference_picture(view: str, part: Part, space: str) -> None:
         surrounded(tiny_scene(6, dynamic=False)),
         replace(surrounded(tiny_scene(9)), occupancy=np.zeros((2, 300, 2, 3), bool)),
         displaced(surrounded(tiny_scene(6)), most=0.5),
+        undirected(tiny_scene(6)),
     ],
-    ids=["static", "uneven", "few texels", "one cell", "nothing", "contracted", "nothing anywhere", "thrown about"],
+    ids=["static", "uneven", "few texels", "one cell", "nothing", "contracted", "nothing anywhere", "thrown about", "one colour"],
 )
 def test_scenes_of_all_shapes(scene: Scene) -> None:
     renderer = Renderer(gl.context(), scene)
@@ -145,7 +150,7 @@ def test_a_scene_too_large_for_the_card_is_refused(monkeypatch: pytest.MonkeyPat
 
 def test_a_decoder_too_large_for_a_shader_is_refused() -> None:
     scene = tiny_scene(4)
-    wide = replace(scene.decoder, w1=np.zeros((2000, 9)), b1=np.zeros(2000), w2=np.zeros((3, 16, 2000)))
+    wide = replace(scene.decoder, w1=np.zeros((2000, 9)), b1=np.zeros(2000), w2=np.ones((3, 16, 2000)))
     with pytest.raises(DisplayError, match="weights"):
         Renderer(gl.context(), replace(scene, decoder=wide))
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -81,3 +83,5 @@ def test_decoder_arrays_keep_every_weight() -> None:
     assert np.array_equal(w1[:, :9], decoder.w1) and np.array_equal(w1[:, 9], decoder.b1)
     assert arrays["density_bias"][0, 0] == decoder.density_bias
     assert arrays["w2"].sum() == pytest.approx(decoder.w2.sum(), rel=1e-4)  # the padding is 0
+    undirected = replace(decoder, w2=np.zeros_like(decoder.w2))
+    assert set(decoder_arrays(undirected, scene, layout)) == {"density_weight", "density_bias", "b2"}

@@ -1,6 +1,6 @@
 // The picture of a scene; normative text and a readable twin: kpc.player.reference.
 //
-// SCALES, LAYERS (of four channels), HIDDEN: its shape. ROWS: 1 where rows of time planes are multiplied in at every
+// SCALES, LAYERS (of four channels), HIDDEN: its shape; HIDDEN is 0 where colour is the same from all sides. ROWS: 1 where rows of time planes are multiplied in at every
 // sample. REFINED: how much finer than the scene's the planes are along the row folded into them; 1 where none is.
 // CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
 // NDC: 1 where all this is in device coordinates. EARLY: 1 where a ray may end sooner than the format says: what is left of its
@@ -49,6 +49,7 @@ uniform vec3 eye;
 layout(location = 0) out vec4 seen;     // rgb and opacity
 layout(location = 1) out vec4 met;      // sum of weight t, samples
 
+#if HIDDEN
 vec4 basis[3 * FEATURES];
 
 void find_basis(vec3 d) {
@@ -65,6 +66,9 @@ void find_basis(vec3 d) {
         basis[i] = sum;
     }
 }
+#else
+#define basis b2
+#endif
 
 vec4 feature(vec3 u, int scale, int layer) {
     vec3 p = u * (resolution[scale] - 1.0);
@@ -84,13 +88,15 @@ vec4 feature(vec3 u, int scale, int layer) {
 void main() {
     Path path = path_of(eye, camera_direction(gl_FragCoord.xy, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
-    find_basis(path.way);
 
     vec3 rgb = vec3(0.0);
     float trans = 1.0;
     float depth = 0.0;
     float samples = 0.0;
     bool more = to_occupied(walk, cells, cell_count);
+#if HIDDEN
+    if (more) find_basis(path.way);
+#endif
     // Tested at its end: neighbouring rays run as one, and a test up front would cost them all one more body.
     do {
         if (more) {
