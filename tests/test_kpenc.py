@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import datasets as make
@@ -25,7 +25,7 @@ from kpc.encoder.train import Trainer
 from kpc.format import cli, file
 from kpc.format.space import DeviceCoordinates
 
-pytestmark = pytest.mark.usefixtures("one_thread", "tiny")
+pytestmark = pytest.mark.usefixtures("one_thread", "tiny", "heeded_signals")
 TINY = dict(
     resolutions=(8, 16),
     samples_across=32,
@@ -37,6 +37,14 @@ TINY = dict(
     occupancy_start=8,
     occupancy_every=4,
 )
+
+
+@pytest.fixture
+def heeded_signals() -> Iterator[None]:
+    """kpenc leaves a signal alone that its parent ignores; what runs these tests may ignore Ctrl-C, as nohup in scripts does."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture
