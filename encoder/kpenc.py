@@ -284,7 +284,7 @@ def _plan(trainer: Trainer) -> str:
     elif mapping is not None:
         beyond = f" of device coordinates, near {mapping.near:.4g}, baseline {mapping.baseline:.4g}"
     nodes = "" if trainer.field.motion is None else (
-        f", read where a motion grid of {'x'.join(str(n) for n in trainer.field.motion.shape[2::-1])} nodes leads")
+        f", read where a motion grid of {'x'.join(str(n) for n in trainer.field.motion.shape[3:0:-1])} nodes leads")
     return (f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
             f"{layout.size / 1e6:.2f} M parameters{nodes}; on {trainer.device}")
 
