@@ -26,7 +26,7 @@ def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
         DatasetError: neither holds.
     """
     cameras = _distinct_cameras(pictures)
-    if np.all(np.isfinite(pictures.near[cameras])) and np.all(np.isfinite(pictures.far[cameras])):
+    if _near_and_far_known(pictures, cameras):
         corners = np.concatenate([_frustum(pictures, p) for p in cameras])
         return np.stack([corners.min(0), corners.max(0)]).astype(np.float32)
     focus = _focus(pictures, cameras)
@@ -52,8 +52,7 @@ def reaches_beyond(pictures: Pictures, has_alpha: bool) -> tuple[bool, str]:
     """
     if has_alpha:
         return False, "the pictures have alpha: an object on its own"
-    cameras = _distinct_cameras(pictures)
-    if np.all(np.isfinite(pictures.near[cameras])) and np.all(np.isfinite(pictures.far[cameras])):
+    if _near_and_far_known(pictures, _distinct_cameras(pictures)):
         return False, "the cameras' near and far are known"
     return True, "nothing bounds what the cameras see"
 
@@ -98,7 +97,7 @@ def device_coordinates_of(pictures: Pictures) -> tuple[DeviceCoordinates, np.nda
             lies less than a tenth of that depth before the foremost camera.
     """
     cameras = _distinct_cameras(pictures)
-    if not (np.all(np.isfinite(pictures.near[cameras])) and np.all(np.isfinite(pictures.far[cameras]))):
+    if not _near_and_far_known(pictures, cameras):
         raise DatasetError("device coordinates need each camera's near and far; try --space contracted")
     poses = pictures.camera_to_world[cameras, :3]
     eyes, back = poses[:, :, 3], poses[:, :, 2].mean(0)
@@ -175,6 +174,10 @@ def _distinct_cameras(pictures: Pictures) -> np.ndarray:
     poses = np.round(pictures.camera_to_world[train].reshape(len(train), 16), 9)
     _, first = np.unique(poses, axis=0, return_index=True)
     return train[np.sort(first)]
+
+
+def _near_and_far_known(pictures: Pictures, cameras: np.ndarray) -> bool:
+    return bool(np.all(np.isfinite(pictures.near[cameras])) and np.all(np.isfinite(pictures.far[cameras])))
 
 
 def _frustum(pictures: Pictures, p: int) -> np.ndarray:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from kpc.encoder.config import TrainConfig
+from kpc.encoder.occupancy import grid_shape
 from kpc.format.scene import (
     ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Clip, Decoder, Scene,
 )
@@ -80,9 +81,8 @@ def motion_nodes(config: TrainConfig, aabb: np.ndarray, layout: Layout) -> tuple
     """Nodes of the motion grid along t, z, y and x: a row for each of the time planes, cells as near to cubes as may be."""
     if not config.motion_cells or not layout.is_dynamic:
         return None
-    edges = np.asarray(aabb[1] - aabb[0], np.float64)
-    x, y, z = (max(1, round(config.motion_cells * e / edges.max())) + 1 for e in edges)
-    return int(layout.resolution[0, 3]), z, y, x
+    nz, ny, nx = grid_shape(aabb, config.motion_cells)
+    return int(layout.resolution[0, 3]), nz + 1, ny + 1, nx + 1
 
 
 class Field(nn.Module):

@@ -303,28 +303,28 @@ def _spread_of_cameras(dataset: Dataset) -> list[int]:
 def _space_of(dataset: Dataset, options: Options) -> tuple[np.ndarray, SpaceMapping | None, str]:
     """The box asked for or found, (2, 3) float32, within what a file can hold; how space beyond it is held; and why so."""
     beyond, why = reaches_beyond(dataset.pictures, dataset.has_alpha)
-    contracted = beyond if options.space == "auto" else options.space == "contracted"
-    if options.space == "ndc":
-        if options.box is not None:
-            raise UsageError("--box is in world units, device coordinates have a box of their own: drop --box or --space ndc")
-        try:
+    space = options.space if options.space != "auto" else "contracted" if beyond else "box"
+    if space == "ndc" and options.box is not None:
+        raise UsageError("--box is in world units, device coordinates have a box of their own: drop --box or --space ndc")
+    mapping: SpaceMapping | None = None
+    try:
+        if space == "ndc":
             mapping, aabb = device_coordinates_of(dataset.pictures)
-        except DatasetError as error:
-            raise DatasetError(f"{options.source}: {error}") from error
-        return aabb, mapping, "as told"
-    if options.box is not None:
-        aabb = np.array(options.box, np.float32).reshape(2, 3)
-    else:
-        try:
-            aabb = find_inner_box(dataset.pictures) if contracted else find_box(dataset.pictures, dataset.has_alpha)
-        except DatasetError as error:
-            raise DatasetError(f"{options.source}: {error}") from error
-    mapping = contraction_of(dataset.pictures, aabb) if contracted else None
+        elif options.box is not None:
+            aabb = np.array(options.box, np.float32).reshape(2, 3)
+        elif space == "contracted":
+            aabb = find_inner_box(dataset.pictures)
+        else:
+            aabb = find_box(dataset.pictures, dataset.has_alpha)
+    except DatasetError as error:
+        raise DatasetError(f"{options.source}: {error}") from error
+    if space == "contracted":
+        mapping = contraction_of(dataset.pictures, aabb)
     if not (np.abs(aabb) <= file.BOX_LIMIT).all() or not (aabb[1] - aabb[0] >= 1 / file.BOX_LIMIT).all():
         raise DatasetError(f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; "
                            "give another with --box x0,y0,z0,x1,y1,z1")
-    samples = mapping.even * options.config(dataset).samples_across / (aabb[1] - aabb[0]).max() if mapping else 0.0
-    if samples > file.SAMPLE_LIMIT:
+    across = options.config(dataset).samples_across / (aabb[1] - aabb[0]).max()
+    if isinstance(mapping, Contraction) and mapping.even * across > file.SAMPLE_LIMIT:
         raise DatasetError(f"{options.source}: the box is too small for cameras that lie {mapping.even:.4g} from its far side; "
                            "give a larger one with --box x0,y0,z0,x1,y1,z1, or --space box")
     if not seen_cells(dataset.pictures, aabb, grid_shape(aabb, 64), mapping).any():

@@ -410,7 +410,7 @@ class FusedOptimiser:
             self.field.density.grad = torch.from_numpy(grad_density.sum(0))
             self.field.density.grad[:-1] *= kept
             if moving:
-                torch.stack(list(motion_priors(self.field, config).values())).sum().backward()
+                _total(motion_priors(self.field, config)).backward()
                 self.field.motion.grad += torch.from_numpy(grad_motion.sum(0))
             _set_rate(self.decoder, rate)
             self.decoder.step()
@@ -469,10 +469,10 @@ class PlainOptimiser:
         error = (rgb - targets.to(device)).square().mean()
         loss = error + config.distortion * distortion
         if number % config.regularise_every == 0:
-            loss = loss + config.regularise_every * torch.stack(list(priors(self.field, config).values())).sum()
+            loss = loss + config.regularise_every * _total(priors(self.field, config))
         moving = self.field.motion is not None and number % config.motion_every == 0
         if moving:
-            loss = loss + torch.stack(list(motion_priors(self.field, config).values())).sum()
+            loss = loss + _total(motion_priors(self.field, config))
         for optimiser in (self.planes, self.decoder):
             optimiser.zero_grad()
             _set_rate(optimiser, rate)
@@ -497,6 +497,10 @@ class PlainOptimiser:
         if "exp_avg_sq" not in state:
             return np.zeros(self.field.theta.numel(), np.float32)
         return state["exp_avg_sq"].cpu().numpy()
+
+
+def _total(weighed: dict[str, torch.Tensor]) -> torch.Tensor:
+    return torch.stack(list(weighed.values())).sum()
 
 
 def add_priors(field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, times: float) -> None:

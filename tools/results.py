@@ -96,15 +96,14 @@ COLUMNS: dict[str, list[Column]] = {
         ("steps", _number("steps", "{:,.0f}")),
     ],
     "ablate": [
-        ("dataset", lambda r: r["name"]),
+        _ENCODED[0],
         ("changed", lambda r: r["settings"]["ablation"]),
         *_ENCODED[2:],
         ("identity", _number("identity_share", "{:.0%}")),
         ("training", _number("train_s", "{:.0f} s")),
     ],
     "step": [
-        ("dataset", lambda r: r["name"]),
-        ("preset", lambda r: r["settings"]["preset"]),
+        *_ENCODED[:2],
         ("M param", _number("parameters", "{:.2f}", 1e6)),
         ("samples/ray", _number("samples_per_ray", "{:.1f}")),
         ("rays/s", _number("rays_per_s", "{:,.0f}")),

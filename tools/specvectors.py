@@ -115,13 +115,11 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
     dynamic = _scene(dynamic=True, sizes=[(2, 5, 4, 3, 3), (4, 9, 8, 7, 6)], cameras=2)
     packed = encode(dynamic, segment_rows=4)
     minimal = minimal_scene()
-    contracted = replace(_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), mapping=Contraction(3.5),
-                         occupancy=_noise((2, 3, 3, 5), 98) > -64)
-    moved = replace(_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), occupancy=_noise((2, 3, 3, 5), 98) > -64,
-                    motion=_motion(4, 3, 2, 5))
+    dense = replace(_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), occupancy=_noise((2, 3, 3, 5), 98) > -64)
+    contracted, moved = replace(dense, mapping=Contraction(3.5)), replace(dense, motion=_motion(4, 3, 2, 5))
     frame = np.array([[0.96, 0, 0.28, 0.5], [0, 1, 0, -0.25], [-0.28, 0, 0.96, 3]])
-    faced = replace(_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), occupancy=_noise((2, 3, 3, 5), 98) > -64,
-                    mapping=DeviceCoordinates(frame, 1.5, 2.0), aabb=np.array([[-0.5, -0.5, 0.125], [0.5, 0.5, 1.25]], np.float32))
+    faced = replace(dense, mapping=DeviceCoordinates(frame, 1.5, 2.0),
+                    aabb=np.array([[-0.5, -0.5, 0.125], [0.5, 0.5, 1.25]], np.float32))
     note = Chunk("note", [b"readers skip what they need not know"])
     chunks = scene_chunks(minimal)
     index = Reader(packed).index
@@ -164,9 +162,12 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     def set_at(offset: int, layout: str, *numbers: int | float) -> Callable[[bytes], bytes]:
         return lambda raw: patched(raw, offset, layout, *numbers)
 
+    def with_chunks(kind: str, *parts: bytes) -> bytes:
+        """The file with more chunks, of a kind that follows SCNE."""
+        return pack([chunks[scne], *(Chunk(kind, [part]) for part in parts), *chunks[deco:]], values, compress=False)
+
     def warped(*parts: bytes) -> bytes:
-        """The file with WARP chunks."""
-        return pack([chunks[scne], *(Chunk("WARP", [part]) for part in parts), *chunks[deco:]], values, compress=False)
+        return with_chunks("WARP", *parts)
 
     still = _scene(dynamic=False, sizes=[(1, 2, 2, 2, 0)])
     still_values = Reader(encode(still)).header.value_count
@@ -175,8 +176,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         return struct.pack("<I12ddd", 2, 1, 0, 0, 0.5, skew, 1, 0, -0.25, 0, 0, 1, 3, near, 2.0)
 
     def displaced(*parts: bytes) -> bytes:
-        """The file with MOVE chunks."""
-        return pack([chunks[scne], *(Chunk("MOVE", [part]) for part in parts), *chunks[deco:]], values, compress=False)
+        return with_chunks("MOVE", *parts)
 
     def move(rows: int, nz: int, ny: int, nx: int, step: float) -> bytes:
         return struct.pack("<4Hf", rows, nz, ny, nx, step) + bytes(6 * 16)

@@ -1,7 +1,8 @@
 // The picture of a scene; normative text and a readable twin: kpc.player.reference.
 //
-// SCALES, LAYERS (of four channels), HIDDEN: its shape; HIDDEN is 0 where colour is the same from all sides. ROWS: 1 where rows of time planes are multiplied in at every
-// sample. REFINED: how much finer than the scene's the planes are along the row folded into them; 1 where none is.
+// SCALES, LAYERS (of four channels), HIDDEN: its shape; HIDDEN is 0 where colour is the same from all sides. ROWS: 1 where
+// rows of time planes are multiplied in at every sample. REFINED: how much finer than the scene's the planes are along the
+// row folded into them; 1 where none is.
 // CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
 // NDC: 1 where all this is in device coordinates. EARLY: 1 where a ray may end sooner than the format says: what is left of its
 // light then counts as what it has met so far. A sixth of all samples lie behind that point.
