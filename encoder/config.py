@@ -20,6 +20,10 @@ class TrainConfig:
     motion_cells: int = 0
     """Cells of the motion grid (`kpc.format.motion`) along the longest edge of the box; 0 for none. It has a row for each row of
     the time planes. Not for objects in surroundings that stand still: a cell holds some of both, and liam loses 4.6 dB."""
+    hybrid: bool = False
+    """The hybrid decoder, two small MLPs for each sample, in place of the explicit one (`kpc.format.scene`)."""
+    hybrid_width: int = 32
+    """Width of its layers (K-Planes uses 64, and three of them)."""
     hidden: int = 16
     """Width of the MLP that maps a view direction to the colour basis."""
     view_dependent: bool = True
@@ -102,7 +106,7 @@ class TrainConfig:
     """What quantisation may cost on training views; the coarsest steps within it are taken."""
 
     def __post_init__(self) -> None:
-        positive = ("channels", "steps", "rays", "samples", "hidden", "samples_across", "cells_across", "warmup",
+        positive = ("channels", "steps", "rays", "samples", "hidden", "hybrid_width", "samples_across", "cells_across", "warmup",
                     "regularise_every", "motion_every", "occupancy_every", "occupancy_slots", "occupancy_split_every")
         for name in positive:
             if getattr(self, name) < 1:

@@ -10,15 +10,19 @@ from torch.nn.functional import conv2d
 
 from kpc.encoder import kernels
 from kpc.encoder.datasets import Dataset, rays
-from kpc.encoder.field import Field
+from kpc.encoder.field import Field, HybridField
+from kpc.encoder.render import Rays, collected, composite, fused_features
 from kpc.encoder.train import sample_capacity
 from kpc.format.scene import Scene
+from kpc.format.space import Contraction
 
 WHITE = np.ones(3, np.float32)
 
+RAYS_AT_ONCE = 1 << 16
+
 
 class SceneRenderer:
-    """Renders rays of a scene with the fused kernel; the same pictures as `kpc.player.reference`, much faster."""
+    """Renders rays of a scene with the kernels; the same pictures as `kpc.player.reference`, much faster."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.field = scene, Field.from_scene(scene)
@@ -31,21 +35,37 @@ class SceneRenderer:
         self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Colours (N, 3), opacities (N,) and mean depths (N,) along the same rays, as those measure, float32."""
-        scene, field, layout = self.scene, self.field, self.field.layout
+        draw = self._composited if isinstance(self.field, HybridField) else self._marched
         out = []
-        for start in range(0, len(origins), 1 << 16):
-            o, d, t = (np.ascontiguousarray(a[start : start + (1 << 16)], np.float32) for a in (origins, directions, times))
-            with torch.no_grad():
-                basis = field.basis(torch.from_numpy(d)).numpy()
-            colours, opacities, depths, _ = kernels.render(
-                field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
-                layout.channels, scene.motion, scene.aabb, kernels.even_of(scene.mapping), scene.occupancy.view(np.uint8),
-                np.float32(scene.step), np.float32(scene.extent), o, d, t, basis, np.arange(len(o)), scene.background,
-                sample_capacity(scene.aabb, scene.step, scene.mapping), 8 * numba.get_num_threads(),
-            )
-            out.append((colours, opacities, depths))
+        for start in range(0, len(origins), RAYS_AT_ONCE):
+            rays = (np.ascontiguousarray(a[start : start + RAYS_AT_ONCE], np.float32) for a in (origins, directions, times))
+            out.append(draw(*rays))
         colours, opacities, depths = (np.concatenate(parts) for parts in zip(*out, strict=True))
         return colours, opacities, depths
+
+    def _marched(self, o: np.ndarray, d: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        scene, field, layout = self.scene, self.field, self.field.layout
+        with torch.no_grad():
+            basis = field.basis(torch.from_numpy(d)).numpy()
+        colours, opacities, depths, _ = kernels.render(
+            field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
+            layout.channels, scene.motion, scene.aabb, kernels.even_of(scene.mapping), scene.occupancy.view(np.uint8),
+            np.float32(scene.step), np.float32(scene.extent), o, d, t, basis, np.arange(len(o)), scene.background,
+            sample_capacity(scene.aabb, scene.step, scene.mapping), 8 * numba.get_num_threads(),
+        )
+        return colours, opacities, depths
+
+    def _composited(self, o: np.ndarray, d: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        scene = self.scene
+        backgrounds = np.broadcast_to(scene.background, o.shape).copy()
+        batch = Rays(*(torch.from_numpy(a) for a in (o, d, t, np.full(len(o), 0.5, np.float32), backgrounds)))
+        samples = collected(batch, scene.aabb, scene.occupancy, scene.step, scene.mapping)
+        with torch.no_grad():
+            met = composite(self.field, batch, samples, fused_features(self.field), scene.step, scene.extent)
+        along = samples.s.numpy() if not isinstance(scene.mapping, Contraction) else scene.mapping.distance(samples.s.numpy())
+        depths = np.bincount(samples.ray.numpy(), met.weights.numpy() * along, len(o)).astype(np.float32)
+        opacities = met.opacity.numpy()
+        return met.rgb.numpy(), opacities, depths / np.maximum(opacities, np.float32(1e-6))
 
     def picture(self, dataset: Dataset, number: int) -> np.ndarray:
         """The scene as a picture of the dataset shows it, its lens included: (H, W, 3) float32."""

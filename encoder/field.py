@@ -1,11 +1,11 @@
-"""The radiance field that is trained: K-Planes with the explicit decoder (arXiv:2301.10241), parameters and plain PyTorch.
+"""The radiance field that is trained: K-Planes (arXiv:2301.10241), parameters and plain PyTorch.
 
 The planes live in one flat vector `theta`, channel-last, so that the fused kernels (`kpc.encoder.kernels`), the optimiser and
-the priors see one array. `render_reference` is the readable twin of the kernels: it runs on any device, with autograd.
+the priors see one array. `kpc.encoder.render` makes pictures of it.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +15,17 @@ from torch import Tensor, nn
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.occupancy import grid_shape
 from kpc.format.scene import (
-    ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Clip, Decoder, Scene,
+    ACTIVATION_LIMIT, ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TIME_PLANES, AnyDecoder, Clip, Decoder, HybridDecoder, Scene,
 )
-from kpc.format.space import Contraction, SpaceMapping
+from kpc.format.space import SpaceMapping
 
 AXES = "xyzt"
+
+FEATURE_GAIN = 8.0
+"""Of the hybrid decoder's first layer at the start."""
+
+Uniform = Callable[..., Tensor]
+"""Random numbers from low to high, of a shape."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +96,8 @@ class Field(nn.Module):
 
     Attributes:
         theta: (layout.size,) the planes. Space planes start uniform in [0.1, 0.5], time planes at 1 (K-Planes).
-        density: (F + 1,) weights of the log density, its bias last.
         motion: (T, Nz, Ny, Nx, 3) displacements, `kpc.format.motion`, at first 0; or None.
+        density: (F + 1,) weights of the log density, its bias last.
         w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.Decoder`. w2 starts at 0: colour depends on the
             direction only as far as the pictures insist.
     """
@@ -103,7 +109,6 @@ class Field(nn.Module):
         super().__init__()
         self.layout = layout
         self.motion = None if motion_nodes is None else nn.Parameter(torch.zeros(*motion_nodes, 3))
-        F = layout.features
 
         def uniform(low: float, high: float, *shape: int) -> Tensor:
             return torch.rand(shape, generator=generator) * (high - low) + low
@@ -113,6 +118,9 @@ class Field(nn.Module):
             if name in SPACE_PLANES:
                 theta[start : start + rows * columns * layout.channels] = uniform(0.1, 0.5, rows * columns * layout.channels)
         self.theta = nn.Parameter(theta)
+        self._make_decoder(layout.features, hidden, uniform)
+
+    def _make_decoder(self, F: int, hidden: int, uniform: Uniform) -> None:
         # Weights of zero mean: the box starts evenly thin, whatever the seed, with log density -1 on average.
         weights = uniform(-3, 3, F)
         self.density = nn.Parameter(torch.cat([weights - weights.mean(), torch.tensor([-1.0])]))
@@ -129,13 +137,44 @@ class Field(nn.Module):
         M = self.layout.channels
         return self.theta[start : start + rows * columns * M].view(rows, columns, M)
 
-    def basis(self, directions: Tensor) -> Tensor:
-        """Colour basis of unit directions (N, 3): (N, 3, F). basis(d) = w2 relu(w1 e(d) + b1) + b2."""
+    def direction_hidden(self, directions: Tensor) -> Tensor:
+        """w1 e(d) + b1 of unit directions (N, 3): (N, H)."""
         x, y, z = directions.unbind(-1)
         encoded = torch.stack([x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], dim=-1)
-        h = torch.relu(encoded @ self.w1.T + self.b1)
+        return encoded @ self.w1.T + self.b1
+
+    def basis(self, directions: Tensor) -> Tensor:
+        """Colour basis of unit directions (N, 3): (N, 3, F). basis(d) = w2 relu(w1 e(d) + b1) + b2."""
         F, H = self.w2.shape[1:]
-        return (h @ self.w2.reshape(3 * F, H).T).view(-1, 3, F) + self.b2
+        return (torch.relu(self.direction_hidden(directions)) @ self.w2.reshape(3 * F, H).T).view(-1, 3, F) + self.b2
+
+    def once_a_ray(self, directions: Tensor) -> Tensor:
+        """What `colours` takes of (N, 3) directions: their basis."""
+        return self.basis(directions)
+
+    def decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Of features (n, F) the clipped log densities, per longest edge of the box, (n,), and what `colours` takes of them."""
+        return (features @ self.density[:-1] + self.density[-1]).clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT), features
+
+    def colours(self, latent: Tensor, terms: Tensor, ray: Tensor) -> Tensor:
+        """Colours (n, 3) of n samples on the rays `ray` (n,), from what `decode` and `once_a_ray` gave."""
+        return torch.sigmoid(torch.einsum("nf,ncf->nc", latent, terms[ray]))
+
+    def decoder_parameters(self, view_dependent: bool) -> list[nn.Parameter]:
+        """What there is to train beside planes and motion."""
+        return [self.density, self.b2] + ([self.w1, self.b1, self.w2] if view_dependent else [])
+
+    def decoder_as_data(self) -> AnyDecoder:
+        """The decoder, its weights copied."""
+        density = _array(self.density)
+        return Decoder(density[:-1].copy(), float(density[-1]), *(_array(p) for p in (self.w1, self.b1, self.w2, self.b2)))
+
+    def load_decoder(self, decoder: AnyDecoder) -> None:
+        """Take the weights of a decoder of the same kind, of any width."""
+        bias = np.float32(decoder.density_bias)
+        weights = vars(decoder) | {"density": np.append(decoder.density_weight, bias)}
+        for name in weights.keys() - {"density_weight", "density_bias"}:
+            setattr(self, name, nn.Parameter(torch.from_numpy(np.array(weights[name], np.float32))))
 
     def features(self, points: Tensor, times: Tensor) -> Tensor:
         """Features at (N, 3) points in [0, 1]^3 and (N,) times in [0, 1]: (N, F).
@@ -155,10 +194,6 @@ class Field(nn.Module):
             scales.append(product)
         return torch.cat(scales, dim=-1)
 
-    def log_density(self, features: Tensor) -> Tensor:
-        """Clipped log density, per longest edge of the box: (N,)."""
-        return (features @ self.density[:-1] + self.density[-1]).clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)
-
     def to_scene(
         self, aabb: np.ndarray, clip: Clip, occupancy: np.ndarray, background: np.ndarray, step: float,
         mapping: SpaceMapping | None = None,
@@ -170,13 +205,11 @@ class Field(nn.Module):
                 {name: self.plane(s, name).cpu().numpy().copy() for name in names}
                 for s in range(len(self.layout.resolution))
             )
-            arrays = [p.detach().cpu().numpy().copy() for p in (self.w1, self.b1, self.w2, self.b2)]
-            density = self.density.detach().cpu().numpy()
         return Scene(
             aabb=np.asarray(aabb, np.float32), clip=clip, scales=scales,
-            decoder=Decoder(density[:-1].copy(), float(density[-1]), *arrays),
+            decoder=self.decoder_as_data(),
             occupancy=np.asarray(occupancy, bool), background=np.asarray(background, np.float32), step=float(step),
-            mapping=mapping, motion=None if self.motion is None else self.motion.detach().cpu().numpy().copy(),
+            mapping=mapping, motion=None if self.motion is None else _array(self.motion),
         )
 
     @staticmethod
@@ -188,18 +221,72 @@ class Field(nn.Module):
             rows_t = scale["xt"].shape[0] if scene.is_dynamic else 0
             resolution.append([scale["xy"].shape[1], scale["xy"].shape[0], scale["xz"].shape[0], rows_t])
         layout = Layout.of(np.array(resolution), shape["xy"][2])
-        field = Field(layout, scene.decoder.b1.size, motion_nodes=None if scene.motion is None else scene.motion.shape[:4])
+        kind = HybridField if isinstance(scene.decoder, HybridDecoder) else Field
+        field = kind(layout, scene.decoder.b1.size, motion_nodes=None if scene.motion is None else scene.motion.shape[:4])
         with torch.no_grad():
             for s, scale in enumerate(scene.scales):
                 for name, plane in scale.items():
-                    field.plane(s, name).copy_(torch.from_numpy(np.asarray(plane, np.float32)))
-            if field.motion is not None:
-                field.motion.copy_(torch.from_numpy(np.asarray(scene.motion, np.float32)))
-            d = scene.decoder
-            field.density.copy_(torch.from_numpy(np.append(d.density_weight, np.float32(d.density_bias)).astype(np.float32)))
-            for parameter, value in ((field.w1, d.w1), (field.b1, d.b1), (field.w2, d.w2), (field.b2, d.b2)):
-                parameter.copy_(torch.from_numpy(np.asarray(value, np.float32)))
+                    _fill(field.plane(s, name), plane)
+            if field.motion is not None and scene.motion is not None:
+                _fill(field.motion, scene.motion)
+            field.load_decoder(scene.decoder)
         return field
+
+
+class HybridField(Field):
+    """Planes and hybrid decoder.
+
+    Attributes:
+        theta, motion: as in `Field`.
+        v, a, w1, b1, u, w2, b2: as in `kpc.format.scene.HybridDecoder`, all its layers of the same width.
+        density: (G + 1,) weights of the log density, its bias last.
+    """
+
+    def _make_decoder(self, F: int, hidden: int, uniform: Uniform) -> None:
+        def layer(rows: int, columns: int) -> nn.Parameter:
+            reach = math.sqrt(6 / columns)  # He et al., arXiv:1502.01852
+            return nn.Parameter(uniform(-reach, reach, rows, columns))
+
+        # Features start at some 0.03, the product of three texels: weights as much larger bring them into a layer's range.
+        self.v = nn.Parameter(layer(hidden, F).detach() * FEATURE_GAIN)
+        self.a = nn.Parameter(torch.zeros(hidden))
+        weights = uniform(-1, 1, hidden) / math.sqrt(hidden)
+        self.density = nn.Parameter(torch.cat([weights, torch.tensor([-1.0])]))
+        self.w1 = nn.Parameter(uniform(-1, 1, hidden, 9) / 8)
+        self.b1 = nn.Parameter(torch.zeros(hidden))
+        self.u = layer(hidden, hidden)
+        self.w2 = layer(3, hidden)
+        self.b2 = nn.Parameter(torch.zeros(3))
+
+    def once_a_ray(self, directions: Tensor) -> Tensor:
+        """What `colours` takes of (N, 3) directions: (N, H), their part of the hidden layer."""
+        return self.direction_hidden(directions)
+
+    def decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        h = (features @ self.v.T + self.a).clamp(0, ACTIVATION_LIMIT)
+        return (h @ self.density[:-1] + self.density[-1]).clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT), h
+
+    def colours(self, latent: Tensor, terms: Tensor, ray: Tensor) -> Tensor:
+        hidden = (terms[ray] + latent @ self.u.T).clamp(0, ACTIVATION_LIMIT)
+        return torch.sigmoid(hidden @ self.w2.T + self.b2)
+
+    def decoder_parameters(self, view_dependent: bool) -> list[nn.Parameter]:
+        return [self.v, self.a, self.density, self.b1, self.u, self.w2, self.b2] + ([self.w1] if view_dependent else [])
+
+    def decoder_as_data(self) -> AnyDecoder:
+        density = _array(self.density)
+        return HybridDecoder(v=_array(self.v), a=_array(self.a), density_weight=density[:-1].copy(), density_bias=float(density[-1]),
+                             w1=_array(self.w1), b1=_array(self.b1), u=_array(self.u), w2=_array(self.w2), b2=_array(self.b2))
+
+
+def _array(parameter: Tensor) -> np.ndarray:
+    """A copy."""
+    return parameter.detach().cpu().numpy().copy()
+
+
+def _fill(parameter: Tensor, values: np.ndarray) -> None:
+    with torch.no_grad():
+        parameter.copy_(torch.from_numpy(np.asarray(values, np.float32)))
 
 
 def tap(x: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -230,83 +317,6 @@ def bilinear(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
     low = flat[k] * (1 - fu) + flat[k + 1] * fu
     high = flat[k + columns] * (1 - fu) + flat[k + columns + 1] * fu
     return low * (1 - fv) + high * fv
-
-
-@dataclass(frozen=True)
-class Rays:
-    """A batch of rays; every member has N rows. Directions are unit vectors, times and jitters lie in [0, 1)."""
-
-    origins: Tensor
-    directions: Tensor
-    times: Tensor
-    jitters: Tensor
-    backgrounds: Tensor
-
-
-def place(points: Tensor, t: Tensor, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
-    """Places (..., 3) of world points in [0, 1]^3, and what a step there counts, `kpc.format.space.Contraction.stretch`.
-
-    `t` (...): how far along their rays they lie.
-    """
-    u = (points - aabb[0]) / (aabb[1] - aabb[0])
-    if not isinstance(mapping, Contraction):
-        return u, torch.ones_like(t)
-    y = 2 * u - 1
-    radius = y.abs().amax(-1).clamp(min=1)
-    stretch = ((t / mapping.even).clamp(min=1) / radius).square()
-    return y * ((2 - 1 / radius) / radius / 4)[..., None] + 0.5, stretch
-
-
-def render_reference(
-    field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, kept: Tensor | None = None,
-    mapping: SpaceMapping | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Colours of a batch of rays, in plain PyTorch: the reference of `kernels.backpropagate`.
-
-    Sample k of a ray lies at s = near + (k + jitter) * step, which is its distance unless there is a mapping, and counts where
-    the occupancy grid (slots, Nz, Ny, Nx) is set; alpha = 1 - exp(-sigma stretch step / extent), stretch = 1 in a box; a ray
-    ends once its transmittance falls below TERMINATION. `kept` (F,), where given, multiplies the features.
-
-    Returns:
-        Colours (N, 3); the mean over rays of the distortion D that `kernels.backpropagate` states; of the n samples taken
-        their weights (n,), and their cells (n, 3) int64 in the order z, y, x.
-    """
-    extent = (aabb[1] - aabb[0]).max()
-    inverse = 1 / rays.directions
-    t0, t1 = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse
-    near = torch.minimum(t0, t1).nan_to_num(-torch.inf).amax(1).clamp(min=0)
-    far = torch.maximum(t0, t1).nan_to_num(torch.inf).amin(1)
-    if isinstance(mapping, Contraction):
-        near, far = torch.zeros_like(near), torch.full_like(far, mapping.end)
-    longest = float((far - near).clamp(min=0).max())
-    k = torch.arange(max(1, math.ceil(longest / step)), device=near.device)
-    s = near[:, None] + (k + rays.jitters[:, None]) * step
-    t = s
-    if isinstance(mapping, Contraction):
-        t = torch.where(s <= mapping.even, s, mapping.even / (2 - s.clamp(max=mapping.end) / mapping.even))
-    u, stretch = place(rays.origins[:, None] + t[..., None] * rays.directions[:, None], t, aabb, mapping)
-    size = torch.tensor(occupancy.shape[:0:-1], device=u.device)
-    cell = (u.detach() * size).long().clamp(min=0).minimum(size - 1)
-    slot = (rays.times * occupancy.shape[0]).long().clamp(max=occupancy.shape[0] - 1)[:, None]
-    cell = cell.flip(-1)
-    taken = occupancy[slot, cell[..., 0], cell[..., 1], cell[..., 2]].bool() & (s < far[:, None])
-    ray, _ = index = taken.nonzero(as_tuple=True)
-
-    features = field.features(u[index], rays.times[ray])
-    if kept is not None:
-        features = features * kept
-    tau = torch.zeros_like(s).index_put(index, field.log_density(features).exp() * (step / extent) * stretch[index])
-    trans = torch.exp(-torch.cumsum(torch.nn.functional.pad(tau, (1, 0)), dim=1))
-    weights = torch.where(trans[:, :-1] >= TERMINATION, trans[:, :-1] * (1 - torch.exp(-tau)), 0)
-    basis = field.basis(rays.directions)
-    colours = torch.sigmoid(torch.einsum("nf,ncf->nc", features, basis[ray]))
-    rgb = torch.zeros_like(rays.backgrounds).index_add(0, ray, weights[index][:, None] * colours)
-    reached = trans[:, :-1][index] >= TERMINATION
-    rgb = rgb + (1 - weights.sum(1, keepdim=True)) * rays.backgrounds
-    along = (k + rays.jitters[:, None]) * (step / extent)
-    before, before_s = (torch.cumsum(x, 1) - x for x in (weights, weights * along))
-    distortion = (2 * weights * (along * before - before_s) + weights.square() * (step / extent / 3)).sum(1).mean()
-    return rgb, distortion, weights[index][reached], cell[index][reached]
 
 
 def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:

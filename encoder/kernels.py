@@ -571,6 +571,84 @@ def log_densities(theta, table, resolution, density, M, motion, points, times, w
 
 
 @_parallel
+def features(theta, table, resolution, M, motion, points, times, workers):
+    """Features at (N, 3) points in [0, 1]^3 and (N,) times, `kpc.encoder.field.Field.features`: (N, F) float32."""
+    N, S = points.shape[0], table.shape[0]
+    out = np.empty((N, S * M), np.float32)
+    for worker in prange(workers):
+        values, _, at, corners, fractions, _, _, _ = _scratch(table, M, 1)
+        point = at[0]
+        for i in range(worker * N // workers, (worker + 1) * N // workers):
+            point[0], point[1], point[2] = _moved(motion, points[i, 0], points[i, 1], points[i, 2], times[i])
+            point[3] = times[i]
+            _sample_planes(theta, table, resolution, point, M, corners[0], fractions[0], values[0])
+            _features(values[0], S, M, out[i])
+    return out
+
+
+@_parallel
+def scatter(theta, grad, table, resolution, M, motion, grad_motion, points, times, g):
+    """The transpose of the derivative of `features`: add to grad (workers, n), and to grad_motion (workers, as motion) unless
+    that is None, what g (N, F) = d loss / d features makes of them. The features are looked up once more, not kept: they lie
+    in the cache by then, and all of them would not."""
+    N, workers = points.shape[0], grad.shape[0]
+    for worker in prange(workers):
+        values, _, at, corners, fractions, _, _, _ = _scratch(table, M, 1)
+        point = at[0]
+        plane_scratch = np.empty(6 * M, np.float32)
+        slopes = None if motion is None else np.empty(3 * M, np.float32)
+        ones, g_place = np.ones(M, np.float32), np.empty(3, np.float32)
+        for i in range(worker * N // workers, (worker + 1) * N // workers):
+            point[0], point[1], point[2] = _moved(motion, points[i, 0], points[i, 1], points[i, 2], times[i])
+            point[3] = times[i]
+            _sample_planes(theta, table, resolution, point, M, corners[0], fractions[0], values[0])
+            if motion is not None:
+                slopes[:] = np.float32(0.0)
+            _scatter_planes(
+                grad[worker], table, resolution, M, corners[0], fractions[0], values[0], g[i], plane_scratch, theta, slopes, True
+            )
+            if motion is not None:
+                for axis in range(3):
+                    clamped = point[axis] < np.float32(0.0) or point[axis] > np.float32(1.0)
+                    g_place[axis] = np.float32(0.0) if clamped else _dot(slopes[axis * M : (axis + 1) * M], ones, M)
+                _spread_motion(grad_motion[worker], points[i], times[i], g_place)
+
+
+@_parallel
+def collect(aabb, even, occupancy, step, origins, directions, times, jitters, starts, points, places, stretches, cells, workers):
+    """The occupied samples of rays, none of them ended early: (N,) int64, how many each ray has.
+
+    Unless `points` is None, those of ray i are written from starts[i] on: points (n, 3) in [0, 1]^3, places (n,) their s,
+    stretches (n,) what the step counts, cells (n, 3) int64 z, y, x.
+    """
+    N, slots = origins.shape[0], occupancy.shape[0]
+    inv = np.float32(1.0) / (aabb[1] - aabb[0])
+    counts = np.empty(N, np.int64)
+    for worker in prange(workers):
+        for ray in range(worker, N, workers):
+            near, far = _span(origins[ray], directions[ray], aabb, even)
+            occupied = occupancy[min(int(times[ray] * slots), slots - 1)]
+            count, k = 0, 0
+            while True:
+                s = near + (np.float32(k) + jitters[ray]) * step
+                k += 1
+                if not s < far:
+                    break
+                u, v, w, stretch = _place(origins[ray], directions[ray], _distance(s, even), aabb, inv, even)
+                cell = _cell(occupied, u, v, w)
+                if occupied[cell] == 0:
+                    continue
+                if points is not None:
+                    at = starts[ray] + count
+                    points[at, 0], points[at, 1], points[at, 2] = u, v, w
+                    places[at], stretches[at] = s, stretch
+                    cells[at, 0], cells[at, 1], cells[at, 2] = cell
+                count += 1
+            counts[ray] = count
+    return counts
+
+
+@_parallel
 def adam(theta, grad, mean, square, lr, beta1, beta2, epsilon, step_number):
     """One step of Adam (arXiv:1412.6980, algorithm 1) on theta with the sum over workers of grad, which is cleared."""
     n = theta.size

@@ -285,8 +285,9 @@ def _plan(trainer: Trainer) -> str:
         beyond = f" of device coordinates, near {mapping.near:.4g}, baseline {mapping.baseline:.4g}"
     nodes = "" if trainer.field.motion is None else (
         f", read where a motion grid of {'x'.join(str(n) for n in trainer.field.motion.shape[3:0:-1])} nodes leads")
+    decoder = "hybrid" if trainer.config.hybrid else "explicit"
     return (f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
-            f"{layout.size / 1e6:.2f} M parameters{nodes}; on {trainer.device}")
+            f"{layout.size / 1e6:.2f} M parameters{nodes}; {decoder} decoder; on {trainer.device}")
 
 
 def _spread_of_cameras(dataset: Dataset) -> list[int]:

@@ -18,9 +18,10 @@ from kpc.encoder import kernels
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.box import seen_cells
 from kpc.encoder.datasets import Dataset, rays
-from kpc.encoder.field import Field, Rays, motion_nodes, motion_priors, plan_layout, priors, render_reference
+from kpc.encoder.field import Field, HybridField, motion_nodes, motion_priors, plan_layout, priors
 from kpc.encoder.importance import TileWeights, cameras_stand_still
 from kpc.encoder.occupancy import OccupancyGrid, grid_shape
+from kpc.encoder.render import Rays, collected, composite, fused_features, samples_of
 from kpc.format.cli import written_aside
 from kpc.format.errors import TrainingError
 from kpc.format.scene import SPACE_PLANES, Scene
@@ -74,14 +75,18 @@ class Trainer:
         self.rng = np.random.default_rng(config.seed)
         layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
         nodes = motion_nodes(config, self.aabb, layout)
-        self.field = Field(layout, config.hidden, torch.Generator().manual_seed(config.seed), nodes).to(self.device)
+        kind, hidden = (HybridField, config.hybrid_width) if config.hybrid else (Field, config.hidden)
+        self.field = kind(layout, hidden, torch.Generator().manual_seed(config.seed), nodes).to(self.device)
+        if not config.view_dependent:
+            torch.nn.init.zeros_(self.field.w1)
         shape = grid_shape(self.aabb, config.cells_across)
         threshold = math.log(-math.log(1 - config.occupancy_alpha) * steps_across)
         self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape, mapping), threshold)
         self.slots = min(config.occupancy_slots, dataset.clip.frame_count) if dataset.is_dynamic else 1
+        on_cpu = self.device.type == "cpu"
         self.optimiser: FusedOptimiser | PlainOptimiser = (
-            FusedOptimiser(self.field, config, shape, mapping) if self.device.type == "cpu" else
-            PlainOptimiser(self.field, config, shape, mapping)
+            FusedOptimiser(self.field, config, shape, mapping) if on_cpu and not config.hybrid else
+            PlainOptimiser(self.field, config, shape, mapping, fused=on_cpu)
         )
         self.watch = self.optimiser.watch
         self.step = 0
@@ -206,13 +211,13 @@ class Trainer:
 
     def density_at(self, points: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Log densities at (N, 3) points in [0, 1]^3 and (N,) times."""
-        if self.device.type == "cpu":
+        if isinstance(self.optimiser, FusedOptimiser):
             return log_densities(self.field, points, times)
         out = []
         with torch.no_grad():
             for p, t in zip(np.array_split(points, len(points) // 2**18 + 1), np.array_split(times, len(times) // 2**18 + 1)):
-                features = self.field.features(torch.from_numpy(p).to(self.device), torch.from_numpy(t).to(self.device))
-                out.append(self.field.log_density(features).cpu().numpy())
+                features = self.optimiser.features(*(torch.from_numpy(np.float32(a)).to(self.device) for a in (p, t)))
+                out.append(self.field.decode(features)[0].cpu().numpy())
         return np.concatenate(out)
 
     def save(self, path: Path) -> None:
@@ -434,14 +439,20 @@ class FusedOptimiser:
 
 
 class PlainOptimiser:
-    """A step in plain PyTorch, on any device that PyTorch knows."""
+    """A step in plain PyTorch, on any device that PyTorch knows; or `fused`, on the CPU: kernels for the planes."""
 
     def __init__(
-        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: SpaceMapping | None = None
+        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: SpaceMapping | None = None, *,
+        fused: bool = False,
     ) -> None:
         self.field, self.config, self.mapping = field, config, mapping
         self.watch = Stopwatch()
         self._peaks = torch.zeros(cells, device=field.theta.device)
+        self.fused = fused
+        self.features = fused_features(field) if fused else field.features
+        if fused:
+            numba.get_num_threads()  # starts numba's threads, which would undo the next line
+            torch.set_num_threads(1)  # several add up gradients in any order: no run would end where another did
         self.planes = _adam([([field.theta], config.learning_rate)])
         self.decoder = _decoder_optimiser(field, config)
 
@@ -457,31 +468,42 @@ class PlainOptimiser:
     ) -> tuple[float, float]:
         """Mean squared error a colour channel, and samples a ray."""
         config, device = self.config, self.field.theta.device
-        batch = Rays(*(value.to(device) for value in vars(batch).values()))
-        occupancy_there = torch.from_numpy(occupancy).to(device)
-        rgb, distortion, weights, cells = render_reference(
-            self.field, batch, torch.from_numpy(aabb).to(device), occupancy_there, step_length,
-            kept_channels(self.field, config, number), self.mapping,
-        )
-        _, ny, nx = self._peaks.shape
-        flat = (cells[:, 0] * ny + cells[:, 1]) * nx + cells[:, 2]
-        self._peaks.view(-1).scatter_reduce_(0, flat, weights.detach(), "amax")
-        error = (rgb - targets.to(device)).square().mean()
-        loss = error + config.distortion * distortion
-        if number % config.regularise_every == 0:
-            loss = loss + config.regularise_every * _total(priors(self.field, config))
-        moving = self.field.motion is not None and number % config.motion_every == 0
-        if moving:
-            loss = loss + _total(motion_priors(self.field, config))
-        for optimiser in (self.planes, self.decoder):
-            optimiser.zero_grad()
-            _set_rate(optimiser, rate)
-        loss.backward()  # type: ignore[no-untyped-call]
-        if self.field.motion is not None and not moving:
-            self.field.motion.grad = None
-        self.planes.step()
-        self.decoder.step()
-        return float(error.detach()), len(weights) / len(targets)
+        with self.watch("samples"):
+            if self.fused:
+                samples = collected(batch, aabb, occupancy, step_length, self.mapping)
+            else:
+                batch = Rays(*(value.to(device) for value in vars(batch).values()))
+                there = torch.from_numpy(aabb).to(device), torch.from_numpy(occupancy).to(device)
+                samples = samples_of(batch, *there, step_length, self.mapping)
+        with self.watch("forward"):
+            kept = kept_channels(self.field, config, number)
+            met = composite(self.field, batch, samples, self.features, step_length, extent, kept)
+            error = (met.rgb - targets.to(device)).square().mean()
+            loss = error + config.distortion * met.distortion
+            moving = self.field.motion is not None and number % config.motion_every == 0
+            if moving:
+                loss = loss + _total(motion_priors(self.field, config))
+            regularised = number % config.regularise_every == 0
+            if regularised and not self.fused:
+                loss = loss + config.regularise_every * _total(priors(self.field, config))
+        with self.watch("backward"):
+            for optimiser in (self.planes, self.decoder):
+                optimiser.zero_grad()
+                _set_rate(optimiser, rate)
+            loss.backward()  # type: ignore[no-untyped-call]
+            if self.field.motion is not None and not moving:
+                self.field.motion.grad = None
+        with self.watch("priors"):
+            if regularised and self.fused:
+                theta, grad = self.field.theta.detach().numpy(), self.field.theta.grad.numpy()
+                add_priors(self.field, theta, grad, config, config.regularise_every)
+        with self.watch("adam"):
+            self.planes.step()
+            self.decoder.step()
+            _, ny, nx = self._peaks.shape
+            flat = (samples.cell[:, 0] * ny + samples.cell[:, 1]) * nx + samples.cell[:, 2]
+            self._peaks.view(-1).scatter_reduce_(0, flat, met.weights.detach(), "amax")
+        return float(error.detach()), float(met.reached.sum()) / len(targets)
 
     def state(self) -> dict[str, Any]:
         return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict(), "peaks": self._peaks}
@@ -563,7 +585,7 @@ def _unusable(path: Path, error: Exception) -> TrainingError:
 
 def _decoder_optimiser(field: Field, config: TrainConfig) -> torch.optim.Adam:
     """Of all but the planes."""
-    decoder = [field.density, field.b2] + ([field.w1, field.b1, field.w2] if config.view_dependent else [])
+    decoder = field.decoder_parameters(config.view_dependent)
     motion = [] if field.motion is None else [([field.motion], config.motion_learning_rate)]
     return _adam([(decoder, config.decoder_learning_rate), *motion])
 

@@ -3,8 +3,8 @@
     SCNE  box, clip, sizes, steps and offsets of every plane      needed before anything else
     WARP  how space beyond the box is held; absent where it is not
     MOVE  the motion grid; absent where nothing is displaced
-    DECO  decoder weights                 OCCU  occupancy grid
-    came  cameras (may be ignored)        PLNE  one segment of one plane
+    DECO  weights of the explicit decoder, or HYBR of the hybrid one        OCCU  occupancy grid
+    came  cameras (may be ignored)                                          PLNE  one segment of one plane
 
 The order in the file is the order in which a player wants them: the coarsest picture of the first seconds, then finer
 scales, then later seconds. A plane segment that has not arrived is uncoded: it reads as its offset.
@@ -26,7 +26,7 @@ from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
-from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
+from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 
 Parsed = TypeVar("Parsed")
@@ -45,6 +45,8 @@ MOTION_STRUCT = struct.Struct("<4Hf")
 """T, Nz, Ny, Nx, step"""
 DECODER_STRUCT = struct.Struct("<HHf")
 """features, hidden, density_bias"""
+HYBRID_STRUCT = struct.Struct("<HHHf")
+"""features, width, hidden, density_bias"""
 OCCUPANCY_STRUCT = struct.Struct("<4H")
 """slots, Nz, Ny, Nx"""
 CAMERA_STRUCT = struct.Struct("<HH16f")
@@ -153,7 +155,8 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
             move = _pack_motion(scene.motion)
             _parse_motion(move, parsed.is_dynamic)
             chunks.append(Chunk("MOVE", [move]))
-        chunks += [Chunk("DECO", [_pack_decoder(scene.decoder, parsed.feature_count)]),
+        kind = "HYBR" if isinstance(scene.decoder, HybridDecoder) else "DECO"
+        chunks += [Chunk(kind, [_pack_decoder(scene.decoder, parsed.feature_count)]),
                    Chunk("OCCU", [_pack_occupancy(scene.occupancy)])]
         if scene.cameras:
             chunks.append(Chunk("came", [_pack_cameras(scene.cameras)]))
@@ -207,16 +210,20 @@ def _check_planes(scene: QuantisedScene, head: SceneHead) -> None:
                 raise FormatError(f"{where}: an uncoded texel holds a symbol other than 0")
 
 
-def _pack_decoder(decoder: Decoder, features: int) -> bytes:
-    hidden = len(decoder.b1)
-    shapes = _decoder_shapes(features, hidden)
-    weights = (decoder.density_weight, decoder.w1, decoder.b1, decoder.w2, decoder.b2)
-    if tuple(np.shape(w) for w in weights) != shapes:
-        raise FormatError(f"decoder: weights of shapes {[np.shape(w) for w in weights]}, not {list(shapes)}")
-    if any(not np.array_equal(w, w.astype(np.float16)) for w in weights):
+def _pack_decoder(decoder: AnyDecoder, features: int) -> bytes:
+    hidden, bias = len(decoder.b1), decoder.density_bias
+    if isinstance(decoder, HybridDecoder):
+        width = len(decoder.a)
+        head, shapes = HYBRID_STRUCT.pack(features, width, hidden, bias), _hybrid_shapes(features, width, hidden)
+    else:
+        head, shapes = DECODER_STRUCT.pack(features, hidden, bias), _decoder_shapes(features, hidden)
+    weights = {name: getattr(decoder, name) for name in shapes}
+    for name, shape in shapes.items():
+        if np.shape(weights[name]) != shape:
+            raise FormatError(f"decoder: {name} is {np.shape(weights[name])}, not {shape}")
+    if any(not np.array_equal(w, w.astype(np.float16)) for w in weights.values()):
         raise FormatError("decoder: the weights are not rounded to float16 (kpc.format.quantise.round_decoder)")
-    return b"".join([DECODER_STRUCT.pack(features, hidden, decoder.density_bias),
-                     *(np.asarray(w).astype("<f2").tobytes() for w in weights)])
+    return b"".join([head, *(np.asarray(w).astype("<f2").tobytes() for w in weights.values())])
 
 
 def _pack_mapping(mapping: SpaceMapping) -> bytes:
@@ -311,7 +318,7 @@ class SceneReader(Reader):
             raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory, more than the budget of "
                               f"{memory_budget:,}")
         self._check_segments()
-        self._only("DECO")
+        self._decoder_number()
         self._only("OCCU")
 
     def segment(self, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -337,11 +344,16 @@ class SceneReader(Reader):
         self._afford(8 * self.index[number].raw_length, "its motion grid")  # int16 and float32, and their making
         return self._parsed(lambda raw: _parse_motion(raw, self.head.is_dynamic), self.chunk(number))
 
-    def decoder(self) -> Decoder:
-        """The DECO chunk."""
-        features = self.head.feature_count
-        most = DECODER_STRUCT.size + 2 * sum(map(math.prod, _decoder_shapes(features, HIDDEN_LIMIT)))
-        return self._parsed(lambda raw: _parse_decoder(raw, features), self.chunk(self._only("DECO"), most))
+    def decoder(self) -> AnyDecoder:
+        """The DECO or HYBR chunk."""
+        features, number = self.head.feature_count, self._decoder_number()
+        parse: Callable[[bytes, int], AnyDecoder]
+        if self.index[number].kind == "HYBR":
+            head, parse, shapes = HYBRID_STRUCT, _parse_hybrid, _hybrid_shapes(features, HIDDEN_LIMIT, HIDDEN_LIMIT)
+        else:
+            head, parse, shapes = DECODER_STRUCT, _parse_decoder, _decoder_shapes(features, HIDDEN_LIMIT)
+        most = head.size + 2 * sum(map(math.prod, shapes.values()))
+        return self._parsed(lambda raw: parse(raw, features), self.chunk(number, most))
 
     def occupancy(self) -> np.ndarray:
         """The OCCU chunk: (slots, Nz, Ny, Nx) bool."""
@@ -361,6 +373,12 @@ class SceneReader(Reader):
         if len(found) != 1:
             raise FormatError(f"{self.name}: holds {len(found)} {kind} chunks, not one")
         return found[0]
+
+    def _decoder_number(self) -> int:
+        kinds = [entry.kind for entry in self.index]
+        if "DECO" in kinds and "HYBR" in kinds:
+            raise FormatError(f"{self.name}: holds two decoders, DECO and HYBR")
+        return self._only("HYBR" if "HYBR" in kinds else "DECO")
 
     def _at_most_one(self, kind: str) -> int | None:
         return self._only(kind) if any(entry.kind == kind for entry in self.index) else None
@@ -404,7 +422,7 @@ class SceneReader(Reader):
                 raise FormatError(f"{self.name}: {where}: its segments hold {row} rows, not {head.rows}")
 
 
-KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "OCCU", "came", "PLNE"})
+KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "PLNE"})
 HEAD_LIMIT = SCENE_STRUCT.size + SCALE_LIMIT * (SCALE_STRUCT.size + 9 * 4 * CHANNEL_LIMIT)
 
 
@@ -491,8 +509,13 @@ def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, Pla
     return planes
 
 
-def _decoder_shapes(features: int, hidden: int) -> tuple[tuple[int, ...], ...]:
-    return (features,), (hidden, 9), (hidden,), (3, features, hidden), (3, features)
+def _decoder_shapes(features: int, hidden: int) -> dict[str, tuple[int, ...]]:
+    return {"density_weight": (features,), "w1": (hidden, 9), "b1": (hidden,), "w2": (3, features, hidden), "b2": (3, features)}
+
+
+def _hybrid_shapes(features: int, width: int, hidden: int) -> dict[str, tuple[int, ...]]:
+    return {"v": (width, features), "a": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
+            "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
 
 
 def _parse_decoder(raw: bytes, expected_features: int) -> Decoder:
@@ -501,14 +524,26 @@ def _parse_decoder(raw: bytes, expected_features: int) -> Decoder:
     if features != expected_features or not 0 < hidden <= HIDDEN_LIMIT or not math.isfinite(bias):
         raise FormatError(f"DECO: {features} features (the planes give {expected_features}), {hidden} hidden units "
                           f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}")
+    return Decoder(density_bias=bias, **_parse_weights(cursor, _decoder_shapes(features, hidden)))
+
+
+def _parse_hybrid(raw: bytes, expected_features: int) -> HybridDecoder:
+    cursor = _Cursor(raw, "HYBR")
+    features, width, hidden, bias = cursor.unpack(HYBRID_STRUCT)
+    if features != expected_features or not 0 < min(width, hidden) <= max(width, hidden) <= HIDDEN_LIMIT \
+            or not math.isfinite(bias):
+        raise FormatError(f"HYBR: {features} features (the planes give {expected_features}), {width} and {hidden} hidden units "
+                          f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}")
+    return HybridDecoder(density_bias=bias, **_parse_weights(cursor, _hybrid_shapes(features, width, hidden)))
+
+
+def _parse_weights(cursor: "_Cursor", shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     with np.errstate(invalid="ignore"):  # a signalling NaN says so when it is cast
-        weights = [cursor.array("<f2", math.prod(shape)).astype(np.float32).reshape(shape)
-                   for shape in _decoder_shapes(features, hidden)]
+        weights = {name: cursor.array("<f2", math.prod(shape)).astype(np.float32).reshape(shape) for name, shape in shapes.items()}
     cursor.finish()
-    if not all(np.isfinite(w).all() for w in weights):
-        raise FormatError("DECO: a weight is NaN or infinite")
-    density, w1, b1, w2, b2 = weights
-    return Decoder(density, bias, w1, b1, w2, b2)
+    if not all(np.isfinite(w).all() for w in weights.values()):
+        raise FormatError(f"{cursor.kind}: a weight is NaN or infinite")
+    return weights
 
 
 def _parse_occupancy(raw: bytes) -> np.ndarray:

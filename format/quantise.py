@@ -15,7 +15,7 @@ import numpy as np
 from kpc.format.cameras import Camera
 from kpc.format.errors import FormatError
 from kpc.format.motion import QuantisedMotion, places_reached, quantise_motion
-from kpc.format.scene import TIME_PLANES, Clip, Decoder, Scene
+from kpc.format.scene import TIME_PLANES, AnyDecoder, Clip, Scene
 from kpc.format.space import SpaceMapping
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
@@ -108,7 +108,7 @@ class QuantisedScene:
     aabb: np.ndarray
     clip: Clip
     scales: tuple[Mapping[str, QuantisedPlane], ...]
-    decoder: Decoder
+    decoder: AnyDecoder
     occupancy: np.ndarray
     background: np.ndarray
     step: float
@@ -196,7 +196,7 @@ def _reach(texels: int, cells: int) -> np.ndarray:
     return (((i + 1) * cells >= c * (texels - 1)) & ((i - 1) * cells <= (c + 1) * (texels - 1))).astype(np.float32)
 
 
-def round_decoder(decoder: Decoder) -> Decoder:
+def round_decoder(decoder: AnyDecoder) -> AnyDecoder:
     """The decoder with its weights rounded to float16 (the density bias to float32), as float32 arrays.
 
     Raises:
@@ -210,8 +210,8 @@ def round_decoder(decoder: Decoder) -> Decoder:
 
     if not np.isfinite(decoder.density_bias):
         raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
-    return Decoder(half(decoder.density_weight), float(np.float32(decoder.density_bias)), half(decoder.w1),
-                   half(decoder.b1), half(decoder.w2), half(decoder.b2))
+    weights = {name: value if name == "density_bias" else half(value) for name, value in vars(decoder).items()}
+    return replace(decoder, **weights | {"density_bias": float(np.float32(decoder.density_bias))})
 
 
 def round_camera(camera: Camera) -> Camera:

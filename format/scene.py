@@ -4,10 +4,12 @@ Feature of a point p at time t (K-Planes, arXiv:2301.10241, eq. 1; multiplicatio
 
     f_s(p, t) = prod over planes c of bilinear(P[s][c], project_c(p, t))         f = concat over scales s of f_s
 
-With a motion grid the planes are read elsewhere, `kpc.format.motion`. Density and colour (the explicit decoder, section 3.3 of the paper):
+With a motion grid the planes are read elsewhere, `kpc.format.motion`. Density and colour, per longest edge of the box, come from
+the explicit decoder (section 3.3 of the paper), in which a direction MLP gives the basis once a ray,
 
-    sigma = exp(clip(f . density_weight + density_bias, -20, 20))       per longest edge of the box
-    rgb   = sigmoid(f . basis_{R,G,B}(d))                               basis(d) = direction MLP, once a ray
+    sigma = exp(clip(f . density_weight + density_bias, -20, 20))       rgb = sigmoid(f . basis_{R,G,B}(d))
+
+or from the hybrid one, two small MLPs for each sample: `HybridDecoder`.
 """
 
 import itertools
@@ -25,6 +27,9 @@ ALL_PLANES = SPACE_PLANES + TIME_PLANES
 
 LOG_DENSITY_LIMIT = 20.0
 """|log density| is clipped here: exp(20) is opaque within any step, exp(-20) is empty over any box."""
+
+ACTIVATION_LIMIT = 65504.0
+"""Hidden units of the hybrid decoder are clipped here: float16 holds them, and their weighted sums stay finite in float32."""
 
 TERMINATION = 1.0 / 1024.0
 """A ray ends once its transmittance falls below this; a quarter of an 8-bit level."""
@@ -61,7 +66,40 @@ class Decoder:
 
     @property
     def parameter_count(self) -> int:
-        return self.density_weight.size + 1 + self.w1.size + self.b1.size + self.w2.size + self.b2.size
+        return sum(np.size(weights) for weights in vars(self).values())
+
+
+@dataclass(frozen=True)
+class HybridDecoder:
+    """The hybrid decoder (section 3.3 of the paper): MLPs in place of both linear maps. G and H are their widths.
+
+        h     = clip(v f + a, 0, ACTIVATION_LIMIT)
+        sigma = exp(clip(h . density_weight + density_bias, -20, 20))
+        rgb   = sigmoid(w2 clip(w1 e(d) + b1 + u h, 0, ACTIVATION_LIMIT) + b2)     e(d) as in `Decoder`; w1 e(d) + b1 once a ray
+
+    The paper hands a few linear outputs of the density's MLP on to the colour's; here its hidden layer is handed on as it is.
+
+    Attributes:
+        v: (G, F), a: (G,), density_weight: (G,) float32; density_bias: float32 scalar.
+        w1: (H, 9), b1: (H,), u: (H, G), w2: (3, H), b2: (3,) float32.
+    """
+
+    v: np.ndarray
+    a: np.ndarray
+    density_weight: np.ndarray
+    density_bias: float
+    w1: np.ndarray
+    b1: np.ndarray
+    u: np.ndarray
+    w2: np.ndarray
+    b2: np.ndarray
+
+    @property
+    def parameter_count(self) -> int:
+        return sum(np.size(weights) for weights in vars(self).values())
+
+
+AnyDecoder = Decoder | HybridDecoder
 
 
 @dataclass(frozen=True)
@@ -90,7 +128,7 @@ class Scene:
     aabb: np.ndarray
     clip: Clip
     scales: tuple[Mapping[str, np.ndarray], ...]
-    decoder: Decoder
+    decoder: AnyDecoder
     occupancy: np.ndarray
     background: np.ndarray
     step: float

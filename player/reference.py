@@ -23,7 +23,9 @@ import numpy as np
 from kpc.format.cameras import Camera
 from kpc.format.grid import linear, tap
 from kpc.format.motion import moved
-from kpc.format.scene import LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Decoder, Scene
+from kpc.format.scene import (
+    ACTIVATION_LIMIT, LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, AnyDecoder, Decoder, HybridDecoder, Scene,
+)
 from kpc.format.space import Contraction, DeviceCoordinates, contract
 
 RAYS_AT_ONCE = 8192
@@ -176,22 +178,46 @@ def features(scene: Scene, moment: Moment, u: np.ndarray) -> np.ndarray:
     return np.concatenate(out, axis=1)
 
 
-def density(decoder: Decoder, f: np.ndarray) -> np.ndarray:
-    """sigma = exp(clip(f . w + b, -20, 20)) per longest edge of the box: (N, F) -> (N,)."""
-    return np.exp(np.clip(f @ decoder.density_weight + decoder.density_bias, -LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT))
+def density(decoder: AnyDecoder, f: np.ndarray) -> np.ndarray:
+    """sigma per longest edge of the box of features (N, F): (N,). `kpc.format.scene`."""
+    values = activations(decoder, f) if isinstance(decoder, HybridDecoder) else f
+    return np.exp(np.clip(values @ decoder.density_weight + decoder.density_bias, -LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT))
+
+
+def activations(decoder: HybridDecoder, f: np.ndarray) -> np.ndarray:
+    """h of `HybridDecoder`: (N, F) -> (N, G)."""
+    return np.clip(f @ decoder.v.T + decoder.a, 0, ACTIVATION_LIMIT)
+
+
+def direction_hidden(decoder: AnyDecoder, directions: np.ndarray) -> np.ndarray:
+    """w1 e(d) + b1 of unit directions (N, 3): (N, H)."""
+    x, y, z = directions.T
+    encoded = np.stack([x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
+    return encoded @ decoder.w1.T + decoder.b1
 
 
 def direction_basis(decoder: Decoder, directions: np.ndarray) -> np.ndarray:
     """basis(d) = w2 relu(w1 e(d) + b1) + b2 of unit directions (N, 3): (N, 3, F)."""
-    x, y, z = directions.T
-    encoded = np.stack([x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
-    hidden = np.maximum(encoded @ decoder.w1.T + decoder.b1, 0)
-    return np.einsum("cfh,nh->ncf", decoder.w2, hidden, optimize=True) + decoder.b2
+    return np.einsum("cfh,nh->ncf", decoder.w2, np.maximum(direction_hidden(decoder, directions), 0), optimize=True) + decoder.b2
 
 
-def colour(f: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """rgb = sigmoid(f . basis_{R,G,B}): (N, F), (N, 3, F) -> (N, 3)."""
-    return 1 / (1 + np.exp(-np.einsum("nf,ncf->nc", f, basis)))
+def once_a_ray(decoder: AnyDecoder, directions: np.ndarray) -> np.ndarray:
+    """What `colour` takes of unit directions (N, 3): their basis, or with a hybrid decoder their part of its hidden layer."""
+    terms = direction_hidden(decoder, directions) if isinstance(decoder, HybridDecoder) else direction_basis(decoder, directions)
+    return terms.astype(np.float32)
+
+
+def colour(decoder: AnyDecoder, f: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """rgb of features (N, F), given `once_a_ray` of their rays: (N, 3). `kpc.format.scene`."""
+    if isinstance(decoder, HybridDecoder):
+        hidden = np.clip(terms + activations(decoder, f) @ decoder.u.T, 0, ACTIVATION_LIMIT)
+        return sigmoid(hidden @ decoder.w2.T + decoder.b2)
+    return sigmoid(np.einsum("nf,ncf->nc", f, terms))
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore"):  # exp of much more than 88 is infinite, and the result 0
+        return 1 / (1 + np.exp(-x))
 
 
 def composite(alphas: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -211,7 +237,7 @@ def _march(scene: Scene, moment: Moment, origins: np.ndarray, directions: np.nda
         path = scene.mapping.path(origins, directions)
         origins, directions = path.begin, path.way
     near, far = sample_range(scene, origins, directions)
-    basis = direction_basis(scene.decoder, directions).astype(np.float32)
+    terms = once_a_ray(scene.decoder, directions)
     rgb, depth = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
     trans, samples = np.ones(n, np.float32), np.zeros(n, np.int32)
     step = np.float32(scene.step)
@@ -233,7 +259,7 @@ def _march(scene: Scene, moment: Moment, origins: np.ndarray, directions: np.nda
         row, column, f = row[shown], column[shown], f[shown]
 
         weight, ray = weights[row, column], rays[row]
-        seen = weight[:, None] * colour(f, basis[ray])
+        seen = weight[:, None] * colour(scene.decoder, f, terms[ray])
         for channel in range(3):
             rgb[:, channel] += np.bincount(ray, seen[:, channel], n).astype(np.float32)
         distance = t if path is None else path.distance(s, rays)

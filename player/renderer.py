@@ -15,7 +15,7 @@ from kpc.format.scene import Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
 from kpc.player.reference import Part, Rendering, slot_at
-from kpc.player.textures import FOLDED_AXIS, Layout, Rows, decoder_arrays, distances
+from kpc.player.textures import FOLDED_AXIS, Layout, Rows, decoder_arrays, decoder_shape, distances
 
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
@@ -255,7 +255,7 @@ class Renderer:
             {
                 "SCALES": layout.scales,
                 "LAYERS": layout.layers,
-                "HIDDEN": len(scene.decoder.b1) if scene.decoder.w2.any() else 0,
+                **decoder_shape(scene.decoder),
                 "ROWS": int(rows),
                 "EARLY": int(early),
                 "CONTRACTED": int(isinstance(scene.mapping, Contraction)),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.format.grid import dilate, linear
-from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
+from kpc.format.scene import SPACE_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder, Scene
 
 FOLDED_AXIS = {"xy": "x", "xz": "z", "yz": "y"}
 """Along which axis of a plane a row is folded into it: each axis once."""
@@ -126,11 +126,21 @@ def distances(occupied: np.ndarray) -> np.ndarray:
     return out
 
 
-def decoder_arrays(decoder: Decoder, scene: Scene, layout: Layout) -> dict[str, np.ndarray]:
+def decoder_shape(decoder: AnyDecoder) -> dict[str, int]:
+    """What march.glsl is told of it."""
+    if isinstance(decoder, HybridDecoder):
+        return {"HYBRID": 1, "HIDDEN": -(-len(decoder.b1) // 4) * 4, "WIDTH": -(-len(decoder.a) // 4) * 4}
+    return {"HYBRID": 0, "HIDDEN": len(decoder.b1) if decoder.w2.any() else 0}
+
+
+def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[str, np.ndarray]:
     """The decoder's weights as march.glsl wants them, (N, 4) float32 each, features in the padded layout of the planes.
 
-    density_weight (F / 4), w1 (H x 3: nine columns, then b1, then zeros), w2 (3 x F / 4 x H), b2 (3 x F / 4),
+    Explicit: density_weight (F / 4), w1 (H x 3: nine columns, then b1, then zeros), w2 (3 x F / 4 x H), b2 (3 x F / 4),
     density_bias (1, in x). Without w1 and w2 where colour is the same from all sides, w2 being 0.
+
+    Hybrid, with G and H filled up with zeros to multiples of four: from_features (G x F / 4) is v, from_features_bias (G / 4) a,
+    passed_on (H x G / 4) u; density_weight (G / 4), w1 (H x 3), w2 (3 x H / 4), b2 (1, in xyz), density_bias as above.
     """
     features = layout.scales * layout.layers * 4
     place = np.concatenate(
@@ -142,13 +152,32 @@ def decoder_arrays(decoder: Decoder, scene: Scene, layout: Layout) -> dict[str, 
         out[..., place] = weights
         return out.reshape(*weights.shape[:-1], features // 4, 4)
 
-    arrays = {
-        "density_weight": spread(decoder.density_weight),
-        "density_bias": np.array([decoder.density_bias, 0, 0, 0]),
-        "b2": spread(decoder.b2),
-    }
-    if decoder.w2.any():
-        arrays["w1"] = np.zeros((len(decoder.b1), 12), np.float32)
-        arrays["w1"][:, :9], arrays["w1"][:, 9] = decoder.w1, decoder.b1
-        arrays["w2"] = np.moveaxis(spread(np.moveaxis(decoder.w2, 2, 0)), 0, 2)
+    arrays = {"density_bias": np.array([decoder.density_bias, 0, 0, 0])}
+    if isinstance(decoder, HybridDecoder):
+        arrays |= {
+            "from_features": _filled(spread(decoder.v), 0),
+            "from_features_bias": _filled(decoder.a, 0),
+            "density_weight": _filled(decoder.density_weight, 0),
+            "w1": _direction_layer(decoder),
+            "passed_on": _filled(_filled(decoder.u, 0), 1),
+            "w2": _filled(decoder.w2, 1),
+            "b2": np.append(decoder.b2, 0),
+        }
+    else:
+        arrays |= {"density_weight": spread(decoder.density_weight), "b2": spread(decoder.b2)}
+        if decoder.w2.any():
+            arrays["w1"] = _direction_layer(decoder)[: len(decoder.b1)]
+            arrays["w2"] = np.moveaxis(spread(np.moveaxis(decoder.w2, 2, 0)), 0, 2)
     return {name: np.ascontiguousarray(array, np.float32).reshape(-1, 4) for name, array in arrays.items()}
+
+
+def _direction_layer(decoder: AnyDecoder) -> np.ndarray:
+    """w1 and b1, (H, 12), H filled up to a multiple of four."""
+    return _filled(np.concatenate([decoder.w1, decoder.b1[:, None], np.zeros((len(decoder.b1), 2))], axis=1), 0)
+
+
+def _filled(array: np.ndarray, axis: int) -> np.ndarray:
+    """With zeros added along an axis up to a multiple of four."""
+    ends = [(0, 0)] * array.ndim
+    ends[axis] = 0, -array.shape[axis] % 4
+    return np.pad(array, ends)

@@ -87,7 +87,7 @@ def chunks(data, partial):  # sections 3, 4 and 10
         require(kind.isalpha() and reserved == 0 and offset == expected and raw <= largest_raw, "index entry")
         expected += stored
         body = data[offset:offset + stored]
-        known = kind in (b"SCNE", b"DECO", b"OCCU", b"PLNE", b"WARP", b"MOVE", b"came")
+        known = kind in (b"SCNE", b"DECO", b"OCCU", b"PLNE", b"WARP", b"MOVE", b"HYBR", b"came")
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
         if len(body) < stored:
@@ -121,8 +121,9 @@ def decode(data, partial=False):
         else:
             require(kind not in parts, f"two {kind} chunks")
             parts[kind] = raw
-    for kind in ("SCNE", "DECO", "OCCU"):
+    for kind in ("SCNE", "HYBR" if "HYBR" in parts else "DECO", "OCCU"):
         require(parts.get(kind) is not None, f"no {kind} chunk")
+    require(not ("DECO" in parts and "HYBR" in parts), "two decoders")
     scene = scene_chunk(Bytes(parts["SCNE"]))
     values = sum(p["rows"] * p["columns"] * s["channels"] for s in scene["scales"] for p in s["planes"].values())
     require(values == value_count, "value count")
@@ -132,7 +133,8 @@ def decode(data, partial=False):
         scene |= warp_chunk(Bytes(parts["WARP"]), scene)
     require("MOVE" not in parts or parts["MOVE"] is not None, "no MOVE chunk")
     scene["motion"] = motion_chunk(Bytes(parts["MOVE"]), scene["scales"]) if "MOVE" in parts else None
-    scene |= decoder_chunk(Bytes(parts["DECO"]), sum(s["channels"] for s in scene["scales"]))
+    expected = sum(s["channels"] for s in scene["scales"])
+    scene |= hybrid_chunk(Bytes(parts["HYBR"]), expected) if "HYBR" in parts else decoder_chunk(Bytes(parts["DECO"]), expected)
     scene |= occupancy_chunk(Bytes(parts["OCCU"]))
     scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") else []
 
@@ -250,10 +252,22 @@ def decoder_chunk(chunk, expected):  # section 7
     require(features == expected and 1 <= hidden <= 256 and math.isfinite(bias), "decoder sizes")
     weights = {"density_weight": features, "w1": hidden * 9, "b1": hidden, "w2": 3 * features * hidden,
                "b2": 3 * features}
-    scene = {name: chunk.unpack(f"{count}e") for name, count in weights.items()}
-    require(all(math.isfinite(w) for array in scene.values() for w in array), "weights")
+    return halves(chunk, weights) | {"density_bias": bias, "hidden": hidden, "width": None}
+
+
+def hybrid_chunk(chunk, expected):  # section 7
+    features, width, hidden, bias = chunk.unpack("HHHf")
+    require(features == expected and 1 <= width <= 256 and 1 <= hidden <= 256 and math.isfinite(bias), "decoder sizes")
+    weights = {"v": width * features, "a": width, "density_weight": width, "w1": hidden * 9, "b1": hidden,
+               "u": hidden * width, "w2": 3 * hidden, "b2": 3}
+    return halves(chunk, weights) | {"density_bias": bias, "hidden": hidden, "width": width}
+
+
+def halves(chunk, counts):
+    weights = {name: chunk.unpack(f"{count}e") for name, count in counts.items()}
+    require(all(math.isfinite(w) for array in weights.values() for w in array), "weights")
     chunk.end()
-    return scene | {"density_bias": bias, "hidden": hidden}
+    return weights
 
 
 def occupancy_chunk(chunk):  # section 8
@@ -296,7 +310,7 @@ def render_ray(scene, origin, direction, time):  # section 11
     if even:
         t_near, t_out = 0.0, (2 - 1 / 256) * even  # of s
 
-    basis = direction_basis(scene, direction)
+    towards = looking(scene, direction)
     slot = min(math.floor(time * scene["slots"]), scene["slots"] - 1)
     colour, depth, T, k = [0.0, 0.0, 0.0], 0.0, 1.0, 0
     while T >= 1 / 1024 and t_near + (k + 0.5) * scene["step"] < t_out:
@@ -314,11 +328,12 @@ def render_ray(scene, origin, direction, time):  # section 11
         if not scene["occupancy"][((m * ny + j) * nx + i) * scene["slots"] + slot]:
             continue
         f = features(scene, dict(zip("xyzt", [*moved(scene["motion"], u, time), time])))
-        log_density = sum(a * b for a, b in zip(f, scene["density_weight"])) + scene["density_bias"]
+        if scene["width"]:
+            f = clipped(layer(scene["v"], scene["a"], f))
+        log_density = dot(f, scene["density_weight"]) + scene["density_bias"]
         alpha = 1 - math.exp(-math.exp(min(max(log_density, -20.0), 20.0)) * length / extent)
         w = T * alpha
-        for c in range(3):
-            logit = sum(a * b for a, b in zip(f, basis[c]))
+        for c, logit in enumerate(logits(scene, f, towards)):
             colour[c] += w / (1 + math.exp(-logit)) if logit > -700 else 0.0
         depth += w * world(t_k)
         T *= 1 - alpha
@@ -390,13 +405,34 @@ def bilinear(plane, channels, u, v):
     return sample
 
 
-def direction_basis(scene, direction):
+def dot(a, b):
+    return sum(x * y for x, y in zip(a, b))
+
+
+def layer(weights, biases, values):
+    n = len(values)
+    return [dot(weights[n * row:n * row + n], values) + bias for row, bias in enumerate(biases)]
+
+
+def clipped(values):
+    return [min(max(x, 0.0), 65504.0) for x in values]
+
+
+def looking(scene, direction):
+    """What colours take of a ray: the basis of its direction, or with a hybrid decoder its part of the hidden layer."""
     x, y, z = direction
-    e = [x, y, z, x * x, y * y, z * z, x * y, y * z, z * x]
-    H, F = scene["hidden"], len(scene["density_weight"])
-    h = [max(sum(w * a for w, a in zip(scene["w1"][9 * n:9 * n + 9], e)) + scene["b1"][n], 0.0) for n in range(H)]
-    return [[sum(w * a for w, a in zip(scene["w2"][(c * F + i) * H:(c * F + i + 1) * H], h)) + scene["b2"][c * F + i]
-             for i in range(F)] for c in range(3)]
+    hidden = layer(scene["w1"], scene["b1"], [x, y, z, x * x, y * y, z * z, x * y, y * z, z * x])
+    if scene["width"]:
+        return hidden
+    F = len(scene["density_weight"])
+    basis = layer(scene["w2"], scene["b2"], [max(x, 0.0) for x in hidden])
+    return [basis[c * F:(c + 1) * F] for c in range(3)]
+
+
+def logits(scene, f, towards):
+    if not scene["width"]:
+        return [dot(f, basis) for basis in towards]
+    return layer(scene["w2"], scene["b2"], clipped(layer(scene["u"], towards, f)))
 
 
 def hashes(scene):  # section 16

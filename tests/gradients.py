@@ -7,9 +7,15 @@ import torch
 from scenes import displaced, surrounded, tiny_scene
 
 from kpc.encoder import kernels
-from kpc.encoder.field import Field, Rays, render_reference
+from kpc.encoder.field import Field
+from kpc.encoder.render import Rays, render_reference
 from kpc.encoder.train import motion_of, sample_capacity
 from kpc.format.scene import Scene
+
+
+KINDS = [(True, False, False), (True, False, True), (False, False, False), (True, True, False), (True, True, True),
+         (False, True, False)]
+"""Whether it moves, lies in contracted space, has a motion grid."""
 
 
 def misty(dynamic: bool = True, contracted: bool = False, moved: bool = False) -> Scene:

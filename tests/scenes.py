@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.format.cameras import Camera
-from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Clip, Decoder, Scene
+from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates
 
 
@@ -79,10 +79,21 @@ def faced(scene: Scene) -> Scene:
     return replace(scene, mapping=DeviceCoordinates(frame, 0.8, 2.0), aabb=aabb)
 
 
+def hybrid(scene: Scene, seed: int = 6, width: int = 6, hidden: int = 7) -> Scene:
+    """A scene with a hybrid decoder, of widths that fill no vectors of four, about as dense as before."""
+    rng = np.random.default_rng(seed)
+    F = scene.decoder.w2.shape[1]
+    shapes = {"v": (width, F), "a": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
+              "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
+    weights = {name: rng.normal(0.0, 2.0 / np.sqrt(shape[-1]), shape).astype(np.float32) for name, shape in shapes.items()}
+    return replace(scene, decoder=HybridDecoder(density_bias=3.5, **weights))
+
+
 SPACES: dict[str, Callable[[Scene], Scene]] = {
     "box": lambda scene: scene, "contracted": surrounded, "displaced": displaced, "ndc": faced,
+    "hybrid": hybrid,
 }
-"""What there is besides a plain box."""
+"""What there is besides a plain box and the explicit decoder."""
 
 
 def look_at(eye: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int,

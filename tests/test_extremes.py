@@ -18,7 +18,8 @@ from kpc.encoder.box import find_box
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluate import SceneRenderer, evaluate
-from kpc.encoder.field import Field, Layout, Rays, priors
+from kpc.encoder.field import Field, Layout, priors
+from kpc.encoder.render import Rays
 from kpc.encoder.kpenc import to_scene
 from kpc.encoder.train import Report, Trainer, add_priors
 from kpc.format.errors import DatasetError

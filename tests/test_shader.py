@@ -3,11 +3,11 @@ import re
 import gl
 import numpy as np
 import pytest
-from scenes import tiny_scene
+from scenes import hybrid, tiny_scene
 
 from kpc.format.errors import DisplayError
 from kpc.player import shader
-from kpc.player.textures import Layout, decoder_arrays
+from kpc.player.textures import Layout, decoder_arrays, decoder_shape
 
 
 def test_includes_come_once_and_lines_keep_their_numbers() -> None:
@@ -75,7 +75,7 @@ def test_constants_are_exact() -> None:
     assert np.array_equal(np.array(numbers, np.float32).reshape(3, 4), values)
 
 
-@pytest.mark.parametrize("space", ["box", "contracted", "ndc"])
+@pytest.mark.parametrize("space", ["box", "contracted", "ndc", "hybrid"])
 @pytest.mark.parametrize("rows", [0, 1])
 @pytest.mark.parametrize("motion", [0, 1])
 @pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl"])
@@ -84,9 +84,10 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     if "GL_ARB_ES3_compatibility" not in ctx.extensions:
         pytest.skip("this OpenGL compiles no GLSL ES 3.00")
     scene = tiny_scene(0, scales=3, channels=5)
+    scene = hybrid(scene) if space == "hybrid" else scene
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
-    defines = {"SCALES": 3, "LAYERS": layout.layers, "HIDDEN": len(scene.decoder.b1), "ROWS": rows, "REFINED": 1, "EARLY": 1 - rows,
+    defines = {"SCALES": 3, "LAYERS": layout.layers, **decoder_shape(scene.decoder), "ROWS": rows, "REFINED": 1, "EARLY": 1 - rows,
                "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion}  # fmt: skip
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights})
     vertex, _ = shader.compose("fullscreen.glsl", preamble=shader.ES30)

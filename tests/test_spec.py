@@ -66,7 +66,7 @@ def same(layout: str, expected: struct.Struct) -> bool:
 
 @pytest.mark.parametrize("number, structures", [
     (3, [container.HEADER]), (4, [container.ENTRY]), (5, [file.SCENE_STRUCT, file.SCALE_STRUCT, file.WARP_STRUCT, file.NDC_STRUCT, file.MOTION_STRUCT]),
-    (7, [file.DECODER_STRUCT]), (8, [file.OCCUPANCY_STRUCT]), (9, [file.CAMERA_STRUCT]),
+    (7, [file.DECODER_STRUCT, file.HYBRID_STRUCT]), (8, [file.OCCUPANCY_STRUCT]), (9, [file.CAMERA_STRUCT]),
 ])
 def test_byte_tables_are_the_code_s_structures(number, structures):
     tables = layouts(section(number))

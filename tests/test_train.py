@@ -14,7 +14,8 @@ from kpc.encoder.box import contraction_of, find_box
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluate import evaluate, psnr
-from kpc.encoder.field import Field, Rays
+from kpc.encoder.field import Field
+from kpc.encoder.render import Rays
 from kpc.encoder.kpenc import to_scene
 from kpc.encoder.train import PlainOptimiser, RaySampler, Report, Trainer, kept_channels
 from kpc.format.errors import TrainingError
@@ -81,9 +82,10 @@ def assert_same(one: Trainer, two: Trainer) -> None:
     assert one.rng.bit_generator.state == two.rng.bit_generator.state
 
 
-def test_it_learns_what_moves(moving: Dataset) -> None:
-    before = evaluate(to_scene(trainer(moving)), moving)
-    run = trained(moving, steps=200)
+@pytest.mark.parametrize("hybrid", [False, True])
+def test_it_learns_what_moves(moving: Dataset, hybrid: bool) -> None:
+    before = evaluate(to_scene(trainer(moving, hybrid=hybrid)), moving)
+    run = trained(moving, steps=200, hybrid=hybrid)
     after = evaluate(to_scene(run), moving)
     assert before is not None and after is not None
     assert after.psnr > before.psnr + 8, (before, after)
@@ -100,17 +102,18 @@ def test_it_learns_what_stands_still_with_three_planes(still: Dataset) -> None:
     assert not scene.is_dynamic and len(scene.occupancy) == 1 and set(scene.scales[0]) == {"xy", "xz", "yz"}
 
 
-def test_a_seed_repeats_bitwise(moving: Dataset) -> None:
+@pytest.mark.parametrize("hybrid", [False, True])
+def test_a_seed_repeats_bitwise(moving: Dataset, hybrid: bool) -> None:
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    one, two, other = trained(moving, steps=20), trained(moving, steps=20), trained(moving, steps=20, seed=1)
+    one, two, other = (trained(moving, steps=20, hybrid=hybrid, seed=seed) for seed in (0, 0, 1))
     assert_same(one, two)
     assert not torch.equal(one.field.theta, other.field.theta)
 
 
 # before the occupancy grid forms, between two updates of it, and after it has been split
-@pytest.mark.parametrize("stop_at", [5, 21, 68])
-def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(moving: Dataset, tmp_path: Path, stop_at: int) -> None:
-    changes = {"steps": 80, "channel_dropout": 0.25, "occupancy_split_every": 64, "motion_cells": 3}
+@pytest.mark.parametrize(("stop_at", "hybrid"), [(5, False), (21, False), (68, False), (68, True)])
+def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(moving: Dataset, tmp_path: Path, stop_at: int, hybrid: bool) -> None:
+    changes = {"hybrid": hybrid, "steps": 80, "channel_dropout": 0.25, "occupancy_split_every": 64, "motion_cells": 3}
     whole = trained(moving, **changes)
     assert len(whole.grid.marched) == whole.slots > 1
     first = trainer(moving, **changes)
@@ -507,6 +510,12 @@ def test_the_whole_loop_runs_on_plain_pytorch(moving: Dataset, tmp_path: Path) -
     assert second.step == 24 and second.grid.occupied.any()
     # PyTorch adds with atomics in no fixed order here and there; the runs agree as nearly as two runs do.
     assert psnr(second.field.theta.detach().numpy(), whole.field.theta.detach().numpy()) > 40
+
+
+def test_the_hybrid_decoder_without_direction_sees_the_same_from_everywhere(moving: Dataset) -> None:
+    field = trained(moving, view_dependent=False, hybrid=True, steps=20).field
+    directions = torch.nn.functional.normalize(torch.randn(8, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    assert field.b1.any() and torch.equal(field.once_a_ray(directions), field.b1.expand(8, -1))
 
 
 def test_a_colour_without_direction_keeps_it_out(moving: Dataset) -> None:

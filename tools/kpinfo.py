@@ -20,7 +20,7 @@ from kpc.format.container import CODEC_RAW, CODEC_ZSTD, DEFAULT_BUDGET, VERSION,
 from kpc.format.errors import FormatError, UsageError
 from kpc.format.file import SceneReader, read
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
-from kpc.format.scene import ALL_PLANES, SPACE_PLANES
+from kpc.format.scene import ALL_PLANES, SPACE_PLANES, HybridDecoder
 from kpc.format.space import FAR, Contraction, SpaceMapping
 
 CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd"}
@@ -89,7 +89,8 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
                    "largest": float(np.abs(scene.motion.dequantise()).max())},
         "background": scene.background.tolist(),
         "scales": [_describe_scale(scale) for scale in scene.scales],
-        "decoder": {"features": len(scene.decoder.density_weight), "hidden": len(scene.decoder.b1)},
+        "decoder": {"kind": "hybrid" if isinstance(scene.decoder, HybridDecoder) else "explicit", "hidden": len(scene.decoder.b1),
+                    "features": sum(scale["xy"].symbols.shape[2] for scale in scene.scales)},
         "occupancy": {"slots": scene.occupancy.shape[0], "cells_zyx": list(scene.occupancy.shape[1:]),
                       "share": float(scene.occupancy.mean())},
         "cameras": len(scene.cameras),
@@ -164,7 +165,7 @@ def _page(info: dict[str, Any]) -> str:
         + (f" within {_corner(info['camera_box'][0])} to {_corner(info['camera_box'][1])}" if info["cameras"] else ""),
         f"  occupancy   {occupancy['slots']} x {'x'.join(map(str, reversed(occupancy['cells_zyx'])))} cells, "
         f"{occupancy['share']:.1%} occupied",
-        f"  decoder     {info['decoder']['features']} features, {info['decoder']['hidden']} hidden units",
+        f"  decoder     {info['decoder']['kind']}, {info['decoder']['features']} features, {info['decoder']['hidden']} hidden units",
     ]
     for number, scale in enumerate(info["scales"]):
         planes = ", ".join(f"{name} {p['columns']}x{p['rows']}" for name, p in scale["planes"].items())

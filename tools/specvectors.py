@@ -13,6 +13,7 @@ import struct
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from kpc.format.errors import UsageError
 from kpc.format.file import encode, read, scene_chunks
 from kpc.format.motion import QuantisedMotion
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
-from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder
+from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates
 from kpc.player import reference
 
@@ -64,7 +65,6 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
     """What a decoder must find in a file: SHA-256 of every array, in the order that the spec's last section gives."""
     scene = read(data, allow_partial=partial)
     decoder = scene.decoder
-    weights = [decoder.density_weight, np.float32(decoder.density_bias), decoder.w1, decoder.b1, decoder.w2, decoder.b2]
     return {
         "partial": partial,
         "zstd": ZSTD_VERSION if any(entry.codec for entry in Reader(data, allow_partial=partial).index) else None,
@@ -80,8 +80,9 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
         "background": scene.background.tolist(),
         "cameras": [_camera(camera) for camera in scene.cameras],
         "occupancy": {"shape": list(scene.occupancy.shape), "sha256": _sha256(scene.occupancy.astype(np.uint8))},
-        "decoder": {"features": len(decoder.density_weight), "hidden": len(decoder.b1),
-                    "sha256": _sha256(*(np.asarray(w, "<f4") for w in weights))},
+        "decoder": {"features": sum(scale["xy"].symbols.shape[2] for scale in scene.scales),
+                    **({"width": len(decoder.a)} if isinstance(decoder, HybridDecoder) else {}), "hidden": len(decoder.b1),
+                    "sha256": _sha256(*(np.asarray(w, "<f4") for w in vars(decoder).values()))},
         "planes": [
             {"scale": number, "plane": name, "shape": list(plane.symbols.shape),
              "symbols_sha256": _sha256(plane.symbols), "coded_sha256": _sha256(plane.coded.astype(np.uint8)),
@@ -120,6 +121,7 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
     frame = np.array([[0.96, 0, 0.28, 0.5], [0, 1, 0, -0.25], [-0.28, 0, 0.96, 3]])
     faced = replace(dense, mapping=DeviceCoordinates(frame, 1.5, 2.0),
                     aabb=np.array([[-0.5, -0.5, 0.125], [0.5, 0.5, 1.25]], np.float32))
+    hybrid = replace(dense, decoder=_hybrid(2, 5, 3))
     note = Chunk("note", [b"readers skip what they need not know"])
     chunks = scene_chunks(minimal)
     index = Reader(packed).index
@@ -138,6 +140,8 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "moved-prefix": (encode(moved)[:Reader(encode(moved)).index[4].offset], True),
         "moved-contracted": (encode(replace(contracted, motion=_motion(2, 2, 2, 2, 32.0)), compress=False), False),
         "device-coordinates": (encode(faced), False),
+        "hybrid": (encode(hybrid), False),
+        "hybrid-moved": (encode(replace(hybrid, motion=moved.motion, decoder=_hybrid(2, 1, 1)), compress=False), False),
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
     }
 
@@ -180,6 +184,13 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
 
     def move(rows: int, nz: int, ny: int, nx: int, step: float) -> bytes:
         return struct.pack("<4Hf", rows, nz, ny, nx, step) + bytes(6 * 16)
+
+    mlps = b"".join(scene_chunks(replace(scene, decoder=_hybrid(2, 2, 2)))[deco].parts)
+
+    def decoded_by(*changes: Callable[[bytes], bytes]) -> bytes:
+        """The file with a hybrid decoder, changed so."""
+        raw = reduce(lambda raw, change: change(raw), changes, mlps)
+        return pack([*chunks[:deco], Chunk("HYBR", [raw]), *chunks[occu:]], values, compress=False)
 
     def without(number: int) -> bytes:
         return pack(chunks[:number] + chunks[number + 1:], values, compress=False)
@@ -268,6 +279,14 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
                         broken, "static scene"),
         "decoder-features": (repacked(deco, set_at(0, "<H", 3)), broken, "3 features"),
         "decoder-nan": (repacked(deco, set_at(8, "<H", 0x7E00)), broken, "NaN or infinite"),
+        "hybrid-features": (decoded_by(set_at(0, "<H", 3)), broken, "3 features"),
+        "hybrid-width": (decoded_by(set_at(2, "<H", 0)), broken, "0 and 2 hidden units"),
+        "hybrid-hidden": (decoded_by(set_at(4, "<H", 257)), broken, "2 and 257 hidden units"),
+        "hybrid-bias": (decoded_by(set_at(6, "<f", nan)), broken, "density bias nan"),
+        "hybrid-nan": (decoded_by(set_at(10, "<H", 0x7C00)), broken, "NaN or infinite"),
+        "hybrid-long": (decoded_by(lambda raw: raw + bytes(2)), broken, "2 bytes too long"),
+        "hybrid-twice": (with_chunks("HYBR", mlps, mlps), broken, "two decoders"),
+        "two-decoders": (with_chunks("HYBR", mlps), broken, "two decoders"),
         "decoder-short": (repacked(deco, lambda raw: raw[:-1]), broken, "ends after"),
         "occupancy-bits": (repacked(occu, lambda raw: raw[:-1] + b"\xff"), broken, "unused bits"),
         "occupancy-zero": (repacked(occu, set_at(0, "<H", 0)), broken, "makes no sense"),
@@ -309,6 +328,13 @@ def _scene(dynamic: bool, sizes: list[tuple[int, int, int, int, int]], amplitude
         np.array([[-1, -0.75, -0.5], [1, 0.75, 0.5]], np.float32), Clip(12, 24.0) if dynamic else Clip(1, 24.0),
         tuple(scales), Decoder(density, 0.5, w1, b1, w2, b2), occupancy, np.array([0.25, 0.5, 1], np.float32), 0.0625,
         tuple(Camera(64 + k, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(cameras)))
+
+
+def _hybrid(features: int, width: int, hidden: int) -> HybridDecoder:
+    shapes = {"v": (width, features), "a": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
+              "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
+    return HybridDecoder(density_bias=0.5, **{
+        name: _noise(shape, 17 + k) / np.float32(64) for k, (name, shape) in enumerate(shapes.items())})
 
 
 def _motion(rows: int, nz: int, ny: int, nx: int, step: float = 8.0) -> QuantisedMotion:

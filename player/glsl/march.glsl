@@ -1,6 +1,7 @@
 // The picture of a scene; normative text and a readable twin: kpc.player.reference.
 //
-// SCALES, LAYERS (of four channels), HIDDEN: its shape; HIDDEN is 0 where colour is the same from all sides. ROWS: 1 where
+// SCALES, LAYERS (of four channels), HIDDEN: its shape; HIDDEN is 0 where colour is the same from all sides. HYBRID: 1 where the
+// decoder is the hybrid one, of layers of WIDTH and HIDDEN units. ROWS: 1 where
 // rows of time planes are multiplied in at every sample. REFINED: how much finer than the scene's the planes are along the
 // row folded into them; 1 where none is.
 // CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
@@ -13,7 +14,7 @@
 #include "motion.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
-#include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2 (kpc.player.textures)
+#include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.textures)
 
 #define FEATURES (SCALES * LAYERS)
 #if EARLY
@@ -51,16 +52,34 @@ layout(location = 0) out vec4 seen;     // rgb and opacity
 layout(location = 1) out vec4 met;      // sum of weight t, samples
 
 #if HIDDEN
+// e of a direction, in three parts: x y z xx, yy zz xy yz, zx 1; the last is for b1.
+mat3x4 encoded(vec3 d) {
+    return mat3x4(d, d.x * d.x, d.y * d.y, d.z * d.z, d.x * d.y, d.y * d.z, d.z * d.x, 1.0, 0.0, 0.0);
+}
+
+// One number of w1 e + b1.
+float direction_hidden(mat3x4 e, int h) {
+    return dot(w1[3 * h], e[0]) + dot(w1[3 * h + 1], e[1]) + dot(w1[3 * h + 2], e[2]);
+}
+#endif
+
+#if HYBRID
+vec4 towards[HIDDEN / 4];  // w1 e + b1 of the ray
+
+void look_along(vec3 d) {
+    mat3x4 e = encoded(d);
+    for (int i = 0; i < HIDDEN / 4; ++i) {
+        towards[i] = vec4(direction_hidden(e, 4 * i), direction_hidden(e, 4 * i + 1),
+                          direction_hidden(e, 4 * i + 2), direction_hidden(e, 4 * i + 3));
+    }
+}
+#elif HIDDEN
 vec4 basis[3 * FEATURES];
 
-void find_basis(vec3 d) {
-    vec4 e0 = vec4(d, d.x * d.x);
-    vec4 e1 = vec4(d.y * d.y, d.z * d.z, d.x * d.y, d.y * d.z);
-    vec4 e2 = vec4(d.z * d.x, 1.0, 0.0, 0.0);
+void look_along(vec3 d) {
+    mat3x4 e = encoded(d);
     float hidden[HIDDEN];
-    for (int h = 0; h < HIDDEN; ++h) {
-        hidden[h] = max(dot(w1[3 * h], e0) + dot(w1[3 * h + 1], e1) + dot(w1[3 * h + 2], e2), 0.0);
-    }
+    for (int h = 0; h < HIDDEN; ++h) hidden[h] = max(direction_hidden(e, h), 0.0);
     for (int i = 0; i < 3 * FEATURES; ++i) {
         vec4 sum = b2[i];
         for (int h = 0; h < HIDDEN; ++h) sum += hidden[h] * w2[i * HIDDEN + h];
@@ -86,6 +105,36 @@ vec4 feature(vec3 u, int scale, int layer) {
     return f;
 }
 
+#if HYBRID
+// A weight below which a sample's colour is not worked out: 4096 of them could not make up an 8-bit level and a half.
+const float NEGLIGIBLE = 1e-4;
+
+// Four numbers of v f.
+vec4 four_rows(int i, vec4 f[FEATURES]) {
+    vec4 sum = vec4(0.0);
+    for (int j = 0; j < FEATURES; ++j) {
+        int at = 4 * i * FEATURES + j;
+        sum += vec4(dot(from_features[at], f[j]), dot(from_features[at + FEATURES], f[j]), dot(from_features[at + 2 * FEATURES], f[j]), dot(from_features[at + 3 * FEATURES], f[j]));
+    }
+    return sum;
+}
+
+// The logits of the colour, from the hidden layer of the density.
+vec3 shade_of(vec4 h[WIDTH / 4]) {
+    vec3 shade = b2[0].xyz;
+    for (int i = 0; i < HIDDEN / 4; ++i) {
+        vec4 sum = towards[i];
+        for (int j = 0; j < WIDTH / 4; ++j) {
+            int at = i * WIDTH + j;
+            sum += vec4(dot(passed_on[at], h[j]), dot(passed_on[at + WIDTH / 4], h[j]), dot(passed_on[at + WIDTH / 2], h[j]), dot(passed_on[at + 3 * WIDTH / 4], h[j]));
+        }
+        sum = activated(sum);
+        shade += vec3(dot(w2[i], sum), dot(w2[HIDDEN / 4 + i], sum), dot(w2[HIDDEN / 2 + i], sum));
+    }
+    return shade;
+}
+#endif
+
 void main() {
     Path path = path_of(eye, camera_direction(gl_FragCoord.xy, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
@@ -96,7 +145,7 @@ void main() {
     float samples = 0.0;
     bool more = to_occupied(walk, cells, cell_count);
 #if HIDDEN
-    if (more) find_basis(path.way);
+    if (more) look_along(path.way);
 #endif
     // Tested at its end: neighbouring rays run as one, and a test up front would cost them all one more body.
     do {
@@ -115,6 +164,15 @@ void main() {
 #endif
             float log_density = density_bias[0].x;
             vec3 shade = vec3(0.0);
+#if HYBRID
+            vec4 f[FEATURES];
+            for (int i = 0; i < FEATURES; ++i) f[i] = feature(u, i / LAYERS, i % LAYERS);
+            vec4 h[WIDTH / 4];
+            for (int i = 0; i < WIDTH / 4; ++i) {
+                h[i] = activated(from_features_bias[i] + four_rows(i, f));
+                log_density += dot(h[i], density_weight[i]);
+            }
+#else
             for (int scale = 0; scale < SCALES; ++scale) {
                 for (int layer = 0; layer < LAYERS; ++layer) {
                     int i = scale * LAYERS + layer;
@@ -123,7 +181,11 @@ void main() {
                     shade += vec3(dot(f, basis[i]), dot(f, basis[FEATURES + i]), dot(f, basis[2 * FEATURES + i]));
                 }
             }
+#endif
             float weight = trans * alpha_of(log_density, thickness);
+#if HYBRID
+            if (weight > NEGLIGIBLE) shade = shade_of(h);
+#endif
             rgb += weight * sigmoid(shade);
             depth += weight * world_distance(path, t);
             trans -= weight;

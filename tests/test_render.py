@@ -1,0 +1,115 @@
+"""Rendering in PyTorch: the parts that the kernels stand in for, and the hybrid decoder, whose gradients only PyTorch has."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from gradients import KINDS, misty, rays_at
+from scenes import hybrid, tiny_scene
+
+from kpc.encoder.evaluate import SceneRenderer
+from kpc.encoder.field import Field, HybridField, Layout
+from kpc.encoder.render import Rays, collected, composite, fused_features, samples_of
+from kpc.player import reference
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bool]) -> None:
+    scene = misty(*kind)
+    rays = rays_at(scene, 403)
+    ours = collected(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
+    theirs = samples_of(rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step, scene.mapping)
+    # A sample within rounding of a cell's face may count here and not there: rays of as many samples have the same ones.
+    counts = [np.bincount(samples.ray.numpy(), minlength=403) for samples in (ours, theirs)]
+    same = counts[0] == counts[1]
+    assert same.mean() > 0.98 and counts[0].sum() > 403
+    mine, other = same[ours.ray], same[theirs.ray]
+    np.testing.assert_array_equal(ours.ray[mine], theirs.ray[other])
+    for name, tolerance in (("points", 1e-5), ("s", 1e-4), ("stretch", 1e-4)):
+        np.testing.assert_allclose(getattr(ours, name)[mine], getattr(theirs, name)[other], atol=tolerance, rtol=1e-4, err_msg=name)
+    assert (ours.cell[mine] == theirs.cell[other]).float().mean() > 0.999
+
+
+def test_rays_that_meet_nothing_have_no_samples() -> None:
+    scene = misty()
+    rays = rays_at(scene, 13)
+    away = replace(rays, origins=rays.origins + 100)
+    samples = collected(away, scene.aabb, scene.occupancy, scene.step)
+    assert len(samples.ray) == 0
+    field = Field.from_scene(hybrid(scene))
+    met = composite(field, away, samples, fused_features(field), scene.step, scene.extent)
+    assert torch.equal(met.rgb, away.backgrounds) and not met.opacity.any() and float(met.distortion.detach()) == 0
+
+
+@pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_fused_features_are_plain_ones_with_their_gradient(dynamic: bool, moved: bool) -> None:
+    scene = misty(dynamic, False, moved and dynamic)
+    ours, theirs = Field.from_scene(scene), Field.from_scene(scene).double()
+    generator = torch.Generator().manual_seed(0)
+    points, times = torch.rand(500, 3, generator=generator), torch.rand(500, generator=generator)
+    g = torch.randn(500, ours.layout.features, generator=generator)
+    found, wanted = fused_features(ours)(points, times), theirs.features(points.double(), times.double())
+    np.testing.assert_allclose(found.detach(), wanted.detach(), rtol=1e-4, atol=1e-5)
+    (found * g).sum().backward()
+    (wanted * g.double()).sum().backward()
+    for name in ("theta", *(["motion"] if ours.motion is not None else [])):
+        mine, other = getattr(ours, name).grad, getattr(theirs, name).grad
+        np.testing.assert_allclose(mine, other, atol=1e-3 * float(other.abs().max()), err_msg=name)
+
+
+def test_the_hybrid_decoder_has_the_gradient_of_finite_differences() -> None:
+    generator = torch.Generator().manual_seed(3)
+    field = HybridField(Layout.of(np.array([[3, 3, 2, 2]]), 2), 3, generator).double()
+    aabb = torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]], dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(4, 3, generator=generator, dtype=torch.float64), dim=1)
+    chances = (torch.rand(4, generator=generator).double() for _ in range(2))
+    rays = Rays(-2 * directions, directions, *chances, torch.rand(4, 3, generator=generator).double())
+    samples = samples_of(rays, aabb, torch.ones(1, 2, 2, 2), 0.3)
+    parameters = dict(field.named_parameters())
+
+    def met(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        changed = torch.func.functional_call(
+            _Calling(field, lambda: composite(field, rays, samples, field.features, 0.3, 2.0)),
+            {f"field.{name}": value for name, value in zip(parameters, values)}, (),
+        )
+        return changed.rgb, changed.distortion
+
+    values = tuple(p.detach().clone().requires_grad_() for p in parameters.values())
+    assert torch.autograd.gradcheck(met, values)
+    rgb, _ = met(*values)
+    for name, gradient in zip(parameters, torch.autograd.grad(rgb.square().sum(), values)):
+        assert gradient.abs().max() > 0, name
+
+
+class _Calling(torch.nn.Module):
+    """Makes a function of a field's parameters out of one that uses the field."""
+
+    def __init__(self, field: Field, call: object) -> None:
+        super().__init__()
+        self.field, self.forward = field, call
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pictures_of_a_hybrid_scene_are_the_reference_s(kind: tuple[bool, bool, bool]) -> None:
+    scene = hybrid(misty(*kind))
+    renderer = SceneRenderer(scene)
+    for camera in scene.cameras:
+        origins, directions = camera.rays()
+        theirs = reference.render_rays(scene, origins, directions, 0.3)
+        rgb, opacity, depth = renderer.render(origins, directions, np.full(len(origins), 0.3))
+        # A sample within rounding of a cell's face may count here and not there; few rays have one.
+        assert np.mean(np.abs(rgb - theirs.rgb).max(1) > 1e-4) < 0.005
+        assert np.abs(rgb - theirs.rgb).max() < 0.3
+        assert np.mean(np.abs(opacity - theirs.opacity) > 1e-4) < 0.005
+        there = theirs.opacity > 0.01
+        assert np.mean(np.abs(depth[there] - theirs.depth[there]) > 0.01) < 0.01
+
+
+def test_a_hybrid_field_is_its_scene_again() -> None:
+    scene = hybrid(tiny_scene())
+    field = Field.from_scene(scene)
+    assert isinstance(field, HybridField)
+    for name, weights in vars(field.decoder_as_data()).items():
+        np.testing.assert_array_equal(weights, getattr(scene.decoder, name), err_msg=name)
