@@ -33,6 +33,9 @@ class TrainConfig:
     cells_across: int = 96
     """Cells of the occupancy grid along the longest edge of the box."""
 
+    mixed_precision: bool = True
+    """On a GPU the planes are read as float16 and the hybrid decoder's layers compute in bfloat16 (`Field.mixed`)."""
+
     # --- the optimiser
     steps: int = 6000
     """Optimiser steps when no time budget is given."""

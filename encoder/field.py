@@ -97,6 +97,8 @@ class Field(nn.Module):
     Attributes:
         theta: (layout.size,) the planes. Space planes start uniform in [0.1, 0.5], time planes at 1 (K-Planes).
         motion: (T, Nz, Ny, Nx, 3) displacements, `kpc.format.motion`, at first 0; or None.
+        mixed: whether `features` reads the planes as float16, and the hybrid decoder's layers compute in bfloat16: half the bytes,
+            and what GPUs are built for. Sums, products of planes, densities, gradients and the optimiser stay in float32.
         density: (F + 1,) weights of the log density, its bias last.
         w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.Decoder`. w2 starts at 0: colour depends on the
             direction only as far as the pictures insist.
@@ -108,6 +110,7 @@ class Field(nn.Module):
         """`motion_nodes`: of the motion grid along t, z, y and x; None for a field without one."""
         super().__init__()
         self.layout = layout
+        self.mixed = False
         self.motion = None if motion_nodes is None else nn.Parameter(torch.zeros(*motion_nodes, 3))
 
         def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -158,7 +161,7 @@ class Field(nn.Module):
 
     def colours(self, latent: Tensor, terms: Tensor, ray: Tensor) -> Tensor:
         """Colours (n, 3) of n samples on the rays `ray` (n,), from what `decode` and `once_a_ray` gave."""
-        return torch.sigmoid(torch.einsum("nf,ncf->nc", latent, terms[ray]))
+        return torch.sigmoid(torch.einsum("nf,ncf->nc", latent, terms.index_select(0, ray)))
 
     def decoder_parameters(self, view_dependent: bool) -> list[nn.Parameter]:
         """What there is to train beside planes and motion."""
@@ -188,7 +191,7 @@ class Field(nn.Module):
         for s in range(len(self.layout.resolution)):
             product: Tensor | None = None
             for name in ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES:
-                sample = bilinear(self.plane(s, name), coordinate[name[0]], coordinate[name[1]])
+                sample = bilinear(self.plane(s, name), coordinate[name[0]], coordinate[name[1]], self.mixed)
                 product = sample if product is None else product * sample
             assert product is not None
             scales.append(product)
@@ -263,12 +266,18 @@ class HybridField(Field):
         return self.direction_hidden(directions)
 
     def decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        h = (features @ self.v.T + self.a).clamp(0, ACTIVATION_LIMIT)
+        h = (self._times(features, self.v) + self.a).clamp(0, ACTIVATION_LIMIT)
         return (h @ self.density[:-1] + self.density[-1]).clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT), h
 
     def colours(self, latent: Tensor, terms: Tensor, ray: Tensor) -> Tensor:
-        hidden = (terms[ray] + latent @ self.u.T).clamp(0, ACTIVATION_LIMIT)
-        return torch.sigmoid(hidden @ self.w2.T + self.b2)
+        hidden = (terms.index_select(0, ray) + self._times(latent, self.u)).clamp(0, ACTIVATION_LIMIT)
+        return torch.sigmoid(self._times(hidden, self.w2) + self.b2)
+
+    def _times(self, values: Tensor, weights: Tensor) -> Tensor:
+        """values weights^T: (n, columns), (rows, columns) to (n, rows)."""
+        if not self.mixed:
+            return values @ weights.T
+        return (values.bfloat16() @ weights.bfloat16().T).to(values.dtype)
 
     def decoder_parameters(self, view_dependent: bool) -> list[nn.Parameter]:
         return [self.v, self.a, self.density, self.b1, self.u, self.w2, self.b2] + ([self.w1] if view_dependent else [])
@@ -308,15 +317,38 @@ def moved(points: Tensor, times: Tensor, motion: Tensor) -> Tensor:
     return out.clamp(0, 1)
 
 
-def bilinear(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Sample a (rows, columns, M) plane, corner-aligned: u in [0, 1] along columns, v along rows. Returns (N, M)."""
+def bilinear(plane: Tensor, u: Tensor, v: Tensor, in_half: bool = False) -> Tensor:
+    """Sample a (rows, columns, M) plane, corner-aligned: u in [0, 1] along columns, v along rows. Returns (N, M).
+
+    `in_half`: texels are read as float16; what is made of them, and the gradient, is in the type of the plane.
+    """
     rows, columns, M = plane.shape
     (i, fu), (j, fv) = tap(u, columns), tap(v, rows)
     flat = plane.reshape(-1, M)
+    half = flat.detach().half() if in_half else None
+
+    def texels(k: Tensor) -> Tensor:
+        return flat.index_select(0, k) if half is None else _HalfTexels.apply(flat, half, k)  # type: ignore[no-untyped-call]
+
     k = j * columns + i
-    low = flat[k] * (1 - fu) + flat[k + 1] * fu
-    high = flat[k + columns] * (1 - fu) + flat[k + columns + 1] * fu
+    low = texels(k) * (1 - fu) + texels(k + 1) * fu
+    high = texels(k + columns) * (1 - fu) + texels(k + columns + 1) * fu
     return low * (1 - fv) + high * fv
+
+
+class _HalfTexels(torch.autograd.Function):
+    """Rows `k` of a (texels, M) plane, read from its float16 copy; the gradient is added up in the plane's own type."""
+
+    @staticmethod
+    def forward(ctx, flat, half, k):  # type: ignore[no-untyped-def]
+        ctx.save_for_backward(k)
+        ctx.shape = flat.shape
+        return half.index_select(0, k).to(flat.dtype)
+
+    @staticmethod
+    def backward(ctx, g):  # type: ignore[no-untyped-def]
+        k, = ctx.saved_tensors
+        return g.new_zeros(ctx.shape).index_add_(0, k, g), None, None
 
 
 def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:

@@ -20,6 +20,10 @@ from kpc.format.scene import TERMINATION
 from kpc.format.space import Contraction, SpaceMapping
 
 
+OPAQUE = 50.0
+"""Optical thickness of a sample beyond which more makes no difference to what lies behind it."""
+
+
 @dataclass(frozen=True)
 class Rays:
     """A batch of rays; every member has N rows. Directions are unit vectors, times and jitters lie in [0, 1)."""
@@ -81,10 +85,17 @@ def render_reference(
     return met.rgb, met.distortion, met.weights[met.reached], samples.cell[met.reached]
 
 
-def samples_of(rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, mapping: SpaceMapping | None = None) -> Samples:
+def samples_of(
+    rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, mapping: SpaceMapping | None = None, *,
+    most: int | None = None, capacity: int | None = None,
+) -> Samples:
     """The samples of rays where the occupancy grid (slots, Nz, Ny, Nx) is set.
 
     Sample k of a ray lies at s = near + (k + jitter) * step, which is its distance unless there is a mapping.
+
+    How many there are is known only where they are counted, and a GPU would have to be waited for. With `most`, samples that a
+    ray can take, and `capacity` nobody waits: there are `capacity` samples, those left over are of no length, on the last ray,
+    and those beyond are lost.
     """
     inverse = 1 / rays.directions
     t0, t1 = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse
@@ -92,21 +103,27 @@ def samples_of(rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, mapping
     far = torch.maximum(t0, t1).nan_to_num(torch.inf).amin(1)
     if isinstance(mapping, Contraction):
         near, far = torch.zeros_like(near), torch.full_like(far, mapping.end)
-        longest = mapping.end
-    else:
-        longest = float(torch.linalg.vector_norm(aabb[1] - aabb[0]))  # not the rays' own: a GPU would have to be waited for
-    k = torch.arange(max(1, math.ceil(longest / step)) + 1, device=near.device)
+    if most is None:
+        most = max(1, math.ceil(float((far - near).clamp(min=0).max()) / step))
+    k = torch.arange(most, device=near.device)
     s = near[:, None] + (k + rays.jitters[:, None]) * step
     t = s
     if isinstance(mapping, Contraction):
         t = torch.where(s <= mapping.even, s, mapping.even / (2 - s.clamp(max=mapping.end) / mapping.even))
     u, stretch = place(rays.origins[:, None] + t[..., None] * rays.directions[:, None], t, aabb, mapping)
-    size = torch.tensor(occupancy.shape[:0:-1], device=u.device)
-    cell = (u.detach() * size).long().clamp(min=0).minimum(size - 1).flip(-1)
+    cell = torch.stack([(u[..., axis] * n).long().clamp(0, n - 1) for axis, n in zip((2, 1, 0), occupancy.shape[1:])], dim=-1)
     slot = (rays.times * occupancy.shape[0]).long().clamp(max=occupancy.shape[0] - 1)[:, None]
     taken = occupancy[slot, cell[..., 0], cell[..., 1], cell[..., 2]].bool() & (s < far[:, None])
-    index = taken.nonzero(as_tuple=True)
-    return Samples(index[0], u[index], s[index], stretch[index], cell[index])
+    if capacity is None:
+        index = taken.nonzero(as_tuple=True)
+        return Samples(index[0], u[index], s[index], stretch[index], cell[index])
+    taken = taken.flatten()
+    number = torch.where(taken, taken.cumsum(0) - 1, capacity).clamp(max=capacity)
+    last = torch.full((capacity + 1,), taken.numel() - 1, device=taken.device)
+    chosen = last.scatter_(0, number, torch.arange(taken.numel(), device=taken.device))[:capacity]
+    there = torch.arange(capacity, device=taken.device) < taken.sum()
+    return Samples(chosen // most, u.flatten(0, 1)[chosen], s.flatten()[chosen], stretch.flatten()[chosen] * there,
+                   cell.flatten(0, 1)[chosen])
 
 
 def place(points: Tensor, t: Tensor, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
@@ -138,23 +155,30 @@ def composite(
     ray, N = samples.ray, len(rays.times)
     f = features(samples.points, rays.times[ray])
     log_density, latent = field.decode(f if kept is None else f * kept)
-    # Samples side by side, a row for each ray: sums along rays are sums along rows.
-    counts = torch.bincount(ray, minlength=N)
-    number = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
-    index, shape = (ray, number), (N, max(1, int(counts.max())))
-    zeros = log_density.new_zeros(shape)
-    tau = zeros.index_put(index, log_density.exp() * (step / extent) * samples.stretch)
-    trans = torch.exp(-torch.cumsum(torch.nn.functional.pad(tau, (1, 0)), dim=1))
-    lit = trans[:, :-1] >= TERMINATION
-    weights = torch.where(lit, trans[:, :-1] * (1 - torch.exp(-tau)), 0)
+    counts = torch.zeros_like(rays.times, dtype=torch.int64).index_add(0, ray, torch.ones_like(ray))
+    first = (counts.cumsum(0) - counts)[ray]
+    tau = log_density.exp() * (step / extent) * samples.stretch
+    # A running sum over all rays must not meet numbers so large that the rest is lost beside them.
+    trans = torch.exp(-_before(tau.clamp(max=OPAQUE), first))
+    lit = trans >= TERMINATION
+    weights = torch.where(lit, trans * (1 - torch.exp(-tau)), 0)
     colours = field.colours(latent, field.once_a_ray(rays.directions), ray)
-    rgb = torch.zeros_like(rays.backgrounds).index_add(0, ray, weights[index][:, None] * colours)
-    opacity = weights.sum(1)
+    rgb = torch.zeros_like(rays.backgrounds).index_add(0, ray, weights[:, None] * colours)
+    opacity = torch.zeros_like(rgb[:, 0]).index_add(0, ray, weights)
     rgb = rgb + (1 - opacity)[:, None] * rays.backgrounds
-    along = zeros.index_put(index, (samples.s / extent).to(zeros.dtype))
-    before, before_s = (torch.cumsum(x, 1) - x for x in (weights, weights * along))
-    distortion = (2 * weights * (along * before - before_s) + weights.square() * (step / extent / 3)).sum(1).mean()
-    return Composite(rgb, opacity, weights[index], lit[index], distortion)
+    along = ((samples.s - samples.s[first]) / extent).to(weights.dtype)
+    apart = along * _before(weights, first) - _before(weights * along, first)
+    distortion = (2 * weights * apart + weights.square() * (step / extent / 3)).sum() / N
+    return Composite(rgb, opacity, weights, lit, distortion)
+
+
+def _before(values: Tensor, first: Tensor) -> Tensor:
+    """For each of (n,) values the sum of those before it on its ray, which begins at number `first` (n,).
+
+    One running sum over all rays, in float64: what is taken off at the start of a ray is far larger than what is wanted.
+    """
+    total = torch.cumsum(values.double(), 0) - values
+    return (total - total[first]).to(values.dtype)
 
 
 def collected(

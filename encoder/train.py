@@ -5,6 +5,7 @@ import hashlib
 import math
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,11 +22,14 @@ from kpc.encoder.datasets import Dataset, rays
 from kpc.encoder.field import Field, HybridField, motion_nodes, motion_priors, plan_layout, priors
 from kpc.encoder.importance import TileWeights, cameras_stand_still
 from kpc.encoder.occupancy import OccupancyGrid, grid_shape
-from kpc.encoder.render import Rays, collected, composite, fused_features, samples_of
+from kpc.encoder.render import Rays, Samples, collected, composite, fused_features, samples_of
 from kpc.format.cli import written_aside
 from kpc.format.errors import TrainingError
 from kpc.format.scene import SPACE_PLANES, Scene
 from kpc.format.space import Contraction, SpaceMapping
+
+ROOM = 3
+"""Samples that a step on a GPU has room for, in multiples of `TrainConfig.samples`, which they are on average."""
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 """Adam's constants as Instant-NGP sets them for grids (arXiv:2201.05989, section 4)."""
@@ -438,8 +442,34 @@ class FusedOptimiser:
         return self.square
 
 
+class Figures:
+    """Small tensors from a device, read LATE steps after they were made, so that nobody waits; on the CPU at once."""
+
+    LATE = 8
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._waiting: deque[tuple[torch.Tensor, torch.cuda.Event]] = deque()
+
+    def of(self, made: torch.Tensor) -> list[float]:
+        """The numbers of `made`, or of what was made LATE calls ago; of the first, as long as there is none."""
+        if self.device.type == "cpu":
+            return made.tolist()  # type: ignore[no-any-return]
+        host = torch.empty_like(made, device="cpu", pin_memory=True).copy_(made, non_blocking=True)
+        done = torch.cuda.Event()
+        done.record()
+        self._waiting.append((host, done))
+        host, done = self._waiting.popleft() if len(self._waiting) > self.LATE else self._waiting[0]
+        done.synchronize()
+        return host.tolist()  # type: ignore[no-any-return]
+
+
 class PlainOptimiser:
-    """A step in plain PyTorch, on any device that PyTorch knows; or `fused`, on the CPU: kernels for the planes."""
+    """A step in plain PyTorch, on any device that PyTorch knows; or `fused`, on the CPU: kernels for the planes.
+
+    On a GPU nothing in a step waits for it: shapes do not depend on what it computes, and `step` returns numbers that it worked
+    out a few steps before.
+    """
 
     def __init__(
         self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: SpaceMapping | None = None, *,
@@ -447,9 +477,13 @@ class PlainOptimiser:
     ) -> None:
         self.field, self.config, self.mapping = field, config, mapping
         self.watch = Stopwatch()
-        self._peaks = torch.zeros(cells, device=field.theta.device)
+        self.device = field.theta.device
+        self._peaks = torch.zeros(cells, device=self.device)
+        self._figures = Figures(self.device)
+        self._occupancy: tuple[np.ndarray, torch.Tensor] | None = None
         self.fused = fused
         self.features = fused_features(field) if fused else field.features
+        field.mixed = config.mixed_precision and self.device.type != "cpu"
         if fused:
             numba.get_num_threads()  # starts numba's threads, which would undo the next line
             torch.set_num_threads(1)  # several add up gradients in any order: no run would end where another did
@@ -467,18 +501,14 @@ class PlainOptimiser:
         aabb: np.ndarray, occupancy: np.ndarray, step_length: float, extent: float,
     ) -> tuple[float, float]:
         """Mean squared error a colour channel, and samples a ray."""
-        config, device = self.config, self.field.theta.device
+        config = self.config
         with self.watch("samples"):
-            if self.fused:
-                samples = collected(batch, aabb, occupancy, step_length, self.mapping)
-            else:
-                batch = Rays(*(value.to(device) for value in vars(batch).values()))
-                there = torch.from_numpy(aabb).to(device), torch.from_numpy(occupancy).to(device)
-                samples = samples_of(batch, *there, step_length, self.mapping)
+            batch, targets = Rays(*(self._there(value) for value in vars(batch).values())), self._there(targets)
+            samples = self._samples(batch, aabb, occupancy, step_length)
         with self.watch("forward"):
-            kept = kept_channels(self.field, config, number)
+            kept = self._there(kept_channels(self.field, config, number))
             met = composite(self.field, batch, samples, self.features, step_length, extent, kept)
-            error = (met.rgb - targets.to(device)).square().mean()
+            error = (met.rgb - targets).square().mean()
             loss = error + config.distortion * met.distortion
             moving = self.field.motion is not None and number % config.motion_every == 0
             if moving:
@@ -503,7 +533,22 @@ class PlainOptimiser:
             _, ny, nx = self._peaks.shape
             flat = (samples.cell[:, 0] * ny + samples.cell[:, 1]) * nx + samples.cell[:, 2]
             self._peaks.view(-1).scatter_reduce_(0, flat, met.weights.detach(), "amax")
-        return float(error.detach()), float(met.reached.sum()) / len(targets)
+        taken = (met.reached & (samples.stretch > 0)).sum() / len(targets)
+        squared_error, samples_a_ray = self._figures.of(torch.stack([error.detach(), taken]))
+        return squared_error, samples_a_ray
+
+    def _samples(self, batch: Rays, aabb: np.ndarray, occupancy: np.ndarray, step_length: float) -> Samples:
+        if self.fused:
+            return collected(batch, aabb, occupancy, step_length, self.mapping)
+        if self._occupancy is None or self._occupancy[0] is not occupancy:
+            self._occupancy = occupancy, self._there(torch.from_numpy(occupancy))
+        fixed = {} if self.device.type == "cpu" else {
+            "most": sample_capacity(aabb, step_length, self.mapping), "capacity": ROOM * self.config.samples}
+        return samples_of(batch, self._there(torch.from_numpy(aabb)), self._occupancy[1], step_length, self.mapping, **fixed)
+
+    def _there(self, values: torch.Tensor) -> torch.Tensor:
+        """On the device, without waiting for it: only pinned memory can be copied behind one's back."""
+        return values if self.device.type == "cpu" else values.pin_memory().to(self.device, non_blocking=True)
 
     def state(self) -> dict[str, Any]:
         return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict(), "peaks": self._peaks}

@@ -23,6 +23,7 @@ from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import pixels
 from kpc.encoder.train import Trainer
 from kpc.format import cli, file
+from kpc.format.scene import HybridDecoder
 from kpc.format.space import DeviceCoordinates
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny", "heeded_signals")
@@ -136,6 +137,16 @@ def test_a_folder_becomes_a_file(
     np.testing.assert_array_equal(scene.aabb, np.float32(result["box"]))
     assert layout in err and "box" in err and ("dynamic, " if dynamic else "static") in err
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
+
+
+@pytest.mark.parametrize("name", ["n3dv", "blender"])
+def test_the_hybrid_decoder(run: Kpenc, sets: Path, tmp_path: Path, name: str) -> None:
+    code, out, err = run(sets / name, "--json", "--decoder", "hybrid")
+    assert code == 0 and "hybrid decoder" in err
+    decoder = file.read(tmp_path / "out.kpc").decoder
+    assert isinstance(decoder, HybridDecoder) and decoder.w2.any()
+    assert decoder.w1.any() == (name == "n3dv")  # a lone object has the same colour from everywhere
+    assert 5 < json.loads(out)["test_psnr"] < 60
 
 
 def test_what_is_printed(run: Kpenc, sets: Path) -> None:

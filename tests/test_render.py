@@ -8,9 +8,11 @@ import torch
 from gradients import KINDS, misty, rays_at
 from scenes import hybrid, tiny_scene
 
+from kpc.encoder.config import TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
-from kpc.encoder.field import Field, HybridField, Layout
+from kpc.encoder.field import Field, HybridField, Layout, bilinear
 from kpc.encoder.render import Rays, collected, composite, fused_features, samples_of
+from kpc.encoder.train import Figures, PlainOptimiser, sample_capacity
 from kpc.player import reference
 
 
@@ -29,6 +31,78 @@ def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bo
     for name, tolerance in (("points", 1e-5), ("s", 1e-4), ("stretch", 1e-4)):
         np.testing.assert_allclose(getattr(ours, name)[mine], getattr(theirs, name)[other], atol=tolerance, rtol=1e-4, err_msg=name)
     assert (ours.cell[mine] == theirs.cell[other]).float().mean() > 0.999
+
+
+@pytest.mark.parametrize("short", [0, 300])
+def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(short: int) -> None:
+    scene = misty()
+    rays, field = rays_at(scene, 103), Field.from_scene(scene)
+    told = rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step
+    wanted = samples_of(*told)
+    n = len(wanted.ray) - short
+    found = samples_of(*told, most=sample_capacity(scene.aabb, scene.step), capacity=n + (0 if short else 500))
+    for name in ("ray", "points", "s", "stretch", "cell"):
+        assert torch.equal(getattr(found, name)[:n], getattr(wanted, name)[:n]), name
+    assert len(found.ray) == n + (0 if short else 500) and not found.stretch[n:].any() and short < n
+    if not short:
+        one, two = (composite(field, rays, s, field.features, scene.step, scene.extent) for s in (wanted, found))
+        assert torch.equal(one.rgb, two.rgb) and torch.equal(one.weights, two.weights[:n])
+        assert torch.isclose(one.distortion, two.distortion, rtol=1e-5)
+
+
+@pytest.mark.parametrize("decoder", ["explicit", "hybrid"])
+def test_mixed_precision_is_float32_within_its_bound(decoder: str) -> None:
+    """A texel read as float16 errs by 2^-11 of itself at most; six of them, so a feature by 6 / 2^11, 0.3 %.
+
+    The layers' inputs and weights err by 2^-9 of themselves, bfloat16's half step, a number of them summed in float32: less than
+    1 % of a colour's range; so do gradients, against the largest of their kind.
+    """
+    scene = misty()
+    scene = hybrid(scene) if decoder == "hybrid" else scene
+    rays = rays_at(scene, 203)
+    samples = samples_of(rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step)
+    met, gradients, features = {}, {}, {}
+    for mixed in (False, True):
+        field = Field.from_scene(scene)
+        field.mixed = mixed
+        features[mixed] = field.features(samples.points, rays.times[samples.ray]).detach()
+        met[mixed] = composite(field, rays, samples, field.features, scene.step, scene.extent)
+        met[mixed].rgb.square().mean().backward()
+        gradients[mixed] = {name: p.grad for name, p in field.named_parameters()}
+        assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in field.parameters())
+    assert ((features[True] - features[False]).abs() <= 6 / 2**11 * features[False].abs() * 1.01).all()
+    assert not torch.equal(features[True], features[False])
+    assert (met[True].rgb - met[False].rgb).abs().max() < 0.01
+    for name, gradient in gradients[False].items():
+        assert (gradient - gradients[True][name]).abs().max() < 0.03 * gradient.abs().max(), name
+
+
+def test_mixed_precision_adds_up_gradients_in_float32() -> None:
+    """A thousand of 1/4096 after one of 1: a float16 sum would stay at 1."""
+    plane = torch.ones(2, 2, 1, requires_grad=True)
+    u = torch.zeros(1001)
+    g = torch.full((1001, 1), 1 / 4096)
+    g[0] = 1
+    (bilinear(plane, u, u, in_half=True) * g).sum().backward()
+    assert plane.grad is not None and plane.grad[0, 0, 0] == 1 + 1000 / 4096
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("hybrid_decoder", [False, True])
+def test_a_step_on_a_gpu_waits_for_nothing(hybrid_decoder: bool) -> None:
+    scene = hybrid(misty()) if hybrid_decoder else misty()
+    field = Field.from_scene(scene).cuda()
+    config = TrainConfig(hybrid=hybrid_decoder)
+    optimiser = PlainOptimiser(field, config, scene.occupancy.shape[1:])
+    rays, targets = rays_at(scene, 203), torch.rand(203, 3)
+    told = scene.aabb, scene.occupancy, scene.step, scene.extent
+    losses = [optimiser.step(k, 0.1, rays, targets, *told)[0] for k in range(Figures.LATE + 2)]
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        losses += [optimiser.step(k, 0.1, rays, targets, *told)[0] for k in range(20)]
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert losses[-1] < losses[0]
 
 
 def test_rays_that_meet_nothing_have_no_samples() -> None:
