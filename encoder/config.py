@@ -89,6 +89,17 @@ class TrainConfig:
     regularise_every: int = 4
     """The priors enter every so many steps, multiplied by that number: unbiased, and a fraction of the cost."""
 
+    # --- proposal sampling, in place of the march through the occupancy grid while training (`kpc.encoder.proposals`)
+    proposals: bool = False
+    proposal_resolutions: tuple[int, int] = (64, 128)
+    """Texels along the longest edge of the box, of the coarse and of the fine proposal."""
+    proposal_channels: int = 8
+    """As in K-Planes."""
+    proposal_samples: tuple[int, int, int] = (96, 48, 32)
+    """Samples a ray: evenly for the first proposal, by its weights for the second, by that one's for the field."""
+    histogram: float = 1.0
+    """Weight of the histogram loss (arXiv:2111.12077, eq. 13), which trains the proposals and nothing else."""
+
     # --- the occupancy grid
     occupancy_start: int = 128
     """Steps with every visible cell occupied."""

@@ -61,7 +61,7 @@ class SceneRenderer:
         batch = Rays(*(torch.from_numpy(a) for a in (o, d, t, np.full(len(o), 0.5, np.float32), backgrounds)))
         samples = collected(batch, scene.aabb, scene.occupancy, scene.step, scene.mapping)
         with torch.no_grad():
-            met = composite(self.field, batch, samples, fused_features(self.field), scene.step, scene.extent)
+            met = composite(self.field, batch, samples, fused_features(self.field), scene.extent)
         along = samples.s.numpy() if not isinstance(scene.mapping, Contraction) else scene.mapping.distance(samples.s.numpy())
         depths = np.bincount(samples.ray.numpy(), met.weights.numpy() * along, len(o)).astype(np.float32)
         opacities = met.opacity.numpy()

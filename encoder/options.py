@@ -18,6 +18,7 @@ class Options:
     output: Path
     preset: str = "balanced"
     decoder: str = "explicit"
+    sampling: str = "grid"
     steps: int | None = None
     time_budget_s: float | None = None
     seed: int = 0
@@ -44,7 +45,7 @@ class Options:
         if dataset.has_alpha and dataset.one_view_at_a_time:
             config = config.for_lone_object()
         most = config.max_coding_loss_db if self.max_loss_db is None else self.max_loss_db
-        config = replace(config, hybrid=self.decoder == "hybrid", seed=self.seed, steps=self.steps or config.steps, max_coding_loss_db=most)
+        config = replace(config, hybrid=self.decoder == "hybrid", proposals=self.sampling == "proposals", seed=self.seed, steps=self.steps or config.steps, max_coding_loss_db=most)
         return ABLATIONS[self.ablation](config)
 
 
@@ -56,6 +57,9 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     parser.add_argument("--preset", choices=sorted(PRESETS), default="balanced", help="how much to spend (default: balanced)")
     parser.add_argument("--decoder", choices=("explicit", "hybrid"), default="explicit",
                         help="hybrid: two small MLPs for each sample; slower to train and to play (default: explicit)")
+    parser.add_argument("--sampling", choices=("grid", "proposals"), default="grid",
+                        help="where to look on a ray while training: where an occupancy grid is set, or where two small fields "
+                             "say; what is written is marched through the grid either way (default: grid)")
     parser.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
     parser.add_argument("--time-budget", type=cli.duration_s, metavar="10m", help="train for so long instead of a number of steps")
     parser.add_argument("--seed", type=_seed, default=0, help="of everything random (default: 0)")
@@ -79,7 +83,7 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
                         help="only say what would be done, how long it would take and how much memory")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     a = parser.parse_args(_box_joined(argv))
-    options = Options(a.source, a.output, a.preset, a.decoder, a.steps, a.time_budget, a.seed, a.device, a.downscale, a.holdout,
+    options = Options(a.source, a.output, a.preset, a.decoder, a.sampling, a.steps, a.time_budget, a.seed, a.device, a.downscale, a.holdout,
                       a.space, a.box, a.work, a.keep, a.resume, a.test_views, a.max_loss, a.target_size)
     if a.dry_run and a.resume:
         parser.error("--dry-run tells what a whole run takes; drop --resume")

@@ -41,13 +41,15 @@ class Samples:
 
     Attributes:
         ray: (n,) int64, of the batch.
-        points: (n, 3) in [0, 1]^3; s: (n,) as in `kpc.encoder.kernels`; stretch: (n,) what a step there counts.
+        points: (n, 3) in [0, 1]^3; s: (n,) as in `kpc.encoder.kernels`; length: (n,) of the step, in s; stretch: (n,) what a unit
+            of it counts.
         cell: (n, 3) int64, of the occupancy grid, in the order z, y, x.
     """
 
     ray: Tensor
     points: Tensor
     s: Tensor
+    length: Tensor
     stretch: Tensor
     cell: Tensor
 
@@ -81,7 +83,7 @@ def render_reference(
         Colours (N, 3); the distortion; of the n samples reached their weights (n,), and their cells (n, 3) int64.
     """
     samples = samples_of(rays, aabb, occupancy, step, mapping)
-    met = composite(field, rays, samples, field.features, step, float((aabb[1] - aabb[0]).max()), kept)
+    met = composite(field, rays, samples, field.features, float((aabb[1] - aabb[0]).max()), kept)
     return met.rgb, met.distortion, met.weights[met.reached], samples.cell[met.reached]
 
 
@@ -97,41 +99,44 @@ def samples_of(
     ray can take, and `capacity` nobody waits: there are `capacity` samples, those left over are of no length, on the last ray,
     and those beyond are lost.
     """
-    inverse = 1 / rays.directions
-    t0, t1 = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse
-    near = torch.minimum(t0, t1).nan_to_num(-torch.inf).amax(1).clamp(min=0)
-    far = torch.maximum(t0, t1).nan_to_num(torch.inf).amin(1)
-    if isinstance(mapping, Contraction):
-        near, far = torch.zeros_like(near), torch.full_like(far, mapping.end)
+    near, far = spans_of(rays, aabb, mapping)
     if most is None:
         most = max(1, math.ceil(float((far - near).clamp(min=0).max()) / step))
     k = torch.arange(most, device=near.device)
     s = near[:, None] + (k + rays.jitters[:, None]) * step
-    t = s
-    if isinstance(mapping, Contraction):
-        t = torch.where(s <= mapping.even, s, mapping.even / (2 - s.clamp(max=mapping.end) / mapping.even))
-    u, stretch = place(rays.origins[:, None] + t[..., None] * rays.directions[:, None], t, aabb, mapping)
-    cell = torch.stack([(u[..., axis] * n).long().clamp(0, n - 1) for axis, n in zip((2, 1, 0), occupancy.shape[1:])], dim=-1)
+    u, stretch = places(rays, s, aabb, mapping)
+    cell = cells_of(u, tuple(occupancy.shape[1:]))
     slot = (rays.times * occupancy.shape[0]).long().clamp(max=occupancy.shape[0] - 1)[:, None]
     taken = occupancy[slot, cell[..., 0], cell[..., 1], cell[..., 2]].bool() & (s < far[:, None])
     if capacity is None:
         index = taken.nonzero(as_tuple=True)
-        return Samples(index[0], u[index], s[index], stretch[index], cell[index])
+        return Samples(index[0], u[index], s[index], torch.full_like(s[index], step), stretch[index], cell[index])
     taken = taken.flatten()
     number = torch.where(taken, taken.cumsum(0) - 1, capacity).clamp(max=capacity)
     last = torch.full((capacity + 1,), taken.numel() - 1, device=taken.device)
     chosen = last.scatter_(0, number, torch.arange(taken.numel(), device=taken.device))[:capacity]
     there = torch.arange(capacity, device=taken.device) < taken.sum()
-    return Samples(chosen // most, u.flatten(0, 1)[chosen], s.flatten()[chosen], stretch.flatten()[chosen] * there,
+    return Samples(chosen // most, u.flatten(0, 1)[chosen], s.flatten()[chosen], step * there, stretch.flatten()[chosen],
                    cell.flatten(0, 1)[chosen])
 
 
-def place(points: Tensor, t: Tensor, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
-    """Places (..., 3) of world points in [0, 1]^3, and what a step there counts, `kpc.format.space.Contraction.stretch`.
+def spans_of(rays: Rays, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
+    """s where the samples of rays begin and end, (N,) each; they end before they begin where a ray misses the box."""
+    if isinstance(mapping, Contraction):
+        return torch.zeros_like(rays.times), torch.full_like(rays.times, mapping.end)
+    inverse = 1 / rays.directions
+    t0, t1 = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse
+    near = torch.minimum(t0, t1).nan_to_num(-torch.inf).amax(1).clamp(min=0)
+    return near, torch.maximum(t0, t1).nan_to_num(torch.inf).amin(1)
 
-    `t` (...): how far along their rays they lie.
-    """
-    u = (points - aabb[0]) / (aabb[1] - aabb[0])
+
+def places(rays: Rays, s: Tensor, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
+    """Of samples at s (N, K) on N rays: their places (N, K, 3) in [0, 1]^3, and what a unit of s there counts (N, K),
+    `kpc.format.space.Contraction.stretch`."""
+    t = s
+    if isinstance(mapping, Contraction):
+        t = torch.where(s <= mapping.even, s, mapping.even / (2 - s.clamp(max=mapping.end) / mapping.even))
+    u = (rays.origins[:, None] + t[..., None] * rays.directions[:, None] - aabb[0]) / (aabb[1] - aabb[0])
     if not isinstance(mapping, Contraction):
         return u, torch.ones_like(t)
     y = 2 * u - 1
@@ -140,13 +145,18 @@ def place(points: Tensor, t: Tensor, aabb: Tensor, mapping: SpaceMapping | None)
     return y * ((2 - 1 / radius) / radius / 4)[..., None] + 0.5, stretch
 
 
+def cells_of(u: Tensor, cells: tuple[int, ...]) -> Tensor:
+    """The cells z, y, x of a grid (Nz, Ny, Nx) that hold places (..., 3): (..., 3) int64."""
+    return torch.stack([(u[..., axis] * n).long().clamp(0, n - 1) for axis, n in zip((2, 1, 0), cells)], dim=-1)
+
+
 def composite(
-    field: Field, rays: Rays, samples: Samples, features: Callable[[Tensor, Tensor], Tensor], step: float, extent: float,
+    field: Field, rays: Rays, samples: Samples, features: Callable[[Tensor, Tensor], Tensor], extent: float,
     kept: Tensor | None = None,
 ) -> Composite:
     """Spend the light of N rays on their samples, front to back.
 
-    With tau = sigma * stretch * step / extent: alpha = 1 - exp(-tau), weight = trans * alpha; a ray ends once its transmittance
+    With tau = sigma * stretch * length / extent: alpha = 1 - exp(-tau), weight = trans * alpha; a ray ends once its transmittance
     falls below TERMINATION.
 
     Args:
@@ -157,7 +167,8 @@ def composite(
     log_density, latent = field.decode(f if kept is None else f * kept)
     counts = torch.zeros_like(rays.times, dtype=torch.int64).index_add(0, ray, torch.ones_like(ray))
     first = (counts.cumsum(0) - counts)[ray]
-    tau = log_density.exp() * (step / extent) * samples.stretch
+    length = samples.length / extent
+    tau = log_density.exp() * length * samples.stretch
     # A running sum over all rays must not meet numbers so large that the rest is lost beside them.
     trans = torch.exp(-_before(tau.clamp(max=OPAQUE), first))
     lit = trans >= TERMINATION
@@ -168,7 +179,7 @@ def composite(
     rgb = rgb + (1 - opacity)[:, None] * rays.backgrounds
     along = ((samples.s - samples.s[first]) / extent).to(weights.dtype)
     apart = along * _before(weights, first) - _before(weights * along, first)
-    distortion = (2 * weights * apart + weights.square() * (step / extent / 3)).sum() / N
+    distortion = (2 * weights * apart + weights.square() * length / 3).sum() / N
     return Composite(rgb, opacity, weights, lit, distortion)
 
 
@@ -195,7 +206,7 @@ def collected(
     cell = np.empty((n, 3), np.int64)
     kernels.collect(*told, ends - counts, points, s, stretch, cell, workers)
     ray = np.repeat(np.arange(len(counts)), counts)
-    return Samples(*(torch.from_numpy(a) for a in (ray, points, s, stretch, cell)))
+    return Samples(*(torch.from_numpy(a) for a in (ray, points, s, np.full_like(s, step), stretch, cell)))
 
 
 class FusedFeatures(torch.autograd.Function):

@@ -6,7 +6,7 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from kpc.encoder.datasets import Dataset, rays
 from kpc.encoder.field import Field, HybridField, motion_nodes, motion_priors, plan_layout, priors
 from kpc.encoder.importance import TileWeights, cameras_stand_still
 from kpc.encoder.occupancy import OccupancyGrid, grid_shape
+from kpc.encoder.proposals import Level, Proposals, histogram_loss
 from kpc.encoder.render import Rays, Samples, collected, composite, fused_features, samples_of
 from kpc.format.cli import written_aside
 from kpc.format.errors import TrainingError
@@ -88,9 +89,10 @@ class Trainer:
         self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape, mapping), threshold)
         self.slots = min(config.occupancy_slots, dataset.clip.frame_count) if dataset.is_dynamic else 1
         on_cpu = self.device.type == "cpu"
+        proposals = Proposals(config, self.aabb, dataset.clip, dataset.is_dynamic).to(self.device) if config.proposals else None
         self.optimiser: FusedOptimiser | PlainOptimiser = (
-            FusedOptimiser(self.field, config, shape, mapping) if on_cpu and not config.hybrid else
-            PlainOptimiser(self.field, config, shape, mapping, fused=on_cpu)
+            FusedOptimiser(self.field, config, shape, mapping) if on_cpu and not config.hybrid and proposals is None else
+            PlainOptimiser(self.field, config, shape, mapping, fused=on_cpu, proposals=proposals)
         )
         self.watch = self.optimiser.watch
         self.step = 0
@@ -473,9 +475,9 @@ class PlainOptimiser:
 
     def __init__(
         self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: SpaceMapping | None = None, *,
-        fused: bool = False,
+        fused: bool = False, proposals: Proposals | None = None,
     ) -> None:
-        self.field, self.config, self.mapping = field, config, mapping
+        self.field, self.config, self.mapping, self.proposals = field, config, mapping, proposals
         self.watch = Stopwatch()
         self.device = field.theta.device
         self._peaks = torch.zeros(cells, device=self.device)
@@ -483,12 +485,14 @@ class PlainOptimiser:
         self._occupancy: tuple[np.ndarray, torch.Tensor] | None = None
         self.fused = fused
         self.features = fused_features(field) if fused else field.features
-        field.mixed = config.mixed_precision and self.device.type != "cpu"
         if fused:
             numba.get_num_threads()  # starts numba's threads, which would undo the next line
             torch.set_num_threads(1)  # several add up gradients in any order: no run would end where another did
-        self.planes = _adam([([field.theta], config.learning_rate)])
-        self.decoder = _decoder_optimiser(field, config)
+        helpers = [] if proposals is None else list(proposals.fields)
+        for each in (field, *helpers):
+            each.mixed = config.mixed_precision and self.device.type != "cpu"
+        self.planes = _adam([([f.theta for f in (field, *helpers)], config.learning_rate)])
+        self.decoder = _decoder_optimiser(field, config, [f.density for f in helpers])
 
     def peaks(self) -> np.ndarray:
         """As `FusedOptimiser.peaks`."""
@@ -504,12 +508,19 @@ class PlainOptimiser:
         config = self.config
         with self.watch("samples"):
             batch, targets = Rays(*(self._there(value) for value in vars(batch).values())), self._there(targets)
-            samples = self._samples(batch, aabb, occupancy, step_length)
+            levels: list[Level] = []
+            if self.proposals is None:
+                samples = self._samples(batch, aabb, occupancy, step_length)
+            else:
+                box, cells = self._there(torch.from_numpy(aabb)), tuple(self._peaks.shape)
+                samples, edges, levels = self.proposals.sample(batch, box, self.mapping, cells, number, self.fused)
         with self.watch("forward"):
             kept = self._there(kept_channels(self.field, config, number))
-            met = composite(self.field, batch, samples, self.features, step_length, extent, kept)
+            met = composite(self.field, batch, samples, self.features, extent, kept)
             error = (met.rgb - targets).square().mean()
             loss = error + config.distortion * met.distortion
+            for level in levels:
+                loss = loss + config.histogram * histogram_loss(edges, met.weights.view(len(targets), -1), level)
             moving = self.field.motion is not None and number % config.motion_every == 0
             if moving:
                 loss = loss + _total(motion_priors(self.field, config))
@@ -533,7 +544,7 @@ class PlainOptimiser:
             _, ny, nx = self._peaks.shape
             flat = (samples.cell[:, 0] * ny + samples.cell[:, 1]) * nx + samples.cell[:, 2]
             self._peaks.view(-1).scatter_reduce_(0, flat, met.weights.detach(), "amax")
-        taken = (met.reached & (samples.stretch > 0)).sum() / len(targets)
+        taken = (met.reached & (samples.length > 0)).sum() / len(targets)
         squared_error, samples_a_ray = self._figures.of(torch.stack([error.detach(), taken]))
         return squared_error, samples_a_ray
 
@@ -551,12 +562,15 @@ class PlainOptimiser:
         return values if self.device.type == "cpu" else values.pin_memory().to(self.device, non_blocking=True)
 
     def state(self) -> dict[str, Any]:
-        return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict(), "peaks": self._peaks}
+        return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict(), "peaks": self._peaks,
+                "proposals": self.proposals and self.proposals.state_dict()}
 
     def load(self, state: dict[str, Any]) -> None:
         self._peaks.copy_(state["peaks"])
         self.planes.load_state_dict(state["planes"])
         self.decoder.load_state_dict(state["decoder"])
+        if self.proposals is not None:
+            self.proposals.load_state_dict(state["proposals"])
 
     def curvature(self) -> np.ndarray:
         """As `FusedOptimiser.curvature`."""
@@ -628,9 +642,11 @@ def _unusable(path: Path, error: Exception) -> TrainingError:
     return TrainingError(f"{path}: not a usable checkpoint ({type(error).__name__}); delete it to start afresh")
 
 
-def _decoder_optimiser(field: Field, config: TrainConfig) -> torch.optim.Adam:
+def _decoder_optimiser(
+    field: Field, config: TrainConfig, others: Sequence[torch.nn.Parameter] = ()
+) -> torch.optim.Adam:
     """Of all but the planes."""
-    decoder = field.decoder_parameters(config.view_dependent)
+    decoder = [*field.decoder_parameters(config.view_dependent), *others]
     motion = [] if field.motion is None else [([field.motion], config.motion_learning_rate)]
     return _adam([(decoder, config.decoder_learning_rate), *motion])
 

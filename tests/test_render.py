@@ -28,7 +28,7 @@ def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bo
     assert same.mean() > 0.98 and counts[0].sum() > 403
     mine, other = same[ours.ray], same[theirs.ray]
     np.testing.assert_array_equal(ours.ray[mine], theirs.ray[other])
-    for name, tolerance in (("points", 1e-5), ("s", 1e-4), ("stretch", 1e-4)):
+    for name, tolerance in (("points", 1e-5), ("s", 1e-4), ("length", 0), ("stretch", 1e-4)):
         np.testing.assert_allclose(getattr(ours, name)[mine], getattr(theirs, name)[other], atol=tolerance, rtol=1e-4, err_msg=name)
     assert (ours.cell[mine] == theirs.cell[other]).float().mean() > 0.999
 
@@ -41,11 +41,11 @@ def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(sh
     wanted = samples_of(*told)
     n = len(wanted.ray) - short
     found = samples_of(*told, most=sample_capacity(scene.aabb, scene.step), capacity=n + (0 if short else 500))
-    for name in ("ray", "points", "s", "stretch", "cell"):
+    for name in ("ray", "points", "s", "length", "stretch", "cell"):
         assert torch.equal(getattr(found, name)[:n], getattr(wanted, name)[:n]), name
-    assert len(found.ray) == n + (0 if short else 500) and not found.stretch[n:].any() and short < n
+    assert len(found.ray) == n + (0 if short else 500) and not found.length[n:].any() and short < n
     if not short:
-        one, two = (composite(field, rays, s, field.features, scene.step, scene.extent) for s in (wanted, found))
+        one, two = (composite(field, rays, s, field.features, scene.extent) for s in (wanted, found))
         assert torch.equal(one.rgb, two.rgb) and torch.equal(one.weights, two.weights[:n])
         assert torch.isclose(one.distortion, two.distortion, rtol=1e-5)
 
@@ -66,7 +66,7 @@ def test_mixed_precision_is_float32_within_its_bound(decoder: str) -> None:
         field = Field.from_scene(scene)
         field.mixed = mixed
         features[mixed] = field.features(samples.points, rays.times[samples.ray]).detach()
-        met[mixed] = composite(field, rays, samples, field.features, scene.step, scene.extent)
+        met[mixed] = composite(field, rays, samples, field.features, scene.extent)
         met[mixed].rgb.square().mean().backward()
         gradients[mixed] = {name: p.grad for name, p in field.named_parameters()}
         assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in field.parameters())
@@ -112,7 +112,7 @@ def test_rays_that_meet_nothing_have_no_samples() -> None:
     samples = collected(away, scene.aabb, scene.occupancy, scene.step)
     assert len(samples.ray) == 0
     field = Field.from_scene(hybrid(scene))
-    met = composite(field, away, samples, fused_features(field), scene.step, scene.extent)
+    met = composite(field, away, samples, fused_features(field), scene.extent)
     assert torch.equal(met.rgb, away.backgrounds) and not met.opacity.any() and float(met.distortion.detach()) == 0
 
 
@@ -145,7 +145,7 @@ def test_the_hybrid_decoder_has_the_gradient_of_finite_differences() -> None:
 
     def met(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         changed = torch.func.functional_call(
-            _Calling(field, lambda: composite(field, rays, samples, field.features, 0.3, 2.0)),
+            _Calling(field, lambda: composite(field, rays, samples, field.features, 2.0)),
             {f"field.{name}": value for name, value in zip(parameters, values)}, (),
         )
         return changed.rgb, changed.distortion

@@ -111,9 +111,11 @@ def test_a_seed_repeats_bitwise(moving: Dataset, hybrid: bool) -> None:
 
 
 # before the occupancy grid forms, between two updates of it, and after it has been split
-@pytest.mark.parametrize(("stop_at", "hybrid"), [(5, False), (21, False), (68, False), (68, True)])
-def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(moving: Dataset, tmp_path: Path, stop_at: int, hybrid: bool) -> None:
-    changes = {"hybrid": hybrid, "steps": 80, "channel_dropout": 0.25, "occupancy_split_every": 64, "motion_cells": 3}
+@pytest.mark.parametrize(("stop_at", "other"), [(5, {}), (21, {}), (68, {}), (68, {"hybrid": True}), (68, {"proposals": True})])
+def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(
+    moving: Dataset, tmp_path: Path, stop_at: int, other: dict[str, bool]
+) -> None:
+    changes = other | {"steps": 80, "channel_dropout": 0.25, "occupancy_split_every": 64, "motion_cells": 3}
     whole = trained(moving, **changes)
     assert len(whole.grid.marched) == whole.slots > 1
     first = trainer(moving, **changes)
