@@ -59,34 +59,51 @@ class Rendering:
     samples: np.ndarray
 
 
-def render(scene: Scene, camera: Camera, time: float, *, part: Part = Part.FULL) -> Rendering:
-    """Render `scene` as `camera` sees it at `time` in [0, 1] over the clip."""
+def render(
+    scene: Scene, camera: Camera, time: float, *, part: Part = Part.FULL, appearance: np.ndarray | None = None
+) -> Rendering:
+    """Render `scene` as `camera` sees it at `time` in [0, 1] over the clip, and as `code_of` says of `appearance`."""
     origins, directions = camera.rays()
-    flat = render_rays(scene, origins, directions, time, part=part)
+    flat = render_rays(scene, origins, directions, time, part=part, appearance=appearance)
     shape = (camera.height, camera.width)
     return Rendering(flat.rgb.reshape(*shape, 3), *(a.reshape(shape) for a in (flat.depth, flat.opacity, flat.samples)))
 
 
 def render_rays(
-    scene: Scene, origins: np.ndarray, directions: np.ndarray, time: float, *, part: Part = Part.FULL
+    scene: Scene, origins: np.ndarray, directions: np.ndarray, time: float, *, part: Part = Part.FULL,
+    appearance: np.ndarray | None = None,
 ) -> Rendering:
     """Render rays, (N, 3) float32 origins and unit directions in world coordinates. Memory does not grow with N but for
-    the result."""
+    the result. `appearance` as in `code_of`."""
     if not 0.0 <= time <= 1.0:
         raise ValueError(f"time {time} lies outside [0, 1]")
     if part is Part.DYNAMIC:
-        full = render_rays(scene, origins, directions, time)
-        static = render_rays(scene, origins, directions, time, part=Part.STATIC)
+        full = render_rays(scene, origins, directions, time, appearance=appearance)
+        static = render_rays(scene, origins, directions, time, part=Part.STATIC, appearance=appearance)
         return Rendering(np.abs(full.rgb - static.rgb), full.depth, full.opacity, full.samples)
-    moment = Moment.of(scene, time, with_motion=part is Part.FULL)
+    moment, code = Moment.of(scene, time, with_motion=part is Part.FULL), code_of(scene, appearance)
     n = len(origins)
     out = Rendering(np.empty((n, 3), np.float32), *(np.empty(n, t) for t in (np.float32, np.float32, np.int32)))
     for start in range(0, n, RAYS_AT_ONCE):
         block = slice(start, start + RAYS_AT_ONCE)
-        piece = _march(scene, moment, origins[block], directions[block])
+        piece = _march(scene, moment, code, origins[block], directions[block])
         out.rgb[block], out.depth[block] = piece.rgb, piece.depth
         out.opacity[block], out.samples[block] = piece.opacity, piece.samples
     return out
+
+
+def code_of(scene: Scene, appearance: np.ndarray | None) -> np.ndarray:
+    """The code to show a scene with, (H,) float32: 0, the average look, for None.
+
+    Raises:
+        ValueError: it is not (H,), or the scene has no appearances, so that its decoder knows no codes.
+    """
+    hidden = len(scene.decoder.b1)
+    if appearance is None:
+        return np.zeros(hidden, np.float32)
+    if np.shape(appearance) != (hidden,) or not scene.appearances:
+        raise ValueError(f"a code of shape {np.shape(appearance)} for {len(scene.appearances)} appearances of {hidden} numbers")
+    return np.asarray(appearance, np.float32)
 
 
 @dataclass(frozen=True)
@@ -181,11 +198,16 @@ def density(decoder: Decoder, f: np.ndarray) -> np.ndarray:
     return np.exp(np.clip(f @ decoder.density_weight + decoder.density_bias, -LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT))
 
 
-def direction_basis(decoder: Decoder, directions: np.ndarray) -> np.ndarray:
-    """basis(d) = w2 relu(w1 e(d) + b1) + b2 of unit directions (N, 3): (N, 3, F)."""
+def hidden_layer(decoder: Decoder, directions: np.ndarray, code: np.ndarray) -> np.ndarray:
+    """w1 e(d) + b1 + code of unit directions (N, 3) and an appearance's code (H,): (N, H), constant along a ray."""
     x, y, z = directions.T
     encoded = np.stack([x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
-    hidden = np.maximum(encoded @ decoder.w1.T + decoder.b1, 0)
+    return encoded @ decoder.w1.T + (decoder.b1 + code)
+
+
+def direction_basis(decoder: Decoder, directions: np.ndarray, code: np.ndarray) -> np.ndarray:
+    """basis(d) = w2 relu(hidden layer) + b2 of unit directions (N, 3): (N, 3, F)."""
+    hidden = np.maximum(hidden_layer(decoder, directions, code), 0)
     return np.einsum("cfh,nh->ncf", decoder.w2, hidden, optimize=True) + decoder.b2
 
 
@@ -205,13 +227,13 @@ def composite(alphas: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.nda
     return weights, through[np.arange(len(trans)), reached.sum(axis=1)], reached
 
 
-def _march(scene: Scene, moment: Moment, origins: np.ndarray, directions: np.ndarray) -> Rendering:
+def _march(scene: Scene, moment: Moment, code: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Rendering:
     n, path = len(origins), None
     if isinstance(scene.mapping, DeviceCoordinates):
         path = scene.mapping.path(origins, directions)
         origins, directions = path.begin, path.way
     near, far = sample_range(scene, origins, directions)
-    basis = direction_basis(scene.decoder, directions).astype(np.float32)
+    basis = direction_basis(scene.decoder, directions, code).astype(np.float32)
     rgb, depth = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
     trans, samples = np.ones(n, np.float32), np.zeros(n, np.int32)
     step = np.float32(scene.step)

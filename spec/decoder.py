@@ -87,7 +87,7 @@ def chunks(data, partial):  # sections 3, 4 and 10
         require(kind.isalpha() and reserved == 0 and offset == expected and raw <= largest_raw, "index entry")
         expected += stored
         body = data[offset:offset + stored]
-        known = kind in (b"SCNE", b"DECO", b"OCCU", b"PLNE", b"WARP", b"MOVE", b"came")
+        known = kind in (b"SCNE", b"DECO", b"OCCU", b"PLNE", b"WARP", b"MOVE", b"came", b"appe")
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
         if len(body) < stored:
@@ -134,7 +134,8 @@ def decode(data, partial=False):
     scene["motion"] = motion_chunk(Bytes(parts["MOVE"]), scene["scales"]) if "MOVE" in parts else None
     scene |= decoder_chunk(Bytes(parts["DECO"]), sum(s["channels"] for s in scene["scales"]))
     scene |= occupancy_chunk(Bytes(parts["OCCU"]))
-    scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") else []
+    scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") is not None else []
+    scene["appearances"] = appearances_chunk(Bytes(parts["appe"]), scene["hidden"]) if parts.get("appe") is not None else {}
 
     for scale in scene["scales"]:
         for plane in scale["planes"].values():  # uncoded until a segment says otherwise
@@ -276,8 +277,28 @@ def cameras_chunk(chunk):  # section 9
     return cameras
 
 
-def render_ray(scene, origin, direction, time):  # section 11
-    """(rgb, opacity, depth) that a ray sees."""
+def appearances_chunk(chunk, expected):  # section 9
+    """{name: code}"""
+    count, hidden = chunk.unpack("HH")
+    require(1 <= count <= 16384 and hidden == expected, "number of appearances or of hidden units")
+    codes = [chunk.unpack(f"{hidden}e") for _ in range(count)]
+    require(all(math.isfinite(a) for code in codes for a in code), "codes")
+    appearances = {}
+    for code in codes:
+        length, = chunk.unpack("B")
+        try:
+            name = chunk.take(length).decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise Refused("name") from error
+        require(name and name not in appearances, "name empty or twice")
+        require(not any(ord(c) < 0x20 or 0x7F <= ord(c) <= 0x9F for c in name), "control character")
+        appearances[name] = code
+    chunk.end()
+    return appearances
+
+
+def render_ray(scene, origin, direction, time, appearance=None):  # section 11
+    """(rgb, opacity, depth) that a ray sees, with the appearance of that name."""
     low, high = scene["aabb"]
     world = float  # the distance in the world of one along the ray
     if scene["frame"]:
@@ -296,7 +317,7 @@ def render_ray(scene, origin, direction, time):  # section 11
     if even:
         t_near, t_out = 0.0, (2 - 1 / 256) * even  # of s
 
-    basis = direction_basis(scene, direction)
+    basis = direction_basis(scene, direction, scene["appearances"][appearance] if appearance else [0.0] * scene["hidden"])
     slot = min(math.floor(time * scene["slots"]), scene["slots"] - 1)
     colour, depth, T, k = [0.0, 0.0, 0.0], 0.0, 1.0, 0
     while T >= 1 / 1024 and t_near + (k + 0.5) * scene["step"] < t_out:
@@ -390,11 +411,11 @@ def bilinear(plane, channels, u, v):
     return sample
 
 
-def direction_basis(scene, direction):
+def direction_basis(scene, direction, code):
     x, y, z = direction
     e = [x, y, z, x * x, y * y, z * z, x * y, y * z, z * x]
     H, F = scene["hidden"], len(scene["density_weight"])
-    h = [max(sum(w * a for w, a in zip(scene["w1"][9 * n:9 * n + 9], e)) + scene["b1"][n], 0.0) for n in range(H)]
+    h = [max(sum(w * a for w, a in zip(scene["w1"][9 * n:9 * n + 9], e)) + scene["b1"][n] + code[n], 0.0) for n in range(H)]
     return [[sum(w * a for w, a in zip(scene["w2"][(c * F + i) * H:(c * F + i + 1) * H], h)) + scene["b2"][c * F + i]
              for i in range(F)] for c in range(3)]
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.format.cameras import Camera
-from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Clip, Decoder, Scene
+from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates
 
 
@@ -77,6 +77,13 @@ def faced(scene: Scene) -> Scene:
     frame = look_at((0.3, 0.9, 2.1), (0.1, 0.05, 0.05), 1, 1, 1.0).camera_to_world[:3]
     aabb = np.array([[-0.8, -0.7, 0.1], [0.9, 0.6, 2 * (1 / 0.8 - 1 / 50)]], np.float32)
     return replace(scene, mapping=DeviceCoordinates(frame, 0.8, 2.0), aabb=aabb)
+
+
+def varied(scene: Scene, names: tuple[str, ...] = ("dawn.jpg", "noon.jpg", "dusk.jpg"), seed: int = 7) -> Scene:
+    """A scene whose pictures disagree about its colours: an appearance of each name, their codes random, of mean 0."""
+    codes = np.random.default_rng(seed).normal(0, 1, (len(names), len(scene.decoder.b1)))
+    codes = (codes - codes.mean(0)).astype(np.float32)
+    return replace(scene, appearances=tuple(Appearance(name, code) for name, code in zip(names, codes, strict=True)))
 
 
 SPACES: dict[str, Callable[[Scene], Scene]] = {
