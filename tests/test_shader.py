@@ -87,7 +87,7 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     defines = {"SCALES": 3, "LAYERS": layout.layers, "HIDDEN": len(scene.decoder.b1), "ROWS": rows, "REFINED": 1, "EARLY": 1 - rows,
-               "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion}  # fmt: skip
+               "APPEARANCE": rows, "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion}  # fmt: skip
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights})
     vertex, _ = shader.compose("fullscreen.glsl", preamble=shader.ES30)
     ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()

@@ -4,7 +4,7 @@
 // rows of time planes are multiplied in at every sample. REFINED: how much finer than the scene's the planes are along the
 // row folded into them; 1 where none is.
 // CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
-// NDC: 1 where all this is in device coordinates. EARLY: 1 where a ray may end sooner than the format says: what is left of its
+// NDC: 1 where all this is in device coordinates. APPEARANCE: 1 where colours come in more than one appearance. EARLY: 1 where a ray may end sooner than the format says: what is left of its
 // light then counts as what it has met so far. A sixth of all samples lie behind that point.
 
 #include "ray.glsl"
@@ -41,6 +41,9 @@ uniform mat4x3 frame;               // NDC: of its camera
 uniform float near;                 // NDC
 uniform float baseline;             // NDC
 uniform float tau;                  // stride / longest edge of the box
+#if HIDDEN && APPEARANCE
+uniform vec4 appearance[(HIDDEN + 3) / 4];  // the code to show, padded
+#endif
 
 uniform float height;
 uniform vec4 lens;
@@ -53,14 +56,23 @@ layout(location = 1) out vec4 met;      // sum of weight t, samples
 #if HIDDEN
 vec4 basis[3 * FEATURES];
 
-void find_basis(vec3 d) {
+// w1 e(d) + b1 + code, constant along a ray.
+void find_hidden(vec3 d, out float hidden[HIDDEN]) {
     vec4 e0 = vec4(d, d.x * d.x);
     vec4 e1 = vec4(d.y * d.y, d.z * d.z, d.x * d.y, d.y * d.z);
     vec4 e2 = vec4(d.z * d.x, 1.0, 0.0, 0.0);
-    float hidden[HIDDEN];
     for (int h = 0; h < HIDDEN; ++h) {
-        hidden[h] = max(dot(w1[3 * h], e0) + dot(w1[3 * h + 1], e1) + dot(w1[3 * h + 2], e2), 0.0);
+        hidden[h] = dot(w1[3 * h], e0) + dot(w1[3 * h + 1], e1) + dot(w1[3 * h + 2], e2);
+#if APPEARANCE
+        hidden[h] += appearance[h / 4][h % 4];
+#endif
     }
+}
+
+void find_basis(vec3 d) {
+    float hidden[HIDDEN];
+    find_hidden(d, hidden);
+    for (int h = 0; h < HIDDEN; ++h) hidden[h] = max(hidden[h], 0.0);
     for (int i = 0; i < 3 * FEATURES; ++i) {
         vec4 sum = b2[i];
         for (int h = 0; h < HIDDEN; ++h) sum += hidden[h] * w2[i * HIDDEN + h];
