@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.occupancy import grid_shape
 from kpc.format.scene import (
-    ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Clip, Decoder, Scene,
+    ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, Appearance, Clip, Decoder, Scene,
 )
 from kpc.format.space import Contraction, SpaceMapping
 
@@ -94,14 +94,17 @@ class Field(nn.Module):
         motion: (T, Nz, Ny, Nx, 3) displacements, `kpc.format.motion`, at first 0; or None.
         w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.Decoder`. w2 starts at 0: colour depends on the
             direction only as far as the pictures insist.
+        codes: (K, H) of appearances, at first 0; or None.
     """
 
     def __init__(
-        self, layout: Layout, hidden: int, generator: torch.Generator | None = None, motion_nodes: Sequence[int] | None = None
+        self, layout: Layout, hidden: int, generator: torch.Generator | None = None, motion_nodes: Sequence[int] | None = None,
+        appearances: int = 0,
     ) -> None:
-        """`motion_nodes`: of the motion grid along t, z, y and x; None for a field without one."""
+        """`motion_nodes`: of the motion grid along t, z, y and x; None for a field without one. `appearances`: their number, K."""
         super().__init__()
         self.layout = layout
+        self.codes = nn.Parameter(torch.zeros(appearances, hidden)) if appearances else None
         self.motion = None if motion_nodes is None else nn.Parameter(torch.zeros(*motion_nodes, 3))
         F = layout.features
 
@@ -129,11 +132,23 @@ class Field(nn.Module):
         M = self.layout.channels
         return self.theta[start : start + rows * columns * M].view(rows, columns, M)
 
-    def basis(self, directions: Tensor) -> Tensor:
-        """Colour basis of unit directions (N, 3): (N, 3, F). basis(d) = w2 relu(w1 e(d) + b1) + b2."""
+    def hidden(self, directions: Tensor, codes: Tensor | None = None) -> Tensor:
+        """w1 e(d) + b1 + code of unit directions (N, 3) and codes (N, H) or (H,), None for 0: (N, H), constant along a ray."""
         x, y, z = directions.unbind(-1)
         encoded = torch.stack([x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], dim=-1)
-        h = torch.relu(encoded @ self.w1.T + self.b1)
+        hidden = encoded @ self.w1.T + self.b1
+        return hidden if codes is None else hidden + codes
+
+    def codes_of(self, rays: "Rays") -> Tensor | None:
+        """(N, H) the code of each ray's appearance; None where there are none."""
+        if self.codes is None or rays.appearances is None:
+            return None
+        # Unlike that of indexing, its gradient is summed in a fixed order.
+        return nn.functional.embedding(rays.appearances, self.codes)
+
+    def basis(self, directions: Tensor, codes: Tensor | None = None) -> Tensor:
+        """Colour basis of unit directions (N, 3): (N, 3, F). basis(d) = w2 relu(hidden) + b2; `codes` as in `hidden`."""
+        h = torch.relu(self.hidden(directions, codes))
         F, H = self.w2.shape[1:]
         return (h @ self.w2.reshape(3 * F, H).T).view(-1, 3, F) + self.b2
 
@@ -161,9 +176,12 @@ class Field(nn.Module):
 
     def to_scene(
         self, aabb: np.ndarray, clip: Clip, occupancy: np.ndarray, background: np.ndarray, step: float,
-        mapping: SpaceMapping | None = None,
+        mapping: SpaceMapping | None = None, appearance_names: Sequence[str] = (),
     ) -> Scene:
-        """The field as data; the planes are copied."""
+        """The field as data; the planes are copied. `appearance_names`: as many as it has codes.
+
+        The mean of the codes moves into b1, which changes no picture that has a code, and makes their average the look without.
+        """
         names = ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES
         with torch.no_grad():
             scales = tuple(
@@ -172,29 +190,37 @@ class Field(nn.Module):
             )
             arrays = [p.detach().cpu().numpy().copy() for p in (self.w1, self.b1, self.w2, self.b2)]
             density = self.density.detach().cpu().numpy()
+            codes = np.zeros((0, len(self.b1)), np.float32) if self.codes is None else self.codes.cpu().numpy()
+        if len(codes):
+            mean = codes.mean(0, dtype=np.float64).astype(np.float32)
+            arrays[1], codes = arrays[1] + mean, codes - mean
         return Scene(
             aabb=np.asarray(aabb, np.float32), clip=clip, scales=scales,
             decoder=Decoder(density[:-1].copy(), float(density[-1]), *arrays),
             occupancy=np.asarray(occupancy, bool), background=np.asarray(background, np.float32), step=float(step),
             mapping=mapping, motion=None if self.motion is None else self.motion.detach().cpu().numpy().copy(),
+            appearances=tuple(Appearance(name, code) for name, code in zip(appearance_names, codes, strict=True)),
         )
 
     @staticmethod
     def from_scene(scene: Scene) -> "Field":
-        """The field whose planes and decoder a scene holds."""
+        """The field whose planes, decoder and codes a scene holds."""
         shape = {name: scene.scales[0][name].shape for name in scene.scales[0]}
         resolution = []
         for scale in scene.scales:
             rows_t = scale["xt"].shape[0] if scene.is_dynamic else 0
             resolution.append([scale["xy"].shape[1], scale["xy"].shape[0], scale["xz"].shape[0], rows_t])
         layout = Layout.of(np.array(resolution), shape["xy"][2])
-        field = Field(layout, scene.decoder.b1.size, motion_nodes=None if scene.motion is None else scene.motion.shape[:4])
+        field = Field(layout, scene.decoder.b1.size, motion_nodes=None if scene.motion is None else scene.motion.shape[:4],
+                      appearances=len(scene.appearances))
         with torch.no_grad():
             for s, scale in enumerate(scene.scales):
                 for name, plane in scale.items():
                     field.plane(s, name).copy_(torch.from_numpy(np.asarray(plane, np.float32)))
             if field.motion is not None:
                 field.motion.copy_(torch.from_numpy(np.asarray(scene.motion, np.float32)))
+            if field.codes is not None:
+                field.codes.copy_(torch.from_numpy(np.stack([appearance.code for appearance in scene.appearances])))
             d = scene.decoder
             field.density.copy_(torch.from_numpy(np.append(d.density_weight, np.float32(d.density_bias)).astype(np.float32)))
             for parameter, value in ((field.w1, d.w1), (field.b1, d.b1), (field.w2, d.w2), (field.b2, d.b2)):
@@ -234,13 +260,44 @@ def bilinear(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Rays:
-    """A batch of rays; every member has N rows. Directions are unit vectors, times and jitters lie in [0, 1)."""
+    """A batch of rays; every member has N rows. Directions are unit vectors, times and jitters lie in [0, 1). `appearances`, int64,
+    are rows of `Field.codes`; None for the look without a code."""
 
     origins: Tensor
     directions: Tensor
     times: Tensor
     jitters: Tensor
     backgrounds: Tensor
+    appearances: Tensor | None = None
+
+    def __getitem__(self, some: slice) -> "Rays":
+        return Rays(*(None if value is None else value[some] for value in vars(self).values()))
+
+    def to(self, device: torch.device) -> "Rays":
+        return Rays(*(None if value is None else value.to(device) for value in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What a batch of N rays meets: n samples, in the order of their rays.
+
+    Attributes:
+        ray: (n,) int64, the ray of each.
+        features: (n, F).
+        weights: (n,), 0 beyond where a ray ends.
+        cells: (n, 3) int64 of the occupancy grid, in the order z, y, x.
+        reached: (n,) bool, whether the ray has not ended before.
+        left: (N, 1) transmittance that is left for the background.
+        distortion: the mean over rays of the distortion D that `kernels.backpropagate` states.
+    """
+
+    ray: Tensor
+    features: Tensor
+    weights: Tensor
+    cells: Tensor
+    reached: Tensor
+    left: Tensor
+    distortion: Tensor
 
 
 def place(points: Tensor, t: Tensor, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
@@ -261,15 +318,33 @@ def render_reference(
     field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, kept: Tensor | None = None,
     mapping: SpaceMapping | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Colours of a batch of rays, in plain PyTorch: the reference of `kernels.backpropagate`.
-
-    Sample k of a ray lies at s = near + (k + jitter) * step, which is its distance unless there is a mapping, and counts where
-    the occupancy grid (slots, Nz, Ny, Nx) is set; alpha = 1 - exp(-sigma stretch step / extent), stretch = 1 in a box; a ray
-    ends once its transmittance falls below TERMINATION. `kept` (F,), where given, multiplies the features.
+    """Colours of a batch of rays, in plain PyTorch: the reference of `kernels.backpropagate`. Arguments as of `met_by`.
 
     Returns:
         Colours (N, 3); the mean over rays of the distortion D that `kernels.backpropagate` states; of the n samples taken
         their weights (n,), and their cells (n, 3) int64 in the order z, y, x.
+    """
+    met = met_by(field, rays, aabb, occupancy, step, kept, mapping)
+    rgb = shade(met, field.basis(rays.directions, field.codes_of(rays)), rays.backgrounds)
+    return rgb, met.distortion, met.weights[met.reached], met.cells[met.reached]
+
+
+def shade(met: Samples, basis: Tensor, backgrounds: Tensor) -> Tensor:
+    """Colours (N, 3) of rays with a colour basis (N, 3, F) each: sum of weight * sigmoid(f . basis) + left * background."""
+    colours = torch.sigmoid(torch.einsum("nf,ncf->nc", met.features, basis[met.ray]))
+    rgb = torch.zeros_like(backgrounds).index_add(0, met.ray, met.weights[:, None] * colours)
+    return rgb + met.left * backgrounds
+
+
+def met_by(
+    field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, kept: Tensor | None = None,
+    mapping: SpaceMapping | None = None,
+) -> Samples:
+    """All that a batch of rays meets, but for its colour, in plain PyTorch.
+
+    Sample k of a ray lies at s = near + (k + jitter) * step, which is its distance unless there is a mapping, and counts where
+    the occupancy grid (slots, Nz, Ny, Nx) is set; alpha = 1 - exp(-sigma stretch step / extent), stretch = 1 in a box; a ray
+    ends once its transmittance falls below TERMINATION. `kept` (F,), where given, multiplies the features.
     """
     extent = (aabb[1] - aabb[0]).max()
     inverse = 1 / rays.directions
@@ -298,15 +373,11 @@ def render_reference(
     tau = torch.zeros_like(s).index_put(index, field.log_density(features).exp() * (step / extent) * stretch[index])
     trans = torch.exp(-torch.cumsum(torch.nn.functional.pad(tau, (1, 0)), dim=1))
     weights = torch.where(trans[:, :-1] >= TERMINATION, trans[:, :-1] * (1 - torch.exp(-tau)), 0)
-    basis = field.basis(rays.directions)
-    colours = torch.sigmoid(torch.einsum("nf,ncf->nc", features, basis[ray]))
-    rgb = torch.zeros_like(rays.backgrounds).index_add(0, ray, weights[index][:, None] * colours)
     reached = trans[:, :-1][index] >= TERMINATION
-    rgb = rgb + (1 - weights.sum(1, keepdim=True)) * rays.backgrounds
     along = (k + rays.jitters[:, None]) * (step / extent)
     before, before_s = (torch.cumsum(x, 1) - x for x in (weights, weights * along))
     distortion = (2 * weights * (along * before - before_s) + weights.square() * (step / extent / 3)).sum(1).mean()
-    return rgb, distortion, weights[index][reached], cell[index][reached]
+    return Samples(ray, features, weights[index], cell[index], reached, 1 - weights.sum(1, keepdim=True), distortion)
 
 
 def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
@@ -343,3 +414,11 @@ def motion_priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
     n = field.motion.numel()
     in_time, *in_space = (field.motion.diff(n=2, dim=dim).square().sum() / n for dim in range(4))
     return {"motion_smoothness": config.motion_smoothness * in_time, "motion_bending": config.motion_bending * sum(in_space)}
+
+
+def appearance_priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
+    """The weighted prior of the codes a of appearances, none where there are none: appearance_size * mean of a^2.
+
+    Without it codes and b1 could drift together, and what a few pictures say of a look would be taken for the truth.
+    """
+    return {} if field.codes is None else {"appearance_size": config.appearance_size * field.codes.square().mean()}

@@ -603,10 +603,11 @@ def _parse_appearances(raw: bytes, expected_hidden: int) -> tuple[Appearance, ..
 
 
 def is_name(text: str) -> bool:
-    """Whether an appearance may be called so: not empty, at most NAME_LIMIT bytes of UTF-8, no control characters, which a
-    terminal might obey."""
+    """Whether an appearance may be called so: 1 to NAME_LIMIT bytes of UTF-8, no control characters, which a terminal
+    might obey."""
+    encoded = text.encode(errors="replace")
     controls = any(c < " " or "\x7f" <= c <= "\x9f" for c in text)
-    return 0 < len(text.encode(errors="replace")) <= NAME_LIMIT and not controls
+    return 0 < len(encoded) <= NAME_LIMIT and encoded.decode() == text and not controls
 
 
 class _Cursor:
