@@ -247,8 +247,9 @@ def test_masks_count_in_halves(tmp_path: Path, with_codes: Trainer) -> None:
     assert not SceneRenderer(scene).code_of_left_half(masked, 8).any()
 
 
-def test_a_fitted_code_shows_what_it_was_fitted_to() -> None:
-    scene = varied(misty())
+@pytest.mark.parametrize("contracted", [False, True])
+def test_a_fitted_code_shows_what_it_was_fitted_to(contracted: bool) -> None:
+    scene = varied(misty(contracted=contracted))
     wanted = scene.appearance("dusk.jpg") / 2
     backgrounds = torch.from_numpy(np.tile(scene.background, (300, 1)))
     rays = replace(rays_at(scene, 300), jitters=torch.full((300,), 0.5), backgrounds=backgrounds)
