@@ -11,7 +11,7 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "the coarsest scale alone": lambda c: replace(c, resolutions=c.resolutions[:1]),
     "half the channels": lambda c: replace(c, channels=max(1, c.channels // 2)),
     "twice the channels": lambda c: replace(c, channels=2 * c.channels),
-    "one colour from all sides": lambda c: replace(c, view_dependent=False),
+    "one colour from all sides": lambda c: replace(c, view_dependent=False, appearance="none"),
     "no time smoothness": lambda c: replace(c, time_smoothness=0.0),
     "time smoothness x 10": lambda c: replace(c, time_smoothness=10 * c.time_smoothness),
     "no sparse transients": lambda c: replace(c, sparse_transients=0.0),
@@ -20,11 +20,13 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "no space variation": lambda c: replace(c, space_variation=0.0),
     "no distortion loss": lambda c: replace(c, distortion=0.0),
     "rays drawn evenly": lambda c: replace(c, temporal_start=1.0, object_rays=0.0),
+    "no appearances": lambda c: replace(c, appearance="none"),
     "no motion grid": lambda c: replace(c, motion_cells=0),
     "the hybrid decoder": lambda c: replace(c, hybrid=True),
     "no channel dropout": lambda c: replace(c, channel_dropout=0.0),
 }
-"""What is changed, by name, the unchanged run first."""
+"""What is changed, by name, the unchanged run first. Appearances act through what "one colour from all sides" leaves out. Runs with
+appearances are scored on right halves of pictures (`evaluate`), those without on whole ones."""
 
 
 def changed_by(config: TrainConfig) -> list[str]:

@@ -47,8 +47,17 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
 
     pixels = trainer.dataset.pictures.width.astype(np.int64) * trainer.dataset.pictures.height
     rendered = (PROBES + 1) * probe_rays + 2 * tested * float(pixels.mean())
+    fits_s = 2 * tested * _seconds_a_fit(trainer) if trainer.names and tested else 0.0
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()
-    return Estimate(train_s, spent_s + rendered * _seconds_a_ray(trainer), memory)
+    return Estimate(train_s, spent_s + rendered * _seconds_a_ray(trainer) + fits_s, memory)
+
+
+def _seconds_a_fit(trainer: Trainer) -> float:
+    """Finding the appearance of a held-out picture."""
+    renderer, held_out = SceneRenderer(trainer.scene()), np.flatnonzero(trainer.dataset.pictures.is_test)
+    started = time.perf_counter()
+    renderer.code_of_left_half(trainer.dataset, int(held_out[0]))
+    return time.perf_counter() - started
 
 
 def _seconds_a_ray(trainer: Trainer, count: int = 1 << 14) -> float:

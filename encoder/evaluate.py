@@ -9,9 +9,10 @@ import torch
 from torch.nn.functional import conv2d
 
 from kpc.encoder import kernels
+from kpc.encoder.appearances import FIT_RAYS, fitted_code
 from kpc.encoder.datasets import Dataset, rays
 from kpc.encoder.field import Field, HybridField
-from kpc.encoder.render import Rays, collected, composite, fused_features
+from kpc.encoder.render import Rays, collected, fused_features, meet, shade
 from kpc.encoder.train import sample_capacity
 from kpc.format.scene import Scene
 from kpc.format.space import Contraction
@@ -27,26 +28,36 @@ class SceneRenderer:
     def __init__(self, scene: Scene) -> None:
         self.scene, self.field = scene, Field.from_scene(scene)
 
-    def rgb(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """(N, 3) float32 colours of (N, 3) origins, (N, 3) unit directions and (N,) times; rays as `datasets.rays` makes them."""
-        return self.render(origins, directions, times)[0]
+    def rgb(
+        self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(N, 3) float32 colours of (N, 3) origins, (N, 3) unit directions and (N,) times; rays as `datasets.rays` makes them.
+        `codes`: (N, H) of their appearances, None for the average."""
+        return self.render(origins, directions, times, codes)[0]
+
+    def codes(self, appearances: np.ndarray | None) -> np.ndarray | None:
+        """(N, H) the codes of appearances by their numbers (N,), None for None."""
+        return None if appearances is None else np.stack([a.code for a in self.scene.appearances])[appearances]
 
     def render(
-        self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray
+        self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Colours (N, 3), opacities (N,) and mean depths (N,) along the same rays, as those measure, float32."""
+        """Colours (N, 3), opacities (N,) and mean depths (N,) along the same rays, as those measure, float32. `codes`: see `rgb`."""
         draw = self._composited if isinstance(self.field, HybridField) else self._marched
         out = []
         for start in range(0, len(origins), RAYS_AT_ONCE):
-            rays = (np.ascontiguousarray(a[start : start + RAYS_AT_ONCE], np.float32) for a in (origins, directions, times))
-            out.append(draw(*rays))
+            some = slice(start, start + RAYS_AT_ONCE)
+            rays = (np.ascontiguousarray(a[some], np.float32) for a in (origins, directions, times))
+            with torch.no_grad():
+                out.append(draw(*rays, None if codes is None else torch.from_numpy(codes[some])))
         colours, opacities, depths = (np.concatenate(parts) for parts in zip(*out, strict=True))
         return colours, opacities, depths
 
-    def _marched(self, o: np.ndarray, d: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _marched(
+        self, o: np.ndarray, d: np.ndarray, t: np.ndarray, codes: torch.Tensor | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         scene, field, layout = self.scene, self.field, self.field.layout
-        with torch.no_grad():
-            basis = field.basis(torch.from_numpy(d)).numpy()
+        basis = field.basis(torch.from_numpy(d), codes).numpy()
         colours, opacities, depths, _ = kernels.render(
             field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
             layout.channels, scene.motion, scene.aabb, kernels.even_of(scene.mapping), scene.occupancy.view(np.uint8),
@@ -55,25 +66,40 @@ class SceneRenderer:
         )
         return colours, opacities, depths
 
-    def _composited(self, o: np.ndarray, d: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _composited(
+        self, o: np.ndarray, d: np.ndarray, t: np.ndarray, codes: torch.Tensor | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         scene = self.scene
         backgrounds = np.broadcast_to(scene.background, o.shape).copy()
         batch = Rays(*(torch.from_numpy(a) for a in (o, d, t, np.full(len(o), 0.5, np.float32), backgrounds)))
         samples = collected(batch, scene.aabb, scene.occupancy, scene.step, scene.mapping)
-        with torch.no_grad():
-            met = composite(self.field, batch, samples, fused_features(self.field), scene.extent)
+        met = meet(self.field, batch, samples, fused_features(self.field), scene.extent)
         along = samples.s.numpy() if not isinstance(scene.mapping, Contraction) else scene.mapping.distance(samples.s.numpy())
         depths = np.bincount(samples.ray.numpy(), met.weights.numpy() * along, len(o)).astype(np.float32)
         opacities = met.opacity.numpy()
-        return met.rgb.numpy(), opacities, depths / np.maximum(opacities, np.float32(1e-6))
+        return shade(self.field, batch, met, codes).numpy(), opacities, depths / np.maximum(opacities, np.float32(1e-6))
 
-    def picture(self, dataset: Dataset, number: int) -> np.ndarray:
-        """The scene as a picture of the dataset shows it, its lens included: (H, W, 3) float32."""
+    def picture(self, dataset: Dataset, number: int, first: int = 0, code: np.ndarray | None = None) -> np.ndarray:
+        """The scene as a picture of the dataset shows it, its lens included, from column `first` on: (H, W - first, 3) float32.
+        `code`: (H,) of the appearance to show it in, None for the average."""
         pictures = dataset.pictures
-        w, h = int(pictures.width[number]), int(pictures.height[number])
+        h, w = int(pictures.height[number]), int(pictures.width[number]) - first
         row, column = np.divmod(np.arange(w * h), w)
-        origins, directions = rays(pictures, np.full(w * h, number), column, row, self.scene.mapping)
-        return self.rgb(origins, directions, np.full(w * h, pictures.time[number], np.float32)).reshape(h, w, 3)
+        origins, directions = rays(pictures, np.full(w * h, number), column + first, row, self.scene.mapping)
+        codes = None if code is None else np.tile(code, (w * h, 1))
+        return self.rgb(origins, directions, np.full(w * h, pictures.time[number], np.float32), codes).reshape(h, w, 3)
+
+    def code_of_left_half(self, dataset: Dataset, number: int) -> np.ndarray:
+        """The code that suits at most FIT_RAYS usable pixels of the left half of a picture best, `appearances.fitted_code`."""
+        pictures, rng = dataset.pictures, np.random.default_rng(number)
+        row, column = np.nonzero(dataset.usable(number)[:, : _middle(dataset, number)])
+        chosen = rng.permutation(len(row))[:FIT_RAYS]
+        row, column, n = row[chosen], column[chosen], len(chosen)
+        origins, directions = rays(pictures, np.full(n, number), column, row, self.scene.mapping)
+        times, backgrounds = np.full(n, pictures.time[number]), np.tile(self.scene.background, (n, 1))
+        arrays = (origins, directions, times, np.full(n, 0.5), backgrounds)
+        batch = Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
+        return fitted_code(self.scene, self.field, batch, torch.from_numpy(true_picture(dataset, number)[row, column]))
 
 
 @dataclass(frozen=True)
@@ -90,25 +116,36 @@ def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None) -> Qual
 
     Pictures with alpha are composited on white, the background such scenes are stored with. What a mask ignores does not
     count, and a picture not at all where its mask leaves no window of SSIM.
+
+    Where the scene has appearances, a picture that was not trained on has none yet: a code is fitted to its left half, and its
+    right half alone counts (K-Planes, section 4.3; the protocol is that of NeRF in the Wild, arXiv:2008.02268).
     """
     held_out = np.flatnonzero(dataset.pictures.is_test)
+    first = {int(number): _middle(dataset, int(number)) if scene.appearances else 0 for number in held_out}
     if dataset.masks is not None:
-        held_out = held_out[[bool(_centres(dataset.usable(int(number))).any()) for number in held_out]]
+        held_out = held_out[[bool(_centres(dataset.usable(n)[:, start:]).any()) for n, start in first.items()]]
     if len(held_out) == 0:
         return None
     if most is not None and len(held_out) > most:
         held_out = held_out[np.linspace(0, len(held_out) - 1, most).round().astype(int)]
     renderer = SceneRenderer(scene)
     scores = []
-    for number in held_out:
-        picture, truth = np.clip(renderer.picture(dataset, int(number)), 0, 1), true_picture(dataset, int(number))
+    for number in map(int, held_out):
+        start, code = first[number], renderer.code_of_left_half(dataset, number) if scene.appearances else None
+        picture = np.clip(renderer.picture(dataset, number, start, code), 0, 1)
+        truth = true_picture(dataset, number)[:, start:]
         if dataset.masks is None:
             scores.append((psnr(picture, truth), ssim(picture, truth)))
         else:
-            usable = dataset.usable(int(number))
+            usable = dataset.usable(number)[:, start:]
             scores.append((psnr(picture[usable], truth[usable]), ssim(picture, truth, usable)))
     mean_psnr, mean_ssim = np.mean(scores, axis=0)
     return Quality(float(mean_psnr), float(mean_ssim), len(scores))
+
+
+def _middle(dataset: Dataset, number: int) -> int:
+    """The first column of a picture's right half."""
+    return int(dataset.pictures.width[number]) // 2
 
 
 def true_picture(dataset: Dataset, number: int) -> np.ndarray:

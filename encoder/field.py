@@ -6,7 +6,7 @@ the priors see one array. `kpc.encoder.render` makes pictures of it.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.occupancy import grid_shape
 from kpc.format.scene import (
-    ACTIVATION_LIMIT, ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TIME_PLANES, AnyDecoder, Clip, Decoder, HybridDecoder, Scene,
+    ACTIVATION_LIMIT, ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder,
+    HybridDecoder, Scene,
 )
 from kpc.format.space import SpaceMapping
 
@@ -102,15 +103,18 @@ class Field(nn.Module):
         density: (F + 1,) weights of the log density, its bias last.
         w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.Decoder`. w2 starts at 0: colour depends on the
             direction only as far as the pictures insist.
+        codes: (K, H) of appearances, at first 0; or None.
     """
 
     def __init__(
-        self, layout: Layout, hidden: int, generator: torch.Generator | None = None, motion_nodes: Sequence[int] | None = None
+        self, layout: Layout, hidden: int, generator: torch.Generator | None = None, motion_nodes: Sequence[int] | None = None,
+        appearances: int = 0,
     ) -> None:
-        """`motion_nodes`: of the motion grid along t, z, y and x; None for a field without one."""
+        """`motion_nodes`: of the motion grid along t, z, y and x; None for a field without one. `appearances`: their number, K."""
         super().__init__()
         self.layout = layout
         self.mixed = False
+        self.codes = nn.Parameter(torch.zeros(appearances, hidden)) if appearances else None
         self.motion = None if motion_nodes is None else nn.Parameter(torch.zeros(*motion_nodes, 3))
 
         def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -140,20 +144,28 @@ class Field(nn.Module):
         M = self.layout.channels
         return self.theta[start : start + rows * columns * M].view(rows, columns, M)
 
-    def direction_hidden(self, directions: Tensor) -> Tensor:
-        """w1 e(d) + b1 of unit directions (N, 3): (N, H)."""
+    def hidden(self, directions: Tensor, codes: Tensor | None = None) -> Tensor:
+        """w1 e(d) + b1 + code of unit directions (N, 3) and codes (N, H) or (H,), None for 0: (N, H), constant along a ray."""
         x, y, z = directions.unbind(-1)
         encoded = torch.stack([x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], dim=-1)
-        return encoded @ self.w1.T + self.b1
+        hidden = encoded @ self.w1.T + self.b1
+        return hidden if codes is None else hidden + codes
 
-    def basis(self, directions: Tensor) -> Tensor:
-        """Colour basis of unit directions (N, 3): (N, 3, F). basis(d) = w2 relu(w1 e(d) + b1) + b2."""
+    def codes_of(self, appearances: Tensor | None) -> Tensor | None:
+        """(N, H) the codes of appearances by their numbers (N,); None where there are none."""
+        if self.codes is None or appearances is None:
+            return None
+        # Unlike that of indexing, its gradient is summed in a fixed order.
+        return nn.functional.embedding(appearances, self.codes)
+
+    def basis(self, directions: Tensor, codes: Tensor | None = None) -> Tensor:
+        """Colour basis of unit directions (N, 3): (N, 3, F). basis(d) = w2 relu(hidden) + b2; `codes` as in `hidden`."""
         F, H = self.w2.shape[1:]
-        return (torch.relu(self.direction_hidden(directions)) @ self.w2.reshape(3 * F, H).T).view(-1, 3, F) + self.b2
+        return (torch.relu(self.hidden(directions, codes)) @ self.w2.reshape(3 * F, H).T).view(-1, 3, F) + self.b2
 
-    def once_a_ray(self, directions: Tensor) -> Tensor:
-        """What `colours` takes of (N, 3) directions: their basis."""
-        return self.basis(directions)
+    def once_a_ray(self, directions: Tensor, codes: Tensor | None = None) -> Tensor:
+        """What `colours` takes of (N, 3) directions: their basis; `codes` as in `hidden`."""
+        return self.basis(directions, codes)
 
     def decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Of features (n, F) the clipped log densities, per longest edge of the box, (n,), and what `colours` takes of them."""
@@ -199,25 +211,33 @@ class Field(nn.Module):
 
     def to_scene(
         self, aabb: np.ndarray, clip: Clip, occupancy: np.ndarray, background: np.ndarray, step: float,
-        mapping: SpaceMapping | None = None,
+        mapping: SpaceMapping | None = None, appearance_names: Sequence[str] = (),
     ) -> Scene:
-        """The field as data; the planes are copied."""
+        """The field as data; the planes are copied. `appearance_names`: as many as it has codes.
+
+        The mean of the codes moves into b1, which changes no picture that has a code, and makes their average the look without.
+        """
         names = ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES
         with torch.no_grad():
             scales = tuple(
                 {name: self.plane(s, name).cpu().numpy().copy() for name in names}
                 for s in range(len(self.layout.resolution))
             )
+        decoder, codes = self.decoder_as_data(), np.zeros((0, len(self.b1)), np.float32)
+        if self.codes is not None:
+            mean = _array(self.codes).mean(0, dtype=np.float64).astype(np.float32)
+            decoder, codes = replace(decoder, b1=decoder.b1 + mean), _array(self.codes) - mean
         return Scene(
             aabb=np.asarray(aabb, np.float32), clip=clip, scales=scales,
-            decoder=self.decoder_as_data(),
+            decoder=decoder,
             occupancy=np.asarray(occupancy, bool), background=np.asarray(background, np.float32), step=float(step),
             mapping=mapping, motion=None if self.motion is None else _array(self.motion),
+            appearances=tuple(Appearance(name, code) for name, code in zip(appearance_names, codes, strict=True)),
         )
 
     @staticmethod
     def from_scene(scene: Scene) -> "Field":
-        """The field whose planes and decoder a scene holds."""
+        """The field whose planes, decoder and codes a scene holds."""
         shape = {name: scene.scales[0][name].shape for name in scene.scales[0]}
         resolution = []
         for scale in scene.scales:
@@ -225,13 +245,16 @@ class Field(nn.Module):
             resolution.append([scale["xy"].shape[1], scale["xy"].shape[0], scale["xz"].shape[0], rows_t])
         layout = Layout.of(np.array(resolution), shape["xy"][2])
         kind = HybridField if isinstance(scene.decoder, HybridDecoder) else Field
-        field = kind(layout, scene.decoder.b1.size, motion_nodes=None if scene.motion is None else scene.motion.shape[:4])
+        field = kind(layout, scene.decoder.b1.size, motion_nodes=None if scene.motion is None else scene.motion.shape[:4],
+                     appearances=len(scene.appearances))
         with torch.no_grad():
             for s, scale in enumerate(scene.scales):
                 for name, plane in scale.items():
                     _fill(field.plane(s, name), plane)
             if field.motion is not None and scene.motion is not None:
                 _fill(field.motion, scene.motion)
+            if field.codes is not None:
+                _fill(field.codes, np.stack([appearance.code for appearance in scene.appearances]))
             field.load_decoder(scene.decoder)
         return field
 
@@ -241,7 +264,7 @@ class HybridField(Field):
 
     Attributes:
         theta, motion: as in `Field`.
-        v, a, w1, b1, u, w2, b2: as in `kpc.format.scene.HybridDecoder`, all its layers of the same width.
+        v, v_bias, w1, b1, u, w2, b2: as in `kpc.format.scene.HybridDecoder`, all its layers of the same width.
         density: (G + 1,) weights of the log density, its bias last.
     """
 
@@ -252,7 +275,7 @@ class HybridField(Field):
 
         # Features start at some 0.03, the product of three texels: weights as much larger bring them into a layer's range.
         self.v = nn.Parameter(layer(hidden, F).detach() * FEATURE_GAIN)
-        self.a = nn.Parameter(torch.zeros(hidden))
+        self.v_bias = nn.Parameter(torch.zeros(hidden))
         weights = uniform(-1, 1, hidden) / math.sqrt(hidden)
         self.density = nn.Parameter(torch.cat([weights, torch.tensor([-1.0])]))
         self.w1 = nn.Parameter(uniform(-1, 1, hidden, 9) / 8)
@@ -261,12 +284,12 @@ class HybridField(Field):
         self.w2 = layer(3, hidden)
         self.b2 = nn.Parameter(torch.zeros(3))
 
-    def once_a_ray(self, directions: Tensor) -> Tensor:
+    def once_a_ray(self, directions: Tensor, codes: Tensor | None = None) -> Tensor:
         """What `colours` takes of (N, 3) directions: (N, H), their part of the hidden layer."""
-        return self.direction_hidden(directions)
+        return self.hidden(directions, codes)
 
     def decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        h = (self._times(features, self.v) + self.a).clamp(0, ACTIVATION_LIMIT)
+        h = (self._times(features, self.v) + self.v_bias).clamp(0, ACTIVATION_LIMIT)
         return (h @ self.density[:-1] + self.density[-1]).clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT), h
 
     def colours(self, latent: Tensor, terms: Tensor, ray: Tensor) -> Tensor:
@@ -280,11 +303,11 @@ class HybridField(Field):
         return (values.bfloat16() @ weights.bfloat16().T).to(values.dtype)
 
     def decoder_parameters(self, view_dependent: bool) -> list[nn.Parameter]:
-        return [self.v, self.a, self.density, self.b1, self.u, self.w2, self.b2] + ([self.w1] if view_dependent else [])
+        return [self.v, self.v_bias, self.density, self.b1, self.u, self.w2, self.b2] + ([self.w1] if view_dependent else [])
 
     def decoder_as_data(self) -> AnyDecoder:
         density = _array(self.density)
-        return HybridDecoder(v=_array(self.v), a=_array(self.a), density_weight=density[:-1].copy(), density_bias=float(density[-1]),
+        return HybridDecoder(v=_array(self.v), v_bias=_array(self.v_bias), density_weight=density[:-1].copy(), density_bias=float(density[-1]),
                              w1=_array(self.w1), b1=_array(self.b1), u=_array(self.u), w2=_array(self.w2), b2=_array(self.b2))
 
 
@@ -385,3 +408,11 @@ def motion_priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
     n = field.motion.numel()
     in_time, *in_space = (field.motion.diff(n=2, dim=dim).square().sum() / n for dim in range(4))
     return {"motion_smoothness": config.motion_smoothness * in_time, "motion_bending": config.motion_bending * sum(in_space)}
+
+
+def appearance_priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
+    """The weighted prior of the codes a of appearances, none where there are none: appearance_size * mean of a^2.
+
+    Without it codes and b1 could drift together, and what a few pictures say of a look would be taken for the truth.
+    """
+    return {} if field.codes is None else {"appearance_size": config.appearance_size * field.codes.square().mean()}

@@ -68,6 +68,8 @@ def _command(argv: list[str]) -> None:
     if result["test_psnr"] is not None:
         quality = (f"held-out PSNR {result['test_psnr']:.2f} dB, SSIM {result['test_ssim']:.4f} "
                    f"over {result['test_pictures']} pictures")
+        if result["appearances"]:
+            quality += ", right halves, each in an appearance fitted to its left half"
     print(f"{options.output}: {quality} (rendered from the decoded file)")
     print(f"{result['size_bytes']:,} bytes, {result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}; "
           f"coding loss {result['coding_loss_db']:.3f} dB" + (" on held-out views" if result["test_psnr"] is not None else ""))
@@ -114,6 +116,7 @@ def encode(options: Options) -> dict[str, Any]:
         "file": str(options.output), "layout": dataset.layout, "dynamic": dataset.is_dynamic, "preset": options.preset,
         "seed": options.seed, "device": str(trainer.device), "box": trainer.aabb.tolist(),
         "space": SPACES[type(trainer.mapping)][0],
+        "appearance": trainer.config.appearance, "appearances": len(trainer.names),
         "test_psnr": test and test.psnr, "test_ssim": test and test.ssim, "test_pictures": test.pictures if test else 0,
         "coding_loss_db": before.psnr - test.psnr if test and before else probe_loss,
         "size_bytes": size, "parameters": quantised.parameter_count,
@@ -174,6 +177,8 @@ def _trainer(options: Options) -> Trainer:
         raise
     _say(dataset.describe())
     _say(f"space: {SPACES[type(mapping)][1]} ({why})")
+    appearance, why = options.appearance_of(dataset)
+    _say(f"appearance: {'none' if appearance == 'none' else f'a code for each {appearance}'} ({why})")
     config, resumes, survey_s = options.config(dataset), options.resume and checkpoint.exists(), 0.0
     if options.box is None and not isinstance(mapping, Contraction):
         if resumes:
@@ -207,8 +212,11 @@ def quantise(trainer: Trainer, scene: Scene, target_bytes: int | None = None) ->
     batch, targets = trainer.sampler.draw(np.random.default_rng(1), PROBE_RAYS, scene.background)
     rays = [a.numpy() for a in (batch.origins, batch.directions, batch.times)]
 
+    appearances = None if batch.appearances is None else batch.appearances.numpy()
+
     def fidelity(candidate: Scene) -> float:
-        return psnr(SceneRenderer(candidate).rgb(*rays), targets.numpy())
+        renderer = SceneRenderer(candidate)
+        return psnr(renderer.rgb(*rays, renderer.codes(appearances)), targets.numpy())
 
     steps = relative_steps(trainer.field, trainer.optimiser.curvature())
     if target_bytes is None:

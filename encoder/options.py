@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from kpc.encoder.ablations import ABLATIONS
-from kpc.encoder.config import PRESETS, TrainConfig
+from kpc.encoder.appearances import choose_kind
+from kpc.encoder.config import APPEARANCES, PRESETS, TrainConfig
 from kpc.encoder.datasets import Dataset
 from kpc.format import cli
 
@@ -27,6 +28,7 @@ class Options:
     holdout: str | None = None
     space: str = "auto"
     box: tuple[float, ...] | None = None
+    appearance: str = "auto"
     work: Path | None = None
     keep: bool = False
     resume: bool = False
@@ -45,8 +47,19 @@ class Options:
         if dataset.has_alpha and dataset.one_view_at_a_time:
             config = config.for_lone_object()
         most = config.max_coding_loss_db if self.max_loss_db is None else self.max_loss_db
-        config = replace(config, hybrid=self.decoder == "hybrid", proposals=self.sampling == "proposals", seed=self.seed, steps=self.steps or config.steps, max_coding_loss_db=most)
+        appearance, _ = self.appearance_of(dataset)
+        config = replace(config, hybrid=self.decoder == "hybrid", proposals=self.sampling == "proposals", seed=self.seed,
+                         steps=self.steps or config.steps, max_coding_loss_db=most, appearance=appearance,
+                         view_dependent=config.view_dependent or appearance != "none")  # codes act through the direction MLP
         return ABLATIONS[self.ablation](config)
+
+
+    def appearance_of(self, dataset: Dataset) -> tuple[str, str]:
+        """What is to have an appearance, as `TrainConfig.appearance`, and why, in words for the log."""
+        if self.appearance != "auto":
+            return self.appearance, "as told"
+        kind, why = choose_kind(dataset)
+        return kind, f"{why}; --appearance overrides"
 
 
 def parse(argv: list[str]) -> tuple[Options, bool, bool]:
@@ -71,6 +84,9 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
                              "for cameras that face one way (default: auto)")
     parser.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1",
                         help="corners of the scene, or of its undistorted part, taken as they are, instead of those found")
+    parser.add_argument("--appearance", choices=("auto", *APPEARANCES), default="auto",
+                        help="learn beside the scene how each camera, or each image, shows its colours: unequal exposure, white "
+                             "balance, weather (default: auto, image for photographs by many lenses, else none)")
     parser.add_argument("--work", type=Path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)")
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
@@ -83,8 +99,8 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
                         help="only say what would be done, how long it would take and how much memory")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     a = parser.parse_args(_box_joined(argv))
-    options = Options(a.source, a.output, a.preset, a.decoder, a.sampling, a.steps, a.time_budget, a.seed, a.device, a.downscale, a.holdout,
-                      a.space, a.box, a.work, a.keep, a.resume, a.test_views, a.max_loss, a.target_size)
+    options = Options(a.source, a.output, a.preset, a.decoder, a.sampling, a.steps, a.time_budget, a.seed, a.device, a.downscale,
+                      a.holdout, a.space, a.box, a.appearance, a.work, a.keep, a.resume, a.test_views, a.max_loss, a.target_size)
     if a.dry_run and a.resume:
         parser.error("--dry-run tells what a whole run takes; drop --resume")
     return options, a.dry_run, a.json

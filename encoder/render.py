@@ -2,7 +2,7 @@
 do not serve: on a GPU, and with the hybrid decoder.
 
 Three parts, each with a plain version for any device: which samples rays take (`samples_of`), what the field holds there
-(`Field.features`), and what becomes of them (`composite`). On the CPU `collected` and `FusedFeatures` stand in for the first two.
+(`Field.features`), and what becomes of it (`meet`, `shade`). On the CPU `collected` and `FusedFeatures` stand in for the first two.
 """
 
 import math
@@ -26,13 +26,19 @@ OPAQUE = 50.0
 
 @dataclass(frozen=True)
 class Rays:
-    """A batch of rays; every member has N rows. Directions are unit vectors, times and jitters lie in [0, 1)."""
+    """A batch of rays; every member has N rows. Directions are unit vectors, times and jitters lie in [0, 1). `appearances`, int64,
+    are rows of `Field.codes`; None for the look without a code."""
 
     origins: Tensor
     directions: Tensor
     times: Tensor
     jitters: Tensor
     backgrounds: Tensor
+    appearances: Tensor | None = None
+
+    def apply(self, change: Callable[[Tensor], Tensor]) -> "Rays":
+        """The same with every member changed."""
+        return Rays(*(None if value is None else change(value) for value in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -55,19 +61,21 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Composite:
-    """What N rays met.
+class Met:
+    """What N rays meet, but for its colour: n samples, in the order of their rays.
 
     Attributes:
-        rgb: (N, 3). opacity: (N,) 1 - what is left of the transmittance at the end.
-        weights: (n,) of the samples; 0 of those behind the end of their ray. reached: (n,) bool, those that are not behind it.
+        ray: (n,) int64. latent: (n, ...) what `Field.colours` takes.
+        weights: (n,), 0 of those behind the end of their ray. reached: (n,) bool, those that are not behind it.
+        opacity: (N,) 1 - what is left of the transmittance at the end.
         distortion: the mean over rays of D that `kernels.backpropagate` states.
     """
 
-    rgb: Tensor
-    opacity: Tensor
+    ray: Tensor
+    latent: Tensor
     weights: Tensor
     reached: Tensor
+    opacity: Tensor
     distortion: Tensor
 
 
@@ -83,8 +91,8 @@ def render_reference(
         Colours (N, 3); the distortion; of the n samples reached their weights (n,), and their cells (n, 3) int64.
     """
     samples = samples_of(rays, aabb, occupancy, step, mapping)
-    met = composite(field, rays, samples, field.features, float((aabb[1] - aabb[0]).max()), kept)
-    return met.rgb, met.distortion, met.weights[met.reached], samples.cell[met.reached]
+    met = meet(field, rays, samples, field.features, float((aabb[1] - aabb[0]).max()), kept)
+    return shade(field, rays, met), met.distortion, met.weights[met.reached], samples.cell[met.reached]
 
 
 def samples_of(
@@ -150,10 +158,10 @@ def cells_of(u: Tensor, cells: tuple[int, ...]) -> Tensor:
     return torch.stack([(u[..., axis] * n).long().clamp(0, n - 1) for axis, n in zip((2, 1, 0), cells)], dim=-1)
 
 
-def composite(
+def meet(
     field: Field, rays: Rays, samples: Samples, features: Callable[[Tensor, Tensor], Tensor], extent: float,
     kept: Tensor | None = None,
-) -> Composite:
+) -> Met:
     """Spend the light of N rays on their samples, front to back.
 
     With tau = sigma * stretch * length / extent: alpha = 1 - exp(-tau), weight = trans * alpha; a ray ends once its transmittance
@@ -173,14 +181,22 @@ def composite(
     trans = torch.exp(-_before(tau.clamp(max=OPAQUE), first))
     lit = trans >= TERMINATION
     weights = torch.where(lit, trans * (1 - torch.exp(-tau)), 0)
-    colours = field.colours(latent, field.once_a_ray(rays.directions), ray)
-    rgb = torch.zeros_like(rays.backgrounds).index_add(0, ray, weights[:, None] * colours)
-    opacity = torch.zeros_like(rgb[:, 0]).index_add(0, ray, weights)
-    rgb = rgb + (1 - opacity)[:, None] * rays.backgrounds
+    opacity = torch.zeros_like(rays.backgrounds[:, 0]).index_add(0, ray, weights)
     along = ((samples.s - samples.s[first]) / extent).to(weights.dtype)
     apart = along * _before(weights, first) - _before(weights * along, first)
     distortion = (2 * weights * apart + weights.square() * length / 3).sum() / N
-    return Composite(rgb, opacity, weights, lit, distortion)
+    return Met(ray, latent, weights, lit, opacity, distortion)
+
+
+def shade(field: Field, rays: Rays, met: Met, codes: Tensor | None = None) -> Tensor:
+    """Colours (N, 3): sum of weight * colour + what is left * background.
+
+    `codes`: (N, H) or (H,) of appearances in place of those that the rays name.
+    """
+    terms = field.once_a_ray(rays.directions, field.codes_of(rays.appearances) if codes is None else codes)
+    colours = field.colours(met.latent, terms, met.ray)
+    rgb = torch.zeros_like(rays.backgrounds).index_add(0, met.ray, met.weights[:, None] * colours)
+    return rgb + (1 - met.opacity)[:, None] * rays.backgrounds
 
 
 def _before(values: Tensor, first: Tensor) -> Tensor:

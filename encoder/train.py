@@ -16,14 +16,15 @@ import numpy as np
 import torch
 
 from kpc.encoder import kernels
+from kpc.encoder.appearances import number_pictures
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.box import seen_cells
 from kpc.encoder.datasets import Dataset, rays
-from kpc.encoder.field import Field, HybridField, motion_nodes, motion_priors, plan_layout, priors
+from kpc.encoder.field import Field, HybridField, appearance_priors, motion_nodes, motion_priors, plan_layout, priors
 from kpc.encoder.importance import TileWeights, cameras_stand_still
 from kpc.encoder.occupancy import OccupancyGrid, grid_shape
 from kpc.encoder.proposals import Level, Proposals, histogram_loss
-from kpc.encoder.render import Rays, Samples, collected, composite, fused_features, samples_of
+from kpc.encoder.render import Rays, Samples, collected, fused_features, meet, samples_of, shade
 from kpc.format.cli import written_aside
 from kpc.format.errors import TrainingError
 from kpc.format.scene import SPACE_PLANES, Scene
@@ -80,8 +81,10 @@ class Trainer:
         self.rng = np.random.default_rng(config.seed)
         layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
         nodes = motion_nodes(config, self.aabb, layout)
+        appearances, self.names = number_pictures(dataset, config.appearance)
         kind, hidden = (HybridField, config.hybrid_width) if config.hybrid else (Field, config.hidden)
-        self.field = kind(layout, hidden, torch.Generator().manual_seed(config.seed), nodes).to(self.device)
+        generator = torch.Generator().manual_seed(config.seed)
+        self.field = kind(layout, hidden, generator, nodes, len(self.names)).to(self.device)
         if not config.view_dependent:
             torch.nn.init.zeros_(self.field.w1)
         shape = grid_shape(self.aabb, config.cells_across)
@@ -98,7 +101,7 @@ class Trainer:
         self.step = 0
         self.elapsed_s = elapsed_s
         self.samples_per_ray = float(config.samples_across)
-        self.sampler = RaySampler(dataset, mapping)
+        self.sampler = RaySampler(dataset, mapping, appearances if self.names else None)
         # Objects with alpha are shown on white. Elsewhere what the box leaves open is grey: the least wrong guess.
         self.background = np.full(3, 1.0 if dataset.has_alpha else 0.5, np.float32)
         self._weights: TileWeights | None = None
@@ -190,7 +193,8 @@ class Trainer:
         """The field as it stands, with an occupancy (slots, Nz, Ny, Nx), or with that of training; the planes are copied."""
         if occupancy is None:
             occupancy = self.grid.marched
-        return self.field.to_scene(self.aabb, self.dataset.clip, occupancy, self.background, self.step_length, self.mapping)
+        return self.field.to_scene(
+            self.aabb, self.dataset.clip, occupancy, self.background, self.step_length, self.mapping, self.names)
 
     def _weights_at(self, fraction: float) -> TileWeights | None:
         """What decides which rays are drawn at this share of the run; it follows from the dataset, so no checkpoint holds it."""
@@ -207,7 +211,8 @@ class Trainer:
 
     def _not_finite(self) -> str:
         """Which terms of the loss hold NaN or infinity, the colours being one of them, and which parameters they come from."""
-        weighed = priors(self.field, self.config) | motion_priors(self.field, self.config)
+        field, config = self.field, self.config
+        weighed = priors(field, config) | motion_priors(field, config) | appearance_priors(field, config)
         terms = ["colour"] + [name for name, value in weighed.items() if not torch.isfinite(value)]
         planes = [f"{name} at scale {s}" for s, name, *_ in self.field.layout.planes()
                   if not torch.isfinite(self.field.plane(s, name)).all()]
@@ -290,8 +295,11 @@ class RaySampler:
     MARGIN = 0.03
     """Of a picture's longer side, about what is not transparent: the outline wants to be learnt from both sides."""
 
-    def __init__(self, dataset: Dataset, mapping: SpaceMapping | None = None) -> None:
-        self.dataset, self.mapping = dataset, mapping
+    def __init__(
+        self, dataset: Dataset, mapping: SpaceMapping | None = None, appearances: np.ndarray | None = None
+    ) -> None:
+        """`appearances`: (P,) int64, of each picture, as `appearances.number_pictures` has them; None where there are none."""
+        self.dataset, self.mapping, self.appearances = dataset, mapping, appearances
         self.train = np.flatnonzero(~dataset.pictures.is_test)
         self.ends = np.cumsum(dataset.usable_counts[self.train])
         self.frames: np.ndarray | None = None
@@ -337,7 +345,9 @@ class RaySampler:
             targets = targets * colours[:, 3:] + backgrounds * (1 - colours[:, 3:])
         jitters = rng.random(count, dtype=np.float32)
         arrays = (origins, directions, pictures.time[picture], jitters, backgrounds)
-        return Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays)), torch.from_numpy(targets)
+        numbers = None if self.appearances is None else torch.from_numpy(self.appearances[picture])
+        batch = Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays), numbers)
+        return batch, torch.from_numpy(targets)
 
     def _frame(self, alpha: np.ndarray) -> tuple[int, int, int, int]:
         rows, columns = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))
@@ -397,7 +407,10 @@ class FusedOptimiser:
         layout, config = self.field.layout, self.config
         with self.watch("decoder"):
             kept = kept_channels(self.field, config, number)
-            basis = (self.field.basis(batch.directions) if config.view_dependent else self.field.b2[None]) * kept
+            basis = self.field.b2[None]
+            if config.view_dependent:
+                basis = self.field.basis(batch.directions, self.field.codes_of(batch.appearances))
+            basis = basis * kept
             density = torch.cat([self.field.density.detach()[:-1] * kept, self.field.density.detach()[-1:]])
             grad_basis = np.zeros((len(basis) if config.view_dependent else self.workers, *basis.shape[1:]), np.float32)
             grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
@@ -420,6 +433,8 @@ class FusedOptimiser:
             basis.backward(torch.from_numpy(grad_basis if config.view_dependent else grad_basis.sum(0, keepdims=True)))
             self.field.density.grad = torch.from_numpy(grad_density.sum(0))
             self.field.density.grad[:-1] *= kept
+            if self.field.codes is not None:
+                _total(appearance_priors(self.field, config)).backward()
             if moving:
                 _total(motion_priors(self.field, config)).backward()
                 self.field.motion.grad += torch.from_numpy(grad_motion.sum(0))
@@ -507,7 +522,7 @@ class PlainOptimiser:
         """Mean squared error a colour channel, and samples a ray."""
         config = self.config
         with self.watch("samples"):
-            batch, targets = Rays(*(self._there(value) for value in vars(batch).values())), self._there(targets)
+            batch, targets = batch.apply(self._there), self._there(targets)
             levels: list[Level] = []
             if self.proposals is None:
                 samples = self._samples(batch, aabb, occupancy, step_length)
@@ -516,14 +531,16 @@ class PlainOptimiser:
                 samples, edges, levels = self.proposals.sample(batch, box, self.mapping, cells, number, self.fused)
         with self.watch("forward"):
             kept = self._there(kept_channels(self.field, config, number))
-            met = composite(self.field, batch, samples, self.features, extent, kept)
-            error = (met.rgb - targets).square().mean()
+            met = meet(self.field, batch, samples, self.features, extent, kept)
+            error = (shade(self.field, batch, met) - targets).square().mean()
             loss = error + config.distortion * met.distortion
             for level in levels:
                 loss = loss + config.histogram * histogram_loss(edges, met.weights.view(len(targets), -1), level)
             moving = self.field.motion is not None and number % config.motion_every == 0
             if moving:
                 loss = loss + _total(motion_priors(self.field, config))
+            if self.field.codes is not None:
+                loss = loss + _total(appearance_priors(self.field, config))
             regularised = number % config.regularise_every == 0
             if regularised and not self.fused:
                 loss = loss + config.regularise_every * _total(priors(self.field, config))
@@ -648,7 +665,8 @@ def _decoder_optimiser(
     """Of all but the planes."""
     decoder = [*field.decoder_parameters(config.view_dependent), *others]
     motion = [] if field.motion is None else [([field.motion], config.motion_learning_rate)]
-    return _adam([(decoder, config.decoder_learning_rate), *motion])
+    codes = [] if field.codes is None else [([field.codes], config.appearance_learning_rate)]
+    return _adam([(decoder, config.decoder_learning_rate), *motion, *codes])
 
 
 def _adam(groups: list[tuple[list[torch.nn.Parameter], float]]) -> torch.optim.Adam:

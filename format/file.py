@@ -5,6 +5,7 @@
     MOVE  the motion grid; absent where nothing is displaced
     DECO  weights of the explicit decoder, or HYBR of the hybrid one        OCCU  occupancy grid
     came  cameras (may be ignored)                                          PLNE  one segment of one plane
+    appe  appearances (may be ignored)
 
 The order in the file is the order in which a player wants them: the coarsest picture of the first seconds, then finer
 scales, then later seconds. A plane segment that has not arrived is uncoded: it reads as its offset.
@@ -26,7 +27,7 @@ from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
-from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Clip, Decoder, HybridDecoder
+from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 
 Parsed = TypeVar("Parsed")
@@ -51,6 +52,8 @@ OCCUPANCY_STRUCT = struct.Struct("<4H")
 """slots, Nz, Ny, Nx"""
 CAMERA_STRUCT = struct.Struct("<HH16f")
 """width, height, fl_x, fl_y, cx, cy, the first three rows of camera_to_world"""
+APPEARANCE_STRUCT = struct.Struct("<HH")
+"""count, hidden"""
 
 CONTRACTED, DEVICE_COORDINATES = 1, 2
 
@@ -61,6 +64,9 @@ MOTION_LIMIT = 256
 """Nodes of the motion grid along an axis of space."""
 HIDDEN_LIMIT = 256
 CAMERA_LIMIT = 4096
+APPEARANCE_LIMIT = 16384
+NAME_LIMIT = 255
+"""Bytes of an appearance's name in UTF-8."""
 FRAME_LIMIT = 1 << 24
 SAMPLE_LIMIT = 65536
 """Samples along the box's diagonal, or along a ray through contracted space, so that no file can make a ray endless."""
@@ -90,7 +96,7 @@ class PlaneHead:
 
 @dataclass(frozen=True)
 class SceneHead:
-    """The SCNE chunk: everything but the planes' symbols, the decoder, the occupancy and the cameras."""
+    """The SCNE chunk: everything but the planes' symbols, the decoder, the occupancy, the cameras and the appearances."""
 
     aabb: np.ndarray
     clip: Clip
@@ -160,6 +166,10 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
                    Chunk("OCCU", [_pack_occupancy(scene.occupancy)])]
         if scene.cameras:
             chunks.append(Chunk("came", [_pack_cameras(scene.cameras)]))
+        if scene.appearances:
+            appe = _pack_appearances(scene.appearances, len(scene.decoder.b1))
+            _parse_appearances(appe, len(scene.decoder.b1))
+            chunks.append(Chunk("appe", [appe]))
     except (struct.error, OverflowError) as error:
         raise FormatError(f"scene: a number does not fit its field ({error})") from error
     latest = max(plane.rows for scale in parsed.scales for name, plane in scale.items() if name in TIME_PLANES) \
@@ -213,7 +223,7 @@ def _check_planes(scene: QuantisedScene, head: SceneHead) -> None:
 def _pack_decoder(decoder: AnyDecoder, features: int) -> bytes:
     hidden, bias = len(decoder.b1), decoder.density_bias
     if isinstance(decoder, HybridDecoder):
-        width = len(decoder.a)
+        width = len(decoder.v_bias)
         head, shapes = HYBRID_STRUCT.pack(features, width, hidden, bias), _hybrid_shapes(features, width, hidden)
     else:
         head, shapes = DECODER_STRUCT.pack(features, hidden, bias), _decoder_shapes(features, hidden)
@@ -254,6 +264,17 @@ def _pack_cameras(cameras: tuple[Camera, ...]) -> bytes:
         for c in cameras)
 
 
+def _pack_appearances(appearances: tuple[Appearance, ...], hidden: int) -> bytes:
+    codes = [appearance.code for appearance in appearances]
+    if any(np.shape(code) != (hidden,) for code in codes):
+        raise FormatError(f"appearances: codes of shapes {sorted({np.shape(code) for code in codes})}, not {(hidden,)}")
+    if any(not np.array_equal(code, code.astype(np.float16)) for code in codes):
+        raise FormatError("appearances: the codes are not rounded to float16 (kpc.format.quantise.half)")
+    names = [appearance.name.encode(errors="surrogatepass") for appearance in appearances]  # the parser refuses surrogates
+    return b"".join([APPEARANCE_STRUCT.pack(len(codes), hidden), np.stack(codes).astype("<f2").tobytes(),
+                     *(struct.pack("<B", len(name)) + name for name in names)])
+
+
 # --- reading
 
 
@@ -286,7 +307,8 @@ def read(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, memory
         elif entry.kind not in KNOWN_KINDS:
             reader.stored(number)  # ignored, but never damaged
     return QuantisedScene(reader.head.aabb, reader.head.clip, scales, reader.decoder(), reader.occupancy(),
-                          reader.head.background, reader.head.step, reader.cameras(), reader.mapping(), reader.motion())
+                          reader.head.background, reader.head.step, reader.cameras(), reader.mapping(), reader.motion(),
+                          reader.appearances())
 
 
 class SceneReader(Reader):
@@ -368,6 +390,16 @@ class SceneReader(Reader):
             return ()
         return self._parsed(_parse_cameras, self.chunk(number, 2 + CAMERA_LIMIT * CAMERA_STRUCT.size))
 
+    def appearances(self) -> tuple[Appearance, ...]:
+        """The appearances, none if the file has (or has yet) no such chunk."""
+        number = self._at_most_one("appe")
+        if number is None or not self.available(number):
+            return ()
+        hidden = len(self.decoder().b1)
+        most = APPEARANCE_STRUCT.size + APPEARANCE_LIMIT * (2 * hidden + 1 + NAME_LIMIT)
+        self._afford(4 * self.index[number].raw_length, "its appearances")  # as they are stored, float32, and names
+        return self._parsed(lambda raw: _parse_appearances(raw, hidden), self.chunk(number, most))
+
     def _only(self, kind: str) -> int:
         found = [number for number, entry in enumerate(self.index) if entry.kind == kind]
         if len(found) != 1:
@@ -422,7 +454,7 @@ class SceneReader(Reader):
                 raise FormatError(f"{self.name}: {where}: its segments hold {row} rows, not {head.rows}")
 
 
-KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "PLNE"})
+KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "PLNE"})
 HEAD_LIMIT = SCENE_STRUCT.size + SCALE_LIMIT * (SCALE_STRUCT.size + 9 * 4 * CHANNEL_LIMIT)
 
 
@@ -514,7 +546,7 @@ def _decoder_shapes(features: int, hidden: int) -> dict[str, tuple[int, ...]]:
 
 
 def _hybrid_shapes(features: int, width: int, hidden: int) -> dict[str, tuple[int, ...]]:
-    return {"v": (width, features), "a": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
+    return {"v": (width, features), "v_bias": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
             "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
 
 
@@ -578,6 +610,39 @@ def _parse_cameras(raw: bytes) -> tuple[Camera, ...]:
             raise FormatError(f"came: camera {number}: {error}") from error
     cursor.finish()
     return tuple(cameras)
+
+
+def _parse_appearances(raw: bytes, expected_hidden: int) -> tuple[Appearance, ...]:
+    cursor = _Cursor(raw, "appe")
+    count, hidden = cursor.unpack(APPEARANCE_STRUCT)
+    if not 0 < count <= APPEARANCE_LIMIT or hidden != expected_hidden:
+        raise FormatError(f"appe: {count} appearances (1 to {APPEARANCE_LIMIT} allowed) of {hidden} numbers (the decoder has "
+                          f"{expected_hidden} hidden units)")
+    with np.errstate(invalid="ignore"):  # a signalling NaN says so when it is cast
+        codes = cursor.array("<f2", count * hidden).astype(np.float32).reshape(count, hidden)
+    if not np.isfinite(codes).all():
+        raise FormatError("appe: a code is NaN or infinite")
+    appearances, known = [], set()
+    for number, code in enumerate(codes):
+        length, = cursor.unpack(struct.Struct("<B"))
+        try:
+            name = cursor.take(length).decode()
+        except UnicodeDecodeError as error:
+            raise FormatError(f"appe: the name of appearance {number} is not UTF-8") from error
+        if not is_name(name) or name in known:
+            raise FormatError(f"appe: the name of appearance {number} is empty, holds a control character, or is there twice")
+        known.add(name)
+        appearances.append(Appearance(name, code))
+    cursor.finish()
+    return tuple(appearances)
+
+
+def is_name(text: str) -> bool:
+    """Whether an appearance may be called so: 1 to NAME_LIMIT bytes of UTF-8, no control characters, which a terminal
+    might obey."""
+    encoded = text.encode(errors="replace")
+    controls = any(c < " " or "\x7f" <= c <= "\x9f" for c in text)
+    return 0 < len(encoded) <= NAME_LIMIT and encoded.decode() == text and not controls
 
 
 class _Cursor:

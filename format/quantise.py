@@ -15,7 +15,7 @@ import numpy as np
 from kpc.format.cameras import Camera
 from kpc.format.errors import FormatError
 from kpc.format.motion import QuantisedMotion, places_reached, quantise_motion
-from kpc.format.scene import TIME_PLANES, AnyDecoder, Clip, Scene
+from kpc.format.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
 from kpc.format.space import SpaceMapping
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
@@ -103,7 +103,7 @@ def _at_least(step: np.ndarray, bound: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class QuantisedScene:
-    """A `Scene` as the file stores it: planes as symbols, decoder weights and cameras rounded. Fields as in `Scene`."""
+    """A `Scene` as the file stores it: planes as symbols, decoder weights, codes and cameras rounded. Fields as in `Scene`."""
 
     aabb: np.ndarray
     clip: Clip
@@ -115,12 +115,13 @@ class QuantisedScene:
     cameras: tuple[Camera, ...] = field(default=())
     mapping: SpaceMapping | None = None
     motion: QuantisedMotion | None = None
+    appearances: tuple[Appearance, ...] = field(default=())
 
     def dequantise(self) -> Scene:
         """The scene that every decoder sees."""
         scales = tuple({name: plane.dequantise() for name, plane in scale.items()} for scale in self.scales)
         return Scene(self.aabb, self.clip, scales, self.decoder, self.occupancy, self.background, self.step,
-                     self.cameras, self.mapping, None if self.motion is None else self.motion.dequantise())
+                     self.cameras, self.mapping, None if self.motion is None else self.motion.dequantise(), self.appearances)
 
     @property
     def is_dynamic(self) -> bool:
@@ -129,8 +130,9 @@ class QuantisedScene:
     @property
     def parameter_count(self) -> int:
         """Numbers in the model, coded or not; the same as the dequantised scene's."""
-        motion = 0 if self.motion is None else self.motion.symbols.size
-        return sum(p.symbols.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count + motion
+        others = 0 if self.motion is None else self.motion.symbols.size
+        others += self.decoder.parameter_count + sum(appearance.code.size for appearance in self.appearances)
+        return sum(p.symbols.size for scale in self.scales for p in scale.values()) + others
 
     @property
     def identity_share(self) -> float:
@@ -166,6 +168,7 @@ def quantise_scene(scene: Scene, steps: Sequence[Mapping[str, np.ndarray | float
         np.asarray(scene.occupancy, bool), np.asarray(scene.background, np.float32), float(scene.step),
         tuple(round_camera(camera) for camera in scene.cameras), scene.mapping,
         None if scene.motion is None else quantise_motion(scene.motion),
+        tuple(Appearance(appearance.name, half(appearance.code, "appearances")) for appearance in scene.appearances),
     )
 
 
@@ -202,16 +205,21 @@ def round_decoder(decoder: AnyDecoder) -> AnyDecoder:
     Raises:
         FormatError: a weight is NaN, infinite or beyond float16's 65504.
     """
-    def half(weights: np.ndarray) -> np.ndarray:
-        if not (np.abs(weights) <= 65504.0).all():
-            raise FormatError("decoder: a weight is NaN or beyond 65504, which no file can store; "
-                              "lower the learning rate")
-        return np.asarray(weights).astype(np.float16).astype(np.float32)
-
     if not np.isfinite(decoder.density_bias):
         raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
     weights = {name: value if name == "density_bias" else half(value) for name, value in vars(decoder).items()}
     return replace(decoder, **weights | {"density_bias": float(np.float32(decoder.density_bias))})
+
+
+def half(weights: np.ndarray, what: str = "decoder") -> np.ndarray:
+    """Numbers rounded to float16, as float32.
+
+    Raises:
+        FormatError: one is NaN, infinite or beyond float16's 65504.
+    """
+    if not (np.abs(weights) <= 65504.0).all():
+        raise FormatError(f"{what}: a weight is NaN or beyond 65504, which no file can store; lower the learning rate")
+    return np.asarray(weights).astype(np.float16).astype(np.float32)
 
 
 def round_camera(camera: Camera) -> Camera:

@@ -10,6 +10,9 @@ the explicit decoder (section 3.3 of the paper), in which a direction MLP gives 
     sigma = exp(clip(f . density_weight + density_bias, -20, 20))       rgb = sigmoid(f . basis_{R,G,B}(d))
 
 or from the hybrid one, two small MLPs for each sample: `HybridDecoder`.
+
+Pictures that disagree about colours (exposure, white balance, time of day) have each an appearance: a code that is added to the
+hidden layer that depends on the direction, and to nothing else, so that it never changes geometry (section 3.3 of the paper).
 """
 
 import itertools
@@ -19,6 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from kpc.format.cameras import Camera
+from kpc.format.errors import UsageError
 from kpc.format.space import DeviceCoordinates, SpaceMapping
 
 SPACE_PLANES = ("xy", "xz", "yz")
@@ -53,8 +57,8 @@ class Decoder:
 
     Attributes:
         density_weight: (F,) float32; density_bias: float32 scalar.
-        w1: (H, 9), b1: (H,), w2: (3, F, H), b2: (3, F) float32, the direction MLP:
-            basis(d) = w2 relu(w1 e(d) + b1) + b2,  e(d) = [x, y, z, xx, yy, zz, xy, yz, zx]
+        w1: (H, 9), b1: (H,), w2: (3, F, H), b2: (3, F) float32, the direction MLP, `code` that of an appearance or 0:
+            basis(d) = w2 relu(w1 e(d) + b1 + code) + b2,  e(d) = [x, y, z, xx, yy, zz, xy, yz, zx]
     """
 
     density_weight: np.ndarray
@@ -73,19 +77,19 @@ class Decoder:
 class HybridDecoder:
     """The hybrid decoder (section 3.3 of the paper): MLPs in place of both linear maps. G and H are their widths.
 
-        h     = clip(v f + a, 0, ACTIVATION_LIMIT)
+        h     = clip(v f + v_bias, 0, ACTIVATION_LIMIT)
         sigma = exp(clip(h . density_weight + density_bias, -20, 20))
-        rgb   = sigmoid(w2 clip(w1 e(d) + b1 + u h, 0, ACTIVATION_LIMIT) + b2)     e(d) as in `Decoder`; w1 e(d) + b1 once a ray
+        rgb   = sigmoid(w2 clip(w1 e(d) + b1 + code + u h, 0, ACTIVATION_LIMIT) + b2)     e(d) as in `Decoder`, all but u h once a ray
 
     The paper hands a few linear outputs of the density's MLP on to the colour's; here its hidden layer is handed on as it is.
 
     Attributes:
-        v: (G, F), a: (G,), density_weight: (G,) float32; density_bias: float32 scalar.
+        v: (G, F), v_bias: (G,), density_weight: (G,) float32; density_bias: float32 scalar.
         w1: (H, 9), b1: (H,), u: (H, G), w2: (3, H), b2: (3,) float32.
     """
 
     v: np.ndarray
-    a: np.ndarray
+    v_bias: np.ndarray
     density_weight: np.ndarray
     density_bias: float
     w1: np.ndarray
@@ -100,6 +104,15 @@ class HybridDecoder:
 
 
 AnyDecoder = Decoder | HybridDecoder
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """How one picture or camera, `name`, shows the colours of a scene: `code` (H,) float32, H as in `Decoder`. All of a scene's
+    average 0, the look without a code."""
+
+    name: str
+    code: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -123,6 +136,7 @@ class Scene:
         mapping: how what lies outside the box is held, too; None: nothing does.
         motion: (T, Nz, Ny, Nx, 3) float32, displacements at the nodes of a grid over time and space, in box edges (of what the
             planes cover, with a mapping), `kpc.format.motion`; None: nothing is displaced. Dynamic scenes only.
+        appearances: how its pictures or cameras showed its colours, names all different; none where they agree.
     """
 
     aabb: np.ndarray
@@ -135,6 +149,7 @@ class Scene:
     cameras: tuple[Camera, ...] = field(default=())
     mapping: SpaceMapping | None = None
     motion: np.ndarray | None = None
+    appearances: tuple[Appearance, ...] = field(default=())
 
     @property
     def is_dynamic(self) -> bool:
@@ -156,6 +171,29 @@ class Scene:
 
     @property
     def parameter_count(self) -> int:
-        """Numbers in the model: every texel of every channel of every plane, the decoder's weights, the displacements."""
+        """Numbers in the model: every texel of every channel of every plane, the decoder's weights, displacements, codes."""
         motion = 0 if self.motion is None else self.motion.size
-        return sum(p.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count + motion
+        codes = sum(appearance.code.size for appearance in self.appearances)
+        return sum(p.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count + motion + codes
+
+    def appearance(self, name: str) -> np.ndarray:
+        """The code of an appearance, (H,) float32.
+
+        Raises:
+            UsageError: there is none of that name; the message names some.
+        """
+        for appearance in self.appearances:
+            if appearance.name == name:
+                return appearance.code
+        if not self.appearances:
+            raise UsageError(f"appearance {name!r}: the scene has none, all its pictures agree; leave it out")
+        some = ", ".join(appearance.name for appearance in self.appearances[:8]) + ", ..." * (len(self.appearances) > 8)
+        raise UsageError(f"appearance {name!r}: the scene has no such one, but {some}")
+
+    def appearance_between(self, one: str, other: str, share: float) -> np.ndarray:
+        """The code so far from one appearance to another, share in [0, 1]: (1 - share) one + share other, (H,) float32.
+
+        Raises:
+            UsageError: as `appearance`.
+        """
+        return np.float32(1 - share) * self.appearance(one) + np.float32(share) * self.appearance(other)

@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kpc.format.cameras import Camera
-from kpc.format.scene import Clip
+from kpc.format.scene import Clip, Scene
 from kpc.player.orbit import Rig, fitted
 
 STEEPEST = math.radians(1.0)
 """Orbiting stops this far from looking straight up or down."""
+FADE_S = 0.4
+"""From one appearance to the next."""
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 
@@ -118,6 +120,45 @@ class Playback:
         """Go so many steps along SPEEDS."""
         nearest = min(range(len(SPEEDS)), key=lambda i: abs(SPEEDS[i] - self.speed))
         self.speed = SPEEDS[min(max(nearest + steps, 0), len(SPEEDS) - 1)]
+
+
+class Wardrobe:
+    """Which appearance of a scene is shown: the average first, then each of them; a change takes FADE_S.
+
+    Attributes:
+        names: "average", then those of the scene's appearances.
+        number: of the one shown, or on its way.
+        progress: of that change, [0, 1].
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.names = ("average", *(appearance.name for appearance in scene.appearances))
+        average = np.zeros(len(scene.decoder.b1), np.float32)
+        self._codes = [average, *(appearance.code for appearance in scene.appearances)]
+        self._before = average
+        self.number, self.progress = 0, 1.0
+
+    @property
+    def code(self) -> np.ndarray | None:
+        """(H,) what to show now: (1 - s) before + s next, s = p^2 (3 - 2 p) of the progress p; None in a scene without any."""
+        if len(self._codes) == 1:
+            return None
+        share = np.float32(self.progress * self.progress * (3 - 2 * self.progress))
+        return (1 - share) * self._before + share * self._codes[self.number]
+
+    def wear(self, number: int) -> None:
+        """Begin to change into another, from whatever is shown now."""
+        shown = self.code
+        if shown is not None and number != self.number:
+            self._before, self.number, self.progress = shown, number, 0.0
+
+    def next(self) -> None:
+        """Begin to change into the next; after the last, the average."""
+        self.wear((self.number + 1) % len(self._codes))
+
+    def advance(self, seconds: float) -> None:
+        """Let real time pass."""
+        self.progress = min(self.progress + seconds / FADE_S, 1.0)
 
 
 @dataclass

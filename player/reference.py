@@ -61,34 +61,51 @@ class Rendering:
     samples: np.ndarray
 
 
-def render(scene: Scene, camera: Camera, time: float, *, part: Part = Part.FULL) -> Rendering:
-    """Render `scene` as `camera` sees it at `time` in [0, 1] over the clip."""
+def render(
+    scene: Scene, camera: Camera, time: float, *, part: Part = Part.FULL, appearance: np.ndarray | None = None
+) -> Rendering:
+    """Render `scene` as `camera` sees it at `time` in [0, 1] over the clip, and as `code_of` says of `appearance`."""
     origins, directions = camera.rays()
-    flat = render_rays(scene, origins, directions, time, part=part)
+    flat = render_rays(scene, origins, directions, time, part=part, appearance=appearance)
     shape = (camera.height, camera.width)
     return Rendering(flat.rgb.reshape(*shape, 3), *(a.reshape(shape) for a in (flat.depth, flat.opacity, flat.samples)))
 
 
 def render_rays(
-    scene: Scene, origins: np.ndarray, directions: np.ndarray, time: float, *, part: Part = Part.FULL
+    scene: Scene, origins: np.ndarray, directions: np.ndarray, time: float, *, part: Part = Part.FULL,
+    appearance: np.ndarray | None = None,
 ) -> Rendering:
     """Render rays, (N, 3) float32 origins and unit directions in world coordinates. Memory does not grow with N but for
-    the result."""
+    the result. `appearance` as in `code_of`."""
     if not 0.0 <= time <= 1.0:
         raise ValueError(f"time {time} lies outside [0, 1]")
     if part is Part.DYNAMIC:
-        full = render_rays(scene, origins, directions, time)
-        static = render_rays(scene, origins, directions, time, part=Part.STATIC)
+        full = render_rays(scene, origins, directions, time, appearance=appearance)
+        static = render_rays(scene, origins, directions, time, part=Part.STATIC, appearance=appearance)
         return Rendering(np.abs(full.rgb - static.rgb), full.depth, full.opacity, full.samples)
-    moment = Moment.of(scene, time, with_motion=part is Part.FULL)
+    moment, code = Moment.of(scene, time, with_motion=part is Part.FULL), code_of(scene, appearance)
     n = len(origins)
     out = Rendering(np.empty((n, 3), np.float32), *(np.empty(n, t) for t in (np.float32, np.float32, np.int32)))
     for start in range(0, n, RAYS_AT_ONCE):
         block = slice(start, start + RAYS_AT_ONCE)
-        piece = _march(scene, moment, origins[block], directions[block])
+        piece = _march(scene, moment, code, origins[block], directions[block])
         out.rgb[block], out.depth[block] = piece.rgb, piece.depth
         out.opacity[block], out.samples[block] = piece.opacity, piece.samples
     return out
+
+
+def code_of(scene: Scene, appearance: np.ndarray | None) -> np.ndarray:
+    """The code to show a scene with, (H,) float32: 0, the average look, for None.
+
+    Raises:
+        ValueError: it is not (H,), or the scene has no appearances, so that its decoder knows no codes.
+    """
+    hidden = len(scene.decoder.b1)
+    if appearance is None:
+        return np.zeros(hidden, np.float32)
+    if np.shape(appearance) != (hidden,) or not scene.appearances:
+        raise ValueError(f"a code of shape {np.shape(appearance)} for {len(scene.appearances)} appearances of {hidden} numbers")
+    return np.asarray(appearance, np.float32)
 
 
 @dataclass(frozen=True)
@@ -186,25 +203,26 @@ def density(decoder: AnyDecoder, f: np.ndarray) -> np.ndarray:
 
 def activations(decoder: HybridDecoder, f: np.ndarray) -> np.ndarray:
     """h of `HybridDecoder`: (N, F) -> (N, G)."""
-    return np.clip(f @ decoder.v.T + decoder.a, 0, ACTIVATION_LIMIT)
+    return np.clip(f @ decoder.v.T + decoder.v_bias, 0, ACTIVATION_LIMIT)
 
 
-def direction_hidden(decoder: AnyDecoder, directions: np.ndarray) -> np.ndarray:
-    """w1 e(d) + b1 of unit directions (N, 3): (N, H)."""
+def hidden_layer(decoder: AnyDecoder, directions: np.ndarray, code: np.ndarray) -> np.ndarray:
+    """w1 e(d) + b1 + code of unit directions (N, 3) and an appearance's code (H,): (N, H), constant along a ray."""
     x, y, z = directions.T
     encoded = np.stack([x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
-    return encoded @ decoder.w1.T + decoder.b1
+    return encoded @ decoder.w1.T + (decoder.b1 + code)
 
 
-def direction_basis(decoder: Decoder, directions: np.ndarray) -> np.ndarray:
-    """basis(d) = w2 relu(w1 e(d) + b1) + b2 of unit directions (N, 3): (N, 3, F)."""
-    return np.einsum("cfh,nh->ncf", decoder.w2, np.maximum(direction_hidden(decoder, directions), 0), optimize=True) + decoder.b2
+def direction_basis(decoder: Decoder, directions: np.ndarray, code: np.ndarray) -> np.ndarray:
+    """basis(d) = w2 relu(hidden layer) + b2 of unit directions (N, 3): (N, 3, F)."""
+    hidden = np.maximum(hidden_layer(decoder, directions, code), 0)
+    return np.einsum("cfh,nh->ncf", decoder.w2, hidden, optimize=True) + decoder.b2
 
 
-def once_a_ray(decoder: AnyDecoder, directions: np.ndarray) -> np.ndarray:
+def once_a_ray(decoder: AnyDecoder, directions: np.ndarray, code: np.ndarray) -> np.ndarray:
     """What `colour` takes of unit directions (N, 3): their basis, or with a hybrid decoder their part of its hidden layer."""
-    terms = direction_hidden(decoder, directions) if isinstance(decoder, HybridDecoder) else direction_basis(decoder, directions)
-    return terms.astype(np.float32)
+    terms = hidden_layer if isinstance(decoder, HybridDecoder) else direction_basis
+    return terms(decoder, directions, code).astype(np.float32)  # type: ignore[arg-type]
 
 
 def colour(decoder: AnyDecoder, f: np.ndarray, terms: np.ndarray) -> np.ndarray:
@@ -231,13 +249,13 @@ def composite(alphas: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.nda
     return weights, through[np.arange(len(trans)), reached.sum(axis=1)], reached
 
 
-def _march(scene: Scene, moment: Moment, origins: np.ndarray, directions: np.ndarray) -> Rendering:
+def _march(scene: Scene, moment: Moment, code: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Rendering:
     n, path = len(origins), None
     if isinstance(scene.mapping, DeviceCoordinates):
         path = scene.mapping.path(origins, directions)
         origins, directions = path.begin, path.way
     near, far = sample_range(scene, origins, directions)
-    terms = once_a_ray(scene.decoder, directions)
+    terms = once_a_ray(scene.decoder, directions, code)
     rgb, depth = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
     trans, samples = np.ones(n, np.float32), np.zeros(n, np.int32)
     step = np.float32(scene.step)

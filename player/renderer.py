@@ -14,7 +14,7 @@ from kpc.format.grid import linear
 from kpc.format.scene import Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
-from kpc.player.reference import Part, Rendering, slot_at
+from kpc.player.reference import Part, Rendering, code_of, slot_at
 from kpc.player.textures import FOLDED_AXIS, Layout, Rows, decoder_arrays, decoder_shape, distances
 
 REFINED = 2
@@ -145,12 +145,14 @@ class Renderer:
         return sum(4 * t.width * t.height * t.components for t in textures) + int(self.scene.occupancy[0].size) + (
             0 if self._motion_texture is None else 16 * int(np.prod(self._motion_texture.size)))
 
-    def render(self, camera: Camera, time: float, *, part: Part = Part.FULL) -> Rendering:
+    def render(
+        self, camera: Camera, time: float, *, part: Part = Part.FULL, appearance: np.ndarray | None = None
+    ) -> Rendering:
         """What `kpc.player.reference.render` gives, by OpenGL."""
-        target = self.march(camera, time, part=Part.STATIC if part is Part.STATIC else Part.FULL)
+        target = self.march(camera, time, part=Part.STATIC if part is Part.STATIC else Part.FULL, appearance=appearance)
         rgb, depth, opacity, samples = _read(target)
         if part is Part.DYNAMIC:
-            rgb = np.abs(rgb - _read(self.march(camera, time, part=Part.STATIC))[0])
+            rgb = np.abs(rgb - _read(self.march(camera, time, part=Part.STATIC, appearance=appearance))[0])
         self.check()
         return Rendering(rgb, depth, opacity, samples)
 
@@ -164,18 +166,20 @@ class Renderer:
         look: Look = Look.COLOUR,
         depths: tuple[float, float] = (0.0, 1.0),
         most_samples: float = 64.0,
+        appearance: np.ndarray | None = None,
     ) -> None:
-        """Draw what `camera` sees over the whole of `screen`, stretched to its size.
+        """Draw what `camera` sees over the whole of `screen`, stretched to its size, `appearance` as in `reference.code_of`.
 
         Depth goes from bright to dark over `depths`, world units; samples up to `most_samples`.
         """
         if look is Look.OCCUPANCY:
             target = self.march(camera, time, part=Part.STATIC, program="cells.glsl")
         else:
-            target = self.march(camera, time, part=Part.STATIC if part is Part.STATIC else Part.FULL)
+            shown = Part.STATIC if part is Part.STATIC else Part.FULL
+            target = self.march(camera, time, part=shown, appearance=appearance)
         without, view = target, Look.COLOUR.value if look is Look.OCCUPANCY else look.value
         if part is Part.DYNAMIC and look is Look.COLOUR:
-            without, view = self.march(camera, time, part=Part.STATIC), 1
+            without, view = self.march(camera, time, part=Part.STATIC, appearance=appearance), 1
         present, vertices = self._program("present.glsl", self.layout)
         _set(
             present,
@@ -192,10 +196,14 @@ class Renderer:
         without.seen.use(WITHOUT_UNIT)
         self._draw(screen, vertices)
 
-    def march(self, camera: Camera, time: float, *, part: Part = Part.FULL, program: str = "march.glsl") -> Target:
+    def march(
+        self, camera: Camera, time: float, *, part: Part = Part.FULL, program: str = "march.glsl",
+        appearance: np.ndarray | None = None,
+    ) -> Target:
         """Draw into a target of the camera's size, which stays valid until the next march of the same part and size.
 
-        `part` is FULL or STATIC. `program` is march.glsl or another that takes a subset of its uniforms.
+        `part` is FULL or STATIC. `program` is march.glsl or another that takes a subset of its uniforms. `appearance` as in
+        `reference.code_of`.
         """
         moving = part is Part.FULL and self._rows is not None
         self._occupy(slot_at(self.scene, time))
@@ -213,6 +221,7 @@ class Renderer:
             lens=(camera.fl_x, camera.fl_y, camera.cx, camera.cy),
             axes=tuple(camera.camera_to_world[:3, :3].T.ravel()),
             eye=tuple(camera.camera_to_world[:3, 3]),
+            appearance=_vectors(code_of(self.scene, appearance)),
         )
         planes.use(PLANES_UNIT)
         self._row_texture.use(ROWS_UNIT)
@@ -258,6 +267,7 @@ class Renderer:
                 **decoder_shape(scene.decoder),
                 "ROWS": int(rows),
                 "EARLY": int(early),
+                "APPEARANCE": int(bool(scene.appearances)),
                 "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
                 "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
                 "MOTION": int(displaced),
@@ -350,6 +360,14 @@ def _set(program: moderngl.Program, **values: object) -> None:
         member = program.get(name, None)
         if isinstance(member, moderngl.Uniform):
             member.value = value
+
+
+def _vectors(code: np.ndarray) -> list[tuple[float, ...]] | tuple[float, ...]:
+    """A code as a uniform array of vec4s, padded with 0; moderngl wants an array of one without the brackets."""
+    padded = np.zeros((-(-len(code) // 4), 4))
+    padded.ravel()[: len(code)] = code
+    vectors = [tuple(map(float, vector)) for vector in padded]
+    return vectors if len(vectors) > 1 else vectors[0]
 
 
 def _frame_of(mapping: SpaceMapping | None) -> dict[str, object]:

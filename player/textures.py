@@ -129,7 +129,7 @@ def distances(occupied: np.ndarray) -> np.ndarray:
 def decoder_shape(decoder: AnyDecoder) -> dict[str, int]:
     """What march.glsl is told of it."""
     if isinstance(decoder, HybridDecoder):
-        return {"HYBRID": 1, "HIDDEN": -(-len(decoder.b1) // 4) * 4, "WIDTH": -(-len(decoder.a) // 4) * 4}
+        return {"HYBRID": 1, "HIDDEN": -(-len(decoder.b1) // 4) * 4, "WIDTH": -(-len(decoder.v_bias) // 4) * 4}
     return {"HYBRID": 0, "HIDDEN": len(decoder.b1) if decoder.w2.any() else 0}
 
 
@@ -139,7 +139,7 @@ def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[st
     Explicit: density_weight (F / 4), w1 (H x 3: nine columns, then b1, then zeros), w2 (3 x F / 4 x H), b2 (3 x F / 4),
     density_bias (1, in x). Without w1 and w2 where colour is the same from all sides, w2 being 0.
 
-    Hybrid, with G and H filled up with zeros to multiples of four: from_features (G x F / 4) is v, from_features_bias (G / 4) a,
+    Hybrid, with G and H filled up with zeros to multiples of four: from_features (G x F / 4) is v, from_features_bias (G / 4) v_bias,
     passed_on (H x G / 4) u; density_weight (G / 4), w1 (H x 3), w2 (3 x H / 4), b2 (1, in xyz), density_bias as above.
     """
     features = layout.scales * layout.layers * 4
@@ -156,7 +156,7 @@ def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[st
     if isinstance(decoder, HybridDecoder):
         arrays |= {
             "from_features": _filled(spread(decoder.v), 0),
-            "from_features_bias": _filled(decoder.a, 0),
+            "from_features_bias": _filled(decoder.v_bias, 0),
             "density_weight": _filled(decoder.density_weight, 0),
             "w1": _direction_layer(decoder),
             "passed_on": _filled(_filled(decoder.u, 0), 1),

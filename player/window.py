@@ -14,7 +14,7 @@ from imgui_bundle import imgui
 from kpc.format.errors import DisplayError
 from kpc.format.media import write_image
 from kpc.format.scene import Scene
-from kpc.player.controls import SPEEDS, Pace, Playback, View
+from kpc.player.controls import SPEEDS, Pace, Playback, View, Wardrobe
 from kpc.player.orbit import Rig
 from kpc.player.overlay import Overlay
 from kpc.player.reference import Part
@@ -32,6 +32,7 @@ KEYS = (
     ("L", "loop"),
     ("R", "back to the opening camera"),
     ("N", "the next camera of the scene"),
+    ("V", "the next appearance, if it has several"),
     ("1 2 3 4", "colour, depth, samples, occupancy"),
     ("C", "all, what stays, what moves"),
     ("F", "exact or folded time planes"),
@@ -153,6 +154,7 @@ class Player:
         self.camera_number = 0
         self.view = View.of(self.rig, self.rig.cameras[0])
         self.playback = Playback(scene.clip, playing=scene.clip.duration_s > 0)
+        self.wardrobe = Wardrobe(scene)
         self.pace = Pace(1 / 15 if software else 1 / 50)
         self.part, self.look = Part.FULL, Look.COLOUR
         self.show_hud, self.show_keys = True, False
@@ -194,6 +196,7 @@ class Player:
             self._type(key, mods)
         self.window.pressed.clear()
         self.playback.advance(seconds)
+        self.wardrobe.advance(seconds)
         self._draw(now)
         self._widgets()
         self._finish()
@@ -223,7 +226,8 @@ class Player:
 
     def _draw(self, now: float) -> None:
         """Draw the scene if anything has changed, finely once nothing does any more."""
-        wanted = (self.view, self.playback.time, self.part, self.look, self.renderer.folded)
+        worn = (self.wardrobe.number, self.wardrobe.progress)
+        wanted = (self.view, self.playback.time, self.part, self.look, self.renderer.folded, worn)
         if wanted != self._drawn:
             self._drawn, self._moved, self._is_sharp = wanted, now, False
             self._picture(self.pace.scale)
@@ -247,6 +251,7 @@ class Player:
             look=self.look,
             depths=self.depths,
             most_samples=self.most_samples,
+            appearance=self.wardrobe.code,
         )
         self.ctx.finish()
         self.draw_s = clock.monotonic() - started
@@ -315,6 +320,8 @@ class Player:
         elif key in (glfw.KEY_R, glfw.KEY_N):
             self.camera_number = (self.camera_number + 1) % len(self.rig.cameras) if key == glfw.KEY_N else 0
             self.view = View.of(self.rig, self.rig.cameras[self.camera_number])
+        elif key == glfw.KEY_V:
+            self.wardrobe.next()
         elif glfw.KEY_1 <= key < glfw.KEY_1 + len(LOOKS):
             self.look = list(LOOKS)[key - glfw.KEY_1]
         elif key == glfw.KEY_C and self.scene.is_dynamic:
@@ -376,6 +383,13 @@ class Player:
             for look, label in LOOKS.items():
                 if imgui.radio_button(label, self.look is look):
                     self.look = look
+            if self.scene.appearances:
+                imgui.separator()
+                imgui.text_disabled("appearance")
+                imgui.set_next_item_width(12 * em)
+                changed, chosen = imgui.combo("##appearance", self.wardrobe.number, list(self.wardrobe.names))
+                if changed:
+                    self.wardrobe.wear(chosen)
             if self.scene.is_dynamic:
                 imgui.separator()
                 for part, label in PARTS.items():

@@ -87,7 +87,7 @@ def chunks(data, partial):  # sections 3, 4 and 10
         require(kind.isalpha() and reserved == 0 and offset == expected and raw <= largest_raw, "index entry")
         expected += stored
         body = data[offset:offset + stored]
-        known = kind in (b"SCNE", b"DECO", b"OCCU", b"PLNE", b"WARP", b"MOVE", b"HYBR", b"came")
+        known = kind in (b"SCNE", b"DECO", b"HYBR", b"OCCU", b"PLNE", b"WARP", b"MOVE", b"came", b"appe")
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
         if len(body) < stored:
@@ -136,7 +136,8 @@ def decode(data, partial=False):
     expected = sum(s["channels"] for s in scene["scales"])
     scene |= hybrid_chunk(Bytes(parts["HYBR"]), expected) if "HYBR" in parts else decoder_chunk(Bytes(parts["DECO"]), expected)
     scene |= occupancy_chunk(Bytes(parts["OCCU"]))
-    scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") else []
+    scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") is not None else []
+    scene["appearances"] = appearances_chunk(Bytes(parts["appe"]), scene["hidden"]) if parts.get("appe") is not None else {}
 
     for scale in scene["scales"]:
         for plane in scale["planes"].values():  # uncoded until a segment says otherwise
@@ -258,7 +259,7 @@ def decoder_chunk(chunk, expected):  # section 7
 def hybrid_chunk(chunk, expected):  # section 7
     features, width, hidden, bias = chunk.unpack("HHHf")
     require(features == expected and 1 <= width <= 256 and 1 <= hidden <= 256 and math.isfinite(bias), "decoder sizes")
-    weights = {"v": width * features, "a": width, "density_weight": width, "w1": hidden * 9, "b1": hidden,
+    weights = {"v": width * features, "v_bias": width, "density_weight": width, "w1": hidden * 9, "b1": hidden,
                "u": hidden * width, "w2": 3 * hidden, "b2": 3}
     return halves(chunk, weights) | {"density_bias": bias, "hidden": hidden, "width": width}
 
@@ -290,8 +291,28 @@ def cameras_chunk(chunk):  # section 9
     return cameras
 
 
-def render_ray(scene, origin, direction, time):  # section 11
-    """(rgb, opacity, depth) that a ray sees."""
+def appearances_chunk(chunk, expected):  # section 9
+    """{name: code}"""
+    count, hidden = chunk.unpack("HH")
+    require(1 <= count <= 16384 and hidden == expected, "number of appearances or of hidden units")
+    codes = [chunk.unpack(f"{hidden}e") for _ in range(count)]
+    require(all(math.isfinite(a) for code in codes for a in code), "codes")
+    appearances = {}
+    for code in codes:
+        length, = chunk.unpack("B")
+        try:
+            name = chunk.take(length).decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise Refused("name") from error
+        require(name and name not in appearances, "name empty or twice")
+        require(not any(ord(c) < 0x20 or 0x7F <= ord(c) <= 0x9F for c in name), "control character")
+        appearances[name] = code
+    chunk.end()
+    return appearances
+
+
+def render_ray(scene, origin, direction, time, appearance=None):  # section 11
+    """(rgb, opacity, depth) that a ray sees, with the appearance of that name."""
     low, high = scene["aabb"]
     world = float  # the distance in the world of one along the ray
     if scene["frame"]:
@@ -310,7 +331,7 @@ def render_ray(scene, origin, direction, time):  # section 11
     if even:
         t_near, t_out = 0.0, (2 - 1 / 256) * even  # of s
 
-    towards = looking(scene, direction)
+    towards = looking(scene, direction, scene["appearances"][appearance] if appearance else [0.0] * scene["hidden"])
     slot = min(math.floor(time * scene["slots"]), scene["slots"] - 1)
     colour, depth, T, k = [0.0, 0.0, 0.0], 0.0, 1.0, 0
     while T >= 1 / 1024 and t_near + (k + 0.5) * scene["step"] < t_out:
@@ -329,7 +350,7 @@ def render_ray(scene, origin, direction, time):  # section 11
             continue
         f = features(scene, dict(zip("xyzt", [*moved(scene["motion"], u, time), time])))
         if scene["width"]:
-            f = clipped(layer(scene["v"], scene["a"], f))
+            f = clipped(layer(scene["v"], scene["v_bias"], f))
         log_density = dot(f, scene["density_weight"]) + scene["density_bias"]
         alpha = 1 - math.exp(-math.exp(min(max(log_density, -20.0), 20.0)) * length / extent)
         w = T * alpha
@@ -418,10 +439,11 @@ def clipped(values):
     return [min(max(x, 0.0), 65504.0) for x in values]
 
 
-def looking(scene, direction):
+def looking(scene, direction, code):
     """What colours take of a ray: the basis of its direction, or with a hybrid decoder its part of the hidden layer."""
     x, y, z = direction
     hidden = layer(scene["w1"], scene["b1"], [x, y, z, x * x, y * y, z * z, x * y, y * z, z * x])
+    hidden = [x + c for x, c in zip(hidden, code)]
     if scene["width"]:
         return hidden
     F = len(scene["density_weight"])

@@ -125,6 +125,29 @@ def write_surrounded(folder: Path, images: int = 40) -> list[Camera]:
     return rig
 
 
+def write_unequal(folder: Path, images: int = 32, own_lens: bool = True, unequal: bool = True) -> list[Camera]:
+    """A patterned ball of radius 0.7 on nothing, from all around; each image has an exposure and a white balance of its own where
+    `unequal`, drawn from a fixed seed, and a lens of its own where `own_lens`. Every eighth image tests."""
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    rng, rig, frames = np.random.default_rng(11), [], []
+    for k in range(images):
+        angle, height = 2 * np.pi * k / images, (0.4, 1.2, -0.3)[k % 3]
+        camera = look_at((2.4 * np.sin(angle), -2.4 * np.cos(angle), height), width=32, height=32)
+        focal = camera.fl_x * (1 + 0.002 * k * own_lens)
+        rig.append(Camera(32, 32, focal, focal, 16, 16, camera.camera_to_world))
+        gain = rng.uniform(0.45, 1.0) * rng.uniform(0.75, 1.0, 3) if unequal else np.full(3, 0.65)
+        origins, directions = rig[-1].rays()
+        along = -(origins * directions).sum(1)
+        beside = np.linalg.norm(origins + directions * along[:, None], axis=1)
+        met = origins + directions * (along - np.sqrt(np.maximum(0.49 - beside**2, 0)))[:, None]
+        pattern = 150 + 100 * np.sin(5 * met @ np.array([[1, 0.3, 0], [0, 1, 0.5], [0.6, -0.8, 1]]))
+        pixels = np.concatenate([gain * pattern, 255.0 * (beside < 0.7)[:, None]], axis=1)
+        write_image(folder / "images" / f"{k:04d}.png", np.rint(pixels).astype(np.uint8).reshape(32, 32, 4))
+        frames.append({"file_path": f"images/{k:04d}.png", "transform_matrix": camera.camera_to_world.tolist(), "fl_x": focal})
+    (folder / "transforms.json").write_text(json.dumps({"w": 32, "h": 32, "cx": 16, "cy": 16, "fl_x": 1, "frames": frames}))
+    return rig
+
+
 COLMAP_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 
 

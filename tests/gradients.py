@@ -96,9 +96,9 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
 def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict[str, np.ndarray]:
     """The same by autograd through `render_reference`, in float64."""
     field = Field.from_scene(scene).double()
-    rays = Rays(*(a.double() for a in vars(rays).values()))
+    rays = rays.apply(torch.Tensor.double)
     basis = field.basis(rays.directions).detach().requires_grad_()
-    field.basis = lambda directions: basis  # type: ignore[method-assign]
+    field.basis = lambda directions, codes: basis  # type: ignore[method-assign]
     aabb, occupancy = torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy)
     rgb, distortion, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step, mapping=scene.mapping)
     squared = (rgb - targets.double()).square()

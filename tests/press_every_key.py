@@ -32,6 +32,10 @@ def main(scene_file: str) -> None:
         window._clicked(None, button, glfw.RELEASE, 0)
         player.frame()
 
+    def canvas() -> np.ndarray:
+        player._picture(1.0)
+        return np.frombuffer(player.canvas.read(components=3, alignment=1), np.uint8).astype(int)
+
     player.frame()
     assert player.playback.playing
     press(glfw.KEY_SPACE)
@@ -53,6 +57,16 @@ def main(scene_file: str) -> None:
     folded = player.renderer.folded
     press(glfw.KEY_F)
     assert player.renderer.folded is not folded
+
+    average = canvas()
+    for number, name in enumerate(("dawn.jpg", "noon.jpg", "dusk.jpg"), 1):
+        press(glfw.KEY_V)
+        assert player.wardrobe.number == number and player.wardrobe.names[number] == name
+    player.wardrobe.advance(1.0)
+    assert np.abs(canvas() - average).max() > 10
+    press(glfw.KEY_V)
+    player.wardrobe.advance(1.0)
+    assert np.array_equal(canvas(), average)
 
     before = player.view
     drag(0, 30, 10)

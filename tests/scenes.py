@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.format.cameras import Camera
-from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Clip, Decoder, HybridDecoder, Scene
+from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates
 
 
@@ -83,10 +83,17 @@ def hybrid(scene: Scene, seed: int = 6, width: int = 6, hidden: int = 7) -> Scen
     """A scene with a hybrid decoder, of widths that fill no vectors of four, about as dense as before."""
     rng = np.random.default_rng(seed)
     F = scene.decoder.w2.shape[1]
-    shapes = {"v": (width, F), "a": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
+    shapes = {"v": (width, F), "v_bias": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
               "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
     weights = {name: rng.normal(0.0, 2.0 / np.sqrt(shape[-1]), shape).astype(np.float32) for name, shape in shapes.items()}
     return replace(scene, decoder=HybridDecoder(density_bias=3.5, **weights))
+
+
+def varied(scene: Scene, names: tuple[str, ...] = ("dawn.jpg", "noon.jpg", "dusk.jpg"), seed: int = 7) -> Scene:
+    """A scene whose pictures disagree about its colours: an appearance of each name, their codes random, of mean 0."""
+    codes = np.random.default_rng(seed).normal(0, 1, (len(names), len(scene.decoder.b1)))
+    codes = (codes - codes.mean(0)).astype(np.float32)
+    return replace(scene, appearances=tuple(Appearance(name, code) for name, code in zip(names, codes, strict=True)))
 
 
 SPACES: dict[str, Callable[[Scene], Scene]] = {

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import tiny_scene
+from scenes import tiny_scene, varied
 
 from kpc.format.scene import Clip
-from kpc.player.controls import SPEEDS, Pace, Playback, View
+from kpc.player.controls import FADE_S, SPEEDS, Pace, Playback, View, Wardrobe
 from kpc.player.orbit import Rig
 
 SCENE = tiny_scene(0)
@@ -114,3 +114,35 @@ def test_the_pace_settles_where_pictures_come_in_time(full_s: float, low: float,
     for _ in range(40):
         pace.saw(full_s * pace.scale**2)
     assert low <= pace.scale <= high
+
+
+def test_appearances_follow_one_another_smoothly_and_end_where_they_began() -> None:
+    scene = varied(tiny_scene())
+    codes = [np.zeros(16, np.float32), *(appearance.code for appearance in scene.appearances)]
+    wardrobe = Wardrobe(scene)
+    assert wardrobe.names == ("average", "dawn.jpg", "noon.jpg", "dusk.jpg") and not wardrobe.code.any()
+    for number in (1, 2, 3, 0):
+        before = wardrobe.code
+        wardrobe.next()
+        np.testing.assert_allclose(wardrobe.code, before, atol=1e-6)  # nothing jumps
+        wardrobe.advance(FADE_S / 2)
+        np.testing.assert_allclose(wardrobe.code, (before + codes[number]) / 2, atol=1e-6)
+        wardrobe.advance(FADE_S)
+        np.testing.assert_allclose(wardrobe.code, codes[number], atol=1e-6)
+        assert wardrobe.number == number and wardrobe.progress == 1
+    wardrobe.next()
+    wardrobe.advance(FADE_S / 4)
+    shown = wardrobe.code
+    wardrobe.wear(3)  # in the midst of another change
+    np.testing.assert_allclose(wardrobe.code, shown, atol=1e-6)
+    wardrobe.advance(FADE_S / 4)
+    half_way = wardrobe.code
+    wardrobe.wear(3)  # where it is going anyway
+    np.testing.assert_array_equal(wardrobe.code, half_way)
+
+
+def test_a_scene_of_one_appearance_knows_no_other() -> None:
+    wardrobe = Wardrobe(tiny_scene())
+    wardrobe.next()
+    wardrobe.advance(1.0)
+    assert wardrobe.code is None and wardrobe.number == 0 and wardrobe.names == ("average",)

@@ -154,6 +154,7 @@ def test_features_multiply_planes_and_concatenate_scales() -> None:
         {"channels": 0}, {"steps": 0}, {"rays": -1}, {"resolutions": ()}, {"resolutions": (64, 1)}, {"object_rays": 1.0},
         {"temporal_start": -0.1}, {"temporal_floor": 1.1},
         {"channel_dropout": -0.1}, {"channel_dropout": 1.0},
+        {"appearance": "sometimes"}, {"appearance": "image", "view_dependent": False},
     ],
 )
 def test_a_config_that_makes_no_sense_is_refused(change: dict[str, object]) -> None:

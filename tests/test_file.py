@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import displaced, faced, tiny_scene
+from scenes import displaced, faced, tiny_scene, varied
 
 import kpc
 from kpc.format.cameras import Camera
 from kpc.format.container import HEADER, Reader
 from kpc.format.errors import BudgetError, FormatError
-from kpc.format.file import SceneReader, encode, read, write
+from kpc.format.file import APPEARANCE_LIMIT, NAME_LIMIT, SceneReader, encode, read, write
 from kpc.format.motion import STEP, QuantisedMotion
 from kpc.format.quantise import QuantisedScene, quantise_scene
-from kpc.format.scene import TIME_PLANES
+from kpc.format.scene import TIME_PLANES, Appearance
 from kpc.format.space import Contraction, DeviceCoordinates
 
 
@@ -40,6 +40,9 @@ def assert_same(a: QuantisedScene, b: QuantisedScene) -> None:
         assert np.array_equal(one.camera_to_world, other.camera_to_world)
         assert [getattr(one, k) for k in ("width", "height", "fl_x", "fl_y", "cx", "cy")] == \
             [getattr(other, k) for k in ("width", "height", "fl_x", "fl_y", "cx", "cy")]
+    assert [one.name for one in a.appearances] == [other.name for other in b.appearances]
+    for one, other in zip(a.appearances, b.appearances, strict=True):
+        assert one.code.dtype == other.code.dtype and np.array_equal(one.code, other.code)
     assert [list(s) for s in a.scales] == [list(s) for s in b.scales]
     for one, other in zip(a.scales, b.scales, strict=True):
         for name in one:
@@ -121,6 +124,39 @@ def test_a_motion_grid_counts_against_the_budget():
     assert len(data) < least
     with pytest.raises(BudgetError, match="motion grid"):
         read(data, memory_budget=least + 10_000)
+
+
+def quantised_varied(names: tuple[str, ...] = ("dawn.jpg", "noon.jpg", "dusk.jpg")) -> QuantisedScene:
+    scene = varied(tiny_scene(), names)
+    return quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
+
+
+def test_appearances_come_back_and_say_so_in_a_chunk_of_their_own():
+    coded = quantised_varied(("cam 1.mp4", "東京/夜:1.jpg", "x" * NAME_LIMIT))
+    data = encode(coded)
+    assert_same(read(data), coded)
+    assert [e.kind for e in Reader(data).index][:6] == ["SCNE", "DECO", "OCCU", "came", "appe", "PLNE"]
+    assert "appe" not in [e.kind for e in Reader(encode(quantised())).index]
+    scene = read(data).dequantise()
+    assert scene.parameter_count == coded.parameter_count == quantised().parameter_count + 3 * 16
+    for ours, theirs in zip(scene.appearances, varied(tiny_scene()).appearances, strict=True):
+        np.testing.assert_allclose(ours.code, theirs.code, rtol=2.0**-11)  # float16 rounds to the nearest
+
+
+def test_a_prefix_without_the_appearances_plays_the_average():
+    data = encode(quantised_varied())
+    index = Reader(data).index
+    assert read(data[:index[4].offset], allow_partial=True).appearances == ()
+    assert len(read(data[:index[5].offset], allow_partial=True).appearances) == 3
+
+
+def test_appearances_count_against_the_budget():
+    scene = quantised(scales=1, channels=1, resolution=(2, 2, 2), time=1)
+    codes = np.zeros((APPEARANCE_LIMIT, 16), np.float32)
+    data = encode(replace(scene, appearances=tuple(Appearance(f"{k:0200}", code) for k, code in enumerate(codes))))
+    assert len(read(data).appearances) == APPEARANCE_LIMIT and len(data) < 300_000
+    with pytest.raises(BudgetError, match="appearances"):
+        read(data, memory_budget=8_000_000)
 
 
 def test_rows_in_time_may_differ_from_scale_to_scale():
@@ -333,6 +369,14 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
     (lambda s: {"scales": s.scales[:1]}, "decoder"),
     (lambda s: {"scales": ({k: v for k, v in s.scales[0].items() if k != "yt"},)}, "scale 0 holds planes"),
     (lambda s: {"decoder": replace(s.decoder, w1=s.decoder.w1 + np.float32(1e-5))}, "float16"),
+    (lambda s: {"appearances": (Appearance("a", np.zeros(15, np.float32)),)}, "shapes"),
+    (lambda s: {"appearances": (Appearance("a", np.full(16, 0.1, np.float32)),)}, "float16"),
+    (lambda s: {"appearances": (Appearance("a", np.full(16, np.inf, np.float32)),)}, "infinite"),
+    (lambda s: {"appearances": 2 * (Appearance("a", np.zeros(16, np.float32)),)}, "there twice"),
+    (lambda s: {"appearances": (Appearance("", np.zeros(16, np.float32)),)}, "empty"),
+    (lambda s: {"appearances": (Appearance("a\nb", np.zeros(16, np.float32)),)}, "control character"),
+    (lambda s: {"appearances": (Appearance("\ud800", np.zeros(16, np.float32)),)}, "UTF-8"),
+    (lambda s: {"appearances": (Appearance("x" * 256, np.zeros(16, np.float32)),)}, "does not fit"),
     (lambda s: {"cameras": (Camera(70000, 4, 5.0, 5.0, 1.0, 1.0, np.eye(4)),)}, "does not fit"),
     (lambda s: {"scales": (s.scales[0], {**s.scales[1], "xt": replace(
         s.scales[1]["xt"], offset=np.zeros(8, np.float32))})}, "offset of a time plane"),

@@ -1,5 +1,6 @@
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import gl
@@ -103,8 +104,9 @@ def test_ablate_changes_one_thing_at_a_time(
 
 def test_every_ablation_changes_something_somewhere() -> None:
     plain = PRESETS["balanced"]
-    lone = plain.for_lone_object()
-    assert set(changed_by(plain)) | set(changed_by(lone)) == set(ABLATIONS)
+    lone, unequal = plain.for_lone_object(), replace(plain, appearance="image")
+    assert set(changed_by(plain)) | set(changed_by(lone)) | set(changed_by(unequal)) == set(ABLATIONS)
+    assert "no appearances" in changed_by(unequal) and "no appearances" not in changed_by(plain)
     assert "no motion grid" in changed_by(lone) and "no motion grid" not in changed_by(plain)
     assert "one colour from all sides" not in changed_by(lone) and changed_by(plain)[0] == "as it is"
     assert ABLATIONS["as it is"](plain) is plain

@@ -60,6 +60,7 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make.write_n3dv(folder / "n3dv", cameras=4)
     make.write_blender(folder / "blender")
     make.write_nerfstudio(folder / "nerfstudio")
+    make.write_unequal(folder / "unequal")
     make.write_colmap(folder / "colmap", model="OPENCV", lens=(0.06, -0.08, -0.001, 0.0002))
     for k in range(10):
         make.write_mask(folder / f"colmap/masks/{k:04d}.png.png", np.arange(32) + np.zeros((24, 1)) > k)
@@ -450,6 +451,53 @@ def test_space_is_a_box_where_something_bounds_it(run: Kpenc, sets: Path, name: 
     assert code == 0 and json.loads(out)["space"] == "box" and why in err
 
 
+@pytest.mark.parametrize("asked, names", [("auto", "image"), ("image", "image"), ("camera", "camera"), ("none", "none")])
+def test_appearances_are_chosen_said_and_overridden(run: Kpenc, sets: Path, tmp_path: Path, asked: str, names: str) -> None:
+    code, out, err = run(sets / "unequal", "--appearance", asked, "--steps", "60")
+    assert code == 0 and ("28 of 28 pictures have a lens" if asked == "auto" else "as told") in err
+    assert ("appearance: none" if names == "none" else f"appearance: a code for each {names} (") in err
+    assert ("right halves, each in an appearance fitted to its left half" in out) == (names != "none")
+    scene = file.read(tmp_path / "out.kpc")
+    found = [appearance.name for appearance in scene.appearances]
+    endings = {"image": ".png", "camera": "", "none": ""}
+    assert found == ([] if names == "none" else [f"{k:04d}{endings[names]}" for k in range(32) if k % 8])
+    assert names == "none" or np.abs([appearance.code for appearance in scene.appearances]).max() > 0.01
+
+
+def test_appearances_in_numbers_and_in_the_plan(run: Kpenc, sets: Path) -> None:
+    code, out, _ = run(sets / "unequal", "--json", "--test-views", "2")
+    result = json.loads(out)
+    assert code == 0 and (result["appearance"], result["appearances"], result["test_pictures"]) == ("image", 28, 2)
+    assert 5 < result["test_psnr"] < 60
+    code, out, err = run(sets / "unequal", "--dry-run", "--json")
+    assert code == 0 and "appearance: a code for each image" in err and json.loads(out)["rest_s"] > 0
+    code, out, err = run(sets / "n3dv", "--json", "--steps", "2")
+    assert code == 0 and json.loads(out)["appearance"] == "none" and "appearance: none (a clip, filmed as one" in err
+    code, out, err = run(sets / "n3dv", "--json", "--steps", "2", "--holdout", "none", "--appearance", "camera")
+    assert code == 0 and (json.loads(out)["appearances"], json.loads(out)["test_psnr"]) == (4, None)
+
+
+def test_a_lone_object_gets_colour_by_direction_where_appearances_are_asked_for(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+    for options, directed in (((), False), (("--appearance", "image"), True)):
+        assert run(sets / "blender", *options)[0] == 0
+        scene = file.read(tmp_path / "out.kpc")
+        assert bool(scene.decoder.w2.any()) == bool(scene.appearances) == directed
+
+
+def test_an_interrupted_run_with_appearances_resumes_to_the_same_file_but_not_with_others(
+    run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(sets / "unequal")[0] == 0
+    whole = (tmp_path / "out.kpc").read_bytes()
+    with monkeypatch.context() as patch:
+        _signal_at_step(patch, 13, signal.SIGINT)
+        assert run(sets / "unequal")[0] == 130
+    code, _, err = run(sets / "unequal", "--resume", "--appearance", "none")
+    assert code == 1 and "other settings" in err
+    code, _, err = run(sets / "unequal", "--resume")
+    assert code == 0 and "resumed at step 13" in err and (tmp_path / "out.kpc").read_bytes() == whole
+
+
 def test_device_coordinates_for_cameras_that_face_one_way(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     code, out, err = run(sets / "n3dv", "--json", "--space", "ndc")
     scene = file.read(tmp_path / "out.kpc")
@@ -522,6 +570,7 @@ def test_outputs_that_cannot_be(run: Kpenc, sets: Path, tmp_path: Path) -> None:
         ("--box", "1,0,0,0,1,1"),
         ("--preset", "huge"),
         ("--device", "tpu"),
+        ("--appearance", "video"),
         ("--nonsense",),
     ],
 )

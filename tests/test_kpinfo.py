@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from scenes import displaced, faced, surrounded, tiny_scene
+from scenes import displaced, faced, surrounded, tiny_scene, varied
 
 from kpc.format.container import Reader
 from kpc.format.file import write
@@ -85,6 +85,22 @@ def test_a_scene_with_a_motion_grid(tmp_path, capsys):
     motion = json.loads(capsys.readouterr().out)["motion"]
     assert motion["rows"] == 6 and motion["nodes_zyx"] == [3, 2, 4]
     assert motion["largest"] == pytest.approx(np.abs(scene.motion).max(), abs=STEP / 2 + 1e-7)
+
+
+def test_a_scene_with_appearances(tmp_path, capsys):
+    names = tuple(f"{k:02}.jpg" for k in range(11))
+    scene = varied(tiny_scene(), names)
+    path = tmp_path / "varied.kpc"
+    write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), path)
+    assert kpinfo.main([str(path), "--verify"]) == 0
+    page = capsys.readouterr().out
+    assert "appearances 11: 00.jpg, 01.jpg" in page and "07.jpg, ..." in page and "08.jpg" not in page and "appe" in page
+    assert kpinfo.main([str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["appearances"] == [*names]
+    data = bytearray(path.read_bytes())
+    data[Reader(bytes(data)).index[4].offset + 2] ^= 1
+    path.write_bytes(data)
+    assert kpinfo.main([str(path), "--verify"]) == 1 and "4 (appe)" in capsys.readouterr().err
 
 
 def test_verify_lists_every_damaged_chunk(scene_file, capsys):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import tiny_scene
+from scenes import tiny_scene, varied
 
 from kpc.format.file import write
 from kpc.format.media import read_image
@@ -17,7 +17,7 @@ from kpc.format.quantise import quantise_scene
 @pytest.fixture(scope="module")
 def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scene") / "tiny.kpc"
-    scene = tiny_scene(4)
+    scene = varied(tiny_scene(4))
     write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
     return path
 

@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
-from scenes import surrounded, tiny_scene
+from scenes import surrounded, tiny_scene, varied
 
 import kpc
 from kpc.format.cameras import load_shots
@@ -167,6 +167,48 @@ def test_static_and_dynamic_only(run, scene_file: Path, tmp_path: Path) -> None:
     difference = np.abs(pictures[""] - pictures["--static-only"])
     assert difference.max() > 5
     assert np.abs(difference - pictures["--dynamic-only"]).max() <= 1
+
+
+@pytest.fixture(scope="module")
+def varied_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("varied") / "varied.kpc"
+    scene = varied(tiny_scene(4), ("dawn.jpg", "5:00 pm", "a/b.jpg", "x:y:0.5"))
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    return path
+
+
+@pytest.mark.parametrize("backend", ["gl", "reference"])
+@pytest.mark.parametrize("text, one, other, share", [
+    ("dawn.jpg", 0, 0, 0), ("x:y:0.5", 3, 3, 0), ("dawn.jpg:5:00 pm:0.3", 0, 1, 0.3), ("5:00 pm:a/b.jpg:1", 1, 2, 1.0),
+    ("x:y:0.5:dawn.jpg:0.75", 3, 0, 0.75),
+])
+def test_appearances_by_name_and_between_two(
+    run, varied_file: Path, tmp_path: Path, backend: str, text: str, one: int, other: int, share: float
+) -> None:
+    if backend == "gl":
+        gl.context()
+    code, _, _ = run(varied_file, "--time", 0.4, "--appearance", text, "--backend", backend, "-o", tmp_path / "x.png")
+    assert code == 0
+    scene = kpc.load(varied_file)
+    codes = [appearance.code for appearance in scene.appearances]
+    wanted, average = (
+        kpc.render(scene, scene.cameras[0], 0.4, appearance).rgb
+        for appearance in ((1 - share) * codes[one] + share * codes[other], None)
+    )
+    assert np.abs(read_image(tmp_path / "x.png") / 255 - wanted).max() < 1.5 / 255
+    assert np.abs(wanted - average).max() > 5 / 255
+
+
+@pytest.mark.parametrize("text, words", [
+    ("dusk.jpg", "'dusk.jpg'"), ("", "''"), ("dawn.jpg:dusk.jpg", "'dawn.jpg:dusk.jpg'"), ("dawn.jpg:dusk.jpg:0.5", "'dusk.jpg'"),
+    ("dawn.jpg:a/b.jpg:1.5", "not a share"), ("dawn.jpg:a/b.jpg:x", "not a share"),
+])
+def test_appearances_that_are_not_there(run, varied_file: Path, scene_file: Path, tmp_path: Path, text: str, words: str) -> None:
+    arguments = ("--appearance", text, "--time", 0, "--backend", "reference", "-o", tmp_path / "x.png")
+    code, _, complaint = run(varied_file, *arguments)
+    assert code == 2 and words in complaint and complaint.count("\n") == 1
+    code, _, complaint = run(scene_file, *arguments)
+    assert code == 2 and ("none" in complaint or words == "not a share") and not (tmp_path / "x.png").exists()
 
 
 @pytest.mark.parametrize(

@@ -204,7 +204,8 @@ def test_without_masks_the_same_rays_are_drawn_as_ever(tmp_path: Path) -> None:
         make.write_mask(folder / f"masks/{k:04d}.png", np.ones(SIZE, bool))
     whole = load(folder)
     assert whole.masks is not None
-    (rays, targets), (same_rays, same_targets) = (RaySampler(d).draw(np.random.default_rng(5), 500) for d in (plain, whole))
+    (rays, targets), (same_rays, same_targets) = (
+        RaySampler(d, appearances=np.arange(10)).draw(np.random.default_rng(5), 500) for d in (plain, whole))
     for a, b in zip((*vars(rays).values(), targets), (*vars(same_rays).values(), same_targets), strict=True):
         np.testing.assert_array_equal(a.numpy(), b.numpy())
 

@@ -1,12 +1,14 @@
 """The reference renderer against the normative text, done ray by ray and sample by sample in float64."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import look_at, tiny_scene
+from scenes import look_at, tiny_scene, varied
 
 from kpc.format.cameras import Camera
+from kpc.format.errors import UsageError
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TERMINATION, Scene
 from kpc.player import reference
 from kpc.player.reference import Part, render, render_rays
@@ -153,3 +155,40 @@ def test_times_outside_the_clip_are_refused(time: float) -> None:
     scene = tiny_scene(0)
     with pytest.raises(ValueError, match="outside"):
         render(scene, Camera(2, 2, 1, 1, 1, 1, np.eye(4)), time)
+
+
+@pytest.mark.parametrize("part", Part)
+def test_an_appearance_is_a_change_of_the_hidden_bias_and_of_colour_alone(part: Part) -> None:
+    scene = varied(tiny_scene(4))
+    camera, code = scene.cameras[0].resized(24, 18), scene.appearance("noon.jpg")
+    average, shown = (render(scene, camera, 0.3, part=part, appearance=a) for a in (None, code))
+    biased = replace(scene, decoder=replace(scene.decoder, b1=scene.decoder.b1 + code))
+    np.testing.assert_allclose(shown.rgb, render(biased, camera, 0.3, part=part).rgb, atol=1e-5)
+    assert np.abs(shown.rgb - average.rgb).max() > 0.05
+    for name in ("depth", "opacity", "samples"):
+        np.testing.assert_array_equal(getattr(shown, name), getattr(average, name))
+    zero = render(scene, camera, 0.3, part=part, appearance=np.zeros_like(code))
+    np.testing.assert_array_equal(zero.rgb, average.rgb)
+
+
+def test_codes_that_no_decoder_knows_are_refused() -> None:
+    scene = varied(tiny_scene(4))
+    with pytest.raises(ValueError, match="shape"):
+        render(scene, scene.cameras[0], 0.3, appearance=np.zeros(15, np.float32))
+    with pytest.raises(ValueError, match="0 appearances"):
+        render(tiny_scene(4), scene.cameras[0], 0.3, appearance=np.zeros(16, np.float32))
+
+
+def test_appearances_by_name_and_between_two() -> None:
+    scene = varied(tiny_scene(4))
+    dawn, noon, _ = (appearance.code for appearance in scene.appearances)
+    assert scene.appearance("noon.jpg") is noon
+    np.testing.assert_array_equal(scene.appearance_between("dawn.jpg", "noon.jpg", 0), dawn)
+    np.testing.assert_array_equal(scene.appearance_between("dawn.jpg", "noon.jpg", 1), noon)
+    np.testing.assert_allclose(scene.appearance_between("dawn.jpg", "noon.jpg", 0.25), 0.75 * dawn + 0.25 * noon, atol=1e-6)
+    with pytest.raises(UsageError, match="'night.jpg'.*dawn.jpg, noon.jpg, dusk.jpg$"):
+        scene.appearance("night.jpg")
+    with pytest.raises(UsageError, match="none.*leave it out"):
+        tiny_scene(4).appearance("noon.jpg")
+    with pytest.raises(UsageError, match=r"7.jpg, \.\.\.$"):
+        varied(tiny_scene(4), tuple(f"{k}.jpg" for k in range(9))).appearance("noon.jpg")

@@ -11,7 +11,7 @@ from scenes import hybrid, tiny_scene
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.field import Field, HybridField, Layout, bilinear
-from kpc.encoder.render import Rays, collected, composite, fused_features, samples_of
+from kpc.encoder.render import Rays, collected, fused_features, meet, samples_of, shade
 from kpc.encoder.train import Figures, PlainOptimiser, sample_capacity
 from kpc.player import reference
 
@@ -45,8 +45,8 @@ def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(sh
         assert torch.equal(getattr(found, name)[:n], getattr(wanted, name)[:n]), name
     assert len(found.ray) == n + (0 if short else 500) and not found.length[n:].any() and short < n
     if not short:
-        one, two = (composite(field, rays, s, field.features, scene.extent) for s in (wanted, found))
-        assert torch.equal(one.rgb, two.rgb) and torch.equal(one.weights, two.weights[:n])
+        one, two = (meet(field, rays, s, field.features, scene.extent) for s in (wanted, found))
+        assert torch.equal(shade(field, rays, one), shade(field, rays, two)) and torch.equal(one.weights, two.weights[:n])
         assert torch.isclose(one.distortion, two.distortion, rtol=1e-5)
 
 
@@ -61,18 +61,18 @@ def test_mixed_precision_is_float32_within_its_bound(decoder: str) -> None:
     scene = hybrid(scene) if decoder == "hybrid" else scene
     rays = rays_at(scene, 203)
     samples = samples_of(rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step)
-    met, gradients, features = {}, {}, {}
+    rgb, gradients, features = {}, {}, {}
     for mixed in (False, True):
         field = Field.from_scene(scene)
         field.mixed = mixed
         features[mixed] = field.features(samples.points, rays.times[samples.ray]).detach()
-        met[mixed] = composite(field, rays, samples, field.features, scene.extent)
-        met[mixed].rgb.square().mean().backward()
+        rgb[mixed] = shade(field, rays, meet(field, rays, samples, field.features, scene.extent))
+        rgb[mixed].square().mean().backward()
         gradients[mixed] = {name: p.grad for name, p in field.named_parameters()}
         assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in field.parameters())
     assert ((features[True] - features[False]).abs() <= 6 / 2**11 * features[False].abs() * 1.01).all()
     assert not torch.equal(features[True], features[False])
-    assert (met[True].rgb - met[False].rgb).abs().max() < 0.01
+    assert (rgb[True] - rgb[False]).abs().max() < 0.01
     for name, gradient in gradients[False].items():
         assert (gradient - gradients[True][name]).abs().max() < 0.03 * gradient.abs().max(), name
 
@@ -112,8 +112,8 @@ def test_rays_that_meet_nothing_have_no_samples() -> None:
     samples = collected(away, scene.aabb, scene.occupancy, scene.step)
     assert len(samples.ray) == 0
     field = Field.from_scene(hybrid(scene))
-    met = composite(field, away, samples, fused_features(field), scene.extent)
-    assert torch.equal(met.rgb, away.backgrounds) and not met.opacity.any() and float(met.distortion.detach()) == 0
+    met = meet(field, away, samples, fused_features(field), scene.extent)
+    assert torch.equal(shade(field, away, met), away.backgrounds) and not met.opacity.any() and float(met.distortion.detach()) == 0
 
 
 @pytest.mark.parametrize("moved", [False, True])
@@ -143,12 +143,13 @@ def test_the_hybrid_decoder_has_the_gradient_of_finite_differences() -> None:
     samples = samples_of(rays, aabb, torch.ones(1, 2, 2, 2), 0.3)
     parameters = dict(field.named_parameters())
 
+    def rendered() -> tuple[torch.Tensor, torch.Tensor]:
+        met = meet(field, rays, samples, field.features, 2.0)
+        return shade(field, rays, met), met.distortion
+
     def met(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        changed = torch.func.functional_call(
-            _Calling(field, lambda: composite(field, rays, samples, field.features, 2.0)),
-            {f"field.{name}": value for name, value in zip(parameters, values)}, (),
-        )
-        return changed.rgb, changed.distortion
+        changed = {f"field.{name}": value for name, value in zip(parameters, values)}
+        return torch.func.functional_call(_Calling(field, rendered), changed, ())  # type: ignore[no-any-return]
 
     values = tuple(p.detach().clone().requires_grad_() for p in parameters.values())
     assert torch.autograd.gradcheck(met, values)

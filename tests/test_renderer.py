@@ -5,7 +5,7 @@ from dataclasses import replace
 import gl
 import numpy as np
 import pytest
-from scenes import SPACES, displaced, look_at, surrounded, tiny_scene
+from scenes import SPACES, displaced, hybrid, look_at, surrounded, tiny_scene, varied
 
 from kpc.format.cameras import Camera
 from kpc.format.errors import DisplayError
@@ -69,6 +69,59 @@ def test_scenes_of_all_shapes(scene: Scene) -> None:
     renderer = Renderer(gl.context(), scene)
     for time in (0.0, 0.5, 1.0):
         check(renderer.render(CAMERAS["outside"], time), render(scene, CAMERAS["outside"], time))
+
+
+@pytest.mark.parametrize("hidden", [16, 5, 1])
+@pytest.mark.parametrize("part", Part)
+def test_appearances_are_those_of_the_reference(part: Part, hidden: int) -> None:
+    scene = tiny_scene(4)
+    d = scene.decoder
+    narrow = replace(d, w1=d.w1[:hidden], b1=d.b1[:hidden] + 2, w2=16 / hidden * d.w2[..., :hidden])
+    scene = varied(replace(scene, decoder=narrow))
+    renderer, pictures = Renderer(gl.context(), scene), []
+    between = scene.appearance_between("dawn.jpg", "dusk.jpg", 0.5)
+    for code in (None, *(appearance.code for appearance in scene.appearances), between):
+        got, wanted = (render_it(CAMERAS["outside"], 0.62, part=part, appearance=code)
+                       for render_it in (renderer.render, lambda *a, **k: render(scene, *a, **k)))
+        check(got, wanted)
+        pictures.append(got.rgb)
+    average, _, noon, dusk, _ = pictures
+    assert all(np.abs(a - b).max() > 4 / 255 for a, b in ((average, noon), (average, dusk), (noon, dusk)))
+    with pytest.raises(ValueError, match="shape"):
+        renderer.render(CAMERAS["outside"], 0.62, appearance=np.zeros(hidden + 1, np.float32))
+    with pytest.raises(ValueError, match="0 appearances"):
+        Renderer(gl.context(), tiny_scene(4)).render(CAMERAS["outside"], 0.62, appearance=np.zeros(16, np.float32))
+
+
+def test_appearances_of_a_hybrid_scene_are_those_of_the_reference() -> None:
+    scene = varied(hybrid(tiny_scene(4)))
+    renderer, pictures = Renderer(gl.context(), scene), []
+    for code in (None, scene.appearance("noon.jpg")):
+        got = renderer.render(CAMERAS["outside"], 0.62, appearance=code)
+        check(got, render(scene, CAMERAS["outside"], 0.62, appearance=code))
+        pictures.append(got.rgb)
+    assert np.abs(pictures[0] - pictures[1]).max() > 4 / 255
+
+
+@pytest.mark.parametrize("part", Part)
+def test_an_appearance_comes_to_the_screen(part: Part) -> None:
+    ctx, scene = gl.context(), varied(tiny_scene(4))
+    screen, renderer, camera = ctx.framebuffer([ctx.texture((64, 48), 4)]), Renderer(ctx, scene), CAMERAS["outside"]
+    for code in (None, scene.appearance("dusk.jpg")):
+        renderer.show(screen, camera, 0.62, part=part, appearance=code)
+        shown = np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(48, 64, 3)[::-1] / 255
+        assert np.abs(shown - renderer.render(camera, 0.62, part=part, appearance=code).rgb.clip(0, 1)).max() < 1 / 255
+
+
+def test_scenes_without_appearances_have_no_code_in_the_shader() -> None:
+    for scene, held in ((tiny_scene(4), False), (varied(tiny_scene(4)), True), (varied(undirected(tiny_scene(4))), False)):
+        renderer = Renderer(gl.context(), scene)
+        renderer.render(CAMERAS["outside"], 0.62)
+        ((program, _),) = renderer._programs.values()
+        assert (program.get("appearance", None) is not None) == held
+        if not held and scene.appearances:  # colour is the same from all sides, whatever the code
+            check(renderer.render(CAMERAS["outside"], 0.62, appearance=scene.appearance("dawn.jpg")),
+                  render(scene, CAMERAS["outside"], 0.62, appearance=scene.appearance("dawn.jpg")))
 
 
 def test_sparse_occupancy_loses_no_sample() -> None:

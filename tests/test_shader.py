@@ -88,7 +88,7 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     defines = {"SCALES": 3, "LAYERS": layout.layers, **decoder_shape(scene.decoder), "ROWS": rows, "REFINED": 1, "EARLY": 1 - rows,
-               "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion}  # fmt: skip
+               "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion, "APPEARANCE": rows}  # fmt: skip
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights})
     vertex, _ = shader.compose("fullscreen.glsl", preamble=shader.ES30)
     ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()

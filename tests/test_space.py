@@ -9,7 +9,7 @@ import torch
 from scenes import faced, look_at, surrounded, tiny_scene
 
 from kpc.encoder import kernels
-from kpc.encoder.field import place
+from kpc.encoder import render as in_pytorch
 from kpc.format.scene import Scene
 from kpc.format.space import FAR, LEAST_DISPARITY, Contraction, DeviceCoordinates, contract, expand
 from kpc.player.reference import places, render
@@ -89,10 +89,10 @@ def test_every_language_puts_samples_in_the_same_place(even: float) -> None:
 
 
 def _torch(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
-    t = scene.mapping.distance(s)
-    u, stretch = place(*map(torch.from_numpy, (origins[:, None] + t[..., None] * directions[:, None], t, scene.aabb)),
-                       scene.mapping)
-    return t, u.numpy(), stretch.numpy()
+    o, d, *rest = map(torch.from_numpy, (origins, directions, s, scene.aabb))
+    nothing = torch.zeros(len(o))
+    u, stretch = in_pytorch.places(in_pytorch.Rays(o, d, nothing, nothing, nothing), *rest, scene.mapping)
+    return scene.mapping.distance(s), u.numpy(), stretch.numpy()
 
 
 def _kernels(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -115,8 +115,9 @@ def test_a_seed_repeats_bitwise(moving: Dataset, hybrid: bool) -> None:
 def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(
     moving: Dataset, tmp_path: Path, stop_at: int, other: dict[str, bool]
 ) -> None:
-    changes = other | {"steps": 80, "channel_dropout": 0.25, "occupancy_split_every": 64, "motion_cells": 3}
+    changes = other | {"steps": 80, "channel_dropout": 0.25, "occupancy_split_every": 64, "motion_cells": 3, "appearance": "image"}
     whole = trained(moving, **changes)
+    assert whole.field.codes is not None and whole.field.codes.any(1).all()
     assert len(whole.grid.marched) == whole.slots > 1
     first = trainer(moving, **changes)
     with pytest.raises(KeyboardInterrupt):
@@ -458,20 +459,23 @@ def test_random_backgrounds_are_what_shines_through(moving: Dataset) -> None:
 def plain_twin(fused: Trainer) -> PlainOptimiser:
     """The optimiser of other devices, on a copy of a trainer's field."""
     motion = fused.field.motion
-    field = Field(fused.field.layout, fused.config.hidden, motion_nodes=None if motion is None else motion.shape[:4])
+    nodes = None if motion is None else motion.shape[:4]
+    field = Field(fused.field.layout, fused.config.hidden, motion_nodes=nodes, appearances=len(fused.names))
     field.load_state_dict(fused.field.state_dict())
     return PlainOptimiser(field, fused.config, fused.grid.seen.shape, fused.mapping)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("mapping", [None, Contraction(4.0)])
 @pytest.mark.parametrize(
-    ("channel_dropout", "view_dependent", "motion_cells"), [(0.0, True, 0), (0.5, True, 0), (0.5, False, 0), (0.0, True, 3)]
+    ("channel_dropout", "view_dependent", "motion_cells", "appearance"),
+    [(0.0, True, 0, "none"), (0.5, True, 0, "none"), (0.5, False, 0, "none"), (0.0, True, 3, "none"), (0.5, True, 0, "image")],
 )
 def test_plain_pytorch_takes_the_same_steps(
-    moving: Dataset, channel_dropout: float, view_dependent: bool, motion_cells: int, mapping: Contraction | None
+    moving: Dataset, channel_dropout: float, view_dependent: bool, motion_cells: int, appearance: str, mapping: Contraction | None
 ) -> None:
     """Adam moves by the sign of a gradient at first; where that is all rounding, either way."""
-    run = trainer(moving, mapping, channel_dropout=channel_dropout, view_dependent=view_dependent, motion_cells=motion_cells)
+    run = trainer(moving, mapping, channel_dropout=channel_dropout, view_dependent=view_dependent, motion_cells=motion_cells,
+                  appearance=appearance)
     plain = plain_twin(run)
     for number in range(3):
         batch, targets = run.sampler.draw(run.rng, 256)
@@ -484,6 +488,9 @@ def test_plain_pytorch_takes_the_same_steps(
     assert float((off > 0.1 * moved).float().mean()) < 0.02
     for ours, theirs in ((run.field.density, plain.field.density), (run.field.b2, plain.field.b2)):
         assert float((ours - theirs).detach().abs().max()) < 1e-3
+    if run.names:
+        off, far = (run.field.codes - plain.field.codes).abs(), run.config.appearance_learning_rate * 0.1 * 3
+        assert float((off > 0.1 * far).float().mean()) < 0.05 and run.field.codes.abs().max().item() > 0.3 * far
     if motion_cells:
         off, far = (run.field.motion - plain.field.motion).abs(), run.config.motion_learning_rate * 0.1 * 3
         assert float((off > 0.1 * far).float().mean()) < 0.05 and run.field.motion.abs().max().item() > 0.5 * far

@@ -23,6 +23,7 @@ from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, HybridDecoder
 from kpc.format.space import FAR, Contraction, SpaceMapping
 
+NAMES_SHOWN = 8
 CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd"}
 
 
@@ -67,7 +68,7 @@ def verify(reader: SceneReader) -> None:
                           "fetch the file again")
     if damaged:
         raise damaged[0][2]
-    reader.mapping(), reader.motion(), reader.decoder(), reader.occupancy(), reader.cameras()
+    reader.mapping(), reader.motion(), reader.decoder(), reader.occupancy(), reader.cameras(), reader.appearances()
 
 
 def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
@@ -95,6 +96,7 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
                       "share": float(scene.occupancy.mean())},
         "cameras": len(scene.cameras),
         "camera_box": _camera_box(scene),
+        "appearances": [appearance.name for appearance in scene.appearances],
         "parameter_count": scene.parameter_count,
         "bits_per_parameter": 8 * size / scene.parameter_count,
         "identity_share": scene.identity_share,
@@ -163,6 +165,7 @@ def _page(info: dict[str, Any]) -> str:
         *_motion(info["motion"]),
         f"  cameras     {info['cameras']}"
         + (f" within {_corner(info['camera_box'][0])} to {_corner(info['camera_box'][1])}" if info["cameras"] else ""),
+        *_appearances(info["appearances"]),
         f"  occupancy   {occupancy['slots']} x {'x'.join(map(str, reversed(occupancy['cells_zyx'])))} cells, "
         f"{occupancy['share']:.1%} occupied",
         f"  decoder     {info['decoder']['kind']}, {info['decoder']['features']} features, {info['decoder']['hidden']} hidden units",
@@ -203,6 +206,13 @@ def _motion(motion: Mapping[str, Any] | None) -> list[str]:
         return []
     nodes = "x".join(map(str, reversed(motion["nodes_zyx"])))
     return [f"  motion      {motion['rows']} x {nodes} nodes, displacements up to {motion['largest']:.3f} of the box"]
+
+
+def _appearances(names: Sequence[str]) -> list[str]:
+    """The first few; --json has them all."""
+    if not names:
+        return []
+    return [f"  appearances {len(names)}: {', '.join(names[:NAMES_SHOWN])}" + ", ..." * (len(names) > NAMES_SHOWN)]
 
 
 def _corner(point: Sequence[float]) -> str:

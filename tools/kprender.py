@@ -4,6 +4,7 @@ kprender scene.kpc -o clip.mp4                            the clip, from the sce
 kprender scene.kpc --orbit 96 -o orbit.mp4                a path around it while the clip plays
 kprender scene.kpc --cameras cameras.json -o DIR          one picture for each frame the file lists
 kprender scene.kpc --time 0.5 --size 960x720 -o still.png
+kprender scene.kpc --appearance dawn.jpg:dusk.jpg:0.3 -o clip.mp4
 """
 
 import argparse
@@ -118,6 +119,12 @@ def _parser() -> argparse.ArgumentParser:
         "--dynamic-only", action="store_const", dest="part", const=Part.DYNAMIC, help="|all of it - what never moves|"
     )
     parser.add_argument(
+        "--appearance",
+        metavar="NAME|A:B:0.3",
+        help="show colours as the picture or camera NAME did, or so far from A's to B's (default: the average; "
+        "kpinfo lists the names)",
+    )
+    parser.add_argument(
         "--format",
         choices=("png", "exr"),
         default="png",
@@ -137,6 +144,28 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.set_defaults(part=Part.FULL)
     return parser
+
+
+def _appearance(scene: Scene, text: str | None) -> np.ndarray | None:
+    """The code that --appearance asks for: NAME, or ONE:OTHER:SHARE, which lies so far from one to the other; names may hold
+    colons themselves. None, the average, where it asks for nothing.
+
+    Raises:
+        UsageError: the scene has no appearance of such a name, or the share lies outside [0, 1].
+    """
+    if text is None:
+        return None
+    names = {appearance.name for appearance in scene.appearances}
+    pair, _, share = text.rpartition(":")
+    if text in names or ":" not in pair:
+        return scene.appearance(text)
+    try:
+        so_far = _moment(share)
+    except argparse.ArgumentTypeError as error:
+        raise UsageError(f"--appearance {text}: {share!r} is not a share in [0, 1]; give NAME or NAME:NAME:SHARE") from error
+    cuts = [k for k, letter in enumerate(pair) if letter == ":"]
+    cut = next((k for k in cuts if names.issuperset({pair[:k], pair[k + 1 :]})), cuts[0])
+    return scene.appearance_between(pair[:cut], pair[cut + 1 :], so_far)
 
 
 def _count(text: str) -> int:
@@ -196,16 +225,19 @@ def _shots(scene: Scene, options: argparse.Namespace) -> list[Shot]:
 
 def _backend(scene: Scene, options: argparse.Namespace) -> tuple[Render, str]:
     """How to render, and its name. OpenGL is looked for only where it is wanted."""
+    appearance = _appearance(scene, options.appearance)
     if options.backend == "reference":
         return lambda camera, time: reference.render(
-            scene, camera, time, part=options.part
+            scene, camera, time, part=options.part, appearance=appearance
         ), "reference renderer (numpy)"
     from kpc.player import offscreen
     from kpc.player.renderer import Renderer
 
     ctx = offscreen.open_context()
     renderer = Renderer(ctx, scene, folded=options.folded)
-    return lambda camera, time: renderer.render(camera, time, part=options.part), offscreen.describe(ctx)
+    return lambda camera, time: renderer.render(
+        camera, time, part=options.part, appearance=appearance
+    ), offscreen.describe(ctx)
 
 
 def _paths(out: Path, shots: list[Shot], suffix: str) -> Iterator[Path]:

@@ -8,6 +8,7 @@ on the version of that library, and only in how they are packed (valid/NAME.json
 """
 
 import hashlib
+import itertools
 import json
 import struct
 import sys
@@ -28,7 +29,7 @@ from kpc.format.errors import UsageError
 from kpc.format.file import encode, read, scene_chunks
 from kpc.format.motion import QuantisedMotion
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
-from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip, Decoder, HybridDecoder
+from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates
 from kpc.player import reference
 
@@ -76,12 +77,15 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
            if isinstance(scene.mapping, DeviceCoordinates) else {}),
         **({"motion": {"shape": list(scene.motion.symbols.shape), "sha256": _sha256(scene.motion.dequantise().astype("<f4"))}}
            if scene.motion else {}),
+        **({"appearances": {"names": [appearance.name for appearance in scene.appearances],
+                            "sha256": _sha256(*(appearance.code.astype("<f4") for appearance in scene.appearances))}}
+           if scene.appearances else {}),
         "aabb": scene.aabb.tolist(),
         "background": scene.background.tolist(),
         "cameras": [_camera(camera) for camera in scene.cameras],
         "occupancy": {"shape": list(scene.occupancy.shape), "sha256": _sha256(scene.occupancy.astype(np.uint8))},
         "decoder": {"features": sum(scale["xy"].symbols.shape[2] for scale in scene.scales),
-                    **({"width": len(decoder.a)} if isinstance(decoder, HybridDecoder) else {}), "hidden": len(decoder.b1),
+                    **({"width": len(decoder.v_bias)} if isinstance(decoder, HybridDecoder) else {}), "hidden": len(decoder.b1),
                     "sha256": _sha256(*(np.asarray(w, "<f4") for w in vars(decoder).values()))},
         "planes": [
             {"scale": number, "plane": name, "shape": list(plane.symbols.shape),
@@ -122,6 +126,7 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
     faced = replace(dense, mapping=DeviceCoordinates(frame, 1.5, 2.0),
                     aabb=np.array([[-0.5, -0.5, 0.125], [0.5, 0.5, 1.25]], np.float32))
     hybrid = replace(dense, decoder=_hybrid(2, 5, 3))
+    varied = replace(dense, appearances=_appearances("north.mp4", "süd.mp4", "東/0003.jpg"))
     note = Chunk("note", [b"readers skip what they need not know"])
     chunks = scene_chunks(minimal)
     index = Reader(packed).index
@@ -142,6 +147,8 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "device-coordinates": (encode(faced), False),
         "hybrid": (encode(hybrid), False),
         "hybrid-moved": (encode(replace(hybrid, motion=moved.motion, decoder=_hybrid(2, 1, 1)), compress=False), False),
+        "appearances": (encode(varied), False),
+        "appearances-prefix": (encode(varied)[:Reader(encode(varied)).index[4].offset], True),
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
     }
 
@@ -191,6 +198,12 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         """The file with a hybrid decoder, changed so."""
         raw = reduce(lambda raw, change: change(raw), changes, mlps)
         return pack([*chunks[:deco], Chunk("HYBR", [raw]), *chunks[occu:]], values, compress=False)
+
+    def varied(*parts: bytes) -> bytes:
+        return with_chunks("appe", *parts)
+
+    def appe(*names: bytes, count: int = 2, hidden: int = 3, codes: bytes = bytes(2 * 2 * 3)) -> bytes:
+        return struct.pack("<HH", count, hidden) + codes + b"".join(struct.pack("<B", len(name)) + name for name in names)
 
     def without(number: int) -> bytes:
         return pack(chunks[:number] + chunks[number + 1:], values, compress=False)
@@ -294,6 +307,18 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "camera-far": (repacked(came, set_at(34, "<f", 1e30)), broken, "absurdly far"),
         "camera-axes": (repacked(came, set_at(22, "<f", 0.0)), broken, "not of length 1"),
         "camera-nan": (repacked(came, set_at(22, "<f", nan)), broken, "NaN or infinity"),
+        "appearances-none": (varied(struct.pack("<HH", 0, 3)), broken, "0 appearances"),
+        "appearances-many": (varied(appe(b"a", b"b", count=16385)), broken, "16385 appearances"),
+        "appearances-hidden": (varied(appe(b"a", b"b", hidden=4)), broken, "4 numbers"),
+        "appearances-nan": (varied(appe(b"a", b"b", codes=bytes(10) + b"\x00\x7e")), broken, "NaN or infinite"),
+        "appearances-short": (varied(appe(b"a")), broken, "ends after"),
+        "appearances-long": (varied(appe(b"a", b"b") + bytes(1)), broken, "1 bytes too long"),
+        "appearances-empty": (varied(appe(b"a", b"")), broken, "is empty"),
+        "appearances-same": (varied(appe(b"a", b"a")), broken, "there twice"),
+        "appearances-latin": (varied(appe(b"a", b"\xe9")), broken, "not UTF-8"),
+        "appearances-escape": (varied(appe(b"a", b"\x1b[2J")), broken, "control character"),
+        "appearances-control": (varied(appe(b"a", "\x9b".encode())), broken, "control character"),
+        "appearances-twice": (varied(*2 * [appe(b"a", b"b")]), broken, "2 appe chunks"),
     }
 
 
@@ -331,7 +356,7 @@ def _scene(dynamic: bool, sizes: list[tuple[int, int, int, int, int]], amplitude
 
 
 def _hybrid(features: int, width: int, hidden: int) -> HybridDecoder:
-    shapes = {"v": (width, features), "a": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
+    shapes = {"v": (width, features), "v_bias": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
               "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
     return HybridDecoder(density_bias=0.5, **{
         name: _noise(shape, 17 + k) / np.float32(64) for k, (name, shape) in enumerate(shapes.items())})
@@ -342,6 +367,12 @@ def _motion(rows: int, nz: int, ny: int, nx: int, step: float = 8.0) -> Quantise
     symbols = _noise((rows, nz, ny, nx, 3), 41).astype(np.int16)
     symbols[0, 0, 0, 0], symbols[1, 0, 0, 0] = (32767, -32768, 0), (-32768, 32767, 1)
     return QuantisedMotion(symbols, step / 8192)
+
+
+def _appearances(*names: str) -> tuple[Appearance, ...]:
+    """For a scene of `_scene`'s three hidden units."""
+    codes = _noise((len(names), 3), 53) / np.float32(32)
+    return tuple(Appearance(name, code) for name, code in zip(names, codes, strict=True))
 
 
 def _plane(rows: int, columns: int, channels: int, amplitude: int, seed: int, is_time: bool) -> QuantisedPlane:
@@ -368,7 +399,7 @@ def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
 def _rays(scene: QuantisedScene) -> list[dict[str, Any]]:
     """What four rays see: through the box's centre at the clip's start, across it, from inside it, and past it.
 
-    In contracted space some of it lies outside.
+    In contracted space some of it lies outside. The last ray shows the average of the appearances, if there are any.
     """
     bounds = scene.dequantise().bounds.astype(np.float32)
     centre, size = bounds.mean(0), bounds[1] - bounds[0]
@@ -377,15 +408,16 @@ def _rays(scene: QuantisedScene) -> list[dict[str, Any]]:
     origins = (centre + starts * size).astype(np.float32)
     directions = towards * size
     directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
-    rays = []
-    for origin, direction, time in zip(origins, directions, (0.0, 0.375, 0.8125, 1.0), strict=True):
+    rays, appearances = [], itertools.islice(itertools.chain(scene.appearances, itertools.repeat(None)), 4)
+    for origin, direction, time, look in zip(origins, directions, (0.0, 0.375, 0.8125, 1.0), appearances, strict=True):
         with np.errstate(over="ignore"):  # a vector may saturate colours
-            seen = reference.render_rays(scene.dequantise(), origin[None], direction[None], time)
+            seen = reference.render_rays(scene.dequantise(), origin[None], direction[None], time, appearance=look and look.code)
         depth = float(seen.depth[0])
         rays.append({
             "origin": origin.tolist(), "direction": direction.tolist(), "time": time,
             "rgb": [round(float(c), 6) for c in seen.rgb[0]], "opacity": round(float(seen.opacity[0]), 6),
             "depth": round(depth, 6) if np.isfinite(depth) else None,
+            **({"appearance": look and look.name} if scene.appearances else {}),
         })
     return rays
 

@@ -1,9 +1,9 @@
 // The picture of a scene; normative text and a readable twin: kpc.player.reference.
 //
 // SCALES, LAYERS (of four channels), HIDDEN: its shape; HIDDEN is 0 where colour is the same from all sides. HYBRID: 1 where the
-// decoder is the hybrid one, of layers of WIDTH and HIDDEN units. ROWS: 1 where
-// rows of time planes are multiplied in at every sample. REFINED: how much finer than the scene's the planes are along the
-// row folded into them; 1 where none is.
+// decoder is the hybrid one, of layers of WIDTH and HIDDEN units. APPEARANCE: 1 where colours come in more than one appearance.
+// ROWS: 1 where rows of time planes are multiplied in at every sample. REFINED: how much finer than the scene's the planes are
+// along the row folded into them; 1 where none is.
 // CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
 // NDC: 1 where all this is in device coordinates. EARLY: 1 where a ray may end sooner than the format says: what is left of its
 // light then counts as what it has met so far. A sixth of all samples lie behind that point.
@@ -42,6 +42,9 @@ uniform mat4x3 frame;               // NDC: of its camera
 uniform float near;                 // NDC
 uniform float baseline;             // NDC
 uniform float tau;                  // stride / longest edge of the box
+#if HIDDEN && APPEARANCE
+uniform vec4 appearance[(HIDDEN + 3) / 4];  // the code to show, padded
+#endif
 
 uniform float height;
 uniform vec4 lens;
@@ -57,14 +60,18 @@ mat3x4 encoded(vec3 d) {
     return mat3x4(d, d.x * d.x, d.y * d.y, d.z * d.z, d.x * d.y, d.y * d.z, d.z * d.x, 1.0, 0.0, 0.0);
 }
 
-// One number of w1 e + b1.
+// One number of w1 e + b1 + code.
 float direction_hidden(mat3x4 e, int h) {
-    return dot(w1[3 * h], e[0]) + dot(w1[3 * h + 1], e[1]) + dot(w1[3 * h + 2], e[2]);
+    float sum = dot(w1[3 * h], e[0]) + dot(w1[3 * h + 1], e[1]) + dot(w1[3 * h + 2], e[2]);
+#if APPEARANCE
+    sum += appearance[h / 4][h % 4];
+#endif
+    return sum;
 }
 #endif
 
 #if HYBRID
-vec4 towards[HIDDEN / 4];  // w1 e + b1 of the ray
+vec4 towards[HIDDEN / 4];  // w1 e + b1 + code of the ray
 
 void look_along(vec3 d) {
     mat3x4 e = encoded(d);

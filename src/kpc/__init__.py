@@ -14,6 +14,8 @@ from kpc.format.errors import KpcError
 from kpc.format.scene import Scene
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from kpc.player.reference import Rendering
 
 __all__ = ["Camera", "KpcError", "Scene", "load", "render"]
@@ -34,15 +36,16 @@ def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int =
     return read(path, memory_budget=memory_budget).dequantise()
 
 
-def render(scene: Scene, camera: Camera, time: float) -> "Rendering":
+def render(scene: Scene, camera: Camera, time: float, appearance: "np.ndarray | None" = None) -> "Rendering":
     """Render one picture with the readable reference renderer; no graphics card is needed.
 
     Args:
         time: in [0, 1] over the clip.
+        appearance: a code, `scene.appearance(name)`, where the scene has any; None for their average.
 
     Returns:
         `.rgb` (H, W, 3) float32 in [0, 1], `.depth` (H, W), `.opacity` (H, W).
     """
     from kpc.player import reference
 
-    return reference.render(scene, camera, time)
+    return reference.render(scene, camera, time, appearance=appearance)
