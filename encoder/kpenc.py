@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import signal
 import sys
@@ -22,9 +23,11 @@ from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.estimate import Estimate, estimate
 from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr
+from kpc.encoder.field import time_rows
 from kpc.encoder.occupancy import grid_shape
 from kpc.encoder.options import Options, parse
 from kpc.encoder.profile import profile
+from kpc.encoder.structure import TimeResolution, fitted_in_time
 from kpc.encoder.train import Report, Trainer, box_of_checkpoint
 from kpc.encoder.trim import trim_box
 from kpc.format import cli, file
@@ -174,7 +177,10 @@ def _trainer(options: Options) -> Trainer:
         raise
     _say(dataset.describe())
     _say(f"space: {SPACES[type(mapping)][1]} ({why})")
-    config, resumes, survey_s = options.config(dataset), options.resume and checkpoint.exists(), 0.0
+    config, in_time = fitted_in_time(options.config(dataset), dataset)
+    if dataset.is_dynamic:
+        _say(_rows_in_time(config, dataset, in_time))
+    resumes, survey_s = options.resume and checkpoint.exists(), 0.0
     if options.box is None and not isinstance(mapping, Contraction):
         if resumes:
             aabb = box_of_checkpoint(checkpoint)
@@ -287,6 +293,17 @@ def _plan(trainer: Trainer) -> str:
         f", read where a motion grid of {'x'.join(str(n) for n in trainer.field.motion.shape[3:0:-1])} nodes leads")
     return (f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
             f"{layout.size / 1e6:.2f} M parameters{nodes}; on {trainer.device}")
+
+
+def _rows_in_time(config: TrainConfig, dataset: Dataset, found: TimeResolution | None) -> str:
+    """How far apart the rows of the time planes are, and why."""
+    rows = time_rows(dataset.clip.frame_count, config.frames_per_row)
+    said = f"time: {rows} rows, one for {config.frames_per_row:g} of {dataset.clip.frame_count} frames"
+    if found is None:
+        return f"{said} (the preset's: only pictures of cameras that stand still tell how fast things change)"
+    wider = "" if math.isnan(found.next_error) else f", wider apart {found.next_error:.3f}"
+    return (f"{said} (lines between them miss {found.changing:.1%} of the pixels, those that change, by {found.error:.3f} of the full "
+            f"range{wider}; {config.time_tolerance:g} allowed; noise {found.noise:.3f})")
 
 
 def _spread_of_cameras(dataset: Dataset) -> list[int]:

@@ -141,6 +141,7 @@ def test_a_folder_becomes_a_file(
 def test_what_is_printed(run: Kpenc, sets: Path) -> None:
     code, out, err = run(sets / "blender")
     assert code == 0 and "read where a motion grid of 11x11x11 nodes leads" in err
+    assert "time: 2 rows, one for 4 of 5 frames (the preset's" in err
     assert all(
         words in out
         for words in (
@@ -154,6 +155,21 @@ def test_what_is_printed(run: Kpenc, sets: Path) -> None:
             "96 steps",
         )
     )
+
+
+@pytest.mark.parametrize("tolerance, rows, why", [(1.0, 2, "1 allowed"), (1e-4, 4, "0.0001 allowed"), (0.0, 3, "the preset's")])
+def test_rows_of_time_are_as_far_apart_as_the_motion_allows(
+    run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tolerance: float, rows: int, why: str
+) -> None:
+    """Of four frames; a run that is resumed finds the same number."""
+    told = TrainConfig(**TINY | {"time_tolerance": tolerance, "frames_per_row": 1.5})  # type: ignore[arg-type]
+    monkeypatch.setitem(PRESETS, "draft", told)
+    for options in (("--keep",), ("--resume",)):
+        code, _, err = run(sets / "n3dv", "--steps", "2", *options)
+        (said,) = [line for line in err.splitlines() if line.startswith("time: ")]
+        assert code == 0 and f"time: {rows} rows, one for {4 / rows if rows != 3 else 1.5:g} of 4 frames" in said and why in said
+        assert len(file.read(tmp_path / "out.kpc").scales[0]["xt"].symbols) == rows
+    assert "resumed at step 2" in err
 
 
 def test_options(run: Kpenc, sets: Path, tmp_path: Path) -> None:
