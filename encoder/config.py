@@ -105,7 +105,9 @@ class TrainConfig:
 
     # --- the file
     max_coding_loss_db: float = 0.15
-    """What quantisation may cost on training views; the coarsest steps within it are taken."""
+    """What coding may cost on training views: what is left out, and quantisation, of which the coarsest steps within it are taken."""
+    prune_share: float = 0.25
+    """Of that, what may be spent on leaving out view dependence, channels and scales, `kpc.encoder.prune`; 0: they all stay."""
 
     def __post_init__(self) -> None:
         positive = ("channels", "steps", "rays", "samples", "hidden", "samples_across", "cells_across", "warmup",
@@ -116,7 +118,7 @@ class TrainConfig:
         for name in ("object_rays", "channel_dropout"):
             if not 0 <= getattr(self, name) < 1:
                 raise UsageError(f"{name} must be at least 0 and less than 1, not {getattr(self, name)}")
-        for name in ("temporal_start", "temporal_floor", "time_tolerance"):
+        for name in ("temporal_start", "temporal_floor", "time_tolerance", "prune_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"{name} must be from 0 to 1, not {getattr(self, name)}")
         if not self.resolutions or min(self.resolutions) < 2:
