@@ -309,7 +309,7 @@ def _rows_in_time(config: TrainConfig, dataset: Dataset, found: TimeResolution |
     rows = time_rows(dataset.clip.frame_count, config.frames_per_row)
     said = f"time: {rows} rows, one for {config.frames_per_row:g} of {dataset.clip.frame_count} frames"
     if found is None:
-        return f"{said} (the preset's: only pictures of cameras that stand still tell how fast things change)"
+        return f"{said} (the preset's; it is measured where cameras stand still)"
     wider = "" if math.isnan(found.next_error) else f", wider apart {found.next_error:.3f}"
     return (f"{said} (lines between them miss {found.changing:.1%} of the pixels, those that change, by {found.error:.3f} of the full "
             f"range{wider}; {config.time_tolerance:g} allowed; noise {found.noise:.3f})")
