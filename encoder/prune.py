@@ -135,16 +135,21 @@ def dispensable(decoder: Decoder, seen: Seen) -> np.ndarray:
     the second moments G of the features. That, of log density and the logits of three colours, is the estimate; each step
     takes the least and passes it on.
     """
-    left = list(range(seen.features.shape[1]))
-    basis, weight, order = seen.basis.copy(), decoder.density_weight.astype(np.float64), []
+    F = seen.features.shape[1]
+    left, order = list(range(F)), []
+    weight = decoder.density_weight.astype(np.float64)
+    basis = seen.basis.reshape(-1, F)
+    listened = basis.T @ basis / len(seen.basis)  # second moments of the colour basis, summed over colours
     moments, all_moments = _moments(seen.features), _moments(seen.all_features, constant=True)
     while len(left) > 1:
-        lost = np.square(basis[..., left]).sum(1).mean(0) / np.diag(np.linalg.inv(moments[np.ix_(left, left)]))
+        lost = np.diag(listened)[left] / np.diag(np.linalg.inv(moments[np.ix_(left, left)]))
         with_constant = [*left, -1]
         lost += np.square(weight[left]) / np.diag(np.linalg.inv(all_moments[np.ix_(with_constant, with_constant)]))[:-1]
         m = left.pop(int(np.argmin(lost)))
-        share = np.linalg.solve(moments[np.ix_(left, left)], moments[left, m])
-        basis[..., left] += basis[..., m, None] * share
+        share = np.zeros(F)
+        share[left] = np.linalg.solve(moments[np.ix_(left, left)], moments[left, m])
+        passed = np.outer(listened[:, m], share)
+        listened += passed + passed.T + listened[m, m] * np.outer(share, share)
         weight[left] += weight[m] * np.linalg.solve(all_moments[np.ix_([*left, -1], [*left, -1])], all_moments[[*left, -1], m])[:-1]
         order.append(m)
     return np.array(order, np.int64)
