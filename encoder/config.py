@@ -18,7 +18,7 @@ class TrainConfig:
     """Frames of the clip to one row of a space-time plane (K-Planes trains 300 frames on 150 rows). A row for every frame costs
     room 0.2 dB and a fifth of its size, and the default scene time, for no gain in held-out PSNR. Where the cameras stand still
     it is measured instead, `kpc.encoder.structure`."""
-    time_tolerance: float = 0.065
+    time_tolerance: float = 0.061
     """What straight lines between rows may leave of the pixels that change, root mean square as a share of the full range; the
     rows are as far apart as that allows. 0: `frames_per_row` as it is. The default scene gets a row for 2 frames. Held-out PSNR and
     size of others, and with a row for 2 (`fast`): liam, 6 frames, 23.19 dB and 128 KB, 23.13 dB and 143 KB (1,000 steps); room, 3,
@@ -106,7 +106,7 @@ class TrainConfig:
 
     # --- the file
     max_coding_loss_db: float = 0.15
-    """What coding may cost on training views: what is left out, and quantisation, of which the coarsest steps within it are taken."""
+    """What coding may cost on training views: what is left out, and quantisation; the coarsest steps within it are taken."""
     prune_share: float = 0.25
     """Of that, what may be spent on leaving out view dependence, channels and scales, `kpc.encoder.prune`; 0: they all stay."""
 

@@ -311,8 +311,8 @@ def _rows_in_time(config: TrainConfig, dataset: Dataset, found: TimeResolution |
     if found is None:
         return f"{said} (the preset's; it is measured where cameras stand still)"
     wider = "" if math.isnan(found.next_error) else f", wider apart {found.next_error:.3f}"
-    return (f"{said} (lines between them miss {found.changing:.1%} of the pixels, those that change, by {found.error:.3f} of the full "
-            f"range{wider}; {config.time_tolerance:g} allowed; noise {found.noise:.3f})")
+    return (f"{said} (lines between them miss {found.changing:.1%} of the pixels, those that change, by {found.error:.3f} of the "
+            f"full range{wider}; {config.time_tolerance:g} allowed; noise {found.noise:.3f})")
 
 
 def _left_out(scene: Scene, pruned: Pruned, spare_db: float) -> str:

@@ -170,7 +170,8 @@ def test_passing_on_is_least_squares() -> None:
     with_constant = np.concatenate([seen.all_features[:, left], np.ones((len(seen.all_features), 1))], axis=1)
     target = seen.all_features[:, gone] @ scene.decoder.density_weight[gone]
     least = np.square(with_constant @ np.linalg.lstsq(with_constant, target, rcond=None)[0] - target).mean()
-    change = seen.all_features @ (after.density_weight - scene.decoder.density_weight) + after.density_bias - scene.decoder.density_bias
+    before = scene.decoder
+    change = seen.all_features @ (after.density_weight - before.density_weight) + after.density_bias - before.density_bias
     assert np.square(change).mean() == pytest.approx(least, rel=1e-2)
     assert not after.density_weight[gone].any() and not after.b2[:, gone].any() and not after.w2[:, gone].any()
 
