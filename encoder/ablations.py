@@ -23,6 +23,8 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "no appearances": lambda c: replace(c, appearance="none"),
     "no motion grid": lambda c: replace(c, motion_cells=0),
     "the hybrid decoder": lambda c: replace(c, hybrid=True),
+    "rows of time by the preset": lambda c: replace(c, time_tolerance=0.0),
+    "nothing left out": lambda c: replace(c, prune_share=0.0),
     "no channel dropout": lambda c: replace(c, channel_dropout=0.0),
 }
 """What is changed, by name, the unchanged run first. Appearances act through what "one colour from all sides" leaves out. Runs with

@@ -7,6 +7,7 @@ import numpy as np
 
 from kpc.encoder.compress import PROBES
 from kpc.encoder.evaluate import SceneRenderer
+from kpc.encoder.prune import renderings
 from kpc.encoder.train import Trainer
 from kpc.format.memory import peak_memory_bytes
 
@@ -46,7 +47,8 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
     train_s = time_budget_s or trainer.elapsed_s + a_step * (config.steps - trainer.step)
 
     pixels = trainer.dataset.pictures.width.astype(np.int64) * trainer.dataset.pictures.height
-    rendered = (PROBES + 1) * probe_rays + 2 * tested * float(pixels.mean())
+    probes = PROBES + (renderings(trainer.field.layout.features) if config.prune_share and not config.hybrid else 0)
+    rendered = (probes + 1) * probe_rays + 2 * tested * float(pixels.mean())
     fits_s = 2 * tested * _seconds_a_fit(trainer) if trainer.names and tested else 0.0
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()
     return Estimate(train_s, spent_s + rendered * _seconds_a_ray(trainer) + fits_s, memory)

@@ -1,7 +1,7 @@
 """How good a scene is: pictures rendered on the CPU, PSNR and SSIM against the held-out ones."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -26,7 +26,7 @@ class SceneRenderer:
     """Renders rays of a scene with the kernels; the same pictures as `kpc.player.reference`, much faster."""
 
     def __init__(self, scene: Scene) -> None:
-        self.scene, self.field = scene, Field.from_scene(scene)
+        self.scene, self.field = scene, Field.from_scene(evenly_wide(scene))
 
     def rgb(
         self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
@@ -100,6 +100,28 @@ class SceneRenderer:
         arrays = (origins, directions, times, np.full(n, 0.5), backgrounds)
         batch = Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
         return fitted_code(self.scene, self.field, batch, torch.from_numpy(true_picture(dataset, number)[row, column]))
+
+
+def evenly_wide(scene: Scene) -> Scene:
+    """The same scene with as many channels at every scale as the widest has: the kernels know one number. What is added is 0 and
+    weighs nothing; the features of each scale stay in front of it."""
+    counts = [scale["xy"].shape[2] for scale in scene.scales]
+    most = max(counts)
+    if min(counts) == most:
+        return scene
+
+    def widened(weights: np.ndarray, axis: int) -> np.ndarray:
+        parts = np.split(weights, np.cumsum(counts)[:-1], axis=axis)
+        return np.concatenate([_filled_up(part, axis, most) for part in parts], axis=axis)
+
+    d = scene.decoder
+    decoder = replace(d, density_weight=widened(d.density_weight, 0), w2=widened(d.w2, 1), b2=widened(d.b2, 1))
+    scales = tuple({name: _filled_up(plane, 2, most) for name, plane in scale.items()} for scale in scene.scales)
+    return replace(scene, scales=scales, decoder=decoder)
+
+
+def _filled_up(values: np.ndarray, axis: int, size: int) -> np.ndarray:
+    return np.pad(values, [(0, size - n if k == axis else 0) for k, n in enumerate(values.shape)])
 
 
 @dataclass(frozen=True)

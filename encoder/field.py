@@ -79,9 +79,14 @@ def plan_layout(config: TrainConfig, aabb: np.ndarray, clip: Clip, is_dynamic: b
     The number of rows in time is the same at every scale (K-Planes, section 3.1). No axis has fewer than two texels.
     """
     edges = np.asarray(aabb[1] - aabb[0], np.float64)
-    rows = max(2, math.ceil(clip.frame_count / config.frames_per_row)) if is_dynamic else 0
+    rows = time_rows(clip.frame_count, config.frames_per_row) if is_dynamic else 0
     resolution = [[max(2, round(n * e / edges.max())) for e in edges] + [rows] for n in config.resolutions]
     return Layout.of(np.array(resolution), config.channels)
+
+
+def time_rows(frame_count: int, frames_per_row: float) -> int:
+    """Rows of the time planes over a clip."""
+    return max(2, math.ceil(frame_count / frames_per_row))
 
 
 def motion_nodes(config: TrainConfig, aabb: np.ndarray, layout: Layout) -> tuple[int, int, int, int] | None:

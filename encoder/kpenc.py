@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import signal
 import sys
@@ -22,9 +23,12 @@ from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.estimate import Estimate, estimate
 from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr
+from kpc.encoder.field import time_rows
 from kpc.encoder.occupancy import grid_shape
 from kpc.encoder.options import Options, parse
 from kpc.encoder.profile import profile
+from kpc.encoder.prune import Pruned, prune
+from kpc.encoder.structure import TimeResolution, fitted_in_time
 from kpc.encoder.train import Report, Trainer, box_of_checkpoint
 from kpc.encoder.trim import trim_box
 from kpc.format import cli, file
@@ -179,7 +183,10 @@ def _trainer(options: Options) -> Trainer:
     _say(f"space: {SPACES[type(mapping)][1]} ({why})")
     appearance, why = options.appearance_of(dataset)
     _say(f"appearance: {'none' if appearance == 'none' else f'a code for each {appearance}'} ({why})")
-    config, resumes, survey_s = options.config(dataset), options.resume and checkpoint.exists(), 0.0
+    config, in_time = fitted_in_time(options.config(dataset), dataset)
+    if dataset.is_dynamic:
+        _say(_rows_in_time(config, dataset, in_time))
+    resumes, survey_s = options.resume and checkpoint.exists(), 0.0
     if options.box is None and not isinstance(mapping, Contraction):
         if resumes:
             aabb = box_of_checkpoint(checkpoint)
@@ -203,8 +210,8 @@ def to_scene(trainer: Trainer) -> Scene:
 
 
 def quantise(trainer: Trainer, scene: Scene, target_bytes: int | None = None) -> tuple[QuantisedScene, float]:
-    """Symbols as coarse as `max_coding_loss_db` on training rays allows, or as fine as a file of `target_bytes` can hold;
-    and that loss in dB.
+    """What of a scene is needed, `kpc.encoder.prune`, in symbols as coarse as `max_coding_loss_db` on training rays allows in
+    all, or as fine as a file of `target_bytes` can hold; and that loss in dB.
 
     Raises:
         TrainingError: no file of this model is so small.
@@ -218,14 +225,22 @@ def quantise(trainer: Trainer, scene: Scene, target_bytes: int | None = None) ->
         renderer = SceneRenderer(candidate)
         return psnr(renderer.rgb(*rays, renderer.codes(appearances)), targets.numpy())
 
+    config, spent = trainer.config, 0.0
     steps = relative_steps(trainer.field, trainer.optimiser.curvature())
+    whole = scene
+    if config.prune_share and not config.hybrid:
+        spare = config.prune_share * config.max_coding_loss_db
+        pruned = prune(scene, (rays[0], rays[1], rays[2]), fidelity, spare)
+        _say(_left_out(scene, pruned, spare))
+        scene, steps, spent = pruned.scene, pruned.of_each_plane(steps), pruned.loss_db
     if target_bytes is None:
-        return compress(scene, steps, fidelity, trainer.config.max_coding_loss_db)
+        quantised, loss = compress(scene, steps, fidelity, config.max_coding_loss_db - spent)
+        return quantised, spent + loss
     quantised = compress_to_size(scene, steps, target_bytes, lambda candidate: len(file.encode(candidate)))
     if (least := len(file.encode(quantised))) > target_bytes:
         raise TrainingError(f"{least:,} bytes is the least that this model takes, not {target_bytes:,}; give another "
                             "--target-size with --resume, or train anew with a smaller --preset")
-    return quantised, fidelity(scene) - fidelity(quantised.dequantise())
+    return quantised, fidelity(whole) - fidelity(quantised.dequantise())
 
 
 def _trimmed(
@@ -296,6 +311,29 @@ def _plan(trainer: Trainer) -> str:
     decoder = "hybrid" if trainer.config.hybrid else "explicit"
     return (f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
             f"{layout.size / 1e6:.2f} M parameters{nodes}; {decoder} decoder; on {trainer.device}")
+
+
+def _rows_in_time(config: TrainConfig, dataset: Dataset, found: TimeResolution | None) -> str:
+    """How far apart the rows of the time planes are, and why."""
+    rows = time_rows(dataset.clip.frame_count, config.frames_per_row)
+    said = f"time: {rows} rows, one for {config.frames_per_row:g} of {dataset.clip.frame_count} frames"
+    if found is None:
+        return f"{said} (the preset's; it is measured where cameras stand still)"
+    wider = "" if math.isnan(found.next_error) else f", wider apart {found.next_error:.3f}"
+    return (f"{said} (lines between them miss {found.changing:.1%} of the pixels, those that change, by {found.error:.3f} of the "
+            f"full range{wider}; {config.time_tolerance:g} allowed; noise {found.noise:.3f})")
+
+
+def _left_out(scene: Scene, pruned: Pruned, spare_db: float) -> str:
+    """What the scene can do without, and what it cost or would cost."""
+    worth, counts = pruned.view_worth_db, [scale["xy"].shape[2] for scale in scene.scales]
+    said = "colour: the same from all sides, as trained"
+    if worth is not None:
+        said = f"colour: by direction, worth {worth:.3f} dB" if worth > spare_db else (
+            f"colour: the same from all sides, direction is worth {worth:.3f} dB")
+    left = " + ".join(f"{len(kept)} of {count}" for kept, count in zip(pruned.kept, counts))
+    more = "" if math.isinf(pruned.next_db) else f", {pruned.next_db:.3f} dB with fewer"
+    return f"{said}; channels: {left} a scale; costs {pruned.loss_db:.3f} dB{more} ({spare_db:.3f} allowed)"
 
 
 def _spread_of_cameras(dataset: Dataset) -> list[int]:

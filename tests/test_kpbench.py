@@ -88,6 +88,8 @@ def test_ablate_changes_one_thing_at_a_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(kpbench, "_alone", lambda work, job: work(job))
+    # After three steps no channel is worth anything yet: keep them all.
+    monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], prune_share=0.0))
     for name in set(ABLATIONS) - {"as it is", "half the channels", "no motion grid"}:
         monkeypatch.delitem(ABLATIONS, name)
     write_n3dv(tmp_path / "tiny", frames=2)

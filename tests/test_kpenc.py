@@ -153,6 +153,8 @@ def test_the_hybrid_decoder(run: Kpenc, sets: Path, tmp_path: Path, name: str) -
 def test_what_is_printed(run: Kpenc, sets: Path) -> None:
     code, out, err = run(sets / "blender")
     assert code == 0 and "read where a motion grid of 11x11x11 nodes leads" in err
+    assert "colour: the same from all sides, as trained; channels: " in err
+    assert "time: 2 rows, one for 4 of 5 frames (the preset's" in err
     assert all(
         words in out
         for words in (
@@ -166,6 +168,21 @@ def test_what_is_printed(run: Kpenc, sets: Path) -> None:
             "96 steps",
         )
     )
+
+
+@pytest.mark.parametrize("tolerance, rows, why", [(1.0, 2, "1 allowed"), (1e-4, 4, "0.0001 allowed"), (0.0, 3, "the preset's")])
+def test_rows_of_time_are_as_far_apart_as_the_motion_allows(
+    run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tolerance: float, rows: int, why: str
+) -> None:
+    """Of four frames; a run that is resumed finds the same number."""
+    told = TrainConfig(**TINY | {"time_tolerance": tolerance, "frames_per_row": 1.5})  # type: ignore[arg-type]
+    monkeypatch.setitem(PRESETS, "draft", told)
+    for options in (("--keep",), ("--resume",)):
+        code, _, err = run(sets / "n3dv", "--steps", "2", *options)
+        (said,) = [line for line in err.splitlines() if line.startswith("time: ")]
+        assert code == 0 and f"time: {rows} rows, one for {4 / rows if rows != 3 else 1.5:g} of 4 frames" in said and why in said
+        assert len(file.read(tmp_path / "out.kpc").scales[0]["xt"].symbols) == rows
+    assert "resumed at step 2" in err
 
 
 def test_options(run: Kpenc, sets: Path, tmp_path: Path) -> None:
@@ -216,6 +233,21 @@ def test_masks_and_what_a_damaged_model_says(run: Kpenc, sets: Path, tmp_path: P
     fails(run, tmp_path, folder, "every pixel to train on")
     (folder / "sparse/0/images.bin").write_bytes((folder / "sparse/0/images.bin").read_bytes()[:-9])
     fails(run, tmp_path, folder, "images.bin", "it ends early")
+
+
+@pytest.mark.parametrize("share", [1.0, 0.0])
+def test_what_is_left_out_is_said_and_missing_from_the_file(
+    run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
+) -> None:
+    """After 24 steps hardly anything is worth a decibel; the loss that is reported counts all that coding costs."""
+    monkeypatch.setitem(PRESETS, "draft", TrainConfig(**TINY | {"prune_share": share}))  # type: ignore[arg-type]
+    code, out, err = run(sets / "n3dv", "--max-loss", "1dB", "--holdout", "none", "--json")
+    scene = file.read(tmp_path / "out.kpc")
+    counts = [scale["xy"].symbols.shape[2] for scale in scene.scales]
+    assert code == 0 and json.loads(out)["coding_loss_db"] <= 1
+    assert ("colour: the same from all sides, direction is worth" in err) == (share > 0) == (scene.decoder.w1.shape == (1, 9))
+    assert sum(counts) < 16 if share else counts == [8, 8]
+    assert all(f"{count} of 8" in err for count in counts) == (share > 0)
 
 
 def test_a_time_budget(run: Kpenc, sets: Path) -> None:

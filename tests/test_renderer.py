@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scenes import SPACES, displaced, hybrid, look_at, surrounded, tiny_scene, varied
 
+from kpc.encoder.prune import without
 from kpc.format.cameras import Camera
 from kpc.format.errors import DisplayError
 from kpc.format.scene import Scene
@@ -62,8 +63,10 @@ def test_gives_the_reference_picture(view: str, part: Part, space: str) -> None:
         replace(surrounded(tiny_scene(9)), occupancy=np.zeros((2, 300, 2, 3), bool)),
         displaced(surrounded(tiny_scene(6)), most=0.5),
         undirected(tiny_scene(6)),
+        without(tiny_scene(4, scales=3), (np.array([1, 4, 6]), np.array([0]), np.arange(8))),
     ],
-    ids=["static", "uneven", "few texels", "one cell", "nothing", "contracted", "nothing anywhere", "thrown about", "one colour"],
+    ids=["static", "uneven", "few texels", "one cell", "nothing", "contracted", "nothing anywhere", "thrown about", "one colour",
+         "pruned"],
 )
 def test_scenes_of_all_shapes(scene: Scene) -> None:
     renderer = Renderer(gl.context(), scene)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from kpc.encoder.datasets import load_dataset, rays
 from kpc.format.cameras import Camera, load_shots
 from kpc.format.media import read_image
 from kpc.tools import scenegen
-from kpc.tools.scenegen import Film, Options, movers, rig, unseen
+from kpc.tools.scenegen import GRADES, Film, Options, movers, rig, unseen
 
 TINY = Options(cameras=3, frames=3, width=40, height=30, samples=1)
 
@@ -102,7 +103,7 @@ def test_shortcuts_change_nothing(monkeypatch: pytest.MonkeyPatch, time: float) 
     quick = Film(rig(TINY)[0], TINY).picture(time)
     small = movers
     monkeypatch.setattr(
-        scenegen, "movers", lambda t: tuple(scenegen.Mover(m.centre, 6.0, m.distance, m.materials) for m in small(t))
+        scenegen, "movers", lambda t, *c: tuple(scenegen.Mover(m.centre, 6.0, m.distance, m.materials) for m in small(t, *c))
     )
     slow = Film(rig(TINY)[0], TINY).picture(time)
     difference = np.abs(quick.astype(int) - slow)
@@ -160,3 +161,31 @@ def test_ground_truth_json_is_what_the_renderers_read(folder: Path) -> None:
     document = json.loads((folder / "gt" / "cameras.json").read_text())
     assert {"w", "h", "fl_x", "fl_y", "cx", "cy", "frames"} == set(document)
     assert all({"file", "time", "transform_matrix"} <= set(frame) for frame in document["frames"])
+
+
+def test_grades_hold_less_and_less_of_the_same_room() -> None:
+    """Half of the things and patterns, and a quarter; what stays looks as it did, but for shadows of what went."""
+    moving = {grade: len(movers(0.3, content)) for grade, content in GRADES.items()}
+    assert moving == {"full": 2, "half": 1, "quarter": 1}
+    camera, pictures = rig(TINY)[0], {}
+    for grade, content in GRADES.items():
+        film = Film(camera, replace(TINY, content=grade))
+        pictures[grade] = film.picture(0.3).astype(int)
+        shown = set(np.unique(film.buffer.material))
+        assert shown - content.things == {scenegen.FLOOR, scenegen.BACK_WALL, scenegen.SIDE_WALL, scenegen.BOARD}
+        assert shown & content.things == content.things - {scenegen.BALL, scenegen.RING, scenegen.BEAD}
+        assert len(content.patterns) == {"full": 4, "half": 2, "quarter": 1}[grade]
+    # The rug lies in the picture's lower middle, the ball above it.
+    same = [np.abs(pictures[grade] - pictures["full"]).max(2)[22:27, 12:26] for grade in ("half", "quarter")]
+    assert all((difference <= 2).mean() > 0.9 for difference in same)
+    uneven = {grade: np.abs(np.diff(picture, axis=1)).mean() for grade, picture in pictures.items()}
+    assert uneven["full"] > uneven["half"] > uneven["quarter"]
+
+
+def test_grades_are_chosen_on_the_command_line(tmp_path: Path) -> None:
+    words = ["--cameras", "2", "--frames", "1", "--size", "24x16", "--samples", "1"]
+    for grade in GRADES:
+        assert scenegen.main([str(tmp_path / grade), *words, "--content", grade]) == 0
+    assert scenegen.main([str(tmp_path / "default"), *words]) == 0
+    assert digests(tmp_path / "default") == digests(tmp_path / "full")
+    assert len({digests(tmp_path / grade)["gt/cam00_f000.png"] for grade in GRADES}) == 3

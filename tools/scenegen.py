@@ -1,7 +1,7 @@
 """The embedded default scene: a corner of a room, a glossy vase, a bouncing ball and a turning ring.
 
 `python -m kpc.tools.scenegen DIR` writes it as a rig of cameras would film it (N3DV layout), with exact pictures from
-cameras the rig does not have:
+cameras the rig does not have (with `--content half` or `quarter` a room that holds less):
 
     cam00.mp4 ...         one H.264 video a camera; cam00 is central
     poses_bounds.npy      N x 17, the LLFF convention
@@ -21,7 +21,7 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +52,27 @@ VASE, PLINTH, CUBE, STAND, BALL, RING, BEAD, FLOOR, BACK_WALL, SIDE_WALL, BOARD 
 
 
 @dataclass(frozen=True)
+class Content:
+    """What the room holds, by material, and which of its surfaces bear a pattern; the others are of one colour."""
+
+    things: frozenset[int]
+    patterns: frozenset[str]
+
+
+GRADES = {
+    "full": Content(
+        frozenset((VASE, PLINTH, CUBE, STAND, RING, BEAD, BALL)), frozenset(("planks", "rug", "mural", "stripes"))
+    ),
+    "half": Content(frozenset((CUBE, BALL)), frozenset(("planks", "rug"))),
+    "quarter": Content(frozenset((BALL,)), frozenset(("rug",))),
+}
+"""Graded complexity. Of four things (the vase on its plinth, the cube, the ring on its stand, the ball) and four patterns: all,
+two of each, one of each. Room, light, rig and the ball's path are the same."""
+
+FULL = GRADES["full"]
+
+
+@dataclass(frozen=True)
 class Options:
     """What to write; see the command line's help."""
 
@@ -62,6 +83,8 @@ class Options:
     height: int = 144
     fps: float = 12.0
     samples: int = 3
+    content: str = "full"
+    """Of GRADES."""
 
 
 # --- what is where
@@ -77,12 +100,12 @@ class Mover:
     materials: tuple[tuple[int, Distance], ...]
 
 
-def still(p: np.ndarray) -> dict[int, np.ndarray]:
+def still(p: np.ndarray, content: Content = FULL) -> dict[int, np.ndarray]:
     """Distances to all that stands still, by material."""
     x, y, z = p
     wall = np.minimum(BACK - y, np.minimum(x - LEFT, RIGHT - x))
     board = np.maximum(z - 0.11, wall - 0.025)
-    return {
+    distances = {
         FLOOR: z,
         BACK_WALL: BACK - y,
         SIDE_WALL: np.minimum(x - LEFT, RIGHT - x),
@@ -95,18 +118,19 @@ def still(p: np.ndarray) -> dict[int, np.ndarray]:
             _rounded_cylinder(x - 0.28, y - 0.92, z - 0.22, 0.03, 0.22, 0.01),
         ),
     }
+    return {m: d for m, d in distances.items() if m in content.things or m not in FULL.things}
 
 
-def still_distance(p: np.ndarray) -> np.ndarray:
-    distances = list(still(p).values())
+def still_distance(p: np.ndarray, content: Content = FULL) -> np.ndarray:
+    distances = list(still(p, content).values())
     nearest = distances[0]
     for other in distances[1:]:
         nearest = np.minimum(nearest, other)
     return nearest
 
 
-def movers(time: float) -> tuple[Mover, ...]:
-    """The ball (two bounces a clip) and the ring (half a turn a clip, so that the clip loops)."""
+def movers(time: float, content: Content = FULL) -> tuple[Mover, ...]:
+    """The ball (two bounces a clip) and the ring (half a turn a clip, so that the clip loops), as far as they are there."""
     radius = 0.2
     bounce = (2 * time) % 1.0
     ball = np.array(
@@ -136,7 +160,7 @@ def movers(time: float) -> tuple[Mover, ...]:
     def ball_distance(p: np.ndarray) -> np.ndarray:
         return np.sqrt(((p - ball[:, None]) ** 2).sum(0)) - radius
 
-    return (
+    things = (
         Mover(ball, radius, ball_distance, ((BALL, ball_distance),)),
         Mover(
             ring,
@@ -145,6 +169,7 @@ def movers(time: float) -> tuple[Mover, ...]:
             ((RING, ring_distance), (BEAD, bead_distance)),
         ),
     )
+    return tuple(thing for thing in things if thing.materials[0][0] in content.things)
 
 
 def _rounded_cylinder(
@@ -187,6 +212,7 @@ class Paint:
     """Colours of surfaces: procedural, smooth at the scale of a centimetre or two, chosen by the seed."""
 
     seed: int
+    content: Content = FULL
 
     def albedo(self, material: int, p: np.ndarray, time: float) -> np.ndarray:
         """Linear colour (3, N) of points (3, N) on a material."""
@@ -196,6 +222,8 @@ class Paint:
         if material == BACK_WALL:
             return self._mural(x, z)
         if material == SIDE_WALL:
+            if "stripes" not in self.content.patterns:
+                return _plain((0.58, 0.49, 0.355), p)
             stripe = _smooth(np.sin(2 * np.pi * y / 0.5), -0.25, 0.25)
             base = _mix((0.64, 0.55, 0.41), (0.52, 0.43, 0.30), stripe)
             return base * (1 + 0.06 * self.noise(x * 5, y * 5 + z, z * 5 - y))
@@ -208,16 +236,25 @@ class Paint:
         if material == BALL:
             return self._ball(p, time)
         if material == RING:
-            return np.broadcast_to(np.array([[0.80], [0.47], [0.06]], np.float32), p.shape)
+            return _plain((0.80, 0.47, 0.06), p)
         colour = {
             VASE: (0.012, 0.10, 0.115),
             STAND: (0.09, 0.09, 0.10),
             BEAD: (0.07, 0.30, 0.42),
             BOARD: (0.80, 0.77, 0.70),
         }[material]
-        return np.broadcast_to(np.array(colour, np.float32)[:, None], p.shape)
+        return _plain(colour, p)
 
     def _floor(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        wood = self._planks(x, y) if "planks" in self.content.patterns else _plain((0.43, 0.24, 0.115), np.stack([x, x, x]))
+        if "rug" not in self.content.patterns:
+            return wood
+        r = np.hypot(x - 0.1, (y + 0.25) * 1.15)
+        rug = _mix((0.045, 0.085, 0.20), (0.62, 0.56, 0.44), _smooth(np.sin(r * 2 * np.pi / 0.34 + 0.4), -0.3, 0.3))
+        rug = rug * (1 + 0.12 * self.noise(x * 12, y * 12, x * 0))
+        return _mix_arrays(rug, wood, _smooth(r, 0.88, 0.90))
+
+    def _planks(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         plank = np.floor(x / 0.26)
         along = y + 0.7 * self._hash(plank, plank * 0 + 5, plank * 0)
         board = np.floor(along / 1.3)
@@ -225,14 +262,12 @@ class Paint:
         grain = self.noise(x * 14, y * 1.6, plank)
         wood = _mix((0.38, 0.20, 0.095), (0.52, 0.30, 0.145), 0.25 + 0.5 * tone + 0.22 * grain)
         seam = np.minimum(_edge(x / 0.26) * 0.26, _edge(along / 1.3) * 1.3)
-        wood = wood * (0.62 + 0.38 * _smooth(seam, 0.002, 0.020))
-        r = np.hypot(x - 0.1, (y + 0.25) * 1.15)
-        rug = _mix((0.045, 0.085, 0.20), (0.62, 0.56, 0.44), _smooth(np.sin(r * 2 * np.pi / 0.34 + 0.4), -0.3, 0.3))
-        rug = rug * (1 + 0.12 * self.noise(x * 12, y * 12, x * 0))
-        return _mix_arrays(rug, wood, _smooth(r, 0.88, 0.90))
+        return wood * (0.62 + 0.38 * _smooth(seam, 0.002, 0.020))
 
     def _mural(self, x: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Hills under a sun."""
+        if "mural" not in self.content.patterns:
+            return _plain((0.265, 0.40, 0.43), np.stack([x, x, x]))
         wall = _mix((0.24, 0.37, 0.40), (0.29, 0.43, 0.46), _smooth(z, 0.6, 2.0))
         sun = _smooth(np.hypot(x - 0.72, z - 1.28), 0.33, 0.35)
         wall = _mix_arrays(np.array([[0.80], [0.33], [0.13]], np.float32), wall, sun)
@@ -293,6 +328,10 @@ def _edge(x: np.ndarray) -> np.ndarray:
 
 def _mix(a: tuple[float, ...], b: tuple[float, ...], s: np.ndarray) -> np.ndarray:
     return _mix_arrays(np.array(a, np.float32)[:, None], np.array(b, np.float32)[:, None], s)
+
+
+def _plain(colour: tuple[float, float, float], p: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(np.array(colour, np.float32)[:, None], p.shape)
 
 
 def _mix_arrays(a: np.ndarray, b: np.ndarray, s: np.ndarray) -> np.ndarray:
@@ -374,19 +413,25 @@ class Buffer:
     def __post_init__(self) -> None:
         count = self.origins.shape[1]
         far = np.full(count, 20.0, np.float32)
-        self.t = march(still_distance, self.origins, self.directions, np.full(count, 0.02, np.float32), far)
+        standing = self.standing
+        self.t = march(standing, self.origins, self.directions, np.full(count, 0.02, np.float32), far)
         self.t = np.where(np.isfinite(self.t), self.t, far)
         self.p = self.origins + self.directions * self.t
-        self.n = normals(still_distance, self.p)
-        distances = still(self.p)
+        self.n = normals(standing, self.p)
+        distances = still(self.p, self.paint.content)
         self.material = np.array(list(distances))[np.argmin(np.stack(list(distances.values())), axis=0)]
         self.albedo = np.zeros_like(self.p)
         for material in np.unique(self.material):
             there = self.material == material
             self.albedo[:, there] = self.paint.albedo(material, self.p[:, there], 0.0)
-        self.seen = _still_shadow(self.p, self.n)
-        self.open = occlusion(still_distance, self.p, self.n)
+        self.seen = _still_shadow(self.p, self.n, self.paint.content)
+        self.open = occlusion(standing, self.p, self.n)
         self.plain = shade(self.material, self.p, self.n, self.albedo, self.directions, self.seen, self.open)
+
+    @property
+    def standing(self) -> Distance:
+        """Of all that stands still."""
+        return partial(still_distance, content=self.paint.content)
 
     @cached_property
     def mirror(self) -> tuple[np.ndarray, np.ndarray, "Buffer"] | None:
@@ -404,7 +449,7 @@ class Buffer:
 
     def frame(self, time: float) -> np.ndarray:
         """Linear colours (3, N) at a time in [0, 1]."""
-        things = movers(time)
+        things = movers(time, self.paint.content)
         lit = self.plain.copy()
         touched, seen, open_ = _moving_light(things, self.p, self.n)
         if touched.size:
@@ -450,7 +495,7 @@ class Buffer:
         for number in ids:
             there = material == number
             albedo[:, there] = self.paint.albedo(int(number), p[:, there], time)
-        seen, open_ = _still_shadow(p, n), occlusion(still_distance, p, n)
+        seen, open_ = _still_shadow(p, n, self.paint.content), occlusion(self.standing, p, n)
         touched, moving_seen, moving_open = _moving_light(things, p, n)
         seen[touched] *= moving_seen
         open_[touched] *= moving_open
@@ -500,21 +545,21 @@ def _to_light(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return offset / length, length
 
 
-def _still_shadow(p: np.ndarray, n: np.ndarray) -> np.ndarray:
+def _still_shadow(p: np.ndarray, n: np.ndarray, content: Content) -> np.ndarray:
     to_light, length = _to_light(p)
     lit = np.flatnonzero((n * to_light).sum(0) > 0)
     seen = np.zeros(p.shape[1], np.float32)
     start = p[:, lit] + n[:, lit] * np.float32(0.01)
-    seen[lit] = shadow(
-        still_furniture, start, to_light[:, lit], np.minimum(length[lit], 4.0), np.zeros(lit.size, np.float32)
-    )
+    casting = partial(still_furniture, content=content)
+    seen[lit] = shadow(casting, start, to_light[:, lit], np.minimum(length[lit], 4.0), np.zeros(lit.size, np.float32))
     return seen
 
 
-def still_furniture(p: np.ndarray) -> np.ndarray:
-    """What casts shadows: all but floor and walls, which lie behind whatever they could shade."""
-    distances = still(p)
-    return np.minimum.reduce([distances[m] for m in (PLINTH, VASE, CUBE, STAND)])
+def still_furniture(p: np.ndarray, content: Content = FULL) -> np.ndarray:
+    """What casts shadows: all but floor and walls, which lie behind whatever they could shade. Far off where nothing does."""
+    distances = still(p, content)
+    casting = [distances[m] for m in (PLINTH, VASE, CUBE, STAND) if m in distances]
+    return np.minimum.reduce(casting) if casting else np.full(p.shape[1], 1e3, np.float32)
 
 
 def _moving_light(things: tuple[Mover, ...], p: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -600,9 +645,10 @@ class Film:
 
     def __init__(self, camera: Camera, options: Options) -> None:
         self.camera, self.samples = camera, options.samples
+        self.paint = Paint(options.seed, GRADES[options.content])
         fine = camera.resized(camera.width * options.samples, camera.height * options.samples)
         origins, directions = fine.rays()
-        self.buffer = Buffer(Paint(options.seed), np.ascontiguousarray(origins.T), np.ascontiguousarray(directions.T))
+        self.buffer = Buffer(self.paint, np.ascontiguousarray(origins.T), np.ascontiguousarray(directions.T))
 
     def picture(self, time: float) -> np.ndarray:
         """samples^2 rays a pixel, averaged as displayed (after the tone curve), so that a bright edge stays smooth."""
@@ -619,7 +665,7 @@ class Film:
         near = min(
             float((thing.centre - centre) @ forward) - thing.radius
             for t in np.linspace(0, 1, 64)
-            for thing in movers(t)
+            for thing in movers(t, self.paint.content)
         )
         return min(near, float(depth.min())), float(depth.max())
 
@@ -702,6 +748,12 @@ def _command(argv: list[str]) -> None:
     parser.add_argument(
         "--samples", type=int, default=default.samples, help="rays across a pixel (default %(default)s)"
     )
+    parser.add_argument(
+        "--content",
+        choices=tuple(GRADES),
+        default=default.content,
+        help="how much the room holds: all things and patterns, half or a quarter of them (default %(default)s)",
+    )
     given = parser.parse_args(argv)
     try:
         width, height = (int(n) for n in given.size.lower().split("x"))
@@ -718,7 +770,8 @@ def _command(argv: list[str]) -> None:
         raise UsageError(
             "at least 2 cameras, 1 frame, 1 sample, 8x8 pixels, a positive fps and a seed from 0 are needed"
         )
-    generate(given.folder, Options(given.seed, given.cameras, given.frames, width, height, given.fps, given.samples))
+    options = Options(given.seed, given.cameras, given.frames, width, height, given.fps, given.samples, given.content)
+    generate(given.folder, options)
     print(given.folder)
 
 
