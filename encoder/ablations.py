@@ -22,6 +22,7 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "rays drawn evenly": lambda c: replace(c, temporal_start=1.0, object_rays=0.0),
     "no appearances": lambda c: replace(c, appearance="none"),
     "no motion grid": lambda c: replace(c, motion_cells=0),
+    "planes added up": lambda c: replace(c, summed=True, sparse_transients=0.0),
     "the hybrid decoder": lambda c: replace(c, hybrid=True),
     "rows of time by the preset": lambda c: replace(c, time_tolerance=0.0),
     "nothing left out": lambda c: replace(c, prune_share=0.0),

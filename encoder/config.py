@@ -34,6 +34,8 @@ class TrainConfig:
     """The hybrid decoder, two small MLPs for each sample, in place of the explicit one (`kpc.format.scene`)."""
     hybrid_width: int = 32
     """Width of its layers (K-Planes uses 64, and three of them)."""
+    summed: bool = False
+    """The planes are added up in place of being multiplied: to be compared with (K-Planes, section 4.4), not to be stored."""
     hidden: int = 16
     """Width of the MLP that maps a view direction to the colour basis."""
     view_dependent: bool = True

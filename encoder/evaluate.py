@@ -11,7 +11,7 @@ from torch.nn.functional import conv2d
 from kpc.encoder import kernels
 from kpc.encoder.appearances import FIT_RAYS, fitted_code
 from kpc.encoder.datasets import Dataset, rays
-from kpc.encoder.field import Field, HybridField
+from kpc.encoder.field import Field
 from kpc.encoder.render import Rays, collected, fused_features, meet, shade
 from kpc.encoder.train import sample_capacity
 from kpc.format.scene import Scene
@@ -25,8 +25,9 @@ RAYS_AT_ONCE = 1 << 16
 class SceneRenderer:
     """Renders rays of a scene with the kernels; the same pictures as `kpc.player.reference`, much faster."""
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene, self.field = scene, Field.from_scene(evenly_wide(scene))
+    def __init__(self, scene: Scene, field: Field | None = None) -> None:
+        """`field`: of which the scene is but the surroundings, where no scene can hold it."""
+        self.scene, self.field = scene, field or Field.from_scene(evenly_wide(scene))
 
     def rgb(
         self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
@@ -43,7 +44,7 @@ class SceneRenderer:
         self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Colours (N, 3), opacities (N,) and mean depths (N,) along the same rays, as those measure, float32. `codes`: see `rgb`."""
-        draw = self._composited if isinstance(self.field, HybridField) else self._marched
+        draw = self._marched if type(self.field) is Field else self._composited
         out = []
         for start in range(0, len(origins), RAYS_AT_ONCE):
             some = slice(start, start + RAYS_AT_ONCE)
@@ -133,14 +134,15 @@ class Quality:
     pictures: int
 
 
-def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None) -> Quality | None:
+def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None, field: Field | None = None) -> Quality | None:
     """PSNR and SSIM over the held-out pictures, or over `most` of them evenly spaced; None where none are held out.
 
     Pictures with alpha are composited on white, the background such scenes are stored with. What a mask ignores does not
     count, and a picture not at all where its mask leaves no window of SSIM.
 
     Where the scene has appearances, a picture that was not trained on has none yet: a code is fitted to its left half, and its
-    right half alone counts (K-Planes, section 4.3; the protocol is that of NeRF in the Wild, arXiv:2008.02268).
+    right half alone counts (K-Planes, section 4.3; the protocol is that of NeRF in the Wild, arXiv:2008.02268). `field` as in
+    `SceneRenderer`.
     """
     held_out = np.flatnonzero(dataset.pictures.is_test)
     first = {int(number): _middle(dataset, int(number)) if scene.appearances else 0 for number in held_out}
@@ -150,7 +152,7 @@ def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None) -> Qual
         return None
     if most is not None and len(held_out) > most:
         held_out = held_out[np.linspace(0, len(held_out) - 1, most).round().astype(int)]
-    renderer = SceneRenderer(scene)
+    renderer = SceneRenderer(scene, field)
     scores = []
     for number in map(int, held_out):
         start, code = first[number], renderer.code_of_left_half(dataset, number) if scene.appearances else None

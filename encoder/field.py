@@ -111,6 +111,9 @@ class Field(nn.Module):
         codes: (K, H) of appearances, at first 0; or None.
     """
 
+    IDENTITY = 1.0
+    """What a time plane holds where nothing changes."""
+
     def __init__(
         self, layout: Layout, hidden: int, generator: torch.Generator | None = None, motion_nodes: Sequence[int] | None = None,
         appearances: int = 0,
@@ -125,7 +128,7 @@ class Field(nn.Module):
         def uniform(low: float, high: float, *shape: int) -> Tensor:
             return torch.rand(shape, generator=generator) * (high - low) + low
 
-        theta = torch.ones(layout.size)
+        theta = torch.full((layout.size,), self.IDENTITY)
         for _, name, start, rows, columns in layout.planes():
             if name in SPACE_PLANES:
                 theta[start : start + rows * columns * layout.channels] = uniform(0.1, 0.5, rows * columns * layout.channels)
@@ -209,7 +212,7 @@ class Field(nn.Module):
             product: Tensor | None = None
             for name in ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES:
                 sample = bilinear(self.plane(s, name), coordinate[name[0]], coordinate[name[1]], self.mixed)
-                product = sample if product is None else product * sample
+                product = sample if product is None else self.combined(product, sample)
             assert product is not None
             scales.append(product)
         return torch.cat(scales, dim=-1)
@@ -262,6 +265,22 @@ class Field(nn.Module):
                 _fill(field.codes, np.stack([appearance.code for appearance in scene.appearances]))
             field.load_decoder(scene.decoder)
         return field
+
+
+    @staticmethod
+    def combined(one: Tensor, other: Tensor) -> Tensor:
+        """What two planes together say."""
+        return one * other
+
+
+class SummedField(Field):
+    """A field whose planes are added up. Only `Field.features` knows it: no kernel, no file and no player does."""
+
+    IDENTITY = 0.0
+
+    @staticmethod
+    def combined(one: Tensor, other: Tensor) -> Tensor:
+        return one + other
 
 
 class HybridField(Field):

@@ -108,6 +108,8 @@ def encode(options: Options) -> dict[str, Any]:
         if not _wants_partial(trainer, checkpoint):
             raise
 
+    if trainer.config.summed:
+        return _not_written(trainer, options, started)
     _say("writing: choosing quantisation steps, rendering held-out views")
     scene = to_scene(trainer)
     quantised, probe_loss = quantise(trainer, scene, options.target_bytes)
@@ -128,6 +130,18 @@ def encode(options: Options) -> dict[str, Any]:
         "identity_share": quantised.identity_share if quantised.is_dynamic else None,
         "steps": trainer.step, "train_s": trainer.elapsed_s, "encode_s": time.monotonic() - started,
         "rays_per_s": trainer.rays_per_second,
+    }
+
+
+def _not_written(trainer: Trainer, options: Options, started: float) -> dict[str, Any]:
+    """What was measured on a model that no file can hold, as far as `encode` says it of others."""
+    test = evaluate(to_scene(trainer), trainer.dataset, most=options.most_tests, field=trainer.field)
+    if not options.keep:
+        _clear(options.work_dir)
+    return {
+        "file": str(options.output), "device": str(trainer.device), "seed": options.seed, "steps": trainer.step,
+        "test_psnr": test and test.psnr, "test_ssim": test and test.ssim, "test_pictures": test.pictures if test else 0,
+        "train_s": trainer.elapsed_s, "encode_s": time.monotonic() - started,
     }
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kpc.encoder import kernels
-from kpc.encoder.field import Field, Layout
+from kpc.encoder.field import Field, Layout, SummedField
 from kpc.format.scene import TERMINATION
 from kpc.format.space import Contraction, SpaceMapping
 
@@ -251,5 +251,7 @@ class FusedFeatures(torch.autograd.Function):
 
 def fused_features(field: Field) -> Callable[[Tensor, Tensor], Tensor]:
     """`Field.features` of a field on the CPU."""
+    if isinstance(field, SummedField):
+        return field.features
     return lambda points, times: FusedFeatures.apply(  # type: ignore[no-any-return,no-untyped-call]
         field.theta, field.motion, field.layout, points, times)

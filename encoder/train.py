@@ -20,7 +20,7 @@ from kpc.encoder.appearances import number_pictures
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.box import seen_cells
 from kpc.encoder.datasets import Dataset, rays
-from kpc.encoder.field import Field, HybridField, appearance_priors, motion_nodes, motion_priors, plan_layout, priors
+from kpc.encoder.field import Field, HybridField, SummedField, appearance_priors, motion_nodes, motion_priors, plan_layout, priors
 from kpc.encoder.importance import TileWeights, cameras_stand_still
 from kpc.encoder.occupancy import OccupancyGrid, grid_shape
 from kpc.encoder.proposals import Level, Proposals, histogram_loss
@@ -82,7 +82,9 @@ class Trainer:
         layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
         nodes = motion_nodes(config, self.aabb, layout)
         appearances, self.names = number_pictures(dataset, config.appearance)
-        kind, hidden = (HybridField, config.hybrid_width) if config.hybrid else (Field, config.hidden)
+        kind, hidden = (SummedField if config.summed else Field), config.hidden
+        if config.hybrid:
+            kind, hidden = HybridField, config.hybrid_width
         generator = torch.Generator().manual_seed(config.seed)
         self.field = kind(layout, hidden, generator, nodes, len(self.names)).to(self.device)
         if not config.view_dependent:
@@ -94,7 +96,8 @@ class Trainer:
         on_cpu = self.device.type == "cpu"
         proposals = Proposals(config, self.aabb, dataset.clip, dataset.is_dynamic).to(self.device) if config.proposals else None
         self.optimiser: FusedOptimiser | PlainOptimiser = (
-            FusedOptimiser(self.field, config, shape, mapping) if on_cpu and not config.hybrid and proposals is None else
+            FusedOptimiser(self.field, config, shape, mapping)
+            if on_cpu and proposals is None and not (config.hybrid or config.summed) else
             PlainOptimiser(self.field, config, shape, mapping, fused=on_cpu, proposals=proposals)
         )
         self.watch = self.optimiser.watch

@@ -41,7 +41,7 @@ def trim_box(
     steps = min(MOST_STEPS, config.steps // 10)
     if time_budget_s is None and steps < LEAST_STEPS:
         return aabb, 0.0
-    coarse = replace(config, hybrid=False, resolutions=(32, 64), channels=8, motion_cells=0, channel_dropout=0.0,
+    coarse = replace(config, hybrid=False, summed=False, resolutions=(32, 64), channels=8, motion_cells=0, channel_dropout=0.0,
                      temporal_start=1.0, samples_across=160, cells_across=64, steps=steps, occupancy_start=64)
     trainer = Trainer(dataset, coarse, aabb, "cpu", mapping=mapping)
     trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10)

@@ -90,15 +90,16 @@ def test_ablate_changes_one_thing_at_a_time(
     monkeypatch.setattr(kpbench, "_alone", lambda work, job: work(job))
     # After three steps no channel is worth anything yet: keep them all.
     monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], prune_share=0.0))
-    for name in set(ABLATIONS) - {"as it is", "half the channels", "no motion grid"}:
+    for name in set(ABLATIONS) - {"as it is", "half the channels", "planes added up", "no motion grid"}:
         monkeypatch.delitem(ABLATIONS, name)
     write_n3dv(tmp_path / "tiny", frames=2)
     out = tmp_path / "ablate.json"
     command = ["ablate", str(tmp_path / "tiny"), "--preset", "draft", "--steps", "3", "--box=-1,-1,-1,1,1,1", "--out", str(out)]
     assert kpbench.main(command) == 0
     records = results.load([out])  # there is no motion grid to leave out
-    assert [record["settings"]["ablation"] for record in records] == ["as it is", "half the channels"]
-    whole, half = (record["repeats"][0] for record in records)
+    assert [record["settings"]["ablation"] for record in records] == ["as it is", "half the channels", "planes added up"]
+    whole, half, added = (record["repeats"][0] for record in records)
+    assert added["test_psnr"] > 5 and "size_bytes" not in added  # no file can hold it
     assert whole["parameters"] > 1.8 * half["parameters"] and whole["steps"] == half["steps"] == 3
     assert "changed" in capsys.readouterr().err and "half the channels" in results.markdown(records)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ablate.json", "tiny"]

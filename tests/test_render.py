@@ -10,7 +10,7 @@ from scenes import hybrid, tiny_scene
 
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
-from kpc.encoder.field import Field, HybridField, Layout, bilinear
+from kpc.encoder.field import Field, HybridField, Layout, SummedField, bilinear
 from kpc.encoder.render import Rays, collected, fused_features, meet, samples_of, shade
 from kpc.encoder.train import Figures, PlainOptimiser, sample_capacity
 from kpc.player import reference
@@ -188,3 +188,13 @@ def test_a_hybrid_field_is_its_scene_again() -> None:
     assert isinstance(field, HybridField)
     for name, weights in vars(field.decoder_as_data()).items():
         np.testing.assert_array_equal(weights, getattr(scene.decoder, name), err_msg=name)
+
+
+def test_added_planes_are_their_sum() -> None:
+    field = SummedField(Layout.of(np.array([[4, 3, 2, 3]]), 2), 2, torch.Generator().manual_seed(0))
+    assert not field.plane(0, "xt").any() and field.plane(0, "xy").all()
+    points, times = torch.rand(9, 3), torch.rand(9)
+    axis = {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2], "t": times}
+    wanted = sum(bilinear(field.plane(0, name), axis[name[0]], axis[name[1]]) for name in ("xy", "xz", "yz", "xt", "yt", "zt"))
+    torch.testing.assert_close(field.features(points, times), wanted)
+    assert fused_features(field)(points, times).equal(field.features(points, times))
