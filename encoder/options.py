@@ -53,7 +53,6 @@ class Options:
                          view_dependent=config.view_dependent or appearance != "none")  # codes act through the direction MLP
         return ABLATIONS[self.ablation](config)
 
-
     def appearance_of(self, dataset: Dataset) -> tuple[str, str]:
         """What is to have an appearance, as `TrainConfig.appearance`, and why, in words for the log."""
         if self.appearance != "auto":

@@ -116,3 +116,11 @@ def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict
         "samples": len(weights),
         "peaks": peaks.numpy(),
     }
+
+
+class Calling(torch.nn.Module):
+    """Makes a function of a field's parameters out of one that uses the field."""
+
+    def __init__(self, field: Field, call: object) -> None:
+        super().__init__()
+        self.field, self.forward = field, call

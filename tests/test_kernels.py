@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gradients import KINDS, backpropagate, misty, rays_at, reference_gradients
+from gradients import KINDS, Calling, backpropagate, misty, rays_at, reference_gradients
 from scenes import displaced, tiny_scene
 
 from kpc.encoder import kernels
@@ -93,18 +93,10 @@ def test_the_reference_has_the_gradient_of_finite_differences() -> None:
             return render_reference(field, rays, aabb, torch.ones(1, 2, 2, 2), 0.3)[0]
 
         return torch.func.functional_call(
-            _Calling(field, rendered), {"field.theta": theta, "field.density": density}, ()
+            Calling(field, rendered), {"field.theta": theta, "field.density": density}, ()
         )
 
     assert torch.autograd.gradcheck(colours, (theta, density))
-
-
-class _Calling(torch.nn.Module):
-    """Makes a function of a field's parameters out of one that uses the field."""
-
-    def __init__(self, field: Field, call: object) -> None:
-        super().__init__()
-        self.field, self.forward = field, call
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gradients import KINDS, misty, rays_at
+from gradients import KINDS, Calling, misty, rays_at
 from scenes import hybrid, tiny_scene
 
 from kpc.encoder.config import TrainConfig
@@ -149,21 +149,13 @@ def test_the_hybrid_decoder_has_the_gradient_of_finite_differences() -> None:
 
     def met(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         changed = {f"field.{name}": value for name, value in zip(parameters, values)}
-        return torch.func.functional_call(_Calling(field, rendered), changed, ())  # type: ignore[no-any-return]
+        return torch.func.functional_call(Calling(field, rendered), changed, ())  # type: ignore[no-any-return]
 
     values = tuple(p.detach().clone().requires_grad_() for p in parameters.values())
     assert torch.autograd.gradcheck(met, values)
     rgb, _ = met(*values)
     for name, gradient in zip(parameters, torch.autograd.grad(rgb.square().sum(), values)):
         assert gradient.abs().max() > 0, name
-
-
-class _Calling(torch.nn.Module):
-    """Makes a function of a field's parameters out of one that uses the field."""
-
-    def __init__(self, field: Field, call: object) -> None:
-        super().__init__()
-        self.field, self.forward = field, call
 
 
 @pytest.mark.parametrize("kind", KINDS)
