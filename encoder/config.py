@@ -179,13 +179,13 @@ class TrainConfig:
         return replace(self, resolutions=tuple(max(16, n // 2) for n in self.resolutions[:: len(self.resolutions) - 1 or 1]),
                        channels=8 * self.channels,
                        frames_per_row=2 * self.frames_per_row, motion_cells=10, channel_dropout=0.25, view_dependent=False,
-                       samples_across=max(32, self.samples_across // 2), steps=5 * self.steps // 2)
+                       samples_across=max(32, self.samples_across // 2), steps=2 * self.steps)
 
 
 PRESETS = {
     "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500,
                          occupancy_start=64),
     "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
-    "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=8000, temporal_start=0.75, temporal_floor=0.3),
+    "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=10000, temporal_start=0.75, temporal_floor=0.3),
     "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000),
 }
