@@ -23,10 +23,10 @@ class TrainConfig:
     it is measured instead, `kpc.encoder.structure`."""
     time_tolerance: float = 0.055
     """What straight lines between rows may leave of the pixels that change, root mean square as a share of the full range; the
-    rows are as far apart as that allows. 0: `frames_per_row` as it is. The default scene and room get a row for 2 frames (0.0546 and
-    0.0452 are left; with one for 3, 0.072 and 0.060), liam one for 6 (0.053; for 8, 0.061). Held-out PSNR and size after short runs
-    of `fast`, and with a row for 2: liam, 6 frames, 23.19 dB and 128 KB, 23.13 dB and 143 KB (1,000 steps); room, 3 frames, 20.35 dB
-    and 105 KB, 20.18 dB and 115 KB (600 steps)."""
+    rows are as far apart as that allows. 0: `frames_per_row` as it is. The default scene and room get a row for 2 frames (0.0546
+    and 0.0452 are left; with one for 3, 0.072 and 0.060), liam one for 6 (0.053; for 8, 0.061). Held-out PSNR and size after
+    short runs of `fast`, and with a row for 2: liam, 6 frames, 23.19 dB and 128 KB, 23.13 dB and 143 KB (1,000 steps); room, 3
+    frames, 20.35 dB and 105 KB, 20.18 dB and 115 KB (600 steps)."""
     motion_cells: int = 0
     """Cells of the motion grid (`kpc.format.motion`) along the longest edge of the box; 0 for none. It has a row for each row of
     the time planes. Not for objects in surroundings that stand still: a cell holds some of both, and liam loses 4.6 dB."""

@@ -12,8 +12,8 @@ from kpc.encoder import kernels
 from kpc.encoder.appearances import FIT_RAYS, fitted_code
 from kpc.encoder.datasets import Dataset, rays
 from kpc.encoder.field import Field
+from kpc.encoder.optimisers import sample_capacity
 from kpc.encoder.render import Rays, collected, fused_features, meet, shade
-from kpc.encoder.train import sample_capacity
 from kpc.format.scene import Scene
 from kpc.format.space import Contraction
 
@@ -43,7 +43,7 @@ class SceneRenderer:
     def render(
         self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Colours (N, 3), opacities (N,) and mean depths (N,) along the same rays, as those measure, float32. `codes`: see `rgb`."""
+        """Colours (N, 3), opacities (N,), mean depths (N,) along the same rays, as those measure, float32. `codes` as in `rgb`."""
         draw = self._marched if type(self.field) is Field else self._composited
         out = []
         for start in range(0, len(origins), RAYS_AT_ONCE):

@@ -331,8 +331,8 @@ class HybridField(Field):
 
     def decoder_as_data(self) -> AnyDecoder:
         density = _array(self.density)
-        return HybridDecoder(v=_array(self.v), v_bias=_array(self.v_bias), density_weight=density[:-1].copy(), density_bias=float(density[-1]),
-                             w1=_array(self.w1), b1=_array(self.b1), u=_array(self.u), w2=_array(self.w2), b2=_array(self.b2))
+        weights = {name: _array(getattr(self, name)) for name in ("v", "v_bias", "w1", "b1", "u", "w2", "b2")}
+        return HybridDecoder(density_weight=density[:-1].copy(), density_bias=float(density[-1]), **weights)
 
 
 def _array(parameter: Tensor) -> np.ndarray:

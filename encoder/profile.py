@@ -9,7 +9,8 @@ from typing import Any
 import torch
 
 from kpc.encoder.field import Layout
-from kpc.encoder.train import PlainOptimiser, Trainer
+from kpc.encoder.optimisers import PlainOptimiser
+from kpc.encoder.train import Trainer
 
 STEPS = 8
 """Steps before the profile, in multiples of the first with an occupancy grid: the grid has formed, and been split in time."""

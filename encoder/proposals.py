@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from kpc.encoder.config import TrainConfig
-from kpc.encoder.field import Field, Layout, plan_layout
+from kpc.encoder.field import Field, plan_layout
 from kpc.encoder.render import Rays, Samples, cells_of, fused_features, places, spans_of
 from kpc.format.scene import Clip
 from kpc.format.space import SpaceMapping
@@ -38,15 +38,16 @@ class Proposals(nn.Module):
         super().__init__()
         fields = []
         for level, texels in enumerate(config.proposal_resolutions):
-            layout: Layout = plan_layout(replace(config, resolutions=(texels,), channels=config.proposal_channels), aabb, clip, is_dynamic)
-            fields.append(Field(layout, 1, torch.Generator().manual_seed(config.seed + 1 + level)))
+            shape = replace(config, resolutions=(texels,), channels=config.proposal_channels)
+            generator = torch.Generator().manual_seed(config.seed + 1 + level)
+            fields.append(Field(plan_layout(shape, aabb, clip, is_dynamic), 1, generator))
         self.fields = nn.ModuleList(fields)
         self.counts = config.proposal_samples
 
     def sample(
         self, rays: Rays, aabb: Tensor, mapping: SpaceMapping | None, cells: tuple[int, int, int], step: int, fused: bool,
     ) -> tuple[Samples, Tensor, list[Level]]:
-        """Samples for the field that is to be had, as many on every ray; their edges (N, K + 1); what each proposal made of the rays.
+        """Samples for the field that is to be had, as many on every ray; their edges (N, K + 1); what each proposal made of them.
 
         Args:
             cells: (Nz, Ny, Nx) of the occupancy grid. step: number of the training step. fused: whether the kernels look the

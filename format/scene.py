@@ -79,7 +79,7 @@ class HybridDecoder:
 
         h     = clip(v f + v_bias, 0, ACTIVATION_LIMIT)
         sigma = exp(clip(h . density_weight + density_bias, -20, 20))
-        rgb   = sigmoid(w2 clip(w1 e(d) + b1 + code + u h, 0, ACTIVATION_LIMIT) + b2)     e(d) as in `Decoder`, all but u h once a ray
+        rgb   = sigmoid(w2 clip(w1 e(d) + b1 + code + u h, 0, ACTIVATION_LIMIT) + b2)    e(d) as in `Decoder`; once a ray but u h
 
     The paper hands a few linear outputs of the density's MLP on to the colour's; here its hidden layer is handed on as it is.
 

@@ -139,8 +139,8 @@ def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[st
     Explicit: density_weight (F / 4), w1 (H x 3: nine columns, then b1, then zeros), w2 (3 x F / 4 x H), b2 (3 x F / 4),
     density_bias (1, in x). Without w1 and w2 where colour is the same from all sides, w2 being 0.
 
-    Hybrid, with G and H filled up with zeros to multiples of four: from_features (G x F / 4) is v, from_features_bias (G / 4) v_bias,
-    passed_on (H x G / 4) u; density_weight (G / 4), w1 (H x 3), w2 (3 x H / 4), b2 (1, in xyz), density_bias as above.
+    Hybrid, with G and H filled up with zeros to multiples of four: from_features (G x F / 4) is v, from_features_bias (G / 4)
+    v_bias, passed_on (H x G / 4) u; density_weight (G / 4), w1 (H x 3), w2 (3 x H / 4), b2 (1, in xyz), density_bias as above.
     """
     features = layout.scales * layout.layers * 4
     place = np.concatenate(

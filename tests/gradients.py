@@ -8,8 +8,8 @@ from scenes import displaced, surrounded, tiny_scene
 
 from kpc.encoder import kernels
 from kpc.encoder.field import Field
+from kpc.encoder.optimisers import motion_of, sample_capacity
 from kpc.encoder.render import Rays, render_reference
-from kpc.encoder.train import motion_of, sample_capacity
 from kpc.format.scene import Scene
 
 

@@ -19,9 +19,10 @@ from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluate import SceneRenderer, evaluate
 from kpc.encoder.field import Field, Layout, priors
-from kpc.encoder.render import Rays
 from kpc.encoder.kpenc import to_scene
-from kpc.encoder.train import Report, Trainer, add_priors
+from kpc.encoder.optimisers import add_priors
+from kpc.encoder.render import Rays
+from kpc.encoder.train import Report, Trainer
 from kpc.format.errors import DatasetError
 from kpc.format.media import write_image
 from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION, Scene

@@ -19,8 +19,8 @@ from kpc.encoder import kernels
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.field import Field, Layout, priors
+from kpc.encoder.optimisers import BETA1, BETA2, EPSILON, add_priors, log_densities, sample_capacity
 from kpc.encoder.render import Rays, render_reference
-from kpc.encoder.train import BETA1, BETA2, EPSILON, add_priors, log_densities, sample_capacity
 from kpc.player import reference
 
 COLOUR = 1e-4

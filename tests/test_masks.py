@@ -16,7 +16,7 @@ from test_datasets import fails, load
 from kpc.encoder.datasets import Dataset, pixels
 from kpc.encoder.datasets.masks import BLOCK
 from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr, ssim, true_picture
-from kpc.encoder.train import RaySampler
+from kpc.encoder.sampler import RaySampler
 from kpc.format.media import write_image
 
 SIZE = (24, 32)

@@ -11,8 +11,8 @@ from scenes import hybrid, tiny_scene
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.field import Field, HybridField, Layout, SummedField, bilinear
+from kpc.encoder.optimisers import Figures, PlainOptimiser, sample_capacity
 from kpc.encoder.render import Rays, collected, fused_features, meet, samples_of, shade
-from kpc.encoder.train import Figures, PlainOptimiser, sample_capacity
 from kpc.player import reference
 
 

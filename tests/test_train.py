@@ -15,9 +15,11 @@ from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluate import evaluate, psnr
 from kpc.encoder.field import Field
-from kpc.encoder.render import Rays
 from kpc.encoder.kpenc import to_scene
-from kpc.encoder.train import PlainOptimiser, RaySampler, Report, Trainer, kept_channels
+from kpc.encoder.optimisers import PlainOptimiser, kept_channels
+from kpc.encoder.render import Rays
+from kpc.encoder.sampler import RaySampler
+from kpc.encoder.train import Report, Trainer
 from kpc.format.errors import TrainingError
 from kpc.format.media import read_image, write_image
 from kpc.format.space import Contraction

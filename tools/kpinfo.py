@@ -168,7 +168,7 @@ def _page(info: dict[str, Any]) -> str:
         *_appearances(info["appearances"]),
         f"  occupancy   {occupancy['slots']} x {'x'.join(map(str, reversed(occupancy['cells_zyx'])))} cells, "
         f"{occupancy['share']:.1%} occupied",
-        f"  decoder     {info['decoder']['kind']}, {info['decoder']['features']} features, {info['decoder']['hidden']} hidden units",
+        "  decoder     {kind}, {features} features, {hidden} hidden units".format(**info["decoder"]),
     ]
     for number, scale in enumerate(info["scales"]):
         planes = ", ".join(f"{name} {p['columns']}x{p['rows']}" for name, p in scale["planes"].items())

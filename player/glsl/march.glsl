@@ -121,7 +121,8 @@ vec4 four_rows(int i, vec4 f[FEATURES]) {
     vec4 sum = vec4(0.0);
     for (int j = 0; j < FEATURES; ++j) {
         int at = 4 * i * FEATURES + j;
-        sum += vec4(dot(from_features[at], f[j]), dot(from_features[at + FEATURES], f[j]), dot(from_features[at + 2 * FEATURES], f[j]), dot(from_features[at + 3 * FEATURES], f[j]));
+        sum += vec4(dot(from_features[at], f[j]), dot(from_features[at + FEATURES], f[j]),
+                    dot(from_features[at + 2 * FEATURES], f[j]), dot(from_features[at + 3 * FEATURES], f[j]));
     }
     return sum;
 }
@@ -133,7 +134,8 @@ vec3 shade_of(vec4 h[WIDTH / 4]) {
         vec4 sum = towards[i];
         for (int j = 0; j < WIDTH / 4; ++j) {
             int at = i * WIDTH + j;
-            sum += vec4(dot(passed_on[at], h[j]), dot(passed_on[at + WIDTH / 4], h[j]), dot(passed_on[at + WIDTH / 2], h[j]), dot(passed_on[at + 3 * WIDTH / 4], h[j]));
+            sum += vec4(dot(passed_on[at], h[j]), dot(passed_on[at + WIDTH / 4], h[j]),
+                        dot(passed_on[at + WIDTH / 2], h[j]), dot(passed_on[at + 3 * WIDTH / 4], h[j]));
         }
         sum = activated(sum);
         shade += vec3(dot(w2[i], sum), dot(w2[HIDDEN / 4 + i], sum), dot(w2[HIDDEN / 2 + i], sum));

@@ -1,0 +1,331 @@
+"""One training step, on the CPU with the kernels alone or in PyTorch: render a batch, weigh what is wrong, move the field."""
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+
+from kpc.encoder import kernels
+from kpc.encoder.config import TrainConfig
+from kpc.encoder.field import Field, appearance_priors, motion_priors, priors
+from kpc.encoder.proposals import Level, Proposals, histogram_loss
+from kpc.encoder.render import Rays, Samples, collected, fused_features, meet, samples_of, shade
+from kpc.format.scene import SPACE_PLANES
+from kpc.format.space import Contraction, SpaceMapping
+
+ROOM = 3
+"""Samples that a step on a GPU has room for, in multiples of `TrainConfig.samples`, which they are on average."""
+
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+"""Adam's constants as Instant-NGP sets them for grids (arXiv:2201.05989, section 4)."""
+
+
+class Stopwatch:
+    """Seconds of wall clock by what they went to: `with watch("name"): ...`."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+
+def kept_channels(field: Field, config: TrainConfig, step: int) -> torch.Tensor:
+    """Factors on the features for one step, (F,) float32: 0 where `channel_dropout` leaves a channel out, at all scales alike.
+
+    The others carry its weight: the mean over steps is 1.
+    """
+    M = field.layout.channels
+    dropped = min(round(config.channel_dropout * M), M - 1)
+    factors = np.full(M, M / (M - dropped), np.float32)
+    factors[np.random.default_rng((config.seed, step)).permutation(M)[:dropped]] = 0
+    return torch.from_numpy(np.tile(factors, len(field.layout.resolution))).to(field.theta.device)
+
+
+class FusedOptimiser:
+    """A step on the CPU: fused kernels for the planes, PyTorch for the small decoder."""
+
+    def __init__(
+        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: SpaceMapping | None = None
+    ) -> None:
+        self.field, self.config, self.mapping = field, config, mapping
+        self.watch = Stopwatch()
+        self.workers = numba.get_num_threads()  # starts numba's threads, which would undo the next line
+        torch.set_num_threads(1)  # the decoder is so small that sharing it out costs more, a hundredfold on a busy machine
+        self.theta = field.theta.detach().numpy()
+        self.grad = np.zeros((self.workers, self.theta.size), np.float32)
+        self.mean, self.square = np.zeros_like(self.theta), np.zeros_like(self.theta)
+        self._peaks = np.zeros((self.workers, *cells), np.float32)
+        self.decoder = _decoder_optimiser(field, config)
+
+    def peaks(self) -> np.ndarray:
+        """The largest weight in each cell since the last call: (Nz, Ny, Nx) float32."""
+        peaks = self._peaks.max(0)
+        self._peaks[:] = 0
+        return peaks
+
+    def step(
+        self, number: int, rate: float, batch: Rays, targets: torch.Tensor,
+        aabb: np.ndarray, occupancy: np.ndarray, step_length: float, extent: float,
+    ) -> tuple[float, float]:
+        """Mean squared error a colour channel, and samples a ray."""
+        layout, config = self.field.layout, self.config
+        with self.watch("decoder"):
+            kept = kept_channels(self.field, config, number)
+            basis = self.field.b2[None]
+            if config.view_dependent:
+                basis = self.field.basis(batch.directions, self.field.codes_of(batch.appearances))
+            basis = basis * kept
+            density = torch.cat([self.field.density.detach()[:-1] * kept, self.field.density.detach()[-1:]])
+            grad_basis = np.zeros((len(basis) if config.view_dependent else self.workers, *basis.shape[1:]), np.float32)
+            grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
+            motion = motion_of(self.field)
+            grad_motion = None if motion is None else np.zeros((self.workers, *motion.shape), np.float32)
+            moving = motion is not None and number % config.motion_every == 0
+        with self.watch("kernel"):
+            errors, counts = kernels.backpropagate(
+                self.theta, self.grad, layout.table, layout.resolution, density.numpy(), grad_density,
+                layout.channels, motion, grad_motion, moving, aabb, kernels.even_of(self.mapping), occupancy.view(np.uint8),
+                np.float32(step_length), np.float32(extent), batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(),
+                batch.jitters.numpy(), basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(),
+                self._peaks, np.float32(config.distortion), sample_capacity(aabb, step_length, self.mapping),
+            )
+        with self.watch("priors"):
+            if number % config.regularise_every == 0:
+                add_priors(self.field, self.theta, self.grad[0], config, config.regularise_every)
+        with self.watch("decoder"):
+            self.decoder.zero_grad()
+            basis.backward(torch.from_numpy(grad_basis if config.view_dependent else grad_basis.sum(0, keepdims=True)))
+            self.field.density.grad = torch.from_numpy(grad_density.sum(0))
+            self.field.density.grad[:-1] *= kept
+            if self.field.codes is not None:
+                _total(appearance_priors(self.field, config)).backward()
+            if moving:
+                _total(motion_priors(self.field, config)).backward()
+                self.field.motion.grad += torch.from_numpy(grad_motion.sum(0))
+            _set_rate(self.decoder, rate)
+            self.decoder.step()
+        with self.watch("adam"):
+            kernels.adam(self.theta, self.grad, self.mean, self.square, config.learning_rate * rate, BETA1, BETA2, EPSILON,
+                         number + 1)
+        return float(errors.mean(dtype=np.float64)) / 3, float(counts.mean())
+
+    def state(self) -> dict[str, Any]:
+        return {"mean": torch.from_numpy(self.mean), "square": torch.from_numpy(self.square),
+                "peaks": torch.from_numpy(self._peaks.max(0)), "decoder": self.decoder.state_dict()}
+
+    def load(self, state: dict[str, Any]) -> None:
+        self.mean[:], self.square[:] = state["mean"].numpy(), state["square"].numpy()
+        self._peaks[:] = state["peaks"].numpy()
+        self.decoder.load_state_dict(state["decoder"])
+
+    def curvature(self) -> np.ndarray:
+        """Running mean of the squared gradient of each element of theta, a diagonal estimate of how much an error there costs."""
+        return self.square
+
+
+class Figures:
+    """Small tensors from a device, read LATE steps after they were made, so that nobody waits; on the CPU at once."""
+
+    LATE = 8
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._waiting: deque[tuple[torch.Tensor, torch.cuda.Event]] = deque()
+
+    def of(self, made: torch.Tensor) -> list[float]:
+        """The numbers of `made`, or of what was made LATE calls ago; of the first, as long as there is none."""
+        if self.device.type == "cpu":
+            return made.tolist()  # type: ignore[no-any-return]
+        host = torch.empty_like(made, device="cpu", pin_memory=True).copy_(made, non_blocking=True)
+        done = torch.cuda.Event()
+        done.record()
+        self._waiting.append((host, done))
+        host, done = self._waiting.popleft() if len(self._waiting) > self.LATE else self._waiting[0]
+        done.synchronize()
+        return host.tolist()  # type: ignore[no-any-return]
+
+
+class PlainOptimiser:
+    """A step in plain PyTorch, on any device that PyTorch knows; or `fused`, on the CPU: kernels for the planes.
+
+    On a GPU nothing in a step waits for it: shapes do not depend on what it computes, and `step` returns numbers that it worked
+    out a few steps before.
+    """
+
+    def __init__(
+        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: SpaceMapping | None = None, *,
+        fused: bool = False, proposals: Proposals | None = None,
+    ) -> None:
+        self.field, self.config, self.mapping, self.proposals = field, config, mapping, proposals
+        self.watch = Stopwatch()
+        self.device = field.theta.device
+        self._peaks = torch.zeros(cells, device=self.device)
+        self._figures = Figures(self.device)
+        self._occupancy: tuple[np.ndarray, torch.Tensor] | None = None
+        self.fused = fused
+        self.features = fused_features(field) if fused else field.features
+        if fused:
+            numba.get_num_threads()  # starts numba's threads, which would undo the next line
+            torch.set_num_threads(1)  # several add up gradients in any order: no run would end where another did
+        self.fields: list[Field] = [field] if proposals is None else [field, *proposals.fields]
+        for each in self.fields:
+            each.mixed = config.mixed_precision and self.device.type != "cpu"
+        self.planes = _adam([([each.theta for each in self.fields], config.learning_rate)])
+        self.decoder = _decoder_optimiser(field, config, [each.density for each in self.fields[1:]])
+
+    def peaks(self) -> np.ndarray:
+        """As `FusedOptimiser.peaks`."""
+        peaks = self._peaks.cpu().numpy().copy()
+        self._peaks.zero_()
+        return peaks
+
+    def step(
+        self, number: int, rate: float, batch: Rays, targets: torch.Tensor,
+        aabb: np.ndarray, occupancy: np.ndarray, step_length: float, extent: float,
+    ) -> tuple[float, float]:
+        """Mean squared error a colour channel, and samples a ray."""
+        config = self.config
+        with self.watch("samples"):
+            batch, targets = batch.apply(self._there), self._there(targets)
+            levels: list[Level] = []
+            if self.proposals is None:
+                samples = self._samples(batch, aabb, occupancy, step_length)
+            else:
+                box, cells = self._there(torch.from_numpy(aabb)), tuple(self._peaks.shape)
+                samples, edges, levels = self.proposals.sample(batch, box, self.mapping, cells, number, self.fused)
+        with self.watch("forward"):
+            kept = self._there(kept_channels(self.field, config, number))
+            met = meet(self.field, batch, samples, self.features, extent, kept)
+            error = (shade(self.field, batch, met) - targets).square().mean()
+            loss = error + config.distortion * met.distortion
+            for level in levels:
+                loss = loss + config.histogram * histogram_loss(edges, met.weights.view(len(targets), -1), level)
+            moving = self.field.motion is not None and number % config.motion_every == 0
+            if moving:
+                loss = loss + _total(motion_priors(self.field, config))
+            if self.field.codes is not None:
+                loss = loss + _total(appearance_priors(self.field, config))
+            regularised = number % config.regularise_every == 0
+            for each in self.fields if regularised and not self.fused else ():
+                loss = loss + config.regularise_every * _total(priors(each, config))
+        with self.watch("backward"):
+            for optimiser in (self.planes, self.decoder):
+                optimiser.zero_grad()
+                _set_rate(optimiser, rate)
+            loss.backward()  # type: ignore[no-untyped-call]
+            if self.field.motion is not None and not moving:
+                self.field.motion.grad = None
+        with self.watch("priors"):
+            for each in self.fields if regularised and self.fused else ():
+                theta, grad = each.theta.detach().numpy(), each.theta.grad.numpy()
+                add_priors(each, theta, grad, config, config.regularise_every)
+        with self.watch("adam"):
+            self.planes.step()
+            self.decoder.step()
+            _, ny, nx = self._peaks.shape
+            flat = (samples.cell[:, 0] * ny + samples.cell[:, 1]) * nx + samples.cell[:, 2]
+            self._peaks.view(-1).scatter_reduce_(0, flat, met.weights.detach(), "amax")
+        taken = (met.reached & (samples.length > 0)).sum() / len(targets)
+        squared_error, samples_a_ray = self._figures.of(torch.stack([error.detach(), taken]))
+        return squared_error, samples_a_ray
+
+    def _samples(self, batch: Rays, aabb: np.ndarray, occupancy: np.ndarray, step_length: float) -> Samples:
+        if self.fused:
+            return collected(batch, aabb, occupancy, step_length, self.mapping)
+        if self._occupancy is None or self._occupancy[0] is not occupancy:
+            self._occupancy = occupancy, self._there(torch.from_numpy(occupancy))
+        fixed = {} if self.device.type == "cpu" else {
+            "most": sample_capacity(aabb, step_length, self.mapping), "capacity": ROOM * self.config.samples}
+        return samples_of(batch, self._there(torch.from_numpy(aabb)), self._occupancy[1], step_length, self.mapping, **fixed)
+
+    def _there(self, values: torch.Tensor) -> torch.Tensor:
+        """On the device, without waiting for it: only pinned memory can be copied behind one's back."""
+        return values if self.device.type == "cpu" else values.pin_memory().to(self.device, non_blocking=True)
+
+    def state(self) -> dict[str, Any]:
+        return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict(), "peaks": self._peaks,
+                "proposals": self.proposals and self.proposals.state_dict()}
+
+    def load(self, state: dict[str, Any]) -> None:
+        self._peaks.copy_(state["peaks"])
+        self.planes.load_state_dict(state["planes"])
+        self.decoder.load_state_dict(state["decoder"])
+        if self.proposals is not None:
+            self.proposals.load_state_dict(state["proposals"])
+
+    def curvature(self) -> np.ndarray:
+        """As `FusedOptimiser.curvature`."""
+        state = self.planes.state[self.field.theta]
+        if "exp_avg_sq" not in state:
+            return np.zeros(self.field.theta.numel(), np.float32)
+        return state["exp_avg_sq"].cpu().numpy()
+
+
+def _total(weighed: dict[str, torch.Tensor]) -> torch.Tensor:
+    return torch.stack(list(weighed.values())).sum()
+
+
+def add_priors(field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, times: float) -> None:
+    """Add `times` the gradient of `kpc.encoder.field.priors` to grad."""
+    M = field.layout.channels
+    space, transient = times * config.space_variation, times * config.transient_variation
+    for _, name, start, rows, columns in field.layout.planes():
+        if name in SPACE_PLANES:
+            kernels.add_variation(theta, grad, start, rows, columns, M, space, space)
+            continue
+        kernels.add_variation(theta, grad, start, rows, columns, M, transient, 0.0)
+        kernels.add_time_smoothness(theta, grad, start, rows, columns, M, times * config.time_smoothness)
+        size = rows * columns * field.layout.channels
+        kernels.add_sparse_transients(theta, grad, start, size, times * config.sparse_transients)
+
+
+def log_densities(field: Field, points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Log densities at (N, 3) points in [0, 1]^3 and (N,) times, on the CPU."""
+    layout = field.layout
+    return kernels.log_densities(
+        field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
+        layout.channels, motion_of(field), np.asarray(points, np.float32), np.asarray(times, np.float32),
+        8 * numba.get_num_threads(),
+    )
+
+
+def motion_of(field: Field) -> np.ndarray | None:
+    """The motion grid as the kernels take it."""
+    return None if field.motion is None else field.motion.detach().numpy()
+
+
+def sample_capacity(aabb: np.ndarray, step_length: float, mapping: SpaceMapping | None = None) -> int:
+    """Samples a ray can take at most: the box's diagonal in steps, or all of a ray through contracted space."""
+    longest = np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64)) if not isinstance(mapping, Contraction) else mapping.end
+    return int(longest / step_length) + 2
+
+
+def _decoder_optimiser(
+    field: Field, config: TrainConfig, others: Sequence[torch.nn.Parameter] = ()
+) -> torch.optim.Adam:
+    """Of all but the planes."""
+    decoder = [*field.decoder_parameters(config.view_dependent), *others]
+    motion = [] if field.motion is None else [([field.motion], config.motion_learning_rate)]
+    codes = [] if field.codes is None else [([field.codes], config.appearance_learning_rate)]
+    return _adam([(decoder, config.decoder_learning_rate), *motion, *codes])
+
+
+def _adam(groups: list[tuple[list[torch.nn.Parameter], float]]) -> torch.optim.Adam:
+    """For groups of parameters and the peak of the learning rate of each."""
+    return torch.optim.Adam([{"params": parameters, "peak": peak, "lr": peak} for parameters, peak in groups],
+                            betas=(BETA1, BETA2), eps=EPSILON)
+
+
+def _set_rate(optimiser: torch.optim.Adam, rate: float) -> None:
+    """`rate`: a share of the peaks."""
+    for group in optimiser.param_groups:
+        group["lr"] = group["peak"] * rate
