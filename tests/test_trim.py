@@ -38,4 +38,4 @@ def test_a_lone_object_seen_once_gets_a_model_of_its_own(moving: Dataset, tmp_pa
     assert surrounded == replace(plain, steps=7, seed=3)
     twice = replace(moving.pictures, time=np.zeros(len(moving.pictures), np.float32))
     assert options.config(replace(moving, pictures=twice)).view_dependent
-    assert replace(options, steps=None).config(moving).steps == 4 * plain.steps and lone.motion_cells > plain.motion_cells == 0
+    assert replace(options, steps=None).config(moving).steps == 2 * plain.steps and lone.motion_cells > plain.motion_cells == 0
