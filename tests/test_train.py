@@ -355,9 +355,9 @@ def test_pytorch_does_not_compete_with_the_kernels_for_the_cores(moving: Dataset
 
 
 def test_a_time_budget_ends_the_run(moving: Dataset) -> None:
-    run = trainer(moving)
+    run = trainer(moving, steps=10**9)
     run.run(ignore, time_budget_s=0.3)
-    assert 0.3 <= run.elapsed_s < 5 and run.step != CONFIG.steps
+    assert run.elapsed_s >= 0.3 and 0 < run.step < 10**9
 
 
 def test_reports_come_twice_a_second(moving: Dataset) -> None:
