@@ -162,6 +162,11 @@ class TrainConfig:
         if not self.resolutions or min(self.resolutions) < 2:
             raise UsageError(f"resolutions {self.resolutions}: every scale needs at least 2 texels")
 
+    @property
+    def prunes(self) -> bool:
+        """Whether anything may be left out: the explicit decoder alone is linear, as `kpc.encoder.prune` wants it."""
+        return self.prune_share > 0 and not self.hybrid
+
     def for_lone_object(self) -> "TrainConfig":
         """For an object without surroundings that one moving camera has seen: soldier, and D-NeRF's scenes.
 

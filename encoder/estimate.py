@@ -47,7 +47,7 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
     train_s = time_budget_s or trainer.elapsed_s + a_step * (config.steps - trainer.step)
 
     pixels = trainer.dataset.pictures.width.astype(np.int64) * trainer.dataset.pictures.height
-    probes = PROBES + (renderings(trainer.field.layout.features) if config.prune_share and not config.hybrid else 0)
+    probes = PROBES + (renderings(trainer.field.layout.features) if config.prunes else 0)
     rendered = (probes + 1) * probe_rays + 2 * tested * float(pixels.mean())
     fits_s = 2 * tested * _seconds_a_fit(trainer) if trainer.names and tested else 0.0
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()

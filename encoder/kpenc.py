@@ -242,7 +242,7 @@ def quantise(trainer: Trainer, scene: Scene, target_bytes: int | None = None) ->
     config, spent = trainer.config, 0.0
     steps = relative_steps(trainer.field, trainer.optimiser.curvature())
     whole = scene
-    if config.prune_share and not config.hybrid:
+    if config.prunes:
         spare = config.prune_share * config.max_coding_loss_db
         pruned = prune(scene, (rays[0], rays[1], rays[2]), fidelity, spare)
         _say(_left_out(scene, pruned, spare))

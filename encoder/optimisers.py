@@ -39,7 +39,7 @@ class Stopwatch:
 
 
 def kept_channels(field: Field, config: TrainConfig, step: int) -> torch.Tensor:
-    """Factors on the features for one step, (F,) float32: 0 where `channel_dropout` leaves a channel out, at all scales alike.
+    """Factors on the features for one step, (F,) float32 on the CPU: 0 where `channel_dropout` leaves a channel out, at all scales alike.
 
     The others carry its weight: the mean over steps is 1.
     """
@@ -47,7 +47,7 @@ def kept_channels(field: Field, config: TrainConfig, step: int) -> torch.Tensor:
     dropped = min(round(config.channel_dropout * M), M - 1)
     factors = np.full(M, M / (M - dropped), np.float32)
     factors[np.random.default_rng((config.seed, step)).permutation(M)[:dropped]] = 0
-    return torch.from_numpy(np.tile(factors, len(field.layout.resolution))).to(field.theta.device)
+    return torch.from_numpy(np.tile(factors, len(field.layout.resolution)))
 
 
 class FusedOptimiser:

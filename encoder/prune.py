@@ -117,8 +117,8 @@ class Seen:
         ends = ends if len(ends) else np.arange(len(origins))
         s = np.where(np.isfinite(depths), depths, 0)[ends].astype(np.float32)
         s = scene.mapping.progress(s) if isinstance(scene.mapping, Contraction) else s
-        nothing = torch.zeros(len(ends))
-        rays = render.Rays(*(torch.from_numpy(a[ends]) for a in (origins, directions, times)), nothing, nothing)
+        nothing = np.zeros(len(ends))
+        rays = render.Rays.of(*(a[ends] for a in (origins, directions, times)), nothing, nothing)
         u, _ = render.places(rays, torch.from_numpy(s)[:, None], torch.from_numpy(scene.aabb), scene.mapping)
         slots, *cells = scene.occupancy.shape
         rng = np.random.default_rng(0)

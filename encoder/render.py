@@ -19,7 +19,6 @@ from kpc.encoder.field import Field, Layout, SummedField
 from kpc.format.scene import TERMINATION
 from kpc.format.space import Contraction, SpaceMapping
 
-
 OPAQUE = 50.0
 """Optical thickness of a sample beyond which more makes no difference to what lies behind it."""
 
@@ -35,6 +34,12 @@ class Rays:
     jitters: Tensor
     backgrounds: Tensor
     appearances: Tensor | None = None
+
+    @staticmethod
+    def of(*arrays: np.ndarray, appearances: np.ndarray | None = None) -> "Rays":
+        """Of the first five members as arrays of any float type, and of int64 appearances."""
+        floats = (torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays)
+        return Rays(*floats, None if appearances is None else torch.from_numpy(appearances))
 
     def apply(self, change: Callable[[Tensor], Tensor]) -> "Rays":
         """The same with every member changed."""

@@ -71,9 +71,8 @@ class RaySampler:
         if self.dataset.has_alpha:
             targets = targets * colours[:, 3:] + backgrounds * (1 - colours[:, 3:])
         jitters = rng.random(count, dtype=np.float32)
-        arrays = (origins, directions, pictures.time[picture], jitters, backgrounds)
-        numbers = None if self.appearances is None else torch.from_numpy(self.appearances[picture])
-        batch = Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays), numbers)
+        numbers = None if self.appearances is None else self.appearances[picture]
+        batch = Rays.of(origins, directions, pictures.time[picture], jitters, backgrounds, appearances=numbers)
         return batch, torch.from_numpy(targets)
 
     def _frame(self, alpha: np.ndarray) -> tuple[int, int, int, int]:

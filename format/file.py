@@ -16,6 +16,7 @@ import os
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
@@ -224,9 +225,9 @@ def _pack_decoder(decoder: AnyDecoder, features: int) -> bytes:
     hidden, bias = len(decoder.b1), decoder.density_bias
     if isinstance(decoder, HybridDecoder):
         width = len(decoder.v_bias)
-        head, shapes = HYBRID_STRUCT.pack(features, width, hidden, bias), _hybrid_shapes(features, width, hidden)
+        head, shapes = HYBRID_STRUCT.pack(features, width, hidden, bias), HybridDecoder.shapes(features, width, hidden)
     else:
-        head, shapes = DECODER_STRUCT.pack(features, hidden, bias), _decoder_shapes(features, hidden)
+        head, shapes = DECODER_STRUCT.pack(features, hidden, bias), Decoder.shapes(features, hidden)
     weights = {name: getattr(decoder, name) for name in shapes}
     for name, shape in shapes.items():
         if np.shape(weights[name]) != shape:
@@ -368,12 +369,16 @@ class SceneReader(Reader):
 
     def decoder(self) -> AnyDecoder:
         """The DECO or HYBR chunk."""
+        return self._decoder
+
+    @cached_property
+    def _decoder(self) -> AnyDecoder:
         features, number = self.head.feature_count, self._decoder_number()
         parse: Callable[[bytes, int], AnyDecoder]
         if self.index[number].kind == "HYBR":
-            head, parse, shapes = HYBRID_STRUCT, _parse_hybrid, _hybrid_shapes(features, HIDDEN_LIMIT, HIDDEN_LIMIT)
+            head, parse, shapes = HYBRID_STRUCT, _parse_hybrid, HybridDecoder.shapes(features, HIDDEN_LIMIT, HIDDEN_LIMIT)
         else:
-            head, parse, shapes = DECODER_STRUCT, _parse_decoder, _decoder_shapes(features, HIDDEN_LIMIT)
+            head, parse, shapes = DECODER_STRUCT, _parse_decoder, Decoder.shapes(features, HIDDEN_LIMIT)
         most = head.size + 2 * sum(map(math.prod, shapes.values()))
         return self._parsed(lambda raw: parse(raw, features), self.chunk(number, most))
 
@@ -541,22 +546,13 @@ def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, Pla
     return planes
 
 
-def _decoder_shapes(features: int, hidden: int) -> dict[str, tuple[int, ...]]:
-    return {"density_weight": (features,), "w1": (hidden, 9), "b1": (hidden,), "w2": (3, features, hidden), "b2": (3, features)}
-
-
-def _hybrid_shapes(features: int, width: int, hidden: int) -> dict[str, tuple[int, ...]]:
-    return {"v": (width, features), "v_bias": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
-            "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
-
-
 def _parse_decoder(raw: bytes, expected_features: int) -> Decoder:
     cursor = _Cursor(raw, "DECO")
     features, hidden, bias = cursor.unpack(DECODER_STRUCT)
     if features != expected_features or not 0 < hidden <= HIDDEN_LIMIT or not math.isfinite(bias):
         raise FormatError(f"DECO: {features} features (the planes give {expected_features}), {hidden} hidden units "
                           f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}")
-    return Decoder(density_bias=bias, **_parse_weights(cursor, _decoder_shapes(features, hidden)))
+    return Decoder(density_bias=bias, **_parse_weights(cursor, Decoder.shapes(features, hidden)))
 
 
 def _parse_hybrid(raw: bytes, expected_features: int) -> HybridDecoder:
@@ -566,7 +562,7 @@ def _parse_hybrid(raw: bytes, expected_features: int) -> HybridDecoder:
             or not math.isfinite(bias):
         raise FormatError(f"HYBR: {features} features (the planes give {expected_features}), {width} and {hidden} hidden units "
                           f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}")
-    return HybridDecoder(density_bias=bias, **_parse_weights(cursor, _hybrid_shapes(features, width, hidden)))
+    return HybridDecoder(density_bias=bias, **_parse_weights(cursor, HybridDecoder.shapes(features, width, hidden)))
 
 
 def _parse_weights(cursor: "_Cursor", shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:

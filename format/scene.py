@@ -68,6 +68,11 @@ class Decoder:
     w2: np.ndarray
     b2: np.ndarray
 
+    @staticmethod
+    def shapes(features: int, hidden: int) -> dict[str, tuple[int, ...]]:
+        """Of the arrays, in their order."""
+        return {"density_weight": (features,), "w1": (hidden, 9), "b1": (hidden,), "w2": (3, features, hidden), "b2": (3, features)}
+
     @property
     def parameter_count(self) -> int:
         return sum(np.size(weights) for weights in vars(self).values())
@@ -97,6 +102,12 @@ class HybridDecoder:
     u: np.ndarray
     w2: np.ndarray
     b2: np.ndarray
+
+    @staticmethod
+    def shapes(features: int, width: int, hidden: int) -> dict[str, tuple[int, ...]]:
+        """Of the arrays, in their order."""
+        return {"v": (width, features), "v_bias": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
+                "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
 
     @property
     def parameter_count(self) -> int:

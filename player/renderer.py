@@ -15,7 +15,7 @@ from kpc.format.scene import Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
 from kpc.player.reference import Part, Rendering, code_of, slot_at
-from kpc.player.textures import FOLDED_AXIS, Layout, Rows, decoder_arrays, decoder_shape, distances
+from kpc.player.textures import FOLDED_AXIS, Layout, Rows, decoder_arrays, decoder_shape, distances, filled_to_four
 
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
@@ -364,9 +364,7 @@ def _set(program: moderngl.Program, **values: object) -> None:
 
 def _vectors(code: np.ndarray) -> list[tuple[float, ...]] | tuple[float, ...]:
     """A code as a uniform array of vec4s, padded with 0; moderngl wants an array of one without the brackets."""
-    padded = np.zeros((-(-len(code) // 4), 4))
-    padded.ravel()[: len(code)] = code
-    vectors = [tuple(map(float, vector)) for vector in padded]
+    vectors = [tuple(map(float, vector)) for vector in filled_to_four(code, 0).reshape(-1, 4)]
     return vectors if len(vectors) > 1 else vectors[0]
 
 

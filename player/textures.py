@@ -155,12 +155,12 @@ def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[st
     arrays = {"density_bias": np.array([decoder.density_bias, 0, 0, 0])}
     if isinstance(decoder, HybridDecoder):
         arrays |= {
-            "from_features": _filled(spread(decoder.v), 0),
-            "from_features_bias": _filled(decoder.v_bias, 0),
-            "density_weight": _filled(decoder.density_weight, 0),
+            "from_features": filled_to_four(spread(decoder.v), 0),
+            "from_features_bias": filled_to_four(decoder.v_bias, 0),
+            "density_weight": filled_to_four(decoder.density_weight, 0),
             "w1": _direction_layer(decoder),
-            "passed_on": _filled(_filled(decoder.u, 0), 1),
-            "w2": _filled(decoder.w2, 1),
+            "passed_on": filled_to_four(filled_to_four(decoder.u, 0), 1),
+            "w2": filled_to_four(decoder.w2, 1),
             "b2": np.append(decoder.b2, 0),
         }
     else:
@@ -173,10 +173,10 @@ def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[st
 
 def _direction_layer(decoder: AnyDecoder) -> np.ndarray:
     """w1 and b1, (H, 12), H filled up to a multiple of four."""
-    return _filled(np.concatenate([decoder.w1, decoder.b1[:, None], np.zeros((len(decoder.b1), 2))], axis=1), 0)
+    return filled_to_four(np.concatenate([decoder.w1, decoder.b1[:, None], np.zeros((len(decoder.b1), 2))], axis=1), 0)
 
 
-def _filled(array: np.ndarray, axis: int) -> np.ndarray:
+def filled_to_four(array: np.ndarray, axis: int) -> np.ndarray:
     """With zeros added along an axis up to a multiple of four."""
     ends = [(0, 0)] * array.ndim
     ends[axis] = 0, -array.shape[axis] % 4

@@ -38,7 +38,7 @@ def rays_at(scene: Scene, count: int, seed: int = 0) -> Rays:
     origins = np.concatenate([origins[chosen], centre - 3 * np.eye(3)])
     directions = np.concatenate([directions[chosen], np.eye(3)])
     arrays = (origins, directions, rng.random(count), rng.random(count), rng.random((count, 3)))
-    return Rays(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
+    return Rays.of(*arrays)
 
 
 DISTORTION = 0.3

@@ -83,8 +83,7 @@ def hybrid(scene: Scene, seed: int = 6, width: int = 6, hidden: int = 7) -> Scen
     """A scene with a hybrid decoder, of widths that fill no vectors of four, about as dense as before."""
     rng = np.random.default_rng(seed)
     F = scene.decoder.w2.shape[1]
-    shapes = {"v": (width, F), "v_bias": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
-              "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
+    shapes = HybridDecoder.shapes(F, width, hidden)
     weights = {name: rng.normal(0.0, 2.0 / np.sqrt(shape[-1]), shape).astype(np.float32) for name, shape in shapes.items()}
     return replace(scene, decoder=HybridDecoder(density_bias=3.5, **weights))
 

@@ -1,7 +1,5 @@
 """Proposal sampling: new intervals hold even shares, the loss is its equation, and training puts samples where surfaces are."""
 
-from pathlib import Path
-
 import datasets as make
 import numpy as np
 import pytest

@@ -14,7 +14,6 @@ import struct
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -194,10 +193,9 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
 
     mlps = b"".join(scene_chunks(replace(scene, decoder=_hybrid(2, 2, 2)))[deco].parts)
 
-    def decoded_by(*changes: Callable[[bytes], bytes]) -> bytes:
-        """The file with a hybrid decoder, changed so."""
-        raw = reduce(lambda raw, change: change(raw), changes, mlps)
-        return pack([*chunks[:deco], Chunk("HYBR", [raw]), *chunks[occu:]], values, compress=False)
+    def decoded_by(*parts: bytes) -> bytes:
+        """The file with hybrid decoders in place of its own."""
+        return pack([*chunks[:deco], *(Chunk("HYBR", [part]) for part in parts), *chunks[occu:]], values, compress=False)
 
     def varied(*parts: bytes) -> bytes:
         return with_chunks("appe", *parts)
@@ -292,13 +290,13 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
                         broken, "static scene"),
         "decoder-features": (repacked(deco, set_at(0, "<H", 3)), broken, "3 features"),
         "decoder-nan": (repacked(deco, set_at(8, "<H", 0x7E00)), broken, "NaN or infinite"),
-        "hybrid-features": (decoded_by(set_at(0, "<H", 3)), broken, "3 features"),
-        "hybrid-width": (decoded_by(set_at(2, "<H", 0)), broken, "0 and 2 hidden units"),
-        "hybrid-hidden": (decoded_by(set_at(4, "<H", 257)), broken, "2 and 257 hidden units"),
-        "hybrid-bias": (decoded_by(set_at(6, "<f", nan)), broken, "density bias nan"),
-        "hybrid-nan": (decoded_by(set_at(10, "<H", 0x7C00)), broken, "NaN or infinite"),
-        "hybrid-long": (decoded_by(lambda raw: raw + bytes(2)), broken, "2 bytes too long"),
-        "hybrid-twice": (with_chunks("HYBR", mlps, mlps), broken, "two decoders"),
+        "hybrid-features": (decoded_by(patched(mlps, 0, "<H", 3)), broken, "3 features"),
+        "hybrid-width": (decoded_by(patched(mlps, 2, "<H", 0)), broken, "0 and 2 hidden units"),
+        "hybrid-hidden": (decoded_by(patched(mlps, 4, "<H", 257)), broken, "2 and 257 hidden units"),
+        "hybrid-bias": (decoded_by(patched(mlps, 6, "<f", nan)), broken, "density bias nan"),
+        "hybrid-nan": (decoded_by(patched(mlps, 10, "<H", 0x7C00)), broken, "NaN or infinite"),
+        "hybrid-long": (decoded_by(mlps + bytes(2)), broken, "2 bytes too long"),
+        "hybrid-twice": (decoded_by(mlps, mlps), broken, "2 HYBR chunks"),
         "two-decoders": (with_chunks("HYBR", mlps), broken, "two decoders"),
         "decoder-short": (repacked(deco, lambda raw: raw[:-1]), broken, "ends after"),
         "occupancy-bits": (repacked(occu, lambda raw: raw[:-1] + b"\xff"), broken, "unused bits"),
@@ -345,19 +343,18 @@ def _scene(dynamic: bool, sizes: list[tuple[int, int, int, int, int]], amplitude
             for name in (ALL_PLANES if dynamic else SPACE_PLANES)
         })
     features, hidden = sum(size[0] for size in sizes), 3
-    shapes = [(features,), (hidden, 9), (hidden,), (3, features, hidden), (3, features)]
-    density, w1, b1, w2, b2 = (_noise(shape, 17 + k) / np.float32(64) for k, shape in enumerate(shapes))
+    weights = {name: _noise(shape, 17 + k) / np.float32(64)
+               for k, (name, shape) in enumerate(Decoder.shapes(features, hidden).items())}
     occupancy = _noise((2 if dynamic else 1, 3, 3, 5), 99) > 0
     pose = np.array([[1, 0, 0, 0.5], [0, 1, 0, -0.25], [0, 0, 1, 3], [0, 0, 0, 1]], np.float64)
     return QuantisedScene(
         np.array([[-1, -0.75, -0.5], [1, 0.75, 0.5]], np.float32), Clip(12, 24.0) if dynamic else Clip(1, 24.0),
-        tuple(scales), Decoder(density, 0.5, w1, b1, w2, b2), occupancy, np.array([0.25, 0.5, 1], np.float32), 0.0625,
+        tuple(scales), Decoder(density_bias=0.5, **weights), occupancy, np.array([0.25, 0.5, 1], np.float32), 0.0625,
         tuple(Camera(64 + k, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(cameras)))
 
 
 def _hybrid(features: int, width: int, hidden: int) -> HybridDecoder:
-    shapes = {"v": (width, features), "v_bias": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
-              "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
+    shapes = HybridDecoder.shapes(features, width, hidden)
     return HybridDecoder(density_bias=0.5, **{
         name: _noise(shape, 17 + k) / np.float32(64) for k, (name, shape) in enumerate(shapes.items())})
 

@@ -113,8 +113,8 @@ vec4 feature(vec3 u, int scale, int layer) {
 }
 
 #if HYBRID
-// A weight below which a sample's colour is not worked out: 4096 of them could not make up an 8-bit level and a half.
-const float NEGLIGIBLE = 1e-4;
+// A weight below which a sample's colour is not worked out but grey: 4096 of them are not off by more than half an 8-bit level.
+const float NEGLIGIBLE = 4e-7;
 
 // Four numbers of v f.
 vec4 four_rows(int i, vec4 f[FEATURES]) {
