@@ -1,4 +1,4 @@
-"""From a dataset to a scene. Needs PyTorch and numba, the extra `kpc[encoder]`, which viewers do without."""
+"""From a dataset to a scene. Needs PyTorch, the extra `kpc[encoder]`, which viewers do without."""
 
 import sys
 
@@ -8,7 +8,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         from kpc.encoder import kpenc
     except ModuleNotFoundError as error:
-        if error.name not in ("torch", "numba"):
+        if error.name != "torch":
             raise
         print(f'kpenc: needs {error.name}, which is not installed; pip install "kpc[encoder]"', file=sys.stderr)
         return 1

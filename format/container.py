@@ -9,6 +9,7 @@ This module knows nothing of scenes: a chunk is a kind, a place in the scene, an
 import io
 import os
 import struct
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ VERSION = 0
 HEADER = struct.Struct("<8sHHIQIIQQIIII")
 ENTRY = struct.Struct("<4sHBBIIHHIIIQ")
 
-CODEC_RAW, CODEC_ZSTD = 0, 1
+CODEC_RAW, CODEC_ZSTD, CODEC_SYMBOLS = 0, 1, 2
 ZSTD_LEVEL = 19
 
 EXPANSION_LIMIT = 32768
@@ -96,7 +97,10 @@ class Entry:
 
 @dataclass(frozen=True)
 class Chunk:
-    """One chunk to be written: its place and its raw bytes, cut where their statistics change."""
+    """One chunk to be written: its place and its raw bytes, cut where their statistics change.
+
+    A plane segment has another form besides, that of `kpc.format.symbols`: `symbols`, which stand for `symbol_count` bytes.
+    """
 
     kind: str
     parts: Sequence[bytes]
@@ -104,10 +108,13 @@ class Chunk:
     plane: int = 0
     row_start: int = 0
     row_count: int = 0
+    symbols: bytes | None = None
+    symbol_count: int = 0
 
 
 def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
-    """Lay chunks out in the given order; each is stored raw, or as a zstd frame where that is smaller.
+    """Lay chunks out in the given order; each is stored raw, or coded where that is smaller: as symbols if it has them, else
+    as a zstd frame.
 
     Args:
         value_count: numbers in all planes together.
@@ -120,15 +127,19 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) ->
     entries, bodies, largest = [], [], 0
     for chunk in chunks:
         raw = b"".join(chunk.parts)
-        body, codec = raw, CODEC_RAW
-        if compress:
+        body, codec, length = raw, CODEC_RAW, len(raw)
+        if compress and chunk.symbols is not None and chunk.symbol_count <= len(chunk.symbols) * EXPANSION_LIMIT:
+            if len(chunk.symbols) < len(raw):
+                body, codec, length = chunk.symbols, CODEC_SYMBOLS, chunk.symbol_count
+        elif compress:
             smallest = min(_zstd_frames(chunk.parts), key=len)
-            body, codec = (smallest, CODEC_ZSTD) if len(smallest) < len(raw) else (raw, CODEC_RAW)
+            if len(smallest) < len(raw):
+                body, codec = smallest, CODEC_ZSTD
         entries.append(ENTRY.pack(chunk.kind.encode("ascii"), 0, chunk.scale, chunk.plane, chunk.row_start,
-                                  chunk.row_count, codec, 0, len(body), len(raw), google_crc32c.value(body), offset))
+                                  chunk.row_count, codec, 0, len(body), length, google_crc32c.value(body), offset))
         bodies.append(body)
         offset += len(body)
-        largest = max(largest, len(raw))
+        largest = max(largest, length)
     index = b"".join(entries)
     if max(value_count, largest) > offset * EXPANSION_LIMIT:
         raise FormatError(f"the scene is too empty for its size: {value_count:,} values in {offset:,} bytes; "
@@ -175,6 +186,7 @@ class Reader:
     def __init__(self, source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, allow_partial: bool = False):
         self.source = _as_source(source)
         self.name = self.source.name
+        self._reading = threading.Lock()
         self.header = self._read_header(allow_partial)
         self.index = self._read_index()
 
@@ -236,9 +248,10 @@ class Reader:
         return entry.offset + entry.stored_length <= self.source.size
 
     def stored(self, number: int) -> bytes:
-        """A chunk as it lies in the file, its CRC32C verified."""
+        """A chunk as it lies in the file, its CRC32C verified. Several threads may ask; the source is read by one at a time."""
         entry = self.index[number]
-        body = self.source.read_at(entry.offset, entry.stored_length)
+        with self._reading:
+            body = self.source.read_at(entry.offset, entry.stored_length)
         if len(body) != entry.stored_length:
             raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is not there; fetch the file again")
         if google_crc32c.value(body) != entry.crc:

@@ -15,6 +15,7 @@ import math
 import os
 import struct
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, BinaryIO, TypeVar
@@ -23,13 +24,14 @@ import numpy as np
 
 from kpc.format.cameras import Camera
 from kpc.format.cli import written_aside
-from kpc.format.container import DEFAULT_BUDGET, Chunk, Entry, Reader, Source, pack
+from kpc.format.container import CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, Chunk, Entry, Reader, Source, pack
 from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
+from kpc.format.symbols import decode_symbols, encode_symbols
 
 Parsed = TypeVar("Parsed")
 
@@ -183,8 +185,9 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
                 else:
                     stop = len(plane.symbols) if start == 0 else 0
                 if start < stop:
-                    payload = encode_segment(plane.symbols[start:stop], plane.coded[start:stop])
-                    chunks.append(Chunk("PLNE", payload, number, ALL_PLANES.index(name), start, stop - start))
+                    segment, coded = plane.symbols[start:stop], plane.coded[start:stop]
+                    chunks.append(Chunk("PLNE", encode_segment(segment, coded), number, ALL_PLANES.index(name), start, stop - start,
+                                        encode_symbols(segment, coded), segment.size))
     return chunks
 
 
@@ -298,14 +301,15 @@ def read(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, memory
                              np.zeros((p.rows, p.columns), bool))
         for name, p in scale.items()
     } for scale in reader.head.scales)
-    for number, entry in enumerate(reader.index):
-        if not reader.available(number):
-            continue
-        if entry.kind == "PLNE":
+    segments = [number for number, entry in enumerate(reader.index) if entry.kind == "PLNE" and reader.available(number)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for number, (decoded, coded) in zip(segments, pool.map(reader.segment, segments), strict=True):
+            entry = reader.index[number]
             plane = scales[entry.scale][ALL_PLANES[entry.plane]]
             rows = slice(entry.row_start, entry.row_start + entry.row_count)
-            plane.symbols[rows], plane.coded[rows] = reader.segment(number)
-        elif entry.kind not in KNOWN_KINDS:
+            plane.symbols[rows], plane.coded[rows] = decoded, coded
+    for number, entry in enumerate(reader.index):
+        if entry.kind not in KNOWN_KINDS and reader.available(number):
             reader.stored(number)  # ignored, but never damaged
     return QuantisedScene(reader.head.aabb, reader.head.clip, scales, reader.decoder(), reader.occupancy(),
                           reader.head.background, reader.head.step, reader.cameras(), reader.mapping(), reader.motion(),
@@ -348,9 +352,17 @@ class SceneReader(Reader):
         """Decode a PLNE chunk: (row_count, W, M) int8 symbols and (row_count, W) bool coded texels."""
         entry = self.index[number]
         plane = self.head.scales[entry.scale][ALL_PLANES[entry.plane]]
-        texels = entry.row_count * plane.columns
-        payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * (1 + texels))
-        return self._parsed(lambda raw: decode_segment(raw, entry.row_count, plane.columns, plane.channels), payload)
+        texels, shape = entry.row_count * plane.columns, (entry.row_count, plane.columns, plane.channels)
+        if entry.codec != CODEC_SYMBOLS:
+            payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * (1 + texels))
+            return self._parsed(lambda raw: decode_segment(raw, *shape), payload)
+        if entry.raw_length != texels * plane.channels:
+            raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
+                              f"{texels * plane.channels:,} of its rows")
+        if entry.raw_length > entry.stored_length * EXPANSION_LIMIT:
+            raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, more than "
+                              f"{entry.stored_length:,} bytes can hold")
+        return self._parsed(lambda body: decode_symbols(body, *shape), self.stored(number))
 
     def mapping(self) -> SpaceMapping | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""

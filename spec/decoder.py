@@ -95,8 +95,12 @@ def chunks(data, partial):  # sections 3, 4 and 10
         else:
             require(crc32c(body) == crc, "chunk damaged")
         if known:
-            raw_bytes = None if body is None else decoded(body, codec, raw)
-            yield kind.decode(), scale, plane, start, rows, raw_bytes, value_count
+            if kind == b"PLNE" and codec == 2:
+                require(raw <= 32768 * stored, "symbols in too few bytes")
+                content = None if body is None else (raw, body)
+            else:
+                content = None if body is None else decoded(body, codec, raw)
+            yield kind.decode(), scale, plane, start, rows, content, value_count
     require(expected == file_length, "chunks do not fill the file")
 
 
@@ -152,7 +156,11 @@ def decode(data, partial=False):
         plane["next_row"] += rows
         plane["segments"] += 1
         if raw is not None:
-            coded, symbols = segment(Bytes(raw), rows, plane["columns"], channels)
+            if isinstance(raw, tuple):
+                require(raw[0] == rows * plane["columns"] * channels, "number of symbols")
+                coded, symbols = context_coded(Bytes(raw[1]), rows, plane["columns"], channels)
+            else:
+                coded, symbols = segment(Bytes(raw), rows, plane["columns"], channels)
             first = start * plane["columns"]
             plane["coded"][first:first + len(coded)] = coded
             plane["symbols"][first * channels:first * channels + len(symbols)] = symbols
@@ -246,6 +254,113 @@ def segment(chunk, rows, columns, channels):  # section 6
                     symbols[(y * columns + x) * channels + c] = value - 256 if value > 127 else value
     chunk.end()
     return coded, symbols
+
+
+class Decisions:  # section 6, codec 2
+    def __init__(self, state, words):
+        require(state >= 1 << 16, "first state")
+        self.state, self.words, self.counters = state, words, {}
+
+    def decide(self, p):
+        low, high = self.state % 4096, self.state >> 12
+        one = low < p
+        self.state = p * high + low if one else (4096 - p) * high + low - p
+        if self.state < 1 << 16:
+            require(self.words, "too few words")
+            self.state = self.state << 16 | self.words.pop()
+        return int(one)
+
+    def by_counter(self, name):
+        P, n = self.counters.get(name, (32768, 0))
+        one, R = self.decide(P >> 4), 327680 // (5 * n + 8)
+        self.counters[name] = (P + ((65536 - P) * R >> 16) if one else P - (P * R >> 16)), min(n + 1, 120)
+        return one
+
+    def error(self, context):
+        if not self.by_counter((context, "any")):
+            return 0
+        sign = 1 if self.by_counter((context, "positive")) else -1
+        for k in range(4):
+            if not self.by_counter((context, sign, k)):
+                return sign * (k + 1)
+        bits = 0
+        while bits < 7 and self.by_counter((context, sign, 4 + bits)):
+            bits += 1
+        spelt = 0
+        for _ in range(bits):
+            spelt = 2 * spelt + self.decide(2048)
+        return sign * (4 + 2**bits + spelt)
+
+
+def context_coded(chunk, H, W, channels):  # section 6, codec 2
+    """As `segment`."""
+    set_count, map_flag = chunk.unpack("BB")
+    require(set_count in (1, 2, 4, 8) and map_flag <= 1, "sets of weights or map flag")
+    sets = [chunk.unpack("9b") for _ in range(set_count)]
+    state, = chunk.unpack("I")
+    words = chunk.rest()
+    require(len(words) % 2 == 0, "half a word")
+    decisions = Decisions(state, list(struct.unpack(f"<{len(words) // 2}H", words))[::-1])
+
+    coded = {(y, x): 1 for y in range(H) for x in range(W)}
+    if map_flag:
+        coded = {}
+        around = [(2, 1), (2, 0), (2, -1), (1, 2), (1, 1), (1, 0), (1, -1), (1, -2), (0, 2), (0, 1)]
+        for y in range(H):
+            for x in range(W):
+                coded[y, x] = decisions.by_counter(("map", *(coded.get((y - i, x - j), 0) for i, j in around)))
+
+    symbols = [0] * (H * W * channels)
+    cross = {}
+    for c in range(channels):
+        known = {}  # (v, r) of the texels so far
+
+        def at(y, x, row):
+            """v and r at (y, x), seen from a texel of that row."""
+            if y == -1 and row == 1:
+                y = 0
+            if x < 0:
+                return known[y - 1, 0] if y > 0 else (0, 16)
+            return known[y, min(x, W - 1)]
+
+        for y in range(H):
+            for x in range(W):
+                left = at(y, x - 1, y)
+
+                def near(i, j):
+                    return left if y == 0 and i < 0 else at(y + i, x + j, y)
+
+                if not coded[y, x]:
+                    known[y, x] = left if y == 0 or coded.get((y, x - 1)) else near(-1, 1)
+                    continue
+                (w, r_w), (n, r_n), (nw, r_nw), (ne, r_ne) = near(0, -1), near(-1, 0), near(-1, -1), near(-1, 1)
+                (ww, r_ww), (nn, r_nn) = near(0, -2), near(-2, 0)
+                both = w + n
+                gradient = abs(w - nw) + abs(n - nw) + abs(n - ne) + abs(w - ww) + abs(n - nn)
+                k = sets[min(gradient.bit_length(), 7) * set_count >> 3]
+                others = [nw, ne, ww, nn, near(-1, -2)[0], near(-2, -1)[0], near(-2, 1)[0], near(-1, 2)[0]]
+                predicted = 64 * both + k[0] * (w - n) + sum(a * (2 * v - both) for a, v in zip(k[1:], others))
+                predicted = min(max(predicted, -16384), 16256)
+                whole = predicted + 64 >> 7
+                fraction = predicted - 128 * whole
+
+                own = 2 * r_w + 2 * r_n + r_nw + r_ne + r_ww + r_nn
+                activity = (11 * own + 5 * cross[y, x] >> 2 if c else 4 * own) + 20 * gradient
+                a = activity + 128 >> 6
+                b = a.bit_length()
+                context = 3 * (2 * (b - 2) + (a >> b - 2) % 2) + min(3 * abs(fraction) >> 6, 2)
+                error = decisions.error(context)
+                v = whole + (-error if fraction < 0 else error)
+                require(-128 <= v <= 127, "a symbol leaves 8 bits")
+                known[y, x] = v, abs(128 * v - predicted) >> 3
+                symbols[(y * W + x) * channels + c] = v
+        for y in range(H):
+            for x in range(W):
+                smooth = sum((2 - abs(i)) * (2 - abs(j)) * at(min(max(y + i, 0), H - 1), x + j, 0)[1]
+                             for i in (-1, 0, 1) for j in (-1, 0, 1)) >> 1
+                cross[y, x] = cross[y, x] + (smooth - cross[y, x] >> 3) if c else smooth
+    require(not decisions.words and decisions.state == 1 << 16, "words and symbols end apart")
+    return [coded[y, x] for y in range(H) for x in range(W)], symbols
 
 
 def decoder_chunk(chunk, expected):  # section 7

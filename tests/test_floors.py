@@ -12,7 +12,6 @@ FORBIDDEN = {
         "kpc.player",
         "kpc.tools",
         "torch",
-        "numba",
         "moderngl",
         "glfw",
         "imgui_bundle",
@@ -54,5 +53,5 @@ def test_floors_hold(floor: str) -> None:
 
 def test_the_package_itself_needs_no_torch() -> None:
     assert not any(
-        is_within(m, p) for m in imports(ROOT / "src/kpc/__init__.py") for p in ("torch", "numba", "kpc.encoder")
+        is_within(m, p) for m in imports(ROOT / "src/kpc/__init__.py") for p in ("torch", "kpc.encoder")
     )

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from kpc.format import cli
-from kpc.format.container import CODEC_RAW, CODEC_ZSTD, DEFAULT_BUDGET, VERSION, Entry
+from kpc.format.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, DEFAULT_BUDGET, VERSION, Entry
 from kpc.format.errors import FormatError, UsageError
 from kpc.format.file import SceneReader, read
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
@@ -24,7 +24,7 @@ from kpc.format.scene import ALL_PLANES, SPACE_PLANES, HybridDecoder
 from kpc.format.space import FAR, Contraction, SpaceMapping
 
 NAMES_SHOWN = 8
-CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd"}
+CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd", CODEC_SYMBOLS: "rANS"}
 
 
 def main(argv: list[str] | None = None) -> int:

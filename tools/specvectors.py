@@ -23,13 +23,14 @@ import zstandard
 
 from kpc.format import cli
 from kpc.format.cameras import Camera
-from kpc.format.container import ENTRY, HEADER, Chunk, Reader, pack
+from kpc.format.container import CODEC_ZSTD, ENTRY, HEADER, Chunk, Reader, pack
 from kpc.format.errors import UsageError
-from kpc.format.file import encode, read, scene_chunks
+from kpc.format.file import read, scene_chunks
 from kpc.format.motion import QuantisedMotion
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates
+from kpc.format.symbols import WEIGHTS, encode_with
 from kpc.player import reference
 
 ZSTD_VERSION = ".".join(map(str, zstandard.ZSTD_VERSION))
@@ -67,7 +68,7 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
     decoder = scene.decoder
     return {
         "partial": partial,
-        "zstd": ZSTD_VERSION if any(entry.codec for entry in Reader(data, allow_partial=partial).index) else None,
+        "zstd": ZSTD_VERSION if any(entry.codec == CODEC_ZSTD for entry in Reader(data, allow_partial=partial).index) else None,
         "frame_count": scene.clip.frame_count,
         "fps": scene.clip.fps,
         "step": scene.step,
@@ -115,6 +116,37 @@ def patched(data: bytes, offset: int, layout: str, *values: int | float | bytes)
     return bytes(out)
 
 
+def encode(scene: QuantisedScene, *, segment_rows: int = 16, compress: bool = True) -> bytes:
+    """A file without context-coded symbols: as kpc.format.file.encode made it before there were any."""
+    chunks = [replace(chunk, symbols=None) for chunk in scene_chunks(scene, segment_rows=segment_rows)]
+    return pack(chunks, _value_count(scene), compress=compress)
+
+
+def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 16) -> bytes:
+    """A file all of whose planes are context-coded, also where raw ones would be smaller, with so many sets of weights.
+
+    The weights are no good ones but such as need no floating-point fit, and the largest and the smallest among them.
+    """
+    weights = (_noise((sets, WEIGHTS), 61) / 4).astype(np.int8)
+    weights[0, 0], weights[-1, -1] = -128, 127
+    chunks = []
+    for chunk in scene_chunks(scene, segment_rows=segment_rows):
+        if chunk.kind == "PLNE":
+            plane, rows = scene.scales[chunk.scale][ALL_PLANES[chunk.plane]], slice(chunk.row_start, chunk.row_start + chunk.row_count)
+            chunk = _forced(chunk, encode_with(weights, plane.symbols[rows], plane.coded[rows]))
+        chunks.append(chunk)
+    return pack(chunks, _value_count(scene))
+
+
+def _forced(chunk: Chunk, body: bytes) -> Chunk:
+    """The chunk with a context-coded body, which the writer takes because the raw one is no longer smaller."""
+    return replace(chunk, parts=[body, b"\0"], symbols=body)
+
+
+def _value_count(scene: QuantisedScene) -> int:
+    return sum(plane.symbols.size for scale in scene.scales for plane in scale.values())
+
+
 def _valid() -> dict[str, tuple[bytes, bool]]:
     dynamic = _scene(dynamic=True, sizes=[(2, 5, 4, 3, 3), (4, 9, 8, 7, 6)], cameras=2)
     packed = encode(dynamic, segment_rows=4)
@@ -148,6 +180,13 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "hybrid-moved": (encode(replace(hybrid, motion=moved.motion, decoder=_hybrid(2, 1, 1)), compress=False), False),
         "appearances": (encode(varied), False),
         "appearances-prefix": (encode(varied)[:Reader(encode(varied)).index[4].offset], True),
+        "symbols": (context_coded(dynamic, 8, segment_rows=4), False),
+        "symbols-prefix": (context_coded(dynamic, 2)[:Reader(context_coded(dynamic, 2)).index[9].offset], True),
+        "symbols-extremes": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4), False),
+        "symbols-noise": (context_coded(_painted(_noise), 2), False),
+        "symbols-constant": (context_coded(_painted(lambda shape, seed: np.full(shape, (127, -128, 1)[seed % 3]))), False),
+        "symbols-empty": (context_coded(_painted(lambda shape, seed: np.zeros(shape), coded=False)), False),
+        "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
     }
 
@@ -212,6 +251,32 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     bomb_file = pack([*chunks[:xy], Chunk("PLNE", [bomb], 0, 0, 0, 4), *chunks[xy + 1:]], values, compress=False)
     nan = float("nan")
     broken = "FormatError"
+
+    symbols = np.array([[[0, 1], [100, -7]], [[-128, 127], [3, 3]]], np.int16)
+    weights = np.zeros((1, WEIGHTS), np.int8)
+    coarse = encode_with(weights, symbols.astype(np.int8), np.ones((2, 2), bool))
+    small = _scene(dynamic=False, sizes=[(2, 2, 2, 2, 0)])
+    small_chunks = scene_chunks(small)
+    small_xy = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "PLNE")
+
+    def context(body: bytes) -> bytes:
+        """A file whose first plane is so coded."""
+        told = [*small_chunks[:small_xy], _forced(small_chunks[small_xy], body), *small_chunks[small_xy + 1:]]
+        return pack([chunk if number == small_xy else replace(chunk, symbols=None) for number, chunk in enumerate(told)], 24)
+
+    told = context(coarse)
+    small_entry = HEADER.size + ENTRY.size * small_xy
+    state_at = 2 + WEIGHTS
+    # A plane of nothing, told in fewer bytes than its number of symbols allows; the writer itself would take the zstd frame.
+    vast = _scene(dynamic=False, sizes=[(256, 64, 64, 1, 0)])
+    vast = replace(vast, scales=({name: replace(plane, symbols=0 * plane.symbols, coded=plane.coded & False)
+                                  for name, plane in vast.scales[0].items()},))
+    nothing = encode_with(weights, vast.scales[0]["xy"].symbols, vast.scales[0]["xy"].coded)
+    hollow = [replace(chunk, symbols=None, parts=[nothing] if number == small_xy else chunk.parts)
+              for number, chunk in enumerate(scene_chunks(vast))]
+    bomb_symbols = patched(pack(hollow, _value_count(vast)), small_entry + 16, "<H", 2)
+    for place in (48, small_entry + 24):
+        bomb_symbols = patched(bomb_symbols, place, "<I", 64 * 64 * 256)
     return {
         "empty": (b"", broken, "not a .kpc file"),
         "magic": (patched(good, 1, "4s", b"JPEG"), broken, "not a .kpc file"),
@@ -241,6 +306,18 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "zstd-length": (resealed(patched(patched(bomb_file, entry[xy] + 16, "<H", 1), entry[xy] + 24, "<I", 40)),
                         broken, "claims another length"),
         "zstd-garbage": (resealed(patched(good, entry[xy] + 16, "<H", 1)), broken, "zstd frame"),
+        "symbols-sets": (context(patched(coarse, 0, "<B", 3)), broken, "number of sets"),
+        "symbols-map-flag": (context(patched(coarse, 1, "<B", 2)), broken, "map flag"),
+        "symbols-short": (context(coarse[:state_at + 3]), broken, "cut off within its weights or words"),
+        "symbols-half-word": (context(coarse[:-1]), broken, "cut off within its weights or words"),
+        "symbols-cut": (context(coarse[:-2]), broken, "do not end where its symbols do"),
+        "symbols-long": (context(coarse + bytes(2)), broken, "do not end where its symbols do"),
+        "symbols-state": (context(patched(coarse, state_at, "<I", 65535)), broken, "first state is too small"),
+        "symbols-end": (context(patched(coarse, len(coarse) - 1, "<B", coarse[-1] ^ 1)), broken, "do not end where its symbols do"),
+        "symbols-bomb": (resealed(bomb_symbols), broken, "more than 15 bytes can hold"),
+        "symbols-range": (context(encode_with(weights, symbols + 200, np.ones((2, 2), bool))), broken, "leaves its 8 bits"),
+        "symbols-count": (resealed(patched(told, small_entry + 24, "<I", 7)), broken, "claims 7 symbols"),
+        "symbols-elsewhere": (resealed(patched(good, entry[occu] + 16, "<H", 2)), broken, "codec 2"),
         "no-decoder": (without(deco), broken, "0 DECO chunks"),
         "no-segment": (without(len(chunks) - 1), broken, "its segments hold 2 rows, not 3"),
         "two-occupancies": (pack([*chunks, chunks[occu]], values, compress=False), broken, "2 OCCU chunks"),
@@ -351,6 +428,16 @@ def _scene(dynamic: bool, sizes: list[tuple[int, int, int, int, int]], amplitude
         np.array([[-1, -0.75, -0.5], [1, 0.75, 0.5]], np.float32), Clip(12, 24.0) if dynamic else Clip(1, 24.0),
         tuple(scales), Decoder(density_bias=0.5, **weights), occupancy, np.array([0.25, 0.5, 1], np.float32), 0.0625,
         tuple(Camera(64 + k, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(cameras)))
+
+
+def _painted(paint: Callable[[tuple[int, int, int], int], np.ndarray], coded: bool = True) -> QuantisedScene:
+    """A static scene of `paint(shape, number)` on every plane, all of whose texels are coded, or none."""
+    scene = _scene(dynamic=False, sizes=[(3, 9, 6, 5, 0)])
+    planes = {
+        name: replace(plane, symbols=paint(plane.symbols.shape, number).astype(np.int8), coded=np.full(plane.coded.shape, coded))
+        for number, (name, plane) in enumerate(scene.scales[0].items())
+    }
+    return replace(scene, scales=(planes,))
 
 
 def _hybrid(features: int, width: int, hidden: int) -> HybridDecoder:

@@ -1,0 +1,105 @@
+"""Adaptive binary decisions under rANS, in integers (spec/kpc-format.md, section 6, "Context coding").
+
+A *counter* estimates how likely its decision is 1, out of 2^16, and how often it was asked. rANS (arXiv:1311.2540) turns decisions and
+their probabilities into bits: a decoder's state holds, in its low 12 bits, the next decision. Encoding runs backwards, so an encoder
+first writes down every decision beside its probability (the *trace*), then turns the trace into words.
+
+Compiled with numba; with NUMBA_DISABLE_JIT=1 the same lines run as plain Python.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+LOWEST_STATE = 1 << 16
+"""The state lies in [2^16, 2^32) between decisions. An encoder begins at 2^16, so there a decoder must end."""
+SCALE_BITS = 12
+SCALE = 1 << SCALE_BITS
+WORD_BITS = 16
+
+EVEN = 1 << 15
+"""A counter that knows nothing."""
+PATIENCE = 120
+"""Decisions after which a counter no longer slows down: it forgets with a time constant of that many."""
+RATES = np.array([327680 // (5 * n + 8) for n in range(PATIENCE + 1)])
+"""How far, out of 2^16, the nth decision moves its counter: 1 / (n + 1.6), a little faster than the plain mean of n."""
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """numba's njit, cached on disk where numba finds a folder to write to (the package's, else the user's), without a GIL."""
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        try:
+            return njit(cache=True, nogil=True, **options)(function)
+        except RuntimeError:  # no such folder at all: compiled anew by each process
+            return njit(nogil=True, **options)(function)
+
+    return decorate
+
+
+@compiled()
+def counters(count):
+    """(count,) int32 of counters that know nothing: the probability of a 1 out of 2^16, times 256, plus decisions seen."""
+    return np.full(count, EVEN << 8, np.int32)
+
+
+@compiled(forceinline=True)
+def decide(bit, probability, state, at, words, trace):
+    """One decision of a given probability of 1, out of SCALE: (bit, state, at).
+
+    Encoding (`words` is None): trace[at] = probability, negative for a 0. Decoding (`trace` is None): the bit comes from `state` and, where that runs
+    low, from words[at]; past the end zeros come, and `at` goes on, for the caller to see.
+    """
+    if words is not None:
+        low = state & (SCALE - 1)
+        if low < probability:
+            bit = 1
+            state = probability * (state >> SCALE_BITS) + low
+        else:
+            bit = 0
+            state = (SCALE - probability) * (state >> SCALE_BITS) + low - probability
+        if state < LOWEST_STATE:
+            state <<= WORD_BITS
+            if at < words.size:
+                state |= int(words[at])
+            at += 1
+    if trace is not None:
+        trace[at] = probability if bit else -probability
+        at += 1
+    return bit, state, at
+
+
+@compiled(forceinline=True)
+def adapt(bit, table, which, state, at, words, trace):
+    """`decide` with the probability of a counter, which then learns the bit."""
+    counter = int(table[which])
+    p, n = counter >> 8, counter & 255
+    bit, state, at = decide(bit, p >> 16 - SCALE_BITS, state, at, words, trace)
+    if bit:
+        p += (65536 - p) * RATES[n] >> 16
+    else:
+        p -= p * RATES[n] >> 16
+    table[which] = p << 8 | min(n + 1, PATIENCE)
+    return bit, state, at
+
+
+@compiled()
+def words_of(trace):
+    """A trace as the words that a decoder reads, the first two of them its state: (N,) uint16."""
+    backwards = np.empty(trace.size + 2, np.uint16)
+    state, count = LOWEST_STATE, 0
+    for at in range(trace.size - 1, -1, -1):
+        probability = int(trace[at])
+        if probability > 0:
+            size, start = probability, 0
+        else:
+            size, start = SCALE + probability, -probability
+        if state >= size << 32 - SCALE_BITS:
+            backwards[count] = state & 0xFFFF
+            state >>= WORD_BITS
+            count += 1
+        state = (state // size << SCALE_BITS) + state % size + start
+    backwards[count] = state >> WORD_BITS
+    backwards[count + 1] = state & 0xFFFF
+    return backwards[: count + 2][::-1].copy()

@@ -1,0 +1,263 @@
+"""Plane segments under codec 2: every symbol predicted from its neighbours, the error coded in contexts (spec, section 6).
+
+    C (1 byte) | map flag (1 byte) | weights (9 C bytes) | rANS words: of the map, then of the symbols, channel by channel
+
+A prediction is a weighted mean of ten neighbours. Its weights are the segment's own, a set for each class of slopes around a texel:
+where a plane is flat it pays to average the noise of quantisation away, where it is steep to extrapolate. How far predictions were
+off nearby, in this channel and in those before it, says how far this one may be, and so which counters the error is coded with. All
+of this is in integers; all that is stored beside the errors is the weights.
+
+Naming, throughout this module
+    v           symbols of one channel; r  by how much predictions missed them, in 1 / 16 of a symbol. Rings of three rows with two
+                more columns on either side: rows `here`, `above` and `higher`, column x at X = x + 2
+    w n nw ne   values to the left, above, above to the left and to the right
+    cross       what r was in the channels before, smoothed
+    table       counters of `kpc.format.rans`
+    state at words trace    of `kpc.format.rans.decide`
+"""
+
+import numpy as np
+
+from kpc.format.errors import FormatError
+from kpc.format.rans import LOWEST_STATE, SCALE, adapt, compiled, counters, decide, words_of
+
+SET_COUNTS = (1, 2, 4, 8)
+"""How many sets of weights a segment may store."""
+WEIGHTS = 9
+"""Of a set, each in 1 / 64."""
+
+UNARY, ESCAPES = 4, 7
+"""Errors of 1 to UNARY take a decision each; of larger ones the number of bits, up to ESCAPES, comes first."""
+DECISIONS = 2 + 2 * (UNARY + ESCAPES)
+"""Counters of a context: is there an error, is it positive; and of either sign, its magnitude."""
+ACTIVITIES, FRACTIONS = 22, 3
+"""Contexts: how active the neighbourhood is, and how far the prediction lies from a whole symbol."""
+MAP_CONTEXTS = 1 << 10
+MOST_DECISIONS = 2 + UNARY + 2 * ESCAPES
+"""That a symbol takes."""
+
+REWEIGHTINGS, FIT_VALUES, RIDGE = 4, 1 << 14, 4.0
+"""Of the fit of weights: how often errors are weighted anew, the most values to fit, and what keeps it solvable on a flat plane."""
+
+UNKNOWN = 16
+"""r before anything is known: one symbol."""
+
+_BIT_LENGTHS = np.array([k.bit_length() for k in range(5 * 255 + 1)], np.int8)
+_LOGARITHMS = np.array([0, 0] + [2 * (k.bit_length() - 2) + (k >> k.bit_length() - 2 & 1) for k in range(2, 2443)], np.int8)
+"""Of k >= 2: 2 log2(k / 2), rounded down after linear interpolation between powers of two."""
+
+
+def encode_symbols(symbols: np.ndarray, coded: np.ndarray) -> bytes:
+    """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False, with as many sets of weights as make it shortest."""
+    values = int(coded.sum()) * symbols.shape[2]
+    trace, neighbours = np.empty(values * MOST_DECISIONS, np.int16), np.empty((values, 2 + WEIGHTS), np.int16)
+    walk(symbols, coded, np.zeros((1, WEIGHTS), np.int8), 0, 0, None, trace, neighbours)
+    return min((encode_with(fitted(neighbours, count), symbols, coded) for count in SET_COUNTS), key=len)
+
+
+def encode_with(weights: np.ndarray, symbols: np.ndarray, coded: np.ndarray) -> bytes:
+    """The same, with (C, WEIGHTS) int8 weights that are given; C is one of SET_COUNTS."""
+    trace, at = np.empty(coded.size + int(coded.sum()) * symbols.shape[2] * MOST_DECISIONS, np.int16), 0
+    has_map = not coded.all()
+    if has_map:
+        _, at = walk_map(coded, 0, at, None, trace)
+    _, at, _ = walk(symbols, coded, weights, 0, at, None, trace, None)
+    return bytes([len(weights), has_map]) + weights.tobytes() + words_of(trace[:at]).astype("<u2").tobytes()
+
+
+def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Undo `encode_symbols`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels.
+
+    Raises:
+        FormatError: the body is cut, too long, or says what only a damaged one would.
+    """
+    if len(body) < 2 or body[0] not in SET_COUNTS or body[1] > 1:
+        raise FormatError("plane segment: unknown number of sets of weights or map flag")
+    sets, has_map = body[0], body[1] == 1
+    start = 2 + WEIGHTS * sets
+    if len(body) < start + 4 or (len(body) - start) % 2:
+        raise FormatError("plane segment: cut off within its weights or words")
+    weights = np.frombuffer(body, np.int8, WEIGHTS * sets, 2).reshape(sets, WEIGHTS)
+    state = int.from_bytes(body[start:start + 4], "little")
+    words = np.frombuffer(body, "<u2", offset=start + 4).astype(np.uint16)
+    if state < LOWEST_STATE:
+        raise FormatError("plane segment: its first state is too small")
+
+    symbols, coded = np.zeros((rows, columns, channels), np.int8), np.ones((rows, columns), bool)
+    at, fit = 0, True
+    if has_map:
+        state, at = walk_map(coded, state, at, words, None)
+    if at <= len(words):
+        state, at, fit = walk(symbols, coded, weights, state, at, words, None, None)
+    if not fit:
+        raise FormatError("plane segment: a symbol leaves its 8 bits")
+    if at != len(words) or state != LOWEST_STATE:
+        raise FormatError("plane segment: its words do not end where its symbols do")
+    return symbols, coded
+
+
+def fitted(neighbours: np.ndarray, count: int) -> np.ndarray:
+    """(count, WEIGHTS) int8: weights that make the sum of absolute errors small, for each class of slopes.
+
+    Least squares, reweighted by the errors (Lawson's algorithm turned to the 1-norm); an encoder may take any weights.
+
+    Args:
+        neighbours: (N, 2 + WEIGHTS) int16 from `walk`: slope, twice the differences to their mean of symbol and neighbours.
+    """
+    weights = np.zeros((count, WEIGHTS), np.int8)
+    classes = neighbours[:, 0] * count >> 3
+    for number in range(count):
+        own = neighbours[classes == number, 1:]
+        own = own[:: -(-len(own) // FIT_VALUES) or 1].astype(np.float32)
+        wanted, around = own[:, 0], own[:, 1:]
+        importance = np.ones(len(own), np.float32)
+        for _ in range(REWEIGHTINGS):
+            weighted = around * importance[:, None]
+            normal = (weighted.T @ around).astype(np.float64) + RIDGE * np.eye(WEIGHTS)
+            solution = np.linalg.solve(normal, (wanted @ weighted).astype(np.float64))
+            importance = 1 / (np.abs(wanted - around @ solution.astype(np.float32)) + 1)
+        weights[number] = np.clip(np.rint(64 * solution), -128, 127)
+    return weights
+
+
+# --- the walk that encoder and decoder share
+
+
+@compiled()
+def walk_map(coded, state, at, words, trace):
+    """Code `coded`, or decode into it, bit by bit in contexts of ten neighbours: (state, at)."""
+    H, W = coded.shape
+    table = counters(MAP_CONTEXTS)
+    for y in range(H):
+        left, above, higher = 0, 0, 0  # of these rows the 2 texels before x, the 5 and the 3 around it
+        for x in range(-2, W):
+            above = above << 1 & 31 | (1 if y > 0 and x + 2 < W and coded[y - 1, x + 2] else 0)
+            higher = higher << 1 & 7 | (1 if y > 1 and -1 <= x < W - 1 and coded[y - 2, x + 1] else 0)
+            if x >= 0:
+                bit = 1 if coded[y, x] else 0
+                bit, state, at = adapt(bit, table, higher << 7 | above << 2 | left, state, at, words, trace)
+                coded[y, x] = bit == 1
+                left = left << 1 & 3 | bit
+        if words is not None and at > words.size:
+            break
+    return state, at
+
+
+@compiled()
+def walk(symbols, coded, weights, state, at, words, trace, neighbours):
+    """Code `symbols`, or decode into them, where `coded`: (state, at, whether all fit 8 bits).
+
+    Args:
+        weights: (C, WEIGHTS) int8, in 1 / 64.
+        neighbours: None, or (values, 2 + WEIGHTS) int16 to note what `fitted` takes.
+    """
+    H, W, M = symbols.shape
+    sets = weights.astype(np.int64)
+    table = counters(ACTIVITIES * FRACTIONS * DECISIONS)
+    v, r = np.zeros((3, W + 4), np.int64), np.zeros((3, W + 4), np.int64)
+    cross = np.zeros((H, W), np.int16)
+    noted = 0
+    for m in range(M):
+        for y in range(H):
+            here, above, higher = y % 3, (y + 2) % 3, (y + 1) % 3
+            v0, v1, v2, r0, r1, r2, past = v[here], v[above], v[higher], r[here], r[above], r[higher], cross[y]
+            _begin_row(v0, v1, v2, y, 0)
+            _begin_row(r0, r1, r2, y, UNKNOWN)
+            for x in range(W):
+                X = x + 2
+                if not coded[y, x]:
+                    if y == 0 or x > 0 and coded[y, x - 1]:
+                        v0[X], r0[X] = v0[X - 1], r0[X - 1]
+                    else:
+                        v0[X], r0[X] = v1[X + 1], r1[X + 1]
+                    continue
+                if y == 0:  # nothing is above but what is to the left
+                    v1[x:x + 5], v2[x:x + 5] = v0[X - 1], v0[X - 1]
+                    r1[x:x + 5], r2[x:x + 5] = r0[X - 1], r0[X - 1]
+                w, n, nw, ne, ww, nn = v0[X - 1], v1[X], v1[X - 1], v1[X + 1], v0[X - 2], v2[X]
+                gradient = abs(w - nw) + abs(n - nw) + abs(n - ne) + abs(w - ww) + abs(n - nn)
+                slope = min(int(_BIT_LENGTHS[gradient]), 7)
+                both, c = w + n, slope * len(weights) >> 3
+                predicted = 64 * both + sets[c, 0] * (w - n) + sets[c, 1] * (2 * nw - both) + sets[c, 2] * (2 * ne - both) \
+                    + sets[c, 3] * (2 * ww - both) + sets[c, 4] * (2 * nn - both) + sets[c, 5] * (2 * v1[X - 2] - both) \
+                    + sets[c, 6] * (2 * v2[X - 1] - both) + sets[c, 7] * (2 * v2[X + 1] - both) + sets[c, 8] * (2 * v1[X + 2] - both)
+                predicted = min(max(predicted, -128 * 128), 127 * 128)  # in 1 / 128 of a symbol
+                whole = predicted + 64 >> 7
+                fraction = predicted - (whole << 7)
+
+                own = 2 * (r0[X - 1] + r1[X]) + r1[X - 1] + r1[X + 1] + r0[X - 2] + r2[X]
+                activity = (4 * own if m == 0 else 11 * own + 5 * int(past[x]) >> 2) + 20 * gradient
+                context = int(_LOGARITHMS[activity + 128 >> 6]) * FRACTIONS + min(3 * abs(fraction) >> 6, FRACTIONS - 1)
+                sign = -1 if fraction < 0 else 1
+                error = sign * (int(symbols[y, x, m]) - whole)
+                error, state, at = _error(error, table, context * DECISIONS, state, at, words, trace)
+                value = whole + sign * error
+                if not -128 <= value <= 127:
+                    return state, at, False
+                symbols[y, x, m] = value
+                v0[X] = value
+                r0[X] = abs((value << 7) - predicted) >> 3
+                if neighbours is not None:
+                    row = neighbours[noted]
+                    row[0], row[1], row[2] = slope, 2 * value - both, w - n
+                    row[3], row[4], row[5], row[6] = 2 * nw - both, 2 * ne - both, 2 * ww - both, 2 * nn - both
+                    row[7], row[8] = 2 * v1[X - 2] - both, 2 * v2[X - 1] - both
+                    row[9], row[10] = 2 * v2[X + 1] - both, 2 * v1[X + 2] - both
+                    noted += 1
+            v0[W + 2:], r0[W + 2:] = v0[W + 1], r0[W + 1]
+            if words is not None and at > words.size:
+                return state, at, True
+            if y > 0:
+                _remember(cross[y - 1], r2, r1, r0, m)
+        last = r[(H - 1) % 3]
+        _remember(cross[H - 1], r[max(H - 2, 0) % 3], last, last, m)
+    return state, at, True
+
+
+@compiled(forceinline=True)
+def _begin_row(here, above, higher, y, unknown):
+    """What lies outside: to the left, the start of the row above; above the first row, from the second on, itself."""
+    here[:2] = above[2] if y > 0 else unknown
+    if y == 1:
+        higher[:] = above
+
+
+@compiled(forceinline=True)
+def _error(error, table, first, state, at, words, trace):
+    """Code or decode an error in the context whose counters begin at `first`: (error, state, at)."""
+    bit, state, at = adapt(1 if error != 0 else 0, table, first, state, at, words, trace)
+    if not bit:
+        return 0, state, at
+    positive, state, at = adapt(1 if error > 0 else 0, table, first + 1, state, at, words, trace)
+    first += 2 if positive else 2 + UNARY + ESCAPES
+    beyond, found = abs(error) - 1, 0
+    while found < UNARY:
+        bit, state, at = adapt(1 if beyond > found else 0, table, first + found, state, at, words, trace)
+        if not bit:
+            break
+        found += 1
+    if found == UNARY:  # Exp-Golomb: as many ones as bits follow, a zero, the bits
+        rest, bits = beyond - UNARY + 1, 0
+        while bits < ESCAPES:
+            bit, state, at = adapt(1 if rest >> bits + 1 != 0 else 0, table, first + UNARY + bits, state, at, words, trace)
+            if not bit:
+                break
+            bits += 1
+        low = 1
+        for place in range(bits - 1, -1, -1):
+            bit, state, at = decide(rest >> place & 1, SCALE >> 1, state, at, words, trace)
+            low = low << 1 | bit
+        found += low - 1
+    magnitude = found + 1
+    return magnitude if positive else -magnitude, state, at
+
+
+@compiled(forceinline=True)
+def _remember(cross, above, here, below, m):
+    """Let `cross`, of one row, take in r of this channel: smoothed by (1 2 1) x (1 2 1) / 2, an eighth of the way."""
+    for x in range(cross.size):
+        X = x + 2
+        smooth = (above[X - 1] + 2 * above[X] + above[X + 1] + 2 * (here[X - 1] + 2 * here[X] + here[X + 1])
+                  + below[X - 1] + 2 * below[X] + below[X + 1]) >> 1
+        past = int(cross[x])
+        cross[x] = smooth if m == 0 else past + (smooth - past >> 3)

@@ -1,0 +1,189 @@
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kpc.format.errors import FormatError
+from kpc.format.planes import encode_segment
+from kpc.format.symbols import SET_COUNTS, WEIGHTS, decode_symbols, encode_symbols, encode_with
+
+shapes = st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 5))
+
+PAINTS = {
+    "noise": lambda rng, shape: rng.integers(-128, 128, shape),
+    "extremes": lambda rng, shape: rng.choice([-128, 127], shape),
+    "ramps": lambda rng, shape: rng.integers(-3, 4, shape).cumsum(0).cumsum(1),  # wraps in the corner
+    "nearly flat": lambda rng, shape: rng.random(shape) < 0.05,
+    "constant": lambda rng, shape: np.full(shape, rng.choice([-128, -1, 0, 127])),
+}
+
+
+def painted(paint: str, shape: tuple[int, int, int], seed: int, share: float) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    symbols = PAINTS[paint](rng, shape).astype(np.int8)
+    coded = rng.random(shape[:2]) < share
+    symbols[~coded] = 0
+    return symbols, coded
+
+
+def assert_decodes(body: bytes, symbols: np.ndarray, coded: np.ndarray) -> None:
+    decoded, where = decode_symbols(body, *symbols.shape)
+    assert decoded.dtype == np.int8 and np.array_equal(decoded, symbols)
+    assert where.dtype == bool and np.array_equal(where, coded)
+
+
+@given(paint=st.sampled_from(sorted(PAINTS)), shape=shapes, seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.3, 0.8, 1.0]))
+@settings(deadline=None)
+def test_symbols_come_back(paint, shape, seed, share):
+    symbols, coded = painted(paint, shape, seed, share)
+    assert_decodes(encode_symbols(symbols, coded), symbols, coded)
+
+
+@given(shape=shapes, seed=st.integers(0, 2**32 - 1), count=st.sampled_from(SET_COUNTS), extreme=st.booleans())
+@settings(deadline=None)
+def test_any_weights_will_do(shape, seed, count, extreme):
+    symbols, coded = painted("noise", shape, seed, 0.8)
+    rng = np.random.default_rng(seed)
+    weights = rng.choice([-128, 127], (count, WEIGHTS)) if extreme else rng.integers(-128, 128, (count, WEIGHTS))
+    assert_decodes(encode_with(weights.astype(np.int8), symbols, coded), symbols, coded)
+
+
+def textured(rows: int = 60, columns: int = 70, channels: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    """Smooth waves and noise, stronger on one side, within an ellipse."""
+    rng = np.random.default_rng(0)
+    y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij")
+    waves = sum(np.multiply.outer(np.sin(a * x + b * y + c), 25 * rng.normal(0, 1, channels)) for a, b, c in rng.normal(0, 3, (4, 3)))
+    symbols = np.clip(np.rint(waves + (1.5 + x)[..., None] * rng.normal(0, 1, waves.shape)), -128, 127).astype(np.int8)
+    coded = x * x + y * y < 0.9
+    symbols[~coded] = 0
+    return symbols, coded
+
+
+def test_smooth_planes_take_far_less_than_with_zstd():
+    symbols, coded = textured()
+    body = encode_symbols(symbols, coded)
+    assert_decodes(body, symbols, coded)
+    frame = zstandard.ZstdCompressor(level=19).compress(b"".join(encode_segment(symbols, coded)))
+    assert len(body) < 0.85 * len(frame)
+
+
+def test_noise_takes_hardly_more_than_it_holds():
+    symbols, coded = painted("noise", (40, 40, 4), 0, 1.0)
+    assert len(encode_symbols(symbols, coded)) < 1.15 * symbols.size
+
+
+def test_what_is_not_coded_costs_its_map_and_a_map_without_surprises_little():
+    still, nowhere = np.zeros((100, 200, 8), np.int8), np.zeros((100, 200), bool)
+    assert len(encode_symbols(still, nowhere)) < 40
+    assert len(encode_symbols(still, ~nowhere)) < 120
+    half = nowhere | (np.arange(200) < 90)
+    assert len(encode_symbols(still, half)) < 200
+
+
+# The same lines, not compiled: what numba makes of integers must be what Python makes of them.
+PLAIN = """
+import hashlib, sys
+import numpy as np
+from test_symbols import painted, textured
+from kpc.format.rans import adapt
+from kpc.format.symbols import decode_symbols, encode_with
+
+for symbols, coded in (textured(14, 12, 3), painted("noise", (7, 9, 3), 1, 0.7), painted("extremes", (9, 5, 2), 2, 1.0)):
+    weights = np.random.default_rng(3).integers(-128, 128, (4, 9)).astype(np.int8)
+    body = encode_with(weights, symbols, coded)
+    assert np.array_equal(decode_symbols(body, *symbols.shape)[0], symbols)
+    print(hasattr(adapt, "py_func"), hashlib.sha256(body).hexdigest())
+"""
+
+
+def test_compiled_code_and_plain_python_give_the_same_bytes():
+    def run(**more: str) -> list[list[str]]:
+        path = os.pathsep.join([os.path.dirname(__file__), *sys.path])
+        done = subprocess.run([sys.executable, "-W", "error", "-c", PLAIN], capture_output=True, text=True, check=True,
+                              env={**os.environ, "PYTHONPATH": path, **more})
+        return [line.split() for line in done.stdout.splitlines()]
+
+    compiled, plain = run(), run(NUMBA_DISABLE_JIT="1")
+    assert {kind for kind, _ in compiled} == {"True"} and {kind for kind, _ in plain} == {"False"}
+    assert [digest for _, digest in compiled] == [digest for _, digest in plain]
+
+
+# --- damage and hostility
+
+
+def decodes_or_is_refused(body: bytes, shape: tuple[int, int, int]) -> bool:
+    try:
+        symbols, coded = decode_symbols(body, *shape)
+    except FormatError:
+        return False
+    assert symbols.shape == shape and coded.shape == shape[:2] and not symbols[~coded].any()
+    return True
+
+
+@pytest.fixture(scope="module")
+def small() -> tuple[bytes, tuple[int, int, int]]:
+    symbols, coded = textured(9, 11, 3)
+    return encode_symbols(symbols, coded), symbols.shape
+
+
+def test_every_truncation_is_refused(small):
+    body, shape = small
+    assert decodes_or_is_refused(body, shape)
+    assert not any(decodes_or_is_refused(body[:length], shape) for length in range(len(body)))
+
+
+def test_flipped_bits_are_refused_or_mean_something_else(small):
+    """Nearly all are refused, since the last state must come out right; none leads outside of the arrays."""
+    body, shape = small
+    accepted = 0
+    for position in range(len(body)):
+        for bit in range(8):
+            damaged = bytearray(body)
+            damaged[position] ^= 1 << bit
+            accepted += decodes_or_is_refused(bytes(damaged), shape)
+    assert accepted <= len(body) // 100
+
+
+@given(body=st.binary(max_size=80), shape=shapes, count=st.sampled_from([0, 1, 2, 3, 4, 8, 255]), flag=st.integers(0, 2))
+@settings(deadline=None)
+def test_any_bytes_decode_or_are_refused(body, shape, count, flag):
+    decodes_or_is_refused(body, shape)
+    decodes_or_is_refused(bytes([count, flag]) + body, shape)
+
+
+def test_a_body_of_another_shape_is_refused(small):
+    body, (rows, columns, channels) = small
+    for other in ((rows, columns, channels + 1), (rows + 1, columns, channels), (columns, rows, channels), (1, 1, 1)):
+        assert not decodes_or_is_refused(body, other)
+
+
+def test_a_stream_that_ends_early_is_given_up_at_once():
+    """Within a row of its end: the hundreds of millions of symbols after it would take ten seconds and more."""
+    symbols, coded = painted("noise", (8, 8, 1), 0, 1.0)
+    body = encode_symbols(symbols, coded)
+    start = time.perf_counter()
+    with pytest.raises(FormatError, match="plane segment"):
+        decode_symbols(body, 4, 16, 1 << 22)
+    assert time.perf_counter() - start < 2.0
+
+
+@pytest.mark.parametrize("change, complaint", [
+    (lambda body: b"", "number of sets"),
+    (lambda body: b"\3" + body[1:], "number of sets"),
+    (lambda body: b"\0" + body[1:], "number of sets"),
+    (lambda body: body[:1] + b"\2" + body[2:], "map flag"),
+    (lambda body: body[:2 + WEIGHTS + 3], "cut off"),
+    (lambda body: body + b"\0", "cut off"),
+    (lambda body: body + b"\0\0", "do not end"),
+    (lambda body: body[:2 + WEIGHTS] + b"\xff\xff\0\0" + body[2 + WEIGHTS + 4:], "first state"),
+])
+def test_what_is_wrong_is_said(change, complaint):
+    body = encode_with(np.zeros((1, WEIGHTS), np.int8), np.arange(8, dtype=np.int8).reshape(2, 2, 2), np.ones((2, 2), bool))
+    with pytest.raises(FormatError, match=complaint):
+        decode_symbols(change(body), 2, 2, 2)
