@@ -23,7 +23,7 @@ import numpy as np
 
 from kpc.format.cameras import Camera
 from kpc.format.cli import written_aside
-from kpc.format.container import DEFAULT_BUDGET, Chunk, Entry, Reader, Source, pack
+from kpc.format.container import DEFAULT_BUDGET, Chunk, Entry, Reader, Source, open_source, pack
 from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.planes import decode_segment, encode_segment
@@ -293,6 +293,7 @@ def read(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, memory
         BudgetError: it needs more than `memory_budget`; raised before the memory is taken.
     """
     reader = SceneReader(source, memory_budget=memory_budget, allow_partial=allow_partial)
+    reader.source.hold(0, reader.source.size)
     scales = tuple({
         name: QuantisedPlane(np.zeros((p.rows, p.columns, p.channels), np.int8), p.step, p.offset,
                              np.zeros((p.rows, p.columns), bool))
@@ -326,7 +327,7 @@ class SceneReader(Reader):
 
     def __init__(self, source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *,
                  memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False):
-        super().__init__(source, allow_partial=allow_partial)
+        super().__init__(open_source(source, limit=memory_budget), allow_partial=allow_partial)
         self.memory_budget = memory_budget
         for number, entry in enumerate(self.index):
             if entry.is_critical and entry.kind not in KNOWN_KINDS:
