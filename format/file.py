@@ -318,6 +318,9 @@ class SceneReader(Reader):
 
     Opening reads header, index and SCNE, and checks that the index lists a whole scene that fits the memory budget.
 
+    Args:
+        in_parts: the caller never holds all of the planes, and minds himself what those take that he holds.
+
     Attributes:
         head: the SCNE chunk.
 
@@ -326,7 +329,7 @@ class SceneReader(Reader):
     """
 
     def __init__(self, source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *,
-                 memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False):
+                 memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False, in_parts: bool = False):
         super().__init__(open_source(source, limit=memory_budget), allow_partial=allow_partial)
         self.memory_budget = memory_budget
         for number, entry in enumerate(self.index):
@@ -337,9 +340,9 @@ class SceneReader(Reader):
         if self.head.value_count != self.header.value_count:
             raise FormatError(f"{self.name}: the header claims {self.header.value_count:,} values, "
                               f"the scene {self.head.value_count:,}")
-        needed = 5 * self.head.value_count  # one int8 symbol and one float32 each
-        if needed > memory_budget:
-            raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory, more than the budget of "
+        self.planes_bytes = 0 if in_parts else 5 * self.head.value_count  # one int8 symbol and one float32 each
+        if self.planes_bytes > memory_budget:
+            raise BudgetError(f"{self.name}: needs {self.planes_bytes:,} bytes of memory, more than the budget of "
                               f"{memory_budget:,}")
         self._check_segments()
         self._decoder_number()
@@ -422,7 +425,7 @@ class SceneReader(Reader):
         return self._only(kind) if any(entry.kind == kind for entry in self.index) else None
 
     def _afford(self, more_bytes: int, what: str) -> None:
-        needed = 5 * self.head.value_count + more_bytes
+        needed = self.planes_bytes + more_bytes
         if needed > self.memory_budget:
             raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory with {what}, more than the budget of "
                               f"{self.memory_budget:,}")

@@ -103,13 +103,14 @@ class HttpSource:
     Args:
         url: http or https.
         limit: bytes of memory for a file whose server has no ranges.
-        attempts: see ATTEMPTS; infinity never gives up. May be changed at any time.
+        attempts: see ATTEMPTS; infinity never gives up.
         say: told of trouble with the connection, in one line, and with None that it is over.
 
     Attributes:
         name: the URL without what may be secret in it. size: of the file, bytes.
         has_ranges: False if the server sends whole files only.
         received: bytes that came so far.
+        attempts, say: as above; may be changed at any time.
 
     Raises:
         NetworkError: no such file, no http URL, or an answer that cannot be used; UnreachableError: no answer at all.
@@ -120,7 +121,7 @@ class HttpSource:
                  say: Callable[[str | None], None] = say_on_stderr) -> None:
         self.name, self.attempts, self.received, self.has_ranges = _without_secrets(url), attempts, 0, True
         self._url = self._address = url
-        self._limit, self._say, self._closed = limit, say, threading.Event()
+        self._limit, self.say, self._closed = limit, say, threading.Event()
         self._pools: dict[str | None, urllib3.PoolManager] = {}
         self._size: int | None = None
         self._validator: tuple[str, str] | None = None
@@ -154,6 +155,11 @@ class HttpSource:
         else:
             answer.drop_connection()
             self._answer = _Answer(offset, end)
+
+    def forget(self) -> None:
+        """Read anew what is asked for next: it came damaged."""
+        self._answer.drop_connection()
+        self._answer = _Answer(0, 0) if self.has_ranges else _Answer(0, self.size)
 
     def close(self) -> None:
         """Let go of the connection. What is being read fails with UnreachableError."""
@@ -190,7 +196,7 @@ class HttpSource:
                     raise UnreachableError(f"{self.name}: {trouble}; check the address and the connection") from trouble
                 pause = min(FIRST_PAUSE_S * 2 ** min(failures - 1, 10), LONGEST_PAUSE_S) * random.uniform(0.5, 1.5)
                 pause = max(pause, trouble.pause_s)
-                self._say(f"{self.name}: {trouble}; trying again in {pause:.1f} s")
+                self.say(f"{self.name}: {trouble}; trying again in {pause:.1f} s")
                 self._troubled = True
                 self._closed.wait(pause)
 
@@ -203,7 +209,7 @@ class HttpSource:
             answer.data += piece
             self.received += len(piece)
             if self._troubled:
-                self._say(None)
+                self.say(None)
                 self._troubled = False
             answer.check_pace()
         if answer.reached == answer.asked and answer.response is not None:
@@ -280,8 +286,8 @@ class HttpSource:
                 raise BudgetError(f"{self.name}: the server has no ranges, and the whole of {size:,} bytes is more than the budget "
                                   f"of {self._limit:,}")
             if self.has_ranges:
-                self._say(f"{self.name}: the server has no ranges, all of it has to be downloaded")
-                self._say(None)
+                self.say(f"{self.name}: the server has no ranges, all of it has to be downloaded")
+                self.say(None)
             self.has_ranges, self._validator = False, _validator(response)
             if size is None:
                 size = self._read_to_end(answer)
