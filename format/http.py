@@ -167,7 +167,7 @@ class HttpSource:
         if (response := self._answer.response) is not None:
             with contextlib.suppress(OSError, RuntimeError, ValueError):  # it may just have come to its end
                 response.shutdown()
-        if self._reading.acquire(timeout=1.0):
+        if self._reading.acquire(timeout=0.1):  # else the reader itself lets go, once an answer or a time-out comes
             self._answer.drop_connection()
             self._reading.release()
         for pool in self._pools.values():

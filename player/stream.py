@@ -203,7 +203,7 @@ class Stream:
             self._change.notify_all()
         if isinstance(self.source, HttpSource):
             self.source.close()
-        self._thread.join(timeout=2.0)
+        self._thread.join(timeout=0.5)  # on a dead line it may take longer, which nobody has to wait for
 
     def _fixed_bytes(self) -> int:
         """What the scene takes but for its segments of time: textures, folded ones included; occupancy and its distances; motion;
@@ -281,7 +281,7 @@ class Stream:
             self.source.forget()
             symbols, _ = self._reader.segment(number)
         self._came.append((clock.monotonic(), int(self._stored[position])))
-        while len(self._came) > 1000:
+        while self._came[0][0] < clock.monotonic() - RATE_OVER_S:
             self._came.popleft()
         if self.parts.moves[position]:
             return Piece(position, number, symbols)

@@ -53,6 +53,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     line: ClassVar[Line] = Line()
     timeout = 60
+    disable_nagle_algorithm = True  # else a short body waits for the answer to its header
 
     def __init__(self, *args: object, line: Line | None = None, **kwargs: object) -> None:
         self.shared = line or self.line
