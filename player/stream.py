@@ -70,7 +70,7 @@ class Stream:
         self.parts = PartialScene(self._reader)
         self.scene: Scene = self.parts.scene
         self._layout = Layout.of(self.scene)
-        fixed, least = self._fixed_bytes(), least_room(self.parts)
+        fixed, least = self.fixed_bytes, least_room(self.parts)
         if fixed + least > memory:
             raise BudgetError(f"{source.name}: takes {fixed + least:,} bytes to play, more than the {memory:,} of --memory")
         self._room = memory - fixed
@@ -89,6 +89,7 @@ class Stream:
         self._bug: BaseException | None = None
         self._stalled = True
         self._came: deque[tuple[float, int]] = deque()
+        """When how many bytes had come, over the last RATE_OVER_S."""
         if isinstance(source, HttpSource):
             source.attempts, source.say = float("inf"), self._hear
         self._thread = threading.Thread(target=self._run, name="fetching", daemon=True)
@@ -170,14 +171,38 @@ class Stream:
     @property
     def rate(self) -> float:
         """Bytes a second that came lately."""
-        came = [(at, size) for at, size in tuple(self._came) if at > clock.monotonic() - RATE_OVER_S]
-        return sum(size for _, size in came) / RATE_OVER_S
+        now = clock.monotonic()
+        self._came.append((now, self.received))
+        while self._came[0][0] < now - RATE_OVER_S:
+            self._came.popleft()
+        (since, before), (until, after) = self._came[0], self._came[-1]
+        return (after - before) / (until - since) if until > since else 0.0
+
+    @property
+    def received(self) -> int:
+        """Bytes that came so far, through a network or from a disk."""
+        return self.source.received if isinstance(self.source, HttpSource) else int(self._stored[self._taken].sum())
 
     @property
     def memory_bytes(self) -> int:
         """Of the segments of time planes that are there or on their way."""
         with self._change:
             return int(self.parts.sizes[self._taken & self.parts.moves].sum())
+
+    @property
+    def fixed_bytes(self) -> int:
+        """What the scene takes but for its segments of time: textures, folded ones included; occupancy and its distances; motion;
+        planes that wait to be uploaded, and one in the making; what the source holds."""
+        scene, layout = self.scene, self._layout
+        texels = sum(width * height for width, height in (layout.size, Layout.of(scene, REFINED).size if scene.is_dynamic else (0, 0)))
+        if scene.is_dynamic:
+            texels += Rows(scene, layout).width * layout.row_count()
+        largest = layout.layers * max(block.width * block.height for block in layout.blocks)
+        motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
+        decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw
+        whole = isinstance(self.source, HttpSource) and not self.source.has_ranges
+        source = self.source.size if whole else RUN_BYTES + int(max(entry.stored_length for entry in self._reader.index))
+        return 16 * texels + 2 * scene.occupancy.nbytes + motion + decoding + source
 
     @property
     def failure(self) -> str | None:
@@ -192,7 +217,7 @@ class Stream:
         if self._trouble is not None:
             return self._trouble
         if self._stalled:
-            return f"waiting for the scene, {self.rate / 1e3:,.0f} KB/s" if self._here.any() else "waiting for the scene"
+            return f"waiting for the scene, {self.rate / 1e3:,.0f} KB/s"
         return None
 
     def close(self) -> None:
@@ -204,20 +229,6 @@ class Stream:
         if isinstance(self.source, HttpSource):
             self.source.close()
         self._thread.join(timeout=0.5)  # on a dead line it may take longer, which nobody has to wait for
-
-    def _fixed_bytes(self) -> int:
-        """What the scene takes but for its segments of time: textures, folded ones included; occupancy and its distances; motion;
-        planes that wait to be uploaded, and one in the making; what the source holds."""
-        scene, layout = self.scene, self._layout
-        texels = sum(width * height for width, height in (layout.size, Layout.of(scene, REFINED).size if scene.is_dynamic else (0, 0)))
-        if scene.is_dynamic:
-            texels += Rows(scene, layout).width * layout.row_count()
-        largest = layout.layers * max(block.width * block.height for block in layout.blocks)
-        motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
-        decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw
-        whole = isinstance(self.source, HttpSource) and not self.source.has_ranges
-        source = self.source.size if whole else RUN_BYTES + int(max(entry.stored_length for entry in self._reader.index))
-        return 16 * texels + 2 * scene.occupancy.nbytes + motion + decoding + source
 
     def _drop(self, which: np.ndarray) -> None:
         """Under the lock: segments leave the scene."""
@@ -280,9 +291,6 @@ class Stream:
                 raise
             self.source.forget()
             symbols, _ = self._reader.segment(number)
-        self._came.append((clock.monotonic(), int(self._stored[position])))
-        while self._came[0][0] < clock.monotonic() - RATE_OVER_S:
-            self._came.popleft()
         if self.parts.moves[position]:
             return Piece(position, number, symbols)
         plane = self.parts.head_of(number)

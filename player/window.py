@@ -158,7 +158,7 @@ class Player:
         self.view = View.of(self.rig, self.rig.cameras[0])
         self.playback = Playback(scene.clip, playing=scene.clip.duration_s > 0)
         self.wardrobe = Wardrobe(scene)
-        self.pace = Pace(1 / 15 if software else 1 / 50)
+        self.pace = Pace.of(software)
         self.part, self.look = Part.FULL, Look.COLOUR
         self.show_hud, self.show_keys = True, False
         self.frame_s = self.draw_s = 0.0

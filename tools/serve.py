@@ -153,7 +153,7 @@ def _command(argv: list[str]) -> None:
         raise UsageError(f"--port {options.port} is none")
     with serving(options.folder, port=options.port, line=Line(options.rate, options.delay)) as url:
         for path in sorted(options.folder.glob("*.kpc")):
-            print(f"{url}/{path.name}")
+            print(f"{url}/{path.name}", flush=True)
         print(f"serve: {options.folder} at {url}; Ctrl-C ends it", file=sys.stderr)
         threading.Event().wait()
 
