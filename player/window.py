@@ -378,16 +378,11 @@ class Player:
             self._transport()
         if self.show_keys:
             self._key_list()
-        told = self._notice if clock.monotonic() < self._notice_until else None
-        for name, text, place in (("notice", told, 0.82), ("stream", self.stream.message, 0.1)):
-            if text is not None:
-                width, height = self.window.size
-                _place(width / 2, height * place, 0.5, 0.5)
-                imgui.set_next_window_size_constraints(imgui.ImVec2(0, 0), imgui.ImVec2(0.9 * width, height))
-                with _panel(name, imgui.WindowFlags_.no_inputs):
-                    imgui.push_text_wrap_pos(0.88 * width)
-                    imgui.text(text)
-                    imgui.pop_text_wrap_pos()
+        width, height = self.window.size
+        if clock.monotonic() < self._notice_until:
+            _say("notice", self._notice, width, 0.82 * height, 0.5)
+        if (message := self.stream.message) is not None:
+            _say("stream", message, width, 0.8 * imgui.get_font_size(), 0.0)
 
     def _status(self) -> None:
         em = imgui.get_font_size()
@@ -472,6 +467,15 @@ class Player:
 
 def _place(x: float, y: float, pivot_x: float = 0.0, pivot_y: float = 0.0) -> None:
     imgui.set_next_window_pos(imgui.ImVec2(x, y), imgui.Cond_.always, imgui.ImVec2(pivot_x, pivot_y))
+
+
+def _say(name: str, text: str, width: float, y: float, pivot: float) -> None:
+    """A message in the middle of the window's width, wrapped; `pivot` of its height lies at `y`."""
+    _place(width / 2, y, 0.5, pivot)
+    with _panel(name, imgui.WindowFlags_.no_inputs):
+        imgui.push_text_wrap_pos(0.88 * width)
+        imgui.text(text)
+        imgui.pop_text_wrap_pos()
 
 
 @contextlib.contextmanager
