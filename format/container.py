@@ -46,6 +46,9 @@ class Source(Protocol):
     def read_at(self, offset: int, length: int) -> bytes:
         """`length` bytes from `offset`, fewer only at the end."""
 
+    def hold(self, offset: int, length: int) -> None:
+        """The next reads lie within these bytes, in order; a source to which each costs a journey may fetch them in one."""
+
 
 @dataclass(frozen=True)
 class Header:
@@ -172,7 +175,7 @@ class Reader:
     Opening reads the header and the index (two reads, at the very start of the file) and nothing else.
 
     Args:
-        source: a path, the bytes themselves, a binary file object that can seek, or a `Source`.
+        source: a path, an http or https URL, the bytes themselves, a binary file object that can seek, or a `Source`.
         allow_partial: accept a file whose end is missing; `available` tells which chunks are there.
 
     Attributes:
@@ -184,7 +187,7 @@ class Reader:
     """
 
     def __init__(self, source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, allow_partial: bool = False):
-        self.source = _as_source(source)
+        self.source = open_source(source)
         self.name = self.source.name
         self._reading = threading.Lock()
         self.header = self._read_header(allow_partial)
@@ -301,6 +304,9 @@ class _BytesSource:
     def read_at(self, offset: int, length: int) -> bytes:
         return bytes(self.data[offset:offset + length])
 
+    def hold(self, offset: int, length: int) -> None:
+        """All bytes are at hand."""
+
 
 class _FileSource:
     """A seekable file object; opened anew for each read when only its path is known."""
@@ -322,8 +328,21 @@ class _FileSource:
             opened.seek(offset)
             return opened.read(length)
 
+    def hold(self, offset: int, length: int) -> None:
+        """The operating system reads ahead."""
 
-def _as_source(source: "str | os.PathLike[str] | bytes | BinaryIO | Source") -> Source:
+
+def open_source(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, limit: int = DEFAULT_BUDGET) -> Source:
+    """The bytes behind a path, a URL (`kpc.format.http`), or what else a `Reader` takes.
+
+    Args:
+        limit: bytes of memory that a file may take whose server sends it as a whole only.
+    """
+    if isinstance(source, str) and "://" in source:
+        from kpc.format.http import HttpSource, is_url  # only now: what it takes to speak to servers is slow to load
+
+        if is_url(source):
+            return HttpSource(source, limit=limit)
     if isinstance(source, (str, os.PathLike)):
         return _FileSource(Path(source))
     if isinstance(source, (bytes, bytearray, memoryview)):

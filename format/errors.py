@@ -6,6 +6,8 @@
      ├─ MediaError      ffmpeg, an image or a video failed
      ├─ FormatError     a .kpc file is damaged, hostile or of an unknown version
      │   └─ BudgetError   it would need more memory than the reader was given
+     ├─ NetworkError    a server does not give what it should
+     │   └─ UnreachableError   it cannot be reached, or breaks off again and again; it may do so no longer
      ├─ TrainingError   training cannot start or go on
      └─ DisplayError    no OpenGL, or no window to be had
 
@@ -36,6 +38,14 @@ class FormatError(KpcError):
 
 class BudgetError(FormatError):
     """A .kpc file would need more memory than the reader was given."""
+
+
+class NetworkError(KpcError):
+    """A server does not give what it should."""
+
+
+class UnreachableError(NetworkError):
+    """A server cannot be reached, or breaks off again and again; it may do so no longer."""
 
 
 class TrainingError(KpcError):

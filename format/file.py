@@ -24,7 +24,9 @@ import numpy as np
 
 from kpc.format.cameras import Camera
 from kpc.format.cli import written_aside
-from kpc.format.container import CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, Chunk, Entry, Reader, Source, pack
+from kpc.format.container import (
+    CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, Chunk, Entry, Reader, Source, open_source, pack,
+)
 from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.planes import decode_segment, encode_segment
@@ -296,6 +298,7 @@ def read(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, memory
         BudgetError: it needs more than `memory_budget`; raised before the memory is taken.
     """
     reader = SceneReader(source, memory_budget=memory_budget, allow_partial=allow_partial)
+    reader.source.hold(0, reader.source.size)
     scales = tuple({
         name: QuantisedPlane(np.zeros((p.rows, p.columns, p.channels), np.int8), p.step, p.offset,
                              np.zeros((p.rows, p.columns), bool))
@@ -321,6 +324,9 @@ class SceneReader(Reader):
 
     Opening reads header, index and SCNE, and checks that the index lists a whole scene that fits the memory budget.
 
+    Args:
+        in_parts: the caller never holds all of the planes, and minds himself what those take that he holds.
+
     Attributes:
         head: the SCNE chunk.
 
@@ -329,8 +335,8 @@ class SceneReader(Reader):
     """
 
     def __init__(self, source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *,
-                 memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False):
-        super().__init__(source, allow_partial=allow_partial)
+                 memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False, in_parts: bool = False):
+        super().__init__(open_source(source, limit=memory_budget), allow_partial=allow_partial)
         self.memory_budget = memory_budget
         for number, entry in enumerate(self.index):
             if entry.is_critical and entry.kind not in KNOWN_KINDS:
@@ -340,9 +346,9 @@ class SceneReader(Reader):
         if self.head.value_count != self.header.value_count:
             raise FormatError(f"{self.name}: the header claims {self.header.value_count:,} values, "
                               f"the scene {self.head.value_count:,}")
-        needed = 5 * self.head.value_count  # one int8 symbol and one float32 each
-        if needed > memory_budget:
-            raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory, more than the budget of "
+        self.planes_bytes = 0 if in_parts else 5 * self.head.value_count  # one int8 symbol and one float32 each
+        if self.planes_bytes > memory_budget:
+            raise BudgetError(f"{self.name}: needs {self.planes_bytes:,} bytes of memory, more than the budget of "
                               f"{memory_budget:,}")
         self._check_segments()
         self._decoder_number()
@@ -433,7 +439,7 @@ class SceneReader(Reader):
         return self._only(kind) if any(entry.kind == kind for entry in self.index) else None
 
     def _afford(self, more_bytes: int, what: str) -> None:
-        needed = 5 * self.head.value_count + more_bytes
+        needed = self.planes_bytes + more_bytes
         if needed > self.memory_budget:
             raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory with {what}, more than the budget of "
                               f"{self.memory_budget:,}")

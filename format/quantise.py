@@ -42,11 +42,16 @@ class QuantisedPlane:
     coded: np.ndarray
 
     def dequantise(self) -> np.ndarray:
-        """(H, W, M) float32: symbol * step + offset, rounded after the product and after the sum."""
-        values = self.symbols.astype(np.float32)
-        values *= self.step
-        values += self.offset
-        return values
+        """(H, W, M) float32."""
+        return dequantised(self.symbols, self.step, self.offset)
+
+
+def dequantised(symbols: np.ndarray, step: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """(..., M) float32 of (..., M) int8: symbol * step + offset, rounded after the product and after the sum."""
+    values = symbols.astype(np.float32)
+    values *= step
+    values += offset
+    return values
 
 
 def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bool, needed: np.ndarray | None = None,

@@ -100,6 +100,17 @@ class Playback:
             time, self.playing = 1.0, False
         self.time = time % 1.0 if time > 1.0 else time
 
+    def after(self, seconds: float) -> "Playback":
+        """Where it will be then."""
+        later = replace(self)
+        later.advance(seconds)
+        return later
+
+    @property
+    def pace(self) -> float:
+        """Of the clip in a real second; 0 while it does not play."""
+        return self.speed / self.clip.duration_s if self.playing and self.clip.duration_s > 0 else 0.0
+
     def toggle(self) -> None:
         """Play or pause; at the end of a clip that does not loop, begin again."""
         self.playing = not self.playing
@@ -174,6 +185,11 @@ class Pace:
 
     budget_s: float
     scale: float = 1.0
+
+    @staticmethod
+    def of(software: bool) -> "Pace":
+        """For a processor that stands in for a graphics card, or for one: the first picture comes soon, if coarsely."""
+        return Pace(1 / 15, 0.25) if software else Pace(1 / 50)
 
     def saw(self, seconds: float) -> None:
         """Take in how long a picture took at the present scale; the time is in proportion to its pixels."""

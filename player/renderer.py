@@ -99,13 +99,10 @@ class Renderer:
         finer = Layout.of(scene, REFINED)
         self.folded_layout = finer if max(finer.size) <= most else self.layout
         with room_on(ctx, "the scene"):
-            self._planes = _texture(ctx, self.layout.atlas(scene))
+            self._planes = _texture(ctx, self.layout.size)
             self._folded_planes: moderngl.Texture | None = None
-            self._rows: Rows | None = None
-            self._row_texture = _texture(ctx, np.ones((1, 1, 4), np.float32))
-            if scene.is_dynamic:
-                self._rows = Rows(scene, self.layout)
-                self._row_texture = _texture(ctx, np.ones((self.layout.row_count(), self._rows.width, 4), np.float32))
+            self._rows = Rows(scene, self.layout) if scene.is_dynamic else None
+            self._row_texture = _texture(ctx, (1, 1) if self._rows is None else (self._rows.width, self.layout.row_count()))
             self._motion_texture: moderngl.Texture3D | None = None
             if scene.motion is not None:
                 self._motion_texture = ctx.texture3d(scene.motion.shape[3:0:-1], 4, dtype="f4")
@@ -124,6 +121,8 @@ class Renderer:
         self._decoder = shader.constants(weights)
         self._rows_time: float | None = None
         self._folded_time: float | None = None
+        for block in self.layout.blocks:
+            self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
         self._slot: int | None = None
         self._programs: dict[tuple[str, int, bool, bool, bool], tuple[moderngl.Program, moderngl.VertexArray]] = {}
         self._targets: dict[tuple[Part, tuple[int, int]], Target] = {}
@@ -144,6 +143,16 @@ class Renderer:
         textures += [texture for target in self._targets.values() for texture in (target.seen, target.met)]
         return sum(4 * t.width * t.height * t.components for t in textures) + int(self.scene.occupancy[0].size) + (
             0 if self._motion_texture is None else 16 * int(np.prod(self._motion_texture.size)))
+
+    def put(self, scale: int, plane: str, texels: np.ndarray, first: int = 0) -> None:
+        """Replace rows of a space plane from row `first` on: `Layout.texels` of them. Writes to textures that are there."""
+        block = self.layout.block(scale, plane)
+        self._planes.write(texels, viewport=(block.x, block.y + first, texels.shape[1], texels.shape[0]))
+        self._folded_time = None
+
+    def refresh(self) -> None:
+        """Look at the scene's time planes anew: some of their rows have changed."""
+        self._rows_time = self._folded_time = None
 
     def render(
         self, camera: Camera, time: float, *, part: Part = Part.FULL, appearance: np.ndarray | None = None
@@ -317,8 +326,7 @@ class Renderer:
 
     def _fold(self, time: float) -> moderngl.Texture:
         if self._folded_planes is None:
-            self._folded_planes = self.ctx.texture(self.folded_layout.size, 4, dtype="f4")
-            self._folded_planes.repeat_x = self._folded_planes.repeat_y = False
+            self._folded_planes = _texture(self.ctx, self.folded_layout.size)
             self._fold_into = self.ctx.framebuffer([self._folded_planes])
         if time != self._folded_time:
             fold, vertices = self._program("fold.glsl", self.layout)
@@ -346,11 +354,15 @@ class Renderer:
         return self._folded_planes
 
 
-def _texture(ctx: moderngl.Context, texels: np.ndarray) -> moderngl.Texture:
-    """A float32 texture of (height, width, 4), filtered, clamped at its edges."""
-    texture = ctx.texture((texels.shape[1], texels.shape[0]), 4, np.ascontiguousarray(texels, np.float32), dtype="f4")
+def _texture(ctx: moderngl.Context, size: tuple[int, int]) -> moderngl.Texture:
+    """A float32 texture of (width, height) vectors of four, filtered, clamped at its edges, all 0: filters may touch what lies
+    between the blocks of an atlas, with a weight of 0, which does no harm to anything but NaN."""
+    texture = ctx.texture(size, 4, dtype="f4")
     texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
     texture.repeat_x = texture.repeat_y = False
+    whole = ctx.framebuffer([texture])
+    whole.clear()
+    whole.release()
     return texture
 
 

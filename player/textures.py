@@ -27,7 +27,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Layout:
-    """How a scene's planes share one texture.
+    """How a scene's planes share one texture, the atlas.
 
     Attributes:
         layers: texels of four channels that a scale's features fill. The widest scale decides; others are padded.
@@ -64,16 +64,15 @@ class Layout:
         blocks = tuple(placed[s, name] for s, name, *_ in shapes)
         return Layout(len(scene.scales), layers, (width, y + shelf), blocks, refined)
 
-    def atlas(self, scene: Scene) -> np.ndarray:
-        """(height, width, 4) float32 of all space planes; for a layout that is not refined."""
-        out = np.zeros((self.size[1], self.size[0], 4), np.float32)
-        for block in self.blocks:
-            plane = scene.scales[block.scale][block.plane]
-            view = out[block.y : block.y + block.height, block.x : block.x + self.layers * block.width]
-            padded = np.zeros((*plane.shape[:2], self.layers * 4), np.float32)
-            padded[..., : plane.shape[2]] = plane
-            view[:] = padded.reshape(block.height, block.width, self.layers, 4).swapaxes(1, 2).reshape(view.shape)
-        return out
+    def texels(self, plane: np.ndarray) -> np.ndarray:
+        """(rows, layers * columns, 4) float32: a (rows, columns, M) plane as it lies in its block."""
+        rows, columns, channels = plane.shape
+        padded = np.zeros((rows, columns, self.layers * 4), np.float32)
+        padded[..., :channels] = plane
+        return np.ascontiguousarray(padded.reshape(rows, columns, self.layers, 4).swapaxes(1, 2)).reshape(rows, -1, 4)
+
+    def block(self, scale: int, plane: str) -> Block:
+        return self.blocks[3 * scale + SPACE_PLANES.index(plane)]
 
     def row_count(self) -> int:
         return 3 * self.scales * self.layers

@@ -13,12 +13,13 @@ from imgui_bundle import imgui
 
 from kpc.format.errors import DisplayError
 from kpc.format.media import write_image
-from kpc.format.scene import Scene
 from kpc.player.controls import SPEEDS, Pace, Playback, View, Wardrobe
 from kpc.player.orbit import Rig
 from kpc.player.overlay import Overlay
+from kpc.player.prefetch import Playhead
 from kpc.player.reference import Part
 from kpc.player.renderer import Look, Renderer, is_software
+from kpc.player.stream import Stream
 
 KEYS = (
     ("drag", "turn around the scene"),
@@ -140,10 +141,12 @@ class Window:
 
 
 class Player:
-    """A scene in a window, from the first frame to the last."""
+    """A scene in a window, from the first frame to the last, while it arrives."""
 
-    def __init__(self, window: Window, scene: Scene, name: str) -> None:
-        self.window, self.scene, self.name = window, scene, name
+    def __init__(self, window: Window, stream: Stream) -> None:
+        self.window, self.stream, self.scene = window, stream, stream.scene
+        scene = self.scene
+        stream.arrived = glfw.post_empty_event
         self.ctx = window.ctx
         self.device = self.ctx.info["GL_RENDERER"]
         software = is_software(self.ctx)
@@ -155,7 +158,7 @@ class Player:
         self.view = View.of(self.rig, self.rig.cameras[0])
         self.playback = Playback(scene.clip, playing=scene.clip.duration_s > 0)
         self.wardrobe = Wardrobe(scene)
-        self.pace = Pace(1 / 15 if software else 1 / 50)
+        self.pace = Pace.of(software)
         self.part, self.look = Part.FULL, Look.COLOUR
         self.show_hud, self.show_keys = True, False
         self.frame_s = self.draw_s = 0.0
@@ -168,15 +171,15 @@ class Player:
         self._is_sharp = False
 
     def run(self, frames: int | None = None) -> None:
-        """Until the window is closed, or for a number of frames."""
+        """Until the window is closed, or for a number of frames once all of the scene is there that is to come."""
         shown = 0
         while not glfw.window_should_close(self.window.handle) and (frames is None or shown < frames):
-            if frames is None and self._is_sharp:
+            if (frames is None or not self.stream.is_settled) and self._is_sharp:
                 glfw.wait_events_timeout(0.05)  # nothing moves: spend next to nothing
             else:
                 glfw.poll_events()
             self.frame()
-            shown += 1
+            shown += self.stream.is_settled
 
     def frame(self) -> None:
         """One turn: events, the scene, the controls over it."""
@@ -195,13 +198,21 @@ class Player:
         for key, mods in self.window.pressed:
             self._type(key, mods)
         self.window.pressed.clear()
-        self.playback.advance(seconds)
+        self._advance(seconds)
         self.wardrobe.advance(seconds)
         self._draw(now)
         self._widgets()
         self._finish()
         glfw.swap_buffers(self.window.handle)
         self.renderer.check()
+
+    def _advance(self, seconds: float) -> None:
+        """Let the clip go on, unless what comes next is not there yet."""
+        later = self.playback.after(seconds)
+        self.stream.steer(Playhead(later.time, self.playback.pace, self.playback.loop))
+        self.stream.upload(self.renderer)
+        if self.stream.can_show(later.time, self.playback.pace):
+            self.playback = later
 
     def screenshot(self, path: Path, with_controls: bool) -> None:
         """Save the picture at the window's full resolution."""
@@ -222,13 +233,16 @@ class Player:
         self.ctx.viewport = (0, 0, *pixels)
         self.screen = self.ctx.detect_framebuffer(0)
         self.canvas = self.ctx.framebuffer([self.ctx.texture(pixels, 4)])
+        self.canvas.clear(*map(float, self.scene.background))
         self._drawn = ()
 
     def _draw(self, now: float) -> None:
         """Draw the scene if anything has changed, finely once nothing does any more."""
         worn = (self.wardrobe.number, self.wardrobe.progress)
-        wanted = (self.view, self.playback.time, self.part, self.look, self.renderer.folded, worn)
-        if wanted != self._drawn:
+        wanted = (self.view, self.playback.time, self.part, self.look, self.renderer.folded, worn, self.stream.version)
+        if self.stream.scales_here == 0:
+            self._is_sharp = True  # as sharp as nothing can be
+        elif wanted != self._drawn:
             self._drawn, self._moved, self._is_sharp = wanted, now, False
             self._picture(self.pace.scale)
             self.pace.saw(self.draw_s)
@@ -340,7 +354,7 @@ class Player:
 
     def _save_picture(self) -> None:
         """Write the picture without controls into the working directory, under the first name that is free."""
-        stem = Path(self.name).stem
+        stem = Path(self.stream.source.name).stem
         path = next(p for p in (Path(f"{stem}-{n:03d}.png") for n in range(1, 1_000_000)) if not p.exists())
         self._picture(1.0)
         try:
@@ -364,11 +378,11 @@ class Player:
             self._transport()
         if self.show_keys:
             self._key_list()
+        width, height = self.window.size
         if clock.monotonic() < self._notice_until:
-            width, height = self.window.size
-            _place(width / 2, height * 0.82, 0.5, 0.5)
-            with _panel("notice", imgui.WindowFlags_.no_inputs):
-                imgui.text(self._notice)
+            _say("notice", self._notice, width, 0.82 * height, 0.5)
+        if (message := self.stream.message) is not None:
+            _say("stream", message, width, 0.8 * imgui.get_font_size(), 0.0)
 
     def _status(self) -> None:
         em = imgui.get_font_size()
@@ -379,6 +393,8 @@ class Player:
             imgui.text_disabled(f"{self.samples:.1f} samples a ray")
             imgui.text_disabled(f"{self.renderer.memory_bytes / 1e6:.0f} MB of textures")
             imgui.text_disabled(self.device.split("(")[0].strip())
+            if not self.stream.is_settled:
+                imgui.text_disabled(f"{self.stream.share_here:.0%} here, {self.stream.rate / 1e3:,.0f} KB/s")
             imgui.separator()
             for look, label in LOOKS.items():
                 if imgui.radio_button(label, self.look is look):
@@ -451,6 +467,15 @@ class Player:
 
 def _place(x: float, y: float, pivot_x: float = 0.0, pivot_y: float = 0.0) -> None:
     imgui.set_next_window_pos(imgui.ImVec2(x, y), imgui.Cond_.always, imgui.ImVec2(pivot_x, pivot_y))
+
+
+def _say(name: str, text: str, width: float, y: float, pivot: float) -> None:
+    """A message in the middle of the window's width, wrapped; `pivot` of its height lies at `y`."""
+    _place(width / 2, y, 0.5, pivot)
+    with _panel(name, imgui.WindowFlags_.no_inputs):
+        imgui.push_text_wrap_pos(0.88 * width)
+        imgui.text(text)
+        imgui.pop_text_wrap_pos()
 
 
 @contextlib.contextmanager

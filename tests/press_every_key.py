@@ -7,15 +7,19 @@ import glfw
 import numpy as np
 from pytest import approx
 
-import kpc
+from kpc.format.container import open_source
 from kpc.player.reference import Part
 from kpc.player.renderer import Look
+from kpc.player.stream import Stream
 from kpc.player.window import Player, Window
 
 
 def main(scene_file: str) -> None:
     window = Window("test", (320, 240))
-    player = Player(window, kpc.load(scene_file), scene_file)
+    stream = Stream(open_source(scene_file))
+    player = Player(window, stream)
+    while not stream.is_settled:
+        player.frame()
 
     def press(*keys: int) -> None:
         for key in keys:
@@ -92,6 +96,7 @@ def main(scene_file: str) -> None:
     assert glfw.window_should_close(window.handle)
     player.run()
     player.close()
+    stream.close()
     window.close()
 
 

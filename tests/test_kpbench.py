@@ -136,6 +136,28 @@ def test_player_measures_both_paths_of_a_moving_scene(tmp_path: Path, capsys: py
             assert record["accuracy"]["psnr"] > 50 and record["accuracy"]["within_one_level"] > 0.999
 
 
+def test_stream_measures_how_soon_scenes_are_seen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gl.context()
+    monkeypatch.setattr(kpbench, "_alone", lambda work, job: work(job))
+    moving, still = tiny_file(tmp_path / "moving.kpc", True), tiny_file(tmp_path / "still.kpc", False)
+    out = tmp_path / "out.json"
+    assert kpbench.main(["stream", str(moving), str(still), "--size", "48x36", "--out", str(out)]) == 0
+    first, second = results.load([out])
+    assert "first picture ms" in capsys.readouterr().err and "| still | " in results.markdown([second])
+    for record in (first, second):
+        (run,) = record["repeats"]
+        for place in ("disk", "line"):
+            open_ms, first_ms, finest_ms, all_ms = (run[f"{place}_{key}_ms"] for key in ("open", "first_picture", "finest_picture", "all"))
+            assert 0 < open_ms < first_ms < finest_ms <= all_ms
+        assert 0 < run["line_first_picture_bytes"] <= run["size_bytes"]
+        sizes, quality = ([prefix[key] for prefix in record["prefixes"]] for key in ("bytes", "psnr"))
+        assert sizes == sorted(sizes) and sizes[-1] == run["size_bytes"] and quality[-1] > 80 > quality[0]
+    assert first["repeats"][0]["jumps"] >= first["repeats"][0]["jumps_that_waited"] > 0
+    assert "jump_ms" not in second["repeats"][0]
+
+
 def test_what_was_measured_survives_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gl.context()
     good, bad = tiny_file(tmp_path / "good.kpc", False), tmp_path / "bad.kpc"

@@ -12,6 +12,7 @@ from scenes import tiny_scene, varied
 from kpc.format.file import write
 from kpc.format.media import read_image
 from kpc.format.quantise import quantise_scene
+from kpc.tools.serve import Handler, serving
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +70,36 @@ def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> No
     assert picture[12:100, 12:100].mean() < 180  # the HUD
 
 
+def test_plays_from_a_server(scene_file: Path, display: str, tmp_path: Path) -> None:
+    shot = tmp_path / "shot.png"
+    with serving(scene_file.parent) as url:
+        done = kpplay(f"{url}/tiny.kpc", "--size", "400x300", "--frames", 3, "--screenshot", shot, "--memory", "50MB", display=display)
+    assert done.returncode == 0 and done.stdout == done.stderr == "", done.stderr
+    background = np.rint(tiny_scene(4).background * 255)
+    assert np.abs(read_image(shot).astype(int)[150:170, 260:280] - background).max() > 20
+
+
+def test_a_server_that_fails_is_told_in_the_window(scene_file: Path, display: str, tmp_path: Path) -> None:
+    class Failing(Handler):
+        """Gives a little at a time, and after the first picture nothing."""
+
+        def do_GET(self) -> None:
+            first, last = map(int, self.headers["Range"].removeprefix("bytes=").split("-"))
+            if first >= 6000:
+                self.send_error(404)
+                return
+            self.headers.replace_header("Range", f"bytes={first}-{min(last, first + 1999)}")
+            super().do_GET()
+
+    shots = [tmp_path / "whole.png", tmp_path / "told.png"]
+    for handler, shot in zip((Handler, Failing), shots):
+        with serving(scene_file.parent, handler=handler) as url:
+            done = kpplay(f"{url}/tiny.kpc", "--size", "400x300", "--frames", 2, "--screenshot", shot, display=display)
+        assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+    whole, told = (read_image(shot).astype(int)[22:38, 250:390] for shot in shots)  # where the message is, right of the HUD
+    assert told.max() > 200 > 100 > told.min() and np.abs(whole - told).max() > 100
+
+
 def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
     done = kpplay(scene_file)
     assert done.returncode == 1 and done.stderr.count("\n") == 1
@@ -79,6 +110,8 @@ def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
     ("arguments", "code", "words"),
     [
         (["nowhere.kpc"], 1, "nowhere.kpc"),
+        (["http://127.0.0.1:9/nowhere.kpc"], 1, "http://127.0.0.1:9/nowhere.kpc"),
+        (["{scene}", "--memory", "1MB"], 1, "--memory"),
         (["{scene}", "--size", "7x7"], 2, "--size"),
         (["{scene}", "--frames", "0"], 2, "--frames"),
         (["{scene}", "--screenshot", "x.bmp"], 2, "x.bmp"),

@@ -16,7 +16,11 @@ from kpc.player.textures import FARTHEST, Layout, Rows, decoder_arrays, distance
 def test_the_atlas_holds_every_plane(channels: int, scales: int) -> None:
     scene = tiny_scene(0, channels=channels, scales=scales)
     layout = Layout.of(scene)
-    atlas = layout.atlas(scene)
+    atlas = np.zeros((layout.size[1], layout.size[0], 4), np.float32)
+    for block in layout.blocks:
+        assert layout.block(block.scale, block.plane) is block
+        wide = layout.layers * block.width
+        atlas[block.y : block.y + block.height, block.x : block.x + wide] = layout.texels(scene.scales[block.scale][block.plane])
     assert layout.layers == -(-channels // 4) and atlas.shape == (layout.size[1], layout.size[0], 4)
     claimed = np.zeros(atlas.shape[:2], int)
     for block, (s, name) in zip(

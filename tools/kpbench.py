@@ -5,6 +5,7 @@ kpbench curve room liam --minutes 1,2,5,10,20 --out docs/bench/curve.json
 kpbench ablate default --preset fast --steps 2000 --out docs/bench/ablate.json
 kpbench step room soldier --preset balanced --out docs/bench/step.json
 kpbench player room.kpc liam.kpc --out docs/bench/player.json
+kpbench stream room.kpc liam.kpc --out docs/bench/stream.json
 
 Every record says what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
 data) and what came of it, each repeat on its own. Output is one JSON list, a record a line: with --out written after
@@ -96,7 +97,7 @@ def _record(kind: str, source: Path, origin: results.Record, settings: dict[str,
     """What a record says before anything is measured."""
     return {
         "kind": kind,
-        "name": source.resolve().stem if kind == "player" else source.resolve().name,
+        "name": source.resolve().stem if kind in ("player", "stream") else source.resolve().name,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         **origin,
         "load_average": os.getloadavg()[0],
@@ -302,6 +303,26 @@ def _play_once(job: Play) -> results.Record:
     }
 
 
+def _stream(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """A record a scene: how soon it is seen from a disk and over a slow line, and what its prefixes look like."""
+    from kpc.tools import streaming
+
+    for source in options.scenes:
+        settings = {"size": "{}x{}".format(*options.size), "rate": streaming.RATE, "delay": streaming.DELAY}
+        job = streaming.Arrival(source, options.size, kpc.load(source).is_dynamic)
+        record = _record("stream", source, origin, settings)
+        print(f"kpbench: {record['name']}", file=sys.stderr)
+        repeats = [_alone(streaming.measure, job) for _ in range(options.repeats)]
+        yield record | {"seed": None, "renderer": _alone(_renderer, None), "repeats": repeats,
+                        "prefixes": _alone(streaming.prefixes, job)}  # fmt: skip
+
+
+def _renderer(_: None) -> str:
+    from kpc.player import offscreen
+
+    return offscreen.describe(offscreen.open_context())
+
+
 def _compare(job: Play) -> tuple[str, results.Record]:
     """The renderer's name, and how near its picture is to the reference's, in the middle of the clip."""
     from kpc.player import offscreen, reference
@@ -338,7 +359,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|player")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|player|stream")
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
@@ -376,7 +397,13 @@ def _parser() -> argparse.ArgumentParser:
     player.add_argument("--frames", type=_positive, default=60, help="timed frames, spread over the clip (default: 60)")
     player.set_defaults(measure=_player)
 
-    for kind in (encode, curve, ablate, step, player):
+    stream = kinds.add_parser("stream", help="scenes that play while they arrive", description="How soon scenes are seen from a "
+                              "disk and over a slow line, how soon after a jump, and what their prefixes look like.")  # fmt: skip
+    stream.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
+    stream.add_argument("--size", type=_size, default=(320, 240), metavar="WxH", help="of a picture (default: 320x240)")
+    stream.set_defaults(measure=_stream)
+
+    for kind in (encode, curve, ablate, step, player, stream):
         kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
         kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
     return parser

@@ -1,6 +1,7 @@
 """kpinfo: what is inside a .kpc file.
 
     kpinfo scene.kpc             a page on the clip, the box, the planes and the chunks
+    kpinfo https://host/scene.kpc
     kpinfo scene.kpc --json      the same for programs
     kpinfo scene.kpc --verify    check every CRC32C and decode everything; exit code 1 if anything is wrong
 
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from kpc.format import cli
-from kpc.format.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, DEFAULT_BUDGET, VERSION, Entry
+from kpc.format.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, DEFAULT_BUDGET, VERSION, Entry, open_source
 from kpc.format.errors import FormatError, UsageError
 from kpc.format.file import SceneReader, read
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
@@ -33,7 +34,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="kpinfo", description="Show what is inside a .kpc file.")
-    parser.add_argument("scene", help="a .kpc file")
+    parser.add_argument("scene", help="a .kpc file, or its http address")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--verify", action="store_true", help="check every CRC32C and decode everything")
     parser.add_argument("--memory-budget", type=int, default=DEFAULT_BUDGET, metavar="BYTES",
@@ -42,10 +43,12 @@ def _command(argv: list[str]) -> None:
     if options.memory_budget < 1:
         raise UsageError(f"--memory-budget {options.memory_budget} is not positive")
 
-    reader = SceneReader(options.scene, memory_budget=options.memory_budget, allow_partial=not options.verify)
+    source = open_source(options.scene, limit=options.memory_budget)
+    reader = SceneReader(source, memory_budget=options.memory_budget, allow_partial=not options.verify)
+    source.hold(0, source.size)
     if options.verify:
         verify(reader)
-    info = describe(reader, read(options.scene, memory_budget=options.memory_budget, allow_partial=True))
+    info = describe(reader, read(source, memory_budget=options.memory_budget, allow_partial=True))
     info["verified"] = options.verify
     print(json.dumps(info, indent=2) if options.json else _page(info))
 

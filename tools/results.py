@@ -70,6 +70,12 @@ def _against(key: str, limit: str) -> Callable[[Record], str]:
     return lambda record: f"{median(record, key):.0f} of {_of(record, 'limits', limit):.0f}"
 
 
+def _prefixes(record: Record) -> str:
+    """All but the last, which is the whole."""
+    size = record["prefixes"][-1]["bytes"]
+    return ", ".join(f"{prefix['bytes'] / size:.0%}: {prefix['psnr']:.1f}" for prefix in record["prefixes"][:-1])
+
+
 _ENCODED: list[Column] = [
     ("dataset", lambda r: r["name"]),
     ("preset", lambda r: r["settings"]["preset"]),
@@ -130,9 +136,22 @@ COLUMNS: dict[str, list[Column]] = {
         ("PSNR to reference dB", _accuracy("psnr", "{:.1f}")),
         ("within 1/255", _accuracy("within_one_level", "{:.2%}")),
     ],
+    "stream": [
+        ("scene", lambda r: r["name"]),
+        ("file KB", _number("size_bytes", "{:.0f}", 1e3)),
+        ("first picture from disk ms", _number("disk_first_picture_ms", "{:.0f}")),
+        ("line", lambda r: f"{r['settings']['rate']}, {r['settings']['delay']}"),
+        ("first picture ms", _number("line_first_picture_ms", "{:.0f}")),
+        ("after KB", _number("line_first_picture_bytes", "{:.0f}", 1e3)),
+        ("finest ms", _number("line_finest_picture_ms", "{:.0f}")),
+        ("all ms", _number("line_all_ms", "{:.0f}")),
+        ("jump ms", _number("jump_ms", "{:.0f}")),
+        ("of which waiting", _number("jump_wait_ms", "{:.0f}")),
+        ("share of the file: dB to the whole", _prefixes),
+    ],
 }
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
-          "step": "A step of training", "player": "Playing"}
+          "step": "A step of training", "player": "Playing", "stream": "Playing while it arrives"}
 
 
 def cells(kind: str, records: Iterable[Record]) -> list[list[str]]:

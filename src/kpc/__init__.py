@@ -25,11 +25,12 @@ def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int =
     """Read a .kpc file; its planes are numpy arrays by name: `scene.scales[0]["xy"]`.
 
     Args:
-        path: of the file; or its bytes, or an open binary file.
+        path: of the file, or its http or https URL; or its bytes, or an open binary file.
         memory_budget: bytes the scene may take.
 
     Raises:
         FormatError: the file is damaged, hostile or of an unknown version; BudgetError if it is too large.
+        NetworkError: the server of a URL does not give it.
     """
     from kpc.format.file import read
 
