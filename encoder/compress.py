@@ -1,43 +1,121 @@
-"""From a trained field to symbols: how coarse each channel of each plane may be."""
+"""From a scene to symbols: how coarse each channel of each plane may be, and how coarse all of them together.
+
+One factor on all steps states the trade between size and fidelity. A user names what it should bring (`Trade`), and it is sought.
+"""
 
 import math
-from collections.abc import Callable, Mapping
-from typing import TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from kpc.encoder.field import Field
+from kpc.encoder.probe import Measure, Measured
+from kpc.format import file
+from kpc.format.errors import TrainingError
 from kpc.format.quantise import QuantisedScene, quantise_scene, reached_by
 from kpc.format.scene import Scene
 
-T = TypeVar("T")
-
 FINEST, COARSEST = -12.0, 2.0
-"""Base-two logarithms of the factors on all steps, between which one is sought."""
-BISECTIONS = 7
-PROBES = BISECTIONS + 2
-"""Scenes that `compress` renders."""
+"""Base-two logarithms of the factors on all steps, between which one is sought for a trained scene."""
+COARSER = 12.0
+"""The same of the coarsest for a file that is coded again; the finest is its own."""
+TOLERANCE = 0.02
+"""A search ends this share below what it may not exceed."""
+ATTEMPTS = 13
+"""After its first, a search makes at most so many."""
+PROBES = 10
+"""Scenes that a search renders, about."""
+GOLDEN = (math.sqrt(5) - 1) / 2
+NEAR = 0.3
+"""Octaves within which the least cost is sought; at the least it hardly changes."""
+
+DEFAULT_LOSS_DB = 0.15
 
 Steps = list[dict[str, np.ndarray]]
 """One mapping a scale, plane name -> (M,) quantisation steps."""
 
 
-def relative_steps(field: Field, curvature: np.ndarray) -> Steps:
+@dataclass(frozen=True)
+class Trade:
+    """What is given up for what: one of these alone, else DEFAULT_LOSS_DB.
+
+    Attributes:
+        max_loss_db: PSNR that coding may cost on training views, what is left out included, dB.
+        target_bytes: the best file of at most this size.
+        quality: from 1 to 100: pictures agree with those of the uncoded scene to `agreement_of` dB.
+        lam: least D + lam R, with D the mean squared difference of colours from those of the uncoded scene, in squares of 8-bit
+            levels, and R bits of the file per parameter of the model.
+    """
+
+    max_loss_db: float | None = None
+    target_bytes: int | None = None
+    quality: float | None = None
+    lam: float | None = None
+
+    @property
+    def bound(self) -> tuple[str, float]:
+        """Which of them it is, and how much."""
+        for name in ("target_bytes", "quality", "lam", "max_loss_db"):
+            if (value := getattr(self, name)) is not None:
+                return name, float(value)
+        return "max_loss_db", DEFAULT_LOSS_DB
+
+    def loss_db(self, psnr: float) -> float:
+        """What coding may cost, about, where the uncoded scene has so many dB: D adds to its own mean squared error."""
+        name, value = self.bound
+        if name == "target_bytes":
+            return DEFAULT_LOSS_DB
+        if name == "max_loss_db":
+            return value
+        # Where D falls to a quarter with a bit more, as fine quantisation has it, its slope is -2 ln 2 D.
+        error = error_of(value) if name == "quality" else value / (2 * math.log(2))
+        return 10 * math.log10(1 + error / (255**2 * 10 ** (-psnr / 10)))
+
+
+def agreement_of(quality: float) -> float:
+    """PSNR of coded against uncoded pictures, dB, that a quality from 1 to 100 stands for: 20 + quality / 3."""
+    return 20 + quality / 3
+
+
+def error_of(quality: float) -> float:
+    """The same as a mean squared difference, in squares of 8-bit levels."""
+    return 255**2 * 10 ** (-agreement_of(quality) / 10)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A scene quantised; what that gave is found out when asked for."""
+
+    quantised: QuantisedScene
+    measure: Measure
+
+    @cached_property
+    def size_bytes(self) -> int:
+        return len(file.encode(self.quantised))
+
+    @cached_property
+    def measured(self) -> Measured:
+        return self.measure(self.quantised.dequantise())
+
+    def cost(self, lam: float) -> float:
+        """D + lam R."""
+        return self.measured.error + lam * 8 * self.size_bytes / self.quantised.parameter_count
+
+
+def relative_steps(curvature: Sequence[Mapping[str, np.ndarray]]) -> Steps:
     """Steps up to one common factor, such that a bit spent on any channel buys the same.
 
     A uniform quantiser of step d errs by d^2 / 12 on average; an error costs `curvature` h of it, a diagonal Fisher estimate
-    (the running mean of squared gradients); its rate falls by one bit with each doubling of d. At equal slopes h d^2 is the same
-    everywhere: d = 1 / sqrt(mean over texels of h). Channels that no gradient ever reached get the coarsest step of all.
+    (the running mean of squared gradients), one mapping a scale, plane name -> (rows, columns, M); its rate falls by one bit with
+    each doubling of d. At equal slopes h d^2 is the same everywhere: d = 1 / sqrt(mean over texels of h). Channels that no
+    gradient ever reached get the coarsest step of all.
     """
-    M = field.layout.channels
-    steps: Steps = [{} for _ in field.layout.resolution]
-    for s, name, start, rows, columns in field.layout.planes():
-        h = curvature[start : start + rows * columns * M].reshape(-1, M).mean(0, dtype=np.float64)
-        steps[s][name] = h
-    largest = max(h.max() for scale in steps for h in scale.values())
+    means = [{name: h.reshape(-1, h.shape[-1]).mean(0, dtype=np.float64) for name, h in scale.items()} for scale in curvature]
+    largest = max(h.max() for scale in means for h in scale.values())
     if largest <= 0:
-        return [{name: np.ones(M) for name in scale} for scale in steps]
-    return [{name: 1 / np.sqrt(np.maximum(h / largest, 1e-8)) for name, h in scale.items()} for scale in steps]
+        return [{name: np.ones(len(h)) for name, h in scale.items()} for scale in means]
+    return [{name: 1 / np.sqrt(np.maximum(h / largest, 1e-8)) for name, h in scale.items()} for scale in means]
 
 
 def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
@@ -46,44 +124,82 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
 
 
 def compress(
-    scene: Scene, steps: Steps, psnr: Callable[[Scene], float], max_loss_db: float
-) -> tuple[QuantisedScene, float]:
-    """The coarsest quantisation that costs at most `max_loss_db` of `psnr`, and what it costs.
+    scene: Scene, steps: Steps, measure: Measure, uncoded_psnr: float, trade: Trade, as_it_is: QuantisedScene | None = None
+) -> Attempt:
+    """The quantisation that a trade asks for.
 
-    Bisects the common factor of the steps on a logarithmic scale from FINEST to COARSEST; the finest is taken where even
-    that costs more.
-    """
-    reference, reached = psnr(scene), reached_by(scene)
+    Args:
+        measure: judges a coding; `uncoded_psnr` is that of the scene before anything was left out.
+        as_it_is: the file that the scene comes from, whose own steps `steps` are: nothing finer makes sense.
 
-    def attempt(exponent: float) -> tuple[QuantisedScene, float]:
-        candidate = quantise_scene(scene, scaled(steps, 2.0**exponent), reached=reached)
-        return candidate, reference - psnr(candidate.dequantise())
-
-    return _farthest(FINEST, COARSEST, attempt, lambda found: found[1] <= max_loss_db and math.isfinite(found[1]))
-
-
-def compress_to_size(
-    scene: Scene, steps: Steps, target_bytes: int, size: Callable[[QuantisedScene], int]
-) -> QuantisedScene:
-    """The finest quantisation of at most `target_bytes` as `size` counts them; the coarsest where even that takes more.
-
-    Bisects as `compress` does.
+    Raises:
+        TrainingError: no file of this model is as small as the trade wants.
     """
     reached = reached_by(scene)
-    return _farthest(
-        COARSEST, FINEST, lambda exponent: quantise_scene(scene, scaled(steps, 2.0**exponent), reached=reached),
-        lambda found: size(found) <= target_bytes,
-    )
+    finest, coarsest = (FINEST, COARSEST) if as_it_is is None else (0.0, COARSER)
+
+    def attempt(exponent: float) -> Attempt:
+        if as_it_is is not None and exponent == 0:
+            return Attempt(as_it_is, measure)
+        return Attempt(quantise_scene(scene, scaled(steps, 2.0**exponent), reached=reached), measure)
+
+    name, value = trade.bound
+    if name == "lam":
+        return _cheapest(finest, coarsest, attempt, lambda found: found.cost(value))
+    if name == "target_bytes":
+        if as_it_is is not None and (whole := attempt(0.0)).size_bytes <= value:
+            return whole
+        found = _farthest(coarsest, finest, attempt, lambda found: found.size_bytes, value)
+        if found.size_bytes > value:
+            raise TrainingError(f"{found.size_bytes:,} bytes is the least that this model takes, not {int(value):,}; give "
+                                "another --target-size, or train anew with a smaller --preset")
+        return found
+    if name == "quality":
+        return _farthest(finest, coarsest, attempt, lambda found: found.measured.error, error_of(value))
+    return _farthest(finest, coarsest, attempt, lambda found: uncoded_psnr - found.measured.psnr, value)
 
 
-def _farthest(start: float, end: float, attempt: Callable[[float], T], accepts: Callable[[T], bool]) -> T:
-    """What `attempt` makes of the exponent farthest from `start` towards `end` that `accepts`; of `start` where none does."""
+def _farthest(
+    start: float, end: float, attempt: Callable[[float], Attempt], value: Callable[[Attempt], float], most: float
+) -> Attempt:
+    """What `attempt` makes of the exponent farthest from `start` towards `end`, along which `value` rises, where that is `most`
+    or less; of `start` where nowhere.
+
+    Bisects until the value is known and positive on both sides, then goes by its logarithm, nearly a straight line, but never
+    nearer to an end than a tenth of the way. Ends when TOLERANCE is met, or after ATTEMPTS.
+    """
     best = attempt(start)
-    for _ in range(BISECTIONS):
-        middle = (start + end) / 2
+    low, high = value(best), math.nan
+    if not low <= most:
+        return best
+    for _ in range(ATTEMPTS):
+        if low >= (1 - TOLERANCE) * most:
+            break
+        share = 0.5
+        if low > 0 and math.isfinite(high):
+            way = math.log(most * (1 - TOLERANCE / 2) / low) / math.log(high / low)
+            share = min(max(way, 0.1), 0.9)
+        middle = start + share * (end - start)
         candidate = attempt(middle)
-        if accepts(candidate):
-            start, best = middle, candidate
+        found = value(candidate)
+        if found <= most:  # not so with NaN
+            start, low, best = middle, found, candidate
         else:
-            end = middle
+            end, high = middle, found
     return best
+
+
+def _cheapest(low: float, high: float, attempt: Callable[[float], Attempt], cost: Callable[[Attempt], float]) -> Attempt:
+    """What `attempt` makes of the exponent of least cost, by golden section: it falls, then rises."""
+    left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    one, other = attempt(left), attempt(right)
+    while high - low > NEAR:
+        if cost(one) <= cost(other):
+            high, right, other = right, left, one
+            left = high - GOLDEN * (high - low)
+            one = attempt(left)
+        else:
+            low, left, one = left, right, other
+            right = low + GOLDEN * (high - low)
+            other = attempt(right)
+    return min(one, other, key=cost)

@@ -138,10 +138,8 @@ class TrainConfig:
     """A cell is empty if a step through it absorbs less than this."""
 
     # --- the file
-    max_coding_loss_db: float = 0.15
-    """What coding may cost on training views: what is left out, and quantisation; the coarsest steps within it are taken."""
     prune_share: float = 0.25
-    """Of that, what may be spent on leaving out view dependence, channels and scales, `kpc.encoder.prune`; 0: they all stay."""
+    """Of what coding may cost on training views, what may be spent on leaving out view dependence, channels and scales, `kpc.encoder.prune`; 0: they all stay."""
 
     def __post_init__(self) -> None:
         positive = ("channels", "steps", "rays", "samples", "hidden", "hybrid_width", "samples_across", "cells_across", "warmup",

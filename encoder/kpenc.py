@@ -3,7 +3,6 @@
 import contextlib
 import json
 import math
-import os
 import signal
 import sys
 import threading
@@ -18,16 +17,19 @@ import torch
 
 from kpc.encoder.ablations import changed_by
 from kpc.encoder.box import contraction_of, device_coordinates_of, find_box, find_inner_box, reaches_beyond, seen_cells
-from kpc.encoder.compress import compress, compress_to_size, relative_steps
+from kpc.encoder.compress import relative_steps
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.estimate import Estimate, estimate
-from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr
+from kpc.encoder.evaluate import evaluate
 from kpc.encoder.field import time_rows
+from kpc.encoder.model import Model, by_plane, code, save_checkpoint
 from kpc.encoder.occupancy import grid_shape
 from kpc.encoder.options import Options, parse
 from kpc.encoder.profile import profile
-from kpc.encoder.prune import Pruned, prune
+from kpc.encoder.probe import PROBE_RAYS, Probe
+from kpc.encoder.prune import Pruned
+from kpc.encoder.recode import check_outputs, figures, reached, recode
 from kpc.encoder.structure import TimeResolution, fitted_in_time
 from kpc.encoder.train import Report, Trainer, box_of_checkpoint
 from kpc.encoder.trim import trim_box
@@ -37,9 +39,6 @@ from kpc.format.progress import Progress
 from kpc.format.quantise import QuantisedScene
 from kpc.format.scene import Scene
 from kpc.format.space import FAR, Contraction, DeviceCoordinates, SpaceMapping
-
-PROBE_RAYS = 1 << 15
-"""Training rays on which the loss of quantisation is measured."""
 
 MOST_CAMERAS = 32
 """Cameras of the dataset that the file names."""
@@ -64,10 +63,16 @@ def _command(argv: list[str]) -> None:
     if only_plan:
         _print_estimate(dry_run(options), options, as_json)
         return
-    result = encode(options)
+    result = recode(options) if options.source.is_file() else encode(options)
     if as_json:
         print(json.dumps(result, indent=1))
-        return
+    elif options.source.is_file():
+        print(f"{options.output}: {result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}; {reached(result)}")
+    else:
+        _print_result(result, options)
+
+
+def _print_result(result: dict[str, Any], options: Options) -> None:
     quality = "no view held out"
     if result["test_psnr"] is not None:
         quality = (f"held-out PSNR {result['test_psnr']:.2f} dB, SSIM {result['test_ssim']:.4f} "
@@ -77,6 +82,7 @@ def _command(argv: list[str]) -> None:
     print(f"{options.output}: {quality} (rendered from the decoded file)")
     print(f"{result['size_bytes']:,} bytes, {result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}; "
           f"coding loss {result['coding_loss_db']:.3f} dB" + (" on held-out views" if result["test_psnr"] is not None else ""))
+    print(reached(result))
     if result["identity_share"] is not None:
         print(f"time-plane texels exactly at identity: {result['identity_share']:.1%}")
     print(f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps)")
@@ -112,8 +118,14 @@ def encode(options: Options) -> dict[str, Any]:
         return _not_written(trainer, options, started)
     _say("writing: choosing quantisation steps, rendering held-out views")
     scene = to_scene(trainer)
-    quantised, probe_loss = quantise(trainer, scene, options.target_bytes)
-    size = _write(quantised, options.output, work)
+    curvature = by_plane(trainer.field.layout, trainer.optimiser.curvature())
+    probe = Probe.of_training(trainer.sampler, trainer.background)
+    if options.keep_checkpoint is not None:
+        save_checkpoint(options.keep_checkpoint, scene, curvature, probe)
+    coded = code(Model(scene, relative_steps(curvature), probe), options.trade, trainer.config.prune_share)
+    if coded.pruned is not None:
+        _say(_left_out(scene, coded.pruned, coded.spare_db))
+    size = _write(coded.scene, options.output, work)
     decoded = file.read(options.output).dequantise()
     test, before = evaluate(decoded, dataset, most=options.most_tests), evaluate(scene, dataset, most=options.most_tests)
     if not options.keep:
@@ -124,10 +136,8 @@ def encode(options: Options) -> dict[str, Any]:
         "space": SPACES[type(trainer.mapping)][0],
         "appearance": trainer.config.appearance, "appearances": len(trainer.names),
         "test_psnr": test and test.psnr, "test_ssim": test and test.ssim, "test_pictures": test.pictures if test else 0,
-        "coding_loss_db": before.psnr - test.psnr if test and before else probe_loss,
-        "size_bytes": size, "parameters": quantised.parameter_count,
-        "bits_per_parameter": 8 * size / quantised.parameter_count,
-        "identity_share": quantised.identity_share if quantised.is_dynamic else None,
+        "coding_loss_db": before.psnr - test.psnr if test and before else coded.loss_db,
+        **figures(coded, size, options.trade, "training views"),
         "steps": trainer.step, "train_s": trainer.elapsed_s, "encode_s": time.monotonic() - started,
         "rays_per_s": trainer.rays_per_second,
     }
@@ -183,7 +193,7 @@ def ablations(options: Options) -> list[str]:
 
 def _trainer(options: Options) -> Trainer:
     """The dataset decoded, the box found, the model laid out, an interrupted run taken up: ready for the next step."""
-    _check_output(options.output)
+    check_outputs(options)
     device = _device(options.device)
     work, checkpoint = options.work_dir, options.work_dir / CHECKPOINT
     _make_work_dir(work)
@@ -221,40 +231,6 @@ def to_scene(trainer: Trainer) -> Scene:
     slots = min(8, dataset.clip.frame_count) if dataset.is_dynamic else 1
     occupancy = trainer.grid.over_time(trainer.density_at, np.random.default_rng(trainer.config.seed), slots)
     return replace(trainer.scene(occupancy), cameras=tuple(dataset.camera(p) for p in _spread_of_cameras(dataset)))
-
-
-def quantise(trainer: Trainer, scene: Scene, target_bytes: int | None = None) -> tuple[QuantisedScene, float]:
-    """What of a scene is needed, `kpc.encoder.prune`, in symbols as coarse as `max_coding_loss_db` on training rays allows in
-    all, or as fine as a file of `target_bytes` can hold; and that loss in dB.
-
-    Raises:
-        TrainingError: no file of this model is so small.
-    """
-    batch, targets = trainer.sampler.draw(np.random.default_rng(1), PROBE_RAYS, scene.background)
-    rays = [a.numpy() for a in (batch.origins, batch.directions, batch.times)]
-
-    appearances = None if batch.appearances is None else batch.appearances.numpy()
-
-    def fidelity(candidate: Scene) -> float:
-        renderer = SceneRenderer(candidate)
-        return psnr(renderer.rgb(*rays, renderer.codes(appearances)), targets.numpy())
-
-    config, spent = trainer.config, 0.0
-    steps = relative_steps(trainer.field, trainer.optimiser.curvature())
-    whole = scene
-    if config.prunes:
-        spare = config.prune_share * config.max_coding_loss_db
-        pruned = prune(scene, (rays[0], rays[1], rays[2]), fidelity, spare)
-        _say(_left_out(scene, pruned, spare))
-        scene, steps, spent = pruned.scene, pruned.of_each_plane(steps), pruned.loss_db
-    if target_bytes is None:
-        quantised, loss = compress(scene, steps, fidelity, config.max_coding_loss_db - spent)
-        return quantised, spent + loss
-    quantised = compress_to_size(scene, steps, target_bytes, lambda candidate: len(file.encode(candidate)))
-    if (least := len(file.encode(quantised))) > target_bytes:
-        raise TrainingError(f"{least:,} bytes is the least that this model takes, not {target_bytes:,}; give another "
-                            "--target-size with --resume, or train anew with a smaller --preset")
-    return quantised, fidelity(whole) - fidelity(quantised.dequantise())
 
 
 def _trimmed(
@@ -412,16 +388,6 @@ def _clear(work: Path) -> None:
 def _remove_if_empty(work: Path) -> None:
     with contextlib.suppress(OSError):
         work.rmdir()
-
-
-def _check_output(output: Path) -> None:
-    """Find out before hours of training whether the file can be written after them."""
-    if output.is_dir():
-        raise UsageError(f"{output}: is a folder; name a file such as {output / 'scene.kpc'}")
-    if not output.parent.is_dir():
-        raise UsageError(f"{output.parent}: no such folder; make it first")
-    if not os.access(output.parent, os.W_OK):
-        raise TrainingError(f"{output.parent}: no permission to write there; choose another place with -o")
 
 
 def _device(name: str) -> str:

@@ -1,14 +1,20 @@
 """What kpenc can be told, and how its command line says it."""
 
 import argparse
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from kpc.encoder.ablations import ABLATIONS
 from kpc.encoder.appearances import choose_kind
+from kpc.encoder.compress import DEFAULT_LOSS_DB, Trade
 from kpc.encoder.config import APPEARANCES, PRESETS, TrainConfig
 from kpc.encoder.datasets import Dataset
 from kpc.format import cli
+
+
+CODING = {"source", "output", "max_loss", "target_size", "quality", "lam", "json"}
+"""Options that mean something where nothing is trained."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +39,8 @@ class Options:
     keep: bool = False
     resume: bool = False
     most_tests: int | None = None
-    max_loss_db: float | None = None
-    target_bytes: int | None = None
+    trade: Trade = Trade()
+    keep_checkpoint: Path | None = None
     ablation: str = "as it is"
     """Of `kpc.encoder.ablations`; no option of the command line."""
 
@@ -46,10 +52,9 @@ class Options:
         config = PRESETS[self.preset]
         if dataset.has_alpha and dataset.one_view_at_a_time:
             config = config.for_lone_object()
-        most = config.max_coding_loss_db if self.max_loss_db is None else self.max_loss_db
         appearance, _ = self.appearance_of(dataset)
         config = replace(config, hybrid=self.decoder == "hybrid", proposals=self.sampling == "proposals", seed=self.seed,
-                         steps=self.steps or config.steps, max_coding_loss_db=most, appearance=appearance,
+                         steps=self.steps or config.steps, appearance=appearance,
                          view_dependent=config.view_dependent or appearance != "none")  # codes act through the direction MLP
         return ABLATIONS[self.ablation](config)
 
@@ -63,8 +68,11 @@ class Options:
 
 def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     """The options, whether only to plan (--dry-run), and whether to answer in JSON; argparse exits on anything else."""
-    parser = argparse.ArgumentParser("kpenc", description="a folder of posed videos or images becomes a .kpc file")
-    parser.add_argument("source", type=Path, help="folder: videos or images, and poses_bounds.npy, transforms*.json or sparse/0")
+    parser = argparse.ArgumentParser(
+        "kpenc", description="A folder of posed videos or images becomes a .kpc file. A finished checkpoint, or a .kpc file, is "
+                             "coded anew, without pictures and without training: name it, -o, and one of the trades.")
+    parser.add_argument("source", type=Path, help="folder: videos or images, and poses_bounds.npy, transforms*.json or sparse/0; "
+                                                  "or a finished checkpoint, or a .kpc file")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .kpc file to write")
     parser.add_argument("--preset", choices=sorted(PRESETS), default="balanced", help="how much to spend (default: balanced)")
     parser.add_argument("--decoder", choices=("explicit", "hybrid"), default="explicit",
@@ -90,16 +98,27 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
     parser.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
+    parser.add_argument("--keep-checkpoint", type=Path, metavar="MODEL.kpck",
+                        help="write the finished checkpoint there, too: all that coding anew takes")
     trade = parser.add_mutually_exclusive_group()
     trade.add_argument("--max-loss", type=cli.decibels, metavar="0.1dB",
-                       help="PSNR that coding may cost on training views (default: 0.15dB)")
-    trade.add_argument("--target-size", type=cli.byte_count, metavar="2MB", help="the best file of at most this size instead")
+                       help=f"the smallest file that costs at most this PSNR on training views (default: {DEFAULT_LOSS_DB:g}dB)")
+    trade.add_argument("--target-size", type=cli.byte_count, metavar="2MB", help="the best file of at most this size")
+    trade.add_argument("--quality", type=_quality, metavar="1..100",
+                       help="the smallest file whose pictures agree with the uncoded ones to a PSNR of 20 + QUALITY / 3 dB")
+    trade.add_argument("--lam", type=_lam, metavar="LAM", help="the file of least D + LAM R: D the mean squared difference from the "
+                       "uncoded pictures, in squares of 8-bit levels, R bits per parameter")
     parser.add_argument("--dry-run", action="store_true",
                         help="only say what would be done, how long it would take and how much memory")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     a = parser.parse_args(_box_joined(argv))
+    if a.source.is_file():
+        for name, value in vars(a).items():
+            if name not in CODING and value != parser.get_default(name):
+                parser.error(f"--{name.replace('_', '-')}: {a.source} is trained already, it can only be coded anew; drop it")
     options = Options(a.source, a.output, a.preset, a.decoder, a.sampling, a.steps, a.time_budget, a.seed, a.device, a.downscale,
-                      a.holdout, a.space, a.box, a.appearance, a.work, a.keep, a.resume, a.test_views, a.max_loss, a.target_size)
+                      a.holdout, a.space, a.box, a.appearance, a.work, a.keep, a.resume, a.test_views,
+                      Trade(a.max_loss, a.target_size, a.quality, a.lam), a.keep_checkpoint)
     if a.dry_run and a.resume:
         parser.error("--dry-run tells what a whole run takes; drop --resume")
     return options, a.dry_run, a.json
@@ -109,6 +128,24 @@ def _positive(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _quality(text: str) -> float:
+    return _number_within(text, 1, 100)
+
+
+def _lam(text: str) -> float:
+    return _number_within(text, 1e-4, 1e6)
+
+
+def _number_within(text: str, low: float, high: float) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from {low:g} to {high:g}")
     return value
 
 

@@ -38,6 +38,7 @@ class Pruned:
         loss_db: what all of it costs on the probe rays.
         view_worth_db: what the direction MLP was worth there; None where colour did not depend on the direction.
         next_db: what one channel less would have cost in all; infinite where one alone is left.
+        features: channels that there were, over all scales.
     """
 
     scene: Scene
@@ -45,6 +46,12 @@ class Pruned:
     loss_db: float
     view_worth_db: float | None
     next_db: float
+    features: int
+
+    @property
+    def left_out_any(self) -> bool:
+        """Whether anything is gone that was worth anything, or a channel."""
+        return self.loss_db != 0 or sum(map(len, self.kept)) < self.features
 
     def of_each_plane(self, steps: Sequence[dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
         """The part of (M,) numbers of each plane that belongs to what is left."""
@@ -86,7 +93,7 @@ def prune(scene: Scene, probes: Rays, fidelity: Callable[[Scene], float], spare_
         else:
             most, next_db = count, cost
     kept = _kept(scene, order[:fewest])
-    return Pruned(without(best, kept), kept, least, worth, next_db)
+    return Pruned(without(best, kept), kept, least, worth, next_db, features)
 
 
 def one_colour(scene: Scene, directions: np.ndarray) -> Scene:

@@ -19,6 +19,7 @@ from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr, ssim, true_pictu
 from kpc.encoder.field import Field, appearance_priors
 from kpc.encoder.optimisers import FusedOptimiser, PlainOptimiser
 from kpc.encoder.render import render_reference
+from kpc.encoder.probe import Probe
 from kpc.encoder.train import Trainer
 from kpc.format.errors import UsageError
 from kpc.format.file import encode, read
@@ -266,16 +267,9 @@ def test_a_fitted_code_shows_what_it_was_fitted_to(contracted: bool, decoder: st
     assert not fitted_code(scene, renderer.field, rays.apply(lambda a: a[:0]), torch.zeros(0, 3)).any()
 
 
-def test_quantisation_is_judged_with_the_codes_of_the_rays(with_codes: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, judged = kpenc.to_scene(with_codes), []
-
-    def probe(scene: Scene, steps: object, fidelity: object, most: float) -> tuple[Scene, float]:
-        judged.append(fidelity)
-        return scene, 0.0
-
-    monkeypatch.setattr(kpenc, "compress", probe)
-    monkeypatch.setattr(kpenc, "PROBE_RAYS", 4096)
-    kpenc.quantise(with_codes, scene)
-    (fidelity,) = judged
+def test_codings_are_judged_with_the_codes_of_the_rays(with_codes: Trainer) -> None:
+    scene = kpenc.to_scene(with_codes)
+    measure = Probe.of_training(with_codes.sampler, with_codes.background).measure(scene)
     turned = tuple(replace(a, code=b.code) for a, b in zip(scene.appearances, scene.appearances[1:] + scene.appearances[:1]))
-    assert fidelity(scene) > 25 > fidelity(replace(scene, appearances=turned)) + 3
+    judged = measure(replace(scene, appearances=turned))
+    assert measure(scene).psnr > 25 > judged.psnr + 3 and measure(scene).error == 0 < judged.error

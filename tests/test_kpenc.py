@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 
-from kpc.encoder import kpenc
+from kpc.encoder import kpenc, probe
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import pixels
 from kpc.encoder.train import Trainer
@@ -51,7 +51,7 @@ def heeded_signals() -> Iterator[None]:
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "draft", TrainConfig(**TINY))  # type: ignore[arg-type]
-    monkeypatch.setattr(kpenc, "PROBE_RAYS", 512)
+    monkeypatch.setattr(probe, "PROBE_RAYS", 512)
 
 
 @pytest.fixture(scope="module")
@@ -298,7 +298,7 @@ def test_an_interrupted_run_resumes_to_the_same_file(
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc", "out.kpc.work"}
     monkeypatch.undo()
     monkeypatch.setitem(PRESETS, "draft", TrainConfig(**TINY))  # type: ignore[arg-type]
-    monkeypatch.setattr(kpenc, "PROBE_RAYS", 512)
+    monkeypatch.setattr(probe, "PROBE_RAYS", 512)
     code, _, err = run(sets / "blender", "--resume")
     assert code == 0 and "resumed at step 13" in err
     assert output.read_bytes() == whole
@@ -732,8 +732,8 @@ def _failing_for(target: Path, error: BaseException) -> Callable[[Path, Path], N
 def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
     script = (
         f"import sys\n{preparation}\n"
-        "from kpc.encoder import kpenc\nfrom kpc.encoder.config import PRESETS, TrainConfig\n"
-        f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nkpenc.PROBE_RAYS = 512\nsys.exit(kpenc.main({argv!r}))"
+        "from kpc.encoder import kpenc, probe\nfrom kpc.encoder.config import PRESETS, TrainConfig\n"
+        f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nprobe.PROBE_RAYS = 512\nsys.exit(kpenc.main({argv!r}))"
     )
     return subprocess.Popen(
         [sys.executable, "-c", script],

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scenes import SPACES, tiny_scene, varied
 
-from kpc.encoder.compress import compress
+from kpc.encoder.compress import Trade
 from kpc.encoder.evaluate import SceneRenderer, evenly_wide
+from kpc.encoder.model import Model, code
+from kpc.encoder.probe import Probe
 from kpc.encoder.prune import Seen, dispensable, one_colour, passed_on, prune, renderings, without
 from kpc.format import file
 from kpc.format.quantise import quantise_scene
@@ -111,13 +113,16 @@ def test_the_bill_is_what_pictures_show(spare: float) -> None:
 
 def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
     scene = redundant(directed(tiny_scene(), 0.03))
-    fidelity = Fidelity(scene, rays_of(scene))
-    pruned = prune(scene, rays_of(scene), fidelity, SPARE)
-    steps = pruned.of_each_plane([{name: np.arange(1.0, 9.0) for name in scale} for scale in scene.scales])
-    assert [step.tolist() for step in steps[1].values()] == [(pruned.kept[1] + 1.0).tolist()] * 6
-    quantised, loss = compress(pruned.scene, steps, fidelity, 0.15 - pruned.loss_db)
-    assert loss + pruned.loss_db <= 0.15
-    assert fidelity(scene) - fidelity(quantised.dequantise()) == pytest.approx(loss + pruned.loss_db, abs=1e-3)
+    rays = rays_of(scene)
+    steps = [{name: np.arange(1.0, 9.0) for name in scale} for scale in scene.scales]
+    model = Model(scene, steps, Probe(*rays, None, Fidelity(scene, rays).truth))
+    coded = code(model, Trade(max_loss_db=0.15), SPARE / 0.15)
+    assert coded.pruned is not None and coded.spare_db == pytest.approx(SPARE) and coded.pruned.left_out_any
+    kept = coded.pruned.kept[1]
+    assert [step.tolist() for step in coded.pruned.of_each_plane(steps)[1].values()] == [(kept + 1.0).tolist()] * 6
+    assert 0.14 < coded.loss_db <= 0.15 and coded.size_bytes == len(file.encode(coded.scene))
+    fidelity = Fidelity(scene, rays)
+    assert fidelity(scene) - fidelity(coded.scene.dequantise()) == pytest.approx(coded.loss_db, abs=1e-3)
 
 
 @pytest.mark.parametrize("strength, goes", [(0.02, True), (3.0, False)])

@@ -6,6 +6,7 @@ kpbench ablate default --preset fast --steps 2000 --out docs/bench/ablate.json
 kpbench step room soldier --preset balanced --out docs/bench/step.json
 kpbench player room.kpc liam.kpc --out docs/bench/player.json
 kpbench stream room.kpc liam.kpc --out docs/bench/stream.json
+kpbench codec room.kpck liam.kpc --dataset room --dataset liam --out docs/bench/codec.json
 
 Every record says what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
 data) and what came of it, each repeat on its own. Output is one JSON list, a record a line: with --out written after
@@ -97,7 +98,7 @@ def _record(kind: str, source: Path, origin: results.Record, settings: dict[str,
     """What a record says before anything is measured."""
     return {
         "kind": kind,
-        "name": source.resolve().stem if kind in ("player", "stream") else source.resolve().name,
+        "name": source.resolve().stem if kind in ("player", "stream", "codec") else source.resolve().name,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         **origin,
         "load_average": os.getloadavg()[0],
@@ -343,6 +344,36 @@ def _compare(job: Play) -> tuple[str, results.Record]:
     }
 
 
+# --- coding
+
+
+def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """A record for each scene and coder; beside --out also .csv of all points and .svg of the curves."""
+    _encoder()  # what is missing is said before anything is read
+    from kpc.tools import codecbench
+
+    folders: list[Path | None] = options.dataset or [None] * len(options.scenes)
+    if len(folders) != len(options.scenes):
+        raise UsageError(f"--dataset is given {len(folders)} times for {len(options.scenes)} scenes; name one for each, or none")
+    if options.out is not None:
+        from kpc.tools import plot  # needs matplotlib
+    records: list[results.Record] = []
+    for source, folder in zip(options.scenes, folders, strict=True):
+        judged_by = "its own probe" if folder is None else f"held-out views of {_folder(folder).resolve().name}"
+        record = _record("codec", source, origin, {"judged_by": judged_by, "processes": options.processes})
+        print(f"kpbench: {record['name']}, judged by {judged_by}", file=sys.stderr)
+        started = clock.monotonic()
+        coders = codecbench.measure(source, folder, options.processes)
+        took = {"bench_s": clock.monotonic() - started}
+        for coder in coders:
+            records.append(record | {"seed": None, "renderer": "cpu"} | took | coder | {"repeats": [codecbench.headline(coder["points"])]})
+            yield records[-1]
+    if options.out is not None:
+        with cli.written_aside(options.out.with_suffix(".csv")) as aside:
+            aside.write_text(codecbench.as_csv(records))
+        plot.save(plot.rate_distortion(records), options.out.with_suffix(".svg"))
+
+
 def _alone(function: Callable[[Any], T], job: Any) -> T:
     """`function(job)` in a fresh process."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
@@ -359,7 +390,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|player|stream")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|player|stream|codec")
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
@@ -403,8 +434,21 @@ def _parser() -> argparse.ArgumentParser:
     stream.add_argument("--size", type=_size, default=(320, 240), metavar="WxH", help="of a picture (default: 320x240)")
     stream.set_defaults(measure=_stream)
 
+    codec = kinds.add_parser("codec", help="rate against distortion, beside general tools",
+                             description="Code each scene at several rates, and its planes with what a user has at hand: "
+                                         "kpc.tools.rivals. With --out FILE.json also FILE.csv and FILE.svg.")  # fmt: skip
+    codec.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="finished checkpoints (kpenc --keep-checkpoint) or "
+                       ".kpc files")  # fmt: skip
+    codec.add_argument("--dataset", type=Path, action="append", metavar="DIR",
+                       help="judge by its held-out views; once for each scene, in their order (default: training pixels of a "
+                            "checkpoint, a file's own pictures)")  # fmt: skip
+    codec.add_argument("--processes", type=_positive, default=len(os.sched_getaffinity(0)), metavar="N",
+                       help="at a time (default: one a core)")  # fmt: skip
+    codec.set_defaults(measure=_codec)
+
     for kind in (encode, curve, ablate, step, player, stream):
         kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
+    for kind in (encode, curve, ablate, step, player, stream, codec):
         kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
     return parser
 

@@ -1,8 +1,9 @@
-"""Quality and size against seconds of training, drawn from the records of `kpbench curve`.
+"""Quality and size against seconds of training, from the records of `kpbench curve`; rate against distortion, from `kpbench codec`.
 
 python -m kpc.tools.plot docs/bench/curve.json -o docs/curve.svg
+python -m kpc.tools.plot docs/bench/codec.json -o docs/codec.svg
 
-One panel for each of PSNR, SSIM and file size; a line for each dataset and preset goes through the medians of its repeats,
+Of training: one panel for each of PSNR, SSIM and file size; a line for each dataset and preset goes through the medians of its repeats,
 which are dots. Time runs on a logarithmic axis. The ending of the name chooses SVG, PNG or PDF. Needs kpc[bench].
 """
 
@@ -23,6 +24,7 @@ PANELS = (("test_psnr", "held-out PSNR, dB", 1.0), ("test_ssim", "held-out SSIM"
 """Keys of a repeat, what they are, and their units."""
 ENDINGS = (".svg", ".png", ".pdf")
 PANEL_INCHES = (3.6, 3.2)
+RATE_PANEL_INCHES = (4.6, 4.0)
 
 rcParams["svg.fonttype"] = "none"  # text stays text
 rcParams["svg.hashsalt"] = "kpc"  # the same records give the same file
@@ -59,6 +61,47 @@ def curves(records: Sequence[results.Record]) -> Figure:
     return figure
 
 
+def rate_distortion(records: Sequence[results.Record]) -> Figure:
+    """The plot of records of `kpbench codec`: a panel a scene, PSNR against bits per parameter, a line a coder.
+
+    Raises:
+        FormatError: there is nothing to draw.
+    """
+    scenes: dict[str, list[results.Record]] = {}
+    for record in records:
+        if record["kind"] == "codec" and record["points"]:
+            scenes.setdefault(record["name"], []).append(record)
+    if not scenes:
+        raise FormatError("no records of kpbench codec to draw; write some with kpbench codec --out")
+    width, height = RATE_PANEL_INCHES
+    figure = Figure(figsize=(width * len(scenes), height), layout="constrained")
+    for axes, (name, coders) in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes.items()):
+        for number, record in enumerate(coders):
+            points = sorted(record["points"], key=lambda point: float(point["size_bytes"]))
+            axes.plot([p["bits_per_parameter"] for p in points], [p["psnr"] for p in points], marker="o", markersize=3,
+                      linewidth=2.2 if number == 0 else 1, color=f"C{number}", label=record["coder"])  # fmt: skip
+        axes.set(xscale="log", xlabel="bits per parameter", ylabel="PSNR, dB", title=name)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda rate, _: f"{rate:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.grid(color="0.87")
+    axes.legend(fontsize=8)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a plot as its ending says.
+
+    Raises:
+        UsageError: the ending is of no kind that can be written.
+    """
+    kind = path.suffix.lower()
+    if kind not in ENDINGS:
+        raise UsageError(f"{path}: plots are {', '.join(ENDINGS)}")
+    with cli.written_aside(path) as aside:
+        figure.savefig(aside, format=kind[1:], metadata={"Date": None} if kind == ".svg" else None)
+
+
 def _dots(line: Sequence[results.Record], key: str) -> list[tuple[float, float]]:
     """Seconds and values of all repeats that have both."""
     runs = (run for record in line for run in record["repeats"])
@@ -70,16 +113,15 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("plot", description="Quality and size against seconds of training.")
-    parser.add_argument("records", type=Path, nargs="+", help="files that kpbench curve --out wrote")
+    parser = argparse.ArgumentParser("plot", description="Quality and size against training, or rate against distortion.")
+    parser.add_argument("records", type=Path, nargs="+", help="files that kpbench curve or codec --out wrote")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .svg, .png or .pdf file to write")
     options = parser.parse_args(argv)
-    kind = options.output.suffix.lower()
-    if kind not in ENDINGS:
+    if options.output.suffix.lower() not in ENDINGS:
         raise UsageError(f"{options.output}: plots are {', '.join(ENDINGS)}")
-    figure = curves(results.load(options.records))
-    with cli.written_aside(options.output) as aside:
-        figure.savefig(aside, format=kind[1:], metadata={"Date": None} if kind == ".svg" else None)
+    records = results.load(options.records)
+    coding = all(record["kind"] == "codec" for record in records) and records
+    save(rate_distortion(records) if coding else curves(records), options.output)
     print(options.output)
 
 

@@ -149,9 +149,36 @@ COLUMNS: dict[str, list[Column]] = {
         ("of which waiting", _number("jump_wait_ms", "{:.0f}")),
         ("share of the file: dB to the whole", _prefixes),
     ],
+    "codec": [
+        ("scene", lambda r: r["name"]),
+        ("coder", lambda r: r["coder"]),
+        ("KB at 0.15 dB loss", _number("size_at_default_loss", "{:.0f}", 1e3)),
+        ("kpc is smaller by", lambda r: _smaller(r)),
+        ("near it: KB", _number("size_bytes", "{:.0f}", 1e3)),
+        ("bits/param", _number("bits_per_parameter", "{:.2f}")),
+        ("PSNR loss dB", _number("loss_db", "{:.2f}")),
+        ("encode s", _number("encode_s", "{:.1f}")),
+        ("decode s", _number("decode_s", "{:.2f}")),
+        ("chunks", lambda r: _shares(r)),
+    ],
 }
+def _smaller(record: Record) -> str:
+    """By how much ours is smaller at equal PSNR, on average over the curve."""
+    if record.get("missing"):
+        return str(record["missing"])
+    rate = record["bd_rate"]
+    return "-" if rate is None else f"{-rate:.0%}"
+
+
+def _shares(record: Record) -> str:
+    """Of our bytes, by kind of chunk, the largest first."""
+    shares: dict[str, float] = record["repeats"][0].get("shares") or {}
+    return ", ".join(f"{kind} {share:.0%}" for kind, share in sorted(shares.items(), key=lambda kind: -kind[1]) if share >= 0.01) or "-"
+
+
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
-          "step": "A step of training", "player": "Playing", "stream": "Playing while it arrives"}
+          "step": "A step of training", "player": "Playing", "stream": "Playing while it arrives",
+          "codec": "Coding, beside what is at hand"}
 
 
 def cells(kind: str, records: Iterable[Record]) -> list[list[str]]:

@@ -200,10 +200,22 @@ def rays(
     distortion = pictures.distortion[picture]
     if distortion.any():
         x, y = undistort(x, y, distortion)
-    pose = pictures.camera_to_world[picture]
+    return _through(x, y, pictures.camera_to_world[picture], mapping)
+
+
+def rays_of_camera(camera: Camera, places: np.ndarray, mapping: SpaceMapping | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """As `rays`, through (N, 2) places on the raster of a pinhole camera, pixels from the left and top edges."""
+    x, y = ((places - (camera.cx, camera.cy)) / (camera.fl_x, camera.fl_y)).T
+    return _through(x, y, camera.camera_to_world[None], mapping)
+
+
+def _through(
+    x: np.ndarray, y: np.ndarray, pose: np.ndarray, mapping: SpaceMapping | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of (N,) slopes in the frames of (N or 1, 4, 4) cameras."""
     directions = pose[:, :3, 0] * x[:, None] - pose[:, :3, 1] * y[:, None] - pose[:, :3, 2]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = pose[:, :3, 3]
+    origins = np.broadcast_to(pose[:, :3, 3], directions.shape)
     if isinstance(mapping, DeviceCoordinates):
         path = mapping.path(origins, directions)
         origins, directions = path.begin, path.way

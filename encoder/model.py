@@ -1,0 +1,251 @@
+"""What training made, ready to be coded, again and again: a finished checkpoint, or a .kpc file.
+
+A checkpoint holds the scene in full precision, what an error in each number would cost, and training pixels to judge codings by.
+A file holds the scene as it was coded; its own steps say what errors cost, and it is judged by its own pictures.
+"""
+
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from kpc.encoder.compress import Attempt, Steps, Trade, compress, relative_steps
+from kpc.encoder.field import Layout
+from kpc.encoder.probe import Measured, Probe
+from kpc.encoder.prune import Pruned, prune
+from kpc.format import file
+from kpc.format.cameras import Camera
+from kpc.format.cli import written_aside
+from kpc.format.container import MAGIC
+from kpc.format.errors import FormatError, TrainingError, UsageError
+from kpc.format.quantise import QuantisedScene, quantise_scene
+from kpc.format.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
+from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
+
+CHECKPOINT_MAGIC = b"PK"
+"""PyTorch writes ZIP archives."""
+VERSION = 1
+"""Of a finished checkpoint."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A scene to be coded.
+
+    Attributes:
+        scene: as trained, or as a file holds it.
+        steps: of quantisation, for each channel of each plane; up to a common factor, or those of the file.
+        probe: rays to judge codings by.
+        coded: the file as it is; None for a scene in full precision.
+    """
+
+    scene: Scene
+    steps: Steps
+    probe: Probe
+    coded: QuantisedScene | None = None
+
+
+@dataclass(frozen=True)
+class Coded:
+    """What became of a model.
+
+    Attributes:
+        scene: what the file is to hold. size_bytes: of that file.
+        loss_db: PSNR that coding costs on the probe rays, all that was left out included.
+        agreement_db: PSNR of its pictures against those of the model.
+        pruned: what was left out; None if nothing was to be.
+        spare_db: that could have been spent on it.
+    """
+
+    scene: QuantisedScene
+    size_bytes: int
+    loss_db: float
+    agreement_db: float
+    pruned: Pruned | None
+    spare_db: float
+
+
+def code(model: Model, trade: Trade, prune_share: float) -> Coded:
+    """What of a model is needed, `kpc.encoder.prune`, in symbols as coarse or as fine as a trade asks for.
+
+    `prune_share`: of what coding may cost, what may be spent on leaving something out.
+
+    Raises:
+        TrainingError: no file of this model is so small.
+    """
+    scene, steps, coded, pruned = model.scene, model.steps, model.coded, None
+    measure = model.probe.measure(scene)
+    whole = measure(scene).psnr
+    spare = prune_share * trade.loss_db(whole)
+    if spare > 0 and isinstance(scene.decoder, Decoder):  # no other is linear
+        pruned = prune(scene, model.probe.rays, lambda candidate: measure(candidate).psnr, spare)
+        if coded is None or pruned.left_out_any:
+            scene, steps, coded = pruned.scene, pruned.of_each_plane(steps), None
+    found = compress(scene, steps, measure, whole, trade, coded)
+    measured: Measured = found.measured
+    return Coded(found.quantised, found.size_bytes, whole - measured.psnr, measured.agreement_db, pruned, spare)
+
+
+def load(path: Path) -> Model:
+    """A finished checkpoint or a .kpc file, whichever it is.
+
+    Raises:
+        UsageError: it is neither. TrainingError: the checkpoint cannot be used. FormatError: the file cannot be read.
+    """
+    with path.open("rb") as opened:
+        begins = opened.read(len(MAGIC))
+    if begins == MAGIC:
+        coded = file.read(path)
+        scene = coded.dequantise()
+        steps = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in coded.scales]
+        return Model(scene, steps, Probe.of_cameras(scene), coded)
+    if begins.startswith(CHECKPOINT_MAGIC):
+        return load_checkpoint(path)
+    raise UsageError(f"{path}: neither a folder of videos or images, nor a finished checkpoint, nor a .kpc file")
+
+
+def by_plane(layout: Layout, values: np.ndarray) -> list[dict[str, np.ndarray]]:
+    """Numbers of every element of `Field.theta` as one mapping a scale, plane name -> (rows, columns, M)."""
+    planes: list[dict[str, np.ndarray]] = [{} for _ in layout.resolution]
+    for s, name, start, rows, columns in layout.planes():
+        size = rows * columns * layout.channels
+        planes[s][name] = values[start : start + size].reshape(rows, columns, layout.channels)
+    return planes
+
+
+# --- finished checkpoints
+
+
+def save_checkpoint(path: Path, scene: Scene, curvature: Sequence[Mapping[str, np.ndarray]], probe: Probe) -> None:
+    """Write all that coding asks for, as plain tensors and numbers.
+
+    Raises:
+        TrainingError: it cannot be written; what was there is left as it was.
+    """
+    kind = "hybrid" if isinstance(scene.decoder, HybridDecoder) else "explicit"
+    state = {
+        "kpc": VERSION, "aabb": scene.aabb, "frame_count": scene.clip.frame_count, "fps": float(scene.clip.fps),
+        "scales": scene.scales, "curvature": curvature, "kind": kind, "decoder": vars(scene.decoder),
+        "occupancy": scene.occupancy, "background": scene.background, "step": float(scene.step),
+        "cameras": np.array([_camera_as_numbers(camera) for camera in scene.cameras]).reshape(-1, 22),
+        "mapping": _mapping_as_numbers(scene.mapping), "motion": scene.motion,
+        "names": [appearance.name for appearance in scene.appearances],
+        "codes": [appearance.code for appearance in scene.appearances], "probe": vars(probe),
+    }
+    try:
+        with written_aside(path) as aside:
+            torch.save(_changed(state, np.ndarray, lambda a: torch.from_numpy(np.ascontiguousarray(a))), aside)
+    except (OSError, RuntimeError) as error:  # PyTorch reports a full disk as RuntimeError
+        reason = error.strerror if isinstance(error, OSError) else str(error).partition("\n")[0]
+        raise TrainingError(f"{path}: the checkpoint cannot be written ({reason}); free space there, or name another "
+                            "--keep-checkpoint") from error
+
+
+def load_checkpoint(path: Path) -> Model:
+    """What `save_checkpoint` wrote. Nothing in it is executed, and it takes no more memory than a few times its size.
+
+    Raises:
+        TrainingError: it is something else, damaged, or breaks a rule that files must keep.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:  # what is not compressed cannot grow
+            entries = archive.infolist()
+            if any(entry.compress_type for entry in entries) or sum(e.file_size for e in entries) > path.stat().st_size:
+                raise ValueError("compressed")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict) or state.get("kpc") != VERSION:
+            raise TrainingError(f"{path}: no finished checkpoint; kpenc DATASET --keep-checkpoint writes one, --resume goes on "
+                                "from one of a run")
+        state = _changed(state, torch.Tensor, _as_array)
+        scene, curvature = _scene_of(state), state["curvature"]
+        probe = Probe(**state["probe"])
+        _check(scene, curvature, probe)
+        steps = relative_steps(curvature)
+        # What no file could hold is found here, by the rules of every reader, before anything is rendered.
+        file.scene_chunks(quantise_scene(scene, [{name: 8.0 for name in scale} for scale in scene.scales], skip_unseen=False))
+    except (TrainingError, OSError):
+        raise
+    except FormatError as error:
+        raise TrainingError(f"{path}: not a usable checkpoint ({error})") from error
+    except Exception as error:  # what a damaged file holds may be of any kind
+        raise TrainingError(f"{path}: not a usable checkpoint ({type(error).__name__}); train anew") from error
+    return Model(scene, steps, probe)
+
+
+def _scene_of(state: Mapping[str, Any]) -> Scene:
+    kind = {"explicit": Decoder, "hybrid": HybridDecoder}[state["kind"]]
+    return Scene(
+        state["aabb"], Clip(int(state["frame_count"]), float(state["fps"])), tuple(state["scales"]), kind(**state["decoder"]),
+        state["occupancy"], state["background"], float(state["step"]),
+        tuple(_camera_of(numbers) for numbers in state["cameras"]), _mapping_of(state["mapping"]), state["motion"],
+        tuple(Appearance(name, code) for name, code in zip(state["names"], state["codes"], strict=True)),
+    )
+
+
+def _check(scene: Scene, curvature: Sequence[Mapping[str, np.ndarray]], probe: Probe) -> None:
+    """What coding relies on beyond the rules of files."""
+    for planes, errors in zip(scene.scales, curvature, strict=True):
+        for name, plane in planes.items():
+            if plane.dtype != np.float32 or errors[name].shape != plane.shape:
+                raise ValueError(name)
+            if not (np.isfinite(errors[name]).all() and (errors[name] >= 0).all()):
+                raise ValueError("curvature")
+    n = len(probe.times)
+    wanted = {"origins": (n, 3), "directions": (n, 3), "times": (n,), "truth": (n, 3)}
+    for name, shape in wanted.items():
+        values = getattr(probe, name)
+        if values.shape != shape or values.dtype != np.float32 or not np.isfinite(values).all() or not n:
+            raise ValueError(f"probe {name}")
+    lengths = np.linalg.norm(probe.directions, axis=1)
+    if not ((np.abs(lengths - 1) < 1e-3).all() and (probe.times >= 0).all() and (probe.times <= 1).all()):
+        raise ValueError("probe")
+    numbers = probe.appearances
+    if (numbers is None) != (not scene.appearances):
+        raise ValueError("probe appearances")
+    if numbers is not None and (numbers.shape != (n,) or numbers.min() < 0 or numbers.max() >= len(scene.appearances)):
+        raise ValueError("probe appearances")
+    if scene.motion is not None and not np.isfinite(scene.motion).all():
+        raise ValueError("motion")
+
+
+def _camera_as_numbers(camera: Camera) -> np.ndarray:
+    return np.array([camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy,
+                     *np.ravel(camera.camera_to_world)], np.float64)  # fmt: skip
+
+
+def _camera_of(numbers: np.ndarray) -> Camera:
+    width, height, fl_x, fl_y, cx, cy = map(float, numbers[:6])
+    return Camera(int(width), int(height), fl_x, fl_y, cx, cy, numbers[6:].reshape(4, 4))
+
+
+def _mapping_as_numbers(mapping: SpaceMapping | None) -> dict[str, Any] | None:
+    return None if mapping is None else {"kind": type(mapping).__name__, **vars(mapping)}
+
+
+def _mapping_of(numbers: Mapping[str, Any] | None) -> SpaceMapping | None:
+    if numbers is None:
+        return None
+    kinds: dict[str, type[SpaceMapping]] = {kind.__name__: kind for kind in (Contraction, DeviceCoordinates)}
+    return kinds[numbers["kind"]](**{name: value for name, value in numbers.items() if name != "kind"})
+
+
+def _changed(value: Any, kind: type, change: Any) -> Any:
+    """Plain data with everything of one kind in it changed; mappings become dictionaries, sequences lists."""
+    if isinstance(value, kind):
+        return change(value)
+    if isinstance(value, Mapping):
+        return {key: _changed(item, kind, change) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_changed(item, kind, change) for item in value]
+    return value
+
+
+def _as_array(tensor: torch.Tensor) -> np.ndarray:
+    """One that claims more numbers than are stored is refused."""
+    if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
+        raise ValueError("a tensor without its numbers")
+    return np.ascontiguousarray(tensor.numpy())

@@ -1,0 +1,70 @@
+"""A finished checkpoint, or a .kpc file, coded anew: no pictures, no training."""
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from kpc.encoder import model
+from kpc.encoder.compress import Trade
+from kpc.encoder.config import TrainConfig
+from kpc.encoder.options import Options
+from kpc.format import file
+from kpc.format.errors import TrainingError, UsageError
+
+
+JUDGED_BY = ("training views", "views of its own, taken to be right to 30 dB")
+
+
+def recode(options: Options) -> dict[str, Any]:
+    """Write the .kpc file that `options.trade` asks for; what came of it, as a dictionary that JSON can hold.
+
+    Raises:
+        UsageError, TrainingError, FormatError: the source cannot be used (`kpc.encoder.model.load`), or takes more than it may.
+    """
+    started = time.monotonic()
+    check_outputs(options)
+    source = model.load(options.source)
+    coded = model.code(source, options.trade, TrainConfig().prune_share)
+    size = file.write(coded.scene, options.output)
+    return {"file": str(options.output), "source": str(options.source)} | figures(
+        coded, size, options.trade, JUDGED_BY[source.coded is not None]) | {
+        "encode_s": time.monotonic() - started,
+    }
+
+
+def figures(coded: model.Coded, size: int, trade: Trade, judged_by: str) -> dict[str, Any]:
+    """What is said of every file that is written."""
+    name, value = trade.bound
+    return {
+        "trade": name, "asked": value, "judged_by": judged_by, "probe_loss_db": coded.loss_db, "agreement_db": coded.agreement_db,
+        "size_bytes": size, "parameters": coded.scene.parameter_count,
+        "bits_per_parameter": 8 * size / coded.scene.parameter_count,
+        "identity_share": coded.scene.identity_share if coded.scene.is_dynamic else None,
+    }
+
+
+def reached(result: dict[str, Any]) -> str:
+    """In words, what was asked for and what that gave."""
+    name, asked = result["trade"], result["asked"]
+    said = {"max_loss_db": f"at most {asked:g} dB of loss", "target_bytes": f"at most {asked:,.0f} bytes",
+            "quality": f"quality {asked:g}", "lam": f"lam {asked:g}"}[name]  # fmt: skip
+    return (f"asked for {said}; reached {result['size_bytes']:,} bytes, {result['probe_loss_db']:.3f} dB of loss on {result['judged_by']}, "
+            f"{result['agreement_db']:.1f} dB against the uncoded pictures")
+
+
+def check_outputs(options: Options) -> None:
+    """Find out before hours of training whether the files can be written after them."""
+    if options.output.exists() and options.source.is_file() and options.output.samefile(options.source):
+        raise UsageError(f"{options.output}: is what is to be coded; write elsewhere with -o")
+    for output in filter(None, (options.output, options.keep_checkpoint)):
+        _check_place(output)
+
+
+def _check_place(output: Path) -> None:
+    if output.is_dir():
+        raise UsageError(f"{output}: is a folder; name a file such as {output / 'scene.kpc'}")
+    if not output.parent.is_dir():
+        raise UsageError(f"{output.parent}: no such folder; make it first")
+    if not os.access(output.parent, os.W_OK):
+        raise TrainingError(f"{output.parent}: no permission to write there; choose another place with -o")

@@ -1,0 +1,282 @@
+"""Rate against distortion of scenes, beside what a user has at hand (`kpc.tools.rivals`): what `kpbench codec` measures.
+
+Every coder gets the same planes, those of the checkpoint or, of a .kpc file, its own dequantised ones, and is judged by the same
+pixels. A rival is given for nothing what our file spends bytes on besides planes: decoder, occupancy and cameras are counted as our
+file stores them, header and index not at all.
+"""
+
+import csv
+import io
+import math
+import multiprocessing
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kpc.encoder import model
+from kpc.encoder.compress import DEFAULT_LOSS_DB, Trade
+from kpc.encoder.config import TrainConfig
+from kpc.encoder.datasets import Dataset, load_dataset, rays
+from kpc.encoder.model import Model
+from kpc.encoder.probe import Measure, Measured, Probe
+from kpc.format import file
+from kpc.format.errors import KpcError, TrainingError
+from kpc.format.scene import Scene
+from kpc.tools.rivals import RIVALS, tidied
+
+RATES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0)
+"""Bits per parameter that our coder is asked for, of the file and all that is in it."""
+VIEW_PIXELS = 1 << 15
+"""Random pixels of all held-out views that codings are judged by."""
+OURS = "kpc"
+
+Point = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A coder and a setting for one scene. `rival`: its place in RIVALS, None for our own coder. `others_bytes`: of our file,
+    besides planes."""
+
+    scene: Path
+    rival: int | None
+    setting: float
+    others_bytes: int
+
+
+def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str, Any]]:
+    """The coders, ours first: each its name, its points (or why it has none) and by how much ours is smaller.
+
+    Raises:
+        KpcError: the scene or the dataset cannot be used, or a coder failed.
+    """
+    source = model.load(scene)
+    views = None if dataset is None else held_out_views(source.scene, dataset)
+    others = others_bytes(source)
+    jobs = [Job(scene, None, rate, others) for rate in RATES]
+    missing = {number: why for number, rival in enumerate(RIVALS) if (why := rival.missing())}
+    jobs += [Job(scene, number, setting, others) for number, rival in enumerate(RIVALS) if number not in missing
+             for setting in reversed(rival.settings)]  # fmt: skip
+    points = in_parallel(jobs, views, processes)
+    coders = []
+    for number in (None, *range(len(RIVALS))):
+        name = OURS if number is None else RIVALS[number].name
+        found = [point for job, point in zip(jobs, points, strict=True) if job.rival == number and point is not None]
+        coders.append({"coder": name, "missing": missing.get(-1 if number is None else number), "points": found})
+    for coder in coders:
+        coder["bd_rate"] = None if coder is coders[0] else bd_rate(coders[0]["points"], coder["points"])
+    return coders
+
+
+def in_parallel(jobs: Sequence[Job], views: Probe | None, processes: int) -> list[Point | None]:
+    """Points of all jobs judged by `views`, or by the probe the scene comes with, in processes of their own, none with more than its share of the cores."""
+    before = os.environ.get("NUMBA_NUM_THREADS")
+    os.environ["NUMBA_NUM_THREADS"] = str(max(1, len(os.sched_getaffinity(0)) // processes))
+    try:
+        with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _judge_by, (views,)) as pool:
+            futures: list[Future[Point | None]] = [pool.submit(point, job) for job in jobs]
+            try:
+                return [future.result() for future in futures]
+            except BrokenProcessPool as error:
+                raise KpcError("codec: a process was killed; free some memory, or give fewer --processes") from error
+            finally:
+                pool.shutdown(cancel_futures=True)
+    finally:
+        if before is None:
+            del os.environ["NUMBA_NUM_THREADS"]
+        else:
+            os.environ["NUMBA_NUM_THREADS"] = before
+
+
+def point(job: Job) -> Point | None:
+    """What a coder makes of a scene at one setting; None where it cannot make so little."""
+    source, uncoded, measured = _source(job.scene)
+    if job.rival is not None:
+        coding = RIVALS[job.rival].code(_tidied(job.scene), int(job.setting))
+        judged = measured(replace(source.scene, scales=tuple(coding.planes)))
+        size, took = coding.size_bytes + job.others_bytes, (coding.encode_s, coding.decode_s)
+        return _point(job, source, size, took, uncoded.psnr, judged)
+    target = int(job.setting * source.scene.parameter_count / 8)
+    started = time.perf_counter()
+    try:
+        coded = model.code(source, Trade(target_bytes=target), TrainConfig().prune_share)
+    except TrainingError:
+        return None
+    searched = time.perf_counter()
+    data = file.encode(coded.scene)
+    encoded = time.perf_counter()
+    scene = file.read(data).dequantise()
+    took = encoded - searched, time.perf_counter() - encoded
+    found = _point(job, source, len(data), took, uncoded.psnr, measured(scene))
+    return found | {"search_s": searched - started, "shares": shares(data)}
+
+
+def _point(job: Job, source: Model, size: int, took: tuple[float, float], uncoded_psnr: float, judged: Measured) -> Point:
+    return {
+        "setting": job.setting, "size_bytes": size, "bits_per_parameter": 8 * size / source.scene.parameter_count,
+        "psnr": judged.psnr, "loss_db": uncoded_psnr - judged.psnr, "agreement_db": judged.agreement_db,
+        "encode_s": took[0], "decode_s": took[1],
+    }  # fmt: skip
+
+
+_views: Probe | None = None
+"""What this process judges by; None for the probe a scene comes with."""
+
+
+def _judge_by(views: Probe | None) -> None:
+    global _views
+    _views = views
+
+
+@lru_cache(1)
+def _source(path: Path) -> tuple[Model, Measured, Measure]:
+    source = model.load(path)
+    measured = (_views or source.probe).measure(source.scene)
+    return source, measured(source.scene), measured
+
+
+@lru_cache(1)
+def _tidied(path: Path) -> Any:
+    return tidied(model.load(path).scene)
+
+
+def others_bytes(source: Model) -> int:
+    """Stored bytes of all chunks but planes, in our file of the scene."""
+    coded = source.coded or model.code(source, Trade(), 0.0).scene
+    reader = file.SceneReader(file.encode(coded))
+    return sum(entry.stored_length for entry in reader.index if entry.kind != "PLNE")
+
+
+def shares(data: bytes) -> dict[str, float]:
+    """Of the bytes of a file: those of each kind of chunk, and of header and index."""
+    reader = file.SceneReader(data)
+    stored: dict[str, int] = {}
+    for entry in reader.index:
+        stored[entry.kind] = stored.get(entry.kind, 0) + entry.stored_length
+    stored["index"] = len(data) - sum(stored.values())
+    return {kind: count / len(data) for kind, count in stored.items()}
+
+
+def held_out_views(scene: Scene, folder: Path) -> Probe:
+    """Random pixels of all pictures of a dataset that are held out.
+
+    Raises:
+        KpcError: the dataset cannot be used, or holds nothing out.
+    """
+    with tempfile.TemporaryDirectory(prefix="kpbench-") as work:
+        dataset = load_dataset(folder, Path(work))
+        return _drawn(scene, dataset)
+
+
+def _drawn(scene: Scene, dataset: Dataset) -> Probe:
+    pictures, rng = dataset.pictures, np.random.default_rng(2)
+    held_out = np.flatnonzero(pictures.is_test)
+    if not len(held_out):
+        raise KpcError(f"{dataset.path}: holds no view out to judge by; leave --dataset away")
+    picture = rng.choice(held_out, VIEW_PIXELS)
+    pixel = (rng.random(VIEW_PIXELS) * pictures.width[picture] * pictures.height[picture]).astype(np.int64)
+    usable = dataset.is_usable(picture, pixel)
+    picture, pixel = picture[usable], pixel[usable]
+    row, column = np.divmod(pixel, pictures.width[picture])
+    origins, directions = rays(pictures, picture, column, row, scene.mapping)
+    colours = dataset.pixels.read(pictures.offset[picture] + pixel).astype(np.float32) / np.float32(255)
+    truth = colours[:, :3]
+    if dataset.has_alpha:
+        truth = truth * colours[:, 3:] + scene.background * (1 - colours[:, 3:])
+    return Probe(origins, directions, pictures.time[picture].astype(np.float32), None, truth)
+
+
+# --- curves
+
+
+def bd_rate(ours: Sequence[Point], others: Sequence[Point]) -> float | None:
+    """By what share ours are smaller (below 0) or larger at equal PSNR, on average over the PSNR that both reach.
+
+    Bjøntegaard's measure (ITU-T VCEG-M33, 2001) with piecewise cubic curves that do not overshoot (PCHIP: Fritsch and Carlson,
+    SIAM J. Numer. Anal. 17, 1980; as ITU-T JVET-H0030 has it): the mean over PSNR of log(rate ratio). None where the curves have
+    fewer than four points each, or no PSNR in common.
+    """
+    curves = [_rising(points) for points in (ours, others)]
+    if min(len(psnr) for psnr, _ in curves) < 4:
+        return None
+    low, high = max(psnr[0] for psnr, _ in curves), min(psnr[-1] for psnr, _ in curves)
+    if high - low < 1e-6:
+        return None
+    at = np.linspace(low, high, 1001)
+    mine, theirs = (pchip(psnr, rate, at) for psnr, rate in curves)
+    difference = mine - theirs
+    return math.exp(float(np.mean((difference[1:] + difference[:-1]) / 2))) - 1
+
+
+def size_at(points: Sequence[Point], loss_db: float) -> float | None:
+    """Bytes at a loss, on the same curve; None beyond its ends."""
+    if not points:
+        return None
+    psnr, rate = _rising(points)
+    wanted = points[0]["psnr"] + points[0]["loss_db"] - loss_db
+    if len(psnr) < 3 or not psnr[0] <= wanted <= psnr[-1]:
+        return None
+    return math.exp(float(pchip(psnr, rate, np.array([wanted]))[0]))
+
+
+def headline(points: Sequence[Point]) -> Point:
+    """What a table shows of a coder: its bytes at DEFAULT_LOSS_DB, else nothing of it, and the point nearest to that loss."""
+    if not points:
+        return {}
+    near = min(points, key=lambda point: abs(math.log(max(point["loss_db"], 1e-4) / DEFAULT_LOSS_DB)))
+    return {**near, "size_at_default_loss": size_at(points, DEFAULT_LOSS_DB)}
+
+
+def _rising(points: Sequence[Point]) -> tuple[np.ndarray, np.ndarray]:
+    """PSNR and log sizes of those points that no smaller one equals, by size."""
+    best: list[tuple[float, float]] = []
+    for point in sorted(points, key=lambda point: (point["size_bytes"], -point["psnr"])):
+        if not best or point["psnr"] > best[-1][0] + 1e-6:
+            best.append((point["psnr"], math.log(point["size_bytes"])))
+    psnr, rate = zip(*best) if best else ((), ())
+    return np.array(psnr), np.array(rate)
+
+
+def pchip(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """The monotone piecewise cubic through (n,) points, x rising, n >= 3, at places within them (Fritsch and Carlson)."""
+    h, slope = np.diff(x), np.diff(y) / np.diff(x)
+    inner = np.zeros(len(x) - 2)
+    same = slope[:-1] * slope[1:] > 0
+    w1, w2 = 2 * h[1:] + h[:-1], h[1:] + 2 * h[:-1]
+    inner[same] = ((w1 + w2) / (w1 / np.where(same, slope[:-1], 1) + w2 / np.where(same, slope[1:], 1)))[same]
+    d = np.concatenate([[_end(h[0], h[1], slope[0], slope[1])], inner, [_end(h[-1], h[-2], slope[-1], slope[-2])]])
+    k = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(h) - 1)
+    t = (at - x[k]) / h[k]
+    return (  # type: ignore[no-any-return]
+        (1 + 2 * t) * (1 - t) ** 2 * y[k] + t * (1 - t) ** 2 * h[k] * d[k]
+        + t**2 * (3 - 2 * t) * y[k + 1] - t**2 * (1 - t) * h[k] * d[k + 1]
+    )  # fmt: skip
+
+
+def _end(h0: float, h1: float, slope0: float, slope1: float) -> float:
+    """The slope at an end: of the parabola through three points, kept from overshooting."""
+    d = ((2 * h0 + h1) * slope0 - h0 * slope1) / (h0 + h1)
+    if d * slope0 <= 0:
+        return 0.0
+    return 3 * slope0 if slope0 * slope1 < 0 and abs(d) > 3 * abs(slope0) else float(d)
+
+
+CSV_COLUMNS = ("name", "coder", "setting", "size_bytes", "bits_per_parameter", "psnr", "loss_db", "agreement_db", "encode_s", "decode_s")
+
+
+def as_csv(records: Sequence[dict[str, Any]]) -> str:
+    """All points of `kpbench codec` records, a line each."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, CSV_COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({"name": record["name"], "coder": record["coder"]} | point for record in records for point in record["points"])
+    return text.getvalue()
