@@ -9,7 +9,7 @@ This module knows nothing of scenes: a chunk is a kind, a place in the scene, an
 import io
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol, runtime_checkable
@@ -47,6 +47,22 @@ class Source(Protocol):
 
     def hold(self, offset: int, length: int) -> None:
         """The next reads lie within these bytes, in order; a source to which each costs a journey may fetch them in one."""
+
+
+@runtime_checkable
+class RemoteSource(Source, Protocol):
+    """A source behind a network (`kpc.format.http.HttpSource`, which takes a while to import)."""
+
+    received: int
+    has_ranges: bool
+    attempts: float
+    say: Callable[[str | None], None]
+
+    def forget(self) -> None:
+        """Read anew what is asked for next: it came damaged."""
+
+    def close(self) -> None:
+        """Let go of the connection; what is being read fails."""
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ class _Interrupted(Exception):
     """An answer failed in a way that may pass."""
 
     def __init__(self, reason: str, *, pause_s: float = 0.0, is_slow: bool = False) -> None:
-        super().__init__(reason)
+        super().__init__(_plain(reason))
         self.pause_s, self.is_slow = pause_s, is_slow
 
 
@@ -333,7 +333,7 @@ class HttpSource:
                 self._address = address
                 return response
             response.close()
-            before, address = address, urljoin(address, target)
+            before, address = address, _joined(address, target)
             _check_scheme(address, self.name)
             if before.lower().startswith("https:") and not address.lower().startswith("https:"):
                 raise NetworkError(f"{self.name}: the server leads from a secure connection to one that is not")
@@ -356,7 +356,7 @@ class HttpSource:
 
     def _refused(self, answer: _Answer, message: str) -> NetworkError:
         answer.drop_connection()
-        return NetworkError(f"{self.name}: {message}")
+        return NetworkError(f"{self.name}: {_plain(message)}")
 
 
 def _validator(response: urllib3.BaseHTTPResponse) -> tuple[str, str] | None:
@@ -373,6 +373,15 @@ def _retry_after(response: urllib3.BaseHTTPResponse) -> float:
     return min(float(said), 30.0) if re.fullmatch(r"\d{1,9}", said) else 0.0
 
 
+def _joined(address: str, target: str) -> str:
+    """Where a redirection leads; nowhere if that makes no sense."""
+    try:
+        joined = urljoin(address, target)
+        return joined if urlsplit(joined).hostname else ""
+    except ValueError:
+        return ""
+
+
 def _check_scheme(address: str, name: str) -> None:
     if not is_url(address) or not urlsplit(address).hostname:
         raise NetworkError(f"{name}: leads to no http or https address")
@@ -387,7 +396,12 @@ def _without_secrets(url: str) -> str:
     except ValueError as error:
         raise NetworkError(f"no address that can be asked ({error})") from error
     place = f"[{place}]" if ":" in place else place
-    return "".join(c if c.isprintable() else "?" for c in urlunsplit((parts.scheme, place + port, parts.path, "", "")))
+    return _plain(urlunsplit((parts.scheme, place + port, parts.path, "", "")))
+
+
+def _plain(text: str) -> str:
+    """What a server or an address says, fit for a terminal, which obeys some characters."""
+    return "".join(c if c.isprintable() else "?" for c in text)[:1000]
 
 
 def _reason(error: Exception) -> str:

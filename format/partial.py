@@ -34,6 +34,7 @@ class SegmentedPlane:
 
     def __init__(self, head: PlaneHead, starts: Iterable[int]) -> None:
         self.shape = head.rows, head.columns, head.channels
+        self.size = head.value_count
         self._head = head
         self._starts = sorted(starts)
         self._segments: dict[int, np.ndarray] = {}

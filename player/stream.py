@@ -16,10 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kpc.format.container import DEFAULT_BUDGET, Source
+from kpc.format.container import DEFAULT_BUDGET, RemoteSource, Source
 from kpc.format.errors import BudgetError, FormatError, KpcError
 from kpc.format.file import SceneReader
-from kpc.format.http import HttpSource
 from kpc.format.partial import PartialScene, hold, runs
 from kpc.format.quantise import dequantised
 from kpc.format.scene import ALL_PLANES, Scene
@@ -90,7 +89,7 @@ class Stream:
         self._stalled = True
         self._came: deque[tuple[float, int]] = deque()
         """When how many bytes had come, over the last RATE_OVER_S."""
-        if isinstance(source, HttpSource):
+        if isinstance(source, RemoteSource):
             source.attempts, source.say = float("inf"), self._hear
         self._thread = threading.Thread(target=self._run, name="fetching", daemon=True)
         self._thread.start()
@@ -181,7 +180,7 @@ class Stream:
     @property
     def received(self) -> int:
         """Bytes that came so far, through a network or from a disk."""
-        return self.source.received if isinstance(self.source, HttpSource) else int(self._stored[self._taken].sum())
+        return self.source.received if isinstance(self.source, RemoteSource) else int(self._stored[self._taken].sum())
 
     @property
     def memory_bytes(self) -> int:
@@ -200,7 +199,7 @@ class Stream:
         largest = layout.layers * max(block.width * block.height for block in layout.blocks)
         motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
         decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw
-        whole = isinstance(self.source, HttpSource) and not self.source.has_ranges
+        whole = isinstance(self.source, RemoteSource) and not self.source.has_ranges
         source = self.source.size if whole else RUN_BYTES + int(max(entry.stored_length for entry in self._reader.index))
         return 16 * texels + 2 * scene.occupancy.nbytes + motion + decoding + source
 
@@ -226,7 +225,7 @@ class Stream:
         with self._change:
             self._closed = True
             self._change.notify_all()
-        if isinstance(self.source, HttpSource):
+        if isinstance(self.source, RemoteSource):
             self.source.close()
         self._thread.join(timeout=0.5)  # on a dead line it may take longer, which nobody has to wait for
 
@@ -287,7 +286,7 @@ class Stream:
         try:
             symbols, _ = self._reader.segment(number)
         except FormatError:
-            if not isinstance(self.source, HttpSource):
+            if not isinstance(self.source, RemoteSource):
                 raise
             self.source.forget()
             symbols, _ = self._reader.segment(number)

@@ -13,7 +13,7 @@ from scenes import tiny_scene
 
 import kpc
 from kpc.format import http
-from kpc.format.container import Source
+from kpc.format.container import RemoteSource, Source
 from kpc.format.errors import BudgetError, FormatError, NetworkError, UnreachableError
 from kpc.format.file import SceneReader, write
 from kpc.format.http import FIRST_BYTES, HttpSource, is_url
@@ -60,7 +60,7 @@ def url(folder: Path) -> Iterator[str]:
 
 def test_bytes_come_by_ranges_and_no_more_than_are_wanted(url: str) -> None:
     source = HttpSource(url)
-    assert isinstance(source, Source) and source.size == len(DATA) and source.name == url and source.has_ranges
+    assert isinstance(source, Source) and isinstance(source, RemoteSource) and source.size == len(DATA) and source.name == url and source.has_ranges
     assert source.read_at(0, 64) == DATA[:64] and source.read_at(64, 1000) == DATA[64:1064]
     assert Noting.asked == [f"bytes=0-{FIRST_BYTES - 1}"]
     assert source.read_at(300_000, 5000) == DATA[300_000:305_000]
@@ -326,9 +326,10 @@ def test_redirections_are_followed_once_and_not_for_ever(folder: Path) -> None:
         source.close()
     with serving(folder, handler=leading(lambda path: path)) as address, pytest.raises(NetworkError, match="more than 5 redirections"):
         HttpSource(f"{address}/to/data.bin")
-    with serving(folder, handler=leading(lambda path: "file:///etc/passwd")) as address, \
-            pytest.raises(NetworkError, match="no http or https address"):
-        HttpSource(f"{address}/to/data.bin")
+    for target in ("file:///etc/passwd", "http://[", "https://", "ftp://127.0.0.1/data.bin"):
+        with serving(folder, handler=leading(lambda path, target=target: target)) as address, \
+                pytest.raises(NetworkError, match="no http or https address"):
+            HttpSource(f"{address}/to/data.bin")
 
 
 @pytest.mark.parametrize(
@@ -344,6 +345,15 @@ def test_what_is_secret_in_an_address_is_not_told(url: str) -> None:
     with pytest.raises(NetworkError) as error:
         HttpSource(url.replace("http://", "http://me:password@").replace("data.bin", "nothing.bin?key=token"))
     assert "nothing.bin" in str(error.value) and not any(word in str(error.value) for word in ("password", "token", "me:"))
+
+
+def test_a_server_cannot_speak_to_the_terminal(folder: Path) -> None:
+    class Rude(Noting):
+        def do_GET(self) -> None:
+            self.wfile.write(b"HTTP/1.1 404 \x1b[31mgone\r\nContent-Length: 0\r\n\r\n")
+
+    with serving(folder, handler=Rude) as address, pytest.raises(NetworkError, match=r"404 \?\[31mgone"):
+        HttpSource(f"{address}/data.bin")
 
 
 def test_closing_ends_what_another_thread_waits_for(folder: Path) -> None:

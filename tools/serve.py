@@ -121,11 +121,19 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         """Nothing: a player asks often."""
 
 
+class _Server(http.server.ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A reader that hangs up is nothing to talk about."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+
 @contextmanager
 def serving(folder: Path, *, port: int = 0, line: Line | None = None, handler: type[Handler] = Handler) -> Iterator[str]:
     """Serve a folder to this machine while the context lasts; gives the URL of the folder, without a slash at its end."""
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", port), partial(handler, directory=str(folder), line=line))
-    server.daemon_threads = True
+    server = _Server(("127.0.0.1", port), partial(handler, directory=str(folder), line=line))
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
     thread.start()
     try:
