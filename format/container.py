@@ -58,6 +58,10 @@ class RemoteSource(Source, Protocol):
     attempts: float
     say: Callable[[str | None], None]
 
+    def interrupt(self) -> None:
+        """Something else is wanted sooner: what another thread is reading fails with InterruptedRead, as soon as may be. What came
+        of it is kept for when it is read again."""
+
     def forget(self) -> None:
         """Read anew what is asked for next: it came damaged."""
 

@@ -25,7 +25,7 @@ from urllib.parse import urljoin, urlsplit, urlunsplit
 import urllib3
 
 from kpc.format.container import DEFAULT_BUDGET
-from kpc.format.errors import BudgetError, NetworkError, UnreachableError
+from kpc.format.errors import BudgetError, InterruptedRead, NetworkError, UnreachableError
 
 SCHEMES = ("http", "https")
 FIRST_BYTES = 1 << 16
@@ -73,6 +73,10 @@ class _Answer:
     @property
     def reached(self) -> int:
         return self.start + len(self.data)
+
+    def holds(self, offset: int) -> bool:
+        """Whether `offset` is there, or is what comes next."""
+        return self.start <= offset <= self.reached
 
     def forget(self, offset: int) -> None:
         """What came before `offset`."""
@@ -126,6 +130,9 @@ class HttpSource:
         self._size: int | None = None
         self._validator: tuple[str, str] | None = None
         self._reading, self._troubled = threading.Lock(), False
+        self._interruption = threading.Event()
+        self._parked: _Answer | None = None
+        """What came of the last answer that was left for another."""
         _check_scheme(url, self.name)
         self._answer = _Answer(0, FIRST_BYTES)
         self._bring(1)
@@ -149,17 +156,25 @@ class HttpSource:
         answer, end = self._answer, min(offset + length, self.size)
         if answer.start <= offset and end <= answer.stop:
             return
-        if answer.start <= offset <= answer.reached:  # go on where it ends
-            answer.forget(offset)
-            answer.stop = end
-        else:
+        if not answer.holds(offset):
             answer.drop_connection()
-            self._answer = _Answer(offset, end)
+            before = self._parked
+            if answer.data and answer.reached < answer.stop:
+                self._parked = answer
+            self._answer = answer = before if before is not None and before.holds(offset) else _Answer(offset, end)
+        answer.forget(offset)
+        answer.stop = max(end, answer.reached)
+
+    def interrupt(self) -> None:
+        """Something else is wanted sooner: what another thread is reading fails with InterruptedRead, once some bytes have come. They
+        are kept, with all before them, for when it is read again."""
+        if self.has_ranges:
+            self._interruption.set()
 
     def forget(self) -> None:
         """Read anew what is asked for next: it came damaged."""
         self._answer.drop_connection()
-        self._answer = _Answer(0, 0) if self.has_ranges else _Answer(0, self.size)
+        self._answer, self._parked = (_Answer(0, 0) if self.has_ranges else _Answer(0, self.size)), None
 
     def close(self) -> None:
         """Let go of the connection. What is being read fails with UnreachableError."""
@@ -212,6 +227,9 @@ class HttpSource:
                 self.say(None)
                 self._troubled = False
             answer.check_pace()
+            if self._interruption.is_set() and answer.reached < end:
+                self._interruption.clear()
+                raise InterruptedRead(f"{self.name}: interrupted")
         if answer.reached == answer.asked and answer.response is not None:
             if self._piece(answer, 1):
                 answer.response.close()

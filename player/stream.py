@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.format.container import DEFAULT_BUDGET, RemoteSource, Source
-from kpc.format.errors import BudgetError, FormatError, KpcError
+from kpc.format.errors import BudgetError, FormatError, InterruptedRead, KpcError
 from kpc.format.file import SceneReader
 from kpc.format.partial import PartialScene, hold, runs
 from kpc.format.quantise import dequantised
@@ -83,6 +83,7 @@ class Stream:
         self._finished: deque[Piece] = deque()
         self._change = threading.Condition()
         self._closed = False
+        self._under_way: int | None = None
         self._trouble: str | None = None
         self._failure: KpcError | OSError | None = None
         self._bug: BaseException | None = None
@@ -105,6 +106,7 @@ class Stream:
                 self._drop(self._here & ~self._keep)
             if (self._keep & ~self._taken).any():
                 self._change.notify_all()
+                self._hurry(head.time)
 
     def upload(self, renderer: Renderer, most_bytes: float = UPLOAD_BYTES) -> bool:
         """Take over finished pieces; whether the picture may have changed.
@@ -229,6 +231,13 @@ class Stream:
             self.source.close()
         self._thread.join(timeout=0.5)  # on a dead line it may take longer, which nobody has to wait for
 
+    def _hurry(self, time: float) -> None:
+        """Under the lock: what the picture needs now does not wait for the end of something else, which on a slow line may be far."""
+        now = self.parts.is_needed(time, time) & (self.parts.scales < max(self.scales_here, 1))
+        if self._under_way is not None and not now[self._under_way] and (now & self._keep & ~self._taken).any() \
+                and isinstance(self.source, RemoteSource):
+            self.source.interrupt()
+
     def _drop(self, which: np.ndarray) -> None:
         """Under the lock: segments leave the scene."""
         for position in np.flatnonzero(which & self.parts.moves):
@@ -242,9 +251,15 @@ class Stream:
             held: list[int] = []
             while (step := self._next(held)) is not None:
                 position, held = step
-                piece = self._fetched(position)
+                try:
+                    piece = self._fetched(position)
+                except InterruptedRead:
+                    with self._change:
+                        self._taken[position], self._under_way = False, None
+                    continue
                 with self._change:
                     self._finished.append(piece)
+                    self._under_way = None
                 self.arrived()
         except (KpcError, OSError) as error:
             if not self._closed:
@@ -258,7 +273,7 @@ class Stream:
         """Wait until something is to be fetched; its position, and the chunks held by the source. None once closed."""
         with self._change:
             while not self._closed:
-                order = fetching_order(self.parts, self._head)
+                order = fetching_order(self.parts, self._head, self.scales_here)
                 wanted = order[(self._keep & ~self._taken)[order]]
                 if len(wanted) and not self._is_full(int(wanted[0])):
                     break
@@ -266,7 +281,7 @@ class Stream:
             if self._closed:
                 return None
             position = int(wanted[0])
-            self._taken[position] = True
+            self._taken[position], self._under_way = True, position
         number = int(self.parts.numbers[position])
         if number not in held:
             held = runs(self._reader.index, map(int, self.parts.numbers[wanted[:RUN_CHUNKS]]), RUN_BYTES)[0]

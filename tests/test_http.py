@@ -14,7 +14,7 @@ from scenes import tiny_scene
 import kpc
 from kpc.format import http
 from kpc.format.container import RemoteSource, Source
-from kpc.format.errors import BudgetError, FormatError, NetworkError, UnreachableError
+from kpc.format.errors import BudgetError, FormatError, InterruptedRead, NetworkError, UnreachableError
 from kpc.format.file import SceneReader, write
 from kpc.format.http import FIRST_BYTES, HttpSource, is_url
 from kpc.format.quantise import quantise_scene
@@ -354,6 +354,19 @@ def test_a_server_cannot_speak_to_the_terminal(folder: Path) -> None:
 
     with serving(folder, handler=Rude) as address, pytest.raises(NetworkError, match=r"404 \?\[31mgone"):
         HttpSource(f"{address}/data.bin")
+
+
+def test_an_interrupted_read_goes_on_later_where_it_was(folder: Path) -> None:
+    with serving(folder, line=Line(rate=200_000), handler=Noting) as address:
+        source = HttpSource(f"{address}/data.bin")
+        source.interrupt()
+        with pytest.raises(InterruptedRead):
+            source.read_at(100_000, 100_000)
+        assert source.read_at(300_000, 10) == DATA[300_000:300_010]
+        assert source.read_at(100_000, 100_000) == DATA[100_000:200_000]
+        first, again = int(Noting.asked[1][6:].split("-")[0]), int(Noting.asked[3][6:].split("-")[0])  # type: ignore[index]
+        assert first == 100_000 < again < 200_000 and len(Noting.asked) == 4
+        source.close()
 
 
 def test_closing_ends_what_another_thread_waits_for(folder: Path) -> None:

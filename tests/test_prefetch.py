@@ -36,6 +36,12 @@ def test_while_it_plays_what_comes_soon_precedes_a_finer_scale(scene: PartialSce
     assert max(soon) >= 14 and min(soon) >= 8
 
 
+def test_what_the_picture_shown_needs_precedes_all_else(scene: PartialScene) -> None:
+    order = listed(scene, fetching_order(scene, Playhead(0.5, 0.3), shown=2))
+    moving = [place for place in order if place[1]]
+    assert moving[:12] == [(scale, True, row) for scale in (0, 1) for row in (8, 8, 8, 10, 10, 10)]
+
+
 def test_behind_the_playhead_comes_around_again_or_last(scene: PartialScene) -> None:
     first = [k for k in range(len(scene.numbers)) if scene.moves[k] and scene.entry(int(scene.numbers[k])).row_start == 0]
     loop, once = (distances_ahead(scene, Playhead(0.9, 0.1, loop)) for loop in (True, False))
