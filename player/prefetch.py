@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kpc.format.partial import HAIR, PartialScene
+from kpc.format.partial import PartialScene
 
 URGENT_S = 1.0
 """Segments needed so soon come before a finer scale."""
@@ -62,6 +62,9 @@ def worth_holding(scene: PartialScene, head: Playhead, room_bytes: int) -> np.nd
 
 
 def least_room(scene: PartialScene) -> int:
-    """Bytes of the segments that are needed at once where one ends and the next begins, wherever that takes most."""
-    ends = np.unique(scene.until[scene.moves])
-    return max((int(scene.sizes[scene.moves & scene.is_needed(end - 2 * HAIR, end)].sum()) for end in ends), default=0)
+    """Bytes of the segments that are needed at once, at the time that needs most."""
+    sizes = scene.sizes[scene.moves]
+    times = np.concatenate([scene.since[scene.moves], scene.until[scene.moves]])
+    changes = np.concatenate([sizes, -sizes])
+    order = np.lexsort((-changes, times))  # at one time, what begins counts before what ends
+    return int(changes[order].cumsum().max(initial=0))

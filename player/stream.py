@@ -202,7 +202,7 @@ class Stream:
         motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
         decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw
         whole = isinstance(self.source, RemoteSource) and not self.source.has_ranges
-        source = self.source.size if whole else RUN_BYTES + int(max(entry.stored_length for entry in self._reader.index))
+        source = self.source.size if whole else 2 * (RUN_BYTES + max(entry.stored_length for entry in self._reader.index))
         return 16 * texels + 2 * scene.occupancy.nbytes + motion + decoding + source
 
     @property

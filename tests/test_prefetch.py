@@ -50,6 +50,11 @@ def test_behind_the_playhead_comes_around_again_or_last(scene: PartialScene) -> 
     assert (loop[before] > loop[first].max()).all() and (once[before] < once[first].min()).all()
 
 
+def test_the_least_room_is_what_some_time_needs(scene: PartialScene) -> None:
+    needs = [int(scene.sizes[scene.moves & scene.is_needed(t, t)].sum()) for t in np.linspace(0, 1, 2000)]
+    assert least_room(scene) == max(needs)
+
+
 @pytest.mark.parametrize("time", [0.0, 0.33, 0.5, 0.98, 1.0])
 def test_what_fits_is_what_comes_next_and_what_is_needed_always_fits(scene: PartialScene, time: float) -> None:
     least, every = least_room(scene), int(scene.sizes[scene.moves].sum())
