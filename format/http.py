@@ -166,8 +166,8 @@ class HttpSource:
         answer.stop = max(end, answer.reached)
 
     def interrupt(self) -> None:
-        """Something else is wanted sooner: what another thread is reading fails with InterruptedRead, once some bytes have come. They
-        are kept, with all before them, for when it is read again."""
+        """Something else is wanted sooner: what another thread is reading fails with InterruptedRead, once some bytes have come.
+        They are kept, with all before them, for when it is read again."""
         if self.has_ranges:
             self._interruption.set()
 
@@ -365,7 +365,8 @@ class HttpSource:
             proxy = None
         if proxy not in self._pools:
             timeout = urllib3.Timeout(connect=CONNECT_S, read=SILENCE_S)
-            self._pools[proxy] = urllib3.PoolManager(timeout=timeout) if proxy is None else urllib3.ProxyManager(proxy, timeout=timeout)
+            direct = proxy is None
+            self._pools[proxy] = urllib3.PoolManager(timeout=timeout) if direct else urllib3.ProxyManager(proxy, timeout=timeout)
         return self._pools[proxy]
 
     def _is_same(self, response: urllib3.BaseHTTPResponse) -> bool:
@@ -428,7 +429,7 @@ def _reason(error: Exception) -> str:
         return "no such server is known"
     if isinstance(error, urllib3.exceptions.TimeoutError) and not isinstance(error, urllib3.exceptions.NewConnectionError):
         return "the server does not answer in time"
-    if isinstance(error, urllib3.exceptions.IncompleteRead) or any(isinstance(a, urllib3.exceptions.IncompleteRead) for a in error.args):
+    if any(isinstance(e, urllib3.exceptions.IncompleteRead) for e in (error, *error.args)):
         return "the connection breaks off"
     cause: BaseException = error
     while (below := cause.__cause__ or next((a for a in reversed(cause.args) if isinstance(a, Exception)), None)) is not None:

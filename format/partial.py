@@ -92,8 +92,9 @@ class PartialScene:
         for s, scale in enumerate(head.scales):
             self._planes.append({name: cast(np.ndarray, SegmentedPlane(plane, starts[s, name])) if name in TIME_PLANES
                                  else _unseen(plane) for name, plane in scale.items()})  # fmt: skip
-        self.scene = Scene(head.aabb, head.clip, tuple(self._planes), reader.decoder(), reader.occupancy(), head.background, head.step,
-                           reader.cameras(), reader.mapping(), None if motion is None else motion.dequantise(), reader.appearances())
+        self.scene = Scene(head.aabb, head.clip, tuple(self._planes), reader.decoder(), reader.occupancy(), head.background,
+                           head.step, reader.cameras(), reader.mapping(), None if motion is None else motion.dequantise(),
+                           reader.appearances())  # fmt: skip
 
     def entry(self, number: int) -> Entry:
         return self.reader.index[number]

@@ -58,7 +58,7 @@ def worth_holding(scene: PartialScene, head: Playhead, room_bytes: int) -> np.nd
     order = np.lexsort((scene.numbers, scene.scales, distances_ahead(scene, head)))
     held = np.zeros(len(order), bool)
     held[order] = np.cumsum(np.where(scene.moves, scene.sizes, 0)[order]) <= room_bytes
-    return held | ~scene.moves
+    return np.asarray(held | ~scene.moves)
 
 
 def least_room(scene: PartialScene) -> int:

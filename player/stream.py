@@ -195,7 +195,8 @@ class Stream:
         """What the scene takes but for its segments of time: textures, folded ones included; occupancy and its distances; motion;
         planes that wait to be uploaded, and one in the making; what the source holds."""
         scene, layout = self.scene, self._layout
-        texels = sum(width * height for width, height in (layout.size, Layout.of(scene, REFINED).size if scene.is_dynamic else (0, 0)))
+        atlases = [layout.size, *([Layout.of(scene, REFINED).size] if scene.is_dynamic else [])]
+        texels = sum(width * height for width, height in atlases)
         if scene.is_dynamic:
             texels += Rows(scene, layout).width * layout.row_count()
         largest = layout.layers * max(block.width * block.height for block in layout.blocks)
@@ -232,7 +233,7 @@ class Stream:
         self._thread.join(timeout=0.5)  # on a dead line it may take longer, which nobody has to wait for
 
     def _hurry(self, time: float) -> None:
-        """Under the lock: what the picture needs now does not wait for the end of something else, which on a slow line may be far."""
+        """Under the lock: what the picture needs now does not wait for the end of something else, far as that is on a slow line."""
         now = self.parts.is_needed(time, time) & (self.parts.scales < max(self.scales_here, 1))
         if self._under_way is not None and not now[self._under_way] and (now & self._keep & ~self._taken).any() \
                 and isinstance(self.source, RemoteSource):

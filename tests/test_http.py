@@ -1,7 +1,6 @@
 """Files read from a real server on this machine: a good one, and every kind of bad one."""
 
 import gc
-import io
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -60,7 +59,8 @@ def url(folder: Path) -> Iterator[str]:
 
 def test_bytes_come_by_ranges_and_no_more_than_are_wanted(url: str) -> None:
     source = HttpSource(url)
-    assert isinstance(source, Source) and isinstance(source, RemoteSource) and source.size == len(DATA) and source.name == url and source.has_ranges
+    assert isinstance(source, Source) and isinstance(source, RemoteSource)
+    assert source.size == len(DATA) and source.name == url and source.has_ranges
     assert source.read_at(0, 64) == DATA[:64] and source.read_at(64, 1000) == DATA[64:1064]
     assert Noting.asked == [f"bytes=0-{FIRST_BYTES - 1}"]
     assert source.read_at(300_000, 5000) == DATA[300_000:305_000]
@@ -324,7 +324,7 @@ def test_redirections_are_followed_once_and_not_for_ever(folder: Path) -> None:
         source = HttpSource(f"{address}/to/to/data.bin")
         assert source.read_at(100_000, 10) == DATA[100_000:100_010] and len(Noting.asked) == 4
         source.close()
-    with serving(folder, handler=leading(lambda path: path)) as address, pytest.raises(NetworkError, match="more than 5 redirections"):
+    with serving(folder, handler=leading(lambda path: path)) as address, pytest.raises(NetworkError, match="more than 5 redir"):
         HttpSource(f"{address}/to/data.bin")
     for target in ("file:///etc/passwd", "http://[", "https://", "ftp://127.0.0.1/data.bin"):
         with serving(folder, handler=leading(lambda path, target=target: target)) as address, \
@@ -334,7 +334,8 @@ def test_redirections_are_followed_once_and_not_for_ever(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("address", "words"),
-    [("http://", "no http or https"), ("http://[::1", "no address"), ("http://a:b/c", "no address"), ("http://a b/c", "connection|address")],
+    [("http://", "no http or https"), ("http://[::1", "no address"), ("http://a:b/c", "no address"),
+     ("http://a b/c", "connection|address")],
 )
 def test_addresses_that_make_no_sense(address: str, words: str) -> None:
     with pytest.raises(NetworkError, match=words):
@@ -422,8 +423,8 @@ def test_kpinfo_and_kprender_read_urls(scene_url: str, tmp_path: Path, capsys: p
     assert kpinfo.main([scene_url, "--verify"]) == 0
     assert scene_url in capsys.readouterr().out
     out = tmp_path / "still.png"
-    assert kprender.main([scene_url, "--backend", "reference", "--time", "0", "--size", "16x12", "-o", str(out)]) == 0 and out.is_file()
+    small = ["--backend", "reference", "--time", "0", "--size", "16x12", "-o", str(out)]
+    assert kprender.main([scene_url, *small]) == 0 and out.is_file()
     assert kprender.main([scene_url.replace("scene", "nothing"), "-o", str(out)]) == 1
-    said = capsys.readouterr().err.splitlines()
-    assert said[-1].startswith("kprender: http://127.0.0.1") and "404" in said[-1]
-    assert io.StringIO(said[-1]).read().count("\n") == 0
+    *_, said = capsys.readouterr().err.splitlines()
+    assert said.startswith("kprender: http://127.0.0.1") and "404" in said

@@ -401,7 +401,12 @@ def test_a_large_plane_goes_up_over_several_frames(watched: Callable[..., Stream
     stream, whole = watched(data), kpc.load(data)
     renderer, written = Renderer(gl.context(), stream.scene), []
     put = renderer.put
-    renderer.put = lambda scale, plane, texels, first=0: (written.append(texels.nbytes), put(scale, plane, texels, first))  # type: ignore
+
+    def noted(scale: int, plane: str, texels: np.ndarray, first: int = 0) -> None:
+        written.append(texels.nbytes)
+        put(scale, plane, texels, first)
+
+    renderer.put = noted  # type: ignore[method-assign]
     end = clock.monotonic() + PATIENCE_S
     while not stream.is_settled and clock.monotonic() < end:
         written.clear()

@@ -152,7 +152,7 @@ def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser("serve", description="Serve a folder to this machine by HTTP, with byte ranges.")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--port", type=int, default=8000, help="default: %(default)s")
-    parser.add_argument("--rate", type=_rate, default=float("inf"), metavar="10Mbit", help="bits a second, of all requests together")
+    parser.add_argument("--rate", type=_rate, default=float("inf"), metavar="10Mbit", help="bits a second, all requests together")
     parser.add_argument("--delay", type=_delay, default=0.0, metavar="40ms", help="before every answer")
     options = parser.parse_args(argv)
     if not options.folder.is_dir():
