@@ -10,7 +10,7 @@ import io
 import os
 import struct
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol, runtime_checkable
@@ -48,6 +48,26 @@ class Source(Protocol):
 
     def hold(self, offset: int, length: int) -> None:
         """The next reads lie within these bytes, in order; a source to which each costs a journey may fetch them in one."""
+
+
+@runtime_checkable
+class RemoteSource(Source, Protocol):
+    """A source behind a network (`kpc.format.http.HttpSource`, which takes a while to import)."""
+
+    received: int
+    has_ranges: bool
+    attempts: float
+    say: Callable[[str | None], None]
+
+    def interrupt(self) -> None:
+        """Something else is wanted sooner: what another thread is reading fails with InterruptedRead, as soon as may be. What came
+        of it is kept for when it is read again."""
+
+    def forget(self) -> None:
+        """Read anew what is asked for next: it came damaged."""
+
+    def close(self) -> None:
+        """Let go of the connection; what is being read fails."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@
      ├─ FormatError     a .kpc file is damaged, hostile or of an unknown version
      │   └─ BudgetError   it would need more memory than the reader was given
      ├─ NetworkError    a server does not give what it should
-     │   └─ UnreachableError   it cannot be reached, or breaks off again and again; it may do so no longer
+     │   ├─ UnreachableError   it cannot be reached, or breaks off again and again; it may do so no longer
+     │   └─ InterruptedRead    what was being read is not wanted so soon any more; nothing is wrong
      ├─ TrainingError   training cannot start or go on
      └─ DisplayError    no OpenGL, or no window to be had
 
@@ -46,6 +47,10 @@ class NetworkError(KpcError):
 
 class UnreachableError(NetworkError):
     """A server cannot be reached, or breaks off again and again; it may do so no longer."""
+
+
+class InterruptedRead(NetworkError):
+    """What was being read is not wanted so soon any more; nothing is wrong."""
 
 
 class TrainingError(KpcError):

@@ -25,7 +25,7 @@ from urllib.parse import urljoin, urlsplit, urlunsplit
 import urllib3
 
 from kpc.format.container import DEFAULT_BUDGET
-from kpc.format.errors import BudgetError, NetworkError, UnreachableError
+from kpc.format.errors import BudgetError, InterruptedRead, NetworkError, UnreachableError
 
 SCHEMES = ("http", "https")
 FIRST_BYTES = 1 << 16
@@ -74,6 +74,10 @@ class _Answer:
     def reached(self) -> int:
         return self.start + len(self.data)
 
+    def holds(self, offset: int) -> bool:
+        """Whether `offset` is there, or is what comes next."""
+        return self.start <= offset <= self.reached
+
     def forget(self, offset: int) -> None:
         """What came before `offset`."""
         del self.data[: offset - self.start]
@@ -93,7 +97,7 @@ class _Interrupted(Exception):
     """An answer failed in a way that may pass."""
 
     def __init__(self, reason: str, *, pause_s: float = 0.0, is_slow: bool = False) -> None:
-        super().__init__(reason)
+        super().__init__(_plain(reason))
         self.pause_s, self.is_slow = pause_s, is_slow
 
 
@@ -126,6 +130,9 @@ class HttpSource:
         self._size: int | None = None
         self._validator: tuple[str, str] | None = None
         self._reading, self._troubled = threading.Lock(), False
+        self._interruption = threading.Event()
+        self._parked: _Answer | None = None
+        """What came of the last answer that was left for another."""
         _check_scheme(url, self.name)
         self._answer = _Answer(0, FIRST_BYTES)
         self._bring(1)
@@ -149,17 +156,25 @@ class HttpSource:
         answer, end = self._answer, min(offset + length, self.size)
         if answer.start <= offset and end <= answer.stop:
             return
-        if answer.start <= offset <= answer.reached:  # go on where it ends
-            answer.forget(offset)
-            answer.stop = end
-        else:
+        if not answer.holds(offset):
             answer.drop_connection()
-            self._answer = _Answer(offset, end)
+            before = self._parked
+            if answer.data and answer.reached < answer.stop:
+                self._parked = answer
+            self._answer = answer = before if before is not None and before.holds(offset) else _Answer(offset, end)
+        answer.forget(offset)
+        answer.stop = max(end, answer.reached)
+
+    def interrupt(self) -> None:
+        """Something else is wanted sooner: what another thread is reading fails with InterruptedRead, once some bytes have come.
+        They are kept, with all before them, for when it is read again."""
+        if self.has_ranges:
+            self._interruption.set()
 
     def forget(self) -> None:
         """Read anew what is asked for next: it came damaged."""
         self._answer.drop_connection()
-        self._answer = _Answer(0, 0) if self.has_ranges else _Answer(0, self.size)
+        self._answer, self._parked = (_Answer(0, 0) if self.has_ranges else _Answer(0, self.size)), None
 
     def close(self) -> None:
         """Let go of the connection. What is being read fails with UnreachableError."""
@@ -212,6 +227,9 @@ class HttpSource:
                 self.say(None)
                 self._troubled = False
             answer.check_pace()
+            if self._interruption.is_set() and answer.reached < end:
+                self._interruption.clear()
+                raise InterruptedRead(f"{self.name}: interrupted")
         if answer.reached == answer.asked and answer.response is not None:
             if self._piece(answer, 1):
                 answer.response.close()
@@ -333,7 +351,7 @@ class HttpSource:
                 self._address = address
                 return response
             response.close()
-            before, address = address, urljoin(address, target)
+            before, address = address, _joined(address, target)
             _check_scheme(address, self.name)
             if before.lower().startswith("https:") and not address.lower().startswith("https:"):
                 raise NetworkError(f"{self.name}: the server leads from a secure connection to one that is not")
@@ -347,7 +365,8 @@ class HttpSource:
             proxy = None
         if proxy not in self._pools:
             timeout = urllib3.Timeout(connect=CONNECT_S, read=SILENCE_S)
-            self._pools[proxy] = urllib3.PoolManager(timeout=timeout) if proxy is None else urllib3.ProxyManager(proxy, timeout=timeout)
+            direct = proxy is None
+            self._pools[proxy] = urllib3.PoolManager(timeout=timeout) if direct else urllib3.ProxyManager(proxy, timeout=timeout)
         return self._pools[proxy]
 
     def _is_same(self, response: urllib3.BaseHTTPResponse) -> bool:
@@ -356,7 +375,7 @@ class HttpSource:
 
     def _refused(self, answer: _Answer, message: str) -> NetworkError:
         answer.drop_connection()
-        return NetworkError(f"{self.name}: {message}")
+        return NetworkError(f"{self.name}: {_plain(message)}")
 
 
 def _validator(response: urllib3.BaseHTTPResponse) -> tuple[str, str] | None:
@@ -373,6 +392,15 @@ def _retry_after(response: urllib3.BaseHTTPResponse) -> float:
     return min(float(said), 30.0) if re.fullmatch(r"\d{1,9}", said) else 0.0
 
 
+def _joined(address: str, target: str) -> str:
+    """Where a redirection leads; nowhere if that makes no sense."""
+    try:
+        joined = urljoin(address, target)
+        return joined if urlsplit(joined).hostname else ""
+    except ValueError:
+        return ""
+
+
 def _check_scheme(address: str, name: str) -> None:
     if not is_url(address) or not urlsplit(address).hostname:
         raise NetworkError(f"{name}: leads to no http or https address")
@@ -387,7 +415,12 @@ def _without_secrets(url: str) -> str:
     except ValueError as error:
         raise NetworkError(f"no address that can be asked ({error})") from error
     place = f"[{place}]" if ":" in place else place
-    return "".join(c if c.isprintable() else "?" for c in urlunsplit((parts.scheme, place + port, parts.path, "", "")))
+    return _plain(urlunsplit((parts.scheme, place + port, parts.path, "", "")))
+
+
+def _plain(text: str) -> str:
+    """What a server or an address says, fit for a terminal, which obeys some characters."""
+    return "".join(c if c.isprintable() else "?" for c in text)[:1000]
 
 
 def _reason(error: Exception) -> str:
@@ -396,7 +429,7 @@ def _reason(error: Exception) -> str:
         return "no such server is known"
     if isinstance(error, urllib3.exceptions.TimeoutError) and not isinstance(error, urllib3.exceptions.NewConnectionError):
         return "the server does not answer in time"
-    if isinstance(error, urllib3.exceptions.IncompleteRead) or any(isinstance(a, urllib3.exceptions.IncompleteRead) for a in error.args):
+    if any(isinstance(e, urllib3.exceptions.IncompleteRead) for e in (error, *error.args)):
         return "the connection breaks off"
     cause: BaseException = error
     while (below := cause.__cause__ or next((a for a in reversed(cause.args) if isinstance(a, Exception)), None)) is not None:

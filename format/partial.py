@@ -34,6 +34,7 @@ class SegmentedPlane:
 
     def __init__(self, head: PlaneHead, starts: Iterable[int]) -> None:
         self.shape = head.rows, head.columns, head.channels
+        self.size = head.value_count
         self._head = head
         self._starts = sorted(starts)
         self._segments: dict[int, np.ndarray] = {}
@@ -85,14 +86,15 @@ class PartialScene:
         hold(reader, runs(reader.index, sorted(first_picture.union(self.needed(1, 0.0, 0.0))))[0])
         motion = reader.motion()
         self._planes: list[dict[str, np.ndarray]] = []
+        starts: dict[tuple[int, str], list[int]] = {}
+        for _, entry in chosen:
+            starts.setdefault((entry.scale, ALL_PLANES[entry.plane]), []).append(entry.row_start)
         for s, scale in enumerate(head.scales):
-            planes: dict[str, np.ndarray] = {}
-            for name, plane in scale.items():
-                starts = [e.row_start for _, e in chosen if (e.scale, ALL_PLANES[e.plane]) == (s, name)]
-                planes[name] = cast(np.ndarray, SegmentedPlane(plane, starts)) if name in TIME_PLANES else _unseen(plane)
-            self._planes.append(planes)
-        self.scene = Scene(head.aabb, head.clip, tuple(self._planes), reader.decoder(), reader.occupancy(), head.background, head.step,
-                           reader.cameras(), reader.mapping(), None if motion is None else motion.dequantise(), reader.appearances())
+            self._planes.append({name: cast(np.ndarray, SegmentedPlane(plane, starts[s, name])) if name in TIME_PLANES
+                                 else _unseen(plane) for name, plane in scale.items()})  # fmt: skip
+        self.scene = Scene(head.aabb, head.clip, tuple(self._planes), reader.decoder(), reader.occupancy(), head.background,
+                           head.step, reader.cameras(), reader.mapping(), None if motion is None else motion.dequantise(),
+                           reader.appearances())  # fmt: skip
 
     def entry(self, number: int) -> Entry:
         return self.reader.index[number]

@@ -1,5 +1,6 @@
 """What a player should hold of a scene, and what it should fetch next: no thread, no network, no OpenGL.
 
+    first  segments at the playhead of the scales that are shown already
     0      scale 0: its space planes, and its time planes' segments at the playhead: the first coarse picture
     1      while it plays, segments of scale 0 that will be needed within URGENT_S
     2, 3   the same of scale 1, and so on: the picture gets finer
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kpc.format.partial import HAIR, PartialScene
+from kpc.format.partial import PartialScene
 
 URGENT_S = 1.0
 """Segments needed so soon come before a finer scale."""
@@ -43,11 +44,12 @@ def distances_ahead(scene: PartialScene, head: Playhead) -> np.ndarray:
     return np.where(scene.is_needed(head.time, head.time), 0.0, ahead)
 
 
-def fetching_order(scene: PartialScene, head: Playhead) -> np.ndarray:
-    """(N,) positions in the scene's arrays, what to fetch first first."""
+def fetching_order(scene: PartialScene, head: Playhead, shown: int = 0) -> np.ndarray:
+    """(N,) positions in the scene's arrays, what to fetch first first; of `shown` scales the space planes are all there."""
     distance = distances_ahead(scene, head)
     soon = (distance > 0) & (distance < head.pace * URGENT_S)
     stage = np.where(distance == 0, 2 * scene.scales, np.where(soon, 2 * scene.scales + 1, 2 * scene.scales.max() + 2))
+    stage[(distance == 0) & (scene.scales < shown)] = -1
     return np.lexsort((scene.numbers, scene.scales, distance, stage))
 
 
@@ -56,10 +58,13 @@ def worth_holding(scene: PartialScene, head: Playhead, room_bytes: int) -> np.nd
     order = np.lexsort((scene.numbers, scene.scales, distances_ahead(scene, head)))
     held = np.zeros(len(order), bool)
     held[order] = np.cumsum(np.where(scene.moves, scene.sizes, 0)[order]) <= room_bytes
-    return held | ~scene.moves
+    return np.asarray(held | ~scene.moves)
 
 
 def least_room(scene: PartialScene) -> int:
-    """Bytes of the segments that are needed at once where one ends and the next begins, wherever that takes most."""
-    ends = np.unique(scene.until[scene.moves])
-    return max((int(scene.sizes[scene.moves & scene.is_needed(end - 2 * HAIR, end)].sum()) for end in ends), default=0)
+    """Bytes of the segments that are needed at once, at the time that needs most."""
+    sizes = scene.sizes[scene.moves]
+    times = np.concatenate([scene.since[scene.moves], scene.until[scene.moves]])
+    changes = np.concatenate([sizes, -sizes])
+    order = np.lexsort((-changes, times))  # at one time, what begins counts before what ends
+    return int(changes[order].cumsum().max(initial=0))

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kpc.format.container import DEFAULT_BUDGET, Source
-from kpc.format.errors import BudgetError, FormatError, KpcError
+from kpc.format.container import DEFAULT_BUDGET, RemoteSource, Source
+from kpc.format.errors import BudgetError, FormatError, InterruptedRead, KpcError
 from kpc.format.file import SceneReader
-from kpc.format.http import HttpSource
 from kpc.format.partial import PartialScene, hold, runs
 from kpc.format.quantise import dequantised
 from kpc.format.scene import ALL_PLANES, Scene
@@ -84,13 +83,14 @@ class Stream:
         self._finished: deque[Piece] = deque()
         self._change = threading.Condition()
         self._closed = False
+        self._under_way: int | None = None
         self._trouble: str | None = None
         self._failure: KpcError | OSError | None = None
         self._bug: BaseException | None = None
         self._stalled = True
         self._came: deque[tuple[float, int]] = deque()
         """When how many bytes had come, over the last RATE_OVER_S."""
-        if isinstance(source, HttpSource):
+        if isinstance(source, RemoteSource):
             source.attempts, source.say = float("inf"), self._hear
         self._thread = threading.Thread(target=self._run, name="fetching", daemon=True)
         self._thread.start()
@@ -106,6 +106,7 @@ class Stream:
                 self._drop(self._here & ~self._keep)
             if (self._keep & ~self._taken).any():
                 self._change.notify_all()
+                self._hurry(head.time)
 
     def upload(self, renderer: Renderer, most_bytes: float = UPLOAD_BYTES) -> bool:
         """Take over finished pieces; whether the picture may have changed.
@@ -181,7 +182,7 @@ class Stream:
     @property
     def received(self) -> int:
         """Bytes that came so far, through a network or from a disk."""
-        return self.source.received if isinstance(self.source, HttpSource) else int(self._stored[self._taken].sum())
+        return self.source.received if isinstance(self.source, RemoteSource) else int(self._stored[self._taken].sum())
 
     @property
     def memory_bytes(self) -> int:
@@ -194,14 +195,15 @@ class Stream:
         """What the scene takes but for its segments of time: textures, folded ones included; occupancy and its distances; motion;
         planes that wait to be uploaded, and one in the making; what the source holds."""
         scene, layout = self.scene, self._layout
-        texels = sum(width * height for width, height in (layout.size, Layout.of(scene, REFINED).size if scene.is_dynamic else (0, 0)))
+        atlases = [layout.size, *([Layout.of(scene, REFINED).size] if scene.is_dynamic else [])]
+        texels = sum(width * height for width, height in atlases)
         if scene.is_dynamic:
             texels += Rows(scene, layout).width * layout.row_count()
         largest = layout.layers * max(block.width * block.height for block in layout.blocks)
         motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
         decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw
-        whole = isinstance(self.source, HttpSource) and not self.source.has_ranges
-        source = self.source.size if whole else RUN_BYTES + int(max(entry.stored_length for entry in self._reader.index))
+        whole = isinstance(self.source, RemoteSource) and not self.source.has_ranges
+        source = self.source.size if whole else 2 * (RUN_BYTES + max(entry.stored_length for entry in self._reader.index))
         return 16 * texels + 2 * scene.occupancy.nbytes + motion + decoding + source
 
     @property
@@ -226,9 +228,16 @@ class Stream:
         with self._change:
             self._closed = True
             self._change.notify_all()
-        if isinstance(self.source, HttpSource):
+        if isinstance(self.source, RemoteSource):
             self.source.close()
         self._thread.join(timeout=0.5)  # on a dead line it may take longer, which nobody has to wait for
+
+    def _hurry(self, time: float) -> None:
+        """Under the lock: what the picture needs now does not wait for the end of something else, far as that is on a slow line."""
+        now = self.parts.is_needed(time, time) & (self.parts.scales < max(self.scales_here, 1))
+        if self._under_way is not None and not now[self._under_way] and (now & self._keep & ~self._taken).any() \
+                and isinstance(self.source, RemoteSource):
+            self.source.interrupt()
 
     def _drop(self, which: np.ndarray) -> None:
         """Under the lock: segments leave the scene."""
@@ -243,9 +252,15 @@ class Stream:
             held: list[int] = []
             while (step := self._next(held)) is not None:
                 position, held = step
-                piece = self._fetched(position)
+                try:
+                    piece = self._fetched(position)
+                except InterruptedRead:
+                    with self._change:
+                        self._taken[position], self._under_way = False, None
+                    continue
                 with self._change:
                     self._finished.append(piece)
+                    self._under_way = None
                 self.arrived()
         except (KpcError, OSError) as error:
             if not self._closed:
@@ -259,7 +274,7 @@ class Stream:
         """Wait until something is to be fetched; its position, and the chunks held by the source. None once closed."""
         with self._change:
             while not self._closed:
-                order = fetching_order(self.parts, self._head)
+                order = fetching_order(self.parts, self._head, self.scales_here)
                 wanted = order[(self._keep & ~self._taken)[order]]
                 if len(wanted) and not self._is_full(int(wanted[0])):
                     break
@@ -267,7 +282,7 @@ class Stream:
             if self._closed:
                 return None
             position = int(wanted[0])
-            self._taken[position] = True
+            self._taken[position], self._under_way = True, position
         number = int(self.parts.numbers[position])
         if number not in held:
             held = runs(self._reader.index, map(int, self.parts.numbers[wanted[:RUN_CHUNKS]]), RUN_BYTES)[0]
@@ -287,7 +302,7 @@ class Stream:
         try:
             symbols, _ = self._reader.segment(number)
         except FormatError:
-            if not isinstance(self.source, HttpSource):
+            if not isinstance(self.source, RemoteSource):
                 raise
             self.source.forget()
             symbols, _ = self._reader.segment(number)

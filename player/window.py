@@ -233,7 +233,8 @@ class Player:
         self.ctx.viewport = (0, 0, *pixels)
         self.screen = self.ctx.detect_framebuffer(0)
         self.canvas = self.ctx.framebuffer([self.ctx.texture(pixels, 4)])
-        self.canvas.clear(*map(float, self.scene.background))
+        red, green, blue = map(float, self.scene.background)
+        self.canvas.clear(red, green, blue)
         self._drawn = ()
 
     def _draw(self, now: float) -> None:

@@ -42,6 +42,15 @@ def main(scene_file: str) -> None:
 
     player.frame()
     assert player.playback.playing
+    can_show, stream.can_show = stream.can_show, lambda *where: False  # type: ignore[method-assign]
+    before = player.playback.time
+    time.sleep(0.05)
+    player.frame()
+    assert player.playback.time == before and player.playback.playing  # what is not there is waited for
+    stream.can_show = can_show  # type: ignore[method-assign]
+    time.sleep(0.05)
+    player.frame()
+    assert player.playback.time != before
     press(glfw.KEY_SPACE)
     assert not player.playback.playing
     press(glfw.KEY_HOME, glfw.KEY_RIGHT)

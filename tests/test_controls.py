@@ -146,3 +146,14 @@ def test_a_scene_of_one_appearance_knows_no_other() -> None:
     wardrobe.next()
     wardrobe.advance(1.0)
     assert wardrobe.code is None and wardrobe.number == 0 and wardrobe.names == ("average",)
+
+
+def test_where_a_clip_will_be_is_where_it_comes_to() -> None:
+    playback = Playback(Clip(31, 10.0), time=0.25, speed=2.0)
+    later = playback.after(0.5)
+    assert playback.time == 0.25 and later.time == pytest.approx(0.25 + 1 / 3) == pytest.approx(0.25 + 0.5 * playback.pace)
+    assert Playback(Clip(31, 10.0), playing=False).pace == 0.0 == Playback(Clip(1, 10.0)).pace
+
+
+def test_a_processor_begins_coarsely() -> None:
+    assert Pace.of(software=True).scale < 0.5 and Pace.of(software=False).scale == 1.0

@@ -1,7 +1,6 @@
 """Files read from a real server on this machine: a good one, and every kind of bad one."""
 
 import gc
-import io
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,8 +12,8 @@ from scenes import tiny_scene
 
 import kpc
 from kpc.format import http
-from kpc.format.container import Source
-from kpc.format.errors import BudgetError, FormatError, NetworkError, UnreachableError
+from kpc.format.container import RemoteSource, Source
+from kpc.format.errors import BudgetError, FormatError, InterruptedRead, NetworkError, UnreachableError
 from kpc.format.file import SceneReader, write
 from kpc.format.http import FIRST_BYTES, HttpSource, is_url
 from kpc.format.quantise import quantise_scene
@@ -60,7 +59,8 @@ def url(folder: Path) -> Iterator[str]:
 
 def test_bytes_come_by_ranges_and_no_more_than_are_wanted(url: str) -> None:
     source = HttpSource(url)
-    assert isinstance(source, Source) and source.size == len(DATA) and source.name == url and source.has_ranges
+    assert isinstance(source, Source) and isinstance(source, RemoteSource)
+    assert source.size == len(DATA) and source.name == url and source.has_ranges
     assert source.read_at(0, 64) == DATA[:64] and source.read_at(64, 1000) == DATA[64:1064]
     assert Noting.asked == [f"bytes=0-{FIRST_BYTES - 1}"]
     assert source.read_at(300_000, 5000) == DATA[300_000:305_000]
@@ -324,16 +324,18 @@ def test_redirections_are_followed_once_and_not_for_ever(folder: Path) -> None:
         source = HttpSource(f"{address}/to/to/data.bin")
         assert source.read_at(100_000, 10) == DATA[100_000:100_010] and len(Noting.asked) == 4
         source.close()
-    with serving(folder, handler=leading(lambda path: path)) as address, pytest.raises(NetworkError, match="more than 5 redirections"):
+    with serving(folder, handler=leading(lambda path: path)) as address, pytest.raises(NetworkError, match="more than 5 redir"):
         HttpSource(f"{address}/to/data.bin")
-    with serving(folder, handler=leading(lambda path: "file:///etc/passwd")) as address, \
-            pytest.raises(NetworkError, match="no http or https address"):
-        HttpSource(f"{address}/to/data.bin")
+    for target in ("file:///etc/passwd", "http://[", "https://", "ftp://127.0.0.1/data.bin"):
+        with serving(folder, handler=leading(lambda path, target=target: target)) as address, \
+                pytest.raises(NetworkError, match="no http or https address"):
+            HttpSource(f"{address}/to/data.bin")
 
 
 @pytest.mark.parametrize(
     ("address", "words"),
-    [("http://", "no http or https"), ("http://[::1", "no address"), ("http://a:b/c", "no address"), ("http://a b/c", "connection|address")],
+    [("http://", "no http or https"), ("http://[::1", "no address"), ("http://a:b/c", "no address"),
+     ("http://a b/c", "connection|address")],
 )
 def test_addresses_that_make_no_sense(address: str, words: str) -> None:
     with pytest.raises(NetworkError, match=words):
@@ -344,6 +346,28 @@ def test_what_is_secret_in_an_address_is_not_told(url: str) -> None:
     with pytest.raises(NetworkError) as error:
         HttpSource(url.replace("http://", "http://me:password@").replace("data.bin", "nothing.bin?key=token"))
     assert "nothing.bin" in str(error.value) and not any(word in str(error.value) for word in ("password", "token", "me:"))
+
+
+def test_a_server_cannot_speak_to_the_terminal(folder: Path) -> None:
+    class Rude(Noting):
+        def do_GET(self) -> None:
+            self.wfile.write(b"HTTP/1.1 404 \x1b[31mgone\r\nContent-Length: 0\r\n\r\n")
+
+    with serving(folder, handler=Rude) as address, pytest.raises(NetworkError, match=r"404 \?\[31mgone"):
+        HttpSource(f"{address}/data.bin")
+
+
+def test_an_interrupted_read_goes_on_later_where_it_was(folder: Path) -> None:
+    with serving(folder, line=Line(rate=200_000), handler=Noting) as address:
+        source = HttpSource(f"{address}/data.bin")
+        source.interrupt()
+        with pytest.raises(InterruptedRead):
+            source.read_at(100_000, 100_000)
+        assert source.read_at(300_000, 10) == DATA[300_000:300_010]
+        assert source.read_at(100_000, 100_000) == DATA[100_000:200_000]
+        first, again = int(Noting.asked[1][6:].split("-")[0]), int(Noting.asked[3][6:].split("-")[0])  # type: ignore[index]
+        assert first == 100_000 < again < 200_000 and len(Noting.asked) == 4
+        source.close()
 
 
 def test_closing_ends_what_another_thread_waits_for(folder: Path) -> None:
@@ -399,8 +423,8 @@ def test_kpinfo_and_kprender_read_urls(scene_url: str, tmp_path: Path, capsys: p
     assert kpinfo.main([scene_url, "--verify"]) == 0
     assert scene_url in capsys.readouterr().out
     out = tmp_path / "still.png"
-    assert kprender.main([scene_url, "--backend", "reference", "--time", "0", "--size", "16x12", "-o", str(out)]) == 0 and out.is_file()
+    small = ["--backend", "reference", "--time", "0", "--size", "16x12", "-o", str(out)]
+    assert kprender.main([scene_url, *small]) == 0 and out.is_file()
     assert kprender.main([scene_url.replace("scene", "nothing"), "-o", str(out)]) == 1
-    said = capsys.readouterr().err.splitlines()
-    assert said[-1].startswith("kprender: http://127.0.0.1") and "404" in said[-1]
-    assert io.StringIO(said[-1]).read().count("\n") == 0
+    *_, said = capsys.readouterr().err.splitlines()
+    assert said.startswith("kprender: http://127.0.0.1") and "404" in said

@@ -149,7 +149,8 @@ def test_stream_measures_how_soon_scenes_are_seen(
     for record in (first, second):
         (run,) = record["repeats"]
         for place in ("disk", "line"):
-            open_ms, first_ms, finest_ms, all_ms = (run[f"{place}_{key}_ms"] for key in ("open", "first_picture", "finest_picture", "all"))
+            stages = ("open", "first_picture", "finest_picture", "all")
+            open_ms, first_ms, finest_ms, all_ms = (run[f"{place}_{stage}_ms"] for stage in stages)
             assert 0 < open_ms < first_ms < finest_ms <= all_ms
         assert 0 < run["line_first_picture_bytes"] <= run["size_bytes"]
         sizes, quality = ([prefix[key] for prefix in record["prefixes"]] for key in ("bytes", "psnr"))

@@ -73,7 +73,8 @@ def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> No
 def test_plays_from_a_server(scene_file: Path, display: str, tmp_path: Path) -> None:
     shot = tmp_path / "shot.png"
     with serving(scene_file.parent) as url:
-        done = kpplay(f"{url}/tiny.kpc", "--size", "400x300", "--frames", 3, "--screenshot", shot, "--memory", "50MB", display=display)
+        options = ["--size", "400x300", "--memory", "50MB", "--frames", 3, "--screenshot", shot]
+        done = kpplay(f"{url}/tiny.kpc", *options, display=display)
     assert done.returncode == 0 and done.stdout == done.stderr == "", done.stderr
     background = np.rint(tiny_scene(4).background * 255)
     assert np.abs(read_image(shot).astype(int)[150:170, 260:280] - background).max() > 20

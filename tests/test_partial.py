@@ -101,7 +101,9 @@ def test_planes_can_be_larger_than_the_budget_but_other_chunks_cannot() -> None:
 def test_a_scale_and_a_span_over_http_cost_their_bytes_and_two_requests(tmp_path: Path) -> None:
     scene = tiny_scene(4, time=64, resolution=(96, 80, 64), channels=16)
     rng = np.random.default_rng(0)
-    noisy = replace(scene, scales=tuple({n: p + rng.normal(0, 0.1, p.shape).astype(np.float32) for n, p in s.items()} for s in scene.scales))
+    noisy = replace(scene, scales=tuple(
+        {name: plane + rng.normal(0, 0.1, plane.shape).astype(np.float32) for name, plane in scale.items()} for scale in scene.scales
+    ))  # fmt: skip
     (tmp_path / "scene.kpc").write_bytes(coded(noisy, 8))
     with serving(tmp_path) as url:
         reader = SceneReader(f"{url}/scene.kpc", in_parts=True)

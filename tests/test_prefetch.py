@@ -36,12 +36,23 @@ def test_while_it_plays_what_comes_soon_precedes_a_finer_scale(scene: PartialSce
     assert max(soon) >= 14 and min(soon) >= 8
 
 
+def test_what_the_picture_shown_needs_precedes_all_else(scene: PartialScene) -> None:
+    order = listed(scene, fetching_order(scene, Playhead(0.5, 0.3), shown=2))
+    moving = [place for place in order if place[1]]
+    assert moving[:12] == [(scale, True, row) for scale in (0, 1) for row in (8, 8, 8, 10, 10, 10)]
+
+
 def test_behind_the_playhead_comes_around_again_or_last(scene: PartialScene) -> None:
     first = [k for k in range(len(scene.numbers)) if scene.moves[k] and scene.entry(int(scene.numbers[k])).row_start == 0]
     loop, once = (distances_ahead(scene, Playhead(0.9, 0.1, loop)) for loop in (True, False))
     assert np.allclose(loop[first], 0.1) and (once[first] > 2).all()
     before = [k for k in range(len(scene.numbers)) if scene.moves[k] and scene.entry(int(scene.numbers[k])).row_start == 12]
     assert (loop[before] > loop[first].max()).all() and (once[before] < once[first].min()).all()
+
+
+def test_the_least_room_is_what_some_time_needs(scene: PartialScene) -> None:
+    needs = [int(scene.sizes[scene.moves & scene.is_needed(t, t)].sum()) for t in np.linspace(0, 1, 2000)]
+    assert least_room(scene) == max(needs)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.33, 0.5, 0.98, 1.0])

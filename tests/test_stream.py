@@ -5,6 +5,7 @@ import threading
 import time as clock
 import tracemalloc
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, ClassVar
 
@@ -177,6 +178,29 @@ def test_a_jump_is_served_before_all_that_lies_between(watched: Callable[..., St
         late = [e.offset for e in Reader(data).index if e.kind == "PLNE" and 104 <= e.row_start <= 108]
         since = Noting.asked[before:]
         assert any(offset in late for offset in since[:3])  # what was under way may end first
+
+
+def test_a_jump_does_not_wait_for_the_end_of_a_large_chunk(watched: Callable[..., Stream], tmp_path: Path) -> None:
+    scene = tiny_scene(4, time=120, resolution=(160, 160, 160), scales=3)
+    rng = np.random.default_rng(0)
+    noise = {name: rng.normal(0, 0.2, plane.shape).astype(np.float32) for name, plane in scene.scales[2].items()}
+    finest = {name: plane + (noise[name] if name in ("xy", "xz", "yz") else 0) for name, plane in scene.scales[2].items()}
+    data = coded(replace(scene, scales=(*scene.scales[:2], finest)), 4)
+    (tmp_path / "scene.kpc").write_bytes(data)
+    largest = max(e.stored_length for e in Reader(data).index)
+    assert largest > 100_000
+    with serving(tmp_path, line=Line(rate=100_000)) as url:
+        stream = watched(f"{url}/scene.kpc")
+        renderer = Renderer(gl.context(), stream.scene)
+        until(lambda: stream.scales_here == 2 and stream.can_show(0.0) and stream._under_way is not None, stream, renderer)
+        received = stream.received
+        stream.steer(Playhead(0.7))
+        until(lambda: stream.can_show(0.7), stream, renderer)
+        assert stream.scales_here == 2 and stream.received - received < largest / 2
+        until(lambda: stream.is_settled, stream, renderer)
+        whole = kpc.load(data)
+        assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
+        assert stream.received < 1.05 * len(data)  # what came before the jump was not for nothing
 
 
 def test_a_player_that_stalls_goes_on_by_itself(watched: Callable[..., Stream], tmp_path: Path) -> None:
@@ -377,7 +401,12 @@ def test_a_large_plane_goes_up_over_several_frames(watched: Callable[..., Stream
     stream, whole = watched(data), kpc.load(data)
     renderer, written = Renderer(gl.context(), stream.scene), []
     put = renderer.put
-    renderer.put = lambda scale, plane, texels, first=0: (written.append(texels.nbytes), put(scale, plane, texels, first))  # type: ignore
+
+    def noted(scale: int, plane: str, texels: np.ndarray, first: int = 0) -> None:
+        written.append(texels.nbytes)
+        put(scale, plane, texels, first)
+
+    renderer.put = noted  # type: ignore[method-assign]
     end = clock.monotonic() + PATIENCE_S
     while not stream.is_settled and clock.monotonic() < end:
         written.clear()
