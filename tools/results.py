@@ -130,9 +130,15 @@ COLUMNS: dict[str, list[Column]] = {
         ("PSNR to reference dB", _accuracy("psnr", "{:.1f}")),
         ("within 1/255", _accuracy("within_one_level", "{:.2%}")),
     ],
+    "entropy": [
+        ("scene", lambda r: r["name"]),
+        ("without", lambda r: r["settings"]["left_out"]),
+        ("planes KB", _number("plane_bytes", "{:.1f}", 1e3)),
+        ("decoded ms", _number("decode_ms", "{:.0f}")),
+    ],
 }
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
-          "step": "A step of training", "player": "Playing"}
+          "step": "A step of training", "player": "Playing", "entropy": "Entropy coding of planes, one idea left out; one core"}
 
 
 def cells(kind: str, records: Iterable[Record]) -> list[list[str]]:
