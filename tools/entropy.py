@@ -40,7 +40,8 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
     segments, chunks = [], scene_chunks(quantised, segment_rows=_segment_rows(scene))
     for chunk in chunks:
         if chunk.kind == "PLNE":
-            plane, rows = quantised.scales[chunk.scale][ALL_PLANES[chunk.plane]], slice(chunk.row_start, chunk.row_start + chunk.row_count)
+            plane = quantised.scales[chunk.scale][ALL_PLANES[chunk.plane]]
+            rows = slice(chunk.row_start, chunk.row_start + chunk.row_count)
             segments.append(Segment(plane.symbols[rows], plane.coded[rows], chunk))
     values = sum(segment.symbols.size for segment in segments)
     found = {
@@ -96,7 +97,7 @@ def _compiled(changes: dict[str, Any]) -> Walks:
 
 
 def _bytes(segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callable[[np.ndarray], float] | None = None) -> int:
-    """What the segment takes with the best number of sets of weights, or with none; `size` is of a trace, else that of its words."""
+    """What the segment takes with the best number of sets of weights, or with none; `size` is of a trace, else of its words."""
     symbols, coded = segment.symbols, segment.coded
     values = int(coded.sum()) * symbols.shape[2]
     neighbours = np.empty((values, 2 + WEIGHTS), np.int16)
@@ -131,4 +132,4 @@ LEFT_OUT: dict[str, tuple[dict[str, Any], tuple[int, ...], Callable[[np.ndarray]
     "no errors of channels before": ({"_remember": _forget}, SET_COUNTS, None),
     "stored tables for counters that learn": ({"adapt": _note}, SET_COUNTS, _tables),
 }
-"""Idea left out: what changes in `kpc.format.symbols`, the numbers of sets of weights to try, and how to measure if not by words."""
+"""Idea left out: what changes in `kpc.format.symbols`, numbers of sets of weights to try, and how to measure if not by words."""
