@@ -1,4 +1,4 @@
-"""The payload of a plane segment: symbols as prediction residuals (spec/kpc-format.md, "Plane segments").
+"""The payload of a plane segment under codecs 0 and 1: symbols as prediction residuals (spec/kpc-format.md, section 6).
 
     map flag (1 byte) | map (ceil(H W / 8) bytes, if the flag is 1) | filter (M bytes) | residuals (M x coded texels)
 

@@ -1,8 +1,8 @@
 """Adaptive binary decisions under rANS, in integers (spec/kpc-format.md, section 6, "Context coding").
 
-A *counter* estimates how likely its decision is 1, out of 2^16, and how often it was asked. rANS (arXiv:1311.2540) turns decisions and
-their probabilities into bits: a decoder's state holds, in its low 12 bits, the next decision. Encoding runs backwards, so an encoder
-first writes down every decision beside its probability (the *trace*), then turns the trace into words.
+A *counter* estimates how likely its decision is 1, out of 2^16, and notes how often it was asked. rANS (arXiv:1311.2540) turns
+decisions and their probabilities into bits: the low 12 bits of a decoder's state hold the next decision. Encoding runs backwards,
+so an encoder first writes down every decision and its probability (the *trace*), then turns the trace into words.
 
 Compiled with numba; with NUMBA_DISABLE_JIT=1 the same lines run as plain Python.
 """
@@ -48,8 +48,8 @@ def counters(count):
 def decide(bit, probability, state, at, words, trace):
     """One decision of a given probability of 1, out of SCALE: (bit, state, at).
 
-    Encoding (`words` is None): trace[at] = probability, negative for a 0. Decoding (`trace` is None): the bit comes from `state` and, where that runs
-    low, from words[at]; past the end zeros come, and `at` goes on, for the caller to see.
+    Encoding (`words` is None): trace[at] = probability, negative for a 0. Decoding (`trace` is None): the bit comes from `state`
+    and, where that runs low, from words[at]; past the end zeros come, and `at` goes on, for the caller to see.
     """
     if words is not None:
         low = state & (SCALE - 1)

@@ -180,7 +180,8 @@ def walk(symbols, coded, weights, state, at, words, trace, neighbours):
                 both, c = w + n, slope * len(weights) >> 3
                 predicted = 64 * both + sets[c, 0] * (w - n) + sets[c, 1] * (2 * nw - both) + sets[c, 2] * (2 * ne - both) \
                     + sets[c, 3] * (2 * ww - both) + sets[c, 4] * (2 * nn - both) + sets[c, 5] * (2 * v1[X - 2] - both) \
-                    + sets[c, 6] * (2 * v2[X - 1] - both) + sets[c, 7] * (2 * v2[X + 1] - both) + sets[c, 8] * (2 * v1[X + 2] - both)
+                    + sets[c, 6] * (2 * v2[X - 1] - both) + sets[c, 7] * (2 * v2[X + 1] - both) \
+                    + sets[c, 8] * (2 * v1[X + 2] - both)
                 predicted = min(max(predicted, -128 * 128), 127 * 128)  # in 1 / 128 of a symbol
                 whole = predicted + 64 >> 7
                 fraction = predicted - (whole << 7)

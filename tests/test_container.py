@@ -5,7 +5,7 @@ import google_crc32c
 import numpy as np
 import pytest
 
-from kpc.format.container import CODEC_RAW, CODEC_ZSTD, ENTRY, HEADER, Chunk, Reader, pack
+from kpc.format.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, ENTRY, EXPANSION_LIMIT, HEADER, Chunk, Reader, pack
 from kpc.format.errors import FormatError
 
 NOISE = np.random.default_rng(0).integers(0, 256, 300).astype(np.uint8).tobytes()
@@ -23,6 +23,22 @@ def test_chunks_come_back_with_their_places():
     assert [e.codec for e in reader.index] == [CODEC_RAW, CODEC_ZSTD, CODEC_RAW, CODEC_ZSTD]
     assert reader.header.value_count == 7 and reader.header.largest_raw == 100_000
     assert all(reader.available(n) for n in range(4))
+
+
+@pytest.mark.parametrize("body, count, codec", [
+    (b"s" * 9, 300, CODEC_SYMBOLS), (b"s" * 9, 9 * EXPANSION_LIMIT, CODEC_SYMBOLS), (b"s" * 9, 9 * EXPANSION_LIMIT + 1, CODEC_ZSTD),
+    (b"s" * 500, 300, CODEC_RAW), (None, 0, CODEC_ZSTD),
+])
+def test_symbols_are_taken_where_they_are_shorter_and_may_stand_for_so_many(body, count, codec):
+    data = pack([Chunk("PLNE", [b"x" * 500], symbols=body, symbol_count=count)], 1)
+    entry = Reader(data).index[0]
+    assert entry.codec == codec and entry.raw_length == (count if codec == CODEC_SYMBOLS else 500)
+    if codec == CODEC_SYMBOLS:
+        assert Reader(data).stored(0) == body
+        with pytest.raises(FormatError, match="codec 2, unknown"):  # to a reader that knows nothing of planes
+            Reader(data).chunk(0)
+    else:
+        assert Reader(data).chunk(0) == b"x" * 500
 
 
 def test_without_compression_everything_is_stored_raw():

@@ -12,9 +12,9 @@ from scenes import displaced, faced, tiny_scene, varied
 
 import kpc
 from kpc.format.cameras import Camera
-from kpc.format.container import HEADER, Reader
+from kpc.format.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, HEADER, Reader, pack
 from kpc.format.errors import BudgetError, FormatError
-from kpc.format.file import APPEARANCE_LIMIT, NAME_LIMIT, SceneReader, encode, read, write
+from kpc.format.file import APPEARANCE_LIMIT, NAME_LIMIT, SceneReader, encode, read, scene_chunks, write
 from kpc.format.motion import STEP, QuantisedMotion
 from kpc.format.quantise import QuantisedScene, quantise_scene
 from kpc.format.scene import TIME_PLANES, Appearance
@@ -163,6 +163,18 @@ def test_rows_in_time_may_differ_from_scale_to_scale():
     coarse, fine = quantised(scales=1, time=3), quantised(scales=1, time=11)
     scene = replace(quantised(scales=2), scales=(coarse.scales[0], fine.scales[0]))
     assert_same(read(encode(scene, segment_rows=4)), scene)
+
+
+def test_files_without_context_coded_symbols_stay_readable():
+    scene = quantised(time=6)
+    chunks = scene_chunks(scene, segment_rows=4)
+    now = pack(chunks, sum(p.symbols.size for scale in scene.scales for p in scale.values()))
+    before = pack([replace(chunk, symbols=None) for chunk in chunks], Reader(now).header.value_count)
+    assert {e.codec for e in Reader(before).index} == {CODEC_RAW, CODEC_ZSTD}
+    assert {e.codec for e in Reader(now).index if e.kind == "PLNE"} <= {CODEC_RAW, CODEC_SYMBOLS}
+    assert len(now) < len(before)
+    assert_same(read(before), scene)
+    assert_same(read(now), scene)
 
 
 def test_write_and_load(tmp_path):

@@ -38,7 +38,8 @@ def assert_decodes(body: bytes, symbols: np.ndarray, coded: np.ndarray) -> None:
     assert where.dtype == bool and np.array_equal(where, coded)
 
 
-@given(paint=st.sampled_from(sorted(PAINTS)), shape=shapes, seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.3, 0.8, 1.0]))
+@given(paint=st.sampled_from(sorted(PAINTS)), shape=shapes, seed=st.integers(0, 2**32 - 1),
+       share=st.sampled_from([0.0, 0.3, 0.8, 1.0]))
 @settings(deadline=None)
 def test_symbols_come_back(paint, shape, seed, share):
     symbols, coded = painted(paint, shape, seed, share)
@@ -58,7 +59,8 @@ def textured(rows: int = 60, columns: int = 70, channels: int = 6) -> tuple[np.n
     """Smooth waves and noise, stronger on one side, within an ellipse."""
     rng = np.random.default_rng(0)
     y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij")
-    waves = sum(np.multiply.outer(np.sin(a * x + b * y + c), 25 * rng.normal(0, 1, channels)) for a, b, c in rng.normal(0, 3, (4, 3)))
+    waves = sum(np.multiply.outer(np.sin(a * x + b * y + c), 25 * rng.normal(0, 1, channels))
+                for a, b, c in rng.normal(0, 3, (4, 3)))
     symbols = np.clip(np.rint(waves + (1.5 + x)[..., None] * rng.normal(0, 1, waves.shape)), -128, 127).astype(np.int8)
     coded = x * x + y * y < 0.9
     symbols[~coded] = 0

@@ -7,6 +7,7 @@ kpbench step room soldier --preset balanced --out docs/bench/step.json
 kpbench player room.kpc liam.kpc --out docs/bench/player.json
 kpbench stream room.kpc liam.kpc --out docs/bench/stream.json
 kpbench codec room.kpck liam.kpc --dataset room --dataset liam --out docs/bench/codec.json
+kpbench entropy room.kpc liam.kpc --out docs/bench/entropy.json
 
 Every record says what was run (commit, command, seed, settings), on what (machine, renderer, versions, SHA-256 of the
 data) and what came of it, each repeat on its own. Output is one JSON list, a record a line: with --out written after
@@ -98,7 +99,7 @@ def _record(kind: str, source: Path, origin: results.Record, settings: dict[str,
     """What a record says before anything is measured."""
     return {
         "kind": kind,
-        "name": source.resolve().stem if kind in ("player", "stream", "codec") else source.resolve().name,
+        "name": source.resolve().stem if kind in ("player", "stream", "codec", "entropy") else source.resolve().name,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         **origin,
         "load_average": os.getloadavg()[0],
@@ -374,6 +375,16 @@ def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[resu
         plot.save(plot.rate_distortion(records), options.out.with_suffix(".svg"))
 
 
+def _entropy(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """A record for each scene and idea of the entropy coder that is left out."""
+    from kpc.tools.entropy import measure
+
+    for source in options.scenes:
+        for name, found in measure(source).items():
+            settings = {"left_out": name}
+            yield _record("entropy", source, origin, settings) | {"seed": None, "renderer": "cpu", "repeats": [found]}
+
+
 def _alone(function: Callable[[Any], T], job: Any) -> T:
     """`function(job)` in a fresh process."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
@@ -390,7 +401,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|player|stream|codec")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|player|stream|codec|entropy")
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
@@ -446,9 +457,14 @@ def _parser() -> argparse.ArgumentParser:
                        help="at a time (default: one a core)")  # fmt: skip
     codec.set_defaults(measure=_codec)
 
+    entropy = kinds.add_parser("entropy", help="what the entropy coder's ideas are worth",
+                               description="Code the symbols of each scene again, with one idea left out at a time.")  # fmt: skip
+    entropy.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
+    entropy.set_defaults(measure=_entropy)
+
     for kind in (encode, curve, ablate, step, player, stream):
         kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
-    for kind in (encode, curve, ablate, step, player, stream, codec):
+    for kind in (encode, curve, ablate, step, player, stream, codec, entropy):
         kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
     return parser
 

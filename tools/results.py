@@ -161,6 +161,12 @@ COLUMNS: dict[str, list[Column]] = {
         ("decode s", _number("decode_s", "{:.2f}")),
         ("chunks", lambda r: _shares(r)),
     ],
+    "entropy": [
+        ("scene", lambda r: r["name"]),
+        ("without", lambda r: r["settings"]["left_out"]),
+        ("planes KB", _number("plane_bytes", "{:.1f}", 1e3)),
+        ("decoded ms", _number("decode_ms", "{:.0f}")),
+    ],
 }
 def _smaller(record: Record) -> str:
     """By how much ours is smaller at equal PSNR, on average over the curve."""
@@ -178,7 +184,7 @@ def _shares(record: Record) -> str:
 
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
           "step": "A step of training", "player": "Playing", "stream": "Playing while it arrives",
-          "codec": "Coding, beside what is at hand"}
+          "codec": "Coding, beside what is at hand", "entropy": "Entropy coding of planes, one idea left out; one core"}
 
 
 def cells(kind: str, records: Iterable[Record]) -> list[list[str]]:

@@ -132,7 +132,8 @@ def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 1
     chunks = []
     for chunk in scene_chunks(scene, segment_rows=segment_rows):
         if chunk.kind == "PLNE":
-            plane, rows = scene.scales[chunk.scale][ALL_PLANES[chunk.plane]], slice(chunk.row_start, chunk.row_start + chunk.row_count)
+            plane = scene.scales[chunk.scale][ALL_PLANES[chunk.plane]]
+            rows = slice(chunk.row_start, chunk.row_start + chunk.row_count)
             chunk = _forced(chunk, encode_with(weights, plane.symbols[rows], plane.coded[rows]))
         chunks.append(chunk)
     return pack(chunks, _value_count(scene))
