@@ -35,8 +35,8 @@ from kpc.tools.rivals import RIVALS, tidied
 
 RATES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Bits per parameter that our coder is asked for, of the file and all that is in it."""
-LOSSES = (0.05, 0.15, 0.5, 1.5)
-"""And losses in dB, on the probe that the scene comes with."""
+QUALITIES = (40, 55, 70, 85, 100)
+"""And qualities, `kpc.encoder.compress.Trade`, on the probe that the scene comes with."""
 WORST_LOSS_DB = 3.0
 """Curves are compared down to this: what is worse nobody wants."""
 VIEW_PIXELS = 1 << 15
@@ -69,7 +69,7 @@ def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str,
     others = others_bytes(source)
     count = source.scene.parameter_count
     jobs = [Job(scene, None, f"{rate:g} bits", others, Trade(target_bytes=int(rate * count / 8))) for rate in RATES]
-    jobs += [Job(scene, None, f"{loss:g} dB", others, Trade(max_loss_db=loss)) for loss in LOSSES]
+    jobs += [Job(scene, None, f"quality {quality:g}", others, Trade(quality=quality)) for quality in QUALITIES]
     missing = {number: why for number, rival in enumerate(RIVALS) if (why := rival.missing())}
     jobs += [Job(scene, number, setting, others) for number, rival in enumerate(RIVALS) if number not in missing
              for setting in reversed(rival.settings)]  # fmt: skip

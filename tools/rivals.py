@@ -129,7 +129,7 @@ class Bytes(Rival):
     """Channels from their least to their largest number in uint8, through zstd -19. Setting: bits, the number of levels."""
 
     name = "uint8 + zstd -19"
-    settings = (8, 7, 6, 5, 4, 3)
+    settings = (8, 7, 6, 5, 4)
 
     def encode(self, planes: Planes, setting: int) -> list[bytes]:
         levels, side = _levels(planes, 2**setting - 1)
