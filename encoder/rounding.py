@@ -1,13 +1,16 @@
 """Which symbol a number becomes: not always the nearest, where one that is easier to foresee is nearly as near.
 
-Rate-distortion optimised quantisation, one texel at a time in raster order: of the symbols between the nearest and the expected one,
-that of least
+Rate-distortion optimised quantisation, one texel at a time in raster order: of the symbols between the nearest and the expected
+one, that of least
 
     (value / step - symbol)^2 + LAM * bits(symbol - expected)
 
 The expected symbol is the median of left, up and left + up - upleft (LOCO-I, Weinberger, Seroussi and Sapiro, IEEE Trans. Image
-Process. 9, 2000); bits are those of a geometric distribution whose mean is that of the differences around, up to a constant. So it is
-no coder's own model, but what they all have in common.
+Process. 9, 2000); bits are those of a geometric distribution whose mean is that of the differences around, up to a constant. So it
+is no coder's own model, but what they all have in common.
+
+Weighing texels by their curvature, in place of all of a channel alike, made files 1 to 20 % larger at equal PSNR, and so did shaping
+the errors' spectrum: errors towards the expected go together, which a sum over texels does not see.
 """
 
 import math

@@ -23,7 +23,8 @@ EQUAL = [{name: np.ones(plane.shape[2]) for name, plane in scale.items()} for sc
 
 def measure(scene: Scene) -> Measured:
     """A stand-in for pictures: noise of 1e-3, and what the planes err."""
-    error = float(np.mean([np.square(ours[n] - theirs[n]).mean() for ours, theirs in zip(scene.scales, SCENE.scales) for n in ours]))
+    pairs = zip(scene.scales, SCENE.scales)
+    error = float(np.mean([np.square(ours[n] - theirs[n]).mean() for ours, theirs in pairs for n in ours]))
     return Measured(-10 * math.log10(1e-3 + error), 255**2 * error)
 
 
@@ -119,8 +120,10 @@ def test_what_a_trade_may_cost_in_decibels() -> None:
 
 
 def test_steps_follow_the_curvature() -> None:
-    h = [{n: 4.0 ** -(6 * s + k) * np.tile(np.arange(1.0, p.shape[2] + 1), (*p.shape[:2], 1)) for k, (n, p) in enumerate(scale.items())}
-         for s, scale in enumerate(SCENE.scales)]  # fmt: skip
+    def of(k: int, plane: np.ndarray) -> np.ndarray:
+        return 4.0**-k * np.tile(np.arange(1.0, plane.shape[2] + 1), (*plane.shape[:2], 1))
+
+    h = [{n: of(6 * s + k, p) for k, (n, p) in enumerate(scale.items())} for s, scale in enumerate(SCENE.scales)]
     steps = relative_steps(h)
     largest = h[0]["xy"].max()
     for s, scale in enumerate(h):

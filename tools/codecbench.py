@@ -31,6 +31,7 @@ from kpc.encoder.probe import Measure, Measured, Probe
 from kpc.format import file
 from kpc.format.errors import KpcError, TrainingError
 from kpc.format.scene import Scene
+from kpc.tools.provenance import machine
 from kpc.tools.rivals import RIVALS, tidied
 
 RATES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0)
@@ -69,7 +70,7 @@ def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str,
     others = others_bytes(source)
     count = source.scene.parameter_count
     jobs = [Job(scene, None, f"{rate:g} bits", others, Trade(target_bytes=int(rate * count / 8))) for rate in RATES]
-    jobs += [Job(scene, None, f"quality {quality:g}", others, Trade(quality=quality)) for quality in QUALITIES]
+    jobs += [Job(scene, None, f"quality {q:g}", others, Trade(quality=q)) for q in QUALITIES]
     missing = {number: why for number, rival in enumerate(RIVALS) if (why := rival.missing())}
     jobs += [Job(scene, number, setting, others) for number, rival in enumerate(RIVALS) if number not in missing
              for setting in reversed(rival.settings)]  # fmt: skip
@@ -87,7 +88,7 @@ def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str,
 def in_parallel(jobs: Sequence[Job], views: Probe | None, processes: int) -> list[Point | None]:
     """Points of all jobs judged by `views`, or by the probe the scene comes with, in processes of their own, none with more than its share of the cores."""
     before = os.environ.get("NUMBA_NUM_THREADS")
-    os.environ["NUMBA_NUM_THREADS"] = str(max(1, len(os.sched_getaffinity(0)) // processes))
+    os.environ["NUMBA_NUM_THREADS"] = str(max(1, int(machine()["cores"]) // processes))
     try:
         with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _judge_by, (views,)) as pool:
             futures: list[Future[Point | None]] = [pool.submit(point, job) for job in jobs]
@@ -278,7 +279,8 @@ def _end(h0: float, h1: float, slope0: float, slope1: float) -> float:
     return 3 * slope0 if slope0 * slope1 < 0 and abs(d) > 3 * abs(slope0) else float(d)
 
 
-CSV_COLUMNS = ("name", "coder", "setting", "size_bytes", "bits_per_parameter", "psnr", "loss_db", "agreement_db", "encode_s", "decode_s")
+CSV_COLUMNS = ("name", "coder", "setting", "size_bytes", "bits_per_parameter", "psnr", "loss_db", "agreement_db", "encode_s",
+               "decode_s")  # fmt: skip
 
 
 def as_csv(records: Sequence[dict[str, Any]]) -> str:

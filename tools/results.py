@@ -154,13 +154,18 @@ def _smaller(record: Record) -> str:
 def _shares(record: Record) -> str:
     """Of our bytes, by kind of chunk, the largest first."""
     shares: dict[str, float] = record["repeats"][0].get("shares") or {}
-    return ", ".join(f"{kind} {share:.0%}" for kind, share in sorted(shares.items(), key=lambda kind: -kind[1]) if share >= 0.01) or "-"
+    largest = sorted(shares.items(), key=lambda share: -share[1])
+    return ", ".join(f"{kind} {share:.0%}" for kind, share in largest if share >= 0.01) or "-"
 
 
 def _quality_table(records: Iterable[Record]) -> list[list[str]]:
     """What each quality gives: of our coder alone, bytes and loss."""
-    rows = [(record["name"], {str(p["setting"]).removeprefix("quality "): p for p in record["points"] if "quality" in str(p["setting"])})
-            for record in records if record["coder"] == "kpc"]  # fmt: skip
+    rows = []
+    for record in records:
+        if record["coder"] == "kpc":
+            labelled = ((str(point["setting"]), point) for point in record["points"])
+            points = {label.removeprefix("quality "): point for label, point in labelled if label.startswith("quality ")}
+            rows.append((record["name"], points))
     qualities = sorted({quality for _, points in rows for quality in points}, key=float)
 
     def cell(point: Record | None) -> str:
