@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from kpc.encoder.probe import Measure, Measured
+from kpc.encoder.rounding import rounded
 from kpc.format import file
 from kpc.format.errors import TrainingError
 from kpc.format.quantise import QuantisedScene, quantise_scene, reached_by
@@ -22,7 +23,9 @@ COARSER = 12.0
 """The same of the coarsest for a file that is coded again; the finest is its own."""
 TOLERANCE = 0.02
 """A search ends this share below what it may not exceed."""
-ATTEMPTS = 13
+GRAIN = 0.02
+"""Octaves. Steps that differ by less err differently, but on average the same."""
+ATTEMPTS = 16
 """After its first, a search makes at most so many."""
 PROBES = 10
 """Scenes that a search renders, about."""
@@ -141,7 +144,8 @@ def compress(
     def attempt(exponent: float) -> Attempt:
         if as_it_is is not None and exponent == 0:
             return Attempt(as_it_is, measure)
-        return Attempt(quantise_scene(scene, scaled(steps, 2.0**exponent), reached=reached), measure)
+        nearest = quantise_scene(scene, scaled(steps, 2.0**exponent), reached=reached)
+        return Attempt(rounded(nearest, scene), measure)
 
     name, value = trade.bound
     if name == "lam":
@@ -166,15 +170,23 @@ def _farthest(
     or less; of `start` where nowhere.
 
     Bisects until the value is known and positive on both sides, then goes by its logarithm, nearly a straight line, but never
-    nearer to an end than a tenth of the way. Ends when TOLERANCE is met, or after ATTEMPTS.
+    nearer to an end than a tenth of the way. Where both sides come within GRAIN, `value` is rough: then what lies a few grains on.
+    Ends when TOLERANCE is met, or after ATTEMPTS.
     """
     best = attempt(start)
     low, high = value(best), math.nan
     if not low <= most:
         return best
+    grains = 0
     for _ in range(ATTEMPTS):
         if low >= (1 - TOLERANCE) * most:
             break
+        if abs(end - start) < GRAIN:
+            grains += 1
+            candidate = attempt(end + math.copysign(grains * GRAIN, end - start))
+            if low < value(candidate) <= most:
+                low, best = value(candidate), candidate
+            continue
         share = 0.5
         if low > 0 and math.isfinite(high):
             way = math.log(most * (1 - TOLERANCE / 2) / low) / math.log(high / low)

@@ -67,7 +67,8 @@ def _command(argv: list[str]) -> None:
     if as_json:
         print(json.dumps(result, indent=1))
     elif options.source.is_file():
-        print(f"{options.output}: {result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}; {reached(result)}")
+        rate = f"{result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}"
+        print(f"{options.output}: {rate}; {reached(result)}")
     else:
         _print_result(result, options)
 

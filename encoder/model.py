@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kpc.encoder.compress import Attempt, Steps, Trade, compress, relative_steps
+from kpc.encoder.compress import Steps, Trade, compress, relative_steps
 from kpc.encoder.field import Layout
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune

@@ -106,8 +106,9 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     trade.add_argument("--target-size", type=cli.byte_count, metavar="2MB", help="the best file of at most this size")
     trade.add_argument("--quality", type=_quality, metavar="1..100",
                        help="the smallest file whose pictures agree with the uncoded ones to a PSNR of 20 + QUALITY / 3 dB")
-    trade.add_argument("--lam", type=_lam, metavar="LAM", help="the file of least D + LAM R: D the mean squared difference from the "
-                       "uncoded pictures, in squares of 8-bit levels, R bits per parameter")
+    trade.add_argument("--lam", type=_lam, metavar="LAM",
+                       help="the file of least D + LAM R: D the mean squared difference from the uncoded pictures, in squares of "
+                            "8-bit levels, R bits per parameter")
     parser.add_argument("--dry-run", action="store_true",
                         help="only say what would be done, how long it would take and how much memory")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")

@@ -12,8 +12,8 @@ from kpc.encoder.options import Options
 from kpc.format import file
 from kpc.format.errors import TrainingError, UsageError
 
-
 JUDGED_BY = ("training views", "views of its own, taken to be right to 30 dB")
+"""What losses are measured on: those of a checkpoint, and those of a file."""
 
 
 def recode(options: Options) -> dict[str, Any]:
@@ -27,17 +27,19 @@ def recode(options: Options) -> dict[str, Any]:
     source = model.load(options.source)
     coded = model.code(source, options.trade, TrainConfig().prune_share)
     size = file.write(coded.scene, options.output)
-    return {"file": str(options.output), "source": str(options.source)} | figures(
-        coded, size, options.trade, JUDGED_BY[source.coded is not None]) | {
+    return {
+        "file": str(options.output), "source": str(options.source),
+        **figures(coded, size, options.trade, JUDGED_BY[source.coded is not None]),
         "encode_s": time.monotonic() - started,
-    }
+    }  # fmt: skip
 
 
 def figures(coded: model.Coded, size: int, trade: Trade, judged_by: str) -> dict[str, Any]:
     """What is said of every file that is written."""
     name, value = trade.bound
     return {
-        "trade": name, "asked": value, "judged_by": judged_by, "probe_loss_db": coded.loss_db, "agreement_db": coded.agreement_db,
+        "trade": name, "asked": value, "judged_by": judged_by,
+        "probe_loss_db": coded.loss_db, "agreement_db": coded.agreement_db,
         "size_bytes": size, "parameters": coded.scene.parameter_count,
         "bits_per_parameter": 8 * size / coded.scene.parameter_count,
         "identity_share": coded.scene.identity_share if coded.scene.is_dynamic else None,
@@ -49,7 +51,8 @@ def reached(result: dict[str, Any]) -> str:
     name, asked = result["trade"], result["asked"]
     said = {"max_loss_db": f"at most {asked:g} dB of loss", "target_bytes": f"at most {asked:,.0f} bytes",
             "quality": f"quality {asked:g}", "lam": f"lam {asked:g}"}[name]  # fmt: skip
-    return (f"asked for {said}; reached {result['size_bytes']:,} bytes, {result['probe_loss_db']:.3f} dB of loss on {result['judged_by']}, "
+    lost = f"{result['probe_loss_db']:.3f} dB of loss on {result['judged_by']}"
+    return (f"asked for {said}; reached {result['size_bytes']:,} bytes, {lost}, "
             f"{result['agreement_db']:.1f} dB against the uncoded pictures")
 
 

@@ -18,13 +18,12 @@ from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr, ssim, true_picture
 from kpc.encoder.field import Field, appearance_priors
 from kpc.encoder.optimisers import FusedOptimiser, PlainOptimiser
-from kpc.encoder.render import render_reference
 from kpc.encoder.probe import Probe
+from kpc.encoder.render import render_reference
 from kpc.encoder.train import Trainer
 from kpc.format.errors import UsageError
 from kpc.format.file import encode, read
 from kpc.format.quantise import quantise_scene
-from kpc.format.scene import Scene
 from kpc.player import reference
 
 pytestmark = pytest.mark.usefixtures("one_thread")

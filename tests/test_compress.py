@@ -8,9 +8,10 @@ import pytest
 from scenes import tiny_scene
 
 from kpc.encoder.compress import (
-    FINEST, TOLERANCE, Attempt, Trade, agreement_of, compress, error_of, relative_steps, scaled,
+    FINEST, Attempt, Trade, agreement_of, compress, error_of, relative_steps, scaled,
 )
 from kpc.encoder.probe import Measured
+from kpc.encoder.rounding import rounded
 from kpc.format import file
 from kpc.format.errors import TrainingError
 from kpc.format.quantise import quantise_scene
@@ -22,7 +23,8 @@ EQUAL = [{name: np.ones(plane.shape[2]) for name, plane in scale.items()} for sc
 
 def measure(scene: Scene) -> Measured:
     """A stand-in for pictures: noise of 1e-3, and what the planes err."""
-    error = float(np.mean([np.square(ours[n] - theirs[n]).mean() for ours, theirs in zip(scene.scales, SCENE.scales) for n in ours]))
+    pairs = zip(scene.scales, SCENE.scales)
+    error = float(np.mean([np.square(ours[n] - theirs[n]).mean() for ours, theirs in pairs for n in ours]))
     return Measured(-10 * math.log10(1e-3 + error), 255**2 * error)
 
 
@@ -36,7 +38,7 @@ def loss(found: Attempt) -> float:
 
 @pytest.mark.parametrize("most", [0.02, 0.05, 0.15, 0.4, 1.0])
 def test_a_loss_is_met_from_below(most: float) -> None:
-    assert (1 - TOLERANCE) * most <= loss(coded(max_loss_db=most)) <= most
+    assert 0.9 * most <= loss(coded(max_loss_db=most)) <= most
 
 
 def test_without_a_word_the_loss_is_the_default() -> None:
@@ -85,7 +87,7 @@ def test_a_larger_lam_gives_a_smaller_file() -> None:
 
 def test_where_nothing_is_good_enough_the_finest_is_taken() -> None:
     finest = quantise_scene(SCENE, scaled(EQUAL, 2.0**FINEST))
-    assert file.encode(coded(max_loss_db=-1.0).quantised) == file.encode(finest)
+    assert file.encode(coded(max_loss_db=-1.0).quantised) == file.encode(rounded(finest, SCENE))
 
 
 def test_a_psnr_that_is_not_a_number_does_not_pass() -> None:
@@ -118,8 +120,10 @@ def test_what_a_trade_may_cost_in_decibels() -> None:
 
 
 def test_steps_follow_the_curvature() -> None:
-    h = [{n: 4.0 ** -(6 * s + k) * np.tile(np.arange(1.0, p.shape[2] + 1), (*p.shape[:2], 1)) for k, (n, p) in enumerate(scale.items())}
-         for s, scale in enumerate(SCENE.scales)]  # fmt: skip
+    def of(k: int, plane: np.ndarray) -> np.ndarray:
+        return 4.0**-k * np.tile(np.arange(1.0, plane.shape[2] + 1), (*plane.shape[:2], 1))
+
+    h = [{n: of(6 * s + k, p) for k, (n, p) in enumerate(scale.items())} for s, scale in enumerate(SCENE.scales)]
     steps = relative_steps(h)
     largest = h[0]["xy"].max()
     for s, scale in enumerate(h):

@@ -31,10 +31,15 @@ from kpc.encoder.probe import Measure, Measured, Probe
 from kpc.format import file
 from kpc.format.errors import KpcError, TrainingError
 from kpc.format.scene import Scene
+from kpc.tools.provenance import machine
 from kpc.tools.rivals import RIVALS, tidied
 
 RATES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Bits per parameter that our coder is asked for, of the file and all that is in it."""
+QUALITIES = (40, 55, 70, 85, 100)
+"""And qualities, `kpc.encoder.compress.Trade`, on the probe that the scene comes with."""
+WORST_LOSS_DB = 3.0
+"""Curves are compared down to this: what is worse nobody wants."""
 VIEW_PIXELS = 1 << 15
 """Random pixels of all held-out views that codings are judged by."""
 OURS = "kpc"
@@ -44,13 +49,14 @@ Point = dict[str, Any]
 
 @dataclass(frozen=True)
 class Job:
-    """A coder and a setting for one scene. `rival`: its place in RIVALS, None for our own coder. `others_bytes`: of our file,
-    besides planes."""
+    """A coder and a setting for one scene. `rival`: its place in RIVALS, None for our own coder, which `trade` is for.
+    `others_bytes`: of our file, besides planes."""
 
     scene: Path
     rival: int | None
-    setting: float
+    setting: int | str
     others_bytes: int
+    trade: Trade = Trade()
 
 
 def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str, Any]]:
@@ -62,7 +68,9 @@ def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str,
     source = model.load(scene)
     views = None if dataset is None else held_out_views(source.scene, dataset)
     others = others_bytes(source)
-    jobs = [Job(scene, None, rate, others) for rate in RATES]
+    count = source.scene.parameter_count
+    jobs = [Job(scene, None, f"{rate:g} bits", others, Trade(target_bytes=int(rate * count / 8))) for rate in RATES]
+    jobs += [Job(scene, None, f"quality {q:g}", others, Trade(quality=q)) for q in QUALITIES]
     missing = {number: why for number, rival in enumerate(RIVALS) if (why := rival.missing())}
     jobs += [Job(scene, number, setting, others) for number, rival in enumerate(RIVALS) if number not in missing
              for setting in reversed(rival.settings)]  # fmt: skip
@@ -80,7 +88,7 @@ def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str,
 def in_parallel(jobs: Sequence[Job], views: Probe | None, processes: int) -> list[Point | None]:
     """Points of all jobs judged by `views`, or by the probe the scene comes with, in processes of their own, none with more than its share of the cores."""
     before = os.environ.get("NUMBA_NUM_THREADS")
-    os.environ["NUMBA_NUM_THREADS"] = str(max(1, len(os.sched_getaffinity(0)) // processes))
+    os.environ["NUMBA_NUM_THREADS"] = str(max(1, int(machine()["cores"]) // processes))
     try:
         with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _judge_by, (views,)) as pool:
             futures: list[Future[Point | None]] = [pool.submit(point, job) for job in jobs]
@@ -105,10 +113,9 @@ def point(job: Job) -> Point | None:
         judged = measured(replace(source.scene, scales=tuple(coding.planes)))
         size, took = coding.size_bytes + job.others_bytes, (coding.encode_s, coding.decode_s)
         return _point(job, source, size, took, uncoded.psnr, judged)
-    target = int(job.setting * source.scene.parameter_count / 8)
     started = time.perf_counter()
     try:
-        coded = model.code(source, Trade(target_bytes=target), TrainConfig().prune_share)
+        coded = model.code(source, job.trade, TrainConfig().prune_share)
     except TrainingError:
         return None
     searched = time.perf_counter()
@@ -199,16 +206,18 @@ def _drawn(scene: Scene, dataset: Dataset) -> Probe:
 
 
 def bd_rate(ours: Sequence[Point], others: Sequence[Point]) -> float | None:
-    """By what share ours are smaller (below 0) or larger at equal PSNR, on average over the PSNR that both reach.
+    """By what share ours are smaller (below 0) or larger at equal PSNR, on average over what both reach of the PSNR between that of
+    the uncoded scene and WORST_LOSS_DB less.
 
     Bjøntegaard's measure (ITU-T VCEG-M33, 2001) with piecewise cubic curves that do not overshoot (PCHIP: Fritsch and Carlson,
     SIAM J. Numer. Anal. 17, 1980; as ITU-T JVET-H0030 has it): the mean over PSNR of log(rate ratio). None where the curves have
     fewer than four points each, or no PSNR in common.
     """
     curves = [_rising(points) for points in (ours, others)]
+    best = max((point["psnr"] + point["loss_db"] for point in ours), default=0.0)
     if min(len(psnr) for psnr, _ in curves) < 4:
         return None
-    low, high = max(psnr[0] for psnr, _ in curves), min(psnr[-1] for psnr, _ in curves)
+    low, high = max(best - WORST_LOSS_DB, *(psnr[0] for psnr, _ in curves)), min(psnr[-1] for psnr, _ in curves)
     if high - low < 1e-6:
         return None
     at = np.linspace(low, high, 1001)
@@ -270,7 +279,8 @@ def _end(h0: float, h1: float, slope0: float, slope1: float) -> float:
     return 3 * slope0 if slope0 * slope1 < 0 and abs(d) > 3 * abs(slope0) else float(d)
 
 
-CSV_COLUMNS = ("name", "coder", "setting", "size_bytes", "bits_per_parameter", "psnr", "loss_db", "agreement_db", "encode_s", "decode_s")
+CSV_COLUMNS = ("name", "coder", "setting", "size_bytes", "bits_per_parameter", "psnr", "loss_db", "agreement_db", "encode_s",
+               "decode_s")  # fmt: skip
 
 
 def as_csv(records: Sequence[dict[str, Any]]) -> str:

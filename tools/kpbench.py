@@ -367,7 +367,8 @@ def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[resu
         coders = codecbench.measure(source, folder, options.processes)
         took = {"bench_s": clock.monotonic() - started}
         for coder in coders:
-            records.append(record | {"seed": None, "renderer": "cpu"} | took | coder | {"repeats": [codecbench.headline(coder["points"])]})
+            repeats = [codecbench.headline(coder["points"])]
+            records.append(record | {"seed": None, "renderer": "cpu"} | took | coder | {"repeats": repeats})
             yield records[-1]
     if options.out is not None:
         with cli.written_aside(options.out.with_suffix(".csv")) as aside:
@@ -453,7 +454,7 @@ def _parser() -> argparse.ArgumentParser:
     codec.add_argument("--dataset", type=Path, action="append", metavar="DIR",
                        help="judge by its held-out views; once for each scene, in their order (default: training pixels of a "
                             "checkpoint, a file's own pictures)")  # fmt: skip
-    codec.add_argument("--processes", type=_positive, default=len(os.sched_getaffinity(0)), metavar="N",
+    codec.add_argument("--processes", type=_positive, default=int(machine()["cores"]), metavar="N",
                        help="at a time (default: one a core)")  # fmt: skip
     codec.set_defaults(measure=_codec)
 

@@ -1,4 +1,4 @@
-"""Quality and size against seconds of training, from the records of `kpbench curve`; rate against distortion, from `kpbench codec`.
+"""Quality and size against seconds of training, from records of `kpbench curve`; rate against distortion, from `kpbench codec`.
 
 python -m kpc.tools.plot docs/bench/curve.json -o docs/curve.svg
 python -m kpc.tools.plot docs/bench/codec.json -o docs/codec.svg

@@ -179,7 +179,24 @@ def _smaller(record: Record) -> str:
 def _shares(record: Record) -> str:
     """Of our bytes, by kind of chunk, the largest first."""
     shares: dict[str, float] = record["repeats"][0].get("shares") or {}
-    return ", ".join(f"{kind} {share:.0%}" for kind, share in sorted(shares.items(), key=lambda kind: -kind[1]) if share >= 0.01) or "-"
+    largest = sorted(shares.items(), key=lambda share: -share[1])
+    return ", ".join(f"{kind} {share:.0%}" for kind, share in largest if share >= 0.01) or "-"
+
+
+def _quality_table(records: Iterable[Record]) -> list[list[str]]:
+    """What each quality gives: of our coder alone, bytes and loss."""
+    rows = []
+    for record in records:
+        if record["coder"] == "kpc":
+            labelled = ((str(point["setting"]), point) for point in record["points"])
+            points = {label.removeprefix("quality "): point for label, point in labelled if label.startswith("quality ")}
+            rows.append((record["name"], points))
+    qualities = sorted({quality for _, points in rows for quality in points}, key=float)
+
+    def cell(point: Record | None) -> str:
+        return "-" if point is None else f"{point['size_bytes'] / 1e3:.0f} KB, {point['loss_db']:.2f} dB"
+
+    return [["scene", *qualities]] + [[name, *(cell(points.get(quality)) for quality in qualities)] for name, points in rows]
 
 
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
@@ -207,17 +224,25 @@ def markdown(records: Sequence[Record]) -> str:
         for place in dict.fromkeys(map(_place, ours)):
             here = [record for record in ours if _place(record) == place]
             head, *rows = cells(kind, here)
-            lines = [head, ["---"] * len(head), *rows]
+            lines = _lines(head, rows)
             runs = sorted({len(record["repeats"]) for record in here})
             commits = ", ".join(dict.fromkeys(_short(record["commit"]) for record in here))
             parts.append(f"**{title}** on {place}:")
-            parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
+            parts.append(lines)
+            if kind == "codec":
+                parts.append("The same by `--quality`, size and PSNR loss:")
+                head, *rows = _quality_table(here)
+                parts.append(_lines(head, rows))
             parts.append(
                 f"Commit {commits}; median of {' or '.join(map(str, runs))} run{'s' * (runs != [1])}; "
                 + "; ".join(dict.fromkeys(f"`{record['command']}`" for record in here))
                 + "."
             )
     return "\n\n".join(parts)
+
+
+def _lines(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(line)} |" for line in [head, ["---"] * len(head), *rows])
 
 
 def _place(record: Record) -> str:

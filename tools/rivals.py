@@ -129,7 +129,7 @@ class Bytes(Rival):
     """Channels from their least to their largest number in uint8, through zstd -19. Setting: bits, the number of levels."""
 
     name = "uint8 + zstd -19"
-    settings = (8, 7, 6, 5, 4, 3)
+    settings = (8, 7, 6, 5, 4)
 
     def encode(self, planes: Planes, setting: int) -> list[bytes]:
         levels, side = _levels(planes, 2**setting - 1)
@@ -196,11 +196,13 @@ def _uncanvassed(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class Video(Rival):
-    """Ten-bit grey video through ffmpeg: one a scale, its planes packed into a canvas, a frame for each channel, so that channels
-    may be predicted from one another. Setting: the encoder's constant quality."""
+    """Ten-bit grey video through ffmpeg: one a scale, its planes packed into a canvas, a frame for each channel. Each frame stands
+    alone: predicting channels from one another made files larger. Setting: the encoder's quantiser."""
 
-    def __init__(self, name: str, encoder: str, settings: tuple[int, ...], pix_fmt: str, options: tuple[str, ...]) -> None:
-        self.name, self.encoder, self.settings, self.pix_fmt, self.options = name, encoder, settings, pix_fmt, options
+    PIX_FMT = "gray10le"
+
+    def __init__(self, name: str, encoder: str, settings: tuple[int, ...], options: tuple[str, ...]) -> None:
+        self.name, self.encoder, self.settings, self.options = name, encoder, settings, options
 
     def missing(self) -> str | None:
         return None if self.encoder in _encoders() else f"this ffmpeg has no {self.encoder}"
@@ -215,22 +217,16 @@ class Video(Rival):
         planes = []
         for blob, scale in zip(blobs, shapes):
             height, width = _canvas_size(scale)
-            raw = np.frombuffer(_ffmpeg(["-i", "-", "-f", "rawvideo", "-pix_fmt", self.pix_fmt, "-"], blob), "<u2")
-            frames = raw.reshape(-1, self._frame_numbers(height, width))[:, : height * width].reshape(-1, height, width)
-            planes.append(_unpacked(frames, scale))
+            raw = np.frombuffer(_ffmpeg(["-i", "-", "-f", "rawvideo", "-pix_fmt", self.PIX_FMT, "-"], blob), "<u2")
+            planes.append(_unpacked(raw.reshape(-1, height, width), scale))
         return _unlevelled(planes, blobs[-1])
 
     def _video(self, frames: np.ndarray, setting: int) -> bytes:
-        count, height, width = frames.shape
-        grey = np.full((count, self._frame_numbers(height, width)), 512, "<u2")  # chroma, where there is any, says nothing
-        grey[:, : height * width] = frames.reshape(count, -1)
+        _, height, width = frames.shape
         kind = "hevc" if "265" in self.encoder else "obu"
         options = [option.format(setting) for option in self.options]
-        source = ["-f", "rawvideo", "-pix_fmt", self.pix_fmt, "-s", f"{width}x{height}", "-r", "25", "-i", "-"]
-        return _ffmpeg([*source, "-c:v", self.encoder, *options, "-f", kind, "-"], grey.tobytes())
-
-    def _frame_numbers(self, height: int, width: int) -> int:
-        return height * width * 3 // 2 if "420" in self.pix_fmt else height * width
+        source = ["-f", "rawvideo", "-pix_fmt", self.PIX_FMT, "-s", f"{width}x{height}", "-r", "25", "-i", "-"]
+        return _ffmpeg([*source, "-c:v", self.encoder, *options, "-f", kind, "-"], frames.astype("<u2").tobytes())
 
 
 def _canvas_size(shapes: Mapping[str, tuple[int, ...]]) -> tuple[int, int]:
@@ -275,7 +271,10 @@ def _encoders() -> frozenset[str]:
 
 def _ffmpeg(words: Sequence[str], data: bytes) -> bytes:
     command = [ffmpeg_binary(), "-hide_banner", "-v", "error", *words]
-    done = subprocess.run(command, input=data, capture_output=True, check=False, timeout=TIMEOUT_S)
+    try:
+        done = subprocess.run(command, input=data, capture_output=True, check=False, timeout=TIMEOUT_S)
+    except subprocess.TimeoutExpired as error:
+        raise MediaError(f"ffmpeg: takes longer than {TIMEOUT_S} s") from error
     if done.returncode != 0:
         said = done.stderr.decode(errors="replace").strip().splitlines() or ["it says nothing"]
         raise MediaError(f"ffmpeg: {said[-1]}")
@@ -331,8 +330,7 @@ def _cut(values: np.ndarray, shapes: Sequence[Mapping[str, tuple[int, ...]]]) ->
 
 RIVALS: tuple[Rival, ...] = (
     Half("zstd -19"), Half("xz -9"), Bytes(), Pictures("png"), Pictures("webp"),
-    Video("HEVC", "libx265", (4, 10, 16, 22, 28, 34), "gray10le",
-          ("-preset", "slow", "-tune", "psnr", "-x265-params", "crf={}:log-level=none:info=0")),
-    Video("AV1", "libsvtav1", (4, 12, 20, 30, 40, 50), "yuv420p10le",
-          ("-preset", "3", "-crf", "{}", "-svtav1-params", "tune=1:enable-overlays=0")),
+    Video("HEVC", "libx265", (10, 14, 18, 22, 27, 33),
+          ("-preset", "slow", "-tune", "psnr", "-x265-params", "qp={}:keyint=1:info=0")),
+    Video("AV1", "libaom-av1", (4, 8, 12, 18, 26, 36), ("-usage", "allintra", "-cpu-used", "4", "-crf", "{}", "-b:v", "0")),
 )  # fmt: skip

@@ -1,0 +1,152 @@
+"""Rate against distortion beside other tools: the figures, the curves, and the whole command."""
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from datasets import write_n3dv
+from scenes import tiny_scene
+
+from kpc.format import file
+from kpc.format.quantise import quantise_scene
+from kpc.tools import codecbench, kpbench, plot, results
+from kpc.tools.codecbench import Point, bd_rate, headline, pchip, size_at
+from kpc.tools.rivals import Bytes, Half, Video
+
+
+def points(scale: float, psnrs: tuple[float, ...] = (27.0, 28.0, 29.0, 29.7, 29.9)) -> list[Point]:
+    """A curve whose sizes double with every decibel, times a factor; the uncoded scene has 30 dB."""
+    return [{"psnr": p, "loss_db": 30 - p, "size_bytes": scale * 1000 * 2 ** (p - 27)} for p in psnrs]
+
+
+def test_the_same_curve_at_half_the_rate_is_half_as_large() -> None:
+    assert bd_rate(points(0.5), points(1.0)) == pytest.approx(-0.5, abs=1e-9)
+    assert bd_rate(points(1.3), points(1.0)) == pytest.approx(0.3, abs=1e-9)
+    other = points(1.0, (26.0, 27.5, 28.5, 29.2, 29.8, 29.95))
+    assert bd_rate(points(0.6), other) == pytest.approx(-0.4, abs=1e-9)
+
+
+def test_curves_are_compared_where_both_are_and_not_below_the_worst_loss() -> None:
+    far = [{"psnr": p, "loss_db": 30 - p, "size_bytes": 10.0 * (p + 1)} for p in (1.0, 5.0, 10.0, 20.0)]
+    assert bd_rate(points(0.5) + far, points(1.0) + far) == pytest.approx(-0.5, abs=0.02)
+    assert bd_rate(points(1), [p | {"psnr": p["psnr"] - 20} for p in points(1)]) is None
+    assert bd_rate(points(1)[:3], points(1)) is None and bd_rate([], points(1)) is None
+
+
+def test_points_that_a_smaller_one_beats_count_for_nothing() -> None:
+    worse = {"psnr": 27.5, "loss_db": 2.5, "size_bytes": 9e9}
+    assert bd_rate([*points(0.5), worse], points(1.0)) == pytest.approx(-0.5, abs=1e-9)
+
+
+def test_pchip_goes_through_its_points_and_never_overshoots() -> None:
+    x, y = np.array([0.0, 1, 1.5, 4, 5]), np.array([0.0, 0, 3, 3.1, 9])
+    np.testing.assert_allclose(pchip(x, y, x), y, atol=1e-12)
+    at = np.linspace(0, 5, 501)
+    fine = pchip(x, y, at)
+    assert (np.diff(fine) >= -1e-12).all() and fine.min() >= 0 and fine.max() <= 9
+    np.testing.assert_allclose(pchip(x, 2 * x + 1, at), 2 * at + 1)
+    inside = np.abs(np.diff(pchip(x, y, 1 + np.array([-1e-6, 0, 1e-6]))))
+    assert inside[0] == pytest.approx(inside[1], abs=1e-9)  # its slope is continuous: 0 on both sides of a flat piece
+
+
+def test_what_a_table_shows() -> None:
+    assert size_at(points(1.0), 0.15) == pytest.approx(1000 * 2**2.85)
+    assert size_at(points(1.0), 9.0) is None and size_at([], 1.0) is None
+    shown = headline(points(1.0))
+    assert shown["loss_db"] == pytest.approx(0.1) and shown["size_at_default_loss"] == size_at(points(1.0), 0.15)
+    assert headline([]) == {}
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    scene = tiny_scene(3)
+    file.write(quantise_scene(scene, [{name: 0.002 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
+    return tmp_path / "scene.kpc"
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here, and with little to do; what it does in processes of its own one test says."""
+    def here(jobs: list[codecbench.Job], views: object, processes: int) -> list[Point | None]:
+        codecbench._source.cache_clear()
+        codecbench._judge_by(views)  # type: ignore[arg-type]
+        try:
+            return [codecbench.point(job) for job in jobs]
+        finally:
+            codecbench._judge_by(None)
+
+    monkeypatch.setattr(codecbench, "in_parallel", here)
+    monkeypatch.setattr("kpc.encoder.probe.PROBE_RAYS", 512)
+    monkeypatch.setattr(codecbench, "RATES", (1e-3, 3.0, 4.0))
+    monkeypatch.setattr(codecbench, "QUALITIES", (60, 70, 80, 90))
+    monkeypatch.setattr(codecbench, "RIVALS", (Half("zstd -19"), Bytes(), Video("X", "libnothing", (1,), ())))
+
+
+def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "codec.json"
+    assert kpbench.main(["codec", str(scene_file), "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    records = results.load([out])
+    assert [record["coder"] for record in records] == ["kpc", "fp16 + zstd -19", "uint8 + zstd -19", "X"]
+    ours, halves, levels, missing = records
+    assert missing["missing"] == "this ffmpeg has no libnothing" and missing["points"] == [] and missing["bd_rate"] is None
+    assert len(halves["points"]) == 6 and halves["bd_rate"] is not None
+    whole = scene_file.stat().st_size
+    assert len(ours["points"]) == 6  # no file has a thousandth of a bit
+    for found in ours["points"]:
+        assert found["size_bytes"] <= whole and sum(found["shares"].values()) == pytest.approx(1)
+        assert found["bits_per_parameter"] == pytest.approx(8 * found["size_bytes"] / tiny_scene(3).parameter_count)
+    rates = [p["size_bytes"] for p in ours["points"][:2]]
+    assert rates[0] <= 3 * tiny_scene(3).parameter_count / 8 and rates[0] < rates[1]
+    for found, quality in zip(ours["points"][2:], (60, 70, 80, 90), strict=True):
+        assert found["setting"] == f"quality {quality}"
+        assert 0 <= found["agreement_db"] - (20 + quality / 3) < 1  # a file's own rounding is not much finer
+    assert "| scene | 60 | 70 | 80 | 90 |" in results.markdown(records)
+    others = codecbench.others_bytes(codecbench.model.load(scene_file))
+    assert min(p["size_bytes"] for p in halves["points"]) > others > 100
+    assert all("its own probe" == record["settings"]["judged_by"] for record in records)
+    assert "kpc is smaller by" in said.err and "Coding, beside what is at hand" in results.markdown(records)
+    with (tmp_path / "codec.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    assert len(rows) == 6 + 6 + 5 and {row["coder"] for row in rows} == {"kpc", "fp16 + zstd -19", "uint8 + zstd -19"}
+    assert float(rows[0]["size_bytes"]) == ours["points"][0]["size_bytes"]
+    svg = (tmp_path / "codec.svg").read_text()
+    assert "uint8 + zstd -19" in svg and "bits per parameter" in svg
+    assert plot.main([str(out), "-o", str(tmp_path / "again.svg")]) == 0
+    assert (tmp_path / "again.svg").read_text() == svg
+
+
+def test_held_out_views_judge(few: None, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_n3dv(tmp_path / "set", cameras=3)
+    monkeypatch.setattr(codecbench, "VIEW_PIXELS", 256)
+    out = tmp_path / "codec.json"
+    assert kpbench.main(["codec", str(scene_file), "--dataset", str(tmp_path / "set"), "--out", str(out)]) == 0
+    records = results.load([out])
+    assert records[0]["settings"]["judged_by"] == "held-out views of set"
+    psnrs = {round(p["psnr"] + p["loss_db"], 6) for record in records for p in record["points"]}
+    assert len(psnrs) == 1 and 3 < psnrs.pop() < 25  # one uncoded scene, and not what these pictures show
+
+
+def test_processes_of_their_own(scene_file: Path) -> None:
+    jobs = [codecbench.Job(scene_file, None, "quality 5", 0, codecbench.Trade(quality=5.0)), codecbench.Job(scene_file, 2, 4, 100)]
+    ours, levels = codecbench.in_parallel(jobs, None, 2)
+    assert ours is not None and levels is not None and ours["psnr"] < 30 and levels["size_bytes"] > 100
+    assert math.isfinite(levels["psnr"])
+
+
+def test_errors_are_one_line(few: None, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "bad").write_bytes(b"nonsense")
+    for words in (["codec", str(tmp_path / "bad")], ["codec", str(tmp_path / "none.kpc")],
+                  ["codec", str(scene_file), "--dataset", str(tmp_path / "no")],
+                  ["codec", str(scene_file), "--dataset", ".", "--dataset", "."]):  # fmt: skip
+        assert kpbench.main(words) in (1, 2)
+        said = capsys.readouterr()
+        assert said.out == "" and said.err.splitlines()[-1].startswith("kpbench: ") and "Traceback" not in said.err
+
+
+def test_records_survive_json(few: None, scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert kpbench.main(["codec", str(scene_file)]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["kind"] == "codec"
