@@ -49,6 +49,7 @@ _LOGARITHMS = np.array([0, 0] + [2 * (k.bit_length() - 2) + (k >> k.bit_length()
 
 def encode_symbols(symbols: np.ndarray, coded: np.ndarray) -> bytes:
     """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False, with as many sets of weights as make it shortest."""
+    symbols, coded = np.array(symbols, order="C"), np.array(coded, order="C")  # compiled for this layout; and `walk` writes
     values = int(coded.sum()) * symbols.shape[2]
     trace, neighbours = np.empty(values * MOST_DECISIONS, np.int16), np.empty((values, 2 + WEIGHTS), np.int16)
     walk(symbols, coded, np.zeros((1, WEIGHTS), np.int8), 0, 0, None, trace, neighbours)
@@ -57,6 +58,7 @@ def encode_symbols(symbols: np.ndarray, coded: np.ndarray) -> bytes:
 
 def encode_with(weights: np.ndarray, symbols: np.ndarray, coded: np.ndarray) -> bytes:
     """The same, with (C, WEIGHTS) int8 weights that are given; C is one of SET_COUNTS."""
+    symbols, coded = np.array(symbols, order="C"), np.array(coded, order="C")
     trace, at = np.empty(coded.size + int(coded.sum()) * symbols.shape[2] * MOST_DECISIONS, np.int16), 0
     has_map = not coded.all()
     if has_map:
@@ -99,7 +101,7 @@ def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple
 def fitted(neighbours: np.ndarray, count: int) -> np.ndarray:
     """(count, WEIGHTS) int8: weights that make the sum of absolute errors small, for each class of slopes.
 
-    Least squares, reweighted by the errors (Lawson's algorithm turned to the 1-norm); an encoder may take any weights.
+    Iteratively reweighted least squares; an encoder may take any weights.
 
     Args:
         neighbours: (N, 2 + WEIGHTS) int16 from `walk`: slope, twice the differences to their mean of symbol and neighbours.

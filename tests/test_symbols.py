@@ -75,6 +75,15 @@ def test_smooth_planes_take_far_less_than_with_zstd():
     assert len(body) < 0.85 * len(frame)
 
 
+def test_arrays_may_have_any_layout_and_are_left_as_they_are():
+    symbols, coded = textured(9, 11, 3)
+    body = encode_symbols(symbols, coded)
+    across = np.asfortranarray(symbols)[:, :, :]
+    for array in (symbols, across, coded):
+        array.flags.writeable = False
+    assert encode_symbols(symbols, coded) == encode_symbols(across, np.asfortranarray(coded)) == body
+
+
 def test_noise_takes_hardly_more_than_it_holds():
     symbols, coded = painted("noise", (40, 40, 4), 0, 1.0)
     assert len(encode_symbols(symbols, coded)) < 1.15 * symbols.size
