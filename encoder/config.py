@@ -73,6 +73,9 @@ class TrainConfig:
     and 1.3 dB at 0.03, where what rests loses 0.8 dB; at 0.1 it loses 0.1 dB, room 0.6 dB."""
     channel_dropout: float = 0.0
     """Share of the channels that a step leaves out, others each step, so that none relies on another."""
+    scale_dropout: float = 0.1
+    """Share of the steps that leave out the finer scales, from any of them on, so that the coarser ones make a picture alone: it is what
+    a player shows first of a scene that arrives (spec/kpc-format.md, section 10). @@"""
     learning_rate: float = 4e-2
     """Of the planes at its peak. K-Planes uses 1e-2 with 30,000 steps."""
     decoder_learning_rate: float = 1e-2
@@ -147,7 +150,7 @@ class TrainConfig:
         for name in positive:
             if getattr(self, name) < 1:
                 raise UsageError(f"{name} must be at least 1, not {getattr(self, name)}")
-        for name in ("object_rays", "channel_dropout"):
+        for name in ("object_rays", "channel_dropout", "scale_dropout"):
             if not 0 <= getattr(self, name) < 1:
                 raise UsageError(f"{name} must be at least 0 and less than 1, not {getattr(self, name)}")
         for name in ("temporal_start", "temporal_floor", "time_tolerance", "prune_share"):

@@ -39,15 +39,19 @@ class Stopwatch:
 
 
 def kept_channels(field: Field, config: TrainConfig, step: int) -> torch.Tensor:
-    """Factors on the features for one step, (F,) float32 on the CPU: 0 where `channel_dropout` leaves a channel out, at all scales alike.
+    """Factors on the features for one step, (F,) float32 on the CPU: 0 where `channel_dropout` leaves a channel out, at all scales alike,
+    or `scale_dropout` a scale and all finer ones.
 
-    The others carry its weight: the mean over steps is 1.
+    Of channels the others carry the weight: its mean over steps is 1. Not so of scales: what is coarse is to be a picture by itself.
     """
-    M = field.layout.channels
+    M, scales = field.layout.channels, len(field.layout.resolution)
+    rng = np.random.default_rng((config.seed, step))
     dropped = min(round(config.channel_dropout * M), M - 1)
-    factors = np.full(M, M / (M - dropped), np.float32)
-    factors[np.random.default_rng((config.seed, step)).permutation(M)[:dropped]] = 0
-    return torch.from_numpy(np.tile(factors, len(field.layout.resolution)))
+    factors = np.full((scales, M), M / (M - dropped), np.float32)
+    factors[:, rng.permutation(M)[:dropped]] = 0
+    if scales > 1 and rng.random() < config.scale_dropout:
+        factors[rng.integers(1, scales):] = 0
+    return torch.from_numpy(factors.ravel())
 
 
 class FusedOptimiser:

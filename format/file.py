@@ -290,8 +290,8 @@ def read(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, memory
 
     Args:
         memory_budget: bytes that the scene may take, its float32 planes included.
-        allow_partial: accept a file whose end is missing, as long as SCNE, DECO and OCCU are there. Segments that are
-            not there are uncoded.
+        allow_partial: accept a file whose end is missing, as long as SCNE, DECO and OCCU are there. Space planes that
+            are not there have the value 0, rows of time planes 1.
 
     Raises:
         FormatError: the file is damaged, hostile or of an unknown version.
@@ -299,12 +299,14 @@ def read(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, memory
     """
     reader = SceneReader(source, memory_budget=memory_budget, allow_partial=allow_partial)
     reader.source.hold(0, reader.source.size)
+    segments = [number for number, entry in enumerate(reader.index) if entry.kind == "PLNE" and reader.available(number)]
+    held = {(reader.index[number].scale, ALL_PLANES[reader.index[number].plane]) for number in segments}
     scales = tuple({
-        name: QuantisedPlane(np.zeros((p.rows, p.columns, p.channels), np.int8), p.step, p.offset,
+        name: QuantisedPlane(np.zeros((p.rows, p.columns, p.channels), np.int8), p.step,
+                             p.offset if name in TIME_PLANES or (s, name) in held else np.zeros_like(p.offset),
                              np.zeros((p.rows, p.columns), bool))
         for name, p in scale.items()
-    } for scale in reader.head.scales)
-    segments = [number for number, entry in enumerate(reader.index) if entry.kind == "PLNE" and reader.available(number)]
+    } for s, scale in enumerate(reader.head.scales))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number, (decoded, coded) in zip(segments, pool.map(reader.segment, segments), strict=True):
             entry = reader.index[number]

@@ -5,7 +5,7 @@
     scene.fetch(scene.needed(scales=1, start=0.0, end=0.2))       nothing else is read
     kpc.render(scene.scene, scene.scene.cameras[0], time=0.1)
 
-Planes that are not there have the value `offset`, rows of time that are not there 1. They take no memory.
+Space planes that are not there have the value 0, rows of time that are not there 1. They take no memory.
 """
 
 from bisect import bisect_right
@@ -163,4 +163,4 @@ def hold(reader: Reader, run: Sequence[int]) -> None:
 
 
 def _unseen(plane: PlaneHead) -> np.ndarray:
-    return np.broadcast_to(plane.offset, (plane.rows, plane.columns, plane.channels))
+    return np.broadcast_to(np.float32(0), (plane.rows, plane.columns, plane.channels))

@@ -146,8 +146,8 @@ def decode(data, partial=False):
     for scale in scene["scales"]:
         for plane in scale["planes"].values():  # uncoded until a segment says otherwise
             texels = plane["rows"] * plane["columns"]
-            plane["coded"], plane["symbols"], plane["next_row"], plane["segments"] = [0] * texels, \
-                [0] * (texels * scale["channels"]), 0, 0
+            plane["coded"], plane["symbols"], plane["next_row"], plane["segments"], plane["held"] = [0] * texels, \
+                [0] * (texels * scale["channels"]), 0, 0, False
     for scale, number, start, rows, raw in sorted(segments, key=lambda s: s[:3]):
         require(scale < len(scene["scales"]) and number < 6, "place")
         planes, name = scene["scales"][scale]["planes"], PLANES[number]
@@ -156,6 +156,7 @@ def decode(data, partial=False):
         plane["next_row"] += rows
         plane["segments"] += 1
         if raw is not None:
+            plane["held"] = True
             if isinstance(raw, tuple):
                 require(raw[0] == rows * plane["columns"] * channels, "number of symbols")
                 coded, symbols = context_coded(Bytes(raw[1]), rows, plane["columns"], channels)
@@ -169,6 +170,8 @@ def decode(data, partial=False):
         for name, plane in scale["planes"].items():
             require(plane["next_row"] == plane["rows"], "rows left out")
             require(name in PLANES[3:] or plane["segments"] == 1, "a space plane in pieces")
+            if name in PLANES[:3] and not plane["held"]:  # section 10
+                plane["offset"] = [0.0] * channels
             plane["values"] = [f32(f32(s * plane["step"][i % channels]) + plane["offset"][i % channels])
                                for i, s in enumerate(plane["symbols"])]
     return scene

@@ -153,7 +153,7 @@ def test_features_multiply_planes_and_concatenate_scales() -> None:
     [
         {"channels": 0}, {"steps": 0}, {"rays": -1}, {"resolutions": ()}, {"resolutions": (64, 1)}, {"object_rays": 1.0},
         {"temporal_start": -0.1}, {"temporal_floor": 1.1},
-        {"channel_dropout": -0.1}, {"channel_dropout": 1.0},
+        {"channel_dropout": -0.1}, {"channel_dropout": 1.0}, {"scale_dropout": -0.1}, {"scale_dropout": 1.0},
         {"appearance": "sometimes"}, {"appearance": "image", "view_dependent": False},
     ],
 )

@@ -22,6 +22,7 @@ from kpc.encoder.sampler import RaySampler
 from kpc.encoder.train import Report, Trainer
 from kpc.format.errors import TrainingError
 from kpc.format.media import read_image, write_image
+from kpc.format.scene import SPACE_PLANES
 from kpc.format.space import Contraction
 
 CONFIG = TrainConfig(
@@ -435,15 +436,40 @@ def test_transparent_pictures_have_no_frame(moving: Dataset) -> None:
     assert len(batch.times) == 100
 
 
+def test_finer_scales_are_left_out_now_and_then(moving: Dataset) -> None:
+    """Each step all, or the scales from any but the first on; what is left is as it was."""
+    run = trainer(moving, resolutions=(8, 12, 16), scale_dropout=0.5)
+    M = run.field.layout.channels
+    kept = torch.stack([kept_channels(run.field, run.config, step) for step in range(400)]).view(400, 3, M)
+    assert torch.equal(kept, kept[..., :1].expand_as(kept)) and set(kept.unique().tolist()) == {0.0, 1.0}
+    left = kept[:, :, 0].sum(1)
+    assert (kept[:, :-1] >= kept[:, 1:]).all() and set(left.tolist()) == {1.0, 2.0, 3.0}
+    assert 0.4 < (left < 3).float().mean() < 0.6
+
+
+def test_coarse_scales_make_a_picture_alone(moving: Dataset) -> None:
+    """What is left when the finer scale counts as 0 is nearer to the pictures if training has left it out at times."""
+    def coarse(scale_dropout: float) -> float:
+        run = trainer(moving, steps=150, scale_dropout=scale_dropout)
+        run.run(lambda report: None)
+        scene = to_scene(run)
+        finer = {name: np.zeros_like(plane) if name in SPACE_PLANES else plane for name, plane in scene.scales[1].items()}
+        quality = evaluate(replace(scene, scales=(scene.scales[0], finer)), moving, most=4)
+        assert quality is not None
+        return quality.psnr
+
+    assert coarse(0.2) > coarse(0.0) + 1
+
+
 def test_dropped_channels_take_no_part(moving: Dataset) -> None:
     """Every scale leaves out the same ones, each step others, and the mean over steps is 1."""
-    run = trainer(moving, channel_dropout=0.25)
+    run = trainer(moving, channel_dropout=0.25, scale_dropout=0.0)
     kept = torch.stack([kept_channels(run.field, run.config, step) for step in range(400)])
     M = run.field.layout.channels
     assert kept.shape == (400, 2 * M) and torch.equal(kept[:, :M], kept[:, M:])
     assert ((kept == 0).sum(1) == 2 * M // 4).all() and len(torch.unique(kept, dim=0)) > 10
     torch.testing.assert_close(kept.mean(0), torch.ones(2 * M), atol=0.15, rtol=0)
-    assert torch.equal(kept_channels(run.field, CONFIG, 3), torch.ones(2 * M))
+    assert torch.equal(kept_channels(run.field, replace(CONFIG, scale_dropout=0.0), 3), torch.ones(2 * M))
     before = run.field.theta.detach().clone()
     batch, targets = run.sampler.draw(run.rng, 256)
     run.optimiser.field, run.optimiser.config = run.field, replace(run.config, regularise_every=1000)
