@@ -13,6 +13,7 @@ from imgui_bundle import imgui
 
 from kpc.format.errors import DisplayError
 from kpc.format.media import write_image
+from kpc.format.scene import HybridDecoder
 from kpc.player.controls import SPEEDS, Pace, Playback, View, Wardrobe
 from kpc.player.orbit import Rig
 from kpc.player.overlay import Overlay
@@ -235,6 +236,7 @@ class Player:
         self.canvas = self.ctx.framebuffer([self.ctx.texture(pixels, 4)])
         red, green, blue = map(float, self.scene.background)
         self.canvas.clear(red, green, blue)
+        self.raster = pixels
         self._drawn = ()
 
     def _draw(self, now: float) -> None:
@@ -394,6 +396,8 @@ class Player:
             imgui.text_disabled(f"{self.samples:.1f} samples a ray")
             imgui.text_disabled(f"{self.renderer.memory_bytes / 1e6:.0f} MB of textures")
             imgui.text_disabled(self.device.split("(")[0].strip())
+            if isinstance(self.scene.decoder, HybridDecoder):
+                imgui.text_disabled("hybrid decoder: plays slower")
             if not self.stream.is_settled:
                 imgui.text_disabled(f"{self.stream.share_here:.0%} here, {self.stream.rate / 1e3:,.0f} KB/s")
             imgui.separator()
