@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from kpc.encoder.config import TrainConfig
+from kpc.encoder.config import PROGRESSIVE, TrainConfig
 
 ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "as it is": lambda c: c,
@@ -27,7 +27,7 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "rows of time by the preset": lambda c: replace(c, time_tolerance=0.0),
     "nothing left out": lambda c: replace(c, prune_share=0.0),
     "no channel dropout": lambda c: replace(c, channel_dropout=0.0),
-    "no scale dropout": lambda c: replace(c, scale_dropout=0.0),
+    "finer scales left out at times": lambda c: replace(c, scale_dropout=PROGRESSIVE),
 }
 """What is changed, by name, the unchanged run first. Appearances act through what "one colour from all sides" leaves out. Runs with
 appearances are scored on right halves of pictures (`evaluate`), those without on whole ones."""

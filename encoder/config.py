@@ -73,9 +73,10 @@ class TrainConfig:
     and 1.3 dB at 0.03, where what rests loses 0.8 dB; at 0.1 it loses 0.1 dB, room 0.6 dB."""
     channel_dropout: float = 0.0
     """Share of the channels that a step leaves out, others each step, so that none relies on another."""
-    scale_dropout: float = 0.1
-    """Share of the steps that leave out the finer scales, from any of them on, so that the coarser ones make a picture alone: it is what
-    a player shows first of a scene that arrives (spec/kpc-format.md, section 10). @@"""
+    scale_dropout: float = 0.0
+    """Share of the steps that leave out the finer scales, from any of them on, so that the coarser ones make a picture alone, the first
+    that a player shows of a scene that arrives (spec/kpc-format.md, section 10). After 3,000 steps of `fast` the coarse scale of the
+    default scene has 13.3 dB alone; with 0.1, 27.4 and 26.7 dB (two seeds), and all scales together 0.3 and 0.4 dB less."""
     learning_rate: float = 4e-2
     """Of the planes at its peak. K-Planes uses 1e-2 with 30,000 steps."""
     decoder_learning_rate: float = 1e-2
@@ -187,6 +188,9 @@ class TrainConfig:
                        frames_per_row=2 * self.frames_per_row, motion_cells=10, channel_dropout=0.25, view_dependent=False,
                        samples_across=max(32, self.samples_across // 2), steps=2 * self.steps)
 
+
+PROGRESSIVE = 0.1
+"""`scale_dropout` of scenes that are to be seen while they arrive."""
 
 PRESETS = {
     "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500,

@@ -8,7 +8,7 @@ from pathlib import Path
 from kpc.encoder.ablations import ABLATIONS
 from kpc.encoder.appearances import choose_kind
 from kpc.encoder.compress import DEFAULT_LOSS_DB, Trade
-from kpc.encoder.config import APPEARANCES, PRESETS, TrainConfig
+from kpc.encoder.config import APPEARANCES, PRESETS, PROGRESSIVE, TrainConfig
 from kpc.encoder.datasets import Dataset
 from kpc.format import cli
 
@@ -26,6 +26,7 @@ class Options:
     preset: str = "balanced"
     decoder: str = "explicit"
     sampling: str = "grid"
+    progressive: bool = False
     steps: int | None = None
     time_budget_s: float | None = None
     seed: int = 0
@@ -54,6 +55,7 @@ class Options:
             config = config.for_lone_object()
         appearance, _ = self.appearance_of(dataset)
         config = replace(config, hybrid=self.decoder == "hybrid", proposals=self.sampling == "proposals", seed=self.seed,
+                         scale_dropout=PROGRESSIVE if self.progressive else config.scale_dropout,
                          steps=self.steps or config.steps, appearance=appearance,
                          view_dependent=config.view_dependent or appearance != "none")  # codes act through the direction MLP
         return ABLATIONS[self.ablation](config)
@@ -80,6 +82,9 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     parser.add_argument("--sampling", choices=("grid", "proposals"), default="grid",
                         help="where to look on a ray while training: where an occupancy grid is set, or where two small fields "
                              "say; what is written is marched through the grid either way (default: grid)")
+    parser.add_argument("--progressive", action="store_true",
+                        help="train the coarse scales to make a picture alone, for scenes that are seen while they arrive; costs "
+                             "some 0.4 dB of the whole")
     parser.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
     parser.add_argument("--time-budget", type=cli.duration_s, metavar="10m", help="train for so long instead of a number of steps")
     parser.add_argument("--seed", type=_seed, default=0, help="of everything random (default: 0)")
@@ -117,8 +122,8 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
         for name, value in vars(a).items():
             if name not in CODING and value != parser.get_default(name):
                 parser.error(f"--{name.replace('_', '-')}: {a.source} is trained already, it can only be coded anew; drop it")
-    options = Options(a.source, a.output, a.preset, a.decoder, a.sampling, a.steps, a.time_budget, a.seed, a.device, a.downscale,
-                      a.holdout, a.space, a.box, a.appearance, a.work, a.keep, a.resume, a.test_views,
+    options = Options(a.source, a.output, a.preset, a.decoder, a.sampling, a.progressive, a.steps, a.time_budget, a.seed, a.device,
+                      a.downscale, a.holdout, a.space, a.box, a.appearance, a.work, a.keep, a.resume, a.test_views,
                       Trade(a.max_loss, a.target_size, a.quality, a.lam), a.keep_checkpoint)
     if a.dry_run and a.resume:
         parser.error("--dry-run tells what a whole run takes; drop --resume")

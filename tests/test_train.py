@@ -463,13 +463,13 @@ def test_coarse_scales_make_a_picture_alone(moving: Dataset) -> None:
 
 def test_dropped_channels_take_no_part(moving: Dataset) -> None:
     """Every scale leaves out the same ones, each step others, and the mean over steps is 1."""
-    run = trainer(moving, channel_dropout=0.25, scale_dropout=0.0)
+    run = trainer(moving, channel_dropout=0.25)
     kept = torch.stack([kept_channels(run.field, run.config, step) for step in range(400)])
     M = run.field.layout.channels
     assert kept.shape == (400, 2 * M) and torch.equal(kept[:, :M], kept[:, M:])
     assert ((kept == 0).sum(1) == 2 * M // 4).all() and len(torch.unique(kept, dim=0)) > 10
     torch.testing.assert_close(kept.mean(0), torch.ones(2 * M), atol=0.15, rtol=0)
-    assert torch.equal(kept_channels(run.field, replace(CONFIG, scale_dropout=0.0), 3), torch.ones(2 * M))
+    assert torch.equal(kept_channels(run.field, CONFIG, 3), torch.ones(2 * M))
     before = run.field.theta.detach().clone()
     batch, targets = run.sampler.draw(run.rng, 256)
     run.optimiser.field, run.optimiser.config = run.field, replace(run.config, regularise_every=1000)
