@@ -23,6 +23,7 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 
 from kpc.format.cameras import Camera
+from kpc.format.cells import decode_cells, encode_cells
 from kpc.format.cli import written_aside
 from kpc.format.container import (
     CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, Chunk, Entry, Reader, Source, open_source, pack,
@@ -168,7 +169,7 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
             chunks.append(Chunk("MOVE", [move]))
         kind = "HYBR" if isinstance(scene.decoder, HybridDecoder) else "DECO"
         chunks += [Chunk(kind, [_pack_decoder(scene.decoder, parsed.feature_count)]),
-                   Chunk("OCCU", [_pack_occupancy(scene.occupancy)])]
+                   _occupancy_chunk(scene.occupancy)]
         if scene.cameras:
             chunks.append(Chunk("came", [_pack_cameras(scene.cameras)]))
         if scene.appearances:
@@ -257,11 +258,13 @@ def _pack_motion(motion: QuantisedMotion) -> bytes:
     return MOTION_STRUCT.pack(*symbols.shape[:4], motion.step) + low_bytes_first.tobytes()
 
 
-def _pack_occupancy(occupancy: np.ndarray) -> bytes:
+def _occupancy_chunk(occupancy: np.ndarray) -> Chunk:
     if occupancy.ndim != 4 or occupancy.dtype != bool or not all(0 < n <= AXIS_LIMIT for n in occupancy.shape):
         raise FormatError(f"occupancy: is {occupancy.dtype} {occupancy.shape}, not bool (slots, Nz, Ny, Nx)")
     slots_last = np.moveaxis(occupancy, 0, -1)  # a cell that never changes makes a run of equal bits
-    return OCCUPANCY_STRUCT.pack(*occupancy.shape) + np.packbits(slots_last, bitorder="little").tobytes()
+    head = OCCUPANCY_STRUCT.pack(*occupancy.shape)
+    raw = head + np.packbits(slots_last, bitorder="little").tobytes()
+    return Chunk("OCCU", [raw], symbols=head + encode_cells(occupancy), symbol_count=len(raw))
 
 
 def _pack_cameras(cameras: tuple[Camera, ...]) -> bytes:
@@ -365,10 +368,7 @@ class SceneReader(Reader):
         if entry.raw_length != texels * plane.channels:
             raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
                               f"{texels * plane.channels:,} of its rows")
-        if entry.raw_length > entry.stored_length * EXPANSION_LIMIT:
-            raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, more than "
-                              f"{entry.stored_length:,} bytes can hold")
-        return self._parsed(lambda body: decode_symbols(body, *shape), self.stored(number))
+        return self._parsed(lambda body: decode_symbols(body, *shape), self._context_coded(number))
 
     def mapping(self) -> SpaceMapping | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""
@@ -404,7 +404,10 @@ class SceneReader(Reader):
         """The OCCU chunk: (slots, Nz, Ny, Nx) bool."""
         number = self._only("OCCU")
         self._afford(8 * self.index[number].raw_length, "its occupancy grid")  # a byte for each bit
-        return self._parsed(_parse_occupancy, self.chunk(number))
+        if self.index[number].codec != CODEC_SYMBOLS:
+            return self._parsed(_parse_occupancy, self.chunk(number))
+        raw_length = self.index[number].raw_length
+        return self._parsed(lambda body: _parse_coded_occupancy(body, raw_length), self._context_coded(number))
 
     def cameras(self) -> tuple[Camera, ...]:
         """The cameras, none if the file has (or has yet) no such chunk."""
@@ -422,6 +425,14 @@ class SceneReader(Reader):
         most = APPEARANCE_STRUCT.size + APPEARANCE_LIMIT * (2 * hidden + 1 + NAME_LIMIT)
         self._afford(4 * self.index[number].raw_length, "its appearances")  # as they are stored, float32, and names
         return self._parsed(lambda raw: _parse_appearances(raw, hidden), self.chunk(number, most))
+
+    def _context_coded(self, number: int) -> bytes:
+        """A chunk of codec 2 as it is stored, if it may stand for as much as it claims."""
+        entry = self.index[number]
+        if entry.raw_length > entry.stored_length * EXPANSION_LIMIT:
+            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) claims a length of {entry.raw_length:,}, more than "
+                              f"{entry.stored_length:,} bytes can hold")
+        return self.stored(number)
 
     def _only(self, kind: str) -> int:
         found = [number for number, entry in enumerate(self.index) if entry.kind == kind]
@@ -594,9 +605,7 @@ def _parse_weights(cursor: "_Cursor", shapes: Mapping[str, tuple[int, ...]]) -> 
 
 def _parse_occupancy(raw: bytes) -> np.ndarray:
     cursor = _Cursor(raw, "OCCU")
-    shape = cursor.unpack(OCCUPANCY_STRUCT)
-    if not all(0 < n <= AXIS_LIMIT for n in shape):
-        raise FormatError(f"OCCU: a grid of {shape} cells makes no sense")
+    shape = _occupancy_shape(cursor)
     cells = math.prod(shape)
     packed = cursor.array("u1", -(-cells // 8))
     cursor.finish()
@@ -604,6 +613,21 @@ def _parse_occupancy(raw: bytes) -> np.ndarray:
         raise FormatError("OCCU: the unused bits of its last byte are not 0")
     slots_last = np.unpackbits(packed, bitorder="little", count=cells).reshape(*shape[1:], shape[0])
     return np.ascontiguousarray(np.moveaxis(slots_last, -1, 0)).view(bool)
+
+
+def _parse_coded_occupancy(body: bytes, raw_length: int) -> np.ndarray:
+    cursor = _Cursor(body, "OCCU")
+    shape = _occupancy_shape(cursor)
+    if raw_length != OCCUPANCY_STRUCT.size + -(-math.prod(shape) // 8):
+        raise FormatError(f"OCCU: claims {raw_length:,} bytes, not those of a grid of {shape} cells")
+    return decode_cells(cursor.rest(), shape)
+
+
+def _occupancy_shape(cursor: "_Cursor") -> tuple[int, ...]:
+    shape = cursor.unpack(OCCUPANCY_STRUCT)
+    if not all(0 < n <= AXIS_LIMIT for n in shape):
+        raise FormatError(f"OCCU: a grid of {shape} cells makes no sense")
+    return shape
 
 
 def _parse_cameras(raw: bytes) -> tuple[Camera, ...]:
@@ -677,6 +701,9 @@ class _Cursor:
 
     def array(self, dtype: str, count: int) -> np.ndarray:
         return np.frombuffer(self.take(np.dtype(dtype).itemsize * count), dtype)
+
+    def rest(self) -> bytes:
+        return self.take(len(self.raw) - self.position)
 
     def finish(self) -> None:
         if self.position != len(self.raw):

@@ -1,4 +1,4 @@
-"""Adaptive binary decisions under rANS, in integers (spec/kpc-format.md, section 6, "Context coding").
+"""Adaptive binary decisions under rANS, in integers (spec/kpc-format.md, section 6, "Decisions").
 
 A *counter* estimates how likely its decision is 1, out of 2^16, and notes how often it was asked. rANS (arXiv:1311.2540) turns
 decisions and their probabilities into bits: the low 12 bits of a decoder's state hold the next decision. Encoding runs backwards,
@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+
+from kpc.format.errors import FormatError
 
 LOWEST_STATE = 1 << 16
 """The state lies in [2^16, 2^32) between decisions. An encoder begins at 2^16, so there a decoder must end."""
@@ -103,3 +105,32 @@ def words_of(trace):
     backwards[count] = state >> WORD_BITS
     backwards[count + 1] = state & 0xFFFF
     return backwards[: count + 2][::-1].copy()
+
+
+def stream(trace: np.ndarray) -> bytes:
+    """A trace as the bytes that `opened` takes: state (u32) and words (u16)."""
+    return bytes(words_of(trace).astype("<u2").tobytes())
+
+
+def opened(body: bytes, what: str) -> tuple[int, np.ndarray]:
+    """The first state and the (N,) uint16 words of a `stream`; `what` it is of, for messages.
+
+    Raises:
+        FormatError: it is cut, or its state is none.
+    """
+    if len(body) < 4 or len(body) % 2:
+        raise FormatError(f"{what}: cut off within its words")
+    state = int.from_bytes(body[:4], "little")
+    if state < LOWEST_STATE:
+        raise FormatError(f"{what}: its first state is too small")
+    return state, np.frombuffer(body, "<u2", offset=4).astype(np.uint16)
+
+
+def ended(state: int, at: int, words: np.ndarray, what: str) -> None:
+    """Check that after the last decision all words are taken and the state is an encoder's first.
+
+    Raises:
+        FormatError: it is not so.
+    """
+    if at != len(words) or state != LOWEST_STATE:
+        raise FormatError(f"{what}: its words do not end where they should")

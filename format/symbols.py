@@ -19,7 +19,7 @@ Naming, throughout this module
 import numpy as np
 
 from kpc.format.errors import FormatError
-from kpc.format.rans import LOWEST_STATE, SCALE, adapt, compiled, counters, decide, words_of
+from kpc.format.rans import SCALE, adapt, compiled, counters, decide, ended, opened, stream
 
 SET_COUNTS = (1, 2, 4, 8)
 """How many sets of weights a segment may store."""
@@ -64,7 +64,7 @@ def encode_with(weights: np.ndarray, symbols: np.ndarray, coded: np.ndarray) -> 
     if has_map:
         _, at = walk_map(coded, 0, at, None, trace)
     _, at, _ = walk(symbols, coded, weights, 0, at, None, trace, None)
-    return bytes([len(weights), has_map]) + weights.tobytes() + words_of(trace[:at]).astype("<u2").tobytes()
+    return bytes([len(weights), has_map]) + weights.tobytes() + stream(trace[:at])
 
 
 def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
@@ -77,13 +77,10 @@ def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple
         raise FormatError("plane segment: unknown number of sets of weights or map flag")
     sets, has_map = body[0], body[1] == 1
     start = 2 + WEIGHTS * sets
-    if len(body) < start + 4 or (len(body) - start) % 2:
-        raise FormatError("plane segment: cut off within its weights or words")
+    if len(body) < start:
+        raise FormatError("plane segment: cut off within its weights")
     weights = np.frombuffer(body, np.int8, WEIGHTS * sets, 2).reshape(sets, WEIGHTS)
-    state = int.from_bytes(body[start:start + 4], "little")
-    words = np.frombuffer(body, "<u2", offset=start + 4).astype(np.uint16)
-    if state < LOWEST_STATE:
-        raise FormatError("plane segment: its first state is too small")
+    state, words = opened(body[start:], "plane segment")
 
     symbols, coded = np.zeros((rows, columns, channels), np.int8), np.ones((rows, columns), bool)
     at, fit = 0, True
@@ -93,8 +90,7 @@ def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple
         state, at, fit = walk(symbols, coded, weights, state, at, words, None, None)
     if not fit:
         raise FormatError("plane segment: a symbol leaves its 8 bits")
-    if at != len(words) or state != LOWEST_STATE:
-        raise FormatError("plane segment: its words do not end where its symbols do")
+    ended(state, at, words, "plane segment")
     return symbols, coded
 
 

@@ -95,8 +95,8 @@ def chunks(data, partial):  # sections 3, 4 and 10
         else:
             require(crc32c(body) == crc, "chunk damaged")
         if known:
-            if kind == b"PLNE" and codec == 2:
-                require(raw <= 32768 * stored, "symbols in too few bytes")
+            if kind in (b"PLNE", b"OCCU") and codec == 2:
+                require(raw <= 32768 * stored, "so much in too few bytes")
                 content = None if body is None else (raw, body)
             else:
                 content = None if body is None else decoded(body, codec, raw)
@@ -139,7 +139,7 @@ def decode(data, partial=False):
     scene["motion"] = motion_chunk(Bytes(parts["MOVE"]), scene["scales"]) if "MOVE" in parts else None
     expected = sum(s["channels"] for s in scene["scales"])
     scene |= hybrid_chunk(Bytes(parts["HYBR"]), expected) if "HYBR" in parts else decoder_chunk(Bytes(parts["DECO"]), expected)
-    scene |= occupancy_chunk(Bytes(parts["OCCU"]))
+    scene |= coded_occupancy_chunk(*parts["OCCU"]) if isinstance(parts["OCCU"], tuple) else occupancy_chunk(Bytes(parts["OCCU"]))
     scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") is not None else []
     scene["appearances"] = appearances_chunk(Bytes(parts["appe"]), scene["hidden"]) if parts.get("appe") is not None else {}
 
@@ -257,9 +257,16 @@ def segment(chunk, rows, columns, channels):  # section 6
 
 
 class Decisions:  # section 6, codec 2
-    def __init__(self, state, words):
-        require(state >= 1 << 16, "first state")
-        self.state, self.words, self.counters = state, words, {}
+    def __init__(self, chunk):
+        """From state and words, which are the rest of the chunk."""
+        self.state, = chunk.unpack("I")
+        require(self.state >= 1 << 16, "first state")
+        words = chunk.rest()
+        require(len(words) % 2 == 0, "half a word")
+        self.words, self.counters = list(struct.unpack(f"<{len(words) // 2}H", words))[::-1], {}
+
+    def end(self):
+        require(not self.words and self.state == 1 << 16, "words and decisions end apart")
 
     def decide(self, p):
         low, high = self.state % 4096, self.state >> 12
@@ -297,10 +304,7 @@ def context_coded(chunk, H, W, channels):  # section 6, codec 2
     set_count, map_flag = chunk.unpack("BB")
     require(set_count in (1, 2, 4, 8) and map_flag <= 1, "sets of weights or map flag")
     sets = [chunk.unpack("9b") for _ in range(set_count)]
-    state, = chunk.unpack("I")
-    words = chunk.rest()
-    require(len(words) % 2 == 0, "half a word")
-    decisions = Decisions(state, list(struct.unpack(f"<{len(words) // 2}H", words))[::-1])
+    decisions = Decisions(chunk)
 
     coded = {(y, x): 1 for y in range(H) for x in range(W)}
     if map_flag:
@@ -359,7 +363,7 @@ def context_coded(chunk, H, W, channels):  # section 6, codec 2
                 smooth = sum((2 - abs(i)) * (2 - abs(j)) * at(min(max(y + i, 0), H - 1), x + j, 0)[1]
                              for i in (-1, 0, 1) for j in (-1, 0, 1)) >> 1
                 cross[y, x] = cross[y, x] + (smooth - cross[y, x] >> 3) if c else smooth
-    require(not decisions.words and decisions.state == 1 << 16, "words and symbols end apart")
+    decisions.end()
     return [coded[y, x] for y in range(H) for x in range(W)], symbols
 
 
@@ -390,6 +394,25 @@ def occupancy_chunk(chunk):  # section 8
     slots, nz, ny, nx = chunk.unpack("4H")
     require(all(1 <= n <= 16384 for n in (slots, nz, ny, nx)), "grid")
     return {"cells": (nx, ny, nz), "slots": slots, "occupancy": bits(chunk.rest(), slots * nz * ny * nx)}
+
+
+def coded_occupancy_chunk(raw_length, body):  # section 8, codec 2
+    chunk = Bytes(body)
+    slots, nz, ny, nx = chunk.unpack("4H")
+    require(all(1 <= n <= 16384 for n in (slots, nz, ny, nx)), "grid")
+    require(raw_length == 8 + -(-slots * nz * ny * nx // 8), "raw length")
+    decisions, occupied = Decisions(chunk), {}
+    around = [(0, 0, 0, -1), (0, 0, -1, 0), (0, -1, 0, 0), (0, -1, 1, 0), (0, 0, -1, 1), (0, -1, 0, 1),
+              (-1, 0, 0, 0), (-1, 0, 0, -1), (-1, 1, 0, 0), (-1, 0, -1, 0), (-1, -1, 0, 0)]
+    for s in range(slots):
+        for z in range(nz):
+            for y in range(ny):
+                for x in range(nx):
+                    near = [occupied.get((s + h, z + k, y + j, x + i), 0) for h, k, j, i in around]
+                    occupied[s, z, y, x] = decisions.by_counter(tuple(near))
+    decisions.end()
+    return {"cells": (nx, ny, nz), "slots": slots, "occupancy": [
+        occupied[s, z, y, x] for z in range(nz) for y in range(ny) for x in range(nx) for s in range(slots)]}
 
 
 def cameras_chunk(chunk):  # section 9
