@@ -30,6 +30,7 @@ from kpc.format.container import (
 )
 from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
+from kpc.format.nodes import decode_nodes, encode_nodes
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
@@ -164,9 +165,9 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
             _parse_mapping(warp, parsed)
             chunks.append(Chunk("WARP", [warp]))
         if scene.motion is not None:
-            move = _pack_motion(scene.motion)
-            _parse_motion(move, parsed.is_dynamic)
-            chunks.append(Chunk("MOVE", [move]))
+            move = _motion_chunk(scene.motion)
+            _parse_motion(move.parts[0], parsed.is_dynamic)
+            chunks.append(move)
         kind = "HYBR" if isinstance(scene.decoder, HybridDecoder) else "DECO"
         chunks += [Chunk(kind, [_pack_decoder(scene.decoder, parsed.feature_count)]),
                    _occupancy_chunk(scene.occupancy)]
@@ -249,13 +250,15 @@ def _pack_mapping(mapping: SpaceMapping) -> bytes:
     return NDC_STRUCT.pack(DEVICE_COORDINATES, *np.ravel(mapping.frame), mapping.near, mapping.baseline)
 
 
-def _pack_motion(motion: QuantisedMotion) -> bytes:
+def _motion_chunk(motion: QuantisedMotion) -> Chunk:
     symbols = motion.symbols
     if symbols.ndim != 5 or symbols.shape[4] != 3 or symbols.dtype != np.int16:
         raise FormatError(f"motion: is {symbols.dtype} {symbols.shape}, not int16 (T, Nz, Ny, Nx, 3)")
     differences = np.diff(symbols.astype("<i2").view("<u2"), axis=0, prepend=np.uint16(0))  # modulo 2^16
     low_bytes_first = np.ascontiguousarray(differences.reshape(-1, 1).view(np.uint8).T)
-    return MOTION_STRUCT.pack(*symbols.shape[:4], motion.step) + low_bytes_first.tobytes()
+    head = MOTION_STRUCT.pack(*symbols.shape[:4], motion.step)
+    raw = head + low_bytes_first.tobytes()
+    return Chunk("MOVE", [raw], symbols=head + encode_nodes(symbols), symbol_count=len(raw))
 
 
 def _occupancy_chunk(occupancy: np.ndarray) -> Chunk:
@@ -383,7 +386,10 @@ class SceneReader(Reader):
         if number is None:
             return None
         self._afford(8 * self.index[number].raw_length, "its motion grid")  # int16 and float32, and their making
-        return self._parsed(lambda raw: _parse_motion(raw, self.head.is_dynamic), self.chunk(number))
+        if self.index[number].codec != CODEC_SYMBOLS:
+            return self._parsed(lambda raw: _parse_motion(raw, self.head.is_dynamic), self.chunk(number))
+        raw_length = self.index[number].raw_length
+        return self._parsed(lambda body: _parse_coded_motion(body, raw_length, self.head.is_dynamic), self._context_coded(number))
 
     def decoder(self) -> AnyDecoder:
         """The DECO or HYBR chunk."""
@@ -541,6 +547,23 @@ def _parse_mapping(raw: bytes, head: SceneHead) -> SpaceMapping:
 
 def _parse_motion(raw: bytes, dynamic: bool) -> QuantisedMotion:
     cursor = _Cursor(raw, "MOVE")
+    sizes, step = _motion_head(cursor, dynamic)
+    count = 3 * math.prod(sizes)
+    low, high = cursor.array("u1", count).astype(np.uint16), cursor.array("u1", count).astype(np.uint16)
+    cursor.finish()
+    differences = (low | high << np.uint16(8)).reshape(*sizes, 3)
+    return QuantisedMotion(differences.cumsum(axis=0, dtype=np.uint16).view(np.int16), step)
+
+
+def _parse_coded_motion(body: bytes, raw_length: int, dynamic: bool) -> QuantisedMotion:
+    cursor = _Cursor(body, "MOVE")
+    sizes, step = _motion_head(cursor, dynamic)
+    if raw_length != MOTION_STRUCT.size + 6 * math.prod(sizes):
+        raise FormatError(f"MOVE: claims {raw_length:,} bytes, not those of a grid of {sizes} nodes")
+    return QuantisedMotion(decode_nodes(cursor.rest(), (*sizes, 3)), step)
+
+
+def _motion_head(cursor: "_Cursor", dynamic: bool) -> tuple[list[int], float]:
     *sizes, step = cursor.unpack(MOTION_STRUCT)
     rows, *nodes = sizes
     if not dynamic or not 2 <= rows <= AXIS_LIMIT or not all(2 <= n <= MOTION_LIMIT for n in nodes):
@@ -548,11 +571,7 @@ def _parse_motion(raw: bytes, dynamic: bool) -> QuantisedMotion:
                           "makes no sense")
     if not (step > 0 and 32768 * step <= DISPLACEMENT_LIMIT):  # False for NaN, too
         raise FormatError(f"MOVE: a step of {step} lies outside its range")
-    count = 3 * math.prod(sizes)
-    low, high = cursor.array("u1", count).astype(np.uint16), cursor.array("u1", count).astype(np.uint16)
-    cursor.finish()
-    differences = (low | high << np.uint16(8)).reshape(*sizes, 3)
-    return QuantisedMotion(differences.cumsum(axis=0, dtype=np.uint16).view(np.int16), step)
+    return sizes, step
 
 
 def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, PlaneHead]:

@@ -86,6 +86,39 @@ def adapt(bit, table, which, state, at, words, trace):
     return bit, state, at
 
 
+@compiled(forceinline=True)
+def integer(value, table, first, unary, escapes, state, at, words, trace):
+    """Code or decode an integer in the context whose 2 + 2 (unary + escapes) counters begin at `first`: (value, state, at).
+
+    Magnitudes of 1 to `unary` take a decision each; of larger ones the number of bits, up to `escapes`, comes first.
+    """
+    bit, state, at = adapt(1 if value != 0 else 0, table, first, state, at, words, trace)
+    if not bit:
+        return 0, state, at
+    positive, state, at = adapt(1 if value > 0 else 0, table, first + 1, state, at, words, trace)
+    first += 2 if positive else 2 + unary + escapes
+    beyond, found = abs(value) - 1, 0
+    while found < unary:
+        bit, state, at = adapt(1 if beyond > found else 0, table, first + found, state, at, words, trace)
+        if not bit:
+            break
+        found += 1
+    if found == unary:  # Exp-Golomb: as many ones as bits follow, a zero, the bits
+        rest, bits = beyond - unary + 1, 0
+        while bits < escapes:
+            bit, state, at = adapt(1 if rest >> bits + 1 != 0 else 0, table, first + unary + bits, state, at, words, trace)
+            if not bit:
+                break
+            bits += 1
+        low = 1
+        for place in range(bits - 1, -1, -1):
+            bit, state, at = decide(rest >> place & 1, SCALE >> 1, state, at, words, trace)
+            low = low << 1 | bit
+        found += low - 1
+    magnitude = found + 1
+    return magnitude if positive else -magnitude, state, at
+
+
 @compiled()
 def words_of(trace):
     """A trace as the words that a decoder reads, the first two of them its state: (N,) uint16."""

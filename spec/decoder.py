@@ -95,7 +95,7 @@ def chunks(data, partial):  # sections 3, 4 and 10
         else:
             require(crc32c(body) == crc, "chunk damaged")
         if known:
-            if kind in (b"PLNE", b"OCCU") and codec == 2:
+            if kind in (b"PLNE", b"OCCU", b"MOVE") and codec == 2:
                 require(raw <= 32768 * stored, "so much in too few bytes")
                 content = None if body is None else (raw, body)
             else:
@@ -136,7 +136,7 @@ def decode(data, partial=False):
     if "WARP" in parts:
         scene |= warp_chunk(Bytes(parts["WARP"]), scene)
     require("MOVE" not in parts or parts["MOVE"] is not None, "no MOVE chunk")
-    scene["motion"] = motion_chunk(Bytes(parts["MOVE"]), scene["scales"]) if "MOVE" in parts else None
+    scene["motion"] = motion_chunk(parts["MOVE"], scene["scales"]) if "MOVE" in parts else None
     expected = sum(s["channels"] for s in scene["scales"])
     scene |= hybrid_chunk(Bytes(parts["HYBR"]), expected) if "HYBR" in parts else decoder_chunk(Bytes(parts["DECO"]), expected)
     scene |= coded_occupancy_chunk(*parts["OCCU"]) if isinstance(parts["OCCU"], tuple) else occupancy_chunk(Bytes(parts["OCCU"]))
@@ -218,18 +218,51 @@ def warp_chunk(chunk, scene):  # section 5
     return {"frame": axes, "near": near, "baseline": baseline}
 
 
-def motion_chunk(chunk, scales):  # section 5
+def motion_chunk(content, scales):  # section 5
+    """`content`: the raw bytes, or with codec 2 their length and the stored bytes."""
+    coded = isinstance(content, tuple)
+    chunk = Bytes(content[1] if coded else content)
     rows, *nodes, step = chunk.unpack("4Hf")
     require("xt" in scales[0]["planes"] and 2 <= rows <= 16384 and all(2 <= n <= 256 for n in nodes), "motion grid")
     require(step > 0 and 32768 * step <= 1024, "motion step")
-    a_row = 3 * math.prod(nodes)
+    if coded:
+        require(content[0] == 12 + 6 * rows * math.prod(nodes), "raw length")
+        symbols = coded_motion(chunk, rows, *nodes)
+    else:
+        symbols = summed_motion(chunk, rows, 3 * math.prod(nodes))
+    return {"size": (rows, *nodes), "values": [f32(s * step) for s in symbols]}
+
+
+def summed_motion(chunk, rows, a_row):
     low, high = chunk.take(rows * a_row), chunk.take(rows * a_row)
     chunk.end()
     symbols = []
     for i in range(rows * a_row):
         symbols.append((low[i] + 256 * high[i] + (symbols[i - a_row] if i >= a_row else 0)) % 65536)
-    signed = (s - 65536 if s > 32767 else s for s in symbols)
-    return {"size": (rows, *nodes), "values": [f32(s * step) for s in signed]}
+    return [s - 65536 if s > 32767 else s for s in symbols]
+
+
+def coded_motion(chunk, rows, nz, ny, nx):  # section 5, codec 2
+    k = chunk.unpack("15h")
+    decisions, v, r = Decisions(chunk), {}, {}
+    for t in range(rows):
+        for z in range(nz):
+            for y in range(ny):
+                for x in range(nx):
+                    for component in range(3):
+                        places = {i: (t - (i >> 3), z - (i >> 2 & 1), y - (i >> 1 & 1), x - (i & 1), component) for i in range(16)}
+                        there = [i for i in range(1, 16) if places[i] in v]
+                        weights = k if len(there) == 15 else [1024 if i.bit_count() % 2 else -1024 for i in range(1, 16)]
+                        predicted = sum(weights[i - 1] * v[places[i]] for i in there) + 512 >> 10
+                        predicted = min(max(predicted, -32768), 32767)
+                        around = [r[places[i]] for i in (8, 4, 2, 1) if i in there]
+                        a = sum(around) // len(around) + 2 if around else 66
+                        b = a.bit_length()
+                        error = decisions.error(min(2 * (b - 2) + (a >> b - 2) % 2, 19), 15)
+                        require(-32768 <= predicted + error <= 32767, "a symbol leaves 16 bits")
+                        v[places[0]], r[places[0]] = predicted + error, abs(error)
+    decisions.end()
+    return list(v.values())
 
 
 def segment(chunk, rows, columns, channels):  # section 6
@@ -283,7 +316,7 @@ class Decisions:  # section 6, codec 2
         self.counters[name] = (P + ((65536 - P) * R >> 16) if one else P - (P * R >> 16)), min(n + 1, 120)
         return one
 
-    def error(self, context):
+    def error(self, context, most_bits=7):
         if not self.by_counter((context, "any")):
             return 0
         sign = 1 if self.by_counter((context, "positive")) else -1
@@ -291,7 +324,7 @@ class Decisions:  # section 6, codec 2
             if not self.by_counter((context, sign, k)):
                 return sign * (k + 1)
         bits = 0
-        while bits < 7 and self.by_counter((context, sign, 4 + bits)):
+        while bits < most_bits and self.by_counter((context, sign, 4 + bits)):
             bits += 1
         spelt = 0
         for _ in range(bits):
