@@ -137,7 +137,7 @@ class Chunk:
 
 def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
     """Lay chunks out in the given order; each is stored in what is smallest: raw, as symbols if it has them, or as a zstd
-    frame.
+    frame (of planes only if they have no symbols).
 
     Args:
         value_count: numbers in all planes together.
@@ -153,7 +153,7 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) ->
         forms = [(raw, CODEC_RAW, len(raw))]
         if compress and chunk.symbols is not None and chunk.symbol_count <= len(chunk.symbols) * EXPANSION_LIMIT:
             forms.append((chunk.symbols, CODEC_SYMBOLS, chunk.symbol_count))
-        if compress:
+        if compress and (chunk.kind != "PLNE" or len(forms) == 1):  # zstd would double the time, and never beats symbols of planes
             forms += [(frame, CODEC_ZSTD, len(raw)) for frame in _zstd_frames(chunk.parts)]
         body, codec, length = min(forms, key=lambda form: len(form[0]))
         entries.append(ENTRY.pack(chunk.kind.encode("ascii"), 0, chunk.scale, chunk.plane, chunk.row_start,
