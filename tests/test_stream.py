@@ -350,9 +350,9 @@ def flipping(times: int) -> type[Handler]:
         def send(self, file: IO[bytes], count: int) -> None:
             start = file.tell()
             body = bytearray(file.read(count))
-            if start <= 25_000 < start + count and type(self).left:
+            if start <= 20_000 < start + count and type(self).left:
                 type(self).left -= 1
-                body[25_000 - start] ^= 1
+                body[20_000 - start] ^= 1
             self.wfile.write(body)
 
     return Flipping
