@@ -122,7 +122,7 @@ class Entry:
 class Chunk:
     """One chunk to be written: its place and its raw bytes, cut where their statistics change.
 
-    A plane segment has another form besides, that of `kpc.format.symbols`: `symbols`, which stand for `symbol_count` bytes.
+    Some have another form besides, context-coded: `symbols`, which stand for `symbol_count` symbols or bytes.
     """
 
     kind: str
@@ -136,8 +136,8 @@ class Chunk:
 
 
 def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
-    """Lay chunks out in the given order; each is stored raw, or coded where that is smaller: as symbols if it has them, else
-    as a zstd frame.
+    """Lay chunks out in the given order; each is stored in what is smallest: raw, as symbols if it has them, or as a zstd
+    frame (of planes only if they have no symbols).
 
     Args:
         value_count: numbers in all planes together.
@@ -150,14 +150,12 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) ->
     entries, bodies, largest = [], [], 0
     for chunk in chunks:
         raw = b"".join(chunk.parts)
-        body, codec, length = raw, CODEC_RAW, len(raw)
+        forms = [(raw, CODEC_RAW, len(raw))]
         if compress and chunk.symbols is not None and chunk.symbol_count <= len(chunk.symbols) * EXPANSION_LIMIT:
-            if len(chunk.symbols) < len(raw):
-                body, codec, length = chunk.symbols, CODEC_SYMBOLS, chunk.symbol_count
-        elif compress:
-            smallest = min(_zstd_frames(chunk.parts), key=len)
-            if len(smallest) < len(raw):
-                body, codec = smallest, CODEC_ZSTD
+            forms.append((chunk.symbols, CODEC_SYMBOLS, chunk.symbol_count))
+        if compress and (chunk.kind != "PLNE" or len(forms) == 1):  # zstd would double the time, and never beats symbols of planes
+            forms += [(frame, CODEC_ZSTD, len(raw)) for frame in _zstd_frames(chunk.parts)]
+        body, codec, length = min(forms, key=lambda form: len(form[0]))
         entries.append(ENTRY.pack(chunk.kind.encode("ascii"), 0, chunk.scale, chunk.plane, chunk.row_start,
                                   chunk.row_count, codec, 0, len(body), length, google_crc32c.value(body), offset))
         bodies.append(body)

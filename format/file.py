@@ -23,12 +23,14 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 
 from kpc.format.cameras import Camera
+from kpc.format.cells import decode_cells, encode_cells
 from kpc.format.cli import written_aside
 from kpc.format.container import (
     CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, Chunk, Entry, Reader, Source, open_source, pack,
 )
 from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
+from kpc.format.nodes import decode_nodes, encode_nodes
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
@@ -163,12 +165,12 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
             _parse_mapping(warp, parsed)
             chunks.append(Chunk("WARP", [warp]))
         if scene.motion is not None:
-            move = _pack_motion(scene.motion)
-            _parse_motion(move, parsed.is_dynamic)
-            chunks.append(Chunk("MOVE", [move]))
+            move = _motion_chunk(scene.motion)
+            _parse_motion(move.parts[0], parsed.is_dynamic)
+            chunks.append(move)
         kind = "HYBR" if isinstance(scene.decoder, HybridDecoder) else "DECO"
         chunks += [Chunk(kind, [_pack_decoder(scene.decoder, parsed.feature_count)]),
-                   Chunk("OCCU", [_pack_occupancy(scene.occupancy)])]
+                   _occupancy_chunk(scene.occupancy)]
         if scene.cameras:
             chunks.append(Chunk("came", [_pack_cameras(scene.cameras)]))
         if scene.appearances:
@@ -248,20 +250,24 @@ def _pack_mapping(mapping: SpaceMapping) -> bytes:
     return NDC_STRUCT.pack(DEVICE_COORDINATES, *np.ravel(mapping.frame), mapping.near, mapping.baseline)
 
 
-def _pack_motion(motion: QuantisedMotion) -> bytes:
+def _motion_chunk(motion: QuantisedMotion) -> Chunk:
     symbols = motion.symbols
     if symbols.ndim != 5 or symbols.shape[4] != 3 or symbols.dtype != np.int16:
         raise FormatError(f"motion: is {symbols.dtype} {symbols.shape}, not int16 (T, Nz, Ny, Nx, 3)")
     differences = np.diff(symbols.astype("<i2").view("<u2"), axis=0, prepend=np.uint16(0))  # modulo 2^16
     low_bytes_first = np.ascontiguousarray(differences.reshape(-1, 1).view(np.uint8).T)
-    return MOTION_STRUCT.pack(*symbols.shape[:4], motion.step) + low_bytes_first.tobytes()
+    head = MOTION_STRUCT.pack(*symbols.shape[:4], motion.step)
+    raw = head + low_bytes_first.tobytes()
+    return Chunk("MOVE", [raw], symbols=head + encode_nodes(symbols), symbol_count=len(raw))
 
 
-def _pack_occupancy(occupancy: np.ndarray) -> bytes:
+def _occupancy_chunk(occupancy: np.ndarray) -> Chunk:
     if occupancy.ndim != 4 or occupancy.dtype != bool or not all(0 < n <= AXIS_LIMIT for n in occupancy.shape):
         raise FormatError(f"occupancy: is {occupancy.dtype} {occupancy.shape}, not bool (slots, Nz, Ny, Nx)")
     slots_last = np.moveaxis(occupancy, 0, -1)  # a cell that never changes makes a run of equal bits
-    return OCCUPANCY_STRUCT.pack(*occupancy.shape) + np.packbits(slots_last, bitorder="little").tobytes()
+    head = OCCUPANCY_STRUCT.pack(*occupancy.shape)
+    raw = head + np.packbits(slots_last, bitorder="little").tobytes()
+    return Chunk("OCCU", [raw], symbols=head + encode_cells(occupancy), symbol_count=len(raw))
 
 
 def _pack_cameras(cameras: tuple[Camera, ...]) -> bytes:
@@ -367,10 +373,7 @@ class SceneReader(Reader):
         if entry.raw_length != texels * plane.channels:
             raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
                               f"{texels * plane.channels:,} of its rows")
-        if entry.raw_length > entry.stored_length * EXPANSION_LIMIT:
-            raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, more than "
-                              f"{entry.stored_length:,} bytes can hold")
-        return self._parsed(lambda body: decode_symbols(body, *shape), self.stored(number))
+        return self._parsed(lambda body: decode_symbols(body, *shape), self._context_coded(number))
 
     def mapping(self) -> SpaceMapping | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""
@@ -385,7 +388,10 @@ class SceneReader(Reader):
         if number is None:
             return None
         self._afford(8 * self.index[number].raw_length, "its motion grid")  # int16 and float32, and their making
-        return self._parsed(lambda raw: _parse_motion(raw, self.head.is_dynamic), self.chunk(number))
+        if self.index[number].codec != CODEC_SYMBOLS:
+            return self._parsed(lambda raw: _parse_motion(raw, self.head.is_dynamic), self.chunk(number))
+        raw_length = self.index[number].raw_length
+        return self._parsed(lambda body: _parse_coded_motion(body, raw_length, self.head.is_dynamic), self._context_coded(number))
 
     def decoder(self) -> AnyDecoder:
         """The DECO or HYBR chunk."""
@@ -406,7 +412,10 @@ class SceneReader(Reader):
         """The OCCU chunk: (slots, Nz, Ny, Nx) bool."""
         number = self._only("OCCU")
         self._afford(8 * self.index[number].raw_length, "its occupancy grid")  # a byte for each bit
-        return self._parsed(_parse_occupancy, self.chunk(number))
+        if self.index[number].codec != CODEC_SYMBOLS:
+            return self._parsed(_parse_occupancy, self.chunk(number))
+        raw_length = self.index[number].raw_length
+        return self._parsed(lambda body: _parse_coded_occupancy(body, raw_length), self._context_coded(number))
 
     def cameras(self) -> tuple[Camera, ...]:
         """The cameras, none if the file has (or has yet) no such chunk."""
@@ -424,6 +433,14 @@ class SceneReader(Reader):
         most = APPEARANCE_STRUCT.size + APPEARANCE_LIMIT * (2 * hidden + 1 + NAME_LIMIT)
         self._afford(4 * self.index[number].raw_length, "its appearances")  # as they are stored, float32, and names
         return self._parsed(lambda raw: _parse_appearances(raw, hidden), self.chunk(number, most))
+
+    def _context_coded(self, number: int) -> bytes:
+        """A chunk of codec 2 as it is stored, if it may stand for as much as it claims."""
+        entry = self.index[number]
+        if entry.raw_length > entry.stored_length * EXPANSION_LIMIT:
+            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) claims a length of {entry.raw_length:,}, more than "
+                              f"{entry.stored_length:,} bytes can hold")
+        return self.stored(number)
 
     def _only(self, kind: str) -> int:
         found = [number for number, entry in enumerate(self.index) if entry.kind == kind]
@@ -532,6 +549,23 @@ def _parse_mapping(raw: bytes, head: SceneHead) -> SpaceMapping:
 
 def _parse_motion(raw: bytes, dynamic: bool) -> QuantisedMotion:
     cursor = _Cursor(raw, "MOVE")
+    sizes, step = _motion_head(cursor, dynamic)
+    count = 3 * math.prod(sizes)
+    low, high = cursor.array("u1", count).astype(np.uint16), cursor.array("u1", count).astype(np.uint16)
+    cursor.finish()
+    differences = (low | high << np.uint16(8)).reshape(*sizes, 3)
+    return QuantisedMotion(differences.cumsum(axis=0, dtype=np.uint16).view(np.int16), step)
+
+
+def _parse_coded_motion(body: bytes, raw_length: int, dynamic: bool) -> QuantisedMotion:
+    cursor = _Cursor(body, "MOVE")
+    sizes, step = _motion_head(cursor, dynamic)
+    if raw_length != MOTION_STRUCT.size + 6 * math.prod(sizes):
+        raise FormatError(f"MOVE: claims {raw_length:,} bytes, not those of a grid of {sizes} nodes")
+    return QuantisedMotion(decode_nodes(cursor.rest(), (*sizes, 3)), step)
+
+
+def _motion_head(cursor: "_Cursor", dynamic: bool) -> tuple[list[int], float]:
     *sizes, step = cursor.unpack(MOTION_STRUCT)
     rows, *nodes = sizes
     if not dynamic or not 2 <= rows <= AXIS_LIMIT or not all(2 <= n <= MOTION_LIMIT for n in nodes):
@@ -539,11 +573,7 @@ def _parse_motion(raw: bytes, dynamic: bool) -> QuantisedMotion:
                           "makes no sense")
     if not (step > 0 and 32768 * step <= DISPLACEMENT_LIMIT):  # False for NaN, too
         raise FormatError(f"MOVE: a step of {step} lies outside its range")
-    count = 3 * math.prod(sizes)
-    low, high = cursor.array("u1", count).astype(np.uint16), cursor.array("u1", count).astype(np.uint16)
-    cursor.finish()
-    differences = (low | high << np.uint16(8)).reshape(*sizes, 3)
-    return QuantisedMotion(differences.cumsum(axis=0, dtype=np.uint16).view(np.int16), step)
+    return sizes, step
 
 
 def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, PlaneHead]:
@@ -596,9 +626,7 @@ def _parse_weights(cursor: "_Cursor", shapes: Mapping[str, tuple[int, ...]]) -> 
 
 def _parse_occupancy(raw: bytes) -> np.ndarray:
     cursor = _Cursor(raw, "OCCU")
-    shape = cursor.unpack(OCCUPANCY_STRUCT)
-    if not all(0 < n <= AXIS_LIMIT for n in shape):
-        raise FormatError(f"OCCU: a grid of {shape} cells makes no sense")
+    shape = _occupancy_shape(cursor)
     cells = math.prod(shape)
     packed = cursor.array("u1", -(-cells // 8))
     cursor.finish()
@@ -606,6 +634,21 @@ def _parse_occupancy(raw: bytes) -> np.ndarray:
         raise FormatError("OCCU: the unused bits of its last byte are not 0")
     slots_last = np.unpackbits(packed, bitorder="little", count=cells).reshape(*shape[1:], shape[0])
     return np.ascontiguousarray(np.moveaxis(slots_last, -1, 0)).view(bool)
+
+
+def _parse_coded_occupancy(body: bytes, raw_length: int) -> np.ndarray:
+    cursor = _Cursor(body, "OCCU")
+    shape = _occupancy_shape(cursor)
+    if raw_length != OCCUPANCY_STRUCT.size + -(-math.prod(shape) // 8):
+        raise FormatError(f"OCCU: claims {raw_length:,} bytes, not those of a grid of {shape} cells")
+    return decode_cells(cursor.rest(), shape)
+
+
+def _occupancy_shape(cursor: "_Cursor") -> tuple[int, ...]:
+    shape = cursor.unpack(OCCUPANCY_STRUCT)
+    if not all(0 < n <= AXIS_LIMIT for n in shape):
+        raise FormatError(f"OCCU: a grid of {shape} cells makes no sense")
+    return shape
 
 
 def _parse_cameras(raw: bytes) -> tuple[Camera, ...]:
@@ -679,6 +722,9 @@ class _Cursor:
 
     def array(self, dtype: str, count: int) -> np.ndarray:
         return np.frombuffer(self.take(np.dtype(dtype).itemsize * count), dtype)
+
+    def rest(self) -> bytes:
+        return self.take(len(self.raw) - self.position)
 
     def finish(self) -> None:
         if self.position != len(self.raw):

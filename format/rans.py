@@ -1,4 +1,4 @@
-"""Adaptive binary decisions under rANS, in integers (spec/kpc-format.md, section 6, "Context coding").
+"""Adaptive binary decisions under rANS, in integers (spec/kpc-format.md, section 6, "Decisions").
 
 A *counter* estimates how likely its decision is 1, out of 2^16, and notes how often it was asked. rANS (arXiv:1311.2540) turns
 decisions and their probabilities into bits: the low 12 bits of a decoder's state hold the next decision. Encoding runs backwards,
@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+
+from kpc.format.errors import FormatError
 
 LOWEST_STATE = 1 << 16
 """The state lies in [2^16, 2^32) between decisions. An encoder begins at 2^16, so there a decoder must end."""
@@ -84,6 +86,39 @@ def adapt(bit, table, which, state, at, words, trace):
     return bit, state, at
 
 
+@compiled(forceinline=True)
+def integer(value, table, first, unary, escapes, state, at, words, trace):
+    """Code or decode an integer in the context whose 2 + 2 (unary + escapes) counters begin at `first`: (value, state, at).
+
+    Magnitudes of 1 to `unary` take a decision each; of larger ones the number of bits, up to `escapes`, comes first.
+    """
+    bit, state, at = adapt(1 if value != 0 else 0, table, first, state, at, words, trace)
+    if not bit:
+        return 0, state, at
+    positive, state, at = adapt(1 if value > 0 else 0, table, first + 1, state, at, words, trace)
+    first += 2 if positive else 2 + unary + escapes
+    beyond, found = abs(value) - 1, 0
+    while found < unary:
+        bit, state, at = adapt(1 if beyond > found else 0, table, first + found, state, at, words, trace)
+        if not bit:
+            break
+        found += 1
+    if found == unary:  # Exp-Golomb: as many ones as bits follow, a zero, the bits
+        rest, bits = beyond - unary + 1, 0
+        while bits < escapes:
+            bit, state, at = adapt(1 if rest >> bits + 1 != 0 else 0, table, first + unary + bits, state, at, words, trace)
+            if not bit:
+                break
+            bits += 1
+        low = 1
+        for place in range(bits - 1, -1, -1):
+            bit, state, at = decide(rest >> place & 1, SCALE >> 1, state, at, words, trace)
+            low = low << 1 | bit
+        found += low - 1
+    magnitude = found + 1
+    return magnitude if positive else -magnitude, state, at
+
+
 @compiled()
 def words_of(trace):
     """A trace as the words that a decoder reads, the first two of them its state: (N,) uint16."""
@@ -103,3 +138,32 @@ def words_of(trace):
     backwards[count] = state >> WORD_BITS
     backwards[count + 1] = state & 0xFFFF
     return backwards[: count + 2][::-1].copy()
+
+
+def stream(trace: np.ndarray) -> bytes:
+    """A trace as the bytes that `opened` takes: state (u32) and words (u16)."""
+    return bytes(words_of(trace).astype("<u2").tobytes())
+
+
+def opened(body: bytes, what: str) -> tuple[int, np.ndarray]:
+    """The first state and the (N,) uint16 words of a `stream`; `what` it is of, for messages.
+
+    Raises:
+        FormatError: it is cut, or its state is none.
+    """
+    if len(body) < 4 or len(body) % 2:
+        raise FormatError(f"{what}: cut off within its words")
+    state = int.from_bytes(body[:4], "little")
+    if state < LOWEST_STATE:
+        raise FormatError(f"{what}: its first state is too small")
+    return state, np.frombuffer(body, "<u2", offset=4).astype(np.uint16)
+
+
+def ended(state: int, at: int, words: np.ndarray, what: str) -> None:
+    """Check that after the last decision all words are taken and the state is an encoder's first.
+
+    Raises:
+        FormatError: it is not so.
+    """
+    if at != len(words) or state != LOWEST_STATE:
+        raise FormatError(f"{what}: its words do not end where they should")

@@ -19,7 +19,7 @@ Naming, throughout this module
 import numpy as np
 
 from kpc.format.errors import FormatError
-from kpc.format.rans import LOWEST_STATE, SCALE, adapt, compiled, counters, decide, words_of
+from kpc.format.rans import adapt, compiled, counters, ended, integer, opened, stream
 
 SET_COUNTS = (1, 2, 4, 8)
 """How many sets of weights a segment may store."""
@@ -27,7 +27,7 @@ WEIGHTS = 9
 """Of a set, each in 1 / 64."""
 
 UNARY, ESCAPES = 4, 7
-"""Errors of 1 to UNARY take a decision each; of larger ones the number of bits, up to ESCAPES, comes first."""
+"""Of `kpc.format.rans.integer`."""
 DECISIONS = 2 + 2 * (UNARY + ESCAPES)
 """Counters of a context: is there an error, is it positive; and of either sign, its magnitude."""
 ACTIVITIES, FRACTIONS = 22, 3
@@ -64,7 +64,7 @@ def encode_with(weights: np.ndarray, symbols: np.ndarray, coded: np.ndarray) -> 
     if has_map:
         _, at = walk_map(coded, 0, at, None, trace)
     _, at, _ = walk(symbols, coded, weights, 0, at, None, trace, None)
-    return bytes([len(weights), has_map]) + weights.tobytes() + words_of(trace[:at]).astype("<u2").tobytes()
+    return bytes([len(weights), has_map]) + weights.tobytes() + stream(trace[:at])
 
 
 def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
@@ -77,13 +77,10 @@ def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple
         raise FormatError("plane segment: unknown number of sets of weights or map flag")
     sets, has_map = body[0], body[1] == 1
     start = 2 + WEIGHTS * sets
-    if len(body) < start + 4 or (len(body) - start) % 2:
-        raise FormatError("plane segment: cut off within its weights or words")
+    if len(body) < start:
+        raise FormatError("plane segment: cut off within its weights")
     weights = np.frombuffer(body, np.int8, WEIGHTS * sets, 2).reshape(sets, WEIGHTS)
-    state = int.from_bytes(body[start:start + 4], "little")
-    words = np.frombuffer(body, "<u2", offset=start + 4).astype(np.uint16)
-    if state < LOWEST_STATE:
-        raise FormatError("plane segment: its first state is too small")
+    state, words = opened(body[start:], "plane segment")
 
     symbols, coded = np.zeros((rows, columns, channels), np.int8), np.ones((rows, columns), bool)
     at, fit = 0, True
@@ -93,15 +90,14 @@ def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple
         state, at, fit = walk(symbols, coded, weights, state, at, words, None, None)
     if not fit:
         raise FormatError("plane segment: a symbol leaves its 8 bits")
-    if at != len(words) or state != LOWEST_STATE:
-        raise FormatError("plane segment: its words do not end where its symbols do")
+    ended(state, at, words, "plane segment")
     return symbols, coded
 
 
 def fitted(neighbours: np.ndarray, count: int) -> np.ndarray:
     """(count, WEIGHTS) int8: weights that make the sum of absolute errors small, for each class of slopes.
 
-    Iteratively reweighted least squares; an encoder may take any weights.
+    An encoder may take any weights.
 
     Args:
         neighbours: (N, 2 + WEIGHTS) int16 from `walk`: slope, twice the differences to their mean of symbol and neighbours.
@@ -111,15 +107,22 @@ def fitted(neighbours: np.ndarray, count: int) -> np.ndarray:
     for number in range(count):
         own = neighbours[classes == number, 1:]
         own = own[:: -(-len(own) // FIT_VALUES) or 1].astype(np.float32)
-        wanted, around = own[:, 0], own[:, 1:]
-        importance = np.ones(len(own), np.float32)
-        for _ in range(REWEIGHTINGS):
-            weighted = around * importance[:, None]
-            normal = (weighted.T @ around).astype(np.float64) + RIDGE * np.eye(WEIGHTS)
-            solution = np.linalg.solve(normal, (wanted @ weighted).astype(np.float64))
-            importance = 1 / (np.abs(wanted - around @ solution.astype(np.float32)) + 1)
-        weights[number] = np.clip(np.rint(64 * solution), -128, 127)
+        weights[number] = np.clip(np.rint(64 * least_absolute(own[:, 0], own[:, 1:])), -128, 127)
     return weights
+
+
+def least_absolute(wanted: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """(K,) float64: factors of the columns of (N, K) `around` with which their sum misses (N,) `wanted` by least in all.
+
+    Iteratively reweighted least squares, in the precision of the arguments.
+    """
+    importance = np.ones(len(wanted), wanted.dtype)
+    for _ in range(REWEIGHTINGS):
+        weighted = around * importance[:, None]
+        normal = (weighted.T @ around).astype(np.float64) + RIDGE * np.eye(around.shape[1])
+        solution = np.linalg.solve(normal, (wanted @ weighted).astype(np.float64))
+        importance = 1 / (np.abs(wanted - around @ solution.astype(around.dtype)) + 1)
+    return solution
 
 
 # --- the walk that encoder and decoder share
@@ -193,7 +196,7 @@ def walk(symbols, coded, weights, state, at, words, trace, neighbours):
                 context = int(_LOGARITHMS[activity + 128 >> 6]) * FRACTIONS + min(3 * abs(fraction) >> 6, FRACTIONS - 1)
                 sign = -1 if fraction < 0 else 1
                 error = sign * (int(symbols[y, x, m]) - whole)
-                error, state, at = _error(error, table, context * DECISIONS, state, at, words, trace)
+                error, state, at = integer(error, table, context * DECISIONS, UNARY, ESCAPES, state, at, words, trace)
                 value = whole + sign * error
                 if not -128 <= value <= 127:
                     return state, at, False
@@ -223,36 +226,6 @@ def _begin_row(here, above, higher, y, unknown):
     here[:2] = above[2] if y > 0 else unknown
     if y == 1:
         higher[:] = above
-
-
-@compiled(forceinline=True)
-def _error(error, table, first, state, at, words, trace):
-    """Code or decode an error in the context whose counters begin at `first`: (error, state, at)."""
-    bit, state, at = adapt(1 if error != 0 else 0, table, first, state, at, words, trace)
-    if not bit:
-        return 0, state, at
-    positive, state, at = adapt(1 if error > 0 else 0, table, first + 1, state, at, words, trace)
-    first += 2 if positive else 2 + UNARY + ESCAPES
-    beyond, found = abs(error) - 1, 0
-    while found < UNARY:
-        bit, state, at = adapt(1 if beyond > found else 0, table, first + found, state, at, words, trace)
-        if not bit:
-            break
-        found += 1
-    if found == UNARY:  # Exp-Golomb: as many ones as bits follow, a zero, the bits
-        rest, bits = beyond - UNARY + 1, 0
-        while bits < ESCAPES:
-            bit, state, at = adapt(1 if rest >> bits + 1 != 0 else 0, table, first + UNARY + bits, state, at, words, trace)
-            if not bit:
-                break
-            bits += 1
-        low = 1
-        for place in range(bits - 1, -1, -1):
-            bit, state, at = decide(rest >> place & 1, SCALE >> 1, state, at, words, trace)
-            low = low << 1 | bit
-        found += low - 1
-    magnitude = found + 1
-    return magnitude if positive else -magnitude, state, at
 
 
 @compiled(forceinline=True)

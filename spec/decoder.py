@@ -95,8 +95,8 @@ def chunks(data, partial):  # sections 3, 4 and 10
         else:
             require(crc32c(body) == crc, "chunk damaged")
         if known:
-            if kind == b"PLNE" and codec == 2:
-                require(raw <= 32768 * stored, "symbols in too few bytes")
+            if kind in (b"PLNE", b"OCCU", b"MOVE") and codec == 2:
+                require(raw <= 32768 * stored, "so much in too few bytes")
                 content = None if body is None else (raw, body)
             else:
                 content = None if body is None else decoded(body, codec, raw)
@@ -136,10 +136,10 @@ def decode(data, partial=False):
     if "WARP" in parts:
         scene |= warp_chunk(Bytes(parts["WARP"]), scene)
     require("MOVE" not in parts or parts["MOVE"] is not None, "no MOVE chunk")
-    scene["motion"] = motion_chunk(Bytes(parts["MOVE"]), scene["scales"]) if "MOVE" in parts else None
+    scene["motion"] = motion_chunk(parts["MOVE"], scene["scales"]) if "MOVE" in parts else None
     expected = sum(s["channels"] for s in scene["scales"])
     scene |= hybrid_chunk(Bytes(parts["HYBR"]), expected) if "HYBR" in parts else decoder_chunk(Bytes(parts["DECO"]), expected)
-    scene |= occupancy_chunk(Bytes(parts["OCCU"]))
+    scene |= coded_occupancy_chunk(*parts["OCCU"]) if isinstance(parts["OCCU"], tuple) else occupancy_chunk(Bytes(parts["OCCU"]))
     scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") is not None else []
     scene["appearances"] = appearances_chunk(Bytes(parts["appe"]), scene["hidden"]) if parts.get("appe") is not None else {}
 
@@ -221,18 +221,51 @@ def warp_chunk(chunk, scene):  # section 5
     return {"frame": axes, "near": near, "baseline": baseline}
 
 
-def motion_chunk(chunk, scales):  # section 5
+def motion_chunk(content, scales):  # section 5
+    """`content`: the raw bytes, or with codec 2 their length and the stored bytes."""
+    coded = isinstance(content, tuple)
+    chunk = Bytes(content[1] if coded else content)
     rows, *nodes, step = chunk.unpack("4Hf")
     require("xt" in scales[0]["planes"] and 2 <= rows <= 16384 and all(2 <= n <= 256 for n in nodes), "motion grid")
     require(step > 0 and 32768 * step <= 1024, "motion step")
-    a_row = 3 * math.prod(nodes)
+    if coded:
+        require(content[0] == 12 + 6 * rows * math.prod(nodes), "raw length")
+        symbols = coded_motion(chunk, rows, *nodes)
+    else:
+        symbols = summed_motion(chunk, rows, 3 * math.prod(nodes))
+    return {"size": (rows, *nodes), "values": [f32(s * step) for s in symbols]}
+
+
+def summed_motion(chunk, rows, a_row):
     low, high = chunk.take(rows * a_row), chunk.take(rows * a_row)
     chunk.end()
     symbols = []
     for i in range(rows * a_row):
         symbols.append((low[i] + 256 * high[i] + (symbols[i - a_row] if i >= a_row else 0)) % 65536)
-    signed = (s - 65536 if s > 32767 else s for s in symbols)
-    return {"size": (rows, *nodes), "values": [f32(s * step) for s in signed]}
+    return [s - 65536 if s > 32767 else s for s in symbols]
+
+
+def coded_motion(chunk, rows, nz, ny, nx):  # section 5, codec 2
+    k = chunk.unpack("15h")
+    decisions, v, r = Decisions(chunk), {}, {}
+    for t in range(rows):
+        for z in range(nz):
+            for y in range(ny):
+                for x in range(nx):
+                    for component in range(3):
+                        places = {i: (t - (i >> 3), z - (i >> 2 & 1), y - (i >> 1 & 1), x - (i & 1), component) for i in range(16)}
+                        there = [i for i in range(1, 16) if places[i] in v]
+                        weights = k if len(there) == 15 else [1024 if i.bit_count() % 2 else -1024 for i in range(1, 16)]
+                        predicted = sum(weights[i - 1] * v[places[i]] for i in there) + 512 >> 10
+                        predicted = min(max(predicted, -32768), 32767)
+                        around = [r[places[i]] for i in (8, 4, 2, 1) if i in there]
+                        a = sum(around) // len(around) + 2 if around else 66
+                        b = a.bit_length()
+                        error = decisions.error(min(2 * (b - 2) + (a >> b - 2) % 2, 19), 15)
+                        require(-32768 <= predicted + error <= 32767, "a symbol leaves 16 bits")
+                        v[places[0]], r[places[0]] = predicted + error, abs(error)
+    decisions.end()
+    return list(v.values())
 
 
 def segment(chunk, rows, columns, channels):  # section 6
@@ -260,9 +293,16 @@ def segment(chunk, rows, columns, channels):  # section 6
 
 
 class Decisions:  # section 6, codec 2
-    def __init__(self, state, words):
-        require(state >= 1 << 16, "first state")
-        self.state, self.words, self.counters = state, words, {}
+    def __init__(self, chunk):
+        """From state and words, which are the rest of the chunk."""
+        self.state, = chunk.unpack("I")
+        require(self.state >= 1 << 16, "first state")
+        words = chunk.rest()
+        require(len(words) % 2 == 0, "half a word")
+        self.words, self.counters = list(struct.unpack(f"<{len(words) // 2}H", words))[::-1], {}
+
+    def end(self):
+        require(not self.words and self.state == 1 << 16, "words and decisions end apart")
 
     def decide(self, p):
         low, high = self.state % 4096, self.state >> 12
@@ -279,7 +319,7 @@ class Decisions:  # section 6, codec 2
         self.counters[name] = (P + ((65536 - P) * R >> 16) if one else P - (P * R >> 16)), min(n + 1, 120)
         return one
 
-    def error(self, context):
+    def error(self, context, most_bits=7):
         if not self.by_counter((context, "any")):
             return 0
         sign = 1 if self.by_counter((context, "positive")) else -1
@@ -287,7 +327,7 @@ class Decisions:  # section 6, codec 2
             if not self.by_counter((context, sign, k)):
                 return sign * (k + 1)
         bits = 0
-        while bits < 7 and self.by_counter((context, sign, 4 + bits)):
+        while bits < most_bits and self.by_counter((context, sign, 4 + bits)):
             bits += 1
         spelt = 0
         for _ in range(bits):
@@ -300,10 +340,7 @@ def context_coded(chunk, H, W, channels):  # section 6, codec 2
     set_count, map_flag = chunk.unpack("BB")
     require(set_count in (1, 2, 4, 8) and map_flag <= 1, "sets of weights or map flag")
     sets = [chunk.unpack("9b") for _ in range(set_count)]
-    state, = chunk.unpack("I")
-    words = chunk.rest()
-    require(len(words) % 2 == 0, "half a word")
-    decisions = Decisions(state, list(struct.unpack(f"<{len(words) // 2}H", words))[::-1])
+    decisions = Decisions(chunk)
 
     coded = {(y, x): 1 for y in range(H) for x in range(W)}
     if map_flag:
@@ -362,7 +399,7 @@ def context_coded(chunk, H, W, channels):  # section 6, codec 2
                 smooth = sum((2 - abs(i)) * (2 - abs(j)) * at(min(max(y + i, 0), H - 1), x + j, 0)[1]
                              for i in (-1, 0, 1) for j in (-1, 0, 1)) >> 1
                 cross[y, x] = cross[y, x] + (smooth - cross[y, x] >> 3) if c else smooth
-    require(not decisions.words and decisions.state == 1 << 16, "words and symbols end apart")
+    decisions.end()
     return [coded[y, x] for y in range(H) for x in range(W)], symbols
 
 
@@ -393,6 +430,25 @@ def occupancy_chunk(chunk):  # section 8
     slots, nz, ny, nx = chunk.unpack("4H")
     require(all(1 <= n <= 16384 for n in (slots, nz, ny, nx)), "grid")
     return {"cells": (nx, ny, nz), "slots": slots, "occupancy": bits(chunk.rest(), slots * nz * ny * nx)}
+
+
+def coded_occupancy_chunk(raw_length, body):  # section 8, codec 2
+    chunk = Bytes(body)
+    slots, nz, ny, nx = chunk.unpack("4H")
+    require(all(1 <= n <= 16384 for n in (slots, nz, ny, nx)), "grid")
+    require(raw_length == 8 + -(-slots * nz * ny * nx // 8), "raw length")
+    decisions, occupied = Decisions(chunk), {}
+    around = [(0, 0, 0, -1), (0, 0, -1, 0), (0, -1, 0, 0), (0, -1, 1, 0), (0, 0, -1, 1), (0, -1, 0, 1),
+              (-1, 0, 0, 0), (-1, 0, 0, -1), (-1, 1, 0, 0), (-1, 0, -1, 0), (-1, -1, 0, 0)]
+    for s in range(slots):
+        for z in range(nz):
+            for y in range(ny):
+                for x in range(nx):
+                    near = [occupied.get((s + h, z + k, y + j, x + i), 0) for h, k, j, i in around]
+                    occupied[s, z, y, x] = decisions.by_counter(tuple(near))
+    decisions.end()
+    return {"cells": (nx, ny, nz), "slots": slots, "occupancy": [
+        occupied[s, z, y, x] for z in range(nz) for y in range(ny) for x in range(nx) for s in range(slots)]}
 
 
 def cameras_chunk(chunk):  # section 9

@@ -25,12 +25,14 @@ def test_chunks_come_back_with_their_places():
     assert all(reader.available(n) for n in range(4))
 
 
-@pytest.mark.parametrize("body, count, codec", [
-    (b"s" * 9, 300, CODEC_SYMBOLS), (b"s" * 9, 9 * EXPANSION_LIMIT, CODEC_SYMBOLS), (b"s" * 9, 9 * EXPANSION_LIMIT + 1, CODEC_ZSTD),
-    (b"s" * 500, 300, CODEC_RAW), (None, 0, CODEC_ZSTD),
+@pytest.mark.parametrize("kind, body, count, codec", [
+    *((kind, b"s" * 9, count, codec) for kind in ("PLNE", "OCCU") for count, codec in (
+        (300, CODEC_SYMBOLS), (9 * EXPANSION_LIMIT, CODEC_SYMBOLS), (9 * EXPANSION_LIMIT + 1, CODEC_ZSTD))),
+    ("PLNE", b"s" * 500, 300, CODEC_RAW), ("OCCU", b"s" * 500, 300, CODEC_ZSTD), ("OCCU", b"s" * 100, 300, CODEC_ZSTD),
+    ("PLNE", None, 0, CODEC_ZSTD),
 ])
-def test_symbols_are_taken_where_they_are_shorter_and_may_stand_for_so_many(body, count, codec):
-    data = pack([Chunk("PLNE", [b"x" * 500], symbols=body, symbol_count=count)], 1)
+def test_symbols_are_taken_where_they_are_shorter_and_may_stand_for_so_many(kind, body, count, codec):
+    data = pack([Chunk(kind, [b"x" * 500], symbols=body, symbol_count=count)], 1)
     entry = Reader(data).index[0]
     assert entry.codec == codec and entry.raw_length == (count if codec == CODEC_SYMBOLS else 500)
     if codec == CODEC_SYMBOLS:

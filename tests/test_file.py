@@ -9,6 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import displaced, faced, tiny_scene, varied
+from test_cells import rolling
+from test_nodes import swaying
 
 import kpc
 from kpc.format.cameras import Camera
@@ -175,6 +177,21 @@ def test_files_without_context_coded_symbols_stay_readable():
     assert len(now) < len(before)
     assert_same(read(before), scene)
     assert_same(read(now), scene)
+
+
+def test_grids_are_context_coded_and_count_against_the_budget_all_the_same():
+    scene = replace(quantised(time=6), occupancy=rolling(), motion=QuantisedMotion(swaying(), STEP))
+    chunks = scene_chunks(scene)
+    now = pack(chunks, scene_values := sum(p.symbols.size for scale in scene.scales for p in scale.values()))
+    before = pack([replace(chunk, symbols=None) for chunk in chunks], scene_values)
+    for kind, bytes_held in (("OCCU", scene.occupancy.size), ("MOVE", 4 * scene.motion.symbols.nbytes)):
+        new, old = (next(e for e in Reader(data).index if e.kind == kind) for data in (now, before))
+        assert new.codec == CODEC_SYMBOLS and old.codec == CODEC_ZSTD and new.raw_length == old.raw_length
+        assert new.stored_length < 0.7 * old.stored_length
+        with pytest.raises(BudgetError):
+            read(now, memory_budget=5 * scene_values + bytes_held - 1)
+    assert_same(read(now), scene)
+    assert_same(read(before), scene)
 
 
 def test_write_and_load(tmp_path):

@@ -134,6 +134,10 @@ def test_the_decoder_written_from_the_page_agrees(path, twin):
     for plane in expected["planes"]:
         assert twin.hashes(scene)[plane["scale"], plane["plane"]] == (
             plane["symbols_sha256"], plane["coded_sha256"], plane["values_sha256"])
+    occupied = np.array(scene["occupancy"], np.uint8).reshape(*scene["cells"][::-1], scene["slots"])
+    occupied = np.ascontiguousarray(np.moveaxis(occupied, -1, 0))
+    assert list(occupied.shape) == expected["occupancy"]["shape"]
+    assert hashlib.sha256(occupied.tobytes()).hexdigest() == expected["occupancy"]["sha256"]
     if "motion" in expected:
         values = np.array(scene["motion"]["values"], "<f4")
         assert [*scene["motion"]["size"], 3] == expected["motion"]["shape"]

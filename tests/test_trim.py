@@ -36,6 +36,7 @@ def test_a_lone_object_seen_once_gets_a_model_of_its_own(moving: Dataset, tmp_pa
     assert (lone.channels, lone.view_dependent, lone.steps, lone.seed) == (8 * plain.channels, False, 7, 3)
     surrounded = options.config(replace(moving, has_alpha=False))
     assert surrounded == replace(plain, steps=7, seed=3)
+    assert replace(options, progressive=True).config(moving).scale_dropout > lone.scale_dropout == 0
     twice = replace(moving.pictures, time=np.zeros(len(moving.pictures), np.float32))
     assert options.config(replace(moving, pictures=twice)).view_dependent
     assert replace(options, steps=None).config(moving).steps == 2 * plain.steps and lone.motion_cells > plain.motion_cells == 0

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from kpc.format import rans
 from kpc.format import symbols as module
 from kpc.format.container import Chunk, pack
 from kpc.format.file import SceneReader, read, scene_chunks
@@ -73,7 +74,7 @@ def _decoded(data: bytes) -> dict[str, float]:
 # --- the coder, with something changed
 
 Walks = dict[str, Any]
-"""The names of `kpc.format.symbols`, its functions compiled anew."""
+"""The names of `kpc.format.symbols`, its functions, and what they call of `kpc.format.rans`, compiled anew."""
 
 
 @njit
@@ -89,8 +90,8 @@ def _note(bit, table, which, state, at, words, trace):
 
 
 def _compiled(changes: dict[str, Any]) -> Walks:
-    names = vars(module) | changes
-    for name in ("_begin_row", "_remember", "_error", "walk_map", "walk"):
+    names = vars(rans) | vars(module) | changes
+    for name in ("_begin_row", "_remember", "integer", "walk_map", "walk"):
         if name not in changes:
             names[name] = njit(FunctionType(vars(module)[name].py_func.__code__, names, name))
     return names

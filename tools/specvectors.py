@@ -23,10 +23,13 @@ import zstandard
 
 from kpc.format import cli
 from kpc.format.cameras import Camera
+from kpc.format.cells import encode_cells
 from kpc.format.container import CODEC_ZSTD, ENTRY, HEADER, Chunk, Reader, pack
 from kpc.format.errors import UsageError
-from kpc.format.file import read, scene_chunks
+from kpc.format.file import MOTION_STRUCT, read, scene_chunks
 from kpc.format.motion import QuantisedMotion
+from kpc.format.nodes import LORENZO, NEIGHBOURS
+from kpc.format.nodes import encode_with as encode_nodes_with
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates
@@ -134,14 +137,36 @@ def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 1
         if chunk.kind == "PLNE":
             plane = scene.scales[chunk.scale][ALL_PLANES[chunk.plane]]
             rows = slice(chunk.row_start, chunk.row_start + chunk.row_count)
-            chunk = _forced(chunk, encode_with(weights, plane.symbols[rows], plane.coded[rows]))
-        chunks.append(chunk)
+            chunks.append(_forced(chunk, encode_with(weights, plane.symbols[rows], plane.coded[rows])))
+        else:
+            chunks.append(replace(chunk, symbols=None))
+    return pack(chunks, _value_count(scene))
+
+
+def coded_grids(scene: QuantisedScene) -> bytes:
+    """A file whose planes are as they ever were, but whose grids are context-coded, also where raw ones would be smaller."""
+    chunks = []
+    for chunk in scene_chunks(scene):
+        body = chunk.symbols if chunk.kind == "OCCU" else None
+        if chunk.kind == "MOVE":  # weights that need no floating-point fit, and the largest and the smallest among them
+            weights = LORENZO - _noise((NEIGHBOURS,), 67).astype(np.int16)
+            weights[-2:] = -32768, 32767
+            body = chunk.parts[0][:MOTION_STRUCT.size] + encode_nodes_with(weights, scene.motion.symbols)
+        chunks.append(_forced(chunk, body) if body else replace(chunk, symbols=None))
     return pack(chunks, _value_count(scene))
 
 
 def _forced(chunk: Chunk, body: bytes) -> Chunk:
     """The chunk with a context-coded body, which the writer takes because the raw one is no longer smaller."""
     return replace(chunk, parts=[body, b"\0"], symbols=body)
+
+
+def claiming(chunks: list[Chunk], number: int, value_count: int, length: int) -> bytes:
+    """A file of raw chunks, of which one claims to be context-coded and to stand for so many bytes."""
+    data = pack(chunks, value_count, compress=False)
+    data = patched(data, 48, "<I", max(length, Reader(data).header.largest_raw))
+    entry = HEADER.size + ENTRY.size * number
+    return resealed(patched(patched(data, entry + 16, "<H", 2), entry + 24, "<I", length))
 
 
 def _value_count(scene: QuantisedScene) -> int:
@@ -159,6 +184,8 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
                     aabb=np.array([[-0.5, -0.5, 0.125], [0.5, 0.5, 1.25]], np.float32))
     hybrid = replace(dense, decoder=_hybrid(2, 5, 3))
     varied = replace(dense, appearances=_appearances("north.mp4", "süd.mp4", "東/0003.jpg"))
+    y, x = np.indices((6, 9))
+    rolling = np.stack([np.stack([(x - s - 4) ** 2 + (y - 2) ** 2 + (z - 3) ** 2 < 8 for z in range(5)]) for s in range(3)])
     note = Chunk("note", [b"readers skip what they need not know"])
     chunks = scene_chunks(minimal)
     index = Reader(packed).index
@@ -188,6 +215,18 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "symbols-constant": (context_coded(_painted(lambda shape, seed: np.full(shape, (127, -128, 1)[seed % 3]))), False),
         "symbols-empty": (context_coded(_painted(lambda shape, seed: np.zeros(shape), coded=False)), False),
         "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
+        "cells": (coded_grids(replace(dense, occupancy=rolling)), False),
+        "cells-noise": (coded_grids(dense), False),
+        "cells-prefix": (coded_grids(dense)[:Reader(coded_grids(dense)).index[4].offset], True),
+        "cells-thin": (coded_grids(replace(minimal, occupancy=_noise((1, 1, 1, 70), 97) > 0)), False),
+        "cells-one": (coded_grids(minimal), False),
+        "cells-long-times": (coded_grids(replace(dense, occupancy=_noise((40, 1, 2, 1), 96) > 0)), False),
+        "nodes": (coded_grids(replace(dense, motion=_swaying(6, 4, 3, 5))), False),
+        "nodes-noise": (coded_grids(moved), False),
+        "nodes-prefix": (coded_grids(moved)[:Reader(coded_grids(moved)).index[5].offset], True),
+        "nodes-extremes": (coded_grids(replace(dense, motion=QuantisedMotion(
+            np.where(_noise((3, 2, 4, 3, 3), 43) < 0, -32768, 32767).astype(np.int16), 0.5**13))), False),
+        "nodes-smallest": (coded_grids(replace(dense, motion=_motion(2, 2, 2, 2))), False),
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
     }
 
@@ -268,6 +307,24 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     told = context(coarse)
     small_entry = HEADER.size + ENTRY.size * small_xy
     state_at = 2 + WEIGHTS
+    small_occu = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "OCCU")
+    cells = struct.pack("<4H", 1, 3, 3, 5) + encode_cells(_noise((1, 3, 3, 5), 99) > 0)
+
+    def occupied(body: bytes, length: int = 8 + 6) -> bytes:
+        """A file whose occupancy is so coded, and claims to stand for so many bytes."""
+        stored = [Chunk("OCCU", [body]) if chunk.kind == "OCCU" else chunk for chunk in small_chunks]
+        return claiming(stored, small_occu, 24, length)
+
+    grid = _swaying(3, 2, 2, 2)
+    nodes = struct.pack("<4Hf", 3, 2, 2, 2, grid.step) + encode_nodes_with(LORENZO, grid.symbols)
+    nodes_at = 12 + 2 * NEIGHBOURS
+    leaving = np.zeros((2, 2, 2, 2, 3), np.int32)
+    leaving[0, 0, 0, 0, 0] = 40_000
+
+    def moving(body: bytes, length: int = 12 + 6 * 24) -> bytes:
+        """A file with a motion grid that is so coded, and claims to stand for so many bytes."""
+        return claiming([chunks[scne], Chunk("MOVE", [body]), *chunks[deco:]], 1, values, length)
+
     # A plane of nothing, told in fewer bytes than its number of symbols allows; the writer itself would take the zstd frame.
     vast = _scene(dynamic=False, sizes=[(256, 64, 64, 1, 0)])
     vast = replace(vast, scales=({name: replace(plane, symbols=0 * plane.symbols, coded=plane.coded & False)
@@ -309,16 +366,40 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "zstd-garbage": (resealed(patched(good, entry[xy] + 16, "<H", 1)), broken, "zstd frame"),
         "symbols-sets": (context(patched(coarse, 0, "<B", 3)), broken, "number of sets"),
         "symbols-map-flag": (context(patched(coarse, 1, "<B", 2)), broken, "map flag"),
-        "symbols-short": (context(coarse[:state_at + 3]), broken, "cut off within its weights or words"),
-        "symbols-half-word": (context(coarse[:-1]), broken, "cut off within its weights or words"),
-        "symbols-cut": (context(coarse[:-2]), broken, "do not end where its symbols do"),
-        "symbols-long": (context(coarse + bytes(2)), broken, "do not end where its symbols do"),
+        "symbols-short": (context(coarse[:state_at + 3]), broken, "cut off within its words"),
+        "symbols-half-word": (context(coarse[:-1]), broken, "cut off within its words"),
+        "symbols-cut": (context(coarse[:-2]), broken, "do not end where they should"),
+        "symbols-long": (context(coarse + bytes(2)), broken, "do not end where they should"),
         "symbols-state": (context(patched(coarse, state_at, "<I", 65535)), broken, "first state is too small"),
-        "symbols-end": (context(patched(coarse, len(coarse) - 1, "<B", coarse[-1] ^ 1)), broken, "do not end where its symbols do"),
+        "symbols-end": (context(patched(coarse, len(coarse) - 1, "<B", coarse[-1] ^ 1)), broken, "do not end where they should"),
         "symbols-bomb": (resealed(bomb_symbols), broken, "more than 15 bytes can hold"),
         "symbols-range": (context(encode_with(weights, symbols + 200, np.ones((2, 2), bool))), broken, "leaves its 8 bits"),
         "symbols-count": (resealed(patched(told, small_entry + 24, "<I", 7)), broken, "claims 7 symbols"),
-        "symbols-elsewhere": (resealed(patched(good, entry[occu] + 16, "<H", 2)), broken, "codec 2"),
+        "symbols-elsewhere": (resealed(patched(good, entry[deco] + 16, "<H", 2)), broken, "codec 2"),
+        "cells-short": (occupied(cells[:8 + 3]), broken, "cut off within its words"),
+        "cells-half-word": (occupied(cells[:-1]), broken, "cut off within its words"),
+        "cells-cut": (occupied(cells[:-2]), broken, "do not end where they should"),
+        "cells-long": (occupied(cells + bytes(2)), broken, "do not end where they should"),
+        "cells-state": (occupied(patched(cells, 8, "<I", 65535)), broken, "first state is too small"),
+        "cells-end": (occupied(patched(cells, len(cells) - 1, "<B", cells[-1] ^ 1)), broken, "do not end where they should"),
+        "cells-none": (occupied(patched(cells, 4, "<H", 0)), broken, "makes no sense"),
+        "cells-more": (occupied(patched(cells, 0, "<H", 2), 8 + 12), broken, "do not end where they should"),
+        "cells-length": (occupied(cells, 15), broken, "claims 15 bytes"),
+        "cells-bomb": (occupied(struct.pack("<4HI", 8, 50, 80, 100, 1 << 16), 8 + 400_000), broken, "more than 12 bytes can hold"),
+        "nodes-weights": (moving(nodes[:nodes_at - 1]), broken, "cut off within its weights"),
+        "nodes-short": (moving(nodes[:nodes_at + 3]), broken, "cut off within its words"),
+        "nodes-half-word": (moving(nodes[:-1]), broken, "cut off within its words"),
+        "nodes-cut": (moving(nodes[:-2]), broken, "do not end where they should"),
+        "nodes-long": (moving(nodes + bytes(2)), broken, "do not end where they should"),
+        "nodes-state": (moving(patched(nodes, nodes_at, "<I", 65535)), broken, "first state is too small"),
+        "nodes-end": (moving(patched(nodes, len(nodes) - 1, "<B", nodes[-1] ^ 1)), broken, "do not end where they should"),
+        "nodes-range": (moving(struct.pack("<4Hf", 2, 2, 2, 2, grid.step) + encode_nodes_with(LORENZO, leaving), 12 + 6 * 16),
+                        broken, "leaves its 16 bits"),
+        "nodes-rows": (moving(patched(nodes, 0, "<H", 1)), broken, "makes no sense"),
+        "nodes-step": (moving(patched(nodes, 8, "<f", nan)), broken, "outside its range"),
+        "nodes-length": (moving(nodes, 12 + 6 * 24 + 1), broken, "claims 157 bytes"),
+        "nodes-bomb": (moving(struct.pack("<4Hf15hI", 50, 60, 60, 20, grid.step, *15 * [0], 1 << 16), 12 + 6 * 50 * 60 * 60 * 20),
+                       broken, "more than 46 bytes can hold"),
         "no-decoder": (without(deco), broken, "0 DECO chunks"),
         "no-segment": (without(len(chunks) - 1), broken, "its segments hold 2 rows, not 3"),
         "two-occupancies": (pack([*chunks, chunks[occu]], values, compress=False), broken, "2 OCCU chunks"),
@@ -452,6 +533,13 @@ def _motion(rows: int, nz: int, ny: int, nx: int, step: float = 8.0) -> Quantise
     symbols = _noise((rows, nz, ny, nx, 3), 41).astype(np.int16)
     symbols[0, 0, 0, 0], symbols[1, 0, 0, 0] = (32767, -32768, 0), (-32768, 32767, 1)
     return QuantisedMotion(symbols, step / 8192)
+
+
+def _swaying(rows: int, nz: int, ny: int, nx: int) -> QuantisedMotion:
+    """Displacements that grow with place and time, a little rough: what a prediction from neighbours hits nearly."""
+    t, z, y, x, c = np.indices((rows, nz, ny, nx, 3))
+    symbols = (c + 1) * (3 * x * x - 5 * y * t + 2 * z * t * t) + 40 * t * (c - 1) + _noise(t.shape, 47) // 64
+    return QuantisedMotion(symbols.astype(np.int16), 0.5**11)
 
 
 def _appearances(*names: str) -> tuple[Appearance, ...]:

@@ -1,0 +1,67 @@
+"""Occupancy under codec 2: every cell told in a context of cells already told, around it and one slot before (spec, section 8).
+
+A cell is most often as its neighbours are, and as it was. Which of these agree says how likely it is occupied.
+"""
+
+import numpy as np
+
+from kpc.format.rans import adapt, compiled, counters, ended, opened, stream
+
+CONTEXTS = 1 << 11
+
+
+def encode_cells(occupancy: np.ndarray) -> bytes:
+    """Code (slots, Nz, Ny, Nx) bool."""
+    cells = np.array(occupancy, np.uint8, order="C")
+    trace = np.empty(cells.size, np.int16)
+    walk(cells, 0, 0, None, trace)
+    return stream(trace)
+
+
+def decode_cells(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
+    """Undo `encode_cells`: bool of that shape.
+
+    Raises:
+        FormatError: the body is cut or too long.
+    """
+    state, words = opened(body, "occupancy")
+    cells = np.zeros(shape, np.uint8)
+    state, at = walk(cells, state, 0, words, None)
+    ended(state, at, words, "occupancy")
+    return cells.view(bool)
+
+
+@compiled()
+def walk(cells, state, at, words, trace):
+    """Code (slots, Nz, Ny, Nx) uint8 `cells` of 0 and 1, or decode into them: (state, at). The rest as `kpc.format.rans.decide`."""
+    S, Z, Y, X = cells.shape
+    table, nowhere = counters(CONTEXTS), np.zeros(X, np.uint8)
+    for s in range(S):
+        for z in range(Z):
+            for y in range(Y):
+                here = cells[s, z, y]
+                north, back, below = _row(cells, nowhere, s, z, y - 1), _row(cells, nowhere, s, z - 1, y), \
+                    _row(cells, nowhere, s, z - 1, y + 1)
+                before, front = _row(cells, nowhere, s - 1, z, y), _row(cells, nowhere, s - 1, z + 1, y)
+                above, behind = _row(cells, nowhere, s - 1, z, y - 1), _row(cells, nowhere, s - 1, z - 1, y)
+                left, past = 0, 0
+                for x in range(X):
+                    corners = 2 * int(north[x + 1]) + int(back[x + 1]) if x + 1 < X else 0
+                    now = int(before[x])
+                    context = left << 10 | int(north[x]) << 9 | int(back[x]) << 8 | int(below[x]) << 7 | corners << 5 \
+                        | now << 4 | past << 3 | int(front[x]) << 2 | int(above[x]) << 1 | int(behind[x])
+                    left, state, at = adapt(int(here[x]), table, context, state, at, words, trace)
+                    here[x] = left
+                    past = now
+                if words is not None and at > words.size:
+                    return state, at
+    return state, at
+
+
+@compiled(forceinline=True)
+def _row(cells, nowhere, s, z, y):
+    """The cells of a row, `nowhere` if it lies outside."""
+    _, Z, Y, _ = cells.shape
+    if s < 0 or not 0 <= z < Z or not 0 <= y < Y:
+        return nowhere
+    return cells[s, z, y]
