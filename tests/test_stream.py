@@ -166,7 +166,7 @@ def test_a_jump_is_served_before_all_that_lies_between(watched: Callable[..., St
     data = long_scene()
     (tmp_path / "scene.kpc").write_bytes(data)
     Noting.asked.clear()
-    with serving(tmp_path, line=Line(rate=150_000, delay_s=0.002), handler=Noting) as url:
+    with serving(tmp_path, line=Line(rate=40_000, delay_s=0.002), handler=Noting) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         until(lambda: stream.scales_here == 2 and stream.can_show(0.0), stream, renderer)
