@@ -100,7 +100,7 @@ def test_the_coarse_picture_is_there_long_before_the_rest_and_gets_finer(watched
     data = coded(tiny_scene(4, time=10, scales=3, resolution=(96, 80, 64)))
     (tmp_path / "scene.kpc").write_bytes(data)
     whole, found = kpc.load(data), []
-    with serving(tmp_path, line=Line(rate=100_000)) as url:
+    with serving(tmp_path, line=Line(rate=20_000)) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         for scales in (1, 2, 3):
