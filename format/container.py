@@ -122,7 +122,8 @@ class Entry:
 class Chunk:
     """One chunk to be written: its place and its raw bytes, cut where their statistics change.
 
-    Some have another form besides, context-coded: `symbols`, which stand for `symbol_count` symbols or bytes.
+    Some have another form besides, context-coded: `symbols` makes it, which takes a while; it stands for `symbol_count` symbols or
+    bytes.
     """
 
     kind: str
@@ -131,7 +132,7 @@ class Chunk:
     plane: int = 0
     row_start: int = 0
     row_count: int = 0
-    symbols: bytes | None = None
+    symbols: Callable[[], bytes] | None = None
     symbol_count: int = 0
 
 
@@ -151,8 +152,10 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) ->
     for chunk in chunks:
         raw = b"".join(chunk.parts)
         forms = [(raw, CODEC_RAW, len(raw))]
-        if compress and chunk.symbols is not None and chunk.symbol_count <= len(chunk.symbols) * EXPANSION_LIMIT:
-            forms.append((chunk.symbols, CODEC_SYMBOLS, chunk.symbol_count))
+        if compress and chunk.symbols is not None:
+            body = chunk.symbols()
+            if chunk.symbol_count <= len(body) * EXPANSION_LIMIT:
+                forms.append((body, CODEC_SYMBOLS, chunk.symbol_count))
         if compress and (chunk.kind != "PLNE" or len(forms) == 1):  # zstd would double the time, and never beats symbols of planes
             forms += [(frame, CODEC_ZSTD, len(raw)) for frame in _zstd_frames(chunk.parts)]
         body, codec, length = min(forms, key=lambda form: len(form[0]))

@@ -147,7 +147,7 @@ def coded_grids(scene: QuantisedScene) -> bytes:
     """A file whose planes are as they ever were, but whose grids are context-coded, also where raw ones would be smaller."""
     chunks = []
     for chunk in scene_chunks(scene):
-        body = chunk.symbols if chunk.kind == "OCCU" else None
+        body = chunk.symbols() if chunk.kind == "OCCU" and chunk.symbols else None
         if chunk.kind == "MOVE":  # weights that need no floating-point fit, and the largest and the smallest among them
             weights = LORENZO - _noise((NEIGHBOURS,), 67).astype(np.int16)
             weights[-2:] = -32768, 32767
@@ -158,7 +158,7 @@ def coded_grids(scene: QuantisedScene) -> bytes:
 
 def _forced(chunk: Chunk, body: bytes) -> Chunk:
     """The chunk with a context-coded body, which the writer takes because the raw one is no longer smaller."""
-    return replace(chunk, parts=[body, b"\0"], symbols=body)
+    return replace(chunk, parts=[body, b"\0"], symbols=lambda: body)
 
 
 def claiming(chunks: list[Chunk], number: int, value_count: int, length: int) -> bytes:
