@@ -325,6 +325,18 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         """A file with a motion grid that is so coded, and claims to stand for so many bytes."""
         return claiming([chunks[scne], Chunk("MOVE", [body]), *chunks[deco:]], 1, values, length)
 
+    def damaged_words(name: str, made: Callable[[bytes], bytes], body: bytes, state_at: int) -> dict[str, tuple[bytes, str, str]]:
+        """Files, `made` of a body with state and words from `state_at` to its end, in which these are damaged."""
+        last = len(body) - 1
+        return {
+            f"{name}-short": (made(body[:state_at + 3]), broken, "cut off within its words"),
+            f"{name}-half-word": (made(body[:-1]), broken, "cut off within its words"),
+            f"{name}-cut": (made(body[:-2]), broken, "do not end where they should"),
+            f"{name}-long": (made(body + bytes(2)), broken, "do not end where they should"),
+            f"{name}-state": (made(patched(body, state_at, "<I", 65535)), broken, "first state is too small"),
+            f"{name}-end": (made(patched(body, last, "<B", body[last] ^ 1)), broken, "do not end where they should"),
+        }
+
     # A plane of nothing, told in fewer bytes than its number of symbols allows; the writer itself would take the zstd frame.
     vast = _scene(dynamic=False, sizes=[(256, 64, 64, 1, 0)])
     vast = replace(vast, scales=({name: replace(plane, symbols=0 * plane.symbols, coded=plane.coded & False)
@@ -366,33 +378,18 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "zstd-garbage": (resealed(patched(good, entry[xy] + 16, "<H", 1)), broken, "zstd frame"),
         "symbols-sets": (context(patched(coarse, 0, "<B", 3)), broken, "number of sets"),
         "symbols-map-flag": (context(patched(coarse, 1, "<B", 2)), broken, "map flag"),
-        "symbols-short": (context(coarse[:state_at + 3]), broken, "cut off within its words"),
-        "symbols-half-word": (context(coarse[:-1]), broken, "cut off within its words"),
-        "symbols-cut": (context(coarse[:-2]), broken, "do not end where they should"),
-        "symbols-long": (context(coarse + bytes(2)), broken, "do not end where they should"),
-        "symbols-state": (context(patched(coarse, state_at, "<I", 65535)), broken, "first state is too small"),
-        "symbols-end": (context(patched(coarse, len(coarse) - 1, "<B", coarse[-1] ^ 1)), broken, "do not end where they should"),
+        **damaged_words("symbols", context, coarse, state_at),
         "symbols-bomb": (resealed(bomb_symbols), broken, "more than 15 bytes can hold"),
         "symbols-range": (context(encode_with(weights, symbols + 200, np.ones((2, 2), bool))), broken, "leaves its 8 bits"),
         "symbols-count": (resealed(patched(told, small_entry + 24, "<I", 7)), broken, "claims 7 symbols"),
         "symbols-elsewhere": (resealed(patched(good, entry[deco] + 16, "<H", 2)), broken, "codec 2"),
-        "cells-short": (occupied(cells[:8 + 3]), broken, "cut off within its words"),
-        "cells-half-word": (occupied(cells[:-1]), broken, "cut off within its words"),
-        "cells-cut": (occupied(cells[:-2]), broken, "do not end where they should"),
-        "cells-long": (occupied(cells + bytes(2)), broken, "do not end where they should"),
-        "cells-state": (occupied(patched(cells, 8, "<I", 65535)), broken, "first state is too small"),
-        "cells-end": (occupied(patched(cells, len(cells) - 1, "<B", cells[-1] ^ 1)), broken, "do not end where they should"),
+        **damaged_words("cells", occupied, cells, 8),
         "cells-none": (occupied(patched(cells, 4, "<H", 0)), broken, "makes no sense"),
         "cells-more": (occupied(patched(cells, 0, "<H", 2), 8 + 12), broken, "do not end where they should"),
         "cells-length": (occupied(cells, 15), broken, "claims 15 bytes"),
         "cells-bomb": (occupied(struct.pack("<4HI", 8, 50, 80, 100, 1 << 16), 8 + 400_000), broken, "more than 12 bytes can hold"),
         "nodes-weights": (moving(nodes[:nodes_at - 1]), broken, "cut off within its weights"),
-        "nodes-short": (moving(nodes[:nodes_at + 3]), broken, "cut off within its words"),
-        "nodes-half-word": (moving(nodes[:-1]), broken, "cut off within its words"),
-        "nodes-cut": (moving(nodes[:-2]), broken, "do not end where they should"),
-        "nodes-long": (moving(nodes + bytes(2)), broken, "do not end where they should"),
-        "nodes-state": (moving(patched(nodes, nodes_at, "<I", 65535)), broken, "first state is too small"),
-        "nodes-end": (moving(patched(nodes, len(nodes) - 1, "<B", nodes[-1] ^ 1)), broken, "do not end where they should"),
+        **damaged_words("nodes", moving, nodes, nodes_at),
         "nodes-range": (moving(struct.pack("<4Hf", 2, 2, 2, 2, grid.step) + encode_nodes_with(LORENZO, leaving), 12 + 6 * 16),
                         broken, "leaves its 16 bits"),
         "nodes-rows": (moving(patched(nodes, 0, "<H", 1)), broken, "makes no sense"),
