@@ -1,8 +1,5 @@
 """Occupancy under codec 2 (spec, section 8): the same comes back, real grids shrink, and damage is refused."""
 
-import os
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -10,6 +7,7 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain import assert_plain_python_prints_the_same
 
 from kpc.format.cells import decode_cells, encode_cells
 from kpc.format.errors import FormatError
@@ -65,25 +63,17 @@ PLAIN = """
 import hashlib
 import numpy as np
 from test_cells import rolling
-from kpc.format.cells import decode_cells, encode_cells, walk
+from kpc.format.cells import decode_cells, encode_cells
 
 for occupancy in (rolling(3, 8, 9, 10), np.random.default_rng(1).random((2, 5, 1, 7)) < 0.5):
     body = encode_cells(occupancy)
     assert np.array_equal(decode_cells(body, occupancy.shape), occupancy)
-    print(hasattr(walk, "py_func"), hashlib.sha256(body).hexdigest())
+    print(hashlib.sha256(body).hexdigest())
 """
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    def run(**more: str) -> list[list[str]]:
-        path = os.pathsep.join([os.path.dirname(__file__), *sys.path])
-        done = subprocess.run([sys.executable, "-W", "error", "-c", PLAIN], capture_output=True, text=True, check=True,
-                              env={**os.environ, "PYTHONPATH": path, **more})
-        return [line.split() for line in done.stdout.splitlines()]
-
-    compiled, plain = run(), run(NUMBA_DISABLE_JIT="1")
-    assert {kind for kind, _ in compiled} == {"True"} and {kind for kind, _ in plain} == {"False"}
-    assert [digest for _, digest in compiled] == [digest for _, digest in plain]
+    assert_plain_python_prints_the_same(PLAIN, "kpc.format.cells:walk")
 
 
 # --- damage and hostility

@@ -1,8 +1,5 @@
 """Motion grids under codec 2 (spec, section 5): the same comes back, smooth fields shrink, and damage is refused."""
 
-import os
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -10,6 +7,7 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain import assert_plain_python_prints_the_same
 
 from kpc.format.errors import FormatError
 from kpc.format.nodes import LORENZO, NEIGHBOURS, decode_nodes, encode_nodes, encode_with
@@ -101,26 +99,18 @@ PLAIN = """
 import hashlib
 import numpy as np
 from test_nodes import painted, swaying
-from kpc.format.nodes import decode_nodes, encode_with, walk
+from kpc.format.nodes import decode_nodes, encode_with
 
 for symbols in (swaying(5, 3, 4, 4), painted("noise", (3, 2, 3, 4, 3), 1), painted("extremes", (2, 3, 3, 2, 3), 2)):
     weights = np.random.default_rng(3).integers(-1500, 1501, 15).astype(np.int16)
     body = encode_with(weights, symbols)
     assert np.array_equal(decode_nodes(body, symbols.shape), symbols)
-    print(hasattr(walk, "py_func"), hashlib.sha256(body).hexdigest())
+    print(hashlib.sha256(body).hexdigest())
 """
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    def run(**more: str) -> list[list[str]]:
-        path = os.pathsep.join([os.path.dirname(__file__), *sys.path])
-        done = subprocess.run([sys.executable, "-W", "error", "-c", PLAIN], capture_output=True, text=True, check=True,
-                              env={**os.environ, "PYTHONPATH": path, **more})
-        return [line.split() for line in done.stdout.splitlines()]
-
-    compiled, plain = run(), run(NUMBA_DISABLE_JIT="1")
-    assert {kind for kind, _ in compiled} == {"True"} and {kind for kind, _ in plain} == {"False"}
-    assert [digest for _, digest in compiled] == [digest for _, digest in plain]
+    assert_plain_python_prints_the_same(PLAIN, "kpc.format.nodes:walk")
 
 
 # --- damage and hostility

@@ -1,6 +1,3 @@
-import os
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -8,6 +5,7 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain import assert_plain_python_prints_the_same
 
 from kpc.format.errors import FormatError
 from kpc.format.planes import encode_segment
@@ -99,30 +97,21 @@ def test_what_is_not_coded_costs_its_map_and_a_map_without_surprises_little():
 
 # The same lines, not compiled: what numba makes of integers must be what Python makes of them.
 PLAIN = """
-import hashlib, sys
+import hashlib
 import numpy as np
 from test_symbols import painted, textured
-from kpc.format.rans import adapt
 from kpc.format.symbols import decode_symbols, encode_with
 
 for symbols, coded in (textured(14, 12, 3), painted("noise", (7, 9, 3), 1, 0.7), painted("extremes", (9, 5, 2), 2, 1.0)):
     weights = np.random.default_rng(3).integers(-128, 128, (4, 9)).astype(np.int8)
     body = encode_with(weights, symbols, coded)
     assert np.array_equal(decode_symbols(body, *symbols.shape)[0], symbols)
-    print(hasattr(adapt, "py_func"), hashlib.sha256(body).hexdigest())
+    print(hashlib.sha256(body).hexdigest())
 """
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    def run(**more: str) -> list[list[str]]:
-        path = os.pathsep.join([os.path.dirname(__file__), *sys.path])
-        done = subprocess.run([sys.executable, "-W", "error", "-c", PLAIN], capture_output=True, text=True, check=True,
-                              env={**os.environ, "PYTHONPATH": path, **more})
-        return [line.split() for line in done.stdout.splitlines()]
-
-    compiled, plain = run(), run(NUMBA_DISABLE_JIT="1")
-    assert {kind for kind, _ in compiled} == {"True"} and {kind for kind, _ in plain} == {"False"}
-    assert [digest for _, digest in compiled] == [digest for _, digest in plain]
+    assert_plain_python_prints_the_same(PLAIN, "kpc.format.rans:adapt")
 
 
 # --- damage and hostility
