@@ -99,7 +99,7 @@ def _record(kind: str, source: Path, origin: results.Record, settings: dict[str,
     """What a record says before anything is measured."""
     return {
         "kind": kind,
-        "name": source.resolve().stem if kind in ("player", "stream", "codec", "entropy") else source.resolve().name,
+        "name": source.resolve().stem if source.is_file() else source.resolve().name,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         **origin,
         "load_average": os.getloadavg()[0],

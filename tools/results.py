@@ -76,6 +76,37 @@ def _prefixes(record: Record) -> str:
     return ", ".join(f"{prefix['bytes'] / size:.0%}: {prefix['psnr']:.1f}" for prefix in record["prefixes"][:-1])
 
 
+def _smaller(record: Record) -> str:
+    """By how much ours is smaller at equal PSNR, on average over the curve."""
+    if record.get("missing"):
+        return str(record["missing"])
+    rate = record["bd_rate"]
+    return "-" if rate is None else f"{-rate:.0%}"
+
+
+def _shares(record: Record) -> str:
+    """Of our bytes, by kind of chunk, the largest first."""
+    shares: dict[str, float] = record["repeats"][0].get("shares") or {}
+    largest = sorted(shares.items(), key=lambda share: -share[1])
+    return ", ".join(f"{kind} {share:.0%}" for kind, share in largest if share >= 0.01) or "-"
+
+
+def _quality_table(records: Iterable[Record]) -> list[list[str]]:
+    """What each quality gives: of our coder alone, bytes and loss."""
+    rows = []
+    for record in records:
+        if record["coder"] == "kpc":
+            labelled = ((str(point["setting"]), point) for point in record["points"])
+            points = {label.removeprefix("quality "): point for label, point in labelled if label.startswith("quality ")}
+            rows.append((record["name"], points))
+    qualities = sorted({quality for _, points in rows for quality in points}, key=float)
+
+    def cell(point: Record | None) -> str:
+        return "-" if point is None else f"{point['size_bytes'] / 1e3:.0f} KB, {point['loss_db']:.2f} dB"
+
+    return [["scene", *qualities]] + [[name, *(cell(points.get(quality)) for quality in qualities)] for name, points in rows]
+
+
 _ENCODED: list[Column] = [
     ("dataset", lambda r: r["name"]),
     ("preset", lambda r: r["settings"]["preset"]),
@@ -153,13 +184,13 @@ COLUMNS: dict[str, list[Column]] = {
         ("scene", lambda r: r["name"]),
         ("coder", lambda r: r["coder"]),
         ("KB at 0.15 dB loss", _number("size_at_default_loss", "{:.0f}", 1e3)),
-        ("kpc is smaller by", lambda r: _smaller(r)),
+        ("kpc is smaller by", _smaller),
         ("near it: KB", _number("size_bytes", "{:.0f}", 1e3)),
         ("bits/param", _number("bits_per_parameter", "{:.2f}")),
         ("PSNR loss dB", _number("loss_db", "{:.2f}")),
         ("encode s", _number("encode_s", "{:.1f}")),
         ("decode s", _number("decode_s", "{:.2f}")),
-        ("chunks", lambda r: _shares(r)),
+        ("chunks", _shares),
     ],
     "entropy": [
         ("scene", lambda r: r["name"]),
@@ -168,36 +199,6 @@ COLUMNS: dict[str, list[Column]] = {
         ("decoded ms", _number("decode_ms", "{:.0f}")),
     ],
 }
-def _smaller(record: Record) -> str:
-    """By how much ours is smaller at equal PSNR, on average over the curve."""
-    if record.get("missing"):
-        return str(record["missing"])
-    rate = record["bd_rate"]
-    return "-" if rate is None else f"{-rate:.0%}"
-
-
-def _shares(record: Record) -> str:
-    """Of our bytes, by kind of chunk, the largest first."""
-    shares: dict[str, float] = record["repeats"][0].get("shares") or {}
-    largest = sorted(shares.items(), key=lambda share: -share[1])
-    return ", ".join(f"{kind} {share:.0%}" for kind, share in largest if share >= 0.01) or "-"
-
-
-def _quality_table(records: Iterable[Record]) -> list[list[str]]:
-    """What each quality gives: of our coder alone, bytes and loss."""
-    rows = []
-    for record in records:
-        if record["coder"] == "kpc":
-            labelled = ((str(point["setting"]), point) for point in record["points"])
-            points = {label.removeprefix("quality "): point for label, point in labelled if label.startswith("quality ")}
-            rows.append((record["name"], points))
-    qualities = sorted({quality for _, points in rows for quality in points}, key=float)
-
-    def cell(point: Record | None) -> str:
-        return "-" if point is None else f"{point['size_bytes'] / 1e3:.0f} KB, {point['loss_db']:.2f} dB"
-
-    return [["scene", *qualities]] + [[name, *(cell(points.get(quality)) for quality in qualities)] for name, points in rows]
-
 
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
           "step": "A step of training", "player": "Playing", "stream": "Playing while it arrives",
