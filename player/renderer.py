@@ -136,6 +136,19 @@ class Renderer:
             remedy = "close other programs or use a smaller size" if full else "update the graphics driver"
             raise DisplayError(f"OpenGL reports {error} on {self.ctx.info['GL_RENDERER']}; {remedy}")
 
+    def release(self) -> None:
+        """Give back all that the scene takes of the card."""
+        self.ctx.detect_framebuffer(0).use()  # moderngl would bind again what it knows as bound, though it is gone
+        things: list[Target | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
+        things = [self._planes, self._row_texture, self._cells, *self._targets.values()]
+        things += [thing for pair in self._programs.values() for thing in reversed(pair)]
+        things += [] if self._folded_planes is None else [self._fold_into, self._folded_planes]
+        things += [] if self._motion_texture is None else [self._motion_texture]
+        for thing in things:
+            thing.release()
+        self._targets.clear()
+        self._programs.clear()
+
     @property
     def memory_bytes(self) -> int:
         """Bytes of the textures and buffers that hold the scene and its pictures."""

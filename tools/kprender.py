@@ -26,9 +26,10 @@ import kpc
 from kpc.format import cli
 from kpc.format.cameras import Camera, Shot, load_shots
 from kpc.format.errors import UsageError
+from kpc.format.groups import LongScene
 from kpc.format.media import write_image, write_video
 from kpc.format.progress import progress
-from kpc.format.scene import Scene
+from kpc.format.scene import Clip, Scene
 from kpc.format.space import Contraction
 from kpc.player import reference
 from kpc.player.orbit import Rig, fitted, orbit
@@ -54,17 +55,18 @@ def _command(argv: list[str]) -> None:
     out = Path(options.output)
     if out.suffix.lower() in FILES and not out.absolute().parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(out.absolute().parent))
-    scene = kpc.load(options.scene)
-    shots = _shots(scene, options)
+    loaded = kpc.load(options.scene)
+    scene, _ = loaded.at(0.0)  # of a clip in groups the first says how large it all is
+    shots = _shots(scene, loaded.clip, options)
     if out.suffix.lower() in (".png", ".exr") and len(shots) != 1:
         raise UsageError(f"-o {out}: {len(shots)} pictures do not go into one; give a directory, an .mp4 or --time")
-    render, where = _backend(scene, options)
+    render, where = _backend(loaded, options)
     print(f"kprender: {where}", file=sys.stderr)
 
     started = clock.monotonic()
     if out.suffix.lower() == ".mp4":
         pixels = _depth_pixels(scene, shots) if options.depth else _colour_pixels
-        fps = options.fps or min(max(scene.clip.fps, 1.0), FASTEST)
+        fps = options.fps or min(max(loaded.clip.fps, 1.0), FASTEST)
         renderings = (render(shot.camera, shot.time) for shot in progress(shots, out.name, unit="frame"))
         write_video(out, (pixels(rendering) for rendering in renderings), fps)
         what = f"{out}: {len(shots)} frames at {fps:g} fps"
@@ -201,7 +203,7 @@ def _size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _shots(scene: Scene, options: argparse.Namespace) -> list[Shot]:
+def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[Shot]:
     """What to take: a camera, a time and a name each."""
     if options.cameras is not None:
         shots = load_shots(options.cameras)
@@ -209,7 +211,7 @@ def _shots(scene: Scene, options: argparse.Namespace) -> list[Shot]:
         views = (
             orbit(scene, options.orbit)
             if options.orbit
-            else [Rig.of(scene).cameras[0]] * (1 if options.time is not None else scene.clip.frame_count)
+            else [Rig.of(scene).cameras[0]] * (1 if options.time is not None else clip.frame_count)
         )
         times = np.linspace(0.0, 1.0, len(views))
         shots = [Shot(camera, float(time), f"{number:04d}") for number, (camera, time) in enumerate(zip(views, times))]
@@ -223,21 +225,32 @@ def _shots(scene: Scene, options: argparse.Namespace) -> list[Shot]:
     return shots
 
 
-def _backend(scene: Scene, options: argparse.Namespace) -> tuple[Render, str]:
+def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Render, str]:
     """How to render, and its name. OpenGL is looked for only where it is wanted."""
-    appearance = _appearance(scene, options.appearance)
+    _appearance(loaded.at(0.0)[0], options.appearance)
     if options.backend == "reference":
-        return lambda camera, time: reference.render(
-            scene, camera, time, part=options.part, appearance=appearance
-        ), "reference renderer (numpy)"
+
+        def by_reference(camera: Camera, time: float) -> Rendering:
+            scene, time = loaded.at(time)
+            return reference.render(scene, camera, time, part=options.part, appearance=_appearance(scene, options.appearance))
+
+        return by_reference, "reference renderer (numpy)"
     from kpc.player import offscreen
     from kpc.player.renderer import Renderer
 
     ctx = offscreen.open_context()
-    renderer = Renderer(ctx, scene, folded=options.folded)
-    return lambda camera, time: renderer.render(
-        camera, time, part=options.part, appearance=appearance
-    ), offscreen.describe(ctx)
+    renderer: Renderer | None = None
+
+    def by_graphics(camera: Camera, time: float) -> Rendering:
+        nonlocal renderer
+        scene, time = loaded.at(time)
+        if renderer is None or renderer.scene is not scene:
+            if renderer is not None:
+                renderer.release()
+            renderer = Renderer(ctx, scene, folded=options.folded)
+        return renderer.render(camera, time, part=options.part, appearance=_appearance(scene, options.appearance))
+
+    return by_graphics, offscreen.describe(ctx)
 
 
 def _paths(out: Path, shots: list[Shot], suffix: str) -> Iterator[Path]:
