@@ -251,10 +251,11 @@ def _backend(scene: Scene, options: argparse.Namespace) -> tuple[Render, str]:
             scene, camera, time, part=options.part, appearance=appearance
         ), "reference renderer (numpy)"
     from kpc.player import offscreen
+    from kpc.player.quality import Quality
     from kpc.player.renderer import Renderer
 
     ctx = offscreen.open_context()
-    renderer = Renderer(ctx, scene, folded=options.folded)
+    renderer = Renderer(ctx, scene, Quality(folded=options.folded))
     return lambda camera, time: renderer.render(
         camera, time, part=options.part, appearance=appearance
     ), offscreen.describe(ctx)
