@@ -191,9 +191,9 @@ class Pace:
         """For a processor that stands in for a graphics card, or for one: the first picture comes soon, if coarsely."""
         return Pace(1 / 15, 0.25) if software else Pace(1 / 50)
 
-    def saw(self, seconds: float) -> None:
-        """Take in how long a picture took at the present scale; the time is in proportion to its pixels."""
-        wanted = min(max(self.scale * math.sqrt(self.budget_s / max(seconds, 1e-6)), self.LEAST), 1.0)
+    def saw(self, seconds: float, budget_s: float | None = None) -> None:
+        """Take in how long a picture took at the present scale, and may take; the time is in proportion to its pixels."""
+        wanted = min(max(self.scale * math.sqrt((budget_s or self.budget_s) / max(seconds, 1e-6)), self.LEAST), 1.0)
         if abs(wanted - self.scale) > self.SLACK * self.scale or wanted == 1.0:
             self.scale += (wanted - self.scale) * (0.7 if wanted < self.scale else 0.3)
             self.scale = 1.0 if self.scale > 0.97 else self.scale

@@ -67,9 +67,9 @@ def main(scene_file: str) -> None:
     for part in (Part.STATIC, Part.DYNAMIC, Part.FULL):
         press(glfw.KEY_C)
         assert player.part is part
-    folded = player.renderer.folded
+    folded = player.renderer.quality.folded
     press(glfw.KEY_F)
-    assert player.renderer.folded is not folded
+    assert player.renderer.quality.folded is not folded
 
     average = canvas()
     for number, name in enumerate(("dawn.jpg", "noon.jpg", "dusk.jpg"), 1):

@@ -3,6 +3,7 @@
 kprender scene.kpc -o clip.mp4                            the clip, from the scene's first camera
 kprender scene.kpc --orbit 96 -o orbit.mp4                a path around it while the clip plays
 kprender scene.kpc --cameras cameras.json -o DIR          one picture for each frame the file lists
+kprender scene.kpc --path path.json -o flight.mp4         smoothly through the views it lists, as saved in the player
 kprender scene.kpc --time 0.5 --size 960x720 -o still.png
 kprender scene.kpc --appearance dawn.jpg:dusk.jpg:0.3 -o clip.mp4
 """
@@ -33,6 +34,7 @@ from kpc.format.scene import Clip, Scene
 from kpc.format.space import Contraction
 from kpc.player import reference
 from kpc.player.orbit import Rig, fitted, orbit
+from kpc.player.path import CameraPath
 from kpc.player.reference import Part, Rendering
 
 Render = Callable[[Camera, float], Rendering]
@@ -40,6 +42,8 @@ Render = Callable[[Camera, float], Rendering]
 FILES = (".mp4", ".png", ".exr")
 FASTEST = 240.0
 LARGEST = 16384
+MOST = 100_000
+"""Pictures at one go."""
 NOTHING = 65535
 """In a depth PNG: no surface."""
 FARTHEST_EVEN = 16.0
@@ -66,7 +70,7 @@ def _command(argv: list[str]) -> None:
     started = clock.monotonic()
     if out.suffix.lower() == ".mp4":
         pixels = _depth_pixels(scene, shots) if options.depth else _colour_pixels
-        fps = options.fps or min(max(loaded.clip.fps, 1.0), FASTEST)
+        fps = _fps(loaded.clip, options)
         renderings = (render(shot.camera, shot.time) for shot in progress(shots, out.name, unit="frame"))
         write_video(out, (pixels(rendering) for rendering in renderings), fps)
         what = f"{out}: {len(shots)} frames at {fps:g} fps"
@@ -93,6 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     views = parser.add_mutually_exclusive_group()
     views.add_argument(
         "--cameras", metavar="JSON", help="cameras and times: w h fl_x fl_y cx cy frames[file time transform_matrix]"
+    )
+    views.add_argument(
+        "--path", metavar="JSON", help="a smooth way through such cameras, that passes each `at` so many seconds (else 2 s apart)"
     )
     views.add_argument("--orbit", type=_count, metavar="N", help="N pictures along a path around the scene")
     parser.add_argument(
@@ -132,7 +139,7 @@ def _parser() -> argparse.ArgumentParser:
         default="png",
         help="of pictures in a directory: 8-bit, or linear float colour and depth (default: %(default)s)",
     )
-    parser.add_argument("--fps", type=_rate, metavar="F", help="of an mp4 (default: the clip's)")
+    parser.add_argument("--fps", type=_rate, metavar="F", help="of an mp4, and of --path (default: the clip's)")
     parser.add_argument(
         "--backend",
         choices=("gl", "reference"),
@@ -171,8 +178,8 @@ def _appearance(scene: Scene, text: str | None) -> np.ndarray | None:
 
 
 def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of pictures from 1 to 100000")
+    if not text.isdecimal() or not 1 <= int(text) <= MOST:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of pictures from 1 to {MOST}")
     return int(text)
 
 
@@ -203,10 +210,23 @@ def _size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
+def _fps(clip: Clip, options: argparse.Namespace) -> float:
+    return float(options.fps or min(max(clip.fps, 1.0), FASTEST))
+
+
+def _path_shots(clip: Clip, options: argparse.Namespace) -> list[Shot]:
+    path, fps = CameraPath.load(options.path), _fps(clip, options)
+    if (path.end_s - path.start_s) * fps >= MOST:
+        raise UsageError(f"--path {options.path}: {path.end_s - path.start_s:g} s at {fps:g} fps are more than {MOST} pictures")
+    return path.shots(fps)
+
+
 def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[Shot]:
     """What to take: a camera, a time and a name each."""
     if options.cameras is not None:
         shots = load_shots(options.cameras)
+    elif options.path is not None:
+        shots = _path_shots(clip, options)
     else:
         views = (
             orbit(scene, options.orbit)
@@ -236,6 +256,7 @@ def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Re
 
         return by_reference, "reference renderer (numpy)"
     from kpc.player import offscreen
+    from kpc.player.quality import Quality
     from kpc.player.renderer import Renderer
 
     ctx = offscreen.open_context()
@@ -247,7 +268,7 @@ def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Re
         if renderer is None or renderer.scene is not scene:
             if renderer is not None:
                 renderer.release()
-            renderer = Renderer(ctx, scene, folded=options.folded)
+            renderer = Renderer(ctx, scene, Quality(folded=options.folded))
         return renderer.render(camera, time, part=options.part, appearance=_appearance(scene, options.appearance))
 
     return by_graphics, offscreen.describe(ctx)
