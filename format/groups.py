@@ -111,7 +111,7 @@ class Groups:
             if isinstance(source, RemoteSource) and not source.has_ranges:  # groups are read at the same time
                 self.reader.source = open_source(source.read_at(0, source.size))
             spans = self._spans()
-            self._first = self._opened(0)
+            self._first = self._opened(0, self._slice(0, self.reader.source))
         self.timeline = Timeline(spans, self._first.head.clip.fps)
         self._check(0, self._first)
 
@@ -133,24 +133,24 @@ class Groups:
         """Whether all of a group is there; False only in a partial file."""
         return self.is_single or self.reader.available(self._chunks[number])
 
-    def open(self, number: int) -> SceneReader:
-        """The scene of a group.
+    def open(self, number: int, apart: bool = False) -> SceneReader:
+        """The scene of a group; `apart`: through a source of its own, for another thread to read beside those of other groups.
 
         Raises:
             FormatError, BudgetError: as `SceneReader`, or the index tells of another scene.
         """
-        if number == 0:
+        if number == 0 and not apart:
             return self._first
-        scene = self._opened(number)
+        scene = self._opened(number, self.source_of(number) if apart else self._slice(number, self.reader.source))
         self._check(number, scene)
         return scene
 
     def source_of(self, number: int) -> Source:
         """The bytes of a group, for another thread to read beside those of other groups."""
         source = self.reader.source
-        if self.is_single:
-            return source
-        return self._slice(number, source.another() if isinstance(source, RemoteSource) else source)
+        if isinstance(source, RemoteSource) and source.has_ranges:
+            source = source.another()
+        return source if self.is_single else self._slice(number, source)
 
     def cameras(self) -> tuple[Camera, ...]:
         """Those of the first group stand for all."""
@@ -176,8 +176,8 @@ class Groups:
         entry = self.reader.index[self._chunks[number]]
         return sliced(source, entry.offset, entry.stored_length, f"{self.name}, group {number}")
 
-    def _opened(self, number: int) -> SceneReader:
-        return SceneReader(self._slice(number, self.reader.source), memory_budget=self._budget,
+    def _opened(self, number: int, source: Source) -> SceneReader:
+        return SceneReader(source, memory_budget=self._budget,
                            allow_partial=not self.available(number), in_parts=self._in_parts)
 
     def _check(self, number: int, scene: SceneReader) -> None:
