@@ -56,6 +56,7 @@ class Stream:
         arrived: called by the fetching thread whenever there is something new; may wake the window.
 
     Attributes:
+        memory: as given.
         scene: what is there of it; `upload` changes it.
         version: grows whenever it has changed.
 
@@ -64,7 +65,7 @@ class Stream:
     """
 
     def __init__(self, source: Source, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None) -> None:
-        self.source, self.arrived, self.version = source, arrived, 0
+        self.source, self.memory, self.arrived, self.version = source, memory, arrived, 0
         self._reader = SceneReader(source, memory_budget=memory, in_parts=True)
         self.parts = PartialScene(self._reader)
         self.scene: Scene = self.parts.scene
