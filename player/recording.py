@@ -41,6 +41,11 @@ class Recording:
         return self.taken / self.fps
 
     @property
+    def is_ending(self) -> bool:
+        """Whether it takes no more frames."""
+        return self._ending
+
+    @property
     def has_room(self) -> bool:
         """Whether the next frame would be taken."""
         return not (self._ending or self._waiting.full())

@@ -52,12 +52,11 @@ class Reel:
     """
 
     def __init__(self, source: Source, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None) -> None:
-        self.source, self._memory, self._arrived = source, memory, arrived
+        self.source, self.memory, self._arrived = source, memory, arrived
         self.groups = Groups(source, memory_budget=memory, in_parts=True)
         self.timeline, self.clip = self.groups.timeline, self.groups.clip
-        if not self.groups.is_single:
-            self._memory = memory // 2
-        self._shown = Held(0, Stream(self.groups.open(0), memory=self._memory, arrived=arrived))
+        self._a_group = memory if self.groups.is_single else memory // 2
+        self._shown = Held(0, Stream(self.groups.open(0), memory=self._a_group, arrived=arrived))
         self.cameras = self._shown.stream.scene.cameras
         self._next: Held | None = None
         self._make: Callable[[Scene], Renderer] | None = None
@@ -94,6 +93,10 @@ class Reel:
         assert self._shown.renderer is not None
         return self._shown.renderer
 
+    @property
+    def is_drawn(self) -> bool:
+        return self._shown.renderer is not None
+
     def draw_with(self, make: Callable[[Scene], Renderer]) -> None:
         """Make renderers so: one now, others as groups come."""
         self._make = make
@@ -102,6 +105,22 @@ class Reel:
     def time_in(self, time: float) -> float:
         """The time in the group that shows, at a time of the clip."""
         return self.timeline.time_in(self.number, time)
+
+    def time_of(self, time_in_it: float) -> float:
+        """The time of the clip, at a time in the group that shows."""
+        spans, span = self.timeline.spans, self.timeline.spans[self.number]
+        frame = span.start + time_in_it * (span.count - 1) - spans[0].start
+        return min(max(frame / max(self.clip.frame_count - 1, 1), 0.0), 1.0)
+
+    @property
+    def scales_here(self) -> int:
+        """As of `Stream`."""
+        return self.stream.scales_here
+
+    @property
+    def share_here(self) -> float:
+        """As of `Stream`, of the group that shows."""
+        return self.stream.share_here
 
     @property
     def version(self) -> int:
@@ -232,7 +251,7 @@ class Reel:
 
     def _open_now(self, number: int) -> None:
         try:
-            stream = Stream(self.groups.open(number, apart=True), memory=self._memory, arrived=self._wake)
+            stream = Stream(self.groups.open(number, apart=True), memory=self._a_group, arrived=self._wake)
             if not stream.scene.cameras:
                 stream.scene = replace(stream.scene, cameras=self.cameras)
             self._opened = Held(number, stream)

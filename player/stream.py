@@ -57,6 +57,7 @@ class Stream:
         arrived: called by the fetching thread whenever there is something new; may wake the window.
 
     Attributes:
+        memory: as given.
         scene: what is there of it; `upload` changes it.
         version: grows whenever it has changed.
 
@@ -67,7 +68,7 @@ class Stream:
     def __init__(self, source: Source | Reader, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None) -> None:
         self._reader = SceneReader(source, memory_budget=memory, in_parts=True)
         source = self._reader.source
-        self.source, self.arrived, self.version = source, arrived, 0
+        self.source, self.memory, self.arrived, self.version = source, memory, arrived, 0
         self.parts = PartialScene(self._reader)
         self.scene: Scene = self.parts.scene
         self._layout = Layout.of(self.scene)
