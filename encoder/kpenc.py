@@ -23,8 +23,8 @@ from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.estimate import Estimate, estimate
 from kpc.encoder.evaluate import evaluate
 from kpc.encoder.field import time_rows
-from kpc.encoder.grouped import begin_with, share_of, spans_of
-from kpc.encoder.model import Model, by_plane, code, save_checkpoint
+from kpc.encoder.grouped import LATER, begin_with, share_of, spans_of
+from kpc.encoder.model import Model, by_plane, code, load_checkpoint, save_checkpoint
 from kpc.encoder.occupancy import grid_shape
 from kpc.encoder.options import Options, parse
 from kpc.encoder.profile import profile
@@ -144,7 +144,7 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         _train(trainer, checkpoint, options.time_budget_s)
     except KeyboardInterrupt:
         trainer.save(checkpoint)
-        if not _wants_partial(trainer, checkpoint):
+        if not _wants_partial(trainer, checkpoint, may_be_asked=options.group_s is None):
             raise
 
     if trainer.config.summed:
@@ -185,7 +185,7 @@ def _encode_groups(options: Options) -> dict[str, Any]:
     if numbers[-1] >= len(spans):
         raise UsageError(f"--only {numbers[-1]}: the clip has {len(spans)} groups, numbered from 0")
     first = _part(work, numbers[0])
-    if options.resume and first.exists():
+    if options.resume and first.with_suffix(".json").exists():
         setting = replace(setting, aabb=file.SceneReader(first).head.aabb, is_final=True)
     elif not setting.is_final:
         setting = _trimmed_for_groups(setting, options, spans)
@@ -193,8 +193,13 @@ def _encode_groups(options: Options) -> dict[str, Any]:
     for number in numbers:
         span, part = spans[number], _part(work, number)
         _say(f"group {number} of {len(spans)}: frames {span.start} to {span.last}")
-        told = replace(share_of(options, span, spans), output=part, work=part.with_suffix(""), group_s=None, only=None)
-        found.append(_finished(part, told) if options.resume and part.exists() else _encode_group(told, _of_span(setting, span)))
+        told = replace(share_of(options, number, spans), output=part, work=part.with_suffix(""),
+                       keep_checkpoint=options.keep_checkpoint or part.with_suffix(".kpck"))
+        if options.resume and part.with_suffix(".json").exists():
+            found.append(_finished(part, told))
+        else:
+            before = None if number == numbers[0] else _part(work, number - 1).with_suffix(".kpck")
+            found.append(_encode_group(told, _of_span(setting, span), before))
     size = _joined([groups.Part.of(_part(work, number), spans[number].start) for number in numbers], options)
     if not options.keep:
         _clear(work)
@@ -213,17 +218,25 @@ def _of_span(setting: Setting, span: groups.Span) -> Setting:
 def _trimmed_for_groups(setting: Setting, options: Options, spans: Sequence[groups.Span]) -> Setting:
     """All groups share a box, found from no more frames than one of them has."""
     dataset = setting.dataset.thinned(max(span.count for span in spans))
-    budget_s = share_of(options, spans[0], tuple(spans)).time_budget_s
+    budget_s = share_of(options, 0, spans).time_budget_s
     assert not isinstance(setting.mapping, Contraction)
     aabb, _ = _trimmed(dataset, options.config(dataset), setting.aabb, budget_s, setting.mapping)
     return replace(setting, aabb=aabb, is_final=True)
 
 
-def _encode_group(told: Options, setting: Setting) -> dict[str, Any]:
-    """A group, and beside its file what was measured; with both there it is done."""
-    found = _encode_scene(told, setting)
+def _encode_group(told: Options, setting: Setting, before: Path | None) -> dict[str, Any]:
+    """A group, and beside its file what was measured: with that there it is done. It begins where `before` ended, the finished
+    checkpoint of the one before."""
+    if before is None:
+        found = _encode_scene(told, setting)
+    else:
+        _say(f"it begins where the one before ended, and takes {LATER:.0%} of its steps")
+        shorter = replace(told, steps=math.ceil(LATER * told.config(setting.dataset).steps))
+        found = _encode_scene(shorter, replace(setting, before=load_checkpoint(before).scene))
     with cli.written_aside(told.output.with_suffix(".json")) as aside:
         aside.write_text(json.dumps({"told": _as_told(told), "found": found}))
+    if before is not None:
+        before.unlink()
     return found
 
 
@@ -300,11 +313,11 @@ def dry_run(options: Options) -> Estimate:
     """
     started = time.monotonic()
     setting = _setting(options)
-    groups_count = 1
+    groups_count = 1.0
     if options.group_s is not None:
         spans = spans_of(setting.dataset.clip, options.group_s)
-        groups_count = 1 if options.only is not None else len(spans)
-        options, setting = share_of(options, spans[0], spans), _of_span(setting, spans[0])
+        groups_count = 1 if options.only is not None else 1 + LATER * (len(spans) - 1)
+        options, setting = share_of(options, options.only or 0, spans), _of_span(setting, spans[options.only or 0])
     trainer = _trainer(options, setting)
     tested = int(trainer.dataset.pictures.is_test.sum())
     found = estimate(
@@ -428,11 +441,11 @@ def _write(scene: QuantisedScene, output: Path, work: Path) -> int:
         raise TrainingError(f"{output}: {error.strerror}; make room there{kept}") from error
 
 
-def _wants_partial(trainer: Trainer, checkpoint: Path) -> bool:
+def _wants_partial(trainer: Trainer, checkpoint: Path, may_be_asked: bool) -> bool:
     """After Ctrl-C: on a terminal ask whether to write the scene as it stands; elsewhere only say how to go on."""
     where = f"stopped at step {trainer.step}; {checkpoint} is kept, go on with --resume"
     _say(where)
-    if not (sys.stdin.isatty() and sys.stderr.isatty()) or trainer.step < 2:
+    if not may_be_asked or not (sys.stdin.isatty() and sys.stderr.isatty()) or trainer.step < 2:
         return False
     print("write the scene as trained so far? [y/N] ", end="", file=sys.stderr, flush=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
@@ -530,7 +543,7 @@ def _make_work_dir(work: Path) -> None:
 
 def _clear(work: Path) -> None:
     """Remove what kpenc has put there, and the folder if that was all."""
-    for pattern in ("pixels-*.bin", "pixels-*.json", "group-*.kpc", "group-*.json", CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"):
+    for pattern in ("pixels-*.bin", "pixels-*.json", "group-*.kpc", "group-*.json", "group-*.kpck", CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"):
         for leftover in work.glob(pattern):
             leftover.unlink(missing_ok=True)
     _remove_if_empty(work)

@@ -257,7 +257,7 @@ def drop_files(window: Window, player: Player, scene_file: Path) -> None:
     window._drop(None, [str(scene_file)])
     player.run()
     assert player.successor is not None and not glfw.window_should_close(window.handle)
-    player.successor[0].close()
+    player.successor.close()
     player.successor = None
 
 
