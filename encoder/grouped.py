@@ -17,7 +17,7 @@ from kpc.format.scene import TIME_PLANES, Clip, Scene
 OVERLAP = 2
 """Frames that a group holds beyond those it shows, at either end where there are more: it takes over in the midst of what it knows."""
 
-LATER = 0.5
+LATER = 0.25
 """Steps of a group that begins where another ended, of those of one that begins anew."""
 
 LEAST_FRAMES = 8

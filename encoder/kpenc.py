@@ -36,6 +36,7 @@ from kpc.encoder.train import Report, Trainer, box_of_checkpoint
 from kpc.encoder.trim import trim_box
 from kpc.format import cli, file, groups
 from kpc.format.errors import DatasetError, TrainingError, UsageError
+from kpc.format.memory import peak_memory_bytes
 from kpc.format.progress import Progress
 from kpc.format.quantise import QuantisedScene
 from kpc.format.scene import Scene
@@ -172,7 +173,7 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         "coding_loss_db": before.psnr - test.psnr if test and before else coded.loss_db,
         **figures(coded, size, options.trade, "training views"),
         "steps": trainer.step, "train_s": trainer.elapsed_s, "encode_s": time.monotonic() - started,
-        "rays_per_s": trainer.rays_per_second,
+        "rays_per_s": trainer.rays_per_second, "peak_memory_bytes": peak_memory_bytes(),
     }
 
 
@@ -286,8 +287,8 @@ def _of_all(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size:
         **{key: mean(key, frames) for key in ("coding_loss_db", "probe_loss_db", "agreement_db", "identity_share")},
         "size_bytes": size, "parameters": parameters, "bits_per_parameter": 8 * size / parameters,
         **{key: sum(one[key] for one in found) for key in ("steps", "train_s")},
-        "rays_per_s": mean("rays_per_s", [one["train_s"] for one in found]),
-        "groups": [{"frames": [span.start, span.last]} | {key: one[key] for key in ("size_bytes", "test_psnr", "steps", "train_s")}
+        "rays_per_s": mean("rays_per_s", [one["train_s"] for one in found]), "peak_memory_bytes": found[-1]["peak_memory_bytes"],
+        "groups": [{"frames": [span.start, span.last]} | {key: one[key] for key in ("size_bytes", "test_psnr", "steps", "train_s", "peak_memory_bytes")}
                    for one, span in zip(found, spans, strict=True)],
     }  # fmt: skip
 

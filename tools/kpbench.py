@@ -4,6 +4,7 @@ kpbench encode room liam --preset balanced --out docs/bench/balanced.json
 kpbench curve room liam --minutes 1,2,5,10,20 --out docs/bench/curve.json
 kpbench ablate default --preset fast --steps 2000 --out docs/bench/ablate.json
 kpbench step room soldier --preset balanced --out docs/bench/step.json
+kpbench groups long_clip --preset fast --group 5s --out docs/bench/groups.json
 kpbench player room.kpc liam.kpc --out docs/bench/player.json
 kpbench stream room.kpc liam.kpc --out docs/bench/stream.json
 kpbench codec room.kpck liam.kpc --dataset room --dataset liam --out docs/bench/codec.json
@@ -185,6 +186,42 @@ def _step(options: argparse.Namespace, origin: results.Record) -> Iterator[resul
                 print(f"kpbench: {record['name']}, {options.preset}, a step", file=sys.stderr)
                 record["repeats"].append(_alone(_step_once, job))
             yield record
+
+
+def _groups(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """A record a dataset: the peak of memory after the first group and after all, and how steady the clip is where they join. Beside
+    --out also .svg, the PSNR of each frame."""
+    _encoder()  # what is missing is said before anything is read
+    records: list[results.Record] = []
+    with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
+        kept: Path = options.keep_scenes or Path(scratch)
+        kept.mkdir(parents=True, exist_ok=True)
+        for source in options.datasets:
+            settings = {"preset": options.preset, "group_s": options.group, "steps": options.steps, "downscale": options.downscale,
+                        "space": options.space, "box": options.box, "test_views": options.test_views}  # fmt: skip
+            record = _record("groups", _folder(source), origin, settings) | {"seed": options.seed}
+            work = Path(scratch) / f"{record['name']}.work"
+            job = replace(
+                _job(options, source, options.seed, kept / f"{record['name']}-groups.kpc", work), steps=options.steps,
+                most_tests=options.test_views, group_s=options.group, keep=True,
+            )  # fmt: skip
+            print(f"kpbench: {record['name']}, {options.preset}, groups of {options.group:g} s", file=sys.stderr)
+            device, found = _alone(_encode_once, job)
+            each = found.pop("groups")
+            repeat = found | {"groups": len(each), "peak_of_one_bytes": each[0]["peak_memory_bytes"]}
+            records.append(record | {"renderer": device, "repeats": [repeat], "each": each} | _alone(_joins, job))
+            yield records[-1]
+    if options.out is not None:
+        from kpc.tools import plot  # needs matplotlib
+
+        plot.save(plot.per_frame(records), options.out.with_suffix(".svg"))
+
+
+def _joins(job: Any) -> dict[str, Any]:
+    from kpc.encoder.datasets import load_dataset
+    from kpc.tools.joins import measure
+
+    return measure(job.output, load_dataset(job.source, job.work_dir, holdout=job.holdout, downscale=job.downscale))
 
 
 def _folder(source: Path) -> Path:
@@ -403,7 +440,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|player|stream|codec|entropy")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|groups|player|stream|codec|entropy")
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
@@ -423,14 +460,20 @@ def _parser() -> argparse.ArgumentParser:
     step = kinds.add_parser("step", help="where the time of training goes", description="Profile a training step, on the CPU.")
     step.set_defaults(measure=_step, device="cpu")
 
-    for kind in (encode, curve, ablate, step):
+    groups = kinds.add_parser("groups", help="a long clip in groups", description="Run kpenc --group on each dataset: memory of "
+                              "one group and of all, and how steady held-out views are where groups join.")  # fmt: skip
+    groups.add_argument("--group", type=cli.duration_s, default=10.0, metavar="10s", help="that each shows (default: 10s)")
+    groups.add_argument("--steps", type=_positive, help="optimiser steps of the first group instead of the preset's")
+    groups.set_defaults(measure=_groups)
+
+    for kind in (encode, curve, ablate, step, groups):
         kind.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
         kind.add_argument("--preset", choices=("draft", "fast", "balanced", "best"), default="balanced")
         kind.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
         kind.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
         kind.add_argument("--space", choices=("auto", "box", "contracted", "ndc"), default="auto", help="of every dataset")
         kind.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
-    for kind in (encode, curve, ablate):
+    for kind in (encode, curve, ablate, groups):
         kind.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
         kind.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
         kind.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there")
@@ -466,7 +509,7 @@ def _parser() -> argparse.ArgumentParser:
 
     for kind in (encode, curve, ablate, step, player, stream):
         kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
-    for kind in (encode, curve, ablate, step, player, stream, codec, entropy):
+    for kind in (encode, curve, ablate, step, groups, player, stream, codec, entropy):
         kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
     return parser
 

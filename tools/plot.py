@@ -1,7 +1,9 @@
-"""Quality and size against seconds of training, from records of `kpbench curve`; rate against distortion, from `kpbench codec`.
+"""Quality and size against seconds of training, from records of `kpbench curve`; rate against distortion, from `kpbench codec`;
+PSNR frame by frame, from `kpbench groups`.
 
 python -m kpc.tools.plot docs/bench/curve.json -o docs/curve.svg
 python -m kpc.tools.plot docs/bench/codec.json -o docs/codec.svg
+python -m kpc.tools.plot docs/bench/groups.json -o docs/groups.svg
 
 Of training: one panel for each of PSNR, SSIM and file size; a line for each dataset and preset goes through the medians of its repeats,
 which are dots. Time runs on a logarithmic axis. The ending of the name chooses SVG, PNG or PDF. Needs kpc[bench].
@@ -89,6 +91,34 @@ def rate_distortion(records: Sequence[results.Record]) -> Figure:
     return figure
 
 
+def per_frame(records: Sequence[results.Record]) -> Figure:
+    """The plot of records of `kpbench groups`: a panel a clip, held-out PSNR of each frame, and how much its error changed from the
+    frame before; groups join at the upright lines.
+
+    Raises:
+        FormatError: there is nothing to draw.
+    """
+    clips = [record for record in records if record["kind"] == "groups" and record["frames"]]
+    if not clips:
+        raise FormatError("no records of kpbench groups to draw; write some with kpbench groups --out")
+    width, height = RATE_PANEL_INCHES
+    figure = Figure(figsize=(2 * width * len(clips), 1.5 * height), layout="constrained")
+    for column, record in zip(figure.subplots(2, len(clips), squeeze=False, sharex="col").T, clips):
+        for camera in sorted({frame["camera"] for frame in record["frames"]}):
+            frames = [frame for frame in record["frames"] if frame["camera"] == camera]
+            column[0].plot([f["frame"] for f in frames], [f["psnr"] for f in frames], label=camera)
+            changed = [f for f in frames if f["change"] is not None]
+            column[1].plot([f["frame"] for f in changed], [255 * f["change"] for f in changed])
+        for axes, title in zip(column, ("held-out PSNR, dB", "change of the error from frame to frame, 8-bit levels")):
+            for join in record["joins"]:
+                axes.axvline(join["frame"] - 0.5, color="0.6", linestyle="--", linewidth=1)
+            axes.set(title=f"{record['name']}: {title}")
+            axes.grid(color="0.87")
+        column[0].legend()
+        column[1].set(xlabel="frame", ylim=(0, None))
+    return figure
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write a plot as its ending says.
 
@@ -120,8 +150,8 @@ def _command(argv: list[str]) -> None:
     if options.output.suffix.lower() not in ENDINGS:
         raise UsageError(f"{options.output}: plots are {', '.join(ENDINGS)}")
     records = results.load(options.records)
-    coding = all(record["kind"] == "codec" for record in records) and records
-    save(rate_distortion(records) if coding else curves(records), options.output)
+    draw = {"codec": rate_distortion, "groups": per_frame}.get(records[0]["kind"] if records else "", curves)
+    save(draw(records), options.output)
     print(options.output)
 
 

@@ -76,6 +76,16 @@ def _prefixes(record: Record) -> str:
     return ", ".join(f"{prefix['bytes'] / size:.0%}: {prefix['psnr']:.1f}" for prefix in record["prefixes"][:-1])
 
 
+def _at_joins(record: Record) -> str:
+    """Of each join; changes are in 8-bit levels."""
+    return "; ".join(f"{join['before']:.1f}, {join['after']:.1f}; {255 * join['change']:.1f}" for join in record["joins"])
+
+
+def _usual_change(record: Record) -> str:
+    joins = record["joins"]
+    return f"{255 * joins[0]['usual_change']:.1f}, {255 * joins[0]['high_change']:.1f}" if joins else "-"
+
+
 def _smaller(record: Record) -> str:
     """By how much ours is smaller at equal PSNR, on average over the curve."""
     if record.get("missing"):
@@ -192,6 +202,19 @@ COLUMNS: dict[str, list[Column]] = {
         ("decode s", _number("decode_s", "{:.2f}")),
         ("chunks", _shares),
     ],
+    "groups": [
+        ("dataset", lambda r: r["name"]),
+        ("preset", lambda r: r["settings"]["preset"]),
+        ("groups of", lambda r: f"{r['settings']['group_s']:g} s"),
+        ("groups", _number("groups", "{:.0f}")),
+        ("file KB", _number("size_bytes", "{:.0f}", 1e3)),
+        ("PSNR dB", _number("test_psnr", "{:.2f}")),
+        ("encoded in s", _number("encode_s", "{:.0f}")),
+        ("peak MB, one group", _number("peak_of_one_bytes", "{:.0f}", 1e6)),
+        ("peak MB, all", _number("peak_memory_bytes", "{:.0f}", 1e6)),
+        ("at joins: dB before, after; change", _at_joins),
+        ("usual change, 95th percentile", _usual_change),
+    ],
     "entropy": [
         ("scene", lambda r: r["name"]),
         ("without", lambda r: r["settings"]["left_out"]),
@@ -202,6 +225,7 @@ COLUMNS: dict[str, list[Column]] = {
 
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
           "step": "A step of training", "player": "Playing", "stream": "Playing while it arrives",
+          "groups": "A clip in groups",
           "codec": "Coding, beside what is at hand", "entropy": "Entropy coding of planes, one idea left out; one core"}
 
 
