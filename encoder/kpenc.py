@@ -30,7 +30,7 @@ from kpc.encoder.options import Options, parse
 from kpc.encoder.profile import profile
 from kpc.encoder.probe import PROBE_RAYS, Probe
 from kpc.encoder.prune import Pruned
-from kpc.encoder.recode import check_outputs, figures, reached, recode
+from kpc.encoder.recode import check_outputs, figures, reached, recode, together
 from kpc.encoder.structure import TimeResolution, fitted_in_time
 from kpc.encoder.train import Report, Trainer, box_of_checkpoint
 from kpc.encoder.trim import trim_box
@@ -278,14 +278,11 @@ def _of_all(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size:
         values = [one[name] for one in found]
         return None if None in values or not sum(weights) else float(np.average(values, weights=weights))
 
-    pictures, frames = [one["test_pictures"] for one in found], [span.count for span in spans]
-    parameters = sum(one["parameters"] for one in found)
-    name, value = options.trade.bound
-    return found[0] | {
-        "file": str(options.output), "trade": name, "asked": value,
+    pictures = [one["test_pictures"] for one in found]
+    return found[0] | together(found, spans, size, options.trade) | {
+        "file": str(options.output),
         "test_psnr": mean("test_psnr", pictures), "test_ssim": mean("test_ssim", pictures), "test_pictures": sum(pictures),
-        **{key: mean(key, frames) for key in ("coding_loss_db", "probe_loss_db", "agreement_db", "identity_share")},
-        "size_bytes": size, "parameters": parameters, "bits_per_parameter": 8 * size / parameters,
+        "coding_loss_db": mean("coding_loss_db", [span.count for span in spans]),
         **{key: sum(one[key] for one in found) for key in ("steps", "train_s")},
         "rays_per_s": mean("rays_per_s", [one["train_s"] for one in found]), "peak_memory_bytes": found[-1]["peak_memory_bytes"],
         "groups": [{"frames": [span.start, span.last]} | {key: one[key] for key in ("size_bytes", "test_psnr", "steps", "train_s", "peak_memory_bytes")}
@@ -351,6 +348,7 @@ def ablations(options: Options) -> list[str]:
 def _setting(options: Options) -> Setting:
     """The dataset decoded, the space found that it fills."""
     check_outputs(options)
+    _device(options.device)
     _make_work_dir(options.work_dir)
     try:
         dataset = load_dataset(options.source, options.work_dir, holdout=options.holdout, downscale=options.downscale)

@@ -99,13 +99,17 @@ def load(path: Path) -> Model:
     with path.open("rb") as opened:
         begins = opened.read(len(MAGIC))
     if begins == MAGIC:
-        coded = file.read(path)
-        scene = coded.dequantise()
-        steps = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in coded.scales]
-        return Model(scene, steps, Probe.of_cameras(scene), coded)
+        return model_of(file.read(path))
     if begins.startswith(CHECKPOINT_MAGIC):
         return load_checkpoint(path)
     raise UsageError(f"{path}: neither a folder of videos or images, nor a finished checkpoint, nor a .kpc file")
+
+
+def model_of(coded: QuantisedScene) -> Model:
+    """A scene as a file holds it, to be coded again."""
+    scene = coded.dequantise()
+    steps = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in coded.scales]
+    return Model(scene, steps, Probe.of_cameras(scene), coded)
 
 
 def by_plane(layout: Layout, values: np.ndarray) -> list[dict[str, np.ndarray]]:

@@ -14,7 +14,7 @@ import torch
 
 from kpc.encoder import render
 from kpc.encoder.evaluate import SceneRenderer
-from kpc.encoder.field import Field
+from kpc.encoder.field import Field, Layout
 from kpc.format.scene import Decoder, Scene
 from kpc.format.space import Contraction
 
@@ -132,9 +132,11 @@ class Seen:
         occupied = np.argwhere(scene.occupancy)
         chosen = occupied[rng.integers(len(occupied), size=len(ends))] if len(occupied) else np.zeros((len(ends), 4), np.int64)
         inside = (chosen + rng.random(chosen.shape)) / (slots, *cells)
+        counts = [scale["xy"].shape[2] for scale in scene.scales]  # the renderer's field has as many as the widest at each
+        own = np.concatenate([max(counts) * s + np.arange(count) for s, count in enumerate(counts)])
         with torch.no_grad():
             features, elsewhere = (
-                renderer.field.features(p.float(), t.float()).numpy().astype(np.float64)
+                renderer.field.features(p.float(), t.float()).numpy()[:, own].astype(np.float64)
                 for p, t in ((u[:, 0].clamp(0, 1), torch.from_numpy(times[ends])),
                              (torch.from_numpy(inside[:, :0:-1].copy()), torch.from_numpy(inside[:, 0].copy())))
             )
@@ -216,4 +218,6 @@ def _moments(features: np.ndarray, constant: bool = False) -> np.ndarray:
 def _basis(scene: Scene, directions: np.ndarray) -> np.ndarray:
     """The colour basis of (N, 3) directions: (N, 3, F) float64."""
     with torch.no_grad():
-        return Field.from_scene(scene).basis(torch.from_numpy(directions)).numpy().astype(np.float64)  # type: ignore[no-any-return]
+        field = Field(Layout.of(np.array([[2, 2, 2, 0]]), 1), len(scene.decoder.b1))  # whose planes, evenly wide, are of no matter
+        field.load_decoder(scene.decoder)
+        return field.basis(torch.from_numpy(directions)).numpy().astype(np.float64)  # type: ignore[no-any-return]

@@ -2,14 +2,18 @@
 
 import os
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from kpc.encoder import model
 from kpc.encoder.compress import Trade
 from kpc.encoder.config import TrainConfig
+from kpc.encoder.grouped import share_of
 from kpc.encoder.options import Options
-from kpc.format import file
+from kpc.format import file, groups
+from kpc.format.container import MAGIC
 from kpc.format.errors import TrainingError, UsageError
 
 JUDGED_BY = ("training views", "views of its own, taken to be right to 30 dB")
@@ -24,6 +28,10 @@ def recode(options: Options) -> dict[str, Any]:
     """
     started = time.monotonic()
     check_outputs(options)
+    with options.source.open("rb") as opened:
+        opened_groups = groups.Groups(options.source) if opened.read(len(MAGIC)) == MAGIC else None
+    if opened_groups is not None and not opened_groups.is_single:
+        return _recode_groups(options, opened_groups) | {"encode_s": time.monotonic() - started}
     source = model.load(options.source)
     coded = model.code(source, options.trade, TrainConfig().prune_share)
     size = file.write(coded.scene, options.output)
@@ -31,6 +39,34 @@ def recode(options: Options) -> dict[str, Any]:
         "file": str(options.output), "source": str(options.source),
         **figures(coded, size, options.trade, JUDGED_BY[source.coded is not None]),
         "encode_s": time.monotonic() - started,
+    }  # fmt: skip
+
+
+def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
+    """Each group by itself; the coded ones are in memory together."""
+    spans, parts, found = source.timeline.spans, [], []
+    for number, span in enumerate(spans):
+        trade = share_of(options, number, spans).trade
+        scene = replace(file.read(source.open(number)), cameras=source.open(number).cameras() or source.cameras())
+        coded = model.code(model.model_of(scene), trade, TrainConfig().prune_share)
+        data = file.encode(coded.scene)
+        parts.append(groups.Part.of(data, span.start))
+        found.append(figures(coded, len(data), trade, JUDGED_BY[1]))
+    size = groups.write(parts, options.output)
+    return {"file": str(options.output), "source": str(options.source), **together(found, spans, size, options.trade)}
+
+
+def together(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size: int, trade: Trade) -> dict[str, Any]:
+    """`figures` of a clip whose groups have those found: sums, and means over frames."""
+    frames, parameters = [span.count for span in spans], sum(one["parameters"] for one in found)
+    means = {}
+    for key in ("probe_loss_db", "agreement_db", "identity_share"):
+        known = [(one[key], count) for one, count in zip(found, frames, strict=True) if one[key] is not None]
+        means[key] = sum(value * count for value, count in known) / sum(count for _, count in known) if known else None
+    name, value = trade.bound
+    return {
+        "trade": name, "asked": value, "judged_by": found[0]["judged_by"], **means, "size_bytes": size, "parameters": parameters,
+        "bits_per_parameter": 8 * size / parameters,
     }  # fmt: skip
 
 
