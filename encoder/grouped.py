@@ -1,4 +1,8 @@
-"""A long clip in groups (`kpc.format.groups`): which frames each holds, and how one begins where the one before ended."""
+"""A long clip in groups (`kpc.format.groups`): which frames each holds, and how one begins where the one before ended.
+
+Space planes are coded for each group anew. As differences from those of the group before, at equal steps, they take 1.4 times as many
+bytes (default scene, second group after 600 steps): training moves all of them a little, by about as much as they vary themselves.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -33,6 +33,8 @@ class Held:
     number: int
     stream: Stream
     renderer: Renderer | None = None
+    is_warm: bool = False
+    """Whether the renderer's shaders are compiled."""
 
 
 class Reel:
@@ -60,7 +62,6 @@ class Reel:
         self.cameras = self._shown.stream.scene.cameras
         self._next: Held | None = None
         self._make: Callable[[Scene], Renderer] | None = None
-        self._turns = 0
         self._before = 0
         """Versions of what has shown before."""
         self._waiting = False
@@ -181,8 +182,10 @@ class Reel:
         if coming is not None and self._make is not None:
             if coming.renderer is None:
                 coming.renderer = self._make(coming.stream.scene)
+            elif not coming.is_warm:  # a turn later: compiling takes the longest of all that the window's thread does here
                 coming.renderer.quality = self.renderer.quality
                 coming.renderer.render(Rig.of(coming.stream.scene).cameras[0].resized(*WARM_UP), 0.0)
+                coming.is_warm = True
             elif self._waiting or not changed:
                 coming.stream.upload(coming.renderer)
         return changed
@@ -214,7 +217,7 @@ class Reel:
 
     def _is_ready(self, held: Held, head: Playhead) -> bool:
         there = self._head_in(held.number, head)
-        return held.renderer is not None and held.stream.can_show(there.time, there.pace)
+        return held.is_warm and held.stream.can_show(there.time, there.pace)
 
     def _turn(self) -> None:
         """The next group shows; the one that did is let go."""

@@ -94,7 +94,7 @@ def test_each_group_shows_in_its_time(clip, opened):
 
 def test_the_next_group_is_there_before_it_shows(clip, opened):
     reel, head = opened(clip), Playhead(0.1, PACE)
-    wait_for(reel, head, lambda: reel._next is not None and reel._next.renderer is not None and reel._next.stream.is_settled)
+    wait_for(reel, head, lambda: reel._next is not None and reel._next.is_warm and reel._next.stream.is_settled)
     assert reel.number == 0 and reel._next.number == 1
     assert reel.can_show(8 / 29, PACE)
     reel.steer(Playhead(9.1 / 29, PACE))
