@@ -21,8 +21,10 @@ from kpc.format.scene import TIME_PLANES, Clip, Scene
 OVERLAP = 2
 """Frames that a group holds beyond those it shows, at either end where there are more: it takes over in the midst of what it knows."""
 
-LATER = 0.25
-"""Steps of a group that begins where another ended, of those of one that begins anew."""
+LATER = 0.5
+"""Steps of a group that begins where another ended, of those of one that begins anew. Held-out PSNR of the three groups named below
+with 800 steps of `fast` for the first: 27.2, 30.8, 32.9 dB with 1, 27.2, 29.0, 31.1 dB with 0.5; with 2,400 and 0.25 it is 36.0, 31.5,
+33.9 dB, which falls off where they join."""
 
 LEAST_FRAMES = 8
 """Of a group."""

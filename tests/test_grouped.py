@@ -151,7 +151,7 @@ def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
     result, opened = json.loads(out), Groups(output)
     assert opened.timeline.spans == spans_of(Clip(FRAMES, 8.0), 1.2) and len(opened) == 3
     assert [group["frames"] for group in result["groups"]] == [[span.start, span.last] for span in opened.timeline.spans]
-    assert result["steps"] == 24 + 2 * 6 and result["size_bytes"] == output.stat().st_size
+    assert result["steps"] == 24 * (1 + 2 * LATER) and result["size_bytes"] == output.stat().st_size
     assert 5 < result["test_psnr"] < 60 and result["test_pictures"] == FRAMES + 4 * OVERLAP
     assert all(f"group {number} of 3" in err for number in range(3)) and err.count("begins where the one before ended") == 2
     boxes = [opened.open(number).head.aabb for number in range(3)]
