@@ -1,7 +1,7 @@
 """A long clip in groups (`kpc.format.groups`): which frames each holds, and how one begins where the one before ended.
 
-Space planes are coded for each group anew. As differences from those of the group before, at equal steps, they take 1.4 times as many
-bytes (default scene, second group after 600 steps): training moves all of them a little, by about as much as they vary themselves.
+Space planes are coded for each group anew. As differences from those of the group before, at equal steps, they take 1.4 times as
+many bytes (default scene, second group after 600 steps): training moves all of them a little, by about as much as they vary.
 """
 
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ from kpc.format.groups import Span
 from kpc.format.scene import TIME_PLANES, Clip, Scene
 
 OVERLAP = 2
-"""Frames that a group holds beyond those it shows, at either end where there are more: it takes over in the midst of what it knows."""
+"""Frames that a group holds beyond those it shows, at either end where there are more: it takes over amid what it knows."""
 
 LATER = 0.5
-"""Steps of a group that begins where another ended, of those of one that begins anew. Held-out PSNR of the three groups named below
-with 800 steps of `fast` for the first: 27.2, 30.8, 32.9 dB with 1, 27.2, 29.0, 31.1 dB with 0.5; with 2,400 and 0.25 it is 36.0, 31.5,
-33.9 dB, which falls off where they join."""
+"""Steps of a group that begins where another ended, of those of one that begins anew. Held-out PSNR of the three groups named
+below with 800 steps of `fast` for the first: 27.2, 30.8, 32.9 dB with 1, 27.2, 29.0, 31.1 dB with 0.5; with 2,400 and 0.25 it is 36.0,
+31.5, 33.9 dB, which falls off where they join."""
 
 LEAST_FRAMES = 8
 """Of a group."""
@@ -57,7 +57,9 @@ def share_of(options: Options, number: int, spans: Sequence[Span]) -> Options:
     if trade.target_bytes is not None:
         share = frames[number] / frames.sum()
         trade = Trade(target_bytes=int(share * (trade.target_bytes - HEADER.size - ENTRY.size * len(spans))))
-    return replace(options, trade=trade, time_budget_s=None if budget_s is None else float(budget_s * effort[number] / effort.sum()))
+    if budget_s is not None:
+        budget_s *= float(effort[number] / effort.sum())
+    return replace(options, trade=trade, time_budget_s=budget_s)
 
 
 def begin_with(field: Field, before: Scene) -> None:

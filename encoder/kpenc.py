@@ -47,6 +47,9 @@ MOST_CAMERAS = 32
 
 CHECKPOINT = "checkpoint.kpck"
 
+OF_A_GROUP = ("size_bytes", "test_psnr", "steps", "train_s", "peak_memory_bytes")
+"""What is said of each group of a clip."""
+
 SPACES = {
     type(None): ("box", "a box, nothing outside it"),
     Contraction: ("contracted", "contracted beyond a box"),
@@ -267,8 +270,8 @@ def _joined(parts: Sequence[groups.Part], options: Options) -> int:
     try:
         return groups.write(parts, options.output)
     except OSError as error:
-        raise TrainingError(f"{options.output}: {error.strerror}; make room there, or give another -o with --work {options.work_dir} "
-                            "--resume to keep what is done") from error
+        kept = f"or give another -o with --work {options.work_dir} --resume to keep what is done"
+        raise TrainingError(f"{options.output}: {error.strerror}; make room there, {kept}") from error
 
 
 def _of_all(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size: int, options: Options) -> dict[str, Any]:
@@ -285,7 +288,7 @@ def _of_all(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size:
         "coding_loss_db": mean("coding_loss_db", [span.count for span in spans]),
         **{key: sum(one[key] for one in found) for key in ("steps", "train_s")},
         "rays_per_s": mean("rays_per_s", [one["train_s"] for one in found]), "peak_memory_bytes": found[-1]["peak_memory_bytes"],
-        "groups": [{"frames": [span.start, span.last]} | {key: one[key] for key in ("size_bytes", "test_psnr", "steps", "train_s", "peak_memory_bytes")}
+        "groups": [{"frames": [span.start, span.last]} | {key: one[key] for key in OF_A_GROUP}
                    for one, span in zip(found, spans, strict=True)],
     }  # fmt: skip
 
@@ -542,7 +545,8 @@ def _make_work_dir(work: Path) -> None:
 
 def _clear(work: Path) -> None:
     """Remove what kpenc has put there, and the folder if that was all."""
-    for pattern in ("pixels-*.bin", "pixels-*.json", "group-*.kpc", "group-*.json", "group-*.kpck", CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"):
+    of_groups = ("group-*.kpc", "group-*.json", "group-*.kpck")
+    for pattern in ("pixels-*.bin", "pixels-*.json", *of_groups, CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"):
         for leftover in work.glob(pattern):
             leftover.unlink(missing_ok=True)
     _remove_if_empty(work)

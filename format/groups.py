@@ -164,7 +164,8 @@ class Groups:
                 raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) lies beside groups, not in one; update kpc")
             if entry.kind == GROUP_KIND and (entry.codec != CODEC_RAW or entry.raw_length != entry.stored_length
                                              or entry.scale or entry.plane or not entry.row_count):
-                raise FormatError(f"{self.name}: chunk {number} ({GROUP_KIND}) claims a codec, a place among the planes, or no frame")
+                raise FormatError(f"{self.name}: chunk {number} ({GROUP_KIND}) claims a codec, a place among the planes, or no "
+                                  "frame")
         self._chunks.sort(key=lambda chunk: entries[chunk].group)
         if [entries[chunk].group for chunk in self._chunks] != list(range(len(self._chunks))):
             raise FormatError(f"{self.name}: its groups are not numbered from 0 on, each once")
@@ -245,7 +246,8 @@ class Part:
 
 
 def parts_of(files: Sequence[AnySource]) -> list[Part]:
-    """The groups of all files. Files of groups know their frames, and are put in order if all do; a scene follows what is before it."""
+    """The groups of all files. Files of groups know their frames, and are put in order if all do; a scene follows what is before
+    it."""
     opened = [Groups(source, in_parts=True) for source in files]
     if not any(groups.is_single for groups in opened):
         opened.sort(key=lambda groups: groups.timeline.spans[0].start)
@@ -270,12 +272,13 @@ def write(parts: Sequence[Part], path: str | os.PathLike[str]) -> int:
         raise UsageError(str(error)) from error
     odd = next((part for part in parts if part.fps != parts[0].fps), None)
     if odd is not None:
-        raise UsageError(f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; encode them alike")
+        raise UsageError(f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; encode them "
+                         "alike")
     offset, entries = HEADER.size + ENTRY.size * len(parts), []
     for number, part in enumerate(parts):
         crc, size = google_crc32c.value(part.source.read_at(0, part.source.size)), part.source.size
-        entries.append(ENTRY.pack(GROUP_KIND.encode(), number, 0, 0, part.span.start, part.span.count, CODEC_RAW, 0, size, size, crc,
-                                  offset))
+        span = part.span
+        entries.append(ENTRY.pack(GROUP_KIND.encode(), number, 0, 0, span.start, span.count, CODEC_RAW, 0, size, size, crc, offset))
         offset += size
     head = header_and_index(entries, offset, max(part.value_count for part in parts), max(part.source.size for part in parts))
     with written_aside(path) as aside, aside.open("wb") as opened:
@@ -290,11 +293,11 @@ def check_spans(spans: Sequence[Span], names: str | Sequence[str]) -> None:
 
     `names`: of the file, or of one for each group, for messages.
     """
+    called = [f"{names}: group {k}" for k in range(len(spans))] if isinstance(names, str) else names
     for number, (before, after) in enumerate(zip(spans, spans[1:])):
         if not before.start < after.start <= before.last + 1 or not before.last < after.last:
-            one, other = (f"{names}: group {number}", f"group {number + 1}") if isinstance(names, str) else names[number : number + 2]
+            one, other = called[number : number + 2]
             raise FormatError(f"{one} holds frames {before.start} to {before.last}, {other} frames {after.start} to {after.last}: "
                               "each must begin and end later than the one before, and leave no frame out")
-    if spans[-1].last - spans[0].start >= FRAME_LIMIT:
-        raise FormatError(f"{names if isinstance(names, str) else names[-1]}: {spans[-1].last - spans[0].start + 1:,} frames are more "
-                          f"than {FRAME_LIMIT:,}")
+    if (frames := spans[-1].last - spans[0].start + 1) > FRAME_LIMIT:
+        raise FormatError(f"{called[-1]}: {frames:,} frames are more than {FRAME_LIMIT:,}")

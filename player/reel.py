@@ -131,7 +131,7 @@ class Reel:
     @property
     def is_settled(self) -> bool:
         """Whether all of the group that shows is there that fits the memory, or nothing more will come."""
-        return self.stream.is_settled and not self._waiting or self._failure is not None
+        return self.stream.is_settled and (not self._waiting or self._failure is not None)
 
     @property
     def message(self) -> str | None:
@@ -233,7 +233,8 @@ class Reel:
             held.renderer.release()
 
     def _head_in(self, number: int, head: Playhead) -> Playhead:
-        return Playhead(self.timeline.time_in(number, head.time), self._pace_in(number, head.pace), head.loop and self.groups.is_single)
+        loops = head.loop and self.groups.is_single
+        return Playhead(self.timeline.time_in(number, head.time), self._pace_in(number, head.pace), loops)
 
     def _pace_in(self, number: int, pace: float) -> float:
         """Of a group in a second, where it is `pace` of the clip."""

@@ -65,7 +65,9 @@ class Stream:
         KpcError: as `SceneReader` and `HttpSource`; BudgetError if `memory` is too little to play the scene at all.
     """
 
-    def __init__(self, source: Source | Reader, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, source: Source | Reader, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None
+    ) -> None:
         self._reader = SceneReader(source, memory_budget=memory, in_parts=True)
         source = self._reader.source
         self.source, self.memory, self.arrived, self.version = source, memory, arrived, 0

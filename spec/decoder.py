@@ -97,7 +97,8 @@ def entries(data, partial):  # sections 3, 4 and 10
 
 
 def chunks(data, partial):  # section 4
-    """Yield (kind, scale, plane, row_start, row_count, raw, value_count) of all chunks of a scene; raw is None where a prefix lacks it."""
+    """Yield (kind, scale, plane, row_start, row_count, raw, value_count) of all chunks of a scene; raw is None where a prefix
+    lacks it."""
     for kind, group, scale, plane, start, rows, codec, stored, raw, value_count, body in entries(data, partial):
         known = kind in (b"SCNE", b"DECO", b"HYBR", b"OCCU", b"PLNE", b"WARP", b"MOVE", b"came", b"appe")
         require(known or not kind[:1].isupper(), "unknown critical chunk")
@@ -130,7 +131,8 @@ def groups(data, partial=False):  # section 4
     require(found[-1][0] + found[-1][1] - found[0][0] <= 1 << 24, "frames")
     scenes = [decode(body, len(body) < stored) for _, _, body, stored in found if len(body) == stored or not partial]
     for (_, rows, _, _), scene in zip(found, scenes):
-        require(scene["frame_count"] == rows and scene["fps"] == scenes[0]["fps"] and scene["value_count"] <= most, "a group's clip")
+        require(scene["frame_count"] == rows and scene["fps"] == scenes[0]["fps"], "a group's clip")
+        require(scene["value_count"] <= most, "value count of a group")
     return [(start, rows, body) for start, rows, body, _ in found], scenes
 
 

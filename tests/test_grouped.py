@@ -216,7 +216,8 @@ def test_groups_that_are_coded_apart_are_joined(videos, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("options, complaint", [
-    (["--only", "3"], "has 3 groups"), (["--group", "0.2s"], "too few for a group"), (["--keep-checkpoint", "x.kpck"], "single scene"),
+    (["--only", "3"], "has 3 groups"), (["--group", "0.2s"], "too few for a group"),
+    (["--keep-checkpoint", "x.kpck"], "single scene"),
 ])  # fmt: skip
 def test_what_makes_no_sense_is_refused(videos, tmp_path, capsys, options, complaint):
     try:

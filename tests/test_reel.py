@@ -170,5 +170,6 @@ def test_a_group_that_is_damaged_is_told_and_the_others_play_on(clip, opened, tm
     (tmp_path / "damaged.kpc").write_bytes(data)
     reel = opened(tmp_path / "damaged.kpc")
     wait_for(reel, Playhead(0.5), lambda: reel.message is not None and "group 1" in reel.message)
-    assert reel.is_settled and reel.number == 0
+    wait_for(reel, Playhead(0.5), lambda: reel.is_settled)
+    assert reel.number == 0
     assert_shows(reel, clip, 0.1)

@@ -16,6 +16,8 @@ SCENES = ("moved-contracted", "hybrid-moved", "one-texel", "wrap")
 SLOWER = "minimal"
 """One of a frame at another."""
 
+NOTE = (b"note", b"readers skip what they need not know")
+
 Group = tuple[int, int, bytes]
 """First frame, number of frames, and file of a group."""
 
@@ -38,7 +40,7 @@ def valid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, bool]]:
     joined = packed([(0, 12, one), (9, 12, other), (20, 12, third), (32, 1, still)])
     return {
         "groups": (joined, False),
-        "groups-apart": (packed([(7, 12, one), (19, 12, third)], beside=[(b"note", b"readers skip what they need not know")]), False),
+        "groups-apart": (packed([(7, 12, one), (19, 12, third)], beside=[NOTE]), False),
         "groups-one": (packed([(40, 12, third)]), False),
         "groups-prefix": (joined[:Reader(joined).index[1].offset + len(other) // 2], True),
     }

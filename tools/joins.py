@@ -75,7 +75,8 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
             error = seen - true_picture(some, picture)
             change = None if camera not in last_of else float(np.sqrt(np.mean(np.square(error - last_of[camera]))))
             last_of[camera] = error
-            frames.append(Frame(some.camera_names[camera], int(at[picture]) - first, number, psnr(error, np.zeros_like(error)), change))
+            quality = psnr(error, np.zeros_like(error))
+            frames.append(Frame(some.camera_names[camera], int(at[picture]) - first, number, quality, change))
             if before is not None and at[picture] == shown[0]:
                 earlier, its_span = before
                 same = dataset.between(its_span.start, its_span.last)
@@ -100,8 +101,9 @@ def _joins(groups: Groups, frames: list[Frame], agreements: list[float]) -> list
     others = [frame.change for frame in frames if frame.change is not None and frame.frame not in of_join] or [0.0]
     found = []
     for k, start in enumerate(sorted(of_join)):
-        near = {side: [f.psnr for f in frames if 0 <= sign * (f.frame - start) - side < AROUND] for side, sign in ((1, -1), (0, 1))}
+        before = [f.psnr for f in frames if start - AROUND <= f.frame < start]
+        after = [f.psnr for f in frames if start <= f.frame < start + AROUND]
         changes = [f.change for f in frames if f.frame == start and f.change is not None]
-        found.append(Join(start, agreements[k] if k < len(agreements) else float("nan"), float(np.mean(near[1])), float(np.mean(near[0])),
-                          float(np.mean(changes)), float(np.median(others)), float(np.quantile(others, 0.95))))
+        numbers = (np.mean(before), np.mean(after), np.mean(changes), np.median(others), np.quantile(others, 0.95))
+        found.append(Join(start, agreements[k] if k < len(agreements) else float("nan"), *map(float, numbers)))
     return found

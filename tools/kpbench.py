@@ -189,8 +189,8 @@ def _step(options: argparse.Namespace, origin: results.Record) -> Iterator[resul
 
 
 def _groups(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
-    """A record a dataset: the peak of memory after the first group and after all, and how steady the clip is where they join. Beside
-    --out also .svg, the PSNR of each frame."""
+    """A record a dataset: the peak of memory after the first group and after all, and how steady the clip is where they join.
+    Beside --out also .svg, the PSNR of each frame."""
     _encoder()  # what is missing is said before anything is read
     records: list[results.Record] = []
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:

@@ -107,8 +107,10 @@ def describe_groups(groups: Groups) -> dict[str, Any]:
 def _page_of_groups(info: dict[str, Any]) -> str:
     clip = info["clip"]
     lines = [
-        f"{info['file']}: {info['size_bytes']:,} bytes, format version {info['version']}" + (", verified" if info["verified"] else ""),
-        f"  clip        {clip['frame_count']} frames at {clip['fps']:g} fps, {clip['duration_s']:.2f} s, in {len(info['groups'])} groups",
+        f"{info['file']}: {info['size_bytes']:,} bytes, format version {info['version']}"
+        + (", verified" if info["verified"] else ""),
+        f"  clip        {clip['frame_count']} frames at {clip['fps']:g} fps, {clip['duration_s']:.2f} s, in "
+        f"{len(info['groups'])} groups",
         f"  cameras     {info['cameras']}", "",
         "  group       frames          shown, s       stored   scales       values",
     ]
