@@ -11,6 +11,7 @@ import numpy as np
 from imgui_bundle import imgui
 from pytest import approx
 
+from kpc.format import groups
 from kpc.format.container import open_source
 from kpc.format.media import read_image, read_video
 from kpc.player import kpplay, panels
@@ -18,9 +19,9 @@ from kpc.player import window as window_module
 from kpc.player.path import CameraPath
 from kpc.player.preferences import Preferences, place
 from kpc.player.quality import DEFAULT, climbed
+from kpc.player.reel import Reel
 from kpc.player.reference import Part
 from kpc.player.renderer import Look
-from kpc.player.reel import Reel
 from kpc.player.window import Player, Window
 
 
@@ -138,6 +139,7 @@ def main(scene_file: str) -> None:
     assert kept == Preferences((200, 260), DEFAULT, None, 2.0, False, False, True, True, player.text_size)
     player.run()
     player.close()
+    go_through_groups(window, scene_file)
     stream.close()
     window.close()
     lose_the_card(scene_file)
@@ -259,6 +261,35 @@ def drop_files(window: Window, player: Player, scene_file: Path) -> None:
     assert player.successor is not None and not glfw.window_should_close(window.handle)
     player.successor.close()
     player.successor = None
+
+
+def go_through_groups(window: Window, scene_file: str) -> None:
+    """The scene twice as one clip: each half shows in its time, in the quality and the appearance that were chosen."""
+    groups.write(groups.parts_of([scene_file, scene_file]), "twice.kpc")
+    reel = Reel(open_source("twice.kpc"))
+    player = Player(window, reel, Preferences())
+    player.type(glfw.KEY_SPACE, 0)
+    player.wardrobe.wear(2)
+    player.type(glfw.KEY_MINUS, 0)
+    chosen, times = player.dial.rung, []
+    for key, number in ((glfw.KEY_END, 1), (glfw.KEY_LEFT, 1), (glfw.KEY_HOME, 0)):
+        player.type(key, 0)
+        until = time.monotonic() + 20
+        while not (reel.number == number and reel.is_settled and player._is_sharp):
+            assert time.monotonic() < until
+            player.frame()
+        assert player.scene is reel.scene and player.wardrobe.scene is reel.scene and player.wardrobe.number == 2
+        assert player.dial.rung == chosen
+        times.append((player.playback.time, reel.time_in(player.playback.time)))
+    assert np.allclose(times, [(1.0, 1.0), (20 / 21, 0.9), (0.0, 0.0)], atol=1e-6)
+    player.type(glfw.KEY_SPACE, 0)  # from here it plays over the join
+    until = time.monotonic() + 20
+    while player.playback.time < 0.6:
+        assert time.monotonic() < until
+        player.frame()
+    assert reel.number == 1
+    player.close()
+    reel.close()
 
 
 def lose_the_card(scene_file: str) -> None:
