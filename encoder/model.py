@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from kpc.encoder.checkpoint import save_state
 from kpc.encoder.compress import Steps, Trade, compress, relative_steps
 from kpc.encoder.field import Layout
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
 from kpc.format import file
 from kpc.format.cameras import Camera
-from kpc.format.cli import written_aside
 from kpc.format.container import MAGIC
 from kpc.format.errors import FormatError, TrainingError, UsageError
 from kpc.format.quantise import QuantisedScene, quantise_scene
@@ -136,13 +136,8 @@ def save_checkpoint(path: Path, scene: Scene, curvature: Sequence[Mapping[str, n
         "names": [appearance.name for appearance in scene.appearances],
         "codes": [appearance.code for appearance in scene.appearances], "probe": vars(probe),
     }
-    try:
-        with written_aside(path) as aside:
-            torch.save(_changed(state, np.ndarray, lambda a: torch.from_numpy(np.ascontiguousarray(a))), aside)
-    except (OSError, RuntimeError) as error:  # PyTorch reports a full disk as RuntimeError
-        reason = error.strerror if isinstance(error, OSError) else str(error).partition("\n")[0]
-        raise TrainingError(f"{path}: the checkpoint cannot be written ({reason}); free space there, or name another "
-                            "--keep-checkpoint") from error
+    state = _changed(state, np.ndarray, lambda a: torch.from_numpy(np.ascontiguousarray(a)))
+    save_state(path, state, "name another --keep-checkpoint")
 
 
 def load_checkpoint(path: Path) -> Model:
