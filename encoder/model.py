@@ -54,7 +54,7 @@ class Coded:
     """What became of a model.
 
     Attributes:
-        scene: what the file is to hold. size_bytes: of that file.
+        scene: what the file is to hold. data: that file.
         loss_db: PSNR that coding costs on the probe rays, all that was left out included.
         agreement_db: PSNR of its pictures against those of the model.
         pruned: what was left out; None if nothing was to be.
@@ -62,11 +62,15 @@ class Coded:
     """
 
     scene: QuantisedScene
-    size_bytes: int
+    data: bytes
     loss_db: float
     agreement_db: float
     pruned: Pruned | None
     spare_db: float
+
+    @property
+    def size_bytes(self) -> int:
+        return len(self.data)
 
 
 def code(model: Model, trade: Trade, prune_share: float) -> Coded:
@@ -87,7 +91,7 @@ def code(model: Model, trade: Trade, prune_share: float) -> Coded:
             scene, steps, coded = pruned.scene, pruned.of_each_plane(steps), None
     found = compress(scene, steps, measure, whole, trade, coded)
     measured: Measured = found.measured
-    return Coded(found.quantised, found.size_bytes, whole - measured.psnr, measured.agreement_db, pruned, spare)
+    return Coded(found.quantised, found.data, whole - measured.psnr, measured.agreement_db, pruned, spare)
 
 
 def load(path: Path) -> Model:
