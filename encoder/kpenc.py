@@ -7,8 +7,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.estimate import Estimate, estimate
 from kpc.encoder.evaluate import evaluate
 from kpc.encoder.field import time_rows
-from kpc.encoder.model import Model, by_plane, code, save_checkpoint
+from kpc.encoder.grouped import LATER, begin_with, share_of, spans_of
+from kpc.encoder.model import Model, by_plane, code, load_checkpoint, save_checkpoint
 from kpc.encoder.occupancy import grid_shape
 from kpc.encoder.options import Options, parse
 from kpc.encoder.profile import profile
@@ -33,7 +34,7 @@ from kpc.encoder.recode import check_outputs, figures, reached, recode
 from kpc.encoder.structure import TimeResolution, fitted_in_time
 from kpc.encoder.train import Report, Trainer, box_of_checkpoint
 from kpc.encoder.trim import trim_box
-from kpc.format import cli, file
+from kpc.format import cli, file, groups
 from kpc.format.errors import DatasetError, TrainingError, UsageError
 from kpc.format.progress import Progress
 from kpc.format.scene import Scene
@@ -85,7 +86,14 @@ def _print_result(result: dict[str, Any], options: Options) -> None:
     print(reached(result))
     if result["identity_share"] is not None:
         print(f"time-plane texels exactly at identity: {result['identity_share']:.1%}")
+    if len(result.get("groups", [])) > 1:
+        print(f"{len(result['groups'])} groups: " + ", ".join(_of_group(group) for group in result["groups"]))
     print(f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps)")
+
+
+def _of_group(group: dict[str, Any]) -> str:
+    quality = "" if group["test_psnr"] is None else f", {group['test_psnr']:.2f} dB"
+    return f"{group['size_bytes']:,} bytes{quality}"
 
 
 def _print_estimate(expected: Estimate, options: Options, as_json: bool) -> None:
@@ -104,14 +112,38 @@ def encode(options: Options) -> dict[str, Any]:
         DatasetError, MediaError: the dataset cannot be used. TrainingError: training failed.
         KeyboardInterrupt: stopped by the user; the checkpoint is kept.
     """
+    if options.group_s is not None:
+        return _encode_groups(options)
+    return _encode_scene(options, _setting(options))
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is to be encoded, and where.
+
+    Attributes:
+        dataset: decoded.
+        aabb, mapping: the box, and how space beyond it is held.
+        is_final: the box is not to be cut down any more.
+        before: the scene to begin with, whose last picture is about the first of this; None to begin anew.
+    """
+
+    dataset: Dataset
+    aabb: np.ndarray
+    mapping: SpaceMapping | None
+    is_final: bool
+    before: Scene | None = None
+
+
+def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     started = time.monotonic()
-    trainer = _trainer(options)
+    trainer = _trainer(options, setting)
     dataset, work, checkpoint = trainer.dataset, options.work_dir, options.work_dir / CHECKPOINT
     try:
         _train(trainer, checkpoint, options.time_budget_s)
     except KeyboardInterrupt:
         trainer.save(checkpoint)
-        if not _wants_partial(trainer, checkpoint):
+        if not _wants_partial(trainer, checkpoint, may_be_asked=options.group_s is None):
             raise
 
     if trainer.config.summed:
@@ -143,6 +175,122 @@ def encode(options: Options) -> dict[str, Any]:
     }
 
 
+def _encode_groups(options: Options) -> dict[str, Any]:
+    """Each group as a scene, one after the other, and all of them as one file."""
+    started = time.monotonic()
+    setting = _setting(options)
+    work, spans = options.work_dir, spans_of(setting.dataset.clip, float(options.group_s or 0))
+    numbers = range(len(spans)) if options.only is None else [options.only]
+    if numbers[-1] >= len(spans):
+        raise UsageError(f"--only {numbers[-1]}: the clip has {len(spans)} groups, numbered from 0")
+    first = _part(work, numbers[0])
+    if options.resume and first.with_suffix(".json").exists():
+        setting = replace(setting, aabb=file.SceneReader(first).head.aabb, is_final=True)
+    elif not setting.is_final:
+        setting = _trimmed_for_groups(setting, options, spans)
+    found: list[dict[str, Any]] = []
+    for number in numbers:
+        span, part = spans[number], _part(work, number)
+        _say(f"group {number} of {len(spans)}: frames {span.start} to {span.last}")
+        told = replace(share_of(options, number, spans), output=part, work=part.with_suffix(""),
+                       keep_checkpoint=options.keep_checkpoint or part.with_suffix(".kpck"))
+        if options.resume and part.with_suffix(".json").exists():
+            found.append(_finished(part, told))
+        else:
+            before = None if number == numbers[0] else _part(work, number - 1).with_suffix(".kpck")
+            found.append(_encode_group(told, _of_span(setting, span), before))
+    size = _joined([groups.Part.of(_part(work, number), spans[number].start) for number in numbers], options)
+    if not options.keep:
+        _clear(work)
+    return _of_all(found, [spans[number] for number in numbers], size, options) | {"encode_s": time.monotonic() - started}
+
+
+def _part(work: Path, number: int) -> Path:
+    """Where a finished group waits for the others."""
+    return work / f"group-{number:04d}.kpc"
+
+
+def _of_span(setting: Setting, span: groups.Span) -> Setting:
+    return replace(setting, dataset=setting.dataset.between(span.start, span.last))
+
+
+def _trimmed_for_groups(setting: Setting, options: Options, spans: Sequence[groups.Span]) -> Setting:
+    """All groups share a box, found from no more frames than one of them has."""
+    dataset = setting.dataset.thinned(max(span.count for span in spans))
+    budget_s = share_of(options, 0, spans).time_budget_s
+    assert not isinstance(setting.mapping, Contraction)
+    aabb, _ = _trimmed(dataset, options.config(dataset), setting.aabb, budget_s, setting.mapping)
+    return replace(setting, aabb=aabb, is_final=True)
+
+
+def _encode_group(told: Options, setting: Setting, before: Path | None) -> dict[str, Any]:
+    """A group, and beside its file what was measured: with that there it is done. It begins where `before` ended, the finished
+    checkpoint of the one before."""
+    if before is None:
+        found = _encode_scene(told, setting)
+    else:
+        _say(f"it begins where the one before ended, and takes {LATER:.0%} of its steps")
+        shorter = replace(told, steps=math.ceil(LATER * told.config(setting.dataset).steps))
+        found = _encode_scene(shorter, replace(setting, before=load_checkpoint(before).scene))
+    with cli.written_aside(told.output.with_suffix(".json")) as aside:
+        aside.write_text(json.dumps({"told": _as_told(told), "found": found}))
+    if before is not None:
+        before.unlink()
+    return found
+
+
+def _finished(part: Path, told: Options) -> dict[str, Any]:
+    """What was measured of a group that is done.
+
+    Raises:
+        TrainingError: it was told otherwise.
+    """
+    try:
+        kept = json.loads(part.with_suffix(".json").read_text())
+        if kept["told"] != _as_told(told):
+            raise TrainingError(f"{part}: belongs to a run with other settings; give the same ones or drop --resume")
+        found: dict[str, Any] = kept["found"]
+    except (OSError, ValueError, KeyError) as error:
+        raise TrainingError(f"{part}: what was measured of it is gone; delete it to have the group encoded anew") from error
+    _say(f"{part}: is there already")
+    return found
+
+
+def _as_told(told: Options) -> str:
+    """All options that what comes out depends on."""
+    return repr(replace(told, resume=False, keep=False))
+
+
+def _joined(parts: Sequence[groups.Part], options: Options) -> int:
+    try:
+        return groups.write(parts, options.output)
+    except OSError as error:
+        raise TrainingError(f"{options.output}: {error.strerror}; make room there, or give another -o with --work {options.work_dir} "
+                            "--resume to keep what is done") from error
+
+
+def _of_all(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size: int, options: Options) -> dict[str, Any]:
+    """Of all groups together: sums, means over frames or pictures, and those of each group."""
+
+    def mean(name: str, weights: Sequence[float]) -> float | None:
+        values = [one[name] for one in found]
+        return None if None in values or not sum(weights) else float(np.average(values, weights=weights))
+
+    pictures, frames = [one["test_pictures"] for one in found], [span.count for span in spans]
+    parameters = sum(one["parameters"] for one in found)
+    name, value = options.trade.bound
+    return found[0] | {
+        "file": str(options.output), "trade": name, "asked": value,
+        "test_psnr": mean("test_psnr", pictures), "test_ssim": mean("test_ssim", pictures), "test_pictures": sum(pictures),
+        **{key: mean(key, frames) for key in ("coding_loss_db", "probe_loss_db", "agreement_db", "identity_share")},
+        "size_bytes": size, "parameters": parameters, "bits_per_parameter": 8 * size / parameters,
+        **{key: sum(one[key] for one in found) for key in ("steps", "train_s")},
+        "rays_per_s": mean("rays_per_s", [one["train_s"] for one in found]),
+        "groups": [{"frames": [span.start, span.last]} | {key: one[key] for key in ("size_bytes", "test_psnr", "steps", "train_s")}
+                   for one, span in zip(found, spans, strict=True)],
+    }  # fmt: skip
+
+
 def _not_written(trainer: Trainer, options: Options, started: float) -> dict[str, Any]:
     """What was measured on a model that no file can hold, as far as `encode` says it of others."""
     test = evaluate(to_scene(trainer), trainer.dataset, most=options.most_tests, field=trainer.field)
@@ -163,12 +311,19 @@ def dry_run(options: Options) -> Estimate:
         As `encode`.
     """
     started = time.monotonic()
-    trainer = _trainer(options)
+    setting = _setting(options)
+    groups_count = 1.0
+    if options.group_s is not None:
+        spans = spans_of(setting.dataset.clip, options.group_s)
+        groups_count = 1 if options.only is not None else 1 + LATER * (len(spans) - 1)
+        options, setting = share_of(options, options.only or 0, spans), _of_span(setting, spans[options.only or 0])
+    trainer = _trainer(options, setting)
     tested = int(trainer.dataset.pictures.is_test.sum())
-    return estimate(
+    found = estimate(
         trainer, PROBE_RAYS, min(tested, options.most_tests or tested), time.monotonic() - started - trainer.elapsed_s,
         options.time_budget_s,
     )
+    return replace(found, train_s=groups_count * found.train_s, rest_s=groups_count * found.rest_s)
 
 
 def profile_steps(options: Options) -> dict[str, Any]:
@@ -177,7 +332,7 @@ def profile_steps(options: Options) -> dict[str, Any]:
     Raises:
         As `encode`.
     """
-    return profile(_trainer(options))
+    return profile(_trainer(options, _setting(options)))
 
 
 def ablations(options: Options) -> list[str]:
@@ -191,27 +346,33 @@ def ablations(options: Options) -> list[str]:
     return changed_by(options.config(dataset))
 
 
-def _trainer(options: Options) -> Trainer:
-    """The dataset decoded, the box found, the model laid out, an interrupted run taken up: ready for the next step."""
+def _setting(options: Options) -> Setting:
+    """The dataset decoded, the space found that it fills."""
     check_outputs(options)
-    device = _device(options.device)
-    work, checkpoint = options.work_dir, options.work_dir / CHECKPOINT
-    _make_work_dir(work)
+    _make_work_dir(options.work_dir)
     try:
-        dataset = load_dataset(options.source, work, holdout=options.holdout, downscale=options.downscale)
+        dataset = load_dataset(options.source, options.work_dir, holdout=options.holdout, downscale=options.downscale)
         aabb, mapping, why = _space_of(dataset, options)
     except BaseException:
-        _remove_if_empty(work)
+        _remove_if_empty(options.work_dir)
         raise
     _say(dataset.describe())
     _say(f"space: {SPACES[type(mapping)][1]} ({why})")
+    return Setting(dataset, aabb, mapping, options.box is not None or isinstance(mapping, Contraction))
+
+
+def _trainer(options: Options, setting: Setting) -> Trainer:
+    """The model laid out, the box cut down, an interrupted run taken up: ready for the next step."""
+    device, checkpoint = _device(options.device), options.work_dir / CHECKPOINT
+    _make_work_dir(options.work_dir)
+    dataset, aabb, mapping = setting.dataset, setting.aabb, setting.mapping
     appearance, why = options.appearance_of(dataset)
     _say(f"appearance: {'none' if appearance == 'none' else f'a code for each {appearance}'} ({why})")
     config, in_time = fitted_in_time(options.config(dataset), dataset)
     if dataset.is_dynamic:
         _say(_rows_in_time(config, dataset, in_time))
     resumes, survey_s = options.resume and checkpoint.exists(), 0.0
-    if options.box is None and not isinstance(mapping, Contraction):
+    if not setting.is_final:
         if resumes:
             aabb = box_of_checkpoint(checkpoint)
         else:
@@ -220,6 +381,8 @@ def _trainer(options: Options) -> Trainer:
     _say(_plan(trainer))
     if resumes:
         trainer.resume(checkpoint)
+    elif setting.before is not None:
+        begin_with(trainer.field, setting.before)
     if options.resume:
         _say(f"resumed at step {trainer.step}" if trainer.step else f"{checkpoint}: no checkpoint yet; starting afresh")
     return trainer
@@ -277,11 +440,11 @@ def _write(data: bytes, output: Path, work: Path) -> int:
         raise TrainingError(f"{output}: {error.strerror}; make room there{kept}") from error
 
 
-def _wants_partial(trainer: Trainer, checkpoint: Path) -> bool:
+def _wants_partial(trainer: Trainer, checkpoint: Path, may_be_asked: bool) -> bool:
     """After Ctrl-C: on a terminal ask whether to write the scene as it stands; elsewhere only say how to go on."""
     where = f"stopped at step {trainer.step}; {checkpoint} is kept, go on with --resume"
     _say(where)
-    if not (sys.stdin.isatty() and sys.stderr.isatty()) or trainer.step < 2:
+    if not may_be_asked or not (sys.stdin.isatty() and sys.stderr.isatty()) or trainer.step < 2:
         return False
     print("write the scene as trained so far? [y/N] ", end="", file=sys.stderr, flush=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
@@ -379,7 +542,7 @@ def _make_work_dir(work: Path) -> None:
 
 def _clear(work: Path) -> None:
     """Remove what kpenc has put there, and the folder if that was all."""
-    for pattern in ("pixels-*.bin", "pixels-*.json", CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"):
+    for pattern in ("pixels-*.bin", "pixels-*.json", "group-*.kpc", "group-*.json", "group-*.kpck", CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"):
         for leftover in work.glob(pattern):
             leftover.unlink(missing_ok=True)
     _remove_if_empty(work)

@@ -40,6 +40,8 @@ class Options:
     keep: bool = False
     resume: bool = False
     most_tests: int | None = None
+    group_s: float | None = None
+    only: int | None = None
     trade: Trade = Trade()
     keep_checkpoint: Path | None = None
     ablation: str = "as it is"
@@ -105,6 +107,11 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     parser.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
     parser.add_argument("--keep-checkpoint", type=Path, metavar="MODEL.kpck",
                         help="write the finished checkpoint there, too: all that coding anew takes")
+    parser.add_argument("--group", type=cli.duration_s, metavar="10s",
+                        help="code a long clip in groups that show at most so long each, one after the other: encoding and playing "
+                             "take the memory of one; steps are those of each group")
+    parser.add_argument("--only", type=_number, metavar="N",
+                        help="of --group: code group N alone, from 0 on; kpjoin makes a clip of them")
     trade = parser.add_mutually_exclusive_group()
     trade.add_argument("--max-loss", type=cli.decibels, metavar="0.1dB",
                        help=f"the smallest file that costs at most this PSNR on training views (default: {DEFAULT_LOSS_DB:g}dB)")
@@ -124,7 +131,11 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
                 parser.error(f"--{name.replace('_', '-')}: {a.source} is trained already, it can only be coded anew; drop it")
     options = Options(a.source, a.output, a.preset, a.decoder, a.sampling, a.progressive, a.steps, a.time_budget, a.seed, a.device,
                       a.downscale, a.holdout, a.space, a.box, a.appearance, a.work, a.keep, a.resume, a.test_views,
-                      Trade(a.max_loss, a.target_size, a.quality, a.lam), a.keep_checkpoint)
+                      a.group, a.only, Trade(a.max_loss, a.target_size, a.quality, a.lam), a.keep_checkpoint)
+    if a.only is not None and a.group is None:
+        parser.error("--only names a group; say how long they are with --group 10s")
+    if a.keep_checkpoint is not None and a.group is not None and a.only is None:
+        parser.error("--keep-checkpoint holds a single scene; with --group give --only N, too")
     if a.dry_run and a.resume:
         parser.error("--dry-run tells what a whole run takes; drop --resume")
     return options, a.dry_run, a.json
@@ -135,6 +146,12 @@ def _positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
+
+
+def _number(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 on")
+    return int(text)
 
 
 def _quality(text: str) -> float:

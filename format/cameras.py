@@ -7,12 +7,18 @@ top, so that its centre is (i + 0.5, j + 0.5).
 import json
 import math
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from kpc.format.cli import written_aside
 from kpc.format.errors import DatasetError
+
+LARGEST_FILE = 1 << 26
+"""Bytes of a camera file: a hundred thousand frames, and some."""
+LARGEST_SIDE = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -65,42 +71,75 @@ class Camera:
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture to take: a camera at a time, and the name of the file that holds (or shall hold) it."""
+    """One picture to take: a camera at a time, and the name of the file that holds (or shall hold) it.
+
+    Attributes:
+        time: [0, 1] over the clip.
+        at_s: when a path through such views passes it, seconds; None: not said.
+    """
 
     camera: Camera
-    time: float  # [0, 1] over the clip
+    time: float
     file: str
+    at_s: float | None = None
 
 
 def load_shots(path: str | os.PathLike[str]) -> list[Shot]:
-    """Read a `cameras.json`: `w h fl_x fl_y cx cy` and `frames`, each of which may override them.
+    """Read a `cameras.json`: `w h fl_x fl_y cx cy` and `frames`, each of which may override them, and has `transform_matrix`,
+    `time`, `file`, and for paths `at`.
 
     Raises:
-        DatasetError: a key is missing or of the wrong kind; the message names the file and the frame.
+        DatasetError: the file is too large, or a key is missing or of the wrong kind; the message names the file and the frame.
     """
+    with open(path, "rb") as file:
+        content = file.read(LARGEST_FILE + 1)
+    if len(content) > LARGEST_FILE:
+        raise DatasetError(f"{path}: larger than {LARGEST_FILE >> 20} MiB, which no camera file is")
     try:
-        document = json.loads(Path(path).read_text())
-    except ValueError as error:
+        document = json.loads(content)
+    except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: not JSON ({error})") from error
-    shots = []
+    shots: list[Shot] = []
     try:
-        frames = document["frames"]
-        for number, frame in enumerate(frames):
-            merged = {**document, **frame}
-            w, h = int(merged["w"]), int(merged["h"])
-            camera = Camera(
-                w, h, float(merged["fl_x"]), float(merged.get("fl_y", merged["fl_x"])),
-                float(merged.get("cx", w / 2)), float(merged.get("cy", h / 2)),
-                np.array(merged["transform_matrix"], np.float64),
-            )
-            time = float(merged.get("time", 0.0))
-            if not 0.0 <= time <= 1.0:
-                raise DatasetError(f"time {time} lies outside [0, 1]")
-            shots.append(Shot(camera, time, str(merged.get("file", f"{number:04d}.png"))))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        for number, frame in enumerate(document["frames"]):
+            shots.append(_shot({**document, **frame}, number))
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DatasetError(f"{path}: frame {len(shots)}: missing or malformed {error}") from error
     except DatasetError as error:
         raise DatasetError(f"{path}: frame {len(shots)}: {error}") from error
     if not shots:
         raise DatasetError(f"{path}: lists no frames")
     return shots
+
+
+def _shot(frame: Mapping[str, Any], number: int) -> Shot:
+    w, h = int(frame["w"]), int(frame["h"])
+    if max(w, h) > LARGEST_SIDE:
+        raise DatasetError(f"a picture of {w}x{h} is too large, at most {LARGEST_SIDE} a side")
+    camera = Camera(
+        w, h, float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"])),
+        float(frame.get("cx", w / 2)), float(frame.get("cy", h / 2)),
+        np.array(frame["transform_matrix"], np.float64),
+    )  # fmt: skip
+    time = float(frame.get("time", 0.0))
+    if not 0.0 <= time <= 1.0:
+        raise DatasetError(f"time {time} lies outside [0, 1]")
+    at_s = None if frame.get("at") is None else float(frame["at"])
+    return Shot(camera, time, str(frame.get("file", f"{number:04d}.png")), at_s)
+
+
+def save_shots(path: str | os.PathLike[str], shots: Sequence[Shot]) -> None:
+    """Write a `cameras.json` from which `load_shots` reads the same again."""
+    shared = _intrinsics(shots[0].camera) if shots else {}
+    frames = []
+    for shot in shots:
+        own = {key: value for key, value in _intrinsics(shot.camera).items() if shared[key] != value}
+        at = {} if shot.at_s is None else {"at": shot.at_s}
+        pose = shot.camera.camera_to_world.tolist()
+        frames.append({"file": shot.file, "time": shot.time, **at, **own, "transform_matrix": pose})
+    with written_aside(path) as aside:
+        aside.write_text(json.dumps({**shared, "frames": frames}, indent=1))
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    return {"w": camera.width, "h": camera.height, "fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.cy}

@@ -54,10 +54,19 @@ class Source(Protocol):
 class RemoteSource(Source, Protocol):
     """A source behind a network (`kpc.format.http.HttpSource`, which takes a while to import)."""
 
-    received: int
-    has_ranges: bool
     attempts: float
     say: Callable[[str | None], None]
+
+    @property
+    def received(self) -> int:
+        """Bytes that came so far."""
+
+    @property
+    def has_ranges(self) -> bool:
+        """False if the server sends whole files only."""
+
+    def another(self) -> "RemoteSource":
+        """The same file, for another thread to read at the same time."""
 
     def interrupt(self) -> None:
         """Something else is wanted sooner: what another thread is reading fails with InterruptedRead, as soon as may be. What came
@@ -96,7 +105,8 @@ class Entry:
 
     Attributes:
         kind: four letters; the first is a capital if no reader may ignore the chunk.
-        group, scale, plane, row_start, row_count: the place in the scene of a plane segment; 0 for other kinds.
+        group, scale, plane, row_start, row_count: the place in the scene of a plane segment, or in the clip of a group, whose rows
+            are frames (`kpc.format.groups`); 0 for other kinds.
         codec: how the stored bytes become the raw ones.
         offset, stored_length: where it lies in the file. raw_length: bytes once decoded. crc: of the stored bytes.
     """
@@ -164,13 +174,18 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) ->
         bodies.append(body)
         offset += len(body)
         largest = max(largest, length)
-    index = b"".join(entries)
     if max(value_count, largest) > offset * EXPANSION_LIMIT:
         raise FormatError(f"the scene is too empty for its size: {value_count:,} values in {offset:,} bytes; "
                           "choose a lower resolution")
-    header = HEADER.pack(MAGIC, VERSION, 0, HEADER.size, HEADER.size, len(index), len(chunks), offset, value_count,
-                         largest, 0, google_crc32c.value(index), 0)
-    return b"".join([header[:-4], struct.pack("<I", google_crc32c.value(header[:-4])), index, *bodies])
+    return b"".join([header_and_index(entries, offset, value_count, largest), *bodies])
+
+
+def header_and_index(entries: Sequence[bytes], file_length: int, value_count: int, largest_raw: int) -> bytes:
+    """How a file begins whose chunks the packed `entries` list; the other arguments as in `Header`."""
+    index = b"".join(entries)
+    header = HEADER.pack(MAGIC, VERSION, 0, HEADER.size, HEADER.size, len(index), len(entries), file_length, value_count,
+                         largest_raw, 0, google_crc32c.value(index), 0)
+    return b"".join([header[:-4], struct.pack("<I", google_crc32c.value(header[:-4])), index])
 
 
 def _zstd_frames(parts: Sequence[bytes]) -> list[bytes]:
@@ -196,7 +211,8 @@ class Reader:
     Opening reads the header and the index (two reads, at the very start of the file) and nothing else.
 
     Args:
-        source: a path, an http or https URL, the bytes themselves, a binary file object that can seek, or a `Source`.
+        source: a path, an http or https URL, the bytes themselves, a binary file object that can seek, or a `Source`; or a `Reader`
+            of it, whose header and index are taken over.
         allow_partial: accept a file whose end is missing; `available` tells which chunks are there.
 
     Attributes:
@@ -207,10 +223,13 @@ class Reader:
         FormatError: not a .kpc file, of another version, damaged, or with limits its size does not bear out.
     """
 
-    def __init__(self, source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, allow_partial: bool = False):
+    def __init__(self, source: "AnySource | Reader", *, allow_partial: bool = False):
+        self._reading = threading.Lock()
+        if isinstance(source, Reader):
+            self.source, self.name, self.header, self.index = source.source, source.name, source.header, source.index
+            return
         self.source = open_source(source)
         self.name = self.source.name
-        self._reading = threading.Lock()
         self.header = self._read_header(allow_partial)
         self.index = self._read_index()
 
@@ -353,7 +372,11 @@ class _FileSource:
         """The operating system reads ahead."""
 
 
-def open_source(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, limit: int = DEFAULT_BUDGET) -> Source:
+AnySource = str | os.PathLike[str] | bytes | BinaryIO | Source
+"""What `open_source` takes."""
+
+
+def open_source(source: AnySource, *, limit: int = DEFAULT_BUDGET) -> Source:
     """The bytes behind a path, a URL (`kpc.format.http`), or what else a `Reader` takes.
 
     Args:

@@ -11,6 +11,7 @@
      │   └─ InterruptedRead    what was being read is not wanted so soon any more; nothing is wrong
      ├─ TrainingError   training cannot start or go on
      └─ DisplayError    no OpenGL, or no window to be had
+         └─ ContextLostError   the graphics card was reset, and all that it held is gone
 
 A message is one line: it names the file (or the option) and the remedy. `kpc.format.cli.run` alone turns it into a line
 on stderr and an exit code; anything else that is raised is a bug and keeps its traceback.
@@ -59,3 +60,7 @@ class TrainingError(KpcError):
 
 class DisplayError(KpcError):
     """No OpenGL, or no window to be had."""
+
+
+class ContextLostError(DisplayError):
+    """The graphics card was reset, and all that it held is gone."""

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from kpc.format.cameras import Camera
 from kpc.format.cells import decode_cells, encode_cells
 from kpc.format.cli import written_aside
 from kpc.format.container import (
-    CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, Chunk, Entry, Reader, Source, open_source, pack,
+    CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, AnySource, Chunk, Entry, Reader, open_source, pack,
 )
 from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
@@ -294,7 +294,7 @@ def _pack_appearances(appearances: tuple[Appearance, ...], hidden: int) -> bytes
 # --- reading
 
 
-def read(source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *, memory_budget: int = DEFAULT_BUDGET,
+def read(source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET,
          allow_partial: bool = False) -> QuantisedScene:
     """Read a whole scene; every byte of the file is verified.
 
@@ -346,10 +346,13 @@ class SceneReader(Reader):
         FormatError, BudgetError: as `read`.
     """
 
-    def __init__(self, source: "str | os.PathLike[str] | bytes | BinaryIO | Source", *,
-                 memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False, in_parts: bool = False):
-        super().__init__(open_source(source, limit=memory_budget), allow_partial=allow_partial)
+    def __init__(self, source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False,
+                 in_parts: bool = False):
+        opened = source if isinstance(source, Reader) else open_source(source, limit=memory_budget)
+        super().__init__(opened, allow_partial=allow_partial)
         self.memory_budget = memory_budget
+        if any(entry.kind == GROUP_KIND for entry in self.index):
+            raise FormatError(f"{self.name}: a clip in groups, where a single scene is wanted")
         for number, entry in enumerate(self.index):
             if entry.is_critical and entry.kind not in KNOWN_KINDS:
                 raise FormatError(f"{self.name}: chunk {number} is of the critical kind {entry.kind}, unknown to this "
@@ -500,6 +503,8 @@ class SceneReader(Reader):
                 raise FormatError(f"{self.name}: {where}: its segments hold {row} rows, not {head.rows}")
 
 
+GROUP_KIND = "GRUP"
+"""A scene's file in a file of several, `kpc.format.groups`."""
 KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "PLNE"})
 HEAD_LIMIT = SCENE_STRUCT.size + SCALE_LIMIT * (SCALE_STRUCT.size + 9 * 4 * CHANNEL_LIMIT)
 

@@ -12,6 +12,7 @@ out the bytes of an answer as they arrive.
 """
 
 import contextlib
+import copy
 import random
 import re
 import sys
@@ -164,6 +165,14 @@ class HttpSource:
             self._answer = answer = before if before is not None and before.holds(offset) else _Answer(offset, end)
         answer.forget(offset)
         answer.stop = max(end, answer.reached)
+
+    def another(self) -> "HttpSource":
+        """The same file through connections of its own, for another thread; nothing is asked for before it reads. Without ranges it
+        would be fetched as a whole once more."""
+        other = copy.copy(self)
+        other._pools, other._reading, other._closed, other._interruption = {}, threading.Lock(), threading.Event(), threading.Event()
+        other._answer, other._parked, other._troubled, other.received = _Answer(0, 0), None, False, 0
+        return other
 
     def interrupt(self) -> None:
         """Something else is wanted sooner: what another thread is reading fails with InterruptedRead, once some bytes have come.

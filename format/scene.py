@@ -162,6 +162,10 @@ class Scene:
     motion: np.ndarray | None = None
     appearances: tuple[Appearance, ...] = field(default=())
 
+    def at(self, time: float) -> "tuple[Scene, float]":
+        """What shows at a time, and the time in it: as of a clip in groups (`kpc.format.groups.LongScene`), but always itself."""
+        return self, time
+
     @property
     def is_dynamic(self) -> bool:
         return "xt" in self.scales[0]

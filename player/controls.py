@@ -133,21 +133,28 @@ class Playback:
         self.speed = SPEEDS[min(max(nearest + steps, 0), len(SPEEDS) - 1)]
 
 
+AVERAGE = "average"
+"""The look without an appearance."""
+
+
 class Wardrobe:
     """Which appearance of a scene is shown: the average first, then each of them; a change takes FADE_S.
 
     Attributes:
-        names: "average", then those of the scene's appearances.
+        scene: whose appearances they are.
+        names: AVERAGE, then those of the scene's appearances.
         number: of the one shown, or on its way.
         progress: of that change, [0, 1].
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.names = ("average", *(appearance.name for appearance in scene.appearances))
+    def __init__(self, scene: Scene, worn: str = AVERAGE) -> None:
+        """`worn`: the name to begin with; where the scene has it not, the average."""
+        self.scene = scene
+        self.names = (AVERAGE, *(appearance.name for appearance in scene.appearances))
         average = np.zeros(len(scene.decoder.b1), np.float32)
         self._codes = [average, *(appearance.code for appearance in scene.appearances)]
-        self._before = average
-        self.number, self.progress = 0, 1.0
+        self.number, self.progress = self.names.index(worn) if worn in self.names else 0, 1.0
+        self._before = self._codes[self.number]
 
     @property
     def code(self) -> np.ndarray | None:
@@ -191,9 +198,9 @@ class Pace:
         """For a processor that stands in for a graphics card, or for one: the first picture comes soon, if coarsely."""
         return Pace(1 / 15, 0.25) if software else Pace(1 / 50)
 
-    def saw(self, seconds: float) -> None:
-        """Take in how long a picture took at the present scale; the time is in proportion to its pixels."""
-        wanted = min(max(self.scale * math.sqrt(self.budget_s / max(seconds, 1e-6)), self.LEAST), 1.0)
+    def saw(self, seconds: float, budget_s: float | None = None) -> None:
+        """Take in how long a picture took at the present scale, and may take; the time is in proportion to its pixels."""
+        wanted = min(max(self.scale * math.sqrt((budget_s or self.budget_s) / max(seconds, 1e-6)), self.LEAST), 1.0)
         if abs(wanted - self.scale) > self.SLACK * self.scale or wanted == 1.0:
             self.scale += (wanted - self.scale) * (0.7 if wanted < self.scale else 0.3)
             self.scale = 1.0 if self.scale > 0.97 else self.scale

@@ -3,25 +3,35 @@
 kpplay scene.kpc
 kpplay https://host/scene.kpc                          plays while it arrives
 kpplay scene.kpc --size 1280x720
+kpplay scene.kpc --quality fast                        from fastest to reference; --target-fps 30 chooses by itself
+kpplay scene.kpc --path path.json --folder films       a camera path to follow; where films and screenshots go
 kpplay scene.kpc --frames 30 --screenshot out.png      draw so many frames, save the window, leave
 """
 
 import argparse
+import errno
+import os
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kpc.format import cli
 from kpc.format.container import DEFAULT_BUDGET, open_source
-from kpc.format.errors import UsageError
+from kpc.format.errors import ContextLostError, UsageError
+from kpc.player import preferences
 from kpc.player.orbit import Rig
+from kpc.player.path import CameraPath
+from kpc.player.preferences import TARGET_FPS, WINDOW_SIDES, Preferences
+from kpc.player.quality import LADDER
 
 if TYPE_CHECKING:
-    from kpc.player.stream import Stream
+    from kpc.player.reel import Reel
 
 HEIGHT = 720
-SIZES = range(64, 16385)
+MOST_RESETS = 3
+"""Of the graphics card, before it is given up."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -29,10 +39,33 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
+    options = _parser().parse_args(argv)
+    if options.frames is not None and options.frames < 1:
+        raise UsageError(f"--frames {options.frames} is not positive")
+    if options.screenshot is not None and Path(options.screenshot).suffix.lower() != ".png":
+        raise UsageError(f"--screenshot {options.screenshot} is no .png")
+    if not Path(options.folder).is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), options.folder)
+    path = None if options.path is None else CameraPath.load(options.path)
+
+    from kpc.player.reel import Reel  # only now: what is wrong with the options is told without OpenGL's libraries
+
+    lasting = preferences.place() if options.frames is None else None  # counted frames are a test, which leaves no trace
+    stream = Reel(open_source(options.scene, limit=options.memory), memory=options.memory)
+    wanted = _over(preferences.load(lasting) if lasting else Preferences(), options)
+    last = _play(stream, wanted, options, path)
+    if lasting is not None:
+        try:
+            preferences.save(last, lasting)
+        except OSError as error:
+            print(f"kpplay: settings are not remembered: {lasting}: {error.strerror or error}", file=sys.stderr)
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="kpplay", description="Fly through a .kpc scene. Press H for the keys.")
     parser.add_argument("scene", help="a .kpc file, or its http address")
     parser.add_argument(
-        "--size", type=_size, metavar="WxH", help=f"of the window (default: {HEIGHT} high, as wide as the camera)"
+        "--size", type=_size, metavar="WxH", help=f"of the window (default: as it was; {HEIGHT} high, as wide as the camera)"
     )
     parser.add_argument(
         "--memory",
@@ -41,46 +74,89 @@ def _command(argv: list[str]) -> None:
         metavar="500MB",
         help="for the scene, on the processor's side and on the graphics card's together (default: %(default)s bytes)",
     )
-    parser.add_argument("--frames", type=int, metavar="N", help="leave after N frames")
+    parser.add_argument(
+        "--quality", choices=list(LADDER), help="how finely to draw (default: as it was; else what the device is up to)"
+    )
+    parser.add_argument(
+        "--target-fps", type=_rate, metavar="F", help="hold so many frames a second by moving the quality (default: as it was; else do not)"
+    )
+    parser.add_argument("--path", metavar="JSON", help="a camera path, as saved before, for J to follow")
+    parser.add_argument(
+        "--folder", default=".", metavar="DIR", help="for screenshots, videos and camera paths (default: the working directory)"
+    )
+    parser.add_argument("--frames", type=int, metavar="N", help="leave after N frames, and neither take nor leave settings")
     parser.add_argument("--screenshot", metavar="PNG", help="save the window when leaving")
-    options = parser.parse_args(argv)
-    if options.frames is not None and options.frames < 1:
-        raise UsageError(f"--frames {options.frames} is not positive")
-    if options.screenshot is not None and Path(options.screenshot).suffix.lower() != ".png":
-        raise UsageError(f"--screenshot {options.screenshot} is no .png")
-
-    from kpc.player.stream import Stream  # only now: what is wrong with the options is told without OpenGL's libraries
-
-    stream = Stream(open_source(options.scene, limit=options.memory), memory=options.memory)
-    try:
-        camera = Rig.of(stream.scene).cameras[0]
-        size = options.size or (min(max(round(HEIGHT * camera.width / camera.height), 480), 1600), HEIGHT)
-        _play(stream, size, options.frames, options.screenshot)
-    finally:
-        stream.close()
+    return parser
 
 
-def _play(stream: "Stream", size: tuple[int, int], frames: int | None, screenshot: str | None) -> None:
+def _over(remembered: Preferences, options: argparse.Namespace) -> Preferences:
+    """What is asked for goes before what is remembered; a quality that is asked for is not moved by itself."""
+    target_fps = options.target_fps or (None if options.quality else remembered.target_fps)
+    return replace(
+        remembered, size=options.size or remembered.size, quality=options.quality or remembered.quality, target_fps=target_fps
+    )
+
+
+def _play(stream: "Reel", wanted: Preferences, options: argparse.Namespace, path: CameraPath | None) -> Preferences:
+    """From the first scene to the last that is dragged in, and over a graphics card that is reset; what to remember."""
+    from kpc.player.reel import Reel
     from kpc.player.window import Player, Window  # only now: a scene that cannot be read is told without a display
 
-    window = Window(f"{Path(stream.source.name).name} - kpplay", size)
+    window = Window("kpplay", wanted.size or _opening_size(stream))
+    before, resets = None, 0
     try:
-        player = Player(window, stream)
-        try:
-            player.run(frames)
-            if screenshot is not None:
-                player.screenshot(Path(screenshot), with_controls=True)
-        finally:
-            player.close()
+        while True:
+            window.name(f"{Path(stream.source.name).name} - kpplay")
+            player = Player(window, stream, wanted, before=before, folder=Path(options.folder))
+            player.path, path = path or player.path, None
+            before = None
+            try:
+                player.run(options.frames)
+                if options.screenshot is not None and player.successor is None:
+                    player.screenshot(Path(options.screenshot))
+            except ContextLostError:
+                resets, before = resets + 1, player
+                if resets > MOST_RESETS:
+                    raise
+            finally:
+                wanted = player.preferences()
+                if (told := player.close()) is not None:
+                    print(f"kpplay: {told}", file=sys.stderr)
+            if before is not None:
+                window.close()
+                stream.close()
+                window = Window("kpplay", wanted.size or _opening_size(stream))
+                stream = Reel(open_source(stream.source.name, limit=options.memory), memory=options.memory)
+            elif player.successor is not None:
+                stream.close()
+                stream = player.successor
+            else:
+                return wanted
     finally:
         stream.close()  # before the window goes that it wakes
         window.close()
 
 
+def _opening_size(stream: "Reel") -> tuple[int, int]:
+    camera = Rig.of(stream.scene).cameras[0]
+    return min(max(round(HEIGHT * camera.width / camera.height), 480), 1600), HEIGHT
+
+
+def _rate(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    low, high = TARGET_FPS
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a frame rate from {low:g} to {high:g}")
+    return value
+
+
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
-    if match is None or not all(int(n) in SIZES for n in match.groups()):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size like 1280x720, at least {SIZES[0]} a side")
+    if match is None or not all(int(n) in WINDOW_SIDES for n in match.groups()):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size like 1280x720, at least {WINDOW_SIDES[0]} a side")
     return int(match[1]), int(match[2])
 
 

@@ -74,11 +74,38 @@ def orbit(scene: Scene, count: int) -> list[Camera]:
     turns = 2 * math.pi * np.arange(count) / count
     if is_ring(azimuth):
         return [rig.camera(turn, float(elevation.mean()), float(distance.mean())) for turn in turns]
-    middle_a, middle_e = (azimuth.max() + azimuth.min()) / 2, (elevation.max() + elevation.min()) / 2
-    sway_a = max(INSIDE * (azimuth.max() - azimuth.min()) / 2, SMALL_SWAY[0])
-    sway_e = max(INSIDE * (elevation.max() - elevation.min()) / 2, SMALL_SWAY[1])
+    (middle_a, middle_e), sway_a, sway_e = _sways(azimuth, elevation)
     far = float(np.median(distance))
     return [rig.camera(middle_a + sway_a * math.sin(turn), middle_e + sway_e * math.cos(turn), far) for turn in turns]
+
+
+def _sways(azimuth: np.ndarray, elevation: np.ndarray) -> tuple[tuple[float, float], float, float]:
+    """Of a rig on one side: azimuth and elevation in the middle of its angles, and how far from there it is safe to go in each."""
+    (middle_a, sway_a), (middle_e, sway_e) = (
+        (float(angles.max() + angles.min()) / 2, max(INSIDE * float(angles.max() - angles.min()) / 2, least))
+        for angles, least in zip((azimuth, elevation), SMALL_SWAY, strict=True)
+    )
+    return (middle_a, middle_e), sway_a, sway_e
+
+
+def presets(scene: Scene) -> dict[str, Camera]:
+    """Places to look from, by name, all towards what the scene's cameras look at.
+
+    Cameras all around: its sides, and from above. Cameras on one side: the ends of the angles that were seen. All scenes: near, far.
+    """
+    rig = Rig.of(scene)
+    azimuth, elevation, distance = rig.angles()
+    far, level = float(np.median(distance)), float(elevation.mean())
+    if is_ring(azimuth):
+        around = {"front": (0.0, level), "right": (0.5, level), "back": (1.0, level), "left": (-0.5, level), "above": (0.0, 1.4)}
+        places = {name: (math.pi * turn, height, far) for name, (turn, height) in around.items()}
+    else:
+        middle, sway_a, sway_e = _sways(azimuth, elevation)
+        ways = {"middle": (0, 0), "left": (-1, 0), "right": (1, 0), "above": (0, 1), "below": (0, -1)}
+        places = {name: (middle[0] + x * sway_a, middle[1] + y * sway_e, far) for name, (x, y) in ways.items()}
+    first = next(iter(places.values()))
+    places |= {"near": (*first[:2], 0.6 * far), "far": (*first[:2], 1.6 * far)}
+    return {name: rig.camera(*place) for name, place in places.items()}
 
 
 def is_ring(azimuth: np.ndarray) -> bool:

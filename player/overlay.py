@@ -92,6 +92,15 @@ class Overlay:
         framebuffer.scissor = (0, 0, width, height)
         self.ctx.enable_only(moderngl.NOTHING)
 
+    def adopt(self, texture: moderngl.Texture) -> moderngl.Texture:
+        """A texture that widgets show: `imgui.ImTextureRef(texture.glo)`."""
+        self._textures[texture.glo] = texture
+        return texture
+
+    def forget(self, texture: moderngl.Texture) -> None:
+        """One that none will show any more."""
+        self._textures.pop(texture.glo).release()
+
     def close(self) -> None:
         for texture in imgui.get_platform_io().textures:
             texture.set_tex_id(0)

@@ -14,6 +14,7 @@ from kpc.format.grid import linear
 from kpc.format.scene import Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
+from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, slot_at
 from kpc.player.textures import FOLDED_AXIS, Layout, Rows, decoder_arrays, decoder_shape, distances, filled_to_four
 
@@ -77,18 +78,17 @@ def is_software(ctx: moderngl.Context) -> bool:
 class Renderer:
     """A scene on the graphics card.
 
-    `folded`: multiply the rows of the time planes into the space planes once a frame, instead of sampling them beside
-    the planes at every sample, and end rays at a transmittance of 1/64. Half the fetches at nine samples of ten, and a
-    second-order error where something moves.
+    Attributes:
+        quality: how finely to draw; may be set at any time.
 
     Raises:
         DisplayError: the scene does not fit the card, or a shader does not compile.
     """
 
-    def __init__(self, ctx: moderngl.Context, scene: Scene, *, folded: bool = False) -> None:
+    def __init__(self, ctx: moderngl.Context, scene: Scene, quality: Quality = LADDER["reference"]) -> None:
         self.ctx = ctx
         self.scene = scene
-        self.folded = folded
+        self.quality = quality
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
         if max(self.layout.size) > most:
@@ -124,7 +124,7 @@ class Renderer:
         for block in self.layout.blocks:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
         self._slot: int | None = None
-        self._programs: dict[tuple[str, int, bool, bool, bool], tuple[moderngl.Program, moderngl.VertexArray]] = {}
+        self._programs: dict[tuple[object, ...], tuple[moderngl.Program, moderngl.VertexArray]] = {}
         self._targets: dict[tuple[Part, tuple[int, int]], Target] = {}
         self.check()
 
@@ -135,6 +135,19 @@ class Renderer:
             full = error == "GL_OUT_OF_MEMORY"
             remedy = "close other programs or use a smaller size" if full else "update the graphics driver"
             raise DisplayError(f"OpenGL reports {error} on {self.ctx.info['GL_RENDERER']}; {remedy}")
+
+    def release(self) -> None:
+        """Give back all that the scene takes of the card."""
+        self.ctx.detect_framebuffer(0).use()  # moderngl would bind again what it knows as bound, though it is gone
+        things: list[Target | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
+        things = [self._planes, self._row_texture, self._cells, *self._targets.values()]
+        things += [thing for pair in self._programs.values() for thing in reversed(pair)]
+        things += [] if self._folded_planes is None else [self._fold_into, self._folded_planes]
+        things += [] if self._motion_texture is None else [self._motion_texture]
+        for thing in things:
+            thing.release()
+        self._targets.clear()
+        self._programs.clear()
 
     @property
     def memory_bytes(self) -> int:
@@ -211,21 +224,31 @@ class Renderer:
     ) -> Target:
         """Draw into a target of the camera's size, which stays valid until the next march of the same part and size.
 
+        At a lower resolution of `quality`, into a smaller one first.
+
         `part` is FULL or STATIC. `program` is march.glsl or another that takes a subset of its uniforms. `appearance` as in
         `reference.code_of`.
         """
         moving = part is Part.FULL and self._rows is not None
-        self._occupy(slot_at(self.scene, time))
-        folded = moving and self.folded
+        quality, scene, size = self.quality, self.scene, (camera.width, camera.height)
+        if quality.resolution < 1:
+            camera = camera.resized(*(max(1, round(side * quality.resolution)) for side in size))
+        self._occupy(slot_at(scene, time))
+        folded = moving and quality.folded
         if moving:
             self._cut(time)
         planes = self._fold(time) if folded else self._planes
         target = self._target(part, (camera.width, camera.height))
         displaced = moving and self._motion_texture is not None
         layout = self.folded_layout if folded else self.layout
-        march, vertices = self._program(program, layout, rows=moving and not folded, displaced=displaced, early=folded)
+        drawn = min(quality.scales or layout.scales, layout.scales)
+        march, vertices = self._program(program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn)
+        stride = scene.step * quality.step
         _set(
             march,
+            stride=stride,
+            tau=stride / scene.extent,
+            termination=quality.termination,
             height=float(camera.height),
             lens=(camera.fl_x, camera.fl_y, camera.cx, camera.cy),
             axes=tuple(camera.camera_to_world[:3, :3].T.ravel()),
@@ -237,6 +260,14 @@ class Renderer:
         if self._motion_texture is not None:
             self._motion_texture.use(MOTION_UNIT)
         self._cells.use(CELLS_UNIT)
+        self._draw(target.framebuffer, vertices)
+        return target if target.seen.size == size else self._upscaled(target, self._target(part, size))
+
+    def _upscaled(self, small: Target, target: Target) -> Target:
+        upscale, vertices = self._program("upscale.glsl", self.layout)
+        _set(upscale, seen_small=SEEN_UNIT, met_small=MET_UNIT, size=tuple(map(float, target.seen.size)))
+        small.seen.use(SEEN_UNIT)
+        small.met.use(MET_UNIT)
         self._draw(target.framebuffer, vertices)
         return target
 
@@ -260,10 +291,10 @@ class Renderer:
         return target
 
     def _program(
-        self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, early: bool = False
+        self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0
     ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
-        key = name, layout.refined, rows, displaced, early
+        key = name, layout.refined, rows, displaced, drawn
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
@@ -275,7 +306,7 @@ class Renderer:
                 "LAYERS": layout.layers,
                 **decoder_shape(scene.decoder),
                 "ROWS": int(rows),
-                "EARLY": int(early),
+                "DRAWN": drawn,
                 "APPEARANCE": int(bool(scene.appearances)),
                 "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
                 "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
@@ -300,10 +331,8 @@ class Renderer:
             box_low=tuple(scene.aabb[0]),
             box_high=tuple(scene.aabb[1]),
             background=tuple(scene.background),
-            stride=scene.step,
             even=scene.mapping.even if isinstance(scene.mapping, Contraction) else 0.0,
             **_frame_of(scene.mapping),
-            tau=scene.step / scene.extent,
         )
         entry = self._programs[key] = program, self.ctx.vertex_array(program, [])
         return entry

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kpc.format.container import DEFAULT_BUDGET, RemoteSource, Source
+from kpc.format.container import DEFAULT_BUDGET, Reader, RemoteSource, Source
 from kpc.format.errors import BudgetError, FormatError, InterruptedRead, KpcError
 from kpc.format.file import SceneReader
 from kpc.format.partial import PartialScene, hold, runs
@@ -51,11 +51,13 @@ class Stream:
     Opening it waits for header, index, and all that there can be no picture without but planes; then the thread begins.
 
     Args:
+        source: of the scene's file, or a reader of it, whose header and index are taken over.
         memory: bytes that the scene may take, on the processor's side and on the graphics card's together. Pictures, shaders and
             the program itself are not counted.
         arrived: called by the fetching thread whenever there is something new; may wake the window.
 
     Attributes:
+        memory: as given.
         scene: what is there of it; `upload` changes it.
         version: grows whenever it has changed.
 
@@ -63,9 +65,10 @@ class Stream:
         KpcError: as `SceneReader` and `HttpSource`; BudgetError if `memory` is too little to play the scene at all.
     """
 
-    def __init__(self, source: Source, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None) -> None:
-        self.source, self.arrived, self.version = source, arrived, 0
+    def __init__(self, source: Source | Reader, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None) -> None:
         self._reader = SceneReader(source, memory_budget=memory, in_parts=True)
+        source = self._reader.source
+        self.source, self.memory, self.arrived, self.version = source, memory, arrived, 0
         self.parts = PartialScene(self._reader)
         self.scene: Scene = self.parts.scene
         self._layout = Layout.of(self.scene)

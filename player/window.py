@@ -1,8 +1,10 @@
-"""The player's window: glfw for events, ImGui for controls, the renderer for the picture."""
+"""The player's window: glfw for events, ImGui for controls (`kpc.player.panels`), the renderer for the picture."""
 
-import contextlib
+import ctypes
+import re
 import time as clock
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,51 +13,49 @@ import moderngl
 import numpy as np
 from imgui_bundle import imgui
 
-from kpc.format.errors import DisplayError
+from kpc.format.container import open_source
+from kpc.format.errors import ContextLostError, DisplayError, KpcError
 from kpc.format.media import write_image
-from kpc.format.scene import HybridDecoder
-from kpc.player.controls import SPEEDS, Pace, Playback, View, Wardrobe
-from kpc.player.orbit import Rig
+from kpc.format.scene import Scene
+from kpc.player import panels
+from kpc.player.controls import Playback, View, Wardrobe
+from kpc.player.dial import RUNGS, dial_for
+from kpc.player.orbit import Rig, presets
 from kpc.player.overlay import Overlay
+from kpc.player.panels import LOOKS, PARTS
+from kpc.player.path import GAP_S, CameraPath
+from kpc.player.preferences import TEXT_SIZES, Preferences
 from kpc.player.prefetch import Playhead
+from kpc.player.quality import LADDER, climbed
+from kpc.player.recording import Recording, frames_due
+from kpc.player.reel import Reel
 from kpc.player.reference import Part
 from kpc.player.renderer import Look, Renderer, is_software
-from kpc.player.stream import Stream
 
-KEYS = (
-    ("drag", "turn around the scene"),
-    ("right drag, Shift drag", "move sideways"),
-    ("wheel", "come nearer, go away"),
-    ("W A S D, Q E", "fly; with Shift faster"),
-    ("Space", "play, pause"),
-    ("Left, Right", "one frame back, on"),
-    ("Home, End", "to the start, to the end"),
-    ("[  ]", "slower, faster"),
-    ("L", "loop"),
-    ("R", "back to the opening camera"),
-    ("N", "the next camera of the scene"),
-    ("V", "the next appearance, if it has several"),
-    ("1 2 3 4", "colour, depth, samples, occupancy"),
-    ("C", "all, what stays, what moves"),
-    ("F", "exact or folded time planes"),
-    ("P", "screenshot"),
-    ("Tab", "hide or show all this"),
-    ("H", "these keys"),
-    ("Esc", "quit"),
-)
-LOOKS = {Look.COLOUR: "colour", Look.DEPTH: "depth", Look.SAMPLES: "samples", Look.OCCUPANCY: "occupancy"}
-PARTS = {Part.FULL: "all", Part.STATIC: "static only", Part.DYNAMIC: "dynamic only"}
 REMEDY = "render pictures or a video with kprender instead"
 
+OPENGL = ((4, 3), (3, 3))
+"""Versions to ask for, in this order; macOS gives 4.1 for the second."""
 STATS_EVERY_S = 0.5
 STATS_SIZE = (48, 36)
 SHARPEN_AFTER_S = 0.25
 CROSSING_S = 4.0
 """Flying takes this long to cross the box's longest edge."""
+TOLD_S, COMPLAINED_S = 4.0, 12.0
+"""How long a message is shown, and an error."""
+FILM_FPS = 30.0
+LONGEST_GAP_S = 60.0
+HISTORY = 240
+MOST_MISHAPS = 3
+FINISHING_S = 60.0
+"""How long a video may take to be finished after the window was closed."""
 
 
 class Window:
-    """A glfw window with an OpenGL 3.3 core context, and the events since the last look at them.
+    """A glfw window with an OpenGL 4.3 or 3.3 core context, and the events since the last look at them.
+
+    Attributes:
+        pressed: keys and their modifiers; dropped: files dragged in.
 
     Raises:
         DisplayError: no display, no OpenGL 3.3.
@@ -66,28 +66,36 @@ class Window:
         glfw.set_error_callback(self._complain)
         if not glfw.init():
             raise DisplayError(f"no window to be had ({self._complaint}); {REMEDY}")
-        hints = {
-            glfw.CONTEXT_VERSION_MAJOR: 3,
-            glfw.CONTEXT_VERSION_MINOR: 3,
-            glfw.OPENGL_PROFILE: glfw.OPENGL_CORE_PROFILE,
-            glfw.OPENGL_FORWARD_COMPAT: True,
-            glfw.SCALE_TO_MONITOR: True,
-        }
-        for hint, value in hints.items():
-            glfw.window_hint(hint, value)
-        self.handle = glfw.create_window(*size, title, None, None)
+        self.handle = next(filter(None, (self._create(title, size, version) for version in OPENGL)), None)
         if not self.handle:
             glfw.terminate()
             raise DisplayError(f"no window with OpenGL 3.3 to be had ({self._complaint}): {REMEDY}")
         glfw.make_context_current(self.handle)
         glfw.swap_interval(1)
         self.ctx = self._context()
+        self.ctx.gc_mode = "context_gc"  # what nobody refers to any more waits for `sweep`, in the window's thread
+        self._reset_status = _reset_status()
         self.io: imgui.IO | None = None
         self.pressed: list[tuple[int, int]] = []
+        self.dropped: list[str] = []
         glfw.set_key_callback(self.handle, self._key)
         glfw.set_cursor_pos_callback(self.handle, self._moved)
         glfw.set_mouse_button_callback(self.handle, self._clicked)
         glfw.set_scroll_callback(self.handle, self._scrolled)
+        glfw.set_drop_callback(self.handle, self._drop)
+
+    def _create(self, title: str, size: tuple[int, int], version: tuple[int, int]) -> Any:
+        hints = {
+            glfw.CONTEXT_VERSION_MAJOR: version[0],
+            glfw.CONTEXT_VERSION_MINOR: version[1],
+            glfw.OPENGL_PROFILE: glfw.OPENGL_CORE_PROFILE,
+            glfw.OPENGL_FORWARD_COMPAT: True,
+            glfw.CONTEXT_ROBUSTNESS: glfw.LOSE_CONTEXT_ON_RESET,
+            glfw.SCALE_TO_MONITOR: True,
+        }
+        for hint, value in hints.items():
+            glfw.window_hint(hint, value)
+        return glfw.create_window(*size, title, None, None)
 
     def _context(self) -> moderngl.Context:
         failures = []
@@ -122,6 +130,9 @@ class Window:
         if self.io:
             self.io.add_mouse_wheel_event(x, y)
 
+    def _drop(self, window: object, paths: list[str]) -> None:
+        self.dropped += paths
+
     @property
     def size(self) -> tuple[int, int]:
         """In the system's screen units, those of the pointer."""
@@ -133,49 +144,144 @@ class Window:
         width, height = glfw.get_framebuffer_size(self.handle)
         return width, height
 
+    @property
+    def text_scale(self) -> float:
+        """How large the system draws its text, pixels to one of a plain screen."""
+        return float(glfw.get_window_content_scale(self.handle)[0])
+
+    @property
+    def plain_size(self) -> tuple[int, int]:
+        """What to ask for to get a window of this size again: glfw multiplies by the text's scale where units are pixels."""
+        (width, height), ratio = self.size, self.pixels[0] / max(self.size[0], 1)
+        scale = max(self.text_scale / max(ratio, 1e-6), 1e-6)
+        return round(width / scale), round(height / scale)
+
     def held(self, *keys: int) -> bool:
         return any(glfw.get_key(self.handle, key) == glfw.PRESS for key in keys)
 
+    def check(self) -> None:
+        """Raise a ContextLostError if the graphics card has been reset, and all that it held is gone."""
+        if self._reset_status() != 0:
+            raise ContextLostError("the graphics card was reset; start kpplay anew, or update the graphics driver")
+
+    def sweep(self) -> None:
+        """Release what nobody refers to any more. (moderngl's own `gc` stumbles over what was released by hand.)"""
+        while self.ctx.objects:
+            thing = self.ctx.objects.popleft()
+            if not isinstance(thing, moderngl.InvalidObject):
+                thing.release()
+
+    def name(self, title: str) -> None:
+        glfw.set_window_title(self.handle, title)
+
     def close(self) -> None:
-        glfw.destroy_window(self.handle)
-        glfw.terminate()
+        if self.handle:
+            glfw.destroy_window(self.handle)
+            glfw.terminate()
+        self.handle = None
+
+
+def _reset_status() -> Callable[[], int]:
+    """OpenGL's own function of the context that is current, where it has one."""
+    for name in ("glGetGraphicsResetStatus", "glGetGraphicsResetStatusARB"):
+        address = glfw.get_proc_address(name)
+        if address:
+            return ctypes.CFUNCTYPE(ctypes.c_uint)(address)
+    return lambda: 0
 
 
 class Player:
-    """A scene in a window, from the first frame to the last, while it arrives."""
+    """A scene in a window, from the first frame to the last, while it arrives.
 
-    def __init__(self, window: Window, stream: Stream) -> None:
-        self.window, self.stream, self.scene = window, stream, stream.scene
+    Args:
+        before: a player of the same scene that cannot go on; this one does, where it was.
+        folder: where screenshots, videos and camera paths go.
+    """
+
+    def __init__(
+        self,
+        window: Window,
+        stream: Reel,
+        preferences: Preferences = Preferences(),
+        *,
+        before: "Player | None" = None,
+        folder: Path = Path(),
+    ) -> None:
+        self.window, self.stream, self.folder = window, stream, folder
         scene = self.scene
         stream.arrived = glfw.post_empty_event
         self.ctx = window.ctx
         self.device = self.ctx.info["GL_RENDERER"]
-        software = is_software(self.ctx)
-        self.renderer = Renderer(self.ctx, scene, folded=software and scene.is_dynamic)
+        self.dial = dial_for(is_software(self.ctx), preferences.quality, preferences.target_fps)
+        self.target_fps = preferences.target_fps or FILM_FPS
+        if not stream.is_drawn:
+            stream.draw_with(self._make_renderer)
         self.overlay = Overlay(self.ctx)
         window.io = self.overlay.io
-        self.rig = Rig.of(scene)
-        self.camera_number = 0
+        self.rig, self.presets = Rig.of(scene), presets(scene)
+        self.camera_number, self.preset_number = 0, -1
         self.view = View.of(self.rig, self.rig.cameras[0])
-        self.playback = Playback(scene.clip, playing=scene.clip.duration_s > 0)
+        self.playback = Playback(stream.clip, playing=stream.clip.duration_s > 0, speed=preferences.speed, loop=preferences.loop)
         self.wardrobe = Wardrobe(scene)
-        self.pace = Pace.of(software)
-        self.part, self.look = Part.FULL, Look.COLOUR
-        self.show_hud, self.show_keys = True, False
+        self.part, self.look, self.exact = Part.FULL, Look.COLOUR, False
+        self.path, self.ride_s, self.riding = CameraPath(), 0.0, False
+        self._keyed_at: float | None = None
+        self.film: Recording | None = None
+        self._filming_path, self._filming_since = False, 0.0
+        self.show_hud, self.show_keys, self.show_path = preferences.controls, False, False
+        self.show_graphs, self.show_planes, self.text_size = preferences.graphs, preferences.planes, preferences.text_size
+        self.history = np.zeros((2, HISTORY), np.float32)
+        """Milliseconds from one frame to the next, and that a picture took; the column of the next is `frames % HISTORY`."""
+        self.frames = 0
         self.frame_s = self.draw_s = 0.0
         self.samples, self.most_samples, self.depths = 0.0, 16.0, (0.0, 1.0)
-        self._notice, self._notice_until = "H: keys", clock.monotonic() + 4.0
+        self.planes = panels.PlaneView(scene)
+        self.successor: Reel | None = None
+        self._mishaps = 0
+        self.say("H: keys")
         self._measured = -STATS_EVERY_S
         self._before = self._moved = clock.monotonic()
+        if before is not None:
+            self._go_on_from(before)
         self._resize(window.pixels)
         self._drawn: tuple[object, ...] = ()
         self._is_sharp = False
 
+    @property
+    def scene(self) -> Scene:
+        """What shows: of a clip in groups, the group."""
+        return self.stream.scene
+
+    @property
+    def renderer(self) -> Renderer:
+        return self.stream.renderer
+
+    def _make_renderer(self, scene: Scene) -> Renderer:
+        return Renderer(self.ctx, scene, LADDER[self.dial.rung])
+
+    def _go_on_from(self, before: "Player") -> None:
+        self.view, self.playback, self.path, self.part, self.look = (
+            before.view, before.playback, before.path, before.part, before.look
+        )  # fmt: skip
+        self.dial, self.exact = before.dial, before.exact
+        self.wardrobe.wear(before.wardrobe.number)
+        self.show_hud, self.show_path = before.show_hud, before.show_path
+        self.complain("the graphics card was reset; the scene is there again")
+
+    def preferences(self) -> Preferences:
+        """What to remember of it."""
+        holds = self.dial.target_s is not None
+        return Preferences(
+            self.window.plain_size, self.dial.chosen, self.target_fps if holds else None, self.playback.speed, self.playback.loop,
+            self.show_hud, self.show_graphs, self.show_planes, self.text_size,
+        )  # fmt: skip
+
     def run(self, frames: int | None = None) -> None:
-        """Until the window is closed, or for a number of frames once all of the scene is there that is to come."""
+        """Until the window is closed, another scene is opened, or for a number of frames once all of the scene is there that is
+        to come."""
         shown = 0
-        while not glfw.window_should_close(self.window.handle) and (frames is None or shown < frames):
-            if (frames is None or not self.stream.is_settled) and self._is_sharp:
+        while not glfw.window_should_close(self.window.handle) and (frames is None or shown < frames) and self.successor is None:
+            if (frames is None or not self.stream.is_settled) and self._is_sharp and self.film is None:
                 glfw.wait_events_timeout(0.05)  # nothing moves: spend next to nothing
             else:
                 glfw.poll_events()
@@ -191,40 +297,227 @@ class Player:
         if min(pixels) < 1 or glfw.get_window_attrib(self.window.handle, glfw.ICONIFIED):
             glfw.wait_events_timeout(0.1)
             return
+        self.window.check()
         if pixels != self.canvas.size:
             self._resize(pixels)
         self._begin(seconds)
         self._point()
         self._fly(min(seconds, 0.1))
         for key, mods in self.window.pressed:
-            self._type(key, mods)
+            self.type(key, mods)
         self.window.pressed.clear()
-        self._advance(seconds)
-        self.wardrobe.advance(seconds)
-        self._draw(now)
-        self._widgets()
+        for file in self.window.dropped:
+            self.open(file)
+        self.window.dropped.clear()
+        try:
+            self._advance(seconds)
+            self.wardrobe.advance(seconds)
+            self._draw(now)
+            self.renderer.check()
+        except ContextLostError:
+            raise
+        except DisplayError as error:
+            self._coarser_after(error)
+        self._keep_filming(now)
+        self.history[:, self.frames % HISTORY] = 1e3 * seconds, 1e3 * self.draw_s
+        self.frames += 1
+        panels.show(self)
         self._finish()
         glfw.swap_buffers(self.window.handle)
-        self.renderer.check()
+        self.window.sweep()
+
+    def _coarser_after(self, error: DisplayError) -> None:
+        """The card has no room, say: tell it, and go on with less, but not for ever."""
+        self._mishaps += 1
+        if self._mishaps > MOST_MISHAPS:
+            raise error
+        self.complain(str(error))
+        self.dial.choose(climbed(self.dial.rung, -1))
 
     def _advance(self, seconds: float) -> None:
-        """Let the clip go on, unless what comes next is not there yet."""
-        later = self.playback.after(seconds)
+        """Let the clip, or the camera path, go on, unless what comes next is not there yet."""
+        later, ride_s, view = self.playback.after(seconds), self.ride_s, self.view
+        if self.is_filming_path and self.film is not None:
+            later = replace(later, time=self.path.at(self.path.start_s + self.film.duration_s)[1])
+        elif self.riding:
+            ride_s += seconds
+            if ride_s > self.path.end_s:
+                ride_s, self.riding = (self.path.start_s, True) if self.playback.loop else (self.path.end_s, False)
+            camera, time = self.path.at(ride_s)
+            later, view = replace(later, time=time), View.of(self.rig, camera)
         self.stream.steer(Playhead(later.time, self.playback.pace, self.playback.loop))
-        self.stream.upload(self.renderer)
+        self.stream.upload()
+        if self.wardrobe.scene is not self.scene:
+            self.wardrobe = Wardrobe(self.scene, self.wardrobe.names[self.wardrobe.number])
         if self.stream.can_show(later.time, self.playback.pace):
-            self.playback = later
+            self.playback, self.ride_s, self.view = later, ride_s, view
 
-    def screenshot(self, path: Path, with_controls: bool) -> None:
-        """Save the picture at the window's full resolution."""
+    # --- files
+
+    def say(self, text: str) -> None:
+        """Show a message for a while."""
+        self.notice, self.notice_until, self.notice_is_error = text, clock.monotonic() + TOLD_S, False
+
+    def complain(self, text: str) -> None:
+        """Show what went wrong for longer."""
+        self.notice, self.notice_until, self.notice_is_error = text, clock.monotonic() + COMPLAINED_S, True
+
+    @property
+    def stem(self) -> str:
+        """What files of this scene begin with: part of its name or address, of characters that every system takes."""
+        return re.sub(r"[^\w.+-]", "_", Path(self.stream.source.name).stem)[:80] or "scene"
+
+    def free_name(self, suffix: str) -> Path:
+        """The first that is free of scene-001.png, scene-002.png and so on."""
+        names = (self.folder / f"{self.stem}-{n:03d}{suffix}" for n in range(1, 1_000_000))
+        return next(path for path in names if not path.exists()).absolute()
+
+    def open(self, file: str) -> None:
+        """A camera path, or another scene, which follows this one."""
+        try:
+            if file.lower().endswith(".json"):
+                self.path, self.ride_s, self.show_path = CameraPath.load(file), 0.0, True
+                self.say(f"{len(self.path.keyframes)} keyframes from {file}; J follows them")
+                return
+            stream = Reel(open_source(file, limit=self.stream.memory), memory=self.stream.memory)
+            try:
+                stream.draw_with(self._make_renderer)
+                self.successor = stream
+            except BaseException:
+                stream.close()
+                raise
+        except KpcError as error:
+            self.complain(str(error))
+        except OSError as error:
+            self.complain(f"{file}: {error.strerror or error}")
+
+    def screenshot(self, path: Path) -> None:
+        """Save the window, controls and all, at its full resolution."""
         self._begin(1 / 60)
-        self._picture(1.0)
-        self._widgets()
-        self._finish()
-        source = self.screen if with_controls else self.canvas
-        width, height = self.canvas.size
-        data = source.read(viewport=(0, 0, width, height), components=3, alignment=1)
-        write_image(path, np.frombuffer(data, np.uint8).reshape(height, width, 3)[::-1])
+        self._picture(1.0, self.dial.resting)
+        panels.show(self)
+        self.overlay.draw(self.canvas)
+        write_image(path, self._pixels())
+        self._drawn = ()
+
+    def _save_picture(self) -> None:
+        """Write the picture without controls, under the first name that is free."""
+        path = self.free_name(".png")
+        self._picture(1.0, self.dial.resting)
+        try:
+            write_image(path, self._pixels())
+            self.say(f"saved {path}")
+        except OSError as error:
+            self.complain(f"{path}: {error.strerror or error}")
+
+    def save_path(self) -> None:
+        """Write the camera path, under the first name that is free."""
+        path = self.free_name("-path.json")
+        if not self.path.keyframes:
+            self.complain("there is no camera path yet; K makes a keyframe")
+            return
+        try:
+            self.path.save(path)
+            self.say(f"saved {path}; kprender --path makes a video of it")
+        except OSError as error:
+            self.complain(f"{path}: {error.strerror or error}")
+
+    # --- the camera path, and films
+
+    def scrub(self, time: float) -> None:
+        """Pause the clip there."""
+        self.playback.playing = self.riding = False
+        self.playback.seek(time)
+
+    def ride_to(self, seconds: float) -> None:
+        """See what the camera path passes then."""
+        camera, time = self.path.at(seconds)
+        self.look_from(View.of(self.rig, camera))
+        self.scrub(time)
+        self.ride_s = seconds
+
+    def look_from(self, view: View) -> None:
+        """Go there at once; where a path was followed, that ends."""
+        self.view, self.riding = view, False
+
+    def add_keyframe(self) -> None:
+        """Here and now. While the clip plays, as long after the one before as it took."""
+        now, gap_s = clock.monotonic(), GAP_S
+        if self._keyed_at is not None and self.playback.playing:
+            gap_s = min(max(now - self._keyed_at, 0.1), LONGEST_GAP_S)
+        self._keyed_at = now if self.playback.playing else None
+        self.path = self.path.with_keyframe(self.view.camera(*self.canvas.size), self.playback.time, gap_s)
+        self.show_path = True
+        self.say(f"keyframe {len(self.path.keyframes)}, at {self.path.end_s:.1f} s")
+
+    def remove_keyframe(self, number: int) -> None:
+        self.path, self._keyed_at = self.path.without(number), None
+        self.riding = self.riding and bool(self.path.keyframes)
+
+    def follow(self) -> None:
+        """Follow the camera path from where it was left, or stop."""
+        if not self.path.keyframes:
+            self.complain("there is no camera path yet; K makes a keyframe")
+        elif self.riding:
+            self.riding = False
+        else:
+            self.riding, self.playback.playing = True, False
+            if not self.path.start_s <= self.ride_s < self.path.end_s:
+                self.ride_s = self.path.start_s
+
+    def start_or_stop_filming(self, along_path: bool) -> None:
+        """Begin a video of what the window shows, or of the camera path frame by frame, however long that takes; or end it."""
+        if self.film is not None:
+            self.film.end()
+            return
+        if along_path and not self.path.keyframes:
+            self.complain("there is no camera path yet; K makes a keyframe")
+            return
+        self.film = Recording(self.free_name(".mp4"), FILM_FPS, self.canvas.size)
+        self._filming_path, self._filming_since = along_path, clock.monotonic()
+        if along_path:
+            self.riding, self.playback.playing, self.ride_s = True, False, self.path.start_s
+
+    @property
+    def is_filming_path(self) -> bool:
+        return self._filming_path and self.film is not None and not self.film.is_ending
+
+    def _keep_filming(self, now: float) -> None:
+        """Hand on what is due of a film, and tell how it ended."""
+        film = self.film
+        if film is None:
+            return
+        if film.is_over:
+            self.film = None
+            if film.failure is None:
+                self.say(f"saved {film.path}, {film.duration_s:.1f} s")
+            else:
+                self.complain(film.failure)
+        elif film.is_ending:
+            return
+        elif film.size != self.canvas.size:
+            self.say("the window has another size now: the film ends")
+            film.end()
+        elif self._filming_path:
+            self._film_path(film)
+            self.riding = self.riding and not film.is_ending
+        else:
+            due = frames_due(now - self._filming_since, film.fps, film.taken)
+            frame = self._pixels() if due and film.has_room else None
+            for _ in range(due):
+                if frame is None or not film.take(frame):
+                    break
+
+    def _film_path(self, film: Recording) -> None:
+        """One more frame, once all is there that it shows."""
+        if not self.riding or self.path.start_s + film.duration_s > self.path.end_s + 1e-6:
+            film.end()
+        elif film.has_room and self.stream.is_settled:
+            self.ride_s = self.path.start_s + film.duration_s
+            camera, self.playback.time = self.path.at(self.ride_s)
+            self.view = View.of(self.rig, camera)
+            self._picture(1.0, self.dial.resting)
+            film.take(self._pixels())
 
     # --- the picture
 
@@ -239,22 +532,35 @@ class Player:
         self.raster = pixels
         self._drawn = ()
 
+    def _pixels(self) -> np.ndarray:
+        """What the canvas holds, uint8 (height, width, 3), top row first."""
+        width, height = self.canvas.size
+        data = self.canvas.read(components=3, alignment=1)
+        return np.frombuffer(data, np.uint8).reshape(height, width, 3)[::-1]
+
     def _draw(self, now: float) -> None:
         """Draw the scene if anything has changed, finely once nothing does any more."""
         worn = (self.wardrobe.number, self.wardrobe.progress)
-        wanted = (self.view, self.playback.time, self.part, self.look, self.renderer.folded, worn, self.stream.version)
+        dial = self.dial
+        wanted = (self.view, self.playback.time, self.part, self.look, dial.chosen, self.exact, worn, self.stream.version)
         if self.stream.scales_here == 0:
             self._is_sharp = True  # as sharp as nothing can be
+        elif self.is_filming_path:
+            self._is_sharp = False  # `_film_path` draws
         elif wanted != self._drawn:
             self._drawn, self._moved, self._is_sharp = wanted, now, False
-            self._picture(self.pace.scale)
-            self.pace.saw(self.draw_s)
-        elif not self._is_sharp and (self.pace.scale == 1.0 or now - self._moved > SHARPEN_AFTER_S):
-            self._picture(1.0)
-            self._is_sharp = True
+            self._picture(dial.pace.scale, dial.rung)
+            dial.saw(self.draw_s)
+        elif not self._is_sharp:
+            is_finest = dial.pace.scale == 1.0 and dial.rung == dial.resting
+            if not is_finest and now - self._moved > SHARPEN_AFTER_S:
+                self._picture(1.0, dial.resting)
+            self._is_sharp = is_finest or now - self._moved > SHARPEN_AFTER_S
 
-    def _picture(self, scale: float) -> None:
+    def _picture(self, scale: float, rung: str) -> None:
         """Draw the scene on the canvas, at a share of its resolution."""
+        quality = LADDER[rung]
+        self.renderer.quality = replace(quality, folded=False) if self.exact else quality
         if clock.monotonic() - self._measured > STATS_EVERY_S:
             self._measure()
         started = clock.monotonic()
@@ -263,7 +569,7 @@ class Player:
         self.renderer.show(
             self.canvas,
             self.view.camera(width, height),
-            self.playback.time,
+            self.stream.time_in(self.playback.time),
             part=self.part,
             look=self.look,
             depths=self.depths,
@@ -277,7 +583,7 @@ class Player:
         """Samples a ray, and how far things are, from a very small picture."""
         small = self.renderer.render(
             self.view.camera(*STATS_SIZE),
-            self.playback.time,
+            self.stream.time_in(self.playback.time),
             part=Part.STATIC if self.part is Part.STATIC else Part.FULL,
         )
         self.samples = float(small.samples.mean())
@@ -287,6 +593,9 @@ class Player:
             near, far = np.percentile(seen, (2, 98))
             self.depths = (0.9 * float(near), 1.1 * float(far))
         self._measured = clock.monotonic()
+
+    def _begin(self, seconds: float) -> None:
+        self.overlay.begin(self.window.size, self.canvas.size, self.text_size * self.window.text_scale, seconds)
 
     def _finish(self) -> None:
         """The canvas, and the controls over it, on the screen."""
@@ -305,14 +614,16 @@ class Player:
         shift = self.window.held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT)
         moving = shift or imgui.is_mouse_down(1) or imgui.is_mouse_down(2)
         if (across or down) and moving and any(imgui.is_mouse_down(button) for button in range(3)):
-            self.view = self.view.pan(across, -down)
+            self.look_from(self.view.pan(across, -down))
         elif (across or down) and imgui.is_mouse_down(0):
-            self.view = self.view.orbit(np.pi * across, -np.pi * down)
+            self.look_from(self.view.orbit(np.pi * across, -np.pi * down))
         if io.mouse_wheel:
-            self.view = self.view.zoom(io.mouse_wheel)
+            self.look_from(self.view.zoom(io.mouse_wheel))
 
     def _fly(self, seconds: float) -> None:
         held = self.window.held
+        if held(glfw.KEY_LEFT_CONTROL, glfw.KEY_RIGHT_CONTROL):
+            return  # Ctrl S saves
         right, up, forward = (
             held(plus) - held(minus)
             for plus, minus in ((glfw.KEY_D, glfw.KEY_A), (glfw.KEY_E, glfw.KEY_Q), (glfw.KEY_W, glfw.KEY_S))
@@ -320,23 +631,36 @@ class Player:
         if right or up or forward:
             hurry = 4 if held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT) else 1
             way = hurry * seconds * self.scene.extent / CROSSING_S
-            self.view = self.view.fly(way * right, way * up, way * forward)
+            self.look_from(self.view.fly(way * right, way * up, way * forward))
 
-    def _type(self, key: int, mods: int) -> None:
-        playback = self.playback
-        if key == glfw.KEY_SPACE:
-            playback.toggle()
+    def type(self, key: int, mods: int) -> None:
+        """What a key does."""
+        playback, ctrl, shift = self.playback, bool(mods & glfw.MOD_CONTROL), bool(mods & glfw.MOD_SHIFT)
+        if ctrl:
+            if key == glfw.KEY_S:
+                self.save_path()
+            elif key in (glfw.KEY_MINUS, glfw.KEY_EQUAL):
+                factor = 1.1 if key == glfw.KEY_EQUAL else 1 / 1.1
+                self.text_size = min(max(self.text_size * factor, TEXT_SIZES[0]), TEXT_SIZES[1])
+        elif key == glfw.KEY_SPACE:
+            if self.riding:
+                self.riding = False
+            else:
+                playback.toggle()
         elif key in (glfw.KEY_LEFT, glfw.KEY_RIGHT):
             playback.step(1 if key == glfw.KEY_RIGHT else -1)
+            self.riding = False
         elif key in (glfw.KEY_HOME, glfw.KEY_END):
             playback.seek(0.0 if key == glfw.KEY_HOME else 1.0)
+            self.riding = False
         elif key in (glfw.KEY_LEFT_BRACKET, glfw.KEY_RIGHT_BRACKET):
             playback.faster(1 if key == glfw.KEY_RIGHT_BRACKET else -1)
         elif key == glfw.KEY_L:
             playback.loop = not playback.loop
         elif key in (glfw.KEY_R, glfw.KEY_N):
-            self.camera_number = (self.camera_number + 1) % len(self.rig.cameras) if key == glfw.KEY_N else 0
-            self.view = View.of(self.rig, self.rig.cameras[self.camera_number])
+            self.to_camera((self.camera_number + 1) % len(self.rig.cameras) if key == glfw.KEY_N else 0)
+        elif key == glfw.KEY_B:
+            self.to_preset((self.preset_number + 1) % len(self.presets))
         elif key == glfw.KEY_V:
             self.wardrobe.next()
         elif glfw.KEY_1 <= key < glfw.KEY_1 + len(LOOKS):
@@ -344,8 +668,25 @@ class Player:
         elif key == glfw.KEY_C and self.scene.is_dynamic:
             parts = list(PARTS)
             self.part = parts[(parts.index(self.part) + 1) % len(parts)]
+        elif key in (glfw.KEY_MINUS, glfw.KEY_EQUAL):
+            self.dial.choose(climbed(self.dial.rung, 1 if key == glfw.KEY_EQUAL else -1))
+            self.say(f"quality: {self.dial.rung}, {RUNGS.index(self.dial.rung) + 1} of {len(RUNGS)}")
+        elif key == glfw.KEY_U:
+            self.dial.hold(self.target_fps if self.dial.target_s is None else None)
         elif key == glfw.KEY_F and self.scene.is_dynamic:
-            self.renderer.folded = not self.renderer.folded
+            self.exact = not self.exact
+        elif key == glfw.KEY_K:
+            self.add_keyframe()
+        elif key == glfw.KEY_BACKSPACE and self.path.keyframes:
+            self.remove_keyframe(len(self.path.keyframes) - 1)
+        elif key == glfw.KEY_J:
+            self.follow()
+        elif key == glfw.KEY_O:
+            self.start_or_stop_filming(along_path=shift)
+        elif key == glfw.KEY_T and self.scene.is_dynamic:
+            self.show_planes = not self.show_planes
+        elif key == glfw.KEY_G:
+            self.show_graphs = not self.show_graphs
         elif key == glfw.KEY_TAB:
             self.show_hud = not self.show_hud
         elif key == glfw.KEY_H:
@@ -355,140 +696,24 @@ class Player:
         elif key == glfw.KEY_ESCAPE:
             glfw.set_window_should_close(self.window.handle, True)
 
-    def _save_picture(self) -> None:
-        """Write the picture without controls into the working directory, under the first name that is free."""
-        stem = Path(self.stream.source.name).stem
-        path = next(p for p in (Path(f"{stem}-{n:03d}.png") for n in range(1, 1_000_000)) if not p.exists())
-        self._picture(1.0)
-        try:
-            pixels = np.frombuffer(self.canvas.read(components=3, alignment=1), np.uint8)
-            write_image(path, pixels.reshape(self.canvas.height, self.canvas.width, 3)[::-1])
-            self._notice = f"saved {path}"
-        except OSError as error:
-            self._notice = f"{path}: {error.strerror or error}"
-        self._notice_until = clock.monotonic() + 3.0
+    def to_camera(self, number: int) -> None:
+        """Jump to a camera of the scene."""
+        self.camera_number = number
+        self.look_from(View.of(self.rig, self.rig.cameras[number]))
 
-    # --- controls
+    def to_preset(self, number: int) -> None:
+        """Jump to one of the places to look from."""
+        self.preset_number = number
+        name, camera = list(self.presets.items())[number]
+        self.look_from(View.of(self.rig, camera))
+        self.say(name)
 
-    def _begin(self, seconds: float) -> None:
-        scale = glfw.get_window_content_scale(self.window.handle)[0]
-        self.overlay.begin(self.window.size, self.canvas.size, scale, seconds)
-
-    def _widgets(self) -> None:
-        """Build what is shown over the scene."""
-        if self.show_hud:
-            self._status()
-            self._transport()
-        if self.show_keys:
-            self._key_list()
-        width, height = self.window.size
-        if clock.monotonic() < self._notice_until:
-            _say("notice", self._notice, width, 0.82 * height, 0.5)
-        if (message := self.stream.message) is not None:
-            _say("stream", message, width, 0.8 * imgui.get_font_size(), 0.0)
-
-    def _status(self) -> None:
-        em = imgui.get_font_size()
-        _place(0.8 * em, 0.8 * em)
-        with _panel("status"):
-            imgui.text(f"{1 / max(self.frame_s, 1e-6):.0f} fps   {1e3 * self.draw_s:.1f} ms")
-            imgui.text_disabled("{}x{} of {}x{}".format(*self.raster, *self.canvas.size))
-            imgui.text_disabled(f"{self.samples:.1f} samples a ray")
-            imgui.text_disabled(f"{self.renderer.memory_bytes / 1e6:.0f} MB of textures")
-            imgui.text_disabled(self.device.split("(")[0].strip())
-            if isinstance(self.scene.decoder, HybridDecoder):
-                imgui.text_disabled("hybrid decoder: plays slower")
-            if not self.stream.is_settled:
-                imgui.text_disabled(f"{self.stream.share_here:.0%} here, {self.stream.rate / 1e3:,.0f} KB/s")
-            imgui.separator()
-            for look, label in LOOKS.items():
-                if imgui.radio_button(label, self.look is look):
-                    self.look = look
-            if self.scene.appearances:
-                imgui.separator()
-                imgui.text_disabled("appearance")
-                imgui.set_next_item_width(12 * em)
-                changed, chosen = imgui.combo("##appearance", self.wardrobe.number, list(self.wardrobe.names))
-                if changed:
-                    self.wardrobe.wear(chosen)
-            if self.scene.is_dynamic:
-                imgui.separator()
-                for part, label in PARTS.items():
-                    if imgui.radio_button(label, self.part is part):
-                        self.part = part
-                imgui.separator()
-                changed, folded = imgui.checkbox("folded time planes", self.renderer.folded)
-                if changed:
-                    self.renderer.folded = folded
-                imgui.set_item_tooltip("Multiplies time into the space planes once a frame: faster; some 43 dB from exact.")
-
-    def _transport(self) -> None:
-        """Play, pause, scrub, speed, loop."""
-        playback, clip = self.playback, self.scene.clip
-        if clip.duration_s == 0:
-            return
-        em = imgui.get_font_size()
-        width, height = self.window.size
-        _place(width / 2, height - 0.8 * em, 0.5, 1.0)
-        imgui.set_next_window_size(imgui.ImVec2(min(width - 1.6 * em, 60 * em), 0))
-        with _panel("transport", fitted=False):
-            if imgui.button("pause" if playback.playing else "play", imgui.ImVec2(4 * em, 0)):
-                playback.toggle()
-            imgui.same_line()
-            imgui.set_next_item_width(max(imgui.get_content_region_avail().x - 13.5 * em, 4 * em))
-            label = f"{playback.time * clip.duration_s:.2f} / {clip.duration_s:.2f} s"
-            changed, time = imgui.slider_float("##time", playback.time, 0.0, 1.0, label, imgui.SliderFlags_.no_input)
-            if changed:
-                playback.playing = False
-                playback.seek(time)
-            imgui.same_line()
-            imgui.set_next_item_width(5.5 * em)
-            names = [f"{speed:g}x" for speed in SPEEDS]
-            nearest = min(range(len(SPEEDS)), key=lambda i: abs(SPEEDS[i] - playback.speed))
-            changed, chosen = imgui.combo("##speed", nearest, names)
-            if changed:
-                playback.speed = SPEEDS[chosen]
-            imgui.same_line()
-            _, playback.loop = imgui.checkbox("loop", playback.loop)
-
-    def _key_list(self) -> None:
-        width, height = self.window.size
-        _place(width / 2, height / 2, 0.5, 0.5)
-        imgui.set_next_window_bg_alpha(0.95)
-        with _panel("keys"):
-            if imgui.begin_table("keys", 2, imgui.TableFlags_.sizing_fixed_fit):
-                for key, meaning in KEYS:
-                    imgui.table_next_row()
-                    imgui.table_next_column()
-                    imgui.text(key)
-                    imgui.table_next_column()
-                    imgui.text_disabled(meaning)
-                imgui.end_table()
-
-    def close(self) -> None:
+    def close(self) -> str | None:
+        """Finish a film that is being written, let go of all; what is to be said of the film."""
+        told = None
+        if self.film is not None:
+            self.film.close(FINISHING_S)
+            told = self.film.failure or f"saved {self.film.path}, {self.film.duration_s:.1f} s"
         self.window.io = None
         self.overlay.close()
-
-
-def _place(x: float, y: float, pivot_x: float = 0.0, pivot_y: float = 0.0) -> None:
-    imgui.set_next_window_pos(imgui.ImVec2(x, y), imgui.Cond_.always, imgui.ImVec2(pivot_x, pivot_y))
-
-
-def _say(name: str, text: str, width: float, y: float, pivot: float) -> None:
-    """A message in the middle of the window's width, wrapped; `pivot` of its height lies at `y`."""
-    _place(width / 2, y, 0.5, pivot)
-    with _panel(name, imgui.WindowFlags_.no_inputs):
-        imgui.push_text_wrap_pos(0.88 * width)
-        imgui.text(text)
-        imgui.pop_text_wrap_pos()
-
-
-@contextlib.contextmanager
-def _panel(name: str, flags: int = 0, fitted: bool = True) -> Iterator[None]:
-    """A bare ImGui window that cannot be moved."""
-    bare = imgui.WindowFlags_.no_decoration | imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_nav
-    imgui.begin(f"##{name}", None, bare | flags | (imgui.WindowFlags_.always_auto_resize if fitted else 0))
-    try:
-        yield
-    finally:
-        imgui.end()
+        return told

@@ -67,8 +67,8 @@ class Bytes:
         require(self.at == len(self.data), "chunk too long")
 
 
-def chunks(data, partial):  # sections 3, 4 and 10
-    """Yield (kind, scale, plane, row_start, row_count, raw) of all chunks; raw is None where a prefix lacks it."""
+def entries(data, partial):  # sections 3, 4 and 10
+    """Yield the entries of the index, each with value_count, and the stored bytes, None where a prefix lacks them."""
     require(len(data) >= 64 and data[:8] == b"\x89KPC\r\n\x1a\n", "not a .kpc file")
     (version, flags, header_length, index_offset, index_length, count, file_length, value_count, largest_raw, reserved,
      index_crc, header_crc) = struct.unpack("<HHIQIIQQIIII", data[8:64])
@@ -87,13 +87,21 @@ def chunks(data, partial):  # sections 3, 4 and 10
         require(kind.isalpha() and reserved == 0 and offset == expected and raw <= largest_raw, "index entry")
         expected += stored
         body = data[offset:offset + stored]
+        if len(body) < stored:
+            require(partial, "chunk cut off")
+            body = None if kind != b"GRUP" else body
+        elif kind != b"GRUP":
+            require(crc32c(body) == crc, "chunk damaged")
+        yield kind, group, scale, plane, start, rows, codec, stored, raw, value_count, body
+    require(expected == file_length, "chunks do not fill the file")
+
+
+def chunks(data, partial):  # section 4
+    """Yield (kind, scale, plane, row_start, row_count, raw, value_count) of all chunks of a scene; raw is None where a prefix lacks it."""
+    for kind, group, scale, plane, start, rows, codec, stored, raw, value_count, body in entries(data, partial):
         known = kind in (b"SCNE", b"DECO", b"HYBR", b"OCCU", b"PLNE", b"WARP", b"MOVE", b"came", b"appe")
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
-        if len(body) < stored:
-            body = None
-        else:
-            require(crc32c(body) == crc, "chunk damaged")
         if known:
             if kind in (b"PLNE", b"OCCU", b"MOVE") and codec == 2:
                 require(raw <= 32768 * stored, "so much in too few bytes")
@@ -101,7 +109,38 @@ def chunks(data, partial):  # sections 3, 4 and 10
             else:
                 content = None if body is None else decoded(body, codec, raw)
             yield kind.decode(), scale, plane, start, rows, content, value_count
-    require(expected == file_length, "chunks do not fill the file")
+
+
+def groups(data, partial=False):  # section 4
+    """Of a clip in groups, [(row_start, row_count, the group's file)] in their order and [what `decode` makes of them]; None of
+    other files."""
+    found = {}
+    listed = list(entries(data, partial))
+    if not any(kind == b"GRUP" for kind, *_ in listed):
+        return None
+    for kind, group, scale, plane, start, rows, codec, stored, raw, most, body in listed:
+        require(kind == b"GRUP" or not kind[:1].isupper(), "a chunk of a scene beside groups")
+        if kind == b"GRUP":
+            require(codec == scale == plane == 0 and raw == stored and rows > 0 and group not in found, "group")
+            found[group] = start, rows, body, stored
+    require(sorted(found) == list(range(len(found))), "numbers of groups")
+    found = [found[group] for group in range(len(found))]
+    for (a, n, *_), (b, m, *_) in zip(found, found[1:]):
+        require(a < b <= a + n and a + n < b + m, "frames of groups")
+    require(found[-1][0] + found[-1][1] - found[0][0] <= 1 << 24, "frames")
+    scenes = [decode(body, len(body) < stored) for _, _, body, stored in found if len(body) == stored or not partial]
+    for (_, rows, _, _), scene in zip(found, scenes):
+        require(scene["frame_count"] == rows and scene["fps"] == scenes[0]["fps"] and scene["value_count"] <= most, "a group's clip")
+    return [(start, rows, body) for start, rows, body, _ in found], scenes
+
+
+def shown(spans, time):  # section 4
+    """(number, time in it) of the group that shows at a time; `spans`: (row_start, row_count) of each."""
+    ends = [start + rows - 1 for start, rows in spans]
+    f = spans[0][0] + time * (ends[-1] - spans[0][0])
+    g = sum(f >= (ends[k - 1] + spans[k][0]) / 2 for k in range(1, len(spans)))
+    start, rows = spans[g]
+    return g, min(max((f - start) / (rows - 1), 0.0), 1.0) if rows > 1 else 0.0
 
 
 def decoded(body, codec, raw_length):  # section 4
@@ -131,6 +170,7 @@ def decode(data, partial=False):
     scene = scene_chunk(Bytes(parts["SCNE"]))
     values = sum(p["rows"] * p["columns"] * s["channels"] for s in scene["scales"] for p in s["planes"].values())
     require(values == value_count, "value count")
+    scene["value_count"] = value_count
     require("WARP" not in parts or parts["WARP"] is not None, "no WARP chunk")
     scene |= {"even": None, "frame": None}
     if "WARP" in parts:
@@ -643,7 +683,8 @@ def hashes(scene):  # section 16
 
 if __name__ == "__main__":
     with open(sys.argv[1], "rb") as file:
-        found = decode(file.read())
-    print({key: found[key] for key in ("aabb", "frame_count", "fps", "step", "background", "cells", "slots")})
-    for (number, name), (symbols, _, _) in hashes(found).items():
-        print(f"scale {number} {name}: symbols {symbols}")
+        content = file.read()
+    for found in (groups(content) or ([], [decode(content)]))[1]:
+        print({key: found[key] for key in ("aabb", "frame_count", "fps", "step", "background", "cells", "slots")})
+        for (number, name), (symbols, _, _) in hashes(found).items():
+            print(f"scale {number} {name}: symbols {symbols}")

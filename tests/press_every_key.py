@@ -1,29 +1,39 @@
 """Feeds the player every key and drag it knows, and looks at what they do: `press_every_key.py scene.kpc`."""
 
+import shutil
 import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import glfw
 import numpy as np
+from imgui_bundle import imgui
 from pytest import approx
 
 from kpc.format.container import open_source
+from kpc.format.media import read_image, read_video
+from kpc.player import kpplay, panels
+from kpc.player import window as window_module
+from kpc.player.path import CameraPath
+from kpc.player.preferences import Preferences, place
+from kpc.player.quality import DEFAULT, climbed
 from kpc.player.reference import Part
 from kpc.player.renderer import Look
-from kpc.player.stream import Stream
+from kpc.player.reel import Reel
 from kpc.player.window import Player, Window
 
 
 def main(scene_file: str) -> None:
     window = Window("test", (320, 240))
-    stream = Stream(open_source(scene_file))
-    player = Player(window, stream)
+    stream = Reel(open_source(scene_file))
+    player = Player(window, stream, Preferences(text_size=0.9, speed=1.0))
     while not stream.is_settled:
         player.frame()
 
-    def press(*keys: int) -> None:
+    def press(*keys: int, mods: int = 0) -> None:
         for key in keys:
-            window._key(None, key, 0, glfw.PRESS, 0)
+            window._key(None, key, 0, glfw.PRESS, mods)
             player.frame()
 
     def drag(button: int, x: float, y: float) -> None:
@@ -37,8 +47,8 @@ def main(scene_file: str) -> None:
         player.frame()
 
     def canvas() -> np.ndarray:
-        player._picture(1.0)
-        return np.frombuffer(player.canvas.read(components=3, alignment=1), np.uint8).astype(int)
+        player._picture(1.0, "reference")
+        return player._pixels().astype(int)
 
     player.frame()
     assert player.playback.playing
@@ -67,9 +77,10 @@ def main(scene_file: str) -> None:
     for part in (Part.STATIC, Part.DYNAMIC, Part.FULL):
         press(glfw.KEY_C)
         assert player.part is part
-    folded = player.renderer.folded
-    press(glfw.KEY_F)
-    assert player.renderer.folded is not folded
+    for folded in (False, True):
+        press(glfw.KEY_F)
+        player._picture(1.0, "fine")
+        assert player.renderer.quality.folded is folded
 
     average = canvas()
     for number, name in enumerate(("dawn.jpg", "noon.jpg", "dusk.jpg"), 1):
@@ -95,6 +106,26 @@ def main(scene_file: str) -> None:
     press(glfw.KEY_R)
     assert player.view.eye == approx(before.eye)
 
+    press(glfw.KEY_B)
+    assert player.preset_number == 0 and player.view.eye != approx(before.eye)
+
+    rung = player.dial.rung
+    press(glfw.KEY_MINUS)
+    assert player.dial.rung == climbed(rung, -1) and rung == DEFAULT
+    press(glfw.KEY_EQUAL, glfw.KEY_U)
+    assert player.dial.rung == rung and player.dial.target_s == approx(1 / 30)
+    press(glfw.KEY_U, glfw.KEY_T, glfw.KEY_G)
+    assert player.dial.target_s is None and player.show_planes and player.show_graphs
+    before_size = player.text_size
+    press(glfw.KEY_EQUAL, mods=glfw.MOD_CONTROL)
+    assert player.text_size > before_size
+
+    press(glfw.KEY_J)
+    assert player.notice_is_error and not player.riding  # there is no path yet
+    follow_a_path(player, press)
+    see_every_pixel_once(window, player)
+    drop_files(window, player, Path(scene_file))
+
     press(glfw.KEY_H, glfw.KEY_P)
     glfw.set_window_size(window.handle, 200, 260)
     time.sleep(0.05)
@@ -103,10 +134,176 @@ def main(scene_file: str) -> None:
     assert player.canvas.size == window.pixels
     press(glfw.KEY_TAB, glfw.KEY_ESCAPE)
     assert glfw.window_should_close(window.handle)
+    kept = player.preferences()
+    assert kept == Preferences((200, 260), DEFAULT, None, 2.0, False, False, True, True, player.text_size)
     player.run()
     player.close()
     stream.close()
     window.close()
+    lose_the_card(scene_file)
+    remember(scene_file)
+
+
+def follow_a_path(player: Player, press: Callable[..., None]) -> None:
+    """Two keyframes, the way between them, a film of it, and its file."""
+    player.playback.seek(0.2)
+    press(glfw.KEY_R, glfw.KEY_K)
+    first = player.view.eye
+    player.playback.seek(0.6)
+    press(glfw.KEY_N, glfw.KEY_K, glfw.KEY_K, glfw.KEY_BACKSPACE)
+    second = player.view.eye
+    assert [shot.time for shot in player.path.keyframes] == approx([0.2, 0.6]) and player.path.end_s == 2.0 and player.show_path
+    player.path = player.path.spaced(1, 0.2)
+
+    press(glfw.KEY_J)
+    assert player.riding
+    time.sleep(0.06)
+    player.frame()
+    assert 0.2 < player.playback.time < 0.6 and player.view.eye != approx(first) and player.view.eye != approx(second)
+    time.sleep(0.25)
+    player.frame()
+    assert not player.riding and player.view.eye == approx(second) and player.playback.time == approx(0.6)
+
+    press(glfw.KEY_S, mods=glfw.MOD_CONTROL)
+    assert not player.notice_is_error and "path.json" in player.notice
+    (file,) = Path().glob("*-path.json")
+    assert CameraPath.load(file).end_s == approx(0.2) and str(file) in player.notice
+
+    for shift in (glfw.MOD_SHIFT, 0):
+        press(glfw.KEY_O, mods=shift)
+        film = player.film
+        assert film is not None
+        if not shift:
+            time.sleep(0.2)
+            player.frame()
+            press(glfw.KEY_O)
+        until = time.monotonic() + 20
+        while player.film is not None and time.monotonic() < until:
+            player.frame()
+        assert str(film.path) in player.notice and not player.notice_is_error, player.notice
+        frames = list(read_video(film.path))
+        if shift:
+            assert len(frames) == 7 and player.view.eye == approx(second)  # 0.2 s at 30 a second, both ends
+            assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 2
+        else:
+            assert 3 <= len(frames) <= 20
+        assert frames[0].shape == (*player.canvas.size[::-1], 3)
+
+    press(glfw.KEY_O)
+    glfw.set_window_size(player.window.handle, 300, 240)
+    time.sleep(0.05)
+    until = time.monotonic() + 20
+    while player.film is not None and time.monotonic() < until:
+        glfw.poll_events()
+        player.frame()
+    assert player.film is None and player.canvas.size == (300, 240)
+    Path("nowhere").touch()
+    player.folder = Path("nowhere")  # no folder: what goes wrong is told, and nothing ends
+    press(glfw.KEY_P)
+    assert player.notice_is_error and "nowhere" in player.notice
+    player.folder = Path()
+
+
+def see_every_pixel_once(window: Window, player: Player) -> None:
+    """Where the system counts two or three pixels to its unit, and where it wants larger text instead."""
+    size, pixels, scale = Window.size, Window.pixels, Window.text_scale
+    heights: list[float] = []
+    show = panels.show
+
+    def measure(player: Player) -> None:
+        heights.append(imgui.get_font_size() * player.overlay.io.display_framebuffer_scale.x)
+        show(player)
+
+    for units, count, text in (((320, 240), (320, 240), 1.0), ((160, 120), (320, 240), 2.0), ((320, 240), (320, 240), 2.0)):
+        Window.size, Window.pixels, Window.text_scale = units, count, text  # type: ignore[assignment, method-assign]
+        panels.show = measure
+        player.frame()
+        panels.show = show
+        assert player.canvas.size == count
+        io = player.overlay.io
+        assert (io.display_size.x * io.display_framebuffer_scale.x, io.display_size.y * io.display_framebuffer_scale.y) == count
+        before = player.view
+        window._moved(None, 0.9 * units[0], 0.3 * units[1])
+        player.show_hud = False
+        player.frame()
+        window._clicked(None, 0, glfw.PRESS, 0)
+        player.frame()
+        window._moved(None, 0.9 * units[0] + 0.1 * units[1], 0.3 * units[1])
+        player.frame()
+        window._clicked(None, 0, glfw.RELEASE, 0)
+        player.frame()
+        player.show_hud = True
+        turned = np.arccos(np.clip((np.trace(player.view.axes.T @ before.axes) - 1) / 2, -1, 1))
+        assert turned == approx(0.1 * np.pi, rel=1e-3)  # of the window's height, whatever its units
+        assert window.plain_size == (units if count != units else tuple(n / text for n in units))
+    assert heights[1:] == approx([2 * heights[0]] * 2, rel=0.05)  # sizes of text are whole
+    Window.size, Window.pixels, Window.text_scale = size, pixels, scale  # type: ignore[method-assign]
+    player.frame()
+
+
+def drop_files(window: Window, player: Player, scene_file: Path) -> None:
+    """A camera path, things that are none, and another scene."""
+    (path,) = Path().glob("*-path.json")
+    keyframes = player.path.keyframes
+    player.path = CameraPath()
+    Path("text.kpc").write_text("no scene")
+    for file, words in (("text.kpc", "text.kpc"), ("none.kpc", "none.kpc"), ("none.json", "none.json"), ("text.kpc.JSON", "JSON")):
+        window._drop(None, [file])
+        player.frame()
+        assert player.notice_is_error and words in player.notice and player.successor is None, player.notice
+    window._drop(None, [str(path)])
+    player.frame()
+    assert len(player.path.keyframes) == len(keyframes) and not player.notice_is_error
+    window._drop(None, [str(scene_file)])
+    player.run()
+    assert player.successor is not None and not glfw.window_should_close(window.handle)
+    player.successor.close()
+    player.successor = None
+
+
+def lose_the_card(scene_file: str) -> None:
+    """Once, after a frame: another window goes on where that one was. Again and again: it is given up."""
+    made: list[object] = []
+    real = window_module._reset_status
+
+    def reset_by(turns: int) -> Callable[[], Callable[[], int]]:
+        def look_up() -> Callable[[], int]:
+            turn = iter(range(1_000_000))
+            made.append(window_module.Window)
+            return lambda: 0x8255 if len(made) <= turns and next(turn) == 1 else 0
+
+        return look_up
+
+    window_module._reset_status = reset_by(1)
+    assert kpplay.main([scene_file, "--size", "300x200", "--frames", "4", "--screenshot", "reset.png"]) == 0
+    assert len(made) == 2 and read_image("reset.png").shape == (200, 300, 3)
+    made.clear()
+    window_module._reset_status, kpplay.MOST_RESETS = reset_by(99), 1
+    assert kpplay.main([scene_file, "--size", "300x200", "--frames", "4"]) == 1 and len(made) == kpplay.MOST_RESETS + 1
+    window_module._reset_status = real
+
+
+def remember(scene_file: str) -> None:
+    """What was set in one run is there in the next, unless it is told otherwise; also where nothing can be written."""
+    run, seen = Player.run, []
+
+    def changed(player: Player, frames: int | None = None) -> None:
+        player.frame()
+        seen.append(player.preferences())
+        player.type(glfw.KEY_MINUS, 0)
+        player.type(glfw.KEY_G, 0)
+
+    Player.run = changed  # type: ignore[method-assign]
+    assert kpplay.main([scene_file, "--size", "300x200"]) == 0
+    assert kpplay.main([scene_file, "--target-fps", "25"]) == 0
+    assert kpplay.main([scene_file, "--quality", "fine"]) == 0
+    shutil.rmtree(place().parent)
+    place().parent.write_text("no folder")
+    assert kpplay.main([scene_file]) == 0
+    Player.run = run  # type: ignore[method-assign]
+    assert [one.size for one in seen[:3]] == 3 * [(300, 200)] and [one.graphs for one in seen] == [False, True, False, False]
+    assert [one.quality for one in seen] == [DEFAULT, climbed(DEFAULT, -1), "fine", DEFAULT]
+    assert [one.target_fps for one in seen] == [None, 25.0, None, None]
 
 
 if __name__ == "__main__":

@@ -116,6 +116,11 @@ def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
         (["{scene}", "--size", "7x7"], 2, "--size"),
         (["{scene}", "--frames", "0"], 2, "--frames"),
         (["{scene}", "--screenshot", "x.bmp"], 2, "x.bmp"),
+        (["{scene}", "--folder", "nowhere"], 1, "nowhere"),
+        (["{scene}", "--path", "nowhere.json"], 1, "nowhere.json"),
+        (["{scene}", "--path", "{scene}"], 1, "tiny.kpc"),
+        (["{scene}", "--quality", "perfect"], 2, "fastest"),
+        (["{scene}", "--target-fps", "0"], 2, "--target-fps"),
     ],
 )
 def test_bad_input_is_told_before_a_window_opens(scene_file: Path, arguments: list[str], code: int, words: str) -> None:
@@ -126,8 +131,11 @@ def test_bad_input_is_told_before_a_window_opens(scene_file: Path, arguments: li
 def test_every_key_and_drag(scene_file: Path, display: str, tmp_path: Path) -> None:
     """In a process of its own: Mesa lets none hold both a GLX and an EGL context, and other tests do the latter."""
     command = [sys.executable, "-W", "error", str(Path(__file__).with_name("press_every_key.py")), str(scene_file)]
-    env = {**os.environ, "DISPLAY": display}
+    env = {**os.environ, "DISPLAY": display, "XDG_CONFIG_HOME": str(tmp_path / "settings")}
     done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
+    reset, unwritten = done.stderr.splitlines()
+    assert reset == "kpplay: the graphics card was reset; start kpplay anew, or update the graphics driver"
+    assert unwritten.startswith("kpplay: settings are not remembered")
     saved = list(tmp_path.glob("tiny-*.png"))
-    assert len(saved) == 1 and read_image(saved[0]).shape == (240, 320, 3)
+    assert len(saved) == 1 and read_image(saved[0]).shape == (240, 300, 3)

@@ -19,6 +19,7 @@ from kpc.format.file import write
 from kpc.format.media import read_image, read_video
 from kpc.format.quantise import quantise_scene
 from kpc.player import offscreen, reference
+from kpc.player.path import CameraPath
 from kpc.tools import kprender
 
 
@@ -153,6 +154,22 @@ def test_an_orbit_becomes_a_video(run, scene_file: Path, tmp_path: Path, depth: 
     assert np.abs(frames[0].astype(int) - frames[3]).mean() > 1  # it moves
 
 
+def test_a_path_becomes_a_video_and_its_keyframes_pictures(run, scene_file: Path, tmp_path: Path) -> None:
+    path = CameraPath()
+    for time, camera in zip((0.0, 0.4, 0.9), (*tiny_scene(4).cameras, tiny_scene(4).cameras[0])):
+        path = path.with_keyframe(camera, time, 0.5)
+    path.save(tmp_path / "path.json")
+    code, said, _ = run(scene_file, "--path", tmp_path / "path.json", "--backend", "reference", "-o", tmp_path / "a.mp4", "--fps", 6)
+    assert code == 0 and "7 frames at 6 fps, 48x36" in said
+    frames = list(read_video(tmp_path / "a.mp4"))
+    code, said, _ = run(scene_file, "--cameras", tmp_path / "path.json", "--backend", "reference", "-o", tmp_path / "keys")
+    assert code == 0 and "3 pictures" in said
+    for number, frame in enumerate((frames[0], frames[3], frames[6])):
+        key = read_image(tmp_path / "keys" / f"{number:04d}.png")
+        assert np.abs(frame.astype(float) - key).mean() < 6  # but for H.264's losses
+    assert np.abs(frames[0].astype(int) - frames[3]).mean() > 6
+
+
 def test_the_clip_from_the_first_camera(run, scene_file: Path, tmp_path: Path) -> None:
     code, said, _ = run(scene_file, "--backend", "reference", "-o", tmp_path / "clip.mp4", "--fps", 5)
     assert code == 0 and "11 frames at 5 fps" in said
@@ -220,6 +237,10 @@ def test_appearances_that_are_not_there(run, varied_file: Path, scene_file: Path
         (["{scene}", "--cameras", "{text}", "-o", "{dir}"], 1, "not JSON"),
         (["{scene}", "--cameras", "{empty}", "-o", "{dir}"], 1, "frames"),
         (["{scene}", "--cameras", "{nan}", "-o", "{dir}"], 1, "NaN"),
+        (["{scene}", "--path", "{missing}", "-o", "{dir}"], 1, "missing.kpc"),
+        (["{scene}", "--path", "{nan}", "-o", "{dir}"], 1, "NaN"),
+        (["{scene}", "--path", "{long}", "-o", "{dir}"], 2, "more than 100000 pictures"),
+        (["{scene}", "--path", "x", "--orbit", "2", "-o", "{dir}"], 2, "not allowed"),
         (["{scene}", "--orbit", "2", "-o", "{text}/inside"], 1, "text.kpc"),
         (["{scene}", "--orbit", "2", "-o", "{dir}/no/such/a.mp4"], 1, "no/such"),
         (["{scene}", "--orbit", "2", "-o", "{dir}/a.png"], 2, "2 pictures do not go into one"),
@@ -243,7 +264,10 @@ def test_bad_input_is_one_line(
     pose = np.eye(4).tolist()
     pose[0][3] = float("nan")
     (tmp_path / "nan.json").write_text(json.dumps({"w": 4, "h": 4, "fl_x": 4, "frames": [{"transform_matrix": pose}]}))
+    frames = [{"transform_matrix": np.eye(4).tolist(), "at": at} for at in (0, 80_000)]
+    (tmp_path / "long.json").write_text(json.dumps({"w": 4, "h": 4, "fl_x": 4, "frames": frames}))
     names = {
+        "long": tmp_path / "long.json",
         "scene": scene_file,
         "missing": tmp_path / "missing.kpc",
         "text": tmp_path / "text.kpc",

@@ -7,7 +7,7 @@ from scenes import tiny_scene
 
 from kpc.format.cameras import Camera
 from kpc.format.scene import Scene
-from kpc.player.orbit import Rig, fitted, is_ring, look_at, orbit
+from kpc.player.orbit import Rig, fitted, is_ring, look_at, orbit, presets
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -84,3 +84,17 @@ def test_fitting_keeps_the_vertical_field_of_view() -> None:
     assert wide.fl_x / wide.fl_y == pytest.approx(60 / 62)
     assert (wide.cx - 64) / wide.fl_x == pytest.approx((30 - 32) / 60)
     assert fitted(camera, 64, 48) == camera
+
+
+def test_presets_stay_where_something_was_seen() -> None:
+    around, ahead = presets(scene_of(RING)), presets(scene_of(WALL))
+    assert list(around) == ["front", "right", "back", "left", "above", "near", "far"]
+    eyes = {name: camera.camera_to_world[:3, 3] for name, camera in around.items()}
+    assert eyes["front"][:2] == pytest.approx(-eyes["back"][:2], abs=1e-6) and eyes["left"][:2] == pytest.approx(-eyes["right"][:2], abs=1e-6)
+    assert eyes["above"][2] > 0.95 * np.linalg.norm(eyes["above"])
+    assert np.linalg.norm(eyes["near"]) < np.linalg.norm(eyes["front"]) < np.linalg.norm(eyes["far"])
+    xs = {name: camera.camera_to_world[0, 3] for name, camera in ahead.items()}
+    assert -0.8 < xs["left"] < xs["middle"] < xs["right"] < 0.8 and ahead["below"].camera_to_world[2, 3] > 0.3
+    for camera in (*around.values(), *ahead.values()):  # all look at the focus
+        pose = camera.camera_to_world
+        assert -pose[:3, 2] @ -pose[:3, 3] == pytest.approx(np.linalg.norm(pose[:3, 3]))

@@ -58,7 +58,7 @@ def test_the_camera_file_shown_can_be_read(tmp_path: Path) -> None:
 
 
 def test_keys_are_those_of_the_player() -> None:
-    from kpc.player.window import KEYS
+    from kpc.player.panels import KEYS
 
     assert "".join(f"| {key} | {meaning} |\n" for key, meaning in KEYS) in README
 

@@ -11,6 +11,7 @@ from kpc.encoder.prune import without
 from kpc.format.cameras import Camera
 from kpc.format.errors import DisplayError
 from kpc.format.scene import Scene
+from kpc.player.quality import Quality
 from kpc.player.reference import Part, Rendering, render
 from kpc.player.renderer import Look, Renderer
 
@@ -22,6 +23,8 @@ CAMERAS = {
     "off centre": Camera(64, 48, 80.0, 60.0, 20.0, 40.0, look_at((-2.4, 0.3, 1.8), CENTRE, 1, 1, 1).camera_to_world),
     "looking away": look_at((3.0, 0.0, 0.0), (9.0, 1.0, 0.0), 16, 12, 20.0),
 }
+
+FOLDED = Quality(folded=True, termination=1 / 64)
 
 
 def check(got: Rendering, wanted: Rendering) -> None:
@@ -159,10 +162,10 @@ def test_folding_is_exact_where_nothing_moves_and_close_where_it_does(space: str
     still, moving = tiny_scene(6, dynamic=False), SPACES[space](tiny_scene(4))
     still = surrounded(still) if space == "contracted" else still
     check(
-        Renderer(gl.context(), still, folded=True).render(CAMERAS["outside"], 0.0),
+        Renderer(gl.context(), still, Quality(folded=True)).render(CAMERAS["outside"], 0.0),
         render(still, CAMERAS["outside"], 0.0),
     )
-    renderer = Renderer(gl.context(), moving, folded=True)
+    renderer = Renderer(gl.context(), moving, FOLDED)
     for time in (0.2, 0.7):
         got, wanted = renderer.render(CAMERAS["outside"], time), render(moving, CAMERAS["outside"], time)
         assert -10 * np.log10(np.mean((got.rgb - wanted.rgb) ** 2)) > 50
@@ -171,7 +174,7 @@ def test_folding_is_exact_where_nothing_moves_and_close_where_it_does(space: str
         dense = wanted.opacity > 63 / 64
         assert dense.any() and (got.opacity[wanted.opacity > 0.995] == 1).all()
         assert np.median(np.abs(got.depth[dense] / wanted.depth[dense] - 1)) < 1 / 64
-    renderer.folded = False
+    renderer.quality = Quality()
     check(renderer.render(CAMERAS["outside"], 0.7), render(moving, CAMERAS["outside"], 0.7))
 
 
@@ -214,7 +217,7 @@ def test_a_decoder_too_large_for_a_shader_is_refused() -> None:
 def test_planes_that_fit_only_unrefined_are_folded_so(monkeypatch: pytest.MonkeyPatch) -> None:
     ctx, scene = gl.context(), tiny_scene(4)
     monkeypatch.setitem(ctx.info, "GL_MAX_TEXTURE_SIZE", max(Renderer(ctx, scene).layout.size))
-    renderer = Renderer(ctx, scene, folded=True)
+    renderer = Renderer(ctx, scene, FOLDED)
     assert renderer.folded_layout is renderer.layout
     error = renderer.render(CAMERAS["outside"], 0.7).rgb - render(scene, CAMERAS["outside"], 0.7).rgb
     assert -10 * np.log10(np.mean(error**2)) > 40

@@ -36,7 +36,7 @@ def test_a_missing_file_is_named() -> None:
         shader.compose("a", written={"a": '#include "nowhere.glsl"'})
 
 
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "fullscreen.glsl"])
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "fullscreen.glsl"])
 def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
     text, files = shader.compose(name, written={"decoder_weights": ""}, preamble=shader.ES30)
     assert text.startswith("#version 300 es\n") and text.count("#version") == 1
@@ -78,7 +78,7 @@ def test_constants_are_exact() -> None:
 @pytest.mark.parametrize("space", ["box", "contracted", "ndc", "hybrid"])
 @pytest.mark.parametrize("rows", [0, 1])
 @pytest.mark.parametrize("motion", [0, 1])
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl"])
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "upscale.glsl"])
 def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, rows: int, space: str) -> None:
     ctx = gl.context()
     if "GL_ARB_ES3_compatibility" not in ctx.extensions:
@@ -87,7 +87,7 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     scene = hybrid(scene) if space == "hybrid" else scene
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
-    defines = {"SCALES": 3, "LAYERS": layout.layers, **decoder_shape(scene.decoder), "ROWS": rows, "REFINED": 1, "EARLY": 1 - rows,
+    defines = {"SCALES": 3, "LAYERS": layout.layers, **decoder_shape(scene.decoder), "ROWS": rows, "REFINED": 1, "DRAWN": 2,
                "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion, "APPEARANCE": rows}  # fmt: skip
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights})
     vertex, _ = shader.compose("fullscreen.glsl", preamble=shader.ES30)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scenes import SPACES, tiny_scene
 
-from kpc.format import container, errors, file, planes
+from kpc.format import container, errors, file, groups, planes
 from kpc.format.scene import ALL_PLANES, LOG_DENSITY_LIMIT, TERMINATION
 from kpc.format.space import FAR, FORWARD, LEAST_DISPARITY
 from kpc.player import reference
@@ -20,7 +20,8 @@ from kpc.tools import specvectors
 
 SPEC = Path(__file__).parent.parent / "spec"
 PAGE = (SPEC / "kpc-format.md").read_text()
-VALID = sorted((SPEC / "vectors" / "valid").glob("*.kpc"))
+GROUPED = sorted((SPEC / "vectors" / "valid").glob("groups*.kpc"))
+VALID = sorted(set((SPEC / "vectors" / "valid").glob("*.kpc")) - set(GROUPED))
 INVALID = sorted((SPEC / "vectors" / "invalid").glob("*.kpc"))
 
 RAY_TOLERANCE = 1e-4  # section 16
@@ -96,7 +97,7 @@ def test_limits_are_the_code_s():
 def test_names_and_numbers_are_the_code_s():
     assert container.MAGIC.hex(" ").upper() in section(3)
     assert f"version {container.VERSION}" in PAGE.splitlines()[0]
-    assert set(re.findall(r"^\| ([A-Za-z]{4}) \| [01]", section(4), re.M)) == file.KNOWN_KINDS
+    assert set(re.findall(r"^\| ([A-Za-z]{4}) \| [01]", section(4), re.M)) == file.KNOWN_KINDS | {file.GROUP_KIND}
     numbered = ", ".join(f"{number} `{name}`" for number, name in enumerate(ALL_PLANES))
     assert numbered in section(4)
     filters = re.findall(r"^\| (\d) \| r\[y, x\]", section(6), re.M)
@@ -164,12 +165,38 @@ def test_the_decoder_written_from_the_page_agrees(path, twin):
 def test_invalid_vectors_are_refused_as_is_written(path, twin):
     expected = json.loads(path.with_suffix(".json").read_text())
     with pytest.raises(getattr(errors, expected["error"])) as caught:
-        file.read(path)
+        read_all(path)
     assert type(caught.value).__name__ == expected["error"]
     assert expected["message"] in str(caught.value)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
     with pytest.raises(twin.Refused):
-        twin.decode(path.read_bytes())
+        if twin.groups(path.read_bytes()) is None:
+            twin.decode(path.read_bytes())
+
+
+def read_all(path: Path) -> None:
+    opened = groups.Groups(path)
+    for number in range(len(opened)):
+        file.read(opened.open(number))
+
+
+@pytest.mark.parametrize("path", GROUPED, ids=lambda p: p.stem)
+def test_vectors_of_groups_hold_the_vectors_that_they_say(path, twin):
+    expected, data = json.loads(path.with_suffix(".json").read_text()), path.read_bytes()
+    opened = groups.Groups(path, allow_partial=expected["partial"])
+    theirs, scenes = twin.groups(data, expected["partial"])
+    assert [(span.start, span.count) for span in opened.timeline.spans] == [place[:2] for place in theirs] \
+        == [(group["row_start"], group["row_count"]) for group in expected["groups"]]
+    for number, (group, (*_, content)) in enumerate(zip(expected["groups"], theirs, strict=True)):
+        if group["scene"] is not None:
+            assert content == path.with_name(f"{group['scene']}.kpc").read_bytes()
+            assert file.read(opened.open(number)).clip.frame_count == scenes[number]["frame_count"]
+    assert len(scenes) == sum(group["scene"] is not None for group in expected["groups"])
+    for moment in expected["times"]:
+        number, time_in_it = opened.timeline.at(moment["time"])
+        assert (number, twin.shown([place[:2] for place in theirs], moment["time"])[0]) == (moment["group"],) * 2
+        assert time_in_it == pytest.approx(moment["time_in_it"], abs=1e-6)
+        assert twin.shown([place[:2] for place in theirs], moment["time"])[1] == pytest.approx(time_in_it, abs=1e-9)
 
 
 def test_vectors_are_what_their_maker_makes():
@@ -178,11 +205,11 @@ def test_vectors_are_what_their_maker_makes():
     assert on_disk == set(made)
     for name, content in made.items():
         committed = (SPEC / "vectors" / name).read_bytes()
-        if name.startswith("valid/") and name.endswith(".json"):
+        if name.startswith("valid/") and name.endswith(".json") and "groups" not in json.loads(content):
             assert_described(json.loads(content), json.loads(committed))
-        elif name.startswith("invalid/") or packed_here(name):
+        elif name.endswith(".json") or name.startswith("invalid/") or packed_here(name):
             assert content == committed, name
-    assert sum(len(content) for content in made.values()) < 400_000
+    assert sum(len(content) for content in made.values()) < 450_000
 
 
 def packed_here(name: str) -> bool:

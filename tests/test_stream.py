@@ -23,6 +23,7 @@ from kpc.format.errors import BudgetError
 from kpc.format.scene import Scene
 from kpc.player import stream as module
 from kpc.player.prefetch import Playhead
+from kpc.player.quality import Quality
 from kpc.player.renderer import Renderer
 from kpc.player.stream import Stream
 from kpc.tools.serve import Handler, Line, serving
@@ -76,11 +77,11 @@ def test_once_all_is_there_it_is_the_same_picture(space: str, folded: bool, watc
     data = coded(SPACES[space](tiny_scene(4, time=10)))
     (tmp_path / "scene.kpc").write_bytes(data)
     whole = kpc.load(data)
-    wanted = Renderer(gl.context(), whole, folded=folded)
+    wanted = Renderer(gl.context(), whole, Quality(folded=folded))
     with serving(tmp_path) as url:
         for source in (str(tmp_path / "scene.kpc"), f"{url}/scene.kpc"):
             stream = watched(source)
-            renderer = Renderer(gl.context(), stream.scene, folded=folded)
+            renderer = Renderer(gl.context(), stream.scene, Quality(folded=folded))
             picture(renderer, whole, 0.3)  # whatever is there
             until(lambda stream=stream: stream.is_settled, stream, renderer)
             assert stream.share_here == 1 and stream.can_show(0.3) and stream.message is None
@@ -430,7 +431,7 @@ def test_steady_playback_makes_nothing_on_the_card_and_keeps_memory_flat(
     room = int(probe.parts.sizes[probe.parts.moves].sum()) // 4
     stream = watched(data, memory=probe.fixed_bytes + room)
     ctx = gl.context()
-    renderer, screen = Renderer(ctx, stream.scene, folded=folded), ctx.simple_framebuffer(SIZE, 4)
+    renderer, screen = Renderer(ctx, stream.scene, Quality(folded=folded)), ctx.simple_framebuffer(SIZE, 4)
     camera = stream.scene.cameras[0].resized(*SIZE)
     until(lambda: stream.scales_here == 2, stream, renderer)
     made: list[str] = []

@@ -38,6 +38,7 @@ import kpc
 from kpc.format import cli
 from kpc.format.errors import KpcError, UsageError
 from kpc.format.memory import peak_memory_bytes
+from kpc.player.quality import DEFAULT, LADDER, Quality
 from kpc.tools import results
 from kpc.tools.provenance import commit, data_hash, machine, versions
 
@@ -59,7 +60,7 @@ class Play:
     scene: Path
     size: tuple[int, int]
     frames: int
-    folded: bool
+    quality: Quality
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -253,7 +254,7 @@ def _player(options: argparse.Namespace, origin: results.Record) -> Iterator[res
                 "warm_up": WARM_UP,
             }
             record = _record("player", source, origin, settings)
-            job = Play(source, options.size, options.frames, folded)
+            job = Play(source, options.size, options.frames, LADDER[DEFAULT if folded else "reference"])
             print(f"kpbench: {record['name']}, {settings['path']}", file=sys.stderr)
             repeats = [_alone(_play_once, job) for _ in range(options.repeats)]  # first: drivers keep compiled shaders
             renderer, accuracy = _alone(_compare, job)
@@ -272,7 +273,7 @@ def _play_once(job: Play) -> results.Record:
     opened = clock.perf_counter()
     scene = kpc.load(job.scene)
     loaded = clock.perf_counter()
-    renderer = Renderer(ctx, scene, folded=job.folded)
+    renderer = Renderer(ctx, scene, job.quality)
     ctx.finish()
     uploaded = clock.perf_counter()
     camera = fitted(Rig.of(scene).cameras[0], *job.size)
@@ -311,7 +312,7 @@ def _stream(options: argparse.Namespace, origin: results.Record) -> Iterator[res
 
     for source in options.scenes:
         settings = {"size": "{}x{}".format(*options.size), "rate": streaming.RATE, "delay": streaming.DELAY}
-        job = streaming.Arrival(source, options.size, kpc.load(source).is_dynamic)
+        job = streaming.Arrival(source, options.size, LADDER[DEFAULT])
         record = _record("stream", source, origin, settings)
         print(f"kpbench: {record['name']}", file=sys.stderr)
         repeats = [_alone(streaming.measure, job) for _ in range(options.repeats)]
@@ -334,7 +335,7 @@ def _compare(job: Play) -> tuple[str, results.Record]:
     ctx = offscreen.open_context()
     scene = kpc.load(job.scene)
     camera = fitted(Rig.of(scene).cameras[0], *job.size)
-    drawn = Renderer(ctx, scene, folded=job.folded).render(camera, MIDDLE)
+    drawn = Renderer(ctx, scene, job.quality).render(camera, MIDDLE)
     wanted = reference.render(scene, camera, MIDDLE)
     difference = np.abs(np.clip(drawn.rgb, 0, 1) - np.clip(wanted.rgb, 0, 1))
     return offscreen.describe(ctx), {

@@ -2,6 +2,7 @@
 
     kpinfo scene.kpc             a page on the clip, the box, the planes and the chunks
     kpinfo https://host/scene.kpc
+    kpinfo long.kpc --group 2    the same of one group of a long clip; without --group, its groups
     kpinfo scene.kpc --json      the same for programs
     kpinfo scene.kpc --verify    check every CRC32C and decode everything; exit code 1 if anything is wrong
 
@@ -20,6 +21,7 @@ from kpc.format import cli
 from kpc.format.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, DEFAULT_BUDGET, VERSION, Entry, open_source
 from kpc.format.errors import FormatError, UsageError
 from kpc.format.file import SceneReader, read
+from kpc.format.groups import Groups
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, HybridDecoder
 from kpc.format.space import FAR, Contraction, SpaceMapping
@@ -36,6 +38,7 @@ def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="kpinfo", description="Show what is inside a .kpc file.")
     parser.add_argument("scene", help="a .kpc file, or its http address")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--group", type=int, metavar="N", help="of a clip in groups, describe this one, from 0 on")
     parser.add_argument("--verify", action="store_true", help="check every CRC32C and decode everything")
     parser.add_argument("--memory-budget", type=int, default=DEFAULT_BUDGET, metavar="BYTES",
                         help="memory the scene may take (default: %(default)s)")
@@ -44,11 +47,19 @@ def _command(argv: list[str]) -> None:
         raise UsageError(f"--memory-budget {options.memory_budget} is not positive")
 
     source = open_source(options.scene, limit=options.memory_budget)
-    reader = SceneReader(source, memory_budget=options.memory_budget, allow_partial=not options.verify)
+    groups = Groups(source, memory_budget=options.memory_budget, allow_partial=not options.verify)
     source.hold(0, source.size)
+    if options.group is not None and not 0 <= options.group < len(groups):
+        raise UsageError(f"--group {options.group}: the file has {len(groups)}, numbered from 0")
     if options.verify:
-        verify(reader)
-    info = describe(reader, read(source, memory_budget=options.memory_budget, allow_partial=True))
+        for number in range(len(groups)) if options.group is None else [options.group]:
+            verify(groups.open(number))
+    if options.group is None and not groups.is_single:
+        overview = describe_groups(groups) | {"verified": options.verify}
+        print(json.dumps(overview, indent=2) if options.json else _page_of_groups(overview))
+        return
+    reader = groups.open(options.group or 0)
+    info = describe(reader, read(reader, memory_budget=options.memory_budget, allow_partial=True))
     info["verified"] = options.verify
     print(json.dumps(info, indent=2) if options.json else _page(info))
 
@@ -72,6 +83,40 @@ def verify(reader: SceneReader) -> None:
     if damaged:
         raise damaged[0][2]
     reader.mapping(), reader.motion(), reader.decoder(), reader.occupancy(), reader.cameras(), reader.appearances()
+
+
+def describe_groups(groups: Groups) -> dict[str, Any]:
+    """What kpinfo prints of a clip in groups, as plain data."""
+    clip, sizes, described = groups.clip, groups.size_bytes, []
+    for number, (span, size) in enumerate(zip(groups.timeline.spans, sizes, strict=True)):
+        if whole := groups.available(number):
+            head = groups.open(number).head
+        since, until = (round(time * clip.duration_s, 6) for time in groups.timeline.shown(number))
+        described.append({
+            "frames": [span.start, span.last], "shown_s": [since, until], "size_bytes": size, "missing": not whole,
+            "values": head.value_count if whole else None, "scales": len(head.scales) if whole else None,
+            "is_dynamic": head.is_dynamic if whole else None,
+        })
+    return {
+        "file": groups.name, "version": VERSION, "size_bytes": groups.reader.header.file_length,
+        "clip": {"frame_count": clip.frame_count, "fps": clip.fps, "duration_s": clip.duration_s},
+        "cameras": len(groups.cameras()), "groups": described,
+    }
+
+
+def _page_of_groups(info: dict[str, Any]) -> str:
+    clip = info["clip"]
+    lines = [
+        f"{info['file']}: {info['size_bytes']:,} bytes, format version {info['version']}" + (", verified" if info["verified"] else ""),
+        f"  clip        {clip['frame_count']} frames at {clip['fps']:g} fps, {clip['duration_s']:.2f} s, in {len(info['groups'])} groups",
+        f"  cameras     {info['cameras']}", "",
+        "  group       frames          shown, s       stored   scales       values",
+    ]
+    for number, group in enumerate(info["groups"]):
+        (first, last), (since, until) = group["frames"], group["shown_s"]
+        model = "missing" if group["missing"] else f"{group['scales']:>7}  {group['values']:>11,}"
+        lines.append(f"  {number:>5}  {first:>6}-{last:<6}  {since:>8.2f}-{until:<8.2f}  {group['size_bytes']:>9,}  {model}")
+    return "\n".join(lines)
 
 
 def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 kprender scene.kpc -o clip.mp4                            the clip, from the scene's first camera
 kprender scene.kpc --orbit 96 -o orbit.mp4                a path around it while the clip plays
 kprender scene.kpc --cameras cameras.json -o DIR          one picture for each frame the file lists
+kprender scene.kpc --path path.json -o flight.mp4         smoothly through the views it lists, as saved in the player
 kprender scene.kpc --time 0.5 --size 960x720 -o still.png
 kprender scene.kpc --appearance dawn.jpg:dusk.jpg:0.3 -o clip.mp4
 """
@@ -26,12 +27,14 @@ import kpc
 from kpc.format import cli
 from kpc.format.cameras import Camera, Shot, load_shots
 from kpc.format.errors import UsageError
+from kpc.format.groups import LongScene
 from kpc.format.media import write_image, write_video
 from kpc.format.progress import progress
-from kpc.format.scene import Scene
+from kpc.format.scene import Clip, Scene
 from kpc.format.space import Contraction
 from kpc.player import reference
 from kpc.player.orbit import Rig, fitted, orbit
+from kpc.player.path import CameraPath
 from kpc.player.reference import Part, Rendering
 
 Render = Callable[[Camera, float], Rendering]
@@ -39,6 +42,8 @@ Render = Callable[[Camera, float], Rendering]
 FILES = (".mp4", ".png", ".exr")
 FASTEST = 240.0
 LARGEST = 16384
+MOST = 100_000
+"""Pictures at one go."""
 NOTHING = 65535
 """In a depth PNG: no surface."""
 FARTHEST_EVEN = 16.0
@@ -54,17 +59,18 @@ def _command(argv: list[str]) -> None:
     out = Path(options.output)
     if out.suffix.lower() in FILES and not out.absolute().parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(out.absolute().parent))
-    scene = kpc.load(options.scene)
-    shots = _shots(scene, options)
+    loaded = kpc.load(options.scene)
+    scene, _ = loaded.at(0.0)  # of a clip in groups the first says how large it all is
+    shots = _shots(scene, loaded.clip, options)
     if out.suffix.lower() in (".png", ".exr") and len(shots) != 1:
         raise UsageError(f"-o {out}: {len(shots)} pictures do not go into one; give a directory, an .mp4 or --time")
-    render, where = _backend(scene, options)
+    render, where = _backend(loaded, options)
     print(f"kprender: {where}", file=sys.stderr)
 
     started = clock.monotonic()
     if out.suffix.lower() == ".mp4":
         pixels = _depth_pixels(scene, shots) if options.depth else _colour_pixels
-        fps = options.fps or min(max(scene.clip.fps, 1.0), FASTEST)
+        fps = _fps(loaded.clip, options)
         renderings = (render(shot.camera, shot.time) for shot in progress(shots, out.name, unit="frame"))
         write_video(out, (pixels(rendering) for rendering in renderings), fps)
         what = f"{out}: {len(shots)} frames at {fps:g} fps"
@@ -91,6 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     views = parser.add_mutually_exclusive_group()
     views.add_argument(
         "--cameras", metavar="JSON", help="cameras and times: w h fl_x fl_y cx cy frames[file time transform_matrix]"
+    )
+    views.add_argument(
+        "--path", metavar="JSON", help="a smooth way through such cameras, that passes each `at` so many seconds (else 2 s apart)"
     )
     views.add_argument("--orbit", type=_count, metavar="N", help="N pictures along a path around the scene")
     parser.add_argument(
@@ -130,7 +139,7 @@ def _parser() -> argparse.ArgumentParser:
         default="png",
         help="of pictures in a directory: 8-bit, or linear float colour and depth (default: %(default)s)",
     )
-    parser.add_argument("--fps", type=_rate, metavar="F", help="of an mp4 (default: the clip's)")
+    parser.add_argument("--fps", type=_rate, metavar="F", help="of an mp4, and of --path (default: the clip's)")
     parser.add_argument(
         "--backend",
         choices=("gl", "reference"),
@@ -169,8 +178,8 @@ def _appearance(scene: Scene, text: str | None) -> np.ndarray | None:
 
 
 def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of pictures from 1 to 100000")
+    if not text.isdecimal() or not 1 <= int(text) <= MOST:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of pictures from 1 to {MOST}")
     return int(text)
 
 
@@ -201,15 +210,28 @@ def _size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _shots(scene: Scene, options: argparse.Namespace) -> list[Shot]:
+def _fps(clip: Clip, options: argparse.Namespace) -> float:
+    return float(options.fps or min(max(clip.fps, 1.0), FASTEST))
+
+
+def _path_shots(clip: Clip, options: argparse.Namespace) -> list[Shot]:
+    path, fps = CameraPath.load(options.path), _fps(clip, options)
+    if (path.end_s - path.start_s) * fps >= MOST:
+        raise UsageError(f"--path {options.path}: {path.end_s - path.start_s:g} s at {fps:g} fps are more than {MOST} pictures")
+    return path.shots(fps)
+
+
+def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[Shot]:
     """What to take: a camera, a time and a name each."""
     if options.cameras is not None:
         shots = load_shots(options.cameras)
+    elif options.path is not None:
+        shots = _path_shots(clip, options)
     else:
         views = (
             orbit(scene, options.orbit)
             if options.orbit
-            else [Rig.of(scene).cameras[0]] * (1 if options.time is not None else scene.clip.frame_count)
+            else [Rig.of(scene).cameras[0]] * (1 if options.time is not None else clip.frame_count)
         )
         times = np.linspace(0.0, 1.0, len(views))
         shots = [Shot(camera, float(time), f"{number:04d}") for number, (camera, time) in enumerate(zip(views, times))]
@@ -223,21 +245,33 @@ def _shots(scene: Scene, options: argparse.Namespace) -> list[Shot]:
     return shots
 
 
-def _backend(scene: Scene, options: argparse.Namespace) -> tuple[Render, str]:
+def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Render, str]:
     """How to render, and its name. OpenGL is looked for only where it is wanted."""
-    appearance = _appearance(scene, options.appearance)
+    _appearance(loaded.at(0.0)[0], options.appearance)
     if options.backend == "reference":
-        return lambda camera, time: reference.render(
-            scene, camera, time, part=options.part, appearance=appearance
-        ), "reference renderer (numpy)"
+
+        def by_reference(camera: Camera, time: float) -> Rendering:
+            scene, time = loaded.at(time)
+            return reference.render(scene, camera, time, part=options.part, appearance=_appearance(scene, options.appearance))
+
+        return by_reference, "reference renderer (numpy)"
     from kpc.player import offscreen
+    from kpc.player.quality import Quality
     from kpc.player.renderer import Renderer
 
     ctx = offscreen.open_context()
-    renderer = Renderer(ctx, scene, folded=options.folded)
-    return lambda camera, time: renderer.render(
-        camera, time, part=options.part, appearance=appearance
-    ), offscreen.describe(ctx)
+    renderer: Renderer | None = None
+
+    def by_graphics(camera: Camera, time: float) -> Rendering:
+        nonlocal renderer
+        scene, time = loaded.at(time)
+        if renderer is None or renderer.scene is not scene:
+            if renderer is not None:
+                renderer.release()
+            renderer = Renderer(ctx, scene, Quality(folded=options.folded))
+        return renderer.render(camera, time, part=options.part, appearance=_appearance(scene, options.appearance))
+
+    return by_graphics, offscreen.describe(ctx)
 
 
 def _paths(out: Path, shots: list[Shot], suffix: str) -> Iterator[Path]:

@@ -35,6 +35,7 @@ from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, 
 from kpc.format.space import Contraction, DeviceCoordinates
 from kpc.format.symbols import WEIGHTS, encode_with
 from kpc.player import reference
+from kpc.tools import groupvectors
 
 ZSTD_VERSION = ".".join(map(str, zstandard.ZSTD_VERSION))
 
@@ -56,10 +57,15 @@ def _command(argv: list[str]) -> None:
 def vectors() -> dict[str, bytes]:
     """All files of the vector set: path -> content."""
     files = {}
-    for name, (data, partial) in _valid().items():
+    scenes = _valid()
+    for name, (data, partial) in scenes.items():
         files[f"valid/{name}.kpc"] = data
         files[f"valid/{name}.json"] = _json(described(data, partial))
-    for name, (data, error, message) in _invalid().items():
+    whole = {name: data for name, (data, partial) in scenes.items() if not partial}
+    for name, (data, partial) in groupvectors.valid(whole).items():
+        files[f"valid/{name}.kpc"] = data
+        files[f"valid/{name}.json"] = _json(groupvectors.described(data, partial, {data: name for name, data in whole.items()}))
+    for name, (data, error, message) in (_invalid() | groupvectors.invalid(whole)).items():
         files[f"invalid/{name}.kpc"] = data
         files[f"invalid/{name}.json"] = _json({"error": error, "message": message})
     return files

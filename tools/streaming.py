@@ -26,6 +26,7 @@ from kpc.player import offscreen
 from kpc.player.controls import Pace
 from kpc.player.orbit import Rig, fitted
 from kpc.player.prefetch import Playhead, least_room
+from kpc.player.quality import Quality
 from kpc.player.renderer import Renderer, is_software
 from kpc.player.stream import Stream
 
@@ -42,7 +43,7 @@ class Arrival:
 
     scene: Path
     size: tuple[int, int]
-    folded: bool
+    quality: Quality
 
 
 def measure(job: Arrival) -> dict[str, Any]:
@@ -70,7 +71,7 @@ def _arrival(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, 
         stream = Stream(open_source(source))
         stack.callback(stream.close)
         opened = clock.perf_counter()
-        renderer = Renderer(ctx, stream.scene, folded=job.folded)
+        renderer = Renderer(ctx, stream.scene, job.quality)
         draw = _drawing(screen, renderer, job)
         _until(stream, renderer, lambda: stream.scales_here > 0 and stream.can_show(0.0))
         received = stream.received
@@ -92,7 +93,7 @@ def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, ur
         stack.callback(probe.close)
         stream = Stream(open_source(url), memory=probe.fixed_bytes + least_room(probe.parts))
         stack.callback(stream.close)
-        renderer = Renderer(ctx, stream.scene, folded=job.folded)
+        renderer = Renderer(ctx, stream.scene, job.quality)
         draw = _drawing(screen, renderer, job)
         _until(stream, renderer, lambda: stream.is_settled)
         draw(0.0)

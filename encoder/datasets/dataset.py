@@ -5,7 +5,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,9 @@ LAYOUTS = (llff, blender, nerfstudio, colmap)
 
 ASSUMED_FPS = 30.0
 """Of images with times, where the dataset does not tell."""
+
+SAME_FRAME = 1e-2
+"""Frames that a picture may lie beside its own; times are float32."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,11 @@ class Pictures:
     def __len__(self) -> int:
         return len(self.file)
 
+    def some(self, numbers: np.ndarray) -> "Pictures":
+        """These alone."""
+        chosen = {name: values[numbers] for name, values in vars(self).items() if name != "file"}
+        return Pictures(file=tuple(self.file[n] for n in numbers), **chosen)
+
 
 @dataclass(frozen=True)
 class Dataset:
@@ -88,6 +96,36 @@ class Dataset:
         """Whether no two pictures to train on show the same instant of a clip."""
         times = self.pictures.time[~self.pictures.is_test]
         return self.is_dynamic and len(np.unique(times)) == len(times)
+
+    def between(self, first: int, last: int) -> "Dataset":
+        """Frames `first` to `last` of the clip, as a clip of their own.
+
+        Raises:
+            DatasetError: no picture to train on is of them.
+        """
+        frame = self.pictures.time.astype(np.float64) * max(self.clip.frame_count - 1, 1)
+        numbers = np.flatnonzero((frame > first - SAME_FRAME) & (frame < last + SAME_FRAME))
+        times = (frame[numbers] - first) / max(last - first, 1)
+        chosen = self._some(numbers, np.clip(times, 0, 1), Clip(last - first + 1, self.clip.fps))
+        if chosen.pictures.is_test.all():
+            raise DatasetError(f"{self.path}: frames {first} to {last} hold no picture to train on; give a longer --group")
+        return chosen
+
+    def thinned(self, frame_count: int) -> "Dataset":
+        """The clip at no more than so many of its frames, evenly spread."""
+        clip = self.clip
+        if clip.frame_count <= frame_count:
+            return self
+        kept = np.linspace(0, clip.frame_count - 1, frame_count).round()
+        frame = self.pictures.time.astype(np.float64) * (clip.frame_count - 1)
+        numbers = np.flatnonzero(np.isin(np.rint(frame), kept))
+        return self._some(numbers, self.pictures.time[numbers], Clip(frame_count, clip.fps * frame_count / clip.frame_count))
+
+    def _some(self, numbers: np.ndarray, times: np.ndarray, clip: Clip) -> "Dataset":
+        return replace(
+            self, pictures=replace(self.pictures.some(numbers), time=times.astype(np.float32)), pixels=self.pixels.some(numbers),
+            clip=clip, is_dynamic=clip.frame_count > 1, masks=None if self.masks is None else self.masks.some(numbers),
+        )
 
     def describe(self) -> str:
         """What was found, in one line."""

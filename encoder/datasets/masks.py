@@ -3,6 +3,7 @@
 For `images/x/name.jpg` the mask is `masks/x/name.jpg.png` (COLMAP's custom) or `masks/x/name.png`; 0 stands for ignored.
 """
 
+import copy
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -38,6 +39,14 @@ class Masks:
         self._first_block = np.array([tile.offset for tile in bits.tiles], np.int64)
         self.counts = np.array([ones.sum() for ones in in_block], np.int64)
         self.crc32c = tuple(tile.crc32c for tile in bits.tiles)
+
+    def some(self, numbers: np.ndarray) -> "Masks":
+        """Those of these pictures alone."""
+        chosen = copy.copy(self)  # shares the counts of all blocks, whose numbers stay as they are
+        chosen._bits, chosen._sizes = self._bits.some(numbers), [self._sizes[n] for n in numbers]
+        chosen._first_block, chosen.counts = self._first_block[numbers], self.counts[numbers]
+        chosen.crc32c = tuple(self.crc32c[n] for n in numbers)
+        return chosen
 
     def usable(self, picture: int) -> np.ndarray:
         """(height, width) bool."""

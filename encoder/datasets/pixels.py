@@ -57,6 +57,10 @@ class PixelCache:
             mapping = mmap.mmap(self._fd, size, access=mmap.ACCESS_READ)
             self._mapped = np.frombuffer(mapping, np.uint8).reshape(-1, stored_channels)
 
+    def some(self, numbers: np.ndarray) -> "PixelCache":
+        """These pictures alone, of the same file; indices of pixels stay as they are."""
+        return PixelCache(self.path, tuple(self.tiles[n] for n in numbers), self._stored, self.channels)
+
     def read(self, indices: np.ndarray) -> np.ndarray:
         """Pixels by their index in the cache: (N,) int64 to (N, channels) uint8."""
         if self._mapped is not None:

@@ -5,8 +5,7 @@
 // ROWS: 1 where rows of time planes are multiplied in at every sample. REFINED: how much finer than the scene's the planes are
 // along the row folded into them; 1 where none is.
 // CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
-// NDC: 1 where all this is in device coordinates. EARLY: 1 where a ray may end sooner than the format says: what is left of its
-// light then counts as what it has met so far. A sixth of all samples lie behind that point.
+// NDC: 1 where all this is in device coordinates. DRAWN: how many of the SCALES count.
 
 #include "ray.glsl"
 #include "space.glsl"
@@ -17,11 +16,7 @@
 #include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.textures)
 
 #define FEATURES (SCALES * LAYERS)
-#if EARLY
-const float TERMINATION = 1.0 / 64.0;
-#else
-const float TERMINATION = 1.0 / 1024.0;
-#endif
+const float TERMINATION = 1.0 / 1024.0;  // as in kpc.format.scene
 
 uniform sampler2D planes;
 uniform sampler2D rows;
@@ -42,6 +37,7 @@ uniform mat4x3 frame;               // NDC: of its camera
 uniform float near;                 // NDC
 uniform float baseline;             // NDC
 uniform float tau;                  // stride / longest edge of the box
+uniform float termination;          // a ray ends once its transmittance is less
 #if HIDDEN && APPEARANCE
 uniform vec4 appearance[(HIDDEN + 3) / 4];  // the code to show, padded
 #endif
@@ -175,14 +171,14 @@ void main() {
             vec3 shade = vec3(0.0);
 #if HYBRID
             vec4 f[FEATURES];
-            for (int i = 0; i < FEATURES; ++i) f[i] = feature(u, i / LAYERS, i % LAYERS);
+            for (int i = 0; i < FEATURES; ++i) f[i] = i < DRAWN * LAYERS ? feature(u, i / LAYERS, i % LAYERS) : vec4(0.0);
             vec4 h[WIDTH / 4];
             for (int i = 0; i < WIDTH / 4; ++i) {
                 h[i] = activated(from_features_bias[i] + four_rows(i, f));
                 log_density += dot(h[i], density_weight[i]);
             }
 #else
-            for (int scale = 0; scale < SCALES; ++scale) {
+            for (int scale = 0; scale < DRAWN; ++scale) {
                 for (int layer = 0; layer < LAYERS; ++layer) {
                     int i = scale * LAYERS + layer;
                     vec4 f = feature(u, scale, layer);
@@ -200,18 +196,16 @@ void main() {
             trans -= weight;
             samples += 1.0;
             walk.k += 1.0;
-            more = trans >= TERMINATION;
+            more = trans >= termination;
         }
         more = more && to_occupied(walk, cells, cell_count);
     } while (more);
 
-#if EARLY
-    if (trans < TERMINATION) {
+    if (trans < termination && termination > TERMINATION) {  // sooner than the format says: the rest is like what was met
         rgb /= 1.0 - trans;
         depth /= 1.0 - trans;
         trans = 0.0;
     }
-#endif
     seen = vec4(rgb + trans * background, 1.0 - trans);
     met = vec4(depth, samples, 0.0, 0.0);
 }

@@ -16,37 +16,43 @@ from kpc.format.scene import Scene
 if TYPE_CHECKING:
     import numpy as np
 
+    from kpc.format.groups import LongScene
     from kpc.player.reference import Rendering
 
 __all__ = ["Camera", "KpcError", "Scene", "load", "render"]
 
 
-def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int = 2 << 30) -> Scene:
+def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int = 2 << 30) -> "Scene | LongScene":
     """Read a .kpc file; its planes are numpy arrays by name: `scene.scales[0]["xy"]`.
+
+    A long clip may be in groups, of which one is held at a time, and read when a time in it is asked for: `scene.at(time)` is
+    the scene of that group, and the time in it.
 
     Args:
         path: of the file, or its http or https URL; or its bytes, or an open binary file.
-        memory_budget: bytes the scene may take.
+        memory_budget: bytes the scene, or one group, may take.
 
     Raises:
         FormatError: the file is damaged, hostile or of an unknown version; BudgetError if it is too large.
         NetworkError: the server of a URL does not give it.
     """
-    from kpc.format.file import read
+    from kpc.format import groups
 
-    return read(path, memory_budget=memory_budget).dequantise()
+    return groups.load(path, memory_budget)
 
 
-def render(scene: Scene, camera: Camera, time: float, appearance: "np.ndarray | None" = None) -> "Rendering":
+def render(scene: "Scene | LongScene", camera: Camera, time: float, appearance: "np.ndarray | None" = None) -> "Rendering":
     """Render one picture with the readable reference renderer; no graphics card is needed.
 
     Args:
         time: in [0, 1] over the clip.
-        appearance: a code, `scene.appearance(name)`, where the scene has any; None for their average.
+        appearance: a code, `scene.appearance(name)`, where the scene has any; None for their average. Of a clip in groups, that of
+            the group: `scene.at(time)[0].appearance(name)`.
 
     Returns:
         `.rgb` (H, W, 3) float32 in [0, 1], `.depth` (H, W), `.opacity` (H, W).
     """
     from kpc.player import reference
 
-    return reference.render(scene, camera, time, appearance=appearance)
+    shown, time_in_it = scene.at(time)
+    return reference.render(shown, camera, time_in_it, appearance=appearance)

@@ -1,0 +1,117 @@
+"""The quality dial, and the hand that moves it so that pictures come in time: no window, no OpenGL."""
+
+import statistics
+from collections import deque
+from dataclasses import dataclass, field
+
+from kpc.player.controls import Pace
+from kpc.player.quality import DEFAULT, LADDER, climbed
+
+RUNGS = tuple(LADDER)
+TOO_SLOW, ROOM = 1.1, 0.85
+"""Of the time a picture may take: down from above the one; up if the finer rung is expected to stay below the other."""
+DOWN_AFTER, UP_AFTER = 3, 12
+"""Pictures seen on a rung before it is left: slowness hurts at once, fineness can wait."""
+GUESS = 1.5
+"""How much longer the next rung takes, until it has been tried."""
+UNSETTLED = 1
+"""Pictures after a move that do not count: shaders are compiled, textures made."""
+
+
+@dataclass
+class Dial:
+    """Which rung of LADDER pictures are drawn on while something moves, and how finely below the lowest one.
+
+    With `target_s` it moves by itself. It goes down when the median of the last DOWN_AFTER pictures is too slow. It goes up when
+    that of UP_AFTER leaves room for what the finer rung takes, which it learns whenever it moves: so it does not try again what it
+    knows to be too slow, and does not flicker between two rungs. Below the fastest rung the raster gets coarser (`Pace`).
+
+    Attributes:
+        chosen: the rung that was set by hand, and what a picture that stands still is drawn on at least.
+        rung: what is drawn on while something moves.
+        target_s: seconds a picture may take; None: the rung stays where it is.
+        pace: the raster's share of the window, in as much as the rung is not enough.
+    """
+
+    chosen: str
+    pace: Pace
+    target_s: float | None = None
+    rung: str = field(init=False)
+    _seen: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=UP_AFTER))
+    _skipped: int = field(init=False, default=0)
+    _growth: dict[str, float] = field(init=False, default_factory=dict)
+    """By rung, how many times as long the next finer one takes."""
+    _left: tuple[str, float] | None = field(init=False, default=None)
+    """The rung before the last move, and the time it took there."""
+
+    def __post_init__(self) -> None:
+        self.rung = self.chosen
+
+    @property
+    def resting(self) -> str:
+        """The rung for a picture that stands still."""
+        return max(self.rung, self.chosen, key=RUNGS.index)
+
+    def choose(self, rung: str) -> None:
+        """Set it by hand, which ends its moving by itself."""
+        self.chosen = self.rung = rung
+        self.target_s = None
+        self._restart()
+
+    def hold(self, fps: float | None) -> None:
+        """Move by itself from now on, for so many pictures a second; None: stay on the rung it is on."""
+        if fps is None:
+            self.chosen = self.rung
+        self.target_s = None if fps is None else 1.0 / fps
+        self._restart()
+
+    def saw(self, seconds: float) -> None:
+        """Take in how long a picture took, on `rung` and at the present scale."""
+        if self.target_s is None:
+            self.pace.saw(seconds)
+            return
+        if self._skipped < UNSETTLED:
+            self._skipped += 1
+            return
+        if self.pace.scale < 1.0:  # nothing is finer than a whole raster on the fastest rung
+            self.pace.saw(seconds, ROOM * self.target_s)
+            return
+        self._seen.append(seconds)
+        if len(self._seen) < DOWN_AFTER:
+            return
+        lately = statistics.median(list(self._seen)[-DOWN_AFTER:])
+        if len(self._seen) == DOWN_AFTER:
+            self._learn(lately)
+        if lately > TOO_SLOW * self.target_s:
+            if self.rung == RUNGS[0]:
+                self.pace.saw(lately, ROOM * self.target_s)
+            else:
+                self._move(-1, lately)
+        elif len(self._seen) == UP_AFTER and self.rung != RUNGS[-1]:
+            typical = statistics.median(self._seen)
+            if typical * self._growth.get(self.rung, GUESS) < ROOM * self.target_s:
+                self._move(+1, typical)
+
+    def _move(self, rungs: int, seconds: float) -> None:
+        self._left = self.rung, seconds
+        self.rung = climbed(self.rung, rungs)
+        self._restart()
+
+    def _learn(self, seconds: float) -> None:
+        """How the rung it is on compares with the one it came from."""
+        if self._left is not None:
+            (lower, fast), (_, slow) = sorted((self._left, (self.rung, seconds)), key=lambda pair: RUNGS.index(pair[0]))
+            self._growth[lower] = max(slow / max(fast, 1e-6), 1.0)
+            self._left = None
+
+    def _restart(self) -> None:
+        self._seen.clear()
+        self._skipped = 0
+
+
+def dial_for(software: bool, quality: str | None, target_fps: float | None) -> Dial:
+    """Where a device begins: a processor on the ladder's knee and coarsely, a graphics card on the reference."""
+    dial = Dial(quality or (DEFAULT if software else RUNGS[-1]), Pace.of(software))
+    if target_fps is not None:
+        dial.hold(target_fps)
+    return dial

@@ -1,0 +1,57 @@
+"""How finely to draw: the settings that trade a picture's truth for its time, and a ladder of them to climb up and down.
+
+    LADDER              from fastest to finest; name -> Quality. The last, "reference", is what the format says, exactly
+    DEFAULT             the name of the knee of `kpbench player`'s curve: where a player begins
+    climbed(name, +1)   the name of the next finer one
+
+A `Renderer` takes a Quality when it is made, and another whenever its `quality` is set: no scene is uploaded again.
+"""
+
+from dataclasses import dataclass
+
+from kpc.format.scene import TERMINATION
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Of a picture. The default of every field is what the format says.
+
+    Attributes:
+        folded: multiply the rows of the time planes into the space planes once a frame, instead of sampling them beside the
+            planes at every sample. Half the fetches, and a second-order error where something moves.
+        step: distance between samples, in steps of the scene.
+        termination: a ray ends once its transmittance falls below this. Where that is more than the format's TERMINATION, what
+            is left of its light counts as what it has met so far.
+        resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated.
+        scales: how many of the scene's to use, from the coarsest on; None: all.
+    """
+
+    folded: bool = False
+    step: float = 1.0
+    termination: float = TERMINATION
+    resolution: float = 1.0
+    scales: int | None = None
+
+    def __post_init__(self) -> None:
+        marchable = self.step >= 1 and 0 < self.termination < 1 and 0 < self.resolution <= 1
+        if not marchable or self.scales is not None and self.scales < 1:
+            raise ValueError(f"no picture can be drawn with {self}")
+
+
+LADDER: dict[str, Quality] = {
+    "fastest": Quality(folded=True, step=2.0, termination=1 / 16, resolution=0.5),
+    "faster": Quality(folded=True, step=1.5, termination=1 / 32, resolution=0.5),
+    "fast": Quality(folded=True, step=1.5, termination=1 / 32, resolution=0.75),
+    "balanced": Quality(folded=True, termination=1 / 64),
+    "fine": Quality(folded=True),
+    "reference": Quality(),
+}
+"""From fastest to finest."""
+
+DEFAULT = "balanced"
+
+
+def climbed(name: str, rungs: int) -> str:
+    """The name so many rungs up the ladder from `name`, or at its end."""
+    names = list(LADDER)
+    return names[min(max(names.index(name) + rungs, 0), len(names) - 1)]

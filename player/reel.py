@@ -1,0 +1,275 @@
+"""A clip in groups that plays while it arrives: the group that shows and the one that comes next, each a `Stream` with a renderer.
+
+    steer    where the playhead is: the group it is in shows once it can, the next one is fetched ahead, others are let go
+    upload   what has arrived goes to the renderers; the next group's is made, and its shaders compiled, well before it shows
+
+A thread of its own opens groups, another for each fetches: the window's thread waits for none of them. A file without groups is a
+reel of one, which is always there.
+"""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from kpc.format.container import DEFAULT_BUDGET, RemoteSource, Source
+from kpc.format.errors import KpcError
+from kpc.format.groups import Groups
+from kpc.format.scene import Clip, Scene
+from kpc.player.orbit import Rig
+from kpc.player.prefetch import Playhead
+from kpc.player.renderer import Renderer
+from kpc.player.stream import Stream
+
+AHEAD_S = 5.0
+"""The next group is opened so long before it shows, even if the one that shows is still arriving."""
+WARM_UP = (8, 6)
+"""Pixels of the picture for which a renderer compiles its shaders."""
+
+
+@dataclass
+class Held:
+    """A group that is there, or on its way."""
+
+    number: int
+    stream: Stream
+    renderer: Renderer | None = None
+
+
+class Reel:
+    """See the module.
+
+    Args:
+        source: of the file.
+        memory: bytes that all of it may take; of a clip in groups, half of that for each of two.
+        arrived: called by other threads whenever there is something new; may wake the window.
+
+    Attributes:
+        clip: of all groups together.
+        timeline: when which group shows.
+
+    Raises:
+        KpcError: as `Groups` and `Stream`.
+    """
+
+    def __init__(self, source: Source, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None) -> None:
+        self.source, self.memory, self._arrived = source, memory, arrived
+        self.groups = Groups(source, memory_budget=memory, in_parts=True)
+        self.timeline, self.clip = self.groups.timeline, self.groups.clip
+        self._a_group = memory if self.groups.is_single else memory // 2
+        self._shown = Held(0, Stream(self.groups.open(0), memory=self._a_group, arrived=arrived))
+        self.cameras = self._shown.stream.scene.cameras
+        self._next: Held | None = None
+        self._make: Callable[[Scene], Renderer] | None = None
+        self._turns = 0
+        self._before = 0
+        """Versions of what has shown before."""
+        self._waiting = False
+        self._closed = False
+        self._opening: int | None = None
+        """What a thread opens; what came of it lies in one of the next."""
+        self._opened: Held | None = None
+        self._failure: KpcError | OSError | None = None
+        self._bug: BaseException | None = None
+
+    # --- what shows
+
+    @property
+    def stream(self) -> Stream:
+        """Of the group that shows."""
+        return self._shown.stream
+
+    @property
+    def scene(self) -> Scene:
+        return self.stream.scene
+
+    @property
+    def number(self) -> int:
+        """Of the group that shows."""
+        return self._shown.number
+
+    @property
+    def renderer(self) -> Renderer:
+        """Of the group that shows; there once `draw_with` has been called."""
+        assert self._shown.renderer is not None
+        return self._shown.renderer
+
+    @property
+    def is_drawn(self) -> bool:
+        return self._shown.renderer is not None
+
+    def draw_with(self, make: Callable[[Scene], Renderer]) -> None:
+        """Make renderers so: one now, others as groups come."""
+        self._make = make
+        self._shown.renderer = make(self.scene)
+
+    def time_in(self, time: float) -> float:
+        """The time in the group that shows, at a time of the clip."""
+        return self.timeline.time_in(self.number, time)
+
+    def time_of(self, time_in_it: float) -> float:
+        """The time of the clip, at a time in the group that shows."""
+        spans, span = self.timeline.spans, self.timeline.spans[self.number]
+        frame = span.start + time_in_it * (span.count - 1) - spans[0].start
+        return min(max(frame / max(self.clip.frame_count - 1, 1), 0.0), 1.0)
+
+    @property
+    def scales_here(self) -> int:
+        """As of `Stream`."""
+        return self.stream.scales_here
+
+    @property
+    def share_here(self) -> float:
+        """As of `Stream`, of the group that shows."""
+        return self.stream.share_here
+
+    @property
+    def version(self) -> int:
+        """Grows whenever what shows has changed."""
+        return self._before + self.stream.version
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether all of the group that shows is there that fits the memory, or nothing more will come."""
+        return self.stream.is_settled and not self._waiting or self._failure is not None
+
+    @property
+    def message(self) -> str | None:
+        """What the user should know; None while all goes well."""
+        if self._failure is not None:
+            return f"no more of the scene will come: {self._failure}"
+        if self._waiting:
+            return self.stream.message or f"waiting for the scene, {self.rate / 1e3:,.0f} KB/s"
+        return self.stream.message
+
+    @property
+    def rate(self) -> float:
+        """Bytes a second that came lately."""
+        return self.stream.rate + (0.0 if self._next is None else self._next.stream.rate)
+
+    # --- the window's thread
+
+    def steer(self, head: Playhead) -> None:
+        """Say where the clip is.
+
+        Raises:
+            BaseException: what should not have happened in the thread that opens groups.
+        """
+        if self._bug is not None:
+            raise self._bug
+        self._take_in()
+        number, _ = self.timeline.at(head.time)
+        if self._next is not None and number == self._next.number and self._is_ready(self._next, head):
+            self._turn()
+        self._waiting = number != self.number
+        ahead = number if self._waiting else self._comes_after(head)
+        if self._next is not None and self._next.number != ahead:
+            self._let_go(self._next)
+            self._next = None
+        if ahead is not None and self._next is None and (self._waiting or self._is_near(head) or self.stream.is_settled):
+            self._open(ahead)
+        for held in filter(None, (self._shown, self._next)):
+            held.stream.steer(self._head_in(held.number, head))
+
+    def upload(self) -> bool:
+        """Take over what has arrived; whether the picture may have changed.
+
+        Raises:
+            BaseException: as `Stream.upload`. DisplayError: the card has no room for the next group.
+        """
+        changed = self.stream.upload(self.renderer)
+        coming = self._next
+        if coming is not None and self._make is not None:
+            if coming.renderer is None:
+                coming.renderer = self._make(coming.stream.scene)
+                coming.renderer.quality = self.renderer.quality
+                coming.renderer.render(Rig.of(coming.stream.scene).cameras[0].resized(*WARM_UP), 0.0)
+            elif self._waiting or not changed:
+                coming.stream.upload(coming.renderer)
+        return changed
+
+    def can_show(self, time: float, pace: float = 0.0) -> bool:
+        """As `Stream.can_show`; not while the group is missing."""
+        number, time_in_it = self.timeline.at(time)
+        return number == self.number and self.stream.can_show(time_in_it, self._pace_in(number, pace))
+
+    def close(self) -> None:
+        """End all threads, and let go of the source."""
+        self._closed, self._arrived = True, lambda: None
+        for held in filter(None, (self._opened, self._next, self._shown)):
+            held.stream.close()
+        if isinstance(self.groups.reader.source, RemoteSource):
+            self.groups.reader.source.close()
+
+    # --- groups that come and go
+
+    def _comes_after(self, head: Playhead) -> int | None:
+        """The group after the one that shows."""
+        if self.number + 1 < len(self.groups):
+            return self.number + 1
+        return 0 if head.loop and len(self.groups) > 1 else None
+
+    def _is_near(self, head: Playhead) -> bool:
+        _, until = self.timeline.shown(self.number)
+        return (until - head.time) * self.clip.duration_s < AHEAD_S
+
+    def _is_ready(self, held: Held, head: Playhead) -> bool:
+        there = self._head_in(held.number, head)
+        return held.renderer is not None and held.stream.can_show(there.time, there.pace)
+
+    def _turn(self) -> None:
+        """The next group shows; the one that did is let go."""
+        assert self._next is not None and self._next.renderer is not None
+        self._next.renderer.quality = self.renderer.quality
+        gone, self._shown, self._next = self._shown, self._next, None
+        self._before += gone.stream.version + 1
+        self._let_go(gone)
+
+    def _let_go(self, held: Held) -> None:
+        held.stream.close()
+        if held.renderer is not None:
+            held.renderer.release()
+
+    def _head_in(self, number: int, head: Playhead) -> Playhead:
+        return Playhead(self.timeline.time_in(number, head.time), self._pace_in(number, head.pace), head.loop and self.groups.is_single)
+
+    def _pace_in(self, number: int, pace: float) -> float:
+        """Of a group in a second, where it is `pace` of the clip."""
+        return pace * max(self.clip.frame_count - 1, 1) / max(self.timeline.spans[number].count - 1, 1)
+
+    def _open(self, number: int) -> None:
+        """Have a group opened by a thread, unless that has something to do, or has failed."""
+        if self._opening is None and self._failure is None:
+            self._opening = number
+            threading.Thread(target=self._open_now, args=(number,), name="opening", daemon=True).start()
+
+    def _take_in(self) -> None:
+        """What a thread has opened is the next group, whether it is still wanted or not."""
+        if (opened := self._opened) is not None:
+            if self._next is not None:
+                self._let_go(self._next)
+            self._next, self._opened, self._opening = opened, None, None
+
+    def _open_now(self, number: int) -> None:
+        try:
+            stream = Stream(self.groups.open(number, apart=True), memory=self._a_group, arrived=self._wake)
+            if not stream.scene.cameras:
+                stream.scene = replace(stream.scene, cameras=self.cameras)
+            self._opened = Held(number, stream)
+            if self._closed:
+                stream.close()
+        except (KpcError, OSError) as error:
+            self._failure = error
+        except BaseException as error:  # a bug: told where it is seen, with its traceback
+            self._bug = error
+        self._wake()
+
+    def _wake(self) -> None:
+        self.arrived()
+
+    @property
+    def arrived(self) -> Callable[[], None]:
+        return self._arrived
+
+    @arrived.setter
+    def arrived(self, call: Callable[[], None]) -> None:
+        self._arrived = self._shown.stream.arrived = call
