@@ -94,8 +94,13 @@ class Attempt:
     measure: Measure
 
     @cached_property
+    def data(self) -> bytes:
+        """Its file."""
+        return file.encode(self.quantised)
+
+    @property
     def size_bytes(self) -> int:
-        return len(file.encode(self.quantised))
+        return len(self.data)
 
     @cached_property
     def measured(self) -> Measured:

@@ -38,7 +38,6 @@ from kpc.format import cli, file, groups
 from kpc.format.errors import DatasetError, TrainingError, UsageError
 from kpc.format.memory import peak_memory_bytes
 from kpc.format.progress import Progress
-from kpc.format.quantise import QuantisedScene
 from kpc.format.scene import Scene
 from kpc.format.space import FAR, Contraction, DeviceCoordinates, SpaceMapping
 
@@ -162,7 +161,7 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     coded = code(Model(scene, relative_steps(curvature), probe), options.trade, trainer.config.prune_share)
     if coded.pruned is not None:
         _say(_left_out(scene, coded.pruned, coded.spare_db))
-    size = _write(coded.scene, options.output, work)
+    size = _write(coded.data, options.output, work)
     decoded = file.read(options.output).dequantise()
     test, before = evaluate(decoded, dataset, most=options.most_tests), evaluate(scene, dataset, most=options.most_tests)
     if not options.keep:
@@ -435,9 +434,9 @@ def _on_signals(handler: Callable[[int, Any], None]) -> Iterator[None]:
             signal.signal(number, earlier)
 
 
-def _write(scene: QuantisedScene, output: Path, work: Path) -> int:
+def _write(data: bytes, output: Path, work: Path) -> int:
     try:
-        return file.write(scene, output)
+        return file.save(data, output)
     except OSError as error:
         kept = f", or give another -o with --work {work} --resume to keep what is trained"
         raise TrainingError(f"{output}: {error.strerror}; make room there{kept}") from error

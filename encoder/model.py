@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from kpc.encoder.checkpoint import save_state
 from kpc.encoder.compress import Steps, Trade, compress, relative_steps
 from kpc.encoder.field import Layout
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
 from kpc.format import file
 from kpc.format.cameras import Camera
-from kpc.format.cli import written_aside
 from kpc.format.container import MAGIC
 from kpc.format.errors import FormatError, TrainingError, UsageError
 from kpc.format.quantise import QuantisedScene, quantise_scene
@@ -54,7 +54,7 @@ class Coded:
     """What became of a model.
 
     Attributes:
-        scene: what the file is to hold. size_bytes: of that file.
+        scene: what the file is to hold. data: that file.
         loss_db: PSNR that coding costs on the probe rays, all that was left out included.
         agreement_db: PSNR of its pictures against those of the model.
         pruned: what was left out; None if nothing was to be.
@@ -62,11 +62,15 @@ class Coded:
     """
 
     scene: QuantisedScene
-    size_bytes: int
+    data: bytes
     loss_db: float
     agreement_db: float
     pruned: Pruned | None
     spare_db: float
+
+    @property
+    def size_bytes(self) -> int:
+        return len(self.data)
 
 
 def code(model: Model, trade: Trade, prune_share: float) -> Coded:
@@ -87,7 +91,7 @@ def code(model: Model, trade: Trade, prune_share: float) -> Coded:
             scene, steps, coded = pruned.scene, pruned.of_each_plane(steps), None
     found = compress(scene, steps, measure, whole, trade, coded)
     measured: Measured = found.measured
-    return Coded(found.quantised, found.size_bytes, whole - measured.psnr, measured.agreement_db, pruned, spare)
+    return Coded(found.quantised, found.data, whole - measured.psnr, measured.agreement_db, pruned, spare)
 
 
 def load(path: Path) -> Model:
@@ -140,13 +144,8 @@ def save_checkpoint(path: Path, scene: Scene, curvature: Sequence[Mapping[str, n
         "names": [appearance.name for appearance in scene.appearances],
         "codes": [appearance.code for appearance in scene.appearances], "probe": vars(probe),
     }
-    try:
-        with written_aside(path) as aside:
-            torch.save(_changed(state, np.ndarray, lambda a: torch.from_numpy(np.ascontiguousarray(a))), aside)
-    except (OSError, RuntimeError) as error:  # PyTorch reports a full disk as RuntimeError
-        reason = error.strerror if isinstance(error, OSError) else str(error).partition("\n")[0]
-        raise TrainingError(f"{path}: the checkpoint cannot be written ({reason}); free space there, or name another "
-                            "--keep-checkpoint") from error
+    state = _changed(state, np.ndarray, lambda a: torch.from_numpy(np.ascontiguousarray(a)))
+    save_state(path, state, "name another --keep-checkpoint")
 
 
 def load_checkpoint(path: Path) -> Model:

@@ -87,11 +87,11 @@ class Probe:
         return Probe(origins, directions, rng.random(PROBE_RAYS, dtype=np.float32), None, None)
 
     def measure(self, uncoded: Scene) -> Measure:
-        """What judges codings of a scene by its colours on these rays."""
+        """What judges codings of a scene by its colours on these rays; the scene itself costs nothing to judge."""
         expected = self._colours(uncoded)
 
         def measure(scene: Scene) -> Measured:
-            colours = self._colours(scene)
+            colours = expected if scene is uncoded else self._colours(scene)
             mse = float(np.mean(np.square(colours - expected), dtype=np.float64))
             found = psnr(colours, self.truth) if self.truth is not None else -10 * math.log10(ASSUMED_MSE + mse)
             return Measured(found, 255**2 * mse)

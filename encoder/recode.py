@@ -34,7 +34,7 @@ def recode(options: Options) -> dict[str, Any]:
         return _recode_groups(options, opened_groups) | {"encode_s": time.monotonic() - started}
     source = model.load(options.source)
     coded = model.code(source, options.trade, TrainConfig().prune_share)
-    size = file.write(coded.scene, options.output)
+    size = file.save(coded.data, options.output)
     return {
         "file": str(options.output), "source": str(options.source),
         **figures(coded, size, options.trade, JUDGED_BY[source.coded is not None]),

@@ -16,10 +16,10 @@ the errors' spectrum: errors towards the expected go together, which a sum over 
 import math
 from dataclasses import replace
 
-import numba
 import numpy as np
 
 from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene
+from kpc.format.rans import compiled
 from kpc.format.scene import TIME_PLANES, Scene
 
 LAM = 0.06
@@ -47,7 +47,7 @@ def _rounded_plane(plane: QuantisedPlane, values: np.ndarray, identity: bool) ->
     return replace(plane, symbols=symbols, coded=coded)
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _choose(wanted: np.ndarray, known: np.ndarray, lam: float, least: int, most: int) -> np.ndarray:
     """(H, W) int8 symbols of (H, W) numbers in steps; 0 where nothing is `known`."""
     rows, columns = wanted.shape

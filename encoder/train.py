@@ -14,6 +14,7 @@ import torch
 
 from kpc.encoder.appearances import number_pictures
 from kpc.encoder.box import seen_cells
+from kpc.encoder.checkpoint import save_state
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field import Field, HybridField, SummedField, appearance_priors, motion_nodes, motion_priors, plan_layout, priors
@@ -22,7 +23,6 @@ from kpc.encoder.occupancy import OccupancyGrid, grid_shape
 from kpc.encoder.optimisers import FusedOptimiser, PlainOptimiser, log_densities
 from kpc.encoder.proposals import Proposals
 from kpc.encoder.sampler import RaySampler
-from kpc.format.cli import written_aside
 from kpc.format.errors import TrainingError
 from kpc.format.scene import Scene
 from kpc.format.space import Contraction, SpaceMapping
@@ -224,13 +224,7 @@ class Trainer:
             "samples_per_ray": self.samples_per_ray, "field": self.field.state_dict(), "optimiser": self.optimiser.state(),
             "grid": self.grid.state(), "rng": _rng_to_plain(self.rng), "dataset": _fingerprint(self.dataset),
         }
-        try:
-            with written_aside(path) as aside:
-                torch.save(state, aside)
-        except (OSError, RuntimeError) as error:  # PyTorch reports a full disk as RuntimeError
-            reason = error.strerror if isinstance(error, OSError) else str(error).partition("\n")[0]
-            raise TrainingError(f"{path}: the checkpoint cannot be written ({reason}); free space there, or give another "
-                                "folder with --work") from error
+        save_state(path, state, "give another folder with --work")
 
     def _try_to_save(self, path: Path) -> None:
         try:

@@ -136,7 +136,11 @@ def write(scene: QuantisedScene, path: str | os.PathLike[str], *, segment_rows: 
     Raises:
         FormatError: the scene breaks a rule that every reader checks; the message says which.
     """
-    data = encode(scene, segment_rows=segment_rows)
+    return save(encode(scene, segment_rows=segment_rows), path)
+
+
+def save(data: bytes, path: str | os.PathLike[str]) -> int:
+    """Write what `encode` made; return its size. On failure `path` is left as it was."""
     try:
         with written_aside(path) as aside:
             aside.write_bytes(data)

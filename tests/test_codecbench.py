@@ -5,7 +5,6 @@ import json
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 from datasets import write_n3dv
 from scenes import tiny_scene
@@ -13,7 +12,7 @@ from scenes import tiny_scene
 from kpc.format import file
 from kpc.format.quantise import quantise_scene
 from kpc.tools import codecbench, kpbench, plot, results
-from kpc.tools.codecbench import Point, bd_rate, headline, pchip, size_at
+from kpc.tools.codecbench import Point, bd_rate, headline, size_at
 from kpc.tools.rivals import Bytes, Half, Video
 
 
@@ -39,17 +38,6 @@ def test_curves_are_compared_where_both_are_and_not_below_the_worst_loss() -> No
 def test_points_that_a_smaller_one_beats_count_for_nothing() -> None:
     worse = {"psnr": 27.5, "loss_db": 2.5, "size_bytes": 9e9}
     assert bd_rate([*points(0.5), worse], points(1.0)) == pytest.approx(-0.5, abs=1e-9)
-
-
-def test_pchip_goes_through_its_points_and_never_overshoots() -> None:
-    x, y = np.array([0.0, 1, 1.5, 4, 5]), np.array([0.0, 0, 3, 3.1, 9])
-    np.testing.assert_allclose(pchip(x, y, x), y, atol=1e-12)
-    at = np.linspace(0, 5, 501)
-    fine = pchip(x, y, at)
-    assert (np.diff(fine) >= -1e-12).all() and fine.min() >= 0 and fine.max() <= 9
-    np.testing.assert_allclose(pchip(x, 2 * x + 1, at), 2 * at + 1)
-    inside = np.abs(np.diff(pchip(x, y, 1 + np.array([-1e-6, 0, 1e-6]))))
-    assert inside[0] == pytest.approx(inside[1], abs=1e-9)  # its slope is continuous: 0 on both sides of a flat piece
 
 
 def test_what_a_table_shows() -> None:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from kpc.encoder import model
 from kpc.encoder.compress import DEFAULT_LOSS_DB, Trade
@@ -221,7 +222,7 @@ def bd_rate(ours: Sequence[Point], others: Sequence[Point]) -> float | None:
     if high - low < 1e-6:
         return None
     at = np.linspace(low, high, 1001)
-    mine, theirs = (pchip(psnr, rate, at) for psnr, rate in curves)
+    mine, theirs = (PchipInterpolator(psnr, rate)(at) for psnr, rate in curves)
     difference = mine - theirs
     return math.exp(float(np.mean((difference[1:] + difference[:-1]) / 2))) - 1
 
@@ -234,7 +235,7 @@ def size_at(points: Sequence[Point], loss_db: float) -> float | None:
     wanted = points[0]["psnr"] + points[0]["loss_db"] - loss_db
     if len(psnr) < 3 or not psnr[0] <= wanted <= psnr[-1]:
         return None
-    return math.exp(float(pchip(psnr, rate, np.array([wanted]))[0]))
+    return math.exp(float(PchipInterpolator(psnr, rate)(wanted)))
 
 
 def headline(points: Sequence[Point]) -> Point:
@@ -253,30 +254,6 @@ def _rising(points: Sequence[Point]) -> tuple[np.ndarray, np.ndarray]:
             best.append((point["psnr"], math.log(point["size_bytes"])))
     psnr, rate = zip(*best) if best else ((), ())
     return np.array(psnr), np.array(rate)
-
-
-def pchip(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The monotone piecewise cubic through (n,) points, x rising, n >= 3, at places within them (Fritsch and Carlson)."""
-    h, slope = np.diff(x), np.diff(y) / np.diff(x)
-    inner = np.zeros(len(x) - 2)
-    same = slope[:-1] * slope[1:] > 0
-    w1, w2 = 2 * h[1:] + h[:-1], h[1:] + 2 * h[:-1]
-    inner[same] = ((w1 + w2) / (w1 / np.where(same, slope[:-1], 1) + w2 / np.where(same, slope[1:], 1)))[same]
-    d = np.concatenate([[_end(h[0], h[1], slope[0], slope[1])], inner, [_end(h[-1], h[-2], slope[-1], slope[-2])]])
-    k = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(h) - 1)
-    t = (at - x[k]) / h[k]
-    return (  # type: ignore[no-any-return]
-        (1 + 2 * t) * (1 - t) ** 2 * y[k] + t * (1 - t) ** 2 * h[k] * d[k]
-        + t**2 * (3 - 2 * t) * y[k + 1] - t**2 * (1 - t) * h[k] * d[k + 1]
-    )  # fmt: skip
-
-
-def _end(h0: float, h1: float, slope0: float, slope1: float) -> float:
-    """The slope at an end: of the parabola through three points, kept from overshooting."""
-    d = ((2 * h0 + h1) * slope0 - h0 * slope1) / (h0 + h1)
-    if d * slope0 <= 0:
-        return 0.0
-    return 3 * slope0 if slope0 * slope1 < 0 and abs(d) > 3 * abs(slope0) else float(d)
 
 
 CSV_COLUMNS = ("name", "coder", "setting", "size_bytes", "bits_per_parameter", "psnr", "loss_db", "agreement_db", "encode_s",

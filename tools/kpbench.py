@@ -389,7 +389,7 @@ def _compare(job: Play) -> tuple[str, results.Record]:
 def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
     """A record for each scene and coder; beside --out also .csv of all points and .svg of the curves."""
     _encoder()  # what is missing is said before anything is read
-    from kpc.tools import codecbench
+    from kpc.tools import codecbench  # needs scipy
 
     folders: list[Path | None] = options.dataset or [None] * len(options.scenes)
     if len(folders) != len(options.scenes):
