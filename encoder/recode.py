@@ -49,9 +49,8 @@ def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
         trade = share_of(options, number, spans).trade
         scene = replace(file.read(source.open(number)), cameras=source.open(number).cameras() or source.cameras())
         coded = model.code(model.model_of(scene), trade, TrainConfig().prune_share)
-        data = file.encode(coded.scene)
-        parts.append(groups.Part.of(data, span.start))
-        found.append(figures(coded, len(data), trade, JUDGED_BY[1]))
+        parts.append(groups.Part.of(coded.data, span.start))
+        found.append(figures(coded, coded.size_bytes, trade, JUDGED_BY[1]))
     size = groups.write(parts, options.output)
     return {"file": str(options.output), "source": str(options.source), **together(found, spans, size, options.trade)}
 
