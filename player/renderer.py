@@ -1,9 +1,11 @@
 """Rendering with OpenGL 3.3: a scene becomes textures once, then each picture is one pass of `glsl/march.glsl`."""
 
 import contextlib
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -11,7 +13,7 @@ import numpy as np
 from kpc.format.cameras import Camera
 from kpc.format.errors import DisplayError
 from kpc.format.grid import linear
-from kpc.format.scene import Scene
+from kpc.format.scene import SPACE_PLANES, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
 from kpc.player.quality import LADDER, Quality
@@ -91,11 +93,7 @@ class Renderer:
         self.quality = quality
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
-        if max(self.layout.size) > most:
-            raise DisplayError(
-                "the planes need a texture of {}x{}, ".format(*self.layout.size)
-                + f"{ctx.info['GL_RENDERER']} takes {most}; kprender --backend reference"
-            )
+        _refuse_too_large(scene, self.layout, ctx.info)
         finer = Layout.of(scene, REFINED)
         self.folded_layout = finer if max(finer.size) <= most else self.layout
         with room_on(ctx, "the scene"):
@@ -216,6 +214,8 @@ class Renderer:
         `part` is FULL or STATIC. `program` is march.glsl or another that takes a subset of its uniforms. `appearance` as in
         `reference.code_of`.
         """
+        if not 0.0 <= time <= 1.0:
+            raise ValueError(f"time {time} lies outside [0, 1]")
         moving = part is Part.FULL and self._rows is not None
         quality, scene, size = self.quality, self.scene, (camera.width, camera.height)
         if quality.resolution < 1:
@@ -368,6 +368,29 @@ class Renderer:
                 )
             self._folded_time = time
         return self._folded_planes
+
+
+def _refuse_too_large(scene: Scene, layout: Layout, card: Mapping[str, Any]) -> None:
+    """Raise a DisplayError that names what of the scene is larger than the card's textures may be."""
+    flat, deep = card["GL_MAX_TEXTURE_SIZE"], card["GL_MAX_3D_TEXTURE_SIZE"]
+    planes = {
+        f"plane {name} of scale {number + 1}": (-(-scale[name].shape[2] // 4) * scale[name].shape[1], scale[name].shape[0])
+        for number, scale in enumerate(scene.scales)
+        for name in scale
+        if name in SPACE_PLANES
+    }
+    largest = max(planes, key=lambda name: math.prod(planes[name]))
+    needs = {name: (size, flat) for name, size in planes.items()}
+    needs[f"all planes, of which {largest} is the largest,"] = layout.size, flat
+    needs["the occupancy grid"] = scene.occupancy.shape[:0:-1], deep
+    if scene.motion is not None:
+        needs["the motion grid"] = scene.motion.shape[3:0:-1], deep
+    for what, (size, most) in needs.items():
+        if max(size) > most:
+            raise DisplayError(
+                f"{what} needs a texture of {'x'.join(map(str, size))}, {card['GL_RENDERER']} takes {most} a side; "
+                "kprender --backend reference"
+            )
 
 
 def _texture(ctx: moderngl.Context, size: tuple[int, int]) -> moderngl.Texture:
