@@ -100,7 +100,7 @@ def _record(kind: str, source: Path, origin: results.Record, settings: dict[str,
     """What a record says before anything is measured."""
     return {
         "kind": kind,
-        "name": source.resolve().stem if kind in ("player", "stream", "codec", "entropy") else source.resolve().name,
+        "name": source.resolve().stem if kind in ("player", "stream", "steady", "codec", "entropy") else source.resolve().name,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         **origin,
         "load_average": os.getloadavg()[0],
@@ -320,6 +320,18 @@ def _stream(options: argparse.Namespace, origin: results.Record) -> Iterator[res
                         "prefixes": _alone(streaming.prefixes, job)}  # fmt: skip
 
 
+def _steady(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """A record a scene: whether long playback in a window takes ever more memory."""
+    from kpc.tools import steady
+
+    for source in options.scenes:
+        record = _record("steady", source, origin, {"size": "{}x{}".format(*options.size), "frames": options.frames})
+        print(f"kpbench: {record['name']}", file=sys.stderr)
+        job = steady.Steady(source, options.size, options.frames)
+        repeats = [_alone(steady.measure, job) for _ in range(options.repeats)]
+        yield record | {"seed": None, "renderer": repeats[0].pop("renderer"), "repeats": repeats}
+
+
 def _renderer(_: None) -> str:
     from kpc.player import offscreen
 
@@ -403,7 +415,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|player|stream|codec|entropy")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|player|stream|steady|codec|entropy")
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
@@ -447,6 +459,13 @@ def _parser() -> argparse.ArgumentParser:
     stream.add_argument("--size", type=_size, default=(320, 240), metavar="WxH", help="of a picture (default: 320x240)")
     stream.set_defaults(measure=_stream)
 
+    steady = kinds.add_parser("steady", help="long playback in a window", description="Whether memory stays as it is, and nothing "
+                              "is made anew on the graphics card, while scenes play in a window. Wants a display.")  # fmt: skip
+    steady.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
+    steady.add_argument("--size", type=_size, default=(320, 240), metavar="WxH", help="of the window (default: 320x240)")
+    steady.add_argument("--frames", type=_positive, default=10_000, help="to draw (default: 10000)")
+    steady.set_defaults(measure=_steady)
+
     codec = kinds.add_parser("codec", help="rate against distortion, beside general tools",
                              description="Code each scene at several rates, and its planes with what a user has at hand: "
                                          "kpc.tools.rivals. With --out FILE.json also FILE.csv and FILE.svg.")  # fmt: skip
@@ -464,9 +483,9 @@ def _parser() -> argparse.ArgumentParser:
     entropy.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
     entropy.set_defaults(measure=_entropy)
 
-    for kind in (encode, curve, ablate, step, player, stream):
+    for kind in (encode, curve, ablate, step, player, stream, steady):
         kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
-    for kind in (encode, curve, ablate, step, player, stream, codec, entropy):
+    for kind in (encode, curve, ablate, step, player, stream, steady, codec, entropy):
         kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
     return parser
 

@@ -149,6 +149,16 @@ COLUMNS: dict[str, list[Column]] = {
         ("of which waiting", _number("jump_wait_ms", "{:.0f}")),
         ("share of the file: dB to the whole", _prefixes),
     ],
+    "steady": [
+        ("scene", lambda r: r["name"]),
+        ("window", lambda r: r["settings"]["size"]),
+        ("frames", lambda r: f"{r['settings']['frames']:,}"),
+        ("fps", _number("fps", "{:.0f}")),
+        ("made on the card", _number("made_on_card", "{:.0f}")),
+        ("MB at first", _number("first_bytes", "{:.1f}", 1e6)),
+        ("MB at last", _number("last_bytes", "{:.1f}", 1e6)),
+        ("KB more in 1,000 frames", _number("bytes_per_1000_frames", "{:.1f}", 1e3)),
+    ],
     "codec": [
         ("scene", lambda r: r["name"]),
         ("coder", lambda r: r["coder"]),
@@ -201,6 +211,7 @@ def _quality_table(records: Iterable[Record]) -> list[list[str]]:
 
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
           "step": "A step of training", "player": "Playing", "stream": "Playing while it arrives",
+          "steady": "Playing for long, all controls shown",
           "codec": "Coding, beside what is at hand", "entropy": "Entropy coding of planes, one idea left out; one core"}
 
 
