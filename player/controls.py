@@ -177,11 +177,15 @@ class Pace:
     """How finely to draw so that pictures come in time: the side of the drawn raster over that of the window.
 
     Attributes:
-        budget_s: seconds a picture may take. scale: in [LEAST, 1].
+        budget_s: seconds a picture may take.
+        scale: in [LEAST, 1], a power of STEP: the card is asked for few different rasters, and keeps them.
     """
 
-    LEAST = 0.125
+    STEP = 2**0.25
+    LEAST = STEP**-12
     SLACK = 0.15
+    MOST_DOWN = 3
+    """Steps after one picture, which may have been an exception."""
 
     budget_s: float
     scale: float = 1.0
@@ -189,14 +193,17 @@ class Pace:
     @staticmethod
     def of(software: bool) -> "Pace":
         """For a processor that stands in for a graphics card, or for one: the first picture comes soon, if coarsely."""
-        return Pace(1 / 15, 0.25) if software else Pace(1 / 50)
+        return Pace(1 / 15, Pace.STEP**-8) if software else Pace(1 / 50)
 
     def saw(self, seconds: float, budget_s: float | None = None) -> None:
         """Take in how long a picture took at the present scale, and may take; the time is in proportion to its pixels."""
-        wanted = min(max(self.scale * math.sqrt((budget_s or self.budget_s) / max(seconds, 1e-6)), self.LEAST), 1.0)
-        if abs(wanted - self.scale) > self.SLACK * self.scale or wanted == 1.0:
-            self.scale += (wanted - self.scale) * (0.7 if wanted < self.scale else 0.3)
-            self.scale = 1.0 if self.scale > 0.97 else self.scale
+        steps = -math.log(self.scale, self.STEP)
+        wanted = steps + math.log(max(seconds, 1e-6) / (budget_s or self.budget_s), self.STEP) / 2
+        if wanted <= steps - 1:
+            steps -= 1
+        elif wanted > steps - math.log(1 - self.SLACK, self.STEP):
+            steps = min(math.ceil(wanted), steps + self.MOST_DOWN)
+        self.scale = min(max(self.STEP ** -round(steps), self.LEAST), 1.0)
 
 
 def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:

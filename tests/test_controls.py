@@ -155,5 +155,16 @@ def test_where_a_clip_will_be_is_where_it_comes_to() -> None:
     assert Playback(Clip(31, 10.0), playing=False).pace == 0.0 == Playback(Clip(1, 10.0)).pace
 
 
+def test_the_pace_asks_for_few_rasters_and_stands_still_in_noise() -> None:
+    rng, pace, scales = np.random.default_rng(0), Pace(1 / 15), []
+    for _ in range(500):
+        pace.saw(0.4 * pace.scale**2 * float(np.exp(rng.normal(0, 0.1))))
+        scales.append(pace.scale)
+    assert len(set(scales)) <= 5 and sum(a != b for a, b in zip(scales[50:], scales[51:])) <= 10
+    pace.saw(100.0)  # an exception
+    assert pace.scale > 0.55 * scales[-1]
+    assert {round(4 * math.log2(scale), 9) % 1 for scale in scales} == {0.0}
+
+
 def test_a_processor_begins_coarsely() -> None:
     assert Pace.of(software=True).scale < 0.5 and Pace.of(software=False).scale == 1.0
