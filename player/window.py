@@ -1,6 +1,7 @@
 """The player's window: glfw for events, ImGui for controls (`kpc.player.panels`), the renderer for the picture."""
 
 import ctypes
+import math
 import re
 import time as clock
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import moderngl
 import numpy as np
 from imgui_bundle import imgui
 
+from kpc.format.cameras import Camera
 from kpc.format.container import open_source
 from kpc.format.errors import ContextLostError, DisplayError, KpcError
 from kpc.format.media import write_image
@@ -38,6 +40,8 @@ OPENGL = ((4, 3), (3, 3))
 STATS_EVERY_S = 0.5
 STATS_SIZE = (48, 36)
 SHARPEN_AFTER_S = 0.25
+BAND_S = 0.08
+"""How long a part of a sharp picture may take."""
 CROSSING_S = 4.0
 """Flying takes this long to cross the box's longest edge."""
 TOLD_S, COMPLAINED_S = 4.0, 12.0
@@ -245,7 +249,8 @@ class Player:
             self._go_on_from(before)
         self._resize(window.pixels)
         self._drawn: tuple[object, ...] = ()
-        self._is_sharp = False
+        self._is_sharp, self._sharp_rows = False, 0
+        self._band = self.canvas
 
     def _go_on_from(self, before: "Player") -> None:
         self.view, self.playback, self.path, self.part, self.look = (
@@ -533,27 +538,51 @@ class Player:
         elif self.is_filming_path:
             self._is_sharp = False  # `_film_path` draws
         elif wanted != self._drawn:
-            self._drawn, self._moved, self._is_sharp = wanted, now, False
+            self._drawn, self._moved, self._is_sharp, self._sharp_rows = wanted, now, False, 0
             self._picture(dial.pace.scale, dial.rung)
             dial.saw(self.draw_s)
-        elif not self._is_sharp:
-            is_finest = dial.pace.scale == 1.0 and dial.rung == dial.resting
-            if not is_finest and now - self._moved > SHARPEN_AFTER_S:
-                self._picture(1.0, dial.resting)
-            self._is_sharp = is_finest or now - self._moved > SHARPEN_AFTER_S
+            self._is_sharp = self.raster == self.canvas.size and dial.rung == dial.resting
+        elif not self._is_sharp and now - self._moved > SHARPEN_AFTER_S:
+            self._sharpen()
 
     def _picture(self, scale: float, rung: str) -> None:
         """Draw the scene on the canvas, at a share of its resolution."""
-        quality = LADDER[rung]
-        self.renderer.quality = replace(quality, folded=False) if self.exact else quality
+        self._set_quality(rung)
         if clock.monotonic() - self._measured > STATS_EVERY_S:
             self._measure()
-        started = clock.monotonic()
         width, height = (max(1, round(side * scale)) for side in self.canvas.size)
         self.raster = (width, height)
+        self._show(self.canvas, self.view.camera(width, height))
+
+    def _sharpen(self) -> None:
+        """Draw the next rows of the picture as finely as it is to be, from above, so many as do not keep the controls waiting."""
+        self._set_quality(self.dial.resting)
+        width, height = self.canvas.size
+        if self._sharp_rows == 0:
+            whole_s = self.draw_s * width * height / (self.raster[0] * self.raster[1])
+            bands = math.ceil(whole_s / BAND_S) if self.renderer.quality.resolution == 1.0 else 1
+            rows = -(-height // bands)
+            if self._band.size != (width, rows):
+                self._band = self.ctx.simple_framebuffer((width, rows))
+        rows = self._band.height
+        top = min(self._sharp_rows, height - rows)  # the last may overlap the one before
+        camera = self.view.camera(width, height)
+        self._show(self._band, replace(camera, height=rows, cy=camera.cy - top))
+        canvas = self.canvas.color_attachments[0]
+        canvas.write(self._band.read(components=4, alignment=1), viewport=(0, height - top - rows, width, rows), alignment=1)
+        self._sharp_rows = top + rows
+        if self._sharp_rows == height:
+            self._is_sharp, self.raster = True, (width, height)
+
+    def _set_quality(self, rung: str) -> None:
+        quality = LADDER[rung]
+        self.renderer.quality = replace(quality, folded=False) if self.exact else quality
+
+    def _show(self, target: moderngl.Framebuffer, camera: Camera) -> None:
+        started = clock.monotonic()
         self.renderer.show(
-            self.canvas,
-            self.view.camera(width, height),
+            target,
+            camera,
             self.playback.time,
             part=self.part,
             look=self.look,

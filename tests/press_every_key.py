@@ -124,6 +124,7 @@ def main(scene_file: str) -> None:
     assert player.notice_is_error and not player.riding  # there is no path yet
     follow_a_path(player, press)
     see_every_pixel_once(window, player)
+    come_to_rest(player)
     drop_files(window, player, Path(scene_file))
 
     press(glfw.KEY_H, glfw.KEY_P)
@@ -239,6 +240,26 @@ def see_every_pixel_once(window: Window, player: Player) -> None:
     assert heights[1:] == approx([2 * heights[0]] * 2, rel=0.05)  # sizes of text are whole
     Window.size, Window.pixels, Window.text_scale = size, pixels, scale  # type: ignore[method-assign]
     player.frame()
+
+
+def come_to_rest(player: Player) -> None:
+    """What stands still is drawn anew, row by row, as finely as at once."""
+    player.playback.playing = False
+    player.show_hud = False
+    band_s, window_module.BAND_S = window_module.BAND_S, 1e-6
+    player.look_from(player.view.orbit(0.1, 0.0))
+    player.dial.pace.scale = 0.25
+    player.frame()
+    coarse = player._pixels().astype(int)
+    time.sleep(0.3)
+    turns = 0
+    while not player._is_sharp:
+        player.frame()
+        turns += 1
+    fine = player._pixels().astype(int)
+    player._picture(1.0, player.dial.resting)
+    assert turns == player.canvas.height and np.abs(fine - player._pixels()).max() <= 1 < np.abs(fine - coarse).max()
+    window_module.BAND_S, player.show_hud = band_s, True
 
 
 def drop_files(window: Window, player: Player, scene_file: Path) -> None:
