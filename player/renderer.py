@@ -313,7 +313,7 @@ class Renderer:
             planes_texel=(1 / layout.size[0], 1 / layout.size[1]),
             rows_texel=(1 / self._row_texture.width, 1 / self._row_texture.height),
             blocks=[(block.x, block.y, block.width) for block in layout.blocks],
-            resolution=sizes if len(sizes) > 1 else sizes[0],
+            resolution=sizes,
             cell_count=scene.occupancy.shape[:0:-1],
             box_low=tuple(scene.aabb[0]),
             box_high=tuple(scene.aabb[1]),
@@ -383,17 +383,18 @@ def _texture(ctx: moderngl.Context, size: tuple[int, int]) -> moderngl.Texture:
 
 
 def _set(program: moderngl.Program, **values: object) -> None:
-    """Set the uniforms that a program has; compilers drop those it does not use."""
+    """Set the uniforms that a program has; compilers drop those it does not use, and the unused ends of arrays."""
     for name, value in values.items():
         member = program.get(name, None)
         if isinstance(member, moderngl.Uniform):
+            if isinstance(value, list):  # moderngl wants an array of one without the brackets
+                value = value[: member.array_length] if member.array_length > 1 else value[0]
             member.value = value
 
 
-def _vectors(code: np.ndarray) -> list[tuple[float, ...]] | tuple[float, ...]:
-    """A code as a uniform array of vec4s, padded with 0; moderngl wants an array of one without the brackets."""
-    vectors = [tuple(map(float, vector)) for vector in filled_to_four(code, 0).reshape(-1, 4)]
-    return vectors if len(vectors) > 1 else vectors[0]
+def _vectors(code: np.ndarray) -> list[tuple[float, ...]]:
+    """A code as a uniform array of vec4s, padded with 0."""
+    return [tuple(map(float, vector)) for vector in filled_to_four(code, 0).reshape(-1, 4)]
 
 
 def _frame_of(mapping: SpaceMapping | None) -> dict[str, object]:
