@@ -22,6 +22,7 @@ class Quality:
         step: distance between samples, in steps of the scene.
         termination: a ray ends once its transmittance falls below this. Where that is more than the format's TERMINATION, what
             is left of its light counts as what it has met so far.
+        paired: look up the scales but the finest once for two samples, in the middle between them.
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated.
         scales: how many of the scene's to use, from the coarsest on; None: all.
     """
@@ -29,6 +30,7 @@ class Quality:
     folded: bool = False
     step: float = 1.0
     termination: float = TERMINATION
+    paired: bool = False
     resolution: float = 1.0
     scales: int | None = None
 

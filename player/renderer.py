@@ -13,12 +13,14 @@ import numpy as np
 from kpc.format.cameras import Camera
 from kpc.format.errors import DisplayError
 from kpc.format.grid import linear
-from kpc.format.scene import SPACE_PLANES, Scene
+from kpc.format.scene import SPACE_PLANES, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, slot_at
-from kpc.player.textures import FOLDED_AXIS, Layout, Rows, decoder_arrays, decoder_shape, distances, filled_to_four
+from kpc.player.textures import (
+    FOLDED_AXIS, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four,
+)
 
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
@@ -229,7 +231,8 @@ class Renderer:
         displaced = moving and self._motion_texture is not None
         layout = self.folded_layout if folded else self.layout
         drawn = min(quality.scales or layout.scales, layout.scales)
-        march, vertices = self._program(program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn)
+        paired = quality.paired and drawn > 1 and not isinstance(scene.decoder, HybridDecoder)
+        march, vertices = self._program(program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, paired=paired)
         stride = scene.step * quality.step
         _set(
             march,
@@ -278,10 +281,11 @@ class Renderer:
         return target
 
     def _program(
-        self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0
+        self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
+        paired: bool = False,
     ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
-        key = name, layout.refined, rows, displaced, drawn
+        key = name, layout.refined, rows, displaced, drawn, paired
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
@@ -290,7 +294,7 @@ class Renderer:
             name,
             {
                 "SCALES": layout.scales,
-                "LAYERS": layout.layers,
+                "FEATURES": layout.features,
                 **decoder_shape(scene.decoder),
                 "ROWS": int(rows),
                 "DRAWN": drawn,
@@ -298,11 +302,10 @@ class Renderer:
                 "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
                 "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
                 "MOTION": int(displaced),
-                "REFINED": layout.refined,
+                "PAIRED": int(paired),
             },
-            {"decoder_weights": self._decoder},
+            {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))},
         )
-        sizes = [(s["xy"].shape[1], s["xy"].shape[0], s["xz"].shape[0]) for s in scene.scales]
         _set(
             program,
             planes=PLANES_UNIT,
@@ -310,11 +313,8 @@ class Renderer:
             cells=CELLS_UNIT,
             motion=MOTION_UNIT,
             nodes=(1.0, 1.0, 1.0) if self._motion_texture is None else tuple(map(float, self._motion_texture.size)),
-            planes_texel=(1 / layout.size[0], 1 / layout.size[1]),
             rows_texel=(1 / self._row_texture.width, 1 / self._row_texture.height),
-            blocks=[(block.x, block.y, block.width) for block in layout.blocks],
-            resolution=sizes if len(sizes) > 1 else sizes[0],
-            cell_count=scene.occupancy.shape[:0:-1],
+            cell_count=tuple(map(float, scene.occupancy.shape[:0:-1])),
             box_low=tuple(scene.aabb[0]),
             box_high=tuple(scene.aabb[1]),
             background=tuple(scene.background),
@@ -351,21 +351,19 @@ class Renderer:
             for source, block in zip(self.layout.blocks, self.folded_layout.blocks):
                 axis = FOLDED_AXIS[block.plane]
                 upright = axis == block.plane[1]
-                finest = 1 / self.folded_layout.refined
+                layers = self.layout.layers[block.scale]
                 _set(
                     fold,
-                    source=(source.x, source.y),
-                    source_width=source.width,
+                    source=self.layout.place(source),
+                    source_width=source.width / self.layout.size[0],
                     origin=(block.x, block.y),
                     width=block.width,
-                    shrink=(1.0, finest) if upright else (finest, 1.0),
+                    at_texel=(1 / max(block.width - 1, 1), 1 / max(block.height - 1, 1)),
+                    row_texel=1 / self.folded_layout.refined,
                     upright=upright,
-                    axis="xyz".index(axis),
-                    scale=block.scale,
+                    line=self.layout.first_row("xyz".index(axis), block.scale),
                 )
-                self._draw(
-                    self._fold_into, vertices, (block.x, block.y, self.layout.layers * block.width, block.height)
-                )
+                self._draw(self._fold_into, vertices, (block.x, block.y, layers * block.width, block.height))
             self._folded_time = time
         return self._folded_planes
 
@@ -406,17 +404,18 @@ def _texture(ctx: moderngl.Context, size: tuple[int, int]) -> moderngl.Texture:
 
 
 def _set(program: moderngl.Program, **values: object) -> None:
-    """Set the uniforms that a program has; compilers drop those it does not use."""
+    """Set the uniforms that a program has; compilers drop those it does not use, and the unused ends of arrays."""
     for name, value in values.items():
         member = program.get(name, None)
         if isinstance(member, moderngl.Uniform):
+            if isinstance(value, list):  # moderngl wants an array of one without the brackets
+                value = value[: member.array_length] if member.array_length > 1 else value[0]
             member.value = value
 
 
-def _vectors(code: np.ndarray) -> list[tuple[float, ...]] | tuple[float, ...]:
-    """A code as a uniform array of vec4s, padded with 0; moderngl wants an array of one without the brackets."""
-    vectors = [tuple(map(float, vector)) for vector in filled_to_four(code, 0).reshape(-1, 4)]
-    return vectors if len(vectors) > 1 else vectors[0]
+def _vectors(code: np.ndarray) -> list[tuple[float, ...]]:
+    """A code as a uniform array of vec4s, padded with 0."""
+    return [tuple(map(float, vector)) for vector in filled_to_four(code, 0).reshape(-1, 4)]
 
 
 def _frame_of(mapping: SpaceMapping | None) -> dict[str, object]:

@@ -92,11 +92,16 @@ def build(
 
 
 def constants(arrays: Mapping[str, np.ndarray]) -> str:
-    """GLSL that declares each (N, 4) float32 array as `const vec4 name[N]`, to the last bit."""
+    """GLSL that declares each (N, 4) float32 array as `const vec4 name[N]`, (N,) ones as float or int, to the last bit."""
     lines = []
     for name, array in arrays.items():
-        values = ", ".join("vec4(" + ", ".join(f"{x:.9e}" for x in row) + ")" for row in np.asarray(array, np.float32))
-        lines.append(f"const vec4 {name}[{len(array)}] = vec4[{len(array)}]({values});")
+        if array.ndim == 2:
+            kind, values = "vec4", ["vec4(" + ", ".join(f"{x:.9e}" for x in row) + ")" for row in np.asarray(array, np.float32)]
+        elif array.dtype.kind == "i":
+            kind, values = "int", [str(n) for n in array]
+        else:
+            kind, values = "float", [f"{x:.9e}" for x in np.asarray(array, np.float32)]
+        lines.append(f"const {kind} {name}[{len(array)}] = {kind}[{len(array)}]({', '.join(values)});")
     return "\n".join(lines) + "\n"
 
 

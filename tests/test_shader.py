@@ -7,7 +7,7 @@ from scenes import hybrid, tiny_scene
 
 from kpc.format.errors import DisplayError
 from kpc.player import shader
-from kpc.player.textures import Layout, decoder_arrays, decoder_shape
+from kpc.player.textures import Layout, block_arrays, decoder_arrays, decoder_shape
 
 
 def test_includes_come_once_and_lines_keep_their_numbers() -> None:
@@ -38,7 +38,7 @@ def test_a_missing_file_is_named() -> None:
 
 @pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "fullscreen.glsl"])
 def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
-    text, files = shader.compose(name, written={"decoder_weights": ""}, preamble=shader.ES30)
+    text, files = shader.compose(name, written={"decoder_weights": "", "plane_blocks": ""}, preamble=shader.ES30)
     assert text.startswith("#version 300 es\n") and text.count("#version") == 1
     assert len(set(files)) == len(files)
 
@@ -87,8 +87,9 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     scene = hybrid(scene) if space == "hybrid" else scene
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
-    defines = {"SCALES": 3, "LAYERS": layout.layers, **decoder_shape(scene.decoder), "ROWS": rows, "REFINED": 1, "DRAWN": 2,
+    blocks = shader.constants(block_arrays(scene, layout))
+    defines = {"SCALES": 3, "FEATURES": layout.features, **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "PAIRED": int(space == "box"),
                "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion, "APPEARANCE": rows}  # fmt: skip
-    fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights})
+    fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights, "plane_blocks": blocks})
     vertex, _ = shader.compose("fullscreen.glsl", preamble=shader.ES30)
     ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()

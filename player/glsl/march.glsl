@@ -1,11 +1,11 @@
 // The picture of a scene; normative text and a readable twin: kpc.player.reference.
 //
-// SCALES, LAYERS (of four channels), HIDDEN: its shape; HIDDEN is 0 where colour is the same from all sides. HYBRID: 1 where the
+// FEATURES: layers of four channels of all scales. HIDDEN is 0 where colour is the same from all sides. HYBRID: 1 where the
 // decoder is the hybrid one, of layers of WIDTH and HIDDEN units. APPEARANCE: 1 where colours come in more than one appearance.
-// ROWS: 1 where rows of time planes are multiplied in at every sample. REFINED: how much finer than the scene's the planes are
-// along the row folded into them; 1 where none is.
+// ROWS: 1 where rows of time planes are multiplied in at every sample.
 // CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
-// NDC: 1 where all this is in device coordinates. DRAWN: how many of the SCALES count.
+// NDC: 1 where all this is in device coordinates. DRAWN: how many scales count. PAIRED: 1 where
+// samples are taken in pairs, for each of which the scales but the finest are looked up once, in its middle.
 
 #include "ray.glsl"
 #include "space.glsl"
@@ -13,20 +13,17 @@
 #include "motion.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
-#include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.textures)
+#include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.textures), as the next
+#include "plane_blocks"     // blocks, layer_widths, last_texels, layers, first_layers
 
-#define FEATURES (SCALES * LAYERS)
 const float TERMINATION = 1.0 / 1024.0;  // as in kpc.format.scene
 
 uniform sampler2D planes;
 uniform sampler2D rows;
 uniform usampler3D cells;
 uniform sampler3D motion;
-uniform vec2 planes_texel;          // 1 / size of the texture
-uniform vec2 rows_texel;
-uniform vec3 blocks[SCALES * 3];    // xy, xz, yz of each scale: where they begin, and the width of a layer
-uniform vec3 resolution[SCALES];    // texels along x, y, z
-uniform ivec3 cell_count;
+uniform vec2 rows_texel;            // 1 / size of the texture
+uniform vec3 cell_count;
 uniform vec3 nodes;                 // MOTION: of its grid along x, y, z
 uniform vec3 box_low;
 uniform vec3 box_high;
@@ -94,16 +91,16 @@ void look_along(vec3 d) {
 #endif
 
 vec4 feature(vec3 u, int scale, int layer) {
-    vec3 p = u * (resolution[scale] - 1.0);
-    vec3 q = float(REFINED) * p;  // folded planes are finer along x, z and y
-    vec3 xy = blocks[3 * scale], xz = blocks[3 * scale + 1], yz = blocks[3 * scale + 2];
-    vec4 f = plane_layer(planes, planes_texel, xy.xy, xy.z, vec2(q.x, p.y), layer)
-           * plane_layer(planes, planes_texel, xz.xy, xz.z, vec2(p.x, q.z), layer)
-           * plane_layer(planes, planes_texel, yz.xy, yz.z, vec2(q.y, p.z), layer);
+    int xy = 3 * scale, xz = xy + 1, yz = xy + 2;
+    vec4 f = plane_layer(planes, blocks[xy], layer_widths[xy], u.xy, layer)
+           * plane_layer(planes, blocks[xz], layer_widths[xz], u.xz, layer)
+           * plane_layer(planes, blocks[yz], layer_widths[yz], u.yz, layer);
 #if ROWS
-    f *= row_layer(rows, rows_texel, p.x, 0, scale, layer)
-       * row_layer(rows, rows_texel, p.y, 1, scale, layer)
-       * row_layer(rows, rows_texel, p.z, 2, scale, layer);
+    vec3 p = u * last_texels[scale].xyz;
+    int line = first_layers[scale] + layer;
+    f *= row_layer(rows, rows_texel, p.x, line)
+       * row_layer(rows, rows_texel, p.y, line + FEATURES)
+       * row_layer(rows, rows_texel, p.z, line + 2 * FEATURES);
 #endif
     return f;
 }
@@ -140,72 +137,128 @@ vec3 shade_of(vec4 h[WIDTH / 4]) {
 }
 #endif
 
+#if HYBRID
+// What a sample's features make of it: the logits of its colour, and in w the log of its density.
+vec4 logits_of(vec3 u, float trans, float thickness) {
+    vec4 f[FEATURES];
+    for (int scale = 0; scale < SCALES; ++scale) {
+        for (int layer = 0; layer < layers[scale]; ++layer) {
+            f[first_layers[scale] + layer] = scale < DRAWN ? feature(u, scale, layer) : vec4(0.0);
+        }
+    }
+    vec4 h[WIDTH / 4];
+    float log_density = density_bias[0].x;
+    for (int i = 0; i < WIDTH / 4; ++i) {
+        h[i] = activated(from_features_bias[i] + four_rows(i, f));
+        log_density += dot(h[i], density_weight[i]);
+    }
+    vec3 shade = vec3(0.0);
+    if (trans * alpha_of(log_density, thickness) > NEGLIGIBLE) shade = shade_of(h);
+    return vec4(shade, log_density);
+}
+#else
+// What a scale adds to the logits of the colour, and in w to the log of the density.
+vec4 logits_of_scale(vec3 u, int scale) {
+    vec4 sum = vec4(0.0);
+    for (int layer = 0; layer < layers[scale]; ++layer) {
+        int i = first_layers[scale] + layer;
+        vec4 f = feature(u, scale, layer);
+        sum += vec4(dot(f, basis[i]), dot(f, basis[FEATURES + i]), dot(f, basis[2 * FEATURES + i]), dot(f, density_weight[i]));
+    }
+    return sum;
+}
+
+vec4 logits_of(vec3 u, float trans, float thickness) {
+    vec4 sum = vec4(vec3(0.0), density_bias[0].x);
+    for (int scale = 0; scale < DRAWN; ++scale) sum += logits_of_scale(u, scale);
+    return sum;
+}
+#endif
+
+// Where in the planes to look for what is at a place.
+vec3 looked_up(vec3 u) {
+    u = clamp(u, 0.0, 1.0);
+#if MOTION
+    u = moved(motion, nodes, u);
+#endif
+    return u;
+}
+
+// What a step at a place counts for the density.
+float thickness_at(Walk walk, Place place) {
+#if CONTRACTED
+    return tau * stretch_of(walk.start + place.t * walk.rate, place.t, even);
+#else
+    return tau;
+#endif
+}
+
+// What a ray has met so far.
+struct Met {
+    vec3 rgb;
+    float trans;
+    float depth;
+    float samples;
+};
+
+void add_sample(inout Met sum, vec4 logits, float thickness, float distance) {
+    float weight = sum.trans * alpha_of(logits.w, thickness);
+    sum.rgb += weight * sigmoid(logits.rgb);
+    sum.depth += weight * distance;
+    sum.trans -= weight;
+    sum.samples += 1.0;
+}
+
 void main() {
     Path path = path_of(eye, camera_direction(gl_FragCoord.xy, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
-
-    vec3 rgb = vec3(0.0);
-    float trans = 1.0;
-    float depth = 0.0;
-    float samples = 0.0;
-    bool more = to_occupied(walk, cells, cell_count);
+    Met sum = Met(vec3(0.0), 1.0, 0.0, 0.0);
+    Place place;
+    bool more = to_occupied(walk, cells, place);
 #if HIDDEN
     if (more) look_along(path.way);
+#endif
+#if PAIRED
+    vec4 before = vec4(0.0);
+    float pair_k = -1.0;
 #endif
     // Tested at its end: neighbouring rays run as one, and a test up front would cost them all one more body.
     do {
         if (more) {
-            float t = distance_of(sample_s(walk), even);
-#if CONTRACTED
-            vec3 y = walk.start + t * walk.rate;
-            vec3 u = 0.25 * contracted(y) + 0.5;
-            float thickness = tau * stretch_of(y, t, even);
-#else
-            vec3 u = clamp((path.begin + t * path.way - box_low) / (box_high - box_low), 0.0, 1.0);
-            float thickness = tau;
-#endif
-#if MOTION
-            u = moved(motion, nodes, u);
-#endif
-            float log_density = density_bias[0].x;
-            vec3 shade = vec3(0.0);
-#if HYBRID
-            vec4 f[FEATURES];
-            for (int i = 0; i < FEATURES; ++i) f[i] = i < DRAWN * LAYERS ? feature(u, i / LAYERS, i % LAYERS) : vec4(0.0);
-            vec4 h[WIDTH / 4];
-            for (int i = 0; i < WIDTH / 4; ++i) {
-                h[i] = activated(from_features_bias[i] + four_rows(i, f));
-                log_density += dot(h[i], density_weight[i]);
+            vec3 u = looked_up(place.u);
+#if PAIRED
+            float next_s = sample_s(walk, walk.k + 1.0);
+            Place next = place_at(walk, next_s);
+            bool both = next_s < walk.far && free_around(cells, walk, cell_of(walk, next.u)) == 0u;
+            vec3 next_u = looked_up(next.u);
+            vec3 middle = 0.5 * (u + next_u);
+            vec4 coarse = vec4(vec3(0.0), density_bias[0].x);
+            for (int scale = 0; scale < DRAWN - 1; ++scale) coarse += logits_of_scale(middle, scale);
+            // Two samples on from the pair before, if that is where it was.
+            vec4 slope = walk.k == pair_k ? 0.25 * (coarse - before) : vec4(0.0);
+            before = coarse;
+            vec4 next_logits = coarse + slope + logits_of_scale(next_u, DRAWN - 1);
+            add_sample(sum, coarse - slope + logits_of_scale(u, DRAWN - 1), thickness_at(walk, place), world_distance(path, place.t));
+            if (both && sum.trans >= termination) {
+                add_sample(sum, next_logits, thickness_at(walk, next), world_distance(path, next.t));
             }
+            walk.k += 2.0;
+            pair_k = walk.k;
 #else
-            for (int scale = 0; scale < DRAWN; ++scale) {
-                for (int layer = 0; layer < LAYERS; ++layer) {
-                    int i = scale * LAYERS + layer;
-                    vec4 f = feature(u, scale, layer);
-                    log_density += dot(f, density_weight[i]);
-                    shade += vec3(dot(f, basis[i]), dot(f, basis[FEATURES + i]), dot(f, basis[2 * FEATURES + i]));
-                }
-            }
-#endif
-            float weight = trans * alpha_of(log_density, thickness);
-#if HYBRID
-            if (weight > NEGLIGIBLE) shade = shade_of(h);
-#endif
-            rgb += weight * sigmoid(shade);
-            depth += weight * world_distance(path, t);
-            trans -= weight;
-            samples += 1.0;
+            float thickness = thickness_at(walk, place);
+            add_sample(sum, logits_of(u, sum.trans, thickness), thickness, world_distance(path, place.t));
             walk.k += 1.0;
-            more = trans >= termination;
+#endif
+            more = sum.trans >= termination;
         }
-        more = more && to_occupied(walk, cells, cell_count);
+        more = more && to_occupied(walk, cells, place);
     } while (more);
 
-    if (trans < termination && termination > TERMINATION) {  // sooner than the format says: the rest is like what was met
-        rgb /= 1.0 - trans;
-        depth /= 1.0 - trans;
-        trans = 0.0;
+    if (sum.trans < termination && termination > TERMINATION) {  // sooner than the format says: the rest is like what was met
+        sum.rgb /= 1.0 - sum.trans;
+        sum.depth /= 1.0 - sum.trans;
+        sum.trans = 0.0;
     }
-    seen = vec4(rgb + trans * background, 1.0 - trans);
-    met = vec4(depth, samples, 0.0, 0.0);
+    seen = vec4(sum.rgb + sum.trans * background, 1.0 - sum.trans);
+    met = vec4(sum.depth, sum.samples, 0.0, 0.0);
 }
