@@ -250,6 +250,7 @@ class Player:
         self._resize(window.pixels)
         self._drawn: tuple[object, ...] = ()
         self._is_sharp, self._sharp_rows = False, 0
+        self._is_paced, self._aside_s = False, 0.0
         self._band = self.canvas
 
     def _go_on_from(self, before: "Player") -> None:
@@ -291,6 +292,7 @@ class Player:
             glfw.wait_events_timeout(0.1)
             return
         self.window.check()
+        self._is_paced, self._aside_s = False, 0.0
         if pixels != self.canvas.size:
             self._resize(pixels)
         self._begin(seconds)
@@ -316,6 +318,8 @@ class Player:
         self.frames += 1
         panels.show(self)
         self._finish()
+        if self._is_paced:  # all but waiting for the screen counts, and but for looking at statistics
+            self.dial.saw(clock.monotonic() - now - self._aside_s)
         glfw.swap_buffers(self.window.handle)
         self.window.sweep()
 
@@ -540,7 +544,7 @@ class Player:
         elif wanted != self._drawn:
             self._drawn, self._moved, self._is_sharp, self._sharp_rows = wanted, now, False, 0
             self._picture(dial.pace.scale, dial.rung)
-            dial.saw(self.draw_s)
+            self._is_paced = True
             self._is_sharp = self.raster == self.canvas.size and dial.rung == dial.resting
         elif not self._is_sharp and now - self._moved > SHARPEN_AFTER_S:
             self._sharpen()
@@ -595,6 +599,7 @@ class Player:
 
     def _measure(self) -> None:
         """Samples a ray, and how far things are, from a very small picture."""
+        started = clock.monotonic()
         small = self.renderer.render(
             self.view.camera(*STATS_SIZE),
             self.playback.time,
@@ -607,6 +612,7 @@ class Player:
             near, far = np.percentile(seen, (2, 98))
             self.depths = (0.9 * float(near), 1.1 * float(far))
         self._measured = clock.monotonic()
+        self._aside_s += self._measured - started
 
     def _begin(self, seconds: float) -> None:
         self.overlay.begin(self.window.size, self.canvas.size, self.text_size * self.window.text_scale, seconds)

@@ -30,16 +30,17 @@ def changes(rungs: list[str]) -> int:
     return sum(a != b for a, b in zip(rungs, rungs[1:]))
 
 
-def held(fps: float, start: str = DEFAULT) -> Dial:
-    dial = Dial(start, Pace(1 / 15))
+def held(fps: float, start: str = DEFAULT, scale: float = 1.0) -> Dial:
+    dial = Dial(start, Pace(1 / 15, scale))
     dial.hold(fps)
     return dial
 
 
 @pytest.mark.parametrize("start", RUNGS)
 @pytest.mark.parametrize("rung", RUNGS)
-def test_comes_to_the_finest_rung_that_is_fast_enough_and_stays(start: str, rung: str) -> None:
-    dial = held(rate_for(rung), start)
+@pytest.mark.parametrize("scale", [1.0, 0.25])
+def test_comes_to_the_finest_rung_that_is_fast_enough_and_stays(start: str, rung: str, scale: float) -> None:
+    dial = held(rate_for(rung), start, scale)
     turns(dial, 200)
     assert set(turns(dial, 500)) == {rung}
 
@@ -92,5 +93,5 @@ def test_by_hand_it_stays_and_a_still_picture_is_no_coarser_than_asked_for() -> 
 
 def test_where_a_device_begins() -> None:
     assert dial_for(True, None, None).rung == DEFAULT and dial_for(False, None, None).rung == RUNGS[-1]
-    dial = dial_for(True, RUNGS[1], 25.0)
-    assert dial.rung == RUNGS[1] and dial.target_s == pytest.approx(0.04)
+    dial = dial_for(True, RUNGS[1], 25.0)  # a processor begins with a coarse raster
+    assert (dial.rung, dial.resting) == (RUNGS[0], RUNGS[1]) and dial.target_s == pytest.approx(0.04)
