@@ -7,6 +7,7 @@
 A `Renderer` takes a Quality when it is made, and another whenever its `quality` is set: no scene is uploaded again.
 """
 
+import math
 from dataclasses import dataclass
 
 from kpc.format.scene import TERMINATION
@@ -22,7 +23,9 @@ class Quality:
         step: distance between samples, in steps of the scene.
         termination: a ray ends once its transmittance falls below this. Where that is more than the format's TERMINATION, what
             is left of its light counts as what it has met so far.
-        paired: look up the scales but the finest once for two samples, in the middle between them.
+        share: scales whose texels are at least so many steps long are looked up once for two samples, in the middle between them.
+        interlaced: march every other pixel, like the squares of one colour of a chessboard, and in the next frame those in between.
+            The rest follows the frame before. A frame that follows none, after a jump, is marched whole.
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated.
         scales: how many of the scene's to use, from the coarsest on; None: all.
     """
@@ -30,12 +33,13 @@ class Quality:
     folded: bool = False
     step: float = 1.0
     termination: float = TERMINATION
-    paired: bool = False
+    share: float = math.inf
+    interlaced: bool = False
     resolution: float = 1.0
     scales: int | None = None
 
     def __post_init__(self) -> None:
-        marchable = self.step >= 1 and 0 < self.termination < 1 and 0 < self.resolution <= 1
+        marchable = self.step >= 1 and self.share > 0 and 0 < self.termination < 1 and 0 < self.resolution <= 1
         if not marchable or self.scales is not None and self.scales < 1:
             raise ValueError(f"no picture can be drawn with {self}")
 

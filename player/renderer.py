@@ -2,8 +2,8 @@
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -19,14 +19,17 @@ from kpc.player import shader
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, slot_at
 from kpc.player.textures import (
-    FOLDED_AXIS, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four,
+    FOLDED_AXIS, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four, planes_shape,
 )
 
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
 PLANES_UNIT, ROWS_UNIT, CELLS_UNIT, MOTION_UNIT = 0, 1, 2, 3
 SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
-TARGETS_KEPT = 4
+SEEN_BEFORE_UNIT, MET_BEFORE_UNIT = 2, 3
+TARGETS_KEPT = 8
+FOLLOWS_S = 0.2
+"""A picture so much later in the clip than the one before has too little in common with it to follow it."""
 CONSTANTS = 8192
 """vec4s of decoder weights that a shader may hold, ten times what the largest preset needs; compilers choke on more."""
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
@@ -39,6 +42,15 @@ class Look(Enum):
     DEPTH = 2
     SAMPLES = 3
     OCCUPANCY = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """An interlaced picture: from where, when, and which half of its pixels was marched, those with x + y + parity even."""
+
+    camera: Camera
+    time: float
+    parity: int = 0
 
 
 @dataclass
@@ -125,7 +137,9 @@ class Renderer:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
         self._slot: int | None = None
         self._programs: dict[tuple[object, ...], tuple[moderngl.Program, moderngl.VertexArray]] = {}
-        self._targets: dict[tuple[Part, tuple[int, int]], Target] = {}
+        self._targets: dict[tuple[Part, tuple[int, int], int], Target] = {}
+        self._shots: dict[tuple[Part, tuple[int, int]], Shot] = {}
+        """The last interlaced picture of each size."""
         self.check()
 
     def check(self) -> None:
@@ -227,31 +241,76 @@ class Renderer:
         if moving:
             self._cut(time)
         planes = self._fold(time) if folded else self._planes
-        target = self._target(part, (camera.width, camera.height))
+        raster = (camera.width, camera.height)
+        interlaced = quality.interlaced and program == "march.glsl"
         displaced = moving and self._motion_texture is not None
         layout = self.folded_layout if folded else self.layout
         drawn = min(quality.scales or layout.scales, layout.scales)
-        paired = quality.paired and drawn > 1 and not isinstance(scene.decoder, HybridDecoder)
-        march, vertices = self._program(program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, paired=paired)
+        shared = 0 if isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
+        march, vertices = self._program(program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared,
+                                        interlaced=interlaced)
         stride = scene.step * quality.step
         _set(
             march,
             stride=stride,
             tau=stride / scene.extent,
             termination=quality.termination,
-            height=float(camera.height),
-            lens=(camera.fl_x, camera.fl_y, camera.cx, camera.cy),
-            axes=tuple(camera.camera_to_world[:3, :3].T.ravel()),
-            eye=tuple(camera.camera_to_world[:3, 3]),
+            **_lens_of(camera),
             appearance=_vectors(code_of(self.scene, appearance)),
         )
-        planes.use(PLANES_UNIT)
-        self._row_texture.use(ROWS_UNIT)
-        if self._motion_texture is not None:
-            self._motion_texture.use(MOTION_UNIT)
-        self._cells.use(CELLS_UNIT)
-        self._draw(target.framebuffer, vertices)
-        return target if target.seen.size == size else self._upscaled(target, self._target(part, size))
+        def draw(target: Target) -> None:
+            planes.use(PLANES_UNIT)
+            self._row_texture.use(ROWS_UNIT)
+            if self._motion_texture is not None:
+                self._motion_texture.use(MOTION_UNIT)
+            self._cells.use(CELLS_UNIT)
+            self._draw(target.framebuffer, vertices)
+
+        if interlaced:
+            target = self._woven(march, draw, Shot(camera, time), part)
+        else:
+            target = self._target(part, raster)
+            draw(target)
+        return target if raster == size else self._upscaled(target, self._target(part, size))
+
+    def _woven(self, march: moderngl.Program, draw: Callable[[Target], None], shot: Shot, part: Part) -> Target:
+        """Draw half of the pixels, and let the rest follow the picture before; draw all of them where there is none."""
+        size = shot.camera.width, shot.camera.height
+        before = self._shots.pop((part, size), None)
+        if before is not None and abs(shot.time - before.time) * self.scene.clip.duration_s > FOLLOWS_S:
+            before = None
+        # One picture of half the width, and two whole ones that take turns, one for each parity.
+        half = self._target(part, (-(-size[0] // 2), size[1]), 2)
+        parity = 0 if before is None else 1 - before.parity
+        for turn in (parity,) if before is not None else (1, 0):
+            _set(march, parity=float(turn))
+            draw(half)
+            self._weave(half, self._target(part, size, 1 - turn), self._target(part, size, turn), shot, before, turn)
+        self._shots[part, size] = replace(shot, parity=parity)
+        return self._target(part, size, parity)
+
+    def _weave(self, half: Target, old: Target, new: Target, shot: Shot, before: Shot | None, parity: int) -> None:
+        weave, vertices = self._program("weave.glsl", self.layout)
+        _set(
+            weave,
+            seen_now=SEEN_UNIT, met_now=MET_UNIT, seen_before=SEEN_BEFORE_UNIT, met_before=MET_BEFORE_UNIT,
+            size=tuple(map(float, new.seen.size)),
+            parity=float(parity),
+            afresh=before is None,
+            **_lens_of(shot.camera),
+            **{f"{name}_before": value for name, value in _lens_of((before or shot).camera).items()},
+        )  # fmt: skip
+        half.seen.use(SEEN_UNIT)
+        half.met.use(MET_UNIT)
+        old.seen.use(SEEN_BEFORE_UNIT)
+        old.met.use(MET_BEFORE_UNIT)
+        self._draw(new.framebuffer, vertices)
+
+    def _scales_shared(self) -> int:
+        """How many scales, from the coarsest on, have texels that are long enough for two samples to share a look-up."""
+        step = self.quality.step * self.scene.step / self.scene.extent
+        finest = [max(size - 1 for plane in SPACE_PLANES for size in scale[plane].shape[:2]) for scale in self.scene.scales]
+        return sum(1 / texels >= self.quality.share * step for texels in finest)
 
     def _upscaled(self, small: Target, target: Target) -> Target:
         upscale, vertices = self._program("upscale.glsl", self.layout)
@@ -272,20 +331,23 @@ class Renderer:
         framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
         vertices.render(moderngl.TRIANGLES, vertices=3)
 
-    def _target(self, part: Part, size: tuple[int, int]) -> Target:
+    def _target(self, part: Part, size: tuple[int, int], number: int = 0) -> Target:
         """A target of this size; the few last used are kept."""
-        target = self._targets.pop((part, size), None) or Target.of(self.ctx, size)
-        self._targets[part, size] = target
+        key = part, size, number
+        target = self._targets.pop(key, None) or Target.of(self.ctx, size)
+        self._targets[key] = target
         if len(self._targets) > TARGETS_KEPT:
-            self._targets.pop(next(iter(self._targets))).release()
+            dropped = next(iter(self._targets))
+            self._targets.pop(dropped).release()
+            self._shots.pop(dropped[:2], None)
         return target
 
     def _program(
         self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
-        paired: bool = False,
+        shared: int = 0, interlaced: bool = False,
     ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
-        key = name, layout.refined, rows, displaced, drawn, paired
+        key = name, layout.refined, rows, displaced, drawn, shared, interlaced
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
@@ -293,8 +355,7 @@ class Renderer:
             self.ctx,
             name,
             {
-                "SCALES": layout.scales,
-                "FEATURES": layout.features,
+                **planes_shape(layout),
                 **decoder_shape(scene.decoder),
                 "ROWS": int(rows),
                 "DRAWN": drawn,
@@ -302,7 +363,8 @@ class Renderer:
                 "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
                 "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
                 "MOTION": int(displaced),
-                "PAIRED": int(paired),
+                "SHARED": shared,
+                "INTERLACED": int(interlaced),
             },
             {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))},
         )
@@ -416,6 +478,16 @@ def _set(program: moderngl.Program, **values: object) -> None:
 def _vectors(code: np.ndarray) -> list[tuple[float, ...]]:
     """A code as a uniform array of vec4s, padded with 0."""
     return [tuple(map(float, vector)) for vector in filled_to_four(code, 0).reshape(-1, 4)]
+
+
+def _lens_of(camera: Camera) -> dict[str, object]:
+    """The uniforms of a camera."""
+    return {
+        "height": float(camera.height),
+        "lens": (camera.fl_x, camera.fl_y, camera.cx, camera.cy),
+        "axes": tuple(camera.camera_to_world[:3, :3].T.ravel()),
+        "eye": tuple(camera.camera_to_world[:3, 3]),
+    }
 
 
 def _frame_of(mapping: SpaceMapping | None) -> dict[str, object]:

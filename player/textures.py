@@ -146,8 +146,16 @@ def distances(occupied: np.ndarray) -> np.ndarray:
 def decoder_shape(decoder: AnyDecoder) -> dict[str, int]:
     """What march.glsl is told of it."""
     if isinstance(decoder, HybridDecoder):
-        return {"HYBRID": 1, "HIDDEN": -(-len(decoder.b1) // 4) * 4, "WIDTH": -(-len(decoder.v_bias) // 4) * 4}
-    return {"HYBRID": 0, "HIDDEN": len(decoder.b1) if decoder.w2.any() else 0}
+        hidden_4, width_4 = -(-len(decoder.b1) // 4), -(-len(decoder.v_bias) // 4)
+        return {"HYBRID": 1, "HIDDEN": 4 * hidden_4, "HIDDEN_4": hidden_4, "WIDTH": 4 * width_4, "WIDTH_4": width_4}
+    return {"HYBRID": 0, "HIDDEN": len(decoder.b1) if decoder.w2.any() else 0, "HIDDEN_4": 0, "WIDTH_4": 0}
+
+
+def planes_shape(layout: Layout) -> dict[str, int]:
+    """What march.glsl is told of the planes."""
+    layers = {f"LAYERS_{scale}": count for scale, count in enumerate(layout.layers)}
+    first = {f"FIRST_{scale}": number for scale, number in enumerate(layout.first_layers)}
+    return {"SCALES": layout.scales, "FEATURES": layout.features, "BASIS": 3 * layout.features} | layers | first
 
 
 def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[str, np.ndarray]:
@@ -192,14 +200,13 @@ def block_arrays(scene: Scene, layout: Layout) -> dict[str, np.ndarray]:
     """Where planes lie in an atlas, as march.glsl wants it: float32 (N, 4) and (N,), int32 (N,).
 
     Of each plane, blocks (3 x scales) as `Layout.place`, layer_widths the share of the atlas that a layer is wide; of each scale,
-    last_texels that of its unrefined planes along x, y and z, layers and first_layers.
+    last_texels that of its unrefined planes along x, y and z, and first_layers.
     """
     sizes = [(s["xy"].shape[1] - 1, s["xy"].shape[0] - 1, s["xz"].shape[0] - 1, 0) for s in scene.scales]
     return {
         "blocks": np.array([layout.place(block) for block in layout.blocks], np.float32),
         "layer_widths": np.array([block.width / layout.size[0] for block in layout.blocks], np.float32),
         "last_texels": np.array(sizes, np.float32),
-        "layers": np.array(layout.layers, np.int32),
         "first_layers": np.array(layout.first_layers, np.int32),
     }
 

@@ -388,7 +388,7 @@ class Player:
     def screenshot(self, path: Path) -> None:
         """Save the window, controls and all, at its full resolution."""
         self._begin(1 / 60)
-        self._picture(1.0, self.dial.resting)
+        self._still()
         panels.show(self)
         self.overlay.draw(self.canvas)
         write_image(path, self._pixels())
@@ -397,7 +397,7 @@ class Player:
     def _save_picture(self) -> None:
         """Write the picture without controls, under the first name that is free."""
         path = self.free_name(".png")
-        self._picture(1.0, self.dial.resting)
+        self._still()
         try:
             write_image(path, self._pixels())
             self.say(f"saved {path}")
@@ -510,7 +510,7 @@ class Player:
             self.ride_s = self.path.start_s + film.duration_s
             camera, self.playback.time = self.path.at(self.ride_s)
             self.view = View.of(self.rig, camera)
-            self._picture(1.0, self.dial.resting)
+            self._still()
             film.take(self._pixels())
 
     # --- the picture
@@ -545,13 +545,18 @@ class Player:
             self._drawn, self._moved, self._is_sharp, self._sharp_rows = wanted, now, False, 0
             self._picture(dial.pace.scale, dial.rung)
             self._is_paced = True
-            self._is_sharp = self.raster == self.canvas.size and dial.rung == dial.resting
+            drawn = self.renderer.quality
+            self._is_sharp = self.raster == self.canvas.size and dial.rung == dial.resting and not drawn.interlaced
         elif not self._is_sharp and now - self._moved > SHARPEN_AFTER_S:
             self._sharpen()
 
-    def _picture(self, scale: float, rung: str) -> None:
+    def _still(self) -> None:
+        """Draw the scene on the canvas as finely as a picture that stands still, at once."""
+        self._picture(1.0, self.dial.resting, still=True)
+
+    def _picture(self, scale: float, rung: str, still: bool = False) -> None:
         """Draw the scene on the canvas, at a share of its resolution."""
-        self._set_quality(rung)
+        self._set_quality(rung, still)
         if clock.monotonic() - self._measured > STATS_EVERY_S:
             self._measure()
         width, height = (max(1, round(side * scale)) for side in self.canvas.size)
@@ -560,7 +565,7 @@ class Player:
 
     def _sharpen(self) -> None:
         """Draw the next rows of the picture as finely as it is to be, from above, so many as do not keep the controls waiting."""
-        self._set_quality(self.dial.resting)
+        self._set_quality(self.dial.resting, still=True)
         width, height = self.canvas.size
         if self._sharp_rows == 0:
             whole_s = self.draw_s * width * height / (self.raster[0] * self.raster[1])
@@ -578,9 +583,11 @@ class Player:
         if self._sharp_rows == height:
             self._is_sharp, self.raster = True, (width, height)
 
-    def _set_quality(self, rung: str) -> None:
+    def _set_quality(self, rung: str, still: bool) -> None:
+        """That of a rung, but for what is set by hand; a picture that stands still owes nothing to the one before."""
         quality = LADDER[rung]
-        self.renderer.quality = replace(quality, folded=False) if self.exact else quality
+        folded, interlaced = quality.folded and not self.exact, quality.interlaced and not still
+        self.renderer.quality = replace(quality, folded=folded, interlaced=interlaced)
 
     def _show(self, target: moderngl.Framebuffer, camera: Camera) -> None:
         started = clock.monotonic()

@@ -47,7 +47,7 @@ def main(scene_file: str) -> None:
         player.frame()
 
     def canvas() -> np.ndarray:
-        player._picture(1.0, "reference")
+        player._picture(1.0, "reference", still=True)
         return player._pixels().astype(int)
 
     player.frame()
@@ -257,7 +257,7 @@ def come_to_rest(player: Player) -> None:
         player.frame()
         turns += 1
     fine = player._pixels().astype(int)
-    player._picture(1.0, player.dial.resting)
+    player._still()
     assert turns == player.canvas.height and np.abs(fine - player._pixels()).max() <= 1 < np.abs(fine - coarse).max()
     window_module.BAND_S, player.show_hud = band_s, True
 
