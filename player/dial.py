@@ -74,11 +74,11 @@ class Dial:
 
     def saw(self, seconds: float) -> None:
         """Take in how long a picture took, on `rung` and at the present scale."""
-        if self.target_s is None:
-            self.pace.saw(seconds)
-            return
         if self._skipped < UNSETTLED:
             self._skipped += 1
+            return
+        if self.target_s is None:
+            self.pace.saw(seconds)
             return
         if self.pace.scale < 1.0:  # on the fastest rung
             self.pace.saw(seconds, ROOM * self.target_s)

@@ -69,7 +69,7 @@ class Window:
         glfw.set_error_callback(self._complain)
         if not glfw.init():
             raise DisplayError(f"no window to be had ({self._complaint}); {REMEDY}")
-        self.handle = next(filter(None, (self._create(title, size, version) for version in OPENGL)), None)
+        self.handle: Any = next(filter(None, (self._create(title, size, version) for version in OPENGL)), None)
         if not self.handle:
             glfw.terminate()
             raise DisplayError(f"no window with OpenGL 3.3 to be had ({self._complaint}): {REMEDY}")
@@ -85,7 +85,7 @@ class Window:
         glfw.set_cursor_pos_callback(self.handle, self._moved)
         glfw.set_mouse_button_callback(self.handle, self._clicked)
         glfw.set_scroll_callback(self.handle, self._scrolled)
-        glfw.set_drop_callback(self.handle, self._drop)
+        glfw.set_drop_callback(self.handle, self._drop)  # type: ignore[arg-type]  # the stub means C's arguments
 
     def _create(self, title: str, size: tuple[int, int], version: tuple[int, int]) -> Any:
         hints = {
@@ -189,7 +189,8 @@ def _reset_status() -> Callable[[], int]:
     for name in ("glGetGraphicsResetStatus", "glGetGraphicsResetStatusARB"):
         address = glfw.get_proc_address(name)
         if address:
-            return ctypes.CFUNCTYPE(ctypes.c_uint)(address)
+            status = ctypes.cast(address, ctypes.CFUNCTYPE(ctypes.c_uint))
+            return lambda: int(status())
     return lambda: 0
 
 
@@ -520,7 +521,8 @@ class Player:
         self.ctx.screen.use()
         self.ctx.viewport = (0, 0, *pixels)
         self.screen = self.ctx.detect_framebuffer(0)
-        self.canvas = self.ctx.framebuffer([self.ctx.texture(pixels, 4)])
+        self._canvas_texture = self.ctx.texture(pixels, 4)
+        self.canvas = self.ctx.framebuffer([self._canvas_texture])
         red, green, blue = map(float, self.scene.background)
         self.canvas.clear(red, green, blue)
         self.raster = pixels
@@ -577,8 +579,8 @@ class Player:
         top = min(self._sharp_rows, height - rows)  # the last may overlap the one before
         camera = self.view.camera(width, height)
         self._show(self._band, replace(camera, height=rows, cy=camera.cy - top))
-        canvas = self.canvas.color_attachments[0]
-        canvas.write(self._band.read(components=4, alignment=1), viewport=(0, height - top - rows, width, rows), alignment=1)
+        pixels = self._band.read(components=4, alignment=1)
+        self._canvas_texture.write(pixels, viewport=(0, height - top - rows, width, rows), alignment=1)
         self._sharp_rows = top + rows
         if self._sharp_rows == height:
             self._is_sharp, self.raster = True, (width, height)

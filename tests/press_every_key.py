@@ -9,12 +9,14 @@ from pathlib import Path
 import glfw
 import numpy as np
 from imgui_bundle import imgui
-from pytest import approx
+from pytest import approx, raises
 
 from kpc.format.container import open_source
+from kpc.format.errors import DisplayError
 from kpc.format.media import read_image, read_video
 from kpc.player import kpplay, panels
 from kpc.player import window as window_module
+from kpc.player.dial import RUNGS
 from kpc.player.path import CameraPath
 from kpc.player.preferences import Preferences, place
 from kpc.player.quality import DEFAULT, climbed
@@ -25,6 +27,7 @@ from kpc.player.window import Player, Window
 
 
 def main(scene_file: str) -> None:
+    ask_for_less()
     window = Window("test", (320, 240))
     stream = Stream(open_source(scene_file))
     player = Player(window, stream, Preferences(text_size=0.9, speed=1.0))
@@ -125,6 +128,7 @@ def main(scene_file: str) -> None:
     follow_a_path(player, press)
     see_every_pixel_once(window, player)
     come_to_rest(player)
+    run_out_of_room(player)
     drop_files(window, player, Path(scene_file))
 
     press(glfw.KEY_H, glfw.KEY_P)
@@ -143,6 +147,30 @@ def main(scene_file: str) -> None:
     window.close()
     lose_the_card(scene_file)
     remember(scene_file)
+
+
+def ask_for_less() -> None:
+    """Where there is no OpenGL 4.3, as on macOS, 3.3 is asked for; where there is neither, that is told."""
+    create = glfw.create_window
+    asked: list[object] = []
+
+    def none_above(most: int) -> Callable[..., object]:
+        def attempt(*arguments: object) -> object:
+            asked.append(arguments)
+            return create(*arguments) if len(asked) > most else None
+
+        return attempt
+
+    glfw.create_window = none_above(1)
+    window = Window("test", (64, 64))
+    assert len(asked) == 2 and window.ctx.version_code >= 330
+    window.close()
+    window.close()
+    asked.clear()
+    glfw.create_window = none_above(2)
+    with raises(DisplayError, match="kprender"):
+        Window("test", (64, 64))
+    glfw.create_window = create
 
 
 def follow_a_path(player: Player, press: Callable[..., None]) -> None:
@@ -260,6 +288,28 @@ def come_to_rest(player: Player) -> None:
     player._still()
     assert turns == player.canvas.height and np.abs(fine - player._pixels()).max() <= 1 < np.abs(fine - coarse).max()
     window_module.BAND_S, player.show_hud = band_s, True
+
+
+def run_out_of_room(player: Player) -> None:
+    """What the card refuses is told, and drawn more coarsely; what it refuses again and again ends the player."""
+    show, rung = player.renderer.show, player.dial.rung
+
+    def refuse(*_: object, **__: object) -> None:
+        raise DisplayError("no room for a picture")
+
+    player.renderer.show = refuse  # type: ignore[method-assign]
+    for _ in range(window_module.MOST_MISHAPS):
+        player.look_from(player.view.orbit(0.1, 0.0))
+        player.frame()
+        assert player.notice_is_error and "no room" in player.notice
+    assert RUNGS.index(player.dial.rung) < RUNGS.index(rung)
+    player.look_from(player.view.orbit(0.1, 0.0))
+    with raises(DisplayError, match="no room"):
+        player.frame()
+    imgui.end_frame()
+    player.renderer.show, player._mishaps = show, 0  # type: ignore[method-assign]
+    player.dial.choose(rung)
+    player.frame()
 
 
 def drop_files(window: Window, player: Player, scene_file: Path) -> None:
