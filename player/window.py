@@ -1,10 +1,11 @@
 """The player's window: glfw for events, ImGui for controls (`kpc.player.panels`), the renderer for the picture."""
 
+import contextlib
 import ctypes
 import math
 import re
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -368,9 +369,19 @@ class Player:
         names = (self.folder / f"{self.stem}-{n:03d}{suffix}" for n in range(1, 1_000_000))
         return next(path for path in names if not path.exists()).absolute()
 
+    @contextlib.contextmanager
+    def _told(self, what: object) -> Iterator[None]:
+        """What goes wrong with `what` is shown, and the player goes on."""
+        try:
+            yield
+        except KpcError as error:
+            self.complain(str(error))
+        except OSError as error:
+            self.complain(f"{what}: {error.strerror or error}")
+
     def open(self, file: str) -> None:
         """A camera path, or another scene, which follows this one."""
-        try:
+        with self._told(file):
             if file.lower().endswith(".json"):
                 self.path, self.ride_s, self.show_path = CameraPath.load(file), 0.0, True
                 self.say(f"{len(self.path.keyframes)} keyframes from {file}; J follows them")
@@ -381,10 +392,6 @@ class Player:
             except BaseException:
                 stream.close()
                 raise
-        except KpcError as error:
-            self.complain(str(error))
-        except OSError as error:
-            self.complain(f"{file}: {error.strerror or error}")
 
     def screenshot(self, path: Path) -> None:
         """Save the window, controls and all, at its full resolution."""
@@ -397,25 +404,21 @@ class Player:
 
     def _save_picture(self) -> None:
         """Write the picture without controls, under the first name that is free."""
-        path = self.free_name(".png")
         self._still()
-        try:
+        with self._told(self.folder.absolute()):
+            path = self.free_name(".png")
             write_image(path, self._pixels())
             self.say(f"saved {path}")
-        except OSError as error:
-            self.complain(f"{path}: {error.strerror or error}")
 
     def save_path(self) -> None:
         """Write the camera path, under the first name that is free."""
-        path = self.free_name("-path.json")
         if not self.path.keyframes:
             self.complain("there is no camera path yet; K makes a keyframe")
             return
-        try:
+        with self._told(self.folder.absolute()):
+            path = self.free_name("-path.json")
             self.path.save(path)
             self.say(f"saved {path}; kprender --path makes a video of it")
-        except OSError as error:
-            self.complain(f"{path}: {error.strerror or error}")
 
     # --- the camera path, and films
 
@@ -468,10 +471,11 @@ class Player:
         if along_path and not self.path.keyframes:
             self.complain("there is no camera path yet; K makes a keyframe")
             return
-        self.film = Recording(self.free_name(".mp4"), FILM_FPS, self.canvas.size)
-        self._filming_path, self._filming_since = along_path, clock.monotonic()
-        if along_path:
-            self.riding, self.playback.playing, self.ride_s = True, False, self.path.start_s
+        with self._told(self.folder.absolute()):
+            self.film = Recording(self.free_name(".mp4"), FILM_FPS, self.canvas.size)
+            self._filming_path, self._filming_since = along_path, clock.monotonic()
+            if along_path:
+                self.riding, self.playback.playing, self.ride_s = True, False, self.path.start_s
 
     @property
     def is_filming_path(self) -> bool:
