@@ -281,6 +281,7 @@ class Renderer:
             before = None
         # One picture of half the width, and two whole ones that take turns, one for each parity.
         half = self._target(part, (-(-size[0] // 2), size[1]), 2)
+        half.seen.filter = half.met.filter = moderngl.NEAREST, moderngl.NEAREST
         parity = 0 if before is None else 1 - before.parity
         for turn in (parity,) if before is not None else (1, 0):
             _set(march, parity=float(turn))
@@ -290,7 +291,8 @@ class Renderer:
         return self._target(part, size, parity)
 
     def _weave(self, half: Target, old: Target, new: Target, shot: Shot, before: Shot | None, parity: int) -> None:
-        weave, vertices = self._program("weave.glsl", self.layout)
+        still = before is None or _lens_of(before.camera) == _lens_of(shot.camera)
+        weave, vertices = self._program("weave.glsl", self.layout, still=still)
         _set(
             weave,
             seen_now=SEEN_UNIT, met_now=MET_UNIT, seen_before=SEEN_BEFORE_UNIT, met_before=MET_BEFORE_UNIT,
@@ -344,10 +346,10 @@ class Renderer:
 
     def _program(
         self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
-        shared: int = 0, interlaced: bool = False,
+        shared: int = 0, interlaced: bool = False, still: bool = False,
     ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
-        key = name, layout.refined, rows, displaced, drawn, shared, interlaced
+        key = name, layout.refined, rows, displaced, drawn, shared, interlaced, still
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
@@ -365,6 +367,7 @@ class Renderer:
                 "MOTION": int(displaced),
                 "SHARED": shared,
                 "INTERLACED": int(interlaced),
+                "STILL": int(still),
             },
             {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))},
         )

@@ -3,6 +3,8 @@
 // The others are what was there before, seen from where the camera was then, changed as much as their four neighbours have
 // changed since, all of which were marched now. Where those have changed much, something came or went: then they are kept
 // within what the neighbours show.
+//
+// STILL: 1 where the camera is where it was.
 
 #include "ray.glsl"
 
@@ -25,7 +27,7 @@ uniform vec3 eye_before;
 layout(location = 0) out vec4 seen;
 layout(location = 1) out vec4 met;
 
-const float STILL = 1.0 / 64.0, CHANGED = 1.0 / 8.0;
+const float LITTLE = 1.0 / 64.0, MUCH = 1.0 / 8.0;
 const float NOWHERE = 1e6;  // how far away nothing is, in distances of the eye from where it was before
 
 vec2 in_half(vec2 pixel) {
@@ -34,8 +36,12 @@ vec2 in_half(vec2 pixel) {
 
 // What was seen before at the place that is now at the middle of `pixel`, `depth` away.
 vec4 before_at(vec2 pixel, float depth) {
+#if STILL
+    return texelFetch(seen_before, ivec2(clamp(pixel, vec2(0.0), size - 1.0)), 0);
+#else
     vec3 p = eye + depth * camera_direction(pixel + 0.5, height, lens, axes);
     return textureLod(seen_before, on_raster(p, height, lens_before, axes_before, eye_before) / size, 0.0);
+#endif
 }
 
 void main() {
@@ -63,7 +69,7 @@ void main() {
     most = max(most, max(max(abs(difference.r), abs(difference.g)), max(abs(difference.b), abs(difference.a))));
 #end
     vec4 follows = before_at(pixel, sum.a > 0.0 ? sum_met.x / sum.a : NOWHERE) + change;
-    follows = mix(follows, clamp(follows, low, high), smoothstep(STILL, CHANGED, most));
+    follows = mix(follows, clamp(follows, low, high), smoothstep(LITTLE, MUCH, most));
     vec2 here = (pixel + 0.5) / size;
     seen = marched ? own : afresh ? textureLod(seen_before, here, 0.0) : clamp(follows, 0.0, 1.0);
     // Sum of weight t: at the mean depth of the neighbours.
