@@ -142,7 +142,10 @@ def main(scene_file: str) -> None:
     kept = player.preferences()
     assert kept == Preferences((200, 260), DEFAULT, None, 2.0, False, False, True, True, player.text_size)
     player.run()
-    player.close()
+    press(glfw.KEY_O)
+    player.run(1)
+    told = player.close()  # a film that is being written is finished
+    assert told is not None and told.startswith("saved ") and len(list(read_video(player.film.path))) >= 1
     stream.close()
     window.close()
     lose_the_card(scene_file)

@@ -78,6 +78,7 @@ def measure(job: Steady) -> dict[str, Any]:
             "last_bytes": held[-1],
             "most_bytes": max(held),
             "bytes_per_1000_frames": 1000 * slope,
+            "held_bytes": held,
             "made_on_card": sum(made.values()),
             "made": dict(made),
             "gpu_memory_bytes": player.renderer.memory_bytes,
