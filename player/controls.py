@@ -1,7 +1,7 @@
 """The mathematics of looking around and of playing: no window, no OpenGL."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -183,27 +183,90 @@ class Wardrobe:
 class Pace:
     """How finely to draw so that pictures come in time: the side of the drawn raster over that of the window.
 
+    A picture takes a + b scale^2 seconds. Both are fitted to a mean time of each raster tried, and, with less weight, to one of no
+    pixels that takes no time: so a is 0 until several sizes say otherwise. When a raster takes longer than it did, all do. What is
+    known of a raster is forgotten when it has not been drawn for OLD pictures; all is, when times are EXCEPTION times what was
+    expected, or as many times less, for AGREED pictures on end.
+
     Attributes:
-        budget_s: seconds a picture may take. scale: in [LEAST, 1].
+        budget_s: seconds a picture may take.
+        scale: in [LEAST, 1], a power of STEP: the card is asked for few different rasters, and keeps them.
     """
 
-    LEAST = 0.125
-    SLACK = 0.15
+    STEP = 2**0.25
+    LEAST = STEP**-12
+    SLACK = 0.5
+    """Steps that the raster may be too large before it shrinks. It grows by one, after UP_AFTER pictures that left room for it."""
+    UP_AFTER = 3
+    MOST_DOWN = 3
+    """Steps after one picture."""
+    FRESH = 0.25
+    """Share of the last picture in the mean time of its raster."""
+    AT_NOTHING = 0.5
+    """Weight of the raster of no pixels."""
+    EXCEPTION = 4.0
+    """A picture that takes so many times as long as the last counts as if it took no longer than that."""
+    AGREED = 4
+    OLD = 600
 
     budget_s: float
     scale: float = 1.0
+    _times: dict[int, float] = field(default_factory=dict, repr=False)
+    """By steps down from the whole raster."""
+    _drawn: dict[int, int] = field(default_factory=dict, repr=False)
+    """The number of the last picture on it."""
+    _number: int = field(default=0, repr=False)
+    _spare: int = field(default=0, repr=False)
+    """Pictures on end that left room for a finer raster."""
+    _odd: int = field(default=0, repr=False)
+    """Pictures on end that took a time of another order."""
 
     @staticmethod
     def of(software: bool) -> "Pace":
         """For a processor that stands in for a graphics card, or for one: the first picture comes soon, if coarsely."""
-        return Pace(1 / 15, 0.25) if software else Pace(1 / 50)
+        return Pace(1 / 15, Pace.STEP**-8) if software else Pace(1 / 50)
 
     def saw(self, seconds: float, budget_s: float | None = None) -> None:
-        """Take in how long a picture took at the present scale, and may take; the time is in proportion to its pixels."""
-        wanted = min(max(self.scale * math.sqrt((budget_s or self.budget_s) / max(seconds, 1e-6)), self.LEAST), 1.0)
-        if abs(wanted - self.scale) > self.SLACK * self.scale or wanted == 1.0:
-            self.scale += (wanted - self.scale) * (0.7 if wanted < self.scale else 0.3)
-            self.scale = 1.0 if self.scale > 0.97 else self.scale
+        """Take in how long a picture took at the present scale, and may take."""
+        steps, budget = -round(math.log(self.scale, self.STEP)), budget_s or self.budget_s
+        self._take_in(steps, max(seconds, 1e-6))
+        fixed, growing = self._fit()
+        # where what no raster changes takes most of the time, a coarser one does more harm than good
+        wanted = -math.log(max(budget - fixed, 0.5 * fixed) / growing, self.STEP) / 2
+        self._spare = self._spare + 1 if wanted <= steps - 1 else 0
+        if self._spare == self.UP_AFTER:
+            steps, self._spare = steps - 1, 0
+        elif wanted > steps + self.SLACK:
+            steps = min(math.ceil(wanted), steps + self.MOST_DOWN)
+        self.scale = min(max(self.STEP**-steps, self.LEAST), 1.0)
+
+    def forget(self) -> None:
+        """What follows has nothing to do with what was."""
+        self._times, self._drawn, self._odd = {}, {}, 0
+
+    def _take_in(self, steps: int, seconds: float) -> None:
+        if self._times:
+            fixed, growing = self._fit()
+            ratio = seconds / (fixed + growing * self.scale**2)
+            self._odd = 0 if 1 / self.EXCEPTION < ratio < self.EXCEPTION else self._odd + 1
+        if self._odd == self.AGREED:
+            self.forget()
+        self._number += 1
+        self._drawn[steps] = self._number
+        before = self._times.setdefault(steps, seconds)
+        changed = 1.0 + self.FRESH * (min(seconds / before, self.EXCEPTION) - 1.0)
+        known = (step for step, number in self._drawn.items() if self._number - number < self.OLD)
+        self._times = {step: changed * self._times[step] for step in known}
+        self._drawn = {step: self._drawn[step] for step in self._times}
+
+    def _fit(self) -> tuple[float, float]:
+        """(a, b), neither negative, by least squares."""
+        x = np.array([self.STEP ** (-2 * steps) for steps in self._times])
+        y = np.array(list(self._times.values()))
+        n, xx, xy = len(x) + self.AT_NOTHING, x @ x, x @ y
+        growing = (n * xy - x.sum() * y.sum()) / (n * xx - x.sum() ** 2)
+        fixed = (y.sum() - growing * x.sum()) / n
+        return (0.0, xy / xx) if fixed < 0.0 else (fixed, max(growing, 1e-9))
 
 
 def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:

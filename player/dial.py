@@ -56,24 +56,31 @@ class Dial:
         """Set it by hand, which ends its moving by itself."""
         self.chosen = self.rung = rung
         self.target_s = None
+        self.pace.forget()
         self._restart()
 
     def hold(self, fps: float | None) -> None:
-        """Move by itself from now on, for so many pictures a second; None: stay on the rung it is on."""
+        """Move by itself from now on, for so many pictures a second; None: stay on the rung it is on.
+
+        Where the raster is coarse, it begins from the fastest rung: no other is drawn on any but a whole raster then.
+        """
         if fps is None:
             self.chosen = self.rung
+        elif self.pace.scale < 1.0:
+            self.rung = RUNGS[0]
+        self.pace.forget()
         self.target_s = None if fps is None else 1.0 / fps
         self._restart()
 
     def saw(self, seconds: float) -> None:
         """Take in how long a picture took, on `rung` and at the present scale."""
-        if self.target_s is None:
-            self.pace.saw(seconds)
-            return
         if self._skipped < UNSETTLED:
             self._skipped += 1
             return
-        if self.pace.scale < 1.0:  # nothing is finer than a whole raster on the fastest rung
+        if self.target_s is None:
+            self.pace.saw(seconds)
+            return
+        if self.pace.scale < 1.0:  # on the fastest rung
             self.pace.saw(seconds, ROOM * self.target_s)
             return
         self._seen.append(seconds)

@@ -78,7 +78,8 @@ def _parser() -> argparse.ArgumentParser:
         "--quality", choices=list(LADDER), help="how finely to draw (default: as it was; else what the device is up to)"
     )
     parser.add_argument(
-        "--target-fps", type=_rate, metavar="F", help="hold so many frames a second by moving the quality (default: as it was; else do not)"
+        "--target-fps", type=_rate, metavar="F",
+        help="hold so many frames a second by moving the quality (default: as it was; else do not)",
     )
     parser.add_argument("--path", metavar="JSON", help="a camera path, as saved before, for J to follow")
     parser.add_argument(

@@ -91,7 +91,7 @@ def _sways(azimuth: np.ndarray, elevation: np.ndarray) -> tuple[tuple[float, flo
 def presets(scene: Scene) -> dict[str, Camera]:
     """Places to look from, by name, all towards what the scene's cameras look at.
 
-    Cameras all around: its sides, and from above. Cameras on one side: the ends of the angles that were seen. All scenes: near, far.
+    Cameras all around: its sides, and from above. Cameras on one side: the ends of the angles that were seen. Always: near, far.
     """
     rig = Rig.of(scene)
     azimuth, elevation, distance = rig.angles()

@@ -289,7 +289,7 @@ def _graphs(player: "Player", top: float) -> float:
 def _camera_path(player: "Player", top: float, bottom: float) -> None:
     """On the right, below `top`: the keyframes, and what can be done with them."""
     em, width, path = imgui.get_font_size(), player.window.size[0], player.path
-    _place(width - 0.8 * em, top, 1.0, 0.0, most_height=bottom - top)
+    _place(width - 0.8 * em, top, 1.0, 0.0, most_height=bottom - top, least_width=PANEL_EM * em)
     with _panel("path", scrolls=True):
         if imgui.button("keyframe"):
             player.add_keyframe()
@@ -414,10 +414,12 @@ def _toggle(label: str, on: bool) -> bool:
     return on != pressed
 
 
-def _place(x: float, y: float, pivot_x: float = 0.0, pivot_y: float = 0.0, most_height: float | None = None) -> None:
+def _place(
+    x: float, y: float, pivot_x: float = 0.0, pivot_y: float = 0.0, most_height: float | None = None, least_width: float = 0.0
+) -> None:
     imgui.set_next_window_pos(imgui.ImVec2(x, y), imgui.Cond_.always, imgui.ImVec2(pivot_x, pivot_y))
     if most_height is not None:
-        imgui.set_next_window_size_constraints(imgui.ImVec2(0, 0), imgui.ImVec2(1e5, max(most_height, 1.0)))
+        imgui.set_next_window_size_constraints(imgui.ImVec2(least_width, 0), imgui.ImVec2(1e5, max(most_height, 1.0)))
 
 
 def _say(name: str, text: str, width: float, y: float, pivot: float, colour: imgui.ImVec4 | None = None) -> None:

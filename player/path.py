@@ -24,9 +24,9 @@ class CameraPath:
     """A way through keyframes, which it passes exactly.
 
     Between two it is cubic in seconds, with one velocity at each keyframe (Catmull and Rom's, for gaps of any length): the eye; the
-    quaternion, made a unit vector again; logarithms of focal lengths; the principal point. The clip only runs forwards: to a keyframe
-    of an earlier time it goes through the clip's end, as when it loops; between keyframes neither too far nor back (Fritsch and
-    Butland's slopes).
+    quaternion, made a unit vector again; logarithms of focal lengths; the principal point. The clip only runs forwards: to a
+    keyframe of an earlier time it goes through the clip's end, as when it loops; between keyframes neither too far nor back
+    (Fritsch and Butland's slopes).
 
     Attributes:
         keyframes: Shots whose `at_s` begins anywhere and grows from one to the next; those without are GAP_S apart. All have the
@@ -44,12 +44,13 @@ class CameraPath:
             before = shots[-1].at_s if shots else None
             at_s = shot.at_s if shot.at_s is not None else 0.0 if before is None else before + GAP_S
             if not 0.0 <= at_s <= LONGEST_S or (before is not None and at_s <= before):
-                raise DatasetError(f"keyframe {len(shots) + 1} of the camera path is at {at_s:g} s, which does not follow {before} s")
+                after = "lies outside a day" if before is None else f"does not follow {before:g} s within a day"
+                raise DatasetError(f"keyframe {len(shots) + 1} of the camera path is at {at_s:g} s, which {after}")
             shots.append(replace(shot, at_s=at_s))
         for number, shot in enumerate(shots, 1):
             axes = shot.camera.camera_to_world[:3, :3]
             if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3 or np.linalg.det(axes) < 0:
-                raise DatasetError(f"keyframe {number} of the camera path: its pose is no turn and shift, but scaled, skewed or mirrored")
+                raise DatasetError(f"keyframe {number} of the camera path: its pose is scaled, skewed or mirrored; turn and shift only")
         object.__setattr__(self, "keyframes", tuple(shots))
 
     @staticmethod
@@ -121,7 +122,7 @@ class CameraPath:
 
     @cached_property
     def _values(self) -> np.ndarray:
-        """(N, 12): eye, quaternion, log focal lengths, principal point, the clip's time, and 1 more for each time it has begun again."""
+        """(N, 12): eye, quaternion, log focal lengths, principal point, the clip's time and 1 for each time it has begun anew."""
         first = self.keyframes[0].camera
         cameras = [shot.camera.resized(first.width, first.height) for shot in self.keyframes]
         turns = np.stack([quaternion_of(camera.camera_to_world[:3, :3]) for camera in cameras])
@@ -139,8 +140,8 @@ class CameraPath:
         slopes = np.diff(self._values, axis=0) / gaps
         a, b, before, after = slopes[:-1], slopes[1:], gaps[:-1], gaps[1:]
         inner = (a * after + b * before) / (before + after)
-        even = np.where(a * b > 0, 3 * (before + after) * a * b / _nonzero((2 * after + before) * b + (after + 2 * before) * a), 0.0)
-        inner[:, 11] = even[:, 11]
+        weighted = _nonzero((2 * after + before) * b + (after + 2 * before) * a)
+        inner[:, 11] = np.where(a * b > 0, 3 * (before + after) * a * b / weighted, 0.0)[:, 11]
         return np.concatenate([slopes[:1], inner, slopes[-1:]])
 
 

@@ -1,9 +1,11 @@
 """Rendering with OpenGL 3.3: a scene becomes textures once, then each picture is one pass of `glsl/march.glsl`."""
 
 import contextlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -11,18 +13,23 @@ import numpy as np
 from kpc.format.cameras import Camera
 from kpc.format.errors import DisplayError
 from kpc.format.grid import linear
-from kpc.format.scene import Scene
+from kpc.format.scene import SPACE_PLANES, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, slot_at
-from kpc.player.textures import FOLDED_AXIS, Layout, Rows, decoder_arrays, decoder_shape, distances, filled_to_four
+from kpc.player.textures import (
+    FOLDED_AXIS, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four, planes_shape,
+)
 
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
 PLANES_UNIT, ROWS_UNIT, CELLS_UNIT, MOTION_UNIT = 0, 1, 2, 3
 SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
-TARGETS_KEPT = 4
+SEEN_BEFORE_UNIT, MET_BEFORE_UNIT = 2, 3
+TARGETS_KEPT = 8
+FOLLOWS_S = 0.2
+"""A picture so much later in the clip than the one before has too little in common with it to follow it."""
 CONSTANTS = 8192
 """vec4s of decoder weights that a shader may hold, ten times what the largest preset needs; compilers choke on more."""
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
@@ -35,6 +42,15 @@ class Look(Enum):
     DEPTH = 2
     SAMPLES = 3
     OCCUPANCY = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """An interlaced picture: from where, when, and which half of its pixels was marched, those with x + y + parity even."""
+
+    camera: Camera
+    time: float
+    parity: int = 0
 
 
 @dataclass
@@ -91,11 +107,7 @@ class Renderer:
         self.quality = quality
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
-        if max(self.layout.size) > most:
-            raise DisplayError(
-                "the planes need a texture of {}x{}, ".format(*self.layout.size)
-                + f"{ctx.info['GL_RENDERER']} takes {most}; kprender --backend reference"
-            )
+        _refuse_too_large(scene, self.layout, ctx.info)
         finer = Layout.of(scene, REFINED)
         self.folded_layout = finer if max(finer.size) <= most else self.layout
         with room_on(ctx, "the scene"):
@@ -125,7 +137,9 @@ class Renderer:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
         self._slot: int | None = None
         self._programs: dict[tuple[object, ...], tuple[moderngl.Program, moderngl.VertexArray]] = {}
-        self._targets: dict[tuple[Part, tuple[int, int]], Target] = {}
+        self._targets: dict[tuple[Part, tuple[int, int], int], Target] = {}
+        self._shots: dict[tuple[Part, tuple[int, int]], Shot] = {}
+        """The last interlaced picture of each size."""
         self.check()
 
     def check(self) -> None:
@@ -229,6 +243,8 @@ class Renderer:
         `part` is FULL or STATIC. `program` is march.glsl or another that takes a subset of its uniforms. `appearance` as in
         `reference.code_of`.
         """
+        if not 0.0 <= time <= 1.0:
+            raise ValueError(f"time {time} lies outside [0, 1]")
         moving = part is Part.FULL and self._rows is not None
         quality, scene, size = self.quality, self.scene, (camera.width, camera.height)
         if quality.resolution < 1:
@@ -238,30 +254,78 @@ class Renderer:
         if moving:
             self._cut(time)
         planes = self._fold(time) if folded else self._planes
-        target = self._target(part, (camera.width, camera.height))
+        raster = (camera.width, camera.height)
+        interlaced = quality.interlaced and program == "march.glsl"
         displaced = moving and self._motion_texture is not None
         layout = self.folded_layout if folded else self.layout
         drawn = min(quality.scales or layout.scales, layout.scales)
-        march, vertices = self._program(program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn)
+        shared = 0 if isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
+        march, vertices = self._program(program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared,
+                                        interlaced=interlaced)
         stride = scene.step * quality.step
         _set(
             march,
             stride=stride,
             tau=stride / scene.extent,
             termination=quality.termination,
-            height=float(camera.height),
-            lens=(camera.fl_x, camera.fl_y, camera.cx, camera.cy),
-            axes=tuple(camera.camera_to_world[:3, :3].T.ravel()),
-            eye=tuple(camera.camera_to_world[:3, 3]),
+            **_lens_of(camera),
             appearance=_vectors(code_of(self.scene, appearance)),
         )
-        planes.use(PLANES_UNIT)
-        self._row_texture.use(ROWS_UNIT)
-        if self._motion_texture is not None:
-            self._motion_texture.use(MOTION_UNIT)
-        self._cells.use(CELLS_UNIT)
-        self._draw(target.framebuffer, vertices)
-        return target if target.seen.size == size else self._upscaled(target, self._target(part, size))
+        def draw(target: Target) -> None:
+            planes.use(PLANES_UNIT)
+            self._row_texture.use(ROWS_UNIT)
+            if self._motion_texture is not None:
+                self._motion_texture.use(MOTION_UNIT)
+            self._cells.use(CELLS_UNIT)
+            self._draw(target.framebuffer, vertices)
+
+        if interlaced:
+            target = self._woven(march, draw, Shot(camera, time), part)
+        else:
+            target = self._target(part, raster)
+            draw(target)
+        return target if raster == size else self._upscaled(target, self._target(part, size))
+
+    def _woven(self, march: moderngl.Program, draw: Callable[[Target], None], shot: Shot, part: Part) -> Target:
+        """Draw half of the pixels, and let the rest follow the picture before; draw all of them where there is none."""
+        size = shot.camera.width, shot.camera.height
+        before = self._shots.pop((part, size), None)
+        if before is not None and abs(shot.time - before.time) * self.scene.clip.duration_s > FOLLOWS_S:
+            before = None
+        # One picture of half the width, and two whole ones that take turns, one for each parity.
+        half = self._target(part, (-(-size[0] // 2), size[1]), 2)
+        half.seen.filter = half.met.filter = moderngl.NEAREST, moderngl.NEAREST
+        parity = 0 if before is None else 1 - before.parity
+        for turn in (parity,) if before is not None else (1, 0):
+            _set(march, parity=float(turn))
+            draw(half)
+            self._weave(half, self._target(part, size, 1 - turn), self._target(part, size, turn), shot, before, turn)
+        self._shots[part, size] = replace(shot, parity=parity)
+        return self._target(part, size, parity)
+
+    def _weave(self, half: Target, old: Target, new: Target, shot: Shot, before: Shot | None, parity: int) -> None:
+        still = before is None or _lens_of(before.camera) == _lens_of(shot.camera)
+        weave, vertices = self._program("weave.glsl", self.layout, still=still)
+        _set(
+            weave,
+            seen_now=SEEN_UNIT, met_now=MET_UNIT, seen_before=SEEN_BEFORE_UNIT, met_before=MET_BEFORE_UNIT,
+            size=tuple(map(float, new.seen.size)),
+            parity=float(parity),
+            afresh=before is None,
+            **_lens_of(shot.camera),
+            **{f"{name}_before": value for name, value in _lens_of((before or shot).camera).items()},
+        )  # fmt: skip
+        half.seen.use(SEEN_UNIT)
+        half.met.use(MET_UNIT)
+        old.seen.use(SEEN_BEFORE_UNIT)
+        old.met.use(MET_BEFORE_UNIT)
+        self._draw(new.framebuffer, vertices)
+
+    def _scales_shared(self) -> int:
+        """How many scales, from the coarsest on, have texels that are long enough for two samples to share a look-up."""
+        step = self.quality.step * self.scene.step / self.scene.extent
+        finest = [max(size - 1 for plane in SPACE_PLANES for size in scale[plane].shape[:2]) for scale in self.scene.scales]
+        return sum(1 / texels >= self.quality.share * step for texels in finest)
 
     def _upscaled(self, small: Target, target: Target) -> Target:
         upscale, vertices = self._program("upscale.glsl", self.layout)
@@ -282,19 +346,23 @@ class Renderer:
         framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
         vertices.render(moderngl.TRIANGLES, vertices=3)
 
-    def _target(self, part: Part, size: tuple[int, int]) -> Target:
+    def _target(self, part: Part, size: tuple[int, int], number: int = 0) -> Target:
         """A target of this size; the few last used are kept."""
-        target = self._targets.pop((part, size), None) or Target.of(self.ctx, size)
-        self._targets[part, size] = target
+        key = part, size, number
+        target = self._targets.pop(key, None) or Target.of(self.ctx, size)
+        self._targets[key] = target
         if len(self._targets) > TARGETS_KEPT:
-            self._targets.pop(next(iter(self._targets))).release()
+            dropped = next(iter(self._targets))
+            self._targets.pop(dropped).release()
+            self._shots.pop(dropped[:2], None)
         return target
 
     def _program(
-        self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0
+        self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
+        shared: int = 0, interlaced: bool = False, still: bool = False,
     ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
-        key = name, layout.refined, rows, displaced, drawn
+        key = name, layout.refined, rows, displaced, drawn, shared, interlaced, still
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
@@ -302,8 +370,7 @@ class Renderer:
             self.ctx,
             name,
             {
-                "SCALES": layout.scales,
-                "LAYERS": layout.layers,
+                **planes_shape(layout),
                 **decoder_shape(scene.decoder),
                 "ROWS": int(rows),
                 "DRAWN": drawn,
@@ -311,11 +378,12 @@ class Renderer:
                 "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
                 "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
                 "MOTION": int(displaced),
-                "REFINED": layout.refined,
+                "SHARED": shared,
+                "INTERLACED": int(interlaced),
+                "STILL": int(still),
             },
-            {"decoder_weights": self._decoder},
+            {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))},
         )
-        sizes = [(s["xy"].shape[1], s["xy"].shape[0], s["xz"].shape[0]) for s in scene.scales]
         _set(
             program,
             planes=PLANES_UNIT,
@@ -323,11 +391,8 @@ class Renderer:
             cells=CELLS_UNIT,
             motion=MOTION_UNIT,
             nodes=(1.0, 1.0, 1.0) if self._motion_texture is None else tuple(map(float, self._motion_texture.size)),
-            planes_texel=(1 / layout.size[0], 1 / layout.size[1]),
             rows_texel=(1 / self._row_texture.width, 1 / self._row_texture.height),
-            blocks=[(block.x, block.y, block.width) for block in layout.blocks],
-            resolution=sizes if len(sizes) > 1 else sizes[0],
-            cell_count=scene.occupancy.shape[:0:-1],
+            cell_count=tuple(map(float, scene.occupancy.shape[:0:-1])),
             box_low=tuple(scene.aabb[0]),
             box_high=tuple(scene.aabb[1]),
             background=tuple(scene.background),
@@ -364,23 +429,44 @@ class Renderer:
             for source, block in zip(self.layout.blocks, self.folded_layout.blocks):
                 axis = FOLDED_AXIS[block.plane]
                 upright = axis == block.plane[1]
-                finest = 1 / self.folded_layout.refined
+                layers = self.layout.layers[block.scale]
                 _set(
                     fold,
-                    source=(source.x, source.y),
-                    source_width=source.width,
+                    source=self.layout.place(source),
+                    source_width=source.width / self.layout.size[0],
                     origin=(block.x, block.y),
                     width=block.width,
-                    shrink=(1.0, finest) if upright else (finest, 1.0),
+                    at_texel=(1 / max(block.width - 1, 1), 1 / max(block.height - 1, 1)),
+                    row_texel=1 / self.folded_layout.refined,
                     upright=upright,
-                    axis="xyz".index(axis),
-                    scale=block.scale,
+                    line=self.layout.first_row("xyz".index(axis), block.scale),
                 )
-                self._draw(
-                    self._fold_into, vertices, (block.x, block.y, self.layout.layers * block.width, block.height)
-                )
+                self._draw(self._fold_into, vertices, (block.x, block.y, layers * block.width, block.height))
             self._folded_time = time
         return self._folded_planes
+
+
+def _refuse_too_large(scene: Scene, layout: Layout, card: Mapping[str, Any]) -> None:
+    """Raise a DisplayError that names what of the scene is larger than the card's textures may be."""
+    flat, deep = card["GL_MAX_TEXTURE_SIZE"], card["GL_MAX_3D_TEXTURE_SIZE"]
+    planes = {
+        f"plane {name} of scale {number + 1}": (-(-scale[name].shape[2] // 4) * scale[name].shape[1], scale[name].shape[0])
+        for number, scale in enumerate(scene.scales)
+        for name in scale
+        if name in SPACE_PLANES
+    }
+    largest = max(planes, key=lambda name: math.prod(planes[name]))
+    needs = {name: (size, flat) for name, size in planes.items()}
+    needs[f"all planes, of which {largest} is the largest,"] = layout.size, flat
+    needs["the occupancy grid"] = scene.occupancy.shape[:0:-1], deep
+    if scene.motion is not None:
+        needs["the motion grid"] = scene.motion.shape[3:0:-1], deep
+    for what, (size, most) in needs.items():
+        if max(size) > most:
+            raise DisplayError(
+                f"{what} needs a texture of {'x'.join(map(str, size))}, {card['GL_RENDERER']} takes {most} a side; "
+                "kprender --backend reference"
+            )
 
 
 def _texture(ctx: moderngl.Context, size: tuple[int, int]) -> moderngl.Texture:
@@ -396,17 +482,28 @@ def _texture(ctx: moderngl.Context, size: tuple[int, int]) -> moderngl.Texture:
 
 
 def _set(program: moderngl.Program, **values: object) -> None:
-    """Set the uniforms that a program has; compilers drop those it does not use."""
+    """Set the uniforms that a program has; compilers drop those it does not use, and the unused ends of arrays."""
     for name, value in values.items():
         member = program.get(name, None)
         if isinstance(member, moderngl.Uniform):
+            if isinstance(value, list):  # moderngl wants an array of one without the brackets
+                value = value[: member.array_length] if member.array_length > 1 else value[0]
             member.value = value
 
 
-def _vectors(code: np.ndarray) -> list[tuple[float, ...]] | tuple[float, ...]:
-    """A code as a uniform array of vec4s, padded with 0; moderngl wants an array of one without the brackets."""
-    vectors = [tuple(map(float, vector)) for vector in filled_to_four(code, 0).reshape(-1, 4)]
-    return vectors if len(vectors) > 1 else vectors[0]
+def _vectors(code: np.ndarray) -> list[tuple[float, ...]]:
+    """A code as a uniform array of vec4s, padded with 0."""
+    return [tuple(map(float, vector)) for vector in filled_to_four(code, 0).reshape(-1, 4)]
+
+
+def _lens_of(camera: Camera) -> dict[str, object]:
+    """The uniforms of a camera."""
+    return {
+        "height": float(camera.height),
+        "lens": (camera.fl_x, camera.fl_y, camera.cx, camera.cy),
+        "axes": tuple(camera.camera_to_world[:3, :3].T.ravel()),
+        "eye": tuple(camera.camera_to_world[:3, 3]),
+    }
 
 
 def _frame_of(mapping: SpaceMapping | None) -> dict[str, object]:

@@ -204,7 +204,7 @@ class Stream:
         texels = sum(width * height for width, height in atlases)
         if scene.is_dynamic:
             texels += Rows(scene, layout).width * layout.row_count()
-        largest = layout.layers * max(block.width * block.height for block in layout.blocks)
+        largest = max(layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
         motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
         decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw
         whole = isinstance(self.source, RemoteSource) and not self.source.has_ranges

@@ -30,14 +30,13 @@ class Layout:
     """How a scene's planes share one texture, the atlas.
 
     Attributes:
-        layers: texels of four channels that a scale's features fill. The widest scale decides; others are padded.
+        layers: of each scale, texels of four channels that its features fill.
         size: (width, height) of the atlas, texels.
         blocks: scale by scale, "xy", "xz", "yz".
         refined: texels to one of the plane's, along FOLDED_AXIS; 1 but for planes that rows are to be multiplied into.
     """
 
-    scales: int
-    layers: int
+    layers: tuple[int, ...]
     size: tuple[int, int]
     blocks: tuple[Block, ...]
     refined: int
@@ -45,41 +44,60 @@ class Layout:
     @staticmethod
     def of(scene: Scene, refined: int = 1) -> "Layout":
         """Shelves, tallest block first, in a texture about as wide as it is high."""
-        layers = max(-(-plane.shape[2] // 4) for scale in scene.scales for plane in scale.values())
+        layers = tuple(-(-scale["xy"].shape[2] // 4) for scale in scene.scales)
         shapes: list[tuple[int, str, int, int]] = []
         for s, scale in enumerate(scene.scales):
             for name in SPACE_PLANES:
                 size = {name[1]: scale[name].shape[0], name[0]: scale[name].shape[1]}
                 size[FOLDED_AXIS[name]] = refined * (size[FOLDED_AXIS[name]] - 1) + 1
                 shapes.append((s, name, size[name[1]], size[name[0]]))
-        area = sum(rows * columns * layers for *_, rows, columns in shapes)
-        width = max(int(np.ceil(np.sqrt(area))), max(columns * layers for *_, columns in shapes))
+        area = sum(rows * columns * layers[s] for s, _, rows, columns in shapes)
+        width = max(int(np.ceil(np.sqrt(area))), max(columns * layers[s] for s, *_, columns in shapes))
         placed: dict[tuple[int, str], Block] = {}
         x, y, shelf = 0, 0, 0
         for s, name, rows, columns in sorted(shapes, key=lambda shape: -shape[2]):
-            if x + columns * layers > width:
+            if x + columns * layers[s] > width:
                 x, y, shelf = 0, y + shelf, 0
             placed[s, name] = Block(s, name, x, y, columns, rows)
-            x, shelf = x + columns * layers, max(shelf, rows)
+            x, shelf = x + columns * layers[s], max(shelf, rows)
         blocks = tuple(placed[s, name] for s, name, *_ in shapes)
-        return Layout(len(scene.scales), layers, (width, y + shelf), blocks, refined)
+        return Layout(layers, (width, y + shelf), blocks, refined)
 
-    def texels(self, plane: np.ndarray) -> np.ndarray:
+    @property
+    def scales(self) -> int:
+        return len(self.layers)
+
+    @property
+    def features(self) -> int:
+        """Layers of all scales."""
+        return sum(self.layers)
+
+    @property
+    def first_layers(self) -> tuple[int, ...]:
+        """Of each scale, where its layers begin among those of all."""
+        return tuple(int(n) for n in np.cumsum((0, *self.layers[:-1])))
+
+    @staticmethod
+    def texels(plane: np.ndarray) -> np.ndarray:
         """(rows, layers * columns, 4) float32: a (rows, columns, M) plane as it lies in its block."""
-        rows, columns, channels = plane.shape
-        padded = np.zeros((rows, columns, self.layers * 4), np.float32)
-        padded[..., :channels] = plane
-        return np.ascontiguousarray(padded.reshape(rows, columns, self.layers, 4).swapaxes(1, 2)).reshape(rows, -1, 4)
+        rows, columns, _ = plane.shape
+        padded = filled_to_four(plane.astype(np.float32), 2)
+        return np.ascontiguousarray(padded.reshape(rows, columns, -1, 4).swapaxes(1, 2)).reshape(rows, -1, 4)
+
+    def place(self, block: Block) -> tuple[float, float, float, float]:
+        """As shares of the atlas: where the middle of a block's first texel lies, and how far from it that of a layer's last."""
+        width, height = self.size
+        return (block.x + 0.5) / width, (block.y + 0.5) / height, (block.width - 1) / width, (block.height - 1) / height
 
     def block(self, scale: int, plane: str) -> Block:
         return self.blocks[3 * scale + SPACE_PLANES.index(plane)]
 
     def row_count(self) -> int:
-        return 3 * self.scales * self.layers
+        return 3 * self.features
 
     def first_row(self, axis: int, scale: int) -> int:
         """The line of the rows' texture that holds layer 0 of an axis (0, 1, 2 for x, y, z) at a scale."""
-        return (axis * self.scales + scale) * self.layers
+        return axis * self.features + self.first_layers[scale]
 
 
 class Rows:
@@ -97,10 +115,10 @@ class Rows:
 
     def at(self, time: float) -> np.ndarray:
         """(lines, width, 4) float32 at `time` in [0, 1]; 1 beyond a row's end."""
-        layers = self._layout.layers
         out = np.ones((self._layout.row_count(), self.width, 4), np.float32)
         for axis, scale, plane in self._planes:
             row = linear(plane, time)
+            layers = self._layout.layers[scale]
             padded = np.ones((len(row), layers * 4), np.float32)
             padded[:, : row.shape[1]] = row
             first = self._layout.first_row(axis, scale)
@@ -128,8 +146,16 @@ def distances(occupied: np.ndarray) -> np.ndarray:
 def decoder_shape(decoder: AnyDecoder) -> dict[str, int]:
     """What march.glsl is told of it."""
     if isinstance(decoder, HybridDecoder):
-        return {"HYBRID": 1, "HIDDEN": -(-len(decoder.b1) // 4) * 4, "WIDTH": -(-len(decoder.v_bias) // 4) * 4}
-    return {"HYBRID": 0, "HIDDEN": len(decoder.b1) if decoder.w2.any() else 0}
+        hidden_4, width_4 = -(-len(decoder.b1) // 4), -(-len(decoder.v_bias) // 4)
+        return {"HYBRID": 1, "HIDDEN": 4 * hidden_4, "HIDDEN_4": hidden_4, "WIDTH": 4 * width_4, "WIDTH_4": width_4}
+    return {"HYBRID": 0, "HIDDEN": len(decoder.b1) if decoder.w2.any() else 0, "HIDDEN_4": 0, "WIDTH_4": 0}
+
+
+def planes_shape(layout: Layout) -> dict[str, int]:
+    """What march.glsl is told of the planes."""
+    layers = {f"LAYERS_{scale}": count for scale, count in enumerate(layout.layers)}
+    first = {f"FIRST_{scale}": number for scale, number in enumerate(layout.first_layers)}
+    return {"SCALES": layout.scales, "FEATURES": layout.features, "BASIS": 3 * layout.features} | layers | first
 
 
 def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[str, np.ndarray]:
@@ -141,9 +167,9 @@ def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[st
     Hybrid, with G and H filled up with zeros to multiples of four: from_features (G x F / 4) is v, from_features_bias (G / 4)
     v_bias, passed_on (H x G / 4) u; density_weight (G / 4), w1 (H x 3), w2 (3 x H / 4), b2 (1, in xyz), density_bias as above.
     """
-    features = layout.scales * layout.layers * 4
+    features = layout.features * 4
     place = np.concatenate(
-        [s * layout.layers * 4 + np.arange(scale["xy"].shape[2]) for s, scale in enumerate(scene.scales)]
+        [4 * first + np.arange(scale["xy"].shape[2]) for first, scale in zip(layout.first_layers, scene.scales, strict=True)]
     )
 
     def spread(weights: np.ndarray) -> np.ndarray:
@@ -168,6 +194,21 @@ def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[st
             arrays["w1"] = _direction_layer(decoder)[: len(decoder.b1)]
             arrays["w2"] = np.moveaxis(spread(np.moveaxis(decoder.w2, 2, 0)), 0, 2)
     return {name: np.ascontiguousarray(array, np.float32).reshape(-1, 4) for name, array in arrays.items()}
+
+
+def block_arrays(scene: Scene, layout: Layout) -> dict[str, np.ndarray]:
+    """Where planes lie in an atlas, as march.glsl wants it: float32 (N, 4) and (N,), int32 (N,).
+
+    Of each plane, blocks (3 x scales) as `Layout.place`, layer_widths the share of the atlas that a layer is wide; of each scale,
+    last_texels that of its unrefined planes along x, y and z, and first_layers.
+    """
+    sizes = [(s["xy"].shape[1] - 1, s["xy"].shape[0] - 1, s["xz"].shape[0] - 1, 0) for s in scene.scales]
+    return {
+        "blocks": np.array([layout.place(block) for block in layout.blocks], np.float32),
+        "layer_widths": np.array([block.width / layout.size[0] for block in layout.blocks], np.float32),
+        "last_texels": np.array(sizes, np.float32),
+        "first_layers": np.array(layout.first_layers, np.int32),
+    }
 
 
 def _direction_layer(decoder: AnyDecoder) -> np.ndarray:

@@ -6,9 +6,10 @@ from kpc.format.scene import TIME_PLANES, Scene
 
 MOST_ROWS = 1024
 """Instants in a picture; of more, as many, evenly spread."""
-STILL, VISIBLE = 128, 40
-"""The level of what stands still, and how far from it one sees a difference."""
-MARGIN = 0.15
+STILL = 128
+"""The level of what stands still."""
+QUIET, MARGIN = 0.25, 0.25
+"""Lines with less motion than this share of the liveliest are left out at the edges, but for a margin of the others' height."""
 SPREAD = 99.0
 """This percentile of deviations comes out at the ends of the range."""
 
@@ -38,10 +39,11 @@ def time_plane_picture(scene: Scene, plane: str, scale: int) -> np.ndarray:
 
 
 def moving_part(picture: np.ndarray) -> tuple[float, float]:
-    """Between which shares of a picture's height something moves, with a margin; all of it where nothing does."""
-    moves = np.abs(picture.astype(int) - STILL).max(axis=(1, 2)) > VISIBLE
-    if not moves.any():
+    """Between which shares of a picture's height the most of what moves lies, with a margin; all of it where nothing does."""
+    motion = np.abs(picture.astype(float) - STILL).mean(axis=(1, 2))
+    if motion.max() == 0:
         return 0.0, 1.0
+    moves = motion > QUIET * motion.max()
     first, last = np.flatnonzero(moves)[[0, -1]]
     margin = MARGIN * (last + 1 - first)
     return max(float(first - margin), 0.0) / len(moves), min(float(last + 1 + margin), len(moves)) / len(moves)

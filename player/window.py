@@ -1,9 +1,11 @@
 """The player's window: glfw for events, ImGui for controls (`kpc.player.panels`), the renderer for the picture."""
 
+import contextlib
 import ctypes
+import math
 import re
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import moderngl
 import numpy as np
 from imgui_bundle import imgui
 
+from kpc.format.cameras import Camera
 from kpc.format.container import open_source
 from kpc.format.errors import ContextLostError, DisplayError, KpcError
 from kpc.format.media import write_image
@@ -39,6 +42,8 @@ OPENGL = ((4, 3), (3, 3))
 STATS_EVERY_S = 0.5
 STATS_SIZE = (48, 36)
 SHARPEN_AFTER_S = 0.25
+BAND_S = 0.08
+"""How long a part of a sharp picture may take."""
 CROSSING_S = 4.0
 """Flying takes this long to cross the box's longest edge."""
 TOLD_S, COMPLAINED_S = 4.0, 12.0
@@ -66,7 +71,7 @@ class Window:
         glfw.set_error_callback(self._complain)
         if not glfw.init():
             raise DisplayError(f"no window to be had ({self._complaint}); {REMEDY}")
-        self.handle = next(filter(None, (self._create(title, size, version) for version in OPENGL)), None)
+        self.handle: Any = next(filter(None, (self._create(title, size, version) for version in OPENGL)), None)
         if not self.handle:
             glfw.terminate()
             raise DisplayError(f"no window with OpenGL 3.3 to be had ({self._complaint}): {REMEDY}")
@@ -82,7 +87,7 @@ class Window:
         glfw.set_cursor_pos_callback(self.handle, self._moved)
         glfw.set_mouse_button_callback(self.handle, self._clicked)
         glfw.set_scroll_callback(self.handle, self._scrolled)
-        glfw.set_drop_callback(self.handle, self._drop)
+        glfw.set_drop_callback(self.handle, self._drop)  # type: ignore[arg-type]  # the stub means C's arguments
 
     def _create(self, title: str, size: tuple[int, int], version: tuple[int, int]) -> Any:
         hints = {
@@ -186,7 +191,8 @@ def _reset_status() -> Callable[[], int]:
     for name in ("glGetGraphicsResetStatus", "glGetGraphicsResetStatusARB"):
         address = glfw.get_proc_address(name)
         if address:
-            return ctypes.CFUNCTYPE(ctypes.c_uint)(address)
+            status = ctypes.cast(address, ctypes.CFUNCTYPE(ctypes.c_uint))
+            return lambda: int(status())
     return lambda: 0
 
 
@@ -245,7 +251,9 @@ class Player:
             self._go_on_from(before)
         self._resize(window.pixels)
         self._drawn: tuple[object, ...] = ()
-        self._is_sharp = False
+        self._is_sharp, self._sharp_rows = False, 0
+        self._is_paced, self._aside_s = False, 0.0
+        self._band = self.canvas
 
     @property
     def scene(self) -> Scene:
@@ -298,6 +306,7 @@ class Player:
             glfw.wait_events_timeout(0.1)
             return
         self.window.check()
+        self._is_paced, self._aside_s = False, 0.0
         if pixels != self.canvas.size:
             self._resize(pixels)
         self._begin(seconds)
@@ -323,6 +332,8 @@ class Player:
         self.frames += 1
         panels.show(self)
         self._finish()
+        if self._is_paced:  # all but waiting for the screen counts, and but for looking at statistics
+            self.dial.saw(clock.monotonic() - now - self._aside_s)
         glfw.swap_buffers(self.window.handle)
         self.window.sweep()
 
@@ -372,9 +383,19 @@ class Player:
         names = (self.folder / f"{self.stem}-{n:03d}{suffix}" for n in range(1, 1_000_000))
         return next(path for path in names if not path.exists()).absolute()
 
+    @contextlib.contextmanager
+    def _told(self, what: object) -> Iterator[None]:
+        """What goes wrong with `what` is shown, and the player goes on."""
+        try:
+            yield
+        except KpcError as error:
+            self.complain(str(error))
+        except OSError as error:
+            self.complain(f"{what}: {error.strerror or error}")
+
     def open(self, file: str) -> None:
         """A camera path, or another scene, which follows this one."""
-        try:
+        with self._told(file):
             if file.lower().endswith(".json"):
                 self.path, self.ride_s, self.show_path = CameraPath.load(file), 0.0, True
                 self.say(f"{len(self.path.keyframes)} keyframes from {file}; J follows them")
@@ -386,15 +407,11 @@ class Player:
             except BaseException:
                 stream.close()
                 raise
-        except KpcError as error:
-            self.complain(str(error))
-        except OSError as error:
-            self.complain(f"{file}: {error.strerror or error}")
 
     def screenshot(self, path: Path) -> None:
         """Save the window, controls and all, at its full resolution."""
         self._begin(1 / 60)
-        self._picture(1.0, self.dial.resting)
+        self._still()
         panels.show(self)
         self.overlay.draw(self.canvas)
         write_image(path, self._pixels())
@@ -402,25 +419,21 @@ class Player:
 
     def _save_picture(self) -> None:
         """Write the picture without controls, under the first name that is free."""
-        path = self.free_name(".png")
-        self._picture(1.0, self.dial.resting)
-        try:
+        self._still()
+        with self._told(self.folder.absolute()):
+            path = self.free_name(".png")
             write_image(path, self._pixels())
             self.say(f"saved {path}")
-        except OSError as error:
-            self.complain(f"{path}: {error.strerror or error}")
 
     def save_path(self) -> None:
         """Write the camera path, under the first name that is free."""
-        path = self.free_name("-path.json")
         if not self.path.keyframes:
             self.complain("there is no camera path yet; K makes a keyframe")
             return
-        try:
+        with self._told(self.folder.absolute()):
+            path = self.free_name("-path.json")
             self.path.save(path)
             self.say(f"saved {path}; kprender --path makes a video of it")
-        except OSError as error:
-            self.complain(f"{path}: {error.strerror or error}")
 
     # --- the camera path, and films
 
@@ -473,10 +486,11 @@ class Player:
         if along_path and not self.path.keyframes:
             self.complain("there is no camera path yet; K makes a keyframe")
             return
-        self.film = Recording(self.free_name(".mp4"), FILM_FPS, self.canvas.size)
-        self._filming_path, self._filming_since = along_path, clock.monotonic()
-        if along_path:
-            self.riding, self.playback.playing, self.ride_s = True, False, self.path.start_s
+        with self._told(self.folder.absolute()):
+            self.film = Recording(self.free_name(".mp4"), FILM_FPS, self.canvas.size)
+            self._filming_path, self._filming_since = along_path, clock.monotonic()
+            if along_path:
+                self.riding, self.playback.playing, self.ride_s = True, False, self.path.start_s
 
     @property
     def is_filming_path(self) -> bool:
@@ -516,7 +530,7 @@ class Player:
             self.ride_s = self.path.start_s + film.duration_s
             camera, self.playback.time = self.path.at(self.ride_s)
             self.view = View.of(self.rig, camera)
-            self._picture(1.0, self.dial.resting)
+            self._still()
             film.take(self._pixels())
 
     # --- the picture
@@ -526,7 +540,8 @@ class Player:
         self.ctx.screen.use()
         self.ctx.viewport = (0, 0, *pixels)
         self.screen = self.ctx.detect_framebuffer(0)
-        self.canvas = self.ctx.framebuffer([self.ctx.texture(pixels, 4)])
+        self._canvas_texture = self.ctx.texture(pixels, 4)
+        self.canvas = self.ctx.framebuffer([self._canvas_texture])
         red, green, blue = map(float, self.scene.background)
         self.canvas.clear(red, green, blue)
         self.raster = pixels
@@ -548,27 +563,58 @@ class Player:
         elif self.is_filming_path:
             self._is_sharp = False  # `_film_path` draws
         elif wanted != self._drawn:
-            self._drawn, self._moved, self._is_sharp = wanted, now, False
+            self._drawn, self._moved, self._is_sharp, self._sharp_rows = wanted, now, False, 0
             self._picture(dial.pace.scale, dial.rung)
-            dial.saw(self.draw_s)
-        elif not self._is_sharp:
-            is_finest = dial.pace.scale == 1.0 and dial.rung == dial.resting
-            if not is_finest and now - self._moved > SHARPEN_AFTER_S:
-                self._picture(1.0, dial.resting)
-            self._is_sharp = is_finest or now - self._moved > SHARPEN_AFTER_S
+            self._is_paced = True
+            drawn = self.renderer.quality
+            self._is_sharp = self.raster == self.canvas.size and dial.rung == dial.resting and not drawn.interlaced
+        elif not self._is_sharp and now - self._moved > SHARPEN_AFTER_S:
+            self._sharpen()
 
-    def _picture(self, scale: float, rung: str) -> None:
+    def _still(self) -> None:
+        """Draw the scene on the canvas as finely as a picture that stands still, at once."""
+        self._picture(1.0, self.dial.resting, still=True)
+
+    def _picture(self, scale: float, rung: str, still: bool = False) -> None:
         """Draw the scene on the canvas, at a share of its resolution."""
-        quality = LADDER[rung]
-        self.renderer.quality = replace(quality, folded=False) if self.exact else quality
+        self._set_quality(rung, still)
         if clock.monotonic() - self._measured > STATS_EVERY_S:
             self._measure()
-        started = clock.monotonic()
         width, height = (max(1, round(side * scale)) for side in self.canvas.size)
         self.raster = (width, height)
+        self._show(self.canvas, self.view.camera(width, height))
+
+    def _sharpen(self) -> None:
+        """Draw the next rows of the picture as finely as it is to be, from above, so many as do not keep the controls waiting."""
+        self._set_quality(self.dial.resting, still=True)
+        width, height = self.canvas.size
+        if self._sharp_rows == 0:
+            whole_s = self.draw_s * width * height / (self.raster[0] * self.raster[1])
+            bands = math.ceil(whole_s / BAND_S) if self.renderer.quality.resolution == 1.0 else 1
+            rows = -(-height // bands)
+            if self._band.size != (width, rows):
+                self._band = self.ctx.simple_framebuffer((width, rows))
+        rows = self._band.height
+        top = min(self._sharp_rows, height - rows)  # the last may overlap the one before
+        camera = self.view.camera(width, height)
+        self._show(self._band, replace(camera, height=rows, cy=camera.cy - top))
+        pixels = self._band.read(components=4, alignment=1)
+        self._canvas_texture.write(pixels, viewport=(0, height - top - rows, width, rows), alignment=1)
+        self._sharp_rows = top + rows
+        if self._sharp_rows == height:
+            self._is_sharp, self.raster = True, (width, height)
+
+    def _set_quality(self, rung: str, still: bool) -> None:
+        """That of a rung, but for what is set by hand; a picture that stands still owes nothing to the one before."""
+        quality = LADDER[rung]
+        folded, interlaced = quality.folded and not self.exact, quality.interlaced and not still
+        self.renderer.quality = replace(quality, folded=folded, interlaced=interlaced)
+
+    def _show(self, target: moderngl.Framebuffer, camera: Camera) -> None:
+        started = clock.monotonic()
         self.renderer.show(
-            self.canvas,
-            self.view.camera(width, height),
+            target,
+            camera,
             self.stream.time_in(self.playback.time),
             part=self.part,
             look=self.look,
@@ -581,6 +627,7 @@ class Player:
 
     def _measure(self) -> None:
         """Samples a ray, and how far things are, from a very small picture."""
+        started = clock.monotonic()
         small = self.renderer.render(
             self.view.camera(*STATS_SIZE),
             self.stream.time_in(self.playback.time),
@@ -593,6 +640,7 @@ class Player:
             near, far = np.percentile(seen, (2, 98))
             self.depths = (0.9 * float(near), 1.1 * float(far))
         self._measured = clock.monotonic()
+        self._aside_s += self._measured - started
 
     def _begin(self, seconds: float) -> None:
         self.overlay.begin(self.window.size, self.canvas.size, self.text_size * self.window.text_scale, seconds)

@@ -9,13 +9,15 @@ from pathlib import Path
 import glfw
 import numpy as np
 from imgui_bundle import imgui
-from pytest import approx
+from pytest import approx, raises
 
 from kpc.format import groups
 from kpc.format.container import open_source
+from kpc.format.errors import DisplayError
 from kpc.format.media import read_image, read_video
 from kpc.player import kpplay, panels
 from kpc.player import window as window_module
+from kpc.player.dial import RUNGS
 from kpc.player.path import CameraPath
 from kpc.player.preferences import Preferences, place
 from kpc.player.quality import DEFAULT, climbed
@@ -26,6 +28,7 @@ from kpc.player.window import Player, Window
 
 
 def main(scene_file: str) -> None:
+    ask_for_less()
     window = Window("test", (320, 240))
     stream = Reel(open_source(scene_file))
     player = Player(window, stream, Preferences(text_size=0.9, speed=1.0))
@@ -48,7 +51,7 @@ def main(scene_file: str) -> None:
         player.frame()
 
     def canvas() -> np.ndarray:
-        player._picture(1.0, "reference")
+        player._picture(1.0, "reference", still=True)
         return player._pixels().astype(int)
 
     player.frame()
@@ -125,6 +128,8 @@ def main(scene_file: str) -> None:
     assert player.notice_is_error and not player.riding  # there is no path yet
     follow_a_path(player, press)
     see_every_pixel_once(window, player)
+    come_to_rest(player)
+    run_out_of_room(player)
     drop_files(window, player, Path(scene_file))
 
     press(glfw.KEY_H, glfw.KEY_P)
@@ -138,12 +143,39 @@ def main(scene_file: str) -> None:
     kept = player.preferences()
     assert kept == Preferences((200, 260), DEFAULT, None, 2.0, False, False, True, True, player.text_size)
     player.run()
-    player.close()
+    press(glfw.KEY_O)
+    player.run(1)
+    told = player.close()  # a film that is being written is finished
+    assert told is not None and told.startswith("saved ") and len(list(read_video(player.film.path))) >= 1
     go_through_groups(window, scene_file)
     stream.close()
     window.close()
     lose_the_card(scene_file)
     remember(scene_file)
+
+
+def ask_for_less() -> None:
+    """Where there is no OpenGL 4.3, as on macOS, 3.3 is asked for; where there is neither, that is told."""
+    create = glfw.create_window
+    asked: list[object] = []
+
+    def none_above(most: int) -> Callable[..., object]:
+        def attempt(*arguments: object) -> object:
+            asked.append(arguments)
+            return create(*arguments) if len(asked) > most else None
+
+        return attempt
+
+    glfw.create_window = none_above(1)
+    window = Window("test", (64, 64))
+    assert len(asked) == 2 and window.ctx.version_code >= 330
+    window.close()
+    window.close()
+    asked.clear()
+    glfw.create_window = none_above(2)
+    with raises(DisplayError, match="kprender"):
+        Window("test", (64, 64))
+    glfw.create_window = create
 
 
 def follow_a_path(player: Player, press: Callable[..., None]) -> None:
@@ -240,6 +272,48 @@ def see_every_pixel_once(window: Window, player: Player) -> None:
         assert window.plain_size == (units if count != units else tuple(n / text for n in units))
     assert heights[1:] == approx([2 * heights[0]] * 2, rel=0.05)  # sizes of text are whole
     Window.size, Window.pixels, Window.text_scale = size, pixels, scale  # type: ignore[method-assign]
+    player.frame()
+
+
+def come_to_rest(player: Player) -> None:
+    """What stands still is drawn anew, row by row, as finely as at once."""
+    player.playback.playing = False
+    player.show_hud = False
+    band_s, window_module.BAND_S = window_module.BAND_S, 1e-6
+    player.look_from(player.view.orbit(0.1, 0.0))
+    player.dial.pace.scale = 0.25
+    player.frame()
+    coarse = player._pixels().astype(int)
+    time.sleep(0.3)
+    turns = 0
+    while not player._is_sharp:
+        player.frame()
+        turns += 1
+    fine = player._pixels().astype(int)
+    player._still()
+    assert turns == player.canvas.height and np.abs(fine - player._pixels()).max() <= 1 < np.abs(fine - coarse).max()
+    window_module.BAND_S, player.show_hud = band_s, True
+
+
+def run_out_of_room(player: Player) -> None:
+    """What the card refuses is told, and drawn more coarsely; what it refuses again and again ends the player."""
+    show, rung = player.renderer.show, player.dial.rung
+
+    def refuse(*_: object, **__: object) -> None:
+        raise DisplayError("no room for a picture")
+
+    player.renderer.show = refuse  # type: ignore[method-assign]
+    for _ in range(window_module.MOST_MISHAPS):
+        player.look_from(player.view.orbit(0.1, 0.0))
+        player.frame()
+        assert player.notice_is_error and "no room" in player.notice
+    assert RUNGS.index(player.dial.rung) < RUNGS.index(rung)
+    player.look_from(player.view.orbit(0.1, 0.0))
+    with raises(DisplayError, match="no room"):
+        player.frame()
+    imgui.end_frame()
+    player.renderer.show, player._mishaps = show, 0  # type: ignore[method-assign]
+    player.dial.choose(rung)
     player.frame()
 
 

@@ -155,5 +155,25 @@ def test_where_a_clip_will_be_is_where_it_comes_to() -> None:
     assert Playback(Clip(31, 10.0), playing=False).pace == 0.0 == Playback(Clip(1, 10.0)).pace
 
 
+def test_the_pace_asks_for_few_rasters_and_stands_still_in_noise() -> None:
+    rng, pace, scales = np.random.default_rng(0), Pace(1 / 15), []
+    for _ in range(500):
+        pace.saw(0.4 * pace.scale**2 * float(np.exp(rng.normal(0, 0.1))))
+        scales.append(pace.scale)
+    assert len(set(scales)) <= 5 and sum(a != b for a, b in zip(scales[50:], scales[51:])) <= 25
+    pace.saw(100.0)  # an exception
+    assert pace.scale > 0.55 * scales[-1]
+    assert {round(4 * math.log2(scale), 9) % 1 for scale in scales} == {0.0}
+
+
+@pytest.mark.parametrize(("fixed_s", "low", "high"), [(0.02, 0.34, 0.43), (0.05, 0.24, 0.5), (0.2, 0.4, 1.0)])
+def test_a_raster_gets_no_coarser_than_helps(fixed_s: float, low: float, high: float) -> None:
+    rng, pace, scales = np.random.default_rng(0), Pace(1 / 15), []
+    for _ in range(300):
+        pace.saw((fixed_s + 0.3 * pace.scale**2) * float(np.exp(rng.normal(0, 0.1))))
+        scales.append(pace.scale)
+    assert low <= np.median(scales[100:]) <= high and np.std(scales[100:]) < 0.2 * high
+
+
 def test_a_processor_begins_coarsely() -> None:
     assert Pace.of(software=True).scale < 0.5 and Pace.of(software=False).scale == 1.0

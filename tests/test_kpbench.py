@@ -14,6 +14,7 @@ from kpc.encoder.ablations import ABLATIONS, changed_by
 from kpc.encoder.config import PRESETS
 from kpc.format.file import write
 from kpc.format.quantise import quantise_scene
+from kpc.player.quality import DEFAULT, LADDER
 from kpc.tools import kpbench, limits, plot, results
 from kpc.tools.provenance import data_hash
 
@@ -115,25 +116,28 @@ def test_every_ablation_changes_something_somewhere() -> None:
     assert ABLATIONS["as it is"](plain) is plain
 
 
-def test_player_measures_both_paths_of_a_moving_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_player_measures_every_quality(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gl.context()
     moving, still = tiny_file(tmp_path / "moving.kpc", True), tiny_file(tmp_path / "still.kpc", False)
     out = tmp_path / "out.json"
     assert kpbench.main(["player", str(moving), str(still), "--size", "48x36", "--frames", "4", "--out", str(out)]) == 0
     said = capsys.readouterr()
     records = results.load([out])
-    assert said.out == "" and "within 1/255" in said.err
-    assert [(r["name"], r["settings"]["path"]) for r in records] == [
-        ("moving", "exact"), ("moving", "folded"), ("still", "exact"),
+    assert said.out == "" and "within 1/255" in said.err and f"{DEFAULT} (default)" in said.err
+    assert [(r["name"], r["settings"]["quality"]) for r in records] == [
+        (name, quality) for name in ("moving", "still") for quality in LADDER
     ]  # fmt: skip
     for record in records:
         (run,) = record["repeats"]
         assert len(run["frame_ms"]) == 4 and min(run["frame_ms"]) <= run["frame_ms_median"] <= run["frame_ms_p95"]
         parts = run["load_ms"] + run["upload_ms"] + run["first_render_ms"]
-        assert run["first_frame_ms"] == pytest.approx(parts)
+        assert run["first_frame_ms"] == pytest.approx(parts) and run["cpu_ms_median"] > 0
         assert run["gpu_memory_bytes"] > 0 and record["accuracy"]["samples_per_ray"] > 0 and record["renderer"]
-        if record["settings"]["path"] == "exact":
+        if record["settings"]["quality"] == "reference":
             assert record["accuracy"]["psnr"] > 50 and record["accuracy"]["within_one_level"] > 0.999
+            assert record["accuracy"]["psnr_turning"] > 50 and run["times_reference"] == 1
+    assert plot.main([str(out), "-o", str(tmp_path / "player.svg")]) == 0
+    assert "milliseconds a frame" in (tmp_path / "player.svg").read_text()
 
 
 def test_stream_measures_how_soon_scenes_are_seen(

@@ -1,3 +1,4 @@
+import json
 import os
 import shutil
 import subprocess
@@ -99,6 +100,17 @@ def test_a_server_that_fails_is_told_in_the_window(scene_file: Path, display: st
         assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     whole, told = (read_image(shot).astype(int)[22:38, 250:390] for shot in shots)  # where the message is, right of the HUD
     assert told.max() > 200 > 100 > told.min() and np.abs(whole - told).max() > 100
+
+
+def test_long_playback_makes_nothing_anew(scene_file: Path, display: str) -> None:
+    command = [sys.executable, "-m", "kpc.tools.kpbench", "steady", str(scene_file), "--size", "200x150", "--frames", "40"]
+    env = {**os.environ, "DISPLAY": display}
+    done = subprocess.run(command, capture_output=True, text=True, env=env, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    (record,) = json.loads(done.stdout)
+    (run,) = record["repeats"]
+    assert run["made_on_card"] == 0 and run["most_bytes"] - run["first_bytes"] < 1 << 24 < run["first_bytes"]
+    assert "made on the card" in done.stderr and record["renderer"]
 
 
 def test_without_a_display_kprender_is_named(scene_file: Path) -> None:

@@ -1,5 +1,6 @@
 """OpenGL against the numpy reference."""
 
+import math
 from dataclasses import replace
 
 import gl
@@ -200,11 +201,37 @@ def test_shows_every_look_and_part_on_a_screen_of_another_size(space: str) -> No
     )  # a stretched, filtered copy
 
 
-def test_a_scene_too_large_for_the_card_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    ctx = gl.context()
-    monkeypatch.setitem(ctx.info, "GL_MAX_TEXTURE_SIZE", 64)
-    with pytest.raises(DisplayError, match="--backend reference"):
-        Renderer(ctx, tiny_scene(4, resolution=(200, 200, 200)))
+@pytest.mark.parametrize(("limits", "words"), [
+    ({"GL_MAX_TEXTURE_SIZE": 32}, "plane xy of scale 2 needs a texture of 48x20, .* takes 32"),
+    ({"GL_MAX_TEXTURE_SIZE": 48}, "all planes, of which plane xy of scale 2 is the largest, needs"),
+    ({"GL_MAX_3D_TEXTURE_SIZE": 11}, "the occupancy grid needs a texture of 12x10x8, .* takes 11"),
+    ({"GL_MAX_3D_TEXTURE_SIZE": 12}, "the motion grid needs a texture of 4x2x13"),
+])  # fmt: skip
+def test_a_scene_too_large_for_the_card_is_refused_by_name(
+    limits: dict[str, int], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ctx, scene = gl.context(), displaced(tiny_scene(4))
+    if "motion" in words:
+        scene = replace(scene, motion=np.zeros((6, 13, 2, 4, 3), np.float32))
+    for name, limit in limits.items():
+        monkeypatch.setitem(ctx.info, name, limit)
+    with pytest.raises(DisplayError, match=f"{words}.*--backend reference"):
+        Renderer(ctx, scene)
+
+
+@pytest.mark.parametrize("size", [(4096, 1), (1, 4096), (1, 1)])
+def test_pictures_of_extreme_shapes(size: tuple[int, int]) -> None:
+    scene = tiny_scene(4)
+    camera = Camera(*size, 70.0 if size[0] == 1 else 40.0 * size[0] / 48, 70.0, size[0] / 2, size[1] / 2,
+                    CAMERAS["outside"].camera_to_world)  # fmt: skip
+    for time in (0.0, 1.0):
+        check(Renderer(gl.context(), scene).render(camera, time), render(scene, camera, time))
+
+
+@pytest.mark.parametrize("time", [-0.1, 1.1, math.nan])
+def test_times_outside_the_clip_are_refused(time: float) -> None:
+    with pytest.raises(ValueError, match="outside"):
+        Renderer(gl.context(), tiny_scene(4)).render(CAMERAS["outside"], time)
 
 
 def test_a_decoder_too_large_for_a_shader_is_refused() -> None:

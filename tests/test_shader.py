@@ -7,7 +7,7 @@ from scenes import hybrid, tiny_scene
 
 from kpc.format.errors import DisplayError
 from kpc.player import shader
-from kpc.player.textures import Layout, decoder_arrays, decoder_shape
+from kpc.player.textures import Layout, block_arrays, decoder_arrays, decoder_shape, planes_shape
 
 
 def test_includes_come_once_and_lines_keep_their_numbers() -> None:
@@ -36,9 +36,11 @@ def test_a_missing_file_is_named() -> None:
         shader.compose("a", written={"a": '#include "nowhere.glsl"'})
 
 
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "fullscreen.glsl"])
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "weave.glsl", "fullscreen.glsl"])
 def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
-    text, files = shader.compose(name, written={"decoder_weights": ""}, preamble=shader.ES30)
+    scene = tiny_scene(0)
+    defines = {**planes_shape(Layout.of(scene)), **decoder_shape(scene.decoder), "SHARED": 1}
+    text, files = shader.compose(name, defines, written={"decoder_weights": "", "plane_blocks": ""}, preamble=shader.ES30)
     assert text.startswith("#version 300 es\n") and text.count("#version") == 1
     assert len(set(files)) == len(files)
 
@@ -78,7 +80,7 @@ def test_constants_are_exact() -> None:
 @pytest.mark.parametrize("space", ["box", "contracted", "ndc", "hybrid"])
 @pytest.mark.parametrize("rows", [0, 1])
 @pytest.mark.parametrize("motion", [0, 1])
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "upscale.glsl"])
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "weave.glsl"])
 def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, rows: int, space: str) -> None:
     ctx = gl.context()
     if "GL_ARB_ES3_compatibility" not in ctx.extensions:
@@ -87,8 +89,9 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     scene = hybrid(scene) if space == "hybrid" else scene
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
-    defines = {"SCALES": 3, "LAYERS": layout.layers, **decoder_shape(scene.decoder), "ROWS": rows, "REFINED": 1, "DRAWN": 2,
+    blocks = shader.constants(block_arrays(scene, layout))
+    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "SHARED": int(space == "box"), "INTERLACED": rows, "STILL": motion,
                "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion, "APPEARANCE": rows}  # fmt: skip
-    fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights})
+    fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights, "plane_blocks": blocks})
     vertex, _ = shader.compose("fullscreen.glsl", preamble=shader.ES30)
     ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()

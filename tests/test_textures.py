@@ -19,15 +19,15 @@ def test_the_atlas_holds_every_plane(channels: int, scales: int) -> None:
     atlas = np.zeros((layout.size[1], layout.size[0], 4), np.float32)
     for block in layout.blocks:
         assert layout.block(block.scale, block.plane) is block
-        wide = layout.layers * block.width
+        wide = layout.layers[block.scale] * block.width
         atlas[block.y : block.y + block.height, block.x : block.x + wide] = layout.texels(scene.scales[block.scale][block.plane])
-    assert layout.layers == -(-channels // 4) and atlas.shape == (layout.size[1], layout.size[0], 4)
+    assert layout.layers == (-(-channels // 4),) * scales and atlas.shape == (layout.size[1], layout.size[0], 4)
     claimed = np.zeros(atlas.shape[:2], int)
     for block, (s, name) in zip(
         layout.blocks, [(s, name) for s in range(scales) for name in SPACE_PLANES], strict=True
     ):
         assert (block.scale, block.plane) == (s, name)
-        claimed[block.y : block.y + block.height, block.x : block.x + layout.layers * block.width] += 1
+        claimed[block.y : block.y + block.height, block.x : block.x + layout.layers[block.scale] * block.width] += 1
         for m in range(channels):
             x = block.x + (m // 4) * block.width
             part = atlas[block.y : block.y + block.height, x : x + block.width, m % 4]
@@ -53,7 +53,7 @@ def test_rows_are_the_time_planes_cut() -> None:
             u = np.linspace(0, 1, size, dtype=np.float32)
             wanted = reference.bilinear(scale[name], u, np.full_like(u, at))
             first = layout.first_row(axis, s)
-            got = rows[first : first + layout.layers, :size].swapaxes(0, 1).reshape(size, -1)[:, :6]
+            got = rows[first : first + layout.layers[s], :size].swapaxes(0, 1).reshape(size, -1)[:, :6]
             assert got == pytest.approx(wanted, abs=1e-6)
 
 
@@ -77,8 +77,8 @@ def test_decoder_arrays_keep_every_weight() -> None:
     scene = tiny_scene(4, channels=6)
     layout, decoder = Layout.of(scene), scene.decoder
     arrays = decoder_arrays(decoder, scene, layout)
-    hidden, groups = len(decoder.b1), layout.scales * layout.layers
-    place = np.concatenate([s * layout.layers * 4 + np.arange(6) for s in range(2)])
+    hidden, groups = len(decoder.b1), layout.features
+    place = np.concatenate([layout.first_layers[s] * 4 + np.arange(6) for s in range(2)])
     assert np.array_equal(arrays["density_weight"].ravel()[place], decoder.density_weight)
     assert np.array_equal(arrays["b2"].reshape(3, -1)[:, place], decoder.b2)
     w2 = arrays["w2"].reshape(3, groups, hidden, 4)

@@ -39,7 +39,7 @@ import kpc
 from kpc.format import cli
 from kpc.format.errors import KpcError, UsageError
 from kpc.format.memory import peak_memory_bytes
-from kpc.player.quality import DEFAULT, LADDER, Quality
+from kpc.player.quality import DEFAULT, LADDER
 from kpc.tools import results
 from kpc.tools.provenance import commit, data_hash, machine, versions
 
@@ -50,8 +50,8 @@ Run = tuple[Path, dict[str, Any]]
 
 WARM_UP = 3
 """Frames drawn before those that are timed."""
-MIDDLE = 0.5
-"""The time in the clip at which pictures are compared."""
+MIDDLE, LEAD_IN = 0.5, 6
+"""The time in the clip at which pictures are compared, and how many frames are played up to there."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,6 @@ class Play:
     scene: Path
     size: tuple[int, int]
     frames: int
-    quality: Quality
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -280,26 +279,29 @@ def _encoder() -> ModuleType:
 
 
 def _player(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
-    """A record for each scene and path: exact, and folded where the scene moves."""
+    """A record for each scene and rung of the ladder of qualities. A repeat draws all of them by turns, frame by frame, so that
+    whatever else the machine does slows them all alike."""
     for source in options.scenes:
-        paths = (False, True) if kpc.load(source).is_dynamic else (False,)
-        for folded in paths:
-            settings = {
-                "path": "folded" if folded else "exact",
-                "size": "{}x{}".format(*options.size),
-                "frames": options.frames,
-                "warm_up": WARM_UP,
-            }
-            record = _record("player", source, origin, settings)
-            job = Play(source, options.size, options.frames, LADDER[DEFAULT if folded else "reference"])
-            print(f"kpbench: {record['name']}, {settings['path']}", file=sys.stderr)
-            repeats = [_alone(_play_once, job) for _ in range(options.repeats)]  # first: drivers keep compiled shaders
-            renderer, accuracy = _alone(_compare, job)
-            yield record | {"seed": None, "renderer": renderer, "accuracy": accuracy, "repeats": repeats}
+        common = {"size": "{}x{}".format(*options.size), "frames": options.frames, "warm_up": WARM_UP, "default": DEFAULT}
+        record = _record("player", source, origin, common)
+        job = Play(source, options.size, options.frames)
+        print(f"kpbench: {record['name']}", file=sys.stderr)
+        repeats = [_alone(_play_once, job) for _ in range(options.repeats)]  # first: drivers keep compiled shaders
+        renderer, accuracy = _alone(_compare, job)
+        for name, quality in LADDER.items():
+            settings = {"quality": name, **asdict(quality), "share": str(quality.share), **common}
+            yield record | {"seed": None, "renderer": renderer, "settings": settings, "accuracy": accuracy[name],
+                            "repeats": [repeat[name] for repeat in repeats]}  # fmt: skip
 
 
-def _play_once(job: Play) -> results.Record:
-    """Open the file, draw the first frame, then `job.frames` more with the clip's time moving on with each."""
+def _frame_times(scene: kpc.Scene, frames: int, last: float) -> np.ndarray:
+    """(frames,) times of one frame of the clip after another, up to `last`."""
+    each = 1 / max(scene.clip.frame_count - 1, 1)
+    return np.clip(last - each * np.arange(frames)[::-1] % 1.0, 0.0, 1.0)
+
+
+def _play_once(job: Play) -> dict[str, results.Record]:
+    """Of each quality: open the file, draw the first frame, then `job.frames` more, the clip's own one after the other."""
     from kpc.player import offscreen
     from kpc.player.orbit import Rig, fitted
     from kpc.player.renderer import Renderer
@@ -310,37 +312,45 @@ def _play_once(job: Play) -> results.Record:
     opened = clock.perf_counter()
     scene = kpc.load(job.scene)
     loaded = clock.perf_counter()
-    renderer = Renderer(ctx, scene, job.quality)
-    ctx.finish()
-    uploaded = clock.perf_counter()
     camera = fitted(Rig.of(scene).cameras[0], *job.size)
 
-    def draw(time: float) -> float:
-        """Seconds until the picture is there."""
-        started = clock.perf_counter()
+    def draw(renderer: Renderer, time: float) -> tuple[float, float]:
+        """Milliseconds until the picture is there, and those that the processors spent on it."""
+        started, spent = clock.perf_counter(), clock.process_time()
         renderer.show(screen, camera, time)
         ctx.finish()
-        return clock.perf_counter() - started
+        return round(1e3 * (clock.perf_counter() - started), 3), round(1e3 * (clock.process_time() - spent), 3)
 
-    draw(0.0)
-    shown = clock.perf_counter()
-    for time in np.linspace(0.0, 1.0, WARM_UP + 1)[1:]:
-        draw(float(time))
-    frame_ms = [1e3 * draw(float(time)) for time in np.linspace(0.0, 1.0, job.frames)]
-    renderer.check()
-    return {
-        "context_ms": 1e3 * (opened - begun),
-        "load_ms": 1e3 * (loaded - opened),
-        "upload_ms": 1e3 * (uploaded - loaded),
-        "first_render_ms": 1e3 * (shown - uploaded),
-        "first_frame_ms": 1e3 * (shown - opened),
-        "frame_ms": [round(ms, 3) for ms in frame_ms],
-        "frame_ms_median": float(np.median(frame_ms)),
-        "frame_ms_p95": float(np.percentile(frame_ms, 95)),
-        "fps": 1e3 / float(np.median(frame_ms)),
-        "gpu_memory_bytes": renderer.memory_bytes,
-        "peak_memory_bytes": peak_memory_bytes(),
-    }
+    renderers, found = {}, {}
+    for name, quality in LADDER.items():
+        started = clock.perf_counter()
+        renderers[name] = renderer = Renderer(ctx, scene, quality)
+        ctx.finish()
+        uploaded = clock.perf_counter()
+        draw(renderer, 0.0)
+        shown = clock.perf_counter()
+        parts = {"load_ms": 1e3 * (loaded - opened), "upload_ms": 1e3 * (uploaded - started),
+                 "first_render_ms": 1e3 * (shown - uploaded)}  # fmt: skip
+        found[name] = {"context_ms": 1e3 * (opened - begun), **parts, "first_frame_ms": sum(parts.values())}
+    took: dict[str, list[tuple[float, float]]] = {name: [] for name in LADDER}
+    for time in _frame_times(scene, WARM_UP + job.frames, 1.0):
+        for name, renderer in renderers.items():
+            took[name].append(draw(renderer, float(time)))
+    exact = float(np.median(took["reference"][WARM_UP:], axis=0)[0])
+    for name, renderer in renderers.items():
+        renderer.check()
+        frame_ms, cpu_ms = zip(*took[name][WARM_UP:], strict=True)
+        found[name] |= {
+            "frame_ms": frame_ms,
+            "frame_ms_median": float(np.median(frame_ms)),
+            "frame_ms_p95": float(np.percentile(frame_ms, 95)),
+            "cpu_ms_median": float(np.median(cpu_ms)),
+            "fps": 1e3 / float(np.median(frame_ms)),
+            "times_reference": exact / float(np.median(frame_ms)),
+            "gpu_memory_bytes": renderer.memory_bytes,
+            "peak_memory_bytes": peak_memory_bytes(),
+        }
+    return found
 
 
 def _stream(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
@@ -357,30 +367,57 @@ def _stream(options: argparse.Namespace, origin: results.Record) -> Iterator[res
                         "prefixes": _alone(streaming.prefixes, job)}  # fmt: skip
 
 
+def _steady(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """A record a scene: whether long playback in a window takes ever more memory."""
+    from kpc.tools import steady
+
+    for source in options.scenes:
+        record = _record("steady", source, origin, {"size": "{}x{}".format(*options.size), "frames": options.frames})
+        print(f"kpbench: {record['name']}", file=sys.stderr)
+        job = steady.Steady(source, options.size, options.frames)
+        repeats = [_alone(steady.measure, job) for _ in range(options.repeats)]
+        yield record | {"seed": None, "renderer": repeats[0].pop("renderer"), "repeats": repeats}
+
+
 def _renderer(_: None) -> str:
     from kpc.player import offscreen
 
     return offscreen.describe(offscreen.open_context())
 
 
-def _compare(job: Play) -> tuple[str, results.Record]:
-    """The renderer's name, and how near its picture is to the reference's, in the middle of the clip."""
+def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
+    """The renderer's name, and how near the picture of each quality is to the reference's, in the middle of the clip while it
+    plays: from one camera, and PSNR from one that turns around the scene by a degree a frame, too."""
     from kpc.player import offscreen, reference
-    from kpc.player.orbit import Rig, fitted
+    from kpc.player.orbit import Rig, fitted, orbit
     from kpc.player.renderer import Renderer
 
     ctx = offscreen.open_context()
     scene = kpc.load(job.scene)
-    camera = fitted(Rig.of(scene).cameras[0], *job.size)
-    drawn = Renderer(ctx, scene, job.quality).render(camera, MIDDLE)
-    wanted = reference.render(scene, camera, MIDDLE)
-    difference = np.abs(np.clip(drawn.rgb, 0, 1) - np.clip(wanted.rgb, 0, 1))
-    return offscreen.describe(ctx), {
-        "time": MIDDLE,
-        "psnr": float(-10 * np.log10(max(np.mean(np.square(difference), dtype=np.float64), 1e-10))),
-        "within_one_level": float(np.mean(difference.max(axis=2) <= 1 / 255)),
-        "samples_per_ray": float(drawn.samples.mean()),
-    }
+    times = _frame_times(scene, LEAD_IN, MIDDLE)
+    still = [fitted(Rig.of(scene).cameras[0], *job.size)] * LEAD_IN
+    turning = [fitted(camera, *job.size) for camera in orbit(scene, 360)[:LEAD_IN]]
+    wanted = [np.clip(reference.render(scene, cameras[-1], MIDDLE).rgb, 0, 1) for cameras in (still, turning)]
+    found = {}
+    for name, quality in LADDER.items():
+        differences = []
+        for cameras, picture in zip((turning, still), reversed(wanted), strict=True):
+            renderer = Renderer(ctx, scene, quality)
+            for camera, time in zip(cameras, times, strict=True):
+                drawn = renderer.render(camera, float(time))
+            differences.append(np.abs(np.clip(drawn.rgb, 0, 1) - picture))
+        found[name] = {
+            "time": MIDDLE,
+            "psnr": _psnr(differences[1]),
+            "psnr_turning": _psnr(differences[0]),
+            "within_one_level": float(np.mean(differences[1].max(axis=2) <= 1 / 255)),
+            "samples_per_ray": float(drawn.samples.mean()),
+        }
+    return offscreen.describe(ctx), found
+
+
+def _psnr(difference: np.ndarray) -> float:
+    return float(-10 * np.log10(max(np.mean(np.square(difference), dtype=np.float64), 1e-10)))
 
 
 # --- coding
@@ -440,7 +477,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|groups|player|stream|codec|entropy")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|groups|player|stream|steady|codec|entropy")
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
@@ -490,6 +527,13 @@ def _parser() -> argparse.ArgumentParser:
     stream.add_argument("--size", type=_size, default=(320, 240), metavar="WxH", help="of a picture (default: 320x240)")
     stream.set_defaults(measure=_stream)
 
+    steady = kinds.add_parser("steady", help="long playback in a window", description="Whether memory stays as it is, and nothing "
+                              "is made anew on the graphics card, while scenes play in a window. Wants a display.")  # fmt: skip
+    steady.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
+    steady.add_argument("--size", type=_size, default=(320, 240), metavar="WxH", help="of the window (default: 320x240)")
+    steady.add_argument("--frames", type=_positive, default=10_000, help="to draw (default: 10000)")
+    steady.set_defaults(measure=_steady)
+
     codec = kinds.add_parser("codec", help="rate against distortion, beside general tools",
                              description="Code each scene at several rates, and its planes with what a user has at hand: "
                                          "kpc.tools.rivals. With --out FILE.json also FILE.csv and FILE.svg.")  # fmt: skip
@@ -507,9 +551,9 @@ def _parser() -> argparse.ArgumentParser:
     entropy.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
     entropy.set_defaults(measure=_entropy)
 
-    for kind in (encode, curve, ablate, step, player, stream):
+    for kind in (encode, curve, ablate, step, player, stream, steady):
         kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
-    for kind in (encode, curve, ablate, step, groups, player, stream, codec, entropy):
+    for kind in (encode, curve, ablate, step, groups, player, stream, steady, codec, entropy):
         kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
     return parser
 

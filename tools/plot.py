@@ -1,9 +1,10 @@
 """Quality and size against seconds of training, from records of `kpbench curve`; rate against distortion, from `kpbench codec`;
-PSNR frame by frame, from `kpbench groups`.
+PSNR frame by frame, from `kpbench groups`; milliseconds a frame against nearness to the reference, from `kpbench player`.
 
 python -m kpc.tools.plot docs/bench/curve.json -o docs/curve.svg
 python -m kpc.tools.plot docs/bench/codec.json -o docs/codec.svg
 python -m kpc.tools.plot docs/bench/groups.json -o docs/groups.svg
+python -m kpc.tools.plot docs/bench/player.json -o docs/player.svg
 
 Of training: one panel for each of PSNR, SSIM and file size; a line for each dataset and preset goes through the medians of its repeats,
 which are dots. Time runs on a logarithmic axis. The ending of the name chooses SVG, PNG or PDF. Needs kpc[bench].
@@ -119,6 +120,37 @@ def per_frame(records: Sequence[results.Record]) -> Figure:
     return figure
 
 
+def qualities(records: Sequence[results.Record]) -> Figure:
+    """The plot of records of `kpbench player`: PSNR to the reference against milliseconds a frame, a line for each scene and size
+    through the rungs of the ladder, the default ringed. The reference itself is left out.
+
+    Raises:
+        FormatError: there is nothing to draw.
+    """
+    lines: dict[str, list[tuple[float, float, bool]]] = {}
+    for record in records:
+        if record["kind"] == "player" and record["settings"]["quality"] != "reference":
+            settings = record["settings"]
+            lines.setdefault(f"{record['name']}, {settings['size']}", []).append(
+                (results.median(record, "frame_ms_median") or 0.0, record["accuracy"]["psnr"], settings["quality"] == settings["default"])
+            )
+    if not lines:
+        raise FormatError("no records of kpbench player to draw; write some with kpbench player --out")
+    figure = Figure(figsize=RATE_PANEL_INCHES, layout="constrained")
+    axes = figure.subplots()
+    for number, (name, points) in enumerate(lines.items()):
+        axes.plot([ms for ms, *_ in points], [psnr for _, psnr, _ in points], marker="o", markersize=3, color=f"C{number}", label=name)
+        axes.plot(*zip(*[(ms, psnr) for ms, psnr, default in points if default]), "o", markersize=9, markerfacecolor="none",
+                  color=f"C{number}")  # fmt: skip
+    axes.set(xscale="log", xlabel="milliseconds a frame", ylabel="PSNR to the reference, dB")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda ms, _: f"{ms:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(color="0.87")
+    axes.legend(fontsize=8)
+    return figure
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write a plot as its ending says.
 
@@ -143,12 +175,12 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("plot", description="Quality and size against training, or rate against distortion.")
-    parser.add_argument("records", type=Path, nargs="+", help="files that kpbench curve or codec --out wrote")
+    parser = argparse.ArgumentParser("plot", description="Quality and size against training, rate against distortion, or time against truth.")
+    parser.add_argument("records", type=Path, nargs="+", help="files that kpbench curve, codec, groups or player --out wrote")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .svg, .png or .pdf file to write")
     options = parser.parse_args(argv)
     records = results.load(options.records)
-    draw = {"codec": rate_distortion, "groups": per_frame}.get(records[0]["kind"] if records else "", curves)
+    draw = {"codec": rate_distortion, "groups": per_frame, "player": qualities}.get(records[0]["kind"] if records else "", curves)
     save(draw(records), options.output)
     print(options.output)
 

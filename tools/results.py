@@ -165,16 +165,19 @@ COLUMNS: dict[str, list[Column]] = {
     ],
     "player": [
         ("scene", lambda r: r["name"]),
-        ("path", lambda r: r["settings"]["path"]),
+        ("quality", lambda r: r["settings"]["quality"] + " (default)" * (r["settings"]["quality"] == r["settings"]["default"])),
         ("size", lambda r: r["settings"]["size"]),
         ("first frame ms", _number("first_frame_ms", "{:.0f}")),
         ("median ms", _number("frame_ms_median", "{:.1f}")),
         ("p95 ms", _number("frame_ms_p95", "{:.1f}")),
+        ("processors ms", _number("cpu_ms_median", "{:.1f}")),
         ("fps", _number("fps", "{:.1f}")),
+        ("of reference", _number("times_reference", "{:.1f}x")),
         ("samples/ray", _accuracy("samples_per_ray", "{:.1f}")),
         ("textures MB", _number("gpu_memory_bytes", "{:.1f}", 1e6)),
         ("peak MB", _number("peak_memory_bytes", "{:.0f}", 1e6)),
         ("PSNR to reference dB", _accuracy("psnr", "{:.1f}")),
+        ("turning", _accuracy("psnr_turning", "{:.1f}")),
         ("within 1/255", _accuracy("within_one_level", "{:.2%}")),
     ],
     "stream": [
@@ -189,6 +192,16 @@ COLUMNS: dict[str, list[Column]] = {
         ("jump ms", _number("jump_ms", "{:.0f}")),
         ("of which waiting", _number("jump_wait_ms", "{:.0f}")),
         ("share of the file: dB to the whole", _prefixes),
+    ],
+    "steady": [
+        ("scene", lambda r: r["name"]),
+        ("window", lambda r: r["settings"]["size"]),
+        ("frames", lambda r: f"{r['settings']['frames']:,}"),
+        ("fps", _number("fps", "{:.0f}")),
+        ("made on the card", _number("made_on_card", "{:.0f}")),
+        ("MB at first", _number("first_bytes", "{:.1f}", 1e6)),
+        ("MB at last", _number("last_bytes", "{:.1f}", 1e6)),
+        ("KB more in 1,000 frames", _number("bytes_per_1000_frames", "{:.1f}", 1e3)),
     ],
     "codec": [
         ("scene", lambda r: r["name"]),
@@ -226,6 +239,7 @@ COLUMNS: dict[str, list[Column]] = {
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
           "step": "A step of training", "player": "Playing", "stream": "Playing while it arrives",
           "groups": "A clip in groups",
+          "steady": "Playing for long, all controls shown",
           "codec": "Coding, beside what is at hand", "entropy": "Entropy coding of planes, one idea left out; one core"}
 
 

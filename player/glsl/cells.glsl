@@ -5,7 +5,7 @@
 #include "occupancy.glsl"
 
 uniform usampler3D cells;
-uniform ivec3 cell_count;
+uniform vec3 cell_count;
 uniform vec3 box_low;
 uniform vec3 box_high;
 uniform float stride;
@@ -28,10 +28,11 @@ void main() {
     Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
     seen = vec4(background, 0.0);
     met = vec4(0.0);
-    if (!to_occupied(walk, cells, cell_count)) return;
+    Place place;
+    if (!to_occupied(walk, cells, place)) return;
 
-    float t = distance_of(sample_s(walk), even);
-    vec3 inside = position_at(walk, t, cell_count);
+    float t = place.t;
+    vec3 inside = place.u * cell_count;
     vec3 cell = floor(inside);
 #if CONTRACTED
     // The way is bent: take the face that the sample is nearest to for the one through which the ray came in.
@@ -39,16 +40,16 @@ void main() {
     vec3 face = vec3(greaterThanEqual(local, vec3(largest(local))));
 #else
     // Back from the sample to the face through which the ray came in.
-    vec3 enter = (cell + vec3(lessThan(walk.rate, vec3(0.0))) - walk.start) * walk.inverse;
+    vec3 enter = ((cell + vec3(lessThan(walk.rate, vec3(0.0)))) * walk.edge - walk.start) * walk.inverse;
     t = max(largest(enter), walk.near);
-    vec3 local = abs(walk.start + t * walk.rate - cell - 0.5);
+    vec3 local = abs((walk.start + t * walk.rate) * cell_count - cell - 0.5);
     vec3 face = vec3(greaterThanEqual(enter, vec3(t)));
 #endif
     vec3 across = mix(local, vec3(0.0), face);
     float line = smoothstep(0.40, 0.46, max(across.x, max(across.y, across.z)));
     float lit = dot(face, vec3(0.72, 0.84, 1.0));
-    vec3 place = cell / vec3(cell_count);
-    vec3 tint = mix(vec3(0.30, 0.46, 0.62), vec3(0.90, 0.74, 0.46), place);
+    vec3 shade = cell * walk.edge;
+    vec3 tint = mix(vec3(0.30, 0.46, 0.62), vec3(0.90, 0.74, 0.46), shade);
     seen = vec4(tint * max(lit, 0.6) * mix(1.0, 0.6, line), 1.0);
     met = vec4(world_distance(path, t), 1.0, 0.0, 0.0);
 }

@@ -7,23 +7,22 @@
 
 uniform sampler2D planes;
 uniform sampler2D rows;
-uniform vec2 planes_texel;
 uniform vec2 rows_texel;
-uniform vec2 source;         // the plane's block in `planes`
+uniform vec4 source;         // the plane's block in `planes`
 uniform float source_width;  // of one layer there
-uniform vec2 origin;         // its block in what is written
-uniform float width;
-uniform vec2 shrink;         // texels of the plane to one that is written
+uniform vec2 origin;         // its block in what is written, texels
+uniform float width;         // of one layer
+uniform vec2 at_texel;       // of the plane to one texel that is written
+uniform float row_texel;     // texels of the row to one that is written along it
 uniform bool upright;        // the row runs along the plane's rows, else along its columns
-uniform int axis;
-uniform int scale;
+uniform int line;            // of the row's first layer
 
 layout(location = 0) out vec4 folded;
 
 void main() {
     vec2 local = gl_FragCoord.xy - origin;
     float layer = floor(local.x / width);
-    vec2 position = (vec2(local.x - layer * width, local.y) - 0.5) * shrink;
-    folded = plane_layer(planes, planes_texel, source, source_width, position, int(layer))
-           * row_layer(rows, rows_texel, upright ? position.y : position.x, axis, scale, int(layer));
+    vec2 position = vec2(local.x - layer * width, local.y) - 0.5;
+    folded = plane_layer(planes, source, source_width, position * at_texel, int(layer))
+           * row_layer(rows, rows_texel, (upright ? position.y : position.x) * row_texel, line + int(layer));
 }
