@@ -27,7 +27,8 @@ SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
 SEEN_BEFORE_UNIT, MET_BEFORE_UNIT = 2, 3
 TARGETS_KEPT = 8
 FOLLOWS_S = 0.2
-"""A picture so much later in the clip than the one before has too little in common with it to follow it."""
+"""A picture so much later in the clip than the one before has too little in common with it to follow it; nor does one follow at
+the same time: while the clip stands still, pictures are whole."""
 CONSTANTS = 8192
 """vec4s of decoder weights that a shader may hold, ten times what the largest preset needs; compilers choke on more."""
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
@@ -277,7 +278,7 @@ class Renderer:
         """Draw half of the pixels, and let the rest follow the picture before; draw all of them where there is none."""
         size = shot.camera.width, shot.camera.height
         before = self._shots.pop((part, size), None)
-        if before is not None and abs(shot.time - before.time) * self.scene.clip.duration_s > FOLLOWS_S:
+        if before is not None and not 0 < abs(shot.time - before.time) * self.scene.clip.duration_s < FOLLOWS_S:
             before = None
         # One picture of half the width, and two whole ones that take turns, one for each parity.
         half = self._target(part, (-(-size[0] // 2), size[1]), 2)
