@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from scenes import SPACES, look_at, tiny_scene
 
+from kpc.player import renderer as module
 from kpc.player.quality import DEFAULT, LADDER, Quality, climbed
 from kpc.player.reference import render
-from kpc.player.renderer import Renderer
+from kpc.player.renderer import COMPUTE_VERSION, TRIAL_AFTER, Renderer
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
 
@@ -38,3 +39,38 @@ def test_every_rung_draws_the_scene_and_the_last_exactly(space: str) -> None:
         got = renderer.render(CAMERA, 0.62)
         assert got.rgb.shape == wanted.rgb.shape
         assert psnr(got.rgb, wanted.rgb) > (60 if name == "reference" else 20), name
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_compute_shaders_draw_the_same(space: str) -> None:
+    ctx, scene = gl.context(), SPACES[space](tiny_scene(4))
+    if ctx.version_code < COMPUTE_VERSION:
+        pytest.skip("this OpenGL has no compute shaders")
+    camera = CAMERA.resized(61, 43)  # no whole number of work groups
+    renderer, pictures = Renderer(ctx, scene), {}
+    for renderer.compute in (False, True):
+        for name in ("reference", "balanced", "fine"):
+            renderer.quality = LADDER[name]
+            pictures[name, renderer.compute] = renderer.render(camera, 0.3)
+    renderer.check()
+    for name in ("reference", "balanced", "fine"):
+        one, other = pictures[name, False], pictures[name, True]
+        assert np.mean(np.abs(one.rgb - other.rgb).max(axis=2) < 1 / 255) > 0.999 and psnr(one.rgb, other.rgb) > 55, name
+        assert np.mean(one.samples == other.samples) > 0.99
+
+
+def test_a_card_tries_both_kinds_of_shaders_once_and_keeps_to_the_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+    ctx = gl.context()
+    if ctx.version_code < COMPUTE_VERSION:
+        pytest.skip("this OpenGL has no compute shaders")
+    monkeypatch.setattr(module, "is_software", lambda ctx: False)
+    asked = []
+    monkeypatch.setattr(Renderer, "is_compute_faster", lambda self, camera, time: asked.append(time) or True)
+    renderer = Renderer(ctx, tiny_scene(4))
+    for n in range(TRIAL_AFTER + 3):
+        assert renderer.compute == (n >= TRIAL_AFTER)
+        renderer.march(CAMERA, n / 100)
+    assert asked == [(TRIAL_AFTER - 1) / 100]
+    monkeypatch.undo()
+    assert renderer.is_compute_faster(CAMERA, 0.5) in (True, False) and renderer.compute
+    assert not Renderer(ctx, tiny_scene(4)).compute
