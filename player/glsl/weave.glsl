@@ -44,17 +44,20 @@ vec4 before_at(vec2 pixel, float depth) {
 #endif
 }
 
+// The pixel one way; where that leaves the picture, the other way.
+vec2 beside(vec2 pixel, vec2 way) {
+    vec2 other = pixel + way;
+    return any(lessThan(other, vec2(0.0))) || any(greaterThanEqual(other, size)) ? pixel - way : other;
+}
+
 void main() {
     vec2 pixel = floor(gl_FragCoord.xy);
-    vec2 last = size - 1.0;
     vec4 own = textureLod(seen_now, in_half(pixel), 0.0), own_met = textureLod(met_now, in_half(pixel), 0.0);
     bool marched = mod(pixel.x + pixel.y + parity, 2.0) < 0.5;
 
     vec4 sum = vec4(0.0), sum_met = vec4(0.0), low = vec4(1e9), high = vec4(-1e9), change = vec4(0.0);
-    vec2 at_0 = pixel.x > 0.0 ? pixel - vec2(1.0, 0.0) : pixel + vec2(1.0, 0.0);
-    vec2 at_1 = pixel.x < last.x ? pixel + vec2(1.0, 0.0) : pixel - vec2(1.0, 0.0);
-    vec2 at_2 = pixel.y > 0.0 ? pixel - vec2(0.0, 1.0) : pixel + vec2(0.0, 1.0);
-    vec2 at_3 = pixel.y < last.y ? pixel + vec2(0.0, 1.0) : pixel - vec2(0.0, 1.0);
+    vec2 across = size.x > 1.0 ? vec2(1.0, 0.0) : vec2(0.0, 1.0), up = size.y > 1.0 ? vec2(0.0, 1.0) : vec2(1.0, 0.0);
+    vec2 at_0 = beside(pixel, across), at_1 = beside(pixel, -across), at_2 = beside(pixel, up), at_3 = beside(pixel, -up);
     float most = 0.0;
     vec4 now, now_met, difference;
 #unroll i 4
