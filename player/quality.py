@@ -25,7 +25,7 @@ class Quality:
             is left of its light counts as what it has met so far.
         share: scales whose texels are at least so many steps long are looked up once for two samples, in the middle between them.
         interlaced: march every other pixel, like the squares of one colour of a chessboard, and in the next frame those in between.
-            The rest follows the frame before. A frame that follows none, after a jump, is marched whole.
+            The rest follows the frame before. Only while the clip plays: what follows no frame is marched whole.
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated.
         scales: how many of the scene's to use, from the coarsest on; None: all.
     """

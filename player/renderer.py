@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import time as clock
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -29,7 +30,13 @@ SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
 SEEN_BEFORE_UNIT, MET_BEFORE_UNIT = 2, 3
 TARGETS_KEPT = 8
 FOLLOWS_S = 0.2
-"""A picture so much later in the clip than the one before has too little in common with it to follow it."""
+"""A picture so much later in the clip than the one before has too little in common with it to follow it; nor does one follow at
+the same time: while the clip stands still, pictures are whole."""
+COMPUTE_VERSION = 430
+TRIAL_AFTER, TRIALS = 8, 3
+"""Marches until fragment and compute shaders are tried against each other, and pictures that each of them draws for that."""
+GROUP = 8
+"""Pixels a side that a work group of march.glsl draws."""
 CONSTANTS = 8192
 """vec4s of decoder weights that a shader may hold, ten times what the largest preset needs; compilers choke on more."""
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
@@ -96,6 +103,8 @@ class Renderer:
 
     Attributes:
         quality: how finely to draw; may be set at any time.
+        compute: whether a compute shader marches, else a fragment shader. Graphics cards try both once, where they have
+            both, and keep to the faster; a processor that stands in for one is never faster by compute shaders.
 
     Raises:
         DisplayError: the scene does not fit the card, or a shader does not compile.
@@ -105,6 +114,8 @@ class Renderer:
         self.ctx = ctx
         self.scene = scene
         self.quality = quality
+        self.compute = False
+        self._marches_to_trial = math.inf if is_software(ctx) or ctx.version_code < COMPUTE_VERSION else TRIAL_AFTER
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
         _refuse_too_large(scene, self.layout, ctx.info)
@@ -136,7 +147,7 @@ class Renderer:
         for block in self.layout.blocks:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
         self._slot: int | None = None
-        self._programs: dict[tuple[object, ...], tuple[moderngl.Program, moderngl.VertexArray]] = {}
+        self._programs: dict[tuple[object, ...], tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]] = {}
         self._targets: dict[tuple[Part, tuple[int, int], int], Target] = {}
         self._shots: dict[tuple[Part, tuple[int, int]], Shot] = {}
         """The last interlaced picture of each size."""
@@ -247,8 +258,11 @@ class Renderer:
         layout = self.folded_layout if folded else self.layout
         drawn = min(quality.scales or layout.scales, layout.scales)
         shared = 0 if isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
+        self._marches_to_trial -= 1
+        if self._marches_to_trial == 0:
+            self.compute = self.is_compute_faster(camera, time)
         march, vertices = self._program(program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared,
-                                        interlaced=interlaced)
+                                        interlaced=interlaced, compute=self.compute and program == "march.glsl")
         stride = scene.step * quality.step
         _set(
             march,
@@ -264,7 +278,13 @@ class Renderer:
             if self._motion_texture is not None:
                 self._motion_texture.use(MOTION_UNIT)
             self._cells.use(CELLS_UNIT)
-            self._draw(target.framebuffer, vertices)
+            if isinstance(march, moderngl.ComputeShader):
+                target.seen.bind_to_image(SEEN_UNIT, read=False)
+                target.met.bind_to_image(MET_UNIT, read=False)
+                march.run(*(-(-side // GROUP) for side in target.seen.size))
+                self.ctx.memory_barrier()
+            else:
+                self._draw(target.framebuffer, vertices)
 
         if interlaced:
             target = self._woven(march, draw, Shot(camera, time), part)
@@ -273,11 +293,26 @@ class Renderer:
             draw(target)
         return target if raster == size else self._upscaled(target, self._target(part, size))
 
-    def _woven(self, march: moderngl.Program, draw: Callable[[Target], None], shot: Shot, part: Part) -> Target:
+    def is_compute_faster(self, camera: Camera, time: float) -> bool:
+        """Draw a picture by fragment and by compute shaders, a few times each, and compare the best of their times."""
+        chosen, seconds = self.compute, {}
+        for self.compute in (False, True):
+            took = []
+            for _ in range(1 + TRIALS):  # the first compiles
+                self.ctx.finish()
+                started = clock.perf_counter()
+                self.march(camera, time)
+                self.ctx.finish()
+                took.append(clock.perf_counter() - started)
+            seconds[self.compute] = min(took[1:])
+        self.compute = chosen
+        return seconds[True] < seconds[False]
+
+    def _woven(self, march: moderngl.Program | moderngl.ComputeShader, draw: Callable[[Target], None], shot: Shot, part: Part) -> Target:
         """Draw half of the pixels, and let the rest follow the picture before; draw all of them where there is none."""
         size = shot.camera.width, shot.camera.height
         before = self._shots.pop((part, size), None)
-        if before is not None and abs(shot.time - before.time) * self.scene.clip.duration_s > FOLLOWS_S:
+        if before is not None and not 0 < abs(shot.time - before.time) * self.scene.clip.duration_s < FOLLOWS_S:
             before = None
         # One picture of half the width, and two whole ones that take turns, one for each parity.
         half = self._target(part, (-(-size[0] // 2), size[1]), 2)
@@ -346,14 +381,15 @@ class Renderer:
 
     def _program(
         self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
-        shared: int = 0, interlaced: bool = False, still: bool = False,
-    ) -> tuple[moderngl.Program, moderngl.VertexArray]:
+        shared: int = 0, interlaced: bool = False, still: bool = False, compute: bool = False,
+    ) -> tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
-        key = name, layout.refined, rows, displaced, drawn, shared, interlaced, still
+        key = name, layout.refined, rows, displaced, drawn, shared, interlaced, still, compute
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
-        program = shader.build(
+        build = shader.build_compute if compute else shader.build
+        program = build(
             self.ctx,
             name,
             {
@@ -368,11 +404,14 @@ class Renderer:
                 "SHARED": shared,
                 "INTERLACED": int(interlaced),
                 "STILL": int(still),
+                "COMPUTE": int(compute),
             },
             {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))},
         )
         _set(
             program,
+            seen_picture=SEEN_UNIT,
+            met_picture=MET_UNIT,
             planes=PLANES_UNIT,
             rows=ROWS_UNIT,
             cells=CELLS_UNIT,
@@ -386,7 +425,9 @@ class Renderer:
             even=scene.mapping.even if isinstance(scene.mapping, Contraction) else 0.0,
             **_frame_of(scene.mapping),
         )
-        entry = self._programs[key] = program, self.ctx.vertex_array(program, [])
+        # What draws a compute shader's picture on the screen has vertices of its own.
+        vertices = self._program("present.glsl", layout)[1] if compute else self.ctx.vertex_array(program, [])
+        entry = self._programs[key] = program, vertices
         return entry
 
     def _occupy(self, slot: int) -> None:
@@ -468,7 +509,7 @@ def _texture(ctx: moderngl.Context, size: tuple[int, int]) -> moderngl.Texture:
     return texture
 
 
-def _set(program: moderngl.Program, **values: object) -> None:
+def _set(program: moderngl.Program | moderngl.ComputeShader, **values: object) -> None:
     """Set the uniforms that a program has; compilers drop those it does not use, and the unused ends of arrays."""
     for name, value in values.items():
         member = program.get(name, None)

@@ -4,8 +4,9 @@ The files in `player/glsl` hold no `#version`, so that one set serves desktop Op
 the subset that both understand (GLSL ES 3.00).
 """
 
+import contextlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import resources
 
 import moderngl
@@ -14,6 +15,7 @@ import numpy as np
 from kpc.format.errors import DisplayError
 
 GL33 = "#version 330 core"
+GL43 = "#version 430 core"
 ES30 = """#version 300 es
 precision highp float;
 precision highp int;
@@ -118,8 +120,27 @@ def build(
     """
     vertex_text, _ = compose("fullscreen.glsl", defines)
     text, files = compose(fragment, defines, written=written)
-    try:
+    with _complaints_named(ctx, files):
         return ctx.program(vertex_shader=vertex_text, fragment_shader=text)
+
+
+def build_compute(
+    ctx: moderngl.Context, name: str, defines: Mapping[str, int], written: Mapping[str, str] | None = None
+) -> moderngl.ComputeShader:
+    """Compile a compute shader. The context must be of GL 4.3.
+
+    Raises:
+        DisplayError: as `build`.
+    """
+    text, files = compose(name, defines, GL43, written)
+    with _complaints_named(ctx, files):
+        return ctx.compute_shader(text)
+
+
+@contextlib.contextmanager
+def _complaints_named(ctx: moderngl.Context, files: list[str]) -> Iterator[None]:
+    try:
+        yield
     except moderngl.Error as error:
         message, driver = first_complaint(str(error), files), ctx.info["GL_RENDERER"]
         raise DisplayError(f"{message} (driver: {driver}); update it, or kprender --backend reference") from error

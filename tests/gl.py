@@ -3,9 +3,11 @@
 import functools
 
 import moderngl
+import numpy as np
 import pytest
 
 from kpc.format.errors import DisplayError
+from kpc.player import shader
 from kpc.player.offscreen import open_context
 
 
@@ -22,3 +24,24 @@ def context() -> moderngl.Context:
     if isinstance(found, str):
         pytest.skip(found)
     return found
+
+
+def evaluate(glsl: str, expression: str, *inputs: np.ndarray, **defines: int) -> np.ndarray:
+    """(N, 4) float32: `expression`, a vec4, at each of N places, N a multiple of 256; inputs (N, 4) are called a, b, c, d there.
+
+    `glsl`: what comes before main, `#include`s for the most part.
+    """
+    ctx, names = context(), "abcd"[: len(inputs)]
+    size = (256, len(inputs[0]) // 256)
+    fetch = "".join(f"vec4 {n} = texelFetch(from_{n}, ivec2(gl_FragCoord.xy), 0); " for n in names)
+    text = "".join(f"uniform sampler2D from_{n};\n" for n in names) + glsl
+    program = shader.build(ctx, "main", {"CONTRACTED": 0, "NDC": 0, **defines},
+                           {"main": f"{text}\nout vec4 o;\nvoid main() {{ {fetch} o = {expression}; }}\n"})  # fmt: skip
+    textures = [ctx.texture(size, 4, np.ascontiguousarray(array, np.float32), dtype="f4") for array in inputs]
+    for unit, (name, texture) in enumerate(zip(names, textures, strict=True)):
+        texture.use(unit)
+        program[f"from_{name}"] = unit
+    target = ctx.framebuffer([ctx.texture(size, 4, dtype="f4")])
+    target.use()
+    ctx.vertex_array(program, []).render(moderngl.TRIANGLES, vertices=3)
+    return np.frombuffer(target.read(components=4, dtype="f4"), np.float32).reshape(-1, 4)

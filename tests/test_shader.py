@@ -31,6 +31,20 @@ def test_includes_come_once_and_lines_keep_their_numbers() -> None:
     assert where["int bad;"] == ("a", 4)
 
 
+def test_loops_are_written_out() -> None:
+    written = {"a": "#unroll i TWO\nint x_##i = i;\n#unroll j N_##i  // nested\nint y_##i##j = idle + j;\n#end\n#end\nint bad;\n"}
+    text, _ = shader.compose("a", {"TWO": 2, "N_0": 1, "N_1": 2}, written=written)
+    lines = text.splitlines()
+    assert [line for line in lines if line.startswith("int")] == [
+        "int x_0 = 0;", "int y_00 = idle + 0;", "int x_1 = 1;", "int y_10 = idle + 0;", "int y_11 = idle + 1;", "int bad;",
+    ]  # fmt: skip
+    assert lines[lines.index("int bad;") - 1] == "#line 7" and lines[lines.index("int y_11 = idle + 1;") - 1] == "#line 4"
+    with pytest.raises(ValueError, match="#unroll i has no #end"):
+        shader.compose("a", written={"a": "#unroll i 3\n"})
+    with pytest.raises(ValueError, match="MANY: that count is not known"):
+        shader.compose("a", written={"a": "#unroll i MANY\n#end\n"})
+
+
 def test_a_missing_file_is_named() -> None:
     with pytest.raises(ValueError, match="nowhere"):
         shader.compose("a", written={"a": '#include "nowhere.glsl"'})
@@ -90,7 +104,7 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     blocks = shader.constants(block_arrays(scene, layout))
-    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "SHARED": int(space == "box"), "INTERLACED": rows, "STILL": motion,
+    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "SHARED": int(space == "box"), "INTERLACED": rows, "STILL": motion, "COMPUTE": 0,
                "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion, "APPEARANCE": rows}  # fmt: skip
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights, "plane_blocks": blocks})
     vertex, _ = shader.compose("fullscreen.glsl", preamble=shader.ES30)

@@ -7,6 +7,7 @@
 // NDC: 1 where all this is in device coordinates. DRAWN: how many scales count. SHARED: how many, from
 // the coarsest on, are looked up once for two samples, in the middle between them; the next gives their slope.
 // INTERLACED: 1 where half the pixels are marched, for weave.glsl.
+// COMPUTE: 1 for a compute shader (GL 4.3).
 
 #include "ray.glsl"
 #include "space.glsl"
@@ -47,9 +48,6 @@ uniform float height;
 uniform vec4 lens;
 uniform mat3 axes;
 uniform vec3 eye;
-
-layout(location = 0) out vec4 seen;     // rgb and opacity
-layout(location = 1) out vec4 met;      // sum of weight t, samples
 
 #if HIDDEN
 // e of a direction, in three parts: x y z xx, yy zz xy yz, zx 1; the last is for b1.
@@ -231,8 +229,8 @@ void add_sample(inout Met sum, vec4 logits, float thickness, float distance) {
     sum.samples += 1.0;
 }
 
-void main() {
-    vec2 fragment = gl_FragCoord.xy;
+// seen: rgb and opacity; met: sum of weight t, samples.
+void march(vec2 fragment, out vec4 seen, out vec4 met) {
 #if INTERLACED
     fragment.x = 2.0 * floor(fragment.x) + mod(floor(fragment.y) + parity, 2.0) + 0.5;
 #endif
@@ -291,3 +289,25 @@ void main() {
     seen = vec4(sum.rgb + sum.trans * background, 1.0 - sum.trans);
     met = vec4(sum.depth, sum.samples, 0.0, 0.0);
 }
+
+#if COMPUTE
+layout(local_size_x = 8, local_size_y = 8) in;
+layout(rgba32f) uniform writeonly image2D seen_picture;
+layout(rg32f) uniform writeonly image2D met_picture;
+
+void main() {
+    ivec2 at = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(at, imageSize(seen_picture)))) return;
+    vec4 seen, met;
+    march(vec2(at) + 0.5, seen, met);
+    imageStore(seen_picture, at, seen);
+    imageStore(met_picture, at, met);
+}
+#else
+layout(location = 0) out vec4 seen;
+layout(location = 1) out vec4 met;
+
+void main() {
+    march(gl_FragCoord.xy, seen, met);
+}
+#endif
