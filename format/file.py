@@ -361,6 +361,7 @@ class SceneReader(Reader):
         if self.head.value_count != self.header.value_count:
             raise FormatError(f"{self.name}: the header claims {self.header.value_count:,} values, "
                               f"the scene {self.head.value_count:,}")
+        self._beside: dict[str, int] = {}
         self.planes_bytes = 0 if in_parts else 5 * self.head.value_count  # one int8 symbol and one float32 each
         if self.planes_bytes > memory_budget:
             raise BudgetError(f"{self.name}: needs {self.planes_bytes:,} bytes of memory, more than the budget of "
@@ -465,7 +466,9 @@ class SceneReader(Reader):
         return self._only(kind) if any(entry.kind == kind for entry in self.index) else None
 
     def _afford(self, more_bytes: int, what: str) -> None:
-        needed = self.planes_bytes + more_bytes
+        """Count what else is read against the budget, together with the planes and all that was read before."""
+        self._beside[what] = more_bytes
+        needed = self.planes_bytes + sum(self._beside.values())
         if needed > self.memory_budget:
             raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory with {what}, more than the budget of "
                               f"{self.memory_budget:,}")

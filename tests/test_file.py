@@ -432,3 +432,14 @@ def test_decoding_is_fast():
     start = time.perf_counter()
     kpc.load(data)
     assert time.perf_counter() - start < 1.0
+
+
+def test_grids_and_planes_count_against_the_budget_together():
+    scene = replace(quantised(time=6), occupancy=rolling(), motion=QuantisedMotion(swaying(), STEP))
+    data = encode(scene)
+    reader = SceneReader(data)
+    raw = {entry.kind: entry.raw_length for entry in reader.index}
+    needed = reader.planes_bytes + 8 * (raw["OCCU"] + raw["MOVE"])
+    assert_same(read(data, memory_budget=needed), scene)
+    with pytest.raises(BudgetError):
+        read(data, memory_budget=needed - 1)
