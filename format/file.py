@@ -543,10 +543,10 @@ def _parse_mapping(raw: bytes, head: SceneHead) -> SpaceMapping:
         _, *frame, near, baseline = cursor.unpack(NDC_STRUCT)
         cursor.finish()
         mapping = DeviceCoordinates(np.reshape(frame, (3, 4)), near, baseline)
-        turned = mapping.frame[:, :3].T @ mapping.frame[:, :3] - np.eye(3)
-        within = [1 / BOX_LIMIT <= x <= BOX_LIMIT for x in (near, baseline)]
-        if not all(within) or not (np.abs(mapping.frame) <= BOX_LIMIT).all() or not (np.abs(turned) < FRAME_TOLERANCE).all() \
-                or not head.aabb[1, 2] < baseline / near:  # False for NaN, too
+        within = all(1 / BOX_LIMIT <= x <= BOX_LIMIT for x in (near, baseline)) and (np.abs(mapping.frame) <= BOX_LIMIT).all()
+        # False for NaN, too; only what is within has products that are none of them infinite
+        if not within or not (np.abs(mapping.frame[:, :3].T @ mapping.frame[:, :3] - np.eye(3)) < FRAME_TOLERANCE).all() \
+                or not head.aabb[1, 2] < baseline / near:
             raise FormatError(f"WARP: device coordinates of near {near} and baseline {baseline}, their frame or the box in them "
                               "make no sense")
         return mapping

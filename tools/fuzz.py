@@ -332,12 +332,15 @@ def run(count: int, seed: int, processes: int, budget: int = BUDGET, say: Callab
                 following, told, found = pipe.recv()  # type: ignore[union-attr]
                 tally += told
                 findings += found
+                for number, what in found:
+                    say(f"file {number}: {what}")
                 jobs[pipe] = process, now, range(following, count, processes), skipped
             except EOFError:
                 process.join()
                 del jobs[pipe]
                 if len(numbers):
                     findings.append((int(now[0]), f"the process ended with code {process.exitcode}"))
+                    say("file {}: {}".format(*findings[-1]))
                     tally["finding"] += 1
                     begin(numbers, skipped | {int(now[0])})
         for process, now, *_ in jobs.values():
