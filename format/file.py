@@ -361,6 +361,7 @@ class SceneReader(Reader):
         if self.head.value_count != self.header.value_count:
             raise FormatError(f"{self.name}: the header claims {self.header.value_count:,} values, "
                               f"the scene {self.head.value_count:,}")
+        self._beside: dict[str, int] = {}
         self.planes_bytes = 0 if in_parts else 5 * self.head.value_count  # one int8 symbol and one float32 each
         if self.planes_bytes > memory_budget:
             raise BudgetError(f"{self.name}: needs {self.planes_bytes:,} bytes of memory, more than the budget of "
@@ -465,7 +466,9 @@ class SceneReader(Reader):
         return self._only(kind) if any(entry.kind == kind for entry in self.index) else None
 
     def _afford(self, more_bytes: int, what: str) -> None:
-        needed = self.planes_bytes + more_bytes
+        """Count what else is read against the budget, together with the planes and all that was read before."""
+        self._beside[what] = more_bytes
+        needed = self.planes_bytes + sum(self._beside.values())
         if needed > self.memory_budget:
             raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory with {what}, more than the budget of "
                               f"{self.memory_budget:,}")
@@ -540,10 +543,10 @@ def _parse_mapping(raw: bytes, head: SceneHead) -> SpaceMapping:
         _, *frame, near, baseline = cursor.unpack(NDC_STRUCT)
         cursor.finish()
         mapping = DeviceCoordinates(np.reshape(frame, (3, 4)), near, baseline)
-        turned = mapping.frame[:, :3].T @ mapping.frame[:, :3] - np.eye(3)
-        within = [1 / BOX_LIMIT <= x <= BOX_LIMIT for x in (near, baseline)]
-        if not all(within) or not (np.abs(mapping.frame) <= BOX_LIMIT).all() or not (np.abs(turned) < FRAME_TOLERANCE).all() \
-                or not head.aabb[1, 2] < baseline / near:  # False for NaN, too
+        within = all(1 / BOX_LIMIT <= x <= BOX_LIMIT for x in (near, baseline)) and (np.abs(mapping.frame) <= BOX_LIMIT).all()
+        # False for NaN, too; only what is within has products that are none of them infinite
+        if not within or not (np.abs(mapping.frame[:, :3].T @ mapping.frame[:, :3] - np.eye(3)) < FRAME_TOLERANCE).all() \
+                or not head.aabb[1, 2] < baseline / near:
             raise FormatError(f"WARP: device coordinates of near {near} and baseline {baseline}, their frame or the box in them "
                               "make no sense")
         return mapping

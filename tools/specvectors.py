@@ -438,6 +438,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "ndc-near": (warped(ndc(near=-1.0)), broken, "make no sense"),
         "ndc-nan": (warped(ndc(near=nan)), broken, "make no sense"),
         "ndc-frame": (warped(ndc(skew=0.01)), broken, "make no sense"),
+        "ndc-vast": (warped(ndc(skew=1e200)), broken, "make no sense"),
         "ndc-box": (warped(ndc(near=16.0)), broken, "make no sense"),
         "warp-twice": (warped(*2 * [struct.pack("<Id", 1, 3.5)]), broken, "2 WARP chunks"),
         "move-rows": (displaced(move(1, 2, 2, 2, 0.5**13)), broken, "makes no sense"),
