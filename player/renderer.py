@@ -149,8 +149,8 @@ class Renderer:
         self._slot: int | None = None
         self._programs: dict[tuple[object, ...], tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]] = {}
         self._targets: dict[tuple[Part, tuple[int, int], int], Target] = {}
-        self._shots: dict[tuple[Part, tuple[int, int]], Shot] = {}
-        """The last interlaced picture of each size."""
+        self._shots: dict[Part, Shot] = {}
+        """The last interlaced picture."""
         self.check()
 
     def check(self) -> None:
@@ -324,9 +324,11 @@ class Renderer:
     def _woven(self, march: moderngl.Program | moderngl.ComputeShader, draw: Callable[[Target], None], shot: Shot, part: Part) -> Target:
         """Draw half of the pixels, and let the rest follow the picture before; draw all of them where there is none."""
         size = shot.camera.width, shot.camera.height
-        before = self._shots.pop((part, size), None)
-        if before is not None and not 0 < abs(shot.time - before.time) * self.scene.clip.duration_s < FOLLOWS_S:
-            before = None
+        before = self._shots.pop(part, None)
+        if before is not None:
+            since_s = abs(shot.time - before.time) * self.scene.clip.duration_s
+            if not 0 < since_s < FOLLOWS_S or (before.camera.width, before.camera.height) != size:
+                before = None
         # One picture of half the width, and two whole ones that take turns, one for each parity.
         half = self._target(part, (-(-size[0] // 2), size[1]), 2)
         half.seen.filter = half.met.filter = moderngl.NEAREST, moderngl.NEAREST
@@ -335,7 +337,7 @@ class Renderer:
             _set(march, parity=float(turn))
             draw(half)
             self._weave(half, self._target(part, size, 1 - turn), self._target(part, size, turn), shot, before, turn)
-        self._shots[part, size] = replace(shot, parity=parity)
+        self._shots[part] = replace(shot, parity=parity)
         return self._target(part, size, parity)
 
     def _weave(self, half: Target, old: Target, new: Target, shot: Shot, before: Shot | None, parity: int) -> None:
@@ -389,7 +391,7 @@ class Renderer:
         if len(self._targets) > TARGETS_KEPT:
             dropped = next(iter(self._targets))
             self._targets.pop(dropped).release()
-            self._shots.pop(dropped[:2], None)
+            self._shots.pop(dropped[0], None)
         return target
 
     def _program(

@@ -94,7 +94,7 @@ def main(scene_file: str) -> None:
     assert np.abs(canvas() - average).max() > 10
     press(glfw.KEY_V)
     player.wardrobe.advance(1.0)
-    assert np.array_equal(canvas(), average)
+    assert np.abs(canvas() - average).max() <= 1  # where a value lies between two levels, it may round to either
 
     before = player.view
     drag(0, 30, 10)
