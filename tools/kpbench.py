@@ -282,6 +282,7 @@ def _player(options: argparse.Namespace, origin: results.Record) -> Iterator[res
     """A record for each scene and rung of the ladder of qualities. A repeat draws all of them by turns, frame by frame, so that
     whatever else the machine does slows them all alike."""
     for source in options.scenes:
+        kpc.load(source)  # what is wrong with it is told before anything is measured
         common = {"size": "{}x{}".format(*options.size), "frames": options.frames, "warm_up": WARM_UP, "default": DEFAULT}
         record = _record("player", source, origin, common)
         job = Play(source, options.size, options.frames)
