@@ -23,6 +23,7 @@ def context() -> moderngl.Context:
     found = _context()
     if isinstance(found, str):
         pytest.skip(found)
+    found.__enter__()  # what a test before rendered within a command may have made another one current
     return found
 
 

@@ -17,7 +17,7 @@ from kpc.format.memory import peak_memory_bytes
 from kpc.player import offscreen
 from kpc.player.controls import Pace
 from kpc.player.preferences import Preferences
-from kpc.player.stream import Stream
+from kpc.player.reel import Reel
 from kpc.player.window import Player, Window
 
 MAKERS = ("texture", "texture3d", "texture_array", "texture_cube", "depth_texture", "buffer", "framebuffer", "simple_framebuffer",
@@ -45,7 +45,7 @@ def measure(job: Steady) -> dict[str, Any]:
         DisplayError: there is no display.
     """
     window = Window("kpbench steady", job.size)
-    stream = Stream(open_source(str(job.scene)))
+    stream = Reel(open_source(str(job.scene)))
     try:
         glfw.swap_interval(0)
         player = Player(window, stream, Preferences(graphs=True, planes=True))
