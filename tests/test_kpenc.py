@@ -744,18 +744,6 @@ def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
     )
 
 
-def test_a_machine_s_first_encode_equals_its_second(sets: Path, tmp_path: Path) -> None:
-    """The first compiles the kernels, the second finds them in numba's cache; real presets, all threads, own processes."""
-    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    scenes = []
-    for number in range(2):
-        output = tmp_path / f"{number}.kpc"
-        words = [sys.executable, "-m", "kpc.encoder.kpenc", str(sets / "blender"), "-o", str(output)]
-        subprocess.run([*words, "--preset", "draft", "--steps", "20"], env=env, check=True, capture_output=True)
-        scenes.append(output.read_bytes())
-    assert scenes[0] == scenes[1]
-
-
 def test_the_trade_between_size_and_loss(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     """Coded again from the checkpoint that --keep leaves, without a step of training."""
     _, out, _ = run(sets / "n3dv", "--keep", "--json")
