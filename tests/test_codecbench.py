@@ -135,6 +135,11 @@ def test_errors_are_one_line(few: None, scene_file: Path, tmp_path: Path, capsys
         assert said.out == "" and said.err.splitlines()[-1].startswith("kpbench: ") and "Traceback" not in said.err
 
 
-def test_records_survive_json(few: None, scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_records_survive_json(
+    few: None, scene_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(codecbench, "RATES", (3.0,))
+    monkeypatch.setattr(codecbench, "QUALITIES", (60,))
+    monkeypatch.setattr(codecbench, "RIVALS", (Bytes(),))
     assert kpbench.main(["codec", str(scene_file)]) == 0
     assert json.loads(capsys.readouterr().out)[0]["kind"] == "codec"

@@ -7,12 +7,17 @@ Colours must agree to 1e-4, a fortieth of an 8-bit level; a gradient to 1e-3 of 
 """
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from gradients import KINDS, Calling, backpropagate, misty, rays_at, reference_gradients
+from numba.core.dispatcher import Dispatcher
 from scenes import displaced, tiny_scene
 
 from kpc.encoder import kernels
@@ -64,6 +69,29 @@ def test_workers_share_the_rays_and_change_nothing_but_rounding() -> None:
     np.testing.assert_array_equal(one["peaks"], three["peaks"])
     # A sum of at most 103 * 60 float32 terms in another order.
     np.testing.assert_allclose(one["theta"], three["theta"], atol=1e-5 * np.abs(one["theta"]).max())
+
+
+def test_a_machine_s_first_training_equals_its_second(tmp_path: Path) -> None:
+    """The first process compiles a kernel, the second finds it in numba's cache; sums in any order would differ between them.
+
+    The one that compiles fastest and sums stands for all: they have its flags.
+    """
+    functions = [f for f in vars(kernels).values() if isinstance(f, Dispatcher)]
+    assert len(functions) > 20 and all(f.targetoptions["fastmath"] == kernels._FASTMATH for f in functions)
+    field, rng = Field.from_scene(tiny_scene()), np.random.default_rng(0)
+    theta, density = field.theta.detach().numpy(), field.density.detach().numpy()
+    places = rng.random((500, 3), np.float32), rng.random(500, np.float32)
+    np.savez(tmp_path / "in.npz", theta, field.layout.table, field.layout.resolution, density, *places)
+    script = (
+        "import sys, numpy\nfrom kpc.encoder import kernels\n"
+        "theta, table, resolution, density, points, times = numpy.load(sys.argv[1]).values()\n"
+        f"logs = kernels.log_densities(theta, table, resolution, density, {field.layout.channels}, None, points, times, 2)\n"
+        "sys.stdout.buffer.write(logs.tobytes())"
+    )
+    command, env = [sys.executable, "-c", script, tmp_path / "in.npz"], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    compiled, cached = (subprocess.run(command, env=env, check=True, stdout=subprocess.PIPE).stdout for _ in range(2))
+    assert len(list(tmp_path.glob("cache/**/kernels.log_densities-*.nbc"))) == 1
+    assert len(compiled) == 2000 and compiled == cached
 
 
 def test_rays_that_miss_the_box_show_the_background() -> None:

@@ -38,6 +38,7 @@ CONFIG = TrainConfig(
 )
 pytestmark = pytest.mark.usefixtures("one_thread")
 BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
+PROPOSALS = {"proposals": True, "proposal_resolutions": (8, 12), "proposal_samples": (24, 12, 8)}
 
 
 @pytest.fixture(scope="module")
@@ -114,9 +115,9 @@ def test_a_seed_repeats_bitwise(moving: Dataset, hybrid: bool) -> None:
 
 
 # before the occupancy grid forms, between two updates of it, and after it has been split
-@pytest.mark.parametrize(("stop_at", "other"), [(5, {}), (21, {}), (68, {}), (68, {"hybrid": True}), (68, {"proposals": True})])
+@pytest.mark.parametrize(("stop_at", "other"), [(5, {}), (21, {}), (68, {}), (68, {"hybrid": True}), (68, PROPOSALS)])
 def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(
-    moving: Dataset, tmp_path: Path, stop_at: int, other: dict[str, bool]
+    moving: Dataset, tmp_path: Path, stop_at: int, other: dict[str, object]
 ) -> None:
     changes = other | {"steps": 80, "channel_dropout": 0.25, "occupancy_split_every": 64, "motion_cells": 3, "appearance": "image"}
     whole = trained(moving, **changes)
