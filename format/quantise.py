@@ -194,11 +194,11 @@ def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) ->
     others = tuple(axis for axis in range(4) if axis not in (across, down))
     seen = occupancy.any(axis=others)  # the kept axes stay in the order t, z, y, x
     seen = seen if down < across else seen.T
-    reach: np.ndarray = touches(rows, seen.shape[0]) @ seen.astype(np.float32) @ touches(columns, seen.shape[1]).T
+    reach: np.ndarray = _reach(rows, seen.shape[0]) @ seen.astype(np.float32) @ _reach(columns, seen.shape[1]).T
     return np.greater(reach, 0)
 
 
-def touches(texels: int, cells: int) -> np.ndarray:
+def _reach(texels: int, cells: int) -> np.ndarray:
     """(texels, cells) float32, 1 where cell [c, c+1] / cells meets the closed support [i-1, i+1] / (texels-1)."""
     i, c = np.arange(texels)[:, None], np.arange(cells)[None]
     return (((i + 1) * cells >= c * (texels - 1)) & ((i - 1) * cells <= (c + 1) * (texels - 1))).astype(np.float32)

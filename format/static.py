@@ -4,21 +4,20 @@ A point reads one column of each time plane (`kpc.format.scene`), so a cell of t
 texel differs that reads from within the cell and the slot may touch: of "xt", "yt" and "zt", at every scale. Three slabs at right
 angles must all be still for one cell to be: a plane that wavers along one axis wavers through the whole box.
 
-With a motion grid the displacement must not change over the clip, either; what is read lies where it leads.
+With a motion grid all displacements that act on the cell must be 0 over the whole clip, too. (One that is constant but not 0 moves
+nothing either, yet counts: none is known to come out of training.)
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 
-from kpc.format.grid import linear
-from kpc.format.motion import moved
-from kpc.format.quantise import touches
 from kpc.format.scene import TIME_PLANES, Scene
 
 
 def static_cells(scene: Scene) -> np.ndarray:
-    """(slots, Nz, Ny, Nx) bool: where time planes are exactly 1, and places displaced by the same all over the clip if at all."""
+    """(slots, Nz, Ny, Nx) bool: where time planes are exactly 1, and nothing is displaced."""
     return _untouched(scene, lambda plane: np.any(plane != 1, axis=2))
 
 
@@ -45,39 +44,31 @@ def _share(cells: np.ndarray, occupied: np.ndarray) -> float:
 def _untouched(scene: Scene, differs: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """(slots, Nz, Ny, Nx) bool: cells whose reads of time planes meet no texel that differs; (rows, columns, M) -> (rows, columns)
     bool says which do."""
-    slots, *shape = scene.occupancy.shape
-    out = np.ones((slots, *shape), bool)
+    slots, nz, ny, nx = scene.occupancy.shape
+    out = np.ones((slots, nz, ny, nx), bool)
     if not scene.is_dynamic:
         return out
+    shapes = {"xt": (slots, 1, 1, nx), "yt": (slots, 1, ny, 1), "zt": (slots, nz, 1, 1)}
+    for scale in scene.scales:
+        for name in TIME_PLANES:
+            cells = math.prod(shapes[name]) // slots
+            touched = cells_touched(cells_touched(differs(scale[name]), 0, slots), 1, cells)
+            out &= ~touched.reshape(shapes[name])
     if scene.motion is not None:
-        out &= ~_led_astray(scene.motion, shape)
-    for axis, (first, last) in enumerate(_cells_read(scene)):
-        name, cells = TIME_PLANES[2 - axis], shape[axis]
-        touched = np.zeros((slots, cells), bool)
-        for scale in scene.scales:
-            texels = differs(scale[name]).astype(np.float32)
-            touched |= touches(len(texels), slots).T @ texels @ touches(texels.shape[1], cells) > 0
-        until = np.pad(touched.cumsum(axis=1, dtype=np.int32), ((0, 0), (1, 0)))  # cells touched before each
-        for slot in range(slots):
-            out[slot] &= until[slot, last + 1] == until[slot, first]
+        displaced = (scene.motion != 0).any(axis=(0, 4))
+        for axis, count in enumerate((nz, ny, nx)):
+            displaced = cells_touched(displaced, axis, count)
+        out &= ~displaced
     return out
 
 
-def _cells_read(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Along z, y and x, the first and the last cell of the planes' [0, 1]^3 in which points of each cell are looked up; of shapes
-    that go with (Nz, Ny, Nx). Displaced ones are followed as in `kpc.format.motion.places_reached`, at the first instant."""
-    shape = scene.occupancy.shape[1:]
-    if scene.motion is None:
-        return [(index, index) for index in np.ogrid[tuple(slice(size) for size in shape)]]
-    middles = np.stack(np.indices(shape)[::-1], axis=-1).astype(np.float32) + np.float32(0.5)
-    reached = moved(middles / np.array(shape[::-1], np.float32), linear(scene.motion, 0.0))[..., ::-1] * np.array(shape, np.float32)
-    return [(np.maximum(along - 1, 0).astype(np.int64), np.minimum(along + 1, size - 1).astype(np.int64))
-            for along, size in zip(np.moveaxis(reached, -1, 0), shape)]
-
-
-def _led_astray(motion: np.ndarray, shape: list[int]) -> np.ndarray:
-    """(Nz, Ny, Nx) bool: cells whose displacement changes over the clip: they touch a node of which it does."""
-    reach = (motion != motion[:1]).any(axis=(0, 4)).astype(np.float32)
-    for nodes, cells in zip(motion.shape[1:4], shape):
-        reach = np.tensordot(reach, touches(nodes, cells), axes=(0, 0))  # z, y, x -> y, x, cells along z, and so on
-    return reach > 0
+def cells_touched(texels: np.ndarray, axis: int, cells: int) -> np.ndarray:
+    """Texels or nodes (bool) along an axis of corner-aligned positions -> the cells from which reads may touch one that is set:
+    cell [c, c+1] / cells meets the closed support [i-1, i+1] / (size-1) of texel i. As `kpc.format.quantise.needed_texels`, the
+    other way round."""
+    texels = np.moveaxis(texels, axis, 0)
+    out, spaces = np.zeros((cells, *texels.shape[1:]), bool), max(len(texels) - 1, 1)
+    for i, is_set in enumerate(texels):
+        first, last = -(-(i - 1) * cells // spaces) - 1, (i + 1) * cells // spaces
+        out[max(first, 0) : last + 1] |= is_set
+    return np.moveaxis(out, 0, axis)

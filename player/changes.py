@@ -25,6 +25,7 @@ STILL, LIVELY = 0.1, 0.3
 """A change up to the one counts as none: some noise of fitting and rounding. From the other on a picture shows its full colour."""
 CELLS = 8192
 """Looked at for a share; of more, as many, evenly spread."""
+CELLS_AT_ONCE = 1 << 20
 POINTS_AT_ONCE = 8192
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """Of BT.709."""
@@ -55,15 +56,27 @@ def still_share(scene: Scene) -> float:
     """Of the cells that are ever occupied, the share whose middle at no instant changes by more than STILL, seen as the opening
     camera looks; 1 where none is occupied."""
     ever = scene.occupancy.any(axis=0)
-    cells = np.flatnonzero(ever)
+    cells = _spread(ever.reshape(-1), CELLS)
     if not len(cells):
         return 1.0
-    cells = cells[np.unique(np.linspace(0, len(cells) - 1, min(len(cells), CELLS)).astype(np.int64))]
     middles = (np.stack(np.unravel_index(cells, ever.shape)[::-1], axis=1) + 0.5) / ever.shape[::-1]
     pose = Rig.of(scene).cameras[0].camera_to_world.astype(np.float32)
     terms = _terms(scene, pose[None, :3, 3], -pose[None, :3, 2])
     looks = np.stack([_looks(scene, middles.astype(np.float32), terms, float(instant)) for instant in INSTANTS])
     return float((np.max([_change(now, looks) for now in looks], axis=0) <= STILL).mean())
+
+
+def _spread(cells: np.ndarray, most: int) -> np.ndarray:
+    """Indices of set ones among (N,) bool, at most so many, evenly spread; in blocks, as those of all may not fit in memory."""
+    count = np.count_nonzero(cells)
+    wanted = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+    found, before = [np.empty(0, np.int64)], 0
+    for start in range(0, len(cells), CELLS_AT_ONCE):
+        here = start + np.flatnonzero(cells[start : start + CELLS_AT_ONCE])
+        low, high = np.searchsorted(wanted, (before, before + len(here)))
+        found.append(here[wanted[low:high] - before])
+        before += len(here)
+    return np.concatenate(found)
 
 
 def _change(now: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import SPACES, displaced, tiny_scene
+from scenes import SPACES, tiny_scene
 
 from kpc.format.file import write
-from kpc.format.quantise import quantise_scene
+from kpc.format.quantise import needed_texels, quantise_scene
 from kpc.format.scene import TIME_PLANES, Scene
-from kpc.format.static import static_cells, static_share, unchanging_cells, unchanging_share
-from kpc.player import reference
+from kpc.format.static import cells_touched, static_cells, static_share, unchanging_cells, unchanging_share
+from kpc.player import changes, reference
 from kpc.player.changes import dynamic_map, still_share
 from kpc.player.reference import Moment
 from kpc.tools import kpinfo
@@ -78,14 +78,12 @@ def test_scenes_without_time_planes_are_static() -> None:
     assert static_share(scene) == unchanging_share(scene) == still_share(scene) == 1
 
 
-@pytest.mark.parametrize("constant", [False, True])
-def test_in_static_cells_features_are_those_of_the_static_scene(constant: bool) -> None:
-    """By definition, at random places and times in them; also where all that moves a place moves it by the same always."""
+def test_in_static_cells_features_are_those_of_the_static_scene() -> None:
+    """By definition, at random places and times in them."""
     scene, rng = tiny_scene(), np.random.default_rng(1)
-    if constant:
-        moved = displaced(scene, most=0.2)
-        assert moved.motion is not None
-        scene = replace(moved, motion=np.repeat(moved.motion[:1], len(moved.motion), axis=0))
+    motion = np.zeros((3, 2, 2, 4, 3), np.float32)
+    motion[:, :, :, 3] = rng.uniform(-0.2, 0.2, (3, 2, 2, 3))  # displaces what is farther than 2/3 along x
+    scene = replace(scene, motion=motion)
     cells = np.argwhere(static_cells(scene))
     slots, *shape = scene.occupancy.shape
     assert 0.01 < len(cells) / scene.occupancy.size < 0.9
@@ -93,12 +91,21 @@ def test_in_static_cells_features_are_those_of_the_static_scene(constant: bool) 
         inside = cells[cells[:, 0] == slot][:, 1:]
         u = ((inside + rng.uniform(size=inside.shape)) / shape)[:, ::-1].astype(np.float32)
         for time in (slot + rng.uniform(size=4)) / slots:
-            moment = Moment.of(scene, time)
-            without = replace(moment, rows=({},) * len(moment.rows))
-            assert np.array_equal(reference.features(scene, moment, u), reference.features(scene, without, u))
+            full, static = Moment.of(scene, time), Moment.of(scene, time, with_motion=False)
+            assert np.array_equal(reference.features(scene, full, u), reference.features(scene, static, u))
 
 
-def test_cells_whose_displacement_changes_are_not_static() -> None:
+def test_cells_and_texels_touch_as_the_encoder_has_it() -> None:
+    """`needed_texels` tells which texels a cell needs, `cells_touched` which cells a texel serves."""
+    for texels, cells in [(1, 5), (2, 3), (5, 8), (8, 5), (9, 8), (17, 17), (30, 4)]:
+        for cell in range(cells):
+            occupancy = np.zeros((1, 1, 1, cells), bool)
+            occupancy[..., cell] = True
+            needed = needed_texels(occupancy, "xt", 1, texels)[0]
+            assert [bool(cells_touched(texel, 0, cells)[cell]) for texel in np.eye(texels, dtype=bool)] == needed.tolist()
+
+
+def test_displaced_cells_are_not_static() -> None:
     scene = box_of_cells()
     motion = np.zeros((3, 3, 3, 5, 3), np.float32)
     motion[1, 0, 0, 0] = 0.01  # the node in the corner; its support reaches to 1/4 along x, 1/2 along y and z
@@ -119,6 +126,16 @@ def test_the_map_is_grey_where_nothing_moves(space: str) -> None:
         assert picture.depth is rendering.depth and picture.rgb.shape == rendering.rgb.shape
         assert (np.ptp(picture.rgb, axis=2).max() > 0.2) == colourful
     assert still_share(still_scene) == 1 > still_share(scene)
+
+
+def test_a_share_is_that_of_cells_evenly_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(changes, "CELLS_AT_ONCE", 7)
+    cells = np.random.default_rng(0).uniform(size=100) < 0.4
+    indices = np.flatnonzero(cells)
+    assert np.array_equal(changes._spread(cells, 1000), indices)
+    some = changes._spread(cells, 10)
+    assert len(some) == 10 and some[0] == indices[0] and some[-1] == indices[-1] and cells[some].all()
+    assert len(changes._spread(np.zeros(20, bool), 10)) == 0
 
 
 def test_the_map_colours_what_moves_while_it_is_there() -> None:
