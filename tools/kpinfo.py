@@ -238,7 +238,7 @@ def _page(info: dict[str, Any]) -> str:
         f"  identity    {info['identity_share']:.1%} of the time-plane texels are exactly 1",
         "  static      {identity_share:.1%} of the occupied space-time is identity; {unchanging_share:.1%} of the occupied space "
         "never changes,".format(**info["static"]),
-        f"              {info['static']['still_share']:.1%} by less than {STILL:g} of white and of full opacity",
+        f"              about {info['static']['still_share']:.0%} by less than {STILL:g} of white and of full opacity",
         f"  don't care  {info['dont_care_share']:.1%} of the space-plane texels are not stored",
     ]
     if info["missing_chunks"]:
