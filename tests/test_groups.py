@@ -1,5 +1,6 @@
 """Clips in groups: when which shows, what may be joined, and that one group at a time is held."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,12 @@ from kpc.format import file, groups
 from kpc.format.container import Reader
 from kpc.format.errors import BudgetError, FormatError, UsageError
 from kpc.format.groups import Groups, LongScene, Part, Span, Timeline
+from kpc.format.media import read_image
 from kpc.format.quantise import quantise_scene
 from kpc.format.scene import Clip, Scene
+from kpc.player import reference
+from kpc.player.changes import dynamic_map
+from kpc.player.orbit import fitted
 from kpc.tools import kpinfo, kpjoin, kprender
 from kpc.tools.serve import Handler, serving
 
@@ -61,6 +66,19 @@ def test_a_clip_shows_its_groups(clip, scenes):
         seen = kpc.render(alone, camera, min(max((frame - start) / 10, 0), 1))
         assert np.allclose(kpc.render(long, camera, frame / 29).rgb, seen.rgb, atol=1e-6), frame
     assert long.at(1.0)[0].cameras == long.cameras  # which the last group has not
+
+
+def test_what_moves_is_told_and_shown_of_the_group_that_shows(clip, scenes, tmp_path, capsys):
+    for number, time, own in ((1, 13 / 29, 0.5), (2, 1.0, 1.0)):
+        assert kprender.main([str(clip), "--dynamic-map", "--time", str(time), "--size", "24x18", "--backend", "reference",
+                              "-o", str(tmp_path / "map.png")]) == 0
+        capsys.readouterr()
+        assert kpinfo.main([str(clip), "--group", str(number), "--json"]) == 0
+        shares = json.loads(capsys.readouterr().out)["static"]
+        alone, camera = kpc.load(scenes[number]), fitted(kpc.load(clip).cameras[0], 24, 18)
+        expected = dynamic_map(alone, camera, own, reference.render(alone, camera, own)).rgb
+        assert np.abs(read_image(tmp_path / "map.png") - 255 * np.clip(expected, 0, 1)).max() <= 1
+        assert (shares == {"identity_share": 1, "unchanging_share": 1, "still_share": 1}) == (number == 2)
 
 
 def test_a_scene_is_a_clip_of_one_group(scenes):

@@ -186,6 +186,20 @@ def test_static_and_dynamic_only(run, scene_file: Path, tmp_path: Path) -> None:
     assert np.abs(difference - pictures["--dynamic-only"]).max() <= 1
 
 
+def test_the_dynamic_map_is_grey_and_of_one_colour_by_either_backend(run, scene_file: Path, tmp_path: Path) -> None:
+    gl.context()
+    pictures = []
+    for backend in ("gl", "reference"):
+        path = tmp_path / f"{backend}.png"
+        assert run(scene_file, "--time", 0.4, "--dynamic-map", "--backend", backend, "-o", path)[0] == 0
+        pictures.append(read_image(path).astype(int))
+    assert np.abs(pictures[0] - pictures[1]).mean() < 2
+    red, green, blue = np.moveaxis(pictures[1], -1, 0)
+    assert (red - blue).max() > 60 and (red >= green - 1).all() and (green >= blue - 1).all()
+    assert ((red == green) & (green == blue)).mean() > 0.2
+    assert run(scene_file, "--time", 0, "--dynamic-map", "--static-only", "-o", path)[0] == 2
+
+
 @pytest.fixture(scope="module")
 def varied_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("varied") / "varied.kpc"

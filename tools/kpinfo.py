@@ -25,6 +25,8 @@ from kpc.format.groups import Groups
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, HybridDecoder
 from kpc.format.space import FAR, Contraction, SpaceMapping
+from kpc.format.static import static_share, unchanging_share
+from kpc.player.changes import STILL, still_share
 
 NAMES_SHOWN = 8
 CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd", CODEC_SYMBOLS: "rANS"}
@@ -150,10 +152,18 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
         "parameter_count": scene.parameter_count,
         "bits_per_parameter": 8 * size / scene.parameter_count,
         "identity_share": scene.identity_share,
+        "static": _describe_static(scene),
         "dont_care_share": _uncoded_share([scale[name] for scale in scene.scales for name in SPACE_PLANES]),
         "overhead_bytes": size - sum(entry.stored_length for entry in reader.index),
         "chunks": [_describe_chunk(entry, gone, size) for entry, gone in zip(reader.index, missing, strict=True)],
     }
+
+
+def _describe_static(scene: QuantisedScene) -> dict[str, float]:
+    """How much of what is occupied stands still: where time planes are 1, where nothing changes, and where little does."""
+    decoded = scene.dequantise()
+    return {"identity_share": static_share(decoded), "unchanging_share": unchanging_share(decoded),
+            "still_share": still_share(decoded)}
 
 
 def _describe_space(mapping: SpaceMapping | None) -> dict[str, Any]:
@@ -226,6 +236,9 @@ def _page(info: dict[str, Any]) -> str:
     lines += [
         f"  model       {info['parameter_count']:,} parameters, {info['bits_per_parameter']:.3f} bits each",
         f"  identity    {info['identity_share']:.1%} of the time-plane texels are exactly 1",
+        "  static      {identity_share:.1%} of the occupied space-time is identity; {unchanging_share:.1%} of the occupied space "
+        "never changes,".format(**info["static"]),
+        f"              about {info['static']['still_share']:.0%} by less than {STILL:g} of white and of full opacity",
         f"  don't care  {info['dont_care_share']:.1%} of the space-plane texels are not stored",
     ]
     if info["missing_chunks"]:

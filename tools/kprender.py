@@ -5,6 +5,7 @@ kprender scene.kpc --orbit 96 -o orbit.mp4                a path around it while
 kprender scene.kpc --cameras cameras.json -o DIR          one picture for each frame the file lists
 kprender scene.kpc --path path.json -o flight.mp4         smoothly through the views it lists, as saved in the player
 kprender scene.kpc --time 0.5 --size 960x720 -o still.png
+kprender scene.kpc --dynamic-map -o moves.mp4             what moves in colour, what stands still in grey
 kprender scene.kpc --appearance dawn.jpg:dusk.jpg:0.3 -o clip.mp4
 """
 
@@ -33,6 +34,7 @@ from kpc.format.progress import progress
 from kpc.format.scene import Clip, Scene
 from kpc.format.space import Contraction
 from kpc.player import reference
+from kpc.player.changes import dynamic_map
 from kpc.player.orbit import Rig, fitted, orbit
 from kpc.player.path import CameraPath
 from kpc.player.reference import Part, Rendering
@@ -126,6 +128,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     part.add_argument(
         "--dynamic-only", action="store_const", dest="part", const=Part.DYNAMIC, help="|all of it - what never moves|"
+    )
+    part.add_argument(
+        "--dynamic-map",
+        action="store_true",
+        help="what differs from what is there at other times in colour, the rest in grey",
     )
     parser.add_argument(
         "--appearance",
@@ -248,11 +255,13 @@ def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[Shot]:
 def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Render, str]:
     """How to render, and its name. OpenGL is looked for only where it is wanted."""
     _appearance(loaded.at(0.0)[0], options.appearance)
+    shown = dynamic_map if options.dynamic_map else _as_it_is
     if options.backend == "reference":
 
         def by_reference(camera: Camera, time: float) -> Rendering:
             scene, time = loaded.at(time)
-            return reference.render(scene, camera, time, part=options.part, appearance=_appearance(scene, options.appearance))
+            look = _appearance(scene, options.appearance)
+            return shown(scene, camera, time, reference.render(scene, camera, time, part=options.part, appearance=look))
 
         return by_reference, "reference renderer (numpy)"
     from kpc.player import offscreen
@@ -269,9 +278,14 @@ def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Re
             if renderer is not None:
                 renderer.release()
             renderer = Renderer(ctx, scene, Quality(folded=options.folded))
-        return renderer.render(camera, time, part=options.part, appearance=_appearance(scene, options.appearance))
+        look = _appearance(scene, options.appearance)
+        return shown(scene, camera, time, renderer.render(camera, time, part=options.part, appearance=look))
 
     return by_graphics, offscreen.describe(ctx)
+
+
+def _as_it_is(scene: Scene, camera: Camera, time: float, rendering: Rendering) -> Rendering:
+    return rendering
 
 
 def _paths(out: Path, shots: list[Shot], suffix: str) -> Iterator[Path]:
