@@ -33,8 +33,8 @@ def display() -> Iterator[str]:
     if shutil.which("Xvfb") is None:
         pytest.skip("no display and no Xvfb (Debian: apt install xvfb)")
     reader, writer = os.pipe()
-    server = subprocess.Popen(
-        ["Xvfb", "-displayfd", str(writer), "-screen", "0", "1024x768x24"],
+    server = subprocess.Popen(  # without -noreset it starts over when its last client leaves, and refuses the next meanwhile
+        ["Xvfb", "-noreset", "-displayfd", str(writer), "-screen", "0", "1024x768x24"],
         pass_fds=[writer],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
