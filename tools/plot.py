@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib import rcParams
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -55,11 +56,8 @@ def curves(records: Sequence[results.Record]) -> Figure:
                              if _dots([record], key))  # fmt: skip
             axes.plot([s / 60 for s, _ in medians], [v / unit for _, v in medians], color=f"C{number}", label=name)
             axes.plot(*zip(*dots), "o", markersize=4, color=f"C{number}") if dots else None
-        axes.set(xscale="log", xlabel="training, minutes", title=title)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda minutes, _: f"{minutes:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(color="0.87")
+        axes.set(xlabel="training, minutes", title=title)
+        _logarithmic(axes)
     axes.legend()
     return figure
 
@@ -83,11 +81,8 @@ def rate_distortion(records: Sequence[results.Record]) -> Figure:
             points = sorted(record["points"], key=lambda point: float(point["size_bytes"]))
             axes.plot([p["bits_per_parameter"] for p in points], [p["psnr"] for p in points], marker="o", markersize=3,
                       linewidth=2.2 if number == 0 else 1, color=f"C{number}", label=record["coder"])  # fmt: skip
-        axes.set(xscale="log", xlabel="bits per parameter", ylabel="PSNR, dB", title=name)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda rate, _: f"{rate:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(color="0.87")
+        axes.set(xlabel="bits per parameter", ylabel="PSNR, dB", title=name)
+        _logarithmic(axes)
     axes.legend(fontsize=8)
     return figure
 
@@ -142,13 +137,19 @@ def qualities(records: Sequence[results.Record]) -> Figure:
         axes.plot([ms for ms, *_ in points], [psnr for _, psnr, _ in points], marker="o", markersize=3, color=f"C{number}", label=name)
         axes.plot(*zip(*[(ms, psnr) for ms, psnr, default in points if default]), "o", markersize=9, markerfacecolor="none",
                   color=f"C{number}")  # fmt: skip
-    axes.set(xscale="log", xlabel="milliseconds a frame", ylabel="PSNR to the reference, dB")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda ms, _: f"{ms:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.grid(color="0.87")
+    axes.set(xlabel="milliseconds a frame", ylabel="PSNR to the reference, dB")
+    _logarithmic(axes)
     axes.legend(fontsize=8)
     return figure
+
+
+def _logarithmic(axes: Axes) -> None:
+    """Along x, with plain numbers at 1, 2 and 5; and a grid."""
+    axes.set(xscale="log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(color="0.87")
 
 
 def save(figure: Figure, path: Path) -> None:
