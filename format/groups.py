@@ -15,6 +15,7 @@ import os
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import google_crc32c
@@ -62,8 +63,7 @@ class Timeline:
         One takes over from another in the middle between its own first frame and the other's last.
         """
         frame = self.spans[0].start + time * (self.clip.frame_count - 1)
-        takes_over = [(before.last + after.start) / 2 for before, after in zip(self.spans, self.spans[1:])]
-        number = bisect_right(takes_over, frame)
+        number = bisect_right(self._takes_over, frame)
         return number, self.time_in(number, time)
 
     def time_in(self, number: int, time: float) -> float:
@@ -71,11 +71,22 @@ class Timeline:
         span, frame = self.spans[number], self.spans[0].start + time * (self.clip.frame_count - 1)
         return min(max((frame - span.start) / (span.count - 1), 0.0), 1.0) if span.count > 1 else 0.0
 
+    def time_of(self, number: int, time_in_it: float) -> float:
+        """The time of the clip, at a time in a group."""
+        span = self.spans[number]
+        frame = span.start + time_in_it * (span.count - 1) - self.spans[0].start
+        return min(max(frame / max(self.clip.frame_count - 1, 1), 0.0), 1.0)
+
     def shown(self, number: int) -> tuple[float, float]:
         """From when to when a group shows, [0, 1] over the clip."""
-        frames, spans = max(self.clip.frame_count - 1, 1), self.spans
-        ends = [0.0, *((a.last + b.start - 2 * spans[0].start) / 2 / frames for a, b in zip(spans, spans[1:])), 1.0]
+        frames, start = max(self.clip.frame_count - 1, 1), self.spans[0].start
+        ends = [0.0, *((frame - start) / frames for frame in self._takes_over), 1.0]
         return ends[number], ends[number + 1]
+
+    @cached_property
+    def _takes_over(self) -> list[float]:
+        """Where in the clip, in frames, each group but the first takes over."""
+        return [(before.last + after.start) / 2 for before, after in zip(self.spans, self.spans[1:])]
 
 
 class Groups:
@@ -275,16 +286,17 @@ def write(parts: Sequence[Part], path: str | os.PathLike[str]) -> int:
         raise UsageError(f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; encode them "
                          "alike")
     offset, entries = HEADER.size + ENTRY.size * len(parts), []
-    for number, part in enumerate(parts):
-        crc, size = google_crc32c.value(part.source.read_at(0, part.source.size)), part.source.size
-        span = part.span
-        entries.append(ENTRY.pack(GROUP_KIND.encode(), number, 0, 0, span.start, span.count, CODEC_RAW, 0, size, size, crc, offset))
-        offset += size
-    head = header_and_index(entries, offset, max(part.value_count for part in parts), max(part.source.size for part in parts))
     with written_aside(path) as aside, aside.open("wb") as opened:
-        opened.write(head)
-        for part in parts:
-            opened.write(part.source.read_at(0, part.source.size))
+        opened.seek(offset)  # the index, which comes first, holds checksums of what follows
+        for number, part in enumerate(parts):
+            body, span = part.source.read_at(0, part.source.size), part.span
+            opened.write(body)
+            entries.append(ENTRY.pack(GROUP_KIND.encode(), number, 0, 0, span.start, span.count, CODEC_RAW, 0, len(body), len(body),
+                                      google_crc32c.value(body), offset))
+            offset += len(body)
+        opened.seek(0)
+        opened.write(header_and_index(entries, offset, max(part.value_count for part in parts),
+                                      max(part.source.size for part in parts)))
     return offset
 
 

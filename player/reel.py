@@ -109,9 +109,7 @@ class Reel:
 
     def time_of(self, time_in_it: float) -> float:
         """The time of the clip, at a time in the group that shows."""
-        spans, span = self.timeline.spans, self.timeline.spans[self.number]
-        frame = span.start + time_in_it * (span.count - 1) - spans[0].start
-        return min(max(frame / max(self.clip.frame_count - 1, 1), 0.0), 1.0)
+        return self.timeline.time_of(self.number, time_in_it)
 
     @property
     def scales_here(self) -> int:
