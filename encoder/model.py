@@ -100,13 +100,17 @@ def load(path: Path) -> Model:
     Raises:
         UsageError: it is neither. TrainingError: the checkpoint cannot be used. FormatError: the file cannot be read.
     """
-    with path.open("rb") as opened:
-        begins = opened.read(len(MAGIC))
-    if begins == MAGIC:
+    if begins_with(path, MAGIC):
         return model_of(file.read(path))
-    if begins.startswith(CHECKPOINT_MAGIC):
+    if begins_with(path, CHECKPOINT_MAGIC):
         return load_checkpoint(path)
     raise UsageError(f"{path}: neither a folder of videos or images, nor a finished checkpoint, nor a .kpc file")
+
+
+def begins_with(path: Path, magic: bytes) -> bool:
+    """Whether a file is of the kind that begins so."""
+    with path.open("rb") as opened:
+        return opened.read(len(magic)) == magic
 
 
 def model_of(coded: QuantisedScene) -> Model:

@@ -109,7 +109,7 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
                         help="write the finished checkpoint there, too: all that coding anew takes")
     parser.add_argument("--group", type=cli.duration_s, metavar="10s",
                         help="code a long clip in groups that show at most so long each, one after the other: encoding and playing "
-                             "take the memory of one; steps are those of each group")
+                             "take the memory of one; steps are those of the first group")
     parser.add_argument("--only", type=_number, metavar="N",
                         help="of --group: code group N alone, from 0 on; kpjoin makes a clip of them")
     trade = parser.add_mutually_exclusive_group()

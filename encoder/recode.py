@@ -28,10 +28,8 @@ def recode(options: Options) -> dict[str, Any]:
     """
     started = time.monotonic()
     check_outputs(options)
-    with options.source.open("rb") as opened:
-        opened_groups = groups.Groups(options.source) if opened.read(len(MAGIC)) == MAGIC else None
-    if opened_groups is not None and not opened_groups.is_single:
-        return _recode_groups(options, opened_groups) | {"encode_s": time.monotonic() - started}
+    if model.begins_with(options.source, MAGIC) and not (clip := groups.Groups(options.source)).is_single:
+        return _recode_groups(options, clip) | {"encode_s": time.monotonic() - started}
     source = model.load(options.source)
     coded = model.code(source, options.trade, TrainConfig().prune_share)
     size = file.save(coded.data, options.output)
@@ -47,7 +45,8 @@ def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
     spans, parts, found = source.timeline.spans, [], []
     for number, span in enumerate(spans):
         trade = share_of(options, number, spans).trade
-        scene = replace(file.read(source.open(number)), cameras=source.open(number).cameras() or source.cameras())
+        reader = source.open(number)
+        scene = replace(file.read(reader), cameras=reader.cameras() or source.cameras())
         coded = model.code(model.model_of(scene), trade, TrainConfig().prune_share)
         parts.append(groups.Part.of(coded.data, span.start))
         found.append(figures(coded, coded.size_bytes, trade, JUDGED_BY[1]))

@@ -10,7 +10,7 @@ import numpy as np
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluate import SceneRenderer, psnr, true_picture
 from kpc.format import file
-from kpc.format.groups import Groups, Span
+from kpc.format.groups import Groups
 
 AROUND = 5
 """Frames before and after a join whose mean PSNR is compared."""
@@ -63,12 +63,12 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
     last_of: dict[int, np.ndarray] = {}
     frames: list[Frame] = []
     agreements: list[float] = []
-    before: tuple[SceneRenderer, Span] | None = None
+    before: tuple[SceneRenderer, Dataset, np.ndarray] | None = None
     for number, span in enumerate(groups.timeline.spans):
         some = dataset.between(span.start, span.last)
         renderer = SceneRenderer(file.read(groups.open(number)).dequantise())
         shown = _shown(groups, number)
-        at = np.rint(some.pictures.time * (span.count - 1)).astype(int) + span.start
+        at = np.rint(some.pictures.time * (span.count - 1)).astype(int) + span.start  # frame of each picture
         held_out = np.flatnonzero(some.pictures.is_test & np.isin(at, shown))
         for picture in sorted(map(int, held_out), key=lambda p: int(at[p])):
             camera, seen = int(some.pictures.camera[picture]), np.clip(renderer.picture(some, picture), 0, 1)
@@ -78,13 +78,11 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
             quality = psnr(error, np.zeros_like(error))
             frames.append(Frame(some.camera_names[camera], int(at[picture]) - first, number, quality, change))
             if before is not None and at[picture] == shown[0]:
-                earlier, its_span = before
-                same = dataset.between(its_span.start, its_span.last)
-                its_at = np.rint(same.pictures.time * (its_span.count - 1)).astype(int) + its_span.start
+                earlier, same, its_at = before
                 match = np.flatnonzero((its_at == shown[0]) & (same.pictures.camera == camera) & same.pictures.is_test)
                 if len(match):
                     agreements.append(psnr(np.clip(earlier.picture(same, int(match[0])), 0, 1), seen))
-        before = renderer, span
+        before = renderer, some, at
     return {"frames": [asdict(frame) for frame in frames], "joins": [asdict(join) for join in _joins(groups, frames, agreements)]}
 
 
