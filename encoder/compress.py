@@ -11,13 +11,13 @@ from functools import cached_property
 import numpy as np
 
 from kpc.encoder.probe import Measure, Measured
-from kpc.encoder.rounding import rounded
+from kpc.encoder.trellis import chosen
 from kpc.format import file
 from kpc.format.errors import TrainingError
 from kpc.format.quantise import QuantisedScene, quantise_scene, reached_by
 from kpc.format.scene import Scene
 
-FINEST, COARSEST = -12.0, 2.0
+FINEST, COARSEST = -13.0, 2.0
 """Base-two logarithms of the factors on all steps, between which one is sought for a trained scene."""
 COARSER = 12.0
 """The same of the coarsest for a file that is coded again; the finest is its own."""
@@ -34,6 +34,10 @@ NEAR = 0.3
 """Octaves within which the least cost is sought; at the least it hardly changes."""
 
 DEFAULT_LOSS_DB = 0.15
+
+TRUST = 0.6
+"""In what gradients say of the differences between channels, `relative_steps`. Default scene, `fast`: at equal error of pictures of 1, 2 and 4
+squared levels files are 3, 5 and 5 % smaller with 0.5 to 0.75 than with 1."""
 
 Steps = list[dict[str, np.ndarray]]
 """One mapping a scale, plane name -> (M,) quantisation steps."""
@@ -112,18 +116,18 @@ class Attempt:
 
 
 def relative_steps(curvature: Sequence[Mapping[str, np.ndarray]]) -> Steps:
-    """Steps up to one common factor, such that a bit spent on any channel buys the same.
+    """Steps up to one common factor, such that a bit spent on any channel buys about the same.
 
-    A uniform quantiser of step d errs by d^2 / 12 on average; an error costs `curvature` h of it, a diagonal Fisher estimate
+    A uniform quantiser of step d errs by d^2 / 12 times a constant; an error costs `curvature` h of it, a diagonal Fisher estimate
     (the running mean of squared gradients), one mapping a scale, plane name -> (rows, columns, M); its rate falls by one bit with
-    each doubling of d. At equal slopes h d^2 is the same everywhere: d = 1 / sqrt(mean over texels of h). Channels that no
-    gradient ever reached get the coarsest step of all.
+    each doubling of d. At equal slopes h d^2 is the same everywhere: d = 1 / sqrt(mean over texels of h), if gradients told all. They
+    exaggerate, so d = (mean of h)^(-TRUST / 2). Channels that no gradient ever reached get the coarsest step of all.
     """
     means = [{name: h.reshape(-1, h.shape[-1]).mean(0, dtype=np.float64) for name, h in scale.items()} for scale in curvature]
     largest = max(h.max() for scale in means for h in scale.values())
     if largest <= 0:
         return [{name: np.ones(len(h)) for name, h in scale.items()} for scale in means]
-    return [{name: 1 / np.sqrt(np.maximum(h / largest, 1e-8)) for name, h in scale.items()} for scale in means]
+    return [{name: np.maximum(h / largest, 1e-8) ** (-TRUST / 2) for name, h in scale.items()} for scale in means]
 
 
 def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
@@ -150,7 +154,7 @@ def compress(
         if as_it_is is not None and exponent == 0:
             return Attempt(as_it_is, measure)
         nearest = quantise_scene(scene, scaled(steps, 2.0**exponent), reached=reached)
-        return Attempt(rounded(nearest, scene), measure)
+        return Attempt(chosen(nearest, scene), measure)
 
     name, value = trade.bound
     if name == "lam":

@@ -91,7 +91,7 @@ def _note(bit, table, which, state, at, words, trace):
 
 def _compiled(changes: dict[str, Any]) -> Walks:
     names = vars(rans) | vars(module) | changes
-    for name in ("_begin_row", "_remember", "integer", "walk_map", "walk"):
+    for name in ("_begin_row", "_remember", "next_state", "predict", "nearest", "activity", "integer", "walk_map", "walk"):
         if name not in changes:
             names[name] = njit(FunctionType(vars(module)[name].py_func.__code__, names, name))
     return names
@@ -99,18 +99,16 @@ def _compiled(changes: dict[str, Any]) -> Walks:
 
 def _bytes(segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callable[[np.ndarray], float] | None = None) -> int:
     """What the segment takes with the best number of sets of weights, or with none; `size` is of a trace, else of its words."""
-    symbols, coded = segment.symbols, segment.coded
-    values = int(coded.sum()) * symbols.shape[2]
-    neighbours = np.empty((values, 2 + WEIGHTS), np.int16)
-    trace = np.empty(coded.size + values * MOST_DECISIONS, np.int16)
-    module.walk(symbols, coded, np.zeros((1, WEIGHTS), np.int8), 0, 0, None, trace, neighbours)
+    symbols, coded = np.ascontiguousarray(segment.symbols), np.ascontiguousarray(segment.coded)
+    neighbours, trellis = module.neighbourhoods(symbols, coded), module.follows_trellis(symbols, coded)
+    trace = np.empty(coded.size + len(neighbours) * MOST_DECISIONS, np.int16)
     sizes = []
     for weights in [fitted(neighbours, count) for count in counts] or [np.zeros((1, WEIGHTS), np.int8)]:
         at = 0
         if not coded.all():
             _, at = walks["walk_map"](coded, 0, at, None, trace)
             trace[:at] -= 8192 * (size is not None)  # counters of the map are others
-        _, at, _ = walks["walk"](symbols, coded, weights, 0, at, None, trace, None)
+        _, at, _ = walks["walk"](symbols, coded, trellis, weights, 0, at, None, trace, None)
         sizes.append(2 + (weights.size if counts else 0) + (size(trace[:at]) if size else 2 * len(words_of(trace[:at]))))
     return round(min(sizes))
 

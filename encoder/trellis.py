@@ -1,0 +1,141 @@
+"""Which symbol a number becomes: trellis-coded quantisation, with an eye on what symbols cost.
+
+Symbols lie half as far apart as plain rounding to the same number of bits would have them, but along a row only every other one may
+follow (`kpc.format.symbols.next_state`). A Viterbi search finds the path through a row of least
+
+    (value / step - symbol)^2 + LAM * bits(symbol | those before it)
+
+each survivor with the predictions and contexts that its own symbols lead to. Bits are counted in the contexts of the coder, from what
+the search chose the time before. Marcellin and Fischer (IEEE Trans. Comm. 38, 1990); prediction inside the search as in Wang and Fischer
+(IEEE Trans. Inf. Theory 40, 1994).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene
+from kpc.format.rans import compiled
+from kpc.format.scene import TIME_PLANES, Scene
+from kpc.format.symbols import ACTIVITIES, UNKNOWN, WEIGHTS, _begin_row, _remember, activity, fitted, nearest, neighbourhoods, \
+    next_state, predict
+
+LAM = 0.2
+"""Squared steps that a bit is worth. Where steps are fine an error of (2 step)^2 / 12 / 1.28, that of the trellis, falls to a quarter with
+a bit more, at the slope of 0.36; errors that all go one way count for more than those of rounding, which average out."""
+STATES = 8
+PASSES = 2
+"""Searches: the first knows neither weights nor what symbols cost."""
+SETS = 4
+"""Of weights."""
+TOLD_APART = 40
+"""Magnitudes of errors whose bits are told apart."""
+
+
+def chosen(quantised: QuantisedScene, scene: Scene) -> QuantisedScene:
+    """The same scene, quantised in the same steps, with symbols that follow the trellis."""
+    scales = tuple({name: _chosen_plane(plane, planes[name], name in TIME_PLANES) for name, plane in scale.items()}
+                   for scale, planes in zip(quantised.scales, scene.scales, strict=True))
+    return replace(quantised, scales=scales)
+
+
+def _chosen_plane(plane: QuantisedPlane, values: np.ndarray, identity: bool) -> QuantisedPlane:
+    """(H, W, M) float32 `values` as symbols of the same steps and offsets. What was left out stays so, and holds 0; and so does what
+    is within a step of the identity."""
+    wanted = (values.astype(np.float64) - plane.offset) / plane.step
+    known = np.ascontiguousarray(plane.coded)
+    if not np.isfinite(wanted[known]).all():  # what no symbol stands for
+        return plane
+    if identity:
+        known = known & (np.abs(wanted) >= 1).any(axis=2)
+    weights, bits = np.zeros((1, WEIGHTS), np.int8), _bits(np.zeros((ACTIVITIES, TOLD_APART)))
+    for _ in range(PASSES):
+        symbols, counts = _search(wanted, known, weights, bits)
+        weights, bits = fitted(neighbourhoods(symbols, known), SETS), _bits(counts)
+    return replace(plane, symbols=symbols, coded=symbols.any(axis=2) if identity else known)
+
+
+def _bits(counts: np.ndarray) -> np.ndarray:
+    """(ACTIVITIES, TOLD_APART) bits of errors by their magnitude, sign included, that came so often in each context. What hardly came
+    is taken to be geometrically distributed, with a mean that doubles with every other context."""
+    ratio = 1 / (1 + 25 * 2.0 ** (1.5 - np.arange(ACTIVITIES) / 2))[:, None]
+    expected = (1 - ratio) * ratio ** np.arange(TOLD_APART) + 1e-4
+    shares = counts + 4 * expected
+    bits = -np.log2(shares / shares.sum(1, keepdims=True))
+    bits[:, 1:] += 1
+    return bits
+
+
+@compiled()
+def _search(wanted: np.ndarray, known: np.ndarray, weights: np.ndarray, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, M) int8 symbols of (H, W, M) numbers in steps, 0 where nothing is `known`; and how often errors came, as `bits`.
+
+    v, r, cross and the names of neighbours as in `kpc.format.symbols`; v0 and r0 of survivors are held by their states.
+    """
+    H, W, M = wanted.shape
+    sets = weights.astype(np.int64)
+    symbols, counts = np.zeros((H, W, M), np.int8), np.zeros(bits.shape)
+    v, r = np.zeros((3, W + 4), np.int64), np.zeros((3, W + 4), np.int64)
+    cross = np.zeros((H, W), np.int16)
+    V, R = np.zeros((W + 4, STATES), np.int64), np.zeros((W + 4, STATES), np.int64)  # of the survivor that ends there
+    came, context, missed = np.zeros((W, STATES), np.int64), np.zeros((W, STATES), np.int64), np.zeros((W, STATES), np.int64)
+    for m in range(M):
+        for y in range(H):
+            v0, v1, v2 = v[y % 3], v[(y + 2) % 3], v[(y + 1) % 3]
+            r0, r1, r2, past = r[y % 3], r[(y + 2) % 3], r[(y + 1) % 3], cross[y]
+            _begin_row(v0, v1, v2, y, 0)
+            _begin_row(r0, r1, r2, y, UNKNOWN)
+            for s in range(STATES):
+                V[:2, s], R[:2, s] = v0[:2], r0[:2]
+            cost = np.full(STATES, np.inf)
+            cost[0] = 0
+            for x in range(W):
+                X = x + 2
+                before, cost = cost, np.full(STATES, np.inf)
+                for s in range(STATES):
+                    if before[s] == np.inf:
+                        continue
+                    # left of it, of this survivor: one and, by the way that it came, two texels away
+                    w, rw = V[X - 1, s], R[X - 1, s]
+                    old = came[x - 1, s] if x else s
+                    ww, rww = V[X - 2, old], R[X - 2, old]
+                    if not known[y, x]:
+                        left = y == 0 or x > 0 and known[y, x - 1]
+                        V[X, s], R[X, s] = (w, rw) if left else (v1[X + 1], r1[X + 1])
+                        cost[s], came[x, s] = before[s], s
+                        continue
+                    if y == 0:
+                        n = nw = ne = nn = nww = nnw = nne = nee = w
+                        around = 7 * rw + rww
+                    else:
+                        n, nw, ne, nn = v1[X], v1[X - 1], v1[X + 1], v2[X]
+                        nww, nnw, nne, nee = v1[X - 2], v2[X - 1], v2[X + 1], v1[X + 2]
+                        around = 2 * (rw + r1[X]) + r1[X - 1] + r1[X + 1] + rww + r2[X]
+                    predicted, gradient, _ = predict(sets, w, n, nw, ne, ww, nn, nww, nnw, nne, nee)
+                    whole = nearest(predicted, s & 1, 1)
+                    active = activity(around, int(past[x]), gradient, m)
+                    below = int(np.floor((wanted[y, x, m] - whole) / 2))
+                    lowest = below - 1 if below >= 0 else below
+                    for error in range(lowest, lowest + 3):  # those around it, and the next that costs less
+                        value = whole + 2 * error
+                        if not SYMBOL_MIN <= value <= SYMBOL_MAX:
+                            continue
+                        size = min(abs(error), TOLD_APART - 1)
+                        total = before[s] + (wanted[y, x, m] - value) ** 2 + LAM * bits[active, size]
+                        to = next_state(s, value)
+                        if total < cost[to]:
+                            cost[to], came[x, to], context[x, to], missed[x, to] = total, s, active, size
+                            V[X, to], R[X, to] = value, abs((value << 7) - predicted) >> 3
+            s = int(np.argmin(cost))
+            for x in range(W - 1, -1, -1):
+                v0[x + 2], r0[x + 2] = V[x + 2, s], R[x + 2, s]
+                if known[y, x]:
+                    symbols[y, x, m] = V[x + 2, s]
+                    counts[context[x, s], missed[x, s]] += 1
+                s = came[x, s]
+            v0[W + 2:], r0[W + 2:] = v0[W + 1], r0[W + 1]
+            if y > 0:
+                _remember(cross[y - 1], r2, r1, r0, m)
+        last = r[(H - 1) % 3]
+        _remember(cross[H - 1], r[max(H - 2, 0) % 3], last, last, m)
+    return symbols, counts
