@@ -72,7 +72,7 @@ def entries(data, partial):  # sections 3, 4 and 10
     require(len(data) >= 64 and data[:8] == b"\x89KPC\r\n\x1a\n", "not a .kpc file")
     (version, flags, header_length, index_offset, index_length, count, file_length, value_count, largest_raw, reserved,
      index_crc, header_crc) = struct.unpack("<HHIQIIQQIIII", data[8:64])
-    require(version == 0, "unknown version")
+    require(version in (0, 1), "unknown version")
     require(crc32c(data[:60]) == header_crc, "header damaged")
     require(flags == reserved == 0 and header_length == index_offset == 64, "reserved field")
     require(1 <= count <= 65536 and index_length == 40 * count, "chunk count")

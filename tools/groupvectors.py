@@ -13,6 +13,8 @@ TIMES = (0.0, 0.125, 0.3, 0.5, 0.6875, 1.0)
 
 SCENES = ("moved-contracted", "hybrid-moved", "one-texel", "wrap")
 """Vectors of 12, 12, 12 and 1 frames at one rate."""
+DRAFT = "version-0"
+"""The third of them, as a file of version 0."""
 SLOWER = "minimal"
 """One of a frame at another."""
 
@@ -34,6 +36,12 @@ def packed(groups: Sequence[Group], *, beside: Sequence[tuple[bytes, bytes]] = (
     return header_and_index(entries, offset, most, max(map(len, bodies))) + b"".join(bodies)
 
 
+def of_the_draft(data: bytes) -> bytes:
+    """The same file as it was when the format was a draft, of version 0."""
+    head = data[:8] + struct.pack("<H", 0) + data[10:60]
+    return head + struct.pack("<I", google_crc32c.value(head)) + data[64:]
+
+
 def valid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, bool]]:
     """Files by name, and whether they are prefixes; `scenes`: other vectors. None holds a zstd frame, so these do not either."""
     one, other, third, still = (scenes[name] for name in SCENES)
@@ -42,6 +50,8 @@ def valid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, bool]]:
         "groups": (joined, False),
         "groups-apart": (packed([(7, 12, one), (19, 12, third)], beside=[NOTE]), False),
         "groups-one": (packed([(40, 12, third)]), False),
+        "groups-versions": (packed([(0, 12, scenes[DRAFT]), (12, 12, other)]), False),
+        "version-0-groups": (of_the_draft(packed([(40, 12, scenes[DRAFT])])), False),
         "groups-prefix": (joined[:Reader(joined).index[1].offset + len(other) // 2], True),
     }
 
