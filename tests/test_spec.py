@@ -232,6 +232,27 @@ def test_valid_vectors_cover_every_kind_under_every_codec():
     assert found >= {(kind, codec) for kind, known in codecs.items() for codec in known} | {(file.GROUP_KIND, 0)}
 
 
+def test_valid_vectors_cover_every_context_and_size_of_errors(twin, monkeypatch):
+    """No error is large enough for the last three of the 66 contexts of planes."""
+    contexts, sizes, inner = set(), set(), twin.Decisions.error
+
+    def error(decisions, context, most_bits=7):
+        found = inner(decisions, context, most_bits)
+        contexts.add((most_bits, context))
+        sizes.add((most_bits, found if abs(found) <= 4 else (abs(found) - 4).bit_length() + 4, found > 0))
+        return found
+
+    monkeypatch.setattr(twin.Decisions, "error", error)
+    for path in VALID:
+        if path.stem.startswith(("symbols", "nodes", "limits-nodes")):
+            twin.decode(path.read_bytes(), partial=path.stem.endswith("prefix"))
+    assert contexts == {(7, context) for context in range(63)} | {(15, context) for context in range(20)}
+    for most in (7, 15):
+        of_each_sign = {(most, size, False) for size in range(-4, 1)} | {(most, size, True) for size in range(1, 5)}
+        escapes = {(most, 4 + bits, positive) for bits in range(1, most + 2) for positive in (False, True)}
+        assert sizes >= of_each_sign | escapes
+
+
 def packed_here(name: str) -> bool:
     """Whether a vector's bytes do not depend on the version of zstd, or this is that version."""
     written = json.loads((SPEC / "vectors" / name).with_suffix(".json").read_text())["zstd"]

@@ -136,13 +136,15 @@ def encode(scene: QuantisedScene, *, segment_rows: int = 16, compress: bool = Tr
     return pack(chunks, _value_count(scene), compress=compress)
 
 
-def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 16) -> bytes:
+def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 16, weights: np.ndarray | None = None) -> bytes:
     """A file all of whose planes are context-coded, also where raw ones would be smaller, with so many sets of weights.
 
-    The weights are no good ones but such as need no floating-point fit, and the largest and the smallest among them.
+    The weights, if none are given, are no good ones but such as need no floating-point fit, and the largest and the smallest among
+    them.
     """
-    weights = (_noise((sets, WEIGHTS), 61) / 4).astype(np.int8)
-    weights[0, 0], weights[-1, -1] = -128, 127
+    if weights is None:
+        weights = (_noise((sets, WEIGHTS), 61) / 4).astype(np.int8)
+        weights[0, 0], weights[-1, -1] = -128, 127
     chunks = []
     for chunk in scene_chunks(scene, segment_rows=segment_rows):
         if chunk.kind == "PLNE":
@@ -236,6 +238,7 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "symbols-prefix": (context_coded(dynamic, 2)[:Reader(context_coded(dynamic, 2)).index[9].offset], True),
         "symbols-extremes": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4), False),
         "symbols-noise": (context_coded(_painted(_noise), 2), False),
+        "symbols-contexts": (_in_all_contexts(), False),
         "symbols-constant": (context_coded(_painted(lambda shape, seed: np.full(shape, (127, -128, 1)[seed % 3]))), False),
         "symbols-empty": (context_coded(_painted(lambda shape, seed: np.zeros(shape), coded=False)), False),
         "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
@@ -603,14 +606,28 @@ def _scene(dynamic: bool, sizes: list[tuple[int, int, int, int, int]], amplitude
         tuple(Camera(64 + k, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(cameras)))
 
 
-def _painted(paint: Callable[[tuple[int, int, int], int], np.ndarray], coded: bool = True) -> QuantisedScene:
+def _painted(paint: Callable[[tuple[int, int, int], int], np.ndarray], coded: bool = True,
+             size: tuple[int, int, int] = (9, 6, 5)) -> QuantisedScene:
     """A static scene of `paint(shape, number)` on every plane, all of whose texels are coded, or none."""
-    scene = _scene(dynamic=False, sizes=[(3, 9, 6, 5, 0)])
+    scene = _scene(dynamic=False, sizes=[(3, *size, 0)])
     planes = {
         name: replace(plane, symbols=paint(plane.symbols.shape, number).astype(np.int8), coded=np.full(plane.coded.shape, coded))
         for number, (name, plane) in enumerate(scene.scales[0].items())
     }
     return replace(scene, scales=(planes,))
+
+
+def _in_all_contexts() -> bytes:
+    """Planes full of ends of the range under weights that fail them, and one that hardly changes: with the other vectors, found by trial
+    to have symbols in every context that there can be."""
+    weights = _noise((2, WEIGHTS), 3025).astype(np.int8)
+    weights[0, 8] = 24
+
+    def paint(shape: tuple[int, int, int], number: int) -> np.ndarray:
+        noise = _noise(shape, 3026 + number)
+        return noise > 120 if number == 2 else np.where(noise < 0, -128, np.where(noise > 90, 122, 127))
+
+    return context_coded(_painted(paint, size=(9, 9, 9)), weights=weights)
 
 
 def _hybrid(features: int, width: int, hidden: int) -> HybridDecoder:
