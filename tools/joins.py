@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from kpc.encoder.datasets import Dataset
-from kpc.encoder.evaluate import SceneRenderer, psnr, true_picture
+from kpc.encoder.evaluate import SceneRenderer, true_picture
 from kpc.format import file
+from kpc.format.fidelity import psnr
 from kpc.format.groups import Groups
 
 AROUND = 5
@@ -75,7 +76,7 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
             error = seen - true_picture(some, picture)
             change = None if camera not in last_of else float(np.sqrt(np.mean(np.square(error - last_of[camera]))))
             last_of[camera] = error
-            quality = psnr(error, np.zeros_like(error))
+            quality = psnr(error, 0)
             frames.append(Frame(some.camera_names[camera], int(at[picture]) - first, number, quality, change))
             if before is not None and at[picture] == shown[0]:
                 earlier, same, its_at = before

@@ -42,7 +42,7 @@ from kpc.player.reference import Part, Rendering
 Render = Callable[[Camera, float], Rendering]
 
 FILES = (".mp4", ".png", ".exr")
-FASTEST = 240.0
+SLOWEST, FASTEST = 0.001, 240.0
 LARGEST = 16384
 MOST = 100_000
 """Pictures at one go."""
@@ -146,7 +146,7 @@ def _parser() -> argparse.ArgumentParser:
         default="png",
         help="of pictures in a directory: 8-bit, or linear float colour and depth (default: %(default)s)",
     )
-    parser.add_argument("--fps", type=_rate, metavar="F", help="of an mp4, and of --path (default: the clip's)")
+    parser.add_argument("--fps", type=cli.frame_rate(SLOWEST, FASTEST), metavar="F", help="of an mp4, and of --path (default: the clip's)")
     parser.add_argument(
         "--backend",
         choices=("gl", "reference"),
@@ -197,16 +197,6 @@ def _moment(text: str) -> float:
         value = -1.0
     if not 0.0 <= value <= 1.0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a time in [0, 1]")
-    return value
-
-
-def _rate(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value <= FASTEST:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a frame rate up to {FASTEST:g}")
     return value
 
 
