@@ -200,6 +200,9 @@ def test_vectors_of_groups_hold_the_vectors_that_they_say(path, twin):
         number, time_in_it = opened.timeline.at(moment["time"])
         assert (number, twin.shown([place[:2] for place in theirs], moment["time"])[0]) == (moment["group"],) * 2
         assert time_in_it == pytest.approx(moment["time_in_it"], abs=1e-6)
+        shares = {str(part): share for part, _, share in opened.timeline.mixed(moment["time"])}
+        theirs_mixed = twin.mix([place[:2] for place in theirs], moment["time"])
+        assert shares == pytest.approx(moment["mix"], abs=1e-6) == {str(part): share for part, share in theirs_mixed.items()}
         assert twin.shown([place[:2] for place in theirs], moment["time"])[1] == pytest.approx(time_in_it, abs=1e-9)
 
 

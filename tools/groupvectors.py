@@ -9,7 +9,7 @@ import google_crc32c
 from kpc.format.container import ENTRY, HEADER, Reader, header_and_index
 from kpc.format.groups import Groups
 
-TIMES = (0.0, 0.125, 0.3, 0.5, 0.6875, 1.0)
+TIMES = (0.0, 0.125, 0.3, 0.31, 0.32, 0.5, 0.6875, 1.0)
 
 SCENES = ("moved-contracted", "hybrid-moved", "one-texel", "wrap")
 """Vectors of 12, 12, 12 and 1 frames at one rate."""
@@ -74,6 +74,7 @@ def invalid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, str, str]]:
         "groups-gap": (packed([(0, 12, third), (13, 12, other)]), broken, frames),
         "groups-back": (packed([(3, 12, third), (0, 12, other)]), broken, frames),
         "groups-within": (packed([(0, 12, third), (0, 12, other)]), broken, frames),
+        "groups-three": (packed([(0, 12, third), (9, 12, other), (11, 12, one)]), broken, "not in three"),
         "groups-long": (packed([(0, 12, third), (1, 1 << 24, other)]), broken, "frames are more than"),
         "groups-numbers": (changed(entry + 4, "<H", 2), broken, "not numbered from 0"),
         "groups-twice": (changed(entry + 4, "<H", 0), broken, "not numbered from 0"),
@@ -103,5 +104,7 @@ def described(data: bytes, partial: bool, names: dict[bytes, str]) -> dict[str, 
         "zstd": None,
         "groups": [{"row_start": entry.row_start, "row_count": entry.row_count,
                     "scene": names.get(data[entry.offset : entry.offset + entry.stored_length])} for entry in entries],
-        "times": [{"time": time, "group": number, "time_in_it": round(time_in_it, 9)} for time, number, time_in_it in shown],
+        "times": [{"time": time, "group": number, "time_in_it": round(time_in_it, 9),
+                   "mix": {str(part): round(share, 9) for part, _, share in groups.timeline.mixed(time)}}
+                  for time, number, time_in_it in shown],
     }

@@ -249,9 +249,10 @@ def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Re
     if options.backend == "reference":
 
         def by_reference(camera: Camera, time: float) -> Rendering:
-            scene, time = loaded.at(time)
-            look = _appearance(scene, options.appearance)
-            return shown(scene, camera, time, reference.render(scene, camera, time, part=options.part, appearance=look))
+            return reference.mixed([
+                (shown(scene, camera, time, reference.render(scene, camera, time, part=options.part,
+                                                             appearance=_appearance(scene, options.appearance))), share)
+                for scene, time, share in loaded.mixed(time)])
 
         return by_reference, "reference renderer (numpy)"
     from kpc.player import offscreen
@@ -259,17 +260,22 @@ def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Re
     from kpc.player.renderer import Renderer
 
     ctx = offscreen.open_context()
-    renderer: Renderer | None = None
+    renderers: list[Renderer] = []
 
     def by_graphics(camera: Camera, time: float) -> Rendering:
-        nonlocal renderer
-        scene, time = loaded.at(time)
-        if renderer is None or renderer.scene is not scene:
-            if renderer is not None:
-                renderer.release()
-            renderer = Renderer(ctx, scene, Quality(folded=options.folded))
-        look = _appearance(scene, options.appearance)
-        return shown(scene, camera, time, renderer.render(camera, time, part=options.part, appearance=look))
+        parts = loaded.mixed(time)
+        for gone in [one for one in renderers if all(one.scene is not scene for scene, *_ in parts)]:
+            gone.release()
+            renderers.remove(gone)
+        pictures = []
+        for scene, time, share in parts:
+            renderer = next((one for one in renderers if one.scene is scene), None)
+            if renderer is None:
+                renderers.append(renderer := Renderer(ctx, scene, Quality(folded=options.folded)))
+            look = _appearance(scene, options.appearance)
+            picture = renderer.render(camera, time, part=options.part, appearance=look)
+            pictures.append((shown(scene, camera, time, picture), share))
+        return reference.mixed(pictures)
 
     return by_graphics, offscreen.describe(ctx)
 
