@@ -1,6 +1,5 @@
 """How good a scene is: pictures rendered on the CPU, PSNR and SSIM against the held-out ones."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numba
@@ -14,6 +13,7 @@ from kpc.encoder.datasets import Dataset, rays
 from kpc.encoder.field import Field
 from kpc.encoder.optimisers import sample_capacity
 from kpc.encoder.render import Rays, collected, fused_features, meet, shade
+from kpc.format.fidelity import psnr
 from kpc.format.scene import Scene
 from kpc.format.space import Contraction
 
@@ -180,11 +180,6 @@ def true_picture(dataset: Dataset, number: int) -> np.ndarray:
     if dataset.has_alpha:
         return picture[..., :3] * picture[..., 3:] + WHITE * (1 - picture[..., 3:])
     return picture[..., :3]
-
-
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """-10 log10 of the mean squared difference, dB; both in [0, 1]. 100 dB at most."""
-    return -10 * math.log10(max(float(np.mean(np.square(a - b), dtype=np.float64)), 1e-10))
 
 
 def ssim(a: np.ndarray, b: np.ndarray, usable: np.ndarray | None = None) -> float:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.encoder.datasets import rays_of_camera
-from kpc.encoder.evaluate import SceneRenderer, psnr
+from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.sampler import RaySampler
 from kpc.format.cameras import Camera
+from kpc.format.fidelity import psnr, psnr_of
 from kpc.format.scene import Scene
 
 PROBE_RAYS = 1 << 15
@@ -40,7 +41,7 @@ class Measured:
 
 def agreement_db(error: float) -> float:
     """PSNR of a mean squared error in squares of 8-bit levels, dB; 100 at most."""
-    return 10 * math.log10(255**2 / max(error, 255**2 * 1e-10))
+    return psnr_of(error / 255**2)
 
 
 Measure = Callable[[Scene], Measured]
@@ -93,7 +94,7 @@ class Probe:
         def measure(scene: Scene) -> Measured:
             colours = expected if scene is uncoded else self._colours(scene)
             mse = float(np.mean(np.square(colours - expected), dtype=np.float64))
-            found = psnr(colours, self.truth) if self.truth is not None else -10 * math.log10(ASSUMED_MSE + mse)
+            found = psnr(colours, self.truth) if self.truth is not None else psnr_of(ASSUMED_MSE + mse)
             return Measured(found, 255**2 * mse)
 
         return measure

@@ -24,6 +24,7 @@ from kpc.encoder.optimisers import FusedOptimiser, PlainOptimiser, log_densities
 from kpc.encoder.proposals import Proposals
 from kpc.encoder.sampler import RaySampler
 from kpc.format.errors import TrainingError
+from kpc.format.fidelity import psnr_of
 from kpc.format.scene import Scene
 from kpc.format.space import Contraction, SpaceMapping
 
@@ -133,7 +134,7 @@ class Trainer:
             if self.step > 2 * config.occupancy_start:
                 self._steady_rays, self._steady_s = self._steady_rays + count, self._steady_s + now - started
             if now - since > 0.5:
-                psnr = -10 * math.log10(max(error / drawn, 1e-10))
+                psnr = psnr_of(error / drawn)
                 report(Report(self.step, self._fraction(time_budget_s), psnr, drawn / (now - since),
                               self.samples_per_ray, float(self.grid.occupied.mean()), self.elapsed_s))
                 error, drawn, since = 0.0, 0, now

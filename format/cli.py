@@ -77,6 +77,20 @@ def duration_s(text: str) -> float:
     return value
 
 
+def frame_rate(low: float, high: float) -> Callable[[str], float]:
+    """A parser of pictures a second, from `low` to `high`."""
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a frame rate from {low:g} to {high:g}")
+        return value
+
+    return parse
+
+
 def decibels(text: str) -> float:
     """The number of "0.1" or "0.1dB"."""
     try:

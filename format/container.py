@@ -21,7 +21,9 @@ import zstandard
 from kpc.format.errors import FormatError
 
 MAGIC = b"\x89KPC\r\n\x1a\n"
-VERSION = 0
+VERSION = 1
+READABLE_VERSIONS = (0, 1)
+"""Files of the draft, version 0, are as those of version 1 but for the number."""
 HEADER = struct.Struct("<8sHHIQIIQQIIII")
 ENTRY = struct.Struct("<4sHBBIIHHIIIQ")
 
@@ -84,6 +86,7 @@ class Header:
     """The first 64 bytes.
 
     Attributes:
+        version: of the format.
         index_length, chunk_count: of the index that follows.
         file_length: size of the whole file, bytes.
         value_count: numbers in all planes together, the limit a reader checks against its memory budget.
@@ -91,6 +94,7 @@ class Header:
         index_crc: CRC32C of the index.
     """
 
+    version: int
     index_length: int
     chunk_count: int
     file_length: int
@@ -241,8 +245,8 @@ class Reader:
             raise FormatError(f"{self.name}: cut off within the header; fetch the file again")
         (_, version, flags, header_length, index_offset, index_length, chunk_count, file_length, value_count,
          largest_raw, reserved, index_crc, header_crc) = HEADER.unpack(head)
-        if version != VERSION:
-            raise FormatError(f"{self.name}: format version {version}, this reader knows {VERSION}; update kpc")
+        if version not in READABLE_VERSIONS:
+            raise FormatError(f"{self.name}: format version {version}, this reader knows up to {VERSION}; update kpc")
         if google_crc32c.value(head[:-4]) != header_crc:
             raise FormatError(f"{self.name}: the header is damaged (its CRC32C differs); fetch the file again")
         if flags or reserved or header_length != HEADER.size or index_offset != HEADER.size:
@@ -259,7 +263,7 @@ class Reader:
         if max(value_count, largest_raw) > file_length * EXPANSION_LIMIT:
             raise FormatError(f"{self.name}: claims {value_count:,} values and chunks of {largest_raw:,} bytes, "
                               f"more than {file_length:,} bytes can hold")
-        return Header(index_length, chunk_count, file_length, value_count, largest_raw, index_crc)
+        return Header(version, index_length, chunk_count, file_length, value_count, largest_raw, index_crc)
 
     def _read_index(self) -> tuple[Entry, ...]:
         if self.source.size < HEADER.size + self.header.index_length:

@@ -3,8 +3,8 @@
     GRUP chunk    a whole .kpc file: one group. Its entry in the index says which frames of the clip those of the scene are.
 
 A group is coded, fetched, held and let go as any scene is, with planes, occupancy, motion and decoder of its own; so encoding and
-playing take the memory of a group, however long the clip. Frames that two groups share are there so that both are right where one
-takes over from the other, in the middle of them.
+playing take the memory of a group or two, however long the clip. In the frames that two groups share the picture goes over from one
+to the other: what each misses of the truth is its own, and would be seen to jump.
 
     groups = Groups("long.kpc")                 a file without groups is one group, itself
     number, time = groups.timeline.at(0.7)      which group shows, and where in it that is
@@ -65,6 +65,20 @@ class Timeline:
         frame = self.spans[0].start + time * (self.clip.frame_count - 1)
         number = bisect_right(self._takes_over, frame)
         return number, self.time_in(number, time)
+
+    def mixed(self, time: float) -> list[tuple[int, float, float]]:
+        """What makes the picture at `time`: a group, the time in it, and its share; of one group, or of two amid frames that they share.
+
+        The share of the later one grows evenly from 0 at the first frame that they share to 1 at the last.
+        """
+        number, time_in_it = self.at(time)
+        frame = self.spans[0].start + time * (self.clip.frame_count - 1)
+        for later in range(max(number, 1), min(number + 2, len(self.spans))):
+            first, last = self.spans[later].start, self.spans[later - 1].last
+            if first < frame < last:
+                share = (frame - first) / (last - first)
+                return [(later - 1, self.time_in(later - 1, time), 1 - share), (later, self.time_in(later, time), share)]
+        return [(number, time_in_it, 1.0)]
 
     def time_in(self, number: int, time: float) -> float:
         """The time in a group at a time of the clip; its first or last where it holds none such."""
@@ -203,7 +217,7 @@ class Groups:
 
 
 class LongScene:
-    """A clip in groups, of which one is held at a time.
+    """A clip in groups, of which one is held at a time, or two that are mixed.
 
     Attributes:
         clip: of all groups together. cameras: a few that the first group was filmed from.
@@ -211,8 +225,8 @@ class LongScene:
     """
 
     def __init__(self, groups: Groups) -> None:
-        self._groups, self._number = groups, -1
-        self._scene: Scene | None = None
+        self._groups = groups
+        self._held: dict[int, Scene] = {}
         self.timeline, self.clip, self.cameras = groups.timeline, groups.clip, groups.cameras()
 
     def at(self, time: float) -> tuple[Scene, float]:
@@ -222,12 +236,23 @@ class LongScene:
             FormatError, BudgetError, NetworkError: as `read`.
         """
         number, time = self.timeline.at(time)
-        if number != self._number:
-            self._scene, self._number = None, -1  # let go before there is another
+        return self._scene(number, {number}), time
+
+    def mixed(self, time: float) -> list[tuple[Scene, float, float]]:
+        """As `Timeline.mixed`, scenes in place of groups.
+
+        Raises:
+            As `at`.
+        """
+        parts = self.timeline.mixed(time)
+        return [(self._scene(number, {number for number, *_ in parts}), time_in_it, share) for number, time_in_it, share in parts]
+
+    def _scene(self, number: int, wanted: set[int]) -> Scene:
+        self._held = {held: scene for held, scene in self._held.items() if held in wanted}  # let go before there is another
+        if number not in self._held:
             scene = read(self._groups.open(number)).dequantise()
-            self._scene, self._number = replace(scene, cameras=scene.cameras or self.cameras), number
-        assert self._scene is not None
-        return self._scene, time
+            self._held[number] = replace(scene, cameras=scene.cameras or self.cameras)
+        return self._held[number]
 
 
 def load(source: AnySource, memory_budget: int = DEFAULT_BUDGET) -> Scene | LongScene:
@@ -301,7 +326,8 @@ def write(parts: Sequence[Part], path: str | os.PathLike[str]) -> int:
 
 
 def check_spans(spans: Sequence[Span], names: str | Sequence[str]) -> None:
-    """Refuse frames that do not make a clip: each group begins and ends after the one before, and leaves none out between them.
+    """Refuse frames that do not make a clip: each group begins and ends after the one before, none is left out between them, and none is
+    in three.
 
     `names`: of the file, or of one for each group, for messages.
     """
@@ -311,5 +337,9 @@ def check_spans(spans: Sequence[Span], names: str | Sequence[str]) -> None:
             one, other = called[number : number + 2]
             raise FormatError(f"{one} holds frames {before.start} to {before.last}, {other} frames {after.start} to {after.last}: "
                               "each must begin and end later than the one before, and leave no frame out")
+    for number, (before, after) in enumerate(zip(spans, spans[2:])):
+        if after.start <= before.last:
+            raise FormatError(f"{called[number + 2]} begins with frame {after.start}, which two groups before it hold: a frame may be in "
+                              "two groups, not in three")
     if (frames := spans[-1].last - spans[0].start + 1) > FRAME_LIMIT:
         raise FormatError(f"{called[-1]}: {frames:,} frames are more than {FRAME_LIMIT:,}")

@@ -166,6 +166,10 @@ class Scene:
         """What shows at a time, and the time in it: as of a clip in groups (`kpc.format.groups.LongScene`), but always itself."""
         return self, time
 
+    def mixed(self, time: float) -> "list[tuple[Scene, float, float]]":
+        """What makes the picture at a time, likewise: itself, the time in it, its share."""
+        return [(self, time, 1.0)]
+
     @property
     def is_dynamic(self) -> bool:
         return "xt" in self.scales[0]

@@ -78,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
         "--quality", choices=list(LADDER), help="how finely to draw (default: as it was; else what the device is up to)"
     )
     parser.add_argument(
-        "--target-fps", type=_rate, metavar="F",
+        "--target-fps", type=cli.frame_rate(*TARGET_FPS), metavar="F",
         help="hold so many frames a second by moving the quality (default: as it was; else do not)",
     )
     parser.add_argument("--path", metavar="JSON", help="a camera path, as saved before, for J to follow")
@@ -141,17 +141,6 @@ def _play(stream: "Reel", wanted: Preferences, options: argparse.Namespace, path
 def _opening_size(stream: "Reel") -> tuple[int, int]:
     camera = Rig.of(stream.scene).cameras[0]
     return min(max(round(HEIGHT * camera.width / camera.height), 480), 1600), HEIGHT
-
-
-def _rate(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    low, high = TARGET_FPS
-    if not low <= value <= high:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a frame rate from {low:g} to {high:g}")
-    return value
 
 
 def _size(text: str) -> tuple[int, int]:

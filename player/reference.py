@@ -14,7 +14,7 @@ A ray ends once trans < TERMINATION. Then rgb = sum weight rgb_k + trans backgro
 depth = sum weight t_k / sum weight. K-Planes, arXiv:2301.10241; the quadrature is NeRF's, arXiv:2003.08934, eq. 3.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -59,6 +59,14 @@ class Rendering:
     depth: np.ndarray
     opacity: np.ndarray
     samples: np.ndarray
+
+
+def mixed(parts: Sequence[tuple[Rendering, float]]) -> Rendering:
+    """Pictures of one camera and their shares as one: colours and opacity in these shares, depth of the one whose share is largest, samples
+    of all."""
+    rgb, opacity = (sum(np.float32(share) * getattr(part, name) for part, share in parts) for name in ("rgb", "opacity"))
+    largest, _ = max(parts, key=lambda part: part[1])
+    return Rendering(rgb, largest.depth, opacity, sum(part.samples for part, _ in parts))
 
 
 def render(

@@ -72,7 +72,7 @@ def entries(data, partial):  # sections 3, 4 and 10
     require(len(data) >= 64 and data[:8] == b"\x89KPC\r\n\x1a\n", "not a .kpc file")
     (version, flags, header_length, index_offset, index_length, count, file_length, value_count, largest_raw, reserved,
      index_crc, header_crc) = struct.unpack("<HHIQIIQQIIII", data[8:64])
-    require(version == 0, "unknown version")
+    require(version in (0, 1), "unknown version")
     require(crc32c(data[:60]) == header_crc, "header damaged")
     require(flags == reserved == 0 and header_length == index_offset == 64, "reserved field")
     require(1 <= count <= 65536 and index_length == 40 * count, "chunk count")
@@ -130,6 +130,7 @@ def groups(data, partial=False):  # section 4
         require(a < b <= a + n and a + n < b + m, "frames of groups")
     require(found[-1][0] + found[-1][1] - found[0][0] <= 1 << 24, "frames")
     scenes = [decode(body, len(body) < stored) for _, _, body, stored in found if len(body) == stored or not partial]
+    require(all(a + n <= b for (a, n, *_), (b, *_) in zip(found, found[2:])), "a frame in three groups")
     for (_, rows, _, _), scene in zip(found, scenes):
         require(scene["frame_count"] == rows and scene["fps"] == scenes[0]["fps"], "a group's clip")
         require(scene["value_count"] <= most, "value count of a group")
@@ -143,6 +144,16 @@ def shown(spans, time):  # section 4
     g = sum(f >= (ends[k - 1] + spans[k][0]) / 2 for k in range(1, len(spans)))
     start, rows = spans[g]
     return g, min(max((f - start) / (rows - 1), 0.0), 1.0) if rows > 1 else 0.0
+
+
+def mix(spans, time):  # section 4
+    """{number: share of the picture} of the group, or the two, that show at a time."""
+    f = spans[0][0] + time * (spans[-1][0] + spans[-1][1] - 1 - spans[0][0])
+    for k in range(1, len(spans)):
+        a, b = spans[k][0], spans[k - 1][0] + spans[k - 1][1] - 1
+        if a < f < b:
+            return {k - 1: (b - f) / (b - a), k: (f - a) / (b - a)}
+    return {shown(spans, time)[0]: 1.0}
 
 
 def decoded(body, codec, raw_length):  # section 4

@@ -15,13 +15,14 @@ from kpc.encoder import appearances, kpenc
 from kpc.encoder.appearances import choose_kind, fitted_code, number_pictures
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr, ssim, true_picture
+from kpc.encoder.evaluate import SceneRenderer, evaluate, ssim, true_picture
 from kpc.encoder.field import Field, appearance_priors
 from kpc.encoder.optimisers import FusedOptimiser, PlainOptimiser
 from kpc.encoder.probe import Probe
 from kpc.encoder.render import render_reference
 from kpc.encoder.train import Trainer
 from kpc.format.errors import UsageError
+from kpc.format.fidelity import psnr
 from kpc.format.file import encode, read
 from kpc.format.quantise import quantise_scene
 from kpc.player import reference

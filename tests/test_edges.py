@@ -1,13 +1,16 @@
 """Numbers at the edges of what a file can hold: they come back as near as their steps promise, through the whole file."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scenes import tiny_scene
 
+from kpc.format.errors import BudgetError
 from kpc.format.file import encode, read
-from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedScene, quantise_scene
+from kpc.format.motion import QuantisedMotion
+from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_scene
 from kpc.format.scene import SPACE_PLANES, Scene
 from kpc.format.symbols import WEIGHTS, decode_symbols, encode_with
 
@@ -74,3 +77,49 @@ def test_sizes_of_planes(shape):
     coded = np.ones(shape[:2], bool)
     found, where = decode_symbols(encode_with(np.zeros((1, WEIGHTS), np.int8), symbols, coded), *shape)
     assert np.array_equal(found, symbols) and np.array_equal(where, coded)
+
+
+def of_bits(bits: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Signed numbers of so many bits, the least and the largest among them."""
+    found = np.random.default_rng(bits).integers(-(1 << bits - 1), 1 << bits - 1, shape)
+    found.flat[:2] = -(1 << bits - 1), (1 << bits - 1) - 1
+    return found
+
+
+@pytest.mark.parametrize("bits", range(1, 9))
+def test_planes_of_so_many_bits(bits):
+    before = quantised(tiny_scene(scales=1, channels=2, resolution=(12, 12, 12)), 0.01)
+    planes = {name: replace(plane, symbols=of_bits(bits, plane.symbols.shape).astype(np.int8), coded=plane.coded | True)
+              for name, plane in before.scales[0].items()}
+    assert_comes_back(replace(before, scales=(planes,)))
+
+
+@pytest.mark.parametrize("bits", range(1, 17))
+def test_motion_of_so_many_bits(bits):
+    before = replace(quantised(tiny_scene(scales=1, channels=1, resolution=(2, 2, 2)), 0.01),
+                     motion=QuantisedMotion(of_bits(bits, (3, 4, 3, 2, 3)).astype(np.int16), 0.5**15))
+    found = assert_comes_back(before).motion
+    assert np.array_equal(found.symbols, before.motion.symbols) and found.step == before.motion.step
+
+
+def test_a_file_of_four_million_texels():
+    """Read within the memory that the reader is allowed, one byte less of which it refuses."""
+    side = 2048
+    y, x = np.ogrid[:side, :side]
+    planes = {name: QuantisedPlane(((x[..., None] * y[:rows, :, None] // 97 + x[..., None]) % 251 - 125).astype(np.int8),
+                                   np.float32([0.01]), np.float32([0]), np.ones((rows, side), bool))
+              for name, rows in (("xy", side), ("xz", 1), ("yz", 1))}
+    before = replace(quantised(tiny_scene(scales=1, channels=1, resolution=(2, 2, 2), dynamic=False), 0.01), scales=(planes,))
+    data = encode(before)
+    values = side * side + 2 * side
+    assert len(data) < values
+    tracemalloc.start()
+    try:
+        found = read(data, memory_budget=5 * values + (1 << 16))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert all(np.array_equal(found.scales[0][name].symbols, plane.symbols) for name, plane in planes.items())
+    assert peak < 7 * values  # symbols and coded texels twice, two bytes a texel of the channel before, the file
+    with pytest.raises(BudgetError):
+        read(data, memory_budget=5 * values - 1)

@@ -10,7 +10,8 @@ import pytest
 from scenes import tiny_scene
 
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr, ssim, true_picture
+from kpc.encoder.evaluate import SceneRenderer, evaluate, ssim, true_picture
+from kpc.format.fidelity import psnr
 from kpc.format.scene import Scene
 from kpc.player import reference
 

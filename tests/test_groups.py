@@ -56,11 +56,34 @@ def test_one_group_takes_over_from_another_in_the_middle_of_what_they_share():
     assert timeline.time_in(0, 1.0) == 1 and timeline.time_in(1, 0.0) == 0 and timeline.time_in(2, 0.3) == 0
 
 
+def test_two_groups_are_mixed_amid_the_frames_that_they_share():
+    timeline = Timeline((Span(100, 11), Span(106, 15), Span(121, 1)), 25.0)
+    for frame in np.arange(100, 121.01, 0.25):
+        parts = {number: (time, share) for number, time, share in timeline.mixed((frame - 100) / 21)}
+        assert sum(share for _, share in parts.values()) == pytest.approx(1)
+        assert list(parts) == ([0, 1] if 106 < frame < 110 else [timeline.at((frame - 100) / 21)[0]])
+        for number, (time, share) in parts.items():
+            assert time == timeline.time_in(number, (frame - 100) / 21)
+            assert share == pytest.approx(1 if len(parts) == 1 else abs(frame - (110, 106)[number]) / 4)
+
+
+def test_a_clip_goes_over_from_one_group_to_the_next_without_a_jump(clip):
+    """Pictures either side of the middle of shared frames, where one that shows alone jumps, are as near as their times."""
+    long, camera = kpc.load(clip), kpc.load(clip).cameras[0].resized(8, 6)
+    before, middle, after = (kpc.render(long, camera, frame / 29) for frame in (8.99, 9.0, 9.01))
+    (first, t, _), (second, u, share) = long.mixed(9.0 / 29)
+    one, other = reference.render(first, camera, t), reference.render(second, camera, u)
+    assert share == pytest.approx(0.5) and np.abs(one.rgb - other.rgb).max() > 0.1
+    assert np.abs(middle.rgb - (one.rgb + other.rgb) / 2).max() < 1e-6 and np.array_equal(middle.samples, one.samples + other.samples)
+    assert np.abs(middle.opacity - (one.opacity + other.opacity) / 2).max() < 1e-6
+    assert np.abs(before.rgb - after.rgb).max() < 0.02
+
+
 def test_a_clip_shows_its_groups(clip, scenes):
     long = kpc.load(clip)
     assert isinstance(long, LongScene) and long.clip == Clip(30, 10.0)
     camera = long.cameras[0].resized(12, 9)
-    for frame, number in ((0, 0), (8.9, 0), (9, 1), (18, 1), (18.4, 1), (18.6, 2), (29, 2)):
+    for frame, number in ((0, 0), (8, 0), (10, 1), (18, 1), (18.4, 1), (18.6, 2), (29, 2)):
         start = (0, 8, 19)[number]
         alone = kpc.load(scenes[number])
         seen = kpc.render(alone, camera, min(max((frame - start) / 10, 0), 1))
@@ -89,12 +112,15 @@ def test_a_scene_is_a_clip_of_one_group(scenes):
     assert isinstance(scene, Scene) and scene.at(0.3) == (scene, 0.3)
 
 
-def test_one_group_is_held_at_a_time(clip):
+def test_one_group_is_held_at_a_time_or_two_that_are_mixed(clip):
     long = kpc.load(clip)
     first, _ = long.at(0.0)
     assert long.at(0.2)[0] is first
     second, _ = long.at(0.5)
     assert second is not first and long.at(0.4)[0] is second and long.at(0.0)[0] is not first
+    assert [len(long.mixed(time)) for time in (0.0, 9 / 29, 0.5)] == [1, 2, 1]
+    mixed = [scene for scene, *_ in long.mixed(9 / 29)]
+    assert long.mixed(9.5 / 29)[0][0] is mixed[0] and long.at(0.5)[0] is mixed[1] and len(long._held) == 1
 
 
 def test_the_budget_is_that_of_a_group(clip, scenes):

@@ -15,8 +15,9 @@ from test_datasets import fails, load
 
 from kpc.encoder.datasets import Dataset, pixels
 from kpc.encoder.datasets.masks import BLOCK
-from kpc.encoder.evaluate import SceneRenderer, evaluate, psnr, ssim, true_picture
+from kpc.encoder.evaluate import SceneRenderer, evaluate, ssim, true_picture
 from kpc.encoder.sampler import RaySampler
+from kpc.format.fidelity import psnr
 from kpc.format.media import write_image
 
 SIZE = (24, 32)

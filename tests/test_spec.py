@@ -20,7 +20,7 @@ from kpc.tools import specvectors
 
 SPEC = Path(__file__).parent.parent / "spec"
 PAGE = (SPEC / "kpc-format.md").read_text()
-GROUPED = sorted((SPEC / "vectors" / "valid").glob("groups*.kpc"))
+GROUPED = sorted((SPEC / "vectors" / "valid").glob("*groups*.kpc"))
 VALID = sorted(set((SPEC / "vectors" / "valid").glob("*.kpc")) - set(GROUPED))
 INVALID = sorted((SPEC / "vectors" / "invalid").glob("*.kpc"))
 
@@ -97,6 +97,7 @@ def test_limits_are_the_code_s():
 def test_names_and_numbers_are_the_code_s():
     assert container.MAGIC.hex(" ").upper() in section(3)
     assert f"version {container.VERSION}" in PAGE.splitlines()[0]
+    assert f"| version | {container.VERSION}; or 0," in section(3) and container.READABLE_VERSIONS == (0, container.VERSION)
     assert set(re.findall(r"^\| ([A-Za-z]{4}) \| [01]", section(4), re.M)) == file.KNOWN_KINDS | {file.GROUP_KIND}
     numbered = ", ".join(f"{number} `{name}`" for number, name in enumerate(ALL_PLANES))
     assert numbered in section(4)
@@ -145,10 +146,13 @@ def test_the_decoder_written_from_the_page_agrees(path, twin):
         assert hashlib.sha256(values.tobytes()).hexdigest() == expected["motion"]["sha256"]
     else:
         assert scene["motion"] is None
+    cameras = np.array(scene["cameras"], "<f8")
+    assert {"count": len(cameras), "sha256": hashlib.sha256(cameras.tobytes()).hexdigest()} == expected["cameras"]
     if "appearances" in expected:
         codes = np.array(list(scene["appearances"].values()), "<f4")
-        assert list(scene["appearances"]) == expected["appearances"]["names"]
+        assert hashlib.sha256("".join(scene["appearances"]).encode()).hexdigest() == expected["appearances"]["names_sha256"]
         assert hashlib.sha256(codes.tobytes()).hexdigest() == expected["appearances"]["sha256"]
+        assert len(codes) == expected["appearances"]["count"]
     else:
         assert scene["appearances"] == {}
     for ray in expected["rays"]:
@@ -196,6 +200,9 @@ def test_vectors_of_groups_hold_the_vectors_that_they_say(path, twin):
         number, time_in_it = opened.timeline.at(moment["time"])
         assert (number, twin.shown([place[:2] for place in theirs], moment["time"])[0]) == (moment["group"],) * 2
         assert time_in_it == pytest.approx(moment["time_in_it"], abs=1e-6)
+        shares = {str(part): share for part, _, share in opened.timeline.mixed(moment["time"])}
+        theirs_mixed = twin.mix([place[:2] for place in theirs], moment["time"])
+        assert shares == pytest.approx(moment["mix"], abs=1e-6) == {str(part): share for part, share in theirs_mixed.items()}
         assert twin.shown([place[:2] for place in theirs], moment["time"])[1] == pytest.approx(time_in_it, abs=1e-9)
 
 
@@ -209,7 +216,44 @@ def test_vectors_are_what_their_maker_makes():
             assert_described(json.loads(content), json.loads(committed))
         elif name.endswith(".json") or name.startswith("invalid/") or packed_here(name):
             assert content == committed, name
-    assert sum(len(content) for content in made.values()) < 450_000
+    assert sum(len(content) for content in made.values()) < 500_000
+
+
+@pytest.mark.parametrize("name, digest", {
+    "version-0": "332b031a5b8c07bb5451f6db534829b7548d34a87e6125edd11a70c80040cb42", "version-0-symbols": "2836f74ea5ad19d75e12237690d2e54db6430c45b179f6d22bc2c01d78163ecd", "version-0-groups": "fd15878b0953fd13abe5fe47c2137bfb160260d5ee51b422a15d62a407021845",
+}.items())
+def test_files_of_the_draft_are_kept_as_they_were_made(name, digest):
+    data = (SPEC / "vectors" / "valid" / f"{name}.kpc").read_bytes()
+    assert hashlib.sha256(data).hexdigest() == digest
+    assert container.Reader(data).header.version == 0
+
+
+def test_valid_vectors_cover_every_kind_under_every_codec():
+    found = {(entry.kind, entry.codec) for path in VALID + GROUPED
+             for entry in container.Reader(path.read_bytes(), allow_partial=True).index}
+    codecs = {kind: {0, 1, 2} if kind in ("PLNE", "OCCU", "MOVE") else {0, 1} for kind in file.KNOWN_KINDS}
+    assert found >= {(kind, codec) for kind, known in codecs.items() for codec in known} | {(file.GROUP_KIND, 0)}
+
+
+def test_valid_vectors_cover_every_context_and_size_of_errors(twin, monkeypatch):
+    """No error is large enough for the last three of the 66 contexts of planes."""
+    contexts, sizes, inner = set(), set(), twin.Decisions.error
+
+    def error(decisions, context, most_bits=7):
+        found = inner(decisions, context, most_bits)
+        contexts.add((most_bits, context))
+        sizes.add((most_bits, found if abs(found) <= 4 else (abs(found) - 4).bit_length() + 4, found > 0))
+        return found
+
+    monkeypatch.setattr(twin.Decisions, "error", error)
+    for path in VALID:
+        if path.stem.startswith(("symbols", "nodes", "limits-nodes")):
+            twin.decode(path.read_bytes(), partial=path.stem.endswith("prefix"))
+    assert contexts == {(7, context) for context in range(63)} | {(15, context) for context in range(20)}
+    for most in (7, 15):
+        of_each_sign = {(most, size, False) for size in range(-4, 1)} | {(most, size, True) for size in range(1, 5)}
+        escapes = {(most, 4 + bits, positive) for bits in range(1, most + 2) for positive in (False, True)}
+        assert sizes >= of_each_sign | escapes
 
 
 def packed_here(name: str) -> bool:

@@ -13,7 +13,7 @@ import torch
 from kpc.encoder.box import contraction_of, find_box
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluate import evaluate, psnr
+from kpc.encoder.evaluate import evaluate
 from kpc.encoder.field import Field
 from kpc.encoder.kpenc import to_scene
 from kpc.encoder.optimisers import PlainOptimiser, kept_channels
@@ -21,6 +21,7 @@ from kpc.encoder.render import Rays
 from kpc.encoder.sampler import RaySampler
 from kpc.encoder.train import Report, Trainer
 from kpc.format.errors import TrainingError
+from kpc.format.fidelity import psnr
 from kpc.format.media import read_image, write_image
 from kpc.format.scene import SPACE_PLANES
 from kpc.format.space import Contraction

@@ -5,7 +5,6 @@ python -m kpc.tools.contactsheet gt rendered -o sheet.png
 """
 
 import argparse
-import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from kpc.format import cli
 from kpc.format.errors import MediaError, UsageError
+from kpc.format.fidelity import psnr
 from kpc.format.media import IMAGE_SUFFIXES, read_image, write_image
 
 GAP = 6
@@ -36,8 +36,7 @@ class Pair:
     @property
     def psnr(self) -> float:
         """dB, on 8-bit values; 100 at most."""
-        error = np.mean(np.square(self.truth.astype(np.float64) - self.rendered)) / 255**2
-        return -10 * math.log10(max(float(error), 1e-10))
+        return psnr(self.truth / 255, self.rendered / 255)
 
 
 def pairs(truth: Path, rendered: Path) -> list[Pair]:

@@ -9,10 +9,12 @@ import google_crc32c
 from kpc.format.container import ENTRY, HEADER, Reader, header_and_index
 from kpc.format.groups import Groups
 
-TIMES = (0.0, 0.125, 0.3, 0.5, 0.6875, 1.0)
+TIMES = (0.0, 0.125, 0.3, 0.31, 0.32, 0.5, 0.6875, 1.0)
 
 SCENES = ("moved-contracted", "hybrid-moved", "one-texel", "wrap")
 """Vectors of 12, 12, 12 and 1 frames at one rate."""
+DRAFT = "version-0"
+"""The third of them, as a file of version 0."""
 SLOWER = "minimal"
 """One of a frame at another."""
 
@@ -34,6 +36,12 @@ def packed(groups: Sequence[Group], *, beside: Sequence[tuple[bytes, bytes]] = (
     return header_and_index(entries, offset, most, max(map(len, bodies))) + b"".join(bodies)
 
 
+def of_the_draft(data: bytes) -> bytes:
+    """The same file as it was when the format was a draft, of version 0."""
+    head = data[:8] + struct.pack("<H", 0) + data[10:60]
+    return head + struct.pack("<I", google_crc32c.value(head)) + data[64:]
+
+
 def valid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, bool]]:
     """Files by name, and whether they are prefixes; `scenes`: other vectors. None holds a zstd frame, so these do not either."""
     one, other, third, still = (scenes[name] for name in SCENES)
@@ -42,6 +50,8 @@ def valid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, bool]]:
         "groups": (joined, False),
         "groups-apart": (packed([(7, 12, one), (19, 12, third)], beside=[NOTE]), False),
         "groups-one": (packed([(40, 12, third)]), False),
+        "groups-versions": (packed([(0, 12, scenes[DRAFT]), (12, 12, other)]), False),
+        "version-0-groups": (of_the_draft(packed([(40, 12, scenes[DRAFT])])), False),
         "groups-prefix": (joined[:Reader(joined).index[1].offset + len(other) // 2], True),
     }
 
@@ -64,6 +74,7 @@ def invalid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, str, str]]:
         "groups-gap": (packed([(0, 12, third), (13, 12, other)]), broken, frames),
         "groups-back": (packed([(3, 12, third), (0, 12, other)]), broken, frames),
         "groups-within": (packed([(0, 12, third), (0, 12, other)]), broken, frames),
+        "groups-three": (packed([(0, 12, third), (9, 12, other), (11, 12, one)]), broken, "not in three"),
         "groups-long": (packed([(0, 12, third), (1, 1 << 24, other)]), broken, "frames are more than"),
         "groups-numbers": (changed(entry + 4, "<H", 2), broken, "not numbered from 0"),
         "groups-twice": (changed(entry + 4, "<H", 0), broken, "not numbered from 0"),
@@ -93,5 +104,7 @@ def described(data: bytes, partial: bool, names: dict[bytes, str]) -> dict[str, 
         "zstd": None,
         "groups": [{"row_start": entry.row_start, "row_count": entry.row_count,
                     "scene": names.get(data[entry.offset : entry.offset + entry.stored_length])} for entry in entries],
-        "times": [{"time": time, "group": number, "time_in_it": round(time_in_it, 9)} for time, number, time_in_it in shown],
+        "times": [{"time": time, "group": number, "time_in_it": round(time_in_it, 9),
+                   "mix": {str(part): round(share, 9) for part, _, share in groups.timeline.mixed(time)}}
+                  for time, number, time_in_it in shown],
     }

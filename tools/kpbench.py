@@ -38,6 +38,7 @@ import numpy as np
 import kpc
 from kpc.format import cli
 from kpc.format.errors import KpcError, UsageError
+from kpc.format.fidelity import psnr
 from kpc.format.memory import peak_memory_bytes
 from kpc.player.quality import DEFAULT, LADDER
 from kpc.tools import results
@@ -409,16 +410,12 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
             differences.append(np.abs(np.clip(drawn.rgb, 0, 1) - picture))
         found[name] = {
             "time": MIDDLE,
-            "psnr": _psnr(differences[1]),
-            "psnr_turning": _psnr(differences[0]),
+            "psnr": psnr(differences[1], 0),
+            "psnr_turning": psnr(differences[0], 0),
             "within_one_level": float(np.mean(differences[1].max(axis=2) <= 1 / 255)),
             "samples_per_ray": float(drawn.samples.mean()),
         }
     return offscreen.describe(ctx), found
-
-
-def _psnr(difference: np.ndarray) -> float:
-    return float(-10 * np.log10(max(np.mean(np.square(difference), dtype=np.float64), 1e-10)))
 
 
 # --- coding

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from kpc.format import cli
-from kpc.format.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, DEFAULT_BUDGET, VERSION, Entry, open_source
+from kpc.format.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, DEFAULT_BUDGET, Entry, open_source
 from kpc.format.errors import FormatError, UsageError
 from kpc.format.file import SceneReader, read
 from kpc.format.groups import Groups
@@ -100,7 +100,7 @@ def describe_groups(groups: Groups) -> dict[str, Any]:
             "is_dynamic": head.is_dynamic if whole else None,
         })
     return {
-        "file": groups.name, "version": VERSION, "size_bytes": groups.reader.header.file_length,
+        "file": groups.name, "version": groups.reader.header.version, "size_bytes": groups.reader.header.file_length,
         "clip": {"frame_count": clip.frame_count, "fps": clip.fps, "duration_s": clip.duration_s},
         "cameras": len(groups.cameras()), "groups": described,
     }
@@ -129,7 +129,7 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
     missing = [not reader.available(number) for number in range(len(reader.index))]
     return {
         "file": reader.name,
-        "version": VERSION,
+        "version": reader.header.version,
         "size_bytes": size,
         "missing_chunks": sum(missing),
         "clip": {"frame_count": scene.clip.frame_count, "fps": scene.clip.fps, "duration_s": scene.clip.duration_s,

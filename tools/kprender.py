@@ -42,7 +42,7 @@ from kpc.player.reference import Part, Rendering
 Render = Callable[[Camera, float], Rendering]
 
 FILES = (".mp4", ".png", ".exr")
-FASTEST = 240.0
+SLOWEST, FASTEST = 0.001, 240.0
 LARGEST = 16384
 MOST = 100_000
 """Pictures at one go."""
@@ -146,7 +146,7 @@ def _parser() -> argparse.ArgumentParser:
         default="png",
         help="of pictures in a directory: 8-bit, or linear float colour and depth (default: %(default)s)",
     )
-    parser.add_argument("--fps", type=_rate, metavar="F", help="of an mp4, and of --path (default: the clip's)")
+    parser.add_argument("--fps", type=cli.frame_rate(SLOWEST, FASTEST), metavar="F", help="of an mp4, and of --path (default: the clip's)")
     parser.add_argument(
         "--backend",
         choices=("gl", "reference"),
@@ -200,16 +200,6 @@ def _moment(text: str) -> float:
     return value
 
 
-def _rate(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value <= FASTEST:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a frame rate up to {FASTEST:g}")
-    return value
-
-
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     if match is None or not all(1 <= int(n) <= LARGEST for n in match.groups()):
@@ -259,9 +249,10 @@ def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Re
     if options.backend == "reference":
 
         def by_reference(camera: Camera, time: float) -> Rendering:
-            scene, time = loaded.at(time)
-            look = _appearance(scene, options.appearance)
-            return shown(scene, camera, time, reference.render(scene, camera, time, part=options.part, appearance=look))
+            return reference.mixed([
+                (shown(scene, camera, time, reference.render(scene, camera, time, part=options.part,
+                                                             appearance=_appearance(scene, options.appearance))), share)
+                for scene, time, share in loaded.mixed(time)])
 
         return by_reference, "reference renderer (numpy)"
     from kpc.player import offscreen
@@ -269,17 +260,22 @@ def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Re
     from kpc.player.renderer import Renderer
 
     ctx = offscreen.open_context()
-    renderer: Renderer | None = None
+    renderers: list[Renderer] = []
 
     def by_graphics(camera: Camera, time: float) -> Rendering:
-        nonlocal renderer
-        scene, time = loaded.at(time)
-        if renderer is None or renderer.scene is not scene:
-            if renderer is not None:
-                renderer.release()
-            renderer = Renderer(ctx, scene, Quality(folded=options.folded))
-        look = _appearance(scene, options.appearance)
-        return shown(scene, camera, time, renderer.render(camera, time, part=options.part, appearance=look))
+        parts = loaded.mixed(time)
+        for gone in [one for one in renderers if all(one.scene is not scene for scene, *_ in parts)]:
+            gone.release()
+            renderers.remove(gone)
+        pictures = []
+        for scene, time, share in parts:
+            renderer = next((one for one in renderers if one.scene is scene), None)
+            if renderer is None:
+                renderers.append(renderer := Renderer(ctx, scene, Quality(folded=options.folded)))
+            look = _appearance(scene, options.appearance)
+            picture = renderer.render(camera, time, part=options.part, appearance=look)
+            pictures.append((shown(scene, camera, time, picture), share))
+        return reference.mixed(pictures)
 
     return by_graphics, offscreen.describe(ctx)
 

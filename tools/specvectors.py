@@ -26,7 +26,10 @@ from kpc.format.cameras import Camera
 from kpc.format.cells import encode_cells
 from kpc.format.container import CODEC_ZSTD, ENTRY, HEADER, Chunk, Reader, pack
 from kpc.format.errors import UsageError
-from kpc.format.file import MOTION_STRUCT, read, scene_chunks
+from kpc.format.file import (
+    APPEARANCE_LIMIT, AXIS_LIMIT, BOX_LIMIT, CAMERA_LIMIT, CHANNEL_LIMIT, FRAME_LIMIT, HIDDEN_LIMIT, MOTION_LIMIT, MOTION_STRUCT,
+    NAME_LIMIT, SAMPLE_LIMIT, SCALE_LIMIT, read, scene_chunks,
+)
 from kpc.format.motion import QuantisedMotion
 from kpc.format.nodes import LORENZO, NEIGHBOURS
 from kpc.format.nodes import encode_with as encode_nodes_with
@@ -36,6 +39,7 @@ from kpc.format.space import Contraction, DeviceCoordinates
 from kpc.format.symbols import WEIGHTS, encode_with
 from kpc.player import reference
 from kpc.tools import groupvectors
+from kpc.tools.groupvectors import of_the_draft
 
 ZSTD_VERSION = ".".join(map(str, zstandard.ZSTD_VERSION))
 
@@ -86,12 +90,13 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
            if isinstance(scene.mapping, DeviceCoordinates) else {}),
         **({"motion": {"shape": list(scene.motion.symbols.shape), "sha256": _sha256(scene.motion.dequantise().astype("<f4"))}}
            if scene.motion else {}),
-        **({"appearances": {"names": [appearance.name for appearance in scene.appearances],
-                            "sha256": _sha256(*(appearance.code.astype("<f4") for appearance in scene.appearances))}}
+        **({"appearances": {"count": len(scene.appearances),
+                            "names_sha256": _sha256(*(np.frombuffer(look.name.encode(), np.uint8) for look in scene.appearances)),
+                            "sha256": _sha256(*(look.code.astype("<f4") for look in scene.appearances))}}
            if scene.appearances else {}),
         "aabb": scene.aabb.tolist(),
         "background": scene.background.tolist(),
-        "cameras": [_camera(camera) for camera in scene.cameras],
+        "cameras": {"count": len(scene.cameras), "sha256": _sha256(*map(_camera, scene.cameras))},
         "occupancy": {"shape": list(scene.occupancy.shape), "sha256": _sha256(scene.occupancy.astype(np.uint8))},
         "decoder": {"features": sum(scale["xy"].symbols.shape[2] for scale in scene.scales),
                     **({"width": len(decoder.v_bias)} if isinstance(decoder, HybridDecoder) else {}), "hidden": len(decoder.b1),
@@ -131,13 +136,15 @@ def encode(scene: QuantisedScene, *, segment_rows: int = 16, compress: bool = Tr
     return pack(chunks, _value_count(scene), compress=compress)
 
 
-def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 16) -> bytes:
+def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 16, weights: np.ndarray | None = None) -> bytes:
     """A file all of whose planes are context-coded, also where raw ones would be smaller, with so many sets of weights.
 
-    The weights are no good ones but such as need no floating-point fit, and the largest and the smallest among them.
+    The weights, if none are given, are no good ones but such as need no floating-point fit, and the largest and the smallest among
+    them.
     """
-    weights = (_noise((sets, WEIGHTS), 61) / 4).astype(np.int8)
-    weights[0, 0], weights[-1, -1] = -128, 127
+    if weights is None:
+        weights = (_noise((sets, WEIGHTS), 61) / 4).astype(np.int8)
+        weights[0, 0], weights[-1, -1] = -128, 127
     chunks = []
     for chunk in scene_chunks(scene, segment_rows=segment_rows):
         if chunk.kind == "PLNE":
@@ -160,6 +167,19 @@ def coded_grids(scene: QuantisedScene) -> bytes:
             body = chunk.parts[0][:MOTION_STRUCT.size] + encode_nodes_with(weights, scene.motion.symbols)
         chunks.append(_forced(chunk, body) if body else replace(chunk, symbols=None))
     return pack(chunks, _value_count(scene))
+
+
+def all_zstd(scene: QuantisedScene) -> bytes:
+    """A file all of whose chunks are zstd frames, also where raw ones would be smaller."""
+    chunks = scene_chunks(scene)
+    raws = [b"".join(chunk.parts) for chunk in chunks]
+    bodies = [zstandard.ZstdCompressor(level=19).compress(raw) for raw in raws]
+    data = pack([replace(chunk, parts=[body], symbols=None) for chunk, body in zip(chunks, bodies, strict=True)],
+                _value_count(scene), compress=False)
+    for number, raw in enumerate(raws):
+        entry = HEADER.size + ENTRY.size * number
+        data = patched(patched(data, entry + 16, "<H", CODEC_ZSTD), entry + 24, "<I", len(raw))
+    return resealed(patched(data, 48, "<I", max(map(len, raws))))
 
 
 def _forced(chunk: Chunk, body: bytes) -> Chunk:
@@ -218,6 +238,7 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "symbols-prefix": (context_coded(dynamic, 2)[:Reader(context_coded(dynamic, 2)).index[9].offset], True),
         "symbols-extremes": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4), False),
         "symbols-noise": (context_coded(_painted(_noise), 2), False),
+        "symbols-contexts": (_in_all_contexts(), False),
         "symbols-constant": (context_coded(_painted(lambda shape, seed: np.full(shape, (127, -128, 1)[seed % 3]))), False),
         "symbols-empty": (context_coded(_painted(lambda shape, seed: np.zeros(shape), coded=False)), False),
         "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
@@ -234,7 +255,76 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
             np.where(_noise((3, 2, 4, 3, 3), 43) < 0, -32768, 32767).astype(np.int16), 0.5**13))), False),
         "nodes-smallest": (coded_grids(replace(dense, motion=_motion(2, 2, 2, 2))), False),
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
+        "version-0": (of_the_draft(encode(_scene(dynamic=True, sizes=[(1, 1, 1, 1, 1)]), compress=False)), False),
+        "version-0-symbols": (of_the_draft(context_coded(dynamic, 8, segment_rows=4)), False),
+        "zstd": (all_zstd(replace(varied, mapping=contracted.mapping, motion=moved.motion)), False),
+        "zstd-hybrid": (all_zstd(hybrid), False),
+        "time-empty": (encode(_at_rest(dynamic), segment_rows=4, compress=False), False),
+        "time-empty-symbols": (context_coded(_at_rest(dynamic)), False),
+        **{name: (data, False) for name, data in _limits().items()},
     }
+
+
+def _limits() -> dict[str, bytes]:
+    """Files at the limits of the spec's section 12, each as small as may be; none at that of chunks, whose index takes 2.6 MB."""
+    plain = _scene(dynamic=False, sizes=[(1, 2, 2, 2, 0)], cameras=1)
+    moving = _scene(dynamic=True, sizes=[(1, 2, 2, 2, 2)])
+    deep = _scene(dynamic=False, sizes=SCALE_LIMIT * [(1, 2, 1, 1, 0)])
+    many = _scene(dynamic=False, sizes=[(CHANNEL_LIMIT, 2, 1, 1, 0)])
+    axes = _scene(dynamic=True, sizes=[(1, AXIS_LIMIT, 1, 2, 1), (1, 2, AXIS_LIMIT, 1, 2), (1, 1, 2, AXIS_LIMIT, 1)])
+    rows = _scene(dynamic=True, sizes=[(1, 1, 2, 1, AXIS_LIMIT)])
+    pose = np.diag([1.0, 1, 1, 1])
+    names = [chr(0x4E00 + k) for k in range(APPEARANCE_LIMIT)]
+    plane = plain.scales[0]["xy"]
+    steps = np.float32([16, 8, 0.5**20, 0.5**149, 0.5**126])  # the last two: the least number above 0, the least that is normal
+    wide = {name: QuantisedPlane(np.tile(np.int8([[[-128], [127], [1]]]), (1, 1, 5)), steps, np.float32([0, -1024, 1, 0, 0.5**126]),
+                                 np.ones((1, 3), bool)) for name in SPACE_PLANES[:2]}
+    wide["yz"] = replace(wide["xy"], symbols=wide["xy"].symbols[:, :1], coded=np.ones((1, 1), bool))
+    decoder = _scene(dynamic=False, sizes=[(5, 1, 1, 1, 0)]).decoder
+    far = replace(plain, aabb=np.float32([[-BOX_LIMIT] * 3, [BOX_LIMIT] * 3]), clip=Clip(FRAME_LIMIT, 5e-324), scales=(wide,),
+                  decoder=decoder, step=2.0**32 / SAMPLE_LIMIT, occupancy=np.zeros((1, 1, 1, 1), bool), background=np.float32([0, 1, 1]),
+                  cameras=(Camera(65535, 65535, BOX_LIMIT, BOX_LIMIT, -BOX_LIMIT, BOX_LIMIT, pose + np.pad([[BOX_LIMIT]], ((0, 3), (3, 0)))),),
+                  appearances=_appearances("n" * NAME_LIMIT, "é" * (NAME_LIMIT // 2)))
+    near = replace(plain, aabb=np.float32([[0, 0, 0], [1 / BOX_LIMIT] * 3]), step=2.0**-33, clip=Clip(1, 1.7e308), occupancy=far.occupancy,
+                   mapping=Contraction(1 / BOX_LIMIT))
+    periodic = _noise((97,), 71) / np.float32(64)
+
+    def repeated(shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+        return {name: np.resize(periodic, shape) for name, shape in shapes.items()}
+
+    return {
+        "limits-scales": encode(replace(deep, decoder=replace(deep.decoder, density_weight=np.zeros(SCALE_LIMIT, np.float32)))),
+        "limits-channels": encode(many),
+        "limits-axes": encode(_smooth(replace(axes, occupancy=np.ones((1, 1, 1, AXIS_LIMIT), bool))), segment_rows=AXIS_LIMIT),
+        "limits-rows": encode(_smooth(replace(rows, occupancy=np.ones((AXIS_LIMIT, 1, 1, 1), bool))), segment_rows=AXIS_LIMIT),
+        "limits-motion": encode(replace(moving, motion=QuantisedMotion(
+            np.resize(np.int16([-32768, 32767, 0]), (AXIS_LIMIT, 2, 2, 2, 3)), 1 / 32))),
+        "limits-nodes": coded_grids(replace(moving, motion=_swaying(2, 2, 2, MOTION_LIMIT))),
+        "limits-hidden": encode(replace(plain, decoder=Decoder(density_bias=0.5, **repeated(Decoder.shapes(1, HIDDEN_LIMIT))))),
+        "limits-hybrid": encode(replace(plain, decoder=HybridDecoder(
+            density_bias=0.5, **repeated(HybridDecoder.shapes(1, HIDDEN_LIMIT, HIDDEN_LIMIT))))),
+        "limits-cameras": encode(replace(plain, cameras=tuple(
+            Camera(64 + k % 7, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(CAMERA_LIMIT)))),
+        "limits-appearances": encode(replace(plain, appearances=tuple(Appearance(name, np.zeros(3, np.float32)) for name in names))),
+        "limits-large": encode(far),
+        "limits-small": encode(near),
+    }
+
+
+def _at_rest(scene: QuantisedScene) -> QuantisedScene:
+    """The scene with time planes none of whose texels is coded."""
+    return replace(scene, scales=tuple({
+        name: replace(plane, symbols=0 * plane.symbols, coded=plane.coded & False) if name in TIME_PLANES else plane
+        for name, plane in scale.items()} for scale in scene.scales))
+
+
+def _smooth(scene: QuantisedScene) -> QuantisedScene:
+    """The scene with planes that take few bytes however large they are: they rise and fall slowly, from end to end of 8 bits."""
+    def slow(plane: QuantisedPlane) -> QuantisedPlane:
+        index = np.arange(plane.symbols.size).reshape(plane.symbols.shape) // 32 % 512
+        return replace(plane, symbols=(np.minimum(index, 511 - index) - 128).astype(np.int8), coded=plane.coded | True)
+
+    return replace(scene, scales=tuple({name: slow(plane) for name, plane in scale.items()} for scale in scene.scales))
 
 
 def _invalid() -> dict[str, tuple[bytes, str, str]]:
@@ -356,7 +446,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     return {
         "empty": (b"", broken, "not a .kpc file"),
         "magic": (patched(good, 1, "4s", b"JPEG"), broken, "not a .kpc file"),
-        "version": (resealed(patched(good, 8, "<H", 1)), broken, "format version 1"),
+        "version": (resealed(patched(good, 8, "<H", 2)), broken, "format version 2"),
         "header-crc": (patched(good, 40, "<Q", values + 1), broken, "header is damaged"),
         "header-flags": (resealed(patched(good, 10, "<H", 1)), broken, "reserved"),
         "header-reserved": (resealed(patched(good, 52, "<I", 1)), broken, "reserved"),
@@ -516,14 +606,28 @@ def _scene(dynamic: bool, sizes: list[tuple[int, int, int, int, int]], amplitude
         tuple(Camera(64 + k, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(cameras)))
 
 
-def _painted(paint: Callable[[tuple[int, int, int], int], np.ndarray], coded: bool = True) -> QuantisedScene:
+def _painted(paint: Callable[[tuple[int, int, int], int], np.ndarray], coded: bool = True,
+             size: tuple[int, int, int] = (9, 6, 5)) -> QuantisedScene:
     """A static scene of `paint(shape, number)` on every plane, all of whose texels are coded, or none."""
-    scene = _scene(dynamic=False, sizes=[(3, 9, 6, 5, 0)])
+    scene = _scene(dynamic=False, sizes=[(3, *size, 0)])
     planes = {
         name: replace(plane, symbols=paint(plane.symbols.shape, number).astype(np.int8), coded=np.full(plane.coded.shape, coded))
         for number, (name, plane) in enumerate(scene.scales[0].items())
     }
     return replace(scene, scales=(planes,))
+
+
+def _in_all_contexts() -> bytes:
+    """Planes full of ends of the range under weights that fail them, and one that hardly changes: with the other vectors, found by trial
+    to have symbols in every context that there can be."""
+    weights = _noise((2, WEIGHTS), 3025).astype(np.int8)
+    weights[0, 8] = 24
+
+    def paint(shape: tuple[int, int, int], number: int) -> np.ndarray:
+        noise = _noise(shape, 3026 + number)
+        return noise > 120 if number == 2 else np.where(noise < 0, -128, np.where(noise > 90, 122, 127))
+
+    return context_coded(_painted(paint, size=(9, 9, 9)), weights=weights)
 
 
 def _hybrid(features: int, width: int, hidden: int) -> HybridDecoder:
@@ -599,9 +703,8 @@ def _rays(scene: QuantisedScene) -> list[dict[str, Any]]:
     return rays
 
 
-def _camera(camera: Camera) -> dict[str, Any]:
-    return {"w": camera.width, "h": camera.height, "fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx,
-            "cy": camera.cy, "transform_matrix": camera.camera_to_world.tolist()}
+def _camera(c: Camera) -> np.ndarray:
+    return np.array([c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy, *np.ravel(c.camera_to_world[:3])], "<f8")
 
 
 def _sha256(*arrays: np.ndarray) -> str:
@@ -612,7 +715,13 @@ def _sha256(*arrays: np.ndarray) -> str:
 
 
 def _json(document: dict[str, Any]) -> bytes:
-    return (json.dumps(document, indent=1) + "\n").encode()
+    """A line for each member, and for each element of one that is a list of objects."""
+    def lines(value: Any) -> str:
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            return "[\n  " + ",\n  ".join(json.dumps(element, separators=(",", ":")) for element in value) + "]"
+        return json.dumps(value)
+
+    return ("{" + ",\n ".join(f"{json.dumps(key)}: {lines(value)}" for key, value in document.items()) + "}\n").encode()
 
 
 if __name__ == "__main__":

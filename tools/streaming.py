@@ -19,6 +19,7 @@ import numpy as np
 import kpc
 from kpc.format.container import open_source
 from kpc.format.errors import KpcError
+from kpc.format.fidelity import psnr_of
 from kpc.format.file import SceneReader, encode, read
 from kpc.format.partial import PartialScene
 from kpc.format.scene import TIME_PLANES, Clip
@@ -129,7 +130,7 @@ def prefixes(job: Arrival) -> list[dict[str, Any]]:
         renderer = Renderer(ctx, scene.scene)
         errors = [np.mean((renderer.render(camera, time).rgb.clip(0, 1) - rgb) ** 2) for time, rgb in zip(TIMES, wanted)]
         found.append({"bytes": entry.offset + entry.stored_length, "scale": entry.scale, "row_start": entry.row_start,
-                      "psnr": float(-10 * np.log10(max(float(np.mean(errors)), 1e-10)))})
+                      "psnr": psnr_of(float(np.mean(errors)))})
     return found
 
 

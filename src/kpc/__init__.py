@@ -25,8 +25,8 @@ __all__ = ["Camera", "KpcError", "Scene", "load", "render"]
 def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int = 2 << 30) -> "Scene | LongScene":
     """Read a .kpc file; its planes are numpy arrays by name: `scene.scales[0]["xy"]`.
 
-    A long clip may be in groups, of which one is held at a time, and read when a time in it is asked for: `scene.at(time)` is
-    the scene of that group, and the time in it.
+    A long clip may be in groups, of which one is held at a time, or two that are mixed, and read when a time in it is asked for:
+    `scene.at(time)` is the scene of the group that shows, and the time in it.
 
     Args:
         path: of the file, or its http or https URL; or its bytes, or an open binary file.
@@ -47,12 +47,12 @@ def render(scene: "Scene | LongScene", camera: Camera, time: float, appearance: 
     Args:
         time: in [0, 1] over the clip.
         appearance: a code, `scene.appearance(name)`, where the scene has any; None for their average. Of a clip in groups, that of
-            the group: `scene.at(time)[0].appearance(name)`.
+            the group: `scene.at(time)[0].appearance(name)`; then no other is mixed with it.
 
     Returns:
         `.rgb` (H, W, 3) float32 in [0, 1], `.depth` (H, W), `.opacity` (H, W).
     """
     from kpc.player import reference
 
-    shown, time_in_it = scene.at(time)
-    return reference.render(shown, camera, time_in_it, appearance=appearance)
+    parts = scene.mixed(time) if appearance is None else [(*scene.at(time), 1.0)]
+    return reference.mixed([(reference.render(shown, camera, t, appearance=appearance), share) for shown, t, share in parts])
