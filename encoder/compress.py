@@ -11,10 +11,10 @@ from functools import cached_property
 import numpy as np
 
 from kpc.encoder.probe import Measure, Measured
-from kpc.encoder.trellis import chosen
+from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format import file
 from kpc.format.errors import TrainingError
-from kpc.format.quantise import QuantisedScene, quantise_scene, reached_by
+from kpc.format.quantise import QuantisedScene, reached_by
 from kpc.format.scene import Scene
 
 FINEST, COARSEST = -13.0, 2.0
@@ -153,8 +153,7 @@ def compress(
     def attempt(exponent: float) -> Attempt:
         if as_it_is is not None and exponent == 0:
             return Attempt(as_it_is, measure)
-        nearest = quantise_scene(scene, scaled(steps, 2.0**exponent), reached=reached)
-        return Attempt(chosen(nearest, scene), measure)
+        return Attempt(quantise_on_trellis(scene, scaled(steps, 2.0**exponent), reached), measure)
 
     name, value = trade.bound
     if name == "lam":

@@ -10,11 +10,12 @@ the search chose the time before. Marcellin and Fischer (IEEE Trans. Comm. 38, 1
 (IEEE Trans. Inf. Theory 40, 1994).
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene
+from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_scene
 from kpc.format.rans import compiled
 from kpc.format.scene import TIME_PLANES, Scene
 from kpc.format.symbols import ACTIVITIES, UNKNOWN, WEIGHTS, _begin_row, _remember, activity, fitted, nearest, neighbourhoods, \
@@ -32,20 +33,24 @@ TOLD_APART = 40
 """Magnitudes of errors whose bits are told apart."""
 
 
-def chosen(quantised: QuantisedScene, scene: Scene) -> QuantisedScene:
-    """The same scene, quantised in the same steps, with symbols that follow the trellis."""
-    scales = tuple({name: _chosen_plane(plane, planes[name], name in TIME_PLANES) for name, plane in scale.items()}
-                   for scale, planes in zip(quantised.scales, scene.scales, strict=True))
+def quantise_on_trellis(scene: Scene, steps: Sequence[Mapping[str, np.ndarray]], reached: np.ndarray | None = None) -> QuantisedScene:
+    """As `quantise_scene`, with symbols that follow the trellis."""
+    quantised = quantise_scene(scene, steps, reached=reached)
+    scales = tuple({name: _steered(plane, planes[name], step[name], name in TIME_PLANES) for name, plane in scale.items()}
+                   for scale, planes, step in zip(quantised.scales, scene.scales, steps, strict=True))
     return replace(quantised, scales=scales)
 
 
-def _chosen_plane(plane: QuantisedPlane, values: np.ndarray, identity: bool) -> QuantisedPlane:
-    """(H, W, M) float32 `values` as symbols of the same steps and offsets. What was left out stays so, and holds 0; and so does what
-    is within a step of the identity."""
+def _steered(plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, identity: bool) -> QuantisedPlane:
+    """A plane that is quantised to the nearest, with other symbols. What was left out stays so, and holds 0; and so does what is within
+    a step of the identity.
+
+    Where 8 bits are too few for (M,) `step`, what is nearest errs less than every other symbol would.
+    """
+    if np.median(plane.step / step) >= 2:
+        return plane
     wanted = (values.astype(np.float64) - plane.offset) / plane.step
     known = np.ascontiguousarray(plane.coded)
-    if not np.isfinite(wanted[known]).all():  # what no symbol stands for
-        return plane
     if identity:
         known = known & (np.abs(wanted) >= 1).any(axis=2)
     weights, bits = np.zeros((1, WEIGHTS), np.int8), _bits(np.zeros((ACTIVITIES, TOLD_APART)))

@@ -8,10 +8,10 @@ import pytest
 from scenes import tiny_scene
 
 from kpc.encoder.compress import (
-    FINEST, Attempt, Trade, agreement_of, compress, error_of, relative_steps, scaled,
+    FINEST, TRUST, Attempt, Trade, agreement_of, compress, error_of, relative_steps, scaled,
 )
 from kpc.encoder.probe import Measured
-from kpc.encoder.rounding import rounded
+from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format import file
 from kpc.format.errors import TrainingError
 from kpc.format.quantise import quantise_scene
@@ -48,7 +48,7 @@ def test_without_a_word_the_loss_is_the_default() -> None:
 @pytest.mark.parametrize("quality", [40, 60, 75, 95])
 def test_a_quality_is_an_agreement_with_the_uncoded_scene(quality: float) -> None:
     found = coded(quality=quality)
-    assert agreement_of(quality) <= found.measured.agreement_db <= agreement_of(quality) + 0.1
+    assert agreement_of(quality) <= found.measured.agreement_db <= agreement_of(quality) + 0.2
     assert error_of(quality) == pytest.approx(255**2 * 10 ** (-(20 + quality / 3) / 10))
 
 
@@ -64,7 +64,7 @@ def test_a_size_is_met_from_below(share: float) -> None:
     target = int(smallest + share * (largest - smallest))
     found = coded(target_bytes=target)
     assert found.size_bytes == len(file.encode(found.quantised))
-    assert 0.95 * target < found.size_bytes <= target
+    assert 0.94 * target < found.size_bytes <= target
 
 
 def test_a_size_that_no_file_has_is_refused() -> None:
@@ -75,13 +75,14 @@ def test_a_size_that_no_file_has_is_refused() -> None:
 @pytest.fixture(scope="module")
 def raster() -> list[Attempt]:
     """On a fine raster of factors, for all lam."""
-    return [Attempt(quantise_scene(SCENE, scaled(EQUAL, 2.0**e)), measure) for e in np.arange(-10, 2, 0.1)]
+    return [Attempt(quantise_on_trellis(SCENE, scaled(EQUAL, 2.0**e)), measure) for e in np.arange(-10, 2, 0.1)]
 
 
 @pytest.mark.parametrize("lam", [0.01, 0.3, 10.0])
 def test_lam_finds_the_least_cost(lam: float, raster: list[Attempt]) -> None:
-    """Nothing on the raster is cheaper by more than a little: the least is flat, and bytes are whole."""
-    assert coded(lam=lam).cost(lam) <= 1.02 * min(attempt.cost(lam) for attempt in raster)
+    """Nothing on the raster is cheaper by more than a little: the least is flat, and where 8 bits become too few for the trellis a plane
+    goes back to rounding, which makes the cost jump a little."""
+    assert coded(lam=lam).cost(lam) <= 1.06 * min(attempt.cost(lam) for attempt in raster)
 
 
 def test_a_larger_lam_gives_a_smaller_file() -> None:
@@ -90,8 +91,8 @@ def test_a_larger_lam_gives_a_smaller_file() -> None:
 
 
 def test_where_nothing_is_good_enough_the_finest_is_taken() -> None:
-    finest = quantise_scene(SCENE, scaled(EQUAL, 2.0**FINEST))
-    assert file.encode(coded(max_loss_db=-1.0).quantised) == file.encode(rounded(finest, SCENE))
+    finest = quantise_on_trellis(SCENE, scaled(EQUAL, 2.0**FINEST))
+    assert file.encode(coded(max_loss_db=-1.0).quantised) == file.encode(finest)
 
 
 def test_a_psnr_that_is_not_a_number_does_not_pass() -> None:
@@ -133,7 +134,7 @@ def test_steps_follow_the_curvature() -> None:
     for s, scale in enumerate(h):
         for name, values in scale.items():
             expected = np.maximum(values[0, 0], 1e-8 * largest)
-            np.testing.assert_allclose(expected * steps[s][name] ** 2, largest, rtol=1e-5)  # h d^2 is the same everywhere
+            np.testing.assert_allclose(expected**TRUST * steps[s][name] ** 2, largest**TRUST, rtol=1e-5)
     assert steps[0]["xy"].min() == 1.0
 
 
@@ -142,7 +143,7 @@ def test_channels_that_no_gradient_reached_get_the_coarsest_step() -> None:
          for scale in SCENE.scales]  # fmt: skip
     for scale in relative_steps(h):
         for step in scale.values():
-            assert step[2] == pytest.approx(1e4) and (np.delete(step, 2) == 1).all()
+            assert step[2] == pytest.approx(1e8 ** (TRUST / 2)) and (np.delete(step, 2) == 1).all()
 
 
 def test_without_any_curvature_all_steps_are_equal() -> None:

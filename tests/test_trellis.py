@@ -1,17 +1,16 @@
-"""Symbols that are easier to foresee, and nearly as near."""
+"""Symbols on the trellis: near, and easy to foresee."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scenes import tiny_scene
 
-from kpc.encoder import rounding
-from kpc.encoder.rounding import rounded
-from kpc.format import file
-from kpc.format.quantise import QuantisedScene, quantise_scene
+from kpc.encoder import trellis
+from kpc.encoder.trellis import STATES, TOLD_APART, quantise_on_trellis
+from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
 from kpc.format.scene import TIME_PLANES, Scene
+from kpc.format.symbols import ACTIVITIES, WEIGHTS, encode_symbols, follows_trellis, next_state
 
 
 def noisy(seed: int = 1) -> Scene:
@@ -25,63 +24,94 @@ def quantised(scene: Scene, step: float) -> QuantisedScene:
     return quantise_scene(scene, [{name: step for name in scale} for scale in scene.scales])
 
 
-def plainly(wanted: np.ndarray, known: np.ndarray, lam: float) -> np.ndarray:
-    """What the module's text says, texel by texel, each candidate tried."""
-    chosen, missed = np.zeros(wanted.shape, int), np.zeros(wanted.shape)
-    seen = np.zeros(wanted.shape)
-    for (i, j), value in np.ndenumerate(wanted):
-        left = seen[i, j - 1] if j else (seen[i - 1, j] if i else 0)
-        up = seen[i - 1, j] if i else left
-        corner = seen[i - 1, j - 1] if i and j else (left if i == 0 else up)
-        expected = seen[i, j] = sorted([left, up, left + up - corner])[1]
-        if not known[i, j]:
-            missed[i, j] = missed[i, j - 1] if j else 0
-            continue
-        around = [missed[a, b] for a, b in ((i, j - 1), (i - 1, j), (i - 1, j - 1), (i - 1, j + 1))
-                  if a >= 0 and 0 <= b < wanted.shape[1]]  # fmt: skip
-        mean = (0.3 + sum(around)) / (0.6 + len(around))
-        costs = {s: (value - s) ** 2 + lam * math.log2((1 + mean) / mean) * abs(s - expected) for s in range(-128, 128)}
-        chosen[i, j] = seen[i, j] = min(costs, key=lambda s: costs[s])
-        missed[i, j] = abs(chosen[i, j] - expected)
-    return chosen
+def steered(scene: Scene, step: float) -> QuantisedScene:
+    return quantise_on_trellis(scene, [{name: np.full(plane.shape[2], step) for name, plane in scale.items()} for scale in scene.scales])
 
 
-@pytest.mark.parametrize("lam", [0.0, 0.06, 0.5])
-def test_the_choice_is_the_cheapest_of_all_symbols(lam: float) -> None:
+NO_WEIGHTS = np.zeros((1, WEIGHTS), np.int8)
+FREE = np.zeros((ACTIVITIES, TOLD_APART))
+"""Every error costs nothing."""
+
+
+def searched(wanted: np.ndarray, known: np.ndarray, bits: np.ndarray = FREE) -> np.ndarray:
+    symbols, counts = trellis._search(wanted, known, NO_WEIGHTS, bits)
+    assert counts.sum() == known.sum() * wanted.shape[2]
+    assert follows_trellis(symbols, known) and not symbols[~known].any()
+    return symbols
+
+
+def test_without_a_price_the_path_is_the_nearest_of_all() -> None:
+    """A row's least squared error, against every path through so short a row."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        wanted = rng.uniform(-9, 9, 5)
+        paths = {(0, ()): 0.0}
+        for value in wanted:
+            longer = {}
+            for (state, path), error in paths.items():
+                for symbol in range(-12 + state % 2, 13, 2):
+                    longer[next_state(state, symbol), (*path, symbol)] = error + (value - symbol) ** 2
+            best = {}  # of paths that end in the same state but differ in nothing that is still to come
+            for (state, path), error in longer.items():
+                if state not in best or error < best[state][1]:
+                    best[state] = path, error
+            paths = {(state, path): error for state, (path, error) in best.items()}
+        symbols = searched(wanted.reshape(1, -1, 1), np.ones((1, 5), bool))
+        assert np.square(wanted - symbols.ravel()).sum() == pytest.approx(min(paths.values()))
+
+
+def test_errors_of_the_trellis_are_smaller_than_those_of_rounding_to_as_many_bits() -> None:
+    """Every other symbol to choose from is a quantiser of step 2, which errs by 2^2 / 12; the trellis of 8 states by 1.09 dB less."""
+    wanted = np.random.default_rng(1).uniform(-100, 100, (100, 200, 2))
+    error = np.mean(np.square(wanted - searched(wanted, np.ones((100, 200), bool))))
+    assert 10 * np.log10(4 / 12 / error) == pytest.approx(1.09, abs=0.04)
+
+
+def test_states_part_and_meet_as_a_code_of_8_states_wants() -> None:
+    steps = {state: [next_state(state, symbol) for symbol in (state % 2, state % 2 + 2)] for state in range(STATES)}
+    assert all(a != b for a, b in steps.values())
+    came = [to for pair in steps.values() for to in pair]
+    assert sorted(came) == sorted(2 * list(range(STATES)))  # two ways into each
+    assert next_state(0, 0) == next_state(0, -4) == 0 and next_state(0, -2) == next_state(0, 2)
+
+
+def test_a_price_buys_errors_that_are_nearer_to_what_is_expected() -> None:
+    rng = np.random.default_rng(2)
+    wanted, known = rng.normal(0, 2, (30, 40, 2)), rng.random((30, 40)) < 0.8
+    dear = np.broadcast_to(10.0 * np.arange(TOLD_APART), FREE.shape).copy()
+    free, bought = searched(wanted, known), searched(wanted, known, dear)
+    assert np.abs(bought).sum() < 0.9 * np.abs(free).sum()
+    assert np.square(wanted - bought)[known].sum() > np.square(wanted - free)[known].sum()
+
+
+@pytest.mark.parametrize("step", [0.3, 1.0, 3.0])
+def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float) -> None:
     rng = np.random.default_rng(3)
-    wanted = rng.normal(0, 3, (7, 9)).cumsum(1)
-    known = rng.random((7, 9)) < 0.8
-    chosen = rounding._choose(wanted, known, lam, -128, 127)
-    np.testing.assert_array_equal(chosen, plainly(wanted, known, lam))
-    assert not chosen[~known].any()
+    values = rng.normal(0, 2, (60, 70, 3)).cumsum(0).cumsum(1)
+    values = (10 * values / values.std() + rng.normal(0, 2, values.shape)).astype(np.float32)
+
+    def error(plane: QuantisedPlane) -> float:
+        return float(np.mean(np.square(plane.dequantise() - values)))
+
+    def size(plane: QuantisedPlane) -> int:
+        return len(encode_symbols(plane.symbols, plane.coded))
+
+    economical = trellis._steered(quantise_plane(values, step, identity=False), values, np.full(3, step), False)
+    as_bad = next(plane for k in np.arange(1, 4, 0.01)
+                  if error(plane := quantise_plane(values, k * step, identity=False)) >= error(economical))
+    assert size(economical) < size(as_bad) - 0.12 * values.size / 8  # 1.09 dB are 0.18 bits
 
 
-def test_without_a_price_symbols_are_the_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rounding, "LAM", 0.0)
-    scene = noisy()
-    nearest = quantised(scene, 0.05)
-    assert file.encode(rounded(nearest, scene)) == file.encode(nearest)
-
-
-@pytest.mark.parametrize("step", [0.05, 0.1, 0.2])
-def test_bytes_fall_by_more_than_coarser_steps_would_save(step: float) -> None:
-    """At a square error that is a little larger, the file is smaller than at steps that err as much."""
-    scene = noisy()
-
-    def error(q: QuantisedScene) -> float:
-        needed = quantised(scene, 1e-4).scales
-        planes = zip(q.dequantise().scales, scene.scales, needed)
-        return float(np.mean([np.square(a[n] - b[n])[c[n].coded].mean() for a, b, c in planes for n in a]))
-
-    economical = rounded(quantised(scene, step), scene)
-    coarser = [quantised(scene, step * k) for k in np.arange(1, 1.5, 0.02)]
-    as_bad = next(q for q in coarser if error(q) >= error(economical))
-    assert len(file.encode(economical)) < len(file.encode(as_bad)) < len(file.encode(quantised(scene, step)))
+def test_where_eight_bits_are_too_few_symbols_are_the_nearest() -> None:
+    values = np.random.default_rng(4).uniform(-100, 100, (20, 20, 2)).astype(np.float32)
+    nearest = quantise_plane(values, 0.01, identity=False)
+    assert trellis._steered(nearest, values, np.full(2, 0.01), False) is nearest
+    assert trellis._steered(nearest, values, nearest.step, False) is not nearest
 
 
 def test_what_was_left_out_stays_so_and_steps_stay() -> None:
     scene = noisy()
-    before, after = quantised(scene, 0.05), rounded(quantised(scene, 0.05), scene)
+    before, after = quantised(scene, 0.05), steered(scene, 0.05)
     for ours, theirs in zip(after.scales, before.scales):
         for name in ours:
             np.testing.assert_array_equal(ours[name].step, theirs[name].step)
@@ -97,5 +127,5 @@ def test_symbols_stay_within_eight_bits() -> None:
     planes = [dict(scale) for scale in scene.scales]
     planes[0]["xt"] = planes[0]["xt"] + np.float32(5)
     scene = replace(scene, scales=tuple(planes))
-    after = rounded(quantised(scene, 1e-6), scene)  # steps are raised until the range fits
+    after = steered(scene, 1e-6)  # steps are raised until the range fits
     assert after.scales[0]["xt"].symbols.max() == 127 and np.isfinite(after.dequantise().scales[0]["xt"]).all()

@@ -36,7 +36,7 @@ from kpc.format.nodes import encode_with as encode_nodes_with
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates
-from kpc.format.symbols import WEIGHTS, encode_with
+from kpc.format.symbols import WEIGHTS, encode_with, next_state
 from kpc.player import reference
 from kpc.tools import groupvectors
 from kpc.tools.groupvectors import of_the_draft
@@ -195,6 +195,21 @@ def claiming(chunks: list[Chunk], number: int, value_count: int, length: int) ->
     return resealed(patched(patched(data, entry + 16, "<H", 2), entry + 24, "<I", length))
 
 
+def _on_trellis(scene: QuantisedScene) -> QuantisedScene:
+    """The scene with the last bit of its symbols such that they follow the trellis."""
+
+    def moved(plane: QuantisedPlane) -> QuantisedPlane:
+        symbols = plane.symbols.copy()
+        for y, c in np.ndindex(len(symbols), symbols.shape[2]):
+            place = 0
+            for x in np.flatnonzero(plane.coded[y]):
+                symbols[y, x, c] = symbols[y, x, c] & ~1 | place & 1
+                place = next_state(place, int(symbols[y, x, c]))
+        return replace(plane, symbols=symbols)
+
+    return replace(scene, scales=tuple({name: moved(plane) for name, plane in scale.items()} for scale in scene.scales))
+
+
 def _value_count(scene: QuantisedScene) -> int:
     return sum(plane.symbols.size for scale in scene.scales for plane in scale.values())
 
@@ -241,6 +256,9 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "symbols-contexts": (_in_all_contexts(), False),
         "symbols-constant": (context_coded(_painted(lambda shape, seed: np.full(shape, (127, -128, 1)[seed % 3]))), False),
         "symbols-empty": (context_coded(_painted(lambda shape, seed: np.zeros(shape), coded=False)), False),
+        "trellis": (context_coded(_on_trellis(dynamic), 8, segment_rows=4), False),
+        "trellis-extremes": (context_coded(_on_trellis(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127))), 4),
+                             False),
         "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
         "cells": (coded_grids(replace(dense, occupancy=rolling)), False),
         "cells-noise": (coded_grids(dense), False),
@@ -473,7 +491,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
                         broken, "claims another length"),
         "zstd-garbage": (resealed(patched(good, entry[xy] + 16, "<H", 1)), broken, "zstd frame"),
         "symbols-sets": (context(patched(coarse, 0, "<B", 3)), broken, "number of sets"),
-        "symbols-map-flag": (context(patched(coarse, 1, "<B", 2)), broken, "map flag"),
+        "symbols-flags": (context(patched(coarse, 1, "<B", 4)), broken, "or flag"),
         **damaged_words("symbols", context, coarse, state_at),
         "symbols-bomb": (resealed(bomb_symbols), broken, "more than 15 bytes can hold"),
         "symbols-range": (context(encode_with(weights, symbols + 200, np.ones((2, 2), bool))), broken, "leaves its 8 bits"),
