@@ -45,6 +45,9 @@ STUCK_S = 600.0
 """Seconds on the clock after which it is ended though it does not compute."""
 REPORT_EVERY = 200
 
+LONG = ("limits-cameras", "limits-appearances")
+"""Vectors of so many equal things that reading them takes 0.23 and 0.1 s, of the others 4 ms on average."""
+
 BITS = {1: "<B", 2: "<H", 4: "<I", 8: "<Q"}
 WHOLES = (0, 1, 2, 3, 7, 127, 128, 255, 256, 0x7FFF, 0x8000, 0xFFFF, 0x10000, 1 << 24, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 50)
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-30, 1e30, 3e38, float("nan"), float("inf"), -float("inf"), 5e-324, 1e300)
@@ -224,8 +227,9 @@ def _decompressed(body: bytes) -> bytes | None:
 
 
 def seeds() -> list[Taken]:
-    """The valid conformance vectors, taken apart."""
-    return [Taken.of(data) for path, data in specvectors.vectors().items() if path.startswith("valid/") and path.endswith(".kpc")]
+    """The valid conformance vectors, taken apart, but for those that would take more time than all others together."""
+    return [Taken.of(data) for path, data in specvectors.vectors().items()
+            if path.startswith("valid/") and path.endswith(".kpc") and Path(path).stem not in LONG]
 
 
 def examined(data: bytes, budget: int = BUDGET) -> str:
