@@ -19,7 +19,9 @@ from kpc.format.groups import Span
 from kpc.format.scene import TIME_PLANES, Clip, Scene
 
 OVERLAP = 2
-"""Frames that a group holds beyond those it shows, at either end where there are more: it takes over amid what it knows."""
+"""Frames that a group holds beyond those it shows, at either end where there are more: so four are shared, and the inner two of them mixed
+(`kpc.format.groups`). The error of the default scene over 90 frames in 128x96 pixels (`draft`, 800 steps) changes by 0.027 from one
+frame to the next where a group takes over at once, 0.012 and 0.016 before and after; by 0.014, 0.015 and 0.017 where two are mixed."""
 
 LATER = 0.5
 """Steps of a group that begins where another ended, of those of one that begins anew. Held-out PSNR of the three groups named

@@ -1,6 +1,7 @@
 """A clip in groups that plays while it arrives: the group that shows and the one that comes next, each a `Stream` with a renderer.
 
     steer    where the playhead is: the group it is in shows once it can, the next one is fetched ahead, others are let go
+    beside   what is mixed with it, amid the frames that two groups share
     upload   what has arrived goes to the renderers; the next group's is made, and its shaders compiled, well before it shows
 
 A thread of its own opens groups, another for each fetches: the window's thread waits for none of them. A file without groups is a
@@ -65,6 +66,8 @@ class Reel:
         self._before = 0
         """Versions of what has shown before."""
         self._waiting = False
+        self._beside: int | None = None
+        """The group that is to be mixed with the one that shows."""
         self._closed = False
         self._opening: int | None = None
         """What a thread opens; what came of it lies in one of the next."""
@@ -129,14 +132,15 @@ class Reel:
     @property
     def is_settled(self) -> bool:
         """Whether all of the group that shows is there that fits the memory, or nothing more will come."""
-        return self.stream.is_settled and (not self._waiting or self._failure is not None)
+        return self.stream.is_settled and (self._failure is not None or not self._is_short and (
+            self._beside is None or self._next is not None and self._next.stream.is_settled))
 
     @property
     def message(self) -> str | None:
         """What the user should know; None while all goes well."""
         if self._failure is not None:
             return f"no more of the scene will come: {self._failure}"
-        if self._waiting:
+        if self._is_short:
             return self.stream.message or f"waiting for the scene, {self.rate / 1e3:,.0f} KB/s"
         return self.stream.message
 
@@ -144,6 +148,20 @@ class Reel:
     def rate(self) -> float:
         """Bytes a second that came lately."""
         return self.stream.rate + (0.0 if self._next is None else self._next.stream.rate)
+
+    def beside(self, time: float) -> tuple[Renderer, float, float] | None:
+        """At a time of the clip, what is to be mixed with the group that shows: the renderer of another, the time in it, and its share of
+        the picture. None where nothing is, or where it is not there."""
+        parts = {number: (time_in_it, share) for number, time_in_it, share in self.timeline.mixed(time)}
+        other = self._next
+        if self.number not in parts or other is None or other.number not in parts or other.renderer is None or not other.is_warm:
+            return None
+        time_in_it, share = parts[other.number]
+        return (other.renderer, time_in_it, share) if other.stream.can_show(time_in_it) else None
+
+    def version_at(self, time: float) -> tuple[int, int | None]:
+        """Another whenever what makes the picture at a time of the clip has changed."""
+        return self.version, None if self._next is None or self.beside(time) is None else self._next.stream.version
 
     # --- the window's thread
 
@@ -160,11 +178,13 @@ class Reel:
         if self._next is not None and number == self._next.number and self._is_ready(self._next, head):
             self._turn()
         self._waiting = number != self.number
-        ahead = number if self._waiting else self._comes_after(head)
+        self._beside = next((other for other, *_ in self.timeline.mixed(head.time) if other != number), None)
+        ahead = number if self._waiting else self._comes_after(head) if self._beside is None else self._beside
         if self._next is not None and self._next.number != ahead:
             self._let_go(self._next)
             self._next = None
-        if ahead is not None and self._next is None and (self._waiting or self._is_near(head) or self.stream.is_settled):
+        wanted_now = self._waiting or self._beside is not None or self._is_near(head)
+        if ahead is not None and self._next is None and (wanted_now or self.stream.is_settled):
             self._open(ahead)
         for held in filter(None, (self._shown, self._next)):
             held.stream.steer(self._head_in(held.number, head))
@@ -184,14 +204,16 @@ class Reel:
                 coming.renderer.quality = self.renderer.quality
                 coming.renderer.render(Rig.of(coming.stream.scene).cameras[0].resized(*WARM_UP), 0.0)
                 coming.is_warm = True
-            elif self._waiting or not changed:
-                coming.stream.upload(coming.renderer)
+            elif self._waiting or self._beside is not None or not changed:
+                changed |= coming.stream.upload(coming.renderer) and self._beside is not None
         return changed
 
     def can_show(self, time: float, pace: float = 0.0) -> bool:
-        """As `Stream.can_show`; not while the group is missing."""
+        """As `Stream.can_show`; not while the group is missing, or one that is mixed with it is on its way."""
         number, time_in_it = self.timeline.at(time)
-        return number == self.number and self.stream.can_show(time_in_it, self._pace_in(number, pace))
+        if number != self.number or not self.stream.can_show(time_in_it, self._pace_in(number, pace)):
+            return False
+        return len(self.timeline.mixed(time)) == 1 or self._failure is not None or self.beside(time) is not None
 
     def close(self) -> None:
         """End all threads, and let go of the source."""
@@ -209,6 +231,12 @@ class Reel:
             return self.number + 1
         return 0 if head.loop and len(self.groups) > 1 else None
 
+    @property
+    def _is_short(self) -> bool:
+        """Whether a group is missing that the picture is made of."""
+        there = self._next is not None and self._next.is_warm and self._next.number == self._beside
+        return self._waiting or self._beside is not None and not there
+
     def _is_near(self, head: Playhead) -> bool:
         _, until = self.timeline.shown(self.number)
         return (until - head.time) * self.clip.duration_s < AHEAD_S
@@ -218,12 +246,12 @@ class Reel:
         return held.is_warm and held.stream.can_show(there.time, there.pace)
 
     def _turn(self) -> None:
-        """The next group shows; the one that did is let go."""
+        """The next group shows; the one that did is held as long as it is mixed with it."""
         assert self._next is not None and self._next.renderer is not None
         self._next.renderer.quality = self.renderer.quality
-        gone, self._shown, self._next = self._shown, self._next, None
-        self._before += gone.stream.version + 1
-        self._let_go(gone)
+        self._before += self._shown.stream.version + 1
+        self._shown.is_warm = True
+        self._shown, self._next = self._next, self._shown
 
     def _let_go(self, held: Held) -> None:
         held.stream.close()

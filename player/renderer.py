@@ -214,10 +214,12 @@ class Renderer:
         depths: tuple[float, float] = (0.0, 1.0),
         most_samples: float = 64.0,
         appearance: np.ndarray | None = None,
+        share: float = 1.0,
     ) -> None:
         """Draw what `camera` sees over the whole of `screen`, stretched to its size, `appearance` as in `reference.code_of`.
 
-        Depth goes from bright to dark over `depths`, world units; samples up to `most_samples`.
+        Depth goes from bright to dark over `depths`, world units; samples up to `most_samples`. Of what `screen` shows, 1 - `share`
+        remains.
         """
         if look is Look.OCCUPANCY:
             target = self.march(camera, time, part=Part.STATIC, program="cells.glsl")
@@ -237,11 +239,12 @@ class Renderer:
             viewport=tuple(map(float, screen.size)),
             depths=depths,
             most_samples=most_samples,
+            share=share,
         )
         target.seen.use(SEEN_UNIT)
         target.met.use(MET_UNIT)
         without.seen.use(WITHOUT_UNIT)
-        self._draw(screen, vertices)
+        self._draw(screen, vertices, over=share < 1)
 
     def march(
         self, camera: Camera, time: float, *, part: Part = Part.FULL, program: str = "march.glsl",
@@ -377,8 +380,12 @@ class Renderer:
         framebuffer: moderngl.Framebuffer,
         vertices: moderngl.VertexArray,
         viewport: tuple[int, int, int, int] | None = None,
+        over: bool = False,
     ) -> None:
         self.ctx.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+        if over:
+            self.ctx.enable(moderngl.BLEND)
+            self.ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
         framebuffer.use()
         framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
         vertices.render(moderngl.TRIANGLES, vertices=3)

@@ -557,7 +557,8 @@ class Player:
         """Draw the scene if anything has changed, finely once nothing does any more."""
         worn = (self.wardrobe.number, self.wardrobe.progress)
         dial = self.dial
-        wanted = (self.view, self.playback.time, self.part, self.look, dial.chosen, self.exact, worn, self.stream.version)
+        wanted = (self.view, self.playback.time, self.part, self.look, dial.chosen, self.exact, worn,
+                  self.stream.version_at(self.playback.time))
         if self.stream.scales_here == 0:
             self._is_sharp = True  # as sharp as nothing can be
         elif self.is_filming_path:
@@ -612,16 +613,23 @@ class Player:
 
     def _show(self, target: moderngl.Framebuffer, camera: Camera) -> None:
         started = clock.monotonic()
-        self.renderer.show(
-            target,
-            camera,
-            self.stream.time_in(self.playback.time),
-            part=self.part,
-            look=self.look,
-            depths=self.depths,
-            most_samples=self.most_samples,
-            appearance=self.wardrobe.code,
-        )
+        parts = [(self.renderer, self.stream.time_in(self.playback.time), 1.0, self.wardrobe.code)]
+        if (beside := self.stream.beside(self.playback.time)) is not None:
+            worn = self.wardrobe.names[self.wardrobe.number]
+            parts.append((*beside, Wardrobe(beside[0].scene, worn).code))
+        for renderer, time, share, code in parts:
+            renderer.quality = self.renderer.quality
+            renderer.show(
+                target,
+                camera,
+                time,
+                part=self.part,
+                look=self.look,
+                depths=self.depths,
+                most_samples=self.most_samples,
+                appearance=code,
+                share=share,
+            )
         self.ctx.finish()
         self.draw_s = clock.monotonic() - started
 

@@ -151,6 +151,7 @@ def main(scene_file: str) -> None:
     told = player.close()  # a film that is being written is finished
     assert told is not None and told.startswith("saved ") and len(list(read_video(player.film.path))) >= 1
     go_through_groups(window, scene_file)
+    stand_where_groups_are_mixed(window, scene_file)
     stream.close()
     window.close()
     lose_the_card(scene_file)
@@ -365,6 +366,26 @@ def go_through_groups(window: Window, scene_file: str) -> None:
         assert time.monotonic() < until
         player.frame()
     assert reel.number == 1
+    player.close()
+    reel.close()
+
+
+def stand_where_groups_are_mixed(window: Window, scene_file: str) -> None:
+    """Amid the frames that two groups share the picture is made of both, also once it is sharp."""
+    groups.write([groups.Part.of(scene_file, 0), groups.Part.of(scene_file, 6)], "mixed.kpc")
+    reel = Reel(open_source("mixed.kpc"))
+    player = Player(window, reel, Preferences())
+    player.scrub(0.5)
+    until = time.monotonic() + 20
+    while not (reel.is_settled and reel.beside(0.5) and player._is_sharp):
+        assert time.monotonic() < until
+        player.frame()
+    other, time_in_it, share = reel.beside(0.5)
+    camera = player.view.camera(*player.canvas.size)
+    alone, beside = (renderer.render(camera, at).rgb.clip(0, 1)
+                     for renderer, at in ((reel.renderer, reel.time_in(0.5)), (other, time_in_it)))
+    assert share == 0.5 and np.abs(alone - beside).max() > 0.1
+    assert np.abs(player._pixels() / 255 - (alone + beside) / 2).max() < 2 / 255
     player.close()
     reel.close()
 

@@ -1,7 +1,9 @@
 """Damaged files: whatever is done to one, a reader reads it or refuses it."""
 
 import json
+import os
 import random
+import time
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -83,7 +85,7 @@ def test_other_errors_are_found_and_work_goes_on(monkeypatch):
     sent: list = []
     monkeypatch.setattr(fuzz, "_limit_memory", lambda more: monkeypatch.setattr(fuzz, "examined", breaks))
     pipe = type("Pipe", (), {"send": staticmethod(sent.append)})
-    fuzz._work(pipe, [0.0, 0.0], 1, range(0, 3), frozenset({1}), fuzz.BUDGET)
+    fuzz._work(pipe, [0.0, 0.0, 0.0], 1, range(0, 3), frozenset({1}), fuzz.BUDGET)
     (following, tally, findings), = sent
     assert following == 3 and tally == {"finding": 2}
     assert findings == [(0, "ValueError: as it should not"), (2, "ValueError: as it should not")]
@@ -92,3 +94,32 @@ def test_other_errors_are_found_and_work_goes_on(monkeypatch):
 def test_processes_of_their_own():
     found = fuzz.run(4, seed=3, processes=1)
     assert found["count"] == 4 and not found["findings"]
+
+
+def test_a_run_in_parts(monkeypatch):
+    """Two parts examine what the whole does; each process takes every other of them."""
+    asked: list[range] = []
+
+    class Process:
+        pid, exitcode = 0, 0
+
+        def __init__(self, target, args, daemon):
+            self.pipe, _, _, self.numbers, *_ = args
+
+        def start(self):
+            asked.append(self.numbers)
+            self.pipe.send((self.numbers.stop, fuzz.Counter(read=len(self.numbers)), []))
+
+        def join(self):
+            pass
+
+    context = fuzz.multiprocessing.get_context("spawn")
+    monkeypatch.setattr(type(context), "Process", Process)
+    parts = [fuzz.run(count, seed=1, processes=2, first=first) for first, count in ((0, 5), (5, 4), (9, 1))]
+    assert [part["count"] for part in parts] == [5, 4, 1]
+    assert sorted(number for numbers in asked for number in numbers) == list(range(10))
+
+
+def test_computing_is_told_of_other_processes():
+    assert fuzz._computed_s(os.getpid()) == pytest.approx(time.process_time(), abs=0.2)
+    assert fuzz._computed_s(-1) == 0

@@ -80,6 +80,9 @@ def assert_shows(reel: Reel, path: object, time: float) -> None:
     whole = kpc.load(path)  # type: ignore[arg-type]
     camera = kpc.load(path).cameras[0].resized(16, 12)  # type: ignore[arg-type]
     drawn = reel.renderer.render(camera, reel.time_in(time)).rgb
+    if (beside := reel.beside(time)) is not None:
+        other, time_in_it, share = beside
+        drawn = (1 - share) * drawn + share * other.render(camera, time_in_it).rgb
     assert np.abs(drawn - kpc.render(whole, camera, time).rgb).max() < 2 / 255
 
 
@@ -103,6 +106,27 @@ def test_the_next_group_is_there_before_it_shows(clip, opened):
     version = reel.version
     wait_for(reel, Playhead(0.6, PACE), lambda: reel._next is not None and reel._next.number == 2)
     assert reel.version >= version
+
+
+def test_two_groups_are_mixed_amid_the_frames_that_they_share(clip, opened):
+    """Whether they come to it one after the other or at once; both are held until it is over."""
+    reel = opened(clip)
+    for frame, number in ((8.5, 0), (9.5, 1), (8.5, 0), (25, 2), (9.25, 1), (12, 1), (9.75, 1)):
+        time = frame / 29
+        settled(reel, time, number)
+        assert (reel.beside(time) is not None) == (8 < frame < 10)
+        if reel.beside(time) is not None:
+            assert reel._next.number == 1 - number and reel.version_at(time) == (reel.version, reel._next.stream.version)
+        assert_shows(reel, clip, time)
+
+
+def test_a_clip_does_not_go_on_into_frames_of_a_group_that_is_not_there(clip, opened):
+    reel = opened(clip)
+    settled(reel, 0.0, 0)
+    reel.steer(Playhead(8.5 / 29))
+    assert reel.number == 0 and reel.beside(8.5 / 29) is None
+    assert not reel.can_show(8.5 / 29) and reel.can_show(8 / 29) and not reel.is_settled and "waiting" in reel.message
+    settled(reel, 8.5 / 29, 0)
 
 
 def test_after_the_last_comes_the_first_where_it_loops(clip, opened):

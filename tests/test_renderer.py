@@ -120,6 +120,24 @@ def test_an_appearance_comes_to_the_screen(part: Part) -> None:
         assert np.abs(shown - renderer.render(camera, 0.62, part=part, appearance=code).rgb.clip(0, 1)).max() < 1 / 255
 
 
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_a_share_of_a_picture_goes_over_what_is_there(share: float) -> None:
+    ctx, one, other = gl.context(), tiny_scene(4), tiny_scene(5)
+    screen, camera = ctx.framebuffer([ctx.texture((64, 48), 4)]), CAMERAS["outside"]
+    pictures = []
+    for scene, part in ((one, 1.0), (other, share)):
+        renderer = Renderer(ctx, scene)
+        renderer.show(screen, camera, 0.62, share=part)
+        pictures.append(renderer.render(camera, 0.62).rgb.clip(0, 1))
+    shown = np.frombuffer(screen.read(components=4, alignment=1), np.uint8).reshape(48, 64, 4)[::-1] / 255
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.2
+    assert np.abs(shown[..., :3] - (1 - share) * pictures[0] - share * pictures[1]).max() < 1.5 / 255
+    assert (shown[..., 3] == 1).all()
+    renderer.show(screen, camera, 0.62)  # and what comes next covers it
+    shown = np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(48, 64, 3)[::-1] / 255
+    assert np.abs(shown - pictures[1]).max() < 1 / 255
+
+
 def test_scenes_without_appearances_have_no_code_in_the_shader() -> None:
     for scene, held in ((tiny_scene(4), False), (varied(tiny_scene(4)), True), (varied(undirected(tiny_scene(4))), False)):
         renderer = Renderer(gl.context(), scene)

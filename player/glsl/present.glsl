@@ -10,6 +10,7 @@ uniform vec2 viewport;      // pixels
 uniform vec2 depths;        // shown from bright to dark
 uniform float even;         // CONTRACTED: how far steps are even
 uniform float most_samples;
+uniform float share;        // of the picture; the rest is there already
 
 layout(location = 0) out vec4 shown;
 
@@ -30,5 +31,5 @@ void main() {
         rgb = colour.a * heat(1.0 - clamp((depth - near) / (far - near), 0.0, 1.0));
     }
     if (view == 3) rgb = heat(sums.y / most_samples);
-    shown = vec4(rgb, 1.0);
+    shown = vec4(rgb, share);
 }
