@@ -41,6 +41,8 @@ squared levels files are 3, 5 and 5 % smaller with 0.5 to 0.75 than with 1."""
 
 Steps = list[dict[str, np.ndarray]]
 """One mapping a scale, plane name -> (M,) quantisation steps."""
+Quantise = Callable[..., QuantisedScene]
+"""`quantise_on_trellis`, or to be compared with it `kpc.format.quantise.quantise_scene`."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,8 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
 
 
 def compress(
-    scene: Scene, steps: Steps, measure: Measure, uncoded_psnr: float, trade: Trade, as_it_is: QuantisedScene | None = None
+    scene: Scene, steps: Steps, measure: Measure, uncoded_psnr: float, trade: Trade, as_it_is: QuantisedScene | None = None,
+    quantise: Quantise = quantise_on_trellis,
 ) -> Attempt:
     """The quantisation that a trade asks for.
 
@@ -153,7 +156,7 @@ def compress(
     def attempt(exponent: float) -> Attempt:
         if as_it_is is not None and exponent == 0:
             return Attempt(as_it_is, measure)
-        return Attempt(quantise_on_trellis(scene, scaled(steps, 2.0**exponent), reached), measure)
+        return Attempt(quantise(scene, scaled(steps, 2.0**exponent), reached=reached), measure)
 
     name, value = trade.bound
     if name == "lam":

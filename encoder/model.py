@@ -14,10 +14,11 @@ import numpy as np
 import torch
 
 from kpc.encoder.checkpoint import save_state
-from kpc.encoder.compress import Steps, Trade, compress, relative_steps
+from kpc.encoder.compress import Quantise, Steps, Trade, compress, relative_steps
 from kpc.encoder.field import Layout
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
+from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format import file
 from kpc.format.cameras import Camera
 from kpc.format.container import MAGIC
@@ -73,7 +74,7 @@ class Coded:
         return len(self.data)
 
 
-def code(model: Model, trade: Trade, prune_share: float) -> Coded:
+def code(model: Model, trade: Trade, prune_share: float, quantise: Quantise = quantise_on_trellis) -> Coded:
     """What of a model is needed, `kpc.encoder.prune`, in symbols as coarse or as fine as a trade asks for.
 
     `prune_share`: of what coding may cost, what may be spent on leaving something out.
@@ -89,7 +90,7 @@ def code(model: Model, trade: Trade, prune_share: float) -> Coded:
         pruned = prune(scene, model.probe.rays, lambda candidate: measure(candidate).psnr, spare)
         if coded is None or pruned.left_out_any:
             scene, steps, coded = pruned.scene, pruned.of_each_plane(steps), None
-    found = compress(scene, steps, measure, whole, trade, coded)
+    found = compress(scene, steps, measure, whole, trade, coded, quantise)
     measured: Measured = found.measured
     return Coded(found.quantised, found.data, whole - measured.psnr, measured.agreement_db, pruned, spare)
 

@@ -70,7 +70,8 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kpc.encoder.probe.PROBE_RAYS", 512)
     monkeypatch.setattr(codecbench, "RATES", (1e-3, 3.0, 4.0))
     monkeypatch.setattr(codecbench, "QUALITIES", (60, 70, 80, 90))
-    monkeypatch.setattr(codecbench, "RIVALS", (Half("zstd -19"), Bytes(), Video("X", "libnothing", (1,), ())))
+    others = Half("zstd -19"), Bytes(), Video("X", "libnothing", (1,), ())
+    monkeypatch.setattr(codecbench, "RIVALS", {rival.name: rival for rival in others})
 
 
 def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -78,8 +79,8 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert kpbench.main(["codec", str(scene_file), "--out", str(out)]) == 0
     said = capsys.readouterr()
     records = results.load([out])
-    assert [record["coder"] for record in records] == ["kpc", "fp16 + zstd -19", "uint8 + zstd -19", "X"]
-    ours, halves, levels, missing = records
+    assert [record["coder"] for record in records] == ["kpc", "kpc without the trellis", "fp16 + zstd -19", "uint8 + zstd -19", "X"]
+    ours, rounded, halves, levels, missing = records
     assert missing["missing"] == "this ffmpeg has no libnothing" and missing["points"] == [] and missing["bd_rate"] is None
     assert len(halves["points"]) == 6 and halves["bd_rate"] is not None
     whole = scene_file.stat().st_size
@@ -99,7 +100,8 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert "kpc is smaller by" in said.err and "Coding, beside what is at hand" in results.markdown(records)
     with (tmp_path / "codec.csv").open() as table:
         rows = list(csv.DictReader(table))
-    assert len(rows) == 6 + 6 + 5 and {row["coder"] for row in rows} == {"kpc", "fp16 + zstd -19", "uint8 + zstd -19"}
+    assert len(rows) == 6 + 6 + 6 + 5 and len(rounded["points"]) == 6
+    assert {row["coder"] for row in rows} == {"kpc", "kpc without the trellis", "fp16 + zstd -19", "uint8 + zstd -19"}
     assert float(rows[0]["size_bytes"]) == ours["points"][0]["size_bytes"]
     svg = (tmp_path / "codec.svg").read_text()
     assert "uint8 + zstd -19" in svg and "bits per parameter" in svg
@@ -119,7 +121,7 @@ def test_held_out_views_judge(few: None, scene_file: Path, tmp_path: Path, monke
 
 
 def test_processes_of_their_own(scene_file: Path) -> None:
-    jobs = [codecbench.Job(scene_file, None, "quality 5", 0, codecbench.Trade(quality=5.0)), codecbench.Job(scene_file, 2, 4, 100)]
+    jobs = [codecbench.Job(scene_file, "kpc", "quality 5", 0, codecbench.Trade(quality=5.0)), codecbench.Job(scene_file, Bytes().name, 4, 100)]
     ours, levels = codecbench.in_parallel(jobs, None, 2)
     assert ours is not None and levels is not None and ours["psnr"] < 30 and levels["size_bytes"] > 100
     assert math.isfinite(levels["psnr"])
@@ -140,6 +142,6 @@ def test_records_survive_json(
 ) -> None:
     monkeypatch.setattr(codecbench, "RATES", (3.0,))
     monkeypatch.setattr(codecbench, "QUALITIES", (60,))
-    monkeypatch.setattr(codecbench, "RIVALS", (Bytes(),))
+    monkeypatch.setattr(codecbench, "RIVALS", {Bytes().name: Bytes()})
     assert kpbench.main(["codec", str(scene_file)]) == 0
     assert json.loads(capsys.readouterr().out)[0]["kind"] == "codec"

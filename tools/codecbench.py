@@ -24,16 +24,18 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from kpc.encoder import model
-from kpc.encoder.compress import DEFAULT_LOSS_DB, Trade
+from kpc.encoder.compress import DEFAULT_LOSS_DB, Quantise, Trade
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset, rays
 from kpc.encoder.model import Model
 from kpc.encoder.probe import Measure, Measured, Probe
+from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format import file
 from kpc.format.errors import KpcError, TrainingError
+from kpc.format.quantise import quantise_scene
 from kpc.format.scene import Scene
+from kpc.tools import rivals
 from kpc.tools.provenance import machine
-from kpc.tools.rivals import RIVALS, tidied
 
 RATES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Bits per parameter that our coder is asked for, of the file and all that is in it."""
@@ -43,18 +45,21 @@ WORST_LOSS_DB = 3.0
 """Curves are compared down to this: what is worse nobody wants."""
 VIEW_PIXELS = 1 << 15
 """Random pixels of all held-out views that codings are judged by."""
+RIVALS = {rival.name: rival for rival in rivals.RIVALS}
 OURS = "kpc"
+WITHOUT: dict[str, Quantise] = {"kpc without the trellis": quantise_scene}
+"""Our own coder with something left out."""
 
 Point = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Job:
-    """A coder and a setting for one scene. `rival`: its place in RIVALS, None for our own coder, which `trade` is for.
+    """A coder and a setting for one scene. `coder`: OURS, one of WITHOUT, for both of which `trade` is, or the name of one of RIVALS.
     `others_bytes`: of our file, besides planes."""
 
     scene: Path
-    rival: int | None
+    coder: str
     setting: int | str
     others_bytes: int
     trade: Trade = Trade()
@@ -70,17 +75,17 @@ def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str,
     views = None if dataset is None else held_out_views(source.scene, dataset)
     others = others_bytes(source)
     count = source.scene.parameter_count
-    jobs = [Job(scene, None, f"{rate:g} bits", others, Trade(target_bytes=int(rate * count / 8))) for rate in RATES]
-    jobs += [Job(scene, None, f"quality {q:g}", others, Trade(quality=q)) for q in QUALITIES]
-    missing = {number: why for number, rival in enumerate(RIVALS) if (why := rival.missing())}
-    jobs += [Job(scene, number, setting, others) for number, rival in enumerate(RIVALS) if number not in missing
+    trades = {f"{rate:g} bits": Trade(target_bytes=int(rate * count / 8)) for rate in RATES}
+    trades |= {f"quality {q:g}": Trade(quality=q) for q in QUALITIES}
+    jobs = [Job(scene, name, said, others, trade) for name in (OURS, *WITHOUT) for said, trade in trades.items()]
+    missing = {name: why for name, rival in RIVALS.items() if (why := rival.missing())}
+    jobs += [Job(scene, name, setting, others) for name, rival in RIVALS.items() if name not in missing
              for setting in reversed(rival.settings)]  # fmt: skip
     points = in_parallel(jobs, views, processes)
     coders = []
-    for number in (None, *range(len(RIVALS))):
-        name = OURS if number is None else RIVALS[number].name
-        found = [point for job, point in zip(jobs, points, strict=True) if job.rival == number and point is not None]
-        coders.append({"coder": name, "missing": missing.get(-1 if number is None else number), "points": found})
+    for name in (OURS, *WITHOUT, *RIVALS):
+        found = [point for job, point in zip(jobs, points, strict=True) if job.coder == name and point is not None]
+        coders.append({"coder": name, "missing": missing.get(name), "points": found})
     for coder in coders:
         coder["bd_rate"] = None if coder is coders[0] else bd_rate(coders[0]["points"], coder["points"])
     return coders
@@ -109,14 +114,14 @@ def in_parallel(jobs: Sequence[Job], views: Probe | None, processes: int) -> lis
 def point(job: Job) -> Point | None:
     """What a coder makes of a scene at one setting; None where it cannot make so little."""
     source, uncoded, measured = _source(job.scene)
-    if job.rival is not None:
-        coding = RIVALS[job.rival].code(_tidied(job.scene), int(job.setting))
+    if job.coder in RIVALS:
+        coding = RIVALS[job.coder].code(_tidied(job.scene), int(job.setting))
         judged = measured(replace(source.scene, scales=tuple(coding.planes)))
         size, took = coding.size_bytes + job.others_bytes, (coding.encode_s, coding.decode_s)
         return _point(job, source, size, took, uncoded.psnr, judged)
     started = time.perf_counter()
     try:
-        coded = model.code(source, job.trade, TrainConfig().prune_share)
+        coded = model.code(source, job.trade, TrainConfig().prune_share, WITHOUT.get(job.coder, quantise_on_trellis))
     except TrainingError:
         return None
     searched = time.perf_counter()
@@ -154,7 +159,7 @@ def _source(path: Path) -> tuple[Model, Measured, Measure]:
 
 @lru_cache(1)
 def _tidied(path: Path) -> Any:
-    return tidied(model.load(path).scene)
+    return rivals.tidied(model.load(path).scene)
 
 
 def others_bytes(source: Model) -> int:
