@@ -91,6 +91,34 @@ class Target:
             thing.release()
 
 
+@dataclass
+class Folded:
+    """What folding takes: the planes as fine as they are to be written, the rows likewise, and where their product goes."""
+
+    refined: moderngl.Texture
+    rows: moderngl.Texture
+    planes: moderngl.Texture
+    refine_into: moderngl.Framebuffer
+    fold_into: moderngl.Framebuffer
+
+    @staticmethod
+    def of(ctx: moderngl.Context, layout: Layout, rows: tuple[int, int]) -> "Folded":
+        """For rows that lie, unrefined, in a texture of (width, lines)."""
+        with room_on(ctx, "the folded planes"):
+            finer = layout.refined * (rows[0] - 1) + 1, rows[1]
+            refined, cut, planes = _texture(ctx, layout.size), _texture(ctx, finer), _texture(ctx, layout.size)
+            refined.filter = cut.filter = moderngl.NEAREST, moderngl.NEAREST
+            return Folded(refined, cut, planes, ctx.framebuffer([refined]), ctx.framebuffer([planes]))
+
+    @property
+    def textures(self) -> list[moderngl.Texture]:
+        return [self.refined, self.rows, self.planes]
+
+    def release(self) -> None:
+        for thing in (self.refine_into, self.fold_into, *self.textures):
+            thing.release()
+
+
 @contextlib.contextmanager
 def room_on(ctx: moderngl.Context, what: str) -> Iterator[None]:
     """Turns what moderngl raises while `what` is made into a DisplayError."""
@@ -133,9 +161,10 @@ class Renderer:
         self.folded_layout = finer if max(finer.size) <= most else self.layout
         with room_on(ctx, "the scene"):
             self._planes = _texture(ctx, self.layout.size)
-            self._folded_planes: moderngl.Texture | None = None
+            self._folded: Folded | None = None
             self._rows = Rows(scene, self.layout) if scene.is_dynamic else None
-            self._row_texture = _texture(ctx, (1, 1) if self._rows is None else (self._rows.width, self.layout.row_count()))
+            lines, width = self.layout.row_count(), 1 if self._rows is None else self._rows.width
+            self._row_texture = _texture(ctx, (width, lines))
             self._motion_texture: moderngl.Texture3D | None = None
             if scene.motion is not None:
                 self._motion_texture = ctx.texture3d(scene.motion.shape[3:0:-1], 4, dtype="f4")
@@ -155,7 +184,9 @@ class Renderer:
         self._shots: dict[tuple[Part, tuple[int, int]], Shot] = {}
         """Of each part and size, the last picture if the next may follow it."""
         self._rows_time: float | None = None
+        self._motion_time: float | None = None
         self._folded_time: float | None = None
+        self._is_refined = False
         for block in self.layout.blocks:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
         self._slot: int | None = None
@@ -174,10 +205,10 @@ class Renderer:
     def release(self) -> None:
         """Give back all that the scene takes of the card."""
         self.ctx.detect_framebuffer(0).use()  # moderngl would bind again what it knows as bound, though it is gone
-        things: list[Target | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
+        things: list[Target | Folded | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
         things = [self._planes, self._row_texture, self._cells, *self._targets.values()]
         things += [thing for pair in self._programs.values() for thing in reversed(pair)]
-        things += [] if self._folded_planes is None else [self._fold_into, self._folded_planes]
+        things += [] if self._folded is None else [self._folded]
         things += [] if self._motion_texture is None else [self._motion_texture]
         for thing in things:
             thing.release()
@@ -187,7 +218,7 @@ class Renderer:
     @property
     def memory_bytes(self) -> int:
         """Bytes of the textures and buffers that hold the scene and its pictures."""
-        textures = [self._planes, self._row_texture, *([self._folded_planes] if self._folded_planes else [])]
+        textures = [self._planes, self._row_texture, *(self._folded.textures if self._folded else [])]
         textures += [texture for target in self._targets.values() for texture in (target.seen, target.met)]
         return sum(4 * t.width * t.height * t.components for t in textures) + int(self.scene.occupancy[0].size) + (
             0 if self._motion_texture is None else 16 * int(np.prod(self._motion_texture.size)))
@@ -196,12 +227,12 @@ class Renderer:
         """Replace rows of a space plane from row `first` on: `Layout.texels` of them. Writes to textures that are there."""
         block = self.layout.block(scale, plane)
         self._planes.write(texels, viewport=(block.x, block.y + first, texels.shape[1], texels.shape[0]))
-        self._folded_time = None
+        self._folded_time, self._is_refined = None, False
         self._shots.clear()
 
     def refresh(self) -> None:
         """Look at the scene's time planes anew: some of their rows have changed."""
-        self._rows_time = self._folded_time = None
+        self._rows_time = self._motion_time = self._folded_time = None
         self._shots.clear()
 
     def render(
@@ -273,12 +304,13 @@ class Renderer:
         if quality.resolution < 1:
             camera = camera.resized(*(max(1, round(side * quality.resolution)) for side in size))
         self._occupy(slot_at(scene, time))
-        folded = moving and quality.folded
-        if moving:
+        folded, displaced = moving and quality.folded, moving and self._motion_texture is not None
+        if displaced:
+            self._displace(time)
+        if moving and not folded:
             self._cut(time)
         planes = self._fold(time) if folded else self._planes
         raster = (camera.width, camera.height)
-        displaced = moving and self._motion_texture is not None
         layout = self.folded_layout if folded else self.layout
         drawn = min(quality.scales or layout.scales, layout.scales)
         shared = 0 if isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
@@ -487,37 +519,52 @@ class Renderer:
     def _cut(self, time: float) -> None:
         if time != self._rows_time and self._rows is not None:
             self._row_texture.write(self._rows.at(time))
-            if self._motion_texture is not None and self.scene.motion is not None:
-                offsets = linear(self.scene.motion, time)
-                self._motion_texture.write(np.concatenate([offsets, offsets[..., :1]], axis=-1))  # RGBA: RGB is seldom native
             self._rows_time = time
 
+    def _displace(self, time: float) -> None:
+        if time != self._motion_time and self._motion_texture is not None and self.scene.motion is not None:
+            offsets = linear(self.scene.motion, time)
+            self._motion_texture.write(np.concatenate([offsets, offsets[..., :1]], axis=-1))  # RGBA: RGB is seldom native
+            self._motion_time = time
+
     def _fold(self, time: float) -> moderngl.Texture:
-        if self._folded_planes is None:
-            self._folded_planes = _texture(self.ctx, self.folded_layout.size)
-            self._fold_into = self.ctx.framebuffer([self._folded_planes])
-        if time != self._folded_time:
-            fold, vertices = self._program("fold.glsl", self.layout)
-            self._planes.use(PLANES_UNIT)
-            self._row_texture.use(ROWS_UNIT)
-            for source, block in zip(self.layout.blocks, self.folded_layout.blocks):
-                axis = FOLDED_AXIS[block.plane]
-                upright = axis == block.plane[1]
-                layers = self.layout.layers[block.scale]
-                _set(
-                    fold,
-                    source=self.layout.place(source),
-                    source_width=source.width / self.layout.size[0],
-                    origin=(block.x, block.y),
-                    width=block.width,
-                    at_texel=(1 / max(block.width - 1, 1), 1 / max(block.height - 1, 1)),
-                    row_texel=1 / self.folded_layout.refined,
-                    upright=upright,
-                    line=self.layout.first_row("xyz".index(axis), block.scale),
-                )
-                self._draw(self._fold_into, vertices, (block.x, block.y, layers * block.width, block.height))
+        if self._folded is None:
+            self._folded = Folded.of(self.ctx, self.folded_layout, self._row_texture.size)
+        folded = self._folded
+        if time != self._folded_time and self._rows is not None:
+            if not self._is_refined:
+                self._planes.use(PLANES_UNIT)
+                self._draw_planes("refine.glsl", folded.refine_into)
+                self._is_refined = True
+            folded.rows.write(self._rows.at(time, self.folded_layout.refined))
+            folded.refined.use(PLANES_UNIT)
+            folded.rows.use(ROWS_UNIT)
+            self._draw_planes("fold.glsl", folded.fold_into)
             self._folded_time = time
-        return self._folded_planes
+        return folded.planes
+
+    def _draw_planes(self, name: str, into: moderngl.Framebuffer) -> None:
+        """Draw each plane as it lies in the folded layout, by a shader that is told where that is and which rows go with it."""
+        program, vertices = self._program(name, self.layout)
+        _set(
+            program,
+            refined=PLANES_UNIT,
+            refined_texel=tuple(1 / side for side in into.size),
+            folded_rows_texel=tuple(1 / side for side in self._folded.rows.size) if self._folded else None,
+        )
+        for source, block in zip(self.layout.blocks, self.folded_layout.blocks):
+            axis, layers = FOLDED_AXIS[block.plane], self.layout.layers[block.scale]
+            _set(
+                program,
+                source=self.layout.place(source),
+                source_width=source.width / self.layout.size[0],
+                origin=(block.x, block.y),
+                width=block.width,
+                at_texel=(1 / max(block.width - 1, 1), 1 / max(block.height - 1, 1)),
+                upright=axis == block.plane[1],
+                line=self.layout.first_row("xyz".index(axis), block.scale),
+            )
+            self._draw(into, vertices, (block.x, block.y, layers * block.width, block.height))
 
 
 def _refuse_too_large(scene: Scene, layout: Layout, card: Mapping[str, Any]) -> None:

@@ -8,7 +8,7 @@ import pytest
 from scenes import SPACES, look_at, tiny_scene, varied
 
 from kpc.format.cameras import Camera
-from kpc.format.scene import TERMINATION, Scene
+from kpc.format.scene import SPACE_PLANES, TERMINATION, TIME_PLANES, Scene
 from kpc.player import renderer as module
 from kpc.player.quality import DEFAULT, LADDER, Quality, climbed
 from kpc.player.reference import Part, box_range, render
@@ -202,6 +202,18 @@ def test_a_picture_follows_none_of_another_quality_nor_appearance_nor_of_a_scene
     for r in (renderer, whole):
         r.refresh()
     assert differs(0.48, dusk) < 1e-5 < differs(0.49, dusk)
+
+
+def test_what_arrives_is_folded_anew() -> None:
+    scene, finer = tiny_scene(4), tiny_scene(5)
+    renderer = Renderer(gl.context(), scene, Quality(folded=True))
+    renderer.render(CAMERA, 0.4)
+    for s, scale in enumerate(finer.scales):
+        for plane in SPACE_PLANES:
+            renderer.put(s, plane, renderer.layout.texels(scale[plane]))
+    same_times = [{**new, **{p: old[p] for p in TIME_PLANES}} for new, old in zip(finer.scales, scene.scales, strict=True)]
+    wanted = Renderer(gl.context(), replace(scene, scales=tuple(same_times)), Quality(folded=True)).render(CAMERA, 0.4)
+    assert np.array_equal(renderer.render(CAMERA, 0.4).rgb, wanted.rgb)
 
 
 def test_what_is_drawn_in_between_is_not_followed() -> None:
