@@ -24,8 +24,9 @@ class Quality:
         termination: a ray ends once its transmittance falls below this. Where that is more than the format's TERMINATION, what
             is left of its light counts as what it has met so far.
         share: scales whose texels are at least so many steps long are looked up once for two samples, in the middle between them.
-        interlaced: march every other pixel, like the squares of one colour of a chessboard, and in the next frame those in between.
-            The rest follows the frame before. Only while the clip plays: what follows no frame is marched whole.
+        tolerance: while the clip plays, a picture is predicted from the one before. One pixel of each block of sixteen is marched,
+            all by turns; blocks where that differs from the prediction by more than this, of the full range, or a neighbour's by
+            twice as much, are marched whole. 0: all pixels are. So is a picture that follows no other.
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated.
         scales: how many of the scene's to use, from the coarsest on; None: all.
     """
@@ -34,22 +35,22 @@ class Quality:
     step: float = 1.0
     termination: float = TERMINATION
     share: float = math.inf
-    interlaced: bool = False
+    tolerance: float = 0.0
     resolution: float = 1.0
     scales: int | None = None
 
     def __post_init__(self) -> None:
-        marchable = self.step >= 1 and self.share > 0 and 0 < self.termination < 1 and 0 < self.resolution <= 1
+        marchable = self.step >= 1 and self.share > 0 and 0 < self.termination < 1 and 0 < self.resolution <= 1 and self.tolerance >= 0
         if not marchable or self.scales is not None and self.scales < 1:
             raise ValueError(f"no picture can be drawn with {self}")
 
 
 LADDER: dict[str, Quality] = {
-    "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, interlaced=True, resolution=0.5),
-    "faster": Quality(folded=True, termination=1 / 16, share=2.0, interlaced=True, resolution=0.5),
-    "fast": Quality(folded=True, termination=1 / 16, share=2.0, interlaced=True, resolution=0.75),
-    "quick": Quality(folded=True, termination=1 / 16, share=2.0, interlaced=True),
-    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, interlaced=True),
+    "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, tolerance=5 / 255, resolution=0.5),
+    "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, resolution=0.5),
+    "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, resolution=0.75),
+    "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255),
+    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, tolerance=5 / 255),
     "fine": Quality(folded=True, termination=1 / 64, share=3.0),
     "finer": Quality(folded=True),
     "reference": Quality(),

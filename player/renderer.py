@@ -26,15 +26,22 @@ from kpc.player.textures import (
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
 PLANES_UNIT, ROWS_UNIT, CELLS_UNIT, MOTION_UNIT = 0, 1, 2, 3
+DOUBTS_UNIT = 4
 SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
-SEEN_BEFORE_UNIT, MET_BEFORE_UNIT = 2, 3
-TARGETS_KEPT = 8
+SEEN_PROBES_UNIT, MET_PROBES_UNIT = 2, 3
+BLOCK = 4
+"""Pixels a side of a block of probes.glsl."""
+PICTURE, OTHER_PICTURE, PROBES, DOUBTS = range(4)
+"""The targets of a part and size: pictures take turns while the camera moves."""
+TARGETS_KEPT = 12
 FOLLOWS_S = 0.2
 """A picture so much later in the clip than the one before has too little in common with it to follow it; nor does one follow at
 the same time: while the clip stands still, pictures are whole."""
 COMPUTE_VERSION = 430
 TRIAL_AFTER, TRIALS = 8, 3
 """Marches until fragment and compute shaders are tried against each other, and pictures that each of them draws for that."""
+ALL, ONLY_PROBES, ONLY_DOUBTED = range(3)
+"""PIXELS of march.glsl."""
 GROUP = 8
 """Pixels a side that a work group of march.glsl draws."""
 CONSTANTS = 8192
@@ -53,11 +60,14 @@ class Look(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """An interlaced picture: from where, when, and which half of its pixels was marched, those with x + y + parity even."""
+    """A picture that others may follow: what it shows, how finely, the turn of its probes, and which target holds it."""
 
     camera: Camera
     time: float
-    parity: int = 0
+    appearance: bytes
+    quality: Quality
+    turn: int = 0
+    number: int = PICTURE
 
 
 @dataclass
@@ -78,6 +88,34 @@ class Target:
 
     def release(self) -> None:
         for thing in (self.framebuffer, self.seen, self.met):
+            thing.release()
+
+
+@dataclass
+class Folded:
+    """What folding takes: the planes as fine as they are to be written, the rows likewise, and where their product goes."""
+
+    refined: moderngl.Texture
+    rows: moderngl.Texture
+    planes: moderngl.Texture
+    refine_into: moderngl.Framebuffer
+    fold_into: moderngl.Framebuffer
+
+    @staticmethod
+    def of(ctx: moderngl.Context, layout: Layout, rows: tuple[int, int]) -> "Folded":
+        """For rows that lie, unrefined, in a texture of (width, lines)."""
+        with room_on(ctx, "the folded planes"):
+            finer = layout.refined * (rows[0] - 1) + 1, rows[1]
+            refined, cut, planes = _texture(ctx, layout.size), _texture(ctx, finer), _texture(ctx, layout.size)
+            refined.filter = cut.filter = moderngl.NEAREST, moderngl.NEAREST
+            return Folded(refined, cut, planes, ctx.framebuffer([refined]), ctx.framebuffer([planes]))
+
+    @property
+    def textures(self) -> list[moderngl.Texture]:
+        return [self.refined, self.rows, self.planes]
+
+    def release(self) -> None:
+        for thing in (self.refine_into, self.fold_into, *self.textures):
             thing.release()
 
 
@@ -123,9 +161,10 @@ class Renderer:
         self.folded_layout = finer if max(finer.size) <= most else self.layout
         with room_on(ctx, "the scene"):
             self._planes = _texture(ctx, self.layout.size)
-            self._folded_planes: moderngl.Texture | None = None
+            self._folded: Folded | None = None
             self._rows = Rows(scene, self.layout) if scene.is_dynamic else None
-            self._row_texture = _texture(ctx, (1, 1) if self._rows is None else (self._rows.width, self.layout.row_count()))
+            lines, width = self.layout.row_count(), 1 if self._rows is None else self._rows.width
+            self._row_texture = _texture(ctx, (width, lines))
             self._motion_texture: moderngl.Texture3D | None = None
             if scene.motion is not None:
                 self._motion_texture = ctx.texture3d(scene.motion.shape[3:0:-1], 4, dtype="f4")
@@ -142,15 +181,17 @@ class Renderer:
                 f"{4 * CONSTANTS}; kprender --backend reference"
             )
         self._decoder = shader.constants(weights)
+        self._shots: dict[tuple[Part, tuple[int, int]], Shot] = {}
+        """Of each part and size, the last picture if the next may follow it."""
         self._rows_time: float | None = None
+        self._motion_time: float | None = None
         self._folded_time: float | None = None
+        self._is_refined = False
         for block in self.layout.blocks:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
         self._slot: int | None = None
         self._programs: dict[tuple[object, ...], tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]] = {}
         self._targets: dict[tuple[Part, tuple[int, int], int], Target] = {}
-        self._shots: dict[Part, Shot] = {}
-        """The last interlaced picture."""
         self.check()
 
     def check(self) -> None:
@@ -164,10 +205,10 @@ class Renderer:
     def release(self) -> None:
         """Give back all that the scene takes of the card."""
         self.ctx.detect_framebuffer(0).use()  # moderngl would bind again what it knows as bound, though it is gone
-        things: list[Target | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
+        things: list[Target | Folded | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
         things = [self._planes, self._row_texture, self._cells, *self._targets.values()]
         things += [thing for pair in self._programs.values() for thing in reversed(pair)]
-        things += [] if self._folded_planes is None else [self._fold_into, self._folded_planes]
+        things += [] if self._folded is None else [self._folded]
         things += [] if self._motion_texture is None else [self._motion_texture]
         for thing in things:
             thing.release()
@@ -177,7 +218,7 @@ class Renderer:
     @property
     def memory_bytes(self) -> int:
         """Bytes of the textures and buffers that hold the scene and its pictures."""
-        textures = [self._planes, self._row_texture, *([self._folded_planes] if self._folded_planes else [])]
+        textures = [self._planes, self._row_texture, *(self._folded.textures if self._folded else [])]
         textures += [texture for target in self._targets.values() for texture in (target.seen, target.met)]
         return sum(4 * t.width * t.height * t.components for t in textures) + int(self.scene.occupancy[0].size) + (
             0 if self._motion_texture is None else 16 * int(np.prod(self._motion_texture.size)))
@@ -186,11 +227,13 @@ class Renderer:
         """Replace rows of a space plane from row `first` on: `Layout.texels` of them. Writes to textures that are there."""
         block = self.layout.block(scale, plane)
         self._planes.write(texels, viewport=(block.x, block.y + first, texels.shape[1], texels.shape[0]))
-        self._folded_time = None
+        self._folded_time, self._is_refined = None, False
+        self._shots.clear()
 
     def refresh(self) -> None:
         """Look at the scene's time planes anew: some of their rows have changed."""
-        self._rows_time = self._folded_time = None
+        self._rows_time = self._motion_time = self._folded_time = None
+        self._shots.clear()
 
     def render(
         self, camera: Camera, time: float, *, part: Part = Part.FULL, appearance: np.ndarray | None = None
@@ -264,31 +307,36 @@ class Renderer:
         if quality.resolution < 1:
             camera = camera.resized(*(max(1, round(side * quality.resolution)) for side in size))
         self._occupy(slot_at(scene, time))
-        folded = moving and quality.folded
-        if moving:
+        folded, displaced = moving and quality.folded, moving and self._motion_texture is not None
+        if displaced:
+            self._displace(time)
+        if moving and not folded:
             self._cut(time)
         planes = self._fold(time) if folded else self._planes
         raster = (camera.width, camera.height)
-        interlaced = quality.interlaced and program == "march.glsl"
-        displaced = moving and self._motion_texture is not None
         layout = self.folded_layout if folded else self.layout
         drawn = min(quality.scales or layout.scales, layout.scales)
         shared = 0 if isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
         self._marches_to_trial -= 1
         if self._marches_to_trial == 0:
             self.compute = self.is_compute_faster(camera, time)
-        march, vertices = self._program(program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared,
-                                        interlaced=interlaced, compute=self.compute and program == "march.glsl")
+        code = code_of(scene, appearance)
         stride = scene.step * quality.step
-        _set(
-            march,
-            stride=stride,
-            tau=stride / scene.extent,
-            termination=quality.termination,
-            **_lens_of(camera),
-            appearance=_vectors(code_of(self.scene, appearance)),
-        )
-        def draw(target: Target) -> None:
+
+        def draw(target: Target, pixels: int = ALL, points: int = 0, **more: object) -> None:
+            march, vertices = self._program(
+                program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels,
+                compute=self.compute and program == "march.glsl",
+            )  # fmt: skip
+            _set(
+                march,
+                stride=stride,
+                tau=stride / scene.extent,
+                termination=quality.termination,
+                appearance=_vectors(code),
+                **_lens_of(camera),
+                **more,
+            )
             planes.use(PLANES_UNIT)
             self._row_texture.use(ROWS_UNIT)
             if self._motion_texture is not None:
@@ -300,10 +348,11 @@ class Renderer:
                 march.run(*(-(-side // GROUP) for side in target.seen.size))
                 self.ctx.memory_barrier()
             else:
-                self._draw(target.framebuffer, vertices)
+                self._draw(target.framebuffer, vertices, points=points)
 
-        if interlaced:
-            target = self._woven(march, draw, Shot(camera, time), part)
+        before = self._shots.pop((part, raster), None)
+        if program == "march.glsl" and quality.tolerance > 0:
+            target = self._followed(draw, part, before, Shot(camera, time, code.tobytes(), quality))
         else:
             target = self._target(part, raster)
             draw(target)
@@ -324,42 +373,52 @@ class Renderer:
         self.compute = chosen
         return seconds[True] < seconds[False]
 
-    def _woven(self, march: moderngl.Program | moderngl.ComputeShader, draw: Callable[[Target], None], shot: Shot, part: Part) -> Target:
-        """Draw half of the pixels, and let the rest follow the picture before; draw all of them where there is none."""
+    def _followed(self, draw: Callable[..., None], part: Part, before: Shot | None, shot: Shot) -> Target:
+        """Draw what the picture before does not tell: its probes, and the blocks in which they are not as predicted."""
         size = shot.camera.width, shot.camera.height
-        before = self._shots.pop(part, None)
-        if before is not None:
-            since_s = abs(shot.time - before.time) * self.scene.clip.duration_s
-            if not 0 < since_s < FOLLOWS_S or (before.camera.width, before.camera.height) != size:
-                before = None
-        # One picture of half the width, and two whole ones that take turns, one for each parity.
-        half = self._target(part, (-(-size[0] // 2), size[1]), 2)
-        half.seen.filter = half.met.filter = moderngl.NEAREST, moderngl.NEAREST
-        parity = 0 if before is None else 1 - before.parity
-        for turn in (parity,) if before is not None else (1, 0):
-            _set(march, parity=float(turn))
-            draw(half)
-            self._weave(half, self._target(part, size, 1 - turn), self._target(part, size, turn), shot, before, turn)
-        self._shots[part] = replace(shot, parity=parity)
-        return self._target(part, size, parity)
+        if before is None or not self._follows(shot, before):
+            self._shots[part, size] = shot
+            draw(picture := self._target(part, size))
+            return picture
+        shot = replace(shot, turn=before.turn + 1, number=before.number)
+        picture = self._target(part, size, before.number)
+        moved = _lens_of(shot.camera) != _lens_of(before.camera)
+        if moved:
+            shot = replace(shot, number=PICTURE + OTHER_PICTURE - before.number)
+            picture = self._predicted(picture, self._target(part, size, shot.number), before.camera, shot.camera)
+        blocks = tuple(-(-side // BLOCK) for side in size)
+        probes, doubts = self._target(part, blocks, PROBES), self._target(part, blocks, DOUBTS)
+        common = {"size": tuple(map(float, size)), "turn": shot.turn, "seen_probes": SEEN_PROBES_UNIT, "met_probes": MET_PROBES_UNIT}
+        draw(probes, ONLY_PROBES, **common)
+        probes.seen.use(SEEN_PROBES_UNIT)
+        probes.met.use(MET_PROBES_UNIT)
+        picture.seen.use(SEEN_UNIT)
+        doubt, vertices = self._program("doubt.glsl", self.layout, moved=moved)
+        _set(doubt, seen_predicted=SEEN_UNIT, tolerance=shot.quality.tolerance, **common)
+        self._draw(doubts.framebuffer, vertices)
+        settle, vertices = self._program("settle.glsl", self.layout)
+        _set(settle, **common)
+        self._draw(picture.framebuffer, vertices, points=math.prod(blocks))
+        doubts.seen.use(DOUBTS_UNIT)
+        draw(picture, ONLY_DOUBTED, math.prod(blocks), doubts=DOUBTS_UNIT, **common)
+        self._shots[part, size] = shot
+        return picture
 
-    def _weave(self, half: Target, old: Target, new: Target, shot: Shot, before: Shot | None, parity: int) -> None:
-        still = before is None or _lens_of(before.camera) == _lens_of(shot.camera)
-        weave, vertices = self._program("weave.glsl", self.layout, still=still)
-        _set(
-            weave,
-            seen_now=SEEN_UNIT, met_now=MET_UNIT, seen_before=SEEN_BEFORE_UNIT, met_before=MET_BEFORE_UNIT,
-            size=tuple(map(float, new.seen.size)),
-            parity=float(parity),
-            afresh=before is None,
-            **_lens_of(shot.camera),
-            **{f"{name}_before": value for name, value in _lens_of((before or shot).camera).items()},
-        )  # fmt: skip
-        half.seen.use(SEEN_UNIT)
-        half.met.use(MET_UNIT)
-        old.seen.use(SEEN_BEFORE_UNIT)
-        old.met.use(MET_BEFORE_UNIT)
+    def _follows(self, shot: Shot, before: Shot) -> bool:
+        """Whether a picture shows the same as the one before, a little later."""
+        since_s = abs(shot.time - before.time) * self.scene.clip.duration_s
+        return 0 < since_s < FOLLOWS_S and (shot.appearance, shot.quality) == (before.appearance, before.quality)
+
+    def _predicted(self, old: Target, new: Target, before: Camera, now: Camera) -> Target:
+        """A picture as it was before, seen from where the camera is now."""
+        predict, vertices = self._program("predict.glsl", self.layout)
+        lens_before = {f"{name}_before": value for name, value in _lens_of(before).items()}
+        size = tuple(map(float, new.seen.size))
+        _set(predict, seen_before=SEEN_UNIT, met_before=MET_UNIT, size=size, **_lens_of(now), **lens_before)
+        old.seen.use(SEEN_UNIT)
+        old.met.use(MET_UNIT)
         self._draw(new.framebuffer, vertices)
+        return new
 
     def _scales_shared(self) -> int:
         """How many scales, from the coarsest on, have texels that are long enough for two samples to share a look-up."""
@@ -381,14 +440,17 @@ class Renderer:
         vertices: moderngl.VertexArray,
         viewport: tuple[int, int, int, int] | None = None,
         over: bool = False,
+        points: int = 0,
     ) -> None:
+        """All over a viewport, or so many points; `over` what is there, by alpha."""
         self.ctx.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         if over:
             self.ctx.enable(moderngl.BLEND)
             self.ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
         framebuffer.use()
         framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
-        vertices.render(moderngl.TRIANGLES, vertices=3)
+        self.ctx.enable(moderngl.PROGRAM_POINT_SIZE)
+        vertices.render(moderngl.POINTS if points else moderngl.TRIANGLES, vertices=points or 3)
 
     def _target(self, part: Part, size: tuple[int, int], number: int = 0) -> Target:
         """A target of this size; the few last used are kept."""
@@ -398,38 +460,39 @@ class Renderer:
         if len(self._targets) > TARGETS_KEPT:
             dropped = next(iter(self._targets))
             self._targets.pop(dropped).release()
-            self._shots.pop(dropped[0], None)
+            self._shots.pop(dropped[:2], None)
         return target
 
     def _program(
         self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
-        shared: int = 0, interlaced: bool = False, still: bool = False, compute: bool = False,
+        shared: int = 0, pixels: int = ALL, moved: bool = False, compute: bool = False,
     ) -> tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
-        key = name, layout.refined, rows, displaced, drawn, shared, interlaced, still, compute
+        key = name, layout.refined, rows, displaced, drawn, shared, pixels, moved, compute
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
-        build = shader.build_compute if compute else shader.build
-        program = build(
-            self.ctx,
-            name,
-            {
-                **planes_shape(layout),
-                **decoder_shape(scene.decoder),
-                "ROWS": int(rows),
-                "DRAWN": drawn,
-                "APPEARANCE": int(bool(scene.appearances)),
-                "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
-                "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
-                "MOTION": int(displaced),
-                "SHARED": shared,
-                "INTERLACED": int(interlaced),
-                "STILL": int(still),
-                "COMPUTE": int(compute),
-            },
-            {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))},
-        )
+        defines = {
+            **planes_shape(layout),
+            **decoder_shape(scene.decoder),
+            "ROWS": int(rows),
+            "DRAWN": drawn,
+            "APPEARANCE": int(bool(scene.appearances)),
+            "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
+            "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
+            "MOTION": int(displaced),
+            "SHARED": shared,
+            "PIXELS": pixels,
+            "MOVED": int(moved),
+            "COMPUTE": int(compute),
+        }
+        written = {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))}
+        where = "places.glsl" if name == "settle.glsl" else "blocks.glsl" if pixels == ONLY_DOUBTED else "fullscreen.glsl"
+        program: moderngl.Program | moderngl.ComputeShader
+        if compute:
+            program = shader.build_compute(self.ctx, name, defines, written)
+        else:
+            program = shader.build(self.ctx, name, defines, written, where)
         _set(
             program,
             seen_picture=SEEN_UNIT,
@@ -463,37 +526,52 @@ class Renderer:
     def _cut(self, time: float) -> None:
         if time != self._rows_time and self._rows is not None:
             self._row_texture.write(self._rows.at(time))
-            if self._motion_texture is not None and self.scene.motion is not None:
-                offsets = linear(self.scene.motion, time)
-                self._motion_texture.write(np.concatenate([offsets, offsets[..., :1]], axis=-1))  # RGBA: RGB is seldom native
             self._rows_time = time
 
+    def _displace(self, time: float) -> None:
+        if time != self._motion_time and self._motion_texture is not None and self.scene.motion is not None:
+            offsets = linear(self.scene.motion, time)
+            self._motion_texture.write(np.concatenate([offsets, offsets[..., :1]], axis=-1))  # RGBA: RGB is seldom native
+            self._motion_time = time
+
     def _fold(self, time: float) -> moderngl.Texture:
-        if self._folded_planes is None:
-            self._folded_planes = _texture(self.ctx, self.folded_layout.size)
-            self._fold_into = self.ctx.framebuffer([self._folded_planes])
-        if time != self._folded_time:
-            fold, vertices = self._program("fold.glsl", self.layout)
-            self._planes.use(PLANES_UNIT)
-            self._row_texture.use(ROWS_UNIT)
-            for source, block in zip(self.layout.blocks, self.folded_layout.blocks):
-                axis = FOLDED_AXIS[block.plane]
-                upright = axis == block.plane[1]
-                layers = self.layout.layers[block.scale]
-                _set(
-                    fold,
-                    source=self.layout.place(source),
-                    source_width=source.width / self.layout.size[0],
-                    origin=(block.x, block.y),
-                    width=block.width,
-                    at_texel=(1 / max(block.width - 1, 1), 1 / max(block.height - 1, 1)),
-                    row_texel=1 / self.folded_layout.refined,
-                    upright=upright,
-                    line=self.layout.first_row("xyz".index(axis), block.scale),
-                )
-                self._draw(self._fold_into, vertices, (block.x, block.y, layers * block.width, block.height))
+        if self._folded is None:
+            self._folded = Folded.of(self.ctx, self.folded_layout, self._row_texture.size)
+        folded = self._folded
+        if time != self._folded_time and self._rows is not None:
+            if not self._is_refined:
+                self._planes.use(PLANES_UNIT)
+                self._draw_planes("refine.glsl", folded.refine_into)
+                self._is_refined = True
+            folded.rows.write(self._rows.at(time, self.folded_layout.refined))
+            folded.refined.use(PLANES_UNIT)
+            folded.rows.use(ROWS_UNIT)
+            self._draw_planes("fold.glsl", folded.fold_into)
             self._folded_time = time
-        return self._folded_planes
+        return folded.planes
+
+    def _draw_planes(self, name: str, into: moderngl.Framebuffer) -> None:
+        """Draw each plane as it lies in the folded layout, by a shader that is told where that is and which rows go with it."""
+        program, vertices = self._program(name, self.layout)
+        _set(
+            program,
+            refined=PLANES_UNIT,
+            refined_texel=tuple(1 / side for side in into.size),
+            folded_rows_texel=tuple(1 / side for side in self._folded.rows.size) if self._folded else None,
+        )
+        for source, block in zip(self.layout.blocks, self.folded_layout.blocks):
+            axis, layers = FOLDED_AXIS[block.plane], self.layout.layers[block.scale]
+            _set(
+                program,
+                source=self.layout.place(source),
+                source_width=source.width / self.layout.size[0],
+                origin=(block.x, block.y),
+                width=block.width,
+                at_texel=(1 / max(block.width - 1, 1), 1 / max(block.height - 1, 1)),
+                upright=axis == block.plane[1],
+                line=self.layout.first_row("xyz".index(axis), block.scale),
+            )
+            self._draw(into, vertices, (block.x, block.y, layers * block.width, block.height))
 
 
 def _refuse_too_large(scene: Scene, layout: Layout, card: Mapping[str, Any]) -> None:

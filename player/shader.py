@@ -112,13 +112,14 @@ def build(
     fragment: str,
     defines: Mapping[str, int] | None = None,
     written: Mapping[str, str] | None = None,
+    vertex: str = "fullscreen.glsl",
 ) -> moderngl.Program:
-    """Compile a fragment shader that is drawn over the whole viewport.
+    """Compile a fragment shader that is drawn over the whole viewport, or where `vertex` says.
 
     Raises:
         DisplayError: the driver refuses it; the message names file, line and driver.
     """
-    vertex_text, _ = compose("fullscreen.glsl", defines)
+    vertex_text, _ = compose(vertex, defines)
     text, files = compose(fragment, defines, written=written)
     with _complaints_named(ctx, files):
         return ctx.program(vertex_shader=vertex_text, fragment_shader=text)

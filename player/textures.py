@@ -113,8 +113,9 @@ class Rows:
         ]
         self.width = max(plane.shape[1] for *_, plane in self._planes)
 
-    def at(self, time: float) -> np.ndarray:
-        """(lines, width, 4) float32 at `time` in [0, 1]; 1 beyond a row's end."""
+    def at(self, time: float, refined: int = 1) -> np.ndarray:
+        """(lines, refined (width - 1) + 1, 4) float32 at `time` in [0, 1], so many texels to one of the scene's; anything beyond a
+        row's end."""
         out = np.ones((self._layout.row_count(), self.width, 4), np.float32)
         for axis, scale, plane in self._planes:
             row = linear(plane, time)
@@ -123,7 +124,11 @@ class Rows:
             padded[:, : row.shape[1]] = row
             first = self._layout.first_row(axis, scale)
             out[first : first + layers, : len(row)] = padded.reshape(len(row), layers, 4).swapaxes(0, 1)
-        return out
+        finer = np.empty((len(out), refined * (self.width - 1) + 1, 4), np.float32)
+        for between in range(refined):
+            share = np.float32(between / refined)
+            finer[:, between::refined] = out if between == 0 else (1 - share) * out[:, :-1] + share * out[:, 1:]
+        return finer
 
 
 def distances(occupied: np.ndarray) -> np.ndarray:

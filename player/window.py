@@ -568,7 +568,7 @@ class Player:
             self._picture(dial.pace.scale, dial.rung)
             self._is_paced = True
             drawn = self.renderer.quality
-            self._is_sharp = self.raster == self.canvas.size and dial.rung == dial.resting and not drawn.interlaced
+            self._is_sharp = self.raster == self.canvas.size and dial.rung == dial.resting and not drawn.tolerance
         elif not self._is_sharp and now - self._moved > SHARPEN_AFTER_S:
             self._sharpen()
 
@@ -608,8 +608,8 @@ class Player:
     def _set_quality(self, rung: str, still: bool) -> None:
         """That of a rung, but for what is set by hand; a picture that stands still owes nothing to the one before."""
         quality = LADDER[rung]
-        folded, interlaced = quality.folded and not self.exact, quality.interlaced and not still
-        self.renderer.quality = replace(quality, folded=folded, interlaced=interlaced)
+        folded, tolerance = quality.folded and not self.exact, 0.0 if still else quality.tolerance
+        self.renderer.quality = replace(quality, folded=folded, tolerance=tolerance)
 
     def _show(self, target: moderngl.Framebuffer, camera: Camera) -> None:
         started = clock.monotonic()

@@ -154,6 +154,9 @@ def test_player_measures_every_quality(tmp_path: Path, capsys: pytest.CaptureFix
         if record["settings"]["quality"] == "reference":
             assert record["accuracy"]["psnr"] > 50 and record["accuracy"]["within_one_level"] > 0.999
             assert record["accuracy"]["psnr_turning"] > 50 and run["times_reference"] == 1
+            assert record["accuracy"]["psnr_least"] == record["accuracy"]["psnr_least_turning"] == 100
+        if record["settings"]["quality"] == DEFAULT:
+            assert min(record["accuracy"]["psnr_least"], record["accuracy"]["psnr_least_turning"]) > 35
     assert plot.main([str(out), "-o", str(tmp_path / "player.svg")]) == 0
     assert "milliseconds a frame" in (tmp_path / "player.svg").read_text()
 

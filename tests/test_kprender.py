@@ -175,6 +175,18 @@ def test_the_clip_from_the_first_camera(run, scene_file: Path, tmp_path: Path) -
     assert code == 0 and "11 frames at 5 fps" in said
 
 
+def test_quality_is_a_rung_of_the_ladder(run, scene_file: Path, tmp_path: Path) -> None:
+    gl.context()
+    pictures = {}
+    for name in ("reference", "finer", "fastest"):
+        path = tmp_path / f"{name}.png"
+        assert run(scene_file, "--time", 0.4, "-o", path, "--quality", name)[0] == 0
+        pictures[name] = read_image(path).astype(int)
+    off = [np.abs(pictures[name] - pictures["reference"]).mean() for name in ("finer", "fastest")]
+    assert off[0] < 0.5 < off[1]
+    assert run(scene_file, "--time", 0.4, "-o", tmp_path / "x.png", "--quality", "best")[0] == 2
+
+
 def test_static_and_dynamic_only(run, scene_file: Path, tmp_path: Path) -> None:
     pictures = {}
     for flag in ("", "--static-only", "--dynamic-only"):

@@ -5,10 +5,10 @@ from dataclasses import replace
 import gl
 import numpy as np
 import pytest
-from scenes import SPACES, look_at, tiny_scene
+from scenes import SPACES, look_at, tiny_scene, varied
 
 from kpc.format.cameras import Camera
-from kpc.format.scene import TERMINATION, Scene
+from kpc.format.scene import SPACE_PLANES, TERMINATION, TIME_PLANES, Scene
 from kpc.player import renderer as module
 from kpc.player.quality import DEFAULT, LADDER, Quality, climbed
 from kpc.player.reference import Part, box_range, render
@@ -28,7 +28,7 @@ def test_the_ladder_ends_at_what_the_format_says() -> None:
 
 
 @pytest.mark.parametrize("fault", [{"step": 0.5}, {"step": np.nan}, {"termination": 0.0}, {"termination": 1.0}, {"resolution": 0.0},
-                                   {"resolution": 1.5}, {"scales": 0}])  # fmt: skip
+                                   {"resolution": 1.5}, {"scales": 0}, {"tolerance": -0.1}, {"tolerance": np.nan}])  # fmt: skip
 def test_settings_that_draw_nothing_are_refused(fault: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(fault))):
         Quality(**fault)  # type: ignore[arg-type]
@@ -80,10 +80,11 @@ def test_a_card_tries_both_kinds_of_shaders_once_and_keeps_to_the_faster(monkeyp
     assert not Renderer(ctx, tiny_scene(4)).compute
 
 
-# --- interlaced
+# --- following the picture before
 
 
-INTERLACED = Quality(interlaced=True)
+TOLERANCE = 5 / 255
+FOLLOWING = Quality(tolerance=TOLERANCE)
 
 
 def played(renderer: Renderer, cameras: list[Camera], times: np.ndarray) -> np.ndarray:
@@ -93,41 +94,155 @@ def played(renderer: Renderer, cameras: list[Camera], times: np.ndarray) -> np.n
     return picture
 
 
+def doubted(renderer: Renderer) -> float:
+    """Share of the blocks of the last picture that were marched whole."""
+    (target,) = [target for key, target in renderer._targets.items() if key[2] == module.DOUBTS]
+    return float(np.frombuffer(target.seen.read(), np.float32)[::4].mean())
+
+
+def around(angles: np.ndarray) -> list[Camera]:
+    return [look_at((2.4 * np.cos(a), 1.0, 2.2 * np.cos(a)), (0.1, 0.05, 0.05), 128, 96, 140.0) for a in angles]
+
+
 @pytest.mark.parametrize(
-    ("space", "size"), [*((space, (64, 48)) for space in SPACES), *(("box", size) for size in ((33, 17), (1, 1), (4096, 1), (1, 64)))]
+    ("space", "size"), [*((space, (64, 48)) for space in SPACES), *(("box", size) for size in ((33, 17), (1, 1), (4096, 1), (3, 64)))]
 )
-def test_while_a_clip_plays_half_the_pixels_are_new_and_the_rest_follow(space: str, size: tuple[int, int]) -> None:
-    scene, camera, times = SPACES[space](tiny_scene(4)), CAMERA.resized(*size), np.linspace(0.4, 0.5, 5)
-    renderer, whole = Renderer(gl.context(), scene, INTERLACED), Renderer(gl.context(), scene)
-    got, wanted = played(renderer, [camera] * 5, times), whole.render(camera, 0.5).rgb
-    y, x = np.mgrid[: size[1], : size[0]]
-    new = [np.abs(got - wanted)[::-1][(x + y) % 2 == parity].max(initial=0) < 1e-5 for parity in (0, 1)]
-    assert any(new) and psnr(got, wanted) > (40 if min(size) > 16 else 24)
-    # One after a jump, one at the same time, and one of another size follow none.
-    for time, other in ((0.95, camera), (0.95, camera), (0.96, camera.resized(20, 30))):
+def test_while_a_clip_plays_only_what_has_changed_is_marched_again(space: str, size: tuple[int, int]) -> None:
+    scene, camera, times = SPACES[space](tiny_scene(4)), CAMERA.resized(*size), np.linspace(0.4, 0.5, 9)
+    renderer, whole = Renderer(gl.context(), scene, FOLLOWING), Renderer(gl.context(), scene)
+    wanted = whole.render(camera, 0.5).rgb
+    assert psnr(played(renderer, [camera] * 9, times), wanted) > 40
+    # Of a picture that is wrong all over everything is marched again, up to every edge.
+    renderer._target(Part.FULL, size).framebuffer.clear(9.0, 9.0, 9.0, 9.0)
+    assert np.abs(renderer.render(camera, 0.51).rgb - whole.render(camera, 0.51).rgb).max() < 1e-5
+    # Pictures after a jump, at the same time, and of another size follow none.
+    renderer.quality = FOLLOWING
+    for time, other in ((0.95, camera), (0.0, camera), (0.0, camera), (0.01, camera.resized(20, 30))):
         assert np.abs(renderer.render(other, time).rgb - whole.render(other, time).rgb).max() < 1e-5
 
 
+def test_where_nothing_changes_nothing_but_probes_is_marched() -> None:
+    renderer = Renderer(gl.context(), tiny_scene(4), FOLLOWING)
+    first, *_, last = (renderer.render(CAMERA, time, part=Part.STATIC).rgb for time in (0.4, 0.41, 0.42, 0.43))
+    assert np.abs(last - first).max() < 1e-5 and doubted(renderer) == 0
+
+
+def test_every_pixel_is_a_probe_by_turns() -> None:
+    x, y = np.mgrid[:16, :16].reshape(2, -1)
+    seen = np.zeros((62, 63), int)
+    for turn in range(16):
+        numbers = np.stack([x, y, x, y], 1).astype(np.float32)
+        places = gl.evaluate('#include "probes.glsl"\n', f"vec4(probe_of(a.xy, {turn}, vec2(63.0, 62.0)), 0.0, 0.0)", numbers)
+        column, row = places[:, :2].astype(int).T
+        assert (column // 4 == x).all() and (row // 4 == y).all()
+        np.add.at(seen, (row, column), 1)
+    assert (seen[:60, :60] == 1).all() and (seen > 0).all()
+
+
+def test_nothing_is_left_behind_by_what_moves() -> None:
+    """A block of colour that crosses the picture: at no time is much of it where it was before, nor does it stay after the loop."""
+    scene = tiny_scene(4, resolution=(48, 40, 32))
+    renderer, whole = Renderer(gl.context(), scene, FOLLOWING), Renderer(gl.context(), scene)
+    camera, changed = CAMERA.resized(128, 96), 0.0
+    first = whole.render(camera, 0.0).rgb
+    for time in (*np.linspace(0, 1, 60), *np.linspace(0, 0.2, 12)):
+        error = np.abs(renderer.render(camera, float(time)).rgb - (wanted := whole.render(camera, float(time)).rgb)).max(axis=2)
+        changed = max(changed, float(np.mean(np.abs(wanted - first).max(axis=2) > 8 * TOLERANCE)))
+        assert np.mean(error > 2 * TOLERANCE) < 0.02 and np.mean(error > 8 * TOLERANCE) < 0.001, time
+    assert changed > 0.05
+
+
 def test_a_camera_that_moves_takes_the_picture_along() -> None:
-    scene, times = tiny_scene(4, resolution=(48, 40, 32)), np.linspace(0.4, 0.5, 6)
-    cameras = [look_at((2.4 * np.cos(a), 1.0, 2.2 * np.cos(a)), (0.1, 0.05, 0.05), 128, 96, 140.0) for a in np.arange(6) * 0.02]
-    renderer, whole = Renderer(gl.context(), scene, INTERLACED), Renderer(gl.context(), scene)
+    scene, times = tiny_scene(4, resolution=(48, 40, 32)), np.linspace(0.4, 0.5, 12)
+    cameras = around(np.arange(12) * 0.02)
+    renderer, whole = Renderer(gl.context(), scene, FOLLOWING), Renderer(gl.context(), scene)
     wanted = whole.render(cameras[-1], 0.5).rgb
-    got = psnr(played(renderer, cameras, times), wanted)
-    assert got > 33
-    # Were it not taken along but left where it was, it would be worse.
-    assert got > psnr(whole.render(cameras[-2], 0.5).rgb, wanted) + 2
-    # What comes out of nowhere, a look the other way, is made of its neighbours.
+    assert psnr(played(renderer, cameras, times), wanted) > 40
+
+
+def test_a_picture_is_predicted_from_where_its_places_were_seen() -> None:
+    whole = Renderer(gl.context(), tiny_scene(4, resolution=(48, 40, 32)))
+    cameras = [look_at((2.4 + x, 1.0, 2.2 - x), (0.1 + x, 0.05, 0.05 - x), 128, 96, 1000.0) for x in (0.0, 0.02)]
+    old, new = (whole._target(Part.FULL, (128, 96), number) for number in (module.PICTURE, module.OTHER_PICTURE))
+    before = whole.render(cameras[0], 0.5).rgb
+    predicted = module._read(whole._predicted(old, new, *cameras))
+    wanted = whole.render(cameras[1], 0.5)
+    assert psnr(predicted[0], wanted.rgb) > psnr(before, wanted.rgb) + 10
+    both = (predicted[2] > 0.9) & (wanted.opacity > 0.9)
+    assert np.median(np.abs(predicted[1] - wanted.depth)[both]) < 0.01 and both.any()
+
+
+def test_a_camera_that_looks_elsewhere_sees_what_is_there() -> None:
+    scene = tiny_scene(4, resolution=(48, 40, 32))
+    renderer, whole = Renderer(gl.context(), scene, FOLLOWING), Renderer(gl.context(), scene)
     behind = look_at((-1.8, 1.4, 2.6), (0.1, 0.05, 0.05), 128, 96, 140.0)
-    assert psnr(renderer.render(behind, 0.51).rgb, whole.render(behind, 0.51).rgb) > 20
+    got = played(renderer, [*around(np.zeros(2)), behind], np.array([0.4, 0.41, 0.42]))
+    assert psnr(got, whole.render(behind, 0.42).rgb) > 35
 
 
-def test_what_moves_and_what_stays_are_interlaced_each_for_itself() -> None:
+def test_a_picture_follows_none_of_another_quality_nor_appearance_nor_of_a_scene_less_refined() -> None:
+    scene = varied(tiny_scene(4, scales=3))
+    dawn, dusk = (scene.appearance(name) for name in ("dawn.jpg", "dusk.jpg"))
+    renderer, whole = Renderer(gl.context(), scene, FOLLOWING), Renderer(gl.context(), scene)
+
+    def differs(time: float, code: np.ndarray) -> float:
+        got, wanted = (r.render(CAMERA, time, appearance=code).rgb for r in (renderer, whole))
+        return float(np.abs(got - wanted).max())
+
+    assert differs(0.40, dawn) < 1e-5 < differs(0.41, dawn) and differs(0.42, dusk) < 1e-5
+    renderer.quality = replace(FOLLOWING, scales=1)
+    renderer.render(CAMERA, 0.43, appearance=dusk)
+    renderer.quality = FOLLOWING
+    assert differs(0.44, dusk) < 1e-5 < differs(0.45, dusk)
+    refined = 0.9 * scene.scales[1]["xy"]
+    for r in (renderer, whole):
+        r.put(1, "xy", r.layout.texels(refined))
+    assert differs(0.46, dusk) < 1e-5 < differs(0.47, dusk)
+    scene.scales[0]["xt"][...] *= 0.9
+    for r in (renderer, whole):
+        r.refresh()
+    assert differs(0.48, dusk) < 1e-5 < differs(0.49, dusk)
+
+
+def test_what_arrives_is_folded_anew() -> None:
+    scene, finer = tiny_scene(4), tiny_scene(5)
+    renderer = Renderer(gl.context(), scene, Quality(folded=True))
+    renderer.render(CAMERA, 0.4)
+    for s, scale in enumerate(finer.scales):
+        for plane in SPACE_PLANES:
+            renderer.put(s, plane, renderer.layout.texels(scale[plane]))
+    same_times = [{**new, **{p: old[p] for p in TIME_PLANES}} for new, old in zip(finer.scales, scene.scales, strict=True)]
+    wanted = Renderer(gl.context(), replace(scene, scales=tuple(same_times)), Quality(folded=True)).render(CAMERA, 0.4)
+    assert np.array_equal(renderer.render(CAMERA, 0.4).rgb, wanted.rgb)
+
+
+def test_what_is_drawn_in_between_is_not_followed() -> None:
+    renderer, whole = Renderer(gl.context(), tiny_scene(4), FOLLOWING), Renderer(gl.context(), tiny_scene(4))
+    renderer.render(CAMERA, 0.4)
+    renderer.quality = Quality()
+    renderer.march(CAMERA, 0.4, program="cells.glsl")
+    renderer.quality = FOLLOWING
+    assert np.abs(renderer.render(CAMERA, 0.41).rgb - whole.render(CAMERA, 0.41).rgb).max() < 1e-5
+
+
+def test_what_moves_and_what_stays_follow_each_their_own() -> None:
     scene, times = tiny_scene(4), np.linspace(0.4, 0.5, 5)
-    renderer, whole = Renderer(gl.context(), scene, INTERLACED), Renderer(gl.context(), scene)
+    renderer, whole = Renderer(gl.context(), scene, FOLLOWING), Renderer(gl.context(), scene)
     for time in times:
         got = renderer.render(CAMERA, float(time), part=Part.DYNAMIC)
     assert psnr(got.rgb, whole.render(CAMERA, 0.5, part=Part.DYNAMIC).rgb) > 38
+
+
+def test_compute_shaders_follow_the_same_way() -> None:
+    ctx, scene, pictures = gl.context(), tiny_scene(4), []
+    if ctx.version_code < COMPUTE_VERSION:
+        pytest.skip("this OpenGL has no compute shaders")
+    for compute in (False, True):
+        renderer = Renderer(ctx, scene, FOLLOWING)
+        renderer.compute = compute
+        pictures.append(played(renderer, [CAMERA.resized(61, 43)] * 9, np.linspace(0.4, 0.5, 9)))
+        renderer.check()
+    assert psnr(*pictures) > 50
 
 
 def test_steady_playback_makes_nothing_new() -> None:

@@ -9,6 +9,9 @@ from kpc.format.errors import DisplayError
 from kpc.player import shader
 from kpc.player.textures import Layout, block_arrays, decoder_arrays, decoder_shape, planes_shape
 
+VERTICES = {"settle.glsl": "places.glsl", "march.glsl": "blocks.glsl"}
+"""Those of fragment shaders that are not drawn all over the viewport, or not always."""
+
 
 def test_includes_come_once_and_lines_keep_their_numbers() -> None:
     written = {
@@ -50,7 +53,8 @@ def test_a_missing_file_is_named() -> None:
         shader.compose("a", written={"a": '#include "nowhere.glsl"'})
 
 
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "weave.glsl", "fullscreen.glsl"])
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "refine.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "predict.glsl", "doubt.glsl", "settle.glsl",
+                                  *VERTICES.values(), "fullscreen.glsl"])  # fmt: skip
 def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
     scene = tiny_scene(0)
     defines = {**planes_shape(Layout.of(scene)), **decoder_shape(scene.decoder), "SHARED": 1}
@@ -94,7 +98,7 @@ def test_constants_are_exact() -> None:
 @pytest.mark.parametrize("space", ["box", "contracted", "ndc", "hybrid"])
 @pytest.mark.parametrize("rows", [0, 1])
 @pytest.mark.parametrize("motion", [0, 1])
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "weave.glsl"])
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "refine.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "predict.glsl", "doubt.glsl", "settle.glsl"])
 def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, rows: int, space: str) -> None:
     ctx = gl.context()
     if "GL_ARB_ES3_compatibility" not in ctx.extensions:
@@ -104,8 +108,8 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     blocks = shader.constants(block_arrays(scene, layout))
-    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "SHARED": int(space == "box"), "INTERLACED": rows, "STILL": motion, "COMPUTE": 0,
+    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "SHARED": int(space == "box"), "PIXELS": rows + motion, "MOVED": motion, "COMPUTE": 0,
                "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion, "APPEARANCE": rows}  # fmt: skip
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights, "plane_blocks": blocks})
-    vertex, _ = shader.compose("fullscreen.glsl", preamble=shader.ES30)
+    vertex, _ = shader.compose(VERTICES.get(name, "fullscreen.glsl"), preamble=shader.ES30)
     ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()

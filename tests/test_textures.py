@@ -57,6 +57,13 @@ def test_rows_are_the_time_planes_cut() -> None:
             assert got == pytest.approx(wanted, abs=1e-6)
 
 
+def test_refined_rows_are_straight_between_those_of_the_scene() -> None:
+    rows = Rows(scene := tiny_scene(1, channels=6), Layout.of(scene))
+    whole, finer = rows.at(0.43), rows.at(0.43, 3)
+    assert finer.shape == (len(whole), 3 * (rows.width - 1) + 1, 4) and np.array_equal(finer[:, ::3], whole)
+    assert finer[:, 4::3] == pytest.approx((2 * whole[:, 1:-1] + whole[:, 2:]) / 3, abs=1e-6)
+
+
 def test_a_row_of_ones_stays_exactly_one() -> None:
     scene = tiny_scene(1)
     rows = Rows(scene, Layout.of(scene)).at(0.777)

@@ -1,19 +1,14 @@
 // Multiplies a row of a time plane into one plane of space, for a march that then needs the planes alone.
 //
 // Exact at the texels of what is written. Between them the product of two interpolations becomes the interpolation of a
-// product. That error falls with the square of the distance between texels: the result is written finer along the row.
+// product. That error falls with the square of the distance between texels: plane and row have been made finer along the row.
 
-#include "planes.glsl"
-
-uniform sampler2D planes;
-uniform sampler2D rows;
-uniform vec2 rows_texel;
-uniform vec4 source;         // the plane's block in `planes`
-uniform float source_width;  // of one layer there
-uniform vec2 origin;         // its block in what is written, texels
+uniform sampler2D refined;   // the planes, where they are written, too
+uniform sampler2D rows;      // texel for texel
+uniform vec2 refined_texel;  // 1 / size of the texture, as the next
+uniform vec2 folded_rows_texel;
+uniform vec2 origin;         // the plane's block, texels
 uniform float width;         // of one layer
-uniform vec2 at_texel;       // of the plane to one texel that is written
-uniform float row_texel;     // texels of the row to one that is written along it
 uniform bool upright;        // the row runs along the plane's rows, else along its columns
 uniform int line;            // of the row's first layer
 
@@ -21,8 +16,7 @@ layout(location = 0) out vec4 folded;
 
 void main() {
     vec2 local = gl_FragCoord.xy - origin;
-    float layer = floor(local.x / width);
-    vec2 position = vec2(local.x - layer * width, local.y) - 0.5;
-    folded = plane_layer(planes, source, source_width, position * at_texel, int(layer))
-           * row_layer(rows, rows_texel, (upright ? position.y : position.x) * row_texel, line + int(layer));
+    float layer = floor(local.x / width), along = upright ? local.y : local.x - layer * width;
+    folded = textureLod(refined, gl_FragCoord.xy * refined_texel, 0.0)
+           * textureLod(rows, vec2(along, float(line) + layer + 0.5) * folded_rows_texel, 0.0);
 }

@@ -6,7 +6,7 @@
 // CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
 // NDC: 1 where all this is in device coordinates. DRAWN: how many scales count. SHARED: how many, from
 // the coarsest on, are looked up once for two samples, in the middle between them; the next gives their slope.
-// INTERLACED: 1 where half the pixels are marched, for weave.glsl.
+// PIXELS: 0 all are marched; 1 the probes (probes.glsl), side by side; 2 blocks in doubt (blocks.glsl).
 // COMPUTE: 1 for a compute shader (GL 4.3).
 
 #include "ray.glsl"
@@ -15,6 +15,7 @@
 #include "motion.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
+#include "probes.glsl"
 #include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.textures), as the next
 #include "plane_blocks"     // blocks, layer_widths, last_texels, layers, first_layers
 
@@ -41,8 +42,10 @@ uniform float termination;          // a ray ends once its transmittance is less
 uniform vec4 appearance[(HIDDEN + 3) / 4];  // the code to show, padded
 #endif
 
-#if INTERLACED
-uniform float parity;               // of x + y of the pixels to march; the picture holds them side by side
+#if PIXELS
+uniform vec2 size;                  // of the picture
+uniform int turn;                   // of the probes
+uniform sampler2D doubts;           // a texel a block
 #endif
 uniform float height;
 uniform vec4 lens;
@@ -231,8 +234,8 @@ void add_sample(inout Met sum, vec4 logits, float thickness, float distance) {
 
 // seen: rgb and opacity; met: sum of weight t, samples.
 void march(vec2 fragment, out vec4 seen, out vec4 met) {
-#if INTERLACED
-    fragment.x = 2.0 * floor(fragment.x) + mod(floor(fragment.y) + parity, 2.0) + 0.5;
+#if PIXELS == 1
+    fragment = probe_of(floor(fragment), turn, size) + 0.5;
 #endif
     Path path = path_of(eye, camera_direction(fragment, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
@@ -298,6 +301,9 @@ layout(rg32f) uniform writeonly image2D met_picture;
 void main() {
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(at, imageSize(seen_picture)))) return;
+#if PIXELS == 2
+    if (textureLod(doubts, (floor(vec2(at) / BLOCK) + 0.5) / ceil(size / BLOCK), 0.0).r < 0.5) return;
+#endif
     vec4 seen, met;
     march(vec2(at) + 0.5, seen, met);
     imageStore(seen_picture, at, seen);
