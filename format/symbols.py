@@ -201,8 +201,8 @@ def walk(symbols, coded, trellis, weights, state, at, words, trace, neighbours):
         for y in range(H):
             here, above, higher = y % 3, (y + 2) % 3, (y + 1) % 3
             v0, v1, v2, r0, r1, r2, past = v[here], v[above], v[higher], r[here], r[above], r[higher], cross[y]
-            _begin_row(v0, v1, v2, y, 0)
-            _begin_row(r0, r1, r2, y, UNKNOWN)
+            begin_row(v0, v1, v2, y, 0)
+            begin_row(r0, r1, r2, y, UNKNOWN)
             place = 0
             for x in range(W):
                 X = x + 2
@@ -243,9 +243,9 @@ def walk(symbols, coded, trellis, weights, state, at, words, trace, neighbours):
             if words is not None and at > words.size:
                 return state, at, True
             if y > 0:
-                _remember(cross[y - 1], r2, r1, r0, m)
+                remember(cross[y - 1], r2, r1, r0, m)
         last = r[(H - 1) % 3]
-        _remember(cross[H - 1], r[max(H - 2, 0) % 3], last, last, m)
+        remember(cross[H - 1], r[max(H - 2, 0) % 3], last, last, m)
     return state, at, True
 
 
@@ -275,7 +275,7 @@ def activity(own, past, gradient, m):
 
 
 @compiled(forceinline=True)
-def _begin_row(here, above, higher, y, unknown):
+def begin_row(here, above, higher, y, unknown):
     """What lies outside: to the left, the start of the row above; above the first row, from the second on, itself."""
     here[:2] = above[2] if y > 0 else unknown
     if y == 1:
@@ -283,7 +283,7 @@ def _begin_row(here, above, higher, y, unknown):
 
 
 @compiled(forceinline=True)
-def _remember(cross, above, here, below, m):
+def remember(cross, above, here, below, m):
     """Let `cross`, of one row, take in r of this channel: smoothed by (1 2 1) x (1 2 1) / 2, an eighth of the way."""
     for x in range(cross.size):
         X = x + 2

@@ -103,9 +103,9 @@ def _status(player: "Player", bottom: float) -> None:
     with _panel("status", scrolls=True):
         imgui.text(f"{1 / max(player.frame_s, 1e-6):.0f} fps   {1e3 * player.draw_s:.1f} ms")
         imgui.text_disabled("{}x{} of {}x{}".format(*player.raster, *player.canvas.size))
-        shaders = "compute" if player.renderer.compute else "fragment"
-        imgui.text_disabled(f"{player.samples:.1f} samples a ray, {player.renderer.memory_bytes / 1e6:.0f} MB, {shaders} shaders")
+        imgui.text_disabled(f"{player.samples:.1f} samples a ray, {player.renderer.memory_bytes / 1e6:.0f} MB")
         imgui.text_disabled(player.device.split("(")[0].strip()[:32])
+        imgui.text_disabled(f"{'compute' if player.renderer.compute else 'fragment'} shaders")
         if isinstance(player.scene.decoder, HybridDecoder):
             imgui.text_disabled("hybrid decoder: plays slower")
         if not stream.is_settled:

@@ -79,7 +79,7 @@ Walks = dict[str, Any]
 
 @njit
 def _forget(cross, above, here, below, m):
-    """In place of `_remember`."""
+    """In place of `remember`."""
 
 
 @njit
@@ -91,7 +91,7 @@ def _note(bit, table, which, state, at, words, trace):
 
 def _compiled(changes: dict[str, Any]) -> Walks:
     names = vars(rans) | vars(module) | changes
-    for name in ("_begin_row", "_remember", "next_state", "predict", "nearest", "activity", "integer", "walk_map", "walk"):
+    for name in ("begin_row", "remember", "next_state", "predict", "nearest", "activity", "integer", "walk_map", "walk"):
         if name not in changes:
             names[name] = njit(FunctionType(vars(module)[name].py_func.__code__, names, name))
     return names
@@ -128,7 +128,7 @@ LEFT_OUT: dict[str, tuple[dict[str, Any], tuple[int, ...], Callable[[np.ndarray]
     "no weights: mean of left and above": ({}, (), None),
     "no contexts of activity": ({"_LOGARITHMS": np.zeros_like(module._LOGARITHMS)}, SET_COUNTS, None),
     "no contexts of the fraction": ({"FRACTIONS": 1}, SET_COUNTS, None),
-    "no errors of channels before": ({"_remember": _forget}, SET_COUNTS, None),
+    "no errors of channels before": ({"remember": _forget}, SET_COUNTS, None),
     "stored tables for counters that learn": ({"adapt": _note}, SET_COUNTS, _tables),
 }
 """Idea left out: what changes in `kpc.format.symbols`, numbers of sets of weights to try, and how to measure if not by words."""

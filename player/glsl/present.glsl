@@ -1,11 +1,12 @@
 // Puts what a march gave on the screen: its colours, or one of the other things it met.
+//
+// VIEW: 0 colour, 1 |colour - without|, 2 depth, 3 samples.
 
 #include "space.glsl"
 
 uniform sampler2D seen;
 uniform sampler2D met;
 uniform sampler2D without;  // what a march of the static part has seen
-uniform int view;           // 0 colour, 1 |colour - without|, 2 depth, 3 samples
 uniform vec2 viewport;      // pixels
 uniform vec2 depths;        // shown from bright to dark
 uniform float even;         // CONTRACTED: how far steps are even
@@ -22,14 +23,15 @@ vec3 heat(float x) {
 void main() {
     vec2 at = gl_FragCoord.xy / viewport;
     vec4 colour = texture(seen, at);
-    vec2 sums = texture(met, at).xy;
     vec3 rgb = colour.rgb;
-    if (view == 1) rgb = abs(rgb - texture(without, at).rgb);
-    if (view == 2) {
-        float depth = progress_of(sums.x / max(colour.a, 1e-6), even);
-        float near = progress_of(depths.x, even), far = progress_of(depths.y, even);
-        rgb = colour.a * heat(1.0 - clamp((depth - near) / (far - near), 0.0, 1.0));
-    }
-    if (view == 3) rgb = heat(sums.y / most_samples);
+#if VIEW == 1
+    rgb = abs(rgb - texture(without, at).rgb);
+#elif VIEW == 2
+    float depth = progress_of(texture(met, at).x / max(colour.a, 1e-6), even);
+    float near = progress_of(depths.x, even), far = progress_of(depths.y, even);
+    rgb = colour.a * heat(1.0 - clamp((depth - near) / (far - near), 0.0, 1.0));
+#elif VIEW == 3
+    rgb = heat(texture(met, at).y / most_samples);
+#endif
     shown = vec4(rgb, share);
 }
