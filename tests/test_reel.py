@@ -120,12 +120,21 @@ def test_two_groups_are_mixed_amid_the_frames_that_they_share(clip, opened):
         assert_shows(reel, clip, time)
 
 
-def test_a_clip_does_not_go_on_into_frames_of_a_group_that_is_not_there(clip, opened):
+def held_up(reel: Reel, monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Let no further group be opened until this is set."""
+    gate, open_group = threading.Event(), reel.groups.open
+    monkeypatch.setattr(reel.groups, "open", lambda *args, **options: gate.wait(SOON_S) and open_group(*args, **options))
+    return gate
+
+
+def test_a_clip_does_not_go_on_into_frames_of_a_group_that_is_not_there(clip, opened, monkeypatch):
     reel = opened(clip)
+    gate = held_up(reel, monkeypatch)
     settled(reel, 0.0, 0)
     reel.steer(Playhead(8.5 / 29))
     assert reel.number == 0 and reel.beside(8.5 / 29) is None
     assert not reel.can_show(8.5 / 29) and reel.can_show(8 / 29) and not reel.is_settled and "waiting" in reel.message
+    gate.set()
     settled(reel, 8.5 / 29, 0)
 
 
@@ -150,12 +159,14 @@ def test_two_groups_are_held_at_most_and_their_threads_end(clip, opened):
         clock.sleep(0.01)
 
 
-def test_what_is_not_there_is_waited_for_without_blocking(clip, opened):
+def test_what_is_not_there_is_waited_for_without_blocking(clip, opened, monkeypatch):
     reel = opened(clip)
+    gate = held_up(reel, monkeypatch)
     settled(reel, 0.0, 0)
     reel.steer(Playhead(0.99))
     assert not reel.can_show(0.99) and not reel.is_settled and reel.number == 0
     assert reel.time_in(0.99) == 1.0  # the group before stays, with its last picture
+    gate.set()
     settled(reel, 0.99, 2)
 
 
