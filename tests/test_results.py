@@ -39,6 +39,18 @@ def test_tables_are_split_by_machine_and_say_where_they_come_from() -> None:
     assert "64 cores" in second and "Commit fffffffff+dirty; median of 1 run;" in second
 
 
+def test_in_brief_only_the_default_quality_and_the_reference_are_shown() -> None:
+    accuracy = dict.fromkeys(("samples_per_ray", "psnr", "psnr_least", "psnr_turning", "within_one_level"), 0.5)
+    each = [
+        encode_record("room", [30.0], kind="player", accuracy=accuracy,
+                      settings={"quality": quality, "default": "balanced", "size": "320x240"})
+        for quality in ("fast", "balanced", "fine", "reference")
+    ]  # fmt: skip
+    every, few = (results.markdown([*each, encode_record("liam", [1.0])], brief) for brief in (False, True))
+    assert every.count("| room |") == 4 and few.count("| room |") == 2 and few.count("| liam |") == 1
+    assert "| balanced (default) |" in few and "| reference |" in few
+
+
 def test_the_block_of_a_readme_is_rewritten_and_nothing_else(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,4 +88,4 @@ def test_committed_records_make_the_tables_of_the_readme() -> None:
     files = sorted((root / "docs" / "bench").glob("*.json"))
     if not files:
         pytest.skip("docs/bench holds no records yet")
-    assert results.markdown(results.load(files)) in (root / "README.md").read_text()
+    assert results.markdown(results.load(files), brief=True) in (root / "README.md").read_text()

@@ -177,6 +177,7 @@ COLUMNS: dict[str, list[Column]] = {
         ("textures MB", _number("gpu_memory_bytes", "{:.1f}", 1e6)),
         ("peak MB", _number("peak_memory_bytes", "{:.0f}", 1e6)),
         ("PSNR to reference dB", _accuracy("psnr", "{:.1f}")),
+        ("worst frame", _accuracy("psnr_least", "{:.1f}")),
         ("turning", _accuracy("psnr_turning", "{:.1f}")),
         ("within 1/255", _accuracy("within_one_level", "{:.2%}")),
     ],
@@ -255,8 +256,12 @@ def aligned(table: Sequence[Sequence[str]]) -> str:
     return "\n".join("  ".join(text.ljust(width) for text, width in zip(row, widths)).rstrip() for row in table)
 
 
-def markdown(records: Sequence[Record]) -> str:
-    """Tables of all records, one for each kind and machine, and below each where its numbers come from."""
+def markdown(records: Sequence[Record], brief: bool = False) -> str:
+    """Tables of all records, one for each kind and machine, and below each where its numbers come from. `brief`: of the qualities of
+    playing only the default and the reference."""
+    if brief:
+        records = [record for record in records if record["kind"] != "player"
+                   or record["settings"]["quality"] in (record["settings"]["default"], "reference")]  # fmt: skip
     parts = []
     for kind, title in TITLES.items():
         ours = [record for record in records if record["kind"] == kind]
@@ -340,11 +345,11 @@ def _command(argv: list[str]) -> None:
     parser.add_argument("records", type=Path, nargs="+", help="files that kpbench --out wrote")
     parser.add_argument("--readme", type=Path, help="rewrite the block between this file's markers instead of printing")
     options = parser.parse_args(argv)
-    block = markdown(load(options.records))
+    records = load(options.records)
     if options.readme is None:
-        print(block)
+        print(markdown(records))
     else:
-        rewrite(options.readme, block)
+        rewrite(options.readme, markdown(records, brief=True))
         print(options.readme)
 
 
