@@ -12,7 +12,9 @@ Default scene, `fast`: at equal error of pictures of 1, 2 and 4 squared levels p
 by rate and distortion around the nearest.
 """
 
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -39,8 +41,10 @@ TOLD_APART = 40
 def quantise_on_trellis(scene: Scene, steps: Sequence[Mapping[str, np.ndarray]], reached: np.ndarray | None = None) -> QuantisedScene:
     """As `quantise_scene`, with symbols that follow the trellis."""
     quantised = quantise_scene(scene, steps, reached=reached)
-    scales = tuple({name: _steered(plane, planes[name], step[name], name in TIME_PLANES) for name, plane in scale.items()}
-                   for scale, planes, step in zip(quantised.scales, scene.scales, steps, strict=True))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the search holds no lock
+        waiting = [{name: pool.submit(_steered, plane, planes[name], step[name], name in TIME_PLANES) for name, plane in scale.items()}
+                   for scale, planes, step in zip(quantised.scales, scene.scales, steps, strict=True)]
+        scales = tuple({name: plane.result() for name, plane in scale.items()} for scale in waiting)
     return replace(quantised, scales=scales)
 
 
