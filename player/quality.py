@@ -28,6 +28,10 @@ class Quality:
             all by turns; blocks where that differs from the prediction by more than this, of the full range, or a neighbour's by
             twice as much, are marched whole. 0: all pixels are. So is a picture that follows no other.
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated.
+        across: rays across a pixel, at most: as many as it spans texels of the finest scale, and their mean is its colour. What is far
+            away else shimmers. Room in a picture so small that a pixel spans three texels is 30.0 dB from that of 36 rays a pixel,
+            and 40.3 with 2 x 2; prefiltered planes of half and a quarter of the resolution gave 33.4 and 29.9 (products of means are
+            no means of products).
         scales: how many of the scene's to use, from the coarsest on; None: all.
     """
 
@@ -37,10 +41,11 @@ class Quality:
     share: float = math.inf
     tolerance: float = 0.0
     resolution: float = 1.0
+    across: int = 1
     scales: int | None = None
 
     def __post_init__(self) -> None:
-        marchable = self.step >= 1 and self.share > 0 and 0 < self.termination < 1 and 0 < self.resolution <= 1 and self.tolerance >= 0
+        marchable = self.step >= 1 and self.share > 0 and 0 < self.termination < 1 and 0 < self.resolution <= 1 and self.tolerance >= 0 and self.across >= 1
         if not marchable or self.scales is not None and self.scales < 1:
             raise ValueError(f"no picture can be drawn with {self}")
 
@@ -49,10 +54,10 @@ LADDER: dict[str, Quality] = {
     "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, tolerance=5 / 255, resolution=0.5),
     "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, resolution=0.5),
     "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, resolution=0.75),
-    "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255),
-    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, tolerance=5 / 255),
-    "fine": Quality(folded=True, termination=1 / 64, share=3.0),
-    "finer": Quality(folded=True),
+    "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, across=4),
+    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, tolerance=5 / 255, across=4),
+    "fine": Quality(folded=True, termination=1 / 64, share=3.0, across=4),
+    "finer": Quality(folded=True, across=4),
     "reference": Quality(),
 }
 """From fastest to finest."""

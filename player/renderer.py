@@ -17,6 +17,7 @@ from kpc.format.grid import linear
 from kpc.format.scene import SPACE_PLANES, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
+from kpc.player.cover import Cover
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, slot_at
 from kpc.player.textures import (
@@ -37,6 +38,10 @@ MOVED_TOLERANCE = 0.8
 """Of a quality's tolerance while the camera moves: what is interpolated errs in thin places, too thin for probes to meet them all.
 Turning by a degree a frame, liam is then 42.2 dB from the reference instead of 40.8, in 7 % more time; room 44.2 and 42.6, 15 %."""
 TARGETS_KEPT = 12
+MOST_COVERED = 0.8
+"""Share of a picture beyond which all of it is drawn."""
+PIXELS_MARCHED = 1 << 22
+"""Of a raster with several rays a pixel, at most: 100 MB."""
 FOLLOWS_S = 0.2
 """A picture so much later in the clip than the one before has too little in common with it to follow it; nor does one follow at
 the same time: while the clip stands still, pictures are whole."""
@@ -156,7 +161,8 @@ class Renderer:
         self.scene = scene
         self.quality = quality
         self.compute = False
-        self._marches_to_trial = math.inf if is_software(ctx) or ctx.version_code < COMPUTE_VERSION else TRIAL_AFTER
+        self._is_software = is_software(ctx)
+        self._marches_to_trial = math.inf if self._is_software or ctx.version_code < COMPUTE_VERSION else TRIAL_AFTER
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
         _refuse_too_large(scene, self.layout, ctx.info)
@@ -177,6 +183,7 @@ class Renderer:
             self._cells = ctx.texture3d((nx, ny, nz), 1, alignment=1, dtype="u1")
             self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._distances: dict[int, bytes] = {}
+        self._covers: dict[int, Cover] = {}
         weights = decoder_arrays(scene.decoder, scene, self.layout)
         if sum(map(len, weights.values())) > CONSTANTS:
             raise DisplayError(
@@ -297,7 +304,7 @@ class Renderer:
     ) -> Target:
         """Draw into a target of the camera's size, which stays valid until the next march of the same part and size.
 
-        At a lower resolution of `quality`, into a smaller one first.
+        Where `quality` asks for a lower resolution or several rays a pixel, into a smaller or larger one first.
 
         `part` is FULL or STATIC. `program` is march.glsl or another that takes a subset of its uniforms. `appearance` as in
         `reference.code_of`.
@@ -306,7 +313,10 @@ class Renderer:
             raise ValueError(f"time {time} lies outside [0, 1]")
         moving = part is Part.FULL and self._rows is not None
         quality, scene, size = self.quality, self.scene, (camera.width, camera.height)
-        if quality.resolution < 1:
+        across = self._rays_across(camera)
+        if across > 1:
+            camera = camera.resized(*(across * side for side in size))
+        elif quality.resolution < 1:
             camera = camera.resized(*(max(1, round(side * quality.resolution)) for side in size))
         self._occupy(slot_at(scene, time))
         folded, displaced = moving and quality.folded, moving and self._motion_texture is not None
@@ -352,13 +362,27 @@ class Renderer:
             else:
                 self._draw(target.framebuffer, vertices, points=points)
 
+        def draw_whole(target: Target) -> None:
+            blocks = self._covered(camera) if program == "march.glsl" else None
+            if blocks is None:
+                draw(target)
+                return
+            nothing, vertices = self._program("nothing.glsl", self.layout)
+            self._draw(target.framebuffer, vertices)
+            covered = self._target(part, blocks.shape[::-1], DOUBTS)
+            covered.seen.write(np.repeat(blocks[..., None], 4, axis=-1).astype(np.float32))
+            covered.seen.use(DOUBTS_UNIT)
+            draw(target, ONLY_DOUBTED, blocks.size, doubts=DOUBTS_UNIT, size=tuple(map(float, raster)), turn=0)
+
         before = self._shots.pop((part, raster), None)
         if program == "march.glsl" and quality.tolerance > 0:
-            target = self._followed(draw, part, before, Shot(camera, time, code.tobytes(), quality))
+            target = self._followed(draw, draw_whole, part, before, Shot(camera, time, code.tobytes(), quality))
         else:
             target = self._target(part, raster)
-            draw(target)
-        return target if raster == size else self._upscaled(target, self._target(part, size))
+            draw_whole(target)
+        if raster == size:
+            return target
+        return self._resampled(target, self._target(part, size), across)
 
     def is_compute_faster(self, camera: Camera, time: float) -> bool:
         """Draw a picture by fragment and by compute shaders, a few times each, and compare the best of their times."""
@@ -375,12 +399,12 @@ class Renderer:
         self.compute = chosen
         return seconds[True] < seconds[False]
 
-    def _followed(self, draw: Callable[..., None], part: Part, before: Shot | None, shot: Shot) -> Target:
+    def _followed(self, draw: Callable[..., None], draw_whole: Callable[[Target], None], part: Part, before: Shot | None, shot: Shot) -> Target:
         """Draw what the picture before does not tell: its probes, and the blocks in which they are not as predicted."""
         size = shot.camera.width, shot.camera.height
         if before is None or not self._follows(shot, before):
             self._shots[part, size] = shot
-            draw(picture := self._target(part, size))
+            draw_whole(picture := self._target(part, size))
             return picture
         shot = replace(shot, turn=before.turn + 1, number=before.number)
         picture = self._target(part, size, before.number)
@@ -428,13 +452,38 @@ class Renderer:
         finest = [max(size - 1 for plane in SPACE_PLANES for size in scale[plane].shape[:2]) for scale in self.scene.scales]
         return sum(1 / texels >= self.quality.share * step for texels in finest)
 
-    def _upscaled(self, small: Target, target: Target) -> Target:
-        upscale, vertices = self._program("upscale.glsl", self.layout)
-        _set(upscale, seen_small=SEEN_UNIT, met_small=MET_UNIT, size=tuple(map(float, target.seen.size)))
-        small.seen.use(SEEN_UNIT)
-        small.met.use(MET_UNIT)
+    def _resampled(self, marched: Target, target: Target, across: int) -> Target:
+        """A picture of one size in another: the mean of `across` rays across a pixel, or stretched."""
+        if across > 1:
+            program, vertices = self._program("average.glsl", self.layout)
+            _set(program, seen_fine=SEEN_UNIT, met_fine=MET_UNIT, across=across)
+        else:
+            program, vertices = self._program("upscale.glsl", self.layout)
+            _set(program, seen_small=SEEN_UNIT, met_small=MET_UNIT, size=tuple(map(float, target.seen.size)))
+        marched.seen.use(SEEN_UNIT)
+        marched.met.use(MET_UNIT)
         self._draw(target.framebuffer, vertices)
         return target
+
+    def _covered(self, camera: Camera) -> np.ndarray | None:
+        """`Cover.blocks` of what is occupied now, where drawing only those is quicker: by a processor, and of less than MOST_COVERED."""
+        if not self._is_software or self.scene.mapping is not None or self._slot is None:
+            return None
+        if self._slot not in self._covers:
+            self._covers[self._slot] = Cover.of(self.scene.occupancy[self._slot], self.scene.aabb)
+        blocks = self._covers[self._slot].blocks(camera, BLOCK)
+        return None if blocks is None or blocks.mean() > MOST_COVERED else blocks
+
+    def _rays_across(self, camera: Camera) -> int:
+        """As many as a pixel spans texels of the finest scale in the middle of the box, as far as `quality` and PIXELS_MARCHED allow.
+        One where space is mapped: there texels differ."""
+        if self.scene.mapping is not None:
+            return 1
+        finest = max(size - 1 for plane in SPACE_PLANES for size in self.scene.scales[-1][plane].shape[:2])
+        away = np.linalg.norm(self.scene.aabb.mean(0) - camera.camera_to_world[:3, 3])
+        spanned = away / min(camera.fl_x, camera.fl_y) / (self.scene.extent / finest)
+        room = math.isqrt(max(1, PIXELS_MARCHED // (camera.width * camera.height)))
+        return max(1, min(math.floor(spanned), self.quality.across, room))
 
     def _draw(
         self,

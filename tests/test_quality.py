@@ -28,7 +28,7 @@ def test_the_ladder_ends_at_what_the_format_says() -> None:
 
 
 @pytest.mark.parametrize("fault", [{"step": 0.5}, {"step": np.nan}, {"termination": 0.0}, {"termination": 1.0}, {"resolution": 0.0},
-                                   {"resolution": 1.5}, {"scales": 0}, {"tolerance": -0.1}, {"tolerance": np.nan}])  # fmt: skip
+                                   {"resolution": 1.5}, {"scales": 0}, {"across": 0}, {"tolerance": -0.1}, {"tolerance": np.nan}])  # fmt: skip
 def test_settings_that_draw_nothing_are_refused(fault: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(fault))):
         Quality(**fault)  # type: ignore[arg-type]
@@ -255,6 +255,42 @@ def test_steady_playback_makes_nothing_new() -> None:
     assert (renderer.memory_bytes, set(renderer._programs), set(renderer._targets)) == made
 
 
+# --- what is far away
+
+
+@pytest.mark.parametrize("compute", [False, True])
+def test_what_is_far_away_is_a_mean_of_rays(compute: bool) -> None:
+    ctx, scene = gl.context(), tiny_scene(4, resolution=(96, 80, 64))
+    if compute and ctx.version_code < COMPUTE_VERSION:
+        pytest.skip("this OpenGL has no compute shaders")
+    camera = look_at((24.0, 10.0, 22.0), (0.1, 0.05, 0.05), 32, 24, 70.0)
+    many = render(scene, camera.resized(32 * 12, 24 * 12), 0.62).rgb.reshape(24, 12, 32, 12, 3).mean((1, 3))
+    errors = {}
+    for across in (1, 2, 4):
+        renderer = Renderer(ctx, scene, Quality(across=across))
+        renderer.compute = compute
+        assert renderer._rays_across(camera) == across
+        errors[across] = np.abs(renderer.render(camera, 0.62).rgb - many).mean()
+    assert errors[4] < 0.5 * errors[2] < 0.5 * 0.7 * errors[1]
+
+
+def test_rays_a_pixel_follow_what_it_spans(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = tiny_scene(4, resolution=(33, 17, 17))
+    renderer, middle = Renderer(gl.context(), scene, Quality(across=4)), scene.aabb.mean(0)
+    texel = scene.extent / 32
+    for texels, across in ((0.5, 1), (1.9, 1), (2.1, 2), (3.1, 3), (50, 4)):
+        away = 100 * texels * texel  # a pixel is a hundredth of the distance
+        camera = look_at(tuple(middle + np.array([0, 0, away])), tuple(middle), 64, 48, 70.0)
+        camera = replace(camera, fl_x=100.0, fl_y=100.0)
+        assert renderer._rays_across(camera) == across
+    monkeypatch.setattr(module, "PIXELS_MARCHED", 64 * 48 * 5)
+    assert renderer._rays_across(camera) == 2
+    renderer.quality = Quality()
+    assert renderer._rays_across(camera) == 1
+    for space in ("contracted", "ndc"):
+        assert Renderer(gl.context(), SPACES[space](tiny_scene(4)), Quality(across=4))._rays_across(camera) == 1
+
+
 # --- shared look-ups, scales, extremes
 
 
@@ -297,7 +333,7 @@ def test_fog_of_any_density_against_float64(density: float, step: float) -> None
         samples = np.ceil((far[0] - near[0]) / step - 0.5)
         left = np.exp(-np.minimum(density, np.exp(20.0)) * step / size.max() * samples)
         for name in ("reference", "finer", "fine", "balanced"):
-            quality = LADDER[name]
+            quality = replace(LADDER[name], across=1)  # the ray in the middle of a pixel that sees more than the box
             got = Renderer(gl.context(), scene, quality).render(camera, 0.0).opacity[0, 0]
             error = 1e-6 + samples * 2.0**-22 + density * step / size.max() * left * 2
             expected = 1.0 if quality.termination > TERMINATION and left < quality.termination else 1 - left
