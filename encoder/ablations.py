@@ -27,6 +27,7 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "rows of time by the preset": lambda c: replace(c, time_tolerance=0.0),
     "nothing left out": lambda c: replace(c, prune_share=0.0),
     "no channel dropout": lambda c: replace(c, channel_dropout=0.0),
+    "all scales from the start": lambda c: replace(c, coarse_until=0.0),
     "finer scales left out at times": lambda c: replace(c, scale_dropout=PROGRESSIVE),
 }
 """What is changed, by name, the unchanged run first. Appearances act through what "one colour from all sides" leaves out. Runs with

@@ -55,17 +55,19 @@ class Trade:
         quality: from 1 to 100: pictures agree with those of the uncoded scene to `agreement_of` dB.
         lam: least D + lam R, with D the mean squared difference of colours from those of the uncoded scene, in squares of 8-bit
             levels, and R bits of the file per parameter of the model.
+        psnr_db: the smallest file of at least this PSNR on training views, dB; where the model itself has less, as without a trade.
     """
 
     max_loss_db: float | None = None
     target_bytes: int | None = None
     quality: float | None = None
     lam: float | None = None
+    psnr_db: float | None = None
 
     @property
     def bound(self) -> tuple[str, float]:
         """Which of them it is, and how much."""
-        for name in ("target_bytes", "quality", "lam", "max_loss_db"):
+        for name in ("target_bytes", "quality", "lam", "psnr_db", "max_loss_db"):
             if (value := getattr(self, name)) is not None:
                 return name, float(value)
         return "max_loss_db", DEFAULT_LOSS_DB
@@ -77,6 +79,8 @@ class Trade:
             return DEFAULT_LOSS_DB
         if name == "max_loss_db":
             return value
+        if name == "psnr_db":
+            return psnr - value if psnr > value else DEFAULT_LOSS_DB
         # Where D falls to a quarter with a bit more, as fine quantisation has it, its slope is -2 ln 2 D.
         error = error_of(value) if name == "quality" else value / (2 * math.log(2))
         return 10 * math.log10(1 + error / (255**2 * 10 ** (-psnr / 10)))
@@ -171,7 +175,7 @@ def compress(
         return found
     if name == "quality":
         return _farthest(finest, coarsest, attempt, lambda found: found.measured.error, error_of(value))
-    return _farthest(finest, coarsest, attempt, lambda found: uncoded_psnr - found.measured.psnr, value)
+    return _farthest(finest, coarsest, attempt, lambda found: uncoded_psnr - found.measured.psnr, trade.loss_db(uncoded_psnr))
 
 
 def _farthest(

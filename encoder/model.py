@@ -57,6 +57,7 @@ class Coded:
     Attributes:
         scene: what the file is to hold. data: that file.
         loss_db: PSNR that coding costs on the probe rays, all that was left out included.
+        psnr: of its pictures against what was filmed, dB.
         agreement_db: PSNR of its pictures against those of the model.
         pruned: what was left out; None if nothing was to be.
         spare_db: that could have been spent on it.
@@ -64,6 +65,7 @@ class Coded:
 
     scene: QuantisedScene
     data: bytes
+    psnr: float
     loss_db: float
     agreement_db: float
     pruned: Pruned | None
@@ -92,7 +94,7 @@ def code(model: Model, trade: Trade, prune_share: float, quantise: Quantise = qu
             scene, steps, coded = pruned.scene, pruned.of_each_plane(steps), None
     found = compress(scene, steps, measure, whole, trade, coded, quantise)
     measured: Measured = found.measured
-    return Coded(found.quantised, found.data, whole - measured.psnr, measured.agreement_db, pruned, spare)
+    return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, spare)
 
 
 def load(path: Path) -> Model:

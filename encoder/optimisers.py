@@ -38,19 +38,21 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
 
 
-def kept_channels(field: Field, config: TrainConfig, step: int) -> torch.Tensor:
-    """Factors on the features for one step, (F,) float32 on the CPU: 0 where `channel_dropout` leaves a channel out, at all scales alike,
-    or `scale_dropout` a scale and all finer ones.
+def kept_channels(field: Field, config: TrainConfig, step: int, fraction: float) -> torch.Tensor:
+    """Factors on the features for one step, at a fraction of the run, (F,) float32 on the CPU: 0 where `channel_dropout` leaves a
+    channel out, at all scales alike, `scale_dropout` a scale and all finer ones, or `coarse_until` all but the coarsest.
 
     Of channels the others carry the weight: its mean over steps is 1. Not so of scales: what is coarse is to be a picture by itself.
     """
     M, scales = field.layout.channels, len(field.layout.resolution)
     rng = np.random.default_rng((config.seed, step))
-    dropped = min(round(config.channel_dropout * M), M - 1)
+    dropped = min(round(config.channel_dropout * M), M - 1) if fraction < config.dropout_until else 0
     factors = np.full((scales, M), M / (M - dropped), np.float32)
     factors[:, rng.permutation(M)[:dropped]] = 0
     if scales > 1 and rng.random() < config.scale_dropout:
         factors[rng.integers(1, scales):] = 0
+    if fraction < config.coarse_until:
+        factors[1:] = 0
     return torch.from_numpy(factors.ravel())
 
 
@@ -77,26 +79,30 @@ class FusedOptimiser:
         return peaks
 
     def step(
-        self, number: int, rate: float, batch: Rays, targets: torch.Tensor,
+        self, number: int, fraction: float, rate: float, batch: Rays, targets: torch.Tensor,
         aabb: np.ndarray, occupancy: np.ndarray, step_length: float, extent: float,
     ) -> tuple[float, float]:
-        """Mean squared error a colour channel, and samples a ray."""
+        """Mean squared error a colour channel, and samples a ray, of step `number` at a fraction of the run, with learning rates times
+        `rate`."""
         layout, config = self.field.layout, self.config
         with self.watch("decoder"):
-            kept = kept_channels(self.field, config, number)
+            kept = kept_channels(self.field, config, number, fraction)
+            scales = int(kept.view(-1, layout.channels).any(1).sum())  # the finer ones take no part, nor any time
+            F = scales * layout.channels
+            kept = kept[:F]
             basis = self.field.b2[None]
             if config.view_dependent:
                 basis = self.field.basis(batch.directions, self.field.codes_of(batch.appearances))
-            basis = basis * kept
-            density = torch.cat([self.field.density.detach()[:-1] * kept, self.field.density.detach()[-1:]])
+            basis = (basis[..., :F] * kept).contiguous()
+            density = torch.cat([self.field.density.detach()[:F] * kept, self.field.density.detach()[-1:]])
             grad_basis = np.zeros((len(basis) if config.view_dependent else self.workers, *basis.shape[1:]), np.float32)
-            grad_density = np.zeros((self.workers, layout.features + 1), np.float32)
+            grad_density = np.zeros((self.workers, F + 1), np.float32)
             motion = motion_of(self.field)
             grad_motion = None if motion is None else np.zeros((self.workers, *motion.shape), np.float32)
             moving = motion is not None and number % config.motion_every == 0
         with self.watch("kernel"):
             errors, counts = kernels.backpropagate(
-                self.theta, self.grad, layout.table, layout.resolution, density.numpy(), grad_density,
+                self.theta, self.grad, layout.table[:scales], layout.resolution[:scales], density.numpy(), grad_density,
                 layout.channels, motion, grad_motion, moving, aabb, kernels.even_of(self.mapping), occupancy.view(np.uint8),
                 np.float32(step_length), np.float32(extent), batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(),
                 batch.jitters.numpy(), basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(),
@@ -108,8 +114,10 @@ class FusedOptimiser:
         with self.watch("decoder"):
             self.decoder.zero_grad()
             basis.backward(torch.from_numpy(grad_basis if config.view_dependent else grad_basis.sum(0, keepdims=True)))
-            self.field.density.grad = torch.from_numpy(grad_density.sum(0))
-            self.field.density.grad[:-1] *= kept
+            by_weight = torch.from_numpy(grad_density.sum(0))
+            self.field.density.grad = torch.zeros_like(self.field.density)
+            self.field.density.grad[:F] = by_weight[:-1] * kept
+            self.field.density.grad[-1] = by_weight[-1]
             if self.field.codes is not None:
                 _total(appearance_priors(self.field, config)).backward()
             if moving:
@@ -193,10 +201,10 @@ class PlainOptimiser:
         return peaks
 
     def step(
-        self, number: int, rate: float, batch: Rays, targets: torch.Tensor,
+        self, number: int, fraction: float, rate: float, batch: Rays, targets: torch.Tensor,
         aabb: np.ndarray, occupancy: np.ndarray, step_length: float, extent: float,
     ) -> tuple[float, float]:
-        """Mean squared error a colour channel, and samples a ray."""
+        """As `FusedOptimiser.step`."""
         config = self.config
         with self.watch("samples"):
             batch, targets = batch.apply(self._there), self._there(targets)
@@ -207,7 +215,7 @@ class PlainOptimiser:
                 box, cells = self._there(torch.from_numpy(aabb)), tuple(self._peaks.shape)
                 samples, edges, levels = self.proposals.sample(batch, box, self.mapping, cells, number, self.fused)
         with self.watch("forward"):
-            kept = self._there(kept_channels(self.field, config, number))
+            kept = self._there(kept_channels(self.field, config, number, fraction))
             met = meet(self.field, batch, samples, self.features, extent, kept)
             error = (shade(self.field, batch, met) - targets).square().mean()
             loss = error + config.distortion * met.distortion

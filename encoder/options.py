@@ -13,7 +13,7 @@ from kpc.encoder.datasets import Dataset
 from kpc.format import cli
 
 
-CODING = {"source", "output", "max_loss", "target_size", "quality", "lam", "json"}
+CODING = {"source", "output", "max_loss", "target_size", "quality", "lam", "psnr", "json"}
 """Options that mean something where nothing is trained."""
 
 
@@ -121,6 +121,8 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     trade.add_argument("--lam", type=_lam, metavar="LAM",
                        help="the file of least D + LAM R: D the mean squared difference from the uncoded pictures, in squares of "
                             "8-bit levels, R bits per parameter")
+    trade.add_argument("--psnr", type=cli.decibels, metavar="30dB",
+                       help="the smallest file that has at least this PSNR on training views: what is simple takes less")
     parser.add_argument("--dry-run", action="store_true",
                         help="only say what would be done, how long it would take and how much memory")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
@@ -131,7 +133,7 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
                 parser.error(f"--{name.replace('_', '-')}: {a.source} is trained already, it can only be coded anew; drop it")
     options = Options(a.source, a.output, a.preset, a.decoder, a.sampling, a.progressive, a.steps, a.time_budget, a.seed, a.device,
                       a.downscale, a.holdout, a.space, a.box, a.appearance, a.work, a.keep, a.resume, a.test_views,
-                      a.group, a.only, Trade(a.max_loss, a.target_size, a.quality, a.lam), a.keep_checkpoint)
+                      a.group, a.only, Trade(a.max_loss, a.target_size, a.quality, a.lam, a.psnr), a.keep_checkpoint)
     if a.only is not None and a.group is None:
         parser.error("--only names a group; say how long they are with --group 10s")
     if a.keep_checkpoint is not None and a.group is not None and a.only is None:

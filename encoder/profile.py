@@ -71,7 +71,7 @@ def _plain_step(trainer: Trainer, plain: PlainOptimiser, count: int) -> float:
     torch.set_num_threads(os.cpu_count() or 1)
     try:
         started = time.perf_counter()
-        plain.step(trainer.step, 1e-3, batch, targets, trainer.aabb, trainer.grid.marched, trainer.step_length, trainer.extent)
+        plain.step(trainer.step, 1.0, 1e-3, batch, targets, trainer.aabb, trainer.grid.marched, trainer.step_length, trainer.extent)
         return time.perf_counter() - started
     finally:
         torch.set_num_threads(threads)

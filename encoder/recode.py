@@ -29,8 +29,11 @@ def recode(options: Options) -> dict[str, Any]:
     started = time.monotonic()
     check_outputs(options)
     if model.begins_with(options.source, MAGIC) and not (clip := groups.Groups(options.source)).is_single:
+        _refuse_psnr(options)
         return _recode_groups(options, clip) | {"encode_s": time.monotonic() - started}
     source = model.load(options.source)
+    if source.coded is not None:
+        _refuse_psnr(options)
     coded = model.code(source, options.trade, TrainConfig().prune_share)
     size = file.save(coded.data, options.output)
     return {
@@ -38,6 +41,11 @@ def recode(options: Options) -> dict[str, Any]:
         **figures(coded, size, options.trade, JUDGED_BY[source.coded is not None]),
         "encode_s": time.monotonic() - started,
     }  # fmt: skip
+
+
+def _refuse_psnr(options: Options) -> None:
+    if options.trade.psnr_db is not None:
+        raise UsageError(f"--psnr: {options.source} does not know what was filmed; give its checkpoint, or --quality")
 
 
 def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
@@ -58,7 +66,7 @@ def together(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size
     """`figures` of a clip whose groups have those found: sums, and means over frames."""
     frames, parameters = [span.count for span in spans], sum(one["parameters"] for one in found)
     means = {}
-    for key in ("probe_loss_db", "agreement_db", "identity_share"):
+    for key in ("probe_psnr", "probe_loss_db", "agreement_db", "identity_share"):
         known = [(one[key], count) for one, count in zip(found, frames, strict=True) if one[key] is not None]
         means[key] = sum(value * count for value, count in known) / sum(count for _, count in known) if known else None
     name, value = trade.bound
@@ -73,7 +81,7 @@ def figures(coded: model.Coded, size: int, trade: Trade, judged_by: str) -> dict
     name, value = trade.bound
     return {
         "trade": name, "asked": value, "judged_by": judged_by,
-        "probe_loss_db": coded.loss_db, "agreement_db": coded.agreement_db,
+        "probe_psnr": coded.psnr, "probe_loss_db": coded.loss_db, "agreement_db": coded.agreement_db,
         "size_bytes": size, "parameters": coded.scene.parameter_count,
         "bits_per_parameter": 8 * size / coded.scene.parameter_count,
         "identity_share": coded.scene.identity_share if coded.scene.is_dynamic else None,
@@ -84,9 +92,10 @@ def reached(result: dict[str, Any]) -> str:
     """In words, what was asked for and what that gave."""
     name, asked = result["trade"], result["asked"]
     said = {"max_loss_db": f"at most {asked:g} dB of loss", "target_bytes": f"at most {asked:,.0f} bytes",
-            "quality": f"quality {asked:g}", "lam": f"lam {asked:g}"}[name]  # fmt: skip
+            "quality": f"quality {asked:g}", "lam": f"lam {asked:g}", "psnr_db": f"at least {asked:g} dB"}[name]  # fmt: skip
     lost = f"{result['probe_loss_db']:.3f} dB of loss on {result['judged_by']}"
-    return (f"asked for {said}; reached {result['size_bytes']:,} bytes, {lost}, "
+    at = f"{result['probe_psnr']:.2f} dB, " if name == "psnr_db" else ""
+    return (f"asked for {said}; reached {result['size_bytes']:,} bytes, {at}{lost}, "
             f"{result['agreement_db']:.1f} dB against the uncoded pictures")
 
 

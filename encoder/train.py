@@ -121,7 +121,7 @@ class Trainer:
                 batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays, weights)
             rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
             squared_error, samples = self.optimiser.step(
-                self.step, rate, batch, targets, self.aabb, self.grid.marched,
+                self.step, fraction, rate, batch, targets, self.aabb, self.grid.marched,
                 self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1), self.extent,
             )
             if not math.isfinite(squared_error):

@@ -131,7 +131,7 @@ def test_gradients_are_those_of_autograd_in_double_precision(way: str) -> None:
     field = Field.from_scene(scene)
     optimiser = (FusedOptimiser if way == "fused" else PlainOptimiser)(field, config, scene.occupancy.shape[1:])
     twin = copy.deepcopy(field).double()
-    optimiser.step(1, 0.0, rays, targets, scene.aabb, scene.occupancy, scene.step, scene.extent)  # at a rate of 0
+    optimiser.step(1, 0.0, 0.0, rays, targets, scene.aabb, scene.occupancy, scene.step, scene.extent)  # at a rate of 0
 
     floats = type(rays)(*(value.double() for name, value in vars(rays).items() if name != "appearances"), rays.appearances)
     rgb, distortion, *_ = render_reference(

@@ -41,6 +41,15 @@ def test_a_loss_is_met_from_below(most: float) -> None:
     assert 0.9 * most <= loss(coded(max_loss_db=most)) <= most
 
 
+@pytest.mark.parametrize("psnr", [27.0, 29.0, 29.9])
+def test_a_psnr_is_met_from_above(psnr: float) -> None:
+    assert psnr <= 30.0 - loss(coded(psnr_db=psnr)) <= psnr + 0.1 * (30.0 - psnr)
+
+
+def test_what_a_model_has_not_is_not_sought() -> None:
+    assert loss(coded(psnr_db=31.0)) == loss(coded()) == loss(coded(psnr_db=30.0))
+
+
 def test_without_a_word_the_loss_is_the_default() -> None:
     assert Trade().bound == ("max_loss_db", 0.15) and loss(coded()) == loss(coded(max_loss_db=0.15))
 
@@ -119,6 +128,7 @@ def test_a_file_is_never_made_finer_than_it_is() -> None:
 
 def test_what_a_trade_may_cost_in_decibels() -> None:
     assert Trade(max_loss_db=0.3).loss_db(30) == 0.3 and Trade(target_bytes=9).loss_db(30) == 0.15
+    assert Trade(psnr_db=28.5).loss_db(30) == 1.5 and Trade(psnr_db=31).loss_db(30) == 0.15
     as_much_again = 3 * (30 - 20)  # an error as large as the model's own
     assert Trade(quality=as_much_again).loss_db(30) == pytest.approx(10 * math.log10(2))
     assert Trade(lam=2 * math.log(2) * 255**2 * 1e-3).loss_db(30) == pytest.approx(10 * math.log10(2))

@@ -75,7 +75,7 @@ def saved(path: Path, scene: Scene) -> Path:
 # --- finished checkpoints
 
 
-@pytest.mark.parametrize("trade", [(), ("--max-loss", "1dB"), ("--quality", "60")])
+@pytest.mark.parametrize("trade", [(), ("--max-loss", "1dB"), ("--quality", "60"), ("--psnr", "9dB")])
 def test_a_checkpoint_gives_the_file_that_training_gave(
     tmp_path: Path, kpenc_says: Kpenc, monkeypatch: pytest.MonkeyPatch, trade: tuple[str, ...]
 ) -> None:
@@ -85,7 +85,7 @@ def test_a_checkpoint_gives_the_file_that_training_gave(
     trained = kpenc_says(tmp_path / "set", tmp_path / "out.kpc", "--preset", "draft", *keep, *trade)
     again = kpenc_says(tmp_path / "model.kpck", tmp_path / "again.kpc", *trade)
     assert (tmp_path / "out.kpc").read_bytes() == (tmp_path / "again.kpc").read_bytes()
-    said = ("trade", "asked", "judged_by", "probe_loss_db", "agreement_db", "size_bytes", "parameters", "identity_share")
+    said = ("trade", "asked", "judged_by", "probe_psnr", "probe_loss_db", "agreement_db", "size_bytes", "parameters", "identity_share")
     assert {key: trained[key] for key in said} == {key: again[key] for key in said}
     assert {p.name for p in tmp_path.iterdir()} == {"set", "out.kpc", "again.kpc", "model.kpck"}
 
@@ -198,6 +198,10 @@ def test_a_file_becomes_smaller(scene_file: Path, tmp_path: Path, kpenc_says: Kp
 def test_a_file_keeps_its_symbols_where_they_are_wanted(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
     kpenc_says(scene_file, tmp_path / "same.kpc", "--target-size", "1MB")
     assert (tmp_path / "same.kpc").read_bytes() == scene_file.read_bytes()
+
+
+def test_a_file_does_not_know_what_was_filmed(scene_file: Path, refused: Callable[..., str]) -> None:
+    assert "checkpoint" in refused(scene_file, "--psnr", "30dB", code=2)
 
 
 def test_the_ratio_of_steps_stays(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:

@@ -96,10 +96,10 @@ def test_a_step_on_a_gpu_waits_for_nothing(hybrid_decoder: bool) -> None:
     optimiser = PlainOptimiser(field, config, scene.occupancy.shape[1:])
     rays, targets = rays_at(scene, 203), torch.rand(203, 3)
     told = scene.aabb, scene.occupancy, scene.step, scene.extent
-    losses = [optimiser.step(k, 0.1, rays, targets, *told)[0] for k in range(Figures.LATE + 2)]
+    losses = [optimiser.step(k, 0.0, 0.1, rays, targets, *told)[0] for k in range(Figures.LATE + 2)]
     torch.cuda.set_sync_debug_mode("error")
     try:
-        losses += [optimiser.step(k, 0.1, rays, targets, *told)[0] for k in range(20)]
+        losses += [optimiser.step(k, 0.0, 0.1, rays, targets, *told)[0] for k in range(20)]
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert losses[-1] < losses[0]

@@ -442,7 +442,7 @@ def test_finer_scales_are_left_out_now_and_then(moving: Dataset) -> None:
     """Each step all, or the scales from any but the first on; what is left is as it was."""
     run = trainer(moving, resolutions=(8, 12, 16), scale_dropout=0.5)
     M = run.field.layout.channels
-    kept = torch.stack([kept_channels(run.field, run.config, step) for step in range(400)]).view(400, 3, M)
+    kept = torch.stack([kept_channels(run.field, run.config, step, 0.0) for step in range(400)]).view(400, 3, M)
     assert torch.equal(kept, kept[..., :1].expand_as(kept)) and set(kept.unique().tolist()) == {0.0, 1.0}
     left = kept[:, :, 0].sum(1)
     assert (kept[:, :-1] >= kept[:, 1:]).all() and set(left.tolist()) == {1.0, 2.0, 3.0}
@@ -463,19 +463,33 @@ def test_coarse_scales_make_a_picture_alone(moving: Dataset) -> None:
     assert coarse(0.2) > coarse(0.0) + 1
 
 
+def test_the_coarsest_scale_begins_alone_and_dropout_ends(moving: Dataset) -> None:
+    run = trainer(moving, resolutions=(8, 12, 16), channel_dropout=0.25, dropout_until=0.5, coarse_until=0.3)
+    M = run.field.layout.channels
+    for fraction, scales, channels in ((0.0, 1, M - M // 4), (0.29, 1, M - M // 4), (0.3, 3, M - M // 4), (0.5, 3, M), (1.0, 3, M)):
+        kept = kept_channels(run.field, run.config, 7, fraction).view(3, M)
+        assert kept.any(1).sum() == scales and kept[:scales].bool().sum() == scales * channels
+    before = run.field.theta.detach().clone()
+    batch, targets = run.sampler.draw(run.rng, 256)
+    run.optimiser.config = replace(run.config, regularise_every=1000)
+    run.optimiser.step(1, 0.1, 1.0, batch, targets, run.aabb, run.grid.marched, run.step_length, run.extent)
+    moved, finer = run.field.theta != before, int(run.field.layout.table[1].min())
+    assert moved[:finer].any() and not moved[finer:].any()
+
+
 def test_dropped_channels_take_no_part(moving: Dataset) -> None:
     """Every scale leaves out the same ones, each step others, and the mean over steps is 1."""
     run = trainer(moving, channel_dropout=0.25)
-    kept = torch.stack([kept_channels(run.field, run.config, step) for step in range(400)])
+    kept = torch.stack([kept_channels(run.field, run.config, step, 0.0) for step in range(400)])
     M = run.field.layout.channels
     assert kept.shape == (400, 2 * M) and torch.equal(kept[:, :M], kept[:, M:])
     assert ((kept == 0).sum(1) == 2 * M // 4).all() and len(torch.unique(kept, dim=0)) > 10
     torch.testing.assert_close(kept.mean(0), torch.ones(2 * M), atol=0.15, rtol=0)
-    assert torch.equal(kept_channels(run.field, CONFIG, 3), torch.ones(2 * M))
+    assert torch.equal(kept_channels(run.field, CONFIG, 3, 0.0), torch.ones(2 * M))
     before = run.field.theta.detach().clone()
     batch, targets = run.sampler.draw(run.rng, 256)
     run.optimiser.field, run.optimiser.config = run.field, replace(run.config, regularise_every=1000)
-    run.optimiser.step(1, 1.0, batch, targets, run.aabb, run.grid.marched, run.step_length, run.extent)
+    run.optimiser.step(1, 0.0, 1.0, batch, targets, run.aabb, run.grid.marched, run.step_length, run.extent)
     moved = (run.field.theta != before).view(-1, M).any(0)
     assert torch.equal(moved, kept[1, :M] != 0)
 
@@ -500,16 +514,18 @@ def plain_twin(fused: Trainer) -> PlainOptimiser:
     ("channel_dropout", "view_dependent", "motion_cells", "appearance"),
     [(0.0, True, 0, "none"), (0.5, True, 0, "none"), (0.5, False, 0, "none"), (0.0, True, 3, "none"), (0.5, True, 0, "image")],
 )
+@pytest.mark.parametrize("coarse_until", [0.0, 0.5])
 def test_plain_pytorch_takes_the_same_steps(
-    moving: Dataset, channel_dropout: float, view_dependent: bool, motion_cells: int, appearance: str, mapping: Contraction | None
+    moving: Dataset, channel_dropout: float, view_dependent: bool, motion_cells: int, appearance: str, mapping: Contraction | None,
+    coarse_until: float,
 ) -> None:
     """Adam moves by the sign of a gradient at first; where that is all rounding, either way."""
     run = trainer(moving, mapping, channel_dropout=channel_dropout, view_dependent=view_dependent, motion_cells=motion_cells,
-                  appearance=appearance)
+                  appearance=appearance, coarse_until=coarse_until)
     plain = plain_twin(run)
     for number in range(3):
         batch, targets = run.sampler.draw(run.rng, 256)
-        args = (number, 0.1, batch, targets, run.aabb, run.grid.marched, run.step_length, run.extent)
+        args = (number, 0.0, 0.1, batch, targets, run.aabb, run.grid.marched, run.step_length, run.extent)
         (ours, samples), (theirs, their_samples) = run.optimiser.step(*args), plain.step(*args)
         # Samples below 1e-4 go without colour in the kernels, 83 a ray at most; and what the steps before have left.
         assert ours == pytest.approx(theirs, rel=0.02) and samples == pytest.approx(their_samples, rel=0.01)
