@@ -48,7 +48,7 @@ def tiny_file(path: Path, dynamic: bool) -> Path:
 def test_encode_records_every_repeat(here: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_n3dv(tmp_path / "tiny", frames=2)
     command = ["encode", str(tmp_path / "tiny"), "--preset", "draft", "--steps", "3", "--repeats", "2", "--seed", "5",
-               "--test-views", "1", "--box=-1,-1,-1,1,1,1", "--keep-scenes", str(tmp_path / "kept")]  # fmt: skip
+               "--test-views", "1", "--box=-1,-1,-1,1,1,1", "--keep-scenes", str(tmp_path / "kept"), "--psnr", "3dB"]  # fmt: skip
     assert kpbench.main(command) == 0
     said = capsys.readouterr()
     (record,) = json.loads(said.out)
@@ -56,7 +56,8 @@ def test_encode_records_every_repeat(here: None, tmp_path: Path, capsys: pytest.
     assert record["command"] == shlex.join(["kpbench", *command]) and record["seed"] == 5
     assert record["data_sha256"] == data_hash(tmp_path / "tiny")
     assert record["settings"] == {"preset": "draft", "steps": 3, "time_budget_s": None, "downscale": 1, "test_views": 1,
-                                  "space": "auto", "box": [-1, -1, -1, 1, 1, 1]}  # fmt: skip
+                                  "space": "auto", "box": [-1, -1, -1, 1, 1, 1], "psnr_db": 3.0}  # fmt: skip
+    assert all(run["trade"] == "psnr_db" for run in record["repeats"]) and "--psnr 3" in results.markdown([record])
     assert [run["seed"] for run in record["repeats"]] == [5, 6]
     for run in record["repeats"]:
         kept = tmp_path / "kept" / run["file"]

@@ -152,6 +152,7 @@ def _encodes(
                 "downscale": options.downscale,
                 "space": options.space,
                 "box": options.box,
+                "psnr_db": options.psnr,
                 "test_views": options.test_views,
             }
             record = _record(kind, _folder(source), origin, settings) | {"seed": options.seed, "repeats": []}
@@ -232,7 +233,7 @@ def _folder(source: Path) -> Path:
 
 def _job(options: argparse.Namespace, source: Path, seed: int, output: Path, work: Path) -> Any:
     """kpenc.Options of what all kinds that train have in common."""
-    return _encoder().Options(
+    job = _encoder().Options(
         source=source,
         output=output,
         preset=options.preset,
@@ -243,6 +244,7 @@ def _job(options: argparse.Namespace, source: Path, seed: int, output: Path, wor
         box=options.box,
         work=work,
     )
+    return replace(job, trade=replace(job.trade, psnr_db=options.psnr))
 
 
 def _ablations(job: Any) -> list[str]:
@@ -512,6 +514,8 @@ def _parser() -> argparse.ArgumentParser:
         kind.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
         kind.add_argument("--space", choices=("auto", "box", "contracted", "ndc"), default="auto", help="of every dataset")
         kind.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
+        kind.set_defaults(psnr=None)
+    encode.add_argument("--psnr", type=cli.decibels, metavar="30dB", help="the smallest files of at least this PSNR on training views")
     for kind in (encode, curve, ablate, groups):
         kind.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
         kind.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")

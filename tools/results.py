@@ -117,9 +117,16 @@ def _quality_table(records: Iterable[Record]) -> list[list[str]]:
     return [["scene", *qualities]] + [[name, *(cell(points.get(quality)) for quality in qualities)] for name, points in rows]
 
 
+
+def _preset(record: Record) -> str:
+    """And what the file was to have, if that was said."""
+    psnr = record["settings"].get("psnr_db")
+    return str(record["settings"]["preset"]) + ("" if psnr is None else f", --psnr {psnr:g}")
+
+
 _ENCODED: list[Column] = [
     ("dataset", lambda r: r["name"]),
-    ("preset", lambda r: r["settings"]["preset"]),
+    ("preset", _preset),
     ("PSNR dB", _number("test_psnr", "{:.2f}")),
     ("SSIM", _number("test_ssim", "{:.3f}")),
     ("file KB", _number("size_bytes", "{:.0f}", 1e3)),
