@@ -63,7 +63,8 @@ def test_encode_records_every_repeat(here: None, tmp_path: Path, capsys: pytest.
         kept = tmp_path / "kept" / run["file"]
         assert run["size_bytes"] == kept.stat().st_size and kpc.load(kept).is_dynamic
         assert run["test_pictures"] == 1 and run["test_psnr"] > 3 and run["peak_memory_bytes"] > 1 << 26
-    assert sorted(p.name for p in (tmp_path / "kept").iterdir()) == ["tiny-draft-5.kpc", "tiny-draft-6.kpc"]
+    names = [f"tiny-draft-{seed}.{kind}" for seed in (5, 6) for kind in ("kpc", "kpck")]
+    assert sorted(p.name for p in (tmp_path / "kept").iterdir()) == names
     assert "PSNR dB" in said.err and results.markdown([record])
 
 

@@ -165,6 +165,7 @@ def _encodes(
                     _job(options, source, seed, kept / f"{label}{suffix}.kpc", work),
                     steps=options.steps,
                     most_tests=options.test_views,
+                    keep_checkpoint=kept / f"{label}{suffix}.kpck" if options.keep_scenes else None,
                     **changes,
                 )
                 said = ", ".join(f"{key} {value}" for key, value in changes.items() if value is not None)
@@ -519,7 +520,7 @@ def _parser() -> argparse.ArgumentParser:
     for kind in (encode, curve, ablate, groups):
         kind.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
         kind.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
-        kind.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there")
+        kind.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there, and what `codec` takes, .kpck")
 
     player = kinds.add_parser("player", help="draw each scene, headless", description="Draw each scene, headless.")
     player.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
