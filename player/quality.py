@@ -5,6 +5,13 @@
     climbed(name, +1)   the name of the next finer one
 
 A `Renderer` takes a Quality when it is made, and another whenever its `quality` is set: no scene is uploaded again.
+
+Measured and left out, for a processor that draws gains nothing from them (room, `fast`, 320x240):
+
+* Density from half of the channels, and the others looked up where a sample weighs more than 1 / 256 of its pixel. The scene is worth
+  0.03 dB less (soldier, a quarter of the channels: 0.2), but a picture takes 0.95 of the time where all that neighbours may need is
+  done for each, and 1.15 where they wait for each other at the samples that matter.
+* Planes of bytes with a factor for each layer: filtered look-ups of RGBA8 textures are made at 0.8 to 0.9 of the rate of float32 ones.
 """
 
 import math

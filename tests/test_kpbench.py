@@ -99,7 +99,7 @@ def test_curve_encodes_anew_for_each_time(here: None, tmp_path: Path, capsys: py
         assert run["train_s"] >= record["settings"]["time_budget_s"] and run["steps"] > 0
         assert run["test_psnr"] > 3 and -1 < run["test_ssim"] <= 1
         assert run["size_bytes"] == (tmp_path / "kept" / run["file"]).stat().st_size
-    assert len(list((tmp_path / "kept").iterdir())) == 2
+    assert len(list((tmp_path / "kept").glob("*.kpc"))) == 2
     assert records[0]["repeats"][0]["steps"] < records[1]["repeats"][0]["steps"]
     assert said.out == "" and "training" in said.err and "against time" in results.markdown(records)
     assert plot.main([str(out), "-o", str(tmp_path / "curve.svg")]) == 0
