@@ -1,7 +1,7 @@
 """What an encode will take, from its first steps: `kpenc --dry-run`."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,7 +9,9 @@ from kpc.encoder.compress import PROBES
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.prune import renderings
 from kpc.encoder.train import Trainer
+from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format.memory import peak_memory_bytes
+from kpc.format.scene import Scene
 
 STEPS = 6
 """Steps watched, in multiples of the first with an occupancy grid: by then a step takes what it takes to the end."""
@@ -40,18 +42,38 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
     """
     config = trainer.config
     watched = min(config.steps, STEPS * config.occupancy_start)
-    ticks: list[float] = []
-    trainer.run_to(watched, lambda: ticks.append(trainer.elapsed_s))
-    half = len(ticks) // 2
-    a_step = (trainer.elapsed_s - ticks[half]) / max(1, len(ticks) - 1 - half)
-    train_s = time_budget_s or trainer.elapsed_s + a_step * (config.steps - trainer.step)
+    a_step = _seconds_a_step(trainer, watched)
+    coarse_steps, coarse_s = 0.0, 0.0
+    if config.coarse_until > 0 and trainer.step < config.steps:
+        coarse_steps = max(0.0, config.coarse_until * config.steps - trainer.step)
+        coarse_s = coarse_steps * a_step
+        trainer.optimiser.config = replace(config, coarse_until=0.0)
+        a_step = _seconds_a_step(trainer, min(config.steps, 2 * watched))
+    train_s = time_budget_s or trainer.elapsed_s + coarse_s + a_step * max(0.0, config.steps - trainer.step - coarse_steps)
 
     pixels = trainer.dataset.pictures.width.astype(np.int64) * trainer.dataset.pictures.height
     probes = PROBES + (renderings(trainer.field.layout.features) if config.prunes else 0)
     rendered = (probes + 1) * probe_rays + 2 * tested * float(pixels.mean())
     fits_s = 2 * tested * _seconds_a_fit(trainer) if trainer.names and tested else 0.0
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()
-    return Estimate(train_s, spent_s + rendered * _seconds_a_ray(trainer) + fits_s, memory)
+    coding_s = PROBES * _seconds_a_coding(trainer.scene())
+    return Estimate(train_s, spent_s + rendered * _seconds_a_ray(trainer) + coding_s + fits_s, memory)
+
+
+def _seconds_a_step(trainer: Trainer, to: int) -> float:
+    """Of a run, on the second half of its way to a step."""
+    ticks: list[float] = []
+    trainer.run_to(to, lambda: ticks.append(trainer.elapsed_s))
+    half = len(ticks) // 2
+    return (trainer.elapsed_s - ticks[half]) / max(1, len(ticks) - 1 - half)
+
+
+def _seconds_a_coding(scene: Scene) -> float:
+    """Choosing its symbols once."""
+    steps = [{name: np.full(plane.shape[-1], 2.0**-6) for name, plane in scale.items()} for scale in scene.scales]
+    started = time.perf_counter()
+    quantise_on_trellis(scene, steps)
+    return time.perf_counter() - started
 
 
 def _seconds_a_fit(trainer: Trainer) -> float:

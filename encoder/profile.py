@@ -4,6 +4,7 @@ import copy
 import os
 import statistics
 import time
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -30,6 +31,7 @@ def profile(trainer: Trainer) -> dict[str, Any]:
     config = trainer.config
     if config.steps < STEPS * config.occupancy_start + ROUNDS * FUSED_STEPS:
         raise ValueError(f"{config.steps} steps are too few to profile one")
+    trainer.optimiser.config = replace(config, coarse_until=0.0)  # as in most of the run
     trainer.run_to(STEPS * config.occupancy_start)
     plain = PlainOptimiser(copy.deepcopy(trainer.field), config, trainer.grid.seen.shape, trainer.mapping)
     fused_s, plain_s, parts, samples, rays = [], [], [], [], 0

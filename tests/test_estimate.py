@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import datasets as make
@@ -40,6 +41,24 @@ def test_it_extrapolates_from_the_steps_it_watched(moving: Dataset, monkeypatch:
     assert run.step == watched
     assert found.train_s == pytest.approx(5 + 3 * watched // 2 + 1.0 * (CONFIG.steps - watched // 2), abs=3)
     assert 2 < found.rest_s < 60 and found.memory_bytes > 16 * run.field.theta.numel()
+
+
+def test_steps_with_the_coarsest_scale_alone_are_counted_apart(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the same clock: 1 s a step while it is alone, 4 s with all."""
+    run = Trainer(moving, replace(CONFIG, coarse_until=0.3), BOX, "cpu")
+    watched = module.STEPS * CONFIG.occupancy_start
+    inner = run.run
+
+    def slow(*args: object, interrupted: Callable[[], bool]) -> None:
+        def ticking() -> bool:
+            run.elapsed_s = sum(1.0 if k < watched else 4.0 for k in range(run.step))
+            return interrupted()
+
+        inner(*args, interrupted=ticking)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(run, "run", slow)
+    found = module.estimate(run, probe_rays=100, tested=0, spent_s=0.0, time_budget_s=None)
+    assert run.step > watched and found.train_s == pytest.approx(0.3 * 400 * 1.0 + 0.7 * 400 * 4.0, rel=0.03)
 
 
 def test_a_time_budget_is_the_time(moving: Dataset) -> None:
