@@ -139,6 +139,14 @@ def room_on(ctx: moderngl.Context, what: str) -> Iterator[None]:
         ) from error
 
 
+def _bounds(blocks: np.ndarray) -> tuple[int, int, int, int]:
+    """(left, bottom, width, height) of the least rectangle that holds all that is set."""
+    rows, columns = np.flatnonzero(blocks.any(1)), np.flatnonzero(blocks.any(0))
+    if not len(rows):
+        return 0, 0, 0, 0
+    return int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)
+
+
 def is_software(ctx: moderngl.Context) -> bool:
     """Whether a processor stands in for a graphics card."""
     return any(word in ctx.info["GL_RENDERER"].lower() for word in SOFTWARE)
@@ -335,7 +343,9 @@ class Renderer:
         code = code_of(scene, appearance)
         stride = scene.step * quality.step
 
-        def draw(target: Target, pixels: int = ALL, points: int = 0, **more: object) -> None:
+        def draw(
+            target: Target, pixels: int = ALL, points: int = 0, within: tuple[int, int, int, int] | None = None, **more: object
+        ) -> None:
             march, vertices = self._program(
                 program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels,
                 compute=self.compute and program == "march.glsl",
@@ -360,15 +370,14 @@ class Renderer:
                 march.run(*(-(-side // GROUP) for side in target.seen.size))
                 self.ctx.memory_barrier()
             else:
-                self._draw(target.framebuffer, vertices, points=points)
+                self._draw(target.framebuffer, vertices, points=points, within=within)
 
         def draw_whole(target: Target) -> None:
             blocks = self._covered(camera) if program == "march.glsl" else None
             if blocks is None:
                 draw(target)
                 return
-            nothing, vertices = self._program("nothing.glsl", self.layout)
-            self._draw(target.framebuffer, vertices)
+            self._empty(target)
             covered = self._target(part, blocks.shape[::-1], DOUBTS)
             covered.seen.write(np.repeat(blocks[..., None], 4, axis=-1).astype(np.float32))
             covered.seen.use(DOUBTS_UNIT)
@@ -415,7 +424,11 @@ class Renderer:
         blocks = tuple(-(-side // BLOCK) for side in size)
         probes, doubts = self._target(part, blocks, PROBES), self._target(part, blocks, DOUBTS)
         common = {"size": tuple(map(float, size)), "turn": shot.turn, "seen_probes": SEEN_PROBES_UNIT, "met_probes": MET_PROBES_UNIT}
-        draw(probes, ONLY_PROBES, **common)
+        if (covered := self._covered(shot.camera)) is None:
+            draw(probes, ONLY_PROBES, **common)
+        else:
+            self._empty(probes)
+            draw(probes, ONLY_PROBES, within=_bounds(covered), **common)
         probes.seen.use(SEEN_PROBES_UNIT)
         probes.met.use(MET_PROBES_UNIT)
         picture.seen.use(SEEN_UNIT)
@@ -465,6 +478,11 @@ class Renderer:
         self._draw(target.framebuffer, vertices)
         return target
 
+    def _empty(self, target: Target) -> None:
+        """Draw what rays see that meet nothing."""
+        nothing, vertices = self._program("nothing.glsl", self.layout)
+        self._draw(target.framebuffer, vertices)
+
     def _covered(self, camera: Camera) -> np.ndarray | None:
         """`Cover.blocks` of what is occupied now, where drawing only those is quicker: by a processor, and of less than MOST_COVERED."""
         if not self._is_software or self.scene.mapping is not None or self._slot is None:
@@ -492,14 +510,17 @@ class Renderer:
         viewport: tuple[int, int, int, int] | None = None,
         over: bool = False,
         points: int = 0,
+        within: tuple[int, int, int, int] | None = None,
     ) -> None:
-        """All over a viewport, or so many points; `over` what is there, by alpha."""
+        """All over a viewport, or so many points; `over` what is there, by alpha; `within` a rectangle of pixels (left, bottom, width,
+        height) alone."""
         self.ctx.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         if over:
             self.ctx.enable(moderngl.BLEND)
             self.ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
         framebuffer.use()
         framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
+        framebuffer.scissor = within
         self.ctx.enable(moderngl.PROGRAM_POINT_SIZE)
         vertices.render(moderngl.POINTS if points else moderngl.TRIANGLES, vertices=points or 3)
 

@@ -80,7 +80,7 @@ def test_pictures_are_the_same(kind: str, camera: str) -> None:
         for covered in (True, False):
             renderer = Renderer(gl.context(), scene, LADDER[name])
             renderer._is_software = covered
-            pictures.append([renderer.render(view, time) for time in (0.3, 0.7, 0.7)])
+            pictures.append([renderer.render(view, time) for time in (0.3, 0.31, 0.32, 0.7, 0.7)])
         for one, other in zip(*pictures, strict=True):
             for field in ("rgb", "opacity", "samples", "depth"):
                 np.testing.assert_array_equal(getattr(one, field), getattr(other, field), f"{name} {field}")
