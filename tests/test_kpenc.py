@@ -117,7 +117,7 @@ def fails(
     "name, layout, dynamic, steps",
     [
         ("n3dv", "N3DV", True, 24),
-        ("blender", "Blender", True, 48),
+        ("blender", "Blender", True, 72),
         ("nerfstudio", "nerfstudio", False, 24),
         ("colmap", "COLMAP", False, 24),
     ],
@@ -165,7 +165,7 @@ def test_what_is_printed(run: Kpenc, sets: Path) -> None:
             "bits per parameter",
             "exactly at identity: ",
             "encoded in ",
-            "48 steps",
+            "72 steps",
         )
     )
 
