@@ -373,6 +373,8 @@ def _trainer(options: Options, setting: Setting) -> Trainer:
     config, in_time = fitted_in_time(options.config(dataset), dataset)
     if dataset.is_dynamic:
         _say(_rows_in_time(config, dataset, in_time))
+    if setting.before is not None:
+        config = replace(config, coarse_until=0.0)  # there is more than a coarse scale to begin with
     resumes, survey_s = options.resume and checkpoint.exists(), 0.0
     if not setting.is_final:
         if resumes:

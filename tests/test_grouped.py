@@ -107,6 +107,16 @@ def test_a_field_begins_as_the_last_row_of_another():
     assert later.theta.requires_grad and later.theta.is_leaf
 
 
+def test_what_goes_on_begins_with_all_scales(tmp_path):
+    make.write_blender(tmp_path / "set")
+    options = Options(tmp_path / "set", tmp_path / "out.kpc", preset="draft", box=((-1, -1, -1), (1, 1, 1)))
+    setting = kpenc._setting(options)
+    first = kpenc._trainer(options, setting)
+    later = kpenc._trainer(options, replace(setting, before=first.scene()))
+    assert first.config.coarse_until > 0 and later.config == replace(first.config, coarse_until=0.0)
+    assert torch.equal(later.field.density, first.field.density)
+
+
 def test_frames_of_a_clip_as_a_clip_of_their_own(clip):
     some = clip.between(7, 19)
     assert some.clip == Clip(13, clip.clip.fps) and len(some.pictures) == 3 * 13 and some.is_dynamic
