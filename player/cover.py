@@ -58,7 +58,7 @@ class Cover:
         corners = np.zeros((rows + 1, columns + 1), int)
         for row, column, sign in ((bottom, left, 1), (bottom, right, -1), (top, left, -1), (top, right, 1)):
             np.add.at(corners, (row, column), sign)
-        return corners.cumsum(0).cumsum(1)[:-1, :-1] > 0
+        return np.asarray(corners.cumsum(0).cumsum(1)[:-1, :-1] > 0)
 
 
 def _halved(occupied: np.ndarray) -> np.ndarray:
