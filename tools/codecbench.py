@@ -35,6 +35,7 @@ from kpc.format.errors import KpcError, TrainingError
 from kpc.format.quantise import quantise_scene
 from kpc.format.scene import Scene
 from kpc.tools import rivals
+from kpc.tools.children import end_with_parent
 from kpc.tools.provenance import machine
 
 RATES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0)
@@ -148,6 +149,8 @@ _views: Probe | None = None
 def _judge_by(views: Probe | None) -> None:
     global _views
     _views = views
+    if multiprocessing.parent_process() is not None:
+        end_with_parent()
 
 
 @lru_cache(1)

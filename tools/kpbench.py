@@ -42,6 +42,7 @@ from kpc.format.fidelity import psnr
 from kpc.format.memory import peak_memory_bytes
 from kpc.player.quality import DEFAULT, LADDER
 from kpc.tools import results
+from kpc.tools.children import end_with_parent
 from kpc.tools.provenance import commit, data_hash, machine, versions
 
 T = TypeVar("T")
@@ -468,7 +469,7 @@ def _entropy(options: argparse.Namespace, origin: results.Record) -> Iterator[re
 
 def _alone(function: Callable[[Any], T], job: Any) -> T:
     """`function(job)` in a fresh process."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=end_with_parent) as pool:
         try:
             return pool.submit(function, job).result()
         except BrokenProcessPool as error:

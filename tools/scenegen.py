@@ -31,6 +31,7 @@ from kpc.format.cameras import Camera
 from kpc.format.errors import UsageError
 from kpc.format.media import srgb_from_linear, write_image, write_video
 from kpc.format.progress import progress
+from kpc.tools.children import end_with_parent
 
 Distance = Callable[[np.ndarray], np.ndarray]
 """Distance from points (3, N) to the nearest surface, (N,), or a lower bound of it."""
@@ -685,7 +686,7 @@ def generate(target: str | os.PathLike[str], options: Options) -> None:
         (camera, options, folder, f"cam{k:02d}", times, stills if k == 0 else []) for k, camera in enumerate(filmed)
     ]
     jobs += [(camera, options, folder, f"novel{k:02d}", [], stills[1:-1] or stills) for k, camera in enumerate(extra)]
-    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(jobs)), multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(jobs)), multiprocessing.get_context("spawn"), end_with_parent) as pool:
         depths = list(progress(pool.map(_film, jobs), "filming", len(jobs), "camera"))
     rows = [_poses_bounds(camera, *bounds) for camera, bounds in zip(filmed, depths)]
     with cli.written_aside(folder / "poses_bounds.npy") as aside:
