@@ -255,6 +255,24 @@ def test_steady_playback_makes_nothing_new() -> None:
     assert (renderer.memory_bytes, set(renderer._programs), set(renderer._targets)) == made
 
 
+@pytest.mark.parametrize("software", [True, False])
+def test_where_all_is_in_doubt_pictures_are_whole_for_a_while(monkeypatch: pytest.MonkeyPatch, software: bool) -> None:
+    monkeypatch.setattr(module, "MOST_DOUBTED", -1.0)
+    renderer = Renderer(gl.context(), tiny_scene(4), LADDER["balanced"])
+    whole = Renderer(gl.context(), tiny_scene(4), replace(LADDER["balanced"], tolerance=0.0))
+    renderer._is_software = whole._is_software = software
+    turns = []
+    for k in range(2 + 2 * (module.WHOLE_FOR + 1)):
+        time = 0.2 + 0.01 * k
+        got, wanted = renderer.render(CAMERA, time), whole.render(CAMERA, time)
+        (shot,) = renderer._shots.values()
+        turns.append(shot.turn)
+        if shot.turn == 0:
+            np.testing.assert_array_equal(got.rgb, wanted.rgb)
+    assert (turns == [0, *([1] + module.WHOLE_FOR * [0]) * 2, 1]) == software
+    assert software or turns == list(range(len(turns)))
+
+
 # --- what is far away
 
 
