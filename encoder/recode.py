@@ -28,24 +28,19 @@ def recode(options: Options) -> dict[str, Any]:
     """
     started = time.monotonic()
     check_outputs(options)
-    if model.begins_with(options.source, MAGIC) and not (clip := groups.Groups(options.source)).is_single:
-        _refuse_psnr(options)
+    is_coded = model.begins_with(options.source, MAGIC)
+    if is_coded and options.trade.psnr_db is not None:
+        raise UsageError(f"--psnr: {options.source} does not know what was filmed; give its checkpoint, or --quality")
+    if is_coded and not (clip := groups.Groups(options.source)).is_single:
         return _recode_groups(options, clip) | {"encode_s": time.monotonic() - started}
     source = model.load(options.source)
-    if source.coded is not None:
-        _refuse_psnr(options)
     coded = model.code(source, options.trade, TrainConfig().prune_share)
     size = file.save(coded.data, options.output)
     return {
         "file": str(options.output), "source": str(options.source),
-        **figures(coded, size, options.trade, JUDGED_BY[source.coded is not None]),
+        **figures(coded, size, options.trade, JUDGED_BY[is_coded]),
         "encode_s": time.monotonic() - started,
     }  # fmt: skip
-
-
-def _refuse_psnr(options: Options) -> None:
-    if options.trade.psnr_db is not None:
-        raise UsageError(f"--psnr: {options.source} does not know what was filmed; give its checkpoint, or --quality")
 
 
 def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:

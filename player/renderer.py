@@ -71,7 +71,8 @@ class Look(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A picture that others may follow: what it shows, how finely, the turn of its probes, and which target holds it."""
+    """A picture that others may follow: what it shows, how finely, the turn of its probes, which target holds it, and how many after it
+    are to be marched whole."""
 
     camera: Camera
     time: float
@@ -79,6 +80,7 @@ class Shot:
     quality: Quality
     turn: int = 0
     number: int = PICTURE
+    whole: int = 0
 
 
 @dataclass
@@ -140,6 +142,11 @@ def room_on(ctx: moderngl.Context, what: str) -> Iterator[None]:
         raise DisplayError(
             f"{name} has no room for {what} ({error}); close other programs or use a smaller size"
         ) from error
+
+
+def _texels_across(scale: Mapping[str, np.ndarray]) -> int:
+    """Along the longest edge of the box, from the first one's middle to the last one's."""
+    return max(size - 1 for plane in SPACE_PLANES for size in scale[plane].shape[:2])
 
 
 def _bounds(blocks: np.ndarray) -> tuple[int, int, int, int]:
@@ -204,8 +211,6 @@ class Renderer:
         self._decoder = shader.constants(weights)
         self._shots: dict[tuple[Part, tuple[int, int]], Shot] = {}
         """Of each part and size, the last picture if the next may follow it."""
-        self._whole_for: dict[tuple[Part, tuple[int, int]], int] = {}
-        """Of each part and size, how many pictures are still to be marched whole."""
         self._rows_time: float | None = None
         self._motion_time: float | None = None
         self._folded_time: float | None = None
@@ -416,10 +421,8 @@ class Renderer:
     def _followed(self, draw: Callable[..., None], draw_whole: Callable[[Target], None], part: Part, before: Shot | None, shot: Shot) -> Target:
         """Draw what the picture before does not tell: its probes, and the blocks in which they are not as predicted."""
         size = shot.camera.width, shot.camera.height
-        left = self._whole_for.get((part, size), 0)
-        if before is None or left or not self._follows(shot, before):
-            self._whole_for[part, size] = max(left - 1, 0)
-            self._shots[part, size] = shot
+        if before is None or before.whole or not self._follows(shot, before):
+            self._shots[part, size] = replace(shot, whole=max(before.whole - 1, 0) if before else 0)
             draw_whole(picture := self._target(part, size))
             return picture
         shot = replace(shot, turn=before.turn + 1, number=before.number)
@@ -445,7 +448,7 @@ class Renderer:
         if self._is_software:  # a graphics card would have to be waited for
             doubted = np.frombuffer(doubts.seen.read(), np.float32).sum() / 4  # four channels alike
             seen = math.prod(blocks) if covered is None else np.count_nonzero(covered)
-            self._whole_for[part, size] = WHOLE_FOR if doubted > MOST_DOUBTED * seen else 0
+            shot = replace(shot, whole=WHOLE_FOR if doubted > MOST_DOUBTED * seen else 0)
         settle, vertices = self._program("settle.glsl", self.layout)
         _set(settle, **common)
         self._draw(picture.framebuffer, vertices, points=math.prod(blocks))
@@ -473,8 +476,7 @@ class Renderer:
     def _scales_shared(self) -> int:
         """How many scales, from the coarsest on, have texels that are long enough for two samples to share a look-up."""
         step = self.quality.step * self.scene.step / self.scene.extent
-        finest = [max(size - 1 for plane in SPACE_PLANES for size in scale[plane].shape[:2]) for scale in self.scene.scales]
-        return sum(1 / texels >= self.quality.share * step for texels in finest)
+        return sum(1 / _texels_across(scale) >= self.quality.share * step for scale in self.scene.scales)
 
     def _resampled(self, marched: Target, target: Target, across: int) -> Target:
         """A picture of one size in another: the mean of `across` rays across a pixel, or stretched."""
@@ -508,9 +510,8 @@ class Renderer:
         One where space is mapped: there texels differ."""
         if self.scene.mapping is not None:
             return 1
-        finest = max(size - 1 for plane in SPACE_PLANES for size in self.scene.scales[-1][plane].shape[:2])
         away = np.linalg.norm(self.scene.aabb.mean(0) - camera.camera_to_world[:3, 3])
-        spanned = away / min(camera.fl_x, camera.fl_y) / (self.scene.extent / finest)
+        spanned = away / min(camera.fl_x, camera.fl_y) / (self.scene.extent / _texels_across(self.scene.scales[-1]))
         room = math.isqrt(max(1, PIXELS_MARCHED // (camera.width * camera.height)))
         return max(1, min(math.floor(spanned), self.quality.across, room))
 

@@ -117,7 +117,6 @@ def _quality_table(records: Iterable[Record]) -> list[list[str]]:
     return [["scene", *qualities]] + [[name, *(cell(points.get(quality)) for quality in qualities)] for name, points in rows]
 
 
-
 def _preset(record: Record) -> str:
     """And what the file was to have, if that was said."""
     psnr = record["settings"].get("psnr_db")
