@@ -98,6 +98,8 @@ class TrainConfig:
     warmup: int = 50
     """Steps over which the learning rate rises from 0; then it falls along half a cosine to 1 % of its peak."""
     seed: int = 0
+    adapts: bool = True
+    """Whether `for_lone_object` may change all this for a scene of its kind."""
 
     # --- the priors; each is a weight on a mean over the texels of a plane, summed over planes and scales
     space_variation: float = 5e-3
@@ -205,4 +207,7 @@ PRESETS = {
     "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
     "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=10000, temporal_start=0.75, temporal_floor=0.3),
     "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000),
+    # K-Planes' own settings (section 3.1 and its appendix), but for the march through occupied cells. It wants a GPU.
+    "paper": TrainConfig(resolutions=(64, 128, 256, 512), channels=32, samples_across=640, cells_across=128, steps=30000,
+                         samples=131072, learning_rate=1e-2, space_variation=1e-3, adapts=False),
 }

@@ -4,7 +4,9 @@ The planes live in one flat vector `theta`, channel-last, so that the fused kern
 the priors see one array. `kpc.encoder.render` makes pictures of it.
 """
 
+import functools
 import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -103,12 +105,13 @@ class Field(nn.Module):
     Attributes:
         theta: (layout.size,) the planes. Space planes start uniform in [0.1, 0.5], time planes at 1 (K-Planes).
         motion: (T, Nz, Ny, Nx, 3) displacements, `kpc.format.motion`, at first 0; or None.
-        mixed: whether `features` reads the planes as float16, and the hybrid decoder's layers compute in bfloat16: half the bytes,
-            and what GPUs are built for. Sums, products of planes, densities, gradients and the optimiser stay in float32.
+        mixed: whether layers of a decoder compute in bfloat16, with sums in float32: what GPUs are built for.
         density: (F + 1,) weights of the log density, its bias last.
         w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.Decoder`. w2 starts at 0: colour depends on the
             direction only as far as the pictures insist.
         codes: (K, H) of appearances, at first 0; or None.
+        axes, sizes, first: of the planes that are multiplied, as `features` wants them. neighbours, one_of: of the texels, as `_texels`
+            has them.
     """
 
     IDENTITY = 1.0
@@ -133,7 +136,20 @@ class Field(nn.Module):
             if name in SPACE_PLANES:
                 theta[start : start + rows * columns * layout.channels] = uniform(0.1, 0.5, rows * columns * layout.channels)
         self.theta = nn.Parameter(theta)
+        names = ALL_PLANES if layout.is_dynamic else SPACE_PLANES
+        axes = torch.tensor([[AXES.index(axis) for axis in of_all] for of_all in zip(*names, strict=True)])
+        self._constant("axes", axes)
+        self._constant("sizes", torch.from_numpy(layout.resolution.T)[axes][:, :, None])
+        self._constant("first", torch.from_numpy(layout.table.T[: len(names), None, :, None] // layout.channels))
+        neighbours, one_of = zip(*(_texels(name, start // layout.channels, rows, columns, layout.channels)
+                                   for _, name, start, rows, columns in layout.planes()), strict=True)
+        self._constant("neighbours", torch.cat(neighbours, dim=1))
+        self._constant("one_of", torch.cat(one_of, dim=1))
         self._make_decoder(layout.features, hidden, uniform)
+
+    def _constant(self, name: str, values: Tensor) -> None:
+        """A buffer, which moves to a device as parameters do and is not saved with them."""
+        self.register_buffer(name, values.contiguous(), persistent=False)
 
     def _make_decoder(self, F: int, hidden: int, uniform: Uniform) -> None:
         # Weights of zero mean: the box starts evenly thin, whatever the seed, with log density -1 on average.
@@ -172,16 +188,23 @@ class Field(nn.Module):
         return (torch.relu(self.hidden(directions, codes)) @ self.w2.reshape(3 * F, H).T).view(-1, 3, F) + self.b2
 
     def once_a_ray(self, directions: Tensor, codes: Tensor | None = None) -> Tensor:
-        """What `colours` takes of (N, 3) directions: their basis; `codes` as in `hidden`."""
-        return self.basis(directions, codes)
+        """What `colours` takes of (N, 3) directions: their hidden layer, and 1, (N, H + 1); `codes` as in `hidden`."""
+        return nn.functional.pad(torch.relu(self.hidden(directions, codes)), (0, 1), value=1.0)
 
     def decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Of features (n, F) the clipped log densities, per longest edge of the box, (n,), and what `colours` takes of them."""
         return (features @ self.density[:-1] + self.density[-1]).clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT), features
 
     def colours(self, latent: Tensor, terms: Tensor, ray: Tensor) -> Tensor:
-        """Colours (n, 3) of n samples on the rays `ray` (n,), from what `decode` and `once_a_ray` gave."""
-        return torch.sigmoid(torch.einsum("nf,ncf->nc", latent, terms.index_select(0, ray)))
+        """Colours (n, 3) of n samples on the rays `ray` (n,), from what `decode` and `once_a_ray` gave.
+
+        sigmoid(basis(d) f), with the sum over features before that over the hidden layer: what a sample needs of its ray is then
+        H + 1 numbers in place of 3 F.
+        """
+        F, H = self.w2.shape[1:]
+        weights = torch.cat([self.w2, self.b2[..., None]], dim=2).transpose(0, 1).reshape(F, 3 * (H + 1))
+        by_hidden = (latent @ weights).view(-1, 3, H + 1)
+        return torch.sigmoid((by_hidden * terms.index_select(0, ray)[:, None]).sum(2))
 
     def decoder_parameters(self, view_dependent: bool) -> list[nn.Parameter]:
         """What there is to train beside planes and motion."""
@@ -206,16 +229,11 @@ class Field(nn.Module):
         """
         if self.motion is not None:
             points = moved(points, times, self.motion)
-        coordinate = {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2], "t": times}
-        scales = []
-        for s in range(len(self.layout.resolution)):
-            product: Tensor | None = None
-            for name in ALL_PLANES if self.layout.is_dynamic else SPACE_PLANES:
-                sample = bilinear(self.plane(s, name), coordinate[name[0]], coordinate[name[1]], self.mixed)
-                product = sample if product is None else self.combined(product, sample)
-            assert product is not None
-            scales.append(product)
-        return torch.cat(scales, dim=-1)
+        u, v = torch.cat([points, times[:, None]], dim=1).T[self.axes, :, None]  # (C, N, 1) each
+        corners, shares = corners_of(u, v, *self.sizes)  # (C, N, S, 4)
+        table = self.theta.view(-1, self.layout.channels)
+        planes = Blend.apply(table, self.first + corners, shares)  # type: ignore[no-untyped-call]
+        return self.combined(planes).flatten(1)  # of (N, S, M) each
 
     def to_scene(
         self, aabb: np.ndarray, clip: Clip, occupancy: np.ndarray, background: np.ndarray, step: float,
@@ -268,9 +286,9 @@ class Field(nn.Module):
 
 
     @staticmethod
-    def combined(one: Tensor, other: Tensor) -> Tensor:
-        """What two planes together say."""
-        return one * other
+    def combined(planes: Sequence[Tensor]) -> Tensor:
+        """What planes say together."""
+        return functools.reduce(torch.mul, planes)
 
 
 class SummedField(Field):
@@ -279,8 +297,8 @@ class SummedField(Field):
     IDENTITY = 0.0
 
     @staticmethod
-    def combined(one: Tensor, other: Tensor) -> Tensor:
-        return one + other
+    def combined(planes: Sequence[Tensor]) -> Tensor:
+        return functools.reduce(torch.add, planes)
 
 
 class HybridField(Field):
@@ -345,57 +363,92 @@ def _fill(parameter: Tensor, values: np.ndarray) -> None:
         parameter.copy_(torch.from_numpy(np.asarray(values, np.float32)))
 
 
-def tap(x: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Corner-aligned position x (size - 1), x in [0, 1], as a lower node and the fraction (N, 1) towards the next."""
+def tap(x: Tensor, size: Tensor | int) -> tuple[Tensor, Tensor]:
+    """Corner-aligned positions x (size - 1), x in [0, 1], as lower nodes, int64, and the fractions towards the next."""
     position = x * (size - 1)
-    lower = position.detach().floor().clamp(0, max(size - 2, 0))
-    return lower.long(), (position - lower).clamp(0, 1)[:, None]
+    lower = position.detach().clamp(min=0).long().clamp(max=size - 2)
+    return lower, (position - lower).clamp(0, 1)
+
+
+def corners_of(u: Tensor, v: Tensor, columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """The four texels about each place in a plane, u in [0, 1] along its columns, v along its rows: their numbers in it, and the
+    shares that bilinear interpolation gives them, (..., 4) each."""
+    (i, fu), (j, fv) = tap(u, columns), tap(v, rows)
+    across, along = torch.stack([1 - fu, fu], dim=-1), torch.stack([1 - fv, fv], dim=-1)
+    shares = (along[..., :, None] * across[..., None, :]).flatten(-2)
+    k = torch.arange(4, device=u.device)
+    return (j * columns + i)[..., None] + (k // 2 * columns[..., None] + k % 2), shares
 
 
 def moved(points: Tensor, times: Tensor, motion: Tensor) -> Tensor:
     """Places in the planes of (N, 3) points in [0, 1]^3 at (N,) times: `kpc.format.motion.moved`, differentiable."""
-    rows, nz, ny, nx, _ = motion.shape
-    (h, fh), (i, fi), (j, fj), (k, fk) = (
-        tap(x, size) for x, size in zip((times, points[:, 2], points[:, 1], points[:, 0]), (rows, nz, ny, nx), strict=True))
-    out = points
-    for dh, di, dj, dk in np.ndindex(2, 2, 2, 2):
-        weight = (fh if dh else 1 - fh) * (fi if di else 1 - fi) * (fj if dj else 1 - fj) * (fk if dk else 1 - fk)
-        out = out + weight * motion[h + dh, i + di, j + dj, k + dk]
-    return out.clamp(0, 1)
+    nodes, shares = torch.zeros_like(times, dtype=torch.int64)[:, None], torch.ones_like(times)[:, None]
+    for x, size, stride in zip((times, *points.T.flip(0)), motion.shape, motion.stride(), strict=False):  # t, z, y, x
+        lower, share = tap(x, size)
+        nodes = (nodes[:, :, None] + stride // 3 * torch.stack([lower, lower + 1], dim=-1)[:, None]).flatten(1)
+        shares = (shares[:, :, None] * torch.stack([1 - share, share], dim=-1)[:, None]).flatten(1)
+    shift, = Blend.apply(motion.view(-1, 3), nodes[None], shares[None])  # type: ignore[no-untyped-call]
+    out: Tensor = (points + shift).clamp(0, 1)
+    return out
 
 
-def bilinear(plane: Tensor, u: Tensor, v: Tensor, in_half: bool = False) -> Tensor:
-    """Sample a (rows, columns, M) plane, corner-aligned: u in [0, 1] along columns, v along rows. Returns (N, M).
+class Blend(torch.autograd.Function):
+    """Weighted sums of K rows each: of a table (rows, M) those at `corners` (C, ..., K) int64 times `shares` (C, ..., K), to C tensors
+    (..., M). Whatever the number of planes, that is a matter of a few operations on a GPU."""
 
-    `in_half`: texels are read as float16; what is made of them, and the gradient, is in the type of the plane.
+    @staticmethod
+    def forward(ctx, table, corners, shares):  # type: ignore[no-untyped-def]
+        ctx.save_for_backward(table, corners, shares)
+        K = corners.shape[-1]
+        sums = nn.functional.embedding_bag(corners.view(-1, K), table, per_sample_weights=shares.view(-1, K), mode="sum")
+        return sums.view(*corners.shape[:-1], -1).unbind()
+
+    @staticmethod
+    def backward(ctx, *g):  # type: ignore[no-untyped-def]
+        table, corners, shares = ctx.saved_tensors
+        K, M = corners.shape[-1], table.shape[1]
+        flat, rows, by = torch.stack(g).view(-1, M), corners.view(-1, K), shares.view(-1, K)
+        of_shares = None
+        if ctx.needs_input_grad[2]:
+            of_shares = (table[rows] @ flat[:, :, None]).view_as(shares)
+        return scattered(flat, rows, by, len(table)), None, of_shares
+
+
+def scattered(values: Tensor, rows: Tensor, shares: Tensor, count: int) -> Tensor:
+    """Add each of (n, M) values, times its shares (n, K), to rows (n, K) int64 of a table of so many: (count, M)."""
+    if values.is_cuda:
+        return gathered_by_row(values, rows, shares, count)
+    table = values.new_zeros(count, values.shape[1])
+    for k in range(rows.shape[1]):
+        table.index_add_(0, rows[:, k], shares[:, k, None] * values)
+    return table
+
+
+def gathered_by_row(values: Tensor, rows: Tensor, shares: Tensor, count: int) -> Tensor:
+    """What `scattered` gives, as the product of a sparse matrix: sorted by row, what goes to one is added up where it is wanted, in
+    place of piece by piece in memory. 1.8 ms in place of 4.7 for 2.5 million values of 32 numbers, on an H100."""
+    entries = rows.flatten().int()
+    order = entries.argsort()
+    ends = torch.searchsorted(entries[order], torch.arange(count + 1, device=rows.device, dtype=torch.int32), out_int32=True)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
+        matrix = torch.sparse_csr_tensor(ends, (order // rows.shape[1]).int(), shares.flatten()[order], (count, len(values)),
+                                         check_invariants=False)
+    return matrix @ values
+
+
+def _texels(name: str, first: int, rows: int, columns: int, M: int) -> tuple[Tensor, Tensor]:
+    """What `priors` has to know of the n texels of a plane, from number `first` on in its table.
+
+    Returns:
+        (3, n) int64, their neighbours to the right, below and above, at an edge themselves; (3, n) float32, 1 over the numbers in the
+        plane if it is one of space, or one of time, or within one of time, neither in its first nor its last row; else 0.
     """
-    rows, columns, M = plane.shape
-    (i, fu), (j, fv) = tap(u, columns), tap(v, rows)
-    flat = plane.reshape(-1, M)
-    half = flat.detach().half() if in_half else None
-
-    def texels(k: Tensor) -> Tensor:
-        return flat.index_select(0, k) if half is None else _HalfTexels.apply(flat, half, k)  # type: ignore[no-untyped-call]
-
-    k = j * columns + i
-    low = texels(k) * (1 - fu) + texels(k + 1) * fu
-    high = texels(k + columns) * (1 - fu) + texels(k + columns + 1) * fu
-    return low * (1 - fv) + high * fv
-
-
-class _HalfTexels(torch.autograd.Function):
-    """Rows `k` of a (texels, M) plane, read from its float16 copy; the gradient is added up in the plane's own type."""
-
-    @staticmethod
-    def forward(ctx, flat, half, k):  # type: ignore[no-untyped-def]
-        ctx.save_for_backward(k)
-        ctx.shape = flat.shape
-        return half.index_select(0, k).to(flat.dtype)
-
-    @staticmethod
-    def backward(ctx, g):  # type: ignore[no-untyped-def]
-        k, = ctx.saved_tensors
-        return g.new_zeros(ctx.shape).index_add_(0, k, g), None, None
+    row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    near = [(row, (column + 1).clamp(max=columns - 1)), ((row + 1).clamp(max=rows - 1), column), ((row - 1).clamp(min=0), column)]
+    is_time, within = torch.full_like(row, name in TIME_PLANES), (row > 0) & (row < rows - 1)
+    one_of = torch.stack([1 - is_time, is_time, is_time * within]).flatten(1) / (rows * columns * M)
+    return first + torch.stack([j * columns + i for j, i in near]).flatten(1), one_of
 
 
 def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
@@ -405,19 +458,16 @@ def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
     transient_variation * the same along space alone, time_smoothness * mean (P[t-1] - 2 P[t] + P[t+1])^2, and
     sparse_transients * mean |1 - P|; each summed over the planes it concerns.
     """
-    names = ("space_variation", "transient_variation", "time_smoothness", "sparse_transients")
-    total = {name: field.theta.new_zeros(()) for name in names}
-    for s, name, _, rows, columns in field.layout.planes():
-        p = field.plane(s, name)
-        along_rows = (p[:, 1:] - p[:, :-1]).square().sum() / p.numel()
-        if name in SPACE_PLANES:
-            across_rows = (p[1:] - p[:-1]).square().sum() / p.numel()
-            total["space_variation"] = total["space_variation"] + along_rows + across_rows
-        if name in TIME_PLANES:
-            second_difference = (p[:-2] - 2 * p[1:-1] + p[2:]).square().sum() / p.numel()
-            total["transient_variation"] = total["transient_variation"] + along_rows
-            total["time_smoothness"] = total["time_smoothness"] + second_difference
-            total["sparse_transients"] = total["sparse_transients"] + (1 - p).abs().mean()
+    table = field.theta.view(-1, field.layout.channels)
+    right, below, above = (table.index_select(0, texels) for texels in field.neighbours)
+    along, across = (right - table).square().sum(1), (below - table).square().sum(1)
+    in_space, in_time, within = field.one_of
+    total = {
+        "space_variation": (along + across) @ in_space,
+        "transient_variation": along @ in_time,
+        "time_smoothness": (above - 2 * table + below).square().sum(1) @ within,
+        "sparse_transients": (1 - table).abs().sum(1) @ in_time,
+    }
     return {name: getattr(config, name) * value for name, value in total.items()}
 
 

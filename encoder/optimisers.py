@@ -1,6 +1,7 @@
 """One training step, on the CPU with the kernels alone or in PyTorch: render a batch, weigh what is wrong, move the field."""
 
 import contextlib
+import math
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -14,12 +15,14 @@ from kpc.encoder import kernels
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.field import Field, appearance_priors, motion_priors, priors
 from kpc.encoder.proposals import Level, Proposals, histogram_loss
-from kpc.encoder.render import Rays, Samples, collected, fused_features, meet, samples_of, shade
+from kpc.encoder.render import Rays, Samples, collected, fused_features, meet, reached, samples_of, shade
 from kpc.format.scene import SPACE_PLANES
 from kpc.format.space import Contraction, SpaceMapping
 
-ROOM = 3
-"""Samples that a step on a GPU has room for, in multiples of `TrainConfig.samples`, which they are on average."""
+ROOM = 1.125
+"""Samples that a step on a GPU has room for, in multiples of those that there were some steps before."""
+ROOM_UNIT = 8192
+"""Room for samples is a multiple of this: memory of a few sizes is used again."""
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 """Adam's constants as Instant-NGP sets them for grids (arXiv:2201.05989, section 4)."""
@@ -182,6 +185,7 @@ class PlainOptimiser:
         self.device = field.theta.device
         self._peaks = torch.zeros(cells, device=self.device)
         self._figures = Figures(self.device)
+        self._taken_a_ray = self._reached_a_ray = math.inf
         self._occupancy: tuple[np.ndarray, torch.Tensor] | None = None
         self.fused = fused
         self.features = fused_features(field) if fused else field.features
@@ -207,7 +211,7 @@ class PlainOptimiser:
         """As `FusedOptimiser.step`."""
         config = self.config
         with self.watch("samples"):
-            batch, targets = batch.apply(self._there), self._there(targets)
+            batch, targets = self._all_there(batch, targets)
             levels: list[Level] = []
             if self.proposals is None:
                 samples = self._samples(batch, aabb, occupancy, step_length)
@@ -216,6 +220,12 @@ class PlainOptimiser:
                 samples, edges, levels = self.proposals.sample(batch, box, self.mapping, cells, number, self.fused)
         with self.watch("forward"):
             kept = self._there(kept_channels(self.field, config, number, fraction))
+            taken = (samples.length > 0).sum()
+            if self.device.type != "cpu" and self.proposals is None:
+                # What lies behind the end of its ray takes no part: half of the samples, of which the gradient is spared.
+                with torch.no_grad():
+                    seen = meet(self.field, batch, samples, self.features, extent, kept).reached & (samples.length > 0)
+                samples = reached(samples, seen, self._room(self._reached_a_ray, len(targets), len(samples.ray)))
             met = meet(self.field, batch, samples, self.features, extent, kept)
             error = (shade(self.field, batch, met) - targets).square().mean()
             loss = error + config.distortion * met.distortion
@@ -246,18 +256,35 @@ class PlainOptimiser:
             _, ny, nx = self._peaks.shape
             flat = (samples.cell[:, 0] * ny + samples.cell[:, 1]) * nx + samples.cell[:, 2]
             self._peaks.view(-1).scatter_reduce_(0, flat, met.weights.detach(), "amax")
-        taken = (met.reached & (samples.length > 0)).sum() / len(targets)
-        squared_error, samples_a_ray = self._figures.of(torch.stack([error.detach(), taken]))
-        return squared_error, samples_a_ray
+        counts = torch.stack([taken, (met.reached & (samples.length > 0)).sum()]) / len(targets)
+        figures = self._figures.of(torch.cat([error.detach()[None], counts]))
+        squared_error, self._taken_a_ray, self._reached_a_ray = figures
+        return squared_error, self._reached_a_ray
 
     def _samples(self, batch: Rays, aabb: np.ndarray, occupancy: np.ndarray, step_length: float) -> Samples:
         if self.fused:
             return collected(batch, aabb, occupancy, step_length, self.mapping)
         if self._occupancy is None or self._occupancy[0] is not occupancy:
             self._occupancy = occupancy, self._there(torch.from_numpy(occupancy))
-        fixed = {} if self.device.type == "cpu" else {
-            "most": sample_capacity(aabb, step_length, self.mapping), "capacity": ROOM * self.config.samples}
+        fixed = {}
+        if self.device.type != "cpu":
+            most = sample_capacity(aabb, step_length, self.mapping)
+            fixed = {"most": most, "capacity": self._room(self._taken_a_ray, len(batch.times), 3 * self.config.samples)}
         return samples_of(batch, self._there(torch.from_numpy(aabb)), self._occupancy[1], step_length, self.mapping, **fixed)
+
+    def _room(self, samples_a_ray: float, rays: int, most: int) -> int:
+        """For how many samples a step on a GPU has room, given how many there lately were."""
+        return min((int(ROOM * min(samples_a_ray * rays, most)) // ROOM_UNIT + 1) * ROOM_UNIT, most)
+
+    def _all_there(self, batch: Rays, targets: torch.Tensor) -> tuple[Rays, torch.Tensor]:
+        """Rays and their targets on the device, moved all at once: each move takes its time, however little it moves."""
+        if self.device.type == "cpu":
+            return batch, targets
+        floats = [value.view(len(targets), -1) for name, value in vars(batch).items() if name != "appearances"] + [targets]
+        *members, targets = self._there(torch.cat(floats, dim=1)).split([each.shape[1] for each in floats], dim=1)
+        origins, directions, times, jitters, backgrounds = (value.contiguous() for value in members)
+        appearances = None if batch.appearances is None else self._there(batch.appearances)
+        return Rays(origins, directions, times.view(-1), jitters.view(-1), backgrounds, appearances), targets
 
     def _there(self, values: torch.Tensor) -> torch.Tensor:
         """On the device, without waiting for it: only pinned memory can be copied behind one's back."""
@@ -333,8 +360,9 @@ def _decoder_optimiser(
 
 def _adam(groups: list[tuple[list[torch.nn.Parameter], float]]) -> torch.optim.Adam:
     """For groups of parameters and the peak of the learning rate of each."""
+    on_gpu = groups[0][0][0].is_cuda
     return torch.optim.Adam([{"params": parameters, "peak": peak, "lr": peak} for parameters, peak in groups],
-                            betas=(BETA1, BETA2), eps=EPSILON)
+                            betas=(BETA1, BETA2), eps=EPSILON, fused=on_gpu)
 
 
 def _set_rate(optimiser: torch.optim.Adam, rate: float) -> None:

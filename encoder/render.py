@@ -7,7 +7,7 @@ Three parts, each with a plain version for any device: which samples rays take (
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -124,13 +124,26 @@ def samples_of(
     if capacity is None:
         index = taken.nonzero(as_tuple=True)
         return Samples(index[0], u[index], s[index], torch.full_like(s[index], step), stretch[index], cell[index])
-    taken = taken.flatten()
-    number = torch.where(taken, taken.cumsum(0) - 1, capacity).clamp(max=capacity)
-    last = torch.full((capacity + 1,), taken.numel() - 1, device=taken.device)
-    chosen = last.scatter_(0, number, torch.arange(taken.numel(), device=taken.device))[:capacity]
-    there = torch.arange(capacity, device=taken.device) < taken.sum()
+    chosen, there = _places_of(taken.flatten(), capacity)
     return Samples(chosen // most, u.flatten(0, 1)[chosen], s.flatten()[chosen], step * there, stretch.flatten()[chosen],
                    cell.flatten(0, 1)[chosen])
+
+
+def reached(samples: Samples, is_reached: Tensor, capacity: int) -> Samples:
+    """Those samples that are reached (n,) bool, with room for `capacity` as in `samples_of`."""
+    chosen, there = _places_of(is_reached, capacity)
+    kept = Samples(*(values[chosen] for values in vars(samples).values()))
+    return replace(kept, length=kept.length * there)
+
+
+def _places_of(is_set: Tensor, capacity: int) -> tuple[Tensor, Tensor]:
+    """Where (n,) bool are set, one after another: (capacity,) int64, the last place of all where there are no more, and whether
+    there were, (capacity,) bool."""
+    n = is_set.numel()
+    number = torch.where(is_set, is_set.cumsum(0) - 1, capacity).clamp(max=capacity)
+    places = torch.full((capacity + 1,), n - 1, device=is_set.device)
+    places.scatter_(0, number, torch.arange(n, device=is_set.device))
+    return places[:capacity], torch.arange(capacity, device=is_set.device) < is_set.sum()
 
 
 def spans_of(rays: Rays, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
@@ -179,16 +192,17 @@ def meet(
     f = features(samples.points, rays.times[ray])
     log_density, latent = field.decode(f if kept is None else f * kept)
     counts = torch.zeros_like(rays.times, dtype=torch.int64).index_add(0, ray, torch.ones_like(ray))
-    first = (counts.cumsum(0) - counts)[ray]
+    ends = counts.cumsum(0)
+    first, last = (ends - counts)[ray], (ends - 1)[ray]
     length = samples.length / extent
     tau = log_density.exp() * length * samples.stretch
     # A running sum over all rays must not meet numbers so large that the rest is lost beside them.
-    trans = torch.exp(-_before(tau.clamp(max=OPAQUE), first))
+    trans = torch.exp(-_before(tau.clamp(max=OPAQUE), first, last))
     lit = trans >= TERMINATION
     weights = torch.where(lit, trans * (1 - torch.exp(-tau)), 0)
     opacity = torch.zeros_like(rays.backgrounds[:, 0]).index_add(0, ray, weights)
     along = ((samples.s - samples.s[first]) / extent).to(weights.dtype)
-    apart = along * _before(weights, first) - _before(weights * along, first)
+    apart = along * _before(weights, first, last) - _before(weights * along, first, last)
     distortion = (2 * weights * apart + weights.square() * length / 3).sum() / N
     return Met(ray, latent, weights, lit, opacity, distortion)
 
@@ -204,13 +218,29 @@ def shade(field: Field, rays: Rays, met: Met, codes: Tensor | None = None) -> Te
     return rgb + (1 - met.opacity)[:, None] * rays.backgrounds
 
 
-def _before(values: Tensor, first: Tensor) -> Tensor:
-    """For each of (n,) values the sum of those before it on its ray, which begins at number `first` (n,).
+class _SumBefore(torch.autograd.Function):
+    """For each of (n,) values the sum of those before it on its ray, which goes from number `first` (n,) to number `last` (n,).
 
-    One running sum over all rays, in float64: what is taken off at the start of a ray is far larger than what is wanted.
+    One running sum over all rays, in float64: what is taken off at the start of a ray is far larger than what is wanted. The
+    gradient of a value is the sum of what comes after it, likewise; left to PyTorch it would be a sum at random places.
     """
-    total = torch.cumsum(values.double(), 0) - values
-    return (total - total[first]).to(values.dtype)
+
+    @staticmethod
+    def forward(ctx, values, first, last):  # type: ignore[no-untyped-def]
+        ctx.save_for_backward(last)
+        total = torch.cumsum(values.double(), 0) - values
+        return (total - total[first]).to(values.dtype)
+
+    @staticmethod
+    def backward(ctx, g):  # type: ignore[no-untyped-def]
+        last, = ctx.saved_tensors
+        total = torch.cumsum(g.double(), 0)
+        return (total[last] - total).to(g.dtype), None, None
+
+
+def _before(values: Tensor, first: Tensor, last: Tensor) -> Tensor:
+    summed: Tensor = _SumBefore.apply(values, first, last)  # type: ignore[no-untyped-call]
+    return summed
 
 
 def collected(

@@ -10,7 +10,8 @@ REMEDY = "apt install libegl1 libgl1-mesa-dri (Debian, Ubuntu), or kprender --ba
 
 
 def open_context() -> moderngl.Context:
-    """An OpenGL 3.3 context that draws to textures: through EGL where there is one, else what the system offers.
+    """An OpenGL context that draws to textures, of 4.3 where there is that, for compute shaders, else of 3.3: through EGL where there is
+    one, else what the system offers. (Some drivers give more than they are asked for, NVIDIA's gives just that.)
 
     Raises:
         DisplayError: there is none; the message says how to get one.
@@ -18,10 +19,12 @@ def open_context() -> moderngl.Context:
     complaints = []
     backends: tuple[dict[str, Any], ...] = ({"backend": "egl"}, {})
     for backend in backends:
-        try:
-            return moderngl.create_context(require=330, standalone=True, **backend)
-        except Exception as error:  # glcontext raises bare Exception, ImportError or ValueError, whatever failed
-            complaints.append(str(error))
+        for version in (430, 330):
+            try:
+                return moderngl.create_context(require=version, standalone=True, **backend)
+            except Exception as error:  # glcontext raises bare Exception, ImportError or ValueError, whatever failed
+                complaint = str(error)
+        complaints.append(complaint)
     raise DisplayError(f"no OpenGL 3.3 to be had ({'; '.join(complaints)}): {REMEDY}")
 
 

@@ -162,25 +162,32 @@ def is_software(ctx: moderngl.Context) -> bool:
     return any(word in ctx.info["GL_RENDERER"].lower() for word in SOFTWARE)
 
 
+def tries_compute(ctx: moderngl.Context) -> bool:
+    """Whether there is a choice between fragment and compute shaders."""
+    return ctx.version_code >= COMPUTE_VERSION and not is_software(ctx)
+
+
 class Renderer:
     """A scene on the graphics card.
 
     Attributes:
         quality: how finely to draw; may be set at any time.
-        compute: whether a compute shader marches, else a fragment shader. Graphics cards try both once, where they have
-            both, and keep to the faster; a processor that stands in for one is never faster by compute shaders.
+        compute: whether a compute shader marches, else a fragment shader. Unless told, graphics cards try both once, where they
+            have both, and keep to the faster; a processor that stands in for one is never faster by compute shaders.
 
     Raises:
         DisplayError: the scene does not fit the card, or a shader does not compile.
     """
 
-    def __init__(self, ctx: moderngl.Context, scene: Scene, quality: Quality = LADDER["reference"]) -> None:
+    def __init__(
+        self, ctx: moderngl.Context, scene: Scene, quality: Quality = LADDER["reference"], compute: bool | None = None
+    ) -> None:
         self.ctx = ctx
         self.scene = scene
         self.quality = quality
-        self.compute = False
+        self.compute = bool(compute)
         self._is_software = is_software(ctx)
-        self._marches_to_trial = math.inf if self._is_software or ctx.version_code < COMPUTE_VERSION else TRIAL_AFTER
+        self._marches_to_trial = TRIAL_AFTER if compute is None and tries_compute(ctx) else math.inf
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
         _refuse_too_large(scene, self.layout, ctx.info)
@@ -242,6 +249,13 @@ class Renderer:
             thing.release()
         self._targets.clear()
         self._programs.clear()
+
+    @property
+    def texels_a_sample(self) -> float:
+        """Look-ups in planes and rows that a sample takes, each of four channels with its neighbours."""
+        layers, shared = self.layout.layers, self._scales_shared()
+        planes = 3 if self.quality.folded or self._rows is None else 6
+        return float(planes * sum(count / 2 if scale < shared else count for scale, count in enumerate(layers)))
 
     @property
     def memory_bytes(self) -> int:

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 from scenes import displaced, surrounded, tiny_scene
+from torch import Tensor
 
 from kpc.encoder import kernels
-from kpc.encoder.field import Field
+from kpc.encoder.field import Blend, Field, corners_of
 from kpc.encoder.optimisers import motion_of, sample_capacity
 from kpc.encoder.render import Rays, render_reference
 from kpc.format.scene import Scene
@@ -98,7 +99,9 @@ def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict
     field = Field.from_scene(scene).double()
     rays = rays.apply(torch.Tensor.double)
     basis = field.basis(rays.directions).detach().requires_grad_()
-    field.basis = lambda directions, codes: basis  # type: ignore[method-assign]
+    # The kernels give the gradient of the basis, the field goes without one.
+    field.once_a_ray = lambda directions, codes: basis  # type: ignore[method-assign]
+    field.colours = lambda latent, terms, ray: torch.sigmoid(torch.einsum("nf,ncf->nc", latent, terms[ray]))  # type: ignore[method-assign]
     aabb, occupancy = torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy)
     rgb, distortion, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step, mapping=scene.mapping)
     squared = (rgb - targets.double()).square()
@@ -124,3 +127,11 @@ class Calling(torch.nn.Module):
     def __init__(self, field: Field, call: object) -> None:
         super().__init__()
         self.field, self.forward = field, call
+
+
+def bilinear(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """A plane (rows, columns, M) as `Field.features` reads it, u (N,) along its columns, v along its rows: (N, M)."""
+    rows, columns, M = plane.shape
+    corners, shares = corners_of(u, v, torch.tensor(columns), torch.tensor(rows))
+    values, = Blend.apply(plane.reshape(-1, M), corners[None], shares[None])
+    return values

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gradients import bilinear
 from scenes import displaced, tiny_scene
 
 from kpc.encoder.config import PRESETS, TrainConfig
-from kpc.encoder.field import Field, Layout, bilinear, motion_nodes, motion_priors, plan_layout
+from kpc.encoder.field import Field, Layout, motion_nodes, motion_priors, plan_layout
 from kpc.format.errors import UsageError
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip
 from kpc.player import reference
@@ -164,7 +165,27 @@ def test_a_config_that_makes_no_sense_is_refused(change: dict[str, object]) -> N
 
 def test_presets_grow() -> None:
     names = ("draft", "fast", "balanced", "best")
-    assert set(names) == set(PRESETS)
+    assert set(names) == set(PRESETS) - {"paper"}
     for smaller, larger in zip(names, names[1:]):
         assert PRESETS[smaller].steps < PRESETS[larger].steps
         assert max(PRESETS[smaller].resolutions) < max(PRESETS[larger].resolutions)
+
+
+def test_colours_are_those_of_the_basis() -> None:
+    field = Field(Layout.of(np.array([[4, 3, 2, 3]]), 5), 6, torch.Generator().manual_seed(0)).double()
+    with torch.no_grad():
+        field.w2.normal_()
+    latent, directions = torch.randn(40, 5).double(), torch.nn.functional.normalize(torch.randn(7, 3).double(), dim=1)
+    ray = torch.arange(40) % 7
+    wanted = torch.sigmoid(torch.einsum("nf,ncf->nc", latent, field.basis(directions)[ray]))
+    torch.testing.assert_close(field.colours(latent, field.once_a_ray(directions), ray), wanted)
+
+
+def test_colours_are_those_of_the_basis() -> None:
+    field = Field(Layout.of(np.array([[4, 3, 2, 3]]), 5), 6, torch.Generator().manual_seed(0)).double()
+    with torch.no_grad():
+        field.w2.normal_()
+    latent, directions = torch.randn(40, 5).double(), torch.nn.functional.normalize(torch.randn(7, 3).double(), dim=1)
+    ray = torch.arange(40) % 7
+    wanted = torch.sigmoid(torch.einsum("nf,ncf->nc", latent, field.basis(directions)[ray]))
+    torch.testing.assert_close(field.colours(latent, field.once_a_ray(directions), ray), wanted)

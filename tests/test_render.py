@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gradients import KINDS, Calling, misty, rays_at
+from gradients import KINDS, Calling, bilinear, misty, rays_at
 from scenes import hybrid, tiny_scene
 
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
-from kpc.encoder.field import Field, HybridField, Layout, SummedField, bilinear
+from kpc.encoder.field import Field, HybridField, Layout, SummedField
 from kpc.encoder.optimisers import Figures, PlainOptimiser, sample_capacity
 from kpc.encoder.render import Rays, collected, fused_features, meet, samples_of, shade
 from kpc.player import reference
@@ -50,41 +50,25 @@ def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(sh
         assert torch.isclose(one.distortion, two.distortion, rtol=1e-5)
 
 
-@pytest.mark.parametrize("decoder", ["explicit", "hybrid"])
-def test_mixed_precision_is_float32_within_its_bound(decoder: str) -> None:
-    """A texel read as float16 errs by 2^-11 of itself at most; six of them, so a feature by 6 / 2^11, 0.3 %.
-
-    The layers' inputs and weights err by 2^-9 of themselves, bfloat16's half step, a number of them summed in float32: less than
+def test_mixed_precision_is_float32_within_its_bound() -> None:
+    """The layers' inputs and weights err by 2^-9 of themselves, bfloat16's half step, a number of them summed in float32: less than
     1 % of a colour's range; so do gradients, against the largest of their kind.
     """
-    scene = misty()
-    scene = hybrid(scene) if decoder == "hybrid" else scene
+    scene = hybrid(misty())
     rays = rays_at(scene, 203)
     samples = samples_of(rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step)
-    rgb, gradients, features = {}, {}, {}
+    rgb, gradients = {}, {}
     for mixed in (False, True):
         field = Field.from_scene(scene)
         field.mixed = mixed
-        features[mixed] = field.features(samples.points, rays.times[samples.ray]).detach()
         rgb[mixed] = shade(field, rays, meet(field, rays, samples, field.features, scene.extent))
         rgb[mixed].square().mean().backward()
         gradients[mixed] = {name: p.grad for name, p in field.named_parameters()}
         assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in field.parameters())
-    assert ((features[True] - features[False]).abs() <= 6 / 2**11 * features[False].abs() * 1.01).all()
-    assert not torch.equal(features[True], features[False])
+    assert not torch.equal(rgb[True], rgb[False])
     assert (rgb[True] - rgb[False]).abs().max() < 0.01
     for name, gradient in gradients[False].items():
         assert (gradient - gradients[True][name]).abs().max() < 0.03 * gradient.abs().max(), name
-
-
-def test_mixed_precision_adds_up_gradients_in_float32() -> None:
-    """A thousand of 1/4096 after one of 1: a float16 sum would stay at 1."""
-    plane = torch.ones(2, 2, 1, requires_grad=True)
-    u = torch.zeros(1001)
-    g = torch.full((1001, 1), 1 / 4096)
-    g[0] = 1
-    (bilinear(plane, u, u, in_half=True) * g).sum().backward()
-    assert plane.grad is not None and plane.grad[0, 0, 0] == 1 + 1000 / 4096
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")

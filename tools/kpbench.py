@@ -54,6 +54,8 @@ WARM_UP = 3
 """Frames drawn before those that are timed."""
 MIDDLE, LEAD_IN = 0.5, 24
 """The time in the clip at which pictures are compared, and how many frames are played up to there: more than the turns of probes."""
+COMPARED = 640 * 480
+"""Pixels of the pictures that are compared, at most: the reference takes its time."""
 
 
 @dataclass(frozen=True)
@@ -307,10 +309,12 @@ def _frame_times(scene: kpc.Scene, frames: int, last: float) -> np.ndarray:
 
 
 def _play_once(job: Play) -> dict[str, results.Record]:
-    """Of each quality: open the file, draw the first frame, then `job.frames` more, the clip's own one after the other."""
+    """Of each quality: open the file, draw the first frame, then `job.frames` more, the clip's own one after the other; by fragment and by
+    compute shaders where there is a choice, of which the faster counts."""
     from kpc.player import offscreen
     from kpc.player.orbit import Rig, fitted
-    from kpc.player.renderer import Renderer
+    from kpc.player.renderer import Renderer, tries_compute
+    from kpc.tools.limits import texel_rate
 
     begun = clock.perf_counter()
     ctx = offscreen.open_context()
@@ -328,35 +332,44 @@ def _play_once(job: Play) -> dict[str, results.Record]:
         return round(1e3 * (clock.perf_counter() - started), 3), round(1e3 * (clock.process_time() - spent), 3)
 
     renderers, found = {}, {}
+    ways = ("fragment", "compute") if tries_compute(ctx) else ("fragment",)
     for name, quality in LADDER.items():
-        started = clock.perf_counter()
-        renderers[name] = renderer = Renderer(ctx, scene, quality)
-        ctx.finish()
-        uploaded = clock.perf_counter()
-        draw(renderer, 0.0)
-        shown = clock.perf_counter()
-        parts = {"load_ms": 1e3 * (loaded - opened), "upload_ms": 1e3 * (uploaded - started),
-                 "first_render_ms": 1e3 * (shown - uploaded)}  # fmt: skip
-        found[name] = {"context_ms": 1e3 * (opened - begun), **parts, "first_frame_ms": sum(parts.values())}
-    took: dict[str, list[tuple[float, float]]] = {name: [] for name in LADDER}
+        for way in ways:
+            started = clock.perf_counter()
+            renderers[name, way] = renderer = Renderer(ctx, scene, quality, compute=way == "compute")
+            ctx.finish()
+            uploaded = clock.perf_counter()
+            draw(renderer, 0.0)
+            shown = clock.perf_counter()
+            parts = {"load_ms": 1e3 * (loaded - opened), "upload_ms": 1e3 * (uploaded - started),
+                     "first_render_ms": 1e3 * (shown - uploaded)}  # fmt: skip
+            found[name, way] = {"way": way, "context_ms": 1e3 * (opened - begun), **parts, "first_frame_ms": sum(parts.values())}
+    took: dict[tuple[str, str], list[tuple[float, float]]] = {key: [] for key in renderers}
     for time in _frame_times(scene, WARM_UP + job.frames, 1.0):
-        for name, renderer in renderers.items():
-            took[name].append(draw(renderer, float(time)))
-    exact = float(np.median(took["reference"][WARM_UP:], axis=0)[0])
-    for name, renderer in renderers.items():
+        for key, renderer in renderers.items():
+            took[key].append(draw(renderer, float(time)))
+    median = {key: float(np.median(each[WARM_UP:], axis=0)[0]) for key, each in took.items()}
+    best = {name: found[name, min(ways, key=lambda way: median[name, way])] for name in LADDER}
+    peak = texel_rate(ctx)
+    for name in LADDER:
+        key = name, best[name]["way"]
+        renderer, frame_ms, cpu_ms = renderers[key], *zip(*took[key][WARM_UP:], strict=True)
         renderer.check()
-        frame_ms, cpu_ms = zip(*took[name][WARM_UP:], strict=True)
-        found[name] |= {
+        best[name] |= {
+            **{f"{way}_ms_median": median[name, way] for way in ways},
             "frame_ms": frame_ms,
-            "frame_ms_median": float(np.median(frame_ms)),
+            "frame_ms_median": median[key],
             "frame_ms_p95": float(np.percentile(frame_ms, 95)),
             "cpu_ms_median": float(np.median(cpu_ms)),
-            "fps": 1e3 / float(np.median(frame_ms)),
-            "times_reference": exact / float(np.median(frame_ms)),
+            "fps": 1e3 / median[key],
+            "times_reference": min(median["reference", way] for way in ways) / median[key],
             "gpu_memory_bytes": renderer.memory_bytes,
             "peak_memory_bytes": peak_memory_bytes(),
         }
-    return found
+        if renderer.quality.tolerance == 0 and renderer.quality.across == 1:  # all that a picture shows has been marched for it
+            texels = renderer.texels_a_sample * float(renderer.render(camera, 1.0).samples.sum())
+            best[name] |= {"texels_a_frame": texels, "share_of_texel_rate": texels / (1e-3 * median[key]) / peak}
+    return best
 
 
 def _stream(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
@@ -404,12 +417,15 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
     ctx = offscreen.open_context()
     scene = kpc.load(job.scene)
     times = _frame_times(scene, LEAD_IN, MIDDLE)
-    found: dict[str, results.Record] = {name: {"time": MIDDLE, "frames": LEAD_IN} for name in LADDER}
+    smaller = min(1.0, (COMPARED / (job.size[0] * job.size[1])) ** 0.5)
+    size = round(smaller * job.size[0]), round(smaller * job.size[1])
+    common = {"time": MIDDLE, "frames": LEAD_IN, "size": "{}x{}".format(*size)}
+    found: dict[str, results.Record] = {name: dict(common) for name in LADDER}
     for suffix, cameras in (("", [Rig.of(scene).cameras[0]] * LEAD_IN), ("_turning", orbit(scene, 360)[:LEAD_IN])):
         renderers = {name: Renderer(ctx, scene, quality) for name, quality in LADDER.items()}
         each: dict[str, list[float]] = {name: [] for name in LADDER}
         for view, time in zip(cameras, times, strict=True):
-            camera = fitted(view, *job.size)
+            camera = fitted(view, *size)
             exact = np.clip(renderers["reference"].render(camera, float(time)).rgb, 0, 1)
             drawn = {name: renderer.render(camera, float(time)) for name, renderer in renderers.items()}
             for name, picture in drawn.items():

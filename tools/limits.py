@@ -5,9 +5,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import moderngl
 import numba
 import numpy as np
 from numba import njit, prange
+
+from kpc.player.shader import build
 
 CACHED_BYTES = 1 << 20
 """Of three arrays together for each thread: what fits a second-level cache."""
@@ -51,6 +54,33 @@ def measure() -> Limits:
     a, b, c = (np.ones((threads, size), np.float32) for _ in range(3))
     memory = 12 * a.size / _best(lambda: _triads(a, b, c, 1))
     return Limits(flops / 1e9, cached / 1e9, memory / 1e9)
+
+
+LOOK_UPS, TEXTURE_SIDE, PICTURE_SIDE = 64, 512, 1024
+"""Of `texel_rate`: look-ups a pixel, and sides of what is read and of what is drawn."""
+
+
+def texel_rate(ctx: moderngl.Context) -> float:
+    """Look-ups a second, at most: filtered, of four channels of float32, by a fragment shader whose neighbours read side by side."""
+    texture = ctx.texture((TEXTURE_SIDE, TEXTURE_SIDE), 4, np.random.default_rng(0).random(4 * TEXTURE_SIDE**2, np.float32), dtype="f4")
+    texture.filter = moderngl.LINEAR, moderngl.LINEAR
+    program = build(ctx, "texels.glsl", {"LOOK_UPS": LOOK_UPS})
+    program["side"] = float(TEXTURE_SIDE)
+    target, vertices = ctx.simple_framebuffer((PICTURE_SIDE, PICTURE_SIDE), components=4), ctx.vertex_array(program, [])
+    target.use()
+    texture.use(0)
+
+    def draw(times: int) -> None:
+        for _ in range(times):
+            vertices.render(moderngl.TRIANGLES, vertices=3)
+        ctx.finish()
+
+    once = _best(lambda: draw(1))
+    times = max(1, round(0.05 / once))
+    rate = times * LOOK_UPS * PICTURE_SIDE**2 / _best(lambda: draw(times))
+    for thing in (vertices, program, target, texture):
+        thing.release()
+    return rate
 
 
 def _best(run: Callable[[], None]) -> float:
