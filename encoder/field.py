@@ -463,12 +463,17 @@ def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
     along, across = (right - table).square().sum(1), (below - table).square().sum(1)
     in_space, in_time, within = field.one_of
     total = {
-        "space_variation": (along + across) @ in_space,
-        "transient_variation": along @ in_time,
-        "time_smoothness": (above - 2 * table + below).square().sum(1) @ within,
-        "sparse_transients": (1 - table).abs().sum(1) @ in_time,
+        "space_variation": _sum(along + across, in_space),
+        "transient_variation": _sum(along, in_time),
+        "time_smoothness": _sum((above - 2 * table + below).square().sum(1), within),
+        "sparse_transients": _sum((1 - table).abs().sum(1), in_time),
     }
     return {name: getattr(config, name) * value for name, value in total.items()}
+
+
+def _sum(values: Tensor, shares: Tensor) -> Tensor:
+    """Of values times shares. What has none does not count, were it NaN."""
+    return torch.where(shares > 0, values, 0) @ shares
 
 
 def motion_priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:

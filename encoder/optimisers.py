@@ -5,6 +5,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numba
@@ -15,12 +16,14 @@ from kpc.encoder import kernels
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.field import Field, appearance_priors, motion_priors, priors
 from kpc.encoder.proposals import Level, Proposals, histogram_loss
+from kpc.encoder.recorder import Recorder
 from kpc.encoder.render import Rays, Samples, collected, fused_features, meet, reached, samples_of, shade
 from kpc.format.scene import SPACE_PLANES
 from kpc.format.space import Contraction, SpaceMapping
 
-ROOM = 1.125
-"""Samples that a step on a GPU has room for, in multiples of those that there were some steps before."""
+ROOM, LEAST_ROOM, MOST_ROOM = 1.125, 1.04, 1.35
+"""Samples that a step on a GPU has room for, in multiples of those that there were some steps before: when it is set, and at which it is set
+anew."""
 ROOM_UNIT = 8192
 """Room for samples is a multiple of this: memory of a few sizes is used again."""
 
@@ -169,11 +172,31 @@ class Figures:
         return host.tolist()  # type: ignore[no-any-return]
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What a step of `PlainOptimiser` goes by besides tensors.
+
+    Attributes:
+        number: of the step where proposals are sampled, whose schedule it sets; else 0. rays: how many.
+        step_length, extent: as in `FusedOptimiser.step`. moving, regularised: whether the motion grid, and the planes' priors, take part.
+        most: samples that a ray can take. rooms: on a GPU, for how many samples that are taken, and that are reached; elsewhere for as many as there are, None.
+    """
+
+    number: int
+    rays: int
+    step_length: float
+    extent: float
+    moving: bool
+    regularised: bool
+    most: int
+    rooms: tuple[int, int] | None
+
+
 class PlainOptimiser:
     """A step in plain PyTorch, on any device that PyTorch knows; or `fused`, on the CPU: kernels for the planes.
 
     On a GPU nothing in a step waits for it: shapes do not depend on what it computes, and `step` returns numbers that it worked
-    out a few steps before.
+    out a few steps before. What is the same in many steps is recorded, `kpc.encoder.recorder`.
     """
 
     def __init__(
@@ -183,10 +206,13 @@ class PlainOptimiser:
         self.field, self.config, self.mapping, self.proposals = field, config, mapping, proposals
         self.watch = Stopwatch()
         self.device = field.theta.device
+        self._on_gpu = self.device.type != "cpu"
         self._peaks = torch.zeros(cells, device=self.device)
         self._figures = Figures(self.device)
         self._taken_a_ray = self._reached_a_ray = math.inf
+        self._rooms = (0, 0)
         self._occupancy: tuple[np.ndarray, torch.Tensor] | None = None
+        self._aabb: torch.Tensor | None = None
         self.fused = fused
         self.features = fused_features(field) if fused else field.features
         if fused:
@@ -194,9 +220,10 @@ class PlainOptimiser:
             torch.set_num_threads(1)  # several add up gradients in any order: no run would end where another did
         self.fields: list[Field] = [field] if proposals is None else [field, *proposals.fields]
         for each in self.fields:
-            each.mixed = config.mixed_precision and self.device.type != "cpu"
+            each.mixed = config.mixed_precision and self._on_gpu
         self.planes = _adam([([each.theta for each in self.fields], config.learning_rate)])
         self.decoder = _decoder_optimiser(field, config, [each.density for each in self.fields[1:]])
+        self._recorder = Recorder([p for optimiser in (self.planes, self.decoder) for group in optimiser.param_groups for p in group["params"]])
 
     def peaks(self) -> np.ndarray:
         """As `FusedOptimiser.peaks`."""
@@ -209,43 +236,34 @@ class PlainOptimiser:
         aabb: np.ndarray, occupancy: np.ndarray, step_length: float, extent: float,
     ) -> tuple[float, float]:
         """As `FusedOptimiser.step`."""
-        config = self.config
-        with self.watch("samples"):
-            batch, targets = self._all_there(batch, targets)
-            levels: list[Level] = []
-            if self.proposals is None:
-                samples = self._samples(batch, aabb, occupancy, step_length)
-            else:
-                box, cells = self._there(torch.from_numpy(aabb)), tuple(self._peaks.shape)
-                samples, edges, levels = self.proposals.sample(batch, box, self.mapping, cells, number, self.fused)
-        with self.watch("forward"):
-            kept = self._there(kept_channels(self.field, config, number, fraction))
-            taken = (samples.length > 0).sum()
-            if self.device.type != "cpu" and self.proposals is None:
-                # What lies behind the end of its ray takes no part: half of the samples, of which the gradient is spared.
-                with torch.no_grad():
-                    seen = meet(self.field, batch, samples, self.features, extent, kept).reached & (samples.length > 0)
-                samples = reached(samples, seen, self._room(self._reached_a_ray, len(targets), len(samples.ray)))
-            met = meet(self.field, batch, samples, self.features, extent, kept)
-            error = (shade(self.field, batch, met) - targets).square().mean()
-            loss = error + config.distortion * met.distortion
-            for level in levels:
-                loss = loss + config.histogram * histogram_loss(edges, met.weights.view(len(targets), -1), level)
-            moving = self.field.motion is not None and number % config.motion_every == 0
-            if moving:
-                loss = loss + _total(motion_priors(self.field, config))
-            if self.field.codes is not None:
-                loss = loss + _total(appearance_priors(self.field, config))
-            regularised = number % config.regularise_every == 0
-            for each in self.fields if regularised and not self.fused else ():
-                loss = loss + config.regularise_every * _total(priors(each, config))
-        with self.watch("backward"):
+        config, rays = self.config, len(targets)
+        regularised = number % config.regularise_every == 0
+        most = sample_capacity(aabb, step_length, self.mapping)
+        plan = Plan(
+            number if self.proposals is not None else 0, rays, step_length, extent,
+            self.field.motion is not None and number % config.motion_every == 0, regularised,
+            most, self._rooms_for(rays, most) if self._on_gpu else None,
+        )
+        with self.watch("moves"):
+            if self._aabb is None:
+                self._aabb = self._there(torch.from_numpy(aabb))
+            if self._occupancy is None or self._occupancy[0] is not occupancy:
+                self._occupancy = occupancy, self._there(torch.from_numpy(occupancy))
+            kept = kept_channels(self.field, config, number, fraction)
+            numbers = [] if batch.appearances is None else [self._there(batch.appearances)]
+            inputs = [self._there(_packed(batch, targets)), self._there(kept), self._occupancy[1], *numbers]
+        with self.watch("gradient"):
             for optimiser in (self.planes, self.decoder):
                 optimiser.zero_grad()
                 _set_rate(optimiser, rate)
-            loss.backward()  # type: ignore[no-untyped-call]
-            if self.field.motion is not None and not moving:
-                self.field.motion.grad = None
+
+            def work(*inputs: torch.Tensor) -> torch.Tensor:
+                return self._backpropagate(plan, *inputs)
+
+            if self._on_gpu and self.proposals is None:
+                figures = self._recorder.run((plan, occupancy.shape), inputs, work)
+            else:
+                figures = work(*inputs)
         with self.watch("priors"):
             for each in self.fields if regularised and self.fused else ():
                 theta, grad = each.theta.detach().numpy(), each.theta.grad.numpy()
@@ -253,42 +271,71 @@ class PlainOptimiser:
         with self.watch("adam"):
             self.planes.step()
             self.decoder.step()
-            _, ny, nx = self._peaks.shape
-            flat = (samples.cell[:, 0] * ny + samples.cell[:, 1]) * nx + samples.cell[:, 2]
-            self._peaks.view(-1).scatter_reduce_(0, flat, met.weights.detach(), "amax")
-        counts = torch.stack([taken, (met.reached & (samples.length > 0)).sum()]) / len(targets)
-        figures = self._figures.of(torch.cat([error.detach()[None], counts]))
-        squared_error, self._taken_a_ray, self._reached_a_ray = figures
+        squared_error, self._taken_a_ray, self._reached_a_ray = self._figures.of(figures)
         return squared_error, self._reached_a_ray
 
-    def _samples(self, batch: Rays, aabb: np.ndarray, occupancy: np.ndarray, step_length: float) -> Samples:
+    def _backpropagate(
+        self, plan: Plan, packed: torch.Tensor, kept: torch.Tensor, occupancy: torch.Tensor, appearances: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Give every parameter its gradient, and cells their peaks. Returns the mean squared error, and samples a ray, taken and reached."""
+        field, config = self.field, self.config
+        batch, targets = _unpacked(packed, appearances)
+        assert self._aabb is not None
+        levels: list[Level] = []
+        if self.proposals is None:
+            samples = self._samples(plan, batch, occupancy)
+        else:
+            samples, edges, levels = self.proposals.sample(
+                batch, self._aabb, self.mapping, tuple(self._peaks.shape), plan.number, self.fused)
+        taken = (samples.length > 0).sum()
+        if plan.rooms is not None and self.proposals is None:
+            # What lies behind the end of its ray takes no part: half of the samples, of which the gradient is spared.
+            with torch.no_grad():
+                seen = meet(field, batch, samples, self.features, plan.extent, kept).reached & (samples.length > 0)
+            samples = reached(samples, seen, plan.rooms[1])
+        met = meet(field, batch, samples, self.features, plan.extent, kept)
+        error = (shade(field, batch, met) - targets).square().mean()
+        loss = error + config.distortion * met.distortion
+        for level in levels:
+            loss = loss + config.histogram * histogram_loss(edges, met.weights.view(len(targets), -1), level)
+        if plan.moving:
+            loss = loss + _total(motion_priors(field, config))
+        if field.codes is not None:
+            loss = loss + _total(appearance_priors(field, config))
+        for each in self.fields if plan.regularised and not self.fused else ():
+            loss = loss + config.regularise_every * _total(priors(each, config))
+        loss.backward()  # type: ignore[no-untyped-call]
+        if field.motion is not None and not plan.moving:
+            field.motion.grad = None
+        _, ny, nx = self._peaks.shape
+        flat = (samples.cell[:, 0] * ny + samples.cell[:, 1]) * nx + samples.cell[:, 2]
+        self._peaks.view(-1).scatter_reduce_(0, flat, met.weights.detach(), "amax")
+        counts = torch.stack([taken, (met.reached & (samples.length > 0)).sum()]) / len(targets)
+        return torch.cat([error.detach()[None], counts])
+
+    def _samples(self, plan: Plan, batch: Rays, occupancy: torch.Tensor) -> Samples:
+        assert self._aabb is not None
         if self.fused:
-            return collected(batch, aabb, occupancy, step_length, self.mapping)
-        if self._occupancy is None or self._occupancy[0] is not occupancy:
-            self._occupancy = occupancy, self._there(torch.from_numpy(occupancy))
-        fixed = {}
-        if self.device.type != "cpu":
-            most = sample_capacity(aabb, step_length, self.mapping)
-            fixed = {"most": most, "capacity": self._room(self._taken_a_ray, len(batch.times), 3 * self.config.samples)}
-        return samples_of(batch, self._there(torch.from_numpy(aabb)), self._occupancy[1], step_length, self.mapping, **fixed)
+            return collected(batch, self._aabb.numpy(), occupancy.numpy(), plan.step_length, self.mapping)
+        if plan.rooms is None:
+            return samples_of(batch, self._aabb, occupancy, plan.step_length, self.mapping)
+        return samples_of(batch, self._aabb, occupancy, plan.step_length, self.mapping, most=plan.most, capacity=plan.rooms[0])
 
-    def _room(self, samples_a_ray: float, rays: int, most: int) -> int:
-        """For how many samples a step on a GPU has room, given how many there lately were."""
-        return min((int(ROOM * min(samples_a_ray * rays, most)) // ROOM_UNIT + 1) * ROOM_UNIT, most)
-
-    def _all_there(self, batch: Rays, targets: torch.Tensor) -> tuple[Rays, torch.Tensor]:
-        """Rays and their targets on the device, moved all at once: each move takes its time, however little it moves."""
-        if self.device.type == "cpu":
-            return batch, targets
-        floats = [value.view(len(targets), -1) for name, value in vars(batch).items() if name != "appearances"] + [targets]
-        *members, targets = self._there(torch.cat(floats, dim=1)).split([each.shape[1] for each in floats], dim=1)
-        origins, directions, times, jitters, backgrounds = (value.contiguous() for value in members)
-        appearances = None if batch.appearances is None else self._there(batch.appearances)
-        return Rays(origins, directions, times.view(-1), jitters.view(-1), backgrounds, appearances), targets
+    def _rooms_for(self, rays: int, most: int) -> tuple[int, int]:
+        """For how many samples that are taken, and that are reached, there is room, given how many there lately were: as before as long as
+        that will do, so that steps are like each other."""
+        taken = min(self._taken_a_ray * rays, most * rays, 3 * self.config.samples / ROOM)
+        rooms = []
+        for wanted, room in zip((taken, min(self._reached_a_ray * rays, taken)), self._rooms, strict=True):
+            if not LEAST_ROOM * wanted <= room <= MOST_ROOM * wanted:
+                room = (int(ROOM * wanted) // ROOM_UNIT + 1) * ROOM_UNIT
+            rooms.append(room)
+        self._rooms = rooms[0], min(rooms)
+        return self._rooms
 
     def _there(self, values: torch.Tensor) -> torch.Tensor:
         """On the device, without waiting for it: only pinned memory can be copied behind one's back."""
-        return values if self.device.type == "cpu" else values.pin_memory().to(self.device, non_blocking=True)
+        return values.pin_memory().to(self.device, non_blocking=True) if self._on_gpu else values
 
     def state(self) -> dict[str, Any]:
         return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict(), "peaks": self._peaks,
@@ -307,6 +354,18 @@ class PlainOptimiser:
         if "exp_avg_sq" not in state:
             return np.zeros(self.field.theta.numel(), np.float32)
         return state["exp_avg_sq"].cpu().numpy()
+
+
+def _packed(batch: Rays, targets: torch.Tensor) -> torch.Tensor:
+    """Rays and their targets in one tensor (N, 14): each move to a device takes its time, however little it moves."""
+    columns = (batch.origins, batch.directions, batch.backgrounds, targets, batch.times[:, None], batch.jitters[:, None])
+    return torch.cat(columns, dim=1)
+
+
+def _unpacked(packed: torch.Tensor, appearances: torch.Tensor | None) -> tuple[Rays, torch.Tensor]:
+    origins, directions, backgrounds, targets, times, jitters = (
+        part.contiguous() for part in packed.split([3, 3, 3, 3, 1, 1], dim=1))
+    return Rays(origins, directions, times[:, 0], jitters[:, 0], backgrounds, appearances), targets
 
 
 def _total(weighed: dict[str, torch.Tensor]) -> torch.Tensor:

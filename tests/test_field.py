@@ -9,7 +9,7 @@ from gradients import bilinear
 from scenes import displaced, tiny_scene
 
 from kpc.encoder.config import PRESETS, TrainConfig
-from kpc.encoder.field import Field, Layout, motion_nodes, motion_priors, plan_layout
+from kpc.encoder.field import Field, Layout, gathered_by_row, motion_nodes, motion_priors, plan_layout, scattered
 from kpc.format.errors import UsageError
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip
 from kpc.player import reference
@@ -189,3 +189,9 @@ def test_colours_are_those_of_the_basis() -> None:
     ray = torch.arange(40) % 7
     wanted = torch.sigmoid(torch.einsum("nf,ncf->nc", latent, field.basis(directions)[ray]))
     torch.testing.assert_close(field.colours(latent, field.once_a_ray(directions), ray), wanted)
+
+
+def test_what_is_gathered_by_row_is_what_is_scattered() -> None:
+    values, rows, shares = torch.randn(500, 8), torch.randint(0, 60, (500, 4)), torch.rand(500, 4)
+    rows[rows == 7] = 8  # to one goes nothing
+    torch.testing.assert_close(gathered_by_row(values, rows, shares, 60), scattered(values, rows, shares, 60))

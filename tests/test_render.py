@@ -12,7 +12,8 @@ from kpc.encoder.config import TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.field import Field, HybridField, Layout, SummedField
 from kpc.encoder.optimisers import Figures, PlainOptimiser, sample_capacity
-from kpc.encoder.render import Rays, collected, fused_features, meet, samples_of, shade
+from kpc.encoder.recorder import Recorder
+from kpc.encoder.render import Rays, collected, fused_features, meet, reached, samples_of, shade
 from kpc.player import reference
 
 
@@ -87,6 +88,51 @@ def test_a_step_on_a_gpu_waits_for_nothing(hybrid_decoder: bool) -> None:
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert losses[-1] < losses[0]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_recorded_step_on_a_gpu_is_the_step(moved: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = misty(True, False, moved)
+    rays, targets = rays_at(scene, 203), torch.rand(203, 3)
+    told = scene.aabb, scene.occupancy, scene.step, scene.extent
+    found = []
+    for records in (True, False):
+        if not records:
+            monkeypatch.setattr(Recorder, "run", lambda self, key, inputs, work: work(*inputs))
+        field = Field.from_scene(scene).cuda()
+        optimiser = PlainOptimiser(field, TrainConfig(learning_rate=1e-3), scene.occupancy.shape[1:])
+        losses = [optimiser.step(k, 0.0, 1.0, rays, targets, *told)[0] for k in range(60)]
+        assert bool(optimiser._recorder._recordings) == records
+        found.append((losses[-1], field.theta.detach().cpu(), optimiser.peaks()))
+    (loss, theta, peaks), (wanted_loss, wanted_theta, wanted_peaks) = found
+    assert loss == pytest.approx(wanted_loss, rel=1e-3)
+    torch.testing.assert_close(theta, wanted_theta, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(peaks, wanted_peaks, atol=1e-3)
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_samples_that_are_not_reached_take_no_part(moved: bool) -> None:
+    scene = misty(True, False, moved)
+    rays, field = rays_at(scene, 203), Field.from_scene(scene).double()
+    rays = rays.apply(torch.Tensor.double)
+    samples = samples_of(rays, torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy), scene.step)
+    whole = meet(field, rays, samples, field.features, scene.extent)
+    assert not whole.reached.all()
+    shown = shade(field, rays, whole)
+    shown.square().sum().backward()
+    wanted, field.theta.grad = field.theta.grad, None
+    count = int(whole.reached.sum())
+    for room in (count, count + 100):
+        some = reached(samples, whole.reached, room)
+        assert len(some.ray) == room and (some.ray.diff() >= 0).all()
+        met = meet(field, rays, some, field.features, scene.extent)
+        found = shade(field, rays, met)
+        torch.testing.assert_close(found, shown)
+        torch.testing.assert_close(met.distortion, whole.distortion)
+        found.square().sum().backward()
+        torch.testing.assert_close(field.theta.grad, wanted)
+        field.theta.grad = None
 
 
 def test_rays_that_meet_nothing_have_no_samples() -> None:
