@@ -209,5 +209,5 @@ PRESETS = {
     "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000),
     # K-Planes' own settings (section 3.1 and its appendix), but for the march through occupied cells. It wants a GPU.
     "paper": TrainConfig(resolutions=(64, 128, 256, 512), channels=32, samples_across=640, cells_across=128, steps=30000,
-                         samples=131072, learning_rate=1e-2, space_variation=1e-3, adapts=False),
+                         samples=131072, occupancy_every=32, learning_rate=1e-2, space_variation=1e-3, adapts=False),
 }

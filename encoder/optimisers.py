@@ -207,6 +207,7 @@ class PlainOptimiser:
         self.watch = Stopwatch()
         self.device = field.theta.device
         self._on_gpu = self.device.type != "cpu"
+        self._records = self._on_gpu and proposals is None
         self._peaks = torch.zeros(cells, device=self.device)
         self._figures = Figures(self.device)
         self._taken_a_ray = self._reached_a_ray = math.inf
@@ -224,6 +225,15 @@ class PlainOptimiser:
         self.planes = _adam([([each.theta for each in self.fields], config.learning_rate)])
         self.decoder = _decoder_optimiser(field, config, [each.density for each in self.fields[1:]])
         self._recorder = Recorder([p for optimiser in (self.planes, self.decoder) for group in optimiser.param_groups for p in group["params"]])
+
+    @contextlib.contextmanager
+    def as_written(self) -> Iterator[None]:
+        """While it lasts, steps are not replayed but done operation by operation."""
+        records, self._records = self._records, False
+        try:
+            yield
+        finally:
+            self._records = records
 
     def peaks(self) -> np.ndarray:
         """As `FusedOptimiser.peaks`."""
@@ -260,7 +270,7 @@ class PlainOptimiser:
             def work(*inputs: torch.Tensor) -> torch.Tensor:
                 return self._backpropagate(plan, *inputs)
 
-            if self._on_gpu and self.proposals is None:
+            if self._records:
                 figures = self._recorder.run((plan, occupancy.shape), inputs, work)
             else:
                 figures = work(*inputs)

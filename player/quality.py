@@ -26,7 +26,9 @@ class Quality:
 
     Attributes:
         folded: multiply the rows of the time planes into the space planes once a frame, instead of sampling them beside the
-            planes at every sample. Half the fetches, and a second-order error where something moves.
+            planes at every sample. Half the fetches, and a second-order error where something moves. On a graphics card folded planes
+            are float16, which it looks up at more than twice the rate: room is 74 dB and soldier 80 dB from their pictures in float32.
+            What is larger than 65,504 is cut off there, what is smaller than 6e-5 loses digits, 6e-8 at most.
         step: distance between samples, in steps of the scene.
         termination: a ray ends once its transmittance falls below this. Where that is more than the format's TERMINATION, what
             is left of its light counts as what it has met so far.

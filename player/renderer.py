@@ -51,6 +51,8 @@ the same time: while the clip stands still, pictures are whole."""
 COMPUTE_VERSION = 430
 TRIAL_AFTER, TRIALS = 8, 3
 """Marches until fragment and compute shaders are tried against each other, and pictures that each of them draws for that."""
+LARGEST_HALF, LARGEST_FLOAT = 65504.0, 3.4e38
+"""What float16 and float32 can hold."""
 ALL, ONLY_PROBES, ONLY_DOUBTED = range(3)
 """PIXELS of march.glsl."""
 GROUP = 8
@@ -115,11 +117,13 @@ class Folded:
     fold_into: moderngl.Framebuffer
 
     @staticmethod
-    def of(ctx: moderngl.Context, layout: Layout, rows: tuple[int, int]) -> "Folded":
-        """For rows that lie, unrefined, in a texture of (width, lines)."""
+    def of(ctx: moderngl.Context, layout: Layout, rows: tuple[int, int], in_half: bool) -> "Folded":
+        """For rows that lie, unrefined, in a texture of (width, lines); the product in float16 where it is to be `in_half`, which graphics cards
+        look up at twice the rate and more."""
         with room_on(ctx, "the folded planes"):
             finer = layout.refined * (rows[0] - 1) + 1, rows[1]
-            refined, cut, planes = _texture(ctx, layout.size), _texture(ctx, finer), _texture(ctx, layout.size)
+            refined, cut = _texture(ctx, layout.size), _texture(ctx, finer)
+            planes = _texture(ctx, layout.size, "f2" if in_half else "f4")
             refined.filter = cut.filter = moderngl.NEAREST, moderngl.NEAREST
             return Folded(refined, cut, planes, ctx.framebuffer([refined]), ctx.framebuffer([planes]))
 
@@ -251,6 +255,11 @@ class Renderer:
         self._programs.clear()
 
     @property
+    def in_half(self) -> bool:
+        """Whether samples look up float16: planes that were folded on a graphics card."""
+        return self.quality.folded and self._rows is not None and not self._is_software
+
+    @property
     def texels_a_sample(self) -> float:
         """Look-ups in planes and rows that a sample takes, each of four channels with its neighbours."""
         layers, shared = self.layout.layers, self._scales_shared()
@@ -262,7 +271,7 @@ class Renderer:
         """Bytes of the textures and buffers that hold the scene and its pictures."""
         textures = [self._planes, self._row_texture, *(self._folded.textures if self._folded else [])]
         textures += [texture for target in self._targets.values() for texture in (target.seen, target.met)]
-        return sum(4 * t.width * t.height * t.components for t in textures) + int(self.scene.occupancy[0].size) + (
+        return sum(int(t.dtype[1]) * t.width * t.height * t.components for t in textures) + int(self.scene.occupancy[0].size) + (
             0 if self._motion_texture is None else 16 * int(np.prod(self._motion_texture.size)))
 
     def put(self, scale: int, plane: str, texels: np.ndarray, first: int = 0) -> None:
@@ -345,7 +354,7 @@ class Renderer:
             raise ValueError(f"time {time} lies outside [0, 1]")
         moving = part is Part.FULL and self._rows is not None
         quality, scene, size = self.quality, self.scene, (camera.width, camera.height)
-        across = self._rays_across(camera)
+        across = self.rays_across(camera)
         if across > 1:
             camera = camera.resized(*(across * side for side in size))
         elif quality.resolution < 1:
@@ -519,7 +528,7 @@ class Renderer:
         blocks = self._covers[self._slot].blocks(camera, BLOCK)
         return None if blocks is None or blocks.mean() > MOST_COVERED else blocks
 
-    def _rays_across(self, camera: Camera) -> int:
+    def rays_across(self, camera: Camera) -> int:
         """As many as a pixel spans texels of the finest scale in the middle of the box, as far as `quality` and PIXELS_MARCHED allow.
         One where space is mapped: there texels differ."""
         if self.scene.mapping is not None:
@@ -636,7 +645,7 @@ class Renderer:
 
     def _fold(self, time: float) -> moderngl.Texture:
         if self._folded is None:
-            self._folded = Folded.of(self.ctx, self.folded_layout, self._row_texture.size)
+            self._folded = Folded.of(self.ctx, self.folded_layout, self._row_texture.size, in_half=not self._is_software)
         folded = self._folded
         if time != self._folded_time and self._rows is not None:
             if not self._is_refined:
@@ -657,6 +666,7 @@ class Renderer:
             program,
             refined=PLANES_UNIT,
             refined_texel=tuple(1 / side for side in into.size),
+            largest=LARGEST_HALF if self.in_half else LARGEST_FLOAT,
             folded_rows_texel=tuple(1 / side for side in self._folded.rows.size) if self._folded else None,
         )
         for source, block in zip(self.layout.blocks, self.folded_layout.blocks):
@@ -697,10 +707,10 @@ def _refuse_too_large(scene: Scene, layout: Layout, card: Mapping[str, Any]) -> 
             )
 
 
-def _texture(ctx: moderngl.Context, size: tuple[int, int]) -> moderngl.Texture:
-    """A float32 texture of (width, height) vectors of four, filtered, clamped at its edges, all 0: filters may touch what lies
+def _texture(ctx: moderngl.Context, size: tuple[int, int], dtype: str = "f4") -> moderngl.Texture:
+    """A texture, float32 unless told, of (width, height) vectors of four, filtered, clamped at its edges, all 0: filters may touch what lies
     between the blocks of an atlas, with a weight of 0, which does no harm to anything but NaN."""
-    texture = ctx.texture(size, 4, dtype="f4")
+    texture = ctx.texture(size, 4, dtype=dtype)
     texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
     texture.repeat_x = texture.repeat_y = False
     whole = ctx.framebuffer([texture])

@@ -287,7 +287,7 @@ def test_what_is_far_away_is_a_mean_of_rays(compute: bool) -> None:
     for across in (1, 2, 4):
         renderer = Renderer(ctx, scene, Quality(across=across))
         renderer.compute = compute
-        assert renderer._rays_across(camera) == across
+        assert renderer.rays_across(camera) == across
         errors[across] = np.abs(renderer.render(camera, 0.62).rgb - many).mean()
     assert errors[4] < 0.5 * errors[2] < 0.5 * 0.7 * errors[1]
 
@@ -300,13 +300,13 @@ def test_rays_a_pixel_follow_what_it_spans(monkeypatch: pytest.MonkeyPatch) -> N
         away = 100 * texels * texel  # a pixel is a hundredth of the distance
         camera = look_at(tuple(middle + np.array([0, 0, away])), tuple(middle), 64, 48, 70.0)
         camera = replace(camera, fl_x=100.0, fl_y=100.0)
-        assert renderer._rays_across(camera) == across
+        assert renderer.rays_across(camera) == across
     monkeypatch.setattr(module, "PIXELS_MARCHED", 64 * 48 * 5)
-    assert renderer._rays_across(camera) == 2
+    assert renderer.rays_across(camera) == 2
     renderer.quality = Quality()
-    assert renderer._rays_across(camera) == 1
+    assert renderer.rays_across(camera) == 1
     for space in ("contracted", "ndc"):
-        assert Renderer(gl.context(), SPACES[space](tiny_scene(4)), Quality(across=4))._rays_across(camera) == 1
+        assert Renderer(gl.context(), SPACES[space](tiny_scene(4)), Quality(across=4)).rays_across(camera) == 1
 
 
 # --- shared look-ups, scales, extremes

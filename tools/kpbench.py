@@ -91,7 +91,7 @@ def _command(argv: list[str]) -> None:
                     aside.write_text(_as_json(records))
     finally:  # a failure or Ctrl-C later on takes away nothing that was measured
         if records:
-            print(results.aligned(results.cells(options.kind, records)), file=sys.stderr)
+            print(results.aligned(results.cells(records[0]["kind"], records)), file=sys.stderr)
             if out is None:
                 print(_as_json(records), end="")
 
@@ -184,13 +184,14 @@ def _step(options: argparse.Namespace, origin: results.Record) -> Iterator[resul
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         for source in options.datasets:
             settings = {"preset": options.preset, "downscale": options.downscale, "space": options.space, "box": options.box}
-            record = _record("step", _folder(source), origin, settings) | {"seed": options.seed, "renderer": "cpu", "repeats": []}
+            record = _record("step", _folder(source), origin, settings) | {"seed": options.seed, "repeats": []}
             work = Path(scratch) / f"{record['name']}.work"
             job = _job(options, source, options.seed, Path(scratch) / "none.kpc", work)
             for _ in range(options.repeats):
                 print(f"kpbench: {record['name']}, {options.preset}, a step", file=sys.stderr)
-                record["repeats"].append(_alone(_step_once, job))
-            yield record
+                device, found = _alone(_step_once, job)
+                record["repeats"].append(found)
+            yield record | {"kind": "step" if device == "cpu" else "gpu", "renderer": device}
 
 
 def _groups(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
@@ -256,11 +257,14 @@ def _ablations(job: Any) -> list[str]:
     return names
 
 
-def _step_once(job: Any) -> results.Record:
+def _step_once(job: Any) -> tuple[str, results.Record]:
+    """Where it was trained, and what was found."""
     from kpc.tools.limits import measure
 
     found: results.Record = _encoder().profile_steps(job)
-    return found | {"limits": asdict(measure()), "peak_memory_bytes": peak_memory_bytes()}
+    device = found.pop("device")
+    limits = {"limits": asdict(measure())} if device == "cpu" else {}
+    return device, found | limits | {"peak_memory_bytes": peak_memory_bytes()}
 
 
 def _encode_once(job: Any) -> tuple[str, results.Record]:
@@ -350,7 +354,6 @@ def _play_once(job: Play) -> dict[str, results.Record]:
             took[key].append(draw(renderer, float(time)))
     median = {key: float(np.median(each[WARM_UP:], axis=0)[0]) for key, each in took.items()}
     best = {name: found[name, min(ways, key=lambda way: median[name, way])] for name in LADDER}
-    peak = texel_rate(ctx)
     for name in LADDER:
         key = name, best[name]["way"]
         renderer, frame_ms, cpu_ms = renderers[key], *zip(*took[key][WARM_UP:], strict=True)
@@ -366,8 +369,9 @@ def _play_once(job: Play) -> dict[str, results.Record]:
             "gpu_memory_bytes": renderer.memory_bytes,
             "peak_memory_bytes": peak_memory_bytes(),
         }
-        if renderer.quality.tolerance == 0 and renderer.quality.across == 1:  # all that a picture shows has been marched for it
+        if renderer.quality.tolerance == 0 and renderer.rays_across(camera) == 1:  # all that a picture shows has been marched for it
             texels = renderer.texels_a_sample * float(renderer.render(camera, 1.0).samples.sum())
+            peak = texel_rate(ctx, key[1] == "compute", "f2" if renderer.in_half else "f4")
             best[name] |= {"texels_a_frame": texels, "share_of_texel_rate": texels / (1e-3 * median[key]) / peak}
     return best
 

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numba import njit, prange
 
-from kpc.player.shader import build
+from kpc.player.shader import build, build_compute
 
 CACHED_BYTES = 1 << 20
 """Of three arrays together for each thread: what fits a second-level cache."""
@@ -58,28 +58,39 @@ def measure() -> Limits:
 
 LOOK_UPS, TEXTURE_SIDE, PICTURE_SIDE = 64, 512, 1024
 """Of `texel_rate`: look-ups a pixel, and sides of what is read and of what is drawn."""
+SHORTEST_S = 0.05
 
 
-def texel_rate(ctx: moderngl.Context) -> float:
-    """Look-ups a second, at most: filtered, of four channels of float32, by a fragment shader whose neighbours read side by side."""
-    texture = ctx.texture((TEXTURE_SIDE, TEXTURE_SIDE), 4, np.random.default_rng(0).random(4 * TEXTURE_SIDE**2, np.float32), dtype="f4")
+def texel_rate(ctx: moderngl.Context, compute: bool, dtype: str) -> float:
+    """Look-ups a second, at most: filtered, of four channels of `dtype` ("f4" or "f2"), by neighbours that read side by side, in a compute
+    or else a fragment shader. (A card need not let all its units draw: of an H100's, few do.)"""
+    texels = np.random.default_rng(0).random(4 * TEXTURE_SIDE**2, np.float32).astype({"f4": np.float32, "f2": np.float16}[dtype])
+    texture = ctx.texture((TEXTURE_SIDE, TEXTURE_SIDE), 4, texels.tobytes(), dtype=dtype)
     texture.filter = moderngl.LINEAR, moderngl.LINEAR
-    program = build(ctx, "texels.glsl", {"LOOK_UPS": LOOK_UPS})
+    seen = ctx.texture((PICTURE_SIDE, PICTURE_SIDE), 4, dtype="f4")
+    target = ctx.framebuffer([seen])
+    defines = {"LOOK_UPS": LOOK_UPS, "COMPUTE": int(compute)}
+    program = (build_compute if compute else build)(ctx, "texels.glsl", defines)
     program["side"] = float(TEXTURE_SIDE)
-    target, vertices = ctx.simple_framebuffer((PICTURE_SIDE, PICTURE_SIDE), components=4), ctx.vertex_array(program, [])
+    vertices = None if isinstance(program, moderngl.ComputeShader) else ctx.vertex_array(program, [])
     target.use()
     texture.use(0)
+    seen.bind_to_image(0, read=False)
 
     def draw(times: int) -> None:
         for _ in range(times):
-            vertices.render(moderngl.TRIANGLES, vertices=3)
+            if vertices is None:
+                program.run(PICTURE_SIDE // 8, PICTURE_SIDE // 8)
+            else:
+                vertices.render(moderngl.TRIANGLES, vertices=3)
         ctx.finish()
 
-    once = _best(lambda: draw(1))
-    times = max(1, round(0.05 / once))
+    times = max(1, round(SHORTEST_S / _best(lambda: draw(1))))
     rate = times * LOOK_UPS * PICTURE_SIDE**2 / _best(lambda: draw(times))
-    for thing in (vertices, program, target, texture):
-        thing.release()
+    ctx.detect_framebuffer(0).use()  # moderngl would bind again what it knows as bound, though it is gone
+    for thing in (vertices, program, target, seen, texture):
+        if thing is not None:
+            thing.release()
     return rate
 
 

@@ -44,10 +44,10 @@ def _accuracy(key: str, text: str) -> Callable[[Record], str]:
     return lambda record: text.format(record["accuracy"][key])
 
 
-def _ratio(key: str, other: str, text: str) -> Callable[[Record], str]:
+def _ratio(key: str, other: str, text: str, unit: float = 1.0) -> Callable[[Record], str]:
     def cell(record: Record) -> str:
         value, against = median(record, key), median(record, other)
-        return "-" if value is None or not against else text.format(value / against)
+        return "-" if value is None or not against else text.format(value / against / unit)
 
     return cell
 
@@ -84,6 +84,12 @@ def _at_joins(record: Record) -> str:
 def _usual_change(record: Record) -> str:
     joins = record["joins"]
     return f"{255 * joins[0]['usual_change']:.1f}, {255 * joins[0]['high_change']:.1f}" if joins else "-"
+
+
+def _ways(record: Record) -> str:
+    """Of a frame by each kind of shader, where there is a choice."""
+    times = [median(record, f"{way}_ms_median") for way in ("fragment", "compute")]
+    return "-" if None in times else ", ".join(f"{time:.1f}" for time in times)
 
 
 def _smaller(record: Record) -> str:
@@ -169,6 +175,19 @@ COLUMNS: dict[str, list[Column]] = {
         ("memory GB/s", _limit("memory_gb_s")),
         ("peak MB", _number("peak_memory_bytes", "{:.0f}", 1e6)),
     ],
+    "gpu": [
+        *_ENCODED[:2],
+        ("M param", _number("parameters", "{:.2f}", 1e6)),
+        ("samples/ray", _number("samples_per_ray", "{:.1f}")),
+        ("rays/s", _number("rays_per_s", "{:,.0f}")),
+        ("ms a step", _number("step_s", "{:.1f}", 1e-3)),
+        ("GB a step", _number("bytes", "{:.1f}", 1e9)),
+        ("at least", _number("least_bytes", "{:.1f}", 1e9)),
+        ("GB/s", _ratio("bytes", "step_s", "{:.0f}", 1e9)),
+        ("a copy's", _number("memory_gb_s", "{:.0f}")),
+        ("share", _number("share_of_memory", "{:.0%}")),
+        ("GPU memory GB", _number("gpu_memory_bytes", "{:.1f}", 1e9)),
+    ],
     "player": [
         ("scene", lambda r: r["name"]),
         ("quality", lambda r: r["settings"]["quality"] + " (default)" * (r["settings"]["quality"] == r["settings"]["default"])),
@@ -178,6 +197,9 @@ COLUMNS: dict[str, list[Column]] = {
         ("p95 ms", _number("frame_ms_p95", "{:.1f}")),
         ("processors ms", _number("cpu_ms_median", "{:.1f}")),
         ("fps", _number("fps", "{:.1f}")),
+        ("fragment, compute ms", _ways),
+        ("G texels", _number("texels_a_frame", "{:.2f}", 1e9)),
+        ("of the card's rate", _number("share_of_texel_rate", "{:.0%}")),
         ("of reference", _number("times_reference", "{:.1f}x")),
         ("samples/ray", _accuracy("samples_per_ray", "{:.1f}")),
         ("textures MB", _number("gpu_memory_bytes", "{:.1f}", 1e6)),
@@ -244,7 +266,7 @@ COLUMNS: dict[str, list[Column]] = {
 }
 
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
-          "step": "A step of training", "player": "Playing", "stream": "Playing while it arrives",
+          "step": "A step of training", "gpu": "A step of training", "player": "Playing", "stream": "Playing while it arrives",
           "groups": "A clip in groups",
           "steady": "Playing for long, all controls shown",
           "codec": "Coding, beside what is at hand", "entropy": "Entropy coding of planes, one idea left out; one core"}

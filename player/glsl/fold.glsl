@@ -11,12 +11,14 @@ uniform vec2 origin;         // the plane's block, texels
 uniform float width;         // of one layer
 uniform bool upright;        // the row runs along the plane's rows, else along its columns
 uniform int line;            // of the row's first layer
+uniform float largest;       // number that can be written
 
 layout(location = 0) out vec4 folded;
 
 void main() {
     vec2 local = gl_FragCoord.xy - origin;
     float layer = floor(local.x / width), along = upright ? local.y : local.x - layer * width;
-    folded = textureLod(refined, gl_FragCoord.xy * refined_texel, 0.0)
-           * textureLod(rows, vec2(along, float(line) + layer + 0.5) * folded_rows_texel, 0.0);
+    vec4 product = textureLod(refined, gl_FragCoord.xy * refined_texel, 0.0)
+                 * textureLod(rows, vec2(along, float(line) + layer + 0.5) * folded_rows_texel, 0.0);
+    folded = clamp(product, -largest, largest);
 }
