@@ -431,7 +431,7 @@ def gathered_by_row(values: Tensor, rows: Tensor, shares: Tensor, count: int) ->
     order = entries.argsort()
     ends = torch.searchsorted(entries[order], torch.arange(count + 1, device=rows.device, dtype=torch.int32), out_int32=True)
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
+        warnings.simplefilter("ignore")  # that such tensors are in beta, and that nobody looks at what they are made of
         matrix = torch.sparse_csr_tensor(ends, (order // rows.shape[1]).int(), shares.flatten()[order], (count, len(values)),
                                          check_invariants=False)
     return matrix @ values

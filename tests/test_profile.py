@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from test_train import BOX, CONFIG
 
 from kpc.encoder import profile
@@ -57,3 +58,22 @@ def test_the_rows_of_the_arithmetic_limit_stay_finite() -> None:
     x = np.linspace(-1, 1, 64, dtype=np.float32).reshape(2, -1)
     limits._polynomials(x, 100)
     np.testing.assert_allclose(x, 0.5, atol=1e-5)
+
+
+def test_traffic_is_what_operations_read_and_write() -> None:
+    x, table, rows = torch.rand(100, 50), torch.rand(1000, 8), torch.randint(0, 1000, (60,))
+    with profile.Traffic() as traffic:
+        x + x[:1]  # the row once
+        assert traffic.bytes == 4 * (5000 + 50 + 5000)
+        x.T
+        assert traffic.bytes == 4 * (5000 + 50 + 5000)
+        traffic.bytes = 0
+        table.index_select(0, rows)  # of the table 60 rows
+        assert traffic.bytes == 8 * 60 + 2 * 4 * 60 * 8
+        traffic.bytes = 0
+        torch.nn.functional.embedding_bag(rows.view(15, 4), table, per_sample_weights=torch.rand(15, 4), mode="sum")
+    assert traffic.bytes == pytest.approx(8 * 60 + 4 * 60 + 4 * 60 * 8 + 4 * 15 * 8, rel=0.2)  # and where bags begin
+    x = torch.rand(100, 50, requires_grad=True)
+    with profile.Traffic() as traffic:
+        x.exp().sum().backward()
+    assert traffic.bytes == pytest.approx(4 * (2 * 5000 + 5000 + 2 * 5000), rel=0.01)  # the gradient of the sum is one number

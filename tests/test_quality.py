@@ -366,3 +366,18 @@ def test_boxes_without_a_volume_show_the_background(edges: tuple[float, float, f
     for name, quality in LADDER.items():
         got = Renderer(gl.context(), scene, quality).render(CAMERA, 1.0)
         assert np.isfinite(got.rgb).all() and np.abs(got.rgb - scene.background).max() < 0.02, name
+
+
+def test_folded_planes_in_half_floats_are_near_those_in_floats(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On graphics cards; a processor is told here that it is one."""
+    ctx, scene = gl.context(), tiny_scene(4)
+    exact = Renderer(ctx, scene, LADDER["finer"])
+    monkeypatch.setattr(module, "is_software", lambda ctx: False)
+    half = Renderer(ctx, scene, LADDER["finer"], compute=False)
+    assert (exact.in_half, half.in_half) == (False, True)
+    wanted, found = exact.render(CAMERA, 0.4).rgb, half.render(CAMERA, 0.4).rgb
+    assert half.memory_bytes < exact.memory_bytes and not np.array_equal(found, wanted)
+    assert np.abs(found - wanted).max() < 0.01
+    # What float16 cannot hold is cut off, not infinite.
+    bright = replace(scene, scales=tuple({name: 1e4 * plane for name, plane in scale.items()} for scale in scene.scales))
+    assert np.isfinite(Renderer(ctx, bright, LADDER["finer"], compute=False).render(CAMERA, 0.4).rgb).all()

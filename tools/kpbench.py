@@ -531,7 +531,7 @@ def _parser() -> argparse.ArgumentParser:
 
     for kind in (encode, curve, ablate, step, groups):
         kind.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
-        kind.add_argument("--preset", choices=("draft", "fast", "balanced", "best"), default="balanced")
+        kind.add_argument("--preset", choices=("draft", "fast", "balanced", "best", "paper"), default="balanced")
         kind.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
         kind.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
         kind.add_argument("--space", choices=("auto", "box", "contracted", "ndc"), default="auto", help="of every dataset")
