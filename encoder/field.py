@@ -110,8 +110,7 @@ class Field(nn.Module):
         w1, b1, w2, b2: the direction MLP, shapes as in `kpc.format.scene.Decoder`. w2 starts at 0: colour depends on the
             direction only as far as the pictures insist.
         codes: (K, H) of appearances, at first 0; or None.
-        axes, sizes, first: of the planes that are multiplied, as `features` wants them. neighbours, one_of: of the texels, as `_texels`
-            has them.
+        axes, sizes, first: of the planes that are multiplied, as `features` wants them.
     """
 
     IDENTITY = 1.0
@@ -141,10 +140,6 @@ class Field(nn.Module):
         self._constant("axes", axes)
         self._constant("sizes", torch.from_numpy(layout.resolution.T)[axes][:, :, None])
         self._constant("first", torch.from_numpy(layout.table.T[: len(names), None, :, None] // layout.channels))
-        neighbours, one_of = zip(*(_texels(name, start // layout.channels, rows, columns, layout.channels)
-                                   for _, name, start, rows, columns in layout.planes()), strict=True)
-        self._constant("neighbours", torch.cat(neighbours, dim=1))
-        self._constant("one_of", torch.cat(one_of, dim=1))
         self._make_decoder(layout.features, hidden, uniform)
 
     def _constant(self, name: str, values: Tensor) -> None:
@@ -159,6 +154,14 @@ class Field(nn.Module):
         self.b1 = nn.Parameter(torch.zeros(hidden))
         self.w2 = nn.Parameter(torch.zeros(3, F, hidden))
         self.b2 = nn.Parameter(uniform(-1, 1, 3, F))
+
+    @functools.cached_property
+    def texels(self) -> tuple[Tensor, Tensor]:
+        """Of all texels what `_texels` says of a plane's, where the planes are when it is asked for first."""
+        M = self.layout.channels
+        each = [_texels(name, start // M, rows, columns, M) for _, name, start, rows, columns in self.layout.planes()]
+        neighbours, one_of = (torch.cat(parts, dim=1).to(self.theta.device) for parts in zip(*each, strict=True))
+        return neighbours, one_of.to(self.theta.dtype)
 
     def plane(self, scale: int, name: str) -> Tensor:
         """A view of one plane: (rows, columns, M)."""
@@ -458,10 +461,9 @@ def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
     transient_variation * the same along space alone, time_smoothness * mean (P[t-1] - 2 P[t] + P[t+1])^2, and
     sparse_transients * mean |1 - P|; each summed over the planes it concerns.
     """
-    table = field.theta.view(-1, field.layout.channels)
-    right, below, above = (table.index_select(0, texels) for texels in field.neighbours)
+    table, (neighbours, (in_space, in_time, within)) = field.theta.view(-1, field.layout.channels), field.texels
+    right, below, above = (table.index_select(0, texels) for texels in neighbours)
     along, across = (right - table).square().sum(1), (below - table).square().sum(1)
-    in_space, in_time, within = field.one_of
     total = {
         "space_variation": _sum(along + across, in_space),
         "transient_variation": _sum(along, in_time),

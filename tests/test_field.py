@@ -181,16 +181,6 @@ def test_colours_are_those_of_the_basis() -> None:
     torch.testing.assert_close(field.colours(latent, field.once_a_ray(directions), ray), wanted)
 
 
-def test_colours_are_those_of_the_basis() -> None:
-    field = Field(Layout.of(np.array([[4, 3, 2, 3]]), 5), 6, torch.Generator().manual_seed(0)).double()
-    with torch.no_grad():
-        field.w2.normal_()
-    latent, directions = torch.randn(40, 5).double(), torch.nn.functional.normalize(torch.randn(7, 3).double(), dim=1)
-    ray = torch.arange(40) % 7
-    wanted = torch.sigmoid(torch.einsum("nf,ncf->nc", latent, field.basis(directions)[ray]))
-    torch.testing.assert_close(field.colours(latent, field.once_a_ray(directions), ray), wanted)
-
-
 def test_what_is_gathered_by_row_is_what_is_scattered() -> None:
     values, rows, shares = torch.randn(500, 8), torch.randint(0, 60, (500, 4)), torch.rand(500, 4)
     rows[rows == 7] = 8  # to one goes nothing
