@@ -6,6 +6,7 @@ import random
 import time
 
 import pytest
+import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -123,3 +124,9 @@ def test_a_run_in_parts(monkeypatch):
 def test_computing_is_told_of_other_processes():
     assert fuzz._computed_s(os.getpid()) == pytest.approx(time.process_time(), abs=0.2)
     assert fuzz._computed_s(-1) == 0
+
+
+def test_a_frame_that_says_it_is_vast_is_not_taken_at_its_word() -> None:
+    small, vast = zstandard.compress(b"a" * 100), b"\x28\xb5\x2f\xfd\xe0" + (1 << 50).to_bytes(8, "little") + b"\x01\x00\x00"
+    assert fuzz._decompressed(small) == b"a" * 100
+    assert fuzz._decompressed(vast) is None and fuzz._decompressed(b"no frame") is None
