@@ -27,6 +27,9 @@ AXES = "xyzt"
 FEATURE_GAIN = 8.0
 """Of the hybrid decoder's first layer at the start."""
 
+CACHED_ROWS = 1 << 13
+"""Gradients of so many look-ups at a time are added up by a processor, whose cache holds them until all of their texels have their share."""
+
 Uniform = Callable[..., Tensor]
 """Random numbers from low to high, of a shape."""
 
@@ -422,8 +425,9 @@ def scattered(values: Tensor, rows: Tensor, shares: Tensor, count: int) -> Tenso
     if values.is_cuda:
         return gathered_by_row(values, rows, shares, count)
     table = values.new_zeros(count, values.shape[1])
-    for k in range(rows.shape[1]):
-        table.index_add_(0, rows[:, k], shares[:, k, None] * values)
+    for some, of_them, their in zip(values.split(CACHED_ROWS), rows.split(CACHED_ROWS), shares.split(CACHED_ROWS), strict=True):
+        for k in range(rows.shape[1]):
+            table.index_add_(0, of_them[:, k], their[:, k, None] * some)
     return table
 
 
