@@ -519,8 +519,9 @@ def _parse_head(raw: bytes) -> SceneHead:
     frame_count, fps, step = fields[6:9]
     background = np.array(fields[9:12], np.float32)
     scale_count, dynamic = fields[12:]
-    edges = aabb[1].astype(np.float64) - aabb[0]
-    if not (np.abs(aabb) <= BOX_LIMIT).all() or not (edges >= 1 / BOX_LIMIT).all():  # False for NaN, too
+    within = bool((np.abs(aabb) <= BOX_LIMIT).all())  # not so with NaN
+    edges = aabb[1].astype(np.float64) - aabb[0] if within else np.zeros(3)
+    if not (edges >= 1 / BOX_LIMIT).all():
         raise FormatError("SCNE: the box is empty, not finite or absurdly large")
     if not (math.isfinite(fps) and fps > 0 and 0 < frame_count <= FRAME_LIMIT):
         raise FormatError(f"SCNE: a clip of {frame_count} frames at {fps} fps makes no sense")

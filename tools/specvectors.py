@@ -10,6 +10,7 @@ on the version of that library, and only in how they are packed (valid/NAME.json
 import hashlib
 import itertools
 import json
+import math
 import struct
 import sys
 from collections.abc import Callable
@@ -525,6 +526,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "segment-long": (repacked(xt, lambda raw: raw + bytes(1)), broken, "its map implies"),
         "scene-box": (repacked(scne, set_at(0, "<f", 1e9)), broken, "the box is empty"),
         "scene-box-large": (repacked(scne, set_at(12, "<f", 1e30)), broken, "absurdly large"),
+        "scene-box-infinite": (repacked(scne, set_at(0, "<6f", *6 * [math.inf])), broken, "not finite"),
         "scene-clip": (repacked(scne, set_at(24, "<I", 0)), broken, "a clip of 0 frames"),
         "scene-fps": (repacked(scne, set_at(28, "<d", nan)), broken, "makes no sense"),
         "scene-step": (repacked(scne, set_at(36, "<d", 1e-12)), broken, "a ray step"),
