@@ -191,6 +191,7 @@ class Renderer:
         self.quality = quality
         self.compute = bool(compute)
         self._is_software = is_software(ctx)
+        self._folds_in_half = not self._is_software
         self._marches_to_trial = TRIAL_AFTER if compute is None and tries_compute(ctx) else math.inf
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
@@ -257,7 +258,7 @@ class Renderer:
     @property
     def in_half(self) -> bool:
         """Whether samples look up float16: planes that were folded on a graphics card."""
-        return self.quality.folded and self._rows is not None and not self._is_software
+        return self.quality.folded and self._rows is not None and self._folds_in_half
 
     @property
     def texels_a_sample(self) -> float:
@@ -645,7 +646,7 @@ class Renderer:
 
     def _fold(self, time: float) -> moderngl.Texture:
         if self._folded is None:
-            self._folded = Folded.of(self.ctx, self.folded_layout, self._row_texture.size, in_half=not self._is_software)
+            self._folded = Folded.of(self.ctx, self.folded_layout, self._row_texture.size, self._folds_in_half)
         folded = self._folded
         if time != self._folded_time and self._rows is not None:
             if not self._is_refined:
