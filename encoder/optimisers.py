@@ -177,13 +177,12 @@ class Plan:
     """What a step of `PlainOptimiser` goes by besides tensors.
 
     Attributes:
-        number: of the step where proposals are sampled, whose schedule it sets; else 0. rays: how many.
+        number: of the step where proposals are sampled, whose schedule it sets; else 0.
         step_length, extent: as in `FusedOptimiser.step`. moving, regularised: whether the motion grid, and the planes' priors, take part.
         most: samples that a ray can take. rooms: on a GPU, for how many samples that are taken, and that are reached; elsewhere for as many as there are, None.
     """
 
     number: int
-    rays: int
     step_length: float
     extent: float
     moving: bool
@@ -250,7 +249,7 @@ class PlainOptimiser:
         regularised = number % config.regularise_every == 0
         most = sample_capacity(aabb, step_length, self.mapping)
         plan = Plan(
-            number if self.proposals is not None else 0, rays, step_length, extent,
+            number if self.proposals is not None else 0, step_length, extent,
             self.field.motion is not None and number % config.motion_every == 0, regularised,
             most, self._rooms_for(rays, most) if self._on_gpu else None,
         )
@@ -271,7 +270,7 @@ class PlainOptimiser:
                 return self._backpropagate(plan, *inputs)
 
             if self._records:
-                figures = self._recorder.run((plan, occupancy.shape), inputs, work)
+                figures = self._recorder.run(plan, inputs, work)
             else:
                 figures = work(*inputs)
         with self.watch("priors"):

@@ -5,7 +5,9 @@ import math
 import os
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -78,9 +80,9 @@ def _profile_on_gpu(trainer: Trainer) -> dict[str, Any]:
         steps_s.append((time.perf_counter() - started) / FUSED_STEPS)
     rays = trainer.rays_a_step
     for _ in range(config.regularise_every):
-        batch, targets = trainer.sampler.draw(trainer.rng, rays, None if trainer.dataset.has_alpha else trainer.background)
+        step = _drawn(trainer, optimiser, rays)
         with Traffic() as traffic, optimiser.as_written():
-            optimiser.step(trainer.step, 1.0, 1e-3, batch, targets, trainer.aabb, trainer.grid.marched, trainer.step_length, trainer.extent)
+            step()
         trainer.step += 1
         moved.append(traffic.bytes)
     step_s, bytes_ = statistics.median(steps_s), statistics.mean(moved)
@@ -159,12 +161,18 @@ def work(layout: Layout, samples: float) -> tuple[float, float]:
 
 def _plain_step(trainer: Trainer, plain: PlainOptimiser, count: int) -> float:
     """Seconds of a step with `count` rays, the field's decoder included, by as many threads as the machine has cores."""
-    batch, targets = trainer.sampler.draw(trainer.rng, count, None if trainer.dataset.has_alpha else trainer.background)
-    threads = torch.get_num_threads()
+    step, threads = _drawn(trainer, plain, count), torch.get_num_threads()
     torch.set_num_threads(os.cpu_count() or 1)
     try:
         started = time.perf_counter()
-        plain.step(trainer.step, 1.0, 1e-3, batch, targets, trainer.aabb, trainer.grid.marched, trainer.step_length, trainer.extent)
+        step()
         return time.perf_counter() - started
     finally:
         torch.set_num_threads(threads)
+
+
+def _drawn(trainer: Trainer, optimiser: PlainOptimiser, count: int) -> Callable[[], object]:
+    """A step of `optimiser` with `count` rays, which are drawn at once."""
+    batch, targets = trainer.sampler.draw(trainer.rng, count, None if trainer.dataset.has_alpha else trainer.background)
+    return partial(optimiser.step, trainer.step, 1.0, 1e-3, batch, targets, trainer.aabb, trainer.grid.marched, trainer.step_length,
+                   trainer.extent)

@@ -22,9 +22,9 @@ class Recording:
 
 
 class Recorder:
-    """Does work that a key names: as it is when the key comes up first, then recorded.
+    """Does work that a key names: as it is when the key, with inputs of such shapes, comes up first, then recorded.
 
-    A key has to tell all that work goes by besides its inputs, their shapes included.
+    A key has to tell all else that work goes by.
     """
 
     MOST = 8
@@ -37,9 +37,8 @@ class Recorder:
         self._recordings: dict[Hashable, Recording] = {}
 
     def run(self, key: Hashable, inputs: Sequence[Tensor], work: Work) -> Tensor:
-        """work(*inputs). The result, and gradients, hold until the next call."""
-        for parameter in self.parameters:
-            parameter.grad = None
+        """work(*inputs), with parameters that have no gradient yet. The result, and gradients, hold until the next call."""
+        key = key, tuple(value.shape for value in inputs)
         if key not in self._recordings:
             if key not in self._seen:
                 self._seen.add(key)

@@ -72,6 +72,16 @@ def test_mixed_precision_is_float32_within_its_bound() -> None:
         assert (gradient - gradients[True][name]).abs().max() < 0.03 * gradient.abs().max(), name
 
 
+def test_gradients_are_added_up_in_float32() -> None:
+    """A thousand of 1/4096 after one of 1: a float16 sum would stay at 1."""
+    plane = torch.ones(2, 2, 1, requires_grad=True)
+    u = torch.zeros(1001)
+    g = torch.full((1001, 1), 1 / 4096)
+    g[0] = 1
+    (bilinear(plane, u, u) * g).sum().backward()
+    assert plane.grad is not None and plane.grad[0, 0, 0] == 1 + 1000 / 4096
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("hybrid_decoder", [False, True])
 def test_a_step_on_a_gpu_waits_for_nothing(hybrid_decoder: bool) -> None:
