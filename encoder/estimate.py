@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kpc.encoder.compress import PROBES
+from kpc.encoder.curvature import RAYS, curvature
 from kpc.encoder.evaluate import SceneRenderer
+from kpc.encoder.probe import Probe
 from kpc.encoder.prune import renderings
 from kpc.encoder.train import Trainer
 from kpc.encoder.trellis import quantise_on_trellis
@@ -56,7 +58,7 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
     rendered = (probes + 1) * probe_rays + 2 * tested * float(pixels.mean())
     fits_s = 2 * tested * _seconds_a_fit(trainer) if trainer.names and tested else 0.0
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()
-    coding_s = PROBES * _seconds_a_coding(trainer.scene())
+    coding_s = PROBES * _seconds_a_coding(trainer.scene()) + _seconds_of_curvature(trainer.scene())
     return Estimate(train_s, spent_s + rendered * _seconds_a_ray(trainer) + coding_s + fits_s, memory)
 
 
@@ -74,6 +76,15 @@ def _seconds_a_coding(scene: Scene) -> float:
     started = time.perf_counter()
     quantise_on_trellis(scene, steps)
     return time.perf_counter() - started
+
+
+def _seconds_of_curvature(scene: Scene) -> float:
+    """What errors cost, `kpc.encoder.curvature`: by a sixteenth of its rays."""
+    probe = Probe.of_cameras(scene, RAYS // 16)
+    curvature(scene, probe, 2)  # what is done once
+    started = time.perf_counter()
+    curvature(scene, probe, RAYS // 16)
+    return 16 * (time.perf_counter() - started)
 
 
 def _seconds_a_fit(trainer: Trainer) -> float:

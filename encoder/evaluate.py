@@ -71,7 +71,7 @@ class SceneRenderer:
         self, o: np.ndarray, d: np.ndarray, t: np.ndarray, codes: torch.Tensor | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         scene = self.scene
-        batch = self._batch(o, d, t)
+        batch = self.batch(o, d, t)
         samples = collected(batch, scene.aabb, scene.occupancy, scene.step, scene.mapping)
         met = meet(self.field, batch, samples, fused_features(self.field), scene.extent)
         along = samples.s.numpy() if not isinstance(scene.mapping, Contraction) else scene.mapping.distance(samples.s.numpy())
@@ -96,10 +96,10 @@ class SceneRenderer:
         chosen = rng.permutation(len(row))[:FIT_RAYS]
         row, column, n = row[chosen], column[chosen], len(chosen)
         origins, directions = rays(pictures, np.full(n, number), column, row, self.scene.mapping)
-        batch = self._batch(origins, directions, np.full(n, pictures.time[number]))
+        batch = self.batch(origins, directions, np.full(n, pictures.time[number]))
         return fitted_code(self.scene, self.field, batch, torch.from_numpy(true_picture(dataset, number)[row, column]))
 
-    def _batch(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> Rays:
+    def batch(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> Rays:
         """Rays as pictures are made of them: samples in the middle of their steps, the scene's background."""
         n = len(origins)
         return Rays.of(origins, directions, times, np.full(n, 0.5), np.tile(self.scene.background, (n, 1)))

@@ -17,14 +17,13 @@ import torch
 
 from kpc.encoder.ablations import changed_by
 from kpc.encoder.box import contraction_of, device_coordinates_of, find_box, find_inner_box, reaches_beyond, seen_cells
-from kpc.encoder.compress import relative_steps
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.estimate import Estimate, estimate
 from kpc.encoder.evaluate import evaluate
 from kpc.encoder.field import time_rows
 from kpc.encoder.grouped import LATER, begin_with, share_of, spans_of
-from kpc.encoder.model import Model, by_plane, code, load_checkpoint, save_checkpoint
+from kpc.encoder.model import Model, code, load_checkpoint, save_checkpoint
 from kpc.encoder.occupancy import grid_shape
 from kpc.encoder.options import Options, parse
 from kpc.encoder.profile import profile
@@ -154,11 +153,10 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         return _not_written(trainer, options, started)
     _say("writing: choosing quantisation steps, rendering held-out views")
     scene = to_scene(trainer)
-    curvature = by_plane(trainer.field.layout, trainer.optimiser.curvature())
     probe = Probe.of_training(trainer.sampler, trainer.background)
     if options.keep_checkpoint is not None:
-        save_checkpoint(options.keep_checkpoint, scene, curvature, probe)
-    coded = code(Model(scene, relative_steps(curvature), probe), options.trade, trainer.config.prune_share)
+        save_checkpoint(options.keep_checkpoint, scene, probe)
+    coded = code(Model(scene, probe), options.trade, trainer.config.prune_share)
     if coded.pruned is not None:
         _say(_left_out(scene, coded.pruned, coded.spare_db))
     size = _write(coded.data, options.output, work)

@@ -1,7 +1,7 @@
 """What training made, ready to be coded, again and again: a finished checkpoint, or a .kpc file.
 
-A checkpoint holds the scene in full precision, what an error in each number would cost, and training pixels to judge codings by.
-A file holds the scene as it was coded; its own steps say what errors cost, and it is judged by its own pictures.
+A checkpoint holds the scene in full precision, and training pixels to judge codings by. A file holds the scene as it was coded, and is
+judged by its own pictures.
 """
 
 import zipfile
@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from kpc.encoder.checkpoint import save_state
-from kpc.encoder.compress import Quantise, Steps, Trade, compress, relative_steps
-from kpc.encoder.field import Layout
+from kpc.encoder.compress import Quantise, Trade, compress, importance, relative_steps
+from kpc.encoder.curvature import curvature
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
 from kpc.encoder.trellis import quantise_on_trellis
@@ -39,13 +39,11 @@ class Model:
 
     Attributes:
         scene: as trained, or as a file holds it.
-        steps: of quantisation, for each channel of each plane; up to a common factor, or those of the file.
         probe: rays to judge codings by.
         coded: the file as it is; None for a scene in full precision.
     """
 
     scene: Scene
-    steps: Steps
     probe: Probe
     coded: QuantisedScene | None = None
 
@@ -84,15 +82,17 @@ def code(model: Model, trade: Trade, prune_share: float, quantise: Quantise = qu
     Raises:
         TrainingError: no file of this model is so small.
     """
-    scene, steps, coded, pruned = model.scene, model.steps, model.coded, None
+    scene, coded, pruned = model.scene, model.coded, None
+    steps = None if coded is None else [{name: plane.step for name, plane in scale.items()} for scale in coded.scales]
     measure = model.probe.measure(scene)
     whole = measure(scene).psnr
     spare = prune_share * trade.loss_db(whole)
     if spare > 0 and isinstance(scene.decoder, Decoder):  # no other is linear
         pruned = prune(scene, model.probe.rays, lambda candidate: measure(candidate).psnr, spare)
         if coded is None or pruned.left_out_any:
-            scene, steps, coded = pruned.scene, pruned.of_each_plane(steps), None
-    found = compress(scene, steps, measure, whole, trade, coded, quantise)
+            scene, steps, coded = pruned.scene, steps and pruned.of_each_plane(steps), None
+    important = importance(curvature(scene, model.probe))
+    found = compress(scene, steps or relative_steps(important), important, measure, whole, trade, coded, quantise)
     measured: Measured = found.measured
     return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, spare)
 
@@ -119,23 +119,13 @@ def begins_with(path: Path, magic: bytes) -> bool:
 def model_of(coded: QuantisedScene) -> Model:
     """A scene as a file holds it, to be coded again."""
     scene = coded.dequantise()
-    steps = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in coded.scales]
-    return Model(scene, steps, Probe.of_cameras(scene), coded)
-
-
-def by_plane(layout: Layout, values: np.ndarray) -> list[dict[str, np.ndarray]]:
-    """Numbers of every element of `Field.theta` as one mapping a scale, plane name -> (rows, columns, M)."""
-    planes: list[dict[str, np.ndarray]] = [{} for _ in layout.resolution]
-    for s, name, start, rows, columns in layout.planes():
-        size = rows * columns * layout.channels
-        planes[s][name] = values[start : start + size].reshape(rows, columns, layout.channels)
-    return planes
+    return Model(scene, Probe.of_cameras(scene), coded)
 
 
 # --- finished checkpoints
 
 
-def save_checkpoint(path: Path, scene: Scene, curvature: Sequence[Mapping[str, np.ndarray]], probe: Probe) -> None:
+def save_checkpoint(path: Path, scene: Scene, probe: Probe) -> None:
     """Write all that coding asks for, as plain tensors and numbers.
 
     Raises:
@@ -144,7 +134,7 @@ def save_checkpoint(path: Path, scene: Scene, curvature: Sequence[Mapping[str, n
     kind = "hybrid" if isinstance(scene.decoder, HybridDecoder) else "explicit"
     state = {
         "kpc": VERSION, "aabb": scene.aabb, "frame_count": scene.clip.frame_count, "fps": float(scene.clip.fps),
-        "scales": scene.scales, "curvature": curvature, "kind": kind, "decoder": vars(scene.decoder),
+        "scales": scene.scales, "kind": kind, "decoder": vars(scene.decoder),
         "occupancy": scene.occupancy, "background": scene.background, "step": float(scene.step),
         "cameras": np.array([_camera_as_numbers(camera) for camera in scene.cameras]).reshape(-1, 22),
         "mapping": _mapping_as_numbers(scene.mapping), "motion": scene.motion,
@@ -171,10 +161,9 @@ def load_checkpoint(path: Path) -> Model:
             raise TrainingError(f"{path}: no finished checkpoint; kpenc DATASET --keep-checkpoint writes one, --resume goes on "
                                 "from one of a run")
         state = _changed(state, torch.Tensor, _as_array)
-        scene, curvature = _scene_of(state), state["curvature"]
+        scene = _scene_of(state)
         probe = Probe(**state["probe"])
-        _check(scene, curvature, probe)
-        steps = relative_steps(curvature)
+        _check(scene, probe)
         # What no file could hold is found here, by the rules of every reader, before anything is rendered.
         file.scene_chunks(quantise_scene(scene, [{name: 8.0 for name in scale} for scale in scene.scales], skip_unseen=False))
     except (TrainingError, OSError):
@@ -183,7 +172,7 @@ def load_checkpoint(path: Path) -> Model:
         raise TrainingError(f"{path}: not a usable checkpoint ({error})") from error
     except Exception as error:  # what a damaged file holds may be of any kind
         raise TrainingError(f"{path}: not a usable checkpoint ({type(error).__name__}); train anew") from error
-    return Model(scene, steps, probe)
+    return Model(scene, probe)
 
 
 def _scene_of(state: Mapping[str, Any]) -> Scene:
@@ -196,14 +185,12 @@ def _scene_of(state: Mapping[str, Any]) -> Scene:
     )
 
 
-def _check(scene: Scene, curvature: Sequence[Mapping[str, np.ndarray]], probe: Probe) -> None:
+def _check(scene: Scene, probe: Probe) -> None:
     """What coding relies on beyond the rules of files."""
-    for planes, errors in zip(scene.scales, curvature, strict=True):
+    for planes in scene.scales:
         for name, plane in planes.items():
-            if plane.dtype != np.float32 or errors[name].shape != plane.shape:
+            if plane.dtype != np.float32:
                 raise ValueError(name)
-            if not (np.isfinite(errors[name]).all() and (errors[name] >= 0).all()):
-                raise ValueError("curvature")
     n = len(probe.times)
     wanted = {"origins": (n, 3), "directions": (n, 3), "times": (n,), "truth": (n, 3)}
     for name, shape in wanted.items():

@@ -145,10 +145,6 @@ class FusedOptimiser:
         self._peaks[:] = state["peaks"].numpy()
         self.decoder.load_state_dict(state["decoder"])
 
-    def curvature(self) -> np.ndarray:
-        """Running mean of the squared gradient of each element of theta, a diagonal estimate of how much an error there costs."""
-        return self.square
-
 
 class Figures:
     """Small tensors from a device, read LATE steps after they were made, so that nobody waits; on the CPU at once."""
@@ -356,13 +352,6 @@ class PlainOptimiser:
         self.decoder.load_state_dict(state["decoder"])
         if self.proposals is not None:
             self.proposals.load_state_dict(state["proposals"])
-
-    def curvature(self) -> np.ndarray:
-        """As `FusedOptimiser.curvature`."""
-        state = self.planes.state[self.field.theta]
-        if "exp_avg_sq" not in state:
-            return np.zeros(self.field.theta.numel(), np.float32)
-        return state["exp_avg_sq"].cpu().numpy()
 
 
 def _packed(batch: Rays, targets: torch.Tensor) -> torch.Tensor:

@@ -75,17 +75,17 @@ class Probe:
         return Probe(*rays, None if batch.appearances is None else batch.appearances.numpy(), targets.numpy())
 
     @staticmethod
-    def of_cameras(scene: Scene) -> "Probe":
+    def of_cameras(scene: Scene, count: int | None = None, seed: int = 1) -> "Probe":
         """Random pixels of a scene's own cameras, or of some all around it where it has none, at random times."""
-        rng = np.random.default_rng(1)
+        rng, total = np.random.default_rng(seed), PROBE_RAYS if count is None else count
         cameras = scene.cameras or around(scene)
-        counts = np.bincount(rng.integers(len(cameras), size=PROBE_RAYS), minlength=len(cameras))
+        counts = np.bincount(rng.integers(len(cameras), size=total), minlength=len(cameras))
         parts = []
         for camera, count in zip(cameras, counts, strict=True):
             places = rng.random((count, 2)) * (camera.width, camera.height)
             parts.append(rays_of_camera(camera, places, scene.mapping))
         origins, directions = (np.concatenate(arrays) for arrays in zip(*parts))
-        return Probe(origins, directions, rng.random(PROBE_RAYS, dtype=np.float32), None, None)
+        return Probe(origins, directions, rng.random(total, dtype=np.float32), None, None)
 
     def measure(self, uncoded: Scene) -> Measure:
         """What judges codings of a scene by its colours on these rays; the scene itself costs nothing to judge."""

@@ -79,8 +79,8 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert kpbench.main(["codec", str(scene_file), "--out", str(out)]) == 0
     said = capsys.readouterr()
     records = results.load([out])
-    assert [record["coder"] for record in records] == ["kpc", "kpc without the trellis", "fp16 + zstd -19", "uint8 + zstd -19", "X"]
-    ours, rounded, halves, levels, missing = records
+    assert [record["coder"] for record in records] == ["kpc", *codecbench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19", "X"]
+    ours, rounded, alike, halves, levels, missing = records
     assert missing["missing"] == "this ffmpeg has no libnothing" and missing["points"] == [] and missing["bd_rate"] is None
     assert len(halves["points"]) == 6 and halves["bd_rate"] is not None
     whole = scene_file.stat().st_size
@@ -100,8 +100,8 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert "kpc is smaller by" in said.err and "Coding, beside what is at hand" in results.markdown(records)
     with (tmp_path / "codec.csv").open() as table:
         rows = list(csv.DictReader(table))
-    assert len(rows) == 6 + 6 + 6 + 5 and len(rounded["points"]) == 6
-    assert {row["coder"] for row in rows} == {"kpc", "kpc without the trellis", "fp16 + zstd -19", "uint8 + zstd -19"}
+    assert len(rows) == 6 + 6 + 6 + 6 + 5 and len(rounded["points"]) == len(alike["points"]) == 6
+    assert {row["coder"] for row in rows} == {"kpc", *codecbench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19"}
     assert float(rows[0]["size_bytes"]) == ours["points"][0]["size_bytes"]
     svg = (tmp_path / "codec.svg").read_text()
     assert "uint8 + zstd -19" in svg and "bits per parameter" in svg

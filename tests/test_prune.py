@@ -115,12 +115,12 @@ def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
     # Of a smaller one the loss leaps by a quarter from one step to the next: which is met depends on the processor's rounding.
     scene = redundant(directed(tiny_scene(scales=3, resolution=(48, 40, 32)), 0.03))
     rays = rays_of(scene)
-    steps = [{name: np.arange(1.0, 9.0) for name in scale} for scale in scene.scales]
-    model = Model(scene, steps, Probe(*rays, None, Fidelity(scene, rays).truth))
+    numbers = [{name: np.arange(1.0, 9.0) for name in scale} for scale in scene.scales]
+    model = Model(scene, Probe(*rays, None, Fidelity(scene, rays).truth))
     coded = code(model, Trade(max_loss_db=0.15), SPARE / 0.15)
     assert coded.pruned is not None and coded.spare_db == pytest.approx(SPARE) and coded.pruned.left_out_any
     kept = coded.pruned.kept[1]
-    assert [step.tolist() for step in coded.pruned.of_each_plane(steps)[1].values()] == [(kept + 1.0).tolist()] * 6
+    assert [step.tolist() for step in coded.pruned.of_each_plane(numbers)[1].values()] == [(kept + 1.0).tolist()] * 6
     assert 0.9 * 0.15 < coded.loss_db <= 0.15 and coded.size_bytes == len(file.encode(coded.scene))
     fidelity = Fidelity(scene, rays)
     assert fidelity(scene) - fidelity(coded.scene.dequantise()) == pytest.approx(coded.loss_db, abs=1e-3)

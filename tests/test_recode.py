@@ -63,12 +63,11 @@ def refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[...,
 
 
 def saved(path: Path, scene: Scene) -> Path:
-    """A finished checkpoint of a scene, every error as bad as any other."""
+    """A finished checkpoint of a scene."""
     rays = Probe.of_cameras(scene)
     truth = SceneRenderer(scene).rgb(*rays.rays)
     numbers = np.arange(512) % len(scene.appearances) if scene.appearances else None
-    curvature = [{name: np.ones_like(plane) for name, plane in scale.items()} for scale in scene.scales]
-    model.save_checkpoint(path, scene, curvature, replace(rays, truth=truth, appearances=numbers))
+    model.save_checkpoint(path, scene, replace(rays, truth=truth, appearances=numbers))
     return path
 
 
@@ -140,7 +139,6 @@ def changes() -> dict[str, Callable[[dict[str, Any]], object]]:
         "endless rays": lambda s: s.update(step=1e-9),
         "no frames": lambda s: s.update(frame_count=-1),
         "a wide decoder": lambda s: s["decoder"].update(w1=torch.ones(9999, 9)),
-        "negative curvature": lambda s: s["curvature"][0]["xy"].fill_(-1.0),
         "rays without length": lambda s: s["probe"]["directions"].zero_(),
         "rays of NaN": lambda s: s["probe"]["origins"].fill_(float("nan")),
         "times out of the clip": lambda s: s["probe"]["times"].fill_(2.0),

@@ -8,6 +8,7 @@ from scenes import tiny_scene
 
 from kpc.encoder import trellis
 from kpc.encoder.trellis import STATES, TOLD_APART, quantise_on_trellis
+from kpc.format import file
 from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
 from kpc.format.scene import TIME_PLANES, Scene
 from kpc.format.symbols import ACTIVITIES, WEIGHTS, encode_symbols, follows_trellis, next_state
@@ -33,8 +34,8 @@ FREE = np.zeros((ACTIVITIES, TOLD_APART))
 """Every error costs nothing."""
 
 
-def searched(wanted: np.ndarray, known: np.ndarray, bits: np.ndarray = FREE) -> np.ndarray:
-    symbols, counts = trellis._search(wanted, known, NO_WEIGHTS, bits)
+def searched(wanted: np.ndarray, known: np.ndarray, bits: np.ndarray = FREE, worth: np.ndarray | None = None) -> np.ndarray:
+    symbols, counts = trellis._search(wanted, np.ones(wanted.shape, np.float32) if worth is None else worth, known, NO_WEIGHTS, bits)
     assert counts.sum() == known.sum() * wanted.shape[2]
     assert follows_trellis(symbols, known) and not symbols[~known].any()
     return symbols
@@ -84,6 +85,25 @@ def test_a_price_buys_errors_that_are_nearer_to_what_is_expected() -> None:
     assert np.square(wanted - bought)[known].sum() > np.square(wanted - free)[known].sum()
 
 
+def test_errors_go_where_they_are_worth_little() -> None:
+    """The right half is worth a hundredth: what is saved there is given out on the left."""
+    rng = np.random.default_rng(5)
+    wanted, known = rng.normal(0, 6, (30, 40, 2)), np.ones((30, 40), bool)
+    dear = np.broadcast_to(np.arange(float(TOLD_APART)), FREE.shape).copy()
+    worth = np.ones(wanted.shape, np.float32)
+    worth[:, 20:] = 0.01
+    alike, told = (np.abs(wanted - searched(wanted, known, dear, w)) for w in (None, worth))
+    assert told[:, 20:].mean() > 3 * alike[:, 20:].mean() and told[:, :20].mean() < 1.05 * alike[:, :20].mean()
+
+
+def test_what_is_worth_is_relative_to_the_channel() -> None:
+    scene = noisy()
+    steps = [{name: np.full(plane.shape[2], 0.05) for name, plane in scale.items()} for scale in scene.scales]
+    faint = [{name: np.full(plane.shape, 2.0 ** -np.arange(plane.shape[2]), np.float32) for name, plane in scale.items()}
+             for scale in scene.scales]  # fmt: skip
+    assert file.encode(quantise_on_trellis(scene, steps, important=faint)) == file.encode(quantise_on_trellis(scene, steps))
+
+
 @pytest.mark.parametrize("step", [0.3, 1.0, 3.0])
 def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float) -> None:
     rng = np.random.default_rng(3)
@@ -96,7 +116,7 @@ def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float)
     def size(plane: QuantisedPlane) -> int:
         return len(encode_symbols(plane.symbols, plane.coded))
 
-    economical = trellis._steered(quantise_plane(values, step, identity=False), values, np.full(3, step), False)
+    economical = trellis._steered(quantise_plane(values, step, identity=False), values, np.full(3, step), np.ones_like(values), False)
     as_bad = next(plane for k in np.arange(1, 4, 0.01)
                   if error(plane := quantise_plane(values, k * step, identity=False)) >= error(economical))
     assert size(economical) < size(as_bad) - 0.12 * values.size / 8  # 1.09 dB are 0.18 bits
@@ -105,8 +125,8 @@ def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float)
 def test_where_eight_bits_are_too_few_symbols_are_the_nearest() -> None:
     values = np.random.default_rng(4).uniform(-100, 100, (20, 20, 2)).astype(np.float32)
     nearest = quantise_plane(values, 0.01, identity=False)
-    assert trellis._steered(nearest, values, np.full(2, 0.01), False) is nearest
-    assert trellis._steered(nearest, values, nearest.step, False) is not nearest
+    assert trellis._steered(nearest, values, np.full(2, 0.01), np.ones_like(values), False) is nearest
+    assert trellis._steered(nearest, values, nearest.step, np.ones_like(values), False) is not nearest
 
 
 def test_what_was_left_out_stays_so_and_steps_stay() -> None:

@@ -48,7 +48,10 @@ VIEW_PIXELS = 1 << 15
 """Random pixels of all held-out views that codings are judged by."""
 RIVALS = {rival.name: rival for rival in rivals.RIVALS}
 OURS = "kpc"
-WITHOUT: dict[str, Quantise] = {"kpc without the trellis": quantise_scene}
+WITHOUT: dict[str, Quantise] = {
+    "kpc without the trellis": lambda scene, steps, reached, important: quantise_scene(scene, steps, reached=reached),
+    "kpc, every texel alike": lambda scene, steps, reached, important: quantise_on_trellis(scene, steps, reached),
+}
 """Our own coder with something left out."""
 
 Point = dict[str, Any]
