@@ -7,6 +7,7 @@ judged by its own pictures.
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,11 @@ class Model:
     probe: Probe
     coded: QuantisedScene | None = None
 
+    @cached_property
+    def curvature(self) -> list[dict[str, np.ndarray]]:
+        """What errors cost, `kpc.encoder.curvature`."""
+        return curvature(self.scene, self.probe)
+
 
 @dataclass(frozen=True)
 class Coded:
@@ -83,16 +89,19 @@ def code(model: Model, trade: Trade, prune_share: float, quantise: Quantise = qu
         TrainingError: no file of this model is so small.
     """
     scene, coded, pruned = model.scene, model.coded, None
-    steps = None if coded is None else [{name: plane.step for name, plane in scale.items()} for scale in coded.scales]
+    important = importance(model.curvature)
+    steps = relative_steps(important)
+    if coded is not None:
+        steps = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in coded.scales]
     measure = model.probe.measure(scene)
     whole = measure(scene).psnr
     spare = prune_share * trade.loss_db(whole)
     if spare > 0 and isinstance(scene.decoder, Decoder):  # no other is linear
         pruned = prune(scene, model.probe.rays, lambda candidate: measure(candidate).psnr, spare)
         if coded is None or pruned.left_out_any:
-            scene, steps, coded = pruned.scene, steps and pruned.of_each_plane(steps), None
-    important = importance(curvature(scene, model.probe))
-    found = compress(scene, steps or relative_steps(important), important, measure, whole, trade, coded, quantise)
+            scene, coded = pruned.scene, None
+            steps, important = pruned.of_each_plane(steps), pruned.of_each_plane(important)
+    found = compress(scene, steps, important, measure, whole, trade, coded, quantise)
     measured: Measured = found.measured
     return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, spare)
 

@@ -54,7 +54,7 @@ class Pruned:
         return self.loss_db != 0 or sum(map(len, self.kept)) < self.features
 
     def of_each_plane(self, steps: Sequence[dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
-        """The part of (M,) numbers of each plane that belongs to what is left."""
+        """The part of (..., M) numbers of each plane that belongs to what is left."""
         pairs = zip(self.kept, steps, strict=True)
         return [{name: step[..., kept] for name, step in scale.items()} for kept, scale in pairs if len(kept)]
 
