@@ -161,6 +161,8 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) ->
     Raises:
         FormatError: the result would break a limit that every reader checks.
     """
+    if len(chunks) > CHUNK_LIMIT:
+        raise FormatError(f"{len(chunks)} chunks are more than the {CHUNK_LIMIT} that a file may have; use fewer and longer segments")
     offset = HEADER.size + ENTRY.size * len(chunks)
     entries, bodies, largest = [], [], 0
     for chunk in chunks:

@@ -228,6 +228,28 @@ def test_files_of_the_draft_are_kept_as_they_were_made(name, digest):
     assert container.Reader(data).header.version == 0
 
 
+def test_a_file_may_have_so_many_chunks_and_no_more(twin, monkeypatch):
+    """No vector, for its index takes 2.6 MB: the least file, and after it chunks of nothing that nobody knows."""
+    path = SPEC / "vectors" / "valid" / "minimal.kpc"
+    reader = container.Reader(path.read_bytes())
+    known = [container.Chunk(e.kind, [reader.chunk(k)], e.scale, e.plane, e.row_start, e.row_count) for k, e in enumerate(reader.index)]
+    empty = [container.Chunk("note", [b""])] * (container.CHUNK_LIMIT - len(known))
+    data = container.pack([*known, *empty], reader.header.value_count, compress=False)
+    assert len(container.Reader(data).index) == 65536
+    plain = twin.hashes(twin.decode(path.read_bytes()))
+    assert twin.hashes(twin.decode(data)) == plain
+    assert file.encode(file.read(data)) == file.encode(file.read(path))
+    with pytest.raises(errors.FormatError, match="65537 chunks are more"):
+        container.pack([*known, *empty, *empty[:1]], reader.header.value_count, compress=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(container, "CHUNK_LIMIT", 1 << 20)
+        more = container.pack([*known, *empty, *empty[:1]], reader.header.value_count, compress=False)
+    with pytest.raises(errors.FormatError, match="claims 65537 chunks"):
+        container.Reader(more)
+    with pytest.raises(twin.Refused):
+        twin.decode(more)
+
+
 def test_valid_vectors_cover_every_kind_under_every_codec():
     found = {(entry.kind, entry.codec) for path in VALID + GROUPED
              for entry in container.Reader(path.read_bytes(), allow_partial=True).index}
