@@ -49,7 +49,7 @@ class TrainConfig:
     """Cells of the occupancy grid along the longest edge of the box."""
 
     mixed_precision: bool = True
-    """On a GPU the planes are read as float16 and the hybrid decoder's layers compute in bfloat16 (`Field.mixed`)."""
+    """On a GPU the hybrid decoder's layers compute in bfloat16, with sums in float32 (`Field.mixed`)."""
 
     # --- the optimiser
     steps: int = 6000
