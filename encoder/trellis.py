@@ -65,10 +65,11 @@ def _steered(
     """A plane that is quantised to the nearest, with other symbols. What was left out stays so, and holds 0; and so does what is within
     a step of the identity.
 
-    Where 8 bits are too few for (M,) `step`, what is nearest errs less than every other symbol would.
+    Where 8 bits are too few for (M,) `step` by a factor of two, all symbols may follow: those that the trellis allows would err more.
+    Bits are worth what they are at the steps that were asked for.
     """
-    if np.median(plane.step / step) >= 2:
-        return plane
+    coarser = plane.step / step
+    on_trellis = bool(np.median(coarser) < 2)
     wanted = (values.astype(np.float64) - plane.offset) / plane.step
     known = np.ascontiguousarray(plane.coded)
     if identity:
@@ -78,7 +79,7 @@ def _steered(
     rounded = np.where(known[..., None], plane.symbols, np.int8(0))
     weights, bits = fitted(neighbourhoods(rounded, known), SETS), _bits(np.zeros((ACTIVITIES, TOLD_APART)))
     for _ in range(PASSES):
-        symbols, counts = _search(wanted, worth, known, weights, bits)
+        symbols, counts = _search(wanted, worth * np.float32(coarser**2), known, on_trellis, weights, bits)
         weights, bits = fitted(neighbourhoods(symbols, known), SETS), _bits(counts)
     return replace(plane, symbols=symbols, coded=symbols.any(axis=2) if identity else known)
 
@@ -96,14 +97,16 @@ def _bits(counts: np.ndarray) -> np.ndarray:
 
 @compiled()
 def _search(
-    wanted: np.ndarray, worth: np.ndarray, known: np.ndarray, weights: np.ndarray, bits: np.ndarray
+    wanted: np.ndarray, worth: np.ndarray, known: np.ndarray, on_trellis: bool, weights: np.ndarray, bits: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, M) int8 symbols of (H, W, M) numbers in steps, whose errors are worth as much as that; 0 where nothing is `known`; and how often errors came, as `bits`.
+    """(H, W, M) int8 symbols of (H, W, M) numbers in steps, whose errors are worth as much as that; 0 where nothing is `known`; and how often
+    errors came, as `bits`. `on_trellis`: whether symbols follow it; else any may follow, and survivors differ in which of their last three
+    are odd.
 
     v, r, cross and the names of neighbours as in `kpc.format.symbols`; v0 and r0 of survivors are held by their states.
     """
     H, W, M = wanted.shape
-    sets = weights.astype(np.int64)
+    sets, doubled = weights.astype(np.int64), 1 if on_trellis else 0
     symbols, counts = np.zeros((H, W, M), np.int8), np.zeros(bits.shape)
     v, r = np.zeros((3, W + 4), np.int64), np.zeros((3, W + 4), np.int64)
     cross = np.zeros((H, W), np.int16)
@@ -142,17 +145,17 @@ def _search(
                         nww, nnw, nne, nee = v1[X - 2], v2[X - 1], v2[X + 1], v1[X + 2]
                         around = 2 * (rw + r1[X]) + r1[X - 1] + r1[X + 1] + rww + r2[X]
                     predicted, gradient, _ = predict(sets, w, n, nw, ne, ww, nn, nww, nnw, nne, nee)
-                    whole = nearest(predicted, s & 1, 1)
+                    whole = nearest(predicted, s & doubled, doubled)
                     active = activity(around, int(past[x]), gradient, m)
-                    below = int(np.floor((wanted[y, x, m] - whole) / 2))
+                    below = int(np.floor((wanted[y, x, m] - whole) / (1 + doubled)))
                     lowest = below - 1 if below >= 0 else below
                     for error in (lowest, lowest + 1, lowest + 2, 0):  # those around it, the next that costs less, what is foreseen
-                        value = whole + 2 * error
+                        value = whole + (error << doubled)
                         if not SYMBOL_MIN <= value <= SYMBOL_MAX:
                             continue
                         size = min(abs(error), TOLD_APART - 1)
                         total = before[s] + worth[y, x, m] * (wanted[y, x, m] - value) ** 2 + LAM * bits[active, size]
-                        to = next_state(s, value)
+                        to = next_state(s, value) if on_trellis else (s << 1 | value & 1) & STATES - 1
                         if total < cost[to]:
                             cost[to], came[x, to], context[x, to], missed[x, to] = total, s, active, size
                             V[X, to], R[X, to] = value, abs((value << 7) - predicted) >> 3

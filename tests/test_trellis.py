@@ -35,7 +35,8 @@ FREE = np.zeros((ACTIVITIES, TOLD_APART))
 
 
 def searched(wanted: np.ndarray, known: np.ndarray, bits: np.ndarray = FREE, worth: np.ndarray | None = None) -> np.ndarray:
-    symbols, counts = trellis._search(wanted, np.ones(wanted.shape, np.float32) if worth is None else worth, known, NO_WEIGHTS, bits)
+    worth = np.ones(wanted.shape, np.float32) if worth is None else worth
+    symbols, counts = trellis._search(wanted, worth, known, True, NO_WEIGHTS, bits)
     assert counts.sum() == known.sum() * wanted.shape[2]
     assert follows_trellis(symbols, known) and not symbols[~known].any()
     return symbols
@@ -122,11 +123,21 @@ def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float)
     assert size(economical) < size(as_bad) - 0.12 * values.size / 8  # 1.09 dB are 0.18 bits
 
 
-def test_where_eight_bits_are_too_few_symbols_are_the_nearest() -> None:
-    values = np.random.default_rng(4).uniform(-100, 100, (20, 20, 2)).astype(np.float32)
-    nearest = quantise_plane(values, 0.01, identity=False)
-    assert trellis._steered(nearest, values, np.full(2, 0.01), np.ones_like(values), False) is nearest
-    assert trellis._steered(nearest, values, nearest.step, np.ones_like(values), False) is not nearest
+def test_where_eight_bits_are_too_few_any_symbol_may_follow() -> None:
+    """Those of the trellis would err by four thirds of what the nearest do, and at a step so much coarser than the one asked for bits are
+    worth little: errors are about those of the nearest, but where they are worth next to nothing."""
+    values = np.random.default_rng(4).uniform(-100, 100, (20, 40, 2)).astype(np.float32)
+    nearest, step = quantise_plane(values, 0.2, identity=False), np.full(2, 0.2)
+    important = np.ones_like(values)
+    important[:, 20:] = 1e-9
+    free = trellis._steered(nearest, values, step, np.ones_like(values), False)
+    told = trellis._steered(nearest, values, step, important, False)
+    assert not follows_trellis(free.symbols, free.coded) and np.abs(free.symbols - nearest.symbols.astype(int)).max() <= 1
+    errors = [np.square(plane.dequantise() - values)[:, :20].mean() for plane in (nearest, free, told)]
+    assert errors[0] <= errors[1] < 1.1 * errors[0] and errors[2] < 1.1 * errors[0]
+    assert len(encode_symbols(told.symbols, told.coded)) < 0.95 * len(encode_symbols(nearest.symbols, nearest.coded))
+    steered = trellis._steered(nearest, values, nearest.step, np.ones_like(values), False)
+    assert follows_trellis(steered.symbols, steered.coded)
 
 
 def test_what_was_left_out_stays_so_and_steps_stay() -> None:
