@@ -37,17 +37,17 @@ NEAR = 0.3
 DEFAULT_LOSS_DB = 0.15
 
 TRUST = 0.8
-"""In what curvature says of the differences between texels and channels, `importance`. Room and liam, at equal error of held-out views:
+"""In what curvature says of the differences between texels and channels, `significance`. Room and liam, at equal error of held-out views:
 files are 1 to 2 % larger with 1; 0.7 and 0.9 make no difference."""
-LEAST_IMPORTANCE = 1e-6
+LEAST_SIGNIFICANCE = 1e-6
 """Of a channel, relative to the most important of all numbers."""
 
 Steps = list[dict[str, np.ndarray]]
 """One mapping a scale, plane name -> (M,) quantisation steps."""
-Importance = Sequence[Mapping[str, np.ndarray]]
+Significance = Sequence[Mapping[str, np.ndarray]]
 """One mapping a scale, plane name -> (rows, columns, M)."""
-Quantise = Callable[[Scene, Sequence[Mapping[str, np.ndarray]], np.ndarray, Importance], QuantisedScene]
-"""Of a scene with steps, `reached_by` it and importance: `quantise_on_trellis`, or what is to be compared with it."""
+Quantise = Callable[[Scene, Sequence[Mapping[str, np.ndarray]], np.ndarray, Significance], QuantisedScene]
+"""Of a scene with steps, `reached_by` it and significance: `quantise_on_trellis`, or what is to be compared with it."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Attempt:
         return self.measured.error + lam * 8 * self.size_bytes / self.quantised.parameter_count
 
 
-def importance(curvature: Curvature) -> list[dict[str, np.ndarray]]:
+def significance(curvature: Curvature) -> list[dict[str, np.ndarray]]:
     """What an error in each number costs, as a share of the most that any does: (h / largest)^TRUST of the curvature h, float32.
 
     Of h alone: what is left to cross terms, and to rays that were not drawn, makes the unimportant more important than h has it.
@@ -135,14 +135,14 @@ def importance(curvature: Curvature) -> list[dict[str, np.ndarray]]:
     return [{name: (h / np.float32(largest)) ** np.float32(TRUST) for name, h in scale.items()} for scale in curvature]
 
 
-def relative_steps(important: Importance) -> Steps:
+def relative_steps(significant: Significance) -> Steps:
     """Steps up to one common factor, such that a bit spent on any channel buys about the same.
 
-    A uniform quantiser of step d errs by d^2 / 12 times a constant; the error costs `important` w of it; its rate falls by one bit
+    A uniform quantiser of step d errs by d^2 / 12 times a constant; the error costs `significant` w of it; its rate falls by one bit
     with each doubling of d. At equal slopes the mean of w d^2 is the same everywhere: d = 1 / sqrt(mean w), over texels that matter
     at all. Channels without any get the coarsest step of all.
     """
-    return [{name: np.maximum(_means(w), LEAST_IMPORTANCE) ** -0.5 for name, w in scale.items()} for scale in important]
+    return [{name: np.maximum(_means(w), LEAST_SIGNIFICANCE) ** -0.5 for name, w in scale.items()} for scale in significant]
 
 
 def _means(values: np.ndarray) -> np.ndarray:
@@ -157,7 +157,7 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
 
 
 def compress(
-    scene: Scene, steps: Steps, important: Importance, measure: Measure, uncoded_psnr: float, trade: Trade,
+    scene: Scene, steps: Steps, significant: Significance, measure: Measure, uncoded_psnr: float, trade: Trade,
     as_it_is: QuantisedScene | None = None, quantise: Quantise = quantise_on_trellis,
 ) -> Attempt:
     """The quantisation that a trade asks for.
@@ -175,7 +175,7 @@ def compress(
     def attempt(exponent: float) -> Attempt:
         if as_it_is is not None and exponent == 0:
             return Attempt(as_it_is, measure)
-        return Attempt(quantise(scene, scaled(steps, 2.0**exponent), reached, important), measure)
+        return Attempt(quantise(scene, scaled(steps, 2.0**exponent), reached, significant), measure)
 
     name, value = trade.bound
     if name == "lam":

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from kpc.encoder.checkpoint import save_state
-from kpc.encoder.compress import Quantise, Trade, compress, importance, relative_steps
+from kpc.encoder.compress import Quantise, Trade, compress, relative_steps, significance
 from kpc.encoder.curvature import curvature
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
@@ -89,8 +89,8 @@ def code(model: Model, trade: Trade, prune_share: float, quantise: Quantise = qu
         TrainingError: no file of this model is so small.
     """
     scene, coded, pruned = model.scene, model.coded, None
-    important = importance(model.curvature)
-    steps = relative_steps(important)
+    significant = significance(model.curvature)
+    steps = relative_steps(significant)
     if coded is not None:
         steps = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in coded.scales]
     measure = model.probe.measure(scene)
@@ -100,8 +100,8 @@ def code(model: Model, trade: Trade, prune_share: float, quantise: Quantise = qu
         pruned = prune(scene, model.probe.rays, lambda candidate: measure(candidate).psnr, spare)
         if coded is None or pruned.left_out_any:
             scene, coded = pruned.scene, None
-            steps, important = pruned.of_each_plane(steps), pruned.of_each_plane(important)
-    found = compress(scene, steps, important, measure, whole, trade, coded, quantise)
+            steps, significant = pruned.of_each_plane(steps), pruned.of_each_plane(significant)
+    found = compress(scene, steps, significant, measure, whole, trade, coded, quantise)
     measured: Measured = found.measured
     return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, spare)
 

@@ -8,7 +8,7 @@ import pytest
 from scenes import tiny_scene
 
 from kpc.encoder.compress import (
-    FINEST, LEAST_IMPORTANCE, TRUST, Attempt, Trade, agreement_of, compress, error_of, importance, relative_steps, scaled,
+    FINEST, LEAST_SIGNIFICANCE, TRUST, Attempt, Trade, agreement_of, compress, error_of, relative_steps, scaled, significance,
 )
 from kpc.encoder.probe import Measured
 from kpc.encoder.trellis import quantise_on_trellis
@@ -139,13 +139,13 @@ def test_what_a_trade_may_cost_in_decibels() -> None:
 def test_what_errors_cost_is_trusted_so_far() -> None:
     h = [{name: np.full_like(plane, 4.0**-s) for name, plane in scale.items()} for s, scale in enumerate(SCENE.scales)]
     h[1]["yt"][3, 2, 1] = 64
-    important = importance(h)
-    assert important[1]["yt"][3, 2, 1] == 1 and important[1]["yt"].dtype == np.float32
-    np.testing.assert_allclose(important[0]["xy"], 64.0**-TRUST, rtol=1e-5)
-    np.testing.assert_allclose(important[1]["xy"], 256.0**-TRUST, rtol=1e-5)
+    significant = significance(h)
+    assert significant[1]["yt"][3, 2, 1] == 1 and significant[1]["yt"].dtype == np.float32
+    np.testing.assert_allclose(significant[0]["xy"], 64.0**-TRUST, rtol=1e-5)
+    np.testing.assert_allclose(significant[1]["xy"], 256.0**-TRUST, rtol=1e-5)
 
 
-def test_steps_follow_the_importance() -> None:
+def test_steps_follow_the_significance() -> None:
     """At each step errors that rounding makes cost the same, of all that are not nothing."""
     def of(k: int, plane: np.ndarray) -> np.ndarray:
         w = 0.5**k * np.arange(1.0, plane.shape[2] + 1) * np.linspace(0, 2, plane.shape[0])[:, None, None]
@@ -162,11 +162,11 @@ def test_channels_that_no_ray_reached_get_the_coarsest_step() -> None:
          for scale in SCENE.scales]  # fmt: skip
     for scale in relative_steps(w):
         for step in scale.values():
-            assert step[2] == pytest.approx(LEAST_IMPORTANCE**-0.5) and (np.delete(step, 2) == 1).all()
+            assert step[2] == pytest.approx(LEAST_SIGNIFICANCE**-0.5) and (np.delete(step, 2) == 1).all()
 
 
 def test_where_nothing_costs_anything_all_steps_are_equal() -> None:
-    nothing = importance([{name: np.zeros_like(plane) for name, plane in scale.items()} for scale in SCENE.scales])
+    nothing = significance([{name: np.zeros_like(plane) for name, plane in scale.items()} for scale in SCENE.scales])
     assert len({float(step) for scale in relative_steps(nothing) for steps in scale.values() for step in steps}) == 1
     assert math.isfinite(compress(SCENE, EQUAL, nothing, measure, 30.0, Trade()).measured.psnr)
 

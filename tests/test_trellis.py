@@ -102,7 +102,7 @@ def test_what_is_worth_is_relative_to_the_channel() -> None:
     steps = [{name: np.full(plane.shape[2], 0.05) for name, plane in scale.items()} for scale in scene.scales]
     faint = [{name: np.full(plane.shape, 2.0 ** -np.arange(plane.shape[2]), np.float32) for name, plane in scale.items()}
              for scale in scene.scales]  # fmt: skip
-    assert file.encode(quantise_on_trellis(scene, steps, important=faint)) == file.encode(quantise_on_trellis(scene, steps))
+    assert file.encode(quantise_on_trellis(scene, steps, significant=faint)) == file.encode(quantise_on_trellis(scene, steps))
 
 
 @pytest.mark.parametrize("step", [0.3, 1.0, 3.0])
@@ -128,10 +128,10 @@ def test_where_eight_bits_are_too_few_any_symbol_may_follow() -> None:
     worth little: errors are about those of the nearest, but where they are worth next to nothing."""
     values = np.random.default_rng(4).uniform(-100, 100, (20, 40, 2)).astype(np.float32)
     nearest, step = quantise_plane(values, 0.2, identity=False), np.full(2, 0.2)
-    important = np.ones_like(values)
-    important[:, 20:] = 1e-9
+    significant = np.ones_like(values)
+    significant[:, 20:] = 1e-9
     free = trellis._steered(nearest, values, step, np.ones_like(values), False)
-    told = trellis._steered(nearest, values, step, important, False)
+    told = trellis._steered(nearest, values, step, significant, False)
     assert not follows_trellis(free.symbols, free.coded) and np.abs(free.symbols - nearest.symbols.astype(int)).max() <= 1
     errors = [np.square(plane.dequantise() - values)[:, :20].mean() for plane in (nearest, free, told)]
     assert errors[0] <= errors[1] < 1.1 * errors[0] and errors[2] < 1.1 * errors[0]

@@ -49,8 +49,8 @@ VIEW_PIXELS = 1 << 15
 RIVALS = {rival.name: rival for rival in rivals.RIVALS}
 OURS = "kpc"
 WITHOUT: dict[str, Quantise] = {
-    "kpc without the trellis": lambda scene, steps, reached, important: quantise_scene(scene, steps, reached=reached),
-    "kpc, every texel alike": lambda scene, steps, reached, important: quantise_on_trellis(scene, steps, reached),
+    "kpc without the trellis": lambda scene, steps, reached, significant: quantise_scene(scene, steps, reached=reached),
+    "kpc, every texel alike": lambda scene, steps, reached, significant: quantise_on_trellis(scene, steps, reached),
 }
 """Our own coder with something left out."""
 
