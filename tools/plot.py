@@ -29,6 +29,7 @@ PANELS = (("test_psnr", "held-out PSNR, dB", 1.0), ("test_ssim", "held-out SSIM"
 ENDINGS = (".svg", ".png", ".pdf")
 PANEL_INCHES = (3.6, 3.2)
 RATE_PANEL_INCHES = (4.6, 4.0)
+DEEPEST_DB = 3.5
 
 rcParams["svg.fonttype"] = "none"  # text stays text
 rcParams["svg.hashsalt"] = "kpc"  # the same records give the same file
@@ -63,7 +64,8 @@ def curves(records: Sequence[results.Record]) -> Figure:
 
 
 def rate_distortion(records: Sequence[results.Record]) -> Figure:
-    """The plot of records of `kpbench codec`: a panel a scene, PSNR against bits per parameter, a line a coder.
+    """The plot of records of `kpbench codec`: a panel a scene, PSNR against bits per parameter, a line a coder, down to DEEPEST_DB below
+    the best.
 
     Raises:
         FormatError: there is nothing to draw.
@@ -74,16 +76,21 @@ def rate_distortion(records: Sequence[results.Record]) -> Figure:
             scenes.setdefault(record["name"], []).append(record)
     if not scenes:
         raise FormatError("no records of kpbench codec to draw; write some with kpbench codec --out")
+    names = list(dict.fromkeys(record["coder"] for coders in scenes.values() for record in coders))
+    lines = {}
     width, height = RATE_PANEL_INCHES
     figure = Figure(figsize=(width * len(scenes), height), layout="constrained")
     for axes, (name, coders) in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes.items()):
-        for number, record in enumerate(coders):
+        for record in coders:
+            number = names.index(record["coder"])
             points = sorted(record["points"], key=lambda point: float(point["size_bytes"]))
-            axes.plot([p["bits_per_parameter"] for p in points], [p["psnr"] for p in points], marker="o", markersize=3,
-                      linewidth=2.2 if number == 0 else 1, color=f"C{number}", label=record["coder"])  # fmt: skip
-        axes.set(xlabel="bits per parameter", ylabel="PSNR, dB", title=name)
+            lines[record["coder"]], = axes.plot(
+                [p["bits_per_parameter"] for p in points], [p["psnr"] for p in points], marker="o", markersize=3,
+                linewidth=2.2 if number == 0 else 1, color=f"C{number}", zorder=3 if number == 0 else 2)  # fmt: skip
+        best = max(p["psnr"] for record in coders for p in record["points"])
+        axes.set(xlabel="bits per parameter", ylabel="PSNR, dB", title=name, ylim=(best - DEEPEST_DB, best + 0.1))
         _logarithmic(axes)
-    axes.legend(fontsize=8)
+    axes.legend([lines[name] for name in names], names, fontsize=8)
     return figure
 
 
