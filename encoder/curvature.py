@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
-from scipy.ndimage import convolve1d
 
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.field import Layout
@@ -29,8 +28,6 @@ RAYS = 1 << 17
 percent smaller."""
 RAYS_AT_ONCE = 1 << 10
 """In one gradient: the more, the more cross terms have to cancel; the fewer, the longer it takes."""
-BINOMIAL = np.array([0.25, 0.5, 0.25])
-"""Weights of neighbours along either axis: rays that pass near one texel pass near the next."""
 
 
 def curvature(scene: Scene, probe: Probe, rays: int = RAYS) -> list[dict[str, np.ndarray]]:
@@ -63,5 +60,12 @@ def _by_plane(layout: Layout, scene: Scene, squares: np.ndarray) -> list[dict[st
     for s, name, start, rows, columns in layout.planes():
         plane = squares[start : start + rows * columns * layout.channels].reshape(rows, columns, -1)
         plane = plane[..., : scene.scales[s][name].shape[2]]
-        planes[s][name] = convolve1d(convolve1d(plane, BINOMIAL, axis=0, mode="nearest"), BINOMIAL, axis=1, mode="nearest")
+        planes[s][name] = _smoothed(_smoothed(plane, 0), 1)
     return planes
+
+
+def _smoothed(plane: np.ndarray, axis: int) -> np.ndarray:
+    """The mean of each texel and those between it and its neighbours: rays that pass near one pass near the next."""
+    padded = np.pad(plane, [(1, 1) if k == axis else (0, 0) for k in range(3)], mode="edge")
+    before, after = (np.take(padded, range(k, k + plane.shape[axis]), axis) for k in (0, 2))
+    return plane / 2 + (before + after) / 4
