@@ -54,14 +54,19 @@ def test_constraints_pin_all_that_is_asked_for_and_no_build_of_it() -> None:
     assert not [pin for pin in pins.values() if "+" in pin]
 
 
-WITHOUT_TORCH = """
+def without(*packages: str) -> str:
+    """The beginning of a program that finds none of these."""
+    return f"""
 import sys
 class Nowhere:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] == "torch":
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        if name.split(".")[0] in {packages}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 sys.meta_path.insert(0, Nowhere())
 """
+
+
+WITHOUT_TORCH = without("torch")
 
 
 VIEWERS = (
@@ -73,6 +78,14 @@ VIEWERS = (
 @pytest.mark.parametrize("module", VIEWERS)
 def test_viewers_need_no_torch(module: str) -> None:
     subprocess.run([sys.executable, "-c", f"{WITHOUT_TORCH}\nimport kpc.{module}"], check=True)
+
+
+@pytest.mark.parametrize("module", ["encoder.kpenc", "player.kpplay", "tools.kprender", "tools.kpinfo", "tools.kpjoin", "tools.contactsheet"])
+def test_nobody_needs_what_tests_and_benches_do(module: str) -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    named = {re.split(r"[<>=]", requirement)[0] for extra in ("bench", "test") for requirement in extras[extra]}
+    assert "scipy" in named
+    subprocess.run([sys.executable, "-c", f"{without(*sorted(named))}\nimport kpc.{module}"], check=True)
 
 
 @pytest.mark.parametrize(
