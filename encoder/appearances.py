@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field import Field
-from kpc.encoder.render import Rays, collected, fused_features, meet, shade
+from kpc.encoder.render import Rays, marched, shade
 from kpc.format.errors import UsageError
 from kpc.format.file import APPEARANCE_LIMIT, is_name
 from kpc.format.scene import Scene
@@ -99,8 +99,7 @@ def fitted_code(scene: Scene, field: Field, rays: Rays, targets: Tensor) -> np.n
     if not len(targets):
         return code.detach().numpy()
     with torch.no_grad():
-        samples = collected(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
-        met = meet(field, rays, samples, fused_features(field), scene.extent)
+        _, met = marched(field, rays, scene)
         seen = met.weights > FIT_FAINTEST
         met = replace(met, ray=met.ray[seen], latent=met.latent[seen], weights=met.weights[seen])
     optimiser = torch.optim.Adam([code], lr=FIT_RATE)

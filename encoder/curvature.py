@@ -17,7 +17,7 @@ import torch
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.field import Layout
 from kpc.encoder.probe import Probe
-from kpc.encoder.render import Rays, collected, fused_features, meet, shade
+from kpc.encoder.render import marched, shade
 from kpc.format.scene import Scene
 
 Curvature = Sequence[Mapping[str, np.ndarray]]
@@ -44,8 +44,7 @@ def curvature(scene: Scene, probe: Probe, rays: int = RAYS) -> list[dict[str, np
         for start in range(0, len(order), RAYS_AT_ONCE):
             some = order[start : start + RAYS_AT_ONCE]
             batch = renderer.batch(*(a[some] for a in one.rays))
-            samples = collected(batch, scene.aabb, scene.occupancy, scene.step, scene.mapping)
-            met = meet(field, batch, samples, fused_features(field), scene.extent)
+            _, met = marched(field, batch, scene)
             codes = renderer.codes(None if one.appearances is None else one.appearances[some])
             colours = shade(field, batch, met, None if codes is None else torch.from_numpy(codes))
             signs = torch.from_numpy(rng.choice(np.float32([-1, 1]), tuple(colours.shape)))

@@ -58,7 +58,8 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
     rendered = (probes + 1) * probe_rays + 2 * tested * float(pixels.mean())
     fits_s = 2 * tested * _seconds_a_fit(trainer) if trainer.names and tested else 0.0
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()
-    coding_s = PROBES * _seconds_a_coding(trainer.scene()) + _seconds_of_curvature(trainer.scene())
+    scene = trainer.scene()
+    coding_s = PROBES * _seconds_a_coding(scene) + _seconds_of_curvature(scene)
     return Estimate(train_s, spent_s + rendered * _seconds_a_ray(trainer) + coding_s + fits_s, memory)
 
 

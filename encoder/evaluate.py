@@ -12,7 +12,7 @@ from kpc.encoder.appearances import FIT_RAYS, fitted_code
 from kpc.encoder.datasets import Dataset, rays
 from kpc.encoder.field import Field
 from kpc.encoder.optimisers import sample_capacity
-from kpc.encoder.render import Rays, collected, fused_features, meet, shade
+from kpc.encoder.render import Rays, marched, shade
 from kpc.format.fidelity import psnr
 from kpc.format.scene import Scene
 from kpc.format.space import Contraction
@@ -72,8 +72,7 @@ class SceneRenderer:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         scene = self.scene
         batch = self.batch(o, d, t)
-        samples = collected(batch, scene.aabb, scene.occupancy, scene.step, scene.mapping)
-        met = meet(self.field, batch, samples, fused_features(self.field), scene.extent)
+        samples, met = marched(self.field, batch, scene)
         along = samples.s.numpy() if not isinstance(scene.mapping, Contraction) else scene.mapping.distance(samples.s.numpy())
         depths = np.bincount(samples.ray.numpy(), met.weights.numpy() * along, len(o)).astype(np.float32)
         opacities = met.opacity.numpy()

@@ -90,8 +90,9 @@ def code(model: Model, trade: Trade, prune_share: float, quantise: Quantise = qu
     """
     scene, coded, pruned = model.scene, model.coded, None
     significant = significance(model.curvature)
-    steps = relative_steps(significant)
-    if coded is not None:
+    if coded is None:
+        steps = relative_steps(significant)
+    else:
         steps = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in coded.scales]
     measure = model.probe.measure(scene)
     whole = measure(scene).psnr

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kpc.encoder import kernels
 from kpc.encoder.field import Field, Layout, SummedField
-from kpc.format.scene import TERMINATION
+from kpc.format.scene import TERMINATION, Scene
 from kpc.format.space import Contraction, SpaceMapping
 
 OPAQUE = 50.0
@@ -258,6 +258,12 @@ def collected(
     kernels.collect(*told, ends - counts, points, s, stretch, cell, workers)
     ray = np.repeat(np.arange(len(counts)), counts)
     return Samples(*(torch.from_numpy(a) for a in (ray, points, s, np.full_like(s, step), stretch, cell)))
+
+
+def marched(field: Field, rays: Rays, scene: Scene) -> tuple[Samples, Met]:
+    """The samples that rays take of a scene as it is drawn, and what they meet there in its field, by the kernels on the CPU."""
+    samples = collected(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
+    return samples, meet(field, rays, samples, fused_features(field), scene.extent)
 
 
 class FusedFeatures(torch.autograd.Function):

@@ -81,10 +81,11 @@ def _steered(
     worth = np.where(means > 0, np.maximum(significant / np.maximum(means, 1e-30), LEAST_WORTH), 1.0).astype(np.float32)
     if identity:
         known = known & ((worth * wanted**2).mean(axis=2) >= UNCHANGED)
+    worth = worth * np.float32(coarser**2)
     rounded = np.where(known[..., None], plane.symbols, np.int8(0))
     weights, bits = fitted(neighbourhoods(rounded, known), SETS), _bits(np.zeros((ACTIVITIES, TOLD_APART)))
     for _ in range(PASSES):
-        symbols, counts = _search(wanted, worth * np.float32(coarser**2), known, on_trellis, weights, bits)
+        symbols, counts = _search(wanted, worth, known, on_trellis, weights, bits)
         weights, bits = fitted(neighbourhoods(symbols, known), SETS), _bits(counts)
     return replace(plane, symbols=symbols, coded=symbols.any(axis=2) if identity else known)
 

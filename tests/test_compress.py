@@ -19,7 +19,6 @@ from kpc.format.scene import Scene
 
 SCENE = replace(tiny_scene(), occupancy=np.ones((1, 2, 2, 2), bool))  # every texel is needed
 EQUAL = [{name: np.ones(plane.shape[2]) for name, plane in scale.items()} for scale in SCENE.scales]
-
 ALIKE = [{name: np.ones_like(plane) for name, plane in scale.items()} for scale in SCENE.scales]
 
 

@@ -25,8 +25,9 @@ def quantised(scene: Scene, step: float) -> QuantisedScene:
     return quantise_scene(scene, [{name: step for name in scale} for scale in scene.scales])
 
 
-def steered(scene: Scene, step: float) -> QuantisedScene:
-    return quantise_on_trellis(scene, [{name: np.full(plane.shape[2], step) for name, plane in scale.items()} for scale in scene.scales])
+def steered(scene: Scene, step: float, significant: list[dict[str, np.ndarray]] | None = None) -> QuantisedScene:
+    steps = [{name: np.full(plane.shape[2], step) for name, plane in scale.items()} for scale in scene.scales]
+    return quantise_on_trellis(scene, steps, significant=significant)
 
 
 NO_WEIGHTS = np.zeros((1, WEIGHTS), np.int8)
@@ -99,10 +100,9 @@ def test_errors_go_where_they_are_worth_little() -> None:
 
 def test_what_is_worth_is_relative_to_the_channel() -> None:
     scene = noisy()
-    steps = [{name: np.full(plane.shape[2], 0.05) for name, plane in scale.items()} for scale in scene.scales]
     faint = [{name: np.full(plane.shape, 2.0 ** -np.arange(plane.shape[2]), np.float32) for name, plane in scale.items()}
              for scale in scene.scales]  # fmt: skip
-    assert file.encode(quantise_on_trellis(scene, steps, significant=faint)) == file.encode(quantise_on_trellis(scene, steps))
+    assert file.encode(steered(scene, 0.05, faint)) == file.encode(steered(scene, 0.05))
 
 
 @pytest.mark.parametrize("step", [0.3, 1.0, 3.0])
