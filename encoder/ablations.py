@@ -25,6 +25,7 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "planes added up": lambda c: replace(c, summed=True, sparse_transients=0.0),
     "the hybrid decoder": lambda c: replace(c, hybrid=True),
     "rows of time by the preset": lambda c: replace(c, time_tolerance=0.0),
+    "planes not tuned": lambda c: replace(c, tune_steps=0),
     "nothing left out": lambda c: replace(c, prune_share=0.0),
     "no channel dropout": lambda c: replace(c, channel_dropout=0.0),
     "all scales from the start": lambda c: replace(c, coarse_until=0.0),

@@ -36,6 +36,17 @@ NEAR = 0.3
 
 DEFAULT_LOSS_DB = 0.15
 
+ROUGHLY = 0.2
+"""The same of a search for where to tune."""
+TUNINGS = 3
+"""At most so many codings are tuned: each takes a minute, about."""
+TUNED_ENOUGH = 0.05
+"""A tuned coding this share below what it may not exceed is good enough."""
+TUNING_GAIN = {True: 0.7, False: 1.01}
+"""What tuning leaves of errors, and makes of bytes, about: where it is sought first."""
+APART = 0.3
+"""Octaves between two steps that tell how errors and bytes follow them."""
+
 TRUST = 0.8
 """In what curvature says of the differences between texels and channels, `significance`. Room and liam, at equal error of held-out views:
 files are 1 to 2 % larger with 1; 0.7 and 0.9 make no difference."""
@@ -48,6 +59,8 @@ Significance = Sequence[Mapping[str, np.ndarray]]
 """One mapping a scale, plane name -> (rows, columns, M)."""
 Quantise = Callable[[Scene, Sequence[Mapping[str, np.ndarray]], np.ndarray, Significance], QuantisedScene]
 """Of a scene with steps, `reached_by` it and significance: `quantise_on_trellis`, or what is to be compared with it."""
+Tune = Callable[[Sequence[Mapping[str, np.ndarray]], np.ndarray], QuantisedScene]
+"""A better coding with the same steps, of a scene that is known, `reached_by` which is told."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +116,11 @@ def error_of(quality: float) -> float:
 
 @dataclass(frozen=True)
 class Attempt:
-    """A scene quantised; what that gave is found out when asked for."""
+    """A scene quantised, with steps times two to the power of `exponent`; what that gave is found out when asked for."""
 
     quantised: QuantisedScene
     measure: Measure
+    exponent: float
 
     @cached_property
     def data(self) -> bytes:
@@ -158,50 +172,94 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
 
 def compress(
     scene: Scene, steps: Steps, significant: Significance, measure: Measure, uncoded_psnr: float, trade: Trade,
-    as_it_is: QuantisedScene | None = None, quantise: Quantise = quantise_on_trellis,
+    as_it_is: QuantisedScene | None = None, quantise: Quantise = quantise_on_trellis, tune: Tune | None = None,
 ) -> Attempt:
     """The quantisation that a trade asks for.
 
     Args:
         measure: judges a coding; `uncoded_psnr` is that of the scene before anything was left out.
         as_it_is: the file that the scene comes from, whose own steps `steps` are: nothing finer makes sense.
+        tune: what makes a better coding at some steps, and takes its time: the trade is met by such a one.
 
     Raises:
         TrainingError: no file of this model is as small as the trade wants.
     """
     reached = reached_by(scene)
     finest, coarsest = (FINEST, COARSEST) if as_it_is is None else (0.0, COARSER)
+    tried: list[Attempt] = []
 
     def attempt(exponent: float) -> Attempt:
         if as_it_is is not None and exponent == 0:
-            return Attempt(as_it_is, measure)
-        return Attempt(quantise(scene, scaled(steps, 2.0**exponent), reached, significant), measure)
+            return Attempt(as_it_is, measure, exponent)
+        tried.append(Attempt(quantise(scene, scaled(steps, 2.0**exponent), reached, significant), measure, exponent))
+        return tried[-1]
 
-    name, value = trade.bound
+    def tuned(exponent: float) -> Attempt:
+        assert tune is not None
+        return Attempt(tune(scaled(steps, 2.0**exponent), reached), measure, exponent)
+
+    name, bound = trade.bound
     if name == "lam":
-        return _cheapest(finest, coarsest, attempt, lambda found: found.cost(value))
+        found = _cheapest(finest, coarsest, attempt, lambda found: found.cost(bound))
+        return found if tune is None else min(found, tuned(found.exponent), key=lambda found: found.cost(bound))
     if name == "target_bytes":
-        if as_it_is is not None and (whole := attempt(0.0)).size_bytes <= value:
+        if as_it_is is not None and (whole := attempt(0.0)).size_bytes <= bound:
             return whole
-        found = _farthest(coarsest, finest, attempt, lambda found: found.size_bytes, value)
-        if found.size_bytes > value:
-            raise TrainingError(f"{found.size_bytes:,} bytes is the least that this model takes, not {int(value):,}; give "
-                                "another --target-size, or train anew with a smaller --preset")
+        start, end, most, value = coarsest, finest, bound, lambda found: found.size_bytes
+    elif name == "quality":
+        start, end, most, value = finest, coarsest, error_of(bound), lambda found: found.measured.error
+    else:
+        start, end, most = finest, coarsest, trade.loss_db(uncoded_psnr)
+        value = lambda found: uncoded_psnr - found.measured.psnr
+    found = _farthest(start, end, attempt, value, most, TOLERANCE if tune is None else ROUGHLY)
+    if tune is not None and value(found) <= most:
+        found = _farthest_tuned(found, tried, tuned, value, most, name == "target_bytes", (finest, coarsest))
+    if name == "target_bytes" and found.size_bytes > bound:
+        raise TrainingError(f"{found.size_bytes:,} bytes is the least that this model takes, not {int(bound):,}; give "
+                            "another --target-size, or train anew with a smaller --preset")
+    return found
+
+
+def _farthest_tuned(
+    found: Attempt, tried: Sequence[Attempt], tuned: Callable[[float], Attempt], value: Callable[[Attempt], float], most: float,
+    counts_bytes: bool, ends: tuple[float, float],
+) -> Attempt:
+    """Of codings that are tuned, and the one that was `found` without, the best whose value is `most` or less.
+
+    Tuned ones are sought where their value should be a bit less than that: how the logarithm of the value follows that of the steps is
+    known from what was `tried`.
+    """
+    others = [one for one in tried if abs(one.exponent - found.exponent) >= APART and value(one) > 0]
+    if not others or not value(found) > 0:
         return found
-    if name == "quality":
-        return _farthest(finest, coarsest, attempt, lambda found: found.measured.error, error_of(value))
-    return _farthest(finest, coarsest, attempt, lambda found: uncoded_psnr - found.measured.psnr, trade.loss_db(uncoded_psnr))
+    other = min(others, key=lambda one: abs(one.exponent - found.exponent))
+    slope = math.log(value(other) / value(found)) / (other.exponent - found.exponent)
+    if not math.isfinite(slope) or slope == 0 or (slope < 0) != counts_bytes:
+        return found
+    wanted = math.log(most * (1 - TUNED_ENOUGH / 2))
+    exponent = found.exponent + (wanted - math.log(value(found) * TUNING_GAIN[not counts_bytes])) / slope
+    best = found
+    for _ in range(TUNINGS):
+        candidate = tuned(min(max(exponent, ends[0]), ends[1]))
+        reached = value(candidate)
+        if reached <= most:  # not so with NaN
+            best = min(best, candidate, key=lambda one: one.measured.error if counts_bytes else one.size_bytes)
+        if (1 - TUNED_ENOUGH) * most <= reached <= most or not reached > 0:
+            break
+        exponent = candidate.exponent + (wanted - math.log(reached)) / slope
+    return best
 
 
 def _farthest(
-    start: float, end: float, attempt: Callable[[float], Attempt], value: Callable[[Attempt], float], most: float
+    start: float, end: float, attempt: Callable[[float], Attempt], value: Callable[[Attempt], float], most: float,
+    tolerance: float = TOLERANCE,
 ) -> Attempt:
     """What `attempt` makes of the exponent farthest from `start` towards `end`, along which `value` rises, where that is `most`
     or less; of `start` where nowhere.
 
     Bisects until the value is known and positive on both sides, then goes by its logarithm, nearly a straight line, but never
     nearer to an end than a tenth of the way. Where both sides come within GRAIN, `value` is rough: then what lies a few grains on.
-    Ends when TOLERANCE is met, or after ATTEMPTS.
+    Ends when the tolerance is met, or after ATTEMPTS.
     """
     best = attempt(start)
     low, high = value(best), math.nan
@@ -209,7 +267,7 @@ def _farthest(
         return best
     grains = 0
     for _ in range(ATTEMPTS):
-        if low >= (1 - TOLERANCE) * most:
+        if low >= (1 - tolerance) * most:
             break
         if abs(end - start) < GRAIN:
             grains += 1
@@ -219,7 +277,7 @@ def _farthest(
             continue
         share = 0.5
         if low > 0 and math.isfinite(high):
-            way = math.log(most * (1 - TOLERANCE / 2) / low) / math.log(high / low)
+            way = math.log(most * (1 - tolerance / 2) / low) / math.log(high / low)
             share = min(max(way, 0.1), 0.9)
         middle = start + share * (end - start)
         candidate = attempt(middle)

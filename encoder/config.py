@@ -152,6 +152,9 @@ class TrainConfig:
     # --- the file
     prune_share: float = 0.25
     """Of what coding may cost on training views, what may be spent on leaving out view dependence, channels and scales, `kpc.encoder.prune`; 0: they all stay."""
+    tune_steps: int = 100
+    """Of training that a group of planes gets to make up for the errors of those that are coded, `kpc.encoder.tuning`; 0 for none. Liam: with
+    200 errors are 0.2 dB smaller."""
 
     def __post_init__(self) -> None:
         positive = ("channels", "steps", "rays", "samples", "hidden", "hybrid_width", "samples_across", "cells_across", "warmup",
@@ -159,6 +162,8 @@ class TrainConfig:
         for name in positive:
             if getattr(self, name) < 1:
                 raise UsageError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.tune_steps < 0:
+            raise UsageError(f"tune_steps must be at least 0, not {self.tune_steps}")
         for name in ("object_rays", "channel_dropout", "scale_dropout"):
             if not 0 <= getattr(self, name) < 1:
                 raise UsageError(f"{name} must be at least 0 and less than 1, not {getattr(self, name)}")
@@ -203,7 +208,7 @@ PROGRESSIVE = 0.1
 
 PRESETS = {
     "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500,
-                         occupancy_start=64),
+                         occupancy_start=64, tune_steps=0),
     "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
     "balanced": TrainConfig(resolutions=(64, 128, 256), channels=8, steps=10000, temporal_start=0.75, temporal_floor=0.3),
     "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000),

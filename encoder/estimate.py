@@ -6,14 +6,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kpc.encoder.compress import PROBES
-from kpc.encoder.curvature import RAYS, curvature
+from kpc.encoder.curvature import RAYS as CURVATURE_RAYS
+from kpc.encoder.curvature import curvature
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.probe import Probe
 from kpc.encoder.prune import renderings
 from kpc.encoder.train import Trainer
 from kpc.encoder.trellis import quantise_on_trellis
+from kpc.encoder.tuning import RAYS, order
 from kpc.format.memory import peak_memory_bytes
 from kpc.format.scene import Scene
+
+TUNED = 2
+"""Codings that are tuned, about."""
 
 STEPS = 6
 """Steps watched, in multiples of the first with an occupancy grid: by then a step takes what it takes to the end."""
@@ -59,8 +64,13 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
     fits_s = 2 * tested * _seconds_a_fit(trainer) if trainer.names and tested else 0.0
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()
     scene = trainer.scene()
-    coding_s = PROBES * _seconds_a_coding(scene) + _seconds_of_curvature(scene)
-    return Estimate(train_s, spent_s + rendered * _seconds_a_ray(trainer) + coding_s + fits_s, memory)
+    a_coding, a_ray = _seconds_a_coding(scene), _seconds_a_ray(trainer)
+    coding_s = PROBES * a_coding + _seconds_of_curvature(scene)
+    if config.tune_steps:
+        groups = len(order(scene))
+        steps = (groups - 0.5) * config.tune_steps
+        coding_s += TUNED * (groups * a_coding / 2 + steps * RAYS * (1 / trainer.rays_per_second + a_ray))
+    return Estimate(train_s, spent_s + rendered * a_ray + coding_s + fits_s, memory)
 
 
 def _seconds_a_step(trainer: Trainer, to: int) -> float:
@@ -81,10 +91,10 @@ def _seconds_a_coding(scene: Scene) -> float:
 
 def _seconds_of_curvature(scene: Scene) -> float:
     """What errors cost, `kpc.encoder.curvature`: by a sixteenth of its rays."""
-    probe = Probe.of_cameras(scene, RAYS // 16)
+    probe = Probe.of_cameras(scene, CURVATURE_RAYS // 16)
     curvature(scene, probe, 2)  # what is done once
     started = time.perf_counter()
-    curvature(scene, probe, RAYS // 16)
+    curvature(scene, probe, CURVATURE_RAYS // 16)
     return 16 * (time.perf_counter() - started)
 
 

@@ -14,7 +14,7 @@ from kpc.encoder.field import Field
 from kpc.encoder.optimisers import sample_capacity
 from kpc.encoder.render import Rays, marched, shade
 from kpc.format.fidelity import psnr
-from kpc.format.scene import Scene
+from kpc.format.scene import AnyDecoder, Decoder, Scene
 from kpc.format.space import Contraction
 
 WHITE = np.ones(3, np.float32)
@@ -120,6 +120,15 @@ def evenly_wide(scene: Scene) -> Scene:
     decoder = replace(d, density_weight=widened(d.density_weight, 0), w2=widened(d.w2, 1), b2=widened(d.b2, 1))
     scales = tuple({name: _filled_up(plane, 2, most) for name, plane in scale.items()} for scale in scene.scales)
     return replace(scene, scales=scales, decoder=decoder)
+
+
+def as_wide_as(scene: Scene, decoder: AnyDecoder) -> AnyDecoder:
+    """The decoder of `evenly_wide(scene)` without what was added."""
+    if not isinstance(decoder, Decoder):
+        return decoder
+    counts = [scale["xy"].shape[2] for scale in scene.scales]
+    kept = np.concatenate([np.arange(max(counts)) < count for count in counts])
+    return replace(decoder, density_weight=decoder.density_weight[kept], w2=decoder.w2[:, kept], b2=decoder.b2[:, kept])
 
 
 def _filled_up(values: np.ndarray, axis: int, size: int) -> np.ndarray:

@@ -19,7 +19,8 @@ from kpc.encoder.compress import Quantise, Trade, compress, relative_steps, sign
 from kpc.encoder.curvature import curvature
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
-from kpc.encoder.trellis import quantise_on_trellis
+from kpc.encoder.trellis import Settled, quantise_on_trellis
+from kpc.encoder.tuning import tuned
 from kpc.format import file
 from kpc.format.cameras import Camera
 from kpc.format.container import MAGIC
@@ -80,10 +81,13 @@ class Coded:
         return len(self.data)
 
 
-def code(model: Model, trade: Trade, prune_share: float, quantise: Quantise = quantise_on_trellis) -> Coded:
+def code(model: Model, trade: Trade, prune_share: float, tune_steps: int, quantise: Quantise = quantise_on_trellis) -> Coded:
     """What of a model is needed, `kpc.encoder.prune`, in symbols as coarse or as fine as a trade asks for.
 
-    `prune_share`: of what coding may cost, what may be spent on leaving something out.
+    Args:
+        prune_share: of what coding may cost, what may be spent on leaving something out.
+        tune_steps: of training that a group of planes gets to make up for others, `kpc.encoder.tuning`; 0 for none.
+        quantise: another way to choose symbols, to compare with; not tuned.
 
     Raises:
         TrainingError: no file of this model is so small.
@@ -102,7 +106,14 @@ def code(model: Model, trade: Trade, prune_share: float, quantise: Quantise = qu
         if coded is None or pruned.left_out_any:
             scene, coded = pruned.scene, None
             steps, significant = pruned.of_each_plane(steps), pruned.of_each_plane(significant)
-    found = compress(scene, steps, significant, measure, whole, trade, coded, quantise)
+
+    def tune(steps: Sequence[Mapping[str, np.ndarray]], reached: np.ndarray) -> QuantisedScene:
+        def choose(candidate: Scene, settled: Settled) -> QuantisedScene:
+            return quantise_on_trellis(candidate, steps, reached, significant, settled)
+
+        return tuned(scene, model.scene, choose, tune_steps)
+
+    found = compress(scene, steps, significant, measure, whole, trade, coded, quantise, tune if tune_steps else None)
     measured: Measured = found.measured
     return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, spare)
 

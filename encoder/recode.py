@@ -34,13 +34,17 @@ def recode(options: Options) -> dict[str, Any]:
     if is_coded and not (clip := groups.Groups(options.source)).is_single:
         return _recode_groups(options, clip) | {"encode_s": time.monotonic() - started}
     source = model.load(options.source)
-    coded = model.code(source, options.trade, TrainConfig().prune_share)
+    coded = model.code(source, options.trade, TrainConfig().prune_share, _tune_steps(options))
     size = file.save(coded.data, options.output)
     return {
         "file": str(options.output), "source": str(options.source),
         **figures(coded, size, options.trade, JUDGED_BY[is_coded]),
         "encode_s": time.monotonic() - started,
     }  # fmt: skip
+
+
+def _tune_steps(options: Options) -> int:
+    return TrainConfig().tune_steps if options.tune_steps is None else options.tune_steps
 
 
 def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
@@ -50,7 +54,7 @@ def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
         trade = share_of(options, number, spans).trade
         reader = source.open(number)
         scene = replace(file.read(reader), cameras=reader.cameras() or source.cameras())
-        coded = model.code(model.model_of(scene), trade, TrainConfig().prune_share)
+        coded = model.code(model.model_of(scene), trade, TrainConfig().prune_share, _tune_steps(options))
         parts.append(groups.Part.of(coded.data, span.start))
         found.append(figures(coded, coded.size_bytes, trade, JUDGED_BY[1]))
     size = groups.write(parts, options.output)

@@ -287,7 +287,7 @@ def _unusable(path: Path, error: Exception) -> TrainingError:
 def _comparable(config: dict[str, Any]) -> dict[str, Any]:
     """A config without what may differ between a run and its continuation."""
     return {key: tuple(value) if isinstance(value, list) else value for key, value in config.items()
-            if key not in ("steps", "prune_share")}
+            if key not in ("steps", "prune_share", "tune_steps")}
 
 
 def _fingerprint(dataset: Dataset) -> str:

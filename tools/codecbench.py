@@ -49,10 +49,11 @@ VIEW_PIXELS = 1 << 15
 RIVALS = {rival.name: rival for rival in rivals.RIVALS}
 OURS = "kpc"
 WITHOUT: dict[str, Quantise] = {
+    "kpc without tuning": quantise_on_trellis,
     "kpc without the trellis": lambda scene, steps, reached, significant: quantise_scene(scene, steps, reached=reached),
     "kpc, every texel alike": lambda scene, steps, reached, significant: quantise_on_trellis(scene, steps, reached),
 }
-"""Our own coder with something left out."""
+"""Our own coder with something left out, the latter two without tuning, too; at QUALITIES."""
 
 Point = dict[str, Any]
 
@@ -79,9 +80,10 @@ def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str,
     views = None if dataset is None else held_out_views(source.scene, dataset)
     others = others_bytes(source)
     count = source.scene.parameter_count
-    trades = {f"{rate:g} bits": Trade(target_bytes=int(rate * count / 8)) for rate in RATES}
-    trades |= {f"quality {q:g}": Trade(quality=q) for q in QUALITIES}
-    jobs = [Job(scene, name, said, others, trade) for name in (OURS, *WITHOUT) for said, trade in trades.items()]
+    rates = {f"{rate:g} bits": Trade(target_bytes=int(rate * count / 8)) for rate in RATES}
+    qualities = {f"quality {q:g}": Trade(quality=q) for q in QUALITIES}
+    jobs = [Job(scene, name, said, others, trade) for name in (OURS, *WITHOUT)
+            for said, trade in ((rates if name == OURS else {}) | qualities).items()]  # fmt: skip
     missing = {name: why for name, rival in RIVALS.items() if (why := rival.missing())}
     jobs += [Job(scene, name, setting, others) for name, rival in RIVALS.items() if name not in missing
              for setting in reversed(rival.settings)]  # fmt: skip
@@ -125,7 +127,8 @@ def point(job: Job) -> Point | None:
         return _point(job, source, size, took, uncoded.psnr, judged)
     started = time.perf_counter()
     try:
-        coded = model.code(source, job.trade, TrainConfig().prune_share, WITHOUT.get(job.coder, quantise_on_trellis))
+        tune_steps = TrainConfig().tune_steps if job.coder == OURS else 0
+        coded = model.code(source, job.trade, TrainConfig().prune_share, tune_steps, WITHOUT.get(job.coder, quantise_on_trellis))
     except TrainingError:
         return None
     searched = time.perf_counter()
@@ -170,7 +173,7 @@ def _tidied(path: Path) -> Any:
 
 def others_bytes(source: Model) -> int:
     """Stored bytes of all chunks but planes, in our file of the scene."""
-    coded = source.coded or model.code(source, Trade(), 0.0).scene
+    coded = source.coded or model.code(source, Trade(), 0.0, 0).scene
     reader = file.SceneReader(file.encode(coded))
     return sum(entry.stored_length for entry in reader.index if entry.kind != "PLNE")
 
