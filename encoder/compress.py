@@ -211,9 +211,12 @@ def compress(
     else:
         start, end, most = finest, coarsest, trade.loss_db(uncoded_psnr)
         value = lambda found: uncoded_psnr - found.measured.psnr
-    found = _farthest(start, end, attempt, value, most, TOLERANCE if tune is None else ROUGHLY)
-    if tune is not None and value(found) <= most:
-        found = _farthest_tuned(found, tried, tuned, value, most, name == "target_bytes", (finest, coarsest))
+    if tune is not None:
+        found = _farthest(start, end, attempt, value, most, ROUGHLY)
+        better = _farthest_tuned(found, tried, tuned, value, most, name == "target_bytes", (finest, coarsest))
+        if better is not None:
+            return better
+    found = _farthest(start, end, attempt, value, most)
     if name == "target_bytes" and found.size_bytes > bound:
         raise TrainingError(f"{found.size_bytes:,} bytes is the least that this model takes, not {int(bound):,}; give "
                             "another --target-size, or train anew with a smaller --preset")
@@ -223,31 +226,31 @@ def compress(
 def _farthest_tuned(
     found: Attempt, tried: Sequence[Attempt], tuned: Callable[[float], Attempt], value: Callable[[Attempt], float], most: float,
     counts_bytes: bool, ends: tuple[float, float],
-) -> Attempt:
-    """Of codings that are tuned, and the one that was `found` without, the best whose value is `most` or less.
+) -> Attempt | None:
+    """A coding that is tuned, whose value is `most` or little less, and that is better than what was `found` without; None where there
+    is none.
 
-    Tuned ones are sought where their value should be a bit less than that: how the logarithm of the value follows that of the steps is
-    known from what was `tried`.
+    It is sought where its value should be so: how the logarithm of the value follows that of the steps is known from what was `tried`.
     """
     others = [one for one in tried if abs(one.exponent - found.exponent) >= APART and value(one) > 0]
-    if not others or not value(found) > 0:
-        return found
+    if not others or not 0 < value(found) <= most:
+        return None
     other = min(others, key=lambda one: abs(one.exponent - found.exponent))
     slope = math.log(value(other) / value(found)) / (other.exponent - found.exponent)
     if not math.isfinite(slope) or slope == 0 or (slope < 0) != counts_bytes:
-        return found
+        return None
     wanted = math.log(most * (1 - TUNED_ENOUGH / 2))
     exponent = found.exponent + (wanted - math.log(value(found) * TUNING_GAIN[not counts_bytes])) / slope
-    best = found
     for _ in range(TUNINGS):
         candidate = tuned(min(max(exponent, ends[0]), ends[1]))
         reached = value(candidate)
-        if reached <= most:  # not so with NaN
-            best = min(best, candidate, key=lambda one: one.measured.error if counts_bytes else one.size_bytes)
-        if (1 - TUNED_ENOUGH) * most <= reached <= most or not reached > 0:
-            break
+        if (1 - TUNED_ENOUGH) * most <= reached <= most:
+            better = candidate.measured.error < found.measured.error if counts_bytes else candidate.size_bytes < found.size_bytes
+            return candidate if better else None
+        if not reached > 0:  # so with NaN
+            return None
         exponent = candidate.exponent + (wanted - math.log(reached)) / slope
-    return best
+    return None
 
 
 def _farthest(

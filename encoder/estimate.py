@@ -69,7 +69,8 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
     if config.tune_steps:
         groups = len(order(scene))
         steps = (groups - 0.5) * config.tune_steps
-        coding_s += TUNED * (groups * a_coding / 2 + steps * RAYS * (1 / trainer.rays_per_second + a_ray))
+        trained = 1 / trainer.rays_per_second if trainer.rays_per_second else 3 * a_ray
+        coding_s += TUNED * (groups * a_coding / 2 + steps * RAYS * (trained + a_ray))
     return Estimate(train_s, spent_s + rendered * a_ray + coding_s + fits_s, memory)
 
 

@@ -68,6 +68,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(codecbench, "in_parallel", here)
     monkeypatch.setattr("kpc.encoder.probe.PROBE_RAYS", 512)
+    monkeypatch.setattr(codecbench, "TUNE_STEPS", 0)
     monkeypatch.setattr(codecbench, "RATES", (1e-3, 3.0, 4.0))
     monkeypatch.setattr(codecbench, "QUALITIES", (60, 70, 80, 90))
     others = Half("zstd -19"), Bytes(), Video("X", "libnothing", (1,), ())
@@ -80,7 +81,7 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     said = capsys.readouterr()
     records = results.load([out])
     assert [record["coder"] for record in records] == ["kpc", *codecbench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19", "X"]
-    ours, rounded, alike, halves, levels, missing = records
+    ours, *without, halves, levels, missing = records
     assert missing["missing"] == "this ffmpeg has no libnothing" and missing["points"] == [] and missing["bd_rate"] is None
     assert len(halves["points"]) == 6 and halves["bd_rate"] is not None
     whole = scene_file.stat().st_size
@@ -100,7 +101,7 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert "kpc is smaller by" in said.err and "Coding, beside what is at hand" in results.markdown(records)
     with (tmp_path / "codec.csv").open() as table:
         rows = list(csv.DictReader(table))
-    assert len(rows) == 6 + 6 + 6 + 6 + 5 and len(rounded["points"]) == len(alike["points"]) == 6
+    assert len(rows) == 6 + 3 * 4 + 6 + 5 and [len(one["points"]) for one in without] == [4, 4, 4]
     assert {row["coder"] for row in rows} == {"kpc", *codecbench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19"}
     assert float(rows[0]["size_bytes"]) == ours["points"][0]["size_bytes"]
     svg = (tmp_path / "codec.svg").read_text()
@@ -121,7 +122,7 @@ def test_held_out_views_judge(few: None, scene_file: Path, tmp_path: Path, monke
 
 
 def test_processes_of_their_own(scene_file: Path) -> None:
-    jobs = [codecbench.Job(scene_file, "kpc", "quality 5", 0, codecbench.Trade(quality=5.0)), codecbench.Job(scene_file, Bytes().name, 4, 100)]
+    jobs = [codecbench.Job(scene_file, "kpc without tuning", "quality 5", 0, codecbench.Trade(quality=5.0)), codecbench.Job(scene_file, Bytes().name, 4, 100)]
     ours, levels = codecbench.in_parallel(jobs, None, 2)
     assert ours is not None and levels is not None and ours["psnr"] < 30 and levels["size_bytes"] > 100
     assert math.isfinite(levels["psnr"])
@@ -142,6 +143,7 @@ def test_records_survive_json(
 ) -> None:
     monkeypatch.setattr(codecbench, "RATES", (3.0,))
     monkeypatch.setattr(codecbench, "QUALITIES", (60,))
+    monkeypatch.setattr(codecbench, "TUNE_STEPS", 2)
     monkeypatch.setattr(codecbench, "RIVALS", {Bytes().name: Bytes()})
     assert kpbench.main(["codec", str(scene_file)]) == 0
     assert json.loads(capsys.readouterr().out)[0]["kind"] == "codec"

@@ -8,13 +8,13 @@ import pytest
 from scenes import tiny_scene
 
 from kpc.encoder.compress import (
-    FINEST, LEAST_SIGNIFICANCE, TRUST, Attempt, Trade, agreement_of, compress, error_of, relative_steps, scaled, significance,
+    FINEST, LEAST_SIGNIFICANCE, TRUST, TUNINGS, Attempt, Steps, Trade, agreement_of, compress, error_of, relative_steps, scaled, significance,
 )
 from kpc.encoder.probe import Measured
 from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format import file
 from kpc.format.errors import TrainingError
-from kpc.format.quantise import quantise_scene
+from kpc.format.quantise import QuantisedScene, quantise_scene
 from kpc.format.scene import Scene
 
 SCENE = replace(tiny_scene(), occupancy=np.ones((1, 2, 2, 2), bool))  # every texel is needed
@@ -85,7 +85,7 @@ def test_a_size_that_no_file_has_is_refused() -> None:
 @pytest.fixture(scope="module")
 def raster() -> list[Attempt]:
     """On a fine raster of factors, for all lam."""
-    return [Attempt(quantise_on_trellis(SCENE, scaled(EQUAL, 2.0**e)), measure) for e in np.arange(-10, 2, 0.1)]
+    return [Attempt(quantise_on_trellis(SCENE, scaled(EQUAL, 2.0**e)), measure, float(e)) for e in np.arange(-10, 2, 0.1)]
 
 
 @pytest.mark.parametrize("lam", [0.01, 0.3, 10.0])
@@ -174,3 +174,44 @@ def test_scaled() -> None:
     out = scaled([{"xy": np.array([1.0, 2.0])}], 0.25)
     assert out[0]["xy"].dtype == np.float32
     np.testing.assert_array_equal(out[0]["xy"], [0.25, 0.5])
+
+
+def tuned_to(factor: float, seen: list[Attempt] | None = None, **trade: float) -> Attempt:
+    """With a stand-in for tuning: steps times a factor, at the bytes that those take."""
+    def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
+        made = quantise_on_trellis(SCENE, [{name: factor * step for name, step in scale.items()} for scale in steps], reached)
+        if seen is not None:
+            seen.append(Attempt(made, measure, 0.0))
+        return made
+
+    return compress(SCENE, EQUAL, ALIKE, measure, 30.0, Trade(**trade), tune=tune)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("factor", [0.6, 0.85])
+def test_what_is_tuned_meets_the_trade(factor: float) -> None:
+    """Within 10 %, after few tries, whatever tuning brings."""
+    for most in (0.05, 0.15, 0.4):
+        seen: list[Attempt] = []
+        assert 0.9 * most <= loss(tuned_to(factor, seen, max_loss_db=most)) <= most
+        assert 1 <= len(seen) <= TUNINGS
+    assert agreement_of(60) <= tuned_to(factor, quality=60).measured.agreement_db <= agreement_of(60) + 0.5
+    target = coded(quality=60).size_bytes
+    assert 0.9 * target < tuned_to(factor, target_bytes=target).size_bytes <= target
+
+
+def test_tuning_that_does_harm_is_not_taken() -> None:
+    plain = coded(max_loss_db=0.15)
+    assert tuned_to(1e-3, max_loss_db=0.15).size_bytes < 1.1 * plain.size_bytes
+    assert loss(tuned_to(1e3, max_loss_db=0.15)) <= 0.15
+    assert tuned_to(1e-3, lam=0.3).cost(0.3) <= coded(lam=0.3).cost(0.3)
+
+
+def test_tuning_that_breaks_leaves_what_was_found() -> None:
+    def broken(scene: Scene) -> Measured:
+        return Measured(math.nan, math.nan) if scene.step == 7 else measure(scene)
+
+    def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
+        return replace(quantise_on_trellis(SCENE, steps, reached), step=7.0)
+
+    found = compress(SCENE, EQUAL, ALIKE, broken, 30.0, Trade(0.15), tune=tune)
+    assert found.quantised.step != 7 and 0.07 < loss(found) <= 0.15

@@ -18,7 +18,7 @@ from kpc.encoder.train import Trainer
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = TrainConfig(
     resolutions=(8, 16), samples_across=32, cells_across=12, steps=400, rays=256, samples=8192, warmup=5, occupancy_start=8,
-    occupancy_every=4,
+    occupancy_every=4, tune_steps=0,
 )
 BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
 
@@ -41,6 +41,16 @@ def test_it_extrapolates_from_the_steps_it_watched(moving: Dataset, monkeypatch:
     assert run.step == watched
     assert found.train_s == pytest.approx(5 + 3 * watched // 2 + 1.0 * (CONFIG.steps - watched // 2), abs=3)
     assert 2 < found.rest_s < 60 and found.memory_bytes > 16 * run.field.theta.numel()
+
+
+def test_tuning_is_counted(moving: Dataset) -> None:
+    """By what a ray takes in training, and to be rendered."""
+    found = []
+    for tune_steps in (0, 100):
+        run = Trainer(moving, replace(CONFIG, tune_steps=tune_steps), BOX, "cpu")
+        found.append(module.estimate(run, probe_rays=100, tested=0, spent_s=0.0, time_budget_s=None).rest_s)
+    trained = module.TUNED * 2.5 * 100 * module.RAYS / run.rays_per_second
+    assert found[1] - found[0] == pytest.approx(trained, rel=0.5)
 
 
 def test_steps_with_the_coarsest_scale_alone_are_counted_apart(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:

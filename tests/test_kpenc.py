@@ -28,6 +28,7 @@ from kpc.format.space import DeviceCoordinates
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny", "heeded_signals")
 TINY = dict(
+    tune_steps=0,
     resolutions=(8, 16),
     samples_across=32,
     cells_across=12,

@@ -13,7 +13,7 @@ import pytest
 import torch
 from scenes import SPACES, tiny_scene, varied
 
-from kpc.encoder import kpenc, model, probe
+from kpc.encoder import kpenc, model, probe, tuning
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.probe import ASSUMED_MSE, Probe, around
@@ -32,6 +32,7 @@ Kpenc = Callable[..., dict[str, Any]]
 @pytest.fixture(autouse=True)
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(probe, "PROBE_RAYS", 512)
+    monkeypatch.setattr(tuning, "RAYS", 256)
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def kpenc_says(capsys: pytest.CaptureFixture[str]) -> Kpenc:
 
     def call(source: Path, output: Path, *options: str) -> dict[str, Any]:
         capsys.readouterr()
-        assert kpenc.main([str(source), "-o", str(output), "--json", *options]) == 0
+        assert kpenc.main([str(source), "-o", str(output), "--json", "--tune-steps", "0", *options]) == 0
         found: dict[str, Any] = json.loads(capsys.readouterr().out)
         return found
 
@@ -74,7 +75,7 @@ def saved(path: Path, scene: Scene) -> Path:
 # --- finished checkpoints
 
 
-@pytest.mark.parametrize("trade", [(), ("--max-loss", "1dB"), ("--quality", "60"), ("--psnr", "9dB")])
+@pytest.mark.parametrize("trade", [(), ("--max-loss", "1dB"), ("--quality", "60", "--tune-steps", "4"), ("--psnr", "9dB")])
 def test_a_checkpoint_gives_the_file_that_training_gave(
     tmp_path: Path, kpenc_says: Kpenc, monkeypatch: pytest.MonkeyPatch, trade: tuple[str, ...]
 ) -> None:

@@ -46,6 +46,7 @@ WORST_LOSS_DB = 3.0
 """Curves are compared down to this: what is worse nobody wants."""
 VIEW_PIXELS = 1 << 15
 """Random pixels of all held-out views that codings are judged by."""
+TUNE_STEPS = TrainConfig().tune_steps
 RIVALS = {rival.name: rival for rival in rivals.RIVALS}
 OURS = "kpc"
 WITHOUT: dict[str, Quantise] = {
@@ -127,7 +128,7 @@ def point(job: Job) -> Point | None:
         return _point(job, source, size, took, uncoded.psnr, judged)
     started = time.perf_counter()
     try:
-        tune_steps = TrainConfig().tune_steps if job.coder == OURS else 0
+        tune_steps = TUNE_STEPS if job.coder == OURS else 0
         coded = model.code(source, job.trade, TrainConfig().prune_share, tune_steps, WITHOUT.get(job.coder, quantise_on_trellis))
     except TrainingError:
         return None

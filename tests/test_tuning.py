@@ -1,0 +1,87 @@
+"""Tuning: what is coded later makes up for what was coded before."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+from scenes import displaced, hybrid, tiny_scene, varied
+
+from kpc.encoder import tuning
+from kpc.encoder.evaluate import as_wide_as, evenly_wide
+from kpc.encoder.probe import Probe
+from kpc.encoder.trellis import Settled, quantise_on_trellis
+from kpc.encoder.tuning import order, tuned
+from kpc.format import file
+from kpc.format.quantise import QuantisedScene
+from kpc.format.scene import Decoder, Scene
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+STEP = 0.2
+
+
+@pytest.fixture(autouse=True)
+def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tuning, "RAYS", 512)
+
+
+def choose(scene: Scene, settled: Settled = MappingProxyType({})) -> QuantisedScene:
+    steps = [{name: np.full(plane.shape[2], STEP) for name, plane in scale.items()} for scale in scene.scales]
+    return quantise_on_trellis(scene, steps, settled=settled)
+
+
+def error(scene: Scene, quantised: QuantisedScene) -> float:
+    return Probe.of_cameras(scene, 4096, seed=77).measure(scene)(quantised.dequantise()).error
+
+
+def test_every_plane_has_its_turn_the_finest_first() -> None:
+    scene = tiny_scene(scales=3)
+    groups = order(scene)
+    assert [{s for s, _ in group} for group in groups] == [{2}, {1}, {0}, {0, 1, 2}]
+    assert sorted(plane for group in groups for plane in group) == sorted((s, name) for s in range(3) for name in scene.scales[s])
+    assert order(tiny_scene(dynamic=False, scales=1)) == [[(0, "xy"), (0, "xz"), (0, "yz")]]
+
+
+@pytest.mark.parametrize("make", [tiny_scene, partial(tiny_scene, dynamic=False), lambda: displaced(tiny_scene())])
+def test_pictures_come_nearer_to_those_of_the_whole(make: Callable[[], Scene]) -> None:
+    scene = make()
+    plain, better = choose(scene), tuned(scene, scene, choose, 60)
+    assert error(scene, better) < 0.96 * error(scene, plain)
+    assert file.read(file.encode(better)).parameter_count == plain.parameter_count
+
+
+def test_what_is_coded_first_is_coded_as_it_was_and_nothing_but_planes_and_decoder_changes() -> None:
+    scene = displaced(tiny_scene())
+    plain, better = choose(scene), tuned(scene, scene, choose, 20)
+    for name in ("xy", "xz", "yz"):
+        assert np.array_equal(better.scales[-1][name].symbols, plain.scales[-1][name].symbols)
+    assert not np.array_equal(better.scales[0]["xy"].symbols, plain.scales[0]["xy"].symbols)
+    assert better.motion is not None and plain.motion is not None and np.array_equal(better.motion.symbols, plain.motion.symbols)
+    assert np.array_equal(better.occupancy, plain.occupancy) and isinstance(better.decoder, Decoder)
+    assert not np.array_equal(better.decoder.w2, plain.decoder.w2)  # type: ignore[union-attr]
+
+
+def test_it_comes_out_the_same_each_time() -> None:
+    scene = tiny_scene()
+    assert file.encode(tuned(scene, scene, choose, 5)) == file.encode(tuned(scene, scene, choose, 5))
+
+
+def test_a_look_that_is_the_same_from_everywhere_stays_so() -> None:
+    scene = tiny_scene()
+    scene = replace(scene, decoder=replace(scene.decoder, w2=np.zeros_like(scene.decoder.w2)))  # type: ignore[arg-type]
+    assert not tuned(scene, scene, choose, 5).decoder.w2.any()
+
+
+def test_scales_of_unequal_width_and_appearances_and_the_hybrid_decoder() -> None:
+    whole = tiny_scene()
+    narrow = replace(whole, scales=({name: plane[..., :5] for name, plane in whole.scales[0].items()}, whole.scales[1]),
+                     decoder=as_wide_as(replace(whole, scales=({n: p[..., :5] for n, p in whole.scales[0].items()}, whole.scales[1])),
+                                        whole.decoder))  # fmt: skip
+    assert as_wide_as(narrow, evenly_wide(narrow).decoder).w2.tobytes() == narrow.decoder.w2.tobytes()
+    for scene in (narrow, varied(whole), hybrid(whole)):
+        plain, better = choose(scene), tuned(scene, scene, choose, 40)
+        assert error(scene, better) < error(scene, plain)
+        assert [a.code.tolist() for a in better.appearances] == [a.code.tolist() for a in plain.appearances]
+        file.read(file.encode(better))
