@@ -42,8 +42,8 @@ TUNINGS = 3
 """At most so many codings are tuned: each takes a minute, about."""
 TUNED_ENOUGH = 0.05
 """A tuned coding this share below what it may not exceed is good enough."""
-TUNING_GAIN = {True: 0.7, False: 1.01}
-"""What tuning leaves of errors, and makes of bytes, about: where it is sought first."""
+ERRORS_LEFT, BYTES_MADE = 0.7, 1.01
+"""What tuning makes of errors and of bytes, about: so it is known where to begin."""
 APART = 0.3
 """Octaves between two steps that tell how errors and bytes follow them."""
 
@@ -240,7 +240,8 @@ def _farthest_tuned(
     if not math.isfinite(slope) or slope == 0 or (slope < 0) != counts_bytes:
         return None
     wanted = math.log(most * (1 - TUNED_ENOUGH / 2))
-    exponent = found.exponent + (wanted - math.log(value(found) * TUNING_GAIN[not counts_bytes])) / slope
+    expected = value(found) * (BYTES_MADE if counts_bytes else ERRORS_LEFT)
+    exponent = found.exponent + (wanted - math.log(expected)) / slope
     for _ in range(TUNINGS):
         candidate = tuned(min(max(exponent, ends[0]), ends[1]))
         reached = value(candidate)

@@ -3,12 +3,13 @@
 Symbols lie half as far apart as plain rounding to the same number of bits would have them, but along a row only every other one may
 follow (`kpc.format.symbols.next_state`). A Viterbi search finds the path through a row of least
 
-    u^2 + 2 u (BESIDE (sum of u of the four texels around) + ACROSS (sum of u of the four at the corners)) + LAM * bits(symbol | those before it)
+    u^2 + 2 u (BESIDE * sum of u of the four texels around + ACROSS * sum of u of the four at the corners)
+        + LAM * bits(symbol | those before it),        u = sqrt(worth) (symbol - value / step)
 
-with u = sqrt(worth) (symbol - value / step), each survivor with the predictions and contexts that its own symbols lead to (Marcellin and Fischer, IEEE Trans. Comm. 38, 1990). Bits are
-counted in the contexts of the coder, from what the search before chose. Rows below have the errors that the search before left them. So
-errors next to each other come out with opposite signs, which pictures blend away: they look planes up between texels. What an error is worth differs from texel to texel by orders of
-magnitude (`kpc.encoder.curvature`): where it is worth little, symbols are those that are foreseen.
+each survivor with the predictions and contexts that its own symbols lead to (Marcellin and Fischer, IEEE Trans. Comm. 38, 1990). Bits are
+counted in the contexts of the coder, from what the search before chose; rows below have the errors that the search before left them. So
+errors next to each other get opposite signs, and look-ups, which lie between texels, see less of them. What an error is worth differs from
+texel to texel by orders of magnitude (`kpc.encoder.curvature`): where it is worth little, symbols are those that are foreseen.
 
 Default scene, `fast`: at equal error of pictures of 1, 2 and 4 squared levels planes take 11 to 14 % fewer bytes than with symbols chosen
 by rate and distortion around the nearest. Errors that know of each other save 5 to 8 % more, and 14 % where steps are fine (liam,
@@ -39,7 +40,7 @@ Settled = Mapping[Name, QuantisedPlane]
 LAM = 0.5
 """Squared steps that a bit is worth, where an error is worth what it is in the mean. Where steps are fine an error of
 (2 step)^2 / 12 / 1.28, that of the trellis, falls to a quarter with a bit more, at the slope of 0.36; errors that make up for each other
-allow finer steps at more. Liam and the default scene: with 0.3 and 0.7 files are one to three percent larger at equal PSNR of held-out views."""
+allow finer steps at more. Liam: with 0.3 and 0.7 files are one to four percent larger at equal PSNR of held-out views."""
 BESIDE, ACROSS = 1 / 4, 1 / 16
 """What errors of neighbours cost together, of what they cost each. Bilinear weights are products of 1 - |x|; over look-ups anywhere between
 two texels their product has the mean 1/6, the square of either about a texel 2/3, and at corners it is so along both axes. Measured for
