@@ -34,7 +34,7 @@ FRAMES = 26
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    config = TrainConfig(resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
+    config = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
                          occupancy_start=8, occupancy_every=4)  # fmt: skip
     monkeypatch.setitem(PRESETS, "draft", config)
     monkeypatch.setattr(probe, "PROBE_RAYS", 512)

@@ -23,7 +23,7 @@ from kpc.format.quantise import quantise_scene
 from kpc.format.scene import Scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-TINY = TrainConfig(resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
+TINY = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
                    occupancy_start=8, occupancy_every=4)  # fmt: skip
 
 Kpenc = Callable[..., dict[str, Any]]
