@@ -117,7 +117,7 @@ def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
     rays = rays_of(scene)
     numbers = [{name: np.arange(1.0, 9.0) for name in scale} for scale in scene.scales]
     model = Model(scene, Probe(*rays, None, Fidelity(scene, rays).truth))
-    coded = code(model, Trade(max_loss_db=0.15), SPARE / 0.15)
+    coded = code(model, Trade(max_loss_db=0.15), SPARE / 0.15, 0)
     assert coded.pruned is not None and coded.spare_db == pytest.approx(SPARE) and coded.pruned.left_out_any
     kept = coded.pruned.kept[1]
     assert [step.tolist() for step in coded.pruned.of_each_plane(numbers)[1].values()] == [(kept + 1.0).tolist()] * 6
