@@ -24,6 +24,8 @@ COARSER = 12.0
 """The same of the coarsest for a file that is coded again; the finest is its own."""
 TOLERANCE = 0.02
 """A search ends this share below what it may not exceed."""
+ROUGHLY = 0.2
+"""The same of a search for where to tune."""
 GRAIN = 0.02
 """Octaves. Steps that differ by less err differently, but on average the same."""
 ATTEMPTS = 16
@@ -36,8 +38,6 @@ NEAR = 0.3
 
 DEFAULT_LOSS_DB = 0.15
 
-ROUGHLY = 0.2
-"""The same of a search for where to tune."""
 TUNINGS = 3
 """At most so many codings are tuned: each takes a minute, about."""
 TUNED_ENOUGH = 0.05
@@ -186,13 +186,14 @@ def compress(
     """
     reached = reached_by(scene)
     finest, coarsest = (FINEST, COARSEST) if as_it_is is None else (0.0, COARSER)
-    tried: list[Attempt] = []
+    tried: dict[float, Attempt] = {}
 
     def attempt(exponent: float) -> Attempt:
         if as_it_is is not None and exponent == 0:
             return Attempt(as_it_is, measure, exponent)
-        tried.append(Attempt(quantise(scene, scaled(steps, 2.0**exponent), reached, significant), measure, exponent))
-        return tried[-1]
+        if exponent not in tried:
+            tried[exponent] = Attempt(quantise(scene, scaled(steps, 2.0**exponent), reached, significant), measure, exponent)
+        return tried[exponent]
 
     def tuned(exponent: float) -> Attempt:
         assert tune is not None
@@ -213,7 +214,7 @@ def compress(
         value = lambda found: uncoded_psnr - found.measured.psnr
     if tune is not None:
         found = _farthest(start, end, attempt, value, most, ROUGHLY)
-        better = _farthest_tuned(found, tried, tuned, value, most, name == "target_bytes", (finest, coarsest))
+        better = _farthest_tuned(start, end, found, tuple(tried.values()), tuned, value, most)
         if better is not None:
             return better
     found = _farthest(start, end, attempt, value, most)
@@ -224,14 +225,15 @@ def compress(
 
 
 def _farthest_tuned(
-    found: Attempt, tried: Sequence[Attempt], tuned: Callable[[float], Attempt], value: Callable[[Attempt], float], most: float,
-    counts_bytes: bool, ends: tuple[float, float],
+    start: float, end: float, found: Attempt, tried: Sequence[Attempt], tuned: Callable[[float], Attempt],
+    value: Callable[[Attempt], float], most: float,
 ) -> Attempt | None:
-    """A coding that is tuned, whose value is `most` or little less, and that is better than what was `found` without; None where there
-    is none.
+    """A coding that is tuned, whose value is `most` or little less, and that is better than what `_farthest` found without; None where
+    there is none. Bytes are what rises towards finer steps, errors towards coarser ones.
 
     It is sought where its value should be so: how the logarithm of the value follows that of the steps is known from what was `tried`.
     """
+    counts_bytes = end < start
     others = [one for one in tried if abs(one.exponent - found.exponent) >= APART and value(one) > 0]
     if not others or not 0 < value(found) <= most:
         return None
@@ -243,7 +245,7 @@ def _farthest_tuned(
     expected = value(found) * (BYTES_MADE if counts_bytes else ERRORS_LEFT)
     exponent = found.exponent + (wanted - math.log(expected)) / slope
     for _ in range(TUNINGS):
-        candidate = tuned(min(max(exponent, ends[0]), ends[1]))
+        candidate = tuned(min(max(exponent, min(start, end)), max(start, end)))
         reached = value(candidate)
         if (1 - TUNED_ENOUGH) * most <= reached <= most:
             better = candidate.measured.error < found.measured.error if counts_bytes else candidate.size_bytes < found.size_bytes

@@ -67,10 +67,9 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
     a_coding, a_ray = _seconds_a_coding(scene), _seconds_a_ray(trainer)
     coding_s = PROBES * a_coding + _seconds_of_curvature(scene)
     if config.tune_steps:
-        groups = len(order(scene))
-        steps = (groups - 0.5) * config.tune_steps
+        steps = (len(order(scene)) - 0.5) * config.tune_steps
         trained = 1 / trainer.rays_per_second if trainer.rays_per_second else 3 * a_ray
-        coding_s += TUNED * (groups * a_coding / 2 + steps * RAYS * (trained + a_ray))
+        coding_s += TUNED * (a_coding + steps * RAYS * (trained + a_ray))
     return Estimate(train_s, spent_s + rendered * a_ray + coding_s + fits_s, memory)
 
 

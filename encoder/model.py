@@ -19,7 +19,7 @@ from kpc.encoder.compress import Quantise, Trade, compress, relative_steps, sign
 from kpc.encoder.curvature import curvature
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
-from kpc.encoder.trellis import Settled, quantise_on_trellis
+from kpc.encoder.trellis import Name, quantise_on_trellis
 from kpc.encoder.tuning import tuned
 from kpc.format import file
 from kpc.format.cameras import Camera
@@ -108,8 +108,8 @@ def code(model: Model, trade: Trade, prune_share: float, tune_steps: int, quanti
             steps, significant = pruned.of_each_plane(steps), pruned.of_each_plane(significant)
 
     def tune(steps: Sequence[Mapping[str, np.ndarray]], reached: np.ndarray) -> QuantisedScene:
-        def choose(candidate: Scene, settled: Settled) -> QuantisedScene:
-            return quantise_on_trellis(candidate, steps, reached, significant, settled)
+        def choose(candidate: Scene, group: Sequence[Name]) -> QuantisedScene:
+            return quantise_on_trellis(candidate, steps, reached, significant, group)
 
         return tuned(scene, model.scene, choose, tune_steps)
 

@@ -18,10 +18,9 @@ by rate and distortion around the nearest. Errors that know of each other save 5
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -34,8 +33,6 @@ from kpc.format.symbols import (
 
 Name = tuple[int, str]
 """A plane: scale and name."""
-Settled = Mapping[Name, QuantisedPlane]
-"""Planes that are coded already."""
 
 LAM = 0.5
 """Squared steps that a bit is worth, where an error is worth what it is in the mean. Where steps are fine an error of
@@ -64,22 +61,22 @@ TOLD_APART = 40
 
 def quantise_on_trellis(
     scene: Scene, steps: Sequence[Mapping[str, np.ndarray]], reached: np.ndarray | None = None,
-    significant: Sequence[Mapping[str, np.ndarray]] | None = None, settled: Settled = MappingProxyType({}),
+    significant: Sequence[Mapping[str, np.ndarray]] | None = None, only: Collection[Name] | None = None,
 ) -> QuantisedScene:
     """As `quantise_scene`, with symbols that follow the trellis.
 
     Args:
         significant: what a squared error costs in each number, relative to others of its channel; (H, W, M), none negative. None: the same.
-        settled: planes that are taken as they are.
+        only: the planes whose symbols are searched for; others are rounded. None: all.
     """
     quantised = quantise_scene(scene, steps, reached=reached)
     matters = significant or [{name: np.ones(plane.shape, np.float32) for name, plane in scale.items()} for scale in scene.scales]
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the search holds no lock
         waiting = [{name: pool.submit(_steered, plane, planes[name], step[name], w[name], name in TIME_PLANES)
-                    for name, plane in scale.items() if (s, name) not in settled}
+                    for name, plane in scale.items() if only is None or (s, name) in only}
                    for s, (scale, planes, step, w) in enumerate(zip(quantised.scales, scene.scales, steps, matters, strict=True))]
-        scales = tuple({name: settled[s, name] if (s, name) in settled else waiting[s][name].result() for name in scale}
-                       for s, scale in enumerate(quantised.scales))
+        found = [{name: plane.result() for name, plane in scale.items()} for scale in waiting]
+    scales = tuple({**rounded, **searched} for rounded, searched in zip(quantised.scales, found, strict=True))
     return replace(quantised, scales=scales)
 
 

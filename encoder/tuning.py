@@ -9,7 +9,7 @@ errors of all numbers cost, their diagonal (`kpc.encoder.curvature`) has a twent
 views, at equal steps: errors are 1.5 to 1.9 dB smaller for 1 to 2 % more bytes, which is 10 to 13 % at equal error.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +20,7 @@ from kpc.encoder.evaluate import SceneRenderer, as_wide_as, evenly_wide
 from kpc.encoder.field import Field
 from kpc.encoder.optimisers import FusedOptimiser, PlainOptimiser
 from kpc.encoder.probe import Probe
-from kpc.encoder.render import Rays
-from kpc.encoder.trellis import Name, Settled
+from kpc.encoder.trellis import Name
 from kpc.format.quantise import QuantisedPlane, QuantisedScene, round_decoder
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 
@@ -39,26 +38,27 @@ def order(scene: Scene) -> list[list[Name]]:
     return groups
 
 
-def tuned(scene: Scene, whole: Scene, quantise: Callable[[Scene, Settled], QuantisedScene], steps: int) -> QuantisedScene:
-    """A scene coded plane by plane.
+def tuned(scene: Scene, whole: Scene, quantise: Callable[[Scene, Sequence[Name]], QuantisedScene], steps: int) -> QuantisedScene:
+    """A scene coded group by group.
 
     Args:
-        whole: whose colours it is to have. quantise: all planes, but those that are settled.
+        whole: whose colours it is to have. quantise: some of a scene's planes.
         steps: of training after each group; half as many for the decoder alone.
     """
     teacher, groups = SceneRenderer(whole), order(scene)
     settled: dict[Name, QuantisedPlane] = {}
     for number, group in enumerate(groups):
-        quantised = quantise(scene, settled)
+        quantised = quantise(scene, group)
         settled |= {(s, name): quantised.scales[s][name] for s, name in group}
         scene = replace(scene, scales=tuple(
-            {name: settled[s, name].dequantise() if (s, name) in settled else plane for name, plane in scale.items()}
+            {name: settled[s, name].dequantise() if (s, name) in group else plane for name, plane in scale.items()}
             for s, scale in enumerate(scene.scales)))  # fmt: skip
         scene = _taught(scene, teacher, settled, steps if number < len(groups) - 1 else steps // 2, number)
-    return replace(quantised, decoder=round_decoder(scene.decoder))
+    scales = tuple({name: settled[s, name] for name in scale} for s, scale in enumerate(scene.scales))
+    return replace(quantised, scales=scales, decoder=round_decoder(scene.decoder))
 
 
-def _taught(scene: Scene, teacher: SceneRenderer, settled: Settled, steps: int, seed: int) -> Scene:
+def _taught(scene: Scene, teacher: SceneRenderer, settled: Collection[Name], steps: int, seed: int) -> Scene:
     """With planes that are not settled, and the decoder, nearer to what the teacher shows."""
     field = Field.from_scene(evenly_wide(scene))
     explicit = isinstance(scene.decoder, Decoder)
@@ -73,11 +73,10 @@ def _taught(scene: Scene, teacher: SceneRenderer, settled: Settled, steps: int, 
     kept = [slice(start, start + rows * columns * M) for s, name, start, rows, columns in field.layout.planes() if (s, name) in settled]
     before = [theta[some].copy() for some in kept]
     probe = Probe.of_cameras(scene, RAYS * steps, seed=100 + seed)
-    middle, background = np.full(RAYS, 0.5), np.tile(scene.background, (RAYS, 1))
     for number in range(steps):
         rays = [a[RAYS * number : RAYS * (number + 1)] for a in probe.rays]
         colours = torch.from_numpy(teacher.rgb(*rays))
-        optimiser.step(number + 1, 1.0, 1 - number / steps, Rays.of(*rays, middle, background), colours,
+        optimiser.step(number + 1, 1.0, 1 - number / steps, teacher.batch(*rays), colours,
                        scene.aabb, scene.occupancy, scene.step, scene.extent)
         for some, values in zip(kept, before, strict=True):
             theta[some] = values

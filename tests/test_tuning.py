@@ -1,9 +1,8 @@
 """Tuning: what is coded later makes up for what was coded before."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from scenes import displaced, hybrid, tiny_scene, varied
 from kpc.encoder import tuning
 from kpc.encoder.evaluate import as_wide_as, evenly_wide
 from kpc.encoder.probe import Probe
-from kpc.encoder.trellis import Settled, quantise_on_trellis
+from kpc.encoder.trellis import Name, quantise_on_trellis
 from kpc.encoder.tuning import order, tuned
 from kpc.format import file
 from kpc.format.quantise import QuantisedScene
@@ -27,9 +26,9 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tuning, "RAYS", 512)
 
 
-def choose(scene: Scene, settled: Settled = MappingProxyType({})) -> QuantisedScene:
+def choose(scene: Scene, group: Sequence[Name] | None = None) -> QuantisedScene:
     steps = [{name: np.full(plane.shape[2], STEP) for name, plane in scale.items()} for scale in scene.scales]
-    return quantise_on_trellis(scene, steps, settled=settled)
+    return quantise_on_trellis(scene, steps, only=group)
 
 
 def error(scene: Scene, quantised: QuantisedScene) -> float:
