@@ -21,7 +21,7 @@ from kpc.format.scene import Scene
 FINEST, COARSEST = -13.0, 2.0
 """Base-two logarithms of the factors on all steps, between which one is sought for a trained scene."""
 COARSER = 12.0
-"""The same of the coarsest for a file that is coded again; the finest is its own."""
+"""The same of the coarsest for a file that is coded again, whether as it is or with something left out; the finest is its own."""
 TOLERANCE = 0.02
 """A search ends this share below what it may not exceed."""
 ROUGHLY = 0.2
@@ -173,19 +173,21 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
 def compress(
     scene: Scene, steps: Steps, significant: Significance, measure: Measure, uncoded_psnr: float, trade: Trade,
     as_it_is: QuantisedScene | None = None, quantise: Quantise = quantise_on_trellis, tune: Tune | None = None,
+    own_steps: bool = False,
 ) -> Attempt:
     """The quantisation that a trade asks for.
 
     Args:
         measure: judges a coding; `uncoded_psnr` is that of the scene before anything was left out.
-        as_it_is: the file that the scene comes from, whose own steps `steps` are: nothing finer makes sense.
+        as_it_is: the file that holds just this scene, with these steps.
         tune: what makes a better coding at some steps, and takes its time: the trade is met by such a one.
+        own_steps: `steps` are those of a file, of which something may have been left out since: nothing finer makes sense.
 
     Raises:
         TrainingError: no file of this model is as small as the trade wants.
     """
     reached = reached_by(scene)
-    finest, coarsest = (FINEST, COARSEST) if as_it_is is None else (0.0, COARSER)
+    finest, coarsest = (0.0, COARSER) if own_steps or as_it_is is not None else (FINEST, COARSEST)
     tried: dict[float, Attempt] = {}
 
     def attempt(exponent: float) -> Attempt:

@@ -113,7 +113,8 @@ def code(model: Model, trade: Trade, prune_share: float, tune_steps: int, quanti
 
         return tuned(scene, model.scene, choose, tune_steps)
 
-    found = compress(scene, steps, significant, measure, whole, trade, coded, quantise, tune if tune_steps else None)
+    found = compress(scene, steps, significant, measure, whole, trade, coded, quantise, tune if tune_steps else None,
+                     own_steps=model.coded is not None)
     measured: Measured = found.measured
     return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, spare)
 

@@ -9,7 +9,7 @@ from scenes import SPACES, tiny_scene, varied
 
 from kpc.encoder.compress import Trade
 from kpc.encoder.evaluate import SceneRenderer, evenly_wide
-from kpc.encoder.model import Model, code
+from kpc.encoder.model import Model, code, model_of
 from kpc.encoder.probe import Probe
 from kpc.encoder.prune import Seen, dispensable, one_colour, passed_on, prune, renderings, without
 from kpc.format import file
@@ -217,3 +217,14 @@ def test_the_direction_stays_where_appearances_act_through_it() -> None:
     pruned = prune(scene, probes, lambda candidate: 30.0, 1.0)  # whatever goes costs nothing
     assert pruned.view_worth_db is None and pruned.scene.decoder.w2.any()
     assert pruned.scene.appearances == scene.appearances and len(pruned.scene.decoder.b1) == len(scene.appearances[0].code)
+
+
+@pytest.mark.parametrize("quality", [10, 20, 99])
+def test_a_file_that_something_is_left_out_of_is_coded_between_its_own_steps_and_much_coarser_ones(quality: float) -> None:
+    scene = redundant(tiny_scene(scales=3, resolution=(48, 40, 32)))
+    own = quantise_scene(scene, [{name: 0.004 for name in planes} for planes in scene.scales])
+    coded = code(model_of(own), Trade(quality=quality), 0.25, 0)
+    assert coded.pruned is not None and coded.pruned.left_out_any
+    assert coded.size_bytes < len(file.encode(own))
+    if quality < 50:
+        assert 0 <= coded.agreement_db - (20 + quality / 3) < 0.5
