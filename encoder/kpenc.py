@@ -156,7 +156,7 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     probe = Probe.of_training(trainer.sampler, trainer.background)
     if options.keep_checkpoint is not None:
         save_checkpoint(options.keep_checkpoint, scene, probe)
-    coded = code(Model(scene, probe), options.trade, trainer.config.prune_share, trainer.config.tune_steps)
+    coded = code(Model(scene, probe), options.trade, trainer.config.prune_share, trainer.config.tune_steps, shown=True)
     if coded.pruned is not None:
         _say(_left_out(scene, coded.pruned, coded.spare_db))
     size = _write(coded.data, options.output, work)

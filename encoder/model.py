@@ -81,13 +81,16 @@ class Coded:
         return len(self.data)
 
 
-def code(model: Model, trade: Trade, prune_share: float, tune_steps: int, quantise: Quantise = quantise_on_trellis) -> Coded:
+def code(
+    model: Model, trade: Trade, prune_share: float, tune_steps: int, quantise: Quantise = quantise_on_trellis, shown: bool = False
+) -> Coded:
     """What of a model is needed, `kpc.encoder.prune`, in symbols as coarse or as fine as a trade asks for.
 
     Args:
         prune_share: of what coding may cost, what may be spent on leaving something out.
         tune_steps: of training that a group of planes gets to make up for others, `kpc.encoder.tuning`; 0 for none.
         quantise: another way to choose symbols, to compare with; not tuned.
+        shown: whether progress is, where it takes long.
 
     Raises:
         TrainingError: no file of this model is so small.
@@ -111,7 +114,7 @@ def code(model: Model, trade: Trade, prune_share: float, tune_steps: int, quanti
         def choose(candidate: Scene, group: Sequence[Name]) -> QuantisedScene:
             return quantise_on_trellis(candidate, steps, reached, significant, group)
 
-        return tuned(scene, model.scene, choose, tune_steps)
+        return tuned(scene, model.scene, choose, tune_steps, shown)
 
     found = compress(scene, steps, significant, measure, whole, trade, coded, quantise, tune if tune_steps else None,
                      own_steps=model.coded is not None)

@@ -34,7 +34,7 @@ def recode(options: Options) -> dict[str, Any]:
     if is_coded and not (clip := groups.Groups(options.source)).is_single:
         return _recode_groups(options, clip) | {"encode_s": time.monotonic() - started}
     source = model.load(options.source)
-    coded = model.code(source, options.trade, TrainConfig().prune_share, _tune_steps(options))
+    coded = model.code(source, options.trade, TrainConfig().prune_share, _tune_steps(options), shown=True)
     size = file.save(coded.data, options.output)
     return {
         "file": str(options.output), "source": str(options.source),
@@ -54,7 +54,7 @@ def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
         trade = share_of(options, number, spans).trade
         reader = source.open(number)
         scene = replace(file.read(reader), cameras=reader.cameras() or source.cameras())
-        coded = model.code(model.model_of(scene), trade, TrainConfig().prune_share, _tune_steps(options))
+        coded = model.code(model.model_of(scene), trade, TrainConfig().prune_share, _tune_steps(options), shown=True)
         parts.append(groups.Part.of(coded.data, span.start))
         found.append(figures(coded, coded.size_bytes, trade, JUDGED_BY[1]))
     size = groups.write(parts, options.output)

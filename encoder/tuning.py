@@ -9,7 +9,7 @@ errors of all numbers cost, their diagonal (`kpc.encoder.curvature`) has a twent
 views, at equal steps: errors are 1.5 to 1.9 dB smaller for 1 to 2 % more bytes, which is 10 to 13 % at equal error.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +21,8 @@ from kpc.encoder.field import Field
 from kpc.encoder.optimisers import FusedOptimiser, PlainOptimiser
 from kpc.encoder.probe import Probe
 from kpc.encoder.trellis import Name
-from kpc.format.quantise import QuantisedPlane, QuantisedScene, round_decoder
+from kpc.format.progress import Progress
+from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 
 RAYS = 1 << 12
@@ -38,27 +39,49 @@ def order(scene: Scene) -> list[list[Name]]:
     return groups
 
 
-def tuned(scene: Scene, whole: Scene, quantise: Callable[[Scene, Sequence[Name]], QuantisedScene], steps: int) -> QuantisedScene:
-    """A scene coded group by group.
+def tuned(
+    scene: Scene, whole: Scene, quantise: Callable[[Scene, Sequence[Name]], QuantisedScene], steps: int, shown: bool = False
+) -> QuantisedScene:
+    """A scene quantised group by group.
 
     Args:
-        whole: whose colours it is to have. quantise: some of a scene's planes.
+        whole, steps, shown: as of `coded_in_groups`. quantise: a scene, of which only some planes matter.
+    """
+    settled: dict[Name, QuantisedPlane] = {}
+
+    def coded(candidate: Scene, group: Sequence[Name]) -> dict[Name, np.ndarray]:
+        quantised = quantise(candidate, group)
+        found = {(s, name): quantised.scales[s][name] for s, name in group}
+        settled.update(found)
+        return {key: plane.dequantise() for key, plane in found.items()}
+
+    rest = quantise(coded_in_groups(scene, whole, coded, steps, shown), ())
+    return replace(rest, scales=tuple({name: settled[s, name] for name in scale} for s, scale in enumerate(scene.scales)))
+
+
+def coded_in_groups(
+    scene: Scene, whole: Scene, coded: Callable[[Scene, Sequence[Name]], Mapping[Name, np.ndarray]], steps: int, shown: bool = False
+) -> Scene:
+    """A scene whose planes are what comes back from their coding, whatever codes them, group by group.
+
+    Args:
+        whole: whose colours it is to have. coded: some of a scene's planes, as they come back.
         steps: of training after each group; half as many for the decoder alone.
+        shown: whether progress is.
     """
     teacher, groups = SceneRenderer(whole), order(scene)
-    settled: dict[Name, QuantisedPlane] = {}
-    for number, group in enumerate(groups):
-        quantised = quantise(scene, group)
-        settled |= {(s, name): quantised.scales[s][name] for s, name in group}
-        scene = replace(scene, scales=tuple(
-            {name: settled[s, name].dequantise() if (s, name) in group else plane for name, plane in scale.items()}
-            for s, scale in enumerate(scene.scales)))  # fmt: skip
-        scene = _taught(scene, teacher, settled, steps if number < len(groups) - 1 else steps // 2, number)
-    scales = tuple({name: settled[s, name] for name in scale} for s, scale in enumerate(scene.scales))
-    return replace(quantised, scales=scales, decoder=round_decoder(scene.decoder))
+    settled: set[Name] = set()
+    with Progress("tune", total=(len(groups) - 1) * steps + steps // 2, unit="step", shown=shown) as progress:
+        for number, group in enumerate(groups):
+            back = coded(scene, group)
+            settled |= back.keys()
+            scales = tuple({name: back.get((s, name), plane) for name, plane in scale.items()} for s, scale in enumerate(scene.scales))
+            scene = replace(scene, scales=scales)
+            scene = _taught(scene, teacher, settled, steps if number < len(groups) - 1 else steps // 2, number, progress)
+    return scene
 
 
-def _taught(scene: Scene, teacher: SceneRenderer, settled: Collection[Name], steps: int, seed: int) -> Scene:
+def _taught(scene: Scene, teacher: SceneRenderer, settled: Collection[Name], steps: int, seed: int, progress: Progress) -> Scene:
     """With planes that are not settled, and the decoder, nearer to what the teacher shows."""
     field = Field.from_scene(evenly_wide(scene))
     explicit = isinstance(scene.decoder, Decoder)
@@ -80,6 +103,7 @@ def _taught(scene: Scene, teacher: SceneRenderer, settled: Collection[Name], ste
                        scene.aabb, scene.occupancy, scene.step, scene.extent)
         for some, values in zip(kept, before, strict=True):
             theta[some] = values
+        progress.advance()
     scales = tuple({name: plane if (s, name) in settled else field.plane(s, name).detach().numpy()[..., : plane.shape[2]].copy()
                     for name, plane in scale.items()} for s, scale in enumerate(scene.scales))  # fmt: skip
     return replace(scene, scales=scales, decoder=as_wide_as(scene, field.decoder_as_data()))

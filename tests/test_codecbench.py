@@ -13,7 +13,7 @@ from kpc.format import file
 from kpc.format.quantise import quantise_scene
 from kpc.tools import codecbench, kpbench, plot, results
 from kpc.tools.codecbench import Point, bd_rate, headline, size_at
-from kpc.tools.rivals import Bytes, Half, Video
+from kpc.tools.rivals import Bytes, Half, Planes, Video
 
 
 def points(scale: float, psnrs: tuple[float, ...] = (27.0, 28.0, 29.0, 29.7, 29.9)) -> list[Point]:
@@ -73,6 +73,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(codecbench, "QUALITIES", (60, 70, 80, 90))
     others = Half("zstd -19"), Bytes(), Video("X", "libnothing", (1,), ())
     monkeypatch.setattr(codecbench, "RIVALS", {rival.name: rival for rival in others})
+    monkeypatch.setattr(codecbench, "TUNED", {"X, tuned": "X", "Y, tuned": "Y"})  # the one cannot be used here, of the other nobody knows
 
 
 def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,9 +81,10 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert kpbench.main(["codec", str(scene_file), "--out", str(out)]) == 0
     said = capsys.readouterr()
     records = results.load([out])
-    assert [record["coder"] for record in records] == ["kpc", *codecbench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19", "X"]
-    ours, *without, halves, levels, missing = records
-    assert missing["missing"] == "this ffmpeg has no libnothing" and missing["points"] == [] and missing["bd_rate"] is None
+    assert [record["coder"] for record in records] == ["kpc", *codecbench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19", "X", "X, tuned"]
+    ours, *without, halves, levels, missing, missing_too = records
+    for one in (missing, missing_too):
+        assert one["missing"] == "this ffmpeg has no libnothing" and one["points"] == [] and one["bd_rate"] is None
     assert len(halves["points"]) == 6 and halves["bd_rate"] is not None
     whole = scene_file.stat().st_size
     assert len(ours["points"]) == 6  # no file has a thousandth of a bit
@@ -108,6 +110,28 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert "uint8 + zstd -19" in svg and "bits per parameter" in svg
     assert plot.main([str(out), "-o", str(tmp_path / "again.svg")]) == 0
     assert (tmp_path / "again.svg").read_text() == svg
+
+
+def test_a_rival_that_is_tuned_comes_nearer_and_codes_every_plane_once(
+    few: None, scene_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(codecbench, "TUNED", {"levels, tuned": Bytes().name})
+    monkeypatch.setattr(codecbench, "TUNE_STEPS", 40)
+    monkeypatch.setattr("kpc.encoder.tuning.RAYS", 512)
+    shapes: list[tuple[int, ...]] = []
+    real = Bytes.encode
+
+    def encode(self: Bytes, planes: Planes, setting: int) -> list[bytes]:
+        shapes.extend(plane.shape for scale in planes for plane in scale.values())
+        return real(self, planes, setting)
+
+    monkeypatch.setattr(Bytes, "encode", encode)
+    plain = codecbench.point(codecbench.Job(scene_file, Bytes().name, 4, 100))
+    once, shapes[:] = sorted(shapes), ()
+    tuned = codecbench.point(codecbench.Job(scene_file, "levels, tuned", 4, 100))
+    assert sorted(shapes) == once == sorted(plane.shape for scale in tiny_scene(3).scales for plane in scale.values())
+    assert plain is not None and tuned is not None and tuned["agreement_db"] > plain["agreement_db"] + 0.2
+    assert 0.8 * plain["size_bytes"] < tuned["size_bytes"] < 1.3 * plain["size_bytes"] and tuned["search_s"] > tuned["encode_s"]
 
 
 def test_held_out_views_judge(few: None, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,5 +169,6 @@ def test_records_survive_json(
     monkeypatch.setattr(codecbench, "QUALITIES", (60,))
     monkeypatch.setattr(codecbench, "TUNE_STEPS", 2)
     monkeypatch.setattr(codecbench, "RIVALS", {Bytes().name: Bytes()})
+    monkeypatch.setattr(codecbench, "TUNED", {"levels, tuned": Bytes().name})
     assert kpbench.main(["codec", str(scene_file)]) == 0
     assert json.loads(capsys.readouterr().out)[0]["kind"] == "codec"

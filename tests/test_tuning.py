@@ -12,7 +12,7 @@ from kpc.encoder import tuning
 from kpc.encoder.evaluate import as_wide_as, evenly_wide
 from kpc.encoder.probe import Probe
 from kpc.encoder.trellis import Name, quantise_on_trellis
-from kpc.encoder.tuning import order, tuned
+from kpc.encoder.tuning import coded_in_groups, order, tuned
 from kpc.format import file
 from kpc.format.quantise import QuantisedScene
 from kpc.format.scene import Decoder, Scene
@@ -60,6 +60,24 @@ def test_what_is_coded_first_is_coded_as_it_was_and_nothing_but_planes_and_decod
     assert better.motion is not None and plain.motion is not None and np.array_equal(better.motion.symbols, plain.motion.symbols)
     assert np.array_equal(better.occupancy, plain.occupancy) and isinstance(better.decoder, Decoder)
     assert not np.array_equal(better.decoder.w2, plain.decoder.w2)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("steps", [0, 1])
+def test_few_steps_or_none_are_no_mishap(steps: int) -> None:
+    scene = tiny_scene()
+    planes = coded_in_groups(scene, scene, lambda candidate, group: {(s, name): candidate.scales[s][name] for s, name in group}, steps)
+    assert planes.scales[-1]["xy"].tobytes() == scene.scales[-1]["xy"].tobytes()
+    assert (planes.scales[0]["xt"].tobytes() == scene.scales[0]["xt"].tobytes()) == (steps == 0)
+
+
+def test_progress_is_shown_where_it_is_wanted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("kpc.format.progress.LINE_EVERY_S", 0.0)
+    scene = tiny_scene(scales=1, dynamic=False)
+    tuned(scene, scene, choose, 4)
+    assert capsys.readouterr() == ("", "")
+    tuned(scene, scene, choose, 4, shown=True)
+    out, err = capsys.readouterr()
+    assert out == "" and err.splitlines()[-1].startswith("tune: 2/2 step, 0 s left")
 
 
 def test_it_comes_out_the_same_each_time() -> None:

@@ -2,7 +2,7 @@
 
 Every coder gets the same planes, those of the checkpoint or, of a .kpc file, its own dequantised ones, and is judged by the same
 pixels. A rival is given for nothing what our file spends bytes on besides planes: decoder, occupancy and cameras are counted as our
-file stores them, header and index not at all.
+file stores them, header and index not at all. One is tuned as ours is, too.
 """
 
 import csv
@@ -29,14 +29,16 @@ from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset, rays
 from kpc.encoder.model import Model
 from kpc.encoder.probe import Measure, Measured, Probe
-from kpc.encoder.trellis import quantise_on_trellis
+from kpc.encoder.trellis import Name, quantise_on_trellis
+from kpc.encoder.tuning import coded_in_groups
 from kpc.format import file
 from kpc.format.errors import KpcError, TrainingError
-from kpc.format.quantise import quantise_scene
+from kpc.format.quantise import quantise_scene, round_decoder
 from kpc.format.scene import Scene
 from kpc.tools import rivals
 from kpc.tools.children import end_with_parent
 from kpc.tools.provenance import machine
+from kpc.tools.rivals import Coding, Rival
 
 RATES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Bits per parameter that our coder is asked for, of the file and all that is in it."""
@@ -55,14 +57,16 @@ WITHOUT: dict[str, Quantise] = {
     "kpc, every texel alike": lambda scene, steps, reached, significant: quantise_on_trellis(scene, steps, reached),
 }
 """Our own coder with something left out, the latter two without tuning, too; at QUALITIES."""
+TUNED = {"AV1, tuned": "AV1"}
+"""Rivals that get the tuning of our own coder, `kpc.encoder.tuning`, through what comes back from their own coding."""
 
 Point = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Job:
-    """A coder and a setting for one scene. `coder`: OURS, one of WITHOUT, for both of which `trade` is, or the name of one of RIVALS.
-    `others_bytes`: of our file, besides planes."""
+    """A coder and a setting for one scene. `coder`: OURS, one of WITHOUT, for both of which `trade` is, or the name of one of RIVALS
+    or of TUNED. `others_bytes`: of our file, besides planes."""
 
     scene: Path
     coder: str
@@ -85,12 +89,13 @@ def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str,
     qualities = {f"quality {q:g}": Trade(quality=q) for q in QUALITIES}
     jobs = [Job(scene, name, said, others, trade) for name in (OURS, *WITHOUT)
             for said, trade in ((rates if name == OURS else {}) | qualities).items()]  # fmt: skip
-    missing = {name: why for name, rival in RIVALS.items() if (why := rival.missing())}
-    jobs += [Job(scene, name, setting, others) for name, rival in RIVALS.items() if name not in missing
+    others_at_hand = RIVALS | {name: RIVALS[rival] for name, rival in TUNED.items() if rival in RIVALS}
+    missing = {name: why for name, rival in others_at_hand.items() if (why := rival.missing())}
+    jobs += [Job(scene, name, setting, others) for name, rival in others_at_hand.items() if name not in missing
              for setting in reversed(rival.settings)]  # fmt: skip
     points = in_parallel(jobs, views, processes)
     coders = []
-    for name in (OURS, *WITHOUT, *RIVALS):
+    for name in (OURS, *WITHOUT, *others_at_hand):
         found = [point for job, point in zip(jobs, points, strict=True) if job.coder == name and point is not None]
         coders.append({"coder": name, "missing": missing.get(name), "points": found})
     for coder in coders:
@@ -127,6 +132,12 @@ def point(job: Job) -> Point | None:
         size, took = coding.size_bytes + job.others_bytes, (coding.encode_s, coding.decode_s)
         return _point(job, source, size, took, uncoded.psnr, judged)
     started = time.perf_counter()
+    if job.coder in TUNED:
+        scene, codings = tuned_through(RIVALS[TUNED[job.coder]], int(job.setting), source.scene)
+        size = sum(coding.size_bytes for coding in codings) + job.others_bytes
+        took = sum(coding.encode_s for coding in codings), sum(coding.decode_s for coding in codings)
+        found = _point(job, source, size, took, uncoded.psnr, measured(scene))
+        return found | {"search_s": time.perf_counter() - started}
     try:
         tune_steps = TUNE_STEPS if job.coder == OURS else 0
         coded = model.code(source, job.trade, TrainConfig().prune_share, tune_steps, WITHOUT.get(job.coder, quantise_on_trellis))
@@ -139,6 +150,21 @@ def point(job: Job) -> Point | None:
     took = encoded - searched, time.perf_counter() - encoded
     found = _point(job, source, len(data), took, uncoded.psnr, measured(scene))
     return found | {"search_s": searched - started, "shares": shares(data)}
+
+
+def tuned_through(rival: Rival, setting: int, scene: Scene) -> tuple[Scene, list[Coding]]:
+    """A scene as it comes back from a rival that codes its planes group by group, while those still to be coded, and the decoder, learn to
+    make up for its errors, as with our own coder; and what the groups take."""
+    codings: list[Coding] = []
+
+    def coded(candidate: Scene, group: Sequence[Name]) -> dict[Name, np.ndarray]:
+        planes = rivals.tidied(candidate)
+        scales = sorted({s for s, _ in group})
+        codings.append(rival.code([{name: plane for name, plane in planes[s].items() if (s, name) in group} for s in scales], setting))
+        return {(s, name): plane for s, back in zip(scales, codings[-1].planes, strict=True) for name, plane in back.items()}
+
+    back = coded_in_groups(scene, scene, coded, TUNE_STEPS)
+    return replace(back, decoder=round_decoder(back.decoder)), codings
 
 
 def _point(job: Job, source: Model, size: int, took: tuple[float, float], uncoded_psnr: float, judged: Measured) -> Point:
