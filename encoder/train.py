@@ -92,10 +92,10 @@ class Trainer:
 
     def run(
         self, report: Callable[[Report], None], checkpoint: Path | None = None, *,
-        time_budget_s: float | None = None, checkpoint_every_s: float = 60.0,
+        time_budget_s: float | None = None, most_steps: int | None = None, checkpoint_every_s: float = 60.0,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Train until `config.steps`, or for `time_budget_s` seconds of training where given.
+        """Train until `config.steps`, or for `time_budget_s` seconds of training where given, and `most_steps` at most then.
 
         A checkpoint that cannot be written on the way is said on stderr and tried again: it is no reason to stop.
 
@@ -105,7 +105,7 @@ class Trainer:
         """
         config = self.config
         saved, error, drawn, since = time.monotonic(), 0.0, 0, time.monotonic()
-        while (fraction := self._fraction(time_budget_s)) < 1:
+        while (fraction := self._fraction(time_budget_s, most_steps)) < 1:
             if interrupted():
                 raise KeyboardInterrupt
             started = time.monotonic()
@@ -135,7 +135,7 @@ class Trainer:
                 self._steady_rays, self._steady_s = self._steady_rays + count, self._steady_s + now - started
             if now - since > 0.5:
                 psnr = psnr_of(error / drawn)
-                report(Report(self.step, self._fraction(time_budget_s), psnr, drawn / (now - since),
+                report(Report(self.step, self._fraction(time_budget_s, most_steps), psnr, drawn / (now - since),
                               self.samples_per_ray, float(self.grid.occupied.mean()), self.elapsed_s))
                 error, drawn, since = 0.0, 0, now
             if checkpoint is not None and now - saved > checkpoint_every_s:
@@ -186,10 +186,10 @@ class Trainer:
             self._weights = TileWeights(self.dataset, self.config.temporal_floor)
         return self._weights
 
-    def _fraction(self, time_budget_s: float | None) -> float:
-        if time_budget_s is not None:
-            return self.elapsed_s / time_budget_s
-        return self.step / self.config.steps
+    def _fraction(self, time_budget_s: float | None, most_steps: int | None) -> float:
+        if time_budget_s is None:
+            return self.step / self.config.steps
+        return max(self.elapsed_s / time_budget_s, self.step / most_steps if most_steps else 0.0)
 
     def _not_finite(self) -> str:
         """Which terms of the loss hold NaN or infinity, the colours being one of them, and which parameters they come from."""

@@ -31,7 +31,7 @@ def trim_box(
 ) -> tuple[np.ndarray, float]:
     """The part of a (2, 3) box that holds what the pictures show, and the seconds it took to find out.
 
-    A coarse field is trained on the CPU for a tenth of `config.steps`, at most MOST_STEPS, or of the time budget where given.
+    A coarse field is trained on the CPU for a tenth of `config.steps`, or of the time budget where given, but for at most MOST_STEPS.
     The box then goes from the OUTLIERS quantile to the 1 - OUTLIERS quantile of the points where rays end in something, and
     MARGIN further; never beyond `aabb`. After fewer than LEAST_STEPS, or where nearly all rays end in nothing, it is `aabb`.
 
@@ -44,7 +44,7 @@ def trim_box(
     coarse = replace(config, hybrid=False, summed=False, resolutions=(32, 64), channels=8, motion_cells=0, channel_dropout=0.0,
                      temporal_start=1.0, samples_across=160, cells_across=64, steps=steps, occupancy_start=64)
     trainer = Trainer(dataset, coarse, aabb, "cpu", mapping=mapping)
-    trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10)
+    trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10, most_steps=MOST_STEPS)
     if trainer.step < LEAST_STEPS:
         return aabb, trainer.elapsed_s
     rays, _ = trainer.sampler.draw(np.random.default_rng(config.seed), RAYS, trainer.background)

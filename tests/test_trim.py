@@ -9,7 +9,7 @@ import pytest
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.options import Options
-from kpc.encoder.trim import trim_box
+from kpc.encoder.trim import MOST_STEPS, trim_box
 
 CONFIG = TrainConfig(steps=1500, rays=256, samples=12288, warmup=5)
 LARGE = np.array([[-3, -3, -3], [3, 3, 3]], np.float32)
@@ -28,6 +28,14 @@ def test_a_run_too_short_to_survey_keeps_its_box(moving: Dataset) -> None:
     assert box is LARGE and seconds == 0
     box, _ = trim_box(moving, CONFIG, LARGE, lambda report: None, time_budget_s=1e-3)
     assert box is LARGE
+
+
+def test_time_to_spare_does_not_go_into_the_survey(moving: Dataset) -> None:
+    steps: list[int] = []
+    long = replace(CONFIG, steps=10 * MOST_STEPS)
+    box, seconds = trim_box(moving, long, LARGE, lambda report: steps.append(report.step), time_budget_s=1e5)
+    assert steps[-1] <= MOST_STEPS and seconds < 1e4
+    assert np.array_equal(box, trim_box(moving, long, LARGE, lambda report: None)[0])
 
 
 def test_a_lone_object_seen_once_gets_a_model_of_its_own(moving: Dataset, tmp_path: Path) -> None:
