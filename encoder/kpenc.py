@@ -24,7 +24,7 @@ from kpc.encoder.evaluate import evaluate
 from kpc.encoder.field import time_rows
 from kpc.encoder.grouped import LATER, begin_with, share_of, spans_of
 from kpc.encoder.model import Model, code, load_checkpoint, save_checkpoint
-from kpc.encoder.occupancy import grid_shape
+from kpc.encoder.occupancy import grid_shape, in_fewest_slots
 from kpc.encoder.options import Options, parse
 from kpc.encoder.profile import profile
 from kpc.encoder.probe import PROBE_RAYS, Probe
@@ -153,6 +153,7 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         return _not_written(trainer, options, started)
     _say("writing: choosing quantisation steps, rendering held-out views")
     scene = to_scene(trainer)
+    _say(_occupied(scene))
     probe = Probe.of_training(trainer.sampler, trainer.background)
     if options.keep_checkpoint is not None:
         save_checkpoint(options.keep_checkpoint, scene, probe)
@@ -394,7 +395,7 @@ def to_scene(trainer: Trainer) -> Scene:
     """The trained field with its final occupancy and a few of the cameras, the most central first."""
     dataset = trainer.dataset
     slots = min(8, dataset.clip.frame_count) if dataset.is_dynamic else 1
-    occupancy = trainer.grid.over_time(trainer.density_at, np.random.default_rng(trainer.config.seed), slots)
+    occupancy = in_fewest_slots(trainer.grid.over_time(trainer.density_at, np.random.default_rng(trainer.config.seed), slots))
     return replace(trainer.scene(occupancy), cameras=tuple(dataset.camera(p) for p in _spread_of_cameras(dataset)))
 
 
@@ -477,6 +478,14 @@ def _rows_in_time(config: TrainConfig, dataset: Dataset, found: TimeResolution |
     wider = "" if math.isnan(found.next_error) else f", wider apart {found.next_error:.3f}"
     return (f"{said} (lines between them miss {found.changing:.1%} of the pixels, those that change, by {found.error:.3f} of the "
             f"full range{wider}; {config.time_tolerance:g} allowed; noise {found.noise:.3f})")
+
+
+def _occupied(scene: Scene) -> str:
+    """How many of the cells a renderer marches, and how often that is told."""
+    said, slots = f"occupied: {scene.occupancy.mean():.1%} of all cells", len(scene.occupancy)
+    if slots > 1:
+        return f"{said} at a time, told in {slots} spans of the clip; {scene.occupancy.any(0).mean():.1%} at any time"
+    return f"{said}, told once for the whole clip" if scene.is_dynamic else said
 
 
 def _left_out(scene: Scene, pruned: Pruned, spare_db: float) -> str:

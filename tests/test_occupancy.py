@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kpc.encoder.occupancy import OccupancyGrid, grid_shape
+from kpc.encoder.occupancy import MORE_MARCHED, OccupancyGrid, grid_shape, in_fewest_slots
 from kpc.format.grid import SPACE_AND_TIME, dilate
 
 SHAPE = (6, 5, 8)
@@ -167,3 +167,20 @@ def test_state_goes_into_another_grid() -> None:
     settled(two, moving, np.ones(SHAPE, np.float32), updates=3)
     for name in ("log_density", "peak", "occupied", "marched"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+def test_slots_are_as_few_as_what_moves_allows() -> None:
+    rng = np.random.default_rng(4)
+    still = np.broadcast_to(rng.random((1, 9, 8, 7)) < 0.3, (8, 9, 8, 7)).copy()
+    noisy = still & ((rng.random(still.shape) < 0.99) | (np.arange(8) == 3)[:, None, None, None])
+    halves = still.copy()
+    halves[:4, 5:] = halves[4:, :5] = False
+    turning = np.zeros_like(still)
+    for slot in range(8):
+        turning[slot, slot] = True
+    for before, slots in ((still, 1), (noisy, 1), (halves, 2), (turning, 8), (still[:5], 1), (turning[:5], 5), (still[:1], 1),
+                          (np.zeros_like(still), 1)):  # fmt: skip
+        after = in_fewest_slots(before)
+        assert len(after) == slots and after.dtype == bool and after.mean() <= (1 + MORE_MARCHED) * before.mean()
+        whole = np.repeat(after, len(before) // slots, axis=0)
+        assert (whole | before == whole).all() and (after.any(0) == before.any(0)).all()
