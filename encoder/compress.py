@@ -40,8 +40,8 @@ DEFAULT_LOSS_DB = 0.15
 
 TUNINGS = 3
 """At most so many codings are tuned: each takes a minute, about."""
-TUNED_ENOUGH = 0.05
-"""A tuned coding this share below what it may not exceed is good enough."""
+ENOUGH_BYTES, ENOUGH_ERROR = 0.05, 0.1
+"""A tuned coding this share below the bytes or the error that it may not exceed is good enough: errors are foreseen less well."""
 ERRORS_LEFT, BYTES_MADE = 0.7, 1.01
 """What tuning makes of errors and of bytes, about: so it is known where to begin."""
 APART = 0.3
@@ -243,13 +243,14 @@ def _farthest_tuned(
     slope = math.log(value(other) / value(found)) / (other.exponent - found.exponent)
     if not math.isfinite(slope) or slope == 0 or (slope < 0) != counts_bytes:
         return None
-    wanted = math.log(most * (1 - TUNED_ENOUGH / 2))
+    enough = ENOUGH_BYTES if counts_bytes else ENOUGH_ERROR
+    wanted = math.log(most * (1 - enough / 2))
     expected = value(found) * (BYTES_MADE if counts_bytes else ERRORS_LEFT)
     exponent = found.exponent + (wanted - math.log(expected)) / slope
     for _ in range(TUNINGS):
         candidate = tuned(min(max(exponent, min(start, end)), max(start, end)))
         reached = value(candidate)
-        if (1 - TUNED_ENOUGH) * most <= reached <= most:
+        if (1 - enough) * most <= reached <= most:
             better = candidate.measured.error < found.measured.error if counts_bytes else candidate.size_bytes < found.size_bytes
             return candidate if better else None
         if not reached > 0:  # so with NaN

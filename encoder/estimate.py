@@ -13,7 +13,7 @@ from kpc.encoder.probe import Probe
 from kpc.encoder.prune import renderings
 from kpc.encoder.train import Trainer
 from kpc.encoder.trellis import quantise_on_trellis
-from kpc.encoder.tuning import RAYS, order
+from kpc.encoder.tuning import RAYS, steps_after, steps_in_all
 from kpc.format.memory import peak_memory_bytes
 from kpc.format.scene import Scene
 
@@ -36,13 +36,16 @@ class Estimate:
     memory_bytes: int
 
 
-def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, time_budget_s: float | None) -> Estimate:
+def estimate(
+    trainer: Trainer, probe_rays: int, tested: int, spent_s: float, time_budget_s: float | None, tune_steps: int | None = None
+) -> Estimate:
     """Take the first steps of a run, the same that it will take, and go on in thought.
 
     Args:
         probe_rays: rays on which each try of a quantisation is judged.
         tested: held-out pictures that will be rendered.
         spent_s: seconds since the command started, a survey excluded: they will be spent again.
+        tune_steps: a group; None: as many as the length of training lets a run have.
 
     Raises:
         TrainingError: as `Trainer.run`.
@@ -66,10 +69,12 @@ def estimate(trainer: Trainer, probe_rays: int, tested: int, spent_s: float, tim
     scene = trainer.scene()
     a_coding, a_ray = _seconds_a_coding(scene), _seconds_a_ray(trainer)
     coding_s = PROBES * a_coding + _seconds_of_curvature(scene)
-    if config.tune_steps:
-        steps = (len(order(scene)) - 0.5) * config.tune_steps
-        trained = 1 / trainer.rays_per_second if trainer.rays_per_second else 3 * a_ray
-        coding_s += TUNED * (a_coding + steps * RAYS * (trained + a_ray))
+    if tune_steps is None:
+        trained = config.steps if time_budget_s is None else trainer.step + max(0.0, time_budget_s - trainer.elapsed_s) / max(a_step, 1e-6)
+        tune_steps = steps_after(int(trained), scene, config.tune_steps)
+    if steps := steps_in_all(scene, tune_steps):
+        a_trained_ray = 1 / trainer.rays_per_second if trainer.rays_per_second else 3 * a_ray
+        coding_s += TUNED * (a_coding + steps * RAYS * (a_trained_ray + a_ray))
     return Estimate(train_s, spent_s + rendered * a_ray + coding_s + fits_s, memory)
 
 

@@ -33,6 +33,7 @@ from kpc.encoder.recode import check_outputs, figures, reached, recode, together
 from kpc.encoder.structure import TimeResolution, fitted_in_time
 from kpc.encoder.train import Report, Trainer, box_of_checkpoint
 from kpc.encoder.trim import trim_box
+from kpc.encoder.tuning import steps_after
 from kpc.format import cli, file, groups
 from kpc.format.errors import DatasetError, TrainingError, UsageError
 from kpc.format.memory import peak_memory_bytes
@@ -151,13 +152,17 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
 
     if trainer.config.summed:
         return _not_written(trainer, options, started)
-    _say("writing: choosing quantisation steps, rendering held-out views")
     scene = to_scene(trainer)
+    tune_steps = options.tune_steps
+    if tune_steps is None:
+        tune_steps = steps_after(trainer.step, scene, trainer.config.tune_steps)
     _say(_occupied(scene))
+    tuning = f"tuning planes by {tune_steps} steps a group, " if tune_steps else ""
+    _say(f"writing: choosing quantisation steps, {tuning}rendering held-out views")
     probe = Probe.of_training(trainer.sampler, trainer.background)
     if options.keep_checkpoint is not None:
         save_checkpoint(options.keep_checkpoint, scene, probe)
-    coded = code(Model(scene, probe), options.trade, trainer.config.prune_share, trainer.config.tune_steps, shown=True)
+    coded = code(Model(scene, probe), options.trade, trainer.config.prune_share, tune_steps, shown=True)
     if coded.pruned is not None:
         _say(_left_out(scene, coded.pruned, coded.spare_db))
     size = _write(coded.data, options.output, work)
@@ -321,7 +326,7 @@ def dry_run(options: Options) -> Estimate:
     tested = int(trainer.dataset.pictures.is_test.sum())
     found = estimate(
         trainer, PROBE_RAYS, min(tested, options.most_tests or tested), time.monotonic() - started - trainer.elapsed_s,
-        options.time_budget_s,
+        options.time_budget_s, options.tune_steps,
     )
     return replace(found, train_s=groups_count * found.train_s, rest_s=groups_count * found.rest_s)
 

@@ -127,7 +127,8 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
                        help="the smallest file that has at least this PSNR on training views: what is simple takes less")
     parser.add_argument("--tune-steps", type=_number, metavar="N",
                         help="training steps that a group of planes gets to make up for the errors of those that are coded: files "
-                             "are a tenth smaller with 100, and take a minute or two longer (default: 0 for draft, else 100)")
+                             "are a tenth smaller with 100, and take a minute or two longer (default: 0 for draft, else 100); "
+                             "fewer after short training")
     parser.add_argument("--dry-run", action="store_true",
                         help="only say what would be done, how long it would take and how much memory")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")

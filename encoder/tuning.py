@@ -27,6 +27,8 @@ from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 
 RAYS = 1 << 12
 """A step. Liam, 100 steps a group: with 2,048 rays and 200 steps the same."""
+SHARE = 0.2
+"""Of the steps of training, that tuning once takes at most: a short run is not to be tuned for longer than it was trained."""
 LEARNING_RATE, DECODER_LEARNING_RATE = 2e-3, 5e-4
 """At first; they fall to 0 along a line. With 5e-3 errors are 0.1 dB smaller, but planes, noisier, take 2 % more bytes."""
 
@@ -37,6 +39,16 @@ def order(scene: Scene) -> list[list[Name]]:
     if scene.is_dynamic:
         groups.append([(s, name) for s in range(len(scene.scales)) for name in TIME_PLANES])
     return groups
+
+
+def steps_in_all(scene: Scene, steps: int) -> int:
+    """Of tuning once, with so many a group; half as many for the decoder alone at last."""
+    return (len(order(scene)) - 1) * steps + steps // 2
+
+
+def steps_after(trained: int, scene: Scene, most: int) -> int:
+    """A group, after so many steps of training; at most `most`."""
+    return min(most, int(SHARE * trained / (len(order(scene)) - 0.5)))
 
 
 def tuned(
@@ -66,12 +78,12 @@ def coded_in_groups(
 
     Args:
         whole: whose colours it is to have. coded: some of a scene's planes, as they come back.
-        steps: of training after each group; half as many for the decoder alone.
+        steps: of training after each group, as `steps_in_all`.
         shown: whether progress is.
     """
     teacher, groups = SceneRenderer(whole), order(scene)
     settled: set[Name] = set()
-    with Progress("tune", total=(len(groups) - 1) * steps + steps // 2, unit="step", shown=shown) as progress:
+    with Progress("tune", total=steps_in_all(scene, steps), unit="step", shown=shown) as progress:
         for number, group in enumerate(groups):
             back = coded(scene, group)
             settled |= back.keys()

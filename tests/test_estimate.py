@@ -47,7 +47,7 @@ def test_tuning_is_counted(moving: Dataset) -> None:
     """By what a ray takes in training, and to be rendered."""
     found = []
     for tune_steps in (0, 100):
-        run = Trainer(moving, replace(CONFIG, tune_steps=tune_steps), BOX, "cpu")
+        run = Trainer(moving, replace(CONFIG, steps=1250, tune_steps=tune_steps), BOX, "cpu")
         found.append(module.estimate(run, probe_rays=100, tested=0, spent_s=0.0, time_budget_s=None).rest_s)
     trained = module.TUNED * 2.5 * 100 * module.RAYS / run.rays_per_second
     assert found[1] - found[0] == pytest.approx(trained, rel=0.5)

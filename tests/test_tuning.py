@@ -12,7 +12,7 @@ from kpc.encoder import tuning
 from kpc.encoder.evaluate import as_wide_as, evenly_wide
 from kpc.encoder.probe import Probe
 from kpc.encoder.trellis import Name, quantise_on_trellis
-from kpc.encoder.tuning import coded_in_groups, order, tuned
+from kpc.encoder.tuning import coded_in_groups, order, steps_after, steps_in_all, tuned
 from kpc.format import file
 from kpc.format.quantise import QuantisedScene
 from kpc.format.scene import Decoder, Scene
@@ -60,6 +60,13 @@ def test_what_is_coded_first_is_coded_as_it_was_and_nothing_but_planes_and_decod
     assert better.motion is not None and plain.motion is not None and np.array_equal(better.motion.symbols, plain.motion.symbols)
     assert np.array_equal(better.occupancy, plain.occupancy) and isinstance(better.decoder, Decoder)
     assert not np.array_equal(better.decoder.w2, plain.decoder.w2)  # type: ignore[union-attr]
+
+
+def test_after_short_training_steps_are_few() -> None:
+    scene = tiny_scene(scales=2)
+    assert [steps_after(trained, scene, 100) for trained in (0, 24, 500, 1250, 30_000)] == [0, 1, 40, 100, 100]
+    assert steps_after(30_000, scene, 0) == 0
+    assert steps_in_all(scene, 40) == 100 and steps_in_all(tiny_scene(scales=1, dynamic=False), 40) == 20
 
 
 @pytest.mark.parametrize("steps", [0, 1])
