@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
-# Makes or reuses .venv/, installs KPC with all it needs, runs the whole test suite. Arguments go to pytest.
+# Makes or reuses .venv/, installs KPC with all it needs, runs the whole test suite, a process a core up to four.
+# Arguments go to pytest (`-n 0`: in one process).
 set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 
 install_kpc encoder,test
 has_opengl || echo "tests that need OpenGL are skipped" >&2
-exec .venv/bin/python -m pytest -ra "$@"
+exec .venv/bin/python -m pytest -ra -n auto --maxprocesses 4 --dist worksteal "$@"
