@@ -24,7 +24,9 @@ class Progress:
     def __init__(self, label: str, total: float | None = None, unit: str = "", *, shown: bool = True) -> None:
         self.label, self.total, self.unit, self.shown = label, total, unit, shown
         self.done, self.text = 0.0, ""
-        self.started = self.said = time.monotonic()
+        self.said = time.monotonic()
+        self.first: tuple[float, float] | None = None
+        """What was done, and when, at the first call of `advance`: before it kernels are compiled and caches filled."""
         self.bar = None
         if shown and sys.stderr.isatty():
             layout = "{l_bar}{bar}| {n:.0f}/{total:.0f} [{elapsed}<{remaining}]{postfix}" if total else None
@@ -33,6 +35,7 @@ class Progress:
     def advance(self, count: float = 1) -> None:
         """`count` more units are done."""
         self.done += count
+        self.first = self.first or (self.done, time.monotonic())
         if self.bar is not None:
             self.bar.update(count)
         elif self.shown and time.monotonic() - self.said >= LINE_EVERY_S:
@@ -55,11 +58,12 @@ class Progress:
 
     def _say(self) -> None:
         self.said = time.monotonic()
-        elapsed = self.said - self.started
         parts = [f"{self.label}: {self.done:.0f}"]
         if self.total:
-            left = elapsed * (self.total - self.done) / self.done if self.done else float("nan")
-            parts = [f"{self.label}: {self.done:.0f}/{self.total:.0f} {self.unit}".rstrip(), f"{left:.0f} s left"]
+            parts = [f"{self.label}: {self.done:.0f}/{self.total:.0f} {self.unit}".rstrip()]
+            done, when = self.first or (0.0, self.said)
+            if self.done > done:
+                parts.append(f"{(self.said - when) * (self.total - self.done) / (self.done - done):.0f} s left")
         print(", ".join(parts + ([self.text] if self.text else [])), file=sys.stderr, flush=True)
 
 

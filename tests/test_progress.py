@@ -34,6 +34,16 @@ def test_lines_every_ten_seconds(clock: Clock, capsys: pytest.CaptureFixture[str
     assert err.splitlines() == ["decode: 20/100 frame, 40 s left, fine", "decode: 40/100 frame, 30 s left, fine"]
 
 
+def test_what_comes_before_the_first_unit_does_not_count(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress("train", 1000) as bar:
+        clock.now = 30.0
+        bar.advance()
+        for _ in range(100):
+            clock.now += 0.1
+            bar.advance()
+    assert capsys.readouterr().err.splitlines() == ["train: 1/1000", "train: 101/1000, 90 s left"]
+
+
 def test_without_a_total(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     with Progress("count") as bar:
         clock.now = 11
