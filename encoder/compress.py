@@ -38,8 +38,8 @@ NEAR = 0.3
 
 DEFAULT_LOSS_DB = 0.15
 
-TUNINGS = 3
-"""At most so many codings are tuned: each takes a minute, about."""
+TUNINGS = 4
+"""At most so many codings are tuned: each takes a minute, about. Mostly two are."""
 ENOUGH_BYTES, ENOUGH_ERROR = 0.05, 0.1
 """A tuned coding this share below the bytes or the error that it may not exceed is good enough: errors are foreseen less well."""
 ERRORS_LEFT, BYTES_MADE = 0.7, 1.01
@@ -214,12 +214,16 @@ def compress(
     else:
         start, end, most = finest, coarsest, trade.loss_db(uncoded_psnr)
         value = lambda found: uncoded_psnr - found.measured.psnr
+    better, enough = None, ENOUGH_BYTES if name == "target_bytes" else ENOUGH_ERROR
+    spent: Callable[[Attempt], float] = lambda found: found.measured.error if name == "target_bytes" else found.size_bytes
     if tune is not None:
         found = _farthest(start, end, attempt, value, most, ROUGHLY)
-        better = _farthest_tuned(start, end, found, tuple(tried.values()), tuned, value, most)
-        if better is not None:
+        better = _farthest_tuned(start, end, found, tuple(tried.values()), tuned, value, most, enough)
+        if better is not None and value(better) >= (1 - enough) * most and spent(better) < spent(found):
             return better
     found = _farthest(start, end, attempt, value, most)
+    if better is not None and spent(better) < spent(found):
+        return better
     if name == "target_bytes" and found.size_bytes > bound:
         raise TrainingError(f"{found.size_bytes:,} bytes is the least that this model takes, not {int(bound):,}; give "
                             "another --target-size, or train anew with a smaller --preset")
@@ -228,35 +232,48 @@ def compress(
 
 def _farthest_tuned(
     start: float, end: float, found: Attempt, tried: Sequence[Attempt], tuned: Callable[[float], Attempt],
-    value: Callable[[Attempt], float], most: float,
+    value: Callable[[Attempt], float], most: float, enough: float,
 ) -> Attempt | None:
-    """A coding that is tuned, whose value is `most` or little less, and that is better than what `_farthest` found without; None where
-    there is none. Bytes are what rises towards finer steps, errors towards coarser ones.
+    """A coding that is tuned, whose value is `most` or less, by the share `enough` where a few tunings come so near; None where none has it.
 
-    It is sought where its value should be so: how the logarithm of the value follows that of the steps is known from what was `tried`.
+    It is sought where its value should be so: how the logarithm of the value follows that of the steps is known from what was `tried`,
+    of which `found` is the best without tuning, and ever better from what was tuned.
     """
-    counts_bytes = end < start
     others = [one for one in tried if abs(one.exponent - found.exponent) >= APART and value(one) > 0]
     if not others or not 0 < value(found) <= most:
         return None
     other = min(others, key=lambda one: abs(one.exponent - found.exponent))
     slope = math.log(value(other) / value(found)) / (other.exponent - found.exponent)
-    if not math.isfinite(slope) or slope == 0 or (slope < 0) != counts_bytes:
+    rises_towards_finer = end < start  # as bytes do, and errors do not
+    if not math.isfinite(slope) or slope == 0 or (slope < 0) != rises_towards_finer:
         return None
-    enough = ENOUGH_BYTES if counts_bytes else ENOUGH_ERROR
+    expected = value(found) * (BYTES_MADE if rises_towards_finer else ERRORS_LEFT)
     wanted = math.log(most * (1 - enough / 2))
-    expected = value(found) * (BYTES_MADE if counts_bytes else ERRORS_LEFT)
-    exponent = found.exponent + (wanted - math.log(expected)) / slope
+    exponent, best = found.exponent + (wanted - math.log(expected)) / slope, None
+    known: list[tuple[float, float]] = []
     for _ in range(TUNINGS):
         candidate = tuned(min(max(exponent, min(start, end)), max(start, end)))
         reached = value(candidate)
-        if (1 - enough) * most <= reached <= most:
-            better = candidate.measured.error < found.measured.error if counts_bytes else candidate.size_bytes < found.size_bytes
-            return candidate if better else None
         if not reached > 0:  # so with NaN
-            return None
-        exponent = candidate.exponent + (wanted - math.log(reached)) / slope
-    return None
+            break
+        if reached <= most and (best is None or reached > value(best)):
+            best = candidate
+        if (1 - enough) * most <= reached <= most:
+            break
+        known.append((candidate.exponent, math.log(reached)))
+        exponent = _where(known, wanted, slope)
+    return best
+
+
+def _where(known: Sequence[tuple[float, float]], wanted: float, slope: float) -> float:
+    """The place of a wanted value on the line through the two known (place, value) nearest to it; where there is but one, or the line is
+    steeper or flatter than the slope by more than a factor of three, on one through the nearest with that slope."""
+    (place, value), *others = sorted(known, key=lambda point: abs(point[1] - wanted))
+    if others and others[0][0] != place:
+        own = (others[0][1] - value) / (others[0][0] - place)
+        if 1 / 3 < own / slope < 3:
+            slope = own
+    return place + (wanted - value) / slope
 
 
 def _farthest(

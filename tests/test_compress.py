@@ -176,10 +176,10 @@ def test_scaled() -> None:
     np.testing.assert_array_equal(out[0]["xy"], [0.25, 0.5])
 
 
-def tuned_to(factor: float, seen: list[Attempt] | None = None, **trade: float) -> Attempt:
-    """With a stand-in for tuning: steps times a factor, at the bytes that those take."""
+def tuned_to(factor: float, seen: list[Attempt] | None = None, power: float = 1.0, **trade: float) -> Attempt:
+    """With a stand-in for tuning: steps to some power, times a factor, at the bytes that those take."""
     def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
-        made = quantise_on_trellis(SCENE, [{name: factor * step for name, step in scale.items()} for scale in steps], reached)
+        made = quantise_on_trellis(SCENE, [{name: factor * step**power for name, step in scale.items()} for scale in steps], reached)
         if seen is not None:
             seen.append(Attempt(made, measure, 0.0))
         return made
@@ -197,6 +197,15 @@ def test_what_is_tuned_meets_the_trade(factor: float) -> None:
     assert agreement_of(60) <= tuned_to(factor, quality=60).measured.agreement_db <= agreement_of(60) + 0.5
     target = coded(quality=60).size_bytes
     assert 0.9 * target < tuned_to(factor, target_bytes=target).size_bytes <= target
+
+
+@pytest.mark.parametrize("power", [0.6, 1.6])
+def test_errors_of_what_is_tuned_may_follow_steps_less_or_more(power: float) -> None:
+    plain = coded(max_loss_db=0.15)
+    seen: list[Attempt] = []
+    factor = 0.7 * float(2.0**plain.exponent) ** (1 - power)
+    assert 0.9 * 0.15 <= loss(tuned_to(factor, seen, power, max_loss_db=0.15)) <= 0.15
+    assert 2 <= len(seen) <= TUNINGS
 
 
 def test_tuning_that_does_harm_is_not_taken() -> None:
