@@ -1,14 +1,15 @@
 """Quantisation that lands where a trade says."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from scenes import tiny_scene
 
 from kpc.encoder.compress import (
-    FINEST, LEAST_SIGNIFICANCE, TRUST, TUNINGS, Attempt, Steps, Trade, agreement_of, compress, error_of, relative_steps, scaled, significance,
+    FINEST, LEAST_SIGNIFICANCE, TRUST, TUNINGS, Attempt, Steps, Trade, _farthest_tuned, agreement_of, compress, error_of, relative_steps,
+    scaled, significance,
 )
 from kpc.encoder.probe import Measured
 from kpc.encoder.trellis import quantise_on_trellis
@@ -206,6 +207,43 @@ def test_errors_of_what_is_tuned_may_follow_steps_less_or_more(power: float) -> 
     factor = 0.7 * float(2.0**plain.exponent) ** (1 - power)
     assert 0.9 * 0.15 <= loss(tuned_to(factor, seen, power, max_loss_db=0.15)) <= 0.15
     assert 2 <= len(seen) <= TUNINGS
+
+
+@dataclass(frozen=True)
+class Told:
+    """In place of an Attempt."""
+
+    exponent: float
+    error: float
+
+
+def rough(noise: list[float]) -> tuple[Told | None, list[Told]]:
+    """What is found of tunings whose errors, at most 1, grow with the power 1.2 of steps and are off by `noise`; and all that were tried."""
+    tried = [Told(e, 0.85 * 2 ** (1.2 * (e + 7))) for e in (-7.0, -6.0)]
+    seen: list[Told] = []
+
+    def tuned(exponent: float) -> Told:
+        seen.append(Told(exponent, 0.6 * 2 ** (1.2 * (exponent + 7)) * noise[len(seen)]))
+        return seen[-1]
+
+    return _farthest_tuned(-13, 2, tried[0], tried, tuned, lambda one: one.error, 1.0, 0.1), seen  # type: ignore[arg-type, return-value]
+
+
+@pytest.mark.parametrize("noise, tunings", [((1.0,), 1), ((1.5, 1.5), 2), ((1.6, 1.2, 1.4), 3), ((1.5, 1.3, 1.45, 1.4), 4)])
+def test_rough_tunings_come_near_enough(noise: tuple[float, ...], tunings: int) -> None:
+    found, seen = rough([*noise])
+    assert found is not None and 0.9 <= found.error <= 1 and len(seen) == tunings
+
+
+def test_the_best_of_rough_tunings_is_found() -> None:
+    found, seen = rough([1.6, 0.4, 1.5, 0.7])
+    assert found in seen and len(seen) == TUNINGS
+    assert found.error == max(one.error for one in seen if one.error <= 1)
+
+
+def test_no_tuning_is_found_where_all_err_too_much() -> None:
+    found, seen = rough([2.0, 4.0, 8.0, 16.0])
+    assert found is None and len(seen) == TUNINGS
 
 
 def test_tuning_that_does_harm_is_not_taken() -> None:
