@@ -15,7 +15,9 @@ import numpy as np
 import torch
 
 from kpc.encoder.checkpoint import save_state
-from kpc.encoder.compress import Quantise, Trade, compress, relative_steps, significance
+from kpc.encoder.compress import (
+    MOTION_SHARE, Quantise, Trade, compress, error_at, relative_steps, significance, with_coarser_motion,
+)
 from kpc.encoder.curvature import curvature
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
@@ -109,6 +111,9 @@ def code(
         if coded is None or pruned.left_out_any:
             scene, coded = pruned.scene, None
             steps, significant = pruned.of_each_plane(steps), pruned.of_each_plane(significant)
+    coarser = with_coarser_motion(scene, measure, MOTION_SHARE * error_at(whole, trade.loss_db(whole)))
+    if coarser is not scene:
+        scene, coded = coarser, None
 
     def tune(steps: Sequence[Mapping[str, np.ndarray]], reached: np.ndarray) -> QuantisedScene:
         def choose(candidate: Scene, group: Sequence[Name]) -> QuantisedScene:

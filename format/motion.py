@@ -18,9 +18,8 @@ from kpc.format.errors import FormatError
 from kpc.format.grid import linear, tap
 
 STEP = 2.0**-11
-"""Of the symbols, in box edges. Displacements then err by at most 1/16 texel of a plane of 256. Held-out PSNR of soldier is the
-same to 0.001 dB down to 2^-13, whose grid takes 36 KB through zstd instead of 32 (18 under codec 2); 2^-9 loses 0.006 dB and
-takes 26."""
+"""The finest that is stored, in box edges. Displacements then err by at most 1/16 texel of a plane of 256. Held-out PSNR of soldier is the
+same to 0.001 dB down to 2^-13. (How coarse it may be for a file's sake: `kpc.encoder.compress.with_coarser_motion`.)"""
 
 DISPLACEMENT_LIMIT = 1024.0
 """Magnitude of any displacement, in box edges. Places are clamped to [0, 1]: more than 1 has the effect of 1."""
@@ -44,7 +43,7 @@ class QuantisedMotion:
 
 
 def quantise_motion(offsets: np.ndarray) -> QuantisedMotion:
-    """Round a motion grid to multiples of STEP, or of what 16 bits allow.
+    """Round a motion grid to multiples of STEP, or of what 16 bits allow; one that holds but multiples of k STEP is stored with that step.
 
     Raises:
         FormatError: an offset is NaN or beyond half of DISPLACEMENT_LIMIT.
@@ -54,7 +53,9 @@ def quantise_motion(offsets: np.ndarray) -> QuantisedMotion:
         raise FormatError(f"motion: holds NaN or a displacement of more than {DISPLACEMENT_LIMIT / 2:g} boxes, which no file can "
                           "store; train with a lower learning rate")
     step = np.float32(max(STEP, np.nextafter(np.float32(largest / 32767), np.float32(np.inf))))
-    return QuantisedMotion(np.rint(offsets.astype(np.float64) / step).astype(np.int16), float(step))
+    symbols = np.rint(offsets.astype(np.float64) / step).astype(np.int16)
+    multiple = int(np.gcd.reduce(symbols, axis=None)) if step == STEP else 1  # of a power of two, so that nothing is rounded anew
+    return QuantisedMotion(symbols // np.int16(max(multiple, 1)), float(step) * max(multiple, 1))
 
 
 def moved(u: np.ndarray, offsets: np.ndarray) -> np.ndarray:

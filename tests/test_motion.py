@@ -56,6 +56,14 @@ def test_rounding(most: float) -> None:
     assert np.abs(rounded.dequantise() - offsets).max() <= rounded.step / 2 + most * 2.0**-23
 
 
+@pytest.mark.parametrize("multiple", [1, 3, 16])
+def test_multiples_of_several_steps_are_stored_as_such(multiple: int) -> None:
+    offsets = np.random.default_rng(0).integers(-30, 30, (2, 3, 2, 2, 3)).astype(np.float32) * np.float32(multiple * STEP)
+    rounded = quantise_motion(offsets)
+    assert rounded.step == multiple * STEP and np.abs(rounded.symbols).max() <= 30
+    np.testing.assert_array_equal(rounded.dequantise(), offsets)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, DISPLACEMENT_LIMIT])
 def test_what_no_file_can_store(value: float) -> None:
     offsets = np.zeros((2, 2, 2, 2, 3), np.float32)
