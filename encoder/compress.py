@@ -105,7 +105,12 @@ class Trade:
             return psnr - value if psnr > value else DEFAULT_LOSS_DB
         # Where D falls to a quarter with a bit more, as fine quantisation has it, its slope is -2 ln 2 D.
         error = error_of(value) if name == "quality" else value / (2 * math.log(2))
-        return 10 * math.log10(1 + error / (255**2 * 10 ** (-psnr / 10)))
+        return 10 * math.log10(1 + error / squares_of(psnr))
+
+
+def squares_of(psnr: float) -> float:
+    """A PSNR as a mean squared difference, in squares of 8-bit levels."""
+    return 255**2 * 10 ** (-psnr / 10)
 
 
 def agreement_of(quality: float) -> float:
@@ -115,7 +120,13 @@ def agreement_of(quality: float) -> float:
 
 def error_of(quality: float) -> float:
     """The same as a mean squared difference, in squares of 8-bit levels."""
-    return 255**2 * 10 ** (-agreement_of(quality) / 10)
+    return squares_of(agreement_of(quality))
+
+
+def error_at(psnr: float, loss_db: float) -> float:
+    """The mean squared difference, in squares of 8-bit levels, that takes so many dB from pictures of some PSNR, adding to their own: what
+    `Trade.loss_db` undoes."""
+    return squares_of(psnr) * (10 ** (loss_db / 10) - 1)
 
 
 @dataclass(frozen=True)
@@ -153,16 +164,12 @@ def significance(curvature: Curvature) -> list[dict[str, np.ndarray]]:
     return [{name: (h / np.float32(largest)) ** np.float32(TRUST) for name, h in scale.items()} for scale in curvature]
 
 
-def error_at(psnr: float, loss_db: float) -> float:
-    """The mean squared difference, in squares of 8-bit levels, that takes so many dB from pictures of some PSNR, adding to their own."""
-    return 255**2 * 10 ** (-psnr / 10) * (10 ** (loss_db / 10) - 1)
-
-
 def with_coarser_motion(scene: Scene, measure: Measure, error: float) -> Scene:
     """The scene with displacements rounded to as coarse a multiple of `kpc.format.motion.STEP` as adds at most `error`, in squares of 8-bit
     levels; itself where that changes nothing, or there is none."""
-    multiple = MOST_STEPS if scene.motion is not None else 1
-    known = measure(scene).error if multiple > 1 else 0.0  # of what was left out
+    if scene.motion is None:
+        return scene
+    multiple, known = MOST_STEPS, measure(scene).error  # of what was left out
     while multiple > 1:
         step = np.float32(multiple * STEP)
         candidate = replace(scene, motion=np.rint(scene.motion / step) * step)

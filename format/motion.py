@@ -54,8 +54,9 @@ def quantise_motion(offsets: np.ndarray) -> QuantisedMotion:
                           "store; train with a lower learning rate")
     step = np.float32(max(STEP, np.nextafter(np.float32(largest / 32767), np.float32(np.inf))))
     symbols = np.rint(offsets.astype(np.float64) / step).astype(np.int16)
-    multiple = int(np.gcd.reduce(symbols, axis=None)) if step == STEP else 1  # of a power of two, so that nothing is rounded anew
-    return QuantisedMotion(symbols // np.int16(max(multiple, 1)), float(step) * max(multiple, 1))
+    # Of a power of two, so that nothing is rounded anew; 0 where nothing moves.
+    multiple = int(np.gcd.reduce(symbols, axis=None)) or 1 if step == STEP else 1
+    return QuantisedMotion(symbols // np.int16(multiple), float(step) * multiple)
 
 
 def moved(u: np.ndarray, offsets: np.ndarray) -> np.ndarray:
