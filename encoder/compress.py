@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kpc.encoder.curvature import Curvature
+from kpc.encoder.curvature import PerPlane
 from kpc.encoder.probe import Measure, Measured
 from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format import file
@@ -155,13 +155,13 @@ class Attempt:
         return self.measured.error + lam * 8 * self.size_bytes / self.quantised.parameter_count
 
 
-def significance(curvature: Curvature) -> list[dict[str, np.ndarray]]:
-    """What an error in each number costs, as a share of the most that any does: (h / largest)^TRUST of the curvature h, float32.
+def significance(alone: PerPlane) -> list[dict[str, np.ndarray]]:
+    """What an error in each number costs, as a share of the most that any does: (h / largest)^TRUST of `Curvature.alone` h, float32.
 
     Of h alone: what is left to cross terms, and to rays that were not drawn, makes the unimportant more important than h has it.
     """
-    largest = max(float(h.max()) for scale in curvature for h in scale.values()) or 1.0
-    return [{name: (h / np.float32(largest)) ** np.float32(TRUST) for name, h in scale.items()} for scale in curvature]
+    largest = max(float(h.max()) for scale in alone for h in scale.values()) or 1.0
+    return [{name: (h / np.float32(largest)) ** np.float32(TRUST) for name, h in scale.items()} for scale in alone]
 
 
 def with_coarser_motion(scene: Scene, measure: Measure, error: float) -> Scene:

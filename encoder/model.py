@@ -7,7 +7,7 @@ judged by its own pictures.
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from kpc.encoder.checkpoint import save_state
 from kpc.encoder.compress import (
     MOTION_SHARE, Quantise, Trade, compress, error_at, relative_steps, significance, with_coarser_motion,
 )
-from kpc.encoder.curvature import curvature
+from kpc.encoder.curvature import Curvature, curvature
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
 from kpc.encoder.trellis import Name, quantise_on_trellis
@@ -52,7 +52,7 @@ class Model:
     coded: QuantisedScene | None = None
 
     @cached_property
-    def curvature(self) -> list[dict[str, np.ndarray]]:
+    def curvature(self) -> Curvature:
         """What errors cost, `kpc.encoder.curvature`."""
         return curvature(self.scene, self.probe)
 
@@ -84,7 +84,7 @@ class Coded:
 
 
 def code(
-    model: Model, trade: Trade, prune_share: float, tune_steps: int, quantise: Quantise = quantise_on_trellis, shown: bool = False
+    model: Model, trade: Trade, prune_share: float, tune_steps: int, quantise: Quantise | None = None, shown: bool = False
 ) -> Coded:
     """What of a model is needed, `kpc.encoder.prune`, in symbols as coarse or as fine as a trade asks for.
 
@@ -98,7 +98,7 @@ def code(
         TrainingError: no file of this model is so small.
     """
     scene, coded, pruned = model.scene, model.coded, None
-    significant = significance(model.curvature)
+    significant, together = significance(model.curvature.alone), model.curvature.together
     if coded is None:
         steps = relative_steps(significant)
     else:
@@ -110,18 +110,18 @@ def code(
         pruned = prune(scene, model.probe.rays, lambda candidate: measure(candidate).psnr, spare)
         if coded is None or pruned.left_out_any:
             scene, coded = pruned.scene, None
-            steps, significant = pruned.of_each_plane(steps), pruned.of_each_plane(significant)
+            steps, significant, together = pruned.of_each_plane(steps), pruned.of_each_plane(significant), pruned.of_pairs(together)
     coarser = with_coarser_motion(scene, measure, MOTION_SHARE * error_at(whole, trade.loss_db(whole)))
     if coarser is not scene:
         scene, coded = coarser, None
 
     def tune(steps: Sequence[Mapping[str, np.ndarray]], reached: np.ndarray) -> QuantisedScene:
         def choose(candidate: Scene, group: Sequence[Name]) -> QuantisedScene:
-            return quantise_on_trellis(candidate, steps, reached, significant, group)
+            return quantise_on_trellis(candidate, steps, reached, significant, group, together)
 
         return tuned(scene, model.scene, choose, tune_steps, shown)
 
-    found = compress(scene, steps, significant, measure, whole, trade, coded, quantise, tune if tune_steps else None,
+    found = compress(scene, steps, significant, measure, whole, trade, coded, quantise or partial(quantise_on_trellis, together=together), tune if tune_steps else None,
                      own_steps=model.coded is not None)
     measured: Measured = found.measured
     return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, spare)

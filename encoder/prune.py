@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from kpc.encoder import render
+from kpc.encoder.curvature import PerPlane
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.field import Field, Layout
 from kpc.format.scene import Decoder, Scene
@@ -53,10 +54,15 @@ class Pruned:
         """Whether anything is gone that was worth anything, or a channel."""
         return self.loss_db != 0 or sum(map(len, self.kept)) < self.features
 
-    def of_each_plane(self, steps: Sequence[dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
+    def of_each_plane(self, numbers: PerPlane) -> list[dict[str, np.ndarray]]:
         """The part of (..., M) numbers of each plane that belongs to what is left."""
-        pairs = zip(self.kept, steps, strict=True)
-        return [{name: step[..., kept] for name, step in scale.items()} for kept, scale in pairs if len(kept)]
+        pairs = zip(self.kept, numbers, strict=True)
+        return [{name: some[..., kept] for name, some in scale.items()} for kept, scale in pairs if len(kept)]
+
+    def of_pairs(self, numbers: PerPlane) -> list[dict[str, np.ndarray]]:
+        """The same of (..., M, M)."""
+        pairs = zip(self.kept, numbers, strict=True)
+        return [{name: some[..., kept, :][..., kept] for name, some in scale.items()} for kept, scale in pairs if len(kept)]
 
 
 def renderings(features: int) -> int:

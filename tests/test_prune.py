@@ -121,6 +121,9 @@ def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
     assert coded.pruned is not None and coded.spare_db == pytest.approx(SPARE) and coded.pruned.left_out_any
     kept = coded.pruned.kept[1]
     assert [step.tolist() for step in coded.pruned.of_each_plane(numbers)[1].values()] == [(kept + 1.0).tolist()] * 6
+    pairs = [{name: np.arange(64.0).reshape(1, 1, 8, 8) for name in scale} for scale in scene.scales]
+    for found in coded.pruned.of_pairs(pairs)[1].values():
+        np.testing.assert_array_equal(found[0, 0], 8.0 * kept[:, None] + kept)
     assert 0.9 * 0.15 < coded.loss_db <= 0.15 and coded.size_bytes == len(file.encode(coded.scene))
     fidelity = Fidelity(scene, rays)
     assert fidelity(scene) - fidelity(coded.scene.dequantise()) == pytest.approx(coded.loss_db, abs=1e-3)

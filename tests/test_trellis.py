@@ -35,10 +35,15 @@ FREE = np.zeros((ACTIVITIES, TOLD_APART))
 """Every error costs nothing."""
 
 
-def searched(wanted: np.ndarray, known: np.ndarray, bits: np.ndarray = FREE, worth: np.ndarray | None = None) -> np.ndarray:
+ALONE = np.zeros((0, 0, 0, 0), np.float32)
+"""Channels know nothing of each other."""
+
+
+def searched(wanted: np.ndarray, known: np.ndarray, bits: np.ndarray = FREE, worth: np.ndarray | None = None,
+             together: np.ndarray = ALONE) -> np.ndarray:
     worth = np.ones(wanted.shape, np.float32) if worth is None else worth
     errors = np.zeros((wanted.shape[0] + 2, wanted.shape[1] + 2, wanted.shape[2]), np.float32)
-    symbols, counts = trellis._search(wanted, worth, known, True, NO_WEIGHTS, bits, errors)
+    symbols, counts = trellis._search(wanted, worth, known, True, NO_WEIGHTS, bits, errors, together)
     assert np.allclose(errors[1:-1, 1:-1], np.where(known[..., None], np.sqrt(worth) * (symbols - wanted), 0), atol=1e-4)
     assert counts.sum() == known.sum() * wanted.shape[2]
     assert follows_trellis(symbols, known) and not symbols[~known].any()
@@ -88,6 +93,35 @@ def seen(errors: np.ndarray) -> float:
         before, after = (np.take(padded, range(k, k + errors.shape[axis]), axis) for k in (0, 2))
         both = both + (before + after) / 4
     return float(np.mean(errors * both))
+
+
+def test_a_channel_undoes_what_others_err() -> None:
+    """Two channels of which pictures show but the sum: together they tell it more finely than either, and no less well where they go
+    against each other; of which nothing is known to go together they know nothing."""
+    wanted, known = np.random.default_rng(3).uniform(-9, 9, (21, 41, 2)), np.ones((21, 41), bool)
+    together = np.zeros((11, 21, 2, 2), np.float32)
+    apart = searched(wanted, known)
+    np.testing.assert_array_equal(searched(wanted, known, together=together), apart)
+    for sign in (1, -1):
+        together[..., 0, 1] = together[..., 1, 0] = sign / trellis.TOGETHER
+        errors, errors_apart = (symbols - wanted for symbols in (searched(wanted, known, together=together), apart))
+        shown, shown_apart = (seen(e[..., :1] + sign * e[..., 1:]) for e in (errors, errors_apart))
+        assert shown < 0.6 * shown_apart
+        np.testing.assert_array_equal(errors[..., 0], errors_apart[..., 0])  # whose turn comes first
+
+
+def test_what_goes_together_is_told_block_by_block() -> None:
+    errors = np.zeros((7, 8, 3), np.float32)
+    errors[1:-1, 1:-1] = np.random.default_rng(1).normal(size=(5, 6, 3))
+    together = np.random.default_rng(2).normal(size=(3, 3, 3, 3)).astype(np.float32)
+    c = np.zeros((7, 8))
+    for y, x in np.ndindex(5, 6):
+        c[y + 1, x + 1] = trellis.TOGETHER * (together[y // 2, x // 2, 1] @ errors[y + 1, x + 1])
+    kernel = np.array([trellis.BESIDE, 1, trellis.BESIDE])
+    weights = np.outer(kernel, kernel)  # ACROSS is BESIDE squared
+    expected = [[(weights * c[y : y + 3, x : x + 3]).sum() for x in range(6)] for y in range(5)]
+    assert trellis.ACROSS == trellis.BESIDE**2
+    np.testing.assert_allclose(trellis._others(errors, together, 1), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_seen_is_what_bilinear_look_ups_see() -> None:

@@ -51,12 +51,13 @@ VIEW_PIXELS = 1 << 15
 TUNE_STEPS = TrainConfig().tune_steps
 RIVALS = {rival.name: rival for rival in rivals.RIVALS}
 OURS = "kpc"
-WITHOUT: dict[str, Quantise] = {
-    "kpc without tuning": quantise_on_trellis,
+WITHOUT: dict[str, Quantise | None] = {
+    "kpc without tuning": None,
+    "kpc, channels apart": quantise_on_trellis,
     "kpc without the trellis": lambda scene, steps, reached, significant: quantise_scene(scene, steps, reached=reached),
     "kpc, every texel alike": lambda scene, steps, reached, significant: quantise_on_trellis(scene, steps, reached),
 }
-"""Our own coder with something left out, the latter two without tuning, too; at QUALITIES."""
+"""Our own coder with something left out, the latter three without tuning, too; at QUALITIES."""
 TUNED = {"AV1, tuned": "AV1"}
 """Rivals that get the tuning of our own coder, `kpc.encoder.tuning`, through what comes back from their own coding."""
 
@@ -140,7 +141,7 @@ def point(job: Job) -> Point | None:
         return found | {"search_s": time.perf_counter() - started}
     try:
         tune_steps = TUNE_STEPS if job.coder == OURS else 0
-        coded = model.code(source, job.trade, TrainConfig().prune_share, tune_steps, WITHOUT.get(job.coder, quantise_on_trellis))
+        coded = model.code(source, job.trade, TrainConfig().prune_share, tune_steps, WITHOUT.get(job.coder))
     except TrainingError:
         return None
     searched = time.perf_counter()
