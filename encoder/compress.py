@@ -59,11 +59,9 @@ LEAST_SIGNIFICANCE = 1e-6
 
 Steps = list[dict[str, np.ndarray]]
 """One mapping a scale, plane name -> (M,) quantisation steps."""
-Significance = Sequence[Mapping[str, np.ndarray]]
-"""One mapping a scale, plane name -> (rows, columns, M)."""
-Quantise = Callable[[Scene, Sequence[Mapping[str, np.ndarray]], np.ndarray, Significance], QuantisedScene]
+Quantise = Callable[[Scene, PerPlane, np.ndarray, PerPlane], QuantisedScene]
 """Of a scene with steps, `reached_by` it and significance: `quantise_on_trellis`, or what is to be compared with it."""
-Tune = Callable[[Sequence[Mapping[str, np.ndarray]], np.ndarray], QuantisedScene]
+Tune = Callable[[PerPlane, np.ndarray], QuantisedScene]
 """A better coding with the same steps, of a scene that is known, `reached_by` which is told."""
 
 
@@ -182,7 +180,7 @@ def with_coarser_motion(scene: Scene, measure: Measure, error: float) -> Scene:
     return scene
 
 
-def relative_steps(significant: Significance) -> Steps:
+def relative_steps(significant: PerPlane) -> Steps:
     """Steps up to one common factor, such that a bit spent on any channel buys about the same.
 
     A uniform quantiser of step d errs by d^2 / 12 times a constant; the error costs `significant` w of it; its rate falls by one bit
@@ -204,7 +202,7 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
 
 
 def compress(
-    scene: Scene, steps: Steps, significant: Significance, measure: Measure, uncoded_psnr: float, trade: Trade,
+    scene: Scene, steps: Steps, significant: PerPlane, measure: Measure, uncoded_psnr: float, trade: Trade,
     as_it_is: QuantisedScene | None = None, quantise: Quantise = quantise_on_trellis, tune: Tune | None = None,
     own_steps: bool = False,
 ) -> Attempt:

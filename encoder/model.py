@@ -18,7 +18,7 @@ from kpc.encoder.checkpoint import save_state
 from kpc.encoder.compress import (
     MOTION_SHARE, Quantise, Trade, compress, error_at, relative_steps, significance, with_coarser_motion,
 )
-from kpc.encoder.curvature import Curvature, curvature
+from kpc.encoder.curvature import Curvature, PerPlane, curvature
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
 from kpc.encoder.trellis import Name, quantise_on_trellis
@@ -115,7 +115,7 @@ def code(
     if coarser is not scene:
         scene, coded = coarser, None
 
-    def tune(steps: Sequence[Mapping[str, np.ndarray]], reached: np.ndarray) -> QuantisedScene:
+    def tune(steps: PerPlane, reached: np.ndarray) -> QuantisedScene:
         def choose(candidate: Scene, group: Sequence[Name]) -> QuantisedScene:
             return quantise_on_trellis(candidate, steps, reached, significant, group, together)
 

@@ -22,7 +22,7 @@ by rate and distortion around the nearest. Errors that know of each other save 5
 
 import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, Quantise
 from kpc.format.rans import compiled
 from kpc.format.scene import TIME_PLANES, Scene
 from kpc.format.symbols import (
-    ACTIVITIES, UNKNOWN, WEIGHTS, activity, begin_row, fitted, nearest, neighbourhoods, next_state, predict, remember,
+    ACTIVITIES, UNKNOWN, activity, begin_row, fitted, nearest, neighbourhoods, next_state, predict, remember,
 )
 
 Name = tuple[int, str]
@@ -68,7 +68,7 @@ TOLD_APART = 40
 
 
 def quantise_on_trellis(
-    scene: Scene, steps: Sequence[Mapping[str, np.ndarray]], reached: np.ndarray | None = None,
+    scene: Scene, steps: PerPlane, reached: np.ndarray | None = None,
     significant: PerPlane | None = None, only: Collection[Name] | None = None, together: PerPlane | None = None,
 ) -> QuantisedScene:
     """As `quantise_scene`, with symbols that follow the trellis.

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from kpc.format.container import DEFAULT_BUDGET, RemoteSource, Source
 from kpc.format.errors import KpcError
 from kpc.format.groups import Groups
-from kpc.format.scene import Clip, Scene
+from kpc.format.scene import Scene
 from kpc.player.orbit import Rig
 from kpc.player.prefetch import Playhead
 from kpc.player.renderer import Renderer

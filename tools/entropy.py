@@ -17,7 +17,7 @@ from kpc.format import rans
 from kpc.format import symbols as module
 from kpc.format.container import Chunk, pack
 from kpc.format.file import SceneReader, read, scene_chunks
-from kpc.format.rans import decide, words_of
+from kpc.format.rans import words_of
 from kpc.format.scene import ALL_PLANES
 from kpc.format.symbols import MOST_DECISIONS, SET_COUNTS, WEIGHTS, fitted
 

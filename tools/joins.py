@@ -1,6 +1,5 @@
 """How steady a clip in groups is where one takes over from another: its held-out views, frame by frame, beside the truth."""
 
-import argparse
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any

@@ -294,7 +294,6 @@ def _limits() -> dict[str, bytes]:
     rows = _scene(dynamic=True, sizes=[(1, 1, 2, 1, AXIS_LIMIT)])
     pose = np.diag([1.0, 1, 1, 1])
     names = [chr(0x4E00 + k) for k in range(APPEARANCE_LIMIT)]
-    plane = plain.scales[0]["xy"]
     steps = np.float32([16, 8, 0.5**20, 0.5**149, 0.5**126])  # the last two: the least number above 0, the least that is normal
     wide = {name: QuantisedPlane(np.tile(np.int8([[[-128], [127], [1]]]), (1, 1, 5)), steps, np.float32([0, -1024, 1, 0, 0.5**126]),
                                  np.ones((1, 3), bool)) for name in SPACE_PLANES[:2]}
