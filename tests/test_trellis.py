@@ -195,9 +195,10 @@ def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float)
     assert size(economical) < size(as_bad) - 0.12 * values.size / 8  # 1.09 dB are 0.18 bits
 
 
-def test_where_eight_bits_are_too_few_any_symbol_may_follow() -> None:
+def test_where_eight_bits_are_too_few_any_symbol_may_follow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of the trellis would err by four thirds of what the nearest do, and at a step so much coarser than the one asked for bits are
     worth little: what is seen of errors is less than of those of the nearest, but where they are worth next to nothing."""
+    monkeypatch.setattr(trellis, "LEAST_WORTH", 1e-4)
     values = np.random.default_rng(4).uniform(-100, 100, (20, 40, 2)).astype(np.float32)
     nearest, step = quantise_plane(values, 0.2, identity=False), np.full(2, 0.2)
     significant = np.ones_like(values)
