@@ -12,7 +12,8 @@ from scenes import tiny_scene
 from kpc.format import file
 from kpc.format.quantise import quantise_scene
 from kpc.tools import codecbench, kpbench, plot, results
-from kpc.tools.codecbench import Point, bd_rate, headline, size_at
+from kpc.tools.codecbench import headline
+from kpc.tools.curves import Point, bd_rate, size_at
 from kpc.tools.rivals import Bytes, Half, Planes, Video
 
 
@@ -46,6 +47,15 @@ def test_what_a_table_shows() -> None:
     shown = headline(points(1.0))
     assert shown["loss_db"] == pytest.approx(0.1) and shown["size_at_default_loss"] == size_at(points(1.0), 0.15)
     assert headline([]) == {}
+
+
+def test_sizes_at_equal_loss_beside_the_smallest_at_hand() -> None:
+    curves = {"kpc": points(0.6), "kpc without tuning": points(0.1), "PNG": points(2.0), "AV1": points(1.0), "HEVC": []}
+    records = [{"name": "scene", "coder": coder, "points": curve} for coder, curve in curves.items()]
+    head, row = results._loss_table(records)
+    assert head == ["scene", "0.05 dB", "0.1 dB", "0.2 dB", "0.5 dB", "1 dB", "2 dB"]
+    assert row == ["scene", "-", *(f"{0.6 * 2 ** (3 - loss):.0f} KB, 40% (AV1)" for loss in (0.1, 0.2, 0.5, 1.0, 2.0))]
+    assert results._loss_table(records[:1])[1][2:] == [f"{0.6 * 2 ** (3 - loss):.0f} KB" for loss in (0.1, 0.2, 0.5, 1.0, 2.0)]
 
 
 @pytest.fixture

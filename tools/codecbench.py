@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from kpc.encoder import model
 from kpc.encoder.compress import DEFAULT_LOSS_DB, Quantise, Trade
@@ -37,6 +36,7 @@ from kpc.format.quantise import quantise_scene, round_decoder
 from kpc.format.scene import Scene
 from kpc.tools import rivals
 from kpc.tools.children import end_with_parent
+from kpc.tools.curves import Point, bd_rate, size_at
 from kpc.tools.provenance import machine
 from kpc.tools.rivals import Coding, Rival
 
@@ -44,8 +44,6 @@ RATES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Bits per parameter that our coder is asked for, of the file and all that is in it."""
 QUALITIES = (40, 55, 70, 85, 100)
 """And qualities, `kpc.encoder.compress.Trade`, on the probe that the scene comes with."""
-WORST_LOSS_DB = 3.0
-"""Curves are compared down to this: what is worse nobody wants."""
 VIEW_PIXELS = 1 << 15
 """Random pixels of all held-out views that codings are judged by."""
 TUNE_STEPS = TrainConfig().tune_steps
@@ -60,8 +58,6 @@ WITHOUT: dict[str, Quantise | None] = {
 """Our own coder with something left out, the latter three without tuning, too; at QUALITIES."""
 TUNED = {"AV1, tuned": "AV1"}
 """Rivals that get the tuning of our own coder, `kpc.encoder.tuning`, through what comes back from their own coding."""
-
-Point = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -245,39 +241,7 @@ def _drawn(scene: Scene, dataset: Dataset) -> Probe:
     return Probe(origins, directions, pictures.time[picture].astype(np.float32), None, truth)
 
 
-# --- curves
-
-
-def bd_rate(ours: Sequence[Point], others: Sequence[Point]) -> float | None:
-    """By what share ours are smaller (below 0) or larger at equal PSNR, on average over what both reach of the PSNR between that of
-    the uncoded scene and WORST_LOSS_DB less.
-
-    Bjøntegaard's measure (ITU-T VCEG-M33, 2001) with piecewise cubic curves that do not overshoot (PCHIP: Fritsch and Carlson,
-    SIAM J. Numer. Anal. 17, 1980; as ITU-T JVET-H0030 has it): the mean over PSNR of log(rate ratio). None where the curves have
-    fewer than four points each, or no PSNR in common.
-    """
-    curves = [_rising(points) for points in (ours, others)]
-    best = max((point["psnr"] + point["loss_db"] for point in ours), default=0.0)
-    if min(len(psnr) for psnr, _ in curves) < 4:
-        return None
-    low, high = max(best - WORST_LOSS_DB, *(psnr[0] for psnr, _ in curves)), min(psnr[-1] for psnr, _ in curves)
-    if high - low < 1e-6:
-        return None
-    at = np.linspace(low, high, 1001)
-    mine, theirs = (PchipInterpolator(psnr, rate)(at) for psnr, rate in curves)
-    difference = mine - theirs
-    return math.exp(float(np.mean((difference[1:] + difference[:-1]) / 2))) - 1
-
-
-def size_at(points: Sequence[Point], loss_db: float) -> float | None:
-    """Bytes at a loss, on the same curve; None beyond its ends."""
-    if not points:
-        return None
-    psnr, rate = _rising(points)
-    wanted = points[0]["psnr"] + points[0]["loss_db"] - loss_db
-    if len(psnr) < 3 or not psnr[0] <= wanted <= psnr[-1]:
-        return None
-    return math.exp(float(PchipInterpolator(psnr, rate)(wanted)))
+# --- what is shown
 
 
 def headline(points: Sequence[Point]) -> Point:
@@ -286,16 +250,6 @@ def headline(points: Sequence[Point]) -> Point:
         return {}
     near = min(points, key=lambda point: abs(math.log(max(point["loss_db"], 1e-4) / DEFAULT_LOSS_DB)))
     return {**near, "size_at_default_loss": size_at(points, DEFAULT_LOSS_DB)}
-
-
-def _rising(points: Sequence[Point]) -> tuple[np.ndarray, np.ndarray]:
-    """PSNR and log sizes of those points that no smaller one equals, by size."""
-    best: list[tuple[float, float]] = []
-    for point in sorted(points, key=lambda point: (point["size_bytes"], -point["psnr"])):
-        if not best or point["psnr"] > best[-1][0] + 1e-6:
-            best.append((point["psnr"], math.log(point["size_bytes"])))
-    psnr, rate = zip(*best) if best else ((), ())
-    return np.array(psnr), np.array(rate)
 
 
 CSV_COLUMNS = ("name", "coder", "setting", "size_bytes", "bits_per_parameter", "psnr", "loss_db", "agreement_db", "encode_s",

@@ -17,6 +17,9 @@ from typing import Any
 from kpc.format import cli
 from kpc.format.errors import FormatError
 
+LOSSES_DB = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+"""Of PSNR on held-out views, at which coders are compared."""
+
 Record = dict[str, Any]
 Column = tuple[str, Callable[[Record], str]]
 
@@ -121,6 +124,23 @@ def _quality_table(records: Iterable[Record]) -> list[list[str]]:
         return "-" if point is None else f"{point['size_bytes'] / 1e3:.0f} KB, {point['loss_db']:.2f} dB"
 
     return [["scene", *qualities]] + [[name, *(cell(points.get(quality)) for quality in qualities)] for name, points in rows]
+
+
+def _loss_table(records: Sequence[Record]) -> list[list[str]]:
+    """Our bytes at each of LOSSES_DB, and by how much the smallest of what is at hand is larger there."""
+    from kpc.tools.curves import size_at  # SciPy: not needed for any other table
+
+    rows = []
+    for name in dict.fromkeys(record["name"] for record in records):
+        points = {record["coder"]: record["points"] for record in records if record["name"] == name}
+        row = [name]
+        for loss in LOSSES_DB:
+            ours = size_at(points.get("kpc", []), loss)
+            sizes = {coder: size for coder in points if not coder.startswith("kpc") and (size := size_at(points[coder], loss))}
+            best = min(sizes, key=lambda coder: sizes[coder], default=None)
+            row.append("-" if ours is None else f"{ours / 1e3:.0f} KB" + (f", {1 - ours / sizes[best]:.0%} ({best})" if best else ""))
+        rows.append(row)
+    return [["scene", *(f"{loss:g} dB" for loss in LOSSES_DB)], *rows]
 
 
 def _preset(record: Record) -> str:
@@ -302,7 +322,10 @@ def markdown(records: Sequence[Record], brief: bool = False) -> str:
             parts.append(f"**{title}** on {place}:")
             parts.append(lines)
             if kind == "codec":
-                parts.append("The same by `--quality`, size and PSNR loss:")
+                parts.append("At equal loss: size, and how much smaller that is than the smallest of what is at hand:")
+                head, *rows = _loss_table(here)
+                parts.append(_lines(head, rows))
+                parts.append("By `--quality`, size and PSNR loss:")
                 head, *rows = _quality_table(here)
                 parts.append(_lines(head, rows))
             parts.append(
