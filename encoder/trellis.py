@@ -10,10 +10,10 @@ follow (`kpc.format.symbols.next_state`). A Viterbi search finds the path throug
     c = TOGETHER * sum over other channels of the texel of their u times their correlation with this one (`kpc.encoder.curvature`)
 
 each survivor with the predictions and contexts that its own symbols lead to (Marcellin and Fischer, IEEE Trans. Comm. 38, 1990). Bits are
-counted in the contexts of the coder, from what the search before chose; rows below have the errors that the search before left them. So
-errors next to each other get opposite signs, and look-ups, which lie between texels, see less of them; and a channel undoes what others
-err. What an error is worth differs from
-texel to texel by orders of magnitude (`kpc.encoder.curvature`): where it is worth little, symbols are those that are foreseen.
+counted in the contexts of the coder, from what the search before chose; rows below and channels to come have the errors that the search
+before left them. So errors next to each other get opposite signs, and look-ups, which lie between texels, see less of them; and a channel
+undoes what others err. What an error is worth differs from texel to texel by orders of magnitude (`kpc.encoder.curvature`): where it is
+worth little, symbols are those that are foreseen.
 
 Default scene, `fast`: at equal error of pictures of 1, 2 and 4 squared levels planes take 11 to 14 % fewer bytes than with symbols chosen
 by rate and distortion around the nearest. Errors that know of each other save 5 to 8 % more, and 14 % where steps are fine (liam,
@@ -50,8 +50,8 @@ liam and soldier (off-diagonals of `kpc.encoder.curvature`): 0.25 to 0.42 and 0.
 error are the same with what is measured."""
 TOGETHER = 0.3
 """In what curvature says of two channels. What is left to chance in it, and bits that it takes to make up for others, make less of it
-better than all. At equal error of pictures files are smaller by 2.6 % (default scene), 3.5 % (liam), 3 to 5 % (soldier), with 0.2 to 0.6 by about
-as much for liam, with 0.5 hardly for soldier."""
+better than all. At equal error of pictures files are smaller by 2.6 % (default scene), 3.5 % (liam) and 3 to 5 % (soldier) than without; with
+0.2 to 0.6 liam's by about as much, with 0.5 soldier's hardly."""
 UNCHANGED = 0.6
 """Squared steps, as much as they are worth, in the mean over channels: a texel of a time plane that is nearer to 1 is taken for it. Room and
 liam: from 0.2 to 0.8 files are the same, half a percent smaller than where all channels have to be within a step, and identity is a third
