@@ -22,7 +22,7 @@ def bd_rate(ours: Sequence[Point], others: Sequence[Point]) -> float | None:
     SIAM J. Numer. Anal. 17, 1980; as ITU-T JVET-H0030 has it): the mean over PSNR of log(rate ratio). None where the curves have
     fewer than four points each, or no PSNR in common.
     """
-    curves = [rising(points) for points in (ours, others)]
+    curves = [_rising(points) for points in (ours, others)]
     best = max((point["psnr"] + point["loss_db"] for point in ours), default=0.0)
     if min(len(psnr) for psnr, _ in curves) < 4:
         return None
@@ -39,14 +39,14 @@ def size_at(points: Sequence[Point], loss_db: float) -> float | None:
     """Bytes at a loss, on the same curve; None beyond its ends."""
     if not points:
         return None
-    psnr, rate = rising(points)
+    psnr, rate = _rising(points)
     wanted = points[0]["psnr"] + points[0]["loss_db"] - loss_db
     if len(psnr) < 3 or not psnr[0] <= wanted <= psnr[-1]:
         return None
     return math.exp(float(PchipInterpolator(psnr, rate)(wanted)))
 
 
-def rising(points: Sequence[Point]) -> tuple[np.ndarray, np.ndarray]:
+def _rising(points: Sequence[Point]) -> tuple[np.ndarray, np.ndarray]:
     """PSNR and log sizes of those points that no smaller one equals, by size."""
     best: list[tuple[float, float]] = []
     for point in sorted(points, key=lambda point: (point["size_bytes"], -point["psnr"])):
