@@ -29,6 +29,8 @@ PANELS = (("test_psnr", "held-out PSNR, dB", 1.0), ("test_ssim", "held-out SSIM"
 ENDINGS = (".svg", ".png", ".pdf")
 PANEL_INCHES = (3.6, 3.2)
 RATE_PANEL_INCHES = (4.6, 4.0)
+DASHES = ("-", "--", ":", "-.", (0, (1, 3)))
+"""Of our own coder, whole and with something left out, in one colour."""
 DEEPEST_DB = 3.5
 """Of loss that is drawn; kpbench codec compares down to 3 dB."""
 
@@ -78,16 +80,18 @@ def rate_distortion(records: Sequence[results.Record]) -> Figure:
     if not scenes:
         raise FormatError("no records of kpbench codec to draw; write some with kpbench codec --out")
     names = list(dict.fromkeys(record["coder"] for coders in scenes.values() for record in coders))
+    ours = [name for name in names if name.startswith("kpc")]
+    looks = {name: {"color": "C0", "linestyle": DASHES[number % len(DASHES)]} for number, name in enumerate(ours)}
+    looks |= {name: {"color": f"C{1 + number}"} for number, name in enumerate(n for n in names if n not in ours)}
     lines = {}
     width, height = RATE_PANEL_INCHES
     figure = Figure(figsize=(width * len(scenes), height), layout="constrained")
     for axes, (name, coders) in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes.items()):
         for record in coders:
-            number = names.index(record["coder"])
             points = sorted(record["points"], key=lambda point: float(point["size_bytes"]))
             lines[record["coder"]], = axes.plot(
                 [p["bits_per_parameter"] for p in points], [p["psnr"] for p in points], marker="o", markersize=3,
-                linewidth=2.2 if number == 0 else 1, color=f"C{number}", zorder=3 if number == 0 else 2)  # fmt: skip
+                linewidth=2.2 if record["coder"] == "kpc" else 1, zorder=3 if record["coder"] == "kpc" else 2, **looks[record["coder"]])  # fmt: skip
         best = max(p["psnr"] for record in coders for p in record["points"])
         axes.set(xlabel="bits per parameter", ylabel="PSNR, dB", title=name, ylim=(best - DEEPEST_DB, best + 0.1))
         _logarithmic(axes)
