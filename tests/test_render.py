@@ -47,7 +47,9 @@ def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(sh
     assert len(found.ray) == n + (0 if short else 500) and not found.length[n:].any() and short < n
     if not short:
         one, two = (meet(field, rays, s, field.features, scene.extent) for s in (wanted, found))
-        assert torch.equal(shade(field, rays, one), shade(field, rays, two)) and torch.equal(one.weights, two.weights[:n])
+        # To the last bit or two: where an array ends, vector units may round otherwise.
+        torch.testing.assert_close(shade(field, rays, two), shade(field, rays, one), rtol=2.0**-22, atol=1e-7)
+        torch.testing.assert_close(two.weights[:n], one.weights, rtol=2.0**-22, atol=1e-9)
         assert torch.isclose(one.distortion, two.distortion, rtol=1e-5)
 
 
