@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from kpc.encoder.curvature import PerPlane
-from kpc.encoder.probe import Measure, Measured
+from kpc.encoder.probe import Measure, Measured, squares_of
 from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format import file
 from kpc.format.errors import TrainingError
@@ -104,11 +104,6 @@ class Trade:
         # Where D falls to a quarter with a bit more, as fine quantisation has it, its slope is -2 ln 2 D.
         error = error_of(value) if name == "quality" else value / (2 * math.log(2))
         return 10 * math.log10(1 + error / squares_of(psnr))
-
-
-def squares_of(psnr: float) -> float:
-    """A PSNR as a mean squared difference, in squares of 8-bit levels."""
-    return 255**2 * 10 ** (-psnr / 10)
 
 
 def agreement_of(quality: float) -> float:

@@ -110,7 +110,7 @@ def code(
         pruned = prune(scene, model.probe.rays, lambda candidate: measure(candidate).psnr, spare)
         if coded is None or pruned.left_out_any:
             scene, coded = pruned.scene, None
-            steps, significant, together = pruned.of_each_plane(steps), pruned.of_each_plane(significant), pruned.of_pairs(together)
+            steps, significant, together = pruned.of_each_plane(steps), pruned.of_each_plane(significant), pruned.of_each_plane(together, in_pairs=True)
     coarser = with_coarser_motion(scene, measure, MOTION_SHARE * error_at(whole, trade.loss_db(whole)))
     if coarser is not scene:
         scene, coded = coarser, None

@@ -44,6 +44,11 @@ def agreement_db(error: float) -> float:
     return psnr_of(error / 255**2)
 
 
+def squares_of(psnr: float) -> float:
+    """The mean squared error of a PSNR, in squares of 8-bit levels."""
+    return 255**2 * 10 ** (-psnr / 10)
+
+
 Measure = Callable[[Scene], Measured]
 
 

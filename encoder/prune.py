@@ -54,15 +54,11 @@ class Pruned:
         """Whether anything is gone that was worth anything, or a channel."""
         return self.loss_db != 0 or sum(map(len, self.kept)) < self.features
 
-    def of_each_plane(self, numbers: PerPlane) -> list[dict[str, np.ndarray]]:
-        """The part of (..., M) numbers of each plane that belongs to what is left."""
-        pairs = zip(self.kept, numbers, strict=True)
-        return [{name: some[..., kept] for name, some in scale.items()} for kept, scale in pairs if len(kept)]
-
-    def of_pairs(self, numbers: PerPlane) -> list[dict[str, np.ndarray]]:
-        """The same of (..., M, M)."""
-        pairs = zip(self.kept, numbers, strict=True)
-        return [{name: some[..., kept, :][..., kept] for name, some in scale.items()} for kept, scale in pairs if len(kept)]
+    def of_each_plane(self, numbers: PerPlane, in_pairs: bool = False) -> list[dict[str, np.ndarray]]:
+        """The part of (..., M) numbers of each plane, or of (..., M, M) `in_pairs`, that belongs to what is left."""
+        left = [((..., kept[:, None], kept) if in_pairs else (..., kept), scale)
+                for kept, scale in zip(self.kept, numbers, strict=True) if len(kept)]
+        return [{name: some[part] for name, some in scale.items()} for part, scale in left]
 
 
 def renderings(features: int) -> int:

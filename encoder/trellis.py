@@ -66,6 +66,8 @@ PASSES = 4
 percent smaller."""
 SETS = 4
 """Of weights."""
+ALONE = np.zeros((0, 0, 0, 0), np.float32)
+"""For what goes together, where channels know nothing of each other."""
 TOLD_APART = 40
 """Magnitudes of errors whose bits are told apart."""
 
@@ -85,7 +87,7 @@ def quantise_on_trellis(
     matters = significant or [{name: np.ones(plane.shape, np.float32) for name, plane in scale.items()} for scale in scene.scales]
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the search holds no lock
         waiting = [{name: pool.submit(_steered, plane, planes[name], step[name], w[name], name in TIME_PLANES,
-                                      None if together is None else together[s][name])
+                                      ALONE if together is None else together[s][name])
                     for name, plane in scale.items() if only is None or (s, name) in only}
                    for s, (scale, planes, step, w) in enumerate(zip(quantised.scales, scene.scales, steps, matters, strict=True))]
         found = [{name: plane.result() for name, plane in scale.items()} for scale in waiting]
@@ -95,7 +97,7 @@ def quantise_on_trellis(
 
 def _steered(
     plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool,
-    together: np.ndarray | None = None,
+    together: np.ndarray = ALONE,
 ) -> QuantisedPlane:
     """A plane that is quantised to the nearest, with other symbols. What was left out stays so, and holds 0; and so does what is so near
     the identity that it is not worth telling.
@@ -117,8 +119,6 @@ def _steered(
     errors = np.zeros((values.shape[0] + 2, values.shape[1] + 2, values.shape[2]), np.float32)
     if identity:
         errors[1:-1, 1:-1] = np.where(known[..., None], 0, np.sqrt(worth) * -wanted)
-    if together is None:
-        together = np.zeros((-(-values.shape[0] // SIDE), -(-values.shape[1] // SIDE), 0, 0), np.float32)
     for _ in range(PASSES):
         symbols, counts = _search(wanted, worth, known, on_trellis, weights, bits, errors, together)
         weights, bits = fitted(neighbourhoods(symbols, known), SETS), _bits(counts)
@@ -144,7 +144,7 @@ def _search(
     """(H, W, M) int8 symbols of (H, W, M) numbers in steps, whose errors are worth as much as that; 0 where nothing is `known`; and how often
     errors came, as `bits`. `on_trellis`: whether symbols follow it; else any may follow, and survivors differ in which of their last three
     are odd. `errors`: (H + 2, W + 2, M) float32, u of all texels, one row and one column of 0 around; those of known ones are found anew.
-    `together`: as of `quantise_on_trellis`, or empty.
+    `together`: as of `quantise_on_trellis`, or ALONE.
 
     v, r, cross and the names of neighbours as in `kpc.format.symbols`; v0, r0 and errors of survivors are held by their states.
     """

@@ -112,7 +112,6 @@ def test_the_bill_is_what_pictures_show(spare: float) -> None:
 
 
 def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
-    # Of a smaller one the loss leaps by a quarter from one step to the next: which is met depends on the processor's rounding.
     scene = redundant(directed(tiny_scene(scales=3, resolution=(48, 40, 32)), 0.03))
     rays = rays_of(scene)
     numbers = [{name: np.arange(1.0, 9.0) for name in scale} for scale in scene.scales]
@@ -122,9 +121,10 @@ def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
     kept = coded.pruned.kept[1]
     assert [step.tolist() for step in coded.pruned.of_each_plane(numbers)[1].values()] == [(kept + 1.0).tolist()] * 6
     pairs = [{name: np.arange(64.0).reshape(1, 1, 8, 8) for name in scale} for scale in scene.scales]
-    for found in coded.pruned.of_pairs(pairs)[1].values():
+    for found in coded.pruned.of_each_plane(pairs, in_pairs=True)[1].values():
         np.testing.assert_array_equal(found[0, 0], 8.0 * kept[:, None] + kept)
-    assert 0.9 * 0.15 < coded.loss_db <= 0.15 and coded.size_bytes == len(file.encode(coded.scene))
+    # So small a scene's loss leaps by a quarter from one step to the next: how near it comes depends on the processor's rounding.
+    assert (SPARE + 0.15) / 2 < coded.loss_db <= 0.15 and coded.size_bytes == len(file.encode(coded.scene))
     fidelity = Fidelity(scene, rays)
     assert fidelity(scene) - fidelity(coded.scene.dequantise()) == pytest.approx(coded.loss_db, abs=1e-3)
 

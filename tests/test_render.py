@@ -37,19 +37,19 @@ def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bo
 @pytest.mark.parametrize("short", [0, 300])
 def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(short: int) -> None:
     scene = misty()
-    rays, field = rays_at(scene, 103), Field.from_scene(scene)
+    # So many rays that all samples fill vectors of 16: what is left over of one rounds otherwise, on one thread.
+    rays, field = rays_at(scene, 112), Field.from_scene(scene)
     told = rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step
     wanted = samples_of(*told)
     n = len(wanted.ray) - short
+    assert len(wanted.ray) % 16 == 0
     found = samples_of(*told, most=sample_capacity(scene.aabb, scene.step), capacity=n + (0 if short else 500))
     for name in ("ray", "points", "s", "length", "stretch", "cell"):
         assert torch.equal(getattr(found, name)[:n], getattr(wanted, name)[:n]), name
     assert len(found.ray) == n + (0 if short else 500) and not found.length[n:].any() and short < n
     if not short:
         one, two = (meet(field, rays, s, field.features, scene.extent) for s in (wanted, found))
-        # To the last bit or two: where an array ends, vector units may round otherwise.
-        torch.testing.assert_close(shade(field, rays, two), shade(field, rays, one), rtol=2.0**-22, atol=1e-7)
-        torch.testing.assert_close(two.weights[:n], one.weights, rtol=2.0**-22, atol=1e-9)
+        assert torch.equal(shade(field, rays, one), shade(field, rays, two)) and torch.equal(one.weights, two.weights[:n])
         assert torch.isclose(one.distortion, two.distortion, rtol=1e-5)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scenes import tiny_scene
 
 from kpc.encoder import trellis
-from kpc.encoder.trellis import STATES, TOLD_APART, quantise_on_trellis
+from kpc.encoder.trellis import ALONE, STATES, TOLD_APART, quantise_on_trellis
 from kpc.format import file
 from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
 from kpc.format.scene import TIME_PLANES, Scene
@@ -33,10 +33,6 @@ def steered(scene: Scene, step: float, significant: list[dict[str, np.ndarray]] 
 NO_WEIGHTS = np.zeros((1, WEIGHTS), np.int8)
 FREE = np.zeros((ACTIVITIES, TOLD_APART))
 """Every error costs nothing."""
-
-
-ALONE = np.zeros((0, 0, 0, 0), np.float32)
-"""Channels know nothing of each other."""
 
 
 def searched(wanted: np.ndarray, known: np.ndarray, bits: np.ndarray = FREE, worth: np.ndarray | None = None,

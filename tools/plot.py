@@ -80,7 +80,7 @@ def rate_distortion(records: Sequence[results.Record]) -> Figure:
     if not scenes:
         raise FormatError("no records of kpbench codec to draw; write some with kpbench codec --out")
     names = list(dict.fromkeys(record["coder"] for coders in scenes.values() for record in coders))
-    ours = [name for name in names if name.startswith("kpc")]
+    ours = [name for name in names if results.is_ours(name)]
     looks = {name: {"color": "C0", "linestyle": DASHES[number % len(DASHES)]} for number, name in enumerate(ours)}
     looks |= {name: {"color": f"C{1 + number}"} for number, name in enumerate(n for n in names if n not in ours)}
     lines = {}
@@ -89,9 +89,10 @@ def rate_distortion(records: Sequence[results.Record]) -> Figure:
     for axes, (name, coders) in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes.items()):
         for record in coders:
             points = sorted(record["points"], key=lambda point: float(point["size_bytes"]))
+            is_whole = record["coder"] == "kpc"
             lines[record["coder"]], = axes.plot(
                 [p["bits_per_parameter"] for p in points], [p["psnr"] for p in points], marker="o", markersize=3,
-                linewidth=2.2 if record["coder"] == "kpc" else 1, zorder=3 if record["coder"] == "kpc" else 2, **looks[record["coder"]])  # fmt: skip
+                linewidth=2.2 if is_whole else 1, zorder=3 if is_whole else 2, **looks[record["coder"]])  # fmt: skip
         best = max(p["psnr"] for record in coders for p in record["points"])
         axes.set(xlabel="bits per parameter", ylabel="PSNR, dB", title=name, ylim=(best - DEEPEST_DB, best + 0.1))
         _logarithmic(axes)

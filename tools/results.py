@@ -110,6 +110,11 @@ def _shares(record: Record) -> str:
     return ", ".join(f"{kind} {share:.0%}" for kind, share in largest if share >= 0.01) or "-"
 
 
+def is_ours(coder: str) -> bool:
+    """Whether it is our coder, whole or with something left out."""
+    return coder.startswith("kpc")
+
+
 def _quality_table(records: Iterable[Record]) -> list[list[str]]:
     """What each quality gives: of our coder alone, bytes and loss."""
     rows = []
@@ -127,7 +132,7 @@ def _quality_table(records: Iterable[Record]) -> list[list[str]]:
 
 
 def _loss_table(records: Sequence[Record]) -> list[list[str]]:
-    """Our bytes at each of LOSSES_DB, and by how much the smallest of what is at hand is larger there."""
+    """Our bytes at each of LOSSES_DB, and how much less that is than the smallest of what is at hand."""
     from kpc.tools.curves import size_at  # SciPy: not needed for any other table
 
     rows = []
@@ -136,7 +141,7 @@ def _loss_table(records: Sequence[Record]) -> list[list[str]]:
         row = [name]
         for loss in LOSSES_DB:
             ours = size_at(points.get("kpc", []), loss)
-            sizes = {coder: size for coder in points if not coder.startswith("kpc") and (size := size_at(points[coder], loss))}
+            sizes = {coder: size for coder in points if not is_ours(coder) and (size := size_at(points[coder], loss))}
             best = min(sizes, key=lambda coder: sizes[coder], default=None)
             row.append("-" if ours is None else f"{ours / 1e3:.0f} KB" + (f", {1 - ours / sizes[best]:.0%} ({best})" if best else ""))
         rows.append(row)
