@@ -1,10 +1,11 @@
 """From a scene to symbols: how coarse each channel of each plane may be, how much each texel matters, and how coarse all may be together.
 
-One factor on all steps states the trade between size and fidelity. A user names what it should bring (`Trade`), and it is sought.
+One factor on all steps states the trade between size and fidelity. A user names what it should bring (`Trade`), and it is sought
+(`kpc.encoder.search`).
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,9 +13,9 @@ import numpy as np
 
 from kpc.encoder.curvature import PerPlane
 from kpc.encoder.probe import Measure, Measured, squares_of
+from kpc.encoder.search import TOLERANCE, cheapest, farthest, farthest_tuned
 from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format import file
-from kpc.format.errors import TrainingError
 from kpc.format.motion import STEP
 from kpc.format.quantise import QuantisedScene, reached_by
 from kpc.format.scene import Scene
@@ -23,31 +24,21 @@ FINEST, COARSEST = -13.0, 2.0
 """Base-two logarithms of the factors on all steps, between which one is sought for a trained scene."""
 COARSER = 12.0
 """The same of the coarsest for a file that is coded again, whether as it is or with something left out; the finest is its own."""
-TOLERANCE = 0.02
-"""A search ends this share below what it may not exceed."""
+USUAL, USUALLY_COARSER = -9.5, 1.0
+"""Where searches between them begin."""
+ERRORS_GROW, BYTES_GROW = 2 * math.log(2), 0.5
+"""What logarithms grow by per octave, of errors with coarser steps, with their square, and of bytes with finer ones, about."""
 ROUGHLY = 0.2
-"""The same of a search for where to tune."""
-GRAIN = 0.02
-"""Octaves. Steps that differ by less err differently, but on average the same."""
-ATTEMPTS = 16
-"""After its first, a search makes at most so many."""
-PROBES = 10
+"""How far, as `search.TOLERANCE`, a search may end below that is only to tell where to tune, or what a size costs."""
+PROBES = 8
 """Scenes that a search renders, about."""
-GOLDEN = (math.sqrt(5) - 1) / 2
-NEAR = 0.3
-"""Octaves within which the least cost is sought; at the least it hardly changes."""
 
 DEFAULT_LOSS_DB = 0.15
 
-TUNINGS = 4
-"""At most so many codings are tuned: each takes a minute, about. Mostly two are."""
 ENOUGH_BYTES, ENOUGH_ERROR = 0.05, 0.1
 """A tuned coding this share below the bytes or the error that it may not exceed is good enough: errors are foreseen less well."""
 ERRORS_LEFT, BYTES_MADE = 0.7, 1.01
 """What tuning makes of errors and of bytes, about: so it is known where to begin."""
-APART = 0.3
-"""Octaves between two steps that tell how errors and bytes follow them."""
-
 TRUST = 0.8
 """In what curvature says of the differences between texels and channels, `significance`. Room and liam, at equal error of held-out views:
 files are 1 to 2 % larger with 1; 0.7 and 0.9 make no difference."""
@@ -93,10 +84,10 @@ class Trade:
         return "max_loss_db", DEFAULT_LOSS_DB
 
     def loss_db(self, psnr: float) -> float:
-        """What coding may cost, about, where the uncoded scene has so many dB: D adds to its own mean squared error."""
+        """What coding may cost, about, where the uncoded scene has so many dB: D adds to its own mean squared error. Of a size nobody knows."""
         name, value = self.bound
         if name == "target_bytes":
-            return DEFAULT_LOSS_DB
+            return math.nan
         if name == "max_loss_db":
             return value
         if name == "psnr_db":
@@ -199,21 +190,20 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
 def compress(
     scene: Scene, steps: Steps, significant: PerPlane, measure: Measure, uncoded_psnr: float, trade: Trade,
     as_it_is: QuantisedScene | None = None, quantise: Quantise = quantise_on_trellis, tune: Tune | None = None,
-    own_steps: bool = False,
+    own_steps: bool = False, tolerance: float = TOLERANCE,
 ) -> Attempt:
-    """The quantisation that a trade asks for.
+    """The quantisation that a trade asks for; of a size that no file has, the smallest.
 
     Args:
         measure: judges a coding; `uncoded_psnr` is that of the scene before anything was left out.
         as_it_is: the file that holds just this scene, with these steps.
         tune: what makes a better coding at some steps, and takes its time: the trade is met by such a one.
         own_steps: `steps` are those of a file, of which something may have been left out since: nothing finer makes sense.
-
-    Raises:
-        TrainingError: no file of this model is as small as the trade wants.
+        tolerance: as of `kpc.encoder.search.farthest`.
     """
     reached = reached_by(scene)
-    finest, coarsest = (0.0, COARSER) if own_steps or as_it_is is not None else (FINEST, COARSEST)
+    own_steps = own_steps or as_it_is is not None
+    finest, coarsest, guess = (0.0, COARSER, USUALLY_COARSER) if own_steps else (FINEST, COARSEST, USUAL)
     tried: dict[float, Attempt] = {}
 
     def attempt(exponent: float) -> Attempt:
@@ -229,131 +219,26 @@ def compress(
 
     name, bound = trade.bound
     if name == "lam":
-        found = _cheapest(finest, coarsest, attempt, lambda found: found.cost(bound))
+        found = cheapest(finest, coarsest, attempt, lambda found: found.cost(bound))
         return found if tune is None else min(found, tuned(found.exponent), key=lambda found: found.cost(bound))
+    value: Callable[[Attempt], float]
     if name == "target_bytes":
         if as_it_is is not None and (whole := attempt(0.0)).size_bytes <= bound:
             return whole
-        start, end, most, value = coarsest, finest, bound, lambda found: found.size_bytes
+        start, end, most, slope, value = coarsest, finest, bound, BYTES_GROW, lambda found: found.size_bytes
     elif name == "quality":
-        start, end, most, value = finest, coarsest, error_of(bound), lambda found: found.measured.error
+        start, end, most, slope, value = finest, coarsest, error_of(bound), ERRORS_GROW, lambda found: found.measured.error
     else:
-        start, end, most = finest, coarsest, trade.loss_db(uncoded_psnr)
+        start, end, most, slope = finest, coarsest, trade.loss_db(uncoded_psnr), ERRORS_GROW
         value = lambda found: uncoded_psnr - found.measured.psnr
-    better, enough = None, ENOUGH_BYTES if name == "target_bytes" else ENOUGH_ERROR
-    spent: Callable[[Attempt], float] = lambda found: found.measured.error if name == "target_bytes" else found.size_bytes
-    if tune is not None:
-        found = _farthest(start, end, attempt, value, most, ROUGHLY)
-        better = _farthest_tuned(start, end, found, tuple(tried.values()), tuned, value, most, enough)
-        if better is not None and value(better) >= (1 - enough) * most and spent(better) < spent(found):
-            return better
-    found = _farthest(start, end, attempt, value, most)
-    if better is not None and spent(better) < spent(found):
+    if tune is None:
+        return farthest(start, end, guess, attempt, value, most, slope, tolerance)
+    by_size = name == "target_bytes"
+    made, enough = (BYTES_MADE, ENOUGH_BYTES) if by_size else (ERRORS_LEFT, ENOUGH_ERROR)
+    spent: Callable[[Attempt], float] = lambda found: found.measured.error if by_size else found.size_bytes
+    found = farthest(start, end, guess, attempt, value, most, slope, ROUGHLY)
+    better = farthest_tuned(start, end, found, tried.values(), tuned, value, most, enough, made, slope)
+    if better is not None and value(better) >= (1 - enough) * most and spent(better) < spent(found):
         return better
-    if name == "target_bytes" and found.size_bytes > bound:
-        raise TrainingError(f"{found.size_bytes:,} bytes is the least that this model takes, not {int(bound):,}; give "
-                            "another --target-size, or train anew with a smaller --preset")
-    return found
-
-
-def _farthest_tuned(
-    start: float, end: float, found: Attempt, tried: Sequence[Attempt], tuned: Callable[[float], Attempt],
-    value: Callable[[Attempt], float], most: float, enough: float,
-) -> Attempt | None:
-    """A coding that is tuned, whose value is `most` or less, by the share `enough` where a few tunings come so near; None where none has it.
-
-    It is sought where its value should be so: how the logarithm of the value follows that of the steps is known from what was `tried`,
-    of which `found` is the best without tuning, and ever better from what was tuned.
-    """
-    others = [one for one in tried if abs(one.exponent - found.exponent) >= APART and value(one) > 0]
-    if not others or not 0 < value(found) <= most:
-        return None
-    other = min(others, key=lambda one: abs(one.exponent - found.exponent))
-    slope = math.log(value(other) / value(found)) / (other.exponent - found.exponent)
-    rises_towards_finer = end < start  # as bytes do, and errors do not
-    if not math.isfinite(slope) or slope == 0 or (slope < 0) != rises_towards_finer:
-        return None
-    expected = value(found) * (BYTES_MADE if rises_towards_finer else ERRORS_LEFT)
-    wanted = math.log(most * (1 - enough / 2))
-    exponent, best = found.exponent + (wanted - math.log(expected)) / slope, None
-    known: list[tuple[float, float]] = []
-    for _ in range(TUNINGS):
-        candidate = tuned(min(max(exponent, min(start, end)), max(start, end)))
-        reached = value(candidate)
-        if not reached > 0:  # so with NaN
-            break
-        if reached <= most and (best is None or reached > value(best)):
-            best = candidate
-        if (1 - enough) * most <= reached <= most:
-            break
-        known.append((candidate.exponent, math.log(reached)))
-        exponent = _where(known, wanted, slope)
-    return best
-
-
-def _where(known: Sequence[tuple[float, float]], wanted: float, slope: float) -> float:
-    """The place of a wanted value on the line through the two known (place, value) nearest to it; where there is but one, or that line is
-    steeper or flatter than the slope by more than a factor of three, on one through the latest with that slope."""
-    nearest = sorted(known, key=lambda point: abs(point[1] - wanted))[:2]
-    place, value = known[-1]
-    if len(nearest) == 2 and nearest[0][0] != nearest[1][0]:
-        (one, low), (other, high) = nearest
-        own = (high - low) / (other - one)
-        if 1 / 3 < own / slope < 3:
-            place, value, slope = one, low, own
-    return place + (wanted - value) / slope
-
-
-def _farthest(
-    start: float, end: float, attempt: Callable[[float], Attempt], value: Callable[[Attempt], float], most: float,
-    tolerance: float = TOLERANCE,
-) -> Attempt:
-    """What `attempt` makes of the exponent farthest from `start` towards `end`, along which `value` rises, where that is `most`
-    or less; of `start` where nowhere.
-
-    Bisects until the value is known and positive on both sides, then goes by its logarithm, nearly a straight line, but never
-    nearer to an end than a tenth of the way. Where both sides come within GRAIN, `value` is rough: then what lies a few grains on.
-    Ends when the tolerance is met, or after ATTEMPTS.
-    """
-    best = attempt(start)
-    low, high = value(best), math.nan
-    if not low <= most:
-        return best
-    grains = 0
-    for _ in range(ATTEMPTS):
-        if low >= (1 - tolerance) * most:
-            break
-        if abs(end - start) < GRAIN:
-            grains += 1
-            candidate = attempt(end + math.copysign(grains * GRAIN, end - start))
-            if low < value(candidate) <= most:
-                low, best = value(candidate), candidate
-            continue
-        share = 0.5
-        if low > 0 and math.isfinite(high):
-            way = math.log(most * (1 - tolerance / 2) / low) / math.log(high / low)
-            share = min(max(way, 0.1), 0.9)
-        middle = start + share * (end - start)
-        candidate = attempt(middle)
-        found = value(candidate)
-        if found <= most:  # not so with NaN
-            start, low, best = middle, found, candidate
-        else:
-            end, high = middle, found
-    return best
-
-
-def _cheapest(low: float, high: float, attempt: Callable[[float], Attempt], cost: Callable[[Attempt], float]) -> Attempt:
-    """What `attempt` makes of the exponent of least cost, by golden section: it falls, then rises."""
-    left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-    one, other = attempt(left), attempt(right)
-    while high - low > NEAR:
-        if cost(one) <= cost(other):
-            high, right, other = right, left, one
-            left = high - GOLDEN * (high - low)
-            one = attempt(left)
-        else:
-            low, left, one = left, right, other
-            right = low + GOLDEN * (high - low)
-            other = attempt(right)
-    return min(one, other, key=cost)
+    found = farthest(start, end, guess, attempt, value, most, slope, tolerance, tried.values())
+    return better if better is not None and spent(better) < spent(found) else found

@@ -7,7 +7,7 @@ judged by its own pictures.
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import torch
 
 from kpc.encoder.checkpoint import save_state
 from kpc.encoder.compress import (
-    MOTION_SHARE, Quantise, Trade, compress, error_at, relative_steps, significance, with_coarser_motion,
+    MOTION_SHARE, ROUGHLY, Quantise, Trade, compress, error_at, relative_steps, significance, with_coarser_motion,
 )
 from kpc.encoder.curvature import Curvature, PerPlane, curvature
 from kpc.encoder.probe import Measured, Probe
@@ -105,13 +105,18 @@ def code(
         steps = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in coded.scales]
     measure = model.probe.measure(scene)
     whole = measure(scene).psnr
-    spare = prune_share * trade.loss_db(whole)
+    chosen: Quantise = quantise or (lambda *given: quantise_on_trellis(*given, together=together))  # of what is left, too
+    loss_db = trade.loss_db(whole)
+    if trade.target_bytes is not None:  # what that costs is known when it has been tried
+        roughly = compress(scene, steps, significant, measure, whole, trade, coded, chosen, tolerance=ROUGHLY)
+        loss_db = max(0.0, whole - roughly.measured.psnr)
+    spare = prune_share * loss_db
     if spare > 0 and isinstance(scene.decoder, Decoder):  # no other is linear
         pruned = prune(scene, model.probe.rays, lambda candidate: measure(candidate).psnr, spare)
         if coded is None or pruned.left_out_any:
             scene, coded = pruned.scene, None
             steps, significant, together = pruned.of_each_plane(steps), pruned.of_each_plane(significant), pruned.of_each_plane(together, in_pairs=True)
-    coarser = with_coarser_motion(scene, measure, MOTION_SHARE * error_at(whole, trade.loss_db(whole)))
+    coarser = with_coarser_motion(scene, measure, MOTION_SHARE * error_at(whole, loss_db))
     if coarser is not scene:
         scene, coded = coarser, None
 
@@ -121,8 +126,11 @@ def code(
 
         return tuned(scene, model.scene, choose, tune_steps, shown)
 
-    found = compress(scene, steps, significant, measure, whole, trade, coded, quantise or partial(quantise_on_trellis, together=together), tune if tune_steps else None,
+    found = compress(scene, steps, significant, measure, whole, trade, coded, chosen, tune if tune_steps else None,
                      own_steps=model.coded is not None)
+    if trade.target_bytes is not None and found.size_bytes > trade.target_bytes:
+        raise TrainingError(f"{found.size_bytes:,} bytes is the least that this model takes, not {trade.target_bytes:,}; give "
+                            "another --target-size, or train anew with a smaller --preset")
     measured: Measured = found.measured
     return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, spare)
 
