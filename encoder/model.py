@@ -6,7 +6,7 @@ judged by its own pictures.
 
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from kpc.format import file
 from kpc.format.cameras import Camera
 from kpc.format.container import MAGIC
 from kpc.format.errors import FormatError, TrainingError, UsageError
-from kpc.format.quantise import QuantisedScene, quantise_scene
+from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_scene
 from kpc.format.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 
@@ -105,7 +105,8 @@ def code(
         steps = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in coded.scales]
     measure = model.probe.measure(scene)
     whole = measure(scene).psnr
-    chosen: Quantise = quantise or (lambda *given: quantise_on_trellis(*given, together=together))  # of what is left, too
+    chosen: Quantise = quantise or (  # of channels that are left, too
+        lambda scene, steps, reached, significant: quantise_on_trellis(scene, steps, reached, significant, together=together))
     loss_db = trade.loss_db(whole)
     if trade.target_bytes is not None:  # what that costs is known when it has been tried
         roughly = compress(scene, steps, significant, measure, whole, trade, coded, chosen, tolerance=ROUGHLY)
@@ -156,8 +157,19 @@ def begins_with(path: Path, magic: bytes) -> bool:
 
 def model_of(coded: QuantisedScene) -> Model:
     """A scene as a file holds it, to be coded again."""
+    coded = with_two_texels(coded)
     scene = coded.dequantise()
     return Model(scene, Probe.of_cameras(scene), coded)
+
+
+def with_two_texels(coded: QuantisedScene) -> QuantisedScene:
+    """The same pictures of planes with at least two texels along either axis, as training wants them: files may hold one, all along the axis."""
+    def widened(plane: QuantisedPlane) -> QuantisedPlane:
+        twice = [2 if size == 1 else 1 for size in plane.coded.shape]
+        symbols, known = (a.repeat(twice[0], axis=0).repeat(twice[1], axis=1) for a in (plane.symbols, plane.coded))
+        return replace(plane, symbols=symbols, coded=known)
+
+    return replace(coded, scales=tuple({name: widened(plane) for name, plane in scale.items()} for scale in coded.scales))
 
 
 # --- finished checkpoints
@@ -227,7 +239,7 @@ def _check(scene: Scene, probe: Probe) -> None:
     """What coding relies on beyond the rules of files."""
     for planes in scene.scales:
         for name, plane in planes.items():
-            if plane.dtype != np.float32:
+            if plane.dtype != np.float32 or min(plane.shape[:2]) < 2:
                 raise ValueError(name)
     n = len(probe.times)
     wanted = {"origins": (n, 3), "directions": (n, 3), "times": (n,), "truth": (n, 3)}

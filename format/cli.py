@@ -27,6 +27,10 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         return _fail(name, str(error), 1)
     except KeyboardInterrupt:
         return _fail(name, "interrupted", 130)
+    except SystemError as error:  # what compiled functions make of an interruption that reaches them
+        if not any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):
+            raise
+        return _fail(name, "interrupted", 130)
     except BrokenPipeError:
         sys.stderr.close()  # the reader of our output has gone: nothing is left to tell it
         return 1
@@ -36,6 +40,13 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         where = f"{error.filename}: " if error.filename is not None else ""
         return _fail(name, f"{where}{error.strerror or error}", 1)
     return 0
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An exception, what caused it, and so on."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def _fail(name: str, message: str, code: int) -> int:

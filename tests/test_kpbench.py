@@ -26,6 +26,9 @@ SMALL = replace(PRESETS["draft"], resolutions=(8, 16), samples_across=32, cells_
                 occupancy_start=8, occupancy_every=4)  # fmt: skip
 
 
+GROUPS = str(Path(__file__).parents[1] / "spec" / "vectors" / "valid" / "groups.kpc")
+
+
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch, one_thread: None) -> None:
     """In this process, with little to do. What would go to one of its own and come back is pickled, as it would be."""
@@ -204,7 +207,8 @@ def test_senseless_minutes_are_refused(minutes: str, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(
-    "command", [["encode", "missing"], ["curve", "missing"], ["ablate", "missing"], ["player", "missing.kpc"], ["player", "x.kpc", "--out", "no/x"]]
+    "command", [["encode", "missing"], ["curve", "missing"], ["ablate", "missing"], ["player", "missing.kpc"], ["player", "x.kpc", "--out", "no/x"],
+                ["player", GROUPS]]
 )
 def test_errors_are_one_line(command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                              capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip

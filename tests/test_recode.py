@@ -14,6 +14,7 @@ import torch
 from scenes import SPACES, tiny_scene, varied
 
 from kpc.encoder import kpenc, model, probe, tuning
+from kpc.encoder.compress import Trade
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.probe import ASSUMED_MSE, Probe, around
@@ -21,11 +22,13 @@ from kpc.format import file
 from kpc.format.errors import TrainingError
 from kpc.format.quantise import quantise_scene
 from kpc.format.scene import Scene
+from kpc.player import reference
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 TINY = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
                    occupancy_start=8, occupancy_every=4)  # fmt: skip
 
+VECTORS = Path(__file__).parents[1] / "spec" / "vectors" / "valid"
 Kpenc = Callable[..., dict[str, Any]]
 
 
@@ -245,6 +248,34 @@ def test_a_trade_that_makes_no_sense(words: list[str], tmp_path: Path, capsys: p
     with pytest.raises(SystemExit, match="2"):
         kpenc.main([str(tmp_path), "-o", str(tmp_path / "x.kpc"), *words])
     assert words[0] in capsys.readouterr().err
+
+
+# --- what no training makes, but files may hold
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z", "t"])
+def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
+    """They hold the same all along the axis, and so do two."""
+    scene = tiny_scene()
+    thin = {name: plane[: 1 if axis == name[1] else None, : 1 if axis == name[0] else None] for name, plane in scene.scales[0].items()}
+    whole = quantise_scene(replace(scene, scales=(thin, scene.scales[1])), [{name: 0.01 for name in planes} for planes in scene.scales])
+    with pytest.raises(ValueError, match="one texel"):
+        SceneRenderer(whole.dequantise())
+    source = model.model_of(whole)
+    camera = scene.cameras[0]
+    origins, directions = camera.rays()
+    times = np.full(len(origins), 0.4, np.float32)
+    shown = SceneRenderer(source.scene).rgb(origins, directions, times).reshape(camera.height, camera.width, 3)
+    np.testing.assert_allclose(shown, reference.render(whole.dequantise(), camera, 0.4).rgb, atol=2e-3)
+    coded = model.code(source, Trade(), TrainConfig().prune_share, 1)
+    assert coded.loss_db <= 0.15 and file.read(coded.data).scales[0].keys() == thin.keys()
+
+
+@pytest.mark.parametrize("name", ["appearances", "cells-one", "contracted", "device-coordinates", "dynamic", "hybrid-moved", "limits-large"])
+def test_files_of_all_kinds_are_coded_again(name: str) -> None:
+    source = model.model_of(file.read(VECTORS / f"{name}.kpc"))
+    coded = model.code(source, Trade(), TrainConfig().prune_share, 1)
+    assert coded.loss_db <= 0.15 and len(file.encode(file.read(coded.data))) == coded.size_bytes
 
 
 # --- probes

@@ -67,7 +67,7 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
     agreements: list[list[float]] = [[] for _ in timeline.spans]
     for number, span in enumerate(timeline.spans):
         some = dataset.between(span.start, span.last)
-        renderer = SceneRenderer(file.read(groups.open(number)).dequantise())
+        renderer = SceneRenderer(with_two_texels(file.read(groups.open(number))).dequantise())
         at = np.rint(some.pictures.time * (span.count - 1)).astype(int) + span.start - first  # frame of each picture
         for picture in sorted(map(int, np.flatnonzero(some.pictures.is_test)), key=lambda p: int(at[p])):
             frame, camera = int(at[picture]), int(some.pictures.camera[picture])

@@ -35,11 +35,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-import kpc
-from kpc.format import cli
+from kpc.format import cli, file
 from kpc.format.errors import KpcError, UsageError
 from kpc.format.fidelity import psnr
 from kpc.format.memory import peak_memory_bytes
+from kpc.format.scene import Scene
 from kpc.player.quality import DEFAULT, LADDER
 from kpc.tools import results
 from kpc.tools.children import end_with_parent
@@ -293,7 +293,7 @@ def _player(options: argparse.Namespace, origin: results.Record) -> Iterator[res
     """A record for each scene and rung of the ladder of qualities. A repeat draws all of them by turns, frame by frame, so that
     whatever else the machine does slows them all alike."""
     for source in options.scenes:
-        kpc.load(source)  # what is wrong with it is told before anything is measured
+        file.read(source)  # what is wrong with it is told before anything is measured
         common = {"size": "{}x{}".format(*options.size), "frames": options.frames, "warm_up": WARM_UP, "default": DEFAULT}
         record = _record("player", source, origin, common)
         job = Play(source, options.size, options.frames)
@@ -306,7 +306,7 @@ def _player(options: argparse.Namespace, origin: results.Record) -> Iterator[res
                             "repeats": [repeat[name] for repeat in repeats]}  # fmt: skip
 
 
-def _frame_times(scene: kpc.Scene, frames: int, last: float) -> np.ndarray:
+def _frame_times(scene: Scene, frames: int, last: float) -> np.ndarray:
     """(frames,) times of one frame of the clip after another, up to `last`."""
     each = 1 / max(scene.clip.frame_count - 1, 1)
     return np.clip(last - each * np.arange(frames)[::-1] % 1.0, 0.0, 1.0)
@@ -324,7 +324,7 @@ def _play_once(job: Play) -> dict[str, results.Record]:
     ctx = offscreen.open_context()
     screen = ctx.simple_framebuffer(job.size, components=4)
     opened = clock.perf_counter()
-    scene = kpc.load(job.scene)
+    scene = file.read(job.scene).dequantise()
     loaded = clock.perf_counter()
     camera = fitted(Rig.of(scene).cameras[0], *job.size)
 
@@ -419,7 +419,7 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
     from kpc.player.renderer import Renderer
 
     ctx = offscreen.open_context()
-    scene = kpc.load(job.scene)
+    scene = file.read(job.scene).dequantise()
     times = _frame_times(scene, LEAD_IN, MIDDLE)
     smaller = min(1.0, (COMPARED / (job.size[0] * job.size[1])) ** 0.5)
     size = round(smaller * job.size[0]), round(smaller * job.size[1])

@@ -16,7 +16,6 @@ from typing import Any
 import moderngl
 import numpy as np
 
-import kpc
 from kpc.format.container import open_source
 from kpc.format.errors import KpcError
 from kpc.format.fidelity import psnr_of
@@ -56,7 +55,7 @@ def measure(job: Arrival) -> dict[str, Any]:
     found |= {f"disk_{key}": value for key, value in _arrival(ctx, screen, job, str(job.scene)).items()}
     with served(job.scene, "--rate", RATE, "--delay", DELAY) as url:
         found |= {f"line_{key}": value for key, value in _arrival(ctx, screen, job, url).items()}
-    if kpc.load(job.scene).is_dynamic:
+    if read(job.scene).is_dynamic:
         with TemporaryDirectory() as folder:
             with served(_lengthened(job.scene, Path(folder))) as url:
                 found |= _jumps(ctx, screen, job, url)
@@ -115,7 +114,7 @@ def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, ur
 
 def prefixes(job: Arrival) -> list[dict[str, Any]]:
     """How near the picture of each prefix is to that of the whole file, where a scale, or a segment over all scales, ends."""
-    ctx, whole = offscreen.open_context(), kpc.load(job.scene)
+    ctx, whole = offscreen.open_context(), read(job.scene).dequantise()
     camera = fitted(Rig.of(whole).cameras[0], *job.size)
     scene = PartialScene(SceneReader(str(job.scene), in_parts=True))
     reference = Renderer(ctx, whole)

@@ -1,0 +1,36 @@
+"""What commands raise becomes an exit code and a line, or goes on as a bug."""
+
+import errno
+from collections.abc import Callable
+
+import pytest
+
+from kpc.format import cli
+from kpc.format.errors import FormatError, UsageError
+
+
+def raising(error: BaseException, cause: BaseException | None = None) -> Callable[[list[str]], None]:
+    def command(argv: list[str]) -> None:
+        raise error from cause
+
+    return command
+
+
+@pytest.mark.parametrize("error, cause, code, line", [
+    (FormatError("a.kpc: cut\noff"), None, 1, "a.kpc: cut off"), (UsageError("no such option"), None, 2, "no such option"),
+    (OSError(errno.ENOENT, "nothing there", "b.kpc"), None, 1, "b.kpc: nothing there"), (OSError(errno.ENOSPC, "full"), None, 1, "full"),
+    (KeyboardInterrupt(), None, 130, "interrupted"), (SystemError("compiled"), KeyboardInterrupt(), 130, "interrupted"),
+])  # fmt: skip
+def test_what_a_user_can_mend_is_one_line(
+    error: BaseException, cause: BaseException | None, code: int, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(raising(error, cause), "kpx", []) == code
+    assert capsys.readouterr() == ("", f"kpx: {line}\n")
+
+
+@pytest.mark.parametrize("error, cause", [
+    (SystemError("compiled"), None), (SystemError("compiled"), ValueError()), (ValueError("x"), None), (OSError(errno.EIO, "x"), None),
+])  # fmt: skip
+def test_bugs_keep_their_traceback(error: Exception, cause: Exception | None) -> None:
+    with pytest.raises(type(error)):
+        cli.run(raising(error, cause), "kpx", [])
