@@ -16,7 +16,7 @@ import torch
 
 from kpc.encoder.checkpoint import save_state
 from kpc.encoder.compress import (
-    MOTION_SHARE, ROUGHLY, Quantise, Trade, compress, error_at, relative_steps, significance, with_coarser_motion,
+    MOTION_SHARE, ROUGHLY, Attempt, Quantise, Trade, compress, error_at, relative_steps, significance, with_coarser_motion,
 )
 from kpc.encoder.curvature import Curvature, PerPlane, curvature
 from kpc.encoder.probe import Measured, Probe
@@ -132,6 +132,8 @@ def code(
     if trade.target_bytes is not None and found.size_bytes > trade.target_bytes:
         raise TrainingError(f"{found.size_bytes:,} bytes is the least that this model takes, not {trade.target_bytes:,}; give "
                             "another --target-size, or train anew with a smaller --preset")
+    if model.coded is not None and len(file.encode(model.coded)) <= found.size_bytes:  # it was better off as it was
+        found, pruned = Attempt(model.coded, measure, 0.0), None
     measured: Measured = found.measured
     return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, spare)
 

@@ -276,6 +276,7 @@ def test_files_of_all_kinds_are_coded_again(name: str) -> None:
     source = model.model_of(file.read(VECTORS / f"{name}.kpc"))
     coded = model.code(source, Trade(), TrainConfig().prune_share, 1)
     assert coded.loss_db <= 0.15 and len(file.encode(file.read(coded.data))) == coded.size_bytes
+    assert coded.size_bytes <= len(file.encode(source.coded))  # type: ignore[arg-type]
 
 
 # --- probes
