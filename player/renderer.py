@@ -149,8 +149,8 @@ def room_on(ctx: moderngl.Context, what: str) -> Iterator[None]:
 
 
 def _texels_across(scale: Mapping[str, np.ndarray]) -> int:
-    """Along the longest edge of the box, from the first one's middle to the last one's."""
-    return max(size - 1 for plane in SPACE_PLANES for size in scale[plane].shape[:2])
+    """Along the longest edge of the box, from the first one's middle to the last one's; 1 where one is all there is."""
+    return max(1, *(size - 1 for plane in SPACE_PLANES for size in scale[plane].shape[:2]))
 
 
 def _bounds(blocks: np.ndarray) -> tuple[int, int, int, int]:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import gl
 import numpy as np
@@ -9,10 +10,12 @@ import pytest
 from scenes import SPACES, displaced, hybrid, look_at, surrounded, tiny_scene, varied
 
 from kpc.encoder.prune import without
+from kpc.format import file
 from kpc.format.cameras import Camera
 from kpc.format.errors import DisplayError
 from kpc.format.scene import Scene
-from kpc.player.quality import Quality
+from kpc.player.orbit import Rig, fitted
+from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, render
 from kpc.player.renderer import Look, Renderer
 
@@ -284,3 +287,28 @@ def test_an_error_of_the_card_is_told() -> None:
     renderer.ctx = Card()
     with pytest.raises(DisplayError, match=r"GL_OUT_OF_MEMORY on some card; .*smaller size"):
         renderer.check()
+
+
+VECTORS = Path(__file__).parents[1] / "spec" / "vectors" / "valid"
+WHOLE = sorted(path.stem for path in VECTORS.glob("*.kpc") if "prefix" not in path.stem and "groups" not in path.stem)
+TOO_LARGE = {"limits-axes": "texture of 16384x16391", "limits-hybrid": "weights"}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_conformance_files_are_drawn_at_every_quality(name: str) -> None:
+    """Planes of one texel or thousands, one row of time or many: whatever a file may hold."""
+    scene = file.read(VECTORS / f"{name}.kpc").dequantise()
+    if name == "limits-axes" and gl.context().info["GL_MAX_TEXTURE_SIZE"] > 16384:
+        pytest.skip("this card takes planes that are too large for others")
+    if name in TOO_LARGE:
+        with pytest.raises(DisplayError, match=TOO_LARGE[name]):
+            Renderer(gl.context(), scene)
+        return
+    camera = fitted(Rig.of(scene).cameras[0], 32, 24)
+    renderer = Renderer(gl.context(), scene)
+    for quality in LADDER.values():
+        renderer.quality = quality
+        drawn = renderer.render(camera, 0.4)
+        assert np.isfinite(drawn.rgb).all()
+    check(drawn, render(scene, camera, 0.4))
+    renderer.release()
