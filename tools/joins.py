@@ -8,6 +8,7 @@ import numpy as np
 
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluate import SceneRenderer, true_picture
+from kpc.encoder.model import with_two_texels
 from kpc.format import file
 from kpc.format.fidelity import psnr
 from kpc.format.groups import Groups
