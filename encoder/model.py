@@ -132,8 +132,8 @@ def code(
     if trade.target_bytes is not None and found.size_bytes > trade.target_bytes:
         raise TrainingError(f"{found.size_bytes:,} bytes is the least that this model takes, not {trade.target_bytes:,}; give "
                             "another --target-size, or train anew with a smaller --preset")
-    if model.coded is not None and len(file.encode(model.coded)) <= found.size_bytes:  # it was better off as it was
-        found, pruned = Attempt(model.coded, measure, 0.0), None
+    if model.coded is not None and (as_it_was := Attempt(model.coded, measure, 0.0)).size_bytes <= found.size_bytes:
+        found, pruned = as_it_was, None
     measured: Measured = found.measured
     return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, spare)
 

@@ -75,8 +75,13 @@ def farthest(
             leap *= 2
         else:
             exponent = guess
-        known.append(attempt(min(max(exponent, min(start, end)), max(start, end))))
+        known.append(attempt(_between(start, end, exponent)))
     return attempt(start)
+
+
+def _between(start: float, end: float, exponent: float) -> float:
+    """It, or the one of the two that it lies beyond."""
+    return min(max(exponent, min(start, end)), max(start, end))
 
 
 def _share(low: float, high: float, wanted: float) -> float:
@@ -109,7 +114,7 @@ def farthest_tuned(
     exponent, best = found.exponent + (wanted - math.log(made * value(found))) / slope, None
     known: list[tuple[float, float]] = []
     for _ in range(TUNINGS):
-        candidate = tuned(min(max(exponent, min(start, end)), max(start, end)))
+        candidate = tuned(_between(start, end, exponent))
         reached = value(candidate)
         if not reached > 0:  # so with NaN
             break

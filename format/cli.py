@@ -25,9 +25,7 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         return _fail(name, str(error), 2)
     except KpcError as error:
         return _fail(name, str(error), 1)
-    except KeyboardInterrupt:
-        return _fail(name, "interrupted", 130)
-    except SystemError as error:  # what compiled functions make of an interruption that reaches them
+    except (KeyboardInterrupt, SystemError) as error:  # the latter is what compiled functions make of one that reaches them
         if not any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):
             raise
         return _fail(name, "interrupted", 130)
