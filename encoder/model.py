@@ -21,7 +21,7 @@ from kpc.encoder.compress import (
 from kpc.encoder.curvature import Curvature, PerPlane, curvature
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
-from kpc.encoder.trellis import Name, quantise_on_trellis
+from kpc.encoder.trellis import Name, quantise_on_trellis, step_on_trellis
 from kpc.encoder.tuning import tuned
 from kpc.format import file
 from kpc.format.cameras import Camera
@@ -102,7 +102,7 @@ def code(
     if coded is None:
         steps = relative_steps(significant)
     else:
-        steps = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in coded.scales]
+        steps = [{name: step_on_trellis(plane) for name, plane in scale.items()} for scale in coded.scales]
     measure = model.probe.measure(scene)
     whole = measure(scene).psnr
     chosen: Quantise = quantise or (  # of channels that are left, too

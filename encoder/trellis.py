@@ -15,6 +15,9 @@ before left them. So errors next to each other get opposite signs, and look-ups,
 undoes what others err. What an error is worth differs from texel to texel by orders of magnitude (`kpc.encoder.curvature`): where it is
 worth little, symbols are those that are foreseen.
 
+Where less than a bit is told of a symbol (`THIN`), they follow the trellis around predictions: what is foreseen may then follow everywhere,
+as it should where nothing else is said, and not only every other time.
+
 Default scene, `fast`: at equal error of pictures of 1, 2 and 4 squared levels planes take 11 to 14 % fewer bytes than with symbols chosen
 by rate and distortion around the nearest. Errors that know of each other save 5 to 8 % more, and 14 % where steps are fine (liam,
 `balanced`, at equal error of held-out views).
@@ -29,11 +32,13 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.encoder.curvature import SIDE, PerPlane
-from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_scene
+from kpc.format.file import SEGMENT_ROWS
+from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
 from kpc.format.rans import compiled
 from kpc.format.scene import TIME_PLANES, Scene
 from kpc.format.symbols import (
-    ACTIVITIES, UNKNOWN, activity, begin_row, fitted, nearest, neighbourhoods, next_state, predict, remember,
+    ACTIVITIES, ANY, AROUND, FAR_AROUND, TRELLIS, UNKNOWN, Guide, activity, begin_row, fitted, foreseen, meant, neighbourhoods, next_place,
+    predict, remember,
 )
 
 Name = tuple[int, str]
@@ -60,12 +65,19 @@ LEAST_WORTH = 0.03
 """Of an error, as a share of the channel's mean: what no ray met may yet be seen, and what lets light through may be made to hide what is
 behind. Soldier, held-out views: with 1e-4 squared errors are a tenth larger where steps are fine, and a third where they are coarse, most of
 that in one ray of a hundred; with 0.1 files are up to one percent larger (liam: 2 %)."""
+THIN = 0.9
+"""Bits of a symbol below which the trellis goes around predictions. Room, liam and soldier, each large plane alone, at equal
+slopes: squared errors plus what bits are worth are 2 % less at 0.8 bits, 5 at 0.7, 10 at 0.6 and 20 at 0.4, 3 % more at 1.1."""
+THIN_LAM = 1.0
+"""LAM of those. What bits are worth stays what it is: steps are sqrt(LAM / THIN_LAM) of what they are on the trellis."""
+FAR_SHARE = 0.75
+"""Of channels that have to have room in 8 bits for symbols spaced out by two, whose predictions are finer: two to five percent less of the same."""
 STATES = 8
 PASSES = 4
 """Searches: the first knows but the weights of rounded symbols, not what symbols cost, nor errors of rows below. Two more make files half a
 percent smaller."""
-SETS = 4
-"""Of weights."""
+SETS, MANY = 4, 1 << 17
+"""Of weights, for so many symbols or more; one for fewer."""
 ALONE = np.zeros((0, 0, 0, 0), np.float32)
 """For what goes together, where channels know nothing of each other."""
 TOLD_APART = 40
@@ -99,36 +111,85 @@ def _steered(
     plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool,
     together: np.ndarray = ALONE,
 ) -> QuantisedPlane:
-    """A plane that is quantised to the nearest, with other symbols. What was left out stays so, and holds 0; and so does what is so near
-    the identity that it is not worth telling.
+    """A plane that is quantised to the nearest, with other symbols, and around predictions with other steps. What was left out stays so, and
+    holds 0; and so does what is so near the identity that it is not worth telling.
 
     Where 8 bits are too few for (M,) `step` by a factor of two, all symbols may follow: those that the trellis allows would err more.
     Bits are worth what they are at the steps that were asked for.
     """
-    coarser = plane.step / step
-    on_trellis = bool(np.median(coarser) < 2)
-    wanted = (values.astype(np.float64) - plane.offset) / plane.step
-    known = np.ascontiguousarray(plane.coded)
-    means = significant[known].mean(0, dtype=np.float64) if known.any() else np.ones(values.shape[2])
-    worth = np.where(means > 0, np.maximum(significant / np.maximum(means, 1e-30), LEAST_WORTH), 1.0).astype(np.float32)
-    if identity:
-        known = known & ((worth * wanted**2).mean(axis=2) >= UNCHANGED)
-    worth = worth * np.float32(coarser**2)
-    rounded = np.where(known[..., None], plane.symbols, np.int8(0))
-    weights, bits = fitted(neighbourhoods(rounded, known), SETS), _bits(np.zeros((ACTIVITIES, TOLD_APART)))
-    errors = np.zeros((values.shape[0] + 2, values.shape[1] + 2, values.shape[2]), np.float32)
-    if identity:
-        errors[1:-1, 1:-1] = np.where(known[..., None], 0, np.sqrt(worth) * -wanted)
-    for _ in range(PASSES):
-        symbols, counts = _search(wanted, worth, known, on_trellis, weights, bits, errors, together)
-        weights, bits = fitted(neighbourhoods(symbols, known), SETS), _bits(counts)
-    return replace(plane, symbols=symbols, coded=symbols.any(axis=2) if identity else known)
+    lattice = TRELLIS if np.median(plane.step / step) < 2 else ANY
+    search = _Search(plane, values, step, significant, identity, together, lattice)
+    search.run(1)
+    if lattice == ANY or search.bits_of_a_symbol >= THIN:
+        search.run(PASSES - 1)
+        return search.found()
+    for lattice in (FAR_AROUND, AROUND):
+        finer = step / finer_around(lattice)
+        around = quantise_plane(values, finer, identity=identity, needed=plane.coded)
+        if np.mean(around.step <= 1.01 * finer) >= FAR_SHARE:
+            break
+    search = _Search(around, values, finer, significant, identity, together, lattice)
+    search.run(PASSES)
+    return search.found()
+
+
+def finer_around(lattice: int) -> float:
+    """By how much steps around predictions are finer than those on the trellis at which bits are worth as much."""
+    return math.sqrt(THIN_LAM / LAM) * (lattice - TRELLIS)
+
+
+def step_on_trellis(plane: QuantisedPlane) -> np.ndarray:
+    """(M,) float64: for which steps `quantise_on_trellis` was asked when it made this plane, if it did and 8 bits were enough."""
+    return plane.step.astype(np.float64) * (1.0 if plane.guide is None else finer_around(plane.guide.lattice))
+
+
+class _Search:
+    """Searches for the symbols of one plane, each knowing what the one before found.
+
+    Args: as of `_steered`; `lattice`: as of `kpc.format.symbols`.
+    """
+
+    def __init__(self, plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool,
+                 together: np.ndarray, lattice: int) -> None:
+        self.plane, self.identity, self.together, self.lattice = plane, identity, together, lattice
+        self._finer = finer_around(lattice) if lattice >= AROUND else 1.0
+        self.rows = SEGMENT_ROWS if identity else len(values)
+        coarser = plane.step / step
+        self.wanted = (values.astype(np.float64) - plane.offset) / plane.step
+        known = np.ascontiguousarray(plane.coded)
+        means = significant[known].mean(0, dtype=np.float64) if known.any() else np.ones(values.shape[2])
+        worth = np.where(means > 0, np.maximum(significant / np.maximum(means, 1e-30), LEAST_WORTH), 1.0).astype(np.float32)
+        if identity:
+            known = known & ((worth * self.wanted**2).mean(axis=2) >= UNCHANGED * self._finer**2)
+        self.known, self.worth = known, worth * np.float32(coarser**2)
+        self.symbols = np.where(known[..., None], plane.symbols, np.int8(0))
+        self.counts = np.zeros((2 * ACTIVITIES, TOLD_APART))
+        self.errors = np.zeros((values.shape[0] + 2, values.shape[1] + 2, values.shape[2]), np.float32)
+        if identity:
+            self.errors[1:-1, 1:-1] = np.where(known[..., None], 0, np.sqrt(self.worth) * -self.wanted)
+
+    def run(self, times: int) -> None:
+        for _ in range(times):
+            neighbours = neighbourhoods(self.symbols, self.known)
+            self.weights = fitted(neighbours, SETS if len(neighbours) >= MANY else 1)
+            self.symbols, self.counts = _search(
+                self.wanted, self.worth, self.known, self.rows, self.lattice, self.weights, LAM * self._finer**2 * _bits(self.counts),
+                self.errors, self.together)
+
+    @property
+    def bits_of_a_symbol(self) -> float:
+        return float((self.counts * _bits(self.counts)).sum() / max(self.counts.sum(), 1))
+
+    def found(self) -> QuantisedPlane:
+        if self.lattice >= AROUND:  # what is coded tells what is foreseen
+            return replace(self.plane, symbols=self.symbols, coded=self.known, guide=Guide(self.weights, self.lattice))
+        return replace(self.plane, symbols=self.symbols, coded=self.symbols.any(axis=2) if self.identity else self.known)
 
 
 def _bits(counts: np.ndarray) -> np.ndarray:
-    """(ACTIVITIES, TOLD_APART) bits of errors by their magnitude, sign included, that came so often in each context. What hardly came
-    is taken to be geometrically distributed, with a mean that doubles with every other context."""
-    ratio = 1 / (1 + 25 * 2.0 ** (1.5 - np.arange(ACTIVITIES) / 2))[:, None]
+    """(2 ACTIVITIES, TOLD_APART) bits of errors by their magnitude, sign included, that came so often in each context: at even places, then at
+    odd ones. What hardly came is taken to be geometrically distributed, with a mean that doubles with every other context."""
+    ratio = 1 / (1 + 25 * 2.0 ** (1.5 - np.tile(np.arange(ACTIVITIES), 2) / 2))[:, None]
     expected = (1 - ratio) * ratio ** np.arange(TOLD_APART) + 1e-4
     shares = counts + 4 * expected
     bits = -np.log2(shares / shares.sum(1, keepdims=True))
@@ -138,19 +199,19 @@ def _bits(counts: np.ndarray) -> np.ndarray:
 
 @compiled()
 def _search(
-    wanted: np.ndarray, worth: np.ndarray, known: np.ndarray, on_trellis: bool, weights: np.ndarray, bits: np.ndarray, errors: np.ndarray,
+    wanted: np.ndarray, worth: np.ndarray, known: np.ndarray, rows: int, lattice: int, weights: np.ndarray, price: np.ndarray, errors: np.ndarray,
     together: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, M) int8 symbols of (H, W, M) numbers in steps, whose errors are worth as much as that; 0 where nothing is `known`; and how often
-    errors came, as `bits`. `on_trellis`: whether symbols follow it; else any may follow, and survivors differ in which of their last three
-    are odd. `errors`: (H + 2, W + 2, M) float32, u of all texels, one row and one column of 0 around; those of known ones are found anew.
-    `together`: as of `quantise_on_trellis`, or ALONE.
+    errors came, as `_bits` counts them. Every so many `rows` a segment begins, which knows of none before. `lattice`: as of `kpc.format.symbols`; where any may follow, survivors differ in which of their last
+    three are odd. `price`: of `_bits`, in squared steps. `errors`: (H + 2, W + 2, M) float32, u of all texels, one row and one column of 0
+    around; those of known ones are found anew. `together`: as of `quantise_on_trellis`, or ALONE.
 
     v, r, cross and the names of neighbours as in `kpc.format.symbols`; v0, r0 and errors of survivors are held by their states.
     """
     H, W, M = wanted.shape
-    sets, doubled = weights.astype(np.int64), 1 if on_trellis else 0
-    symbols, counts = np.zeros((H, W, M), np.int8), np.zeros(bits.shape)
+    sets, apart = weights.astype(np.int64), 1 << lattice if lattice < AROUND else 2 * (lattice - TRELLIS)  # of symbols that may follow
+    symbols, counts = np.zeros((H, W, M), np.int8), np.zeros(price.shape)
     v, r = np.zeros((3, W + 4), np.int64), np.zeros((3, W + 4), np.int64)
     cross = np.zeros((H, W), np.int16)
     V, R = np.zeros((W + 4, STATES), np.int64), np.zeros((W + 4, STATES), np.int64)  # of the survivor that ends there
@@ -159,10 +220,11 @@ def _search(
     for m in range(M):
         others = _others(errors, together, m)
         for y in range(H):
+            own = y % rows  # of its segment
             v0, v1, v2 = v[y % 3], v[(y + 2) % 3], v[(y + 1) % 3]
             r0, r1, r2, past = r[y % 3], r[(y + 2) % 3], r[(y + 1) % 3], cross[y]
-            begin_row(v0, v1, v2, y, 0)
-            begin_row(r0, r1, r2, y, UNKNOWN)
+            begin_row(v0, v1, v2, own, 0)
+            begin_row(r0, r1, r2, own, UNKNOWN)
             for s in range(STATES):
                 V[:2, s], R[:2, s] = v0[:2], r0[:2]
             cost = np.full(STATES, np.inf)
@@ -181,11 +243,11 @@ def _search(
                     old = came[x - 1, s] if x else s
                     ww, rww = V[X - 2, old], R[X - 2, old]
                     if not known[y, x]:
-                        left = y == 0 or x > 0 and known[y, x - 1]
+                        left = own == 0 or x > 0 and known[y, x - 1]
                         V[X, s], R[X, s] = (w, rw) if left else (v1[X + 1], r1[X + 1])
                         cost[s], came[x, s], U[x + 1, s] = before[s] + 2 * here * BESIDE * U[x, s], s, here
                         continue
-                    if y == 0:
+                    if own == 0:
                         n = nw = ne = nn = nww = nnw = nne = nee = w
                         around = 7 * rw + rww
                     else:
@@ -193,20 +255,22 @@ def _search(
                         nww, nnw, nne, nee = v1[X - 2], v2[X - 1], v2[X + 1], v1[X + 2]
                         around = 2 * (rw + r1[X]) + r1[X - 1] + r1[X + 1] + rww + r2[X]
                     predicted, gradient, _ = predict(sets, w, n, nw, ne, ww, nn, nww, nnw, nne, nee)
-                    whole = nearest(predicted, s & doubled, doubled)
-                    active = activity(around, int(past[x]), gradient, m)
+                    odd = s & 1 if lattice != ANY else 0
+                    whole = foreseen(predicted, lattice, odd)
+                    active = activity(around, int(past[x]), gradient, m) + (ACTIVITIES if odd and lattice >= AROUND else 0)
                     near = outside + BESIDE * U[x, s]
                     best = min(max(wanted[y, x, m] - near / root, SYMBOL_MIN), SYMBOL_MAX)  # as far as errors go
-                    below = int(np.floor((best - whole) / (1 + doubled)))
-                    lowest = below - 1 if below >= 0 else below
-                    for error in (lowest, lowest + 1, lowest + 2, 0):  # those around it, the next that costs less, what is foreseen
-                        value = whole + (error << doubled)
+                    away = best - whole
+                    size = int((abs(away) + (apart // 2 if odd and lattice >= AROUND else 0)) / apart)
+                    inside = size if away > 0 else -size
+                    for error in (inside - 1, inside, inside + 1, 0):  # those around it, the next that costs less, what is foreseen
+                        value = whole + meant(error, lattice, odd)
                         if not SYMBOL_MIN <= value <= SYMBOL_MAX:
                             continue
                         size = min(abs(error), TOLD_APART - 1)
                         u = root * (value - wanted[y, x, m])
-                        total = before[s] + u * (u + 2 * near) + LAM * bits[active, size]
-                        to = next_state(s, value) if on_trellis else (s << 1 | value & 1) & STATES - 1
+                        total = before[s] + u * (u + 2 * near) + price[active, size]
+                        to = (s << 1 | value & 1) & STATES - 1 if lattice == ANY else next_place(s, value, error, lattice)
                         if total < cost[to]:
                             cost[to], came[x, to], context[x, to], missed[x, to] = total, s, active, size
                             V[X, to], R[X, to], U[x + 1, to] = value, abs((value << 7) - predicted) >> 3, u
@@ -219,10 +283,10 @@ def _search(
                     counts[context[x, s], missed[x, s]] += 1
                 s = came[x, s]
             v0[W + 2:], r0[W + 2:] = v0[W + 1], r0[W + 1]
-            if y > 0:
+            if own > 0:
                 remember(cross[y - 1], r2, r1, r0, m)
-        last = r[(H - 1) % 3]
-        remember(cross[H - 1], r[max(H - 2, 0) % 3], last, last, m)
+            if own == rows - 1 or y == H - 1:
+                remember(cross[y], r1 if own > 0 else r0, r0, r0, m)
     return symbols, counts
 
 

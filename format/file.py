@@ -16,7 +16,7 @@ import os
 import struct
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
@@ -35,7 +35,7 @@ from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
-from kpc.format.symbols import decode_symbols, encode_symbols
+from kpc.format.symbols import Guide, decode_symbols, encode_symbols, guide_of
 
 Parsed = TypeVar("Parsed")
 
@@ -195,7 +195,7 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
                 if start < stop:
                     segment, coded = plane.symbols[start:stop], plane.coded[start:stop]
                     chunks.append(Chunk("PLNE", encode_segment(segment, coded), number, ALL_PLANES.index(name), start, stop - start,
-                                        partial(encode_symbols, segment, coded), segment.size))
+                                        partial(encode_symbols, segment, coded, plane.guide), segment.size))
     return chunks
 
 
@@ -317,12 +317,17 @@ def read(source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET,
                              np.zeros((p.rows, p.columns), bool))
         for name, p in scale.items()
     } for s, scale in enumerate(reader.head.scales))
+    guides: dict[tuple[int, str], list[Guide | None]] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number, (decoded, coded) in zip(segments, pool.map(reader.segment, segments), strict=True):
             entry = reader.index[number]
             plane = scales[entry.scale][ALL_PLANES[entry.plane]]
             rows = slice(entry.row_start, entry.row_start + entry.row_count)
             plane.symbols[rows], plane.coded[rows] = decoded, coded
+            guides.setdefault((entry.scale, ALL_PLANES[entry.plane]), []).append(reader.guide(number))
+    for (scale, name), (guide, *others) in guides.items():
+        if guide is not None and all(guide == other for other in others):
+            scales[scale][name] = replace(scales[scale][name], guide=guide)
     for number, entry in enumerate(reader.index):
         if entry.kind not in KNOWN_KINDS and reader.available(number):
             reader.stored(number)  # ignored, but never damaged
@@ -382,6 +387,10 @@ class SceneReader(Reader):
             raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
                               f"{texels * plane.channels:,} of its rows")
         return self._parsed(lambda body: decode_symbols(body, *shape), self._context_coded(number))
+
+    def guide(self, number: int) -> Guide | None:
+        """By which the symbols of a PLNE chunk were chosen, if they follow one."""
+        return self._parsed(guide_of, self._context_coded(number)) if self.index[number].codec == CODEC_SYMBOLS else None
 
     def mapping(self) -> SpaceMapping | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""

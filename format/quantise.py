@@ -17,6 +17,7 @@ from kpc.format.errors import FormatError
 from kpc.format.motion import QuantisedMotion, places_reached, quantise_motion
 from kpc.format.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
 from kpc.format.space import SpaceMapping
+from kpc.format.symbols import Guide
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
 
@@ -34,12 +35,14 @@ class QuantisedPlane:
         symbols: (H, W, M) int8; 0 wherever `coded` is False.
         step: (M,) float32 > 0; offset: (M,) float32, exactly 1 on time planes.
         coded: (H, W) bool, the texels whose symbols the file stores.
+        guide: by which symbols were chosen, if by any; one that they do not follow does no harm.
     """
 
     symbols: np.ndarray
     step: np.ndarray
     offset: np.ndarray
     coded: np.ndarray
+    guide: Guide | None = None
 
     def dequantise(self) -> np.ndarray:
         """(H, W, M) float32."""

@@ -12,14 +12,23 @@ symbols before say whether the next one is even or odd, `next_state`. So each ha
 bit, and yet by its choice of what comes before a writer has nearly all of them: at as many bits, errors are 1.09 dB smaller
 (`kpc.encoder.trellis`). Whether symbols do is seen from themselves.
 
+Or they follow it *around predictions*: not symbols but their differences from what is foreseen are even or odd, and none is always among
+them. Where hardly anything is told, a symbol may so stay what is foreseen wherever its row has led. Quantisers that are even, or odd and
+zero, are those of dependent quantisation in VVC (ITU-T H.266, section 8.7.3; Schwarz et al., Data Compression Conference 2019). Such
+symbols are known from the weights alone that foresaw them: a `Guide`.
+
 Naming, throughout this module
     v           symbols of one channel; r  by how much predictions missed them, in 1 / 16 of a symbol. Rings of three rows with two
                 more columns on either side: rows `here`, `above` and `higher`, column x at X = x + 2
     w n nw ne   values to the left, above, above to the left and to the right
     cross       what r was in the channels before, smoothed
+    lattice     which symbols may follow: ANY, on the TRELLIS, or AROUND predictions, there spaced out by 1 or, FAR_AROUND, by 2
+    place       on the trellis, one of 8; it is odd where symbols, or differences, have to be
     table       counters of `kpc.format.rans`
     state at words trace    of `kpc.format.rans.decide`
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,15 +39,17 @@ SET_COUNTS = (1, 2, 4, 8)
 """How many sets of weights a segment may store."""
 WEIGHTS = 9
 """Of a set, each in 1 / 64."""
-MAP, TRELLIS = 1, 2
-"""Flags: not all texels are coded; symbols follow the trellis."""
+ANY, TRELLIS, AROUND, FAR_AROUND = range(4)
+"""Lattices."""
+MAP, LATTICE_BIT = 1, 1
+"""Flags: not all texels are coded; from this bit on, the lattice."""
 
 UNARY, ESCAPES = 4, 7
 """Of `kpc.format.rans.integer`."""
 DECISIONS = 2 + 2 * (UNARY + ESCAPES)
 """Counters of a context: is there an error, is it positive; and of either sign, its magnitude."""
 ACTIVITIES, FRACTIONS = 22, 3
-"""Contexts: how active the neighbourhood is, and how far the prediction lies from a whole symbol."""
+"""Contexts: how active the neighbourhood is; and how far the prediction lies from a whole symbol or, around predictions, what place is."""
 MAP_CONTEXTS = 1 << 10
 MOST_DECISIONS = 2 + UNARY + 2 * ESCAPES
 """That a symbol takes."""
@@ -54,22 +65,43 @@ _LOGARITHMS = np.array([0, 0] + [2 * (k.bit_length() - 2) + (k >> k.bit_length()
 """Of k >= 2: 2 log2(k / 2), rounded down after linear interpolation between powers of two."""
 
 
-def encode_symbols(symbols: np.ndarray, coded: np.ndarray) -> bytes:
-    """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False, with as many sets of weights as make it shortest."""
+@dataclass(frozen=True, eq=False)
+class Guide:
+    """By what symbols around predictions were chosen, in each segment of a plane. Told by anything else they take far more bits.
+
+    Attributes:
+        weights: (C, WEIGHTS) int8; C is one of SET_COUNTS.
+        lattice: AROUND or FAR_AROUND.
+    """
+
+    weights: np.ndarray
+    lattice: int
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Guide) and self.lattice == other.lattice and np.array_equal(self.weights, other.weights)
+
+
+def encode_symbols(symbols: np.ndarray, coded: np.ndarray, guide: Guide | None = None) -> bytes:
+    """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: by their guide, if they have one that they follow, else with as many
+    sets of weights as make it shortest."""
+    if guide is not None and (body := encode_with(guide.weights, symbols, coded, guide.lattice)) is not None:
+        return body
     symbols, coded = np.array(symbols, order="C"), np.array(coded, order="C")  # compiled for this layout; and `walk` writes
-    neighbours = neighbourhoods(symbols, coded)
-    return min((encode_with(fitted(neighbours, count), symbols, coded) for count in SET_COUNTS), key=len)
+    neighbours, lattice = neighbourhoods(symbols, coded), TRELLIS if follows_trellis(symbols, coded) else ANY
+    bodies = (encode_with(fitted(neighbours, count), symbols, coded, lattice) for count in SET_COUNTS)
+    return min((body for body in bodies if body is not None), key=len)
 
 
-def encode_with(weights: np.ndarray, symbols: np.ndarray, coded: np.ndarray) -> bytes:
-    """The same, with (C, WEIGHTS) int8 weights that are given; C is one of SET_COUNTS."""
-    symbols, coded = np.array(symbols, order="C"), np.array(coded, order="C")
+def encode_with(weights: np.ndarray, symbols: np.ndarray, coded: np.ndarray, lattice: int) -> bytes | None:
+    """The same, with (C, WEIGHTS) int8 weights that are given, C is one of SET_COUNTS; None where symbols do not follow the lattice."""
+    followed, coded = np.array(symbols, order="C"), np.array(coded, order="C")
     trace, at = np.empty(coded.size + int(coded.sum()) * symbols.shape[2] * MOST_DECISIONS, np.int16), 0
-    has_map, trellis = not coded.all(), follows_trellis(symbols, coded)
-    if has_map:
+    if has_map := not coded.all():
         _, at = walk_map(coded, 0, at, None, trace)
-    _, at, _ = walk(symbols, coded, trellis, weights, 0, at, None, trace, None)
-    return bytes([len(weights), MAP * has_map | TRELLIS * trellis]) + weights.tobytes() + stream(trace[:at])
+    _, at, fit = walk(followed, coded, lattice, weights, 0, at, None, trace, None)
+    if not fit or not np.array_equal(followed, symbols):
+        return None
+    return bytes([len(weights), MAP * has_map | lattice << LATTICE_BIT]) + weights.tobytes() + stream(trace[:at])
 
 
 def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
@@ -78,25 +110,40 @@ def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple
     Raises:
         FormatError: the body is cut, too long, or says what only a damaged one would.
     """
-    if len(body) < 2 or body[0] not in SET_COUNTS or body[1] > MAP | TRELLIS:
-        raise FormatError("plane segment: unknown number of sets of weights or flag")
-    sets, has_map, trellis = body[0], body[1] & MAP != 0, body[1] & TRELLIS != 0
-    start = 2 + WEIGHTS * sets
-    if len(body) < start:
-        raise FormatError("plane segment: cut off within its weights")
-    weights = np.frombuffer(body, np.int8, WEIGHTS * sets, 2).reshape(sets, WEIGHTS)
-    state, words = opened(body[start:], "plane segment")
+    guide, has_map = _head(body)
+    state, words = opened(body[2 + guide.weights.size:], "plane segment")
 
     symbols, coded = np.zeros((rows, columns, channels), np.int8), np.ones((rows, columns), bool)
     at, fit = 0, True
     if has_map:
         state, at = walk_map(coded, state, at, words, None)
     if at <= len(words):
-        state, at, fit = walk(symbols, coded, trellis, weights, state, at, words, None, None)
+        state, at, fit = walk(symbols, coded, guide.lattice, guide.weights, state, at, words, None, None)
     if not fit:
         raise FormatError("plane segment: a symbol leaves its 8 bits")
     ended(state, at, words, "plane segment")
     return symbols, coded
+
+
+def guide_of(body: bytes) -> Guide | None:
+    """Of what `decode_symbols` decodes; None where symbols are not around predictions.
+
+    Raises:
+        FormatError: as `decode_symbols`.
+    """
+    guide, _ = _head(body)
+    return guide if guide.lattice >= AROUND else None
+
+
+def _head(body: bytes) -> tuple[Guide, bool]:
+    """Weights and lattice, whatever it is; and whether there is a map."""
+    if len(body) < 2 or body[0] not in SET_COUNTS or body[1] >> LATTICE_BIT > FAR_AROUND:
+        raise FormatError("plane segment: unknown number of sets of weights or flag")
+    sets = body[0]
+    if len(body) < 2 + WEIGHTS * sets:
+        raise FormatError("plane segment: cut off within its weights")
+    weights = np.frombuffer(body, np.int8, WEIGHTS * sets, 2).reshape(sets, WEIGHTS)
+    return Guide(weights, body[1] >> LATTICE_BIT), body[1] & MAP != 0
 
 
 def neighbourhoods(symbols: np.ndarray, coded: np.ndarray) -> np.ndarray:
@@ -104,7 +151,7 @@ def neighbourhoods(symbols: np.ndarray, coded: np.ndarray) -> np.ndarray:
     left and above."""
     values = int(coded.sum()) * symbols.shape[2]
     trace, neighbours = np.empty(values * MOST_DECISIONS, np.int16), np.empty((values, 2 + WEIGHTS), np.int16)
-    walk(symbols, coded, False, np.zeros((1, WEIGHTS), np.int8), 0, 0, None, trace, neighbours)
+    walk(symbols, coded, ANY, np.zeros((1, WEIGHTS), np.int8), 0, 0, None, trace, neighbours)
     return neighbours
 
 
@@ -182,12 +229,46 @@ def next_state(state, symbol):
     return state >> 1 ^ 5 * (state & 1) ^ symbol & 2
 
 
+@compiled(forceinline=True)
+def meant(error, lattice, odd):
+    """How far from what is foreseen, as `foreseen` has it, an error puts a symbol. `odd`: whether place is."""
+    if lattice < AROUND:
+        return error << lattice
+    spacing = lattice - TRELLIS
+    return spacing * (2 * error - (odd if error > 0 else -odd if error < 0 else 0))
+
+
+@compiled(forceinline=True)
+def told(away, lattice, odd):
+    """The error that means a symbol so far from what is foreseen, or one near to it."""
+    if lattice < AROUND:
+        return away >> lattice
+    spacing = lattice - TRELLIS
+    size = (abs(away) + spacing * odd) // (2 * spacing)
+    return size if away > 0 else -size
+
+
+@compiled(forceinline=True)
+def foreseen(predicted, lattice, odd):
+    """The symbol nearest to a prediction, on the trellis one that may follow; ties go up."""
+    return nearest(predicted, odd, 1) if lattice == TRELLIS else nearest(predicted, 0, 0)
+
+
+@compiled(forceinline=True)
+def next_place(place, value, error, lattice):
+    """After a symbol that an error made: by the one or, around predictions, by the other."""
+    if lattice == ANY:
+        return 0
+    return next_state(place, value if lattice == TRELLIS else 2 * error)
+
+
 @compiled()
-def walk(symbols, coded, trellis, weights, state, at, words, trace, neighbours):
-    """Code `symbols`, or decode into them, where `coded`: (state, at, whether all fit 8 bits).
+def walk(symbols, coded, lattice, weights, state, at, words, trace, neighbours):
+    """Code `symbols`, or decode into them, where `coded`: (state, at, whether all fit 8 bits). Those that do not follow the lattice are
+    changed to near ones that do.
 
     Args:
-        trellis: whether they follow it.
+        lattice: which symbols may follow.
         weights: (C, WEIGHTS) int8, in 1 / 64.
         neighbours: None, or as `neighbourhoods` returns them, to be filled.
     """
@@ -196,7 +277,7 @@ def walk(symbols, coded, trellis, weights, state, at, words, trace, neighbours):
     table = counters(ACTIVITIES * FRACTIONS * DECISIONS)
     v, r = np.zeros((3, W + 4), np.int64), np.zeros((3, W + 4), np.int64)
     cross = np.zeros((H, W), np.int16)
-    noted, doubled = 0, 1 if trellis else 0
+    noted = 0
     for m in range(M):
         for y in range(H):
             here, above, higher = y % 3, (y + 2) % 3, (y + 1) % 3
@@ -217,19 +298,20 @@ def walk(symbols, coded, trellis, weights, state, at, words, trace, neighbours):
                     r1[x:x + 5], r2[x:x + 5] = r0[X - 1], r0[X - 1]
                 w, n, nw, ne, ww, nn = v0[X - 1], v1[X], v1[X - 1], v1[X + 1], v0[X - 2], v2[X]
                 predicted, gradient, slope = predict(sets, w, n, nw, ne, ww, nn, v1[X - 2], v2[X - 1], v2[X + 1], v1[X + 2])
-                whole = nearest(predicted, place & doubled, doubled)
+                odd = place & 1
+                whole = foreseen(predicted, lattice, odd)
                 fraction = predicted - (whole << 7)
+                part = min(odd if lattice >= AROUND else 3 * abs(fraction) >> 6 + lattice, FRACTIONS - 1)
                 own = 2 * (r0[X - 1] + r1[X]) + r1[X - 1] + r1[X + 1] + r0[X - 2] + r2[X]
-                context = activity(own, int(past[x]), gradient, m) * FRACTIONS \
-                    + min(3 * abs(fraction) >> 6 + doubled, FRACTIONS - 1)
+                context = activity(own, int(past[x]), gradient, m) * FRACTIONS + part
                 sign = -1 if fraction < 0 else 1
-                error = sign * (int(symbols[y, x, m]) - whole >> doubled)
+                error = sign * told(int(symbols[y, x, m]) - whole, lattice, odd)
                 error, state, at = integer(error, table, context * DECISIONS, UNARY, ESCAPES, state, at, words, trace)
-                value = whole + (sign * error << doubled)
+                value = whole + meant(sign * error, lattice, odd)
                 if not -128 <= value <= 127:
                     return state, at, False
                 symbols[y, x, m] = value
-                place = next_state(place, value)
+                place = next_place(place, value, error, lattice)
                 v0[X] = value
                 r0[X] = abs((value << 7) - predicted) >> 3
                 if neighbours is not None:

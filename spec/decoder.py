@@ -391,8 +391,8 @@ class Decisions:  # section 6, codec 2
 def context_coded(chunk, H, W, channels):  # section 6, codec 2
     """As `segment`."""
     set_count, flags = chunk.unpack("BB")
-    require(set_count in (1, 2, 4, 8) and flags <= 3, "sets of weights or flags")
-    has_map, trellis = flags % 2, flags // 2
+    require(set_count in (1, 2, 4, 8) and flags <= 7, "sets of weights or flags")
+    has_map, lattice = flags % 2, flags // 2
     sets = [chunk.unpack("9b") for _ in range(set_count)]
     decisions = Decisions(chunk)
 
@@ -418,7 +418,7 @@ def context_coded(chunk, H, W, channels):  # section 6, codec 2
             return known[y, min(x, W - 1)]
 
         for y in range(H):
-            place = 0  # on the trellis
+            place = 0
             for x in range(W):
                 left = at(y, x - 1, y)
 
@@ -436,8 +436,8 @@ def context_coded(chunk, H, W, channels):  # section 6, codec 2
                 others = [nw, ne, ww, nn, near(-1, -2)[0], near(-2, -1)[0], near(-2, 1)[0], near(-1, 2)[0]]
                 predicted = 64 * both + k[0] * (w - n) + sum(a * (2 * v - both) for a, v in zip(k[1:], others))
                 predicted = min(max(predicted, -16384), 16256)
-                if trellis:
-                    odd = place % 2
+                odd = place % 2
+                if lattice == 1:
                     whole = 2 * (predicted - 128 * odd + 128 >> 8) + odd
                 else:
                     whole = predicted + 64 >> 7
@@ -447,11 +447,18 @@ def context_coded(chunk, H, W, channels):  # section 6, codec 2
                 activity = (11 * own + 5 * cross[y, x] >> 2 if c else 4 * own) + 20 * gradient
                 a = activity + 128 >> 6
                 b = a.bit_length()
-                context = 3 * (2 * (b - 2) + (a >> b - 2) % 2) + min(3 * abs(fraction) >> (7 if trellis else 6), 2)
-                error = decisions.error(context)
-                v = whole + (-error if fraction < 0 else error) * (2 if trellis else 1)
+                error = decisions.error(3 * (2 * (b - 2) + (a >> b - 2) % 2)
+                                        + (odd if lattice > 1 else min(3 * abs(fraction) >> (7 if lattice == 1 else 6), 2)))
+                if fraction < 0:
+                    error = -error
+                if lattice > 1:
+                    v = whole + (lattice - 1) * (2 * error - (odd if error > 0 else -odd if error < 0 else 0))
+                    onward = error % 2
+                else:
+                    v = whole + error * (2 if lattice == 1 else 1)
+                    onward = lattice and v % 4 >= 2
                 require(-128 <= v <= 127, "a symbol leaves 8 bits")
-                place = place // 2 ^ (5 if place % 2 else 0) ^ (2 if v % 4 >= 2 else 0)
+                place = place // 2 ^ (5 if odd else 0) ^ (2 if onward else 0)
                 known[y, x] = v, abs(128 * v - predicted) >> 3
                 symbols[(y * W + x) * channels + c] = v
         for y in range(H):

@@ -12,7 +12,7 @@ from kpc.format.file import encode, read
 from kpc.format.motion import QuantisedMotion
 from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_scene
 from kpc.format.scene import SPACE_PLANES, Scene
-from kpc.format.symbols import WEIGHTS, decode_symbols, encode_with
+from kpc.format.symbols import ANY, WEIGHTS, decode_symbols, encode_with
 
 
 def quantised(scene: Scene, step: float) -> QuantisedScene:
@@ -75,7 +75,7 @@ def test_sizes_of_planes(shape):
     y, x, m = np.ogrid[: shape[0], : shape[1], : shape[2]]
     symbols = ((x * y // 97 + 3 * m + x) % 251 - 125).astype(np.int8)
     coded = np.ones(shape[:2], bool)
-    found, where = decode_symbols(encode_with(np.zeros((1, WEIGHTS), np.int8), symbols, coded), *shape)
+    found, where = decode_symbols(encode_with(np.zeros((1, WEIGHTS), np.int8), symbols, coded, ANY), *shape)
     assert np.array_equal(found, symbols) and np.array_equal(where, coded)
 
 

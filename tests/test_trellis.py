@@ -9,9 +9,10 @@ from scenes import tiny_scene
 from kpc.encoder import trellis
 from kpc.encoder.trellis import ALONE, STATES, TOLD_APART, quantise_on_trellis
 from kpc.format import file
+from kpc.format.file import SEGMENT_ROWS
 from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
 from kpc.format.scene import TIME_PLANES, Scene
-from kpc.format.symbols import ACTIVITIES, WEIGHTS, encode_symbols, follows_trellis, next_state
+from kpc.format.symbols import ACTIVITIES, AROUND, FAR_AROUND, TRELLIS, WEIGHTS, encode_symbols, follows_trellis, guide_of, next_state
 
 
 def noisy(seed: int = 1) -> Scene:
@@ -31,7 +32,7 @@ def steered(scene: Scene, step: float, significant: list[dict[str, np.ndarray]] 
 
 
 NO_WEIGHTS = np.zeros((1, WEIGHTS), np.int8)
-FREE = np.zeros((ACTIVITIES, TOLD_APART))
+FREE = np.zeros((2 * ACTIVITIES, TOLD_APART))
 """Every error costs nothing."""
 
 
@@ -39,7 +40,7 @@ def searched(wanted: np.ndarray, known: np.ndarray, bits: np.ndarray = FREE, wor
              together: np.ndarray = ALONE) -> np.ndarray:
     worth = np.ones(wanted.shape, np.float32) if worth is None else worth
     errors = np.zeros((wanted.shape[0] + 2, wanted.shape[1] + 2, wanted.shape[2]), np.float32)
-    symbols, counts = trellis._search(wanted, worth, known, True, NO_WEIGHTS, bits, errors, together)
+    symbols, counts = trellis._search(wanted, worth, known, len(wanted), TRELLIS, NO_WEIGHTS, bits, errors, together)
     assert np.allclose(errors[1:-1, 1:-1], np.where(known[..., None], np.sqrt(worth) * (symbols - wanted), 0), atol=1e-4)
     assert counts.sum() == known.sum() * wanted.shape[2]
     assert follows_trellis(symbols, known) and not symbols[~known].any()
@@ -209,17 +210,72 @@ def test_where_eight_bits_are_too_few_any_symbol_may_follow(monkeypatch: pytest.
     assert follows_trellis(steered.symbols, steered.coded)
 
 
-def test_what_was_left_out_stays_so_and_steps_stay() -> None:
+@pytest.mark.parametrize("step", [0.005, 0.05])
+def test_what_was_left_out_stays_so_and_steps_stay(step: float) -> None:
+    """Steps around predictions are others, but it is known what was asked for."""
     scene = noisy()
-    before, after = quantised(scene, 0.05), steered(scene, 0.05)
+    before, after = quantised(scene, step), steered(scene, step)
+    assert any(plane.guide is not None for scale in after.scales for plane in scale.values()) == (step == 0.05)
     for ours, theirs in zip(after.scales, before.scales):
         for name in ours:
-            np.testing.assert_array_equal(ours[name].step, theirs[name].step)
+            np.testing.assert_allclose(trellis.step_on_trellis(ours[name]), theirs[name].step, rtol=1e-6)
             assert not ours[name].symbols[~ours[name].coded].any() and not (ours[name].coded & ~theirs[name].coded).any()
-            if name in TIME_PLANES:
-                np.testing.assert_array_equal(ours[name].coded, ours[name].symbols.any(2))
-            else:
+            if name not in TIME_PLANES:
                 np.testing.assert_array_equal(ours[name].coded, theirs[name].coded)
+            elif ours[name].guide is None:
+                np.testing.assert_array_equal(ours[name].coded, ours[name].symbols.any(2))
+
+
+def waves(seed: int, rows: int = 60, columns: int = 70) -> np.ndarray:
+    """(rows, columns, 3) of which most is foreseen, and the rest is noise of standard deviation 1."""
+    rng = np.random.default_rng(seed)
+    smooth = rng.normal(0, 1, (rows + 8, columns + 8, 3)).cumsum(0).cumsum(1)
+    kernel = np.ones(9) / 9
+    for axis in (0, 1):
+        smooth = np.apply_along_axis(np.convolve, axis, smooth, kernel, "valid")
+    return (20 * smooth / smooth.std() + rng.normal(0, 1, (rows, columns, 3))).astype(np.float32)
+
+
+@pytest.mark.parametrize("identity", [False, True])
+def test_what_is_hardly_told_goes_around_predictions(monkeypatch: pytest.MonkeyPatch, identity: bool) -> None:
+    """And costs less, errors and bytes together, than on the trellis at the steps that were asked for."""
+    values = waves(11, 48) + identity
+    step, alike = np.full(3, 2.0), np.ones_like(values)
+    rounded = quantise_plane(values, step, identity=identity)
+
+    def cost(plane: QuantisedPlane) -> float:
+        parts = [slice(start, start + SEGMENT_ROWS) for start in range(0, 48, SEGMENT_ROWS)] if identity else [slice(None)]
+        bodies = [encode_symbols(plane.symbols[rows], plane.coded[rows], plane.guide) for rows in parts]
+        assert all(guide_of(body) == plane.guide for body in bodies)
+        errors = plane.dequantise() - values
+        return float((errors / 2.0).ravel() @ (errors / 2.0).ravel() * seen(errors) / np.mean(np.square(errors))) + trellis.LAM * 8 * sum(map(len, bodies))
+
+    around = trellis._steered(rounded, values, step, alike, identity)
+    assert around.guide is not None and around.guide.lattice == FAR_AROUND
+    np.testing.assert_allclose(trellis.step_on_trellis(around), step, rtol=1e-6)
+    monkeypatch.setattr(trellis, "THIN", 0.0)
+    on_trellis = trellis._steered(rounded, values, step, alike, identity)
+    assert on_trellis.guide is None and cost(around) < 0.92 * cost(on_trellis)
+
+
+def test_around_predictions_symbols_are_as_far_apart_as_eight_bits_allow() -> None:
+    values, alike = waves(12), np.ones((60, 70, 3), np.float32)
+    for size, lattice in ((10.0, FAR_AROUND), (80.0, AROUND)):
+        step = np.full(3, 2.0)
+        told = values + np.where(np.arange(70) < 35, size, -size).astype(np.float32)[:, None]  # two plains, and one edge between them
+        plane = trellis._steered(quantise_plane(told, step, identity=False), told, step, alike, False)
+        assert plane.guide is not None and plane.guide.lattice == lattice
+
+
+def test_files_keep_what_symbols_were_chosen_by() -> None:
+    scene = steered(noisy(), 0.05)
+    data = file.encode(scene)
+    back = file.read(data)
+    assert file.encode(back) == data
+    for ours, theirs in zip(back.scales, scene.scales):
+        assert all(ours[name].guide == theirs[name].guide for name in ours)
+    forgotten = replace(back, scales=tuple({name: replace(plane, guide=None) for name, plane in scale.items()} for scale in back.scales))
+    assert len(file.encode(forgotten)) > len(data)
 
 
 def test_symbols_stay_within_eight_bits() -> None:

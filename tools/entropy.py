@@ -19,7 +19,7 @@ from kpc.format.container import Chunk, pack
 from kpc.format.file import SceneReader, read, scene_chunks
 from kpc.format.rans import words_of
 from kpc.format.scene import ALL_PLANES
-from kpc.format.symbols import MOST_DECISIONS, SET_COUNTS, WEIGHTS, fitted
+from kpc.format.symbols import ANY, MOST_DECISIONS, SET_COUNTS, TRELLIS, WEIGHTS, Guide, fitted
 
 DECODINGS = 5
 TABLE_BITS = 12
@@ -28,10 +28,11 @@ TABLE_BITS = 12
 
 @dataclass(frozen=True)
 class Segment:
-    """A plane segment: (H, W, M) int8 symbols, (H, W) bool coded texels, and the chunk that stores it."""
+    """A plane segment: (H, W, M) int8 symbols, (H, W) bool coded texels, what the symbols follow, and the chunk that stores it."""
 
     symbols: np.ndarray
     coded: np.ndarray
+    guide: Guide | None
     chunk: Chunk
 
 
@@ -43,7 +44,7 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
         if chunk.kind == "PLNE":
             plane = quantised.scales[chunk.scale][ALL_PLANES[chunk.plane]]
             rows = slice(chunk.row_start, chunk.row_start + chunk.row_count)
-            segments.append(Segment(plane.symbols[rows], plane.coded[rows], chunk))
+            segments.append(Segment(plane.symbols[rows], plane.coded[rows], plane.guide, chunk))
     values = sum(segment.symbols.size for segment in segments)
     found = {
         "nothing": _decoded(pack(chunks, values)),
@@ -91,25 +92,32 @@ def _note(bit, table, which, state, at, words, trace):
 
 def _compiled(changes: dict[str, Any]) -> Walks:
     names = vars(rans) | vars(module) | changes
-    for name in ("begin_row", "remember", "next_state", "predict", "nearest", "activity", "integer", "walk_map", "walk"):
+    for name in ("begin_row", "remember", "next_state", "next_place", "predict", "nearest", "foreseen", "meant", "told", "activity", "integer",
+                 "walk_map", "walk"):
         if name not in changes:
             names[name] = njit(FunctionType(vars(module)[name].py_func.__code__, names, name))
     return names
 
 
 def _bytes(segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callable[[np.ndarray], float] | None = None) -> int:
-    """What the segment takes with the best number of sets of weights, or with none; `size` is of a trace, else of its words."""
+    """What the segment takes with the best number of sets of weights, or with none; with those of its guide, if it has one. `size` is of
+    a trace, else of its words."""
     symbols, coded = np.ascontiguousarray(segment.symbols), np.ascontiguousarray(segment.coded)
-    neighbours, trellis = module.neighbourhoods(symbols, coded), module.follows_trellis(symbols, coded)
+    neighbours, guide = module.neighbourhoods(symbols, coded), segment.guide
     trace = np.empty(coded.size + len(neighbours) * MOST_DECISIONS, np.int16)
+    if guide is not None:
+        lattice, tried = guide.lattice, [guide.weights]
+    else:
+        lattice = TRELLIS if module.follows_trellis(symbols, coded) else ANY
+        tried = [fitted(neighbours, count) for count in counts] or [np.zeros((1, WEIGHTS), np.int8)]
     sizes = []
-    for weights in [fitted(neighbours, count) for count in counts] or [np.zeros((1, WEIGHTS), np.int8)]:
+    for weights in tried:
         at = 0
         if not coded.all():
             _, at = walks["walk_map"](coded, 0, at, None, trace)
             trace[:at] -= 8192 * (size is not None)  # counters of the map are others
-        _, at, _ = walks["walk"](symbols, coded, trellis, weights, 0, at, None, trace, None)
-        sizes.append(2 + (weights.size if counts else 0) + (size(trace[:at]) if size else 2 * len(words_of(trace[:at]))))
+        _, at, _ = walks["walk"](symbols, coded, lattice, weights, 0, at, None, trace, None)
+        sizes.append(2 + (weights.size if counts or guide else 0) + (size(trace[:at]) if size else 2 * len(words_of(trace[:at]))))
     return round(min(sizes))
 
 

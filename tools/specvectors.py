@@ -37,7 +37,10 @@ from kpc.format.nodes import encode_with as encode_nodes_with
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates
-from kpc.format.symbols import WEIGHTS, encode_with, next_state
+from kpc.format.rans import stream
+from kpc.format.symbols import (
+    ANY, AROUND, FAR_AROUND, LATTICE_BIT, MOST_DECISIONS, TRELLIS, WEIGHTS, Guide, encode_with, follows_trellis, next_state, walk,
+)
 from kpc.player import reference
 from kpc.tools import groupvectors
 from kpc.tools.groupvectors import of_the_draft
@@ -137,24 +140,49 @@ def encode(scene: QuantisedScene, *, segment_rows: int = 16, compress: bool = Tr
     return pack(chunks, _value_count(scene), compress=compress)
 
 
-def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 16, weights: np.ndarray | None = None) -> bytes:
+def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 16, weights: np.ndarray | None = None,
+                  lattice: int | None = None) -> bytes:
     """A file all of whose planes are context-coded, also where raw ones would be smaller, with so many sets of weights.
 
     The weights, if none are given, are no good ones but such as need no floating-point fit, and the largest and the smallest among
-    them.
+    them. With a `lattice`, symbols near to the scene's that follow it.
     """
     if weights is None:
         weights = (_noise((sets, WEIGHTS), 61) / 4).astype(np.int8)
         weights[0, 0], weights[-1, -1] = -128, 127
+    if lattice is not None:
+        scene = around(scene, Guide(weights, lattice), segment_rows)
     chunks = []
     for chunk in scene_chunks(scene, segment_rows=segment_rows):
         if chunk.kind == "PLNE":
             plane = scene.scales[chunk.scale][ALL_PLANES[chunk.plane]]
             rows = slice(chunk.row_start, chunk.row_start + chunk.row_count)
-            chunks.append(_forced(chunk, encode_with(weights, plane.symbols[rows], plane.coded[rows])))
+            symbols, coded = plane.symbols[rows], plane.coded[rows]
+            follows = lattice or (TRELLIS if follows_trellis(symbols, coded) else ANY)
+            chunks.append(_forced(chunk, encode_with(weights, symbols, coded, follows)))
         else:
             chunks.append(replace(chunk, symbols=None))
     return pack(chunks, _value_count(scene))
+
+
+def around(scene: QuantisedScene, guide: Guide, segment_rows: int) -> QuantisedScene:
+    """The scene with near symbols that follow a guide in each segment."""
+
+    def moved(plane: QuantisedPlane, rows: int) -> QuantisedPlane:
+        segments = [plane.symbols[start : start + rows].copy() for start in range(0, len(plane.symbols), rows)]
+        for number, symbols in enumerate(segments):
+            walked(symbols, plane.coded[rows * number : rows * (number + 1)], guide)
+        return replace(plane, symbols=np.concatenate(segments), guide=guide)
+
+    return replace(scene, scales=tuple({name: moved(plane, segment_rows if name in TIME_PLANES else len(plane.symbols))
+                                        for name, plane in scale.items()} for scale in scene.scales))
+
+
+def walked(symbols: np.ndarray, coded: np.ndarray, guide: Guide) -> bytes:
+    """A segment that tells (H, W, M) symbols up to the first that leaves its 8 bits, each moved so that it follows its guide."""
+    trace = np.empty(symbols.size * MOST_DECISIONS, np.int16)
+    _, at, _ = walk(symbols, np.ascontiguousarray(coded), guide.lattice, guide.weights, 0, 0, None, trace, None)
+    return bytes([len(guide.weights), guide.lattice << LATTICE_BIT]) + guide.weights.tobytes() + stream(trace[:at])
 
 
 def coded_grids(scene: QuantisedScene) -> bytes:
@@ -260,6 +288,10 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "trellis": (context_coded(_on_trellis(dynamic), 8, segment_rows=4), False),
         "trellis-extremes": (context_coded(_on_trellis(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127))), 4),
                              False),
+        "around": (context_coded(dynamic, 8, segment_rows=4, lattice=AROUND), False),
+        "around-far": (context_coded(dynamic, 2, segment_rows=4, lattice=FAR_AROUND), False),
+        **{f"around-{name}": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4, lattice=lattice), False)
+           for name, lattice in (("extremes", AROUND), ("far-extremes", FAR_AROUND))},
         "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
         "cells": (coded_grids(replace(dense, occupancy=rolling)), False),
         "cells-noise": (coded_grids(dense), False),
@@ -408,7 +440,8 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
 
     symbols = np.array([[[0, 1], [100, -7]], [[-128, 127], [3, 3]]], np.int16)
     weights = np.zeros((1, WEIGHTS), np.int8)
-    coarse = encode_with(weights, symbols.astype(np.int8), np.ones((2, 2), bool))
+    whole = np.ones((2, 2), bool)
+    coarse = encode_with(weights, symbols.astype(np.int8), whole, ANY)
     small = _scene(dynamic=False, sizes=[(2, 2, 2, 2, 0)])
     small_chunks = scene_chunks(small)
     small_xy = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "PLNE")
@@ -455,7 +488,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     vast = _scene(dynamic=False, sizes=[(256, 64, 64, 1, 0)])
     vast = replace(vast, scales=({name: replace(plane, symbols=0 * plane.symbols, coded=plane.coded & False)
                                   for name, plane in vast.scales[0].items()},))
-    nothing = encode_with(weights, vast.scales[0]["xy"].symbols, vast.scales[0]["xy"].coded)
+    nothing = encode_with(weights, vast.scales[0]["xy"].symbols, vast.scales[0]["xy"].coded, TRELLIS)
     hollow = [replace(chunk, symbols=None, parts=[nothing] if number == small_xy else chunk.parts)
               for number, chunk in enumerate(scene_chunks(vast))]
     bomb_symbols = patched(pack(hollow, _value_count(vast)), small_entry + 16, "<H", 2)
@@ -491,10 +524,11 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
                         broken, "claims another length"),
         "zstd-garbage": (resealed(patched(good, entry[xy] + 16, "<H", 1)), broken, "zstd frame"),
         "symbols-sets": (context(patched(coarse, 0, "<B", 3)), broken, "number of sets"),
-        "symbols-flags": (context(patched(coarse, 1, "<B", 4)), broken, "or flag"),
+        "symbols-flags": (context(patched(coarse, 1, "<B", 8)), broken, "or flag"),
         **damaged_words("symbols", context, coarse, state_at),
         "symbols-bomb": (resealed(bomb_symbols), broken, "more than 15 bytes can hold"),
-        "symbols-range": (context(encode_with(weights, symbols + 200, np.ones((2, 2), bool))), broken, "leaves its 8 bits"),
+        "symbols-range": (context(walked(symbols + 200, whole, Guide(weights, ANY))), broken, "leaves its 8 bits"),
+        "around-range": (context(walked(symbols + 200, whole, Guide(weights, FAR_AROUND))), broken, "leaves its 8 bits"),
         "symbols-count": (resealed(patched(told, small_entry + 24, "<I", 7)), broken, "claims 7 symbols"),
         "symbols-elsewhere": (resealed(patched(good, entry[deco] + 16, "<H", 2)), broken, "codec 2"),
         **damaged_words("cells", occupied, cells, 8),
