@@ -16,7 +16,8 @@ import torch
 
 from kpc.encoder.checkpoint import save_state
 from kpc.encoder.compress import (
-    MOTION_SHARE, ROUGHLY, Attempt, Quantise, Trade, compress, error_at, relative_steps, significance, with_coarser_motion,
+    MOTION_SHARE, ROUGHLY, SLOTS_SHARE, Attempt, Quantise, Trade, compress, error_at, relative_steps, significance, with_coarser_motion,
+    with_fewer_slots,
 )
 from kpc.encoder.curvature import Curvature, PerPlane, curvature
 from kpc.encoder.probe import Measured, Probe
@@ -117,6 +118,8 @@ def code(
         if coded is None or pruned.left_out_any:
             scene, coded = pruned.scene, None
             steps, significant, together = pruned.of_each_plane(steps), pruned.of_each_plane(significant), pruned.of_each_plane(together, in_pairs=True)
+    if model.coded is None:  # a file that is coded again and again is not to be marched ever longer
+        scene = with_fewer_slots(scene, measure, SLOTS_SHARE * error_at(whole, loss_db))
     coarser = with_coarser_motion(scene, measure, MOTION_SHARE * error_at(whole, loss_db))
     if coarser is not scene:
         scene, coded = coarser, None

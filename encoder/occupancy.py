@@ -23,8 +23,8 @@ def grid_shape(aabb: np.ndarray, cells_across: int) -> tuple[int, int, int]:
     return nz, ny, nx
 
 
-def in_fewest_slots(occupancy: np.ndarray) -> np.ndarray:
-    """(slots, Nz, Ny, Nx) bool in as few slots of equal length as leave no more than MORE_MARCHED more cells occupied on average: each
+def in_fewest_slots(occupancy: np.ndarray, more: float = MORE_MARCHED) -> np.ndarray:
+    """(slots, Nz, Ny, Nx) bool in as few slots of equal length as leave no more than this share more cells occupied on average: each
     holds all that those that it stands for hold.
 
     Where little moves, slots differ by the chance of where density was looked at: one in place of eight makes the grid of the default
@@ -33,7 +33,7 @@ def in_fewest_slots(occupancy: np.ndarray) -> np.ndarray:
     """
     slots, *cells = occupancy.shape
     merged = (occupancy.reshape(count, slots // count, *cells).any(1) for count in range(1, slots + 1) if slots % count == 0)
-    return next(grid for grid in merged if grid.mean() <= (1 + MORE_MARCHED) * occupancy.mean())
+    return next(grid for grid in merged if grid.mean() <= (1 + more) * occupancy.mean())
 
 
 class OccupancyGrid:

@@ -33,7 +33,7 @@ import numpy as np
 
 from kpc.encoder.curvature import SIDE, PerPlane
 from kpc.format.file import SEGMENT_ROWS
-from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
+from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene, short_above
 from kpc.format.rans import compiled
 from kpc.format.scene import TIME_PLANES, Scene
 from kpc.format.symbols import (
@@ -124,7 +124,7 @@ def _steered(
         search.run(PASSES - 1)
         return search.found()
     for lattice in (FAR_AROUND, AROUND):
-        finer = step / finer_around(lattice)
+        finer = short_above((step / finer_around(lattice)).astype(np.float32))
         around = quantise_plane(values, finer, identity=identity, needed=plane.coded)
         if np.mean(around.step <= 1.01 * finer) >= FAR_SHARE:
             break

@@ -61,7 +61,7 @@ def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bo
                    name: str = "plane") -> QuantisedPlane:
     """Round a plane to symbols: |dequantised - value| <= step / 2 (the plane's own step) at every needed texel.
 
-    Space planes (identity=False): the offset is the mean over the needed texels, moved by as little as brings the
+    Space planes (identity=False): the offset is the mean over the needed texels, to 8 significant bits, moved by as little as brings the
     whole range into 8 bits; a step too small for the range is enlarged to range / 255. All needed texels are coded.
     Time planes (identity=True): the offset is 1; a step too small is enlarged until [-128, 127] reaches both ends of
     the range. Texels whose symbols all come out 0 are not coded.
@@ -93,8 +93,8 @@ def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bo
         step = _at_least(step, np.maximum((high - 1.0) / SYMBOL_MAX, (low - 1.0) / SYMBOL_MIN))
     else:
         step = _at_least(step, (high - low) / (SYMBOL_MAX - SYMBOL_MIN))
-        mean = wanted.mean(0) if len(wanted) else np.ones(channels)
-        offset = np.clip(mean, high - SYMBOL_MAX * step.astype(np.float64), low - SYMBOL_MIN * step.astype(np.float64))
+        mean = wanted.mean(0).astype(np.float32) if len(wanted) else np.ones(channels, np.float32)
+        offset = np.clip(shortened(mean), high - SYMBOL_MAX * step.astype(np.float64), low - SYMBOL_MIN * step.astype(np.float64))
         offset = offset.astype(np.float32)
 
     symbols = np.zeros(values.shape, np.int8)
@@ -105,8 +105,21 @@ def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bo
 
 
 def _at_least(step: np.ndarray, bound: np.ndarray) -> np.ndarray:
-    """`step`, raised to `bound` where it falls short; rounded up, so that the bound still holds in float32."""
-    return np.where(step < bound, np.nextafter(bound.astype(np.float32), np.float32(np.inf)), step)
+    """`step`, raised to `bound` where it falls short; rounded up, so that the bound still holds."""
+    single = bound.astype(np.float32)
+    single = np.where(single < bound, np.nextafter(single, np.float32(np.inf)), single)
+    return np.where(step < bound, short_above(single), step)
+
+
+def short_above(values: np.ndarray) -> np.ndarray:
+    """float32 numbers of 8 significant bits, at least as large as positive float32 ones and at most 1 / 128 larger: a file holds them in
+    little more than half the bytes."""
+    return shortened((values.view(np.uint32) + np.uint32(0xFFFF)).view(np.float32))
+
+
+def shortened(values: np.ndarray) -> np.ndarray:
+    """float32 numbers without all but their first 8 significant bits."""
+    return (values.view(np.uint32) & np.uint32(0xFFFF0000)).view(np.float32)
 
 
 @dataclass(frozen=True)

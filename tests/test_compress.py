@@ -8,8 +8,8 @@ import pytest
 from scenes import displaced, tiny_scene
 
 from kpc.encoder.compress import (
-    FINEST, LEAST_SIGNIFICANCE, TRUST, Attempt, Steps, Trade, agreement_of, compress, error_of, relative_steps, scaled, significance,
-    with_coarser_motion,
+    FINEST, LEAST_SIGNIFICANCE, MOST_STEPS, TRUST, Attempt, Steps, Trade, agreement_of, compress, error_of, relative_steps, scaled, significance,
+    with_coarser_motion, with_fewer_slots,
 )
 from kpc.encoder.probe import Measured
 from kpc.encoder.search import TUNINGS
@@ -171,7 +171,7 @@ def test_where_nothing_costs_anything_all_steps_are_equal() -> None:
     assert math.isfinite(compress(SCENE, EQUAL, nothing, measure, 30.0, Trade()).measured.psnr)
 
 
-@pytest.mark.parametrize("share, expected", [(1e9, 16), (72.0, 8), (12.0, 3), (1.5, 1), (0.0, 1)])
+@pytest.mark.parametrize("share, expected", [(1e9, 64), (72.0, 8), (12.0, 3), (1.5, 1), (0.0, 1)])
 def test_displacements_are_as_coarse_as_their_error_may_be(share: float, expected: int) -> None:
     """`share`: of the square of motion.STEP; a step errs by a twelfth of its own."""
     scene = displaced(tiny_scene())
@@ -186,7 +186,7 @@ def test_displacements_are_as_coarse_as_their_error_may_be(share: float, expecte
     else:
         np.testing.assert_array_equal(found.motion / np.float32(expected * STEP) % 1, 0)  # type: ignore[operator]
         assert measure(found).error - left_out <= share * STEP**2 / 12
-        assert with_coarser_motion(found, measure, share * STEP**2 / 12) is found or expected < 16
+        assert with_coarser_motion(found, measure, share * STEP**2 / 12) is found or expected < MOST_STEPS
     assert with_coarser_motion(tiny_scene(), measure, 1e9).motion is None
 
 
@@ -195,10 +195,24 @@ def test_displacements_that_break_pictures_stay() -> None:
     assert with_coarser_motion(scene, lambda candidate: Measured(math.nan, math.nan), 1e9) is scene
 
 
+@pytest.mark.parametrize("error, common, slots", [(1.0, 100, 1), (1.0, 50, 2), (0.1, 100, 4)])
+def test_slots_are_fewer_where_they_hold_much_the_same(error: float, common: int, slots: int) -> None:
+    """Unless pictures err by more than they may, or players would have to march too many cells: each slot has ten of its own."""
+    cells = np.zeros((4, 250), bool)
+    cells[:, :common] = True
+    for k in range(4):
+        cells[k, 200 + 10 * k :][:10] = True
+    scene = replace(tiny_scene(), occupancy=cells.reshape(4, 5, 5, 10))
+    found = with_fewer_slots(scene, lambda candidate: Measured(30.0, 0.5 + 0.3 * (len(candidate.occupancy) < 4)), error)
+    assert len(found.occupancy) == slots and (found is scene) == (slots == 4)
+    np.testing.assert_array_equal(found.occupancy.any(0), scene.occupancy.any(0))
+
+
 def test_scaled() -> None:
-    out = scaled([{"xy": np.array([1.0, 2.0])}], 0.25)
+    out = scaled([{"xy": np.array([1.0, 2.0, 0.1])}], 0.25)
     assert out[0]["xy"].dtype == np.float32
-    np.testing.assert_array_equal(out[0]["xy"], [0.25, 0.5])
+    np.testing.assert_array_equal(out[0]["xy"][:2], [0.25, 0.5])
+    assert 0.025 < out[0]["xy"][2] < 0.025 * (1 + 2**-7)
 
 
 def tuned_to(factor: float, seen: list[Attempt] | None = None, power: float = 1.0, **trade: float) -> Attempt:
