@@ -86,7 +86,7 @@ TOLD_APART = 40
 
 def quantise_on_trellis(
     scene: Scene, steps: PerPlane, reached: np.ndarray | None = None,
-    significant: PerPlane | None = None, only: Collection[Name] | None = None, together: PerPlane | None = None,
+    significant: PerPlane | None = None, only: Collection[Name] | None = None, together: PerPlane | None = None, thin: float = THIN,
 ) -> QuantisedScene:
     """As `quantise_scene`, with symbols that follow the trellis.
 
@@ -94,12 +94,13 @@ def quantise_on_trellis(
         significant: what a squared error costs in each number, relative to others of its channel; (H, W, M), none negative. None: the same.
         only: the planes whose symbols are searched for; others are rounded. None: all.
         together: as of `kpc.encoder.curvature.Curvature`. None: channels know nothing of each other.
+        thin: bits of a symbol below which a plane goes around predictions.
     """
     quantised = quantise_scene(scene, steps, reached=reached)
     matters = significant or [{name: np.ones(plane.shape, np.float32) for name, plane in scale.items()} for scale in scene.scales]
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the search holds no lock
         waiting = [{name: pool.submit(_steered, plane, planes[name], step[name], w[name], name in TIME_PLANES,
-                                      ALONE if together is None else together[s][name])
+                                      ALONE if together is None else together[s][name], thin)
                     for name, plane in scale.items() if only is None or (s, name) in only}
                    for s, (scale, planes, step, w) in enumerate(zip(quantised.scales, scene.scales, steps, matters, strict=True))]
         found = [{name: plane.result() for name, plane in scale.items()} for scale in waiting]
@@ -109,7 +110,7 @@ def quantise_on_trellis(
 
 def _steered(
     plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool,
-    together: np.ndarray = ALONE,
+    together: np.ndarray = ALONE, thin: float = THIN,
 ) -> QuantisedPlane:
     """A plane that is quantised to the nearest, with other symbols, and around predictions with other steps. What was left out stays so, and
     holds 0; and so does what is so near the identity that it is not worth telling.
@@ -120,7 +121,7 @@ def _steered(
     lattice = TRELLIS if np.median(plane.step / step) < 2 else ANY
     search = _Search(plane, values, step, significant, identity, together, lattice)
     search.run(1)
-    if lattice == ANY or search.bits_of_a_symbol >= THIN:
+    if lattice == ANY or search.bits_of_a_symbol >= thin:
         search.run(PASSES - 1)
         return search.found()
     for lattice in (FAR_AROUND, AROUND):

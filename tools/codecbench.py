@@ -52,10 +52,13 @@ OURS = "kpc"
 WITHOUT: dict[str, Quantise | None] = {
     "kpc without tuning": None,
     "kpc, channels apart": quantise_on_trellis,
+    "kpc, never around predictions": lambda scene, steps, reached, significant: quantise_on_trellis(
+        scene, steps, reached, significant, thin=0.0),
     "kpc without the trellis": lambda scene, steps, reached, significant: quantise_scene(scene, steps, reached=reached),
     "kpc, every texel alike": lambda scene, steps, reached, significant: quantise_on_trellis(scene, steps, reached),
 }
-"""Our own coder with something left out, the latter three without tuning, too; at QUALITIES."""
+"""Our own coder with something left out: tuning; without it, what channels know of each other's errors; and without either, one thing more.
+At QUALITIES."""
 TUNED = {"AV1, tuned": "AV1"}
 """Rivals that get the tuning of our own coder, `kpc.encoder.tuning`, through what comes back from their own coding."""
 
