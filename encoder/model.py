@@ -5,7 +5,7 @@ judged by its own pictures.
 """
 
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,8 +16,8 @@ import torch
 
 from kpc.encoder.checkpoint import save_state
 from kpc.encoder.compress import (
-    MOTION_SHARE, ROUGHLY, SLOTS_SHARE, Attempt, Quantise, Trade, compress, error_at, relative_steps, significance, with_coarser_motion,
-    with_fewer_slots,
+    DECODER_SHARE, MOTION_SHARE, ROUGHLY, SLOTS_SHARE, Attempt, Quantise, Trade, compress, decoder_bits, error_at, relative_steps, significance,
+    with_coarser_motion, with_fewer_slots,
 )
 from kpc.encoder.curvature import Curvature, PerPlane, curvature
 from kpc.encoder.probe import Measured, Probe
@@ -28,7 +28,7 @@ from kpc.format import file
 from kpc.format.cameras import Camera
 from kpc.format.container import MAGIC
 from kpc.format.errors import FormatError, TrainingError, UsageError
-from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_scene
+from kpc.format.quantise import HALF_BITS, QuantisedPlane, QuantisedScene, quantise_scene, round_decoder
 from kpc.format.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 
@@ -106,8 +106,15 @@ def code(
         steps = [{name: step_on_trellis(plane) for name, plane in scale.items()} for scale in coded.scales]
     measure = model.probe.measure(scene)
     whole = measure(scene).psnr
-    chosen: Quantise = quantise or (  # of channels that are left, too
-        lambda scene, steps, reached, significant: quantise_on_trellis(scene, steps, reached, significant, together=together))
+    bits = HALF_BITS
+
+    def chosen(scene: Scene, steps: PerPlane, reached: np.ndarray, significant: PerPlane, only: Collection[Name] | None = None) -> QuantisedScene:
+        if quantise is not None:
+            quantised = quantise(scene, steps, reached, significant)
+        else:  # of channels that are left, too
+            quantised = quantise_on_trellis(scene, steps, reached, significant, only, together)
+        return replace(quantised, decoder=round_decoder(quantised.decoder, bits))
+
     loss_db = trade.loss_db(whole)
     if trade.target_bytes is not None:  # what that costs is known when it has been tried
         roughly = compress(scene, steps, significant, measure, whole, trade, coded, chosen, tolerance=ROUGHLY)
@@ -118,15 +125,17 @@ def code(
         if coded is None or pruned.left_out_any:
             scene, coded = pruned.scene, None
             steps, significant, together = pruned.of_each_plane(steps), pruned.of_each_plane(significant), pruned.of_each_plane(together, in_pairs=True)
+    error = error_at(whole, loss_db)
     if model.coded is None:  # a file that is coded again and again is not to be marched ever longer
-        scene = with_fewer_slots(scene, measure, SLOTS_SHARE * error_at(whole, loss_db))
-    coarser = with_coarser_motion(scene, measure, MOTION_SHARE * error_at(whole, loss_db))
+        scene = with_fewer_slots(scene, measure, SLOTS_SHARE * error)
+    coarser = with_coarser_motion(scene, measure, MOTION_SHARE * error)
     if coarser is not scene:
         scene, coded = coarser, None
+    bits = decoder_bits(scene, measure, DECODER_SHARE * error)
 
     def tune(steps: PerPlane, reached: np.ndarray) -> QuantisedScene:
         def choose(candidate: Scene, group: Sequence[Name]) -> QuantisedScene:
-            return quantise_on_trellis(candidate, steps, reached, significant, group, together)
+            return chosen(candidate, steps, reached, significant, group)
 
         return tuned(scene, model.scene, choose, tune_steps, shown)
 

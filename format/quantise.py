@@ -23,6 +23,8 @@ SYMBOL_MIN, SYMBOL_MAX = -128, 127
 
 VALUE_LIMIT = 2048.0
 """Magnitude of any plane value: float16 holds it, and with float16 weights no feature, density or colour overflows."""
+HALF_BITS = 11
+"""Significant bits of a float16."""
 COARSEST_STEP = 8.0
 """A coarser step is taken for this one; 128 of it stay within the limit."""
 
@@ -220,16 +222,22 @@ def _reach(texels: int, cells: int) -> np.ndarray:
     return (((i + 1) * cells >= c * (texels - 1)) & ((i - 1) * cells <= (c + 1) * (texels - 1))).astype(np.float32)
 
 
-def round_decoder(decoder: AnyDecoder) -> AnyDecoder:
-    """The decoder with its weights rounded to float16 (the density bias to float32), as float32 arrays.
+def round_decoder(decoder: AnyDecoder, bits: int = HALF_BITS) -> AnyDecoder:
+    """The decoder with its weights rounded to float16 of so many significant bits (the density bias to float32), as float32 arrays.
 
     Raises:
         FormatError: a weight is NaN, infinite or beyond float16's 65504.
     """
     if not np.isfinite(decoder.density_bias):
         raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
-    weights = {name: value if name == "density_bias" else half(value) for name, value in vars(decoder).items()}
+    weights = {name: value if name == "density_bias" else half(_to_bits(value, bits)) for name, value in vars(decoder).items()}
     return replace(decoder, **weights | {"density_bias": float(np.float32(decoder.density_bias))})
+
+
+def _to_bits(values: np.ndarray, bits: int) -> np.ndarray:
+    """Rounded to so many significant bits."""
+    mantissas, exponents = np.frexp(values)
+    return values if bits >= HALF_BITS else np.ldexp(np.rint(np.ldexp(mantissas, bits)), exponents - bits)
 
 
 def half(weights: np.ndarray, what: str = "decoder") -> np.ndarray:

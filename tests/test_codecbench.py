@@ -105,7 +105,8 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert rates[0] <= 3 * tiny_scene(3).parameter_count / 8 and rates[0] < rates[1]
     for found, quality in zip(ours["points"][2:], (60, 70, 80, 90), strict=True):
         assert found["setting"] == f"quality {quality}"
-        assert 0 <= found["agreement_db"] - (20 + quality / 3) < 1  # a file's own rounding is not much finer
+        # A file's own rounding is not much finer; and errors leap where a plane of so few texels leaves the trellis for predictions.
+        assert 0 <= found["agreement_db"] - (20 + quality / 3) < 1.5
     assert "| scene | 60 | 70 | 80 | 90 |" in results.markdown(records)
     others = codecbench.others_bytes(codecbench.model.load(scene_file))
     assert min(p["size_bytes"] for p in halves["points"]) > others > 100

@@ -8,15 +8,15 @@ import pytest
 from scenes import displaced, tiny_scene
 
 from kpc.encoder.compress import (
-    FINEST, LEAST_SIGNIFICANCE, MOST_STEPS, TRUST, Attempt, Steps, Trade, agreement_of, compress, error_of, relative_steps, scaled, significance,
-    with_coarser_motion, with_fewer_slots,
+    FINEST, LEAST_SIGNIFICANCE, MOST_STEPS, TRUST, Attempt, Steps, Trade, agreement_of, compress, decoder_bits, error_of, relative_steps, scaled,
+    significance, with_coarser_motion, with_fewer_slots,
 )
 from kpc.encoder.probe import Measured
 from kpc.encoder.search import TUNINGS
 from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format import file
 from kpc.format.motion import STEP
-from kpc.format.quantise import QuantisedScene, quantise_scene
+from kpc.format.quantise import QuantisedScene, quantise_scene, round_decoder
 from kpc.format.scene import Scene
 
 SCENE = replace(tiny_scene(), occupancy=np.ones((1, 2, 2, 2), bool))  # every texel is needed
@@ -206,6 +206,22 @@ def test_slots_are_fewer_where_they_hold_much_the_same(error: float, common: int
     found = with_fewer_slots(scene, lambda candidate: Measured(30.0, 0.5 + 0.3 * (len(candidate.occupancy) < 4)), error)
     assert len(found.occupancy) == slots and (found is scene) == (slots == 4)
     np.testing.assert_array_equal(found.occupancy.any(0), scene.occupancy.any(0))
+
+
+@pytest.mark.parametrize("error, bits", [(0.0, 11), (2.0**-14, 7), (2.0**-10, 5), (1.0, 4)])
+def test_weights_of_the_decoder_have_as_few_bits_as_their_error_allows(error: float, bits: int) -> None:
+    scene = tiny_scene()
+
+    def measure(candidate: Scene) -> Measured:
+        exact, rounded = (candidate_or.decoder.w1 for candidate_or in (scene, candidate))
+        return Measured(30.0, 0.25 + float(np.max(np.abs(rounded / exact - 1)) ** 2))
+
+    found = decoder_bits(scene, measure, error)
+    assert found == bits
+    rounded = round_decoder(scene.decoder, found)
+    mantissas = np.frexp(rounded.w2)[0] * 2.0**bits
+    np.testing.assert_array_equal(mantissas, np.rint(mantissas))
+    assert measure(replace(scene, decoder=rounded)).error <= 0.25 + error or bits == 11
 
 
 def test_scaled() -> None:
