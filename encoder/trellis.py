@@ -77,7 +77,7 @@ PASSES = 4
 """Searches: the first knows but the weights of rounded symbols, not what symbols cost, nor errors of rows below. Two more make files half a
 percent smaller."""
 SETS, MANY = 4, 1 << 17
-"""Of weights, for so many symbols or more; one for fewer."""
+"""Of weights. Around predictions files hold those of the search: one set, but for so many symbols or more."""
 ALONE = np.zeros((0, 0, 0, 0), np.float32)
 """For what goes together, where channels know nothing of each other."""
 TOLD_APART = 40
@@ -172,7 +172,7 @@ class _Search:
     def run(self, times: int) -> None:
         for _ in range(times):
             neighbours = neighbourhoods(self.symbols, self.known)
-            self.weights = fitted(neighbours, SETS if len(neighbours) >= MANY else 1)
+            self.weights = fitted(neighbours, SETS if self.lattice < AROUND or len(neighbours) >= MANY else 1)
             self.symbols, self.counts = _search(
                 self.wanted, self.worth, self.known, self.rows, self.lattice, self.weights, LAM * self._finer**2 * _bits(self.counts),
                 self.errors, self.together)
@@ -204,9 +204,10 @@ def _search(
     together: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, M) int8 symbols of (H, W, M) numbers in steps, whose errors are worth as much as that; 0 where nothing is `known`; and how often
-    errors came, as `_bits` counts them. Every so many `rows` a segment begins, which knows of none before. `lattice`: as of `kpc.format.symbols`; where any may follow, survivors differ in which of their last
-    three are odd. `price`: of `_bits`, in squared steps. `errors`: (H + 2, W + 2, M) float32, u of all texels, one row and one column of 0
-    around; those of known ones are found anew. `together`: as of `quantise_on_trellis`, or ALONE.
+    errors came, as `_bits` counts them. Every so many `rows` a segment begins, which knows of none before. `lattice`: as of
+    `kpc.format.symbols`; where any may follow, survivors differ in which of their last three are odd. `price`: of `_bits`, in squared steps.
+    `errors`: (H + 2, W + 2, M) float32, u of all texels, one row and one column of 0 around; those of known ones are found anew.
+    `together`: as of `quantise_on_trellis`, or ALONE.
 
     v, r, cross and the names of neighbours as in `kpc.format.symbols`; v0, r0 and errors of survivors are held by their states.
     """
