@@ -330,7 +330,7 @@ def _cut(values: np.ndarray, shapes: Sequence[Mapping[str, tuple[int, ...]]]) ->
 
 RIVALS: tuple[Rival, ...] = (
     Half("zstd -19"), Half("xz -9"), Bytes(), Pictures("png"), Pictures("webp"),
-    Video("HEVC", "libx265", (10, 14, 18, 22, 27, 33),
+    Video("HEVC", "libx265", (10, 14, 18, 22, 27, 33, 39, 45),
           ("-preset", "slow", "-tune", "psnr", "-x265-params", "qp={}:keyint=1:info=0")),
-    Video("AV1", "libaom-av1", (4, 8, 12, 18, 26, 36), ("-usage", "allintra", "-cpu-used", "4", "-crf", "{}", "-b:v", "0")),
+    Video("AV1", "libaom-av1", (4, 8, 12, 18, 26, 36, 46, 56), ("-usage", "allintra", "-cpu-used", "4", "-crf", "{}", "-b:v", "0")),
 )  # fmt: skip
