@@ -15,8 +15,8 @@ before left them. So errors next to each other get opposite signs, and look-ups,
 undoes what others err. What an error is worth differs from texel to texel by orders of magnitude (`kpc.encoder.curvature`): where it is
 worth little, symbols are those that are foreseen.
 
-Where less than a bit is told of a symbol (`THIN`), they follow the trellis around predictions: what is foreseen may then follow everywhere,
-as it should where nothing else is said, and not only every other time.
+Where little more than a bit is told of a symbol (`THIN`), they follow the trellis around predictions where it is flat: what is foreseen may
+then follow everywhere, as it should where nothing else is said, and not only every other time.
 
 Default scene, `fast`: at equal error of pictures of 1, 2 and 4 squared levels planes take 11 to 14 % fewer bytes than with symbols chosen
 by rate and distortion around the nearest. Errors that know of each other save 5 to 8 % more, and 14 % where steps are fine (liam,
@@ -37,7 +37,7 @@ from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, Quantise
 from kpc.format.rans import compiled
 from kpc.format.scene import TIME_PLANES, Scene
 from kpc.format.symbols import (
-    ACTIVITIES, ANY, AROUND, FAR_AROUND, TRELLIS, UNKNOWN, Guide, activity, begin_row, fitted, foreseen, meant, neighbourhoods, next_place,
+    ACTIVITIES, ANY, AROUND, FLAT, TRELLIS, UNKNOWN, Guide, activity, begin_row, fitted, foreseen, meant, neighbourhoods, next_place,
     predict, remember,
 )
 
@@ -65,13 +65,14 @@ LEAST_WORTH = 0.03
 """Of an error, as a share of the channel's mean: what no ray met may yet be seen, and what lets light through may be made to hide what is
 behind. Soldier, held-out views: with 1e-4 squared errors are a tenth larger where steps are fine, and a third where they are coarse, most of
 that in one ray of a hundred; with 0.1 files are up to one percent larger (liam: 2 %)."""
-THIN = 0.9
-"""Bits of a symbol below which the trellis goes around predictions. Room, liam and soldier, each large plane alone, at equal
-slopes: squared errors plus what bits are worth are 2 % less at 0.8 bits, 5 at 0.7, 10 at 0.6 and 20 at 0.4, 3 % more at 1.1."""
+THIN = 1.3
+"""Bits of a symbol below which the trellis goes around predictions. Liam and soldier, large planes alone, at equal slopes: squared errors
+plus what bits are worth are 1 % less at 1.3 bits, 8 at 0.75, 15 at 0.5 and 24 at 0.4."""
 THIN_LAM = 1.0
-"""LAM of those. What bits are worth stays what it is: steps are sqrt(LAM / THIN_LAM) of what they are on the trellis."""
-FAR_SHARE = 0.75
-"""Of channels that have to have room in 8 bits for symbols spaced out by two, whose predictions are finer: two to five percent less of the same."""
+"""LAM of those. What bits are worth stays what it is: steps are sqrt(LAM / THIN_LAM) of what they are on the trellis. With 0.7 it is 0 to 1 %
+less at 1.3 bits, and 3 to 5 % more at 0.5."""
+FINER = math.sqrt(THIN_LAM / LAM)
+"""By how much steps around predictions are finer than those on the trellis at which bits are worth as much."""
 STATES = 8
 PASSES = 4
 """Searches: the first knows but the weights of rounded symbols, not what symbols cost, nor errors of rows below. Two more make files half a
@@ -124,24 +125,16 @@ def _steered(
     if lattice == ANY or search.bits_of_a_symbol >= thin:
         search.run(PASSES - 1)
         return search.found()
-    for lattice in (FAR_AROUND, AROUND):
-        finer = short_above((step / finer_around(lattice)).astype(np.float32))
-        around = quantise_plane(values, finer, identity=identity, needed=plane.coded)
-        if np.mean(around.step <= 1.01 * finer) >= FAR_SHARE:
-            break
-    search = _Search(around, values, finer, significant, identity, together, lattice)
+    finer = short_above((step / FINER).astype(np.float32))
+    around = quantise_plane(values, finer, identity=identity, needed=plane.coded)
+    search = _Search(around, values, finer, significant, identity, together, AROUND)
     search.run(PASSES)
     return search.found()
 
 
-def finer_around(lattice: int) -> float:
-    """By how much steps around predictions are finer than those on the trellis at which bits are worth as much."""
-    return math.sqrt(THIN_LAM / LAM) * (lattice - TRELLIS)
-
-
 def step_on_trellis(plane: QuantisedPlane) -> np.ndarray:
     """(M,) float64: for which steps `quantise_on_trellis` was asked when it made this plane, if it did and 8 bits were enough."""
-    return plane.step.astype(np.float64) * (1.0 if plane.guide is None else finer_around(plane.guide.lattice))
+    return plane.step.astype(np.float64) * (1.0 if plane.guide is None else FINER)
 
 
 class _Search:
@@ -153,7 +146,7 @@ class _Search:
     def __init__(self, plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool,
                  together: np.ndarray, lattice: int) -> None:
         self.plane, self.identity, self.together, self.lattice = plane, identity, together, lattice
-        self._finer = finer_around(lattice) if lattice >= AROUND else 1.0
+        self._finer = FINER if lattice == AROUND else 1.0
         self.rows = SEGMENT_ROWS if identity else len(values)
         coarser = plane.step / step
         self.wanted = (values.astype(np.float64) - plane.offset) / plane.step
@@ -172,7 +165,7 @@ class _Search:
     def run(self, times: int) -> None:
         for _ in range(times):
             neighbours = neighbourhoods(self.symbols, self.known)
-            self.weights = fitted(neighbours, SETS if self.lattice < AROUND or len(neighbours) >= MANY else 1)
+            self.weights = fitted(neighbours, SETS if self.lattice != AROUND or len(neighbours) >= MANY else 1)
             self.symbols, self.counts = _search(
                 self.wanted, self.worth, self.known, self.rows, self.lattice, self.weights, LAM * self._finer**2 * _bits(self.counts),
                 self.errors, self.together)
@@ -182,8 +175,8 @@ class _Search:
         return float((self.counts * _bits(self.counts)).sum() / max(self.counts.sum(), 1))
 
     def found(self) -> QuantisedPlane:
-        if self.lattice >= AROUND:  # what is coded tells what is foreseen
-            return replace(self.plane, symbols=self.symbols, coded=self.known, guide=Guide(self.weights, self.lattice))
+        if self.lattice == AROUND:  # what is coded tells what is foreseen
+            return replace(self.plane, symbols=self.symbols, coded=self.known, guide=Guide(self.weights))
         return replace(self.plane, symbols=self.symbols, coded=self.symbols.any(axis=2) if self.identity else self.known)
 
 
@@ -212,7 +205,7 @@ def _search(
     v, r, cross and the names of neighbours as in `kpc.format.symbols`; v0, r0 and errors of survivors are held by their states.
     """
     H, W, M = wanted.shape
-    sets, apart = weights.astype(np.int64), 1 << lattice if lattice < AROUND else 2 * (lattice - TRELLIS)  # of symbols that may follow
+    sets, apart = weights.astype(np.int64), 1 if lattice == ANY else 2  # of symbols that may follow
     symbols, counts = np.zeros((H, W, M), np.int8), np.zeros(price.shape)
     v, r = np.zeros((3, W + 4), np.int64), np.zeros((3, W + 4), np.int64)
     cross = np.zeros((H, W), np.int16)
@@ -257,22 +250,24 @@ def _search(
                         nww, nnw, nne, nee = v1[X - 2], v2[X - 1], v2[X + 1], v1[X + 2]
                         around = 2 * (rw + r1[X]) + r1[X - 1] + r1[X + 1] + rww + r2[X]
                     predicted, gradient, _ = predict(sets, w, n, nw, ne, ww, nn, nww, nnw, nne, nee)
-                    odd = s & 1 if lattice != ANY else 0
-                    whole = foreseen(predicted, lattice, odd)
-                    active = activity(around, int(past[x]), gradient, m) + (ACTIVITIES if odd and lattice >= AROUND else 0)
+                    active, odd = activity(around, int(past[x]), gradient, m), s & 1 if lattice != ANY else 0
+                    kind = TRELLIS if lattice == AROUND and active >= FLAT else lattice
+                    whole = foreseen(predicted, kind, odd)
+                    if odd and kind == AROUND:
+                        active += ACTIVITIES
                     near = outside + BESIDE * U[x, s]
                     best = min(max(wanted[y, x, m] - near / root, SYMBOL_MIN), SYMBOL_MAX)  # as far as errors go
                     away = best - whole
-                    size = int((abs(away) + (apart // 2 if odd and lattice >= AROUND else 0)) / apart)
+                    size = int((abs(away) + (1 if odd and kind == AROUND else 0)) / apart)
                     inside = size if away > 0 else -size
                     for error in (inside - 1, inside, inside + 1, 0):  # those around it, the next that costs less, what is foreseen
-                        value = whole + meant(error, lattice, odd)
+                        value = whole + meant(error, kind, odd)
                         if not SYMBOL_MIN <= value <= SYMBOL_MAX:
                             continue
                         size = min(abs(error), TOLD_APART - 1)
                         u = root * (value - wanted[y, x, m])
                         total = before[s] + u * (u + 2 * near) + price[active, size]
-                        to = (s << 1 | value & 1) & STATES - 1 if lattice == ANY else next_place(s, value, error, lattice)
+                        to = (s << 1 | value & 1) & STATES - 1 if lattice == ANY else next_place(s, value, error, kind)
                         if total < cost[to]:
                             cost[to], came[x, to], context[x, to], missed[x, to] = total, s, active, size
                             V[X, to], R[X, to], U[x + 1, to] = value, abs((value << 7) - predicted) >> 3, u

@@ -12,17 +12,18 @@ symbols before say whether the next one is even or odd, `next_state`. So each ha
 bit, and yet by its choice of what comes before a writer has nearly all of them: at as many bits, errors are 1.09 dB smaller
 (`kpc.encoder.trellis`). Whether symbols do is seen from themselves.
 
-Or they follow it *around predictions*: not symbols but their differences from what is foreseen are even or odd, and none is always among
-them. Where hardly anything is told, a symbol may so stay what is foreseen wherever its row has led. Quantisers that are even, or odd and
-zero, are those of dependent quantisation in VVC (ITU-T H.266, section 8.7.3; Schwarz et al., Data Compression Conference 2019). Such
-symbols are known from the weights alone that foresaw them: a `Guide`.
+Where the neighbourhood is flat they may do so *around predictions*: not symbols but their differences from what is foreseen are even or odd,
+and none is always among them. So where hardly anything is told a symbol may stay what is foreseen, wherever its row has led. Quantisers
+that are even, or odd and zero, are those of dependent quantisation in VVC (ITU-T H.266, section 8.7.3; Schwarz et al., Data Compression
+Conference 2019). Such symbols are told with the weights alone that foresaw them: a `Guide`.
 
 Naming, throughout this module
     v           symbols of one channel; r  by how much predictions missed them, in 1 / 16 of a symbol. Rings of three rows with two
                 more columns on either side: rows `here`, `above` and `higher`, column x at X = x + 2
     w n nw ne   values to the left, above, above to the left and to the right
     cross       what r was in the channels before, smoothed
-    lattice     which symbols may follow: ANY, on the TRELLIS, or AROUND predictions, there spaced out by 1 or, FAR_AROUND, by 2
+    lattice     which symbols may follow: ANY; those on the TRELLIS; or AROUND predictions, where it is flat, and else on the trellis
+    kind        of a symbol among them: ANY, TRELLIS or AROUND
     place       on the trellis, one of 8; it is odd where symbols, or differences, have to be
     table       counters of `kpc.format.rans`
     state at words trace    of `kpc.format.rans.decide`
@@ -39,8 +40,10 @@ SET_COUNTS = (1, 2, 4, 8)
 """How many sets of weights a segment may store."""
 WEIGHTS = 9
 """Of a set, each in 1 / 64."""
-ANY, TRELLIS, AROUND, FAR_AROUND = range(4)
+ANY, TRELLIS, AROUND = range(3)
 """Lattices."""
+FLAT = 4
+"""Neighbourhoods less active than that are flat."""
 MAP, LATTICE_BIT = 1, 1
 """Flags: not all texels are coded; from this bit on, the lattice."""
 
@@ -71,20 +74,18 @@ class Guide:
 
     Attributes:
         weights: (C, WEIGHTS) int8; C is one of SET_COUNTS.
-        lattice: AROUND or FAR_AROUND.
     """
 
     weights: np.ndarray
-    lattice: int
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Guide) and self.lattice == other.lattice and np.array_equal(self.weights, other.weights)
+        return isinstance(other, Guide) and np.array_equal(self.weights, other.weights)
 
 
 def encode_symbols(symbols: np.ndarray, coded: np.ndarray, guide: Guide | None = None) -> bytes:
     """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: by their guide, if they have one that they follow, else with as many
     sets of weights as make it shortest."""
-    if guide is not None and (body := encode_with(guide.weights, symbols, coded, guide.lattice)) is not None:
+    if guide is not None and (body := encode_with(guide.weights, symbols, coded, AROUND)) is not None:
         return body
     symbols, coded = np.array(symbols, order="C"), np.array(coded, order="C")  # compiled for this layout; and `walk` writes
     neighbours, lattice = neighbourhoods(symbols, coded), TRELLIS if follows_trellis(symbols, coded) else ANY
@@ -110,15 +111,15 @@ def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple
     Raises:
         FormatError: the body is cut, too long, or says what only a damaged one would.
     """
-    guide, has_map = _head(body)
-    state, words = opened(body[2 + guide.weights.size:], "plane segment")
+    weights, lattice, has_map = _head(body)
+    state, words = opened(body[2 + weights.size:], "plane segment")
 
     symbols, coded = np.zeros((rows, columns, channels), np.int8), np.ones((rows, columns), bool)
     at, fit = 0, True
     if has_map:
         state, at = walk_map(coded, state, at, words, None)
     if at <= len(words):
-        state, at, fit = walk(symbols, coded, guide.lattice, guide.weights, state, at, words, None, None)
+        state, at, fit = walk(symbols, coded, lattice, weights, state, at, words, None, None)
     if not fit:
         raise FormatError("plane segment: a symbol leaves its 8 bits")
     ended(state, at, words, "plane segment")
@@ -131,19 +132,19 @@ def guide_of(body: bytes) -> Guide | None:
     Raises:
         FormatError: as `decode_symbols`.
     """
-    guide, _ = _head(body)
-    return guide if guide.lattice >= AROUND else None
+    weights, lattice, _ = _head(body)
+    return Guide(weights) if lattice == AROUND else None
 
 
-def _head(body: bytes) -> tuple[Guide, bool]:
-    """Weights and lattice, whatever it is; and whether there is a map."""
-    if len(body) < 2 or body[0] not in SET_COUNTS or body[1] >> LATTICE_BIT > FAR_AROUND:
+def _head(body: bytes) -> tuple[np.ndarray, int, bool]:
+    """Weights, lattice, and whether there is a map."""
+    if len(body) < 2 or body[0] not in SET_COUNTS or body[1] >> LATTICE_BIT > AROUND:
         raise FormatError("plane segment: unknown number of sets of weights or flag")
     sets = body[0]
     if len(body) < 2 + WEIGHTS * sets:
         raise FormatError("plane segment: cut off within its weights")
     weights = np.frombuffer(body, np.int8, WEIGHTS * sets, 2).reshape(sets, WEIGHTS)
-    return Guide(weights, body[1] >> LATTICE_BIT), body[1] & MAP != 0
+    return weights, body[1] >> LATTICE_BIT, body[1] & MAP != 0
 
 
 def neighbourhoods(symbols: np.ndarray, coded: np.ndarray) -> np.ndarray:
@@ -230,36 +231,34 @@ def next_state(state, symbol):
 
 
 @compiled(forceinline=True)
-def meant(error, lattice, odd):
+def meant(error, kind, odd):
     """How far from what is foreseen, as `foreseen` has it, an error puts a symbol. `odd`: whether place is."""
-    if lattice < AROUND:
-        return error << lattice
-    spacing = lattice - TRELLIS
-    return spacing * (2 * error - (odd if error > 0 else -odd if error < 0 else 0))
+    if kind < AROUND:
+        return error << kind
+    return 2 * error - (odd if error > 0 else -odd if error < 0 else 0)
 
 
 @compiled(forceinline=True)
-def told(away, lattice, odd):
+def told(away, kind, odd):
     """The error that means a symbol so far from what is foreseen, or one near to it."""
-    if lattice < AROUND:
-        return away >> lattice
-    spacing = lattice - TRELLIS
-    size = (abs(away) + spacing * odd) // (2 * spacing)
+    if kind < AROUND:
+        return away >> kind
+    size = abs(away) + odd >> 1
     return size if away > 0 else -size
 
 
 @compiled(forceinline=True)
-def foreseen(predicted, lattice, odd):
+def foreseen(predicted, kind, odd):
     """The symbol nearest to a prediction, on the trellis one that may follow; ties go up."""
-    return nearest(predicted, odd, 1) if lattice == TRELLIS else nearest(predicted, 0, 0)
+    return nearest(predicted, odd, 1) if kind == TRELLIS else nearest(predicted, 0, 0)
 
 
 @compiled(forceinline=True)
-def next_place(place, value, error, lattice):
+def next_place(place, value, error, kind):
     """After a symbol that an error made: by the one or, around predictions, by the other."""
-    if lattice == ANY:
+    if kind == ANY:
         return 0
-    return next_state(place, value if lattice == TRELLIS else 2 * error)
+    return next_state(place, value if kind == TRELLIS else 2 * error)
 
 
 @compiled()
@@ -298,20 +297,21 @@ def walk(symbols, coded, lattice, weights, state, at, words, trace, neighbours):
                     r1[x:x + 5], r2[x:x + 5] = r0[X - 1], r0[X - 1]
                 w, n, nw, ne, ww, nn = v0[X - 1], v1[X], v1[X - 1], v1[X + 1], v0[X - 2], v2[X]
                 predicted, gradient, slope = predict(sets, w, n, nw, ne, ww, nn, v1[X - 2], v2[X - 1], v2[X + 1], v1[X + 2])
-                odd = place & 1
-                whole = foreseen(predicted, lattice, odd)
-                fraction = predicted - (whole << 7)
-                part = min(odd if lattice >= AROUND else 3 * abs(fraction) >> 6 + lattice, FRACTIONS - 1)
                 own = 2 * (r0[X - 1] + r1[X]) + r1[X - 1] + r1[X + 1] + r0[X - 2] + r2[X]
-                context = activity(own, int(past[x]), gradient, m) * FRACTIONS + part
+                active, odd = activity(own, int(past[x]), gradient, m), place & 1
+                kind = TRELLIS if lattice == AROUND and active >= FLAT else lattice
+                whole = foreseen(predicted, kind, odd)
+                fraction = predicted - (whole << 7)
+                part = min(odd if kind == AROUND else 3 * abs(fraction) >> 6 + kind, FRACTIONS - 1)
+                context = active * FRACTIONS + part
                 sign = -1 if fraction < 0 else 1
-                error = sign * told(int(symbols[y, x, m]) - whole, lattice, odd)
+                error = sign * told(int(symbols[y, x, m]) - whole, kind, odd)
                 error, state, at = integer(error, table, context * DECISIONS, UNARY, ESCAPES, state, at, words, trace)
-                value = whole + meant(sign * error, lattice, odd)
+                value = whole + meant(sign * error, kind, odd)
                 if not -128 <= value <= 127:
                     return state, at, False
                 symbols[y, x, m] = value
-                place = next_place(place, value, error, lattice)
+                place = next_place(place, value, error, kind)
                 v0[X] = value
                 r0[X] = abs((value << 7) - predicted) >> 3
                 if neighbours is not None:

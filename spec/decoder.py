@@ -391,7 +391,7 @@ class Decisions:  # section 6, codec 2
 def context_coded(chunk, H, W, channels):  # section 6, codec 2
     """As `segment`."""
     set_count, flags = chunk.unpack("BB")
-    require(set_count in (1, 2, 4, 8) and flags <= 7, "sets of weights or flags")
+    require(set_count in (1, 2, 4, 8) and flags <= 5, "sets of weights or flags")
     has_map, lattice = flags % 2, flags // 2
     sets = [chunk.unpack("9b") for _ in range(set_count)]
     decisions = Decisions(chunk)
@@ -436,27 +436,26 @@ def context_coded(chunk, H, W, channels):  # section 6, codec 2
                 others = [nw, ne, ww, nn, near(-1, -2)[0], near(-2, -1)[0], near(-2, 1)[0], near(-1, 2)[0]]
                 predicted = 64 * both + k[0] * (w - n) + sum(a * (2 * v - both) for a, v in zip(k[1:], others))
                 predicted = min(max(predicted, -16384), 16256)
-                odd = place % 2
-                if lattice == 1:
-                    whole = 2 * (predicted - 128 * odd + 128 >> 8) + odd
-                else:
-                    whole = predicted + 64 >> 7
-                fraction = predicted - 128 * whole
-
                 own = 2 * r_w + 2 * r_n + r_nw + r_ne + r_ww + r_nn
                 activity = (11 * own + 5 * cross[y, x] >> 2 if c else 4 * own) + 20 * gradient
                 a = activity + 128 >> 6
                 b = a.bit_length()
-                error = decisions.error(3 * (2 * (b - 2) + (a >> b - 2) % 2)
-                                        + (odd if lattice > 1 else min(3 * abs(fraction) >> (7 if lattice == 1 else 6), 2)))
+                active = 2 * (b - 2) + (a >> b - 2) % 2
+                around, odd = lattice == 2 and active < 4, place % 2
+                if lattice > 0 and not around:
+                    whole = 2 * (predicted - 128 * odd + 128 >> 8) + odd
+                else:
+                    whole = predicted + 64 >> 7
+                fraction = predicted - 128 * whole
+                error = decisions.error(3 * active + (odd if around else min(3 * abs(fraction) >> (7 if lattice else 6), 2)))
                 if fraction < 0:
                     error = -error
-                if lattice > 1:
-                    v = whole + (lattice - 1) * (2 * error - (odd if error > 0 else -odd if error < 0 else 0))
+                if around:
+                    v = whole + 2 * error - (odd if error > 0 else -odd if error < 0 else 0)
                     onward = error % 2
                 else:
-                    v = whole + error * (2 if lattice == 1 else 1)
-                    onward = lattice and v % 4 >= 2
+                    v = whole + error * (2 if lattice else 1)
+                    onward = v % 4 >= 2
                 require(-128 <= v <= 127, "a symbol leaves 8 bits")
                 place = place // 2 ^ (5 if odd else 0) ^ (2 if onward else 0)
                 known[y, x] = v, abs(128 * v - predicted) >> 3

@@ -7,13 +7,13 @@ from test_symbols import followed, textured
 from kpc.format.container import Chunk
 from kpc.format.file import write
 from kpc.format.quantise import quantise_scene
-from kpc.format.symbols import AROUND, SET_COUNTS, Guide, encode_symbols
+from kpc.format.symbols import SET_COUNTS, Guide, encode_symbols
 from kpc.tools import entropy, kpbench
 
 
 def test_with_nothing_changed_the_coder_is_the_coder():
     symbols, coded = textured(20, 24, 3)
-    guide = Guide(np.int8([[3, -5, 8, 0, 1, -2, 4, 0, 1]]), AROUND)
+    guide = Guide(np.int8([[3, -5, 8, 0, 1, -2, 4, 0, 1]]))
     for symbols, guide in ((symbols, None), (followed(symbols, coded, guide), guide)):
         segment = entropy.Segment(symbols, coded, guide, Chunk("PLNE", []))
         assert entropy._bytes(segment, entropy._compiled({}), SET_COUNTS) == len(encode_symbols(symbols, coded, guide))

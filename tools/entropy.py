@@ -19,7 +19,7 @@ from kpc.format.container import Chunk, pack
 from kpc.format.file import SceneReader, read, scene_chunks
 from kpc.format.rans import words_of
 from kpc.format.scene import ALL_PLANES
-from kpc.format.symbols import ANY, MOST_DECISIONS, SET_COUNTS, TRELLIS, WEIGHTS, Guide, fitted
+from kpc.format.symbols import ANY, AROUND, MOST_DECISIONS, SET_COUNTS, TRELLIS, WEIGHTS, Guide, fitted
 
 DECODINGS = 5
 TABLE_BITS = 12
@@ -106,7 +106,7 @@ def _bytes(segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callab
     neighbours, guide = module.neighbourhoods(symbols, coded), segment.guide
     trace = np.empty(coded.size + len(neighbours) * MOST_DECISIONS, np.int16)
     if guide is not None:
-        lattice, tried = guide.lattice, [guide.weights]
+        lattice, tried = AROUND, [guide.weights]
     else:
         lattice = TRELLIS if module.follows_trellis(symbols, coded) else ANY
         tried = [fitted(neighbours, count) for count in counts] or [np.zeros((1, WEIGHTS), np.int8)]

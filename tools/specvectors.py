@@ -39,7 +39,7 @@ from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, 
 from kpc.format.space import Contraction, DeviceCoordinates
 from kpc.format.rans import stream
 from kpc.format.symbols import (
-    ANY, AROUND, FAR_AROUND, LATTICE_BIT, MOST_DECISIONS, TRELLIS, WEIGHTS, Guide, encode_with, follows_trellis, next_state, walk,
+    ANY, AROUND, LATTICE_BIT, MOST_DECISIONS, TRELLIS, WEIGHTS, Guide, encode_with, follows_trellis, next_state, walk,
 )
 from kpc.player import reference
 from kpc.tools import groupvectors
@@ -151,7 +151,7 @@ def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 1
         weights = (_noise((sets, WEIGHTS), 61) / 4).astype(np.int8)
         weights[0, 0], weights[-1, -1] = -128, 127
     if lattice is not None:
-        scene = around(scene, Guide(weights, lattice), segment_rows)
+        scene = around(scene, Guide(weights), segment_rows)
     chunks = []
     for chunk in scene_chunks(scene, segment_rows=segment_rows):
         if chunk.kind == "PLNE":
@@ -166,23 +166,23 @@ def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 1
 
 
 def around(scene: QuantisedScene, guide: Guide, segment_rows: int) -> QuantisedScene:
-    """The scene with near symbols that follow a guide in each segment."""
+    """The scene with near symbols, none at the ends of 8 bits, that follow a guide in each segment."""
 
     def moved(plane: QuantisedPlane, rows: int) -> QuantisedPlane:
-        segments = [plane.symbols[start : start + rows].copy() for start in range(0, len(plane.symbols), rows)]
+        segments = [np.clip(plane.symbols[start : start + rows], -126, 126) for start in range(0, len(plane.symbols), rows)]
         for number, symbols in enumerate(segments):
-            walked(symbols, plane.coded[rows * number : rows * (number + 1)], guide)
+            walked(symbols, plane.coded[rows * number : rows * (number + 1)], guide.weights, AROUND)
         return replace(plane, symbols=np.concatenate(segments), guide=guide)
 
     return replace(scene, scales=tuple({name: moved(plane, segment_rows if name in TIME_PLANES else len(plane.symbols))
                                         for name, plane in scale.items()} for scale in scene.scales))
 
 
-def walked(symbols: np.ndarray, coded: np.ndarray, guide: Guide) -> bytes:
-    """A segment that tells (H, W, M) symbols up to the first that leaves its 8 bits, each moved so that it follows its guide."""
+def walked(symbols: np.ndarray, coded: np.ndarray, weights: np.ndarray, lattice: int) -> bytes:
+    """A segment that tells (H, W, M) symbols up to the first that leaves its 8 bits, each moved so that it follows the lattice."""
     trace = np.empty(symbols.size * MOST_DECISIONS, np.int16)
-    _, at, _ = walk(symbols, np.ascontiguousarray(coded), guide.lattice, guide.weights, 0, 0, None, trace, None)
-    return bytes([len(guide.weights), guide.lattice << LATTICE_BIT]) + guide.weights.tobytes() + stream(trace[:at])
+    _, at, _ = walk(symbols, np.ascontiguousarray(coded), lattice, weights, 0, 0, None, trace, None)
+    return bytes([len(weights), lattice << LATTICE_BIT]) + weights.tobytes() + stream(trace[:at])
 
 
 def coded_grids(scene: QuantisedScene) -> bytes:
@@ -289,9 +289,8 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "trellis-extremes": (context_coded(_on_trellis(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127))), 4),
                              False),
         "around": (context_coded(dynamic, 8, segment_rows=4, lattice=AROUND), False),
-        "around-far": (context_coded(dynamic, 2, segment_rows=4, lattice=FAR_AROUND), False),
-        **{f"around-{name}": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4, lattice=lattice), False)
-           for name, lattice in (("extremes", AROUND), ("far-extremes", FAR_AROUND))},
+        "around-extremes": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4, lattice=AROUND), False),
+        "around-flat": (context_coded(_painted(lambda shape, seed: _noise(shape, seed) // 50), 2, lattice=AROUND), False),
         "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
         "cells": (coded_grids(replace(dense, occupancy=rolling)), False),
         "cells-noise": (coded_grids(dense), False),
@@ -524,11 +523,11 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
                         broken, "claims another length"),
         "zstd-garbage": (resealed(patched(good, entry[xy] + 16, "<H", 1)), broken, "zstd frame"),
         "symbols-sets": (context(patched(coarse, 0, "<B", 3)), broken, "number of sets"),
-        "symbols-flags": (context(patched(coarse, 1, "<B", 8)), broken, "or flag"),
+        "symbols-flags": (context(patched(coarse, 1, "<B", 6)), broken, "or flag"),
         **damaged_words("symbols", context, coarse, state_at),
         "symbols-bomb": (resealed(bomb_symbols), broken, "more than 15 bytes can hold"),
-        "symbols-range": (context(walked(symbols + 200, whole, Guide(weights, ANY))), broken, "leaves its 8 bits"),
-        "around-range": (context(walked(symbols + 200, whole, Guide(weights, FAR_AROUND))), broken, "leaves its 8 bits"),
+        "symbols-range": (context(walked(symbols + 200, whole, weights, ANY)), broken, "leaves its 8 bits"),
+        "around-range": (context(walked(0 * symbols + 200, whole, weights, AROUND)), broken, "leaves its 8 bits"),
         "symbols-count": (resealed(patched(told, small_entry + 24, "<I", 7)), broken, "claims 7 symbols"),
         "symbols-elsewhere": (resealed(patched(good, entry[deco] + 16, "<H", 2)), broken, "codec 2"),
         **damaged_words("cells", occupied, cells, 8),
