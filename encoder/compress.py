@@ -50,12 +50,11 @@ files that are to be small, from 0.4 dB of loss on."""
 MOTION_SHARE, MOST_STEPS = 0.1, 64
 """Of the error that coding may bring, how much of it displacements may; and how many of `kpc.format.motion.STEP` they may be rounded to.
 Soldier: a motion grid takes 3 KB for each bit of them, planes 18 KB for an error e times smaller; at equal slopes it is a tenth."""
-LEAST_SIGNIFICANCE = 1e-6
-"""Of a channel, relative to the most important of all numbers."""
-
 DECODER_SHARE, FEWEST_BITS = 0.02, 4
 """And of the decoder: how much of the error fewer bits of its weights may bring; and the fewest. Default scene and room: 1.5 and 2.1 KB in place
 of 1.9 and 2.6 with 7 significant bits, 1.4 and 1.9 with 6; an error of a fiftieth planes undo with a fifth of a kilobyte."""
+LEAST_SIGNIFICANCE = 1e-6
+"""Of a channel, relative to the most important of all numbers."""
 
 Steps = list[dict[str, np.ndarray]]
 """One mapping a scale, plane name -> (M,) quantisation steps."""

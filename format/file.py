@@ -319,12 +319,12 @@ def read(source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET,
     } for s, scale in enumerate(reader.head.scales))
     guides: dict[tuple[int, str], list[Guide | None]] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for number, (decoded, coded) in zip(segments, pool.map(reader.segment, segments), strict=True):
+        for number, (decoded, coded, guide) in zip(segments, pool.map(reader.guided_segment, segments), strict=True):
             entry = reader.index[number]
             plane = scales[entry.scale][ALL_PLANES[entry.plane]]
             rows = slice(entry.row_start, entry.row_start + entry.row_count)
             plane.symbols[rows], plane.coded[rows] = decoded, coded
-            guides.setdefault((entry.scale, ALL_PLANES[entry.plane]), []).append(reader.guide(number))
+            guides.setdefault((entry.scale, ALL_PLANES[entry.plane]), []).append(guide)
     for (scale, name), (guide, *others) in guides.items():
         if guide is not None and all(guide == other for other in others):
             scales[scale][name] = replace(scales[scale][name], guide=guide)
@@ -377,20 +377,21 @@ class SceneReader(Reader):
 
     def segment(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Decode a PLNE chunk: (row_count, W, M) int8 symbols and (row_count, W) bool coded texels."""
+        symbols, coded, _ = self.guided_segment(number)
+        return symbols, coded
+
+    def guided_segment(self, number: int) -> tuple[np.ndarray, np.ndarray, Guide | None]:
+        """The same, and by which the symbols were chosen, if by any."""
         entry = self.index[number]
         plane = self.head.scales[entry.scale][ALL_PLANES[entry.plane]]
         texels, shape = entry.row_count * plane.columns, (entry.row_count, plane.columns, plane.channels)
         if entry.codec != CODEC_SYMBOLS:
             payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * (1 + texels))
-            return self._parsed(lambda raw: decode_segment(raw, *shape), payload)
+            return *self._parsed(lambda raw: decode_segment(raw, *shape), payload), None
         if entry.raw_length != texels * plane.channels:
             raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
                               f"{texels * plane.channels:,} of its rows")
-        return self._parsed(lambda body: decode_symbols(body, *shape), self._context_coded(number))
-
-    def guide(self, number: int) -> Guide | None:
-        """By which the symbols of a PLNE chunk were chosen, if they follow one."""
-        return self._parsed(guide_of, self._context_coded(number)) if self.index[number].codec == CODEC_SYMBOLS else None
+        return self._parsed(lambda body: (*decode_symbols(body, *shape), guide_of(body)), self._context_coded(number))
 
     def mapping(self) -> SpaceMapping | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""

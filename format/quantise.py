@@ -235,9 +235,11 @@ def round_decoder(decoder: AnyDecoder, bits: int = HALF_BITS) -> AnyDecoder:
 
 
 def _to_bits(values: np.ndarray, bits: int) -> np.ndarray:
-    """Rounded to so many significant bits."""
+    """Rounded to so many significant bits; as they are where float16 has no more."""
+    if bits >= HALF_BITS:
+        return values
     mantissas, exponents = np.frexp(values)
-    return values if bits >= HALF_BITS else np.ldexp(np.rint(np.ldexp(mantissas, bits)), exponents - bits)
+    return np.ldexp(np.rint(np.ldexp(mantissas, bits)), exponents - bits)
 
 
 def half(weights: np.ndarray, what: str = "decoder") -> np.ndarray:

@@ -213,7 +213,7 @@ def test_weights_of_the_decoder_have_as_few_bits_as_their_error_allows(error: fl
     scene = tiny_scene()
 
     def measure(candidate: Scene) -> Measured:
-        exact, rounded = (candidate_or.decoder.w1 for candidate_or in (scene, candidate))
+        exact, rounded = (one.decoder.w1 for one in (scene, candidate))
         return Measured(30.0, 0.25 + float(np.max(np.abs(rounded / exact - 1)) ** 2))
 
     found = decoder_bits(scene, measure, error)

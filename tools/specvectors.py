@@ -35,9 +35,9 @@ from kpc.format.motion import QuantisedMotion
 from kpc.format.nodes import LORENZO, NEIGHBOURS
 from kpc.format.nodes import encode_with as encode_nodes_with
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.rans import stream
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates
-from kpc.format.rans import stream
 from kpc.format.symbols import (
     ANY, AROUND, LATTICE_BIT, MOST_DECISIONS, TRELLIS, WEIGHTS, Guide, encode_with, follows_trellis, next_state, walk,
 )
@@ -141,16 +141,16 @@ def encode(scene: QuantisedScene, *, segment_rows: int = 16, compress: bool = Tr
 
 
 def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 16, weights: np.ndarray | None = None,
-                  lattice: int | None = None) -> bytes:
+                  flat: bool = False) -> bytes:
     """A file all of whose planes are context-coded, also where raw ones would be smaller, with so many sets of weights.
 
     The weights, if none are given, are no good ones but such as need no floating-point fit, and the largest and the smallest among
-    them. With a `lattice`, symbols near to the scene's that follow it.
+    them. `flat`: symbols near to the scene's that are around predictions where it is flat.
     """
     if weights is None:
         weights = (_noise((sets, WEIGHTS), 61) / 4).astype(np.int8)
         weights[0, 0], weights[-1, -1] = -128, 127
-    if lattice is not None:
+    if flat:
         scene = around(scene, Guide(weights), segment_rows)
     chunks = []
     for chunk in scene_chunks(scene, segment_rows=segment_rows):
@@ -158,8 +158,8 @@ def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 1
             plane = scene.scales[chunk.scale][ALL_PLANES[chunk.plane]]
             rows = slice(chunk.row_start, chunk.row_start + chunk.row_count)
             symbols, coded = plane.symbols[rows], plane.coded[rows]
-            follows = lattice or (TRELLIS if follows_trellis(symbols, coded) else ANY)
-            chunks.append(_forced(chunk, encode_with(weights, symbols, coded, follows)))
+            lattice = AROUND if flat else TRELLIS if follows_trellis(symbols, coded) else ANY
+            chunks.append(_forced(chunk, encode_with(weights, symbols, coded, lattice)))
         else:
             chunks.append(replace(chunk, symbols=None))
     return pack(chunks, _value_count(scene))
@@ -288,9 +288,9 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "trellis": (context_coded(_on_trellis(dynamic), 8, segment_rows=4), False),
         "trellis-extremes": (context_coded(_on_trellis(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127))), 4),
                              False),
-        "around": (context_coded(dynamic, 8, segment_rows=4, lattice=AROUND), False),
-        "around-extremes": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4, lattice=AROUND), False),
-        "around-flat": (context_coded(_painted(lambda shape, seed: _noise(shape, seed) // 50), 2, lattice=AROUND), False),
+        "around": (context_coded(dynamic, 8, segment_rows=4, flat=True), False),
+        "around-extremes": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4, flat=True), False),
+        "around-flat": (context_coded(_painted(lambda shape, seed: _noise(shape, seed) // 50), 2, flat=True), False),
         "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
         "cells": (coded_grids(replace(dense, occupancy=rolling)), False),
         "cells-noise": (coded_grids(dense), False),
