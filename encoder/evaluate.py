@@ -12,7 +12,7 @@ from kpc.encoder.appearances import FIT_RAYS, fitted_code
 from kpc.encoder.datasets import Dataset, rays
 from kpc.encoder.field import Field
 from kpc.encoder.optimisers import sample_capacity
-from kpc.encoder.render import Rays, marched, shade
+from kpc.encoder.render import Rays, marched, sample_counts, shade
 from kpc.format.fidelity import psnr
 from kpc.format.scene import AnyDecoder, Decoder, Scene
 from kpc.format.space import Contraction
@@ -77,6 +77,12 @@ class SceneRenderer:
         depths = np.bincount(samples.ray.numpy(), met.weights.numpy() * along, len(o)).astype(np.float32)
         opacities = met.opacity.numpy()
         return shade(self.field, batch, met, codes).numpy(), opacities, depths / np.maximum(opacities, np.float32(1e-6))
+
+    def meets(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether rays pass where anything may be. The others show the background, whatever planes hold."""
+        scene = self.scene
+        met: np.ndarray = sample_counts(self.batch(origins, directions, times), scene.aabb, scene.occupancy, scene.step, scene.mapping) > 0
+        return met
 
     def picture(self, dataset: Dataset, number: int, first: int = 0, code: np.ndarray | None = None) -> np.ndarray:
         """The scene as a picture of the dataset shows it, its lens included, from column `first` on: (H, W - first, 3) float32.

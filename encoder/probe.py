@@ -1,7 +1,7 @@
 """What coding costs, measured on rays: against what was filmed, and against the pictures of the uncoded model."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,9 @@ from kpc.format.scene import Scene
 
 PROBE_RAYS = 1 << 15
 """Rays on which the loss of coding is measured."""
+
+DRAWS = 16
+"""Times that rays are drawn, to find enough that pass where anything may be."""
 
 ASSUMED_MSE = 1e-3
 """Of the pictures of a .kpc file, which does not know what was filmed: 30 dB, about what moving scenes reach. Errors of coding add
@@ -80,7 +83,7 @@ class Probe:
         return Probe(*rays, None if batch.appearances is None else batch.appearances.numpy(), targets.numpy())
 
     @staticmethod
-    def of_cameras(scene: Scene, count: int | None = None, seed: int = 1) -> "Probe":
+    def of_cameras(scene: Scene, count: int | None = None, seed: int | Sequence[int] = 1) -> "Probe":
         """Random pixels of a scene's own cameras, or of some all around it where it has none, at random times."""
         rng, total = np.random.default_rng(seed), PROBE_RAYS if count is None else count
         cameras = scene.cameras or around(scene)
@@ -91,6 +94,23 @@ class Probe:
             parts.append(rays_of_camera(camera, places, scene.mapping))
         origins, directions = (np.concatenate(arrays) for arrays in zip(*parts))
         return Probe(origins, directions, rng.random(total, dtype=np.float32), None, None)
+
+    @staticmethod
+    def of_surfaces(scene: Scene, count: int, seed: int) -> "Probe":
+        """As `of_cameras`, in random order, those rays alone that pass where anything may be: the others show the background, whatever planes
+        hold. Where DRAWS times as many rays hold too few of them, there are fewer."""
+        renderer, rng, parts, missing = SceneRenderer(scene), np.random.default_rng(seed), [], count
+        for number in range(DRAWS):
+            drawn = Probe.of_cameras(scene, count, (seed, number))
+            parts.append(drawn.some(rng.permutation(np.flatnonzero(renderer.meets(*drawn.rays)))[:missing]))
+            missing -= len(parts[-1].times)
+            if not missing:
+                break
+        return Probe(*(np.concatenate(arrays) for arrays in zip(*(part.rays for part in parts))), None, None)
+
+    def some(self, which: np.ndarray) -> "Probe":
+        """Those of its rays, by their numbers."""
+        return Probe(*(None if a is None else a[which] for a in (*self.rays, self.appearances, self.truth)))
 
     def measure(self, uncoded: Scene) -> Measure:
         """What judges codings of a scene by its colours on these rays; the scene itself costs nothing to judge."""

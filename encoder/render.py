@@ -8,6 +8,7 @@ Three parts, each with a plain version for any device: which samples rays take (
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numba
 import numpy as np
@@ -243,21 +244,34 @@ def _before(values: Tensor, first: Tensor, last: Tensor) -> Tensor:
     return summed
 
 
+def sample_counts(
+    rays: Rays, aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None = None
+) -> np.ndarray:
+    """(N,) int64: how many of `samples_of` each ray takes, on the CPU, by the kernel."""
+    counts: np.ndarray = kernels.collect(*_as_collected(rays, aabb, occupancy, step, mapping), None, None, None, None, None,
+                                         8 * numba.get_num_threads())
+    return counts
+
+
 def collected(
     rays: Rays, aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None = None
 ) -> Samples:
     """`samples_of` on the CPU, by the kernel."""
-    where = [a.numpy() for a in (rays.origins, rays.directions, rays.times, rays.jitters)]
-    told = (aabb, kernels.even_of(mapping), occupancy.view(np.uint8), np.float32(step), *where)
-    workers = 8 * numba.get_num_threads()
-    counts = kernels.collect(*told, None, None, None, None, None, workers)
+    counts = sample_counts(rays, aabb, occupancy, step, mapping)
     ends = np.cumsum(counts)
     n = int(ends[-1]) if len(ends) else 0
     points, s, stretch = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     cell = np.empty((n, 3), np.int64)
-    kernels.collect(*told, ends - counts, points, s, stretch, cell, workers)
+    kernels.collect(*_as_collected(rays, aabb, occupancy, step, mapping), ends - counts, points, s, stretch, cell,
+                    8 * numba.get_num_threads())
     ray = np.repeat(np.arange(len(counts)), counts)
     return Samples(*(torch.from_numpy(a) for a in (ray, points, s, np.full_like(s, step), stretch, cell)))
+
+
+def _as_collected(rays: Rays, aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None) -> tuple[Any, ...]:
+    """As `kernels.collect` is told of rays and of where they go."""
+    where = (a.numpy() for a in (rays.origins, rays.directions, rays.times, rays.jitters))
+    return aabb, kernels.even_of(mapping), occupancy.view(np.uint8), np.float32(step), *where
 
 
 def marched(field: Field, rays: Rays, scene: Scene) -> tuple[Samples, Met]:

@@ -107,9 +107,9 @@ def _taught(scene: Scene, teacher: SceneRenderer, settled: Collection[Name], ste
     theta, M = field.theta.detach().numpy(), field.layout.channels
     kept = [slice(start, start + rows * columns * M) for s, name, start, rows, columns in field.layout.planes() if (s, name) in settled]
     before = [theta[some].copy() for some in kept]
-    probe = Probe.of_cameras(scene, RAYS * steps, seed=100 + seed)
-    for number in range(steps):
-        rays = [a[RAYS * number : RAYS * (number + 1)] for a in probe.rays]
+    probe = Probe.of_surfaces(scene, RAYS * steps, seed=100 + seed)
+    for number in range(steps if len(probe.times) >= steps else 0):
+        rays = [a[number::steps] for a in probe.rays]
         colours = torch.from_numpy(teacher.rgb(*rays))
         optimiser.step(number + 1, 1.0, 1 - number / steps, teacher.batch(*rays), colours,
                        scene.aabb, scene.occupancy, scene.step, scene.extent)

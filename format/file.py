@@ -39,7 +39,9 @@ from kpc.format.symbols import Guide, decode_symbols, encode_symbols, guide_of
 
 Parsed = TypeVar("Parsed")
 
-SEGMENT_ROWS = 16
+SEGMENT_ROWS = 32
+"""Of a time plane, that are decoded together. With 16 files of room and soldier are two and three percent larger, for each segment begins
+without neighbours and with counters that know nothing."""
 
 SCENE_STRUCT = struct.Struct("<6fIdd3fBB")
 """aabb, frame_count, fps, step, background, scale_count, dynamic"""

@@ -30,7 +30,7 @@ def without_the_last_channels(scene: Scene) -> Scene:
 
 
 def probe_of(scene: Scene, count: int) -> Probe:
-    probe = Probe.of_cameras(scene, count)
+    probe = Probe.of_surfaces(scene, count, seed=1)
     return replace(probe, appearances=np.arange(count) % len(scene.appearances) if scene.appearances else None)
 
 
@@ -113,12 +113,21 @@ def test_what_is_seen_more_costs_more() -> None:
         assert not columns[: len(columns) // 2 - 2].any() and columns[len(columns) // 2 + 2 : -4].all()
 
 
-def test_rays_beyond_the_probe_are_drawn_from_the_cameras() -> None:
+def test_rays_beyond_those_of_the_probe_that_meet_something_are_drawn_from_the_cameras() -> None:
     """All of a probe's rays miss: what is found comes from the others, the same ones each time."""
     scene = tiny_scene(3)
     blind = replace(probe_of(scene, 64), origins=np.full((64, 3), 50, np.float32))
-    assert not curvature(scene, blind, 64).alone[0]["xy"].any()
     once, again = (curvature(scene, blind, 1000).alone for _ in range(2))
     assert once[0]["xy"].any()
     for name in once[1]:
         np.testing.assert_array_equal(once[1][name], again[1][name])
+
+
+def test_rays_that_pass_where_nothing_is_do_not_count() -> None:
+    scene = tiny_scene(3)
+    probe = probe_of(scene, 64)
+    astray = replace(probe, origins=np.concatenate([probe.origins, np.full((64, 3), 50, np.float32)]),
+                     directions=np.tile(probe.directions, (2, 1)), times=np.tile(probe.times, 2))
+    with_them, without = curvature(scene, astray, 64), curvature(scene, probe, 64)
+    for name, found in with_them.alone[1].items():
+        assert found.any() and found.tobytes() == without.alone[1][name].tobytes()

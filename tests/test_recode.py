@@ -17,6 +17,7 @@ from kpc.encoder import kpenc, model, probe, tuning
 from kpc.encoder.compress import Trade
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
+from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.probe import ASSUMED_MSE, Probe, around
 from kpc.encoder.trellis import step_on_trellis
 from kpc.format import file
@@ -291,6 +292,26 @@ def test_cameras_around_a_scene_without_any_see_it() -> None:
         pixel = local[:, :2] / -local[:, 2:] * (camera.fl_x, -camera.fl_y) + (camera.cx, camera.cy)
         assert (local[:, 2] < 0).all() and (pixel > 0).all() and (pixel < (camera.width, camera.height)).all()
         np.testing.assert_allclose(camera.camera_to_world[:3, :3].T @ camera.camera_to_world[:3, :3], np.eye(3), atol=1e-12)
+
+
+def test_a_probe_of_surfaces_meets_them_from_all_cameras() -> None:
+    scene = tiny_scene(4)
+    rays, others = (Probe.of_surfaces(scene, 2000, seed) for seed in (1, 2))
+    assert len(rays.times) == 2000 and SceneRenderer(scene).meets(*rays.rays).all()
+    assert not SceneRenderer(scene).meets(*Probe.of_cameras(scene, 2000).rays).all()
+    eyes = [tuple(np.float32(camera.camera_to_world[:3, 3])) for camera in scene.cameras]
+    assert {tuple(origin) for origin in rays.origins[:200]} == set(eyes)
+    assert not np.array_equal(rays.times, others.times)
+
+
+def test_a_probe_of_surfaces_has_what_there_is() -> None:
+    scene = tiny_scene(4)
+    nothing = replace(scene, occupancy=np.zeros_like(scene.occupancy))
+    assert Probe.of_surfaces(nothing, 100, seed=1).origins.shape == (0, 3)
+    speck = np.zeros_like(scene.occupancy)
+    speck[:, 4, 5, 6] = True
+    few = Probe.of_surfaces(replace(scene, occupancy=speck), 100, seed=1)
+    assert 0 < len(few.times) < 100
 
 
 def test_a_probe_of_cameras_goes_through_their_pixels() -> None:

@@ -77,6 +77,14 @@ def test_few_steps_or_none_are_no_mishap(steps: int) -> None:
     assert (planes.scales[0]["xt"].tobytes() == scene.scales[0]["xt"].tobytes()) == (steps == 0)
 
 
+def test_where_nothing_is_nothing_is_learnt() -> None:
+    scene = tiny_scene()
+    scene = replace(scene, occupancy=np.zeros_like(scene.occupancy))
+    plain, same = choose(scene), tuned(scene, scene, choose, 5)
+    for s, scale in enumerate(plain.scales):
+        assert all(np.array_equal(plane.symbols, same.scales[s][name].symbols) for name, plane in scale.items())
+
+
 def test_progress_is_shown_where_it_is_wanted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("kpc.format.progress.LINE_EVERY_S", 0.0)
     scene = tiny_scene(scales=1, dynamic=False)
