@@ -17,7 +17,6 @@ from kpc.encoder import kpenc, model, probe, tuning
 from kpc.encoder.compress import Trade
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
-from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.probe import ASSUMED_MSE, Probe, around
 from kpc.encoder.trellis import step_on_trellis
 from kpc.format import file
