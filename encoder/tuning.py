@@ -1,8 +1,9 @@
 """Planes coded group after group, and what is still to be coded trained to make up for the errors of what is.
 
-Pictures show what all planes give together, so an error in one can be undone by the others, at least in part. The finest planes, which take
-most of the bytes, are coded first. Then all others and the decoder learn, on random rays of the scene's cameras, to give the colours that the
-uncoded scene gives; then the next coarser are coded, and so on; the decoder learns on when all planes are. Nobody needs to know what was filmed.
+Pictures show what all planes give together, so an error in one can be undone by the others, at least in part. The finest planes, which
+take most of the bytes, are coded first. Then all others and the decoder learn, on random rays of the scene's cameras that may meet
+something, to give the colours that the uncoded scene gives; then the next coarser are coded, and so on; the decoder learns on when all
+planes are. Nobody needs to know what was filmed.
 
 So networks are quantised in parts (Zhou et al., "Incremental Network Quantization", arXiv:1702.03044). Why it pays: of what independent
 errors of all numbers cost, their diagonal (`kpc.encoder.curvature`) has a twentieth of the sum of squares (liam). Liam, `balanced`, held-out
