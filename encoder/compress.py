@@ -11,11 +11,11 @@ from functools import cached_property
 
 import numpy as np
 
+from kpc.encoder.choice import quantise_by_cost
 from kpc.encoder.curvature import PerPlane
 from kpc.encoder.occupancy import in_fewest_slots
 from kpc.encoder.probe import Measure, Measured, squares_of
 from kpc.encoder.search import TOLERANCE, cheapest, farthest, farthest_tuned
-from kpc.encoder.trellis import quantise_on_trellis
 from kpc.format import file
 from kpc.format.motion import STEP
 from kpc.format.quantise import HALF_BITS, QuantisedScene, reached_by, round_decoder, short_above
@@ -59,7 +59,7 @@ LEAST_SIGNIFICANCE = 1e-6
 Steps = list[dict[str, np.ndarray]]
 """One mapping a scale, plane name -> (M,) quantisation steps."""
 Quantise = Callable[[Scene, PerPlane, np.ndarray, PerPlane], QuantisedScene]
-"""Of a scene with steps, `reached_by` it and significance: `quantise_on_trellis`, or what is to be compared with it."""
+"""Of a scene with steps, `reached_by` it and significance: `quantise_by_cost`, or what is to be compared with it."""
 Tune = Callable[[PerPlane, np.ndarray], QuantisedScene]
 """A better coding with the same steps, of a scene that is known, `reached_by` which is told."""
 
@@ -214,7 +214,7 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
 
 def compress(
     scene: Scene, steps: Steps, significant: PerPlane, measure: Measure, uncoded_psnr: float, trade: Trade,
-    as_it_is: QuantisedScene | None = None, quantise: Quantise = quantise_on_trellis, tune: Tune | None = None,
+    as_it_is: QuantisedScene | None = None, quantise: Quantise = quantise_by_cost, tune: Tune | None = None,
     own_steps: bool = False, tolerance: float = TOLERANCE,
 ) -> Attempt:
     """The quantisation that a trade asks for; of a size that no file has, the smallest.

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kpc.encoder.choice import quantise_by_cost
 from kpc.encoder.compress import PROBES
 from kpc.encoder.curvature import RAYS as CURVATURE_RAYS
 from kpc.encoder.curvature import curvature
@@ -12,7 +13,6 @@ from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.probe import Probe
 from kpc.encoder.prune import renderings
 from kpc.encoder.train import Trainer
-from kpc.encoder.trellis import quantise_on_trellis
 from kpc.encoder.tuning import RAYS, steps_after, steps_in_all
 from kpc.format.memory import peak_memory_bytes
 from kpc.format.scene import Scene
@@ -90,7 +90,7 @@ def _seconds_a_coding(scene: Scene) -> float:
     """Choosing its symbols once."""
     steps = [{name: np.full(plane.shape[-1], 2.0**-6) for name, plane in scale.items()} for scale in scene.scales]
     started = time.perf_counter()
-    quantise_on_trellis(scene, steps)
+    quantise_by_cost(scene, steps)
     return time.perf_counter() - started
 
 

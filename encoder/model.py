@@ -19,10 +19,11 @@ from kpc.encoder.compress import (
     DECODER_SHARE, MOTION_SHARE, ROUGHLY, SLOTS_SHARE, Attempt, Quantise, Trade, compress, decoder_bits, error_at, relative_steps, significance,
     with_coarser_motion, with_fewer_slots,
 )
+from kpc.encoder.choice import quantise_by_cost, step_asked_for
 from kpc.encoder.curvature import Curvature, PerPlane, curvature
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
-from kpc.encoder.trellis import Name, quantise_on_trellis, step_on_trellis
+from kpc.encoder.worth import Name
 from kpc.encoder.tuning import tuned
 from kpc.format import file
 from kpc.format.cameras import Camera
@@ -103,7 +104,7 @@ def code(
     if coded is None:
         steps = relative_steps(significant)
     else:
-        steps = [{name: step_on_trellis(plane) for name, plane in scale.items()} for scale in coded.scales]
+        steps = [{name: step_asked_for(plane) for name, plane in scale.items()} for scale in coded.scales]
     measure = model.probe.measure(scene)
     whole = measure(scene).psnr
     bits = HALF_BITS
@@ -112,7 +113,7 @@ def code(
         if quantise is not None:
             quantised = quantise(scene, steps, reached, significant)
         else:  # of channels that are left, too
-            quantised = quantise_on_trellis(scene, steps, reached, significant, only, together)
+            quantised = quantise_by_cost(scene, steps, reached, significant, only, together)
         return replace(quantised, decoder=round_decoder(quantised.decoder, bits))
 
     loss_db = trade.loss_db(whole)

@@ -6,10 +6,7 @@ follow (`kpc.format.symbols.next_state`). A Viterbi search finds the path throug
     u^2 + 2 u (BESIDE * sum of u of the four texels around + ACROSS * sum of u of the four at the corners + others)
         + LAM * bits(symbol | those before it),        u = sqrt(worth) (symbol - value / step)
 
-    others = c + BESIDE * sum of c of the four texels around + ACROSS * sum of c of the four at the corners
-    c = TOGETHER * sum over other channels of the texel of their u times their correlation with this one (`kpc.encoder.curvature`)
-
-each survivor with the predictions and contexts that its own symbols lead to (Marcellin and Fischer, IEEE Trans. Comm. 38, 1990). Bits are
+(`kpc.encoder.worth`), each survivor with the predictions and contexts that its own symbols lead to (Marcellin and Fischer, IEEE Trans. Comm. 38, 1990). Bits are
 counted in the contexts of the coder, from what the search before chose; rows below and channels to come have the errors that the search
 before left them. So errors next to each other get opposite signs, and look-ups, which lie between texels, see less of them; and a channel
 undoes what others err. What an error is worth differs from texel to texel by orders of magnitude (`kpc.encoder.curvature`): where it is
@@ -24,47 +21,19 @@ by rate and distortion around the nearest. Errors that know of each other save 5
 """
 
 import math
-import os
-from collections.abc import Collection
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 
-from kpc.encoder.curvature import SIDE, PerPlane
+from kpc.encoder.worth import ACROSS, ALONE, BESIDE, LAM, UNCHANGED, others, worths
 from kpc.format.file import SEGMENT_ROWS
-from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene, short_above
+from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, quantise_plane, short_above
 from kpc.format.rans import compiled
-from kpc.format.scene import TIME_PLANES, Scene
 from kpc.format.symbols import (
     ACTIVITIES, ANY, AROUND, FLAT, TRELLIS, UNKNOWN, Guide, activity, begin_row, fitted, foreseen, meant, neighbourhoods, next_place,
     predict, remember,
 )
 
-Name = tuple[int, str]
-"""A plane: scale and name."""
-
-LAM = 0.5
-"""Squared steps that a bit is worth, where an error is worth what it is in the mean. Where steps are fine an error of
-(2 step)^2 / 12 / 1.28, that of the trellis, falls to a quarter with a bit more, at the slope of 0.36; errors that make up for each other
-allow finer steps at more. Liam: with 0.3 and 0.7 files are one to four percent larger at equal PSNR of held-out views."""
-BESIDE, ACROSS = 1 / 4, 1 / 16
-"""What errors of neighbours cost together, of what they cost each. Bilinear weights are products of 1 - |x|; over look-ups anywhere between
-two texels their product has the mean 1/6, the square of either about a texel 2/3, and at corners it is so along both axes. Measured for
-liam and soldier (off-diagonals of `kpc.encoder.curvature`): 0.25 to 0.42 and 0.06 to 0.2, next to nothing two texels away; files at equal
-error are the same with what is measured."""
-TOGETHER = 0.3
-"""In what curvature says of two channels. What is left to chance in it, and bits that it takes to make up for others, make less of it
-better than all. At equal error of pictures files are smaller by 2.6 % (default scene), 3.5 % (liam) and 3 to 5 % (soldier) than without; with
-0.2 to 0.6 liam's by about as much, with 0.5 soldier's hardly."""
-UNCHANGED = 0.6
-"""Squared steps, as much as they are worth, in the mean over channels: a texel of a time plane that is nearer to 1 is taken for it. Room and
-liam: from 0.2 to 0.8 files are the same, half a percent smaller than where all channels have to be within a step, and identity is a third
-of the time planes in place of a quarter."""
-LEAST_WORTH = 0.03
-"""Of an error, as a share of the channel's mean: what no ray met may yet be seen, and what lets light through may be made to hide what is
-behind. Soldier, held-out views: with 1e-4 squared errors are a tenth larger where steps are fine, and a third where they are coarse, most of
-that in one ray of a hundred; with 0.1 files are up to one percent larger (liam: 2 %)."""
 THIN = 1.3
 """Bits of a symbol below which the trellis goes around predictions. Liam and soldier, large planes alone, at equal slopes: squared errors
 plus what bits are worth are 1 % less at 1.3 bits, 8 at 0.75, 15 at 0.5 and 24 at 0.4."""
@@ -79,37 +48,11 @@ PASSES = 4
 percent smaller."""
 SETS, MANY = 4, 1 << 17
 """Of weights. Around predictions files hold those of the search: one set, but for so many symbols or more."""
-ALONE = np.zeros((0, 0, 0, 0), np.float32)
-"""For what goes together, where channels know nothing of each other."""
 TOLD_APART = 40
 """Magnitudes of errors whose bits are told apart."""
 
 
-def quantise_on_trellis(
-    scene: Scene, steps: PerPlane, reached: np.ndarray | None = None,
-    significant: PerPlane | None = None, only: Collection[Name] | None = None, together: PerPlane | None = None, thin: float = THIN,
-) -> QuantisedScene:
-    """As `quantise_scene`, with symbols that follow the trellis.
-
-    Args:
-        significant: what a squared error costs in each number, relative to others of its channel; (H, W, M), none negative. None: the same.
-        only: the planes whose symbols are searched for; others are rounded. None: all.
-        together: as of `kpc.encoder.curvature.Curvature`. None: channels know nothing of each other.
-        thin: bits of a symbol below which a plane goes around predictions.
-    """
-    quantised = quantise_scene(scene, steps, reached=reached)
-    matters = significant or [{name: np.ones(plane.shape, np.float32) for name, plane in scale.items()} for scale in scene.scales]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the search holds no lock
-        waiting = [{name: pool.submit(_steered, plane, planes[name], step[name], w[name], name in TIME_PLANES,
-                                      ALONE if together is None else together[s][name], thin)
-                    for name, plane in scale.items() if only is None or (s, name) in only}
-                   for s, (scale, planes, step, w) in enumerate(zip(quantised.scales, scene.scales, steps, matters, strict=True))]
-        found = [{name: plane.result() for name, plane in scale.items()} for scale in waiting]
-    scales = tuple({**rounded, **searched} for rounded, searched in zip(quantised.scales, found, strict=True))
-    return replace(quantised, scales=scales)
-
-
-def _steered(
+def on_trellis(
     plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool,
     together: np.ndarray = ALONE, thin: float = THIN,
 ) -> QuantisedPlane:
@@ -118,6 +61,11 @@ def _steered(
 
     Where 8 bits are too few for (M,) `step` by a factor of two, all symbols may follow: those that the trellis allows would err more.
     Bits are worth what they are at the steps that were asked for.
+
+    Args:
+        significant: (H, W, M), what a squared error costs in each number, relative to others of its channel; none negative.
+        together: as of `kpc.encoder.curvature.Curvature`, or ALONE.
+        thin: bits of a symbol below which it goes around predictions.
     """
     lattice = TRELLIS if np.median(plane.step / step) < 2 else ANY
     search = _Search(plane, values, step, significant, identity, together, lattice)
@@ -133,14 +81,14 @@ def _steered(
 
 
 def step_on_trellis(plane: QuantisedPlane) -> np.ndarray:
-    """(M,) float64: for which steps `quantise_on_trellis` was asked when it made this plane, if it did and 8 bits were enough."""
+    """(M,) float64: for which steps `on_trellis` was asked when it made this plane, if it did and 8 bits were enough."""
     return plane.step.astype(np.float64) * (1.0 if plane.guide is None else FINER)
 
 
 class _Search:
     """Searches for the symbols of one plane, each knowing what the one before found.
 
-    Args: as of `_steered`; `lattice`: as of `kpc.format.symbols`.
+    Args: as of `on_trellis`; `lattice`: as of `kpc.format.symbols`.
     """
 
     def __init__(self, plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool,
@@ -151,8 +99,7 @@ class _Search:
         coarser = plane.step / step
         self.wanted = (values.astype(np.float64) - plane.offset) / plane.step
         known = np.ascontiguousarray(plane.coded)
-        means = significant[known].mean(0, dtype=np.float64) if known.any() else np.ones(values.shape[2])
-        worth = np.where(means > 0, np.maximum(significant / np.maximum(means, 1e-30), LEAST_WORTH), 1.0).astype(np.float32)
+        worth = worths(significant, known)
         if identity:
             known = known & ((worth * self.wanted**2).mean(axis=2) >= UNCHANGED * self._finer**2)
         self.known, self.worth = known, worth * np.float32(coarser**2)
@@ -200,7 +147,7 @@ def _search(
     errors came, as `_bits` counts them. Every so many `rows` a segment begins, which knows of none before. `lattice`: as of
     `kpc.format.symbols`; where any may follow, survivors differ in which of their last three are odd. `price`: of `_bits`, in squared steps.
     `errors`: (H + 2, W + 2, M) float32, u of all texels, one row and one column of 0 around; those of known ones are found anew.
-    `together`: as of `quantise_on_trellis`, or ALONE.
+    `together`: as of `on_trellis`, or ALONE.
 
     v, r, cross and the names of neighbours as in `kpc.format.symbols`; v0, r0 and errors of survivors are held by their states.
     """
@@ -213,7 +160,7 @@ def _search(
     U = np.zeros((W + 2, STATES), np.float32)
     came, context, missed = np.zeros((W, STATES), np.int64), np.zeros((W, STATES), np.int64), np.zeros((W, STATES), np.int64)
     for m in range(M):
-        others = _others(errors, together, m)
+        outside_others = others(errors, together, m)
         for y in range(H):
             own = y % rows  # of its segment
             v0, v1, v2 = v[y % 3], v[(y + 2) % 3], v[(y + 1) % 3]
@@ -228,7 +175,7 @@ def _search(
                 X = x + 2
                 before, cost = cost, np.full(STATES, np.inf)
                 root, here = math.sqrt(worth[y, x, m]), errors[y + 1, x + 1, m]
-                outside = others[y, x] + BESIDE * (errors[y, x + 1, m] + errors[y + 2, x + 1, m]) + ACROSS * (
+                outside = outside_others[y, x] + BESIDE * (errors[y, x + 1, m] + errors[y + 2, x + 1, m]) + ACROSS * (
                     errors[y, x, m] + errors[y, x + 2, m] + errors[y + 2, x, m] + errors[y + 2, x + 2, m])
                 for s in range(STATES):
                     if before[s] == np.inf:
@@ -285,20 +232,3 @@ def _search(
             if own == rows - 1 or y == H - 1:
                 remember(cross[y], r1 if own > 0 else r0, r0, r0, m)
     return symbols, counts
-
-
-@compiled()
-def _others(errors: np.ndarray, together: np.ndarray, m: int) -> np.ndarray:
-    """(H, W) float32: what errors in other channels, of a texel and around it, make of one in channel m."""
-    H, W = errors.shape[0] - 2, errors.shape[1] - 2
-    c, out = np.zeros((H + 2, W + 2), np.float32), np.zeros((H, W), np.float32)
-    if together.size == 0:
-        return out
-    for y in range(H):
-        for x in range(W):
-            c[y + 1, x + 1] = TOGETHER * (together[y // SIDE, x // SIDE, m] * errors[y + 1, x + 1]).sum()
-    for y in range(H):
-        for x in range(W):
-            out[y, x] = c[y + 1, x + 1] + BESIDE * (c[y, x + 1] + c[y + 2, x + 1] + c[y + 1, x] + c[y + 1, x + 2]) + ACROSS * (
-                c[y, x] + c[y, x + 2] + c[y + 2, x] + c[y + 2, x + 2])
-    return out

@@ -21,7 +21,7 @@ from kpc.encoder.evaluate import SceneRenderer, as_wide_as, evenly_wide
 from kpc.encoder.field import Field
 from kpc.encoder.optimisers import FusedOptimiser, PlainOptimiser
 from kpc.encoder.probe import Probe
-from kpc.encoder.trellis import Name
+from kpc.encoder.worth import Name
 from kpc.format.progress import Progress
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene

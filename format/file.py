@@ -34,8 +34,8 @@ from kpc.format.nodes import decode_nodes, encode_nodes
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
+from kpc.format.segments import SegmentGuide, decode_coded, encode_coded, guide_at, guide_together, segment_guide
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
-from kpc.format.symbols import Guide, decode_symbols, encode_symbols, guide_of
 
 Parsed = TypeVar("Parsed")
 
@@ -197,7 +197,7 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
                 if start < stop:
                     segment, coded = plane.symbols[start:stop], plane.coded[start:stop]
                     chunks.append(Chunk("PLNE", encode_segment(segment, coded), number, ALL_PLANES.index(name), start, stop - start,
-                                        partial(encode_symbols, segment, coded, plane.guide), segment.size))
+                                        partial(encode_coded, segment, coded, guide_at(plane.guide, start)), segment.size))
     return chunks
 
 
@@ -319,17 +319,16 @@ def read(source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET,
                              np.zeros((p.rows, p.columns), bool))
         for name, p in scale.items()
     } for s, scale in enumerate(reader.head.scales))
-    guides: dict[tuple[int, str], list[Guide | None]] = {}
+    guides: dict[tuple[int, str], dict[int, SegmentGuide | None]] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number, (decoded, coded, guide) in zip(segments, pool.map(reader.guided_segment, segments), strict=True):
             entry = reader.index[number]
             plane = scales[entry.scale][ALL_PLANES[entry.plane]]
             rows = slice(entry.row_start, entry.row_start + entry.row_count)
             plane.symbols[rows], plane.coded[rows] = decoded, coded
-            guides.setdefault((entry.scale, ALL_PLANES[entry.plane]), []).append(guide)
-    for (scale, name), (guide, *others) in guides.items():
-        if guide is not None and all(guide == other for other in others):
-            scales[scale][name] = replace(scales[scale][name], guide=guide)
+            guides.setdefault((entry.scale, ALL_PLANES[entry.plane]), {})[entry.row_start] = guide
+    for (s, name), of_segments in guides.items():
+        scales[s][name] = replace(scales[s][name], guide=guide_together(of_segments))
     for number, entry in enumerate(reader.index):
         if entry.kind not in KNOWN_KINDS and reader.available(number):
             reader.stored(number)  # ignored, but never damaged
@@ -382,7 +381,7 @@ class SceneReader(Reader):
         symbols, coded, _ = self.guided_segment(number)
         return symbols, coded
 
-    def guided_segment(self, number: int) -> tuple[np.ndarray, np.ndarray, Guide | None]:
+    def guided_segment(self, number: int) -> tuple[np.ndarray, np.ndarray, SegmentGuide | None]:
         """The same, and by which the symbols were chosen, if by any."""
         entry = self.index[number]
         plane = self.head.scales[entry.scale][ALL_PLANES[entry.plane]]
@@ -393,7 +392,7 @@ class SceneReader(Reader):
         if entry.raw_length != texels * plane.channels:
             raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
                               f"{texels * plane.channels:,} of its rows")
-        return self._parsed(lambda body: (*decode_symbols(body, *shape), guide_of(body)), self._context_coded(number))
+        return self._parsed(lambda body: (*decode_coded(body, *shape), segment_guide(body)), self._context_coded(number))
 
     def mapping(self) -> SpaceMapping | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""

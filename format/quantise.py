@@ -17,7 +17,7 @@ from kpc.format.errors import FormatError
 from kpc.format.motion import QuantisedMotion, places_reached, quantise_motion
 from kpc.format.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
 from kpc.format.space import SpaceMapping
-from kpc.format.symbols import Guide
+from kpc.format.segments import PlaneGuide
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
 
@@ -44,7 +44,7 @@ class QuantisedPlane:
     step: np.ndarray
     offset: np.ndarray
     coded: np.ndarray
-    guide: Guide | None = None
+    guide: PlaneGuide | None = None
 
     def dequantise(self) -> np.ndarray:
         """(H, W, M) float32."""

@@ -97,7 +97,14 @@ def integer(value, table, first, unary, escapes, state, at, words, trace):
         return 0, state, at
     positive, state, at = adapt(1 if value > 0 else 0, table, first + 1, state, at, words, trace)
     first += 2 if positive else 2 + unary + escapes
-    beyond, found = abs(value) - 1, 0
+    magnitude, state, at = natural(abs(value), table, first, unary, escapes, state, at, words, trace)
+    return magnitude if positive else -magnitude, state, at
+
+
+@compiled(forceinline=True)
+def natural(value, table, first, unary, escapes, state, at, words, trace):
+    """Code or decode a number from 1 on, by unary + escapes counters from `first` on: (value, state, at)."""
+    beyond, found = value - 1, 0
     while found < unary:
         bit, state, at = adapt(1 if beyond > found else 0, table, first + found, state, at, words, trace)
         if not bit:
@@ -115,8 +122,7 @@ def integer(value, table, first, unary, escapes, state, at, words, trace):
             bit, state, at = decide(rest >> place & 1, SCALE >> 1, state, at, words, trace)
             low = low << 1 | bit
         found += low - 1
-    magnitude = found + 1
-    return magnitude if positive else -magnitude, state, at
+    return found + 1, state, at
 
 
 @compiled()

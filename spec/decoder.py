@@ -314,7 +314,7 @@ def coded_motion(chunk, rows, nz, ny, nx):  # section 5, codec 2
                         around = [r[places[i]] for i in (8, 4, 2, 1) if i in there]
                         a = sum(around) // len(around) + 2 if around else 66
                         b = a.bit_length()
-                        error = decisions.error(min(2 * (b - 2) + (a >> b - 2) % 2, 19), 15)
+                        error = decisions.error(min(2 * (b - 2) + (a >> b - 2) % 2, 19), most_bits=15)
                         require(-32768 <= predicted + error <= 32767, "a symbol leaves 16 bits")
                         v[places[0]], r[places[0]] = predicted + error, abs(error)
     decisions.end()
@@ -366,43 +366,50 @@ class Decisions:  # section 6, codec 2
             self.state = self.state << 16 | self.words.pop()
         return int(one)
 
-    def by_counter(self, name):
-        P, n = self.counters.get(name, (32768, 0))
+    def by_counter(self, name, first=(32768, 0)):
+        P, n = self.counters.get(name, first)
         one, R = self.decide(P >> 4), 327680 // (5 * n + 8)
         self.counters[name] = (P + ((65536 - P) * R >> 16) if one else P - (P * R >> 16)), min(n + 1, 120)
         return one
 
-    def error(self, context, most_bits=7):
+    def error(self, context, unary=4, most_bits=7):
         if not self.by_counter((context, "any")):
             return 0
         sign = 1 if self.by_counter((context, "positive")) else -1
-        for k in range(4):
-            if not self.by_counter((context, sign, k)):
-                return sign * (k + 1)
+        return sign * self.magnitude(lambda k: self.by_counter((context, sign, k)), unary, most_bits)
+
+    def magnitude(self, decided, unary, most_bits):
+        """From 1 on; `decided`: by the counter of this number."""
+        for k in range(unary):
+            if not decided(k):
+                return k + 1
         bits = 0
-        while bits < most_bits and self.by_counter((context, sign, 4 + bits)):
+        while bits < most_bits and decided(unary + bits):
             bits += 1
         spelt = 0
         for _ in range(bits):
             spelt = 2 * spelt + self.decide(2048)
-        return sign * (4 + 2**bits + spelt)
+        return unary + 2**bits + spelt
+
+    def map(self, H, W):
+        coded = {}
+        around = [(2, 1), (2, 0), (2, -1), (1, 2), (1, 1), (1, 0), (1, -1), (1, -2), (0, 2), (0, 1)]
+        for y in range(H):
+            for x in range(W):
+                coded[y, x] = self.by_counter(("map", *(coded.get((y - i, x - j), 0) for i, j in around)))
+        return coded
 
 
 def context_coded(chunk, H, W, channels):  # section 6, codec 2
     """As `segment`."""
     set_count, flags = chunk.unpack("BB")
+    if flags in (6, 7):
+        return in_blocks(chunk, set_count, flags, H, W, channels)
     require(set_count in (1, 2, 4, 8) and flags <= 5, "sets of weights or flags")
     has_map, lattice = flags % 2, flags // 2
     sets = [chunk.unpack("9b") for _ in range(set_count)]
     decisions = Decisions(chunk)
-
-    coded = {(y, x): 1 for y in range(H) for x in range(W)}
-    if has_map:
-        coded = {}
-        around = [(2, 1), (2, 0), (2, -1), (1, 2), (1, 1), (1, 0), (1, -1), (1, -2), (0, 2), (0, 1)]
-        for y in range(H):
-            for x in range(W):
-                coded[y, x] = decisions.by_counter(("map", *(coded.get((y - i, x - j), 0) for i, j in around)))
+    coded = decisions.map(H, W) if has_map else {(y, x): 1 for y in range(H) for x in range(W)}
 
     symbols = [0] * (H * W * channels)
     cross = {}
@@ -465,6 +472,95 @@ def context_coded(chunk, H, W, channels):  # section 6, codec 2
                 smooth = sum((2 - abs(i)) * (2 - abs(j)) * at(min(max(y + i, 0), H - 1), x + j, 0)[1]
                              for i in (-1, 0, 1) for j in (-1, 0, 1)) >> 1
                 cross[y, x] = cross[y, x] + (smooth - cross[y, x] >> 3) if c else smooth
+    decisions.end()
+    return [coded[y, x] for y in range(H) for x in range(W)], symbols
+
+
+COSINES = [181, 180, 178, 173, 167, 160, 151, 140, 128, 115, 101, 85, 69, 53, 35, 18, 0]
+COARSER = {4: [52, 55, 64, 80], 8: [52, 53, 55, 59, 64, 71, 80, 87],
+           16: [52, 52, 53, 54, 55, 57, 59, 61, 64, 67, 71, 75, 80, 84, 87, 90]}
+FINER = [181, 128, 91, 64, 45, 32, 23, 16]
+LIKELY = [[27, 66, 61, 86, 79, 96, 118, 143, 168, 190, 206, 220, 230, 238, 243, 248],
+          [19, 26, 24, 37, 37, 48, 67, 90, 120, 151, 179, 201, 217, 229, 235, 244],
+          [110, 100, 90, 86, 82, 80, 87, 98, 117, 135, 160, 184, 204, 220, 230, 243]]
+LIKELY_MEANS = [243, 210, 220]
+
+
+def in_blocks(chunk, N, flags, H, W, channels):  # section 6, codec 2, blocks
+    """As `segment`."""
+    Q, = chunk.unpack("B")
+    require(N in (4, 8, 16) and (N == 4 or N <= 2 * min(H, W)) and Q > 0, "side of blocks or quantiser")
+    decisions = Decisions(chunk)
+    coded = decisions.map(H, W) if flags % 2 else {(y, x): 1 for y in range(H) for x in range(W)}
+    BY, BX = -(-H // N), -(-W // N)
+    told = {(b, d): any(coded.get((y, x)) for y in range(b * N, b * N + N) for x in range(d * N, d * N + N))
+            for b in range(BY) for d in range(BX)}
+    fine = {}
+    for b, d in told:
+        left = fine[b, d - 1] if d else fine[b - 1, d] if b else 3
+        f = left + (fine[b - 1, d] if b else left) + 1 >> 1
+        if told[b, d]:
+            node = 1
+            for _ in range(3):
+                node = 2 * node + decisions.by_counter(("fine", f, node))
+            f = node - 8
+        fine[b, d] = f
+
+    def cosine(i, y):
+        k = 16 // N * i * (2 * y + 1) % 64
+        k = min(k, 64 - k)
+        return 128 if i == 0 else COSINES[k] if k <= 16 else -COSINES[32 - k]
+
+    def level(c, i, j):
+        near = lambda block, di, dj: size.get((c, *block, i + di, j + dj), 0)  # noqa: E731
+        here = b, d
+        quicker = 2 * (near(here, 0, 1) + near(here, 1, 0)) + near(here, 1, 1) + near(here, 0, 2) + near(here, 2, 0)
+        beside = sum(near(block, *by) for block in ((b, d - 1), (b - 1, d)) for by in ((0, 0), (0, 1), (1, 0)))
+        total = 3 * quicker + 2 * beside + 3 * size.get((c - 1, b, d, i, j), 0)
+        n = total.bit_length()
+        large = n if n < 2 else min(2 * n - 2 + (total >> n - 2) % 2, 15)
+        quick = min(5 * (i + j) // N, 7) if i + j else 8
+
+        def decided(k):
+            likely = LIKELY_MEANS[min(k, 2)] if quick == 8 else LIKELY[min(k, 2)][large]
+            return decisions.by_counter((large, quick, k), (256 * likely, 8) if k <= 5 else (32768, 0))
+
+        if not decided(0):
+            return 0
+        m = decisions.magnitude(lambda k: decided(k + 1), 5, 12)
+        return m if decisions.decide(2048) else -m
+
+    symbols, size, end = [0] * (H * W * channels), {}, {}
+    for c in range(channels):
+        mean = {}
+        for b, d in told:
+            q = {(i, j): max(Q * FINER[fine[b, d]] * COARSER[N][i] * COARSER[N][j] + 131072 >> 18, 1) for i in range(N) for j in range(N)}
+            if b == 0 or d == 0:
+                mean[b, d] = mean[b, d - 1] if d else mean[b - 1, d] if b else 0
+            else:
+                left, above = mean[b, d - 1], mean[b - 1, d]
+                mean[b, d] = min(max(left, above), max(min(left, above), left + above - mean[b - 1, d - 1]))
+            if not told[b, d]:
+                continue
+            foreseen = (mean[b, d] + q[0, 0] // 2) // q[0, 0]
+            usual = end.get((c, b, d - 1), 0) + end.get((c, b - 1, d), 0) + 2 * end.get((c - 1, b, d), 0) + 2 >> 2
+            context = 0 if usual == 0 else 1 + (usual - 1) * 7 // (2 * N - 1)
+            end[c, b, d] = min(max(usual + decisions.error(("end", context), 6, 4), 0), 2 * N - 1)
+            levels = {}
+            for diagonal in range(end[c, b, d] - 1, -1, -1):
+                for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1):
+                    levels[i, diagonal - i] = value = level(c, i, diagonal - i)
+                    size[c, b, d, i, diagonal - i] = abs(value)
+            levels[0, 0] = levels.get((0, 0), 0) + foreseen
+            factors = {at: min(max(value * q[at], -32768), 32767) for at, value in levels.items()}
+            mean[b, d] = factors[0, 0]
+            down = [[sum(cosine(i, y) * factors.get((i, j), 0) for i in range(N)) + 64 >> 7 for j in range(N)] for y in range(N)]
+            shift = 10 + {4: 2, 8: 3, 16: 4}[N]
+            for y in range(min(N, H - b * N)):
+                for x in range(min(N, W - d * N)):
+                    if coded[b * N + y, d * N + x]:
+                        v = sum(cosine(j, x) * down[y][j] for j in range(N)) + (1 << shift - 1) >> shift
+                        symbols[((b * N + y) * W + d * N + x) * channels + c] = min(max(v, -128), 127)
     decisions.end()
     return [coded[y, x] for y in range(H) for x in range(W)], symbols
 

@@ -13,7 +13,7 @@ from kpc.encoder.compress import (
 )
 from kpc.encoder.probe import Measured
 from kpc.encoder.search import TUNINGS
-from kpc.encoder.trellis import quantise_on_trellis
+from kpc.encoder.choice import quantise_by_cost
 from kpc.format import file
 from kpc.format.motion import STEP
 from kpc.format.quantise import QuantisedScene, quantise_scene, round_decoder
@@ -86,7 +86,7 @@ def test_of_a_size_that_no_file_has_the_smallest_is_found() -> None:
 @pytest.fixture(scope="module")
 def raster() -> list[Attempt]:
     """On a fine raster of factors, for all lam."""
-    return [Attempt(quantise_on_trellis(SCENE, scaled(EQUAL, 2.0**e)), measure, float(e)) for e in np.arange(-10, 2, 0.1)]
+    return [Attempt(quantise_by_cost(SCENE, scaled(EQUAL, 2.0**e)), measure, float(e)) for e in np.arange(-10, 2, 0.1)]
 
 
 @pytest.mark.parametrize("lam", [0.01, 0.3, 10.0])
@@ -102,7 +102,7 @@ def test_a_larger_lam_gives_a_smaller_file() -> None:
 
 
 def test_where_nothing_is_good_enough_the_finest_is_taken() -> None:
-    finest = quantise_on_trellis(SCENE, scaled(EQUAL, 2.0**FINEST))
+    finest = quantise_by_cost(SCENE, scaled(EQUAL, 2.0**FINEST))
     assert file.encode(coded(max_loss_db=-1.0).quantised) == file.encode(finest)
 
 
@@ -234,7 +234,7 @@ def test_scaled() -> None:
 def tuned_to(factor: float, seen: list[Attempt] | None = None, power: float = 1.0, **trade: float) -> Attempt:
     """With a stand-in for tuning: steps to some power, times a factor, at the bytes that those take."""
     def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
-        made = quantise_on_trellis(SCENE, [{name: factor * step**power for name, step in scale.items()} for scale in steps], reached)
+        made = quantise_by_cost(SCENE, [{name: factor * step**power for name, step in scale.items()} for scale in steps], reached)
         if seen is not None:
             seen.append(Attempt(made, measure, 0.0))
         return made
@@ -275,7 +275,7 @@ def test_tuning_that_breaks_leaves_what_was_found() -> None:
         return Measured(math.nan, math.nan) if scene.step == 7 else measure(scene)
 
     def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
-        return replace(quantise_on_trellis(SCENE, steps, reached), step=7.0)
+        return replace(quantise_by_cost(SCENE, steps, reached), step=7.0)
 
     found = compress(SCENE, EQUAL, ALIKE, broken, 30.0, Trade(0.15), tune=tune)
     assert found.quantised.step != 7 and 0.07 < loss(found) <= 0.15

@@ -18,7 +18,7 @@ from kpc.encoder.compress import Trade
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
 from kpc.encoder.probe import ASSUMED_MSE, Probe, around
-from kpc.encoder.trellis import step_on_trellis
+from kpc.encoder.choice import step_asked_for
 from kpc.format import file
 from kpc.format.errors import TrainingError
 from kpc.format.quantise import quantise_scene
@@ -209,7 +209,7 @@ def test_a_file_does_not_know_what_was_filmed(scene_file: Path, refused: Callabl
 
 def test_the_ratio_of_steps_stays(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
     kpenc_says(scene_file, tmp_path / "smaller.kpc", "--max-loss", "0.02dB")
-    steps = [[step_on_trellis(plane) / step_on_trellis(scene.scales[0]["xy"])[0] for scale in scene.scales for plane in scale.values()]
+    steps = [[step_asked_for(plane) / step_asked_for(scene.scales[0]["xy"])[0] for scale in scene.scales for plane in scale.values()]
              for scene in (file.read(scene_file), file.read(tmp_path / "smaller.kpc"))]  # fmt: skip
     np.testing.assert_allclose(np.concatenate(steps[0]), np.concatenate(steps[1]), rtol=2**-6)  # each to 8 significant bits
 

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scenes import tiny_scene
 
-from kpc.encoder import trellis
-from kpc.encoder.trellis import ALONE, STATES, TOLD_APART, quantise_on_trellis
+from kpc.encoder import trellis, worth
+from kpc.encoder.choice import quantise_by_cost
+from kpc.encoder.trellis import STATES, TOLD_APART
+from kpc.encoder.worth import ALONE
 from kpc.format import file
 from kpc.format.file import SEGMENT_ROWS
 from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
@@ -28,7 +30,7 @@ def quantised(scene: Scene, step: float) -> QuantisedScene:
 
 def steered(scene: Scene, step: float, significant: list[dict[str, np.ndarray]] | None = None) -> QuantisedScene:
     steps = [{name: np.full(plane.shape[2], step) for name, plane in scale.items()} for scale in scene.scales]
-    return quantise_on_trellis(scene, steps, significant=significant)
+    return quantise_by_cost(scene, steps, significant=significant, blocks=False)
 
 
 NO_WEIGHTS = np.zeros((1, WEIGHTS), np.int8)
@@ -100,7 +102,7 @@ def test_a_channel_undoes_what_others_err() -> None:
     apart = searched(wanted, known)
     np.testing.assert_array_equal(searched(wanted, known, together=together), apart)
     for sign in (1, -1):
-        together[..., 0, 1] = together[..., 1, 0] = sign / trellis.TOGETHER
+        together[..., 0, 1] = together[..., 1, 0] = sign / worth.TOGETHER
         errors, errors_apart = (symbols - wanted for symbols in (searched(wanted, known, together=together), apart))
         shown, shown_apart = (seen(e[..., :1] + sign * e[..., 1:]) for e in (errors, errors_apart))
         assert shown < 0.6 * shown_apart
@@ -113,12 +115,12 @@ def test_what_goes_together_is_told_block_by_block() -> None:
     together = np.random.default_rng(2).normal(size=(3, 3, 3, 3)).astype(np.float32)
     c = np.zeros((7, 8))
     for y, x in np.ndindex(5, 6):
-        c[y + 1, x + 1] = trellis.TOGETHER * (together[y // 2, x // 2, 1] @ errors[y + 1, x + 1])
-    kernel = np.array([trellis.BESIDE, 1, trellis.BESIDE])
+        c[y + 1, x + 1] = worth.TOGETHER * (together[y // 2, x // 2, 1] @ errors[y + 1, x + 1])
+    kernel = np.array([worth.BESIDE, 1, worth.BESIDE])
     weights = np.outer(kernel, kernel)  # ACROSS is BESIDE squared
     expected = [[(weights * c[y : y + 3, x : x + 3]).sum() for x in range(6)] for y in range(5)]
-    assert trellis.ACROSS == trellis.BESIDE**2
-    np.testing.assert_allclose(trellis._others(errors, together, 1), expected, rtol=1e-4, atol=1e-5)
+    assert worth.ACROSS == worth.BESIDE**2
+    np.testing.assert_allclose(worth.others(errors, together, 1), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_seen_is_what_bilinear_look_ups_see() -> None:
@@ -186,7 +188,7 @@ def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float)
     def size(plane: QuantisedPlane) -> int:
         return len(encode_symbols(plane.symbols, plane.coded, plane.guide))
 
-    economical = trellis._steered(quantise_plane(values, step, identity=False), values, np.full(3, step), np.ones_like(values), False)
+    economical = trellis.on_trellis(quantise_plane(values, step, identity=False), values, np.full(3, step), np.ones_like(values), False)
     as_bad = next(plane for k in np.arange(1, 4, 0.01)
                   if error(plane := quantise_plane(values, k * step, identity=False)) >= error(economical))
     assert size(economical) < size(as_bad) - 0.12 * values.size / 8  # 1.09 dB are 0.18 bits
@@ -195,18 +197,18 @@ def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float)
 def test_where_eight_bits_are_too_few_any_symbol_may_follow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of the trellis would err by four thirds of what the nearest do, and at a step so much coarser than the one asked for bits are
     worth little: what is seen of errors is less than of those of the nearest, but where they are worth next to nothing."""
-    monkeypatch.setattr(trellis, "LEAST_WORTH", 1e-4)
+    monkeypatch.setattr(worth, "LEAST_WORTH", 1e-4)
     values = np.random.default_rng(4).uniform(-100, 100, (20, 40, 2)).astype(np.float32)
     nearest, step = quantise_plane(values, 0.2, identity=False), np.full(2, 0.2)
     significant = np.ones_like(values)
     significant[:, 20:] = 1e-9
-    free = trellis._steered(nearest, values, step, np.ones_like(values), False)
-    told = trellis._steered(nearest, values, step, significant, False)
+    free = trellis.on_trellis(nearest, values, step, np.ones_like(values), False)
+    told = trellis.on_trellis(nearest, values, step, significant, False)
     assert not follows_trellis(free.symbols, free.coded) and np.abs(free.symbols - nearest.symbols.astype(int)).max() <= 1
     errors = [seen((plane.dequantise() - values)[:, :20]) for plane in (nearest, free, told)]
     assert errors[1] < errors[0] and errors[2] < 1.1 * errors[0]
     assert len(encode_symbols(told.symbols, told.coded)) < 0.95 * len(encode_symbols(nearest.symbols, nearest.coded))
-    steered = trellis._steered(nearest, values, nearest.step, np.ones_like(values), False)
+    steered = trellis.on_trellis(nearest, values, nearest.step, np.ones_like(values), False)
     assert follows_trellis(steered.symbols, steered.coded)
 
 
@@ -248,12 +250,12 @@ def test_what_is_hardly_told_goes_around_predictions(identity: bool) -> None:
         bodies = [encode_symbols(plane.symbols[rows], plane.coded[rows], plane.guide) for rows in parts]
         assert all(guide_of(body) == plane.guide for body in bodies)
         errors = plane.dequantise() - values
-        return float((errors / 2.0).ravel() @ (errors / 2.0).ravel() * seen(errors) / np.mean(np.square(errors))) + trellis.LAM * 8 * sum(map(len, bodies))
+        return float((errors / 2.0).ravel() @ (errors / 2.0).ravel() * seen(errors) / np.mean(np.square(errors))) + worth.LAM * 8 * sum(map(len, bodies))
 
-    around = trellis._steered(rounded, values, step, alike, identity)
+    around = trellis.on_trellis(rounded, values, step, alike, identity)
     assert around.guide is not None
     np.testing.assert_allclose(trellis.step_on_trellis(around), step, rtol=2**-7)
-    on_trellis = trellis._steered(rounded, values, step, alike, identity, thin=0.0)
+    on_trellis = trellis.on_trellis(rounded, values, step, alike, identity, thin=0.0)
     assert on_trellis.guide is None and cost(around) < 0.92 * cost(on_trellis)
 
 

@@ -11,7 +11,8 @@ from scenes import displaced, hybrid, tiny_scene, varied
 from kpc.encoder import tuning
 from kpc.encoder.evaluate import as_wide_as, evenly_wide
 from kpc.encoder.probe import Probe
-from kpc.encoder.trellis import Name, quantise_on_trellis
+from kpc.encoder.choice import quantise_by_cost
+from kpc.encoder.worth import Name
 from kpc.encoder.tuning import coded_in_groups, order, steps_after, steps_in_all, tuned
 from kpc.format import file
 from kpc.format.quantise import QuantisedScene
@@ -28,7 +29,7 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def choose(scene: Scene, group: Sequence[Name] | None = None) -> QuantisedScene:
     steps = [{name: np.full(plane.shape[2], STEP) for name, plane in scale.items()} for scale in scene.scales]
-    return quantise_on_trellis(scene, steps, only=group)
+    return quantise_by_cost(scene, steps, only=group)
 
 
 def error(scene: Scene, quantised: QuantisedScene) -> float:

@@ -23,13 +23,14 @@ from typing import Any
 import numpy as np
 
 from kpc.encoder import model
+from kpc.encoder.choice import quantise_by_cost
 from kpc.encoder.compress import DEFAULT_LOSS_DB, Quantise, Trade
 from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset, rays
 from kpc.encoder.model import Model
 from kpc.encoder.probe import Measure, Measured, Probe
-from kpc.encoder.trellis import Name, quantise_on_trellis
 from kpc.encoder.tuning import coded_in_groups
+from kpc.encoder.worth import Name
 from kpc.format import file
 from kpc.format.errors import KpcError, TrainingError
 from kpc.format.quantise import quantise_scene, round_decoder
@@ -51,11 +52,12 @@ RIVALS = {rival.name: rival for rival in rivals.RIVALS}
 OURS = "kpc"
 WITHOUT: dict[str, Quantise | None] = {
     "kpc without tuning": None,
-    "kpc, channels apart": quantise_on_trellis,
-    "kpc, never around predictions": lambda scene, steps, reached, significant: quantise_on_trellis(
-        scene, steps, reached, significant, thin=0.0),
+    "kpc, channels apart": quantise_by_cost,
+    "kpc, never in blocks": lambda scene, steps, reached, significant: quantise_by_cost(scene, steps, reached, significant, blocks=False),
+    "kpc, never around predictions": lambda scene, steps, reached, significant: quantise_by_cost(
+        scene, steps, reached, significant, thin=0.0, blocks=False),
     "kpc without the trellis": lambda scene, steps, reached, significant: quantise_scene(scene, steps, reached=reached),
-    "kpc, every texel alike": lambda scene, steps, reached, significant: quantise_on_trellis(scene, steps, reached),
+    "kpc, every texel alike": lambda scene, steps, reached, significant: quantise_by_cost(scene, steps, reached),
 }
 """Our own coder with something left out: tuning; without it, what channels know of each other's errors; and without either, one thing more.
 At QUALITIES."""

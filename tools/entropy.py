@@ -28,7 +28,8 @@ TABLE_BITS = 12
 
 @dataclass(frozen=True)
 class Segment:
-    """A plane segment: (H, W, M) int8 symbols, (H, W) bool coded texels, what the symbols follow, and the chunk that stores it."""
+    """A plane segment that is told symbol by symbol: (H, W, M) int8 symbols, (H, W) bool coded texels, what the symbols follow, and the chunk
+    that stores it."""
 
     symbols: np.ndarray
     coded: np.ndarray
@@ -92,10 +93,10 @@ def _note(bit, table, which, state, at, words, trace):
 
 def _compiled(changes: dict[str, Any]) -> Walks:
     names = vars(rans) | vars(module) | changes
-    for name in ("begin_row", "remember", "next_state", "next_place", "predict", "nearest", "foreseen", "meant", "told", "activity", "integer",
-                 "walk_map", "walk"):
+    for name in ("begin_row", "remember", "next_state", "next_place", "predict", "nearest", "foreseen", "meant", "told", "activity", "natural",
+                 "integer", "walk_map", "walk"):
         if name not in changes:
-            names[name] = njit(FunctionType(vars(module)[name].py_func.__code__, names, name))
+            names[name] = njit(FunctionType(names[name].py_func.__code__, names, name))
     return names
 
 

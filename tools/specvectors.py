@@ -23,6 +23,7 @@ import numpy as np
 import zstandard
 
 from kpc.format import cli
+from kpc.format.blocks import FINENESSES, HEAD, Blocks, blocks_of, encode_blocks, largest_side
 from kpc.format.cameras import Camera
 from kpc.format.cells import encode_cells
 from kpc.format.container import CODEC_ZSTD, ENTRY, HEADER, Chunk, Reader, pack
@@ -178,6 +179,25 @@ def around(scene: QuantisedScene, guide: Guide, segment_rows: int) -> QuantisedS
                                         for name, plane in scale.items()} for scale in scene.scales))
 
 
+def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *, segment_rows: int = 16) -> bytes:
+    """A file all of whose planes are told in blocks of a side, or of smaller ones where a segment is small, with levels from noise, those of
+    means as large as may be, quick ones small; levels grow and fall with `spread`."""
+
+    def body(chunk: Chunk) -> bytes:
+        plane = scene.scales[chunk.scale][ALL_PLANES[chunk.plane]]
+        coded = plane.coded[chunk.row_start : chunk.row_start + chunk.row_count]
+        N = min(side, largest_side(*coded.shape))
+        grid, seed = blocks_of(coded, N).shape, 100 + 10 * chunk.plane + chunk.scale
+        levels = _noise((plane.symbols.shape[2], *grid, N, N), seed) / 128 * spread
+        levels *= np.float32(1) / (1 + np.add.outer(np.arange(N), np.arange(N), dtype=np.float32)) ** 2
+        fineness = np.abs(_noise(grid, seed + 1)).astype(np.int64) % FINENESSES
+        return encode_blocks(Blocks(np.trunc(levels).astype(np.int64), fineness, quantiser), coded)
+
+    chunks = [_forced(chunk, body(chunk)) if chunk.kind == "PLNE" else replace(chunk, symbols=None)
+              for chunk in scene_chunks(scene, segment_rows=segment_rows)]
+    return pack(chunks, _value_count(scene))
+
+
 def walked(symbols: np.ndarray, coded: np.ndarray, weights: np.ndarray, lattice: int) -> bytes:
     """A segment that tells (H, W, M) symbols up to the first that leaves its 8 bits, each moved so that it follows the lattice."""
     trace = np.empty(symbols.size * MOST_DECISIONS, np.int16)
@@ -291,6 +311,12 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "around": (context_coded(dynamic, 8, segment_rows=4, flat=True), False),
         "around-extremes": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4, flat=True), False),
         "around-flat": (context_coded(_painted(lambda shape, seed: _noise(shape, seed) // 50), 2, flat=True), False),
+        "blocks": (in_blocks(dynamic, 16, 12, 60, segment_rows=4), False),
+        "blocks-prefix": (in_blocks(dynamic, 8, 64, 8)[:Reader(in_blocks(dynamic, 8, 64, 8)).index[9].offset], True),
+        "blocks-extremes": (in_blocks(_scene(dynamic=True, sizes=[(2, 9, 6, 5, 4)]), 4, 255, 8196), False),
+        "blocks-fine": (in_blocks(_scene(dynamic=False, sizes=[(2, 20, 17, 9, 0)]), 16, 1, 8196), False),
+        "blocks-empty": (in_blocks(_painted(lambda shape, seed: np.zeros(shape), coded=False), 8, 64, 0), False),
+        "blocks-one-texel": (in_blocks(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)]), 4, 64, 20), False),
         "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
         "cells": (coded_grids(replace(dense, occupancy=rolling)), False),
         "cells-noise": (coded_grids(dense), False),
@@ -451,6 +477,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         return pack([chunk if number == small_xy else replace(chunk, symbols=None) for number, chunk in enumerate(told)], 24)
 
     told = context(coarse)
+    in_four = encode_blocks(Blocks(np.trunc(_noise((2, 1, 1, 4, 4), 71) / 8).astype(np.int64), np.full((1, 1), 2), 40), whole)
     small_entry = HEADER.size + ENTRY.size * small_xy
     state_at = 2 + WEIGHTS
     small_occu = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "OCCU")
@@ -523,7 +550,13 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
                         broken, "claims another length"),
         "zstd-garbage": (resealed(patched(good, entry[xy] + 16, "<H", 1)), broken, "zstd frame"),
         "symbols-sets": (context(patched(coarse, 0, "<B", 3)), broken, "number of sets"),
-        "symbols-flags": (context(patched(coarse, 1, "<B", 6)), broken, "or flag"),
+        "symbols-flags": (context(patched(coarse, 1, "<B", 6)), broken, "unknown side of blocks"),
+        "symbols-flags-more": (context(patched(coarse, 1, "<B", 8)), broken, "or flag"),
+        "blocks-side": (context(patched(in_four, 0, "<B", 5)), broken, "unknown side of blocks"),
+        "blocks-large": (context(patched(in_four, 0, "<B", 8)), broken, "more than twice its 2 rows or columns"),
+        "blocks-quantiser": (context(patched(in_four, 2, "<B", 0)), broken, "a quantiser of 0"),
+        "blocks-head": (context(in_four[:2]), broken, "a quantiser of 0"),
+        **damaged_words("blocks", context, in_four, HEAD),
         **damaged_words("symbols", context, coarse, state_at),
         "symbols-bomb": (resealed(bomb_symbols), broken, "more than 15 bytes can hold"),
         "symbols-range": (context(walked(symbols + 200, whole, weights, ANY)), broken, "leaves its 8 bits"),

@@ -1,0 +1,95 @@
+"""Symbols of a scene: of each plane those that cost least, on the trellis (`kpc.encoder.trellis`) or in blocks (`kpc.encoder.blocks`).
+
+Both know at which steps bits are worth as much. So what errors cost, plus what bits are worth, is compared plane by plane.
+"""
+
+import os
+from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from kpc.encoder.blocks import in_blocks, step_in_blocks
+from kpc.encoder.curvature import PerPlane
+from kpc.encoder.trellis import THIN, on_trellis, step_on_trellis
+from kpc.encoder.worth import ALONE, Name, cost, worths
+from kpc.format.file import SEGMENT_ROWS
+from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_scene
+from kpc.format.scene import TIME_PLANES, Scene
+from kpc.format.segments import Told, encode_coded, guide_at
+
+SIDES = 8, 16
+"""Of blocks that are tried. Those of 4 never cost least (room, soldier)."""
+SLOPE = 0.9
+"""Squared steps that a bit is worth where planes are compared: what errors fall by, on the trellis and in blocks, when steps are made finer. (In
+searches bits are worth less, `kpc.encoder.worth.LAM`: what is coarse in one place is made up for in others.)"""
+COHERENT = 1.15
+"""What errors of blocks cost, of what `cost` says: they lack what is quick in all channels and planes alike, and pictures see the sum (soldier, room:
+1.1 to 1.2)."""
+FEW_BITS, MANY_BITS = 0.25, 1.5
+"""A symbol, in blocks: with fewer the trellis, which then always costs more, is not tried; with more larger blocks are not."""
+
+
+def quantise_by_cost(
+    scene: Scene, steps: PerPlane, reached: np.ndarray | None = None,
+    significant: PerPlane | None = None, only: Collection[Name] | None = None, together: PerPlane | None = None, thin: float = THIN,
+    blocks: bool = True,
+) -> QuantisedScene:
+    """As `quantise_scene`, with symbols that cost least.
+
+    Args:
+        significant: what a squared error costs in each number, relative to others of its channel; (H, W, M), none negative. None: the same.
+        only: the planes whose symbols are searched for; others are rounded. None: all.
+        together: as of `kpc.encoder.curvature.Curvature`. None: channels know nothing of each other.
+        thin: as of `kpc.encoder.trellis.on_trellis`. blocks: whether planes may be told in blocks.
+    """
+    quantised = quantise_scene(scene, steps, reached=reached)
+    matters = significant or [{name: np.ones(plane.shape, np.float32) for name, plane in scale.items()} for scale in scene.scales]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the searches hold no lock
+        waiting = [{name: pool.submit(_cheapest if blocks else on_trellis, plane, planes[name], step[name], w[name], name in TIME_PLANES,
+                                      ALONE if together is None else together[s][name], thin)
+                    for name, plane in scale.items() if only is None or (s, name) in only}
+                   for s, (scale, planes, step, w) in enumerate(zip(quantised.scales, scene.scales, steps, matters, strict=True))]
+        found = [{name: plane.result() for name, plane in scale.items()} for scale in waiting]
+    scales = tuple({**rounded, **searched} for rounded, searched in zip(quantised.scales, found, strict=True))
+    return replace(quantised, scales=scales)
+
+
+def step_asked_for(plane: QuantisedPlane) -> np.ndarray:
+    """(M,) float64: for which steps `quantise_by_cost` was asked when it made this plane, if it did and 8 bits were enough."""
+    return step_in_blocks(plane) if isinstance(plane.guide, Told) else step_on_trellis(plane)
+
+
+def _cheapest(
+    plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool, together: np.ndarray, thin: float,
+) -> QuantisedPlane:
+    """The plane that is quantised to the nearest, with the symbols that cost least; arguments as of `on_trellis`."""
+    root = np.sqrt(worths(significant, plane.coded)) * plane.coded[..., None]
+
+    def in_all(candidate: QuantisedPlane, size_bytes: int) -> float:
+        factor = COHERENT if isinstance(candidate.guide, Told) else 1
+        return factor * cost(root * ((candidate.dequantise() - values) / step), together) + SLOPE * 8 * size_bytes
+
+    tried = []
+    for side in SIDES:
+        told = in_blocks(plane, values, step, significant, identity, together, side)
+        if told is None:
+            break
+        tried.append((in_all(*told), told[0]))
+        bits = 8 * told[1] / (plane.coded.sum() * values.shape[2])
+        if bits > MANY_BITS:
+            break
+    if not tried or bits > FEW_BITS:
+        steered = on_trellis(plane, values, step, significant, identity, together, thin)
+        if not tried:
+            return steered
+        tried.append((in_all(steered, _size(steered, identity)), steered))
+    return min(tried, key=lambda one: one[0])[1]
+
+
+def _size(plane: QuantisedPlane, identity: bool) -> int:
+    """Bytes of its segments."""
+    rows = SEGMENT_ROWS if identity else len(plane.symbols)
+    return sum(len(encode_coded(plane.symbols[start : start + rows], plane.coded[start : start + rows], guide_at(plane.guide, start)))
+               for start in range(0, len(plane.symbols), rows))  # fmt: skip

@@ -1,0 +1,65 @@
+"""Plane segments under codec 2, whichever way they are told: symbol by symbol (`kpc.format.symbols`) or in blocks (`kpc.format.blocks`)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from kpc.format.blocks import decode_blocks, holds_blocks
+from kpc.format.symbols import Guide, decode_symbols, encode_symbols, guide_of
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """A plane that is told in blocks. Its symbols follow from these, which cannot be found from them.
+
+    Attributes:
+        segments: of each by its first row, what is stored.
+    """
+
+    segments: Mapping[int, bytes]
+
+
+PlaneGuide = Guide | Told
+SegmentGuide = Guide | bytes
+
+
+def guide_at(guide: PlaneGuide | None, start: int) -> SegmentGuide | None:
+    """Of the segment that begins in a row."""
+    return guide.segments.get(start) if isinstance(guide, Told) else guide
+
+
+def guide_together(guides: Mapping[int, SegmentGuide | None]) -> PlaneGuide | None:
+    """Of a plane whose segments, by their first rows, have these; None where they are not of one kind."""
+    bodies = {start: guide for start, guide in guides.items() if isinstance(guide, bytes)}
+    if len(bodies) == len(guides):
+        return Told(bodies)
+    first, *others = guides.values()
+    return first if isinstance(first, Guide) and all(first == other for other in others) else None
+
+
+def encode_coded(symbols: np.ndarray, coded: np.ndarray, guide: SegmentGuide | None = None) -> bytes:
+    """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: as their guide has it, if it does, else symbol by symbol."""
+    if not isinstance(guide, bytes):
+        return encode_symbols(symbols, coded, guide)
+    told, where = decode_blocks(guide, *symbols.shape)
+    return guide if np.array_equal(told, symbols) and np.array_equal(where, coded) else encode_symbols(symbols, coded)
+
+
+def decode_coded(body: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Undo `encode_coded`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels.
+
+    Raises:
+        FormatError: the body is cut, too long, or says what only a damaged one would.
+    """
+    decode = decode_blocks if holds_blocks(body) else decode_symbols
+    return decode(body, rows, columns, channels)
+
+
+def segment_guide(body: bytes) -> SegmentGuide | None:
+    """Of what `decode_coded` decodes.
+
+    Raises:
+        FormatError: as `decode_coded`.
+    """
+    return bytes(body) if holds_blocks(body) else guide_of(body)
