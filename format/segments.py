@@ -30,12 +30,12 @@ def guide_at(guide: PlaneGuide | None, start: int) -> SegmentGuide | None:
 
 
 def guide_together(guides: Mapping[int, SegmentGuide | None]) -> PlaneGuide | None:
-    """Of a plane whose segments, by their first rows, have these; None where they are not of one kind."""
-    bodies = {start: guide for start, guide in guides.items() if isinstance(guide, bytes)}
-    if len(bodies) == len(guides):
+    """Of a plane whose segments, by their first rows, have these: of those in blocks if there are any, else the one that all have that have any
+    (what has none was smaller as it is)."""
+    if bodies := {start: guide for start, guide in guides.items() if isinstance(guide, bytes)}:
         return Told(bodies)
-    first, *others = guides.values()
-    return first if isinstance(first, Guide) and all(first == other for other in others) else None
+    known = [guide for guide in guides.values() if isinstance(guide, Guide)]
+    return known[0] if known and all(guide == known[0] for guide in known) else None
 
 
 def encode_coded(symbols: np.ndarray, coded: np.ndarray, guide: SegmentGuide | None = None) -> bytes:

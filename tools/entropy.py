@@ -3,7 +3,7 @@
 An idea is left out by compiling `kpc.format.symbols` once more with the one constant or function changed that holds it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
@@ -19,6 +19,7 @@ from kpc.format.container import Chunk, pack
 from kpc.format.file import SceneReader, read, scene_chunks
 from kpc.format.rans import words_of
 from kpc.format.scene import ALL_PLANES
+from kpc.format.segments import Told
 from kpc.format.symbols import ANY, AROUND, MOST_DECISIONS, SET_COUNTS, TRELLIS, WEIGHTS, Guide, fitted
 
 DECODINGS = 5
@@ -38,18 +39,21 @@ class Segment:
 
 
 def measure(scene: Path) -> dict[str, dict[str, float]]:
-    """For each idea left out, the bytes of all planes, `plane_bytes`; of what exists as a codec also `decode_ms`, on one core."""
+    """For each idea left out, the bytes of all planes, `plane_bytes`; of what exists as a codec also `decode_ms`, on one core. Planes that are
+    told in blocks are left out."""
     quantised = read(scene)
     segments, chunks = [], scene_chunks(quantised, segment_rows=_segment_rows(scene))
+    left = {(s, ALL_PLANES.index(name)) for s, planes in enumerate(quantised.scales)
+            for name, plane in planes.items() if not isinstance(plane.guide, Told)}
     for chunk in chunks:
-        if chunk.kind == "PLNE":
+        if chunk.kind == "PLNE" and (chunk.scale, chunk.plane) in left:
             plane = quantised.scales[chunk.scale][ALL_PLANES[chunk.plane]]
             rows = slice(chunk.row_start, chunk.row_start + chunk.row_count)
             segments.append(Segment(plane.symbols[rows], plane.coded[rows], plane.guide, chunk))
-    values = sum(segment.symbols.size for segment in segments)
+    values = sum(plane.symbols.size for planes in quantised.scales for plane in planes.values())
     found = {
-        "nothing": _decoded(pack(chunks, values)),
-        "all of them: zstd": _decoded(pack([replace(chunk, symbols=None) for chunk in chunks], values)),
+        "nothing": _decoded(pack(chunks, values), left),
+        "all of them: zstd": _decoded(pack([replace(chunk, symbols=None) for chunk in chunks], values), left),
     }
     for name, (changes, counts, size) in LEFT_OUT.items():
         walks = _compiled(changes)
@@ -61,9 +65,9 @@ def _segment_rows(scene: Path) -> int:
     return max((entry.row_count for entry in SceneReader(scene).index if entry.kind == "PLNE" and entry.plane >= 3), default=1)
 
 
-def _decoded(data: bytes) -> dict[str, float]:
+def _decoded(data: bytes, left: Collection[tuple[int, int]]) -> dict[str, float]:
     reader = SceneReader(data)
-    planes = [number for number, entry in enumerate(reader.index) if entry.kind == "PLNE"]
+    planes = [number for number, entry in enumerate(reader.index) if entry.kind == "PLNE" and (entry.scale, entry.plane) in left]
     times = []
     for _ in range(DECODINGS + 1):
         start = process_time()
