@@ -140,7 +140,7 @@ def _filled(wanted: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
     border = ((0, -rows % side), (0, -columns % side), (0, 0))
     weights = np.pad(known[..., None].astype(np.float64), border)
     sums = np.pad(wanted * known[..., None], border)
-    mean = sums.sum((0, 1)) / weights.sum()
+    mean = sums.sum((0, 1)) / max(weights.sum(), 1)
     filled, done = np.where(weights > 0, sums, mean), weights > 0
     for _ in range(FILLED):
         sums, weights = _blurred(sums), _blurred(weights)
