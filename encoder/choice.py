@@ -1,6 +1,9 @@
 """Symbols of a scene: of each plane those that cost least, on the trellis (`kpc.encoder.trellis`) or in blocks (`kpc.encoder.blocks`).
 
 Both know at which steps bits are worth as much. So what errors cost, plus what bits are worth, is compared plane by plane.
+
+All planes, at equal error of pictures, beside the trellis alone: soldier takes 17 % fewer bytes at 38 dB of agreement with the uncoded pictures and 28 %
+at 34; shelf_hand 4 % at 40 and 18 % at 35; the default scene 4 % at 35 to 40 and 13 % at 30; room and liam hardly any. Nothing at 44 dB.
 """
 
 import os

@@ -6,11 +6,11 @@ follow (`kpc.format.symbols.next_state`). A Viterbi search finds the path throug
     u^2 + 2 u (BESIDE * sum of u of the four texels around + ACROSS * sum of u of the four at the corners + others)
         + LAM * bits(symbol | those before it),        u = sqrt(worth) (symbol - value / step)
 
-(`kpc.encoder.worth`), each survivor with the predictions and contexts that its own symbols lead to (Marcellin and Fischer, IEEE Trans. Comm. 38, 1990). Bits are
-counted in the contexts of the coder, from what the search before chose; rows below and channels to come have the errors that the search
-before left them. So errors next to each other get opposite signs, and look-ups, which lie between texels, see less of them; and a channel
-undoes what others err. What an error is worth differs from texel to texel by orders of magnitude (`kpc.encoder.curvature`): where it is
-worth little, symbols are those that are foreseen.
+(`kpc.encoder.worth`), each survivor with the predictions and contexts that its own symbols lead to (Marcellin and Fischer, IEEE Trans.
+Comm. 38, 1990). Bits are counted in the contexts of the coder, from what the search before chose; rows below and channels to come have the
+errors that the search before left them. So errors next to each other get opposite signs, and look-ups, which lie between texels, see less of
+them; and a channel undoes what others err. What an error is worth differs from texel to texel by orders of magnitude
+(`kpc.encoder.curvature`): where it is worth little, symbols are those that are foreseen.
 
 Where little more than a bit is told of a symbol (`THIN`), they follow the trellis around predictions where it is flat: what is foreseen may
 then follow everywhere, as it should where nothing else is said, and not only every other time.
