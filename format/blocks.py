@@ -65,6 +65,7 @@ LIKELY_MEANS = np.array([243, 210, 220])
 ENDS, END_UNARY, END_ESCAPES = 8, 6, 4
 """Contexts of ends: what those around are. An end is told as it differs from them, as `kpc.format.rans.integer` tells it."""
 END_DECISIONS = 2 + 2 * (END_UNARY + END_ESCAPES)
+MOST_END_DECISIONS = 2 + END_UNARY + 2 * END_ESCAPES
 MOST_DECISIONS = 2 + UNARY + 2 * ESCAPES
 """That a level takes."""
 
@@ -122,7 +123,7 @@ def encode_blocks(blocks: Blocks, coded: np.ndarray) -> bytes:
     """Code a segment whose (H, W) `coded` texels are those."""
     levels, coded = np.ascontiguousarray(blocks.levels), np.array(coded, order="C")
     side, busy = levels.shape[-1], blocks_of(coded, levels.shape[-1])
-    trace, at = np.empty(coded.size + busy.size * (3 + 5 * len(levels)) + levels.size * MOST_DECISIONS, np.int16), 0
+    trace, at = np.empty(coded.size + busy.size * (3 + MOST_END_DECISIONS * len(levels)) + levels.size * MOST_DECISIONS, np.int16), 0
     if has_map := not coded.all():
         _, at = walk_map(coded, 0, at, None, trace)
     fineness, finer = np.array(blocks.fineness, np.int64), quantisers(side, blocks.quantiser)
