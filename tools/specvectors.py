@@ -54,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    if len(argv) != 1:
+    if len(argv) != 1 or argv[0].startswith("-"):
         raise UsageError("give the folder to write, as in: python -m kpc.tools.specvectors spec/vectors")
     for path, data in vectors().items():
         target = Path(argv[0]) / path
