@@ -94,7 +94,6 @@ def step_in_blocks(plane: QuantisedPlane) -> np.ndarray:
 
 def _own_blocks(together: np.ndarray, start: int, rows: int) -> np.ndarray:
     """What goes together in some rows; SEGMENT_ROWS are whole blocks of it."""
-
     return np.ascontiguousarray(together[start // SIDE : -(-(start + rows) // SIDE)])
 
 

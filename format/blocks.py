@@ -96,7 +96,7 @@ def cosines(side: int) -> np.ndarray:
 
 def coarser(side: int) -> np.ndarray:
     """(N,) int64: how much coarser each frequency is told along an axis, in 1 / 64. Look-ups, which lie between texels, see less of quick
-    errors: (1 + cos(pi k / N) / 2)^(-1/2), as errors of neighbours count together by a quarter (`kpc.encoder.trellis`)."""
+    errors: (1 + cos(pi k / N) / 2)^(-1/2), as errors of neighbours count together by a quarter (`kpc.encoder.worth`)."""
     return np.rint((1 << COARSER_BITS) / np.sqrt(1 + 0.5 * np.cos(np.pi * np.arange(side) / side))).astype(np.int64)
 
 
