@@ -17,7 +17,6 @@ from kpc.encoder.occupancy import in_fewest_slots
 from kpc.encoder.probe import Measure, Measured, squares_of
 from kpc.encoder.search import TOLERANCE, cheapest, farthest, farthest_tuned
 from kpc.format import file
-from kpc.format.motion import STEP
 from kpc.format.quantise import HALF_BITS, QuantisedScene, reached_by, round_decoder, short_above
 from kpc.format.scene import Scene
 
@@ -47,11 +46,8 @@ SLOTS_SHARE, MORE_CELLS = 0.05, 1 / 3
 """Of the error that coding may bring, how much of it fewer slots of the occupancy may; and by how many more cells, at most, players have to
 march. Soldier: 4 slots for 8 take 6.7 KB in place of 12.4, and a picture of 640x480 on two cores 80 ms in place of 64; so it is left to
 files that are to be small, from 0.4 dB of loss on."""
-MOTION_SHARE, MOST_STEPS = 0.1, 64
-"""Of the error that coding may bring, how much of it displacements may; and how many of `kpc.format.motion.STEP` they may be rounded to.
-Soldier: a motion grid takes 3 KB for each bit of them, planes 18 KB for an error e times smaller; at equal slopes it is a tenth."""
 DECODER_SHARE, FEWEST_BITS = 0.02, 4
-"""And of the decoder: how much of the error fewer bits of its weights may bring; and the fewest. Default scene and room: 1.5 and 2.1 KB in place
+"""Of the error that coding may bring, how much fewer bits of the decoder's weights may; and the fewest. Default scene and room: 1.5 and 2.1 KB in place
 of 1.9 and 2.6 with 7 significant bits, 1.4 and 1.9 with 6; an error of a fiftieth planes undo with a fifth of a kilobyte."""
 LEAST_SIGNIFICANCE = 1e-6
 """Of a channel, relative to the most important of all numbers."""
@@ -164,24 +160,6 @@ def with_fewer_slots(scene: Scene, measure: Measure, error: float) -> Scene:
         return scene
     candidate = replace(scene, occupancy=merged)
     return candidate if measure(candidate).error - measure(scene).error <= error else scene
-
-
-def with_coarser_motion(scene: Scene, measure: Measure, error: float) -> Scene:
-    """The scene with displacements rounded to as coarse a multiple of `kpc.format.motion.STEP` as adds at most `error`, in squares of 8-bit
-    levels; itself where that changes nothing, or there is none."""
-    if scene.motion is None:
-        return scene
-    multiple, known = MOST_STEPS, measure(scene).error  # of what was left out
-    while multiple > 1:
-        step = np.float32(multiple * STEP)
-        candidate = replace(scene, motion=np.rint(scene.motion / step) * step)
-        if np.array_equal(candidate.motion, scene.motion):
-            return scene
-        found = measure(candidate).error - known
-        if found <= error:
-            return candidate
-        multiple = min(multiple - 1, int(multiple * math.sqrt(error / found))) if found > error else 1  # errors grow with a step's square
-    return scene
 
 
 def decoder_bits(scene: Scene, measure: Measure, error: float) -> int:

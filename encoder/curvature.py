@@ -44,10 +44,12 @@ class Curvature:
         alone: (rows, columns, M) float32, none negative: mean squared derivatives of colours by each number.
         together: (blocks down, blocks along, M, M) float32: of each block of SIDE x SIDE texels, the correlation of derivatives by two
             channels of a texel, from -1 to 1, and 0 for a channel with itself.
+        motion: (T, Nz, Ny, Nx, 3) float32: as `alone`, of displacements; None where there are none.
     """
 
     alone: PerPlane
     together: PerPlane
+    motion: np.ndarray | None = None
 
 
 def curvature(scene: Scene, probe: Probe, rays: int = RAYS) -> Curvature:
@@ -59,7 +61,8 @@ def curvature(scene: Scene, probe: Probe, rays: int = RAYS) -> Curvature:
     field = renderer.field
     probe = probe.some(rng.permutation(np.flatnonzero(renderer.meets(*probe.rays)))[:rays])
     more = Probe.of_surfaces(scene, rays - len(probe.times), seed=2)
-    squares = torch.zeros_like(field.theta)
+    learnt = [field.theta] if field.motion is None else [field.theta, field.motion]
+    squares = [torch.zeros_like(one) for one in learnt]
     products = [{name: _products(np.zeros_like(plane)) for name, plane in scale.items()} for scale in scene.scales]
     for one in (probe, more):
         for start in range(0, len(one.times), RAYS_AT_ONCE):
@@ -69,14 +72,17 @@ def curvature(scene: Scene, probe: Probe, rays: int = RAYS) -> Curvature:
             codes = renderer.codes(some.appearances)
             colours = shade(field, batch, met, None if codes is None else torch.from_numpy(codes))
             signs = torch.from_numpy(rng.choice(np.float32([-1, 1]), tuple(colours.shape)))
-            gradient, = torch.autograd.grad((signs * colours).sum(), field.theta)
-            for scale, planes in zip(products, _by_plane(field.layout, scene, gradient.numpy()), strict=True):
+            gradients = torch.autograd.grad((signs * colours).sum(), learnt)
+            for scale, planes in zip(products, _by_plane(field.layout, scene, gradients[0].numpy()), strict=True):
                 for name, plane in planes.items():
                     scale[name] += _products(plane)
-            squares += gradient.square_()
+            for total, gradient in zip(squares, gradients, strict=True):
+                total += gradient.square_()
+    of_planes, *of_motion = (total.numpy() / max(1, len(probe.times) + len(more.times)) for total in squares)
     alone = [{name: _smoothed(_smoothed(plane, 0), 1) for name, plane in scale.items()}
-             for scale in _by_plane(field.layout, scene, squares.numpy() / max(1, len(probe.times) + len(more.times)))]
-    return Curvature(alone, [{name: _correlation(sums) for name, sums in scale.items()} for scale in products])
+             for scale in _by_plane(field.layout, scene, of_planes)]
+    together = [{name: _correlation(sums) for name, sums in scale.items()} for scale in products]
+    return Curvature(alone, together, *of_motion)
 
 
 def _by_plane(layout: Layout, scene: Scene, numbers: np.ndarray) -> list[dict[str, np.ndarray]]:

@@ -14,21 +14,24 @@ from typing import Any
 import numpy as np
 import torch
 
+from kpc.encoder.cells import told_cheaply
 from kpc.encoder.checkpoint import save_state
-from kpc.encoder.compress import (
-    DECODER_SHARE, MOTION_SHARE, ROUGHLY, SLOTS_SHARE, Attempt, Quantise, Trade, compress, decoder_bits, error_at, relative_steps, significance,
-    with_coarser_motion, with_fewer_slots,
-)
 from kpc.encoder.choice import quantise_by_cost, step_asked_for
+from kpc.encoder.compress import (
+    DECODER_SHARE, ROUGHLY, SLOTS_SHARE, Attempt, Quantise, Trade, compress, decoder_bits, error_at, relative_steps, significance,
+    with_fewer_slots,
+)
 from kpc.encoder.curvature import Curvature, PerPlane, curvature
+from kpc.encoder.motion import with_coarser_motion
 from kpc.encoder.probe import Measured, Probe
 from kpc.encoder.prune import Pruned, prune
-from kpc.encoder.worth import Name
 from kpc.encoder.tuning import tuned
+from kpc.encoder.worth import Name
 from kpc.format import file
 from kpc.format.cameras import Camera
 from kpc.format.container import MAGIC
 from kpc.format.errors import FormatError, TrainingError, UsageError
+from kpc.format.motion import STEP
 from kpc.format.quantise import HALF_BITS, QuantisedPlane, QuantisedScene, quantise_scene, round_decoder
 from kpc.format.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
@@ -128,8 +131,9 @@ def code(
             steps, significant, together = pruned.of_each_plane(steps), pruned.of_each_plane(significant), pruned.of_each_plane(together, in_pairs=True)
     error = error_at(whole, loss_db)
     if model.coded is None:  # a file that is coded again and again is not to be marched ever longer
-        scene = with_fewer_slots(scene, measure, SLOTS_SHARE * error)
-    coarser = with_coarser_motion(scene, measure, MOTION_SHARE * error)
+        scene = told_cheaply(with_fewer_slots(scene, measure, SLOTS_SHARE * error), model.probe, measure, error)
+    own = 0 if model.coded is None or model.coded.motion is None else round(model.coded.motion.step / STEP)
+    coarser = with_coarser_motion(scene, model.curvature.motion, measure, error, own)
     if coarser is not scene:
         scene, coded = coarser, None
     bits = decoder_bits(scene, measure, DECODER_SHARE * error)

@@ -7,7 +7,12 @@ import numpy as np
 
 from kpc.format.rans import adapt, compiled, counters, ended, opened, stream
 
-CONTEXTS = 1 << 11
+NEIGHBOURS = np.array([
+    (0, 0, 0, -1), (0, 0, -1, 0), (0, -1, 0, 0), (0, -1, 1, 0), (0, 0, -1, 1), (0, -1, 0, 1),
+    (-1, 0, 0, 0), (-1, 0, 0, -1), (-1, 1, 0, 0), (-1, 0, -1, 0), (-1, -1, 0, 0),
+])
+"""(slot, z, y, x) from a cell to those that make its context, the most significant bit first. `walk` has them row by row."""
+CONTEXTS = 1 << len(NEIGHBOURS)
 
 
 def encode_cells(occupancy: np.ndarray) -> bytes:

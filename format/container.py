@@ -27,7 +27,7 @@ READABLE_VERSIONS = (0, 1)
 HEADER = struct.Struct("<8sHHIQIIQQIIII")
 ENTRY = struct.Struct("<4sHBBIIHHIIIQ")
 
-CODEC_RAW, CODEC_ZSTD, CODEC_SYMBOLS = 0, 1, 2
+CODEC_RAW, CODEC_ZSTD, CODEC_SYMBOLS, CODEC_MIDPOINTS = range(4)
 ZSTD_LEVEL = 19
 
 EXPANSION_LIMIT = 32768
@@ -136,8 +136,8 @@ class Entry:
 class Chunk:
     """One chunk to be written: its place and its raw bytes, cut where their statistics change.
 
-    Some have another form besides, context-coded: `symbols` makes it, which takes a while; it stands for `symbol_count` symbols or
-    bytes.
+    Some have other forms besides, context-coded: `symbols` and `midpoints` make them, which takes a while; they stand for `symbol_count`
+    symbols or bytes.
     """
 
     kind: str
@@ -148,6 +148,7 @@ class Chunk:
     row_count: int = 0
     symbols: Callable[[], bytes] | None = None
     symbol_count: int = 0
+    midpoints: Callable[[], bytes] | None = None
 
 
 def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
@@ -168,10 +169,11 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) ->
     for chunk in chunks:
         raw = b"".join(chunk.parts)
         forms = [(raw, CODEC_RAW, len(raw))]
-        if compress and chunk.symbols is not None:
-            body = chunk.symbols()
-            if chunk.symbol_count <= len(body) * EXPANSION_LIMIT:
-                forms.append((body, CODEC_SYMBOLS, chunk.symbol_count))
+        for coded, codec in ((chunk.symbols, CODEC_SYMBOLS), (chunk.midpoints, CODEC_MIDPOINTS)):
+            if compress and coded is not None:
+                body = coded()
+                if chunk.symbol_count <= len(body) * EXPANSION_LIMIT:
+                    forms.append((body, codec, chunk.symbol_count))
         if compress and (chunk.kind != "PLNE" or len(forms) == 1):  # zstd would double the time, and never beats symbols of planes
             forms += [(frame, CODEC_ZSTD, len(raw)) for frame in _zstd_frames(chunk.parts)]
         body, codec, length = min(forms, key=lambda form: len(form[0]))

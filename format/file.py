@@ -26,9 +26,10 @@ from kpc.format.cameras import Camera
 from kpc.format.cells import decode_cells, encode_cells
 from kpc.format.cli import written_aside
 from kpc.format.container import (
-    CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, AnySource, Chunk, Entry, Reader, open_source, pack,
+    CODEC_MIDPOINTS, CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, AnySource, Chunk, Entry, Reader, open_source, pack,
 )
 from kpc.format.errors import BudgetError, DatasetError, FormatError
+from kpc.format.midpoints import decode_midpoints, encode_midpoints
 from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.nodes import decode_nodes, encode_nodes
 from kpc.format.planes import decode_segment, encode_segment
@@ -53,6 +54,8 @@ NDC_STRUCT = struct.Struct("<I12ddd")
 """which mapping (DEVICE_COORDINATES), rows of the frame, near, baseline"""
 MOTION_STRUCT = struct.Struct("<4Hf")
 """T, Nz, Ny, Nx, step"""
+MOTION_CODECS = {CODEC_SYMBOLS: decode_nodes, CODEC_MIDPOINTS: decode_midpoints}
+"""What decodes a motion grid that is context-coded."""
 DECODER_STRUCT = struct.Struct("<HHf")
 """features, hidden, density_bias"""
 HYBRID_STRUCT = struct.Struct("<HHHf")
@@ -264,7 +267,8 @@ def _motion_chunk(motion: QuantisedMotion) -> Chunk:
     low_bytes_first = np.ascontiguousarray(differences.reshape(-1, 1).view(np.uint8).T)
     head = MOTION_STRUCT.pack(*symbols.shape[:4], motion.step)
     raw = head + low_bytes_first.tobytes()
-    return Chunk("MOVE", [raw], symbols=lambda: head + encode_nodes(symbols), symbol_count=len(raw))
+    return Chunk("MOVE", [raw], symbols=lambda: head + encode_nodes(symbols), midpoints=lambda: head + encode_midpoints(symbols),
+                 symbol_count=len(raw))
 
 
 def _occupancy_chunk(occupancy: np.ndarray) -> Chunk:
@@ -407,10 +411,11 @@ class SceneReader(Reader):
         if number is None:
             return None
         self._afford(8 * self.index[number].raw_length, "its motion grid")  # int16 and float32, and their making
-        if self.index[number].codec != CODEC_SYMBOLS:
+        decode = MOTION_CODECS.get(self.index[number].codec)
+        if decode is None:
             return self._parsed(lambda raw: _parse_motion(raw, self.head.is_dynamic), self.chunk(number))
         raw_length = self.index[number].raw_length
-        return self._parsed(lambda body: _parse_coded_motion(body, raw_length, self.head.is_dynamic), self._context_coded(number))
+        return self._parsed(lambda body: _parse_coded_motion(body, raw_length, self.head.is_dynamic, decode), self._context_coded(number))
 
     def decoder(self) -> AnyDecoder:
         """The DECO or HYBR chunk."""
@@ -454,7 +459,7 @@ class SceneReader(Reader):
         return self._parsed(lambda raw: _parse_appearances(raw, hidden), self.chunk(number, most))
 
     def _context_coded(self, number: int) -> bytes:
-        """A chunk of codec 2 as it is stored, if it may stand for as much as it claims."""
+        """A chunk of codec 2 or 3 as it is stored, if it may stand for as much as it claims."""
         entry = self.index[number]
         if entry.raw_length > entry.stored_length * EXPANSION_LIMIT:
             raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) claims a length of {entry.raw_length:,}, more than "
@@ -581,12 +586,14 @@ def _parse_motion(raw: bytes, dynamic: bool) -> QuantisedMotion:
     return QuantisedMotion(differences.cumsum(axis=0, dtype=np.uint16).view(np.int16), step)
 
 
-def _parse_coded_motion(body: bytes, raw_length: int, dynamic: bool) -> QuantisedMotion:
+def _parse_coded_motion(
+    body: bytes, raw_length: int, dynamic: bool, decode: Callable[[bytes, tuple[int, ...]], np.ndarray]
+) -> QuantisedMotion:
     cursor = _Cursor(body, "MOVE")
     sizes, step = _motion_head(cursor, dynamic)
     if raw_length != MOTION_STRUCT.size + 6 * math.prod(sizes):
         raise FormatError(f"MOVE: claims {raw_length:,} bytes, not those of a grid of {sizes} nodes")
-    return QuantisedMotion(decode_nodes(cursor.rest(), (*sizes, 3)), step)
+    return QuantisedMotion(decode(cursor.rest(), (*sizes, 3)), step)
 
 
 def _motion_head(cursor: "_Cursor", dynamic: bool) -> tuple[list[int], float]:

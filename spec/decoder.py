@@ -7,6 +7,7 @@ those of the page. Only Zstandard comes from a library.
 """
 
 import hashlib
+import itertools
 import math
 import struct
 import sys
@@ -104,9 +105,9 @@ def chunks(data, partial):  # section 4
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
         if known:
-            if kind in (b"PLNE", b"OCCU", b"MOVE") and codec == 2:
+            if kind in (b"PLNE", b"OCCU", b"MOVE") and codec == 2 or kind == b"MOVE" and codec == 3:
                 require(raw <= 32768 * stored, "so much in too few bytes")
-                content = None if body is None else (raw, body)
+                content = None if body is None else (raw, body) if codec == 2 else (raw, body, codec)
             else:
                 content = None if body is None else decoded(body, codec, raw)
             yield kind.decode(), scale, plane, start, rows, content, value_count
@@ -275,7 +276,7 @@ def warp_chunk(chunk, scene):  # section 5
 
 
 def motion_chunk(content, scales):  # section 5
-    """`content`: the raw bytes, or with codec 2 their length and the stored bytes."""
+    """`content`: the raw bytes, or with codecs 2 and 3 their length and the stored bytes."""
     coded = isinstance(content, tuple)
     chunk = Bytes(content[1] if coded else content)
     rows, *nodes, step = chunk.unpack("4Hf")
@@ -283,7 +284,7 @@ def motion_chunk(content, scales):  # section 5
     require(step > 0 and 32768 * step <= 1024, "motion step")
     if coded:
         require(content[0] == 12 + 6 * rows * math.prod(nodes), "raw length")
-        symbols = coded_motion(chunk, rows, *nodes)
+        symbols = (coded_motion if len(content) == 2 else halved_motion)(chunk, rows, *nodes)
     else:
         symbols = summed_motion(chunk, rows, 3 * math.prod(nodes))
     return {"size": (rows, *nodes), "values": [f32(s * step) for s in symbols]}
@@ -319,6 +320,52 @@ def coded_motion(chunk, rows, nz, ny, nx):  # section 5, codec 2
                         v[places[0]], r[places[0]] = predicted + error, abs(error)
     decisions.end()
     return list(v.values())
+
+
+def halved_motion(chunk, *sizes):  # section 5, codec 3
+    decisions, v, r = Decisions(chunk), {}, {}
+    there = [[0] for _ in sizes]
+
+    def tell(axis, new, sides, weights):
+        """Of one new place, that is foreseen by those at the sides."""
+        others = [there[a] for a in range(4) if a != axis]
+        for place in itertools.product(*others):
+            node = (*place[:axis], new, *place[axis:])
+            back = [(*place[:a], others[a][others[a].index(place[a]) - 1], *place[a + 1:]) for a in range(3) if place[a] > 0]
+            before = [(*one[:axis], new, *one[axis:]) for one in back]
+            for c in range(3):
+                used = [(k, (*place[:axis], sides[k], *place[axis:], c)) for k in range(4) if weights[k]]
+                predicted = min(max(sum(weights[k] * v[at] for k, at in used) + 32 >> 6, -32768), 32767)
+                R = sum(r[at] * (2 if k in (1, 2) else 1) for k, at in used) + 3 * sum(r[(*node, i)] for i in range(c))
+                R += sum(r[(*one, i)] for one in before for i in range(3))
+                b = R.bit_length()
+                error = decisions.error(b if b < 2 else min(2 * b - 2 + (R >> b - 2) % 2, 19), most_bits=15)
+                require(-32768 <= predicted + error <= 32767, "a symbol leaves 16 bits")
+                v[(*node, c)], r[(*node, c)] = predicted + error, abs(error)
+
+    def weight(new, own, others):
+        A = 64 * math.prod(new - one for one in others)
+        B = math.prod(own - one for one in others)
+        return (2 * A + B) // (2 * B)
+
+    tell(0, 0, [0] * 4, [0] * 4)
+    for axis, n in enumerate(sizes):
+        tell(axis, n - 1, [0] * 4, [0, 64, 0, 0])
+        there[axis].append(n - 1)
+    for h in range(max((n - 2).bit_length() for n in sizes), 0, -1):
+        for axis, n in enumerate(sizes):
+            if (n - 2).bit_length() >= h:
+                old = there[axis]
+                found = [(old[i], i) for i in range(len(old) - 1) if old[i + 1] - old[i] > 1]
+                for p, i in found:
+                    sides = [old[k] if 0 <= k < len(old) else None for k in range(i - 1, i + 3)]
+                    u, real = p + old[i + 1] >> 1, [s for s in sides if s is not None]
+                    weights = [0 if s is None else weight(u, s, [one for one in real if one != s]) for s in sides]
+                    weights[1] += 64 - sum(weights)
+                    tell(axis, u, sides, weights)
+                there[axis] = sorted(old + [p + old[i + 1] >> 1 for p, i in found])
+    decisions.end()
+    return [v[at] for at in itertools.product(*map(range, sizes), range(3))]
 
 
 def segment(chunk, rows, columns, channels):  # section 6

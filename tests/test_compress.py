@@ -5,17 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import displaced, tiny_scene
+from scenes import tiny_scene
 
 from kpc.encoder.compress import (
-    FINEST, LEAST_SIGNIFICANCE, MOST_STEPS, TRUST, Attempt, Steps, Trade, agreement_of, compress, decoder_bits, error_of, relative_steps, scaled,
-    significance, with_coarser_motion, with_fewer_slots,
+    FINEST, LEAST_SIGNIFICANCE, TRUST, Attempt, Steps, Trade, agreement_of, compress, decoder_bits, error_of, relative_steps, scaled,
+    significance, with_fewer_slots,
 )
 from kpc.encoder.probe import Measured
 from kpc.encoder.search import TUNINGS
 from kpc.encoder.choice import quantise_by_cost
 from kpc.format import file
-from kpc.format.motion import STEP
 from kpc.format.quantise import QuantisedScene, quantise_scene, round_decoder
 from kpc.format.scene import Scene
 
@@ -169,30 +168,6 @@ def test_where_nothing_costs_anything_all_steps_are_equal() -> None:
     nothing = significance([{name: np.zeros_like(plane) for name, plane in scale.items()} for scale in SCENE.scales])
     assert len({float(step) for scale in relative_steps(nothing) for steps in scale.values() for step in steps}) == 1
     assert math.isfinite(compress(SCENE, EQUAL, nothing, measure, 30.0, Trade()).measured.psnr)
-
-
-@pytest.mark.parametrize("share, expected", [(1e9, 64), (72.0, 8), (12.0, 3), (1.5, 1), (0.0, 1)])
-def test_displacements_are_as_coarse_as_their_error_may_be(share: float, expected: int) -> None:
-    """`share`: of the square of motion.STEP; a step errs by a twelfth of its own."""
-    scene = displaced(tiny_scene())
-
-    def measure(candidate: Scene) -> Measured:
-        return Measured(30.0, left_out + float(np.mean((candidate.motion - scene.motion) ** 2)))  # type: ignore[operator]
-
-    left_out = 1e-3
-    found = with_coarser_motion(scene, measure, share * STEP**2 / 12)
-    if expected == 1:
-        assert found is scene
-    else:
-        np.testing.assert_array_equal(found.motion / np.float32(expected * STEP) % 1, 0)  # type: ignore[operator]
-        assert measure(found).error - left_out <= share * STEP**2 / 12
-        assert with_coarser_motion(found, measure, share * STEP**2 / 12) is found or expected < MOST_STEPS
-    assert with_coarser_motion(tiny_scene(), measure, 1e9).motion is None
-
-
-def test_displacements_that_break_pictures_stay() -> None:
-    scene = displaced(tiny_scene())
-    assert with_coarser_motion(scene, lambda candidate: Measured(math.nan, math.nan), 1e9) is scene
 
 
 @pytest.mark.parametrize("error, common, slots", [(1.0, 100, 1), (1.0, 50, 2), (0.1, 100, 4)])

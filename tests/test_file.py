@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import displaced, faced, tiny_scene, varied
 from test_cells import rolling
+from test_midpoints import drifting
 from test_nodes import swaying
 
 import kpc
 from kpc.format.cameras import Camera
-from kpc.format.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, HEADER, Reader, pack
+from kpc.format.container import CODEC_MIDPOINTS, CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, HEADER, Reader, pack
 from kpc.format.errors import BudgetError, FormatError
 from kpc.format.file import APPEARANCE_LIMIT, NAME_LIMIT, SceneReader, encode, read, scene_chunks, write
 from kpc.format.motion import STEP, QuantisedMotion
@@ -183,7 +184,7 @@ def test_grids_are_context_coded_and_count_against_the_budget_all_the_same():
     scene = replace(quantised(time=6), occupancy=rolling(), motion=QuantisedMotion(swaying(), STEP))
     chunks = scene_chunks(scene)
     now = pack(chunks, scene_values := sum(p.symbols.size for scale in scene.scales for p in scale.values()))
-    before = pack([replace(chunk, symbols=None) for chunk in chunks], scene_values)
+    before = pack([replace(chunk, symbols=None, midpoints=None) for chunk in chunks], scene_values)
     for kind, bytes_held in (("OCCU", scene.occupancy.size), ("MOVE", 4 * scene.motion.symbols.nbytes)):
         new, old = (next(e for e in Reader(data).index if e.kind == kind) for data in (now, before))
         assert new.codec == CODEC_SYMBOLS and old.codec == CODEC_ZSTD and new.raw_length == old.raw_length
@@ -192,6 +193,14 @@ def test_grids_are_context_coded_and_count_against_the_budget_all_the_same():
             read(now, memory_budget=5 * scene_values + bytes_held - 1)
     assert_same(read(now), scene)
     assert_same(read(before), scene)
+
+
+@pytest.mark.parametrize("motion, codec", [(swaying(), CODEC_SYMBOLS), (drifting(), CODEC_MIDPOINTS)])
+def test_displacements_are_told_in_the_order_that_takes_less(motion, codec):
+    scene = replace(quantised(time=6), motion=QuantisedMotion(motion, STEP))
+    data = encode(scene)
+    assert next(entry.codec for entry in Reader(data).index if entry.kind == "MOVE") == codec
+    assert_same(read(data), scene)
 
 
 def test_write_and_load(tmp_path):

@@ -15,6 +15,7 @@ import struct
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +27,13 @@ from kpc.format import cli
 from kpc.format.blocks import FINENESSES, HEAD, Blocks, blocks_of, encode_blocks, largest_side
 from kpc.format.cameras import Camera
 from kpc.format.cells import encode_cells
-from kpc.format.container import CODEC_ZSTD, ENTRY, HEADER, Chunk, Reader, pack
+from kpc.format.container import CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_ZSTD, ENTRY, HEADER, Chunk, Reader, pack
 from kpc.format.errors import UsageError
 from kpc.format.file import (
     APPEARANCE_LIMIT, AXIS_LIMIT, BOX_LIMIT, CAMERA_LIMIT, CHANNEL_LIMIT, FRAME_LIMIT, HIDDEN_LIMIT, MOTION_LIMIT, MOTION_STRUCT,
     NAME_LIMIT, SAMPLE_LIMIT, SCALE_LIMIT, read, scene_chunks,
 )
+from kpc.format.midpoints import encode_midpoints
 from kpc.format.motion import QuantisedMotion
 from kpc.format.nodes import LORENZO, NEIGHBOURS
 from kpc.format.nodes import encode_with as encode_nodes_with
@@ -137,7 +139,7 @@ def patched(data: bytes, offset: int, layout: str, *values: int | float | bytes)
 
 def encode(scene: QuantisedScene, *, segment_rows: int = 16, compress: bool = True) -> bytes:
     """A file without context-coded symbols: as kpc.format.file.encode made it before there were any."""
-    chunks = [replace(chunk, symbols=None) for chunk in scene_chunks(scene, segment_rows=segment_rows)]
+    chunks = [replace(chunk, symbols=None, midpoints=None) for chunk in scene_chunks(scene, segment_rows=segment_rows)]
     return pack(chunks, _value_count(scene), compress=compress)
 
 
@@ -193,7 +195,7 @@ def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *
         fineness = np.abs(_noise(grid, seed + 1)).astype(np.int64) % FINENESSES
         return encode_blocks(Blocks(np.trunc(levels).astype(np.int64), fineness, quantiser), coded)
 
-    chunks = [_forced(chunk, body(chunk)) if chunk.kind == "PLNE" else replace(chunk, symbols=None)
+    chunks = [_forced(chunk, body(chunk)) if chunk.kind == "PLNE" else replace(chunk, symbols=None, midpoints=None)
               for chunk in scene_chunks(scene, segment_rows=segment_rows)]
     return pack(chunks, _value_count(scene))
 
@@ -206,7 +208,7 @@ def walked(symbols: np.ndarray, coded: np.ndarray, weights: np.ndarray, lattice:
 
 
 def coded_grids(scene: QuantisedScene) -> bytes:
-    """A file whose planes are as they ever were, but whose grids are context-coded, also where raw ones would be smaller."""
+    """A file whose planes are as they ever were, but whose grids are context-coded with codec 2, also where raw ones would be smaller."""
     chunks = []
     for chunk in scene_chunks(scene):
         body = chunk.symbols() if chunk.kind == "OCCU" and chunk.symbols else None
@@ -216,6 +218,15 @@ def coded_grids(scene: QuantisedScene) -> bytes:
             body = chunk.parts[0][:MOTION_STRUCT.size] + encode_nodes_with(weights, scene.motion.symbols)
         chunks.append(_forced(chunk, body) if body else replace(chunk, symbols=None))
     return pack(chunks, _value_count(scene))
+
+
+def halved(scene: QuantisedScene) -> bytes:
+    """A file whose motion grid is told by midpoints, also where a raw one would be smaller, and all else as it ever was."""
+    def told(chunk: Chunk) -> Chunk:
+        body = chunk.midpoints and chunk.midpoints()
+        return replace(chunk, parts=[body, b"\0"], symbols=None, midpoints=lambda: body) if body else replace(chunk, symbols=None)
+
+    return pack(list(map(told, scene_chunks(scene))), _value_count(scene))
 
 
 def all_zstd(scene: QuantisedScene) -> bytes:
@@ -233,15 +244,15 @@ def all_zstd(scene: QuantisedScene) -> bytes:
 
 def _forced(chunk: Chunk, body: bytes) -> Chunk:
     """The chunk with a context-coded body, which the writer takes because the raw one is no longer smaller."""
-    return replace(chunk, parts=[body, b"\0"], symbols=lambda: body)
+    return replace(chunk, parts=[body, b"\0"], symbols=lambda: body, midpoints=None)
 
 
-def claiming(chunks: list[Chunk], number: int, value_count: int, length: int) -> bytes:
+def claiming(chunks: list[Chunk], number: int, value_count: int, length: int, codec: int = CODEC_SYMBOLS) -> bytes:
     """A file of raw chunks, of which one claims to be context-coded and to stand for so many bytes."""
     data = pack(chunks, value_count, compress=False)
     data = patched(data, 48, "<I", max(length, Reader(data).header.largest_raw))
     entry = HEADER.size + ENTRY.size * number
-    return resealed(patched(patched(data, entry + 16, "<H", 2), entry + 24, "<I", length))
+    return resealed(patched(patched(data, entry + 16, "<H", codec), entry + 24, "<I", length))
 
 
 def _on_trellis(scene: QuantisedScene) -> QuantisedScene:
@@ -330,6 +341,13 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "nodes-extremes": (coded_grids(replace(dense, motion=QuantisedMotion(
             np.where(_noise((3, 2, 4, 3, 3), 43) < 0, -32768, 32767).astype(np.int16), 0.5**13))), False),
         "nodes-smallest": (coded_grids(replace(dense, motion=_motion(2, 2, 2, 2))), False),
+        "midpoints": (halved(replace(dense, motion=_swaying(6, 4, 3, 5))), False),
+        "midpoints-noise": (halved(moved), False),
+        "midpoints-prefix": (halved(moved)[:Reader(halved(moved)).index[5].offset], True),
+        "midpoints-extremes": (halved(replace(dense, motion=QuantisedMotion(
+            np.where(_noise((3, 2, 4, 3, 3), 43) < 0, -32768, 32767).astype(np.int16), 0.5**13))), False),
+        "midpoints-smallest": (halved(replace(dense, motion=_motion(2, 2, 2, 2))), False),
+        "midpoints-uneven": (halved(replace(dense, motion=_swaying(12, 2, 8, 7))), False),
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
         "version-0": (of_the_draft(encode(_scene(dynamic=True, sizes=[(1, 1, 1, 1, 1)]), compress=False)), False),
         "version-0-symbols": (of_the_draft(context_coded(dynamic, 8, segment_rows=4)), False),
@@ -494,9 +512,12 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     leaving = np.zeros((2, 2, 2, 2, 3), np.int32)
     leaving[0, 0, 0, 0, 0] = 40_000
 
-    def moving(body: bytes, length: int = 12 + 6 * 24) -> bytes:
+    def moving(body: bytes, length: int = 12 + 6 * 24, codec: int = CODEC_SYMBOLS) -> bytes:
         """A file with a motion grid that is so coded, and claims to stand for so many bytes."""
-        return claiming([chunks[scne], Chunk("MOVE", [body]), *chunks[deco:]], 1, values, length)
+        return claiming([chunks[scne], Chunk("MOVE", [body]), *chunks[deco:]], 1, values, length, codec)
+
+    halves = nodes[:12] + encode_midpoints(grid.symbols)
+    moving_halves = partial(moving, codec=CODEC_MIDPOINTS)
 
     def damaged_words(name: str, made: Callable[[bytes], bytes], body: bytes, state_at: int) -> dict[str, tuple[bytes, str, str]]:
         """Files, `made` of a body with state and words from `state_at` to its end, in which these are damaged."""
@@ -577,6 +598,14 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "nodes-length": (moving(nodes, 12 + 6 * 24 + 1), broken, "claims 157 bytes"),
         "nodes-bomb": (moving(struct.pack("<4Hf15hI", 50, 60, 60, 20, grid.step, *15 * [0], 1 << 16), 12 + 6 * 50 * 60 * 60 * 20),
                        broken, "more than 46 bytes can hold"),
+        **damaged_words("midpoints", moving_halves, halves, 12),
+        "midpoints-range": (moving_halves(struct.pack("<4Hf", 2, 2, 2, 2, grid.step) + encode_midpoints(leaving), 12 + 6 * 16),
+                            broken, "leaves its 16 bits"),
+        "midpoints-rows": (moving_halves(patched(halves, 0, "<H", 1)), broken, "makes no sense"),
+        "midpoints-length": (moving_halves(halves, 12 + 6 * 24 + 1), broken, "claims 157 bytes"),
+        "midpoints-bomb": (moving_halves(struct.pack("<4HfI", 50, 60, 60, 20, grid.step, 1 << 16), 12 + 6 * 50 * 60 * 60 * 20),
+                           broken, "more than 16 bytes can hold"),
+        "midpoints-elsewhere": (resealed(patched(told, small_entry + 16, "<H", CODEC_MIDPOINTS)), broken, "codec 3"),
         "no-decoder": (without(deco), broken, "0 DECO chunks"),
         "no-segment": (without(len(chunks) - 1), broken, "its segments hold 2 rows, not 3"),
         "two-occupancies": (pack([*chunks, chunks[occu]], values, compress=False), broken, "2 OCCU chunks"),

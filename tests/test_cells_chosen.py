@@ -1,0 +1,83 @@
+"""Occupied cells in as few bits as pictures and marching allow (`kpc.encoder.cells`)."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import tiny_scene
+from test_cells import rolling
+
+from kpc.encoder import cells
+from kpc.encoder.cells import CONTRAST, contributions, counted, flipped, told_cheaply
+from kpc.encoder.probe import Measured, Probe
+from kpc.format.cells import CONTEXTS, NEIGHBOURS, encode_cells
+from kpc.format.grid import dilate
+from kpc.format.rans import adapt, counters, stream
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCENE = tiny_scene()
+
+
+def test_contexts_are_those_of_the_coder():
+    """The same grid, coded cell by cell in the contexts that the search sees."""
+    occupancy = rolling(3, 6, 7, 8)
+    told, table, trace, at = occupancy.astype(np.uint8), counters(CONTEXTS), np.empty(occupancy.size, np.int16), 0
+    for place in np.ndindex(told.shape):
+        _, _, at = adapt(int(told[place]), table, cells.context_at(told, *place, NEIGHBOURS), 0, at, None, trace)
+    assert stream(trace) == encode_cells(occupancy)
+    assert counted(told, NEIGHBOURS).sum() == told.size
+
+
+def test_where_errors_cost_nothing_a_ragged_grid_takes_far_fewer_bytes():
+    occupancy = rolling()
+    found = flipped(occupancy, np.zeros(occupancy.shape))
+    assert len(encode_cells(found)) < 0.7 * len(encode_cells(occupancy))
+    assert not (found & ~dilate(occupancy)).any()
+    assert np.mean(found != occupancy) < 0.1
+
+
+def test_what_is_worth_its_bits_stays():
+    occupancy = rolling(2, 12, 13, 14)
+    np.testing.assert_array_equal(flipped(occupancy, np.full(occupancy.shape, 1e6)), occupancy)
+    needed = occupancy & (np.random.default_rng(0).random(occupancy.shape) < 0.3)
+    found = flipped(occupancy, np.where(needed, 1e6, 0.0))
+    assert found[needed].all() and not np.array_equal(found, occupancy)
+
+
+def test_cells_that_rays_need_are_known_and_the_others_too():
+    """Of a scene with cells that hold nothing, and some that no ray passes."""
+    probe = Probe.of_cameras(SCENE, 500)
+    error = contributions(SCENE, probe, 2000)
+    assert error.shape == SCENE.occupancy.shape and (error >= 0).all() and (error[~SCENE.occupancy] == 0).all()
+    assert 0 < error.max() <= 255**2 * CONTRAST
+    thin = replace(SCENE, decoder=replace(SCENE.decoder, density_bias=-30.0))
+    assert contributions(thin, probe, 2000).max() < 1e-6 * error.max()
+
+
+def judged(found: list, error: float):
+    def measure(candidate):
+        found.append(candidate)
+        return Measured(30.0, 1.0 if candidate is SCENE else 1.0 + error)
+
+    return measure
+
+
+@pytest.mark.parametrize("error, tries", [(0.0, 1), (0.04, 1), (0.06, cells.TRIES), (math.nan, cells.TRIES)])
+def test_a_grid_is_taken_where_pictures_hardly_lose_by_it(monkeypatch, error, tries):
+    monkeypatch.setattr(cells, "RAYS", 1000)
+    monkeypatch.setattr(cells, "FEWER_RAYS", 1000)
+    seen: list = []
+    found = told_cheaply(SCENE, Probe.of_cameras(SCENE, 500), judged(seen, error), 1.0)
+    assert len(seen) == 1 + tries and (found is seen[1]) == (tries == 1) and (found is SCENE) == (tries != 1)
+
+
+def test_where_nothing_may_be_lost_nothing_is_looked_at():
+    assert told_cheaply(SCENE, Probe.of_cameras(SCENE, 10), judged([], 0.0), 0.0) is SCENE
+
+
+def test_a_scene_without_a_cell_stays_without():
+    empty = replace(SCENE, occupancy=np.zeros_like(SCENE.occupancy))
+    found = told_cheaply(empty, Probe.of_cameras(SCENE, 10), lambda candidate: Measured(30.0, 0.0), 1.0)
+    assert not found.occupancy.any()
