@@ -45,23 +45,29 @@ SURE = 8.0
 """Bits more that a flipped cell itself would take, for which what it does to others is not looked at."""
 
 
-def told_cheaply(scene: Scene, probe: Probe, measure: Measure, most: float) -> Scene:
+def told_cheaply(scene: Scene, errors: np.ndarray, measure: Measure, most: float) -> Scene:
     """The scene with cells of its occupancy flipped, where it pays and pictures lose no more than SHARE of `most`; else itself.
 
     Args:
-        probe: rays that look for errors, too. measure: of pictures, by which it is known what they lose. most: the error that coding may bring, in squares of 8-bit levels.
+        errors: `errors_of_flips` of the scene, or of one whose slots this one's stand for, several each.
+        measure: of pictures, by which it is known what they lose. most: the error that coding may bring, in squares of 8-bit levels.
     """
     if most <= 0:
         return scene
-    known = measure(scene).error
-    wide = replace(scene, occupancy=dilate(scene.occupancy))
-    error = np.where(scene.occupancy, contributions(scene, probe, RAYS), contributions(wide, probe, FEWER_RAYS))
-    lost = BITS * scene.parameter_count / most * error
+    slots, *cells = scene.occupancy.shape
+    known, lost = measure(scene).error, BITS * scene.parameter_count / most * errors.reshape(slots, -1, *cells).sum(1)
     for number in range(TRIES):
         candidate = replace(scene, occupancy=flipped(scene.occupancy, WARIER**number * lost))
         if measure(candidate).error - known <= SHARE * most:
             return candidate
     return scene
+
+
+def errors_of_flips(scene: Scene, probe: Probe) -> np.ndarray:
+    """(slots, Nz, Ny, Nx) float64: mean squared error of colours, in squares of 8-bit levels, that comes of flipping a cell; 0 of those that are
+    neither occupied nor next to one."""
+    wide = replace(scene, occupancy=dilate(scene.occupancy))
+    return np.where(scene.occupancy, contributions(scene, probe, RAYS), contributions(wide, probe, FEWER_RAYS))
 
 
 def contributions(scene: Scene, probe: Probe, rays: int) -> np.ndarray:

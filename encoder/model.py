@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kpc.encoder.cells import told_cheaply
+from kpc.encoder.cells import errors_of_flips, told_cheaply
 from kpc.encoder.checkpoint import save_state
 from kpc.encoder.choice import quantise_by_cost, step_asked_for
 from kpc.encoder.compress import (
@@ -60,6 +60,11 @@ class Model:
     def curvature(self) -> Curvature:
         """What errors cost, `kpc.encoder.curvature`."""
         return curvature(self.scene, self.probe)
+
+    @cached_property
+    def errors_of_flips(self) -> np.ndarray:
+        """What it costs to tell a cell otherwise than it is, `kpc.encoder.cells`."""
+        return errors_of_flips(self.scene, self.probe)
 
 
 @dataclass(frozen=True)
@@ -131,7 +136,7 @@ def code(
             steps, significant, together = pruned.of_each_plane(steps), pruned.of_each_plane(significant), pruned.of_each_plane(together, in_pairs=True)
     error = error_at(whole, loss_db)
     if model.coded is None:  # a file that is coded again and again is not to be marched ever longer
-        scene = told_cheaply(with_fewer_slots(scene, measure, SLOTS_SHARE * error), model.probe, measure, error)
+        scene = told_cheaply(with_fewer_slots(scene, measure, SLOTS_SHARE * error), model.errors_of_flips, measure, error)
     own = 0 if model.coded is None or model.coded.motion is None else round(model.coded.motion.step / STEP)
     coarser = with_coarser_motion(scene, model.curvature.motion, measure, error, own)
     if coarser is not scene:
