@@ -94,7 +94,7 @@ class Coded:
 
 
 def code(
-    model: Model, trade: Trade, prune_share: float, tune_steps: int, quantise: Quantise | None = None, shown: bool = False
+    model: Model, trade: Trade, prune_share: float, tune_steps: int, quantise: Quantise | None = None, shown: bool = False, grids: bool = True
 ) -> Coded:
     """What of a model is needed, `kpc.encoder.prune`, in symbols as coarse or as fine as a trade asks for.
 
@@ -103,6 +103,7 @@ def code(
         tune_steps: of training that a group of planes gets to make up for others, `kpc.encoder.tuning`; 0 for none.
         quantise: another way to choose symbols, to compare with; not tuned.
         shown: whether progress is, where it takes long.
+        grids: whether occupancy and displacements are such as take few bits; else as they are, but for fewer slots and coarser steps.
 
     Raises:
         TrainingError: no file of this model is so small.
@@ -136,9 +137,10 @@ def code(
             steps, significant, together = pruned.of_each_plane(steps), pruned.of_each_plane(significant), pruned.of_each_plane(together, in_pairs=True)
     error = error_at(whole, loss_db)
     if model.coded is None:  # a file that is coded again and again is not to be marched ever longer
-        scene = told_cheaply(with_fewer_slots(scene, measure, SLOTS_SHARE * error), model.errors_of_flips, measure, error)
+        scene = with_fewer_slots(scene, measure, SLOTS_SHARE * error)
+        scene = told_cheaply(scene, model.errors_of_flips, measure, error) if grids else scene
     own = 0 if model.coded is None or model.coded.motion is None else round(model.coded.motion.step / STEP)
-    coarser = with_coarser_motion(scene, model.curvature.motion, measure, error, own)
+    coarser = with_coarser_motion(scene, model.curvature.motion, measure, error, own, grids)
     if coarser is not scene:
         scene, coded = coarser, None
     bits = decoder_bits(scene, measure, DECODER_SHARE * error)

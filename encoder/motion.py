@@ -34,7 +34,9 @@ TOLD_APART = 40
 """Magnitudes of what predictions miss whose bits are told apart."""
 
 
-def with_coarser_motion(scene: Scene, worth: np.ndarray | None, measure: Measure, most: float, own: int = 0) -> Scene:
+def with_coarser_motion(
+    scene: Scene, worth: np.ndarray | None, measure: Measure, most: float, own: int = 0, searched: bool = True
+) -> Scene:
     """The scene with displacements in as coarse a multiple of `kpc.format.motion.STEP` as adds at most SHARE of an error.
 
     Itself where there are none, or no multiple is coarser than its own.
@@ -43,13 +45,15 @@ def with_coarser_motion(scene: Scene, worth: np.ndarray | None, measure: Measure
         worth: (T, Nz, Ny, Nx, 3), what a squared error in each costs; None: as much everywhere.
         most: the error that coding may bring, in squares of 8-bit levels.
         own: the multiple that a file has been told with; 0 of none.
+        searched: whether symbols are; else they are the nearest.
     """
     if scene.motion is None:
         return scene
     multiple, known, error = MOST_STEPS, measure(scene).error, SHARE * most  # of what was left out
     while multiple > own:
         step = np.float32(multiple * STEP)
-        symbols = told_cheaply(scene.motion / np.float64(step), np.ones(scene.motion.shape) if worth is None else worth)
+        wanted = scene.motion / np.float64(step)
+        symbols = told_cheaply(wanted, np.ones(wanted.shape) if worth is None else worth) if searched else np.rint(wanted)
         candidate = replace(scene, motion=symbols.astype(np.float32) * step)
         found = measure(candidate).error - known
         if found <= error:

@@ -25,7 +25,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kpc.encoder.worth import ACROSS, ALONE, BESIDE, LAM, UNCHANGED, others, worths
+from kpc.encoder.worth import ACROSS, ALONE, BESIDE, LAM, changes, others, worths
 from kpc.format.file import SEGMENT_ROWS
 from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, quantise_plane, short_above
 from kpc.format.rans import compiled
@@ -101,7 +101,7 @@ class _Search:
         known = np.ascontiguousarray(plane.coded)
         worth = worths(significant, known)
         if identity:
-            known = known & ((worth * self.wanted**2).mean(axis=2) >= UNCHANGED * self._finer**2)
+            known = known & changes(self.wanted / self._finer, worth)
         self.known, self.worth = known, worth * np.float32(coarser**2)
         self.symbols = np.where(known[..., None], plane.symbols, np.int8(0))
         self.counts = np.zeros((2 * ACTIVITIES, TOLD_APART))

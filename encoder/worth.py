@@ -49,6 +49,12 @@ def worths(significant: np.ndarray, known: np.ndarray) -> np.ndarray:
     return np.where(means > 0, np.maximum(significant / np.maximum(means, 1e-30), LEAST_WORTH), 1.0).astype(np.float32)
 
 
+def changes(away: np.ndarray, worth: np.ndarray) -> np.ndarray:
+    """(H, W) bool: the texels of a time plane that are worth telling, for how far they are from the identity, (H, W, M) in steps."""
+    far: np.ndarray = (worth * away**2).mean(axis=2) >= UNCHANGED
+    return far
+
+
 def cost(errors: np.ndarray, together: np.ndarray) -> float:
     """The sum above, of (H, W, M) u. `together`: (blocks down, blocks along, M, M) of blocks of SIDE texels, or ALONE."""
     bordered = np.pad(errors.astype(np.float32), ((1, 1), (1, 1), (0, 0)))

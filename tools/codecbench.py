@@ -50,8 +50,10 @@ VIEW_PIXELS = 1 << 15
 TUNE_STEPS = TrainConfig().tune_steps
 RIVALS = {rival.name: rival for rival in rivals.RIVALS}
 OURS = "kpc"
+GRIDS_AS_THEY_ARE = "kpc, grids as they are"
 WITHOUT: dict[str, Quantise | None] = {
     "kpc without tuning": None,
+    GRIDS_AS_THEY_ARE: None,
     "kpc, channels apart": quantise_by_cost,
     "kpc, never in blocks": lambda scene, steps, reached, significant: quantise_by_cost(scene, steps, reached, significant, blocks=False),
     "kpc, never around predictions": lambda scene, steps, reached, significant: quantise_by_cost(
@@ -59,8 +61,8 @@ WITHOUT: dict[str, Quantise | None] = {
     "kpc without the trellis": lambda scene, steps, reached, significant: quantise_scene(scene, steps, reached=reached),
     "kpc, every texel alike": lambda scene, steps, reached, significant: quantise_by_cost(scene, steps, reached),
 }
-"""Our own coder with something left out: tuning; without it, what channels know of each other's errors; and without either, one thing more.
-At QUALITIES."""
+"""Our own coder with something left out: tuning; without it, the search for grids that take few bits, or what channels know of each other's errors;
+and without tuning and that, one thing more. At QUALITIES."""
 TUNED = {"AV1, tuned": "AV1"}
 """Rivals that get the tuning of our own coder, `kpc.encoder.tuning`, through what comes back from their own coding."""
 
@@ -142,7 +144,8 @@ def point(job: Job) -> Point | None:
         return found | {"search_s": time.perf_counter() - started}
     try:
         tune_steps = TUNE_STEPS if job.coder == OURS else 0
-        coded = model.code(source, job.trade, TrainConfig().prune_share, tune_steps, WITHOUT.get(job.coder))
+        coded = model.code(source, job.trade, TrainConfig().prune_share, tune_steps, WITHOUT.get(job.coder),
+                           grids=job.coder != GRIDS_AS_THEY_ARE)
     except TrainingError:
         return None
     searched = time.perf_counter()
