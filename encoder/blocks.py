@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.encoder.curvature import SIDE
-from kpc.encoder.worth import LAM, changes, others, worths
+from kpc.encoder.worth import LAM, bits_of_magnitudes, changes, others, worths
 from kpc.format.blocks import (
     ENDS, FINENESSES, FREQUENCIES, LARGEST, PARTS, SIZES, USUAL, Blocks, around, blocks_of, coarser, cosines, decode_blocks, encode_blocks,
     end_context, foreseen_mean, largest_side, last_diagonal, level_context, quantisers, usual_end,
@@ -157,16 +157,12 @@ def _blurred(values: np.ndarray) -> np.ndarray:
 
 
 def _bits(counts: np.ndarray) -> np.ndarray:
-    """(contexts, TOLD_APART + 1) bits of levels by their magnitude, sign included, that came so often in each context. What hardly came is
-    taken to be geometrically distributed, with the mean of the levels that the context stands for."""
+    """(contexts, TOLD_APART + 1) bits of levels by their magnitude, that came so often in each context. What is expected is the mean of the levels
+    that the context stands for."""
     total = 0.75 * 2.0 ** (np.arange(SIZES) / 2 + 1) * (np.arange(SIZES) > 0)  # of 36 levels, as `level_context` sums them
-    mean = np.repeat(total / 36 + 0.02, FREQUENCIES)[:, None]
+    mean = np.repeat(total / 36 + 0.02, FREQUENCIES)
     mean[FREQUENCIES - 1 :: FREQUENCIES] *= 3
-    ratio = mean / (1 + mean)
-    shares = counts + 4 * ((1 - ratio) * ratio ** np.arange(TOLD_APART + 1) + 1e-4)
-    bits = -np.log2(shares / shares.sum(1, keepdims=True))
-    bits[:, 1:] += 1
-    return bits
+    return bits_of_magnitudes(counts, mean)
 
 
 def _end_bits(counts: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.encoder.probe import Measure
-from kpc.encoder.worth import BESIDE
+from kpc.encoder.worth import BESIDE, bits_of_magnitudes
 from kpc.format.midpoints import CONTEXTS, context_of, foreseen, passes, told_beside
 from kpc.format.motion import STEP
 from kpc.format.rans import compiled
@@ -32,6 +32,8 @@ LEAST_WORTH = 2e-3
 SEARCHES = 5
 TOLD_APART = 40
 """Magnitudes of what predictions miss whose bits are told apart."""
+EXPECTED = 0.05 + 0.1 * 2.0 ** (np.arange(CONTEXTS) / 2)
+"""Of them, in each context, before anything is known."""
 
 
 def with_coarser_motion(
@@ -68,23 +70,12 @@ def told_cheaply(wanted: np.ndarray, worth: np.ndarray) -> np.ndarray:
     root = np.sqrt(np.maximum(worth / max(float(worth.mean()), 1e-30), LEAST_WORTH))
     errors, counts = root * (symbols - wanted), np.zeros((CONTEXTS, TOLD_APART + 1))
     for _ in range(SEARCHES):
-        bits, missed = _bits(counts), np.zeros_like(symbols)
+        bits, missed = bits_of_magnitudes(counts, EXPECTED, 2.0), np.zeros_like(symbols)
         counts = np.zeros_like(counts)
         for one in order:
             values, r, aim, weight, err = (np.moveaxis(a, one.axis, 0) for a in (symbols, missed, wanted, root, errors))
             _search(values, r, aim, weight, err, one.new, one.sides, one.weights, *one.there, PRICE * FINER ** (one.level - 1), bits, counts)
     return symbols
-
-
-def _bits(counts: np.ndarray) -> np.ndarray:
-    """(CONTEXTS, TOLD_APART + 1) bits of errors by their magnitude, sign included, that came so often in each context. What hardly came is
-    taken to be geometrically distributed, with a mean as the context has it."""
-    mean = (0.05 + 0.1 * 2.0 ** (np.arange(CONTEXTS) / 2))[:, None]
-    ratio = mean / (1 + mean)
-    shares = counts + 2 * ((1 - ratio) * ratio ** np.arange(TOLD_APART + 1) + 1e-4)
-    bits = -np.log2(shares / shares.sum(1, keepdims=True))
-    bits[:, 1:] += 1
-    return bits
 
 
 @compiled()

@@ -25,7 +25,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kpc.encoder.worth import ACROSS, ALONE, BESIDE, LAM, changes, others, worths
+from kpc.encoder.worth import ACROSS, ALONE, BESIDE, LAM, bits_of_magnitudes, changes, others, worths
 from kpc.format.file import SEGMENT_ROWS
 from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, quantise_plane, short_above
 from kpc.format.rans import compiled
@@ -128,14 +128,9 @@ class _Search:
 
 
 def _bits(counts: np.ndarray) -> np.ndarray:
-    """(2 ACTIVITIES, TOLD_APART) bits of errors by their magnitude, sign included, that came so often in each context: at even places, then at
-    odd ones. What hardly came is taken to be geometrically distributed, with a mean that doubles with every other context."""
-    ratio = 1 / (1 + 25 * 2.0 ** (1.5 - np.tile(np.arange(ACTIVITIES), 2) / 2))[:, None]
-    expected = (1 - ratio) * ratio ** np.arange(TOLD_APART) + 1e-4
-    shares = counts + 4 * expected
-    bits = -np.log2(shares / shares.sum(1, keepdims=True))
-    bits[:, 1:] += 1
-    return bits
+    """(2 ACTIVITIES, TOLD_APART) bits of errors by their magnitude, that came so often in each context: at even places, then at odd ones. What is
+    expected doubles with every other context."""
+    return bits_of_magnitudes(counts, 0.04 * 2.0 ** (np.tile(np.arange(ACTIVITIES), 2) / 2 - 1.5))
 
 
 @compiled()

@@ -49,6 +49,16 @@ def worths(significant: np.ndarray, known: np.ndarray) -> np.ndarray:
     return np.where(means > 0, np.maximum(significant / np.maximum(means, 1e-30), LEAST_WORTH), 1.0).astype(np.float32)
 
 
+def bits_of_magnitudes(counts: np.ndarray, mean: np.ndarray, trust: float = 4.0) -> np.ndarray:
+    """(contexts, magnitudes) bits, sign included, of what came so often in each context. What hardly came is taken to be geometrically distributed
+    with a (contexts,) mean, as if that had been seen `trust` times."""
+    ratio = (mean / (1 + mean))[:, None]
+    shares = counts + trust * ((1 - ratio) * ratio ** np.arange(counts.shape[1]) + 1e-4)
+    bits: np.ndarray = -np.log2(shares / shares.sum(1, keepdims=True))
+    bits[:, 1:] += 1
+    return bits
+
+
 def changes(away: np.ndarray, worth: np.ndarray) -> np.ndarray:
     """(H, W) bool: the texels of a time plane that are worth telling, for how far they are from the identity, (H, W, M) in steps."""
     far: np.ndarray = (worth * away**2).mean(axis=2) >= UNCHANGED
