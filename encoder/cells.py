@@ -35,10 +35,10 @@ SHARE = 0.05
 WARIER = 8.0
 """How much more errors are taken to cost, where that was exceeded; and how often that is tried."""
 TRIES = 3
-RAYS = 1 << 19
-"""That look for errors. With a quarter of them cells are left out that other rays need: pictures of room then err forty times as much."""
+RAYS, RAYS_A_CELL = 1 << 19, 8
+"""That look for errors, at most. With a quarter of them cells are left out that other rays need: pictures of room then err forty times as much."""
 FEWER_RAYS = 1 << 18
-"""That look for what empty cells would show. Those are marched that are next to occupied ones; where they hide others, it is not known what these show."""
+"""At most, that look for what empty cells would show. Those are marched that are next to occupied ones; where they hide others, it is not known what these show."""
 RAYS_AT_ONCE = 1 << 12
 PASSES = 8
 SURE = 8.0
@@ -67,7 +67,8 @@ def errors_of_flips(scene: Scene, probe: Probe) -> np.ndarray:
     """(slots, Nz, Ny, Nx) float64: mean squared error of colours, in squares of 8-bit levels, that comes of flipping a cell; 0 of those that are
     neither occupied nor next to one."""
     wide = replace(scene, occupancy=dilate(scene.occupancy))
-    return np.where(scene.occupancy, contributions(scene, probe, RAYS), contributions(wide, probe, FEWER_RAYS))
+    rays = RAYS_A_CELL * int(np.count_nonzero(scene.occupancy))
+    return np.where(scene.occupancy, contributions(scene, probe, min(rays, RAYS)), contributions(wide, probe, min(rays, FEWER_RAYS)))
 
 
 def contributions(scene: Scene, probe: Probe, rays: int) -> np.ndarray:
