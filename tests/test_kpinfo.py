@@ -83,7 +83,9 @@ def test_a_scene_with_a_motion_grid(tmp_path, capsys):
     page = capsys.readouterr().out
     assert "6 x 4x2x3 nodes, displacements up to 0.25 of the box"[:30] in page and "MOVE" in page
     assert kpinfo.main([str(path), "--json"]) == 0
-    motion = json.loads(capsys.readouterr().out)["motion"]
+    page = json.loads(capsys.readouterr().out)
+    motion, codecs = page["motion"], {chunk["kind"]: chunk["codec"] for chunk in page["chunks"]}
+    assert codecs["MOVE"] == "rANS"
     assert motion["rows"] == 6 and motion["nodes_zyx"] == [3, 2, 4]
     assert motion["largest"] == pytest.approx(np.abs(scene.motion).max(), abs=STEP / 2 + 1e-7)
 

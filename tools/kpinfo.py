@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from kpc.format import cli
-from kpc.format.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, DEFAULT_BUDGET, Entry, open_source
+from kpc.format.container import CODEC_MIDPOINTS, CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, DEFAULT_BUDGET, Entry, open_source
 from kpc.format.errors import FormatError, UsageError
 from kpc.format.file import SceneReader, read
 from kpc.format.groups import Groups
@@ -29,7 +29,7 @@ from kpc.format.static import static_share, unchanging_share
 from kpc.player.changes import STILL, still_share
 
 NAMES_SHOWN = 8
-CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd", CODEC_SYMBOLS: "rANS"}
+CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd", CODEC_SYMBOLS: "rANS", CODEC_MIDPOINTS: "rANS"}
 
 
 def main(argv: list[str] | None = None) -> int:
