@@ -114,7 +114,7 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert "kpc is smaller by" in said.err and "Coding, beside what is at hand" in results.markdown(records)
     with (tmp_path / "codec.csv").open() as table:
         rows = list(csv.DictReader(table))
-    assert len(rows) == 6 + 6 * 4 + 6 + 5 and [len(one["points"]) for one in without] == [4] * 6
+    assert len(rows) == 6 + 7 * 4 + 6 + 5 and [len(one["points"]) for one in without] == [4] * 7
     assert {row["coder"] for row in rows} == {"kpc", *codecbench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19"}
     assert float(rows[0]["size_bytes"]) == ours["points"][0]["size_bytes"]
     svg = (tmp_path / "codec.svg").read_text()
