@@ -63,12 +63,13 @@ def told_cheaply(scene: Scene, errors: np.ndarray, measure: Measure, most: float
     return scene
 
 
-def errors_of_flips(scene: Scene, probe: Probe) -> np.ndarray:
+def errors_of_flips(scene: Scene, probe: Probe, share: int = 1) -> np.ndarray:
     """(slots, Nz, Ny, Nx) float64: mean squared error of colours, in squares of 8-bit levels, that comes of flipping a cell; 0 of those that are
-    neither occupied nor next to one."""
+    neither occupied nor next to one. By one in `share` of the rays that it takes."""
     wide = replace(scene, occupancy=dilate(scene.occupancy))
     rays = RAYS_A_CELL * int(np.count_nonzero(scene.occupancy))
-    return np.where(scene.occupancy, contributions(scene, probe, min(rays, RAYS)), contributions(wide, probe, min(rays, FEWER_RAYS)))
+    own, next_to_it = (contributions(one, probe, min(rays, most) // share) for one, most in ((scene, RAYS), (wide, FEWER_RAYS)))
+    return np.where(scene.occupancy, own, next_to_it)
 
 
 def contributions(scene: Scene, probe: Probe, rays: int) -> np.ndarray:
@@ -81,8 +82,7 @@ def contributions(scene: Scene, probe: Probe, rays: int) -> np.ndarray:
     more = Probe.of_surfaces(scene, rays, seed=5)
     sums = np.zeros(scene.occupancy.size)
     for one in (probe, more):
-        for start in range(0, len(one.times), RAYS_AT_ONCE):
-            some = one.some(np.arange(start, min(start + RAYS_AT_ONCE, len(one.times))))
+        for some in one.in_parts(RAYS_AT_ONCE):
             with torch.no_grad():
                 samples, met = marched(renderer.field, renderer.batch(*some.rays), scene)
             ray, weights = samples.ray.numpy(), met.weights.numpy().astype(np.float64)

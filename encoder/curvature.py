@@ -65,8 +65,7 @@ def curvature(scene: Scene, probe: Probe, rays: int = RAYS) -> Curvature:
     squares = [torch.zeros_like(one) for one in learnt]
     products = [{name: _products(np.zeros_like(plane)) for name, plane in scale.items()} for scale in scene.scales]
     for one in (probe, more):
-        for start in range(0, len(one.times), RAYS_AT_ONCE):
-            some = one.some(np.arange(start, min(start + RAYS_AT_ONCE, len(one.times))))
+        for some in one.in_parts(RAYS_AT_ONCE):
             batch = renderer.batch(*some.rays)
             _, met = marched(field, batch, scene)
             codes = renderer.codes(some.appearances)

@@ -140,7 +140,7 @@ def code(
         scene = with_fewer_slots(scene, measure, SLOTS_SHARE * error)
         scene = told_cheaply(scene, model.errors_of_flips, measure, error) if grids else scene
     own = 0 if model.coded is None or model.coded.motion is None else round(model.coded.motion.step / STEP)
-    coarser = with_coarser_motion(scene, model.curvature.motion, measure, error, own, grids)
+    coarser = with_coarser_motion(scene, model.curvature.motion if grids else None, measure, error, own)
     if coarser is not scene:
         scene, coded = coarser, None
     bits = decoder_bits(scene, measure, DECODER_SHARE * error)

@@ -36,18 +36,15 @@ EXPECTED = 0.05 + 0.1 * 2.0 ** (np.arange(CONTEXTS) / 2)
 """Of them, in each context, before anything is known."""
 
 
-def with_coarser_motion(
-    scene: Scene, worth: np.ndarray | None, measure: Measure, most: float, own: int = 0, searched: bool = True
-) -> Scene:
+def with_coarser_motion(scene: Scene, worth: np.ndarray | None, measure: Measure, most: float, own: int = 0) -> Scene:
     """The scene with displacements in as coarse a multiple of `kpc.format.motion.STEP` as adds at most SHARE of an error.
 
     Itself where there are none, or no multiple is coarser than its own.
 
     Args:
-        worth: (T, Nz, Ny, Nx, 3), what a squared error in each costs; None: as much everywhere.
+        worth: (T, Nz, Ny, Nx, 3), what a squared error in each costs; None: symbols are the nearest.
         most: the error that coding may bring, in squares of 8-bit levels.
         own: the multiple that a file has been told with; 0 of none.
-        searched: whether symbols are; else they are the nearest.
     """
     if scene.motion is None:
         return scene
@@ -55,7 +52,7 @@ def with_coarser_motion(
     while multiple > own:
         step = np.float32(multiple * STEP)
         wanted = scene.motion / np.float64(step)
-        symbols = told_cheaply(wanted, np.ones(wanted.shape) if worth is None else worth) if searched else np.rint(wanted)
+        symbols = np.rint(wanted) if worth is None else told_cheaply(wanted, worth)
         candidate = replace(scene, motion=symbols.astype(np.float32) * step)
         found = measure(candidate).error - known
         if found <= error:

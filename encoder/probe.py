@@ -1,7 +1,7 @@
 """What coding costs, measured on rays: against what was filmed, and against the pictures of the uncoded model."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,6 +112,11 @@ class Probe:
     def some(self, which: np.ndarray) -> "Probe":
         """Those of its rays, by their numbers."""
         return Probe(*(None if a is None else a[which] for a in (*self.rays, self.appearances, self.truth)))
+
+    def in_parts(self, count: int) -> "Iterator[Probe]":
+        """Its rays, so many at a time."""
+        for start in range(0, len(self.times), count):
+            yield self.some(np.arange(start, min(start + count, len(self.times))))
 
     def measure(self, uncoded: Scene) -> Measure:
         """What judges codings of a scene by its colours on these rays; the scene itself costs nothing to judge."""

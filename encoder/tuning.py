@@ -7,8 +7,8 @@ planes are. Nobody needs to know what was filmed.
 
 So networks are quantised in parts (Zhou et al., "Incremental Network Quantization", arXiv:1702.03044). Why it pays: of what independent
 errors of all numbers cost, their diagonal (`kpc.encoder.curvature`) has a twentieth of the sum of squares (liam). Liam, `balanced`, held-out
-views, at equal steps: errors are 1.5 to 1.9 dB smaller for 1 to 2 % more bytes, which is 10 to 13 % at equal error. Where the space planes of a scale were coded together, and all time planes, files were 3 to 4 % larger (room, 100
-steps a group) and 2 to 3 % (soldier, 60).
+views, at equal steps: errors are 1.5 to 1.9 dB smaller for 1 to 2 % more bytes, which is 10 to 13 % at equal error. Where the space planes of a scale were coded together, and
+all time planes, files were 3 to 4 % larger (room, 100 steps a group) and 2 to 3 % (soldier, 60).
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence

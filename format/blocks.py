@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.format.errors import FormatError
-from kpc.format.rans import SCALE, adapt, compiled, counters, decide, ended, integer, natural, opened, stream
+from kpc.format.rans import SCALE, adapt, compiled, counters, decide, doublings, ended, integer, natural, opened, stream
 from kpc.format.symbols import LATTICE_BIT, MAP, walk_map
 
 SIDES = (4, 8, 16)
@@ -306,10 +306,7 @@ def level_context(here, left, above, before, i, j, side):
     quicker = 2 * (here[i, j + 1] + here[i + 1, j]) + here[i + 1, j + 1] + here[i, j + 2] + here[i + 2, j]
     beside = left[i, j] + above[i, j] + left[i, j + 1] + above[i, j + 1] + left[i + 1, j] + above[i + 1, j]
     total = 3 * quicker + 2 * beside + 3 * before[i, j]
-    bits = 0
-    while total >> bits:
-        bits += 1
-    large = min(2 * bits - 2 + (total >> bits - 2 & 1), SIZES - 1) if bits > 1 else bits
+    large = min(doublings(total), SIZES - 1)
     quick = min(5 * (i + j) // side, FREQUENCIES - 2) if i + j else FREQUENCIES - 1
     return large * FREQUENCIES + quick
 

@@ -10,8 +10,8 @@ import io
 import os
 import struct
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Protocol, runtime_checkable
 
@@ -136,8 +136,8 @@ class Entry:
 class Chunk:
     """One chunk to be written: its place and its raw bytes, cut where their statistics change.
 
-    Some have other forms besides, context-coded: `symbols` and `midpoints` make them, which takes a while; they stand for `symbol_count`
-    symbols or bytes.
+    Some have other forms besides, context-coded: `coded` makes them, by codec, which takes a while; they stand for `symbol_count` symbols
+    or bytes.
     """
 
     kind: str
@@ -146,14 +146,13 @@ class Chunk:
     plane: int = 0
     row_start: int = 0
     row_count: int = 0
-    symbols: Callable[[], bytes] | None = None
+    coded: Mapping[int, Callable[[], bytes]] = field(default_factory=dict)
     symbol_count: int = 0
-    midpoints: Callable[[], bytes] | None = None
 
 
 def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
-    """Lay chunks out in the given order; each is stored in what is smallest: raw, as symbols if it has them, or as a zstd
-    frame (of planes only if they have no symbols).
+    """Lay chunks out in the given order; each is stored in what is smallest: raw, context-coded if it can be, or as a zstd
+    frame (of planes only if they cannot).
 
     Args:
         value_count: numbers in all planes together.
@@ -169,11 +168,10 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) ->
     for chunk in chunks:
         raw = b"".join(chunk.parts)
         forms = [(raw, CODEC_RAW, len(raw))]
-        for coded, codec in ((chunk.symbols, CODEC_SYMBOLS), (chunk.midpoints, CODEC_MIDPOINTS)):
-            if compress and coded is not None:
-                body = coded()
-                if chunk.symbol_count <= len(body) * EXPANSION_LIMIT:
-                    forms.append((body, codec, chunk.symbol_count))
+        for codec, make in chunk.coded.items() if compress else ():
+            body = make()
+            if chunk.symbol_count <= len(body) * EXPANSION_LIMIT:
+                forms.append((body, codec, chunk.symbol_count))
         if compress and (chunk.kind != "PLNE" or len(forms) == 1):  # zstd would double the time, and never beats symbols of planes
             forms += [(frame, CODEC_ZSTD, len(raw)) for frame in _zstd_frames(chunk.parts)]
         body, codec, length = min(forms, key=lambda form: len(form[0]))

@@ -200,7 +200,7 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
                 if start < stop:
                     segment, coded = plane.symbols[start:stop], plane.coded[start:stop]
                     chunks.append(Chunk("PLNE", encode_segment(segment, coded), number, ALL_PLANES.index(name), start, stop - start,
-                                        partial(encode_coded, segment, coded, guide_at(plane.guide, start)), segment.size))
+                                        {CODEC_SYMBOLS: partial(encode_coded, segment, coded, guide_at(plane.guide, start))}, segment.size))
     return chunks
 
 
@@ -267,8 +267,8 @@ def _motion_chunk(motion: QuantisedMotion) -> Chunk:
     low_bytes_first = np.ascontiguousarray(differences.reshape(-1, 1).view(np.uint8).T)
     head = MOTION_STRUCT.pack(*symbols.shape[:4], motion.step)
     raw = head + low_bytes_first.tobytes()
-    return Chunk("MOVE", [raw], symbols=lambda: head + encode_nodes(symbols), midpoints=lambda: head + encode_midpoints(symbols),
-                 symbol_count=len(raw))
+    return Chunk("MOVE", [raw], symbol_count=len(raw), coded={
+        CODEC_SYMBOLS: lambda: head + encode_nodes(symbols), CODEC_MIDPOINTS: lambda: head + encode_midpoints(symbols)})
 
 
 def _occupancy_chunk(occupancy: np.ndarray) -> Chunk:
@@ -277,7 +277,7 @@ def _occupancy_chunk(occupancy: np.ndarray) -> Chunk:
     slots_last = np.moveaxis(occupancy, 0, -1)  # a cell that never changes makes a run of equal bits
     head = OCCUPANCY_STRUCT.pack(*occupancy.shape)
     raw = head + np.packbits(slots_last, bitorder="little").tobytes()
-    return Chunk("OCCU", [raw], symbols=lambda: head + encode_cells(occupancy), symbol_count=len(raw))
+    return Chunk("OCCU", [raw], coded={CODEC_SYMBOLS: lambda: head + encode_cells(occupancy)}, symbol_count=len(raw))
 
 
 def _pack_cameras(cameras: tuple[Camera, ...]) -> bytes:

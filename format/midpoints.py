@@ -13,17 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.format.errors import FormatError
-from kpc.format.rans import compiled, counters, ended, integer, opened, stream
+from kpc.format.nodes import CONTEXTS, DECISIONS, ESCAPES, MOST_DECISIONS, UNARY
+from kpc.format.rans import compiled, counters, doublings, ended, integer, opened, stream
 
 WEIGHT_BITS = 6
 """Weights are multiples of 2^-WEIGHT_BITS."""
-UNARY, ESCAPES = 4, 15
-"""Of `kpc.format.rans.integer`: errors reach +-65535."""
-DECISIONS = 2 + 2 * (UNARY + ESCAPES)
-"""Counters of a context, of which there are CONTEXTS: how large r is around."""
-CONTEXTS = 20
-MOST_DECISIONS = 2 + UNARY + 2 * ESCAPES
-"""That a symbol takes."""
 
 
 @dataclass(frozen=True)
@@ -168,14 +162,11 @@ def foreseen(values, sides, weights, a, b, c, m):
 
 @compiled(forceinline=True)
 def context_of(r, new, sides, weights, beside, a, b, c, m):
-    """Of the r around, the logarithm: two contexts for each doubling."""
+    """Of the r around, the logarithm."""
     total = beside
     for k in range(4):
         if weights[k] != 0:
             total += (2 if k == 1 or k == 2 else 1) * r[sides[k], a, b, c, m]
     for one in range(m):
         total += 3 * r[new, a, b, c, one]
-    bits = 0
-    while total >> bits:
-        bits += 1
-    return min(2 * bits - 2 + (total >> bits - 2 & 1), CONTEXTS - 1) if bits > 1 else bits
+    return min(doublings(total), CONTEXTS - 1)

@@ -12,7 +12,7 @@ Naming as in `kpc.format.symbols`: r is by how much predictions missed; table, s
 import numpy as np
 
 from kpc.format.errors import FormatError
-from kpc.format.rans import compiled, counters, ended, integer, opened, stream
+from kpc.format.rans import compiled, counters, doublings, ended, integer, opened, stream
 from kpc.format.symbols import FIT_VALUES, least_absolute
 
 NEIGHBOURS = 15
@@ -119,7 +119,7 @@ def _predicted(symbols, weights, t, z, y, x, m):
 
 @compiled(forceinline=True)
 def _context(r, t, z, y, x, m):
-    """Of the mean r of the neighbours one step back along one axis, the logarithm: two contexts for each doubling."""
+    """Of the mean r of the neighbours one step back along one axis, the logarithm."""
     now = t & 1
     total, count = 0, 0
     if t > 0:
@@ -131,7 +131,4 @@ def _context(r, t, z, y, x, m):
     if x > 0:
         total, count = total + r[now, z, y, x - 1, m], count + 1
     mean = (int(total) // count if count > 0 else UNKNOWN) + 2
-    halvings = 0
-    while mean >> halvings > 3:
-        halvings += 1
-    return min(2 * halvings + (mean >> halvings & 1), CONTEXTS - 1)
+    return min(doublings(mean) - 2, CONTEXTS - 1)

@@ -87,6 +87,15 @@ def adapt(bit, table, which, state, at, words, trace):
 
 
 @compiled(forceinline=True)
+def doublings(number):
+    """The logarithm of a number from 0 on, two for each doubling: 0, 1, 2, 3, then 4 from 4 on, 5 from 6 on, 6 from 8 on."""
+    bits = 0
+    while number >> bits:
+        bits += 1
+    return 2 * bits - 2 + (number >> bits - 2 & 1) if bits > 1 else bits
+
+
+@compiled(forceinline=True)
 def integer(value, table, first, unary, escapes, state, at, words, trace):
     """Code or decode an integer in the context whose 2 + 2 (unary + escapes) counters begin at `first`: (value, state, at).
 

@@ -107,7 +107,7 @@ def chunks(data, partial):  # section 4
         if known:
             if kind in (b"PLNE", b"OCCU", b"MOVE") and codec == 2 or kind == b"MOVE" and codec == 3:
                 require(raw <= 32768 * stored, "so much in too few bytes")
-                content = None if body is None else (raw, body) if codec == 2 else (raw, body, codec)
+                content = None if body is None else (raw, body, codec)
             else:
                 content = None if body is None else decoded(body, codec, raw)
             yield kind.decode(), scale, plane, start, rows, content, value_count
@@ -193,7 +193,7 @@ def decode(data, partial=False):
     scene["motion"] = motion_chunk(parts["MOVE"], scene["scales"]) if "MOVE" in parts else None
     expected = sum(s["channels"] for s in scene["scales"])
     scene |= hybrid_chunk(Bytes(parts["HYBR"]), expected) if "HYBR" in parts else decoder_chunk(Bytes(parts["DECO"]), expected)
-    scene |= coded_occupancy_chunk(*parts["OCCU"]) if isinstance(parts["OCCU"], tuple) else occupancy_chunk(Bytes(parts["OCCU"]))
+    scene |= coded_occupancy_chunk(*parts["OCCU"][:2]) if isinstance(parts["OCCU"], tuple) else occupancy_chunk(Bytes(parts["OCCU"]))
     scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") is not None else []
     scene["appearances"] = appearances_chunk(Bytes(parts["appe"]), scene["hidden"]) if parts.get("appe") is not None else {}
 
@@ -276,7 +276,7 @@ def warp_chunk(chunk, scene):  # section 5
 
 
 def motion_chunk(content, scales):  # section 5
-    """`content`: the raw bytes, or with codecs 2 and 3 their length and the stored bytes."""
+    """`content`: the raw bytes, or with codecs 2 and 3 their length, the stored bytes and the codec."""
     coded = isinstance(content, tuple)
     chunk = Bytes(content[1] if coded else content)
     rows, *nodes, step = chunk.unpack("4Hf")
@@ -284,7 +284,7 @@ def motion_chunk(content, scales):  # section 5
     require(step > 0 and 32768 * step <= 1024, "motion step")
     if coded:
         require(content[0] == 12 + 6 * rows * math.prod(nodes), "raw length")
-        symbols = (coded_motion if len(content) == 2 else halved_motion)(chunk, rows, *nodes)
+        symbols = {2: coded_motion, 3: halved_motion}[content[2]](chunk, rows, *nodes)
     else:
         symbols = summed_motion(chunk, rows, 3 * math.prod(nodes))
     return {"size": (rows, *nodes), "values": [f32(s * step) for s in symbols]}

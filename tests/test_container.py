@@ -32,7 +32,7 @@ def test_chunks_come_back_with_their_places():
     ("PLNE", None, 0, CODEC_ZSTD),
 ])
 def test_symbols_are_taken_where_they_are_shorter_and_may_stand_for_so_many(kind, body, count, codec):
-    data = pack([Chunk(kind, [b"x" * 500], symbols=body and (lambda: body), symbol_count=count)], 1)
+    data = pack([Chunk(kind, [b"x" * 500], coded={CODEC_SYMBOLS: lambda: body} if body else {}, symbol_count=count)], 1)
     entry = Reader(data).index[0]
     assert entry.codec == codec and entry.raw_length == (count if codec == CODEC_SYMBOLS else 500)
     if codec == CODEC_SYMBOLS:

@@ -172,7 +172,7 @@ def test_files_without_context_coded_symbols_stay_readable():
     scene = quantised(time=6)
     chunks = scene_chunks(scene, segment_rows=4)
     now = pack(chunks, sum(p.symbols.size for scale in scene.scales for p in scale.values()))
-    before = pack([replace(chunk, symbols=None) for chunk in chunks], Reader(now).header.value_count)
+    before = pack([replace(chunk, coded={}) for chunk in chunks], Reader(now).header.value_count)
     assert {e.codec for e in Reader(before).index} == {CODEC_RAW, CODEC_ZSTD}
     assert {e.codec for e in Reader(now).index if e.kind == "PLNE"} <= {CODEC_RAW, CODEC_SYMBOLS}
     assert len(now) < len(before)
@@ -184,7 +184,7 @@ def test_grids_are_context_coded_and_count_against_the_budget_all_the_same():
     scene = replace(quantised(time=6), occupancy=rolling(), motion=QuantisedMotion(swaying(), STEP))
     chunks = scene_chunks(scene)
     now = pack(chunks, scene_values := sum(p.symbols.size for scale in scene.scales for p in scale.values()))
-    before = pack([replace(chunk, symbols=None, midpoints=None) for chunk in chunks], scene_values)
+    before = pack([replace(chunk, coded={}) for chunk in chunks], scene_values)
     for kind, bytes_held in (("OCCU", scene.occupancy.size), ("MOVE", 4 * scene.motion.symbols.nbytes)):
         new, old = (next(e for e in Reader(data).index if e.kind == kind) for data in (now, before))
         assert new.codec == CODEC_SYMBOLS and old.codec == CODEC_ZSTD and new.raw_length == old.raw_length

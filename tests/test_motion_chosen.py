@@ -23,13 +23,21 @@ def errs(scene: Scene, left_out: float = 1e-3):
 def test_displacements_are_as_coarse_as_their_error_may_be(share):
     """`share`: of the square of motion.STEP; rounding errs by a twelfth of a step's own."""
     scene, most = displaced(tiny_scene()), share * STEP**2 / 12 / SHARE
-    found = with_coarser_motion(scene, None, errs(scene), most)
+    found = with_coarser_motion(scene, np.ones(scene.motion.shape), errs(scene), most)
     symbols = found.motion / np.float32(STEP)
     multiple = int(np.gcd.reduce(np.rint(symbols).astype(np.int64), axis=None))
     np.testing.assert_array_equal(symbols, np.rint(symbols))
     assert errs(scene)(found).error - 1e-3 <= share * STEP**2 / 12
     assert math.sqrt(share) / 3 < multiple <= MOST_STEPS or share > 1e6
-    assert with_coarser_motion(found, None, errs(found), most, own=MOST_STEPS) is found
+    assert with_coarser_motion(found, np.ones(scene.motion.shape), errs(found), most, own=MOST_STEPS) is found
+
+
+@pytest.mark.parametrize("share, expected", [(1e9, 64), (72.0, 8), (12.0, 3), (1.5, 1)])
+def test_where_no_worth_is_told_they_are_the_nearest(share, expected):
+    scene = displaced(tiny_scene())
+    found = with_coarser_motion(scene, None, errs(scene), share * STEP**2 / 12 / SHARE)
+    step = np.float32(expected * STEP)
+    np.testing.assert_array_equal(found.motion, np.rint(scene.motion / step) * step)
 
 
 def test_scenes_in_which_nothing_may_err_or_nothing_moves_stay():

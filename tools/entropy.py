@@ -53,7 +53,7 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
     values = sum(plane.symbols.size for planes in quantised.scales for plane in planes.values())
     found = {
         "nothing": _decoded(pack(chunks, values), left),
-        "all of them: zstd": _decoded(pack([replace(chunk, symbols=None) for chunk in chunks], values), left),
+        "all of them: zstd": _decoded(pack([replace(chunk, coded={}) for chunk in chunks], values), left),
     }
     for name, (changes, counts, size) in LEFT_OUT.items():
         walks = _compiled(changes)

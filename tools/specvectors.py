@@ -139,7 +139,7 @@ def patched(data: bytes, offset: int, layout: str, *values: int | float | bytes)
 
 def encode(scene: QuantisedScene, *, segment_rows: int = 16, compress: bool = True) -> bytes:
     """A file without context-coded symbols: as kpc.format.file.encode made it before there were any."""
-    chunks = [replace(chunk, symbols=None, midpoints=None) for chunk in scene_chunks(scene, segment_rows=segment_rows)]
+    chunks = [replace(chunk, coded={}) for chunk in scene_chunks(scene, segment_rows=segment_rows)]
     return pack(chunks, _value_count(scene), compress=compress)
 
 
@@ -164,7 +164,7 @@ def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 1
             lattice = AROUND if flat else TRELLIS if follows_trellis(symbols, coded) else ANY
             chunks.append(_forced(chunk, encode_with(weights, symbols, coded, lattice)))
         else:
-            chunks.append(replace(chunk, symbols=None))
+            chunks.append(replace(chunk, coded={}))
     return pack(chunks, _value_count(scene))
 
 
@@ -195,7 +195,7 @@ def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *
         fineness = np.abs(_noise(grid, seed + 1)).astype(np.int64) % FINENESSES
         return encode_blocks(Blocks(np.trunc(levels).astype(np.int64), fineness, quantiser), coded)
 
-    chunks = [_forced(chunk, body(chunk)) if chunk.kind == "PLNE" else replace(chunk, symbols=None, midpoints=None)
+    chunks = [_forced(chunk, body(chunk)) if chunk.kind == "PLNE" else replace(chunk, coded={})
               for chunk in scene_chunks(scene, segment_rows=segment_rows)]
     return pack(chunks, _value_count(scene))
 
@@ -211,22 +211,20 @@ def coded_grids(scene: QuantisedScene) -> bytes:
     """A file whose planes are as they ever were, but whose grids are context-coded with codec 2, also where raw ones would be smaller."""
     chunks = []
     for chunk in scene_chunks(scene):
-        body = chunk.symbols() if chunk.kind == "OCCU" and chunk.symbols else None
+        body = chunk.coded[CODEC_SYMBOLS]() if chunk.kind == "OCCU" else None
         if chunk.kind == "MOVE":  # weights that need no floating-point fit, and the largest and the smallest among them
             weights = LORENZO - _noise((NEIGHBOURS,), 67).astype(np.int16)
             weights[-2:] = -32768, 32767
             body = chunk.parts[0][:MOTION_STRUCT.size] + encode_nodes_with(weights, scene.motion.symbols)
-        chunks.append(_forced(chunk, body) if body else replace(chunk, symbols=None))
+        chunks.append(_forced(chunk, body) if body else replace(chunk, coded={}))
     return pack(chunks, _value_count(scene))
 
 
 def halved(scene: QuantisedScene) -> bytes:
     """A file whose motion grid is told by midpoints, also where a raw one would be smaller, and all else as it ever was."""
-    def told(chunk: Chunk) -> Chunk:
-        body = chunk.midpoints and chunk.midpoints()
-        return replace(chunk, parts=[body, b"\0"], symbols=None, midpoints=lambda: body) if body else replace(chunk, symbols=None)
-
-    return pack(list(map(told, scene_chunks(scene))), _value_count(scene))
+    chunks = [_forced(chunk, chunk.coded[CODEC_MIDPOINTS](), CODEC_MIDPOINTS) if chunk.kind == "MOVE" else replace(chunk, coded={})
+              for chunk in scene_chunks(scene)]
+    return pack(chunks, _value_count(scene))
 
 
 def all_zstd(scene: QuantisedScene) -> bytes:
@@ -234,7 +232,7 @@ def all_zstd(scene: QuantisedScene) -> bytes:
     chunks = scene_chunks(scene)
     raws = [b"".join(chunk.parts) for chunk in chunks]
     bodies = [zstandard.ZstdCompressor(level=19).compress(raw) for raw in raws]
-    data = pack([replace(chunk, parts=[body], symbols=None) for chunk, body in zip(chunks, bodies, strict=True)],
+    data = pack([replace(chunk, parts=[body], coded={}) for chunk, body in zip(chunks, bodies, strict=True)],
                 _value_count(scene), compress=False)
     for number, raw in enumerate(raws):
         entry = HEADER.size + ENTRY.size * number
@@ -242,9 +240,9 @@ def all_zstd(scene: QuantisedScene) -> bytes:
     return resealed(patched(data, 48, "<I", max(map(len, raws))))
 
 
-def _forced(chunk: Chunk, body: bytes) -> Chunk:
+def _forced(chunk: Chunk, body: bytes, codec: int = CODEC_SYMBOLS) -> Chunk:
     """The chunk with a context-coded body, which the writer takes because the raw one is no longer smaller."""
-    return replace(chunk, parts=[body, b"\0"], symbols=lambda: body, midpoints=None)
+    return replace(chunk, parts=[body, b"\0"], coded={codec: lambda: body})
 
 
 def claiming(chunks: list[Chunk], number: int, value_count: int, length: int, codec: int = CODEC_SYMBOLS) -> bytes:
@@ -272,6 +270,20 @@ def _on_trellis(scene: QuantisedScene) -> QuantisedScene:
 
 def _value_count(scene: QuantisedScene) -> int:
     return sum(plane.symbols.size for scale in scene.scales for plane in scale.values())
+
+
+def _motion_grids(
+    name: str, coded: Callable[[QuantisedScene], bytes], dense: QuantisedScene, moved: QuantisedScene
+) -> dict[str, tuple[bytes, bool]]:
+    """Files whose motion grid is so coded: of a scene that is to move, and of one that does."""
+    extremes = QuantisedMotion(np.where(_noise((3, 2, 4, 3, 3), 43) < 0, -32768, 32767).astype(np.int16), 0.5**13)
+    return {
+        name: (coded(replace(dense, motion=_swaying(6, 4, 3, 5))), False),
+        f"{name}-noise": (coded(moved), False),
+        f"{name}-prefix": (coded(moved)[:Reader(coded(moved)).index[5].offset], True),
+        f"{name}-extremes": (coded(replace(dense, motion=extremes)), False),
+        f"{name}-smallest": (coded(replace(dense, motion=_motion(2, 2, 2, 2))), False),
+    }
 
 
 def _valid() -> dict[str, tuple[bytes, bool]]:
@@ -335,18 +347,8 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "cells-thin": (coded_grids(replace(minimal, occupancy=_noise((1, 1, 1, 70), 97) > 0)), False),
         "cells-one": (coded_grids(minimal), False),
         "cells-long-times": (coded_grids(replace(dense, occupancy=_noise((40, 1, 2, 1), 96) > 0)), False),
-        "nodes": (coded_grids(replace(dense, motion=_swaying(6, 4, 3, 5))), False),
-        "nodes-noise": (coded_grids(moved), False),
-        "nodes-prefix": (coded_grids(moved)[:Reader(coded_grids(moved)).index[5].offset], True),
-        "nodes-extremes": (coded_grids(replace(dense, motion=QuantisedMotion(
-            np.where(_noise((3, 2, 4, 3, 3), 43) < 0, -32768, 32767).astype(np.int16), 0.5**13))), False),
-        "nodes-smallest": (coded_grids(replace(dense, motion=_motion(2, 2, 2, 2))), False),
-        "midpoints": (halved(replace(dense, motion=_swaying(6, 4, 3, 5))), False),
-        "midpoints-noise": (halved(moved), False),
-        "midpoints-prefix": (halved(moved)[:Reader(halved(moved)).index[5].offset], True),
-        "midpoints-extremes": (halved(replace(dense, motion=QuantisedMotion(
-            np.where(_noise((3, 2, 4, 3, 3), 43) < 0, -32768, 32767).astype(np.int16), 0.5**13))), False),
-        "midpoints-smallest": (halved(replace(dense, motion=_motion(2, 2, 2, 2))), False),
+        **_motion_grids("nodes", coded_grids, dense, moved),
+        **_motion_grids("midpoints", halved, dense, moved),
         "midpoints-uneven": (halved(replace(dense, motion=_swaying(12, 2, 8, 7))), False),
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
         "version-0": (of_the_draft(encode(_scene(dynamic=True, sizes=[(1, 1, 1, 1, 1)]), compress=False)), False),
@@ -492,7 +494,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     def context(body: bytes) -> bytes:
         """A file whose first plane is so coded."""
         told = [*small_chunks[:small_xy], _forced(small_chunks[small_xy], body), *small_chunks[small_xy + 1:]]
-        return pack([chunk if number == small_xy else replace(chunk, symbols=None) for number, chunk in enumerate(told)], 24)
+        return pack([chunk if number == small_xy else replace(chunk, coded={}) for number, chunk in enumerate(told)], 24)
 
     told = context(coarse)
     in_four = encode_blocks(Blocks(np.trunc(_noise((2, 1, 1, 4, 4), 71) / 8).astype(np.int64), np.full((1, 1), 2), 40), whole)
@@ -536,7 +538,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     vast = replace(vast, scales=({name: replace(plane, symbols=0 * plane.symbols, coded=plane.coded & False)
                                   for name, plane in vast.scales[0].items()},))
     nothing = encode_with(weights, vast.scales[0]["xy"].symbols, vast.scales[0]["xy"].coded, TRELLIS)
-    hollow = [replace(chunk, symbols=None, parts=[nothing] if number == small_xy else chunk.parts)
+    hollow = [replace(chunk, coded={}, parts=[nothing] if number == small_xy else chunk.parts)
               for number, chunk in enumerate(scene_chunks(vast))]
     bomb_symbols = patched(pack(hollow, _value_count(vast)), small_entry + 16, "<H", 2)
     for place in (48, small_entry + 24):
