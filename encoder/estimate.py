@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kpc.encoder.cells import errors_of_flips
 from kpc.encoder.choice import quantise_by_cost
 from kpc.encoder.compress import PROBES
 from kpc.encoder.curvature import RAYS as CURVATURE_RAYS
@@ -68,7 +69,7 @@ def estimate(
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()
     scene = trainer.scene()
     a_coding, a_ray = _seconds_a_coding(scene), _seconds_a_ray(trainer)
-    coding_s = PROBES * a_coding + _seconds_of_curvature(scene)
+    coding_s = PROBES * a_coding + _seconds_of_errors(scene)
     if tune_steps is None:
         trained = config.steps if time_budget_s is None else trainer.step + max(0.0, time_budget_s - trainer.elapsed_s) / max(a_step, 1e-6)
         tune_steps = steps_after(int(trained), scene, config.tune_steps)
@@ -94,12 +95,13 @@ def _seconds_a_coding(scene: Scene) -> float:
     return time.perf_counter() - started
 
 
-def _seconds_of_curvature(scene: Scene) -> float:
-    """What errors cost, `kpc.encoder.curvature`: by a sixteenth of its rays."""
+def _seconds_of_errors(scene: Scene) -> float:
+    """What errors cost, `kpc.encoder.curvature` and `kpc.encoder.cells`: by a sixteenth of their rays."""
     probe = Probe.of_cameras(scene, CURVATURE_RAYS // 16)
     curvature(scene, probe, 2)  # what is done once
     started = time.perf_counter()
     curvature(scene, probe, CURVATURE_RAYS // 16)
+    errors_of_flips(scene, probe.some(np.arange(2)), 16)
     return 16 * (time.perf_counter() - started)
 
 
