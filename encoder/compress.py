@@ -98,7 +98,7 @@ class Trade:
             return psnr - value if psnr > value else DEFAULT_LOSS_DB
         # Where D falls to a quarter with a bit more, as fine quantisation has it, its slope is -2 ln 2 D.
         error = error_of(value) if name == "quality" else value / (2 * math.log(2))
-        return 10 * math.log10(1 + error / squares_of(psnr))
+        return loss_at(psnr, error)
 
 
 def agreement_of(quality: float) -> float:
@@ -112,9 +112,13 @@ def error_of(quality: float) -> float:
 
 
 def error_at(psnr: float, loss_db: float) -> float:
-    """The mean squared difference, in squares of 8-bit levels, that takes so many dB from pictures of some PSNR, adding to their own: what
-    `Trade.loss_db` undoes."""
+    """The mean squared difference, in squares of 8-bit levels, that takes so many dB from pictures of some PSNR, adding to their own."""
     return squares_of(psnr) * (10 ** (loss_db / 10) - 1)
+
+
+def loss_at(psnr: float, error: float) -> float:
+    """What `error_at` undoes."""
+    return 10 * math.log10(1 + error / squares_of(psnr))
 
 
 @dataclass(frozen=True)

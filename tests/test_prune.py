@@ -129,6 +129,15 @@ def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
     assert fidelity(scene) - fidelity(coded.scene.dequantise()) == pytest.approx(coded.loss_db, abs=1e-3)
 
 
+def test_of_a_size_what_may_be_left_out_is_a_share_of_what_it_costs() -> None:
+    """Not of what it would cost if nothing were."""
+    scene = redundant(directed(tiny_scene(scales=3, resolution=(48, 40, 32)), 0.03))
+    rays = rays_of(scene)
+    model = Model(scene, Probe(*rays, None, Fidelity(scene, rays).truth))
+    coded = code(model, Trade(target_bytes=5_500), 0.1, 0)
+    assert coded.spare_db < 4 * 0.1 * coded.loss_db  # else ten times that
+
+
 @pytest.mark.parametrize("strength, goes", [(0.02, True), (3.0, False)])
 def test_direction_goes_where_it_is_worth_little(strength: float, goes: bool) -> None:
     scene = directed(tiny_scene(), strength)
