@@ -41,7 +41,7 @@ def test_time_to_spare_does_not_go_into_the_survey(moving: Dataset) -> None:
 def test_a_lone_object_seen_once_gets_a_model_of_its_own(moving: Dataset, tmp_path: Path) -> None:
     options = Options(tmp_path, tmp_path / "out.kpc", preset="balanced", steps=7, seed=3)
     plain, lone = PRESETS["balanced"], options.config(moving)
-    assert (lone.channels, lone.view_dependent, lone.steps, lone.seed) == (4 * plain.channels, False, 7, 3)
+    assert (lone.channels, lone.resolutions, lone.view_dependent, lone.steps, lone.seed) == (32, (32, 128), False, 7, 3)
     surrounded = options.config(replace(moving, has_alpha=False))
     assert surrounded == replace(plain, steps=7, seed=3)
     assert replace(options, progressive=True).config(moving).scale_dropout > lone.scale_dropout == 0
