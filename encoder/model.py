@@ -121,9 +121,8 @@ class Kept:
     @staticmethod
     def all_of(model: Model) -> "Kept":
         significant = significance(model.curvature.alone)
-        steps: PerPlane = relative_steps(significant)
-        if model.coded is not None:
-            steps = [{name: step_asked_for(plane) for name, plane in scale.items()} for scale in model.coded.scales]
+        steps: PerPlane = relative_steps(significant) if model.coded is None else [
+            {name: step_asked_for(plane) for name, plane in scale.items()} for scale in model.coded.scales]
         return Kept(model.scene, model.coded, steps, significant, model.curvature.together)
 
     def needed(self, model: Model, measure: Measure, loss_db: float, prune_share: float, grids: bool) -> "Kept":
