@@ -6,6 +6,7 @@ import pytest
 from scenes import displaced, hybrid, look_at, tiny_scene
 
 from kpc.format.scene import Scene
+from kpc.player import renderer as renderer_module
 from kpc.player.cover import MOST_CELLS, Cover
 from kpc.player.quality import LADDER
 from kpc.player.reference import render, slot_at
@@ -72,14 +73,15 @@ def test_from_among_what_is_occupied_all_is_drawn() -> None:
 
 @pytest.mark.parametrize("kind", ["plain", "hybrid", "displaced"])
 @pytest.mark.parametrize("camera", ["near", "far", "beside", "away"])
-def test_pictures_are_the_same(kind: str, camera: str) -> None:
+def test_pictures_are_the_same(monkeypatch: pytest.MonkeyPatch, kind: str, camera: str) -> None:
     make = {"plain": lambda s: s, "hybrid": hybrid, "displaced": displaced}[kind]
     scene, view = sparse(make(tiny_scene(3)), 0.02), CAMERAS[camera]
     for name in ("reference", "balanced"):
         pictures = []
-        for covered in (True, False):
+        for most_covered in (renderer_module.MOST_COVERED, -1.0):
+            monkeypatch.setattr(renderer_module, "MOST_COVERED", most_covered)
             renderer = Renderer(gl.context(), scene, LADDER[name])
-            renderer._is_software = covered
+            renderer._is_software = True
             pictures.append([renderer.render(view, time) for time in (0.3, 0.31, 0.32, 0.7, 0.7)])
         for one, other in zip(*pictures, strict=True):
             for field in ("rgb", "opacity", "samples", "depth"):

@@ -139,6 +139,32 @@ def test_every_pixel_is_a_probe_by_turns() -> None:
     assert (seen[:60, :60] == 1).all() and (seen > 0).all()
 
 
+@pytest.mark.parametrize("tiles", [None, module.SPREAD])
+def test_every_probe_has_a_texel_of_its_own(tiles: module.Tiles | None) -> None:
+    x, y = np.mgrid[:128, :64].reshape(2, -1)
+    blocks = np.stack([x, y, x, y], 1).astype(np.float32)
+    tile, square = (tiles.tile, tiles.square) if tiles else (module.MORE_THAN_A_RASTER,) * 2
+    places = gl.evaluate('#include "tiles.glsl"\n', "vec4(texel_of(a.xy), block_of(texel_of(a.xy)))", blocks, TILE=tile, SQUARE=square)
+    assert np.array_equal(places[:, 2:], blocks[:, :2]) and len(np.unique(places[:, :2], axis=0)) == 128 * 64
+    across, up = tiles.raster((128, 64)) if tiles else (128, 64)
+    assert (places[:, :2] < (across, up)).all() and places[:, 0].max() >= across - square
+
+
+@pytest.mark.parametrize("size", [(64, 48), (170, 90), (321, 1)])
+@pytest.mark.parametrize("covered", [False, True])
+def test_probes_see_the_same_wherever_they_lie(monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], covered: bool) -> None:
+    """Spread over tiles, all of them or those in sight of what is occupied; or side by side."""
+    monkeypatch.setattr(module, "MOST_COVERED", float(covered))
+    scene, camera, pictures = tiny_scene(4), CAMERA.resized(*size), []
+    for tiles in (module.SPREAD, None):
+        monkeypatch.setattr(module, "SPREAD", tiles)
+        renderer = Renderer(gl.context(), scene, FOLLOWING)
+        renderer._is_software = True
+        pictures.append(played(renderer, [camera] * 5, np.linspace(0.4, 0.46, 5)))
+        assert (renderer._covered(camera) is not None) == covered
+    assert np.abs(pictures[0] - pictures[1]).max() < 1e-5 and np.ptp(pictures[0]) > 0.1
+
+
 def test_nothing_is_left_behind_by_what_moves() -> None:
     """A block of colour that crosses the picture: at no time is much of it where it was before, nor does it stay after the loop."""
     scene = tiny_scene(4, resolution=(48, 40, 32))

@@ -1,4 +1,5 @@
 import re
+from itertools import chain
 
 import gl
 import numpy as np
@@ -9,7 +10,7 @@ from kpc.format.errors import DisplayError
 from kpc.player import shader
 from kpc.player.textures import Layout, block_arrays, decoder_arrays, decoder_shape, planes_shape
 
-VERTICES = {"settle.glsl": "places.glsl", "march.glsl": "blocks.glsl"}
+VERTICES = {"settle.glsl": ["places.glsl"], "march.glsl": ["blocks.glsl", "squares.glsl"]}
 """Those of fragment shaders that are not drawn all over the viewport, or not always."""
 
 
@@ -54,7 +55,7 @@ def test_a_missing_file_is_named() -> None:
 
 
 @pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "refine.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "average.glsl", "nothing.glsl", "predict.glsl", "doubt.glsl", "settle.glsl",
-                                  *VERTICES.values(), "fullscreen.glsl"])  # fmt: skip
+                                  *chain(*VERTICES.values()), "fullscreen.glsl"])  # fmt: skip
 def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
     scene = tiny_scene(0)
     defines = {**planes_shape(Layout.of(scene)), **decoder_shape(scene.decoder), "SHARED": 1}
@@ -108,8 +109,9 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     blocks = shader.constants(block_arrays(scene, layout))
-    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "SHARED": int(space == "box"), "PIXELS": rows + motion, "MOVED": motion, "VIEW": rows + 2 * motion, "COMPUTE": 0,
+    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "SHARED": int(space == "box"), "PIXELS": rows + motion, "MOVED": motion, "VIEW": rows + 2 * motion, "COMPUTE": 0, "TILE": 64, "SQUARE": 20,
                "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion, "APPEARANCE": rows}  # fmt: skip
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights, "plane_blocks": blocks})
-    vertex, _ = shader.compose(VERTICES.get(name, "fullscreen.glsl"), preamble=shader.ES30)
-    ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()
+    for where in VERTICES.get(name, ["fullscreen.glsl"]):
+        vertex, _ = shader.compose(where, defines, preamble=shader.ES30)
+        ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()

@@ -5,10 +5,12 @@
 // marched, too: that edge is never predicted to the pixel, and probes meet it too seldom.
 
 #include "probes.glsl"
+#include "tiles.glsl"
 
-uniform sampler2D seen_probes;     // a texel a block
+uniform sampler2D seen_probes;     // as in tiles.glsl
 uniform sampler2D seen_predicted;  // of the whole picture
-uniform vec2 size;                 // of that, pixels
+uniform vec2 raster;               // of probes
+uniform vec2 size;                 // of the picture, pixels
 uniform int turn;
 uniform float tolerance;
 
@@ -23,7 +25,7 @@ void main() {
 #unroll y 3
 #unroll x 3
     block = clamp(here + vec2(x, y) - 1.0, vec2(0.0), blocks - 1.0);
-    difference = abs(textureLod(seen_probes, (block + 0.5) / blocks, 0.0)
+    difference = abs(textureLod(seen_probes, (texel_of(block) + 0.5) / raster, 0.0)
                      - textureLod(seen_predicted, (probe_of(block, turn, size) + 0.5) / size, 0.0));
     most = max(most, (block == here ? 1.0 : 0.5) * max(max(difference.r, difference.g), max(difference.b, difference.a)));
 #end

@@ -6,7 +6,7 @@
 // CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
 // NDC: 1 where all this is in device coordinates. DRAWN: how many scales count. SHARED: how many, from
 // the coarsest on, are looked up once for two samples, in the middle between them; the next gives their slope.
-// PIXELS: 0 all are marched; 1 the probes (probes.glsl), side by side; 2 blocks in doubt (blocks.glsl).
+// PIXELS: 0 all are marched; 1 the probes (probes.glsl), as in tiles.glsl; 2 blocks in doubt (blocks.glsl).
 // COMPUTE: 1 for a compute shader (GL 4.3).
 
 #include "ray.glsl"
@@ -16,6 +16,7 @@
 #include "planes.glsl"
 #include "decoder.glsl"
 #include "probes.glsl"
+#include "tiles.glsl"
 #include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.textures), as the next
 #include "plane_blocks"     // blocks, layer_widths, last_texels, layers, first_layers
 
@@ -235,7 +236,7 @@ void add_sample(inout Met sum, vec4 logits, float thickness, float distance) {
 // seen: rgb and opacity; met: sum of weight t, samples.
 void march(vec2 fragment, out vec4 seen, out vec4 met) {
 #if PIXELS == 1
-    fragment = probe_of(floor(fragment), turn, size) + 0.5;
+    fragment = probe_of(block_of(floor(fragment)), turn, size) + 0.5;
 #endif
     Path path = path_of(eye, camera_direction(fragment, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
