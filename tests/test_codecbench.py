@@ -88,7 +88,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "codec.json"
-    assert kpbench.main(["codec", str(scene_file), "--out", str(out)]) == 0
+    assert kpbench.main(["codec", str(scene_file), "--ablate", "--out", str(out)]) == 0
     said = capsys.readouterr()
     records = results.load([out])
     assert [record["coder"] for record in records] == ["kpc", *codecbench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19", "X", "X, tuned"]

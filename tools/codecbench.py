@@ -79,8 +79,8 @@ class Job:
     trade: Trade = Trade()
 
 
-def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str, Any]]:
-    """The coders, ours first: each its name, its points (or why it has none) and by how much ours is smaller.
+def measure(scene: Path, dataset: Path | None, processes: int, ablate: bool) -> list[dict[str, Any]]:
+    """The coders, ours first, then, to `ablate`, WITHOUT: each its name, its points (or why it has none) and by how much ours is smaller.
 
     Raises:
         KpcError: the scene or the dataset cannot be used, or a coder failed.
@@ -91,7 +91,8 @@ def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str,
     count = source.scene.parameter_count
     rates = {f"{rate:g} bits": Trade(target_bytes=int(rate * count / 8)) for rate in RATES}
     qualities = {f"quality {q:g}": Trade(quality=q) for q in QUALITIES}
-    jobs = [Job(scene, name, said, others, trade) for name in (OURS, *WITHOUT)
+    ours = [OURS, *(WITHOUT if ablate else ())]
+    jobs = [Job(scene, name, said, others, trade) for name in ours
             for said, trade in ((rates if name == OURS else {}) | qualities).items()]  # fmt: skip
     others_at_hand = RIVALS | {name: RIVALS[rival] for name, rival in TUNED.items() if rival in RIVALS}
     missing = {name: why for name, rival in others_at_hand.items() if (why := rival.missing())}
@@ -99,7 +100,7 @@ def measure(scene: Path, dataset: Path | None, processes: int) -> list[dict[str,
              for setting in reversed(rival.settings)]  # fmt: skip
     points = in_parallel(jobs, views, processes)
     coders = []
-    for name in (OURS, *WITHOUT, *others_at_hand):
+    for name in (*ours, *others_at_hand):
         found = [point for job, point in zip(jobs, points, strict=True) if job.coder == name and point is not None]
         coders.append({"coder": name, "missing": missing.get(name), "points": found})
     for coder in coders:

@@ -465,7 +465,7 @@ def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[resu
         record = _record("codec", source, origin, {"judged_by": judged_by, "processes": options.processes})
         print(f"kpbench: {record['name']}, judged by {judged_by}", file=sys.stderr)
         started = clock.monotonic()
-        coders = codecbench.measure(source, folder, options.processes)
+        coders = codecbench.measure(source, folder, options.processes, options.ablate)
         took = {"bench_s": clock.monotonic() - started}
         for coder in coders:
             repeats = [codecbench.headline(coder["points"])]
@@ -570,6 +570,7 @@ def _parser() -> argparse.ArgumentParser:
     codec.add_argument("--dataset", type=Path, action="append", metavar="DIR",
                        help="judge by its held-out views; once for each scene, in their order (default: training pixels of a "
                             "checkpoint, a file's own pictures)")  # fmt: skip
+    codec.add_argument("--ablate", action="store_true", help="measure our own coder with one of its ideas left out, too: for each of them")
     codec.add_argument("--processes", type=_positive, default=int(machine()["cores"]), metavar="N",
                        help="at a time (default: one a core)")  # fmt: skip
     codec.set_defaults(measure=_codec)
