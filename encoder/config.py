@@ -201,7 +201,7 @@ class TrainConfig:
         """
         finest = max(self.resolutions)
         return replace(self, resolutions=(min(max(16, finest // 4), 32), max(16, finest // 2)),
-                       channels=32 if self.channels < 16 else 64,
+                       channels=32 if finest <= 256 else 64,
                        frames_per_row=2 * self.frames_per_row, motion_cells=10, channel_dropout=0.4, coarse_until=0.3, view_dependent=False,
                        samples_across=max(32, self.samples_across // 2), steps=3 * self.steps)
 
@@ -213,10 +213,10 @@ PRESETS = {
     "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500,
                          occupancy_start=64, tune_steps=0),
     "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
-    # Room, held-out views of 3,000 steps and the file of quality 70: with (64, 128, 256) and 8 channels 27.98 dB and 156 KB, with these 28.44 dB
-    # and 183 KB, in as many texels looked up a sample and no more time; with 16 channels 28.95 dB and 213 KB, (64, 128, 256) and 12 channels
-    # 28.87 dB and 196 KB, which take 1.2 times as long to play.
-    "balanced": TrainConfig(resolutions=(96, 256), channels=12, steps=10000, temporal_start=0.75, temporal_floor=0.3),
+    # Room, held-out views of 3,000 steps and the file of quality 70: with (64, 128, 256) and 8 channels 27.98 dB and 156 KB, with (96, 256) and 12
+    # channels 28.44 dB and 183 KB, in as many texels looked up a sample and no more time; with 16 channels 28.95 dB and 213 KB, in 1.2 times the time
+    # that a frame takes to play; with (64, 128, 256) and 12 channels 28.87 dB and 196 KB, in as much.
+    "balanced": TrainConfig(resolutions=(96, 256), channels=16, steps=10000, temporal_start=0.75, temporal_floor=0.3),
     "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000),
     # K-Planes' own settings (section 3.1 and its appendix), but for the march through occupied cells. It wants a GPU.
     "paper": TrainConfig(resolutions=(64, 128, 256, 512), channels=32, samples_across=640, cells_across=128, steps=30000,
