@@ -28,7 +28,7 @@ from kpc.format.blocks import (
 )
 from kpc.format.file import SEGMENT_ROWS
 from kpc.format.quantise import QuantisedPlane, quantise_plane, short_above
-from kpc.format.rans import compiled
+from kpc.format.rans import compiled, inlined
 from kpc.format.segments import Told
 
 PRICE = 0.03
@@ -270,7 +270,7 @@ def _misses(block, quantiser, basis, error):
                 _add(error, basis, i, j, block[i, j] * quantiser[i, j])
 
 
-@compiled(forceinline=True)
+@inlined
 def _add(values, basis, i, j, factor):
     """A cosine more."""
     for y in range(len(basis)):
@@ -291,7 +291,7 @@ def _curve(weight, basis, curve):
                 curve[i, j] = (curve[i, j] if y else 0.0) + along * basis[i, y] * basis[i, y]
 
 
-@compiled(forceinline=True)
+@inlined
 def _slope(error, weight, basis, i, j):
     """The sum of products of a cosine with errors, weighed."""
     total = 0.0
@@ -303,7 +303,7 @@ def _slope(error, weight, basis, i, j):
     return total
 
 
-@compiled(forceinline=True)
+@inlined
 def _cheapest(best, usual, worth, bits):
     """Of the level nearest to the best, the next towards the usual one, and that, the one of least cost."""
     nearest = int(math.floor(min(max(best + 0.5, usual - LARGEST), usual + LARGEST)))
@@ -342,7 +342,7 @@ def _trimmed(block, here, told, left, above, past, last, quantiser, basis, seen,
     return last
 
 
-@compiled(forceinline=True)
+@inlined
 def _any_on(told, diagonal):
     N = len(told)
     for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1):

@@ -20,7 +20,7 @@ from kpc.encoder.probe import Measure, Probe
 from kpc.encoder.render import marched
 from kpc.format.cells import CONTEXTS, NEIGHBOURS
 from kpc.format.grid import dilate
-from kpc.format.rans import compiled
+from kpc.format.rans import compiled, inlined
 from kpc.format.scene import Scene
 
 MARCHED = 0.5
@@ -147,7 +147,7 @@ def _flip(cells, bits, occupied, neighbours):
     return count
 
 
-@compiled(forceinline=True)
+@inlined
 def context_at(cells, s, z, y, x, neighbours):
     """The context of a cell, as `kpc.format.cells.walk` finds it."""
     S, Z, Y, X = cells.shape

@@ -18,7 +18,7 @@ from kpc.encoder.probe import Measure
 from kpc.encoder.worth import BESIDE, bits_of_magnitudes
 from kpc.format.midpoints import CONTEXTS, context_of, foreseen, passes, told_beside
 from kpc.format.motion import STEP
-from kpc.format.rans import compiled
+from kpc.format.rans import compiled, inlined
 from kpc.format.scene import Scene
 
 SHARE, MOST_STEPS = 0.1, 64
@@ -97,7 +97,7 @@ def _search(values, r, wanted, root, errors, new, sides, weights, first, second,
                         counts[context, min(abs(value - usual), TOLD_APART)] += 1
 
 
-@compiled(forceinline=True)
+@inlined
 def _others(errors, t, a, b, c, m):
     """What errors of neighbours make of one."""
     total = 0.0
@@ -111,7 +111,7 @@ def _others(errors, t, a, b, c, m):
     return total
 
 
-@compiled(forceinline=True)
+@inlined
 def _cheapest(best, usual, worth, price, bits):
     """Of the symbol nearest to the best, the next towards the usual one, and that, the one of least cost."""
     nearest = int(math.floor(min(max(best + 0.5, -32768.0), 32767.0)))

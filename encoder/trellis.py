@@ -153,6 +153,7 @@ def _search(
     cross = np.zeros((H, W), np.int16)
     V, R = np.zeros((W + 4, STATES), np.int64), np.zeros((W + 4, STATES), np.int64)  # of the survivor that ends there
     U = np.zeros((W + 2, STATES), np.float32)
+    cost, before = np.zeros(STATES), np.zeros(STATES)
     came, context, missed = np.zeros((W, STATES), np.int64), np.zeros((W, STATES), np.int64), np.zeros((W, STATES), np.int64)
     for m in range(M):
         outside_others = others(errors, together, m)
@@ -164,11 +165,12 @@ def _search(
             begin_row(r0, r1, r2, own, UNKNOWN)
             for s in range(STATES):
                 V[:2, s], R[:2, s] = v0[:2], r0[:2]
-            cost = np.full(STATES, np.inf)
+            cost[:] = np.inf
             cost[0] = 0
             for x in range(W):
                 X = x + 2
-                before, cost = cost, np.full(STATES, np.inf)
+                before, cost = cost, before
+                cost[:] = np.inf
                 root, here = math.sqrt(worth[y, x, m]), errors[y + 1, x + 1, m]
                 outside = outside_others[y, x] + BESIDE * (errors[y, x + 1, m] + errors[y + 2, x + 1, m]) + ACROSS * (
                     errors[y, x, m] + errors[y, x + 2, m] + errors[y + 2, x, m] + errors[y + 2, x + 2, m])

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.format.errors import FormatError
-from kpc.format.rans import SCALE, adapt, compiled, counters, decide, doublings, ended, integer, natural, opened, stream
+from kpc.format.rans import SCALE, adapt, compiled, counters, decide, doublings, ended, inlined, integer, natural, opened, stream
 from kpc.format.symbols import LATTICE_BIT, MAP, walk_map
 
 SIDES = (4, 8, 16)
@@ -261,12 +261,12 @@ def around(down, across, side):
     return np.zeros((down + 1, across + 1, side + 2, side + 2), np.int32)
 
 
-@compiled(forceinline=True)
+@inlined
 def coefficient(level, quantiser):
     return min(max(level * quantiser, COEFFICIENT_MIN), COEFFICIENT_MAX)
 
 
-@compiled(forceinline=True)
+@inlined
 def foreseen_mean(mean, by, bx):
     """The mean of a block by those to the left, above, and above to the left; `mean`: with one more above and to the left."""
     left, above = mean[by + 1, bx], mean[by, bx + 1]
@@ -288,19 +288,19 @@ def last_diagonal(block):
     return last
 
 
-@compiled(forceinline=True)
+@inlined
 def usual_end(left, above, before):
     """What an end may be, by those to the left and above and of the channel before."""
     return left + above + 2 * before + 2 >> 2
 
 
-@compiled(forceinline=True)
+@inlined
 def end_context(usual, side):
     """One of ENDS."""
     return 0 if usual == 0 else 1 + (usual - 1) * (ENDS - 1) // (2 * side - 1)
 
 
-@compiled(forceinline=True)
+@inlined
 def level_context(here, left, above, before, i, j, side):
     """How large a level may be, by those of higher frequencies, of neighbours and of the channel before; and how quick it is."""
     quicker = 2 * (here[i, j + 1] + here[i + 1, j]) + here[i + 1, j + 1] + here[i, j + 2] + here[i + 2, j]
@@ -311,7 +311,7 @@ def level_context(here, left, above, before, i, j, side):
     return large * FREQUENCIES + quick
 
 
-@compiled(forceinline=True)
+@inlined
 def walk_level(value, table, first, state, at, words, trace):
     """Code or decode a level by DECISIONS counters from `first` on: (value, state, at)."""
     bit, state, at = adapt(1 if value != 0 else 0, table, first, state, at, words, trace)

@@ -14,7 +14,7 @@ import numpy as np
 
 from kpc.format.errors import FormatError
 from kpc.format.nodes import CONTEXTS, DECISIONS, ESCAPES, MOST_DECISIONS, UNARY
-from kpc.format.rans import compiled, counters, doublings, ended, integer, opened, stream
+from kpc.format.rans import compiled, counters, doublings, ended, inlined, integer, opened, stream
 
 WEIGHT_BITS = 6
 """Weights are multiples of 2^-WEIGHT_BITS."""
@@ -136,7 +136,7 @@ def walk(values, r, new, sides, weights, first, second, third, table, state, at,
     return state, at, True
 
 
-@compiled(forceinline=True)
+@inlined
 def told_beside(r, new, first, second, third, i, j, k):
     """The sum of r of the same pass at the nodes one back along the other axes."""
     total = 0
@@ -150,7 +150,7 @@ def told_beside(r, new, first, second, third, i, j, k):
     return total
 
 
-@compiled(forceinline=True)
+@inlined
 def foreseen(values, sides, weights, a, b, c, m):
     """The weighted sum of those at the sides, as a symbol."""
     total = 1 << WEIGHT_BITS - 1
@@ -160,7 +160,7 @@ def foreseen(values, sides, weights, a, b, c, m):
     return min(max(total >> WEIGHT_BITS, -32768), 32767)
 
 
-@compiled(forceinline=True)
+@inlined
 def context_of(r, new, sides, weights, beside, a, b, c, m):
     """Of the r around, the logarithm."""
     total = beside

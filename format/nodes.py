@@ -12,7 +12,7 @@ Naming as in `kpc.format.symbols`: r is by how much predictions missed; table, s
 import numpy as np
 
 from kpc.format.errors import FormatError
-from kpc.format.rans import compiled, counters, doublings, ended, integer, opened, stream
+from kpc.format.rans import compiled, counters, doublings, ended, inlined, integer, opened, stream
 from kpc.format.symbols import FIT_VALUES, least_absolute
 
 NEIGHBOURS = 15
@@ -106,7 +106,7 @@ def walk(symbols, weights, state, at, words, trace):
     return state, at, True
 
 
-@compiled(forceinline=True)
+@inlined
 def _predicted(symbols, weights, t, z, y, x, m):
     """The weighted sum of the neighbours that are there, as a symbol."""
     total = 0
@@ -117,7 +117,7 @@ def _predicted(symbols, weights, t, z, y, x, m):
     return min(max(total + (1 << WEIGHT_BITS - 1) >> WEIGHT_BITS, -32768), 32767)
 
 
-@compiled(forceinline=True)
+@inlined
 def _context(r, t, z, y, x, m):
     """Of the mean r of the neighbours one step back along one axis, the logarithm."""
     now = t & 1

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.format.errors import FormatError
-from kpc.format.rans import adapt, compiled, counters, ended, integer, opened, stream
+from kpc.format.rans import adapt, compiled, counters, ended, inlined, integer, opened, stream
 
 SET_COUNTS = (1, 2, 4, 8)
 """How many sets of weights a segment may store."""
@@ -223,14 +223,14 @@ def follows_trellis(symbols, coded):
     return True
 
 
-@compiled(forceinline=True)
+@inlined
 def next_state(state, symbol):
     """From one of 8 states, the first of a row 0; in an odd one a symbol is odd. Ungerboeck's code of parity checks 13 and 04
     (octal; IEEE Trans. Inf. Theory 28, 1982, table I)."""
     return state >> 1 ^ 5 * (state & 1) ^ symbol & 2
 
 
-@compiled(forceinline=True)
+@inlined
 def meant(error, kind, odd):
     """How far from what is foreseen, as `foreseen` has it, an error puts a symbol. `odd`: whether place is."""
     if kind < AROUND:
@@ -238,7 +238,7 @@ def meant(error, kind, odd):
     return 2 * error - (odd if error > 0 else -odd if error < 0 else 0)
 
 
-@compiled(forceinline=True)
+@inlined
 def told(away, kind, odd):
     """The error that means a symbol so far from what is foreseen, or one near to it."""
     if kind < AROUND:
@@ -247,13 +247,13 @@ def told(away, kind, odd):
     return size if away > 0 else -size
 
 
-@compiled(forceinline=True)
+@inlined
 def foreseen(predicted, kind, odd):
     """The symbol nearest to a prediction, on the trellis one that may follow; ties go up."""
     return nearest(predicted, odd, 1) if kind == TRELLIS else nearest(predicted, 0, 0)
 
 
-@compiled(forceinline=True)
+@inlined
 def next_place(place, value, error, kind):
     """After a symbol that an error made: by the one or, around predictions, by the other."""
     if kind == ANY:
@@ -331,7 +331,7 @@ def walk(symbols, coded, lattice, weights, state, at, words, trace, neighbours):
     return state, at, True
 
 
-@compiled(forceinline=True)
+@inlined
 def predict(sets, w, n, nw, ne, ww, nn, nww, nnw, nne, nee):
     """What neighbours say of a symbol, in 1 / 128; how much they differ, and that in 8 classes. `sets`: int64 weights."""
     gradient = abs(w - nw) + abs(n - nw) + abs(n - ne) + abs(w - ww) + abs(n - nn)
@@ -343,28 +343,29 @@ def predict(sets, w, n, nw, ne, ww, nn, nww, nnw, nne, nee):
     return min(max(predicted, -128 * 128), 127 * 128), gradient, slope
 
 
-@compiled(forceinline=True)
+@inlined
 def nearest(predicted, odd, doubled):
     """The symbol nearest to a prediction; where `doubled` is 1, of the even or of the odd ones."""
     return (predicted - (odd << 7) + (64 << doubled) >> 7 + doubled << doubled) + odd
 
 
-@compiled(forceinline=True)
+@inlined
 def activity(own, past, gradient, m):
     """How far predictions may be off, one of ACTIVITIES classes: by r around, by r of the channels before, and by `gradient`."""
     total = (4 * own if m == 0 else 11 * own + 5 * past >> 2) + 20 * gradient
     return int(_LOGARITHMS[total + 128 >> 6])
 
 
-@compiled(forceinline=True)
+@inlined
 def begin_row(here, above, higher, y, unknown):
     """What lies outside: to the left, the start of the row above; above the first row, from the second on, itself."""
     here[:2] = above[2] if y > 0 else unknown
     if y == 1:
-        higher[:] = above
+        for x in range(higher.size):
+            higher[x] = above[x]
 
 
-@compiled(forceinline=True)
+@inlined
 def remember(cross, above, here, below, m):
     """Let `cross`, of one row, take in r of this channel: smoothed by (1 2 1) x (1 2 1) / 2, an eighth of the way."""
     for x in range(cross.size):
