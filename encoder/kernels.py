@@ -41,8 +41,11 @@ _ALONG_COLUMNS, _ALONG_ROWS = (0, 0, 1, 0, 1, 2), (1, 2, 2, 3, 3, 3)
 # and the first training run on a machine would end elsewhere than the second.
 _FASTMATH = {"nsz", "arcp", "contract", "afn"}
 _jit = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True)
-_inlined = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True, forceinline=True)
-"""For what runs many times a sample: an array is some eight arguments, and passing them costs as much as the work."""
+_bare = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True, _nrt=False)
+"""For what makes and returns no array: without counting who holds one, which is atomic and takes a sixth of a step; numba has no public
+name for that."""
+_inlined = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True, _nrt=False, forceinline=True)
+"""The same for what runs many times a sample: an array is some eight arguments, and passing them costs as much as the work."""
 # The innermost loops run over the channels of one plane. Their number is no constant: LLVM would unroll a loop of eight before
 # it could turn it into one of vectors. And they read and write few arrays: it gives up on telling apart more than a handful.
 _parallel = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, parallel=True)
@@ -53,7 +56,7 @@ def even_of(mapping: SpaceMapping | None) -> np.float32 | None:
     return np.float32(mapping.even) if isinstance(mapping, Contraction) else None
 
 
-@_jit
+@_bare
 def _box_span(origin, direction, aabb):
     """Distances at which a ray enters (at least 0) and leaves the box; leaves <= enters where it misses."""
     near, far = np.float32(0.0), np.float32(np.inf)
@@ -84,6 +87,13 @@ def _distance(s, even):
     if even is None:
         return s
     return s if s <= even else even / (np.float32(2.0) - s / even)
+
+
+@_inlined
+def _inverse_edges(aabb):
+    """One over the edges of the box: three numbers, no array."""
+    one = np.float32(1.0)
+    return one / (aabb[1, 0] - aabb[0, 0]), one / (aabb[1, 1] - aabb[0, 1]), one / (aabb[1, 2] - aabb[0, 2])
 
 
 @_inlined
@@ -330,7 +340,7 @@ def _cell(grid, u, v, w):
     return z, y, x
 
 
-@_jit
+@_bare
 def _march(
     theta, table, resolution, density, M, motion, aabb, even, occupancy, origin, direction, time, jitter, step, extent,
     values, features, points, corners, fractions, weights, logs, places,
@@ -343,7 +353,7 @@ def _march(
     near, far = _span(origin, direction, aabb, even)
     slots = occupancy.shape[0]
     slot = min(int(time * slots), slots - 1)
-    inv = np.float32(1.0) / (aabb[1] - aabb[0])
+    inv = _inverse_edges(aabb)
     F = density.size - 1
     trans = np.float32(1.0)
     count = 0
@@ -430,7 +440,7 @@ def render(
     return rgbs, opacities, depths, counts
 
 
-@_jit
+@_bare
 def _distortion_gradient(weights, places, count, step, extent, factor, out):
     """out[k] = factor * d D / d w_k of `backpropagate`, in one pass each way over the sums of w and w s before sample k."""
     total, total_s = np.float32(0.0), np.float32(0.0)
@@ -622,7 +632,7 @@ def collect(aabb, even, occupancy, step, origins, directions, times, jitters, st
     stretches (n,) what the step counts, cells (n, 3) int64 z, y, x.
     """
     N, slots = origins.shape[0], occupancy.shape[0]
-    inv = np.float32(1.0) / (aabb[1] - aabb[0])
+    inv = _inverse_edges(aabb)
     counts = np.empty(N, np.int64)
     for worker in prange(workers):
         for ray in range(worker, N, workers):
