@@ -11,7 +11,7 @@ NEIGHBOURS = np.array([
     (0, 0, 0, -1), (0, 0, -1, 0), (0, -1, 0, 0), (0, -1, 1, 0), (0, 0, -1, 1), (0, -1, 0, 1),
     (-1, 0, 0, 0), (-1, 0, 0, -1), (-1, 1, 0, 0), (-1, 0, -1, 0), (-1, -1, 0, 0),
 ])
-"""(slot, z, y, x) from a cell to those that make its context, the most significant bit first. `walk` has them row by row."""
+"""(slot, z, y, x) from a cell to those that make its context, the most significant bit first."""
 CONTEXTS = 1 << len(NEIGHBOURS)
 
 
@@ -40,33 +40,21 @@ def decode_cells(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
 def walk(cells, state, at, words, trace):
     """Code (slots, Nz, Ny, Nx) uint8 `cells` of 0 and 1, or decode into them: (state, at). The rest as `kpc.format.rans.decide`."""
     S, Z, Y, X = cells.shape
-    table, nowhere = counters(CONTEXTS), np.zeros(X, np.uint8)
+    table = counters(CONTEXTS)
+    slots = np.zeros((2, Z + 2, Y + 2, X + 1), np.uint8)  # this one and the one before, with nothing around: a cell is at [z + 1, y + 1, x]
     for s in range(S):
+        here, before = slots[s & 1], slots[1 - (s & 1)]
         for z in range(Z):
             for y in range(Y):
-                here = cells[s, z, y]
-                north, back, below = _row(cells, nowhere, s, z, y - 1), _row(cells, nowhere, s, z - 1, y), \
-                    _row(cells, nowhere, s, z - 1, y + 1)
-                before, front = _row(cells, nowhere, s - 1, z, y), _row(cells, nowhere, s - 1, z + 1, y)
-                above, behind = _row(cells, nowhere, s - 1, z, y - 1), _row(cells, nowhere, s - 1, z - 1, y)
                 left, past = 0, 0
                 for x in range(X):
-                    corners = 2 * int(north[x + 1]) + int(back[x + 1]) if x + 1 < X else 0
-                    now = int(before[x])
-                    context = left << 10 | int(north[x]) << 9 | int(back[x]) << 8 | int(below[x]) << 7 | corners << 5 \
-                        | now << 4 | past << 3 | int(front[x]) << 2 | int(above[x]) << 1 | int(behind[x])
-                    left, state, at = adapt(int(here[x]), table, context, state, at, words, trace)
-                    here[x] = left
+                    now = int(before[z + 1, y + 1, x])
+                    context = left << 10 | int(here[z + 1, y, x]) << 9 | int(here[z, y + 1, x]) << 8 | int(here[z, y + 2, x]) << 7 \
+                        | int(here[z + 1, y, x + 1]) << 6 | int(here[z, y + 1, x + 1]) << 5 | now << 4 | past << 3 \
+                        | int(before[z + 2, y + 1, x]) << 2 | int(before[z + 1, y, x]) << 1 | int(before[z, y + 1, x])
+                    left, state, at = adapt(int(cells[s, z, y, x]), table, context, state, at, words, trace)
+                    cells[s, z, y, x] = here[z + 1, y + 1, x] = left
                     past = now
                 if words is not None and at > words.size:
                     return state, at
     return state, at
-
-
-@compiled(forceinline=True)
-def _row(cells, nowhere, s, z, y):
-    """The cells of a row, `nowhere` if it lies outside."""
-    _, Z, Y, _ = cells.shape
-    if s < 0 or not 0 <= z < Z or not 0 <= y < Y:
-        return nowhere
-    return cells[s, z, y]
