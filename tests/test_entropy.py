@@ -8,7 +8,7 @@ from kpc.format.container import Chunk
 from kpc.format.file import write
 from kpc.format.quantise import quantise_scene
 from kpc.format.symbols import SET_COUNTS, Guide, encode_symbols
-from kpc.tools import entropy, kpbench
+from kpc.tools import entropy, kpbench, results
 
 
 def test_with_nothing_changed_the_coder_is_the_coder():
@@ -35,3 +35,5 @@ def test_records(tmp_path, monkeypatch):
     assert list(records) == ["nothing", "all of them: zstd", idea]
     assert records["nothing"]["plane_bytes"] < records["all of them: zstd"]["plane_bytes"]
     assert records["nothing"]["decode_ms"] > 0
+    assert records["nothing"]["file_bytes"] == (tmp_path / "tiny.kpc").stat().st_size and records["nothing"]["read_ms"] > 0
+    assert "whole file KB" in results.markdown(json.loads(out.read_text()))

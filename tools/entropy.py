@@ -5,6 +5,7 @@ An idea is left out by compiling `kpc.format.symbols` once more with the one con
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import process_time
 from types import FunctionType
@@ -39,8 +40,8 @@ class Segment:
 
 
 def measure(scene: Path) -> dict[str, dict[str, float]]:
-    """For each idea left out, the bytes of all planes, `plane_bytes`; of what exists as a codec also `decode_ms`, on one core. Planes that are
-    told in blocks are left out."""
+    """For each idea left out, the bytes of all planes, `plane_bytes`; of what exists as a codec also `decode_ms`, on one core; and of the file
+    as it is, `file_bytes`, all that `kpc.format.file.read` does: `read_ms`. Of planes those that are told in blocks are left out."""
     quantised = read(scene)
     segments, chunks = [], scene_chunks(quantised, segment_rows=_segment_rows(scene))
     left = {(s, ALL_PLANES.index(name)) for s, planes in enumerate(quantised.scales)
@@ -52,7 +53,8 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
             segments.append(Segment(plane.symbols[rows], plane.coded[rows], plane.guide, chunk))
     values = sum(plane.symbols.size for planes in quantised.scales for plane in planes.values())
     found = {
-        "nothing": _decoded(pack(chunks, values), left),
+        "nothing": _decoded(pack(chunks, values), left)
+        | {"file_bytes": scene.stat().st_size, "read_ms": _median_ms(partial(read, scene.read_bytes()))},
         "all of them: zstd": _decoded(pack([replace(chunk, coded={}) for chunk in chunks], values), left),
     }
     for name, (changes, counts, size) in LEFT_OUT.items():
@@ -68,13 +70,18 @@ def _segment_rows(scene: Path) -> int:
 def _decoded(data: bytes, left: Collection[tuple[int, int]]) -> dict[str, float]:
     reader = SceneReader(data)
     planes = [number for number, entry in enumerate(reader.index) if entry.kind == "PLNE" and (entry.scale, entry.plane) in left]
+    decode_ms = _median_ms(lambda: [reader.segment(number) for number in planes])
+    return {"plane_bytes": sum(reader.index[n].stored_length for n in planes), "decode_ms": decode_ms}
+
+
+def _median_ms(work: Callable[[], object]) -> float:
+    """Milliseconds of processors that it takes, after a first time."""
     times = []
     for _ in range(DECODINGS + 1):
         start = process_time()
-        for number in planes:
-            reader.segment(number)
+        work()
         times.append(1e3 * (process_time() - start))
-    return {"plane_bytes": sum(reader.index[n].stored_length for n in planes), "decode_ms": float(np.median(times[1:]))}
+    return float(np.median(times[1:]))
 
 
 # --- the coder, with something changed

@@ -287,6 +287,8 @@ COLUMNS: dict[str, list[Column]] = {
         ("without", lambda r: r["settings"]["left_out"]),
         ("planes KB", _number("plane_bytes", "{:.1f}", 1e3)),
         ("decoded ms", _number("decode_ms", "{:.0f}")),
+        ("whole file KB", _number("file_bytes", "{:.1f}", 1e3)),
+        ("read ms", _number("read_ms", "{:.0f}")),
     ],
 }
 
