@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -121,6 +122,34 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert "uint8 + zstd -19" in svg and "bits per parameter" in svg
     assert plot.main([str(out), "-o", str(tmp_path / "again.svg")]) == 0
     assert (tmp_path / "again.svg").read_text() == svg
+
+
+def test_what_was_measured_before_an_end_is_not_measured_again(
+    few: None, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, real, asked = tmp_path / "codec.json", codecbench.point, []
+
+    def ends_at_the_eighth(job: codecbench.Job) -> Point | None:
+        asked.append(job.key)
+        if len(asked) == 8:
+            raise KeyboardInterrupt
+        return real(job)
+
+    def one_by_one(jobs: list[codecbench.Job], views: object, processes: int) -> Iterator[Point | None]:
+        return map(codecbench.point, jobs)
+
+    monkeypatch.setattr(codecbench, "in_parallel", one_by_one)
+    monkeypatch.setattr(codecbench, "point", ends_at_the_eighth)
+    assert kpbench.main(["codec", str(scene_file), "--out", str(out)]) != 0 and not out.exists()
+    (notes,) = tmp_path.glob("codec.*.points")
+    with notes.open("a") as file:
+        file.write('["a line that was cut')
+    assert kpbench.main(["codec", str(scene_file), "--out", str(out)]) == 0
+    assert sorted(asked) == sorted([*set(asked), asked[7]])  # that which it ended at, and no other, twice
+    assert not notes.exists() and len(results.load([out])[0]["points"]) == 6
+    # Of another state of the code nothing is taken over.
+    notes.write_text(json.dumps({"commit": "another"}) + "\n" + json.dumps([asked[0], None]) + "\n")
+    assert codecbench.Notes(notes, {"commit": "this"}).read() == {}
 
 
 def test_a_rival_that_is_tuned_comes_nearer_and_codes_every_plane_once(

@@ -5,14 +5,16 @@ pixels. A rival is given for nothing what our file spends bytes on besides plane
 file stores them, header and index not at all. One is tuned as ours is, too.
 """
 
+import contextlib
 import csv
 import io
+import json
 import math
 import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -78,9 +80,42 @@ class Job:
     others_bytes: int
     trade: Trade = Trade()
 
+    @property
+    def key(self) -> str:
+        """Which it is of those of its scene."""
+        return f"{self.coder}: {self.setting}"
 
-def measure(scene: Path, dataset: Path | None, processes: int, ablate: bool) -> list[dict[str, Any]]:
+
+@dataclass(frozen=True)
+class Notes:
+    """A file that points are noted in as they are found, a line each, so that a bench that was interrupted goes on.
+
+    Attributes:
+        stamp: what all of them depend on, the first line. Points under another are forgotten.
+    """
+
+    path: Path
+    stamp: dict[str, Any]
+
+    def read(self) -> dict[str, Point | None]:
+        """By `Job.key`. A line that was cut off is left out."""
+        found: list[Any] = []
+        with contextlib.suppress(OSError, ValueError), self.path.open() as file:
+            found.extend(map(json.loads, file))
+        return dict(found[1:]) if found and found[0] == self.stamp else {}
+
+    def begin(self, points: dict[str, Point | None]) -> None:
+        """With those that are known."""
+        self.path.write_text("".join(json.dumps(line) + "\n" for line in (self.stamp, *points.items())))
+
+    def add(self, key: str, point: Point | None) -> None:
+        with self.path.open("a") as file:
+            file.write(json.dumps([key, point]) + "\n")
+
+
+def measure(scene: Path, dataset: Path | None, processes: int, ablate: bool, notes: Notes | None = None) -> list[dict[str, Any]]:
     """The coders, ours first, then, to `ablate`, WITHOUT: each its name, its points (or why it has none) and by how much ours is smaller.
+    What `notes` hold is not measured again.
 
     Raises:
         KpcError: the scene or the dataset cannot be used, or a coder failed.
@@ -98,25 +133,34 @@ def measure(scene: Path, dataset: Path | None, processes: int, ablate: bool) -> 
     missing = {name: why for name, rival in others_at_hand.items() if (why := rival.missing())}
     jobs += [Job(scene, name, setting, others) for name, rival in others_at_hand.items() if name not in missing
              for setting in reversed(rival.settings)]  # fmt: skip
-    points = in_parallel(jobs, views, processes)
+    points = {} if notes is None else notes.read()
+    if notes is not None:
+        notes.begin(points)
+    left = [job for job in jobs if job.key not in points]
+    for job, found_point in zip(left, in_parallel(left, views, processes), strict=True):
+        points[job.key] = found_point
+        if notes is not None:
+            notes.add(job.key, found_point)
     coders = []
     for name in (*ours, *others_at_hand):
-        found = [point for job, point in zip(jobs, points, strict=True) if job.coder == name and point is not None]
+        found = [point for job in jobs if job.coder == name and (point := points[job.key]) is not None]
         coders.append({"coder": name, "missing": missing.get(name), "points": found})
     for coder in coders:
         coder["bd_rate"] = None if coder is coders[0] else bd_rate(coders[0]["points"], coder["points"])
     return coders
 
 
-def in_parallel(jobs: Sequence[Job], views: Probe | None, processes: int) -> list[Point | None]:
-    """Points of all jobs judged by `views`, or by the probe the scene comes with, in processes of their own, none with more than its share of the cores."""
+def in_parallel(jobs: Sequence[Job], views: Probe | None, processes: int) -> Iterator[Point | None]:
+    """Points of all jobs, in their order, judged by `views`, or by the probe the scene comes with, in processes of their own, none with more
+    than its share of the cores."""
     before = os.environ.get("NUMBA_NUM_THREADS")
     os.environ["NUMBA_NUM_THREADS"] = str(max(1, int(machine()["cores"]) // processes))
     try:
         with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _judge_by, (views,)) as pool:
             futures: list[Future[Point | None]] = [pool.submit(point, job) for job in jobs]
             try:
-                return [future.result() for future in futures]
+                for future in futures:
+                    yield future.result()
             except BrokenProcessPool as error:
                 raise KpcError("codec: a process was killed; free some memory, or give fewer --processes") from error
             finally:

@@ -450,7 +450,8 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
 
 
 def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
-    """A record for each scene and coder; beside --out also .csv of all points and .svg of the curves."""
+    """A record for each scene and coder; beside --out also .csv of all points and .svg of the curves, and until the end, for another try to go
+    on with, .NAME.points of each scene."""
     _encoder()  # what is missing is said before anything is read
     from kpc.tools import codecbench  # needs scipy
 
@@ -460,21 +461,27 @@ def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[resu
     if options.out is not None:
         from kpc.tools import plot  # needs matplotlib
     records: list[results.Record] = []
+    noted: list[Path] = []
     for source, folder in zip(options.scenes, folders, strict=True):
         judged_by = "its own probe" if folder is None else f"held-out views of {_folder(folder).resolve().name}"
         record = _record("codec", source, origin, {"judged_by": judged_by, "processes": options.processes})
         print(f"kpbench: {record['name']}, judged by {judged_by}", file=sys.stderr)
         started = clock.monotonic()
-        coders = codecbench.measure(source, folder, options.processes, options.ablate)
+        notes = options.out and codecbench.Notes(options.out.with_suffix(f".{record['name']}.points"), {
+            "judged_by": judged_by, **{key: record[key] for key in ("commit", "data_sha256", "machine", "versions")}})
+        coders = codecbench.measure(source, folder, options.processes, options.ablate, notes)
         took = {"bench_s": clock.monotonic() - started}
         for coder in coders:
             repeats = [codecbench.headline(coder["points"])]
             records.append(record | {"seed": None, "renderer": "cpu"} | took | coder | {"repeats": repeats})
             yield records[-1]
+        noted += [notes.path] if notes else []
     if options.out is not None:
         with cli.written_aside(options.out.with_suffix(".csv")) as aside:
             aside.write_text(codecbench.as_csv(records))
         plot.save(plot.rate_distortion(records), options.out.with_suffix(".svg"))
+    for path in noted:
+        path.unlink()
 
 
 def _entropy(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
