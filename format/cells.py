@@ -11,7 +11,7 @@ NEIGHBOURS = np.array([
     (0, 0, 0, -1), (0, 0, -1, 0), (0, -1, 0, 0), (0, -1, 1, 0), (0, 0, -1, 1), (0, -1, 0, 1),
     (-1, 0, 0, 0), (-1, 0, 0, -1), (-1, 1, 0, 0), (-1, 0, -1, 0), (-1, -1, 0, 0),
 ])
-"""(slot, z, y, x) from a cell to those that make its context, the most significant bit first."""
+"""(slot, z, y, x) from a cell to those that make its context, the most significant bit first. `walk` has them row by row."""
 CONTEXTS = 1 << len(NEIGHBOURS)
 
 
@@ -40,20 +40,26 @@ def decode_cells(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
 def walk(cells, state, at, words, trace):
     """Code (slots, Nz, Ny, Nx) uint8 `cells` of 0 and 1, or decode into them: (state, at). The rest as `kpc.format.rans.decide`."""
     S, Z, Y, X = cells.shape
-    table = counters(CONTEXTS)
-    slots = np.zeros((2, Z + 2, Y + 2, X + 1), np.uint8)  # this one and the one before, with nothing around: a cell is at [z + 1, y + 1, x]
+    table, nowhere = counters(CONTEXTS), np.zeros(X, np.uint8)
     for s in range(S):
-        here, before = slots[s & 1], slots[1 - (s & 1)]
         for z in range(Z):
             for y in range(Y):
+                here = cells[s, z, y]
+                north = cells[s, z, y - 1] if y > 0 else nowhere
+                back = cells[s, z - 1, y] if z > 0 else nowhere
+                below = cells[s, z - 1, y + 1] if z > 0 and y + 1 < Y else nowhere
+                before = cells[s - 1, z, y] if s > 0 else nowhere
+                front = cells[s - 1, z + 1, y] if s > 0 and z + 1 < Z else nowhere
+                above = cells[s - 1, z, y - 1] if s > 0 and y > 0 else nowhere
+                behind = cells[s - 1, z - 1, y] if s > 0 and z > 0 else nowhere
                 left, past = 0, 0
                 for x in range(X):
-                    now = int(before[z + 1, y + 1, x])
-                    context = left << 10 | int(here[z + 1, y, x]) << 9 | int(here[z, y + 1, x]) << 8 | int(here[z, y + 2, x]) << 7 \
-                        | int(here[z + 1, y, x + 1]) << 6 | int(here[z, y + 1, x + 1]) << 5 | now << 4 | past << 3 \
-                        | int(before[z + 2, y + 1, x]) << 2 | int(before[z + 1, y, x]) << 1 | int(before[z, y + 1, x])
-                    left, state, at = adapt(int(cells[s, z, y, x]), table, context, state, at, words, trace)
-                    cells[s, z, y, x] = here[z + 1, y + 1, x] = left
+                    corners = 2 * int(north[x + 1]) + int(back[x + 1]) if x + 1 < X else 0
+                    now = int(before[x])
+                    context = left << 10 | int(north[x]) << 9 | int(back[x]) << 8 | int(below[x]) << 7 | corners << 5 \
+                        | now << 4 | past << 3 | int(front[x]) << 2 | int(above[x]) << 1 | int(behind[x])
+                    left, state, at = adapt(int(here[x]), table, context, state, at, words, trace)
+                    here[x] = left
                     past = now
                 if words is not None and at > words.size:
                     return state, at
