@@ -401,10 +401,10 @@ class Renderer:
         code = code_of(scene, appearance)
         stride = scene.step * quality.step
 
-        def draw(target: Target, pixels: int = ALL, points: int = 0, tiles: Tiles | None = None, **more: object) -> None:
+        def draw(target: Target, pixels: int = ALL, points: int = 0, **more: object) -> None:
             march, vertices = self._program(
                 program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels,
-                compute=self.compute and program == "march.glsl", tiles=tiles,
+                compute=self.compute and program == "march.glsl",
             )  # fmt: skip
             _set(
                 march,
@@ -478,7 +478,7 @@ class Renderer:
             shot = replace(shot, number=PICTURE + OTHER_PICTURE - before.number)
             picture = self._predicted(picture, self._target(part, size, shot.number), before.camera, shot.camera)
         blocks = tuple(-(-side // BLOCK) for side in size)
-        tiles = SPREAD if self._is_software and not self.compute else None
+        tiles = self._tiles
         raster = tiles.raster(blocks) if tiles else blocks
         probes, doubts = self._target(part, raster, PROBES), self._target(part, blocks, DOUBTS)
         common = {"size": tuple(map(float, size)), "turn": shot.turn, "raster": tuple(map(float, raster)),
@@ -488,24 +488,29 @@ class Renderer:
             self._empty(probes)
             bounds = _bounds(covered)
         squares = math.prod(tiles.squares(blocks)) if tiles else 0
-        draw(probes, ONLY_PROBES, squares, tiles, bounds=tuple(map(float, bounds)), **common)
+        draw(probes, ONLY_PROBES, squares, bounds=tuple(map(float, bounds)), **common)
         probes.seen.use(SEEN_PROBES_UNIT)
         probes.met.use(MET_PROBES_UNIT)
         picture.seen.use(SEEN_UNIT)
-        doubt, vertices = self._program("doubt.glsl", self.layout, moved=moved, tiles=tiles)
+        doubt, vertices = self._program("doubt.glsl", self.layout, moved=moved)
         _set(doubt, seen_predicted=SEEN_UNIT, tolerance=shot.quality.tolerance * (MOVED_TOLERANCE if moved else 1.0), **common)
         self._draw(doubts.framebuffer, vertices)
         if self._is_software:  # a graphics card would have to be waited for
             doubted = np.frombuffer(doubts.seen.read(), np.float32).sum() / 4  # four channels alike
             seen = math.prod(blocks) if covered is None else np.count_nonzero(covered)
             shot = replace(shot, whole=WHOLE_FOR if doubted > MOST_DOUBTED * seen else 0)
-        settle, vertices = self._program("settle.glsl", self.layout, tiles=tiles)
+        settle, vertices = self._program("settle.glsl", self.layout)
         _set(settle, **common)
         self._draw(picture.framebuffer, vertices, points=math.prod(blocks))
         doubts.seen.use(DOUBTS_UNIT)
         draw(picture, ONLY_DOUBTED, math.prod(blocks), doubts=DOUBTS_UNIT, **common)
         self._shots[part, size] = shot
         return picture
+
+    @property
+    def _tiles(self) -> Tiles | None:
+        """How probes lie; None: side by side."""
+        return SPREAD if self._is_software and not self.compute else None
 
     def _follows(self, shot: Shot, before: Shot) -> bool:
         """Whether a picture shows the same as the one before, a little later."""
@@ -598,9 +603,10 @@ class Renderer:
     def _program(
         self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
         shared: int = 0, pixels: int = ALL, moved: bool = False, view: int = 0,
-        compute: bool = False, tiles: Tiles | None = None,
+        compute: bool = False,
     ) -> tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
+        tiles = self._tiles
         key = name, layout.refined, rows, displaced, drawn, shared, pixels, moved, view, compute, tiles
         if key in self._programs:
             return self._programs[key]
