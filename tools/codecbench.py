@@ -104,9 +104,11 @@ class Notes:
             found.extend(map(json.loads, file))
         return dict(found[1:]) if found and found[0] == self.stamp else {}
 
-    def begin(self, points: dict[str, Point | None]) -> None:
-        """With those that are known."""
+    def begin(self) -> dict[str, Point | None]:
+        """Write the file anew, with what `read` finds, and return that."""
+        points = self.read()
         self.path.write_text("".join(json.dumps(line) + "\n" for line in (self.stamp, *points.items())))
+        return points
 
     def add(self, key: str, point: Point | None) -> None:
         with self.path.open("a") as file:
@@ -133,9 +135,7 @@ def measure(scene: Path, dataset: Path | None, processes: int, ablate: bool, not
     missing = {name: why for name, rival in others_at_hand.items() if (why := rival.missing())}
     jobs += [Job(scene, name, setting, others) for name, rival in others_at_hand.items() if name not in missing
              for setting in reversed(rival.settings)]  # fmt: skip
-    points = {} if notes is None else notes.read()
-    if notes is not None:
-        notes.begin(points)
+    points = {} if notes is None else notes.begin()
     left = [job for job in jobs if job.key not in points]
     for job, found_point in zip(left, in_parallel(left, views, processes), strict=True):
         points[job.key] = found_point
@@ -143,7 +143,7 @@ def measure(scene: Path, dataset: Path | None, processes: int, ablate: bool, not
             notes.add(job.key, found_point)
     coders = []
     for name in (*ours, *others_at_hand):
-        found = [point for job in jobs if job.coder == name and (point := points[job.key]) is not None]
+        found = [one for job in jobs if job.coder == name and (one := points[job.key]) is not None]
         coders.append({"coder": name, "missing": missing.get(name), "points": found})
     for coder in coders:
         coder["bd_rate"] = None if coder is coders[0] else bd_rate(coders[0]["points"], coder["points"])

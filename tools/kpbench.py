@@ -468,7 +468,7 @@ def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[resu
         print(f"kpbench: {record['name']}, judged by {judged_by}", file=sys.stderr)
         started = clock.monotonic()
         notes = options.out and codecbench.Notes(options.out.with_suffix(f".{record['name']}.points"), {
-            "judged_by": judged_by, **{key: record[key] for key in ("commit", "data_sha256", "machine", "versions")}})
+            key: record[key] for key in ("commit", "data_sha256", "machine", "versions", "settings")})
         coders = codecbench.measure(source, folder, options.processes, options.ablate, notes)
         took = {"bench_s": clock.monotonic() - started}
         for coder in coders:
