@@ -30,8 +30,8 @@ from kpc.format.file import SEGMENT_ROWS
 from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, quantise_plane, short_above
 from kpc.format.rans import compiled
 from kpc.format.symbols import (
-    ACTIVITIES, ANY, AROUND, FLAT, TRELLIS, UNKNOWN, Guide, activity, begin_row, fitted, foreseen, meant, neighbourhoods, next_place,
-    predict, remember,
+    ACTIVITIES, ANY, AROUND, FLAT, SLOPES, TRELLIS, UNKNOWN, Guide, activity, begin_row, factors, fitted, foreseen, look_above,
+    meant, neighbourhoods, next_place, predict, remember,
 )
 
 THIN = 1.3
@@ -147,9 +147,11 @@ def _search(
     v, r, cross and the names of neighbours as in `kpc.format.symbols`; v0, r0 and errors of survivors are held by their states.
     """
     H, W, M = wanted.shape
-    sets, apart = weights.astype(np.int64), 1 if lattice == ANY else 2  # of symbols that may follow
+    sets, classes = factors(weights), SLOPES * len(weights) >> 3
+    apart = 1 if lattice == ANY else 2  # of symbols that may follow
     symbols, counts = np.zeros((H, W, M), np.int8), np.zeros(price.shape)
-    v, r = np.zeros((3, W + 4), np.int64), np.zeros((3, W + 4), np.int64)
+    v, r = np.zeros((3, W + 4), np.int32), np.zeros((3, W + 4), np.int32)
+    leaning, steep, restless = np.zeros((len(sets), W), np.int32), np.zeros(W, np.int32), np.zeros(W, np.int32)
     cross = np.zeros((H, W), np.int16)
     V, R = np.zeros((W + 4, STATES), np.int64), np.zeros((W + 4, STATES), np.int64)  # of the survivor that ends there
     U = np.zeros((W + 2, STATES), np.float32)
@@ -163,6 +165,8 @@ def _search(
             r0, r1, r2, past = r[y % 3], r[(y + 2) % 3], r[(y + 1) % 3], cross[y]
             begin_row(v0, v1, v2, own, 0)
             begin_row(r0, r1, r2, own, UNKNOWN)
+            if own > 0:
+                look_above(sets, v1, v2, r1, r2, past, m, leaning, steep, restless)
             for s in range(STATES):
                 V[:2, s], R[:2, s] = v0[:2], r0[:2]
             cost[:] = np.inf
@@ -186,15 +190,11 @@ def _search(
                         V[X, s], R[X, s] = (w, rw) if left else (v1[X + 1], r1[X + 1])
                         cost[s], came[x, s], U[x + 1, s] = before[s] + 2 * here * BESIDE * U[x, s], s, here
                         continue
-                    if own == 0:
-                        n = nw = ne = nn = nww = nnw = nne = nee = w
-                        around = 7 * rw + rww
-                    else:
-                        n, nw, ne, nn = v1[X], v1[X - 1], v1[X + 1], v2[X]
-                        nww, nnw, nne, nee = v1[X - 2], v2[X - 1], v2[X + 1], v1[X + 2]
-                        around = 2 * (rw + r1[X]) + r1[X - 1] + r1[X + 1] + rww + r2[X]
-                    predicted, gradient, _ = predict(sets, w, n, nw, ne, ww, nn, nww, nnw, nne, nee)
-                    active, odd = activity(around, int(past[x]), gradient, m), s & 1 if lattice != ANY else 0
+                    if own == 0:  # nothing is above but what is to the left
+                        v1[x:x + 5], v2[x:x + 5], r1[x:x + 5], r2[x:x + 5] = w, w, rw, rw
+                        look_above(sets, v1[x:], v2[x:], r1[x:], r2[x:], past[x:], m, leaning[:, x:x + 1], steep[x:x + 1], restless[x:x + 1])
+                    predicted, gradient = predict(sets, classes, w, ww, int(v1[X - 1]), x, leaning, steep)
+                    active, odd = activity(restless[x], rw, rww, gradient, m), s & 1 if lattice != ANY else 0
                     kind = TRELLIS if lattice == AROUND and active >= FLAT else lattice
                     whole = foreseen(predicted, kind, odd)
                     if odd and kind == AROUND:

@@ -24,6 +24,7 @@ Naming, throughout this module
     cross       what r was in the channels before, smoothed
     lattice     which symbols may follow: ANY; those on the TRELLIS; or AROUND predictions, where it is flat, and else on the trellis
     kind        of a symbol among them: ANY, TRELLIS or AROUND
+    leaning steep restless      what lies above texels of a row, as `look_above` has it
     place       on the trellis, one of 8; it is odd where symbols, or differences, have to be
     table       counters of `kpc.format.rans`
     state at words trace    of `kpc.format.rans.decide`
@@ -63,7 +64,8 @@ REWEIGHTINGS, FIT_VALUES, RIDGE = 4, 1 << 14, 4.0
 UNKNOWN = 16
 """r before anything is known: one symbol."""
 
-_BIT_LENGTHS = np.array([k.bit_length() for k in range(5 * 255 + 1)], np.int8)
+SLOPES = np.array([min(k.bit_length(), 7) for k in range(5 * 255 + 1)])
+"""Of a gradient: one of 8 classes, of which each set of weights has as many."""
 _LOGARITHMS = np.array([0, 0] + [2 * (k.bit_length() - 2) + (k >> k.bit_length() - 2 & 1) for k in range(2, 2443)], np.int8)
 """Of k >= 2: 2 log2(k / 2), rounded down after linear interpolation between powers of two."""
 
@@ -272,10 +274,12 @@ def walk(symbols, coded, lattice, weights, state, at, words, trace, neighbours):
         neighbours: None, or as `neighbourhoods` returns them, to be filled.
     """
     H, W, M = symbols.shape
-    sets = weights.astype(np.int64)
+    sets = factors(weights)
     table = counters(ACTIVITIES * FRACTIONS * DECISIONS)
-    v, r = np.zeros((3, W + 4), np.int64), np.zeros((3, W + 4), np.int64)
+    v, r = np.zeros((3, W + 4), np.int32), np.zeros((3, W + 4), np.int32)
     cross = np.zeros((H, W), np.int16)
+    classes = SLOPES * len(sets) >> 3
+    leaning, steep, restless = np.zeros((len(sets), W), np.int32), np.zeros(W, np.int32), np.zeros(W, np.int32)
     noted = 0
     for m in range(M):
         for y in range(H):
@@ -283,22 +287,23 @@ def walk(symbols, coded, lattice, weights, state, at, words, trace, neighbours):
             v0, v1, v2, r0, r1, r2, past = v[here], v[above], v[higher], r[here], r[above], r[higher], cross[y]
             begin_row(v0, v1, v2, y, 0)
             begin_row(r0, r1, r2, y, UNKNOWN)
-            place = 0
+            if y > 0:
+                look_above(sets, v1, v2, r1, r2, past, m, leaning, steep, restless)
+            place, w, ww, rw, rww = 0, v0[1], v0[0], r0[1], r0[0]
             for x in range(W):
                 X = x + 2
                 if not coded[y, x]:
-                    if y == 0 or x > 0 and coded[y, x - 1]:
-                        v0[X], r0[X] = v0[X - 1], r0[X - 1]
-                    else:
-                        v0[X], r0[X] = v1[X + 1], r1[X + 1]
+                    ww, rww = w, rw
+                    if not (y == 0 or x > 0 and coded[y, x - 1]):
+                        w, rw = v1[X + 1], r1[X + 1]
+                    v0[X], r0[X] = w, rw
                     continue
                 if y == 0:  # nothing is above but what is to the left
-                    v1[x:x + 5], v2[x:x + 5] = v0[X - 1], v0[X - 1]
-                    r1[x:x + 5], r2[x:x + 5] = r0[X - 1], r0[X - 1]
-                w, n, nw, ne, ww, nn = v0[X - 1], v1[X], v1[X - 1], v1[X + 1], v0[X - 2], v2[X]
-                predicted, gradient, slope = predict(sets, w, n, nw, ne, ww, nn, v1[X - 2], v2[X - 1], v2[X + 1], v1[X + 2])
-                own = 2 * (r0[X - 1] + r1[X]) + r1[X - 1] + r1[X + 1] + r0[X - 2] + r2[X]
-                active, odd = activity(own, int(past[x]), gradient, m), place & 1
+                    v1[x:x + 5], v2[x:x + 5] = w, w
+                    r1[x:x + 5], r2[x:x + 5] = rw, rw
+                    look_above(sets, v1[x:], v2[x:], r1[x:], r2[x:], past[x:], m, leaning[:, x:x + 1], steep[x:x + 1], restless[x:x + 1])
+                predicted, gradient = predict(sets, classes, w, ww, v1[X - 1], x, leaning, steep)
+                active, odd = activity(restless[x], rw, rww, gradient, m), place & 1
                 kind = TRELLIS if lattice == AROUND and active >= FLAT else lattice
                 whole = foreseen(predicted, kind, odd)
                 fraction = predicted - (whole << 7)
@@ -312,15 +317,17 @@ def walk(symbols, coded, lattice, weights, state, at, words, trace, neighbours):
                     return state, at, False
                 symbols[y, x, m] = value
                 place = next_place(place, value, error, kind)
-                v0[X] = value
-                r0[X] = abs((value << 7) - predicted) >> 3
                 if neighbours is not None:
-                    row, both = neighbours[noted], w + n
-                    row[0], row[1], row[2] = slope, 2 * value - both, w - n
-                    row[3], row[4], row[5], row[6] = 2 * nw - both, 2 * ne - both, 2 * ww - both, 2 * nn - both
+                    row, n, nw = neighbours[noted], v1[X], v1[X - 1]
+                    both = w + n
+                    row[0], row[1], row[2] = SLOPES[gradient], 2 * value - both, w - n
+                    row[3], row[4], row[5], row[6] = 2 * nw - both, 2 * v1[X + 1] - both, 2 * ww - both, 2 * v2[X] - both
                     row[7], row[8] = 2 * v1[X - 2] - both, 2 * v2[X - 1] - both
                     row[9], row[10] = 2 * v2[X + 1] - both, 2 * v1[X + 2] - both
                     noted += 1
+                ww, rww = w, rw
+                w, rw = value, abs((value << 7) - predicted) >> 3
+                v0[X], r0[X] = w, rw
             v0[W + 2:], r0[W + 2:] = v0[W + 1], r0[W + 1]
             if words is not None and at > words.size:
                 return state, at, True
@@ -331,16 +338,44 @@ def walk(symbols, coded, lattice, weights, state, at, words, trace, neighbours):
     return state, at, True
 
 
+@compiled()
+def factors(weights):
+    """(C, 1 + WEIGHTS) int32, in 1 / 128: of w n nw ne ww nn, and of the four that lie farther away, in a sum of neighbours. (C, WEIGHTS) weights
+    are of w - n and of what others are beyond the mean of w and n."""
+    sets = np.empty((len(weights), 1 + WEIGHTS), np.int32)
+    for c in range(len(weights)):
+        rest = 64 - weights[c, 1:].sum()
+        sets[c, 0], sets[c, 1] = rest + weights[c, 0], rest - weights[c, 0]
+        sets[c, 2:] = 2 * weights[c, 1:].astype(np.int32)
+    return sets
+
+
 @inlined
-def predict(sets, w, n, nw, ne, ww, nn, nww, nnw, nne, nee):
-    """What neighbours say of a symbol, in 1 / 128; how much they differ, and that in 8 classes. `sets`: int64 weights."""
-    gradient = abs(w - nw) + abs(n - nw) + abs(n - ne) + abs(w - ww) + abs(n - nn)
-    slope = min(int(_BIT_LENGTHS[gradient]), 7)
-    both, c = w + n, slope * len(sets) >> 3
-    predicted = 64 * both + sets[c, 0] * (w - n) + sets[c, 1] * (2 * nw - both) + sets[c, 2] * (2 * ne - both) \
-        + sets[c, 3] * (2 * ww - both) + sets[c, 4] * (2 * nn - both) + sets[c, 5] * (2 * nww - both) \
-        + sets[c, 6] * (2 * nnw - both) + sets[c, 7] * (2 * nne - both) + sets[c, 8] * (2 * nee - both)
-    return min(max(predicted, -128 * 128), 127 * 128), gradient, slope
+def look_above(sets, v1, v2, r1, r2, past, m, leaning, steep, restless):
+    """For each texel of a row, what lies above it adds to its prediction by each set, `leaning`; to the gradient; and to its activity.
+
+    Apart from what lies to the left, since all of a row can be had at once. `sets`: of `factors`."""
+    W = steep.size
+    for c in range(len(sets)):
+        n, nw, ne, nn, nww, nnw, nne, nee = (
+            sets[c, 1], sets[c, 2], sets[c, 3], sets[c, 5], sets[c, 6], sets[c, 7], sets[c, 8], sets[c, 9])
+        for x in range(W):
+            X = x + 2
+            leaning[c, x] = nww * v1[X - 2] + nw * v1[X - 1] + n * v1[X] + ne * v1[X + 1] + nee * v1[X + 2] \
+                + nnw * v2[X - 1] + nn * v2[X] + nne * v2[X + 1]
+    now, before = (16, 0) if m == 0 else (11, 5)
+    for x in range(W):
+        X = x + 2
+        steep[x] = abs(v1[X] - v1[X - 1]) + abs(v1[X] - v1[X + 1]) + abs(v1[X] - v2[X])
+        restless[x] = now * (2 * r1[X] + r1[X - 1] + r1[X + 1] + r2[X]) + before * int(past[x])
+
+
+@inlined
+def predict(sets, classes, w, ww, nw, x, leaning, steep):
+    """What neighbours say of a symbol, in 1 / 128, and how much they differ. `classes`: the set to take, by that."""
+    gradient = abs(w - nw) + abs(w - ww) + steep[x]
+    c = classes[gradient] if len(sets) > 1 else 0  # what waits for the gradient waits long
+    return min(max(sets[c, 0] * w + sets[c, 4] * ww + leaning[c, x], -128 * 128), 127 * 128), gradient
 
 
 @inlined
@@ -350,9 +385,9 @@ def nearest(predicted, odd, doubled):
 
 
 @inlined
-def activity(own, past, gradient, m):
+def activity(restless, rw, rww, gradient, m):
     """How far predictions may be off, one of ACTIVITIES classes: by r around, by r of the channels before, and by `gradient`."""
-    total = (4 * own if m == 0 else 11 * own + 5 * past >> 2) + 20 * gradient
+    total = (restless + (16 if m == 0 else 11) * (2 * rw + rww) >> 2) + 20 * gradient
     return int(_LOGARITHMS[total + 128 >> 6])
 
 
