@@ -40,7 +40,6 @@ _ALONG_COLUMNS, _ALONG_ROWS = (0, 0, 1, 0, 1, 2), (1, 2, 2, 3, 3, 3)
 # Not "reassoc": the order of sums would differ between code compiled in this process and the same code from numba's cache,
 # and the first training run on a machine would end elsewhere than the second.
 _FASTMATH = {"nsz", "arcp", "contract", "afn"}
-_jit = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True)
 _bare = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True, _nrt=False)
 """For what makes and returns no array: without counting who holds one, which is atomic and takes a sixth of a step; numba has no public
 name for that."""
@@ -385,7 +384,7 @@ def _march(
     return count, trans
 
 
-@_jit
+@njit(fastmath=_FASTMATH, error_model="numpy", cache=True, nogil=True)
 def _scratch(table, M, capacity):
     S = table.shape[0]
     values = np.ones((capacity, S * 6 * M), np.float32)  # ones: the planes a static scene does not have

@@ -43,17 +43,19 @@ class QuantisedMotion:
 
 
 def quantise_motion(offsets: np.ndarray) -> QuantisedMotion:
-    """Round a motion grid to multiples of STEP, or of what 16 bits allow; one that holds but multiples of k STEP is stored with that step.
+    """Round a motion grid to multiples of STEP, or of what 16 bits allow; one that holds but multiples of k STEP is stored with that step. What
+    is DISPLACEMENT_LIMIT, but for its sign, is stored as a step less.
 
     Raises:
-        FormatError: an offset is NaN or beyond half of DISPLACEMENT_LIMIT.
+        FormatError: an offset is NaN or beyond DISPLACEMENT_LIMIT.
     """
     largest = float(np.abs(offsets).max())
-    if not largest <= DISPLACEMENT_LIMIT / 2:  # False for NaN, too
-        raise FormatError(f"motion: holds NaN or a displacement of more than {DISPLACEMENT_LIMIT / 2:g} boxes, which no file can "
-                          "store; train with a lower learning rate")
-    step = np.float32(max(STEP, np.nextafter(np.float32(largest / 32767), np.float32(np.inf))))
-    symbols = np.rint(offsets.astype(np.float64) / step).astype(np.int16)
+    if not largest <= DISPLACEMENT_LIMIT:  # False for NaN, too
+        raise FormatError(f"motion: holds NaN or a displacement of more than {DISPLACEMENT_LIMIT:g} boxes, which no file can store; train with a "
+                          "lower learning rate")
+    wide_enough = np.nextafter(np.float32(largest / 32767), np.float32(np.inf))
+    step = np.float32(np.clip(wide_enough, STEP, DISPLACEMENT_LIMIT / 32768))
+    symbols = np.rint(offsets.astype(np.float64) / step).clip(-32768, 32767).astype(np.int16)
     # Of a power of two, so that nothing is rounded anew; 0 where nothing moves.
     multiple = int(np.gcd.reduce(symbols, axis=None)) or 1 if step == STEP else 1
     return QuantisedMotion(symbols // np.int16(multiple), float(step) * multiple)

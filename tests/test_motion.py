@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from kpc.encoder import field
 from kpc.format.errors import FormatError
 from kpc.format.grid import linear
-from kpc.format.motion import DISPLACEMENT_LIMIT, STEP, _fill, moved, places_reached, quantise_motion
+from kpc.format.motion import DISPLACEMENT_LIMIT, STEP, QuantisedMotion, _fill, moved, places_reached, quantise_motion
 
 RNG = np.random.default_rng(0)
 
@@ -64,7 +64,14 @@ def test_multiples_of_several_steps_are_stored_as_such(multiple: int) -> None:
     np.testing.assert_array_equal(rounded.dequantise(), offsets)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, DISPLACEMENT_LIMIT])
+def test_all_that_a_file_can_hold_can_be_stored_anew() -> None:
+    widest = QuantisedMotion(np.resize(np.int16([-32768, 32767, 0]), (2, 2, 2, 2, 3)), DISPLACEMENT_LIMIT / 32768)
+    again = quantise_motion(widest.dequantise())
+    assert again.step == widest.step
+    np.testing.assert_array_equal(again.symbols, widest.symbols)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, np.nextafter(np.float32(-DISPLACEMENT_LIMIT), np.float32(-np.inf))])
 def test_what_no_file_can_store(value: float) -> None:
     offsets = np.zeros((2, 2, 2, 2, 3), np.float32)
     offsets[1, 1, 0, 1, 2] = value
