@@ -466,14 +466,12 @@ def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[resu
         judged_by = "its own probe" if folder is None else f"held-out views of {_folder(folder).resolve().name}"
         record = _record("codec", source, origin, {"judged_by": judged_by, "processes": options.processes})
         print(f"kpbench: {record['name']}, judged by {judged_by}", file=sys.stderr)
-        started = clock.monotonic()
         notes = options.out and codecbench.Notes(options.out.with_suffix(f".{record['name']}.points"), {
             key: record[key] for key in ("commit", "data_sha256", "machine", "versions", "settings")})
         coders = codecbench.measure(source, folder, options.processes, options.ablate, notes)
-        took = {"bench_s": clock.monotonic() - started}
         for coder in coders:
             repeats = [codecbench.headline(coder["points"])]
-            records.append(record | {"seed": None, "renderer": "cpu"} | took | coder | {"repeats": repeats})
+            records.append(record | {"seed": None, "renderer": "cpu"} | coder | {"repeats": repeats})
             yield records[-1]
         noted += [notes.path] if notes else []
     if options.out is not None:
