@@ -351,6 +351,12 @@ def factors(weights):
 
 
 @inlined
+def shares(m):
+    """Of r in this channel and in those before it, in `activity`, in quarters. The first channel has none before it."""
+    return (16, 0) if m == 0 else (11, 5)
+
+
+@inlined
 def look_above(sets, v1, v2, r1, r2, past, m, leaning, steep, restless):
     """For each texel of a row, what lies above it adds to its prediction by each set, `leaning`; to the gradient; and to its activity.
 
@@ -363,7 +369,7 @@ def look_above(sets, v1, v2, r1, r2, past, m, leaning, steep, restless):
             X = x + 2
             leaning[c, x] = nww * v1[X - 2] + nw * v1[X - 1] + n * v1[X] + ne * v1[X + 1] + nee * v1[X + 2] \
                 + nnw * v2[X - 1] + nn * v2[X] + nne * v2[X + 1]
-    now, before = (16, 0) if m == 0 else (11, 5)
+    now, before = shares(m)
     for x in range(W):
         X = x + 2
         steep[x] = abs(v1[X] - v1[X - 1]) + abs(v1[X] - v1[X + 1]) + abs(v1[X] - v2[X])
@@ -387,7 +393,7 @@ def nearest(predicted, odd, doubled):
 @inlined
 def activity(restless, rw, rww, gradient, m):
     """How far predictions may be off, one of ACTIVITIES classes: by r around, by r of the channels before, and by `gradient`."""
-    total = (restless + (16 if m == 0 else 11) * (2 * rw + rww) >> 2) + 20 * gradient
+    total = (restless + shares(m)[0] * (2 * rw + rww) >> 2) + 20 * gradient
     return int(_LOGARITHMS[total + 128 >> 6])
 
 
