@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kpc.encoder.config import TrainConfig
+from kpc.encoder.config import TrainConfig, Variation
 from kpc.encoder.occupancy import grid_shape
 from kpc.format.scene import (
     ACTIVATION_LIMIT, ALL_PLANES, LOG_DENSITY_LIMIT, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder,
@@ -461,23 +461,26 @@ def _texels(name: str, first: int, rows: int, columns: int, M: int) -> tuple[Ten
     return first + torch.stack([j * columns + i for j, i in near]).flatten(1), one_of
 
 
-def priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
+def priors(field: Field, config: TrainConfig, variation: Variation) -> dict[str, Tensor]:
     """The weighted priors of the planes by the name of their weight, in plain PyTorch: the reference of the `add_*` kernels.
 
-    space_variation * mean of squared neighbour differences, on space planes; on space-time planes
+    space_variation * the mean of differences between neighbours, as `variation` weighs them, on space planes; on space-time planes
     transient_variation * the same along space alone, time_smoothness * mean (P[t-1] - 2 P[t] + P[t+1])^2, and
     sparse_transients * mean |1 - P|; each summed over the planes it concerns.
     """
     table, (neighbours, (in_space, in_time, within)) = field.theta.view(-1, field.layout.channels), field.texels
     right, below, above = (table.index_select(0, texels) for texels in neighbours)
-    along, across = (right - table).square().sum(1), (below - table).square().sum(1)
-    total = {
-        "space_variation": _sum(along + across, in_space),
-        "transient_variation": _sum(along, in_time),
-        "time_smoothness": _sum((above - 2 * table + below).square().sum(1), within),
-        "sparse_transients": _sum((1 - table).abs().sum(1), in_time),
+    along, across = (_weighed((other - table).square(), variation.steep).sum(1) for other in (right, below))
+    return {
+        "space_variation": variation.space * _sum(along + across, in_space),
+        "transient_variation": variation.transient * _sum(along, in_time),
+        "time_smoothness": config.time_smoothness * _sum((above - 2 * table + below).square().sum(1), within),
+        "sparse_transients": config.sparse_transients * _sum((1 - table).abs().sum(1), in_time),
     }
-    return {name: getattr(config, name) * value for name, value in total.items()}
+
+
+def _weighed(squares: Tensor, steep: float) -> Tensor:
+    return torch.log1p(steep * squares) / steep if steep else squares
 
 
 def _sum(values: Tensor, shares: Tensor) -> Tensor:

@@ -686,33 +686,39 @@ def adam(theta, grad, mean, square, lr, beta1, beta2, epsilon, step_number):
             p[i] -= rate * (m[i] / correction1) / (math.sqrt(v[i] / correction2) + eps)
 
 
+@_inlined
+def _pull(difference, steep):
+    """Half the slope of log(1 + steep d^2) / steep."""
+    return difference / (np.float32(1.0) + steep * difference * difference)
+
+
 @_parallel
-def add_variation(theta, grad, start, rows, columns, M, along_rows, across_rows):
-    """Add the gradient of the mean over (i, j, m) of squared differences between neighbours (total variation).
+def add_variation(theta, grad, start, rows, columns, M, along_rows, across_rows, steep):
+    """Add the gradient of the mean over (i, j, m) of log(1 + steep d^2) / steep, d differences between neighbours; of d^2 where `steep` is 0.
 
     Those in the same row count `along_rows`, those in the same column `across_rows`: a space-time plane is smoothed along
     space alone, its rows.
     """
-    width = columns * M
+    width, steep = columns * M, np.float32(steep)
     along, across = np.float32(2.0 * along_rows / (rows * width)), np.float32(2.0 * across_rows / (rows * width))
     for row in prange(rows):
         a = start + row * width
         here = theta[a : a + width]
         out = grad[a : a + width]
         for i in range(M, width):
-            out[i] += along * (here[i] - here[i - M])
+            out[i] += along * _pull(here[i] - here[i - M], steep)
         for i in range(width - M):
-            out[i] += along * (here[i] - here[i + M])
+            out[i] += along * _pull(here[i] - here[i + M], steep)
         if across == 0:
             continue
         if row > 0:
             above = theta[a - width : a]
             for i in range(width):
-                out[i] += across * (here[i] - above[i])
+                out[i] += across * _pull(here[i] - above[i], steep)
         if row < rows - 1:
             below = theta[a + width : a + 2 * width]
             for i in range(width):
-                out[i] += across * (here[i] - below[i])
+                out[i] += across * _pull(here[i] - below[i], steep)
 
 
 @_parallel

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from kpc.encoder import kernels
-from kpc.encoder.config import TrainConfig
+from kpc.encoder.config import TrainConfig, Variation
 from kpc.encoder.field import Field, appearance_priors, motion_priors, priors
 from kpc.encoder.proposals import Level, Proposals, histogram_loss
 from kpc.encoder.recorder import Recorder
@@ -116,7 +116,7 @@ class FusedOptimiser:
             )
         with self.watch("priors"):
             if number % config.regularise_every == 0:
-                add_priors(self.field, self.theta, self.grad[0], config, config.regularise_every)
+                add_priors(self.field, self.theta, self.grad[0], config, config.variation(fraction), config.regularise_every)
         with self.watch("decoder"):
             self.decoder.zero_grad()
             basis.backward(torch.from_numpy(grad_basis if config.view_dependent else grad_basis.sum(0, keepdims=True)))
@@ -174,7 +174,8 @@ class Plan:
 
     Attributes:
         number: of the step where proposals are sampled, whose schedule it sets; else 0.
-        step_length, extent: as in `FusedOptimiser.step`. moving, regularised: whether the motion grid, and the planes' priors, take part.
+        step_length, extent: as in `FusedOptimiser.step`. moving: whether the motion grid takes part.
+        variation: None where the planes' priors take no part.
         most: samples that a ray can take. rooms: on a GPU, for how many samples that are taken, and that are reached; elsewhere for as many as there are, None.
     """
 
@@ -182,7 +183,7 @@ class Plan:
     step_length: float
     extent: float
     moving: bool
-    regularised: bool
+    variation: Variation | None
     most: int
     rooms: tuple[int, int] | None
 
@@ -246,7 +247,7 @@ class PlainOptimiser:
         most = sample_capacity(aabb, step_length, self.mapping)
         plan = Plan(
             number if self.proposals is not None else 0, step_length, extent,
-            self.field.motion is not None and number % config.motion_every == 0, regularised,
+            self.field.motion is not None and number % config.motion_every == 0, config.variation(fraction) if regularised else None,
             most, self._rooms_for(rays, most) if self._on_gpu else None,
         )
         with self.watch("moves"):
@@ -272,7 +273,7 @@ class PlainOptimiser:
         with self.watch("priors"):
             for each in self.fields if regularised and self.fused else ():
                 theta, grad = each.theta.detach().numpy(), each.theta.grad.numpy()
-                add_priors(each, theta, grad, config, config.regularise_every)
+                add_priors(each, theta, grad, config, config.variation(fraction), config.regularise_every)
         with self.watch("adam"):
             self.planes.step()
             self.decoder.step()
@@ -307,8 +308,8 @@ class PlainOptimiser:
             loss = loss + _total(motion_priors(field, config))
         if field.codes is not None:
             loss = loss + _total(appearance_priors(field, config))
-        for each in self.fields if plan.regularised and not self.fused else ():
-            loss = loss + config.regularise_every * _total(priors(each, config))
+        for each in self.fields if plan.variation is not None and not self.fused else ():
+            loss = loss + config.regularise_every * _total(priors(each, config, plan.variation))
         loss.backward()  # type: ignore[no-untyped-call]
         if field.motion is not None and not plan.moving:
             field.motion.grad = None
@@ -370,15 +371,15 @@ def _total(weighed: dict[str, torch.Tensor]) -> torch.Tensor:
     return torch.stack(list(weighed.values())).sum()
 
 
-def add_priors(field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, times: float) -> None:
+def add_priors(field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, variation: Variation, times: float) -> None:
     """Add `times` the gradient of `kpc.encoder.field.priors` to grad."""
     M = field.layout.channels
-    space, transient = times * config.space_variation, times * config.transient_variation
+    space, transient, steep = times * variation.space, times * variation.transient, variation.steep
     for _, name, start, rows, columns in field.layout.planes():
         if name in SPACE_PLANES:
-            kernels.add_variation(theta, grad, start, rows, columns, M, space, space)
+            kernels.add_variation(theta, grad, start, rows, columns, M, space, space, steep)
             continue
-        kernels.add_variation(theta, grad, start, rows, columns, M, transient, 0.0)
+        kernels.add_variation(theta, grad, start, rows, columns, M, transient, 0.0, steep)
         kernels.add_time_smoothness(theta, grad, start, rows, columns, M, times * config.time_smoothness)
         size = rows * columns * field.layout.channels
         kernels.add_sparse_transients(theta, grad, start, size, times * config.sparse_transients)

@@ -194,7 +194,7 @@ class Trainer:
     def _not_finite(self) -> str:
         """Which terms of the loss hold NaN or infinity, the colours being one of them, and which parameters they come from."""
         field, config = self.field, self.config
-        weighed = priors(field, config) | motion_priors(field, config) | appearance_priors(field, config)
+        weighed = priors(field, config, config.variation(0.0)) | motion_priors(field, config) | appearance_priors(field, config)
         terms = ["colour"] + [name for name, value in weighed.items() if not torch.isfinite(value)]
         planes = [f"{name} at scale {s}" for s, name, *_ in self.field.layout.planes()
                   if not torch.isfinite(self.field.plane(s, name)).all()]

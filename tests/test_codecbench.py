@@ -109,7 +109,7 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
         # A file's own rounding is not much finer; and errors leap where a plane of so few texels leaves the trellis for predictions.
         assert 0 <= found["agreement_db"] - (20 + quality / 3) < 1.5
     assert "| scene | 60 | 70 | 80 | 90 |" in results.markdown(records)
-    others = codecbench.others_bytes(codecbench.model.load(scene_file))
+    others = codecbench.others_bytes(scene_file)
     assert min(p["size_bytes"] for p in halves["points"]) > others > 100
     assert all("its own probe" == record["settings"]["judged_by"] for record in records)
     assert "kpc is smaller by" in said.err and "Coding, beside what is at hand" in results.markdown(records)

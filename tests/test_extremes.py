@@ -131,9 +131,9 @@ def test_learning_from_planes_exactly_at_identity() -> None:
     rays = rays_at(scene, 203)
     ours = backpropagate(scene, rays, torch.zeros(203, 3))
     field = Field.from_scene(scene)
-    prior = np.zeros(field.layout.size, np.float32)
-    add_priors(field, field.theta.detach().numpy(), prior, TrainConfig(), 1.0)
-    sum(priors(field, TrainConfig()).values()).backward()
+    prior, variation = np.zeros(field.layout.size, np.float32), TrainConfig().variation(1.0)
+    add_priors(field, field.theta.detach().numpy(), prior, TrainConfig(), variation, 1.0)
+    sum(priors(field, TrainConfig(), variation).values()).backward()
     for _, name, start, rows, columns in field.layout.planes():
         part = slice(start, start + rows * columns * field.layout.channels)
         if "t" in name:

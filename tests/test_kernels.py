@@ -199,18 +199,21 @@ WEIGHTS = dict(space_variation=0.3, transient_variation=0.4, time_smoothness=0.7
 
 
 @pytest.mark.parametrize("alone", [None, *WEIGHTS])
+@pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize("dynamic", [True, False])
-def test_priors_are_the_gradient_of_their_twin(dynamic: bool, alone: str | None) -> None:
+def test_priors_are_the_gradient_of_their_twin(dynamic: bool, late: bool, alone: str | None) -> None:
     """All of them together, and each on its own."""
     field = Field.from_scene(tiny_scene(dynamic=dynamic))
     with torch.no_grad():
         field.theta += 0.1 * torch.randn(field.layout.size, generator=torch.Generator().manual_seed(0))
         field.theta[-50:] = 1.0  # the kink of |1 - P|, where the gradient is 0 by agreement
     config = TrainConfig(**{name: weight if alone in (None, name) else 0.0 for name, weight in WEIGHTS.items()})
+    variation = replace(config, late_space_variation=config.space_variation).variation(float(late))
+    assert (variation.steep > 0) is late
     grad = np.ones(field.layout.size, np.float32)
-    add_priors(field, field.theta.detach().numpy(), grad, config, 4.0)
+    add_priors(field, field.theta.detach().numpy(), grad, config, variation, 4.0)
     field = field.double()
-    (4 * sum(priors(field, config).values())).backward()
+    (4 * sum(priors(field, config, variation).values())).backward()
     expected = field.theta.grad.numpy()
     # `grad` held 1 before: what is added is rounded to 2^-24 of that, a few times.
     np.testing.assert_allclose(grad - 1, expected, atol=8 * 2.0**-24 + 1e-6 * np.abs(expected).max())

@@ -72,12 +72,11 @@ TUNED = {"AV1, tuned": "AV1"}
 @dataclass(frozen=True)
 class Job:
     """A coder and a setting for one scene. `coder`: OURS, one of WITHOUT, for both of which `trade` is, or the name of one of RIVALS
-    or of TUNED. `others_bytes`: of our file, besides planes."""
+    or of TUNED."""
 
     scene: Path
     coder: str
     setting: int | str
-    others_bytes: int
     trade: Trade = Trade()
 
     @property
@@ -124,16 +123,14 @@ def measure(scene: Path, dataset: Path | None, processes: int, ablate: bool, not
     """
     source = model.load(scene)
     views = None if dataset is None else held_out_views(source.scene, dataset)
-    others = others_bytes(source)
     count = source.scene.parameter_count
     rates = {f"{rate:g} bits": Trade(target_bytes=int(rate * count / 8)) for rate in RATES}
     qualities = {f"quality {q:g}": Trade(quality=q) for q in QUALITIES}
     ours = [OURS, *(WITHOUT if ablate else ())]
-    jobs = [Job(scene, name, said, others, trade) for name in ours
-            for said, trade in ((rates if name == OURS else {}) | qualities).items()]  # fmt: skip
+    jobs = [Job(scene, name, said, trade) for name in ours for said, trade in ((rates if name == OURS else {}) | qualities).items()]
     others_at_hand = RIVALS | {name: RIVALS[rival] for name, rival in TUNED.items() if rival in RIVALS}
     missing = {name: why for name, rival in others_at_hand.items() if (why := rival.missing())}
-    jobs += [Job(scene, name, setting, others) for name, rival in others_at_hand.items() if name not in missing
+    jobs += [Job(scene, name, setting) for name, rival in others_at_hand.items() if name not in missing
              for setting in reversed(rival.settings)]  # fmt: skip
     points = {} if notes is None else notes.begin()
     left = [job for job in jobs if job.key not in points]
@@ -178,15 +175,16 @@ def point(job: Job) -> Point | None:
     if job.coder in RIVALS:
         coding = RIVALS[job.coder].code(_tidied(job.scene), int(job.setting))
         judged = measured(replace(source.scene, scales=tuple(coding.planes)))
-        size, took = coding.size_bytes + job.others_bytes, (coding.encode_s, coding.decode_s)
+        size, took = coding.size_bytes + others_bytes(job.scene), (coding.encode_s, coding.decode_s)
         return _point(job, source, size, took, uncoded.psnr, judged)
     started = time.perf_counter()
     if job.coder in TUNED:
         scene, codings = tuned_through(RIVALS[TUNED[job.coder]], int(job.setting), source.scene)
-        size = sum(coding.size_bytes for coding in codings) + job.others_bytes
+        searched = time.perf_counter()
+        size = sum(coding.size_bytes for coding in codings) + others_bytes(job.scene)
         took = sum(coding.encode_s for coding in codings), sum(coding.decode_s for coding in codings)
         found = _point(job, source, size, took, uncoded.psnr, measured(scene))
-        return found | {"search_s": time.perf_counter() - started}
+        return found | {"search_s": searched - started}
     try:
         tune_steps = TUNE_STEPS if job.coder == OURS else 0
         coded = model.code(source, job.trade, TrainConfig().prune_share, tune_steps, WITHOUT.get(job.coder),
@@ -248,8 +246,10 @@ def _tidied(path: Path) -> Any:
     return rivals.tidied(model.load(path).scene)
 
 
-def others_bytes(source: Model) -> int:
+@lru_cache(1)
+def others_bytes(path: Path) -> int:
     """Stored bytes of all chunks but planes, in our file of the scene."""
+    source, _, _ = _source(path)  # whose curvature is known then, or found once
     coded = source.coded or model.code(source, Trade(), 0.0, 0).scene
     reader = file.SceneReader(file.encode(coded))
     return sum(entry.stored_length for entry in reader.index if entry.kind != "PLNE")
