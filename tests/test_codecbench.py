@@ -186,7 +186,7 @@ def test_held_out_views_judge(few: None, scene_file: Path, tmp_path: Path, monke
 
 
 def test_processes_of_their_own(scene_file: Path) -> None:
-    jobs = [codecbench.Job(scene_file, "kpc without tuning", "quality 5", 0, codecbench.Trade(quality=5.0)), codecbench.Job(scene_file, Bytes().name, 4, 100)]
+    jobs = [codecbench.Job(scene_file, "kpc without tuning", "quality 5", codecbench.Trade(quality=5.0)), codecbench.Job(scene_file, Bytes().name, 4)]
     ours, levels = codecbench.in_parallel(jobs, None, 2)
     assert ours is not None and levels is not None and ours["psnr"] < 30 and levels["size_bytes"] > 100
     assert math.isfinite(levels["psnr"])
