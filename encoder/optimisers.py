@@ -243,12 +243,11 @@ class PlainOptimiser:
     ) -> tuple[float, float]:
         """As `FusedOptimiser.step`."""
         config, rays = self.config, len(targets)
-        regularised = number % config.regularise_every == 0
+        variation = config.variation(fraction) if number % config.regularise_every == 0 else None
         most = sample_capacity(aabb, step_length, self.mapping)
         plan = Plan(
             number if self.proposals is not None else 0, step_length, extent,
-            self.field.motion is not None and number % config.motion_every == 0, config.variation(fraction) if regularised else None,
-            most, self._rooms_for(rays, most) if self._on_gpu else None,
+            self.field.motion is not None and number % config.motion_every == 0, variation, most, self._rooms_for(rays, most) if self._on_gpu else None,
         )
         with self.watch("moves"):
             if self._aabb is None:
@@ -271,9 +270,9 @@ class PlainOptimiser:
             else:
                 figures = work(*inputs)
         with self.watch("priors"):
-            for each in self.fields if regularised and self.fused else ():
+            for each in self.fields if variation is not None and self.fused else ():
                 theta, grad = each.theta.detach().numpy(), each.theta.grad.numpy()
-                add_priors(each, theta, grad, config, config.variation(fraction), config.regularise_every)
+                add_priors(each, theta, grad, config, variation, config.regularise_every)
         with self.watch("adam"):
             self.planes.step()
             self.decoder.step()

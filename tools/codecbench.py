@@ -243,7 +243,7 @@ def _source(path: Path) -> tuple[Model, Measured, Measure]:
 
 @lru_cache(1)
 def _tidied(path: Path) -> Any:
-    return rivals.tidied(model.load(path).scene)
+    return rivals.tidied(_source(path)[0].scene)
 
 
 @lru_cache(1)
