@@ -568,7 +568,7 @@ class Player:
             self._picture(dial.pace.scale, dial.rung)
             self._is_paced = True
             drawn, resting = self.renderer.quality, LADDER[dial.resting]
-            is_whole = self.raster == self.canvas.size and not drawn.tolerance and drawn.across == resting.across
+            is_whole = self.raster == self.canvas.size and not (drawn.tolerance or drawn.bend) and drawn.across == resting.across
             self._is_sharp = is_whole and dial.rung == dial.resting
         elif not self._is_sharp and now - self._moved > SHARPEN_AFTER_S:
             self._sharpen()
@@ -607,12 +607,14 @@ class Player:
             self._is_sharp, self.raster = True, (width, height)
 
     def _set_quality(self, rung: str, still: bool) -> None:
-        """That of a rung, but for what is set by hand; a picture that stands still owes nothing to the one before. A processor sends
-        several rays through a pixel of that alone: before, more pixels tell more."""
+        """That of a rung, but for what is set by hand; a picture that stands still is marched pixel by pixel. A processor sends several
+        rays through a pixel of that alone: before, more pixels tell more."""
         quality = LADDER[rung]
-        folded, tolerance = quality.folded and not self.exact, 0.0 if still else quality.tolerance
-        across = quality.across if still or not is_software(self.ctx) else 1
-        self.renderer.quality = replace(quality, folded=folded, tolerance=tolerance, across=across)
+        if still:
+            quality = replace(quality, tolerance=0.0, bend=0.0)
+        elif is_software(self.ctx):
+            quality = replace(quality, across=1)
+        self.renderer.quality = replace(quality, folded=quality.folded and not self.exact)
 
     def _show(self, target: moderngl.Framebuffer, camera: Camera) -> None:
         started = clock.monotonic()

@@ -283,20 +283,60 @@ def test_steady_playback_makes_nothing_new() -> None:
 
 @pytest.mark.parametrize("software", [True, False])
 def test_where_all_is_in_doubt_pictures_are_whole_for_a_while(monkeypatch: pytest.MonkeyPatch, software: bool) -> None:
-    monkeypatch.setattr(module, "MOST_DOUBTED", -1.0)
+    monkeypatch.setattr(module, "MOST_DOUBTED", 0.0)
     renderer = Renderer(gl.context(), tiny_scene(4), LADDER["balanced"])
     whole = Renderer(gl.context(), tiny_scene(4), replace(LADDER["balanced"], tolerance=0.0))
     renderer._is_software = whole._is_software = software
     turns = []
-    for k in range(2 + 2 * (module.WHOLE_FOR + 1)):
+    for k in range(2 + 2 * (module.ALONE_FOR + 1)):
         time = 0.2 + 0.01 * k
         got, wanted = renderer.render(CAMERA, time), whole.render(CAMERA, time)
         (shot,) = renderer._shots.values()
         turns.append(shot.turn)
         if shot.turn == 0:
             np.testing.assert_array_equal(got.rgb, wanted.rgb)
-    assert (turns == [0, *([1] + module.WHOLE_FOR * [0]) * 2, 1]) == software
+    assert (turns == [0, *([1] + module.ALONE_FOR * [0]) * 2, 1]) == software
     assert software or turns == list(range(len(turns)))
+
+
+# --- coarse to fine
+
+
+@pytest.mark.parametrize("size", [(128, 96), (127, 61), (16, 200), (1, 1), (4096, 1), (9, 8)])
+@pytest.mark.parametrize("software", [True, False])
+def test_only_where_colours_bend_each_pixel_is_marched(size: tuple[int, int], software: bool) -> None:
+    scene, camera = tiny_scene(4), replace(CAMERA.resized(*size), fl_x=140.0, fl_y=140.0)
+    pictures = {}
+    for bend in (0.0, 1e-6, 0.02, 0.1, 2.0):
+        renderer = Renderer(gl.context(), scene, Quality(bend=bend))
+        renderer._is_software = software
+        pictures[bend] = renderer.render(camera, 0.4)
+        marched = renderer._draw_coarse_to_fine(lambda *_, **__: None, Part.FULL, renderer._target(Part.FULL, size), camera)
+        coarse = [key for key in renderer._targets if key[2] == module.COARSE]
+        assert bool(coarse) == (bend > 0 and min(size) >= 2 * module.BLOCK) and (not software or 0 < marched <= 2)
+    whole = pictures[0.0]
+    if min(size) < 2 * module.BLOCK:
+        assert all(np.array_equal(each.rgb, whole.rgb) for each in pictures.values())
+        return
+    off = {bend: np.abs(each.rgb - whole.rgb).max(axis=2) for bend, each in pictures.items()}
+    assert all(np.mean(off[bend] > bend) < 1e-3 for bend in (1e-6, 0.02, 0.1))  # but for slivers that no coarser ray meets
+    assert psnr(pictures[1e-6].rgb, whole.rgb) > 55 and psnr(pictures[0.02].rgb, whole.rgb) > 50 and psnr(pictures[0.1].rgb, whole.rgb) > 40
+    assert np.abs(pictures[0.1].opacity - whole.opacity).mean() < 0.01
+
+
+def test_each_texel_is_met_by_a_ray() -> None:
+    """What spans less of a pixel's coarser ones is marched as it is; so is a space where texels differ."""
+    scene = tiny_scene(4, resolution=(33, 17, 17))
+    renderer, texel, middle = Renderer(gl.context(), scene, Quality(bend=2.0)), scene.extent / 32, scene.aabb.mean(0)
+    for texels, coarser in ((0.51, 0), (0.49, 1), (0.26, 1), (0.24, 2)):
+        camera = look_at(tuple(middle + np.array([0, 0, 100 * texels * texel])), tuple(middle), 64, 48, 70.0)
+        renderer.render(replace(camera, fl_x=100.0, fl_y=100.0), 0.5)
+        assert sum(key[2] == module.COARSE for key in renderer._targets) == coarser
+        renderer._targets.clear()
+    for space in ("contracted", "ndc"):
+        scene = SPACES[space](tiny_scene(4))
+        renderer, whole = Renderer(gl.context(), scene, Quality(bend=2.0)), Renderer(gl.context(), scene)
+        np.testing.assert_array_equal(renderer.render(CAMERA, 0.5).rgb, whole.render(CAMERA, 0.5).rgb)
 
 
 # --- what is far away
