@@ -30,6 +30,12 @@ def test_the_same_curve_at_half_the_rate_is_half_as_large() -> None:
     assert bd_rate(points(0.6), other) == pytest.approx(-0.4, abs=1e-9)
 
 
+def test_curves_of_planes_leave_out_what_else_there_is() -> None:
+    ours, others = ([point | {"size_bytes": 1e4 + point["size_bytes"], "planes_bytes": point["size_bytes"]} for point in points(scale)] for scale in (0.5, 1.0))
+    assert bd_rate(ours, others, "planes_bytes") == pytest.approx(-0.5, abs=1e-9)
+    assert -0.2 < (bd_rate(ours, others) or 0) < 0
+
+
 def test_curves_are_compared_where_both_are_and_not_below_the_worst_loss() -> None:
     far = [{"psnr": p, "loss_db": 30 - p, "size_bytes": 10.0 * (p + 1)} for p in (1.0, 5.0, 10.0, 20.0)]
     assert bd_rate(points(0.5) + far, points(1.0) + far) == pytest.approx(-0.5, abs=0.02)
@@ -111,6 +117,11 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert "| scene | 60 | 70 | 80 | 90 |" in results.markdown(records)
     others = codecbench.others_bytes(scene_file)
     assert min(p["size_bytes"] for p in halves["points"]) > others > 100
+    assert all(found["size_bytes"] - found["planes_bytes"] == others for found in halves["points"])
+    for found in ours["points"]:
+        of_planes = found["shares"].get("PLNE", 0) + found["shares"]["index"]
+        assert found["planes_bytes"] == pytest.approx(of_planes * found["size_bytes"])
+    assert halves["bd_rate_planes"] < halves["bd_rate"] < 0
     assert all("its own probe" == record["settings"]["judged_by"] for record in records)
     assert "kpc is smaller by" in said.err and "Coding, beside what is at hand" in results.markdown(records)
     with (tmp_path / "codec.csv").open() as table:

@@ -2,7 +2,8 @@
 
 Every coder gets the same planes, those of the checkpoint or, of a .kpc file, its own dequantised ones, and is judged by the same
 pixels. A rival is given for nothing what our file spends bytes on besides planes: decoder, occupancy and cameras are counted as our
-file stores them, header and index not at all. One is tuned as ours is, too.
+file stores them, header and index not at all. One is tuned as ours is, too. What codes the planes alone is compared as well, of our
+files all but those other chunks.
 """
 
 import contextlib
@@ -143,7 +144,8 @@ def measure(scene: Path, dataset: Path | None, processes: int, ablate: bool, not
         found = [one for job in jobs if job.coder == name and (one := points[job.key]) is not None]
         coders.append({"coder": name, "missing": missing.get(name), "points": found})
     for coder in coders:
-        coder["bd_rate"] = None if coder is coders[0] else bd_rate(coders[0]["points"], coder["points"])
+        for key, size in (("bd_rate", "size_bytes"), ("bd_rate_planes", "planes_bytes")):
+            coder[key] = None if coder is coders[0] else bd_rate(coders[0]["points"], coder["points"], size)
     return coders
 
 
@@ -175,15 +177,14 @@ def point(job: Job) -> Point | None:
     if job.coder in RIVALS:
         coding = RIVALS[job.coder].code(_tidied(job.scene), int(job.setting))
         judged = measured(replace(source.scene, scales=tuple(coding.planes)))
-        size, took = coding.size_bytes + others_bytes(job.scene), (coding.encode_s, coding.decode_s)
-        return _point(job, source, size, took, uncoded.psnr, judged)
+        return _point(job, source, coding.size_bytes, others_bytes(job.scene), (coding.encode_s, coding.decode_s), uncoded.psnr, judged)
     started = time.perf_counter()
     if job.coder in TUNED:
         scene, codings = tuned_through(RIVALS[TUNED[job.coder]], int(job.setting), source.scene)
         searched = time.perf_counter()
-        size = sum(coding.size_bytes for coding in codings) + others_bytes(job.scene)
+        size = sum(coding.size_bytes for coding in codings)
         took = sum(coding.encode_s for coding in codings), sum(coding.decode_s for coding in codings)
-        found = _point(job, source, size, took, uncoded.psnr, measured(scene))
+        found = _point(job, source, size, others_bytes(job.scene), took, uncoded.psnr, measured(scene))
         return found | {"search_s": searched - started}
     try:
         tune_steps = TUNE_STEPS if job.coder == OURS else 0
@@ -196,7 +197,8 @@ def point(job: Job) -> Point | None:
     encoded = time.perf_counter()
     scene = file.read(data).dequantise()
     took = encoded - searched, time.perf_counter() - encoded
-    found = _point(job, source, len(data), took, uncoded.psnr, measured(scene))
+    others = _others_in(data)
+    found = _point(job, source, len(data) - others, others, took, uncoded.psnr, measured(scene))
     return found | {"search_s": searched - started, "shares": shares(data)}
 
 
@@ -215,9 +217,12 @@ def tuned_through(rival: Rival, setting: int, scene: Scene) -> tuple[Scene, list
     return replace(back, decoder=round_decoder(back.decoder)), codings
 
 
-def _point(job: Job, source: Model, size: int, took: tuple[float, float], uncoded_psnr: float, judged: Measured) -> Point:
+def _point(
+    job: Job, source: Model, planes_size: int, others_size: int, took: tuple[float, float], uncoded_psnr: float, judged: Measured
+) -> Point:
+    size = planes_size + others_size
     return {
-        "setting": job.setting, "size_bytes": size, "bits_per_parameter": 8 * size / source.scene.parameter_count,
+        "setting": job.setting, "size_bytes": size, "planes_bytes": planes_size, "bits_per_parameter": 8 * size / source.scene.parameter_count,
         "psnr": judged.psnr, "loss_db": uncoded_psnr - judged.psnr, "agreement_db": judged.agreement_db,
         "encode_s": took[0], "decode_s": took[1],
     }  # fmt: skip
@@ -250,9 +255,12 @@ def _tidied(path: Path) -> Any:
 def others_bytes(path: Path) -> int:
     """Stored bytes of all chunks but planes, in our file of the scene."""
     source, _, _ = _source(path)  # whose curvature is known then, or found once
-    coded = source.coded or model.code(source, Trade(), 0.0, 0).scene
-    reader = file.SceneReader(file.encode(coded))
-    return sum(entry.stored_length for entry in reader.index if entry.kind != "PLNE")
+    return _others_in(file.encode(source.coded or model.code(source, Trade(), 0.0, 0).scene))
+
+
+def _others_in(data: bytes) -> int:
+    """Of a file: stored bytes of all chunks but planes. Header and index count for these."""
+    return sum(entry.stored_length for entry in file.SceneReader(data).index if entry.kind != "PLNE")
 
 
 def shares(data: bytes) -> dict[str, float]:

@@ -14,15 +14,15 @@ WORST_LOSS_DB = 3.0
 """Curves are compared down to this: what is worse nobody wants."""
 
 
-def bd_rate(ours: Sequence[Point], others: Sequence[Point]) -> float | None:
+def bd_rate(ours: Sequence[Point], others: Sequence[Point], size: str = "size_bytes") -> float | None:
     """By what share ours are smaller (below 0) or larger at equal PSNR, on average over what both reach of the PSNR between that of
-    the uncoded scene and WORST_LOSS_DB less.
+    the uncoded scene and WORST_LOSS_DB less. `size`: of a point, which bytes to compare.
 
     Bjøntegaard's measure (ITU-T VCEG-M33, 2001) with piecewise cubic curves that do not overshoot (PCHIP: Fritsch and Carlson,
     SIAM J. Numer. Anal. 17, 1980; as ITU-T JVET-H0030 has it): the mean over PSNR of log(rate ratio). None where the curves have
     fewer than four points each, or no PSNR in common.
     """
-    curves = [_rising(points) for points in (ours, others)]
+    curves = [_rising(points, size) for points in (ours, others)]
     best = max((point["psnr"] + point["loss_db"] for point in ours), default=0.0)
     if min(len(psnr) for psnr, _ in curves) < 4:
         return None
@@ -46,11 +46,11 @@ def size_at(points: Sequence[Point], loss_db: float) -> float | None:
     return math.exp(float(PchipInterpolator(psnr, rate)(wanted)))
 
 
-def _rising(points: Sequence[Point]) -> tuple[np.ndarray, np.ndarray]:
+def _rising(points: Sequence[Point], size: str = "size_bytes") -> tuple[np.ndarray, np.ndarray]:
     """PSNR and log sizes of those points that no smaller one equals, by size."""
     best: list[tuple[float, float]] = []
-    for point in sorted(points, key=lambda point: (point["size_bytes"], -point["psnr"])):
+    for point in sorted(points, key=lambda point: (point[size], -point["psnr"])):
         if not best or point["psnr"] > best[-1][0] + 1e-6:
-            best.append((point["psnr"], math.log(point["size_bytes"])))
+            best.append((point["psnr"], math.log(point[size])))
     psnr, rate = zip(*best) if best else ((), ())
     return np.array(psnr), np.array(rate)

@@ -96,11 +96,11 @@ def _ways(record: Record) -> str:
 
 
 def _smaller(record: Record) -> str:
-    """By how much ours is smaller at equal PSNR, on average over the curve."""
+    """By how much ours is smaller at equal PSNR, on average over the curve; and what codes its planes."""
     if record.get("missing"):
         return str(record["missing"])
-    rate = record["bd_rate"]
-    return "-" if rate is None else f"{-rate:.0%}"
+    rates = [record["bd_rate"], record.get("bd_rate_planes")]
+    return ", ".join(f"{-rate:.0%}" for rate in rates if rate is not None) or "-"
 
 
 def _shares(record: Record) -> str:
@@ -261,7 +261,7 @@ COLUMNS: dict[str, list[Column]] = {
         ("scene", lambda r: r["name"]),
         ("coder", lambda r: r["coder"]),
         ("KB at 0.15 dB loss", _number("size_at_default_loss", "{:.0f}", 1e3)),
-        ("kpc is smaller by", _smaller),
+        ("kpc is smaller by, its planes by", _smaller),
         ("near it: KB", _number("size_bytes", "{:.0f}", 1e3)),
         ("bits/param", _number("bits_per_parameter", "{:.2f}")),
         ("PSNR loss dB", _number("loss_db", "{:.2f}")),
