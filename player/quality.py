@@ -38,7 +38,7 @@ class Quality:
             twice as much, are marched whole. 0: all pixels are. So is a picture that follows no other.
         bend: what no picture before tells is marched with half of the rays across and up first, and those with half of them, as long as there
             is one for each texel; blocks where colours bend by more than this, of the full range, from ray to ray are marched whole, others
-            interpolated. Not where space is mapped: there texels differ. 0: all pixels are marched.
+            interpolated. 0: all pixels are marched.
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated.
         across: rays across a pixel, at most: as many as it spans texels of the finest scale, and their mean is its colour. What is far
             away else shimmers. Room in a picture so small that a pixel spans three texels is 30.0 dB from that of 36 rays a pixel,

@@ -19,7 +19,7 @@ from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
 from kpc.player.cover import Cover
 from kpc.player.quality import LADDER, Quality
-from kpc.player.reference import Part, Rendering, code_of, slot_at
+from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
 from kpc.player.textures import (
     FOLDED_AXIS, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four, planes_shape,
 )
@@ -50,6 +50,8 @@ PIXELS_MARCHED = 1 << 22
 FOLLOWS_S = 0.2
 """A picture so much later in the clip than the one before has too little in common with it to follow it; nor does one follow at
 the same time: while the clip stands still, pictures are whole."""
+PLACES_ALONG = 64
+"""Of a ray, to look at how many texels a pixel spans."""
 COMPUTE_VERSION = 430
 TRIAL_AFTER, TRIALS = 8, 3
 """Marches until fragment and compute shaders are tried against each other, and pictures that each of them draws for that."""
@@ -178,6 +180,23 @@ def room_on(ctx: moderngl.Context, what: str) -> Iterator[None]:
 def _texels_across(scale: Mapping[str, np.ndarray]) -> int:
     """Along the longest edge of the box, from the first one's middle to the last one's; 1 where one is all there is."""
     return max(1, *(size - 1 for plane in SPACE_PLANES for size in scale[plane].shape[:2]))
+
+
+def texels_spanned(scene: Scene, camera: Camera) -> float:
+    """Of the finest scale, by a pixel in the middle of a picture: the most anywhere along its ray, of a scene whose space is mapped."""
+    middle = replace(camera.resized(2, 2), fl_x=camera.fl_x, fl_y=camera.fl_y, cx=1.0, cy=1.0)
+    origins, directions = middle.rays()
+    if isinstance(scene.mapping, DeviceCoordinates):
+        path = scene.mapping.path(origins, directions)
+        origins, directions = path.begin, path.way
+    near, far = sample_range(scene, origins, directions)
+    along = np.linspace(near.min(), far.max(), PLACES_ALONG, dtype=np.float32)
+    _, u, _ = places(scene, origins, directions, np.tile(along, (4, 1)))
+    finest = scene.scales[-1]
+    texels = np.array([finest["xy"].shape[1], finest["xy"].shape[0], finest["xz"].shape[0]]) - 1
+    seen = ((u > 0) & (u < 1)).all(axis=(0, 2))
+    apart = np.abs(np.diff(u, axis=0)[::2]) * texels  # of a pixel and the one to its right
+    return float(apart[:, seen].max(initial=0.0))
 
 
 def _bounds(blocks: np.ndarray) -> tuple[int, int, int, int]:
@@ -474,8 +493,8 @@ class Renderer:
     def _draw_coarse_to_fine(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> float:
         """March a coarser picture, itself drawn so, stretch it, and march pixel by pixel those blocks of it in which colours bend. Tells the
         share of pixels that were marched, where a processor draws."""
-        size, mapped = (camera.width, camera.height), self.scene.mapping is not None
-        if not self.quality.bend or mapped or COARSER * self._texels_spanned(camera) > 1 or min(size) < COARSER * BLOCK:
+        size = camera.width, camera.height
+        if not self.quality.bend or min(size) < COARSER * BLOCK or COARSER * self._texels_spanned(camera) > 1:
             return self._draw_all(draw, part, target, camera)
         fewer = camera.resized(*(-(-side // COARSER) for side in size))
         coarse = self._target(part, (fewer.width, fewer.height), COARSE)
@@ -607,7 +626,9 @@ class Renderer:
         return max(1, min(math.floor(self._texels_spanned(camera)), self.quality.across, room))
 
     def _texels_spanned(self, camera: Camera) -> float:
-        """By a pixel, of the finest scale, in the middle of the box."""
+        """By a pixel, of the finest scale: in the middle of the box; where space is mapped, the most along the ray in the picture's middle."""
+        if self.scene.mapping is not None:
+            return texels_spanned(self.scene, camera)
         away = np.linalg.norm(self.scene.aabb.mean(0) - camera.camera_to_world[:3, 3])
         return float(away / min(camera.fl_x, camera.fl_y) / (self.scene.extent / _texels_across(self.scene.scales[-1])))
 
