@@ -451,14 +451,12 @@ class Renderer:
                 self._draw(target.framebuffer, vertices, points=points)
 
         before = self._shots.pop((part, raster), None)
-        if program == "march.glsl" and quality.tolerance > 0:
+        if program == "march.glsl" and quality.tolerance:
             target = self._followed(draw, part, before, Shot(camera, time, code.tobytes(), quality))
+        elif program == "march.glsl":
+            self._draw_coarse_to_fine(draw, part, target := self._target(part, raster), camera)
         else:
-            target = self._target(part, raster)
-            if program == "march.glsl":
-                self._draw_coarse_to_fine(draw, part, target, camera)
-            else:
-                draw(target)
+            draw(target := self._target(part, raster))
         if raster == size:
             return target
         return self._resampled(target, self._target(part, size), across)
