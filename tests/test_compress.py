@@ -224,7 +224,7 @@ def test_what_is_tuned_meets_the_trade(factor: float) -> None:
         seen: list[Attempt] = []
         assert 0.9 * most <= loss(tuned_to(factor, seen, max_loss_db=most)) <= most
         assert 1 <= len(seen) <= TUNINGS
-    assert agreement_of(60) <= tuned_to(factor, quality=60).measured.agreement_db <= agreement_of(60) + 0.5
+    assert agreement_of(60) <= tuned_to(factor, quality=60).measured.agreement_db <= agreement_of(60) + 0.75  # so few texels leap
     target = coded(quality=60).size_bytes
     assert 0.9 * target < tuned_to(factor, target_bytes=target).size_bytes <= target
 
@@ -235,7 +235,7 @@ def test_errors_of_what_is_tuned_may_follow_steps_less_or_more(power: float) -> 
     seen: list[Attempt] = []
     factor = 0.7 * float(2.0**plain.exponent) ** (1 - power)
     assert 0.9 * 0.15 <= loss(tuned_to(factor, seen, power, max_loss_db=0.15)) <= 0.15
-    assert 2 <= len(seen) <= TUNINGS
+    assert 1 <= len(seen) <= TUNINGS  # one where the first guess, which rounding moves, is good enough
 
 
 def test_tuning_that_does_harm_is_not_taken() -> None:
