@@ -35,8 +35,8 @@ class Quality:
         share: scales whose texels are at least so many steps long are looked up once for two samples, in the middle between them.
         tolerance: while the clip plays, a picture is predicted from the one before. One pixel of each block of sixteen is marched,
             all by turns; blocks where that differs from the prediction by more than this, of the full range, or a neighbour's by
-            twice as much, are marched whole. 0: all pixels are. So is a picture that follows no other.
-        bend: what no picture before tells is marched with half of the rays across and up first, and those with half of them, as long as there
+            twice as much, are marched whole. 0: no picture follows another.
+        bend: a picture that follows no other is marched with half of the rays across and up first, and those with half of them, as long as there
             is one for each texel; blocks where colours bend by more than this, of the full range, from ray to ray are marched whole, others
             interpolated. 0: all pixels are marched.
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated.

@@ -454,7 +454,7 @@ class Renderer:
         if program == "march.glsl" and quality.tolerance:
             target = self._followed(draw, part, before, Shot(camera, time, code.tobytes(), quality))
         elif program == "march.glsl":
-            self._draw_coarse_to_fine(draw, part, target := self._target(part, raster), camera)
+            self._draw_alone(draw, part, target := self._target(part, raster), camera)
         else:
             draw(target := self._target(part, raster))
         if raster == size:
@@ -488,15 +488,20 @@ class Renderer:
         self._draw_doubted(draw, target, camera, covered)
         return float(blocks.mean())
 
-    def _draw_coarse_to_fine(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> float:
-        """March a coarser picture, itself drawn so, stretch it, and march pixel by pixel those blocks of it in which colours bend. Tells the
-        share of pixels that were marched, where a processor draws."""
+    def _draw_alone(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> float:
+        """A picture that follows no other. Tells the share of its pixels that were marched, where a processor draws."""
+        spanned = self._texels_spanned(camera) if self.quality.bend else math.inf
+        return self._draw_coarse_to_fine(draw, part, target, camera, spanned)
+
+    def _draw_coarse_to_fine(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera, spanned: float) -> float:
+        """March a coarser picture, itself drawn so, stretch it, and march pixel by pixel those blocks of it in which colours bend; all
+        where the coarser one's pixels would span more than a texel, as this one's `spanned`. Tells as `_draw_alone`."""
         size = camera.width, camera.height
-        if not self.quality.bend or min(size) < COARSER * BLOCK or COARSER * self._texels_spanned(camera) > 1:
+        if min(size) < COARSER * BLOCK or COARSER * spanned > 1:
             return self._draw_all(draw, part, target, camera)
         fewer = camera.resized(*(-(-side // COARSER) for side in size))
         coarse = self._target(part, (fewer.width, fewer.height), COARSE)
-        marched = self._draw_coarse_to_fine(draw, part, coarse, fewer)
+        marched = self._draw_coarse_to_fine(draw, part, coarse, fewer, COARSER * spanned)
         doubts = self._target(part, (-(-size[0] // BLOCK), -(-size[1] // BLOCK)), DOUBTS)
         bent, vertices = self._program("bent.glsl", self.layout)
         _set(bent, seen_coarse=SEEN_UNIT, size=tuple(map(float, size)), most=self.quality.bend)
@@ -520,7 +525,7 @@ class Renderer:
         """Draw what the picture before does not tell: its probes, and the blocks in which they are not as predicted."""
         camera, size = shot.camera, (shot.camera.width, shot.camera.height)
         if before is None or before.alone or not self._follows(shot, before):
-            marched = self._draw_coarse_to_fine(draw, part, picture := self._target(part, size), camera)
+            marched = self._draw_alone(draw, part, picture := self._target(part, size), camera)
             self._shots[part, size] = replace(shot, marched=marched, alone=max(before.alone - 1, 0) if before else 0)
             return picture
         shot = replace(shot, turn=before.turn + 1, number=before.number, marched=before.marched)

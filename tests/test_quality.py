@@ -313,7 +313,7 @@ def test_only_where_colours_bend_each_pixel_is_marched(size: tuple[int, int], so
         renderer = Renderer(gl.context(), scene, Quality(bend=bend))
         renderer._is_software = software
         pictures[bend] = renderer.render(camera, 0.4)
-        marched = renderer._draw_coarse_to_fine(lambda *_, **__: None, Part.FULL, renderer._target(Part.FULL, size), camera)
+        marched = renderer._draw_alone(lambda *_, **__: None, Part.FULL, renderer._target(Part.FULL, size), camera)
         coarse = [key for key in renderer._targets if key[2] == module.COARSE]
         assert bool(coarse) == (bend > 0 and min(size) >= 2 * module.BLOCK) and (not software or 0 < marched <= 2)
     whole = pictures[0.0]

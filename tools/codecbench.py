@@ -15,7 +15,7 @@ import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -197,9 +197,10 @@ def point(job: Job) -> Point | None:
     encoded = time.perf_counter()
     scene = file.read(data).dequantise()
     took = encoded - searched, time.perf_counter() - encoded
-    others = _others_in(data)
+    stored = stored_bytes(data)
+    others = _of_others(stored)
     found = _point(job, source, len(data) - others, others, took, uncoded.psnr, measured(scene))
-    return found | {"search_s": searched - started, "shares": shares(data)}
+    return found | {"search_s": searched - started, "shares": {kind: count / len(data) for kind, count in stored.items()}}
 
 
 def tuned_through(rival: Rival, setting: int, scene: Scene) -> tuple[Scene, list[Coding]]:
@@ -255,22 +256,20 @@ def _tidied(path: Path) -> Any:
 def others_bytes(path: Path) -> int:
     """Stored bytes of all chunks but planes, in our file of the scene."""
     source, _, _ = _source(path)  # whose curvature is known then, or found once
-    return _others_in(file.encode(source.coded or model.code(source, Trade(), 0.0, 0).scene))
+    return _of_others(stored_bytes(file.encode(source.coded or model.code(source, Trade(), 0.0, 0).scene)))
 
 
-def _others_in(data: bytes) -> int:
-    """Of a file: stored bytes of all chunks but planes. Header and index count for these."""
-    return sum(entry.stored_length for entry in file.SceneReader(data).index if entry.kind != "PLNE")
+def _of_others(stored: Mapping[str, int]) -> int:
+    """Of `stored_bytes`, those of all chunks but planes, for which header and index count."""
+    return sum(count for kind, count in stored.items() if kind not in ("PLNE", "index"))
 
 
-def shares(data: bytes) -> dict[str, float]:
-    """Of the bytes of a file: those of each kind of chunk, and of header and index."""
-    reader = file.SceneReader(data)
+def stored_bytes(data: bytes) -> dict[str, int]:
+    """Of a file: the bytes of each kind of chunk, and of header and index."""
     stored: dict[str, int] = {}
-    for entry in reader.index:
+    for entry in file.SceneReader(data).index:
         stored[entry.kind] = stored.get(entry.kind, 0) + entry.stored_length
-    stored["index"] = len(data) - sum(stored.values())
-    return {kind: count / len(data) for kind, count in stored.items()}
+    return stored | {"index": len(data) - sum(stored.values())}
 
 
 def held_out_views(scene: Scene, folder: Path) -> Probe:
