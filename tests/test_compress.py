@@ -18,9 +18,32 @@ from kpc.format import file
 from kpc.format.quantise import QuantisedScene, quantise_scene, round_decoder
 from kpc.format.scene import Scene
 
-SCENE = replace(tiny_scene(), occupancy=np.ones((1, 2, 2, 2), bool))  # every texel is needed
-EQUAL = [{name: np.ones(plane.shape[2]) for name, plane in scale.items()} for scale in SCENE.scales]
-ALIKE = [{name: np.ones_like(plane) for name, plane in scale.items()} for scale in SCENE.scales]
+def needed(scene: Scene) -> Scene:
+    """With every texel."""
+    return replace(scene, occupancy=np.ones((1, 2, 2, 2), bool))
+
+
+def equal(scene: Scene) -> Steps:
+    return [{name: np.ones(plane.shape[2]) for name, plane in scale.items()} for scale in scene.scales]
+
+
+def alike(scene: Scene) -> list[dict[str, np.ndarray]]:
+    return [{name: np.ones_like(plane) for name, plane in scale.items()} for scale in scene.scales]
+
+
+SCENE = needed(tiny_scene())
+EQUAL, ALIKE = equal(SCENE), alike(SCENE)
+
+
+@pytest.fixture
+def steady(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scene whose searches end alike however its numbers are rounded, as processors round differently: with errors of 2e-7 in each number
+    eight of eight times, while those of SCENE end elsewhere in three."""
+    scene = needed(tiny_scene(resolution=(16, 14, 12)))
+    for name, value in (("SCENE", scene), ("EQUAL", equal(scene)), ("ALIKE", alike(scene))):
+        monkeypatch.setattr(f"{__name__}.{name}", value)
+
+
 
 
 def measure(scene: Scene) -> Measured:
@@ -218,24 +241,24 @@ def tuned_to(factor: float, seen: list[Attempt] | None = None, power: float = 1.
 
 
 @pytest.mark.parametrize("factor", [0.6, 0.85])
-def test_what_is_tuned_meets_the_trade(factor: float) -> None:
+def test_what_is_tuned_meets_the_trade(steady: None, factor: float) -> None:
     """Within 10 %, after few tries, whatever tuning brings."""
     for most in (0.05, 0.15, 0.4):
         seen: list[Attempt] = []
         assert 0.9 * most <= loss(tuned_to(factor, seen, max_loss_db=most)) <= most
         assert 1 <= len(seen) <= TUNINGS
-    assert agreement_of(60) <= tuned_to(factor, quality=60).measured.agreement_db <= agreement_of(60) + 0.75  # so few texels leap
+    assert agreement_of(60) <= tuned_to(factor, quality=60).measured.agreement_db <= agreement_of(60) + 0.5
     target = coded(quality=60).size_bytes
     assert 0.9 * target < tuned_to(factor, target_bytes=target).size_bytes <= target
 
 
 @pytest.mark.parametrize("power", [0.6, 1.6])
-def test_errors_of_what_is_tuned_may_follow_steps_less_or_more(power: float) -> None:
+def test_errors_of_what_is_tuned_may_follow_steps_less_or_more(steady: None, power: float) -> None:
     plain = coded(max_loss_db=0.15)
     seen: list[Attempt] = []
     factor = 0.7 * float(2.0**plain.exponent) ** (1 - power)
     assert 0.9 * 0.15 <= loss(tuned_to(factor, seen, power, max_loss_db=0.15)) <= 0.15
-    assert 1 <= len(seen) <= TUNINGS  # one where the first guess, which rounding moves, is good enough
+    assert 2 <= len(seen) <= TUNINGS
 
 
 def test_tuning_that_does_harm_is_not_taken() -> None:
