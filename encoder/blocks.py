@@ -26,10 +26,9 @@ from kpc.format.blocks import (
     ENDS, FINENESSES, FREQUENCIES, LARGEST, PARTS, SIZES, USUAL, Blocks, around, blocks_of, coarser, cosines, decode_blocks, encode_blocks,
     end_context, foreseen_mean, largest_side, last_diagonal, level_context, quantisers, usual_end,
 )
-from kpc.format.file import SEGMENT_ROWS
 from kpc.format.quantise import QuantisedPlane, quantise_plane, short_above
 from kpc.format.rans import compiled, inlined
-from kpc.format.segments import Told
+from kpc.format.segments import Told, rows_of_segments
 
 PRICE = 0.03
 """Squared quantisers that a bit is worth: so quantisers are sqrt(LAM / PRICE) steps of the trellis at which bits are worth as much. With more
@@ -74,7 +73,7 @@ def in_blocks(
     symbol = short_above((STEPS * PARTS / quantiser * step).astype(np.float32))
     finer = quantise_plane(values, symbol, identity=identity, needed=known)
     wanted = (values.astype(np.float64) - finer.offset) / finer.step * (PARTS / quantiser)
-    rows = SEGMENT_ROWS if identity else len(values)
+    rows = rows_of_segments(len(values)) if identity else len(values)
     symbols, told = np.zeros(values.shape, np.int8), {}
     for start in range(0, len(values), rows):
         own = slice(start, start + rows)
@@ -88,12 +87,12 @@ def in_blocks(
 def step_in_blocks(plane: QuantisedPlane) -> np.ndarray:
     """(M,) float64: for which steps `in_blocks` was asked when it made this plane."""
     assert isinstance(plane.guide, Told)
-    quantiser = next(iter(plane.guide.segments.values()))[2]
+    quantiser = next(filter(None, plane.guide.segments.values()))[2]
     return plane.step.astype(np.float64) * quantiser / (STEPS * PARTS)
 
 
 def _own_blocks(together: np.ndarray, start: int, rows: int) -> np.ndarray:
-    """What goes together in some rows; SEGMENT_ROWS are whole blocks of it."""
+    """What goes together in some rows; segments are whole blocks of it."""
     return np.ascontiguousarray(together[start // SIDE : -(-(start + rows) // SIDE)])
 
 

@@ -17,10 +17,9 @@ from kpc.encoder.blocks import in_blocks, step_in_blocks
 from kpc.encoder.curvature import PerPlane
 from kpc.encoder.trellis import THIN, on_trellis, step_on_trellis
 from kpc.encoder.worth import ALONE, Name, cost, worths
-from kpc.format.file import SEGMENT_ROWS
 from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_scene
 from kpc.format.scene import TIME_PLANES, Scene
-from kpc.format.segments import Told, encode_coded, guide_at
+from kpc.format.segments import Told, encode_coded, guide_at, rows_of_segments
 
 SIDES = 8, 16
 """Of blocks that are tried. Those of 4 never cost least (room, soldier)."""
@@ -93,6 +92,6 @@ def _cheapest(
 
 def _size(plane: QuantisedPlane, identity: bool) -> int:
     """Bytes of its segments."""
-    rows = SEGMENT_ROWS if identity else len(plane.symbols)
+    rows = rows_of_segments(len(plane.symbols)) if identity else len(plane.symbols)
     return sum(len(encode_coded(plane.symbols[start : start + rows], plane.coded[start : start + rows], guide_at(plane.guide, start)))
                for start in range(0, len(plane.symbols), rows))  # fmt: skip

@@ -26,9 +26,9 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.encoder.worth import ACROSS, ALONE, BESIDE, LAM, bits_of_magnitudes, changes, others, worths
-from kpc.format.file import SEGMENT_ROWS
 from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, quantise_plane, short_above
 from kpc.format.rans import compiled
+from kpc.format.segments import rows_of_segments
 from kpc.format.symbols import (
     ACTIVITIES, ANY, AROUND, FLAT, SLOPES, TRELLIS, UNKNOWN, Guide, activity, begin_row, factors, fitted, foreseen, look_above,
     meant, neighbourhoods, next_place, predict, remember,
@@ -95,7 +95,7 @@ class _Search:
                  together: np.ndarray, lattice: int) -> None:
         self.plane, self.identity, self.together, self.lattice = plane, identity, together, lattice
         self._finer = FINER if lattice == AROUND else 1.0
-        self.rows = SEGMENT_ROWS if identity else len(values)
+        self.rows = rows_of_segments(len(values)) if identity else len(values)
         coarser = plane.step / step
         self.wanted = (values.astype(np.float64) - plane.offset) / plane.step
         known = np.ascontiguousarray(plane.coded)

@@ -14,10 +14,11 @@ scales, then later seconds. A plane segment that has not arrived is uncoded: it 
 import math
 import os
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -35,14 +36,12 @@ from kpc.format.nodes import decode_nodes, encode_nodes
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
-from kpc.format.segments import SegmentGuide, decode_coded, encode_coded, guide_at, guide_together, segment_guide
+from kpc.format.segments import (
+    SegmentGuide, Told, decode_coded, encode_coded, guide_at, guide_together, rows_of_segments, segment_guide,
+)
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 
 Parsed = TypeVar("Parsed")
-
-SEGMENT_ROWS = 32
-"""Of a time plane, that are decoded together. With 16 files of room and soldier are two and three percent larger, for each segment begins
-without neighbours and with counters that know nothing."""
 
 SCENE_STRUCT = struct.Struct("<6fIdd3fBB")
 """aabb, frame_count, fps, step, background, scale_count, dynamic"""
@@ -132,11 +131,12 @@ class SceneHead:
 # --- writing
 
 
-def write(scene: QuantisedScene, path: str | os.PathLike[str], *, segment_rows: int = SEGMENT_ROWS) -> int:
+def write(scene: QuantisedScene, path: str | os.PathLike[str], *, segment_rows: int | None = None) -> int:
     """Write a scene; return the size in bytes. On failure `path` is left as it was.
 
     Args:
-        segment_rows: rows of a time plane in one segment, the unit in which a player fetches time.
+        segment_rows: rows of a time plane in one segment, the unit in which a player fetches time; None: as many as is usual. Planes told in
+            blocks keep their own.
 
     Raises:
         FormatError: the scene breaks a rule that every reader checks; the message says which.
@@ -154,15 +154,15 @@ def save(data: bytes, path: str | os.PathLike[str]) -> int:
     return len(data)
 
 
-def encode(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS, compress: bool = True) -> bytes:
+def encode(scene: QuantisedScene, *, segment_rows: int | None = None, compress: bool = True) -> bytes:
     """The bytes of the file that `write` makes; without `compress` every chunk is stored raw."""
     chunks = scene_chunks(scene, segment_rows=segment_rows)
     return pack(chunks, sum(p.symbols.size for scale in scene.scales for p in scale.values()), compress=compress)
 
 
-def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> list[Chunk]:
+def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> list[Chunk]:
     """The chunks of a scene's file, in their order."""
-    if segment_rows < 1:
+    if segment_rows is not None and segment_rows < 1:
         raise FormatError(f"segment_rows {segment_rows} is not positive")
     try:
         head = _pack_head(scene)
@@ -188,20 +188,26 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int = SEGMENT_ROWS) -> 
             chunks.append(Chunk("appe", [appe]))
     except (struct.error, OverflowError) as error:
         raise FormatError(f"scene: a number does not fit its field ({error})") from error
-    latest = max(plane.rows for scale in parsed.scales for name, plane in scale.items() if name in TIME_PLANES) \
-        if parsed.is_dynamic else 1
-    for start in range(0, latest, segment_rows):
-        for number, scale in enumerate(scene.scales):
-            for name, plane in scale.items():
-                if name in TIME_PLANES:
-                    stop = min(start + segment_rows, len(plane.symbols))
-                else:
-                    stop = len(plane.symbols) if start == 0 else 0
-                if start < stop:
-                    segment, coded = plane.symbols[start:stop], plane.coded[start:stop]
-                    chunks.append(Chunk("PLNE", encode_segment(segment, coded), number, ALL_PLANES.index(name), start, stop - start,
-                                        {CODEC_SYMBOLS: partial(encode_coded, segment, coded, guide_at(plane.guide, start))}, segment.size))
+    segments = [(start / len(plane.symbols), number, ALL_PLANES.index(name), start, stop) for number, scale in enumerate(scene.scales)
+                for name, plane in scale.items() for start, stop in _segments_of(plane, name in TIME_PLANES, segment_rows)]
+    for _, number, of_plane, start, stop in sorted(segments):
+        plane = scene.scales[number][ALL_PLANES[of_plane]]
+        segment, coded = plane.symbols[start:stop], plane.coded[start:stop]
+        chunks.append(Chunk("PLNE", encode_segment(segment, coded), number, of_plane, start, stop - start,
+                            {CODEC_SYMBOLS: partial(encode_coded, segment, coded, guide_at(plane.guide, start))}, segment.size))
     return chunks
+
+
+def _segments_of(plane: QuantisedPlane, over_time: bool, segment_rows: int | None) -> list[tuple[int, int]]:
+    """First rows, and the rows after the last: as the plane is told, if it is in blocks, else of so many rows, or of as many as is usual."""
+    rows = len(plane.symbols)
+    if not over_time:
+        starts: Iterable[int] = [0]
+    elif isinstance(plane.guide, Told):
+        starts = sorted(plane.guide.segments)
+    else:
+        starts = range(0, rows, segment_rows or rows_of_segments(rows))
+    return list(pairwise([*starts, rows]))
 
 
 def _pack_head(scene: QuantisedScene) -> bytes:

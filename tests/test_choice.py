@@ -70,7 +70,7 @@ def test_errors_are_smaller_where_they_are_worth_more() -> None:
 
 
 def test_time_planes_are_told_by_segments_and_the_identity_stays() -> None:
-    values = np.ones((70, 40, 3), np.float32)
+    values = np.ones((96, 40, 3), np.float32)
     values[:64, 20:] += waves(6, 64, 20) / 10
     plane, size = in_blocks(values, 0.5, identity=True)
     assert isinstance(plane.guide, Told) and sorted(plane.guide.segments) == [0, 32, 64]

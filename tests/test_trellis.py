@@ -11,9 +11,9 @@ from kpc.encoder.choice import quantise_by_cost
 from kpc.encoder.trellis import STATES, TOLD_APART
 from kpc.encoder.worth import ALONE
 from kpc.format import file
-from kpc.format.file import SEGMENT_ROWS
 from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
 from kpc.format.scene import TIME_PLANES, Scene
+from kpc.format.segments import rows_of_segments
 from kpc.format.symbols import ACTIVITIES, TRELLIS, WEIGHTS, encode_symbols, follows_trellis, guide_of, next_state
 
 
@@ -246,7 +246,8 @@ def test_what_is_hardly_told_goes_around_predictions(identity: bool) -> None:
     rounded = quantise_plane(values, step, identity=identity)
 
     def cost(plane: QuantisedPlane) -> float:
-        parts = [slice(start, start + SEGMENT_ROWS) for start in range(0, 48, SEGMENT_ROWS)] if identity else [slice(None)]
+        segments = range(0, len(values), rows_of_segments(len(values)))
+        parts = [slice(start, start + segments.step) for start in segments] if identity else [slice(None)]
         bodies = [encode_symbols(plane.symbols[rows], plane.coded[rows], plane.guide) for rows in parts]
         assert all(guide_of(body) == plane.guide for body in bodies)
         errors = plane.dequantise() - values
