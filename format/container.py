@@ -2,6 +2,7 @@
 
     header (64 bytes) | index (chunk_count entries of 40 bytes) | chunk 0 | chunk 1 | ...        little-endian, no gaps
 
+Files of version 1 hold the index as it is, those of version 2 as a zstd frame of its columns.
 Everything is covered by a CRC32C: the header by its own, the index by one in the header, a chunk by one in its entry.
 This module knows nothing of scenes: a chunk is a kind, a place in the scene, and bytes.
 """
@@ -16,20 +17,26 @@ from pathlib import Path
 from typing import BinaryIO, Protocol, runtime_checkable
 
 import google_crc32c
+import numpy as np
 import zstandard
 
 from kpc.format.errors import FormatError
 
 MAGIC = b"\x89KPC\r\n\x1a\n"
-VERSION = 1
-READABLE_VERSIONS = (0, 1)
+PLAIN_VERSION, VERSION = 1, 2
+READABLE_VERSIONS = (0, PLAIN_VERSION, VERSION)
 """Files of the draft, version 0, are as those of version 1 but for the number."""
 HEADER = struct.Struct("<8sHHIQIIQQIIII")
 ENTRY = struct.Struct("<4sHBBIIHHIIIQ")
+TOLD = ENTRY.size - 8
+"""Bytes of an entry that version 2 tells: all but the offset, which follows from the lengths before it."""
 
 CODEC_RAW, CODEC_ZSTD, CODEC_SYMBOLS, CODEC_MIDPOINTS = range(4)
 ZSTD_LEVEL = 19
 
+LEAST_CHUNK = 8
+"""Bytes that a file of version 2 has for each of its chunks, at least; in one of version 1 each takes ENTRY.size. So few bytes cannot claim
+many chunks."""
 EXPANSION_LIMIT = 32768
 """Decoded bytes a byte of file may stand for (zstd's own limit): a small file cannot claim a huge scene."""
 CHUNK_LIMIT = 1 << 16
@@ -112,7 +119,7 @@ class Entry:
         group, scale, plane, row_start, row_count: the place in the scene of a plane segment, or in the clip of a group, whose rows
             are frames (`kpc.format.groups`); 0 for other kinds.
         codec: how the stored bytes become the raw ones.
-        offset, stored_length: where it lies in the file. raw_length: bytes once decoded. crc: of the stored bytes.
+        stored_length, offset: where it lies in the file. raw_length: bytes once decoded. crc: of the stored bytes.
     """
 
     kind: str
@@ -125,7 +132,7 @@ class Entry:
     stored_length: int
     raw_length: int
     crc: int
-    offset: int
+    offset: int = 0
 
     @property
     def is_critical(self) -> bool:
@@ -150,21 +157,21 @@ class Chunk:
     symbol_count: int = 0
 
 
-def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
+def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True, version: int = VERSION) -> bytes:
     """Lay chunks out in the given order; each is stored in what is smallest: raw, context-coded if it can be, or as a zstd
     frame (of planes only if they cannot).
 
     Args:
         value_count: numbers in all planes together.
-        compress: False stores every chunk raw.
+        compress: False stores every chunk raw, and the index as it is.
+        version: the newest that may be written; 1 has no other index than that.
 
     Raises:
         FormatError: the result would break a limit that every reader checks.
     """
     if len(chunks) > CHUNK_LIMIT:
         raise FormatError(f"{len(chunks)} chunks are more than the {CHUNK_LIMIT} that a file may have; use fewer and longer segments")
-    offset = HEADER.size + ENTRY.size * len(chunks)
-    entries, bodies, largest = [], [], 0
+    entries, bodies = [], []
     for chunk in chunks:
         raw = b"".join(chunk.parts)
         forms = [(raw, CODEC_RAW, len(raw))]
@@ -175,23 +182,46 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) ->
         if compress and (chunk.kind != "PLNE" or len(forms) == 1):  # zstd would double the time, and never beats symbols of planes
             forms += [(frame, CODEC_ZSTD, len(raw)) for frame in _zstd_frames(chunk.parts)]
         body, codec, length = min(forms, key=lambda form: len(form[0]))
-        entries.append(ENTRY.pack(chunk.kind.encode("ascii"), 0, chunk.scale, chunk.plane, chunk.row_start,
-                                  chunk.row_count, codec, 0, len(body), length, google_crc32c.value(body), offset))
+        entries.append(Entry(chunk.kind, 0, chunk.scale, chunk.plane, chunk.row_start, chunk.row_count, codec, len(body), length,
+                             google_crc32c.value(body)))
         bodies.append(body)
-        offset += len(body)
-        largest = max(largest, length)
-    if max(value_count, largest) > offset * EXPANSION_LIMIT:
-        raise FormatError(f"the scene is too empty for its size: {value_count:,} values in {offset:,} bytes; "
+    data = b"".join([header_and_index(entries, value_count, version if compress else PLAIN_VERSION), *bodies])
+    if max(value_count, *(entry.raw_length for entry in entries)) > len(data) * EXPANSION_LIMIT:
+        raise FormatError(f"the scene is too empty for its size: {value_count:,} values in {len(data):,} bytes; "
                           "choose a lower resolution")
-    return b"".join([header_and_index(entries, offset, value_count, largest), *bodies])
+    return data
 
 
-def header_and_index(entries: Sequence[bytes], file_length: int, value_count: int, largest_raw: int) -> bytes:
-    """How a file begins whose chunks the packed `entries` list; the other arguments as in `Header`."""
-    index = b"".join(entries)
-    header = HEADER.pack(MAGIC, VERSION, 0, HEADER.size, HEADER.size, len(index), len(entries), file_length, value_count,
-                         largest_raw, 0, google_crc32c.value(index), 0)
+def header_and_index(entries: Sequence[Entry], value_count: int, version: int = PLAIN_VERSION) -> bytes:
+    """How a file begins that holds the chunks of these entries, which need not know their offsets; as one of version 1 if a later one
+    would not be smaller."""
+    index, stored = _plain_index(entries), sum(entry.stored_length for entry in entries)
+    if version == VERSION:
+        told = _in_columns(index)
+        if len(told) < len(index) and len(told) + stored >= LEAST_CHUNK * len(entries):
+            index = told
+        else:
+            version = PLAIN_VERSION
+    file_length = HEADER.size + len(index) + stored
+    header = HEADER.pack(MAGIC, version, 0, HEADER.size, HEADER.size, len(index), len(entries), file_length, value_count,
+                         max((entry.raw_length for entry in entries), default=0), 0, google_crc32c.value(index), 0)
     return b"".join([header[:-4], struct.pack("<I", google_crc32c.value(header[:-4])), index])
+
+
+def _plain_index(entries: Sequence[Entry]) -> bytes:
+    """As files of version 1 hold it."""
+    offset, parts = HEADER.size + ENTRY.size * len(entries), []
+    for e in entries:
+        parts.append(ENTRY.pack(e.kind.encode("ascii"), e.group, e.scale, e.plane, e.row_start, e.row_count, e.codec, 0, e.stored_length,
+                                e.raw_length, e.crc, offset))
+        offset += e.stored_length
+    return b"".join(parts)
+
+
+def _in_columns(index: bytes) -> bytes:
+    """As those of version 2 hold it: byte 0 of all entries, then byte 1 of all, ..., but for offsets, in a zstd frame."""
+    columns = np.frombuffer(index, np.uint8).reshape(-1, ENTRY.size)[:, :TOLD].T.tobytes()
+    return zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(columns)
 
 
 def _zstd_frames(parts: Sequence[bytes]) -> list[bytes]:
@@ -253,8 +283,11 @@ class Reader:
             raise FormatError(f"{self.name}: the header is damaged (its CRC32C differs); fetch the file again")
         if flags or reserved or header_length != HEADER.size or index_offset != HEADER.size:
             raise FormatError(f"{self.name}: the header uses reserved fields; update kpc")
-        if not 0 < chunk_count <= CHUNK_LIMIT or index_length != chunk_count * ENTRY.size:
+        plain = chunk_count * ENTRY.size
+        if not 0 < chunk_count <= CHUNK_LIMIT or not (index_length < plain if version == VERSION else index_length == plain):
             raise FormatError(f"{self.name}: the header claims {chunk_count} chunks in {index_length} bytes of index")
+        if file_length < HEADER.size + LEAST_CHUNK * chunk_count:
+            raise FormatError(f"{self.name}: the header claims {chunk_count} chunks in a file of {file_length} bytes")
         if file_length < HEADER.size + index_length:
             raise FormatError(f"{self.name}: the header claims a file of {file_length} bytes, less than its index")
         if self.source.size > file_length:
@@ -273,23 +306,30 @@ class Reader:
         index = self.source.read_at(HEADER.size, self.header.index_length)
         if google_crc32c.value(index) != self.header.index_crc:
             raise FormatError(f"{self.name}: the chunk index is damaged (its CRC32C differs); fetch the file again")
-        entries, expected = [], HEADER.size + len(index)
-        for number, fields in enumerate(ENTRY.iter_unpack(index)):
+        entries, expected, has_offsets = [], HEADER.size + len(index), self.header.version != VERSION
+        for number, fields in enumerate(ENTRY.iter_unpack(index if has_offsets else self._out_of_columns(index))):
             kind, group, scale, plane, row_start, row_count, codec, reserved, stored, raw, crc, offset = fields
             if not (kind.isascii() and kind.isalpha()):
                 raise FormatError(f"{self.name}: chunk {number} has a kind that is not four letters")
             if reserved:
                 raise FormatError(f"{self.name}: chunk {number} uses reserved fields; update kpc")
-            if offset != expected:
+            if has_offsets and offset != expected:
                 raise FormatError(f"{self.name}: chunk {number} starts at byte {offset}, not at {expected}")
             if raw > self.header.largest_raw:
                 raise FormatError(f"{self.name}: chunk {number} claims {raw:,} bytes, more than the header's limit")
             entries.append(Entry(kind.decode("ascii"), group, scale, plane, row_start, row_count, codec, stored, raw,
-                                 crc, offset))
+                                 crc, expected))
             expected += stored
         if expected != self.header.file_length:
             raise FormatError(f"{self.name}: the chunks end at byte {expected} of {self.header.file_length}")
         return tuple(entries)
+
+    def _out_of_columns(self, index: bytes) -> bytes:
+        """Undo `_in_columns`; with offsets of 0."""
+        columns = self._unframed(index, self.header.chunk_count * TOLD, "chunk index")
+        rows = np.zeros((self.header.chunk_count, ENTRY.size), np.uint8)
+        rows[:, :TOLD] = np.frombuffer(columns, np.uint8).reshape(TOLD, -1).T
+        return rows.tobytes()
 
     def available(self, number: int) -> bool:
         """Whether all bytes of a chunk are there; False only in a partial file."""
@@ -322,7 +362,7 @@ class Reader:
         if entry.codec == CODEC_RAW:
             raw = body
         elif entry.codec == CODEC_ZSTD:
-            raw = self._decompress(number, body)
+            raw = self._unframed(body, entry.raw_length, f"chunk {number} ({entry.kind})")
         else:
             raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) uses codec {entry.codec}, "
                               "unknown to this reader; update kpc")
@@ -331,16 +371,15 @@ class Reader:
                               f"not the {entry.raw_length} it claims")
         return raw
 
-    def _decompress(self, number: int, body: bytes) -> bytes:
-        entry = self.index[number]
+    def _unframed(self, body: bytes, length: int, what: str) -> bytes:
+        """The content of the zstd frame that the bytes are, of so many bytes."""
         try:
             frame = zstandard.get_frame_parameters(body)
-            if frame.content_size != entry.raw_length or frame.dict_id:
-                raise FormatError(f"{self.name}: chunk {number} ({entry.kind}): its zstd frame claims another length")
-            return zstandard.ZstdDecompressor().decompress(body, max_output_size=entry.raw_length,
-                                                           allow_extra_data=False)
+            if frame.content_size != length or frame.dict_id:
+                raise FormatError(f"{self.name}: {what}: its zstd frame claims another length")
+            return zstandard.ZstdDecompressor().decompress(body, max_output_size=length, allow_extra_data=False)
         except zstandard.ZstdError as error:
-            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is no valid zstd frame ({error})") from error
+            raise FormatError(f"{self.name}: {what} is no valid zstd frame ({error})") from error
 
 
 class _BytesSource:

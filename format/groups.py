@@ -22,7 +22,7 @@ import google_crc32c
 from kpc.format.cameras import Camera
 from kpc.format.cli import written_aside
 from kpc.format.container import (
-    CODEC_RAW, DEFAULT_BUDGET, ENTRY, HEADER, AnySource, Reader, RemoteSource, Source, header_and_index, open_source,
+    CODEC_RAW, DEFAULT_BUDGET, ENTRY, HEADER, AnySource, Entry, Reader, RemoteSource, Source, header_and_index, open_source,
 )
 from kpc.format.errors import FormatError, UsageError
 from kpc.format.file import FRAME_LIMIT, GROUP_KIND, SceneReader, read
@@ -309,19 +309,17 @@ def write(parts: Sequence[Part], path: str | os.PathLike[str]) -> int:
     if odd is not None:
         raise UsageError(f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; encode them "
                          "alike")
-    offset, entries = HEADER.size + ENTRY.size * len(parts), []
+    entries: list[Entry] = []
     with written_aside(path) as aside, aside.open("wb") as opened:
-        opened.seek(offset)  # the index, which comes first, holds checksums of what follows
+        opened.seek(HEADER.size + ENTRY.size * len(parts))  # the index, which comes first, holds checksums of what follows
         for number, part in enumerate(parts):
             body, span = part.source.read_at(0, part.source.size), part.span
             opened.write(body)
-            entries.append(ENTRY.pack(GROUP_KIND.encode(), number, 0, 0, span.start, span.count, CODEC_RAW, 0, len(body), len(body),
-                                      google_crc32c.value(body), offset))
-            offset += len(body)
+            entries.append(Entry(GROUP_KIND, number, 0, 0, span.start, span.count, CODEC_RAW, len(body), len(body), google_crc32c.value(body)))
+        size = opened.tell()
         opened.seek(0)
-        opened.write(header_and_index(entries, offset, max(part.value_count for part in parts),
-                                      max(part.source.size for part in parts)))
-    return offset
+        opened.write(header_and_index(entries, max(part.value_count for part in parts)))
+    return size
 
 
 def check_spans(spans: Sequence[Span], names: str | Sequence[str]) -> None:

@@ -73,19 +73,26 @@ def entries(data, partial):  # sections 3, 4 and 10
     require(len(data) >= 64 and data[:8] == b"\x89KPC\r\n\x1a\n", "not a .kpc file")
     (version, flags, header_length, index_offset, index_length, count, file_length, value_count, largest_raw, reserved,
      index_crc, header_crc) = struct.unpack("<HHIQIIQQIIII", data[8:64])
-    require(version in (0, 1), "unknown version")
+    require(version in (0, 1, 2), "unknown version")
     require(crc32c(data[:60]) == header_crc, "header damaged")
     require(flags == reserved == 0 and header_length == index_offset == 64, "reserved field")
-    require(1 <= count <= 65536 and index_length == 40 * count, "chunk count")
+    require(1 <= count <= 65536 and (index_length < 40 * count if version == 2 else index_length == 40 * count), "chunk count")
+    require(version != 2 or file_length >= 64 + 8 * count, "chunk count")
     require(len(data) <= file_length if partial else len(data) == file_length, "file length")
     require(max(value_count, largest_raw) <= file_length * 32768, "limits")
     index = data[64:64 + index_length]
     require(len(index) == index_length and crc32c(index) == index_crc, "index damaged")
+    if version == 2:
+        columns = decoded(index, 1, 32 * count)
+        listed = [columns[k::count] for k in range(count)]
+    else:
+        listed = [index[40 * k:40 * k + 40] for k in range(count)]
     expected = 64 + index_length
-    for at in range(0, index_length, 40):
-        kind, group, scale, plane, start, rows, codec, reserved, stored, raw, crc, offset = \
-            struct.unpack("<4sHBBIIHHIIIQ", index[at:at + 40])
-        require(kind.isalpha() and reserved == 0 and offset == expected and raw <= largest_raw, "index entry")
+    for entry in listed:
+        kind, group, scale, plane, start, rows, codec, reserved, stored, raw, crc = struct.unpack("<4sHBBIIHHIII", entry[:32])
+        require(kind.isalpha() and reserved == 0 and raw <= largest_raw, "index entry")
+        offset = expected
+        require(version == 2 or struct.unpack("<Q", entry[32:]) == (offset,), "offset")
         expected += stored
         body = data[offset:offset + stored]
         if len(body) < stored:

@@ -1,5 +1,6 @@
 import io
 import struct
+from dataclasses import replace
 
 import google_crc32c
 import numpy as np
@@ -82,10 +83,21 @@ class Recorded:
         pass
 
 
-def test_opening_takes_two_requests_and_a_chunk_one():
-    source = Recorded(pack(CHUNKS, 7))
+def test_an_index_is_stored_in_columns_where_that_is_smaller():
+    many = [*CHUNKS, *[Chunk("note", [NOISE[:20 + k]], row_start=k) for k in range(30)]]
+    plain, told = pack(many, 7, version=1), pack(many, 7)
+    before, now = Reader(plain), Reader(told)
+    assert (before.header.version, now.header.version) == (1, 2) and len(plain) - len(told) > 15 * len(many)
+    assert [replace(entry, offset=0) for entry in now.index] == [replace(entry, offset=0) for entry in before.index]
+    assert [now.stored(k) for k in range(len(many))] == [before.stored(k) for k in range(len(many))]
+    assert Reader(pack(many, 7, compress=False)).header.version == 1
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_opening_takes_two_requests_and_a_chunk_one(version: int):
+    source = Recorded(pack(CHUNKS, 7, version=version))
     reader = Reader(source)
-    assert source.asked == [(0, HEADER.size), (HEADER.size, 4 * ENTRY.size)]
+    assert source.asked == [(0, HEADER.size), (HEADER.size, reader.header.index_length)] and reader.header.version == version
     source.asked.clear()
     assert reader.chunk(1) == b"x" * 500 + NOISE
     assert source.asked == [(reader.index[1].offset, reader.index[1].stored_length)]

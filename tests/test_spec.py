@@ -97,7 +97,10 @@ def test_limits_are_the_code_s():
 def test_names_and_numbers_are_the_code_s():
     assert container.MAGIC.hex(" ").upper() in section(3)
     assert f"version {container.VERSION}" in PAGE.splitlines()[0]
-    assert f"| version | {container.VERSION}; or 0," in section(3) and container.READABLE_VERSIONS == (0, container.VERSION)
+    assert f"| version | {container.VERSION}, or {container.PLAIN_VERSION}, which" in section(3)
+    assert container.READABLE_VERSIONS == (0, container.PLAIN_VERSION, container.VERSION)
+    assert f"content size, {container.TOLD} x chunk_count" in section(4)
+    assert f"at least {container.HEADER.size} + {container.LEAST_CHUNK} chunk_count" in section(3)
     assert set(re.findall(r"^\| ([A-Za-z]{4}) \| [01]", section(4), re.M)) == file.KNOWN_KINDS | {file.GROUP_KIND}
     numbered = ", ".join(f"{number} `{name}`" for number, name in enumerate(ALL_PLANES))
     assert numbered in section(4)
@@ -241,6 +244,11 @@ def test_a_file_may_have_so_many_chunks_and_no_more(twin, monkeypatch):
     assert file.encode(file.read(data)) == file.encode(file.read(path))
     with pytest.raises(errors.FormatError, match="65537 chunks are more"):
         container.pack([*known, *empty, *empty[:1]], reader.header.value_count, compress=False)
+    full = [container.Chunk("note", [bytes(8)])] * len(empty)  # as many in a file of version 2 are no smaller than this
+    data = container.pack([*known, *full], reader.header.value_count)
+    assert container.Reader(data).header.version == 2 and len(data) < 9 * 65536 and len(container.Reader(data).index) == 65536
+    assert twin.hashes(twin.decode(data)) == plain
+    assert container.Reader(container.pack([*known, *empty], reader.header.value_count)).header.version == 1
     with monkeypatch.context() as patch:
         patch.setattr(container, "CHUNK_LIMIT", 1 << 20)
         more = container.pack([*known, *empty, *empty[:1]], reader.header.value_count, compress=False)

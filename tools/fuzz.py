@@ -81,15 +81,10 @@ class Taken:
 
     def together(self) -> bytes:
         """A file again, right in all but what the pieces say."""
-        offset, entries = HEADER.size + ENTRY.size * len(self.pieces), []
-        for piece in self.pieces:
-            e, length = piece.entry, len(piece.body)
-            raw = length if e.codec == CODEC_RAW else min(e.raw_length, 0xFFFFFFFF)
-            entries.append(ENTRY.pack(e.kind.encode(), e.group, e.scale, e.plane, e.row_start, e.row_count, e.codec, 0, length, raw,
-                                      google_crc32c.value(piece.body), offset))
-            offset += length
-        largest = max((struct.unpack_from("<I", entry, 24)[0] for entry in entries), default=0)
-        return header_and_index(entries, offset, self.value_count, largest) + b"".join(piece.body for piece in self.pieces)
+        entries = [replace(e, stored_length=len(body), crc=google_crc32c.value(body),
+                           raw_length=len(body) if e.codec == CODEC_RAW else min(e.raw_length, 0xFFFFFFFF))
+                   for e, body in ((piece.entry, piece.body) for piece in self.pieces)]
+        return header_and_index(entries, self.value_count) + b"".join(piece.body for piece in self.pieces)
 
 
 Mutation = Callable[[random.Random, Taken, Sequence[Taken]], bytes]
@@ -153,6 +148,25 @@ def in_index(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes
     return specvectors.resealed(bytes(out))
 
 
+def in_columns(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
+    """As `in_index`, of a file of version 2: one or two bytes of entries, the frame around them, or their number."""
+    def edited(told: bytes) -> bytes:
+        out = bytearray(told)
+        for _ in range(rng.choice((1, 1, 2)) if out else 0):
+            at = rng.randrange(len(out))
+            out[at] = rng.choice((0, 1, 255, out[at] ^ 1, rng.randrange(256)))
+        return bytes(out)
+
+    data = taken.together()
+    match rng.randrange(4):
+        case 0:
+            return specvectors.in_columns(data, frame=lambda frame: scrambled(rng, frame))
+        case 1:
+            return specvectors.in_columns(data, count=rng.choice(WHOLES) & 0xFFFFFFFF)
+        case _:
+            return specvectors.in_columns(data, edited)
+
+
 def in_content(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
     """A chunk's content changed, under whatever codec it is stored; that of a group likewise in any of these ways."""
     pieces = list(taken.pieces)
@@ -198,9 +212,9 @@ def of_bytes(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes
 
 
 MUTATIONS: dict[str, Mutation] = {
-    "header": in_header, "index": in_index, "content": in_content, "chunks": of_chunks, "bytes": of_bytes,
+    "header": in_header, "index": in_index, "columns": in_columns, "content": in_content, "chunks": of_chunks, "bytes": of_bytes,
 }  # fmt: skip
-SHARES = (1, 3, 12, 3, 1)
+SHARES = (1, 3, 1, 12, 3, 1)
 """How often each is chosen."""
 
 

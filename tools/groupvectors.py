@@ -6,7 +6,7 @@ from typing import Any
 
 import google_crc32c
 
-from kpc.format.container import ENTRY, HEADER, Reader, header_and_index
+from kpc.format.container import ENTRY, HEADER, Entry, Reader, header_and_index
 from kpc.format.groups import Groups
 
 TIMES = (0.0, 0.125, 0.3, 0.31, 0.32, 0.5, 0.6875, 1.0)
@@ -18,22 +18,20 @@ DRAFT = "version-0"
 SLOWER = "minimal"
 """One of a frame at another."""
 
-NOTE = (b"note", b"readers skip what they need not know")
+NOTE = ("note", b"readers skip what they need not know")
 
 Group = tuple[int, int, bytes]
 """First frame, number of frames, and file of a group."""
 
 
-def packed(groups: Sequence[Group], *, beside: Sequence[tuple[bytes, bytes]] = (), value_count: int | None = None) -> bytes:
+def packed(groups: Sequence[Group], *, beside: Sequence[tuple[str, bytes]] = (), value_count: int | None = None) -> bytes:
     """A clip in groups, whether they make one or not; with chunks of other kinds after them."""
     bodies = [body for *_, body in groups] + [body for _, body in beside]
-    offset, entries = HEADER.size + ENTRY.size * len(bodies), []
-    places = [(b"GRUP", number, start, count) for number, (start, count, _) in enumerate(groups)]
-    for (kind, number, start, count), body in zip(places + [(kind, 0, 0, 0) for kind, _ in beside], bodies, strict=True):
-        entries.append(ENTRY.pack(kind, number, 0, 0, start, count, 0, 0, len(body), len(body), google_crc32c.value(body), offset))
-        offset += len(body)
+    places = [("GRUP", number, start, count) for number, (start, count, _) in enumerate(groups)] + [(kind, 0, 0, 0) for kind, _ in beside]
+    entries = [Entry(kind, number, 0, 0, start, count, 0, len(body), len(body), google_crc32c.value(body))
+               for (kind, number, start, count), body in zip(places, bodies, strict=True)]
     most = max(struct.unpack_from("<Q", body, 40)[0] for *_, body in groups) if value_count is None else value_count
-    return header_and_index(entries, offset, most, max(map(len, bodies))) + b"".join(bodies)
+    return header_and_index(entries, most) + b"".join(bodies)
 
 
 def of_the_draft(data: bytes) -> bytes:
@@ -85,7 +83,7 @@ def invalid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, str, str]]:
         "groups-count": (changed(entry + 12, "<I", 13), broken, "not 13 at"),
         "groups-rate": (packed([(0, 1, still), (1, 1, scenes[SLOWER])]), broken, "not 1 at"),
         "groups-values": (packed([(0, 12, third), (9, 12, other)], value_count=7), broken, "more than the header's 7"),
-        "groups-beside": (packed([(0, 12, third)], beside=[(b"SCNE", b"")]), broken, "lies beside groups"),
+        "groups-beside": (packed([(0, 12, third)], beside=[("SCNE", b"")]), broken, "lies beside groups"),
         "groups-in-groups": (packed([(0, 21, good)]), broken, "a clip in groups"),
         "groups-no-file": (packed([(0, 12, third), (9, 12, other)])[: -len(other)] + bytes(len(other)), broken, "not a .kpc file"),
         "groups-cut": (packed([(0, 12, third), (9, 12, other[:-1])]), broken, "cut off"),

@@ -23,11 +23,13 @@ import google_crc32c
 import numpy as np
 import zstandard
 
-from kpc.format import cli
+from kpc.format import cli, container
 from kpc.format.blocks import FINENESSES, HEAD, Blocks, blocks_of, encode_blocks, largest_side
 from kpc.format.cameras import Camera
 from kpc.format.cells import encode_cells
-from kpc.format.container import CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_ZSTD, ENTRY, HEADER, Chunk, Reader, pack
+from kpc.format.container import (
+    CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_ZSTD, ENTRY, HEADER, PLAIN_VERSION, TOLD, VERSION, Chunk, Reader,
+)
 from kpc.format.errors import UsageError
 from kpc.format.file import (
     APPEARANCE_LIMIT, AXIS_LIMIT, BOX_LIMIT, CAMERA_LIMIT, CHANNEL_LIMIT, FRAME_LIMIT, HIDDEN_LIMIT, MOTION_LIMIT, MOTION_STRUCT,
@@ -49,6 +51,9 @@ from kpc.tools import groupvectors
 from kpc.tools.groupvectors import of_the_draft
 
 ZSTD_VERSION = ".".join(map(str, zstandard.ZSTD_VERSION))
+
+pack = partial(container.pack, version=PLAIN_VERSION)
+"""All vectors but those of `in_columns` are of the version that was first."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -245,6 +250,21 @@ def _forced(chunk: Chunk, body: bytes, codec: int = CODEC_SYMBOLS) -> Chunk:
     return replace(chunk, parts=[body, b"\0"], coded={codec: lambda: body})
 
 
+def in_columns(data: bytes, change: Callable[[bytes], bytes] = bytes, count: int | None = None, *,
+               frame: Callable[[bytes], bytes] = bytes) -> bytes:
+    """A file of version 1 as one of version 2, its index in a frame of a raw block, which no library has to make.
+
+    The index may be changed before it comes into the frame, the frame itself, and the number of chunks in the header; checksums are right.
+    """
+    reader = Reader(data)
+    columns = change(np.frombuffer(data, np.uint8, ENTRY.size * len(reader.index), HEADER.size).reshape(-1, ENTRY.size)[:, :TOLD].T.tobytes())
+    index = frame(b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", len(columns)) + struct.pack("<I", 1 | len(columns) << 3)[:3] + columns)
+    body = data[HEADER.size + reader.header.index_length:]
+    head = patched(data[:HEADER.size], 24, "<IIQ", len(index), count or len(reader.index), HEADER.size + len(index) + len(body))
+    head = patched(patched(head, 8, "<H", VERSION), 56, "<I", google_crc32c.value(index))
+    return patched(head, 60, "<I", google_crc32c.value(head[:60])) + index + body
+
+
 def claiming(chunks: list[Chunk], number: int, value_count: int, length: int, codec: int = CODEC_SYMBOLS) -> bytes:
     """A file of raw chunks, of which one claims to be context-coded and to stand for so many bytes."""
     data = pack(chunks, value_count, compress=False)
@@ -303,6 +323,7 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
     chunks = scene_chunks(minimal)
     index = Reader(packed).index
     coarse_ends = next(entry.offset for entry in index if entry.scale == 1)
+    columns = in_columns(context_coded(dynamic, 8, segment_rows=4))
     return {
         "minimal": (encode(minimal, compress=False), False),
         "static": (encode(_scene(dynamic=False, sizes=[(3, 17, 13, 11, 0)])), False),
@@ -353,6 +374,8 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
         "version-0": (of_the_draft(encode(_scene(dynamic=True, sizes=[(1, 1, 1, 1, 1)]), compress=False)), False),
         "version-0-symbols": (of_the_draft(context_coded(dynamic, 8, segment_rows=4)), False),
+        "columns": (columns, False),
+        "columns-prefix": (columns[:Reader(columns).index[9].offset], True),
         "zstd": (all_zstd(replace(varied, mapping=contracted.mapping, motion=moved.motion)), False),
         "zstd-hybrid": (all_zstd(hybrid), False),
         "time-empty": (encode(_at_rest(dynamic), segment_rows=4, compress=False), False),
@@ -362,7 +385,7 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
 
 
 def _limits() -> dict[str, bytes]:
-    """Files at the limits of the spec's section 12, each as small as may be; none at that of chunks, whose index takes 2.6 MB."""
+    """Files at the limits of the spec's section 12, each as small as may be; none at that of chunks, which takes half a megabyte."""
     plain = _scene(dynamic=False, sizes=[(1, 2, 2, 2, 0)], cameras=1)
     moving = _scene(dynamic=True, sizes=[(1, 2, 2, 2, 2)])
     deep = _scene(dynamic=False, sizes=SCALE_LIMIT * [(1, 2, 1, 1, 0)])
@@ -546,7 +569,16 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     return {
         "empty": (b"", broken, "not a .kpc file"),
         "magic": (patched(good, 1, "4s", b"JPEG"), broken, "not a .kpc file"),
-        "version": (resealed(patched(good, 8, "<H", 2)), broken, "format version 2"),
+        "version": (resealed(patched(good, 8, "<H", 2)), broken, "bytes of index"),  # its index is that of version 1
+        "version-3": (resealed(patched(good, 8, "<H", 3)), broken, "format version 3"),
+        "columns-garbage": (in_columns(good, frame=lambda frame: patched(frame, 0, "<B", 0)), broken, "chunk index is no valid zstd frame"),
+        "columns-long": (in_columns(good, frame=lambda frame: frame + b"\0"), broken, "chunk index is no valid zstd frame"),
+        "columns-fewer": (in_columns(good, count=len(chunks) + 1), broken, "claims another length"),
+        "columns-many": (in_columns(good, count=1000), broken, "1000 chunks in a file of"),
+        "columns-reserved": (in_columns(good, lambda told: patched(told, 18 * len(chunks), "<B", 1)), broken, "reserved"),
+        "columns-kind": (in_columns(good, lambda told: patched(told, 0, "<B", 0)), broken, "four letters"),
+        "columns-end": (in_columns(good, lambda told: patched(told, 21 * len(chunks), "<B", 1)), broken, "the chunks end at"),
+        "columns-raw-length": (in_columns(good, lambda told: patched(told, 26 * len(chunks), "<B", 255)), broken, "more than the header's"),
         "header-crc": (patched(good, 40, "<Q", values + 1), broken, "header is damaged"),
         "header-flags": (resealed(patched(good, 10, "<H", 1)), broken, "reserved"),
         "header-reserved": (resealed(patched(good, 52, "<I", 1)), broken, "reserved"),
