@@ -81,13 +81,13 @@ def in_blocks(
         blocks = searched(wanted[own], worth[own], there, _own_blocks(together, start, rows), min(side, largest_side(*there.shape)), quantiser)
         told[start] = encode_blocks(blocks, there)
         symbols[own], _ = decode_blocks(told[start], *symbols[own].shape)
-    return replace(finer, symbols=symbols, coded=known, guide=Told(told)), sum(map(len, told.values()))
+    return replace(finer, symbols=symbols, coded=known, guide=Told(told), starts=tuple(told)), sum(map(len, told.values()))
 
 
 def step_in_blocks(plane: QuantisedPlane) -> np.ndarray:
     """(M,) float64: for which steps `in_blocks` was asked when it made this plane."""
     assert isinstance(plane.guide, Told)
-    quantiser = next(filter(None, plane.guide.segments.values()))[2]
+    quantiser = next(iter(plane.guide.segments.values()))[2]
     return plane.step.astype(np.float64) * quantiser / (STEPS * PARTS)
 
 

@@ -14,7 +14,7 @@ scales, then later seconds. A plane segment that has not arrived is uncoded: it 
 import math
 import os
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -36,9 +36,7 @@ from kpc.format.nodes import decode_nodes, encode_nodes
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
-from kpc.format.segments import (
-    SegmentGuide, Told, decode_coded, encode_coded, guide_at, guide_together, rows_of_segments, segment_guide,
-)
+from kpc.format.segments import SegmentGuide, decode_coded, encode_coded, guide_at, guide_together, rows_of_segments, segment_guide
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 
 Parsed = TypeVar("Parsed")
@@ -135,8 +133,8 @@ def write(scene: QuantisedScene, path: str | os.PathLike[str], *, segment_rows: 
     """Write a scene; return the size in bytes. On failure `path` is left as it was.
 
     Args:
-        segment_rows: rows of a time plane in one segment, the unit in which a player fetches time; None: as many as is usual. Planes told in
-            blocks keep their own.
+        segment_rows: rows of a time plane in one segment, the unit in which a player fetches time; None: as many as is usual. Planes whose
+            symbols were chosen for other segments keep those.
 
     Raises:
         FormatError: the scene breaks a rule that every reader checks; the message says which.
@@ -199,14 +197,9 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> l
 
 
 def _segments_of(plane: QuantisedPlane, over_time: bool, segment_rows: int | None) -> list[tuple[int, int]]:
-    """First rows, and the rows after the last: as the plane is told, if it is in blocks, else of so many rows, or of as many as is usual."""
+    """First rows, and the rows after the last."""
     rows = len(plane.symbols)
-    if not over_time:
-        starts: Iterable[int] = [0]
-    elif isinstance(plane.guide, Told):
-        starts = sorted(plane.guide.segments)
-    else:
-        starts = range(0, rows, segment_rows or rows_of_segments(rows))
+    starts = plane.starts or range(0, rows, (segment_rows or rows_of_segments(rows)) if over_time else rows)
     return list(pairwise([*starts, rows]))
 
 
@@ -329,6 +322,10 @@ def read(source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET,
                              np.zeros((p.rows, p.columns), bool))
         for name, p in scale.items()
     } for s, scale in enumerate(reader.head.scales))
+    starts: dict[tuple[int, str], list[int]] = {}
+    for entry in reader.index:
+        if entry.kind == "PLNE":
+            starts.setdefault((entry.scale, ALL_PLANES[entry.plane]), []).append(entry.row_start)
     guides: dict[tuple[int, str], dict[int, SegmentGuide | None]] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number, (decoded, coded, guide) in zip(segments, pool.map(reader.guided_segment, segments), strict=True):
@@ -338,7 +335,7 @@ def read(source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET,
             plane.symbols[rows], plane.coded[rows] = decoded, coded
             guides.setdefault((entry.scale, ALL_PLANES[entry.plane]), {})[entry.row_start] = guide
     for (s, name), of_segments in guides.items():
-        scales[s][name] = replace(scales[s][name], guide=guide_together(of_segments))
+        scales[s][name] = replace(scales[s][name], guide=guide_together(of_segments), starts=tuple(sorted(starts[s, name])))
     for number, entry in enumerate(reader.index):
         if entry.kind not in KNOWN_KINDS and reader.available(number):
             reader.stored(number)  # ignored, but never damaged

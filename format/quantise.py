@@ -38,6 +38,7 @@ class QuantisedPlane:
         step: (M,) float32 > 0; offset: (M,) float32, exactly 1 on time planes.
         coded: (H, W) bool, the texels whose symbols the file stores.
         guide: by which symbols were chosen, if by any; one that they do not follow does no harm.
+        starts: the first rows of the segments that symbols were chosen for; none: those that are usual, `kpc.format.segments`.
     """
 
     symbols: np.ndarray
@@ -45,6 +46,7 @@ class QuantisedPlane:
     offset: np.ndarray
     coded: np.ndarray
     guide: PlaneGuide | None = None
+    starts: tuple[int, ...] = ()
 
     def dequantise(self) -> np.ndarray:
         """(H, W, M) float32."""

@@ -26,10 +26,10 @@ class Told:
     """A plane that is told in blocks. Its symbols follow from these, which cannot be found from them.
 
     Attributes:
-        segments: of each by its first row, what is stored; None where symbols are (what is stored is smaller so).
+        segments: of each by its first row, what is stored.
     """
 
-    segments: Mapping[int, bytes | None]
+    segments: Mapping[int, bytes]
 
 
 PlaneGuide = Guide | Told
@@ -44,8 +44,8 @@ def guide_at(guide: PlaneGuide | None, start: int) -> SegmentGuide | None:
 def guide_together(guides: Mapping[int, SegmentGuide | None]) -> PlaneGuide | None:
     """Of a plane whose segments, by their first rows, have these: of those in blocks if there are any, else the one that all have that have any
     (what has none was smaller as it is)."""
-    if any(isinstance(guide, bytes) for guide in guides.values()):
-        return Told({start: guide if isinstance(guide, bytes) else None for start, guide in guides.items()})
+    if bodies := {start: guide for start, guide in guides.items() if isinstance(guide, bytes)}:
+        return Told(bodies)
     known = [guide for guide in guides.values() if isinstance(guide, Guide)]
     return known[0] if known and all(guide == known[0] for guide in known) else None
 

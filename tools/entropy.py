@@ -43,7 +43,7 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
     """For each idea left out, the bytes of all planes, `plane_bytes`; of what exists as a codec also `decode_ms`, on one core; and of the file
     as it is, `file_bytes`, all that `kpc.format.file.read` does: `read_ms`. Of planes those that are told in blocks are left out."""
     quantised = read(scene)
-    segments, chunks = [], scene_chunks(quantised, segment_rows=_segment_rows(scene))
+    segments, chunks = [], scene_chunks(quantised)
     left = {(s, ALL_PLANES.index(name)) for s, planes in enumerate(quantised.scales)
             for name, plane in planes.items() if not isinstance(plane.guide, Told)}
     for chunk in chunks:
@@ -61,10 +61,6 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
         walks = _compiled(changes)
         found[name] = {"plane_bytes": sum(_bytes(segment, walks, counts, size) for segment in segments)}
     return found
-
-
-def _segment_rows(scene: Path) -> int:
-    return max((entry.row_count for entry in SceneReader(scene).index if entry.kind == "PLNE" and entry.plane >= 3), default=1)
 
 
 def _decoded(data: bytes, left: Collection[tuple[int, int]]) -> dict[str, float]:
