@@ -159,9 +159,15 @@ def test_decoder_weights_become_float16_and_refuse_what_it_cannot_hold():
         round_decoder(Decoder(d.density_weight, float("nan"), d.w1, d.b1, d.w2, d.b2))
 
 
-def test_cameras_become_float32():
-    camera = Camera(64, 48, 50.1, 50.2, 31.9, 24.3, tiny_scene().cameras[0].camera_to_world)
+def test_cameras_are_rounded_by_no_more_than_pictures_show():
+    pose = tiny_scene().cameras[0].camera_to_world.copy()
+    pose[:3, 3] += 5e5  # a survey's origin may be far away
+    camera = Camera(4000, 48, 3001.07, 50.2, 1999.9, -24.3, pose)
     rounded = round_camera(camera)
-    assert rounded.fl_x == np.float32(50.1) and rounded.width == 64
-    assert np.array_equal(rounded.camera_to_world, camera.camera_to_world.astype(np.float32))
-    assert round_camera(rounded).fl_x == rounded.fl_x
+    assert rounded.width == 4000 and rounded.fl_x == np.float32(rounded.fl_x)
+    for name in ("fl_x", "fl_y", "cx", "cy"):
+        assert abs(getattr(rounded, name) / getattr(camera, name) - 1) <= 2.0**-16
+    assert np.abs(rounded.camera_to_world - pose)[:3, :3].max() <= 2.0**-17
+    assert np.array_equal(rounded.camera_to_world[:3, 3], pose[:3, 3].astype(np.float32))
+    again = round_camera(rounded)
+    assert np.array_equal(again.camera_to_world, rounded.camera_to_world) and again.fl_x == rounded.fl_x
