@@ -38,8 +38,11 @@ from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.segments import SegmentGuide, decode_coded, encode_coded, guide_at, guide_together, rows_of_segments, segment_guide
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
+from kpc.format.weights import decode_weights, encode_weights
 
 Parsed = TypeVar("Parsed")
+Weights = Callable[["_Cursor", Mapping[str, tuple[int, ...]]], dict[str, np.ndarray]]
+"""What reads arrays of these shapes."""
 
 SCENE_STRUCT = struct.Struct("<6fIdd3fBB")
 """aabb, frame_count, fps, step, background, scale_count, dynamic"""
@@ -176,8 +179,7 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> l
             _parse_motion(move.parts[0], parsed.is_dynamic)
             chunks.append(move)
         kind = "HYBR" if isinstance(scene.decoder, HybridDecoder) else "DECO"
-        chunks += [Chunk(kind, [_pack_decoder(scene.decoder, parsed.feature_count)]),
-                   _occupancy_chunk(scene.occupancy)]
+        chunks += [_decoder_chunk(kind, scene.decoder, parsed.feature_count), _occupancy_chunk(scene.occupancy)]
         if scene.cameras:
             chunks.append(Chunk("came", [_pack_cameras(scene.cameras)]))
         if scene.appearances:
@@ -236,7 +238,7 @@ def _check_planes(scene: QuantisedScene, head: SceneHead) -> None:
                 raise FormatError(f"{where}: an uncoded texel holds a symbol other than 0")
 
 
-def _pack_decoder(decoder: AnyDecoder, features: int) -> bytes:
+def _decoder_chunk(kind: str, decoder: AnyDecoder, features: int) -> Chunk:
     hidden, bias = len(decoder.b1), decoder.density_bias
     if isinstance(decoder, HybridDecoder):
         width = len(decoder.v_bias)
@@ -249,7 +251,9 @@ def _pack_decoder(decoder: AnyDecoder, features: int) -> bytes:
             raise FormatError(f"decoder: {name} is {np.shape(weights[name])}, not {shape}")
     if any(not np.array_equal(w, w.astype(np.float16)) for w in weights.values()):
         raise FormatError("decoder: the weights are not rounded to float16 (kpc.format.quantise.round_decoder)")
-    return b"".join([head, *(np.asarray(w).astype("<f2").tobytes() for w in weights.values())])
+    raw = b"".join([head, *(np.asarray(w).astype("<f2").tobytes() for w in weights.values())])
+    told = encode_weights(list(weights.values()))
+    return Chunk(kind, [raw], coded={} if told is None else {CODEC_SYMBOLS: lambda: head + told}, symbol_count=len(raw))
 
 
 def _pack_mapping(mapping: SpaceMapping) -> bytes:
@@ -427,13 +431,17 @@ class SceneReader(Reader):
     @cached_property
     def _decoder(self) -> AnyDecoder:
         features, number = self.head.feature_count, self._decoder_number()
-        parse: Callable[[bytes, int], AnyDecoder]
-        if self.index[number].kind == "HYBR":
+        parse: Callable[[_Cursor, int, Weights], AnyDecoder]
+        kind, raw_length = self.index[number].kind, self.index[number].raw_length
+        if kind == "HYBR":
             head, parse, shapes = HYBRID_STRUCT, _parse_hybrid, HybridDecoder.shapes(features, HIDDEN_LIMIT, HIDDEN_LIMIT)
         else:
             head, parse, shapes = DECODER_STRUCT, _parse_decoder, Decoder.shapes(features, HIDDEN_LIMIT)
+        if self.index[number].codec == CODEC_SYMBOLS:
+            weights: Weights = lambda cursor, of: _coded_weights(cursor, of, raw_length - head.size)
+            return self._parsed(lambda body: parse(_Cursor(body, kind), features, weights), self._context_coded(number))
         most = head.size + 2 * sum(map(math.prod, shapes.values()))
-        return self._parsed(lambda raw: parse(raw, features), self.chunk(number, most))
+        return self._parsed(lambda raw: parse(_Cursor(raw, kind), features, _half_weights), self.chunk(number, most))
 
     def occupancy(self) -> np.ndarray:
         """The OCCU chunk: (slots, Nz, Ny, Nx) bool."""
@@ -630,32 +638,36 @@ def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, Pla
     return planes
 
 
-def _parse_decoder(raw: bytes, expected_features: int) -> Decoder:
-    cursor = _Cursor(raw, "DECO")
+def _parse_decoder(cursor: "_Cursor", expected_features: int, weights: Weights) -> Decoder:
     features, hidden, bias = cursor.unpack(DECODER_STRUCT)
     if features != expected_features or not 0 < hidden <= HIDDEN_LIMIT or not math.isfinite(bias):
         raise FormatError(f"DECO: {features} features (the planes give {expected_features}), {hidden} hidden units "
                           f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}")
-    return Decoder(density_bias=bias, **_parse_weights(cursor, Decoder.shapes(features, hidden)))
+    return Decoder(density_bias=bias, **weights(cursor, Decoder.shapes(features, hidden)))
 
 
-def _parse_hybrid(raw: bytes, expected_features: int) -> HybridDecoder:
-    cursor = _Cursor(raw, "HYBR")
+def _parse_hybrid(cursor: "_Cursor", expected_features: int, weights: Weights) -> HybridDecoder:
     features, width, hidden, bias = cursor.unpack(HYBRID_STRUCT)
     if features != expected_features or not 0 < min(width, hidden) <= max(width, hidden) <= HIDDEN_LIMIT \
             or not math.isfinite(bias):
         raise FormatError(f"HYBR: {features} features (the planes give {expected_features}), {width} and {hidden} hidden units "
                           f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}")
-    return HybridDecoder(density_bias=bias, **_parse_weights(cursor, HybridDecoder.shapes(features, width, hidden)))
+    return HybridDecoder(density_bias=bias, **weights(cursor, HybridDecoder.shapes(features, width, hidden)))
 
 
-def _parse_weights(cursor: "_Cursor", shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+def _half_weights(cursor: "_Cursor", shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     with np.errstate(invalid="ignore"):  # a signalling NaN says so when it is cast
         weights = {name: cursor.array("<f2", math.prod(shape)).astype(np.float32).reshape(shape) for name, shape in shapes.items()}
     cursor.finish()
     if not all(np.isfinite(w).all() for w in weights.values()):
         raise FormatError(f"{cursor.kind}: a weight is NaN or infinite")
     return weights
+
+
+def _coded_weights(cursor: "_Cursor", shapes: Mapping[str, tuple[int, ...]], raw_length: int) -> dict[str, np.ndarray]:
+    if raw_length != 2 * sum(map(math.prod, shapes.values())):
+        raise FormatError(f"{cursor.kind}: claims {raw_length:,} bytes of weights, not those of its sizes")
+    return dict(zip(shapes, decode_weights(cursor.rest(), list(shapes.values())), strict=True))
 
 
 def _parse_occupancy(raw: bytes) -> np.ndarray:

@@ -18,6 +18,7 @@ from kpc.format.motion import QuantisedMotion, places_reached, quantise_motion
 from kpc.format.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
 from kpc.format.space import SpaceMapping
 from kpc.format.segments import PlaneGuide
+from kpc.format.weights import FINEST
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
 
@@ -230,14 +231,16 @@ def _reach(texels: int, cells: int) -> np.ndarray:
 
 
 def round_decoder(decoder: AnyDecoder, bits: int = HALF_BITS) -> AnyDecoder:
-    """The decoder with its weights rounded to float16 of so many significant bits (the density bias to float32), as float32 arrays.
+    """The decoder with its weights rounded to float16 (the density bias to float32), as float32 arrays; with fewer bits, those of an array
+    to as many as the largest of it has in so many.
 
     Raises:
         FormatError: a weight is NaN, infinite or beyond float16's 65504.
     """
     if not np.isfinite(decoder.density_bias):
         raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
-    weights = {name: value if name == "density_bias" else half(_to_bits(value, bits) if bits < HALF_BITS else value) for name, value in vars(decoder).items()}
+    weights = {name: value if name == "density_bias" else half(_to_places(value, bits) if bits < HALF_BITS else value)
+               for name, value in vars(decoder).items()}
     return replace(decoder, **weights | {"density_bias": float(np.float32(decoder.density_bias))})
 
 
@@ -245,6 +248,12 @@ def _to_bits(values: np.ndarray, bits: int) -> np.ndarray:
     """Rounded to so many significant bits."""
     mantissas, exponents = np.frexp(values)
     return np.ldexp(np.rint(np.ldexp(mantissas, bits)), exponents - bits)
+
+
+def _to_places(values: np.ndarray, bits: int) -> np.ndarray:
+    """Rounded to multiples of a power of two, of which the largest takes so many bits."""
+    place = max(int(np.frexp(np.abs(values).max())[1]) - bits, FINEST)
+    return np.ldexp(np.rint(np.ldexp(values, -place)), place)
 
 
 def half(weights: np.ndarray, what: str = "decoder") -> np.ndarray:

@@ -112,7 +112,7 @@ def chunks(data, partial):  # section 4
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
         if known:
-            if kind in (b"PLNE", b"OCCU", b"MOVE") and codec == 2 or kind == b"MOVE" and codec == 3:
+            if kind in (b"PLNE", b"OCCU", b"MOVE", b"DECO", b"HYBR") and codec == 2 or kind == b"MOVE" and codec == 3:
                 require(raw <= 32768 * stored, "so much in too few bytes")
                 content = None if body is None else (raw, body, codec)
             else:
@@ -199,7 +199,7 @@ def decode(data, partial=False):
     require("MOVE" not in parts or parts["MOVE"] is not None, "no MOVE chunk")
     scene["motion"] = motion_chunk(parts["MOVE"], scene["scales"]) if "MOVE" in parts else None
     expected = sum(s["channels"] for s in scene["scales"])
-    scene |= hybrid_chunk(Bytes(parts["HYBR"]), expected) if "HYBR" in parts else decoder_chunk(Bytes(parts["DECO"]), expected)
+    scene |= hybrid_chunk(parts["HYBR"], expected) if "HYBR" in parts else decoder_chunk(parts["DECO"], expected)
     scene |= coded_occupancy_chunk(*parts["OCCU"][:2]) if isinstance(parts["OCCU"], tuple) else occupancy_chunk(Bytes(parts["OCCU"]))
     scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") is not None else []
     scene["appearances"] = appearances_chunk(Bytes(parts["appe"]), scene["hidden"]) if parts.get("appe") is not None else {}
@@ -619,26 +619,48 @@ def in_blocks(chunk, N, flags, H, W, channels):  # section 6, codec 2, blocks
     return [coded[y, x] for y in range(H) for x in range(W)], symbols
 
 
-def decoder_chunk(chunk, expected):  # section 7
+def decoder_chunk(content, expected):  # section 7
+    """`content`: the raw bytes, or with codec 2 their length and the stored bytes, among others."""
+    chunk = opened(content)
     features, hidden, bias = chunk.unpack("HHf")
     require(features == expected and 1 <= hidden <= 256 and math.isfinite(bias), "decoder sizes")
     weights = {"density_weight": features, "w1": hidden * 9, "b1": hidden, "w2": 3 * features * hidden,
                "b2": 3 * features}
-    return halves(chunk, weights) | {"density_bias": bias, "hidden": hidden, "width": None}
+    return weights_of(content, chunk, weights) | {"density_bias": bias, "hidden": hidden, "width": None}
 
 
-def hybrid_chunk(chunk, expected):  # section 7
+def hybrid_chunk(content, expected):  # section 7
+    chunk = opened(content)
     features, width, hidden, bias = chunk.unpack("HHHf")
     require(features == expected and 1 <= width <= 256 and 1 <= hidden <= 256 and math.isfinite(bias), "decoder sizes")
     weights = {"v": width * features, "v_bias": width, "density_weight": width, "w1": hidden * 9, "b1": hidden,
                "u": hidden * width, "w2": 3 * hidden, "b2": 3}
-    return halves(chunk, weights) | {"density_bias": bias, "hidden": hidden, "width": width}
+    return weights_of(content, chunk, weights) | {"density_bias": bias, "hidden": hidden, "width": width}
 
 
-def halves(chunk, counts):
+def opened(content):
+    return Bytes(content[1] if isinstance(content, tuple) else content)
+
+
+def weights_of(content, chunk, counts):
+    if isinstance(content, tuple):
+        require(content[0] == chunk.at + 2 * sum(counts.values()), "raw length")
+        return multiples(chunk, counts)
     weights = {name: chunk.unpack(f"{count}e") for name, count in counts.items()}
     require(all(math.isfinite(w) for array in weights.values() for w in array), "weights")
     chunk.end()
+    return weights
+
+
+def multiples(chunk, counts):  # codec 2
+    powers = chunk.unpack(f"{len(counts)}b")
+    require(all(-24 <= power <= 15 for power in powers), "powers of two")
+    decisions, weights = Decisions(chunk), {}
+    for (name, count), power in zip(counts.items(), powers):
+        wholes = [decisions.error((name, "weights"), most_bits=10) for _ in range(count)]
+        require(all(abs(k) <= 2048 and abs(k) * 2.0**power <= 65504 for k in wholes), "weights")
+        weights[name] = tuple(k * 2.0**power for k in wholes)
+    decisions.end()
     return weights
 
 

@@ -261,7 +261,7 @@ def test_a_file_may_have_so_many_chunks_and_no_more(twin, monkeypatch):
 def test_valid_vectors_cover_every_kind_under_every_codec():
     found = {(entry.kind, entry.codec) for path in VALID + GROUPED
              for entry in container.Reader(path.read_bytes(), allow_partial=True).index}
-    codecs = {kind: {0, 1, 2} if kind in ("PLNE", "OCCU", "MOVE") else {0, 1} for kind in file.KNOWN_KINDS}
+    codecs = {kind: {0, 1, 2} if kind in ("PLNE", "OCCU", "MOVE", "DECO", "HYBR") else {0, 1} for kind in file.KNOWN_KINDS}
     assert found >= {(kind, codec) for kind, known in codecs.items() for codec in known} | {(file.GROUP_KIND, 0)}
 
 

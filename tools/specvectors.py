@@ -32,7 +32,7 @@ from kpc.format.container import (
 )
 from kpc.format.errors import UsageError
 from kpc.format.file import (
-    APPEARANCE_LIMIT, AXIS_LIMIT, BOX_LIMIT, CAMERA_LIMIT, CHANNEL_LIMIT, FRAME_LIMIT, HIDDEN_LIMIT, MOTION_LIMIT, MOTION_STRUCT,
+    APPEARANCE_LIMIT, AXIS_LIMIT, BOX_LIMIT, CAMERA_LIMIT, CHANNEL_LIMIT, DECODER_STRUCT, FRAME_LIMIT, HIDDEN_LIMIT, MOTION_LIMIT, MOTION_STRUCT,
     NAME_LIMIT, SAMPLE_LIMIT, SCALE_LIMIT, read, scene_chunks,
 )
 from kpc.format.midpoints import encode_midpoints
@@ -232,6 +232,13 @@ def halved(scene: QuantisedScene) -> bytes:
     return pack(chunks, _value_count(scene))
 
 
+def coded_weights(scene: QuantisedScene) -> bytes:
+    """A file whose decoder's weights are context-coded, also where raw ones would be smaller, and all else as it ever was."""
+    chunks = [_forced(chunk, chunk.coded[CODEC_SYMBOLS]()) if chunk.kind in ("DECO", "HYBR") else replace(chunk, coded={})
+              for chunk in scene_chunks(scene)]
+    return pack(chunks, _value_count(scene))
+
+
 def all_zstd(scene: QuantisedScene) -> bytes:
     """A file all of whose chunks are zstd frames, also where raw ones would be smaller."""
     chunks = scene_chunks(scene)
@@ -374,6 +381,10 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "unknown-ancillary": (pack([*chunks[:3], note, *chunks[3:]], 12, compress=False), False),
         "version-0": (of_the_draft(encode(_scene(dynamic=True, sizes=[(1, 1, 1, 1, 1)]), compress=False)), False),
         "version-0-symbols": (of_the_draft(context_coded(dynamic, 8, segment_rows=4)), False),
+        "weights": (coded_weights(dense), False),
+        "weights-hybrid": (coded_weights(hybrid), False),
+        "weights-prefix": (coded_weights(dense)[:Reader(coded_weights(dense)).index[4].offset], True),
+        "weights-extremes": (coded_weights(replace(dense, decoder=_extreme(dense.decoder))), False),
         "columns": (columns, False),
         "columns-prefix": (columns[:Reader(columns).index[9].offset], True),
         "zstd": (all_zstd(replace(varied, mapping=contracted.mapping, motion=moved.motion)), False),
@@ -544,6 +555,16 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     halves = nodes[:12] + encode_midpoints(grid.symbols)
     moving_halves = partial(moving, codec=CODEC_MIDPOINTS)
 
+    small_deco = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "DECO")
+    small_weights = small_chunks[small_deco].coded[CODEC_SYMBOLS]()
+    powers_at = DECODER_STRUCT.size
+    small_raw = len(small_chunks[small_deco].parts[0])
+
+    def weighing(body: bytes, length: int = small_raw) -> bytes:
+        """A file whose decoder is so coded, and claims to stand for so many bytes."""
+        stored = [Chunk("DECO", [body]) if number == small_deco else chunk for number, chunk in enumerate(small_chunks)]
+        return claiming(stored, small_deco, 24, length)
+
     def damaged_words(name: str, made: Callable[[bytes], bytes], body: bytes, state_at: int) -> dict[str, tuple[bytes, str, str]]:
         """Files, `made` of a body with state and words from `state_at` to its end, in which these are damaged."""
         last = len(body) - 1
@@ -617,7 +638,8 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "symbols-range": (context(walked(symbols + 200, whole, weights, ANY)), broken, "leaves its 8 bits"),
         "around-range": (context(walked(0 * symbols + 200, whole, weights, AROUND)), broken, "leaves its 8 bits"),
         "symbols-count": (resealed(patched(told, small_entry + 24, "<I", 7)), broken, "claims 7 symbols"),
-        "symbols-elsewhere": (resealed(patched(good, entry[deco] + 16, "<H", 2)), broken, "codec 2"),
+        "symbols-elsewhere": (resealed(patched(good, entry[deco] + 16, "<H", 2)), broken, "weights"),  # DECO had no codec 2 once
+        "symbols-in-head": (resealed(patched(good, entry[scne] + 16, "<H", 2)), broken, "codec 2"),
         **damaged_words("cells", occupied, cells, 8),
         "cells-none": (occupied(patched(cells, 4, "<H", 0)), broken, "makes no sense"),
         "cells-more": (occupied(patched(cells, 0, "<H", 2), 8 + 12), broken, "do not end where they should"),
@@ -639,6 +661,11 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "midpoints-length": (moving_halves(halves, 12 + 6 * 24 + 1), broken, "claims 157 bytes"),
         "midpoints-bomb": (moving_halves(struct.pack("<4HfI", 50, 60, 60, 20, grid.step, 1 << 16), 12 + 6 * 50 * 60 * 60 * 20),
                            broken, "more than 16 bytes can hold"),
+        **damaged_words("weights", weighing, small_weights, powers_at + 5),
+        "weights-power": (weighing(patched(small_weights, powers_at, "<b", 16)), broken, "not one of float16's"),
+        "weights-range": (weighing(patched(small_weights, powers_at, "<b", 15)), broken, "no number of float16"),
+        "weights-none": (weighing(small_weights[:powers_at + 3]), broken, "cut off within its words"),
+        "weights-length": (weighing(small_weights, small_raw + 2), broken, "bytes of weights, not those"),
         "midpoints-elsewhere": (resealed(patched(told, small_entry + 16, "<H", CODEC_MIDPOINTS)), broken, "codec 3"),
         "no-decoder": (without(deco), broken, "0 DECO chunks"),
         "no-segment": (without(len(chunks) - 1), broken, "its segments hold 2 rows, not 3"),
@@ -782,6 +809,13 @@ def _hybrid(features: int, width: int, hidden: int) -> HybridDecoder:
     shapes = HybridDecoder.shapes(features, width, hidden)
     return HybridDecoder(density_bias=0.5, **{
         name: _noise(shape, 17 + k) / np.float32(64) for k, (name, shape) in enumerate(shapes.items())})
+
+
+def _extreme(decoder: Decoder) -> Decoder:
+    """With the largest and the smallest numbers that codec 2 has, and an array of zeros."""
+    return replace(decoder, density_weight=np.float32([-65504, 65504, 32][:len(decoder.density_weight)]), w1=0 * decoder.w1,
+                   b1=np.float32([1, -2, 2048]) * np.float32(0.5**24),
+                   w2=_noise(decoder.w2.shape, 83) * np.float32(16), b2=_noise(decoder.b2.shape, 84) * np.float32(0.5**20))
 
 
 def _motion(rows: int, nz: int, ny: int, nx: int, step: float = 8.0) -> QuantisedMotion:
