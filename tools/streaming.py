@@ -136,7 +136,8 @@ def prefixes(job: Arrival) -> list[dict[str, Any]]:
 def _lengthened(scene: Path, folder: Path) -> Path:
     """A clip LONGER times as long: its time planes over and over."""
     short = read(scene)
-    scales = tuple({name: replace(plane, symbols=np.tile(plane.symbols, (LONGER, 1, 1)), coded=np.tile(plane.coded, (LONGER, 1)))
+    scales = tuple({name: replace(plane, symbols=np.tile(plane.symbols, (LONGER, 1, 1)), coded=np.tile(plane.coded, (LONGER, 1)),
+                                  guide=None, starts=())
                     if name in TIME_PLANES else plane for name, plane in scale.items()} for scale in short.scales)  # fmt: skip
     motion = None if short.motion is None else replace(short.motion, symbols=np.tile(short.motion.symbols, (LONGER, 1, 1, 1, 1)))
     long = replace(short, clip=Clip(short.clip.frame_count * LONGER, short.clip.fps), scales=scales, motion=motion,
