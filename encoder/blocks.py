@@ -73,7 +73,7 @@ def in_blocks(
     symbol = short_above((STEPS * PARTS / quantiser * step).astype(np.float32))
     finer = quantise_plane(values, symbol, identity=identity, needed=known)
     wanted = (values.astype(np.float64) - finer.offset) / finer.step * (PARTS / quantiser)
-    rows = rows_of_segments(len(values)) if identity else len(values)
+    rows = rows_of_segments(len(values), identity)
     symbols, told = np.zeros(values.shape, np.int8), {}
     for start in range(0, len(values), rows):
         own = slice(start, start + rows)

@@ -92,6 +92,6 @@ def _cheapest(
 
 def _size(plane: QuantisedPlane, identity: bool) -> int:
     """Bytes of its segments."""
-    rows = rows_of_segments(len(plane.symbols)) if identity else len(plane.symbols)
+    rows = rows_of_segments(len(plane.symbols), identity)
     return sum(len(encode_coded(plane.symbols[start : start + rows], plane.coded[start : start + rows], guide_at(plane.guide, start)))
                for start in range(0, len(plane.symbols), rows))  # fmt: skip

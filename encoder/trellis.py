@@ -95,7 +95,7 @@ class _Search:
                  together: np.ndarray, lattice: int) -> None:
         self.plane, self.identity, self.together, self.lattice = plane, identity, together, lattice
         self._finer = FINER if lattice == AROUND else 1.0
-        self.rows = rows_of_segments(len(values)) if identity else len(values)
+        self.rows = rows_of_segments(len(values), identity)
         coarser = plane.step / step
         self.wanted = (values.astype(np.float64) - plane.offset) / plane.step
         known = np.ascontiguousarray(plane.coded)

@@ -197,7 +197,7 @@ def header_and_index(entries: Sequence[Entry], value_count: int, version: int = 
     would not be smaller."""
     index, stored = _plain_index(entries), sum(entry.stored_length for entry in entries)
     if version == VERSION:
-        told = _in_columns(index)
+        told = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(in_columns(index))
         if len(told) < len(index) and len(told) + stored >= LEAST_CHUNK * len(entries):
             index = told
         else:
@@ -218,10 +218,9 @@ def _plain_index(entries: Sequence[Entry]) -> bytes:
     return b"".join(parts)
 
 
-def _in_columns(index: bytes) -> bytes:
-    """As those of version 2 hold it: byte 0 of all entries, then byte 1 of all, ..., but for offsets, in a zstd frame."""
-    columns = np.frombuffer(index, np.uint8).reshape(-1, ENTRY.size)[:, :TOLD].T.tobytes()
-    return zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(columns)
+def in_columns(index: bytes) -> bytes:
+    """What the frame of those of version 2 holds: byte 0 of all entries of a plain index, then byte 1 of all, ..., but for offsets."""
+    return np.frombuffer(index, np.uint8).reshape(-1, ENTRY.size)[:, :TOLD].T.tobytes()
 
 
 def _zstd_frames(parts: Sequence[bytes]) -> list[bytes]:
@@ -325,7 +324,7 @@ class Reader:
         return tuple(entries)
 
     def _out_of_columns(self, index: bytes) -> bytes:
-        """Undo `_in_columns`; with offsets of 0."""
+        """The plain index of a frame of its columns, `in_columns`; with offsets of 0."""
         columns = self._unframed(index, self.header.chunk_count * TOLD, "chunk index")
         rows = np.zeros((self.header.chunk_count, ENTRY.size), np.uint8)
         rows[:, :TOLD] = np.frombuffer(columns, np.uint8).reshape(TOLD, -1).T

@@ -201,7 +201,8 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> l
 def _segments_of(plane: QuantisedPlane, over_time: bool, segment_rows: int | None) -> list[tuple[int, int]]:
     """First rows, and the rows after the last."""
     rows = len(plane.symbols)
-    starts = plane.starts or range(0, rows, (segment_rows or rows_of_segments(rows)) if over_time else rows)
+    usual = rows_of_segments(rows, over_time)
+    starts = plane.starts or range(0, rows, segment_rows if segment_rows and over_time else usual)
     return list(pairwise([*starts, rows]))
 
 

@@ -15,8 +15,10 @@ counters that know nothing. With 16 rows files of room and soldier are two and t
 frames have it, shelf_hand's are. And rows, of which segments have a multiple: blocks do not end with them (`kpc.format.blocks`)."""
 
 
-def rows_of_segments(rows: int) -> int:
-    """In each segment, but the last, of a time plane of so many rows."""
+def rows_of_segments(rows: int, over_time: bool) -> int:
+    """In each segment, but the last, of a plane of so many rows: all of a space plane's."""
+    if not over_time:
+        return rows
     count = max(1, rows // SEGMENT_ROWS)
     return -(-rows // (count * WHOLE)) * WHOLE
 

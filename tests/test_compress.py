@@ -44,8 +44,6 @@ def steady(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"{__name__}.{name}", value)
 
 
-
-
 def measure(scene: Scene) -> Measured:
     """A stand-in for pictures: noise of 1e-3, and what the planes err."""
     pairs = zip(scene.scales, SCENE.scales)

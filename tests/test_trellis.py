@@ -246,8 +246,8 @@ def test_what_is_hardly_told_goes_around_predictions(identity: bool) -> None:
     rounded = quantise_plane(values, step, identity=identity)
 
     def cost(plane: QuantisedPlane) -> float:
-        segments = range(0, len(values), rows_of_segments(len(values)))
-        parts = [slice(start, start + segments.step) for start in segments] if identity else [slice(None)]
+        segments = range(0, len(values), rows_of_segments(len(values), identity))
+        parts = [slice(start, start + segments.step) for start in segments]
         bodies = [encode_symbols(plane.symbols[rows], plane.coded[rows], plane.guide) for rows in parts]
         assert all(guide_of(body) == plane.guide for body in bodies)
         errors = plane.dequantise() - values

@@ -28,7 +28,7 @@ from kpc.format.blocks import FINENESSES, HEAD, Blocks, blocks_of, encode_blocks
 from kpc.format.cameras import Camera
 from kpc.format.cells import encode_cells
 from kpc.format.container import (
-    CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_ZSTD, ENTRY, HEADER, PLAIN_VERSION, TOLD, VERSION, Chunk, Reader,
+    CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_ZSTD, ENTRY, HEADER, PLAIN_VERSION, VERSION, Chunk, Reader,
 )
 from kpc.format.errors import UsageError
 from kpc.format.file import (
@@ -264,7 +264,7 @@ def in_columns(data: bytes, change: Callable[[bytes], bytes] = bytes, count: int
     The index may be changed before it comes into the frame, the frame itself, and the number of chunks in the header; checksums are right.
     """
     reader = Reader(data)
-    columns = change(np.frombuffer(data, np.uint8, ENTRY.size * len(reader.index), HEADER.size).reshape(-1, ENTRY.size)[:, :TOLD].T.tobytes())
+    columns = change(container.in_columns(data[HEADER.size:HEADER.size + reader.header.index_length]))
     index = frame(b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", len(columns)) + struct.pack("<I", 1 | len(columns) << 3)[:3] + columns)
     body = data[HEADER.size + reader.header.index_length:]
     head = patched(data[:HEADER.size], 24, "<IIQ", len(index), count or len(reader.index), HEADER.size + len(index) + len(body))
