@@ -34,6 +34,7 @@ from kpc.format.midpoints import decode_midpoints, encode_midpoints
 from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.nodes import decode_nodes, encode_nodes
 from kpc.format.planes import decode_segment, encode_segment
+from kpc.format.poses import decode_poses, encode_poses
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.segments import SegmentGuide, decode_coded, encode_coded, guide_at, guide_together, rows_of_segments, segment_guide
@@ -181,7 +182,7 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> l
         kind = "HYBR" if isinstance(scene.decoder, HybridDecoder) else "DECO"
         chunks += [_decoder_chunk(kind, scene.decoder, parsed.feature_count), _occupancy_chunk(scene.occupancy)]
         if scene.cameras:
-            chunks.append(Chunk("came", [_pack_cameras(scene.cameras)]))
+            chunks.append(_cameras_chunk(scene.cameras))
         if scene.appearances:
             appe = _pack_appearances(scene.appearances, len(scene.decoder.b1))
             _parse_appearances(appe, len(scene.decoder.b1))
@@ -284,10 +285,12 @@ def _occupancy_chunk(occupancy: np.ndarray) -> Chunk:
     return Chunk("OCCU", [raw], coded={CODEC_SYMBOLS: lambda: head + encode_cells(occupancy)}, symbol_count=len(raw))
 
 
-def _pack_cameras(cameras: tuple[Camera, ...]) -> bytes:
-    return struct.pack("<H", len(cameras)) + b"".join(
+def _cameras_chunk(cameras: tuple[Camera, ...]) -> Chunk:
+    raw = struct.pack("<H", len(cameras)) + b"".join(
         CAMERA_STRUCT.pack(c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy, *np.ravel(c.camera_to_world[:3]))
         for c in cameras)
+    told = encode_poses(cameras)
+    return Chunk("came", [raw], coded={} if told is None else {CODEC_SYMBOLS: lambda: told}, symbol_count=len(raw))
 
 
 def _pack_appearances(appearances: tuple[Appearance, ...], hidden: int) -> bytes:
@@ -458,6 +461,9 @@ class SceneReader(Reader):
         number = self._at_most_one("came")
         if number is None or not self.available(number):
             return ()
+        if self.index[number].codec == CODEC_SYMBOLS:
+            raw_length = self.index[number].raw_length
+            return self._parsed(lambda body: _parse_coded_cameras(body, raw_length), self._context_coded(number))
         return self._parsed(_parse_cameras, self.chunk(number, 2 + CAMERA_LIMIT * CAMERA_STRUCT.size))
 
     def appearances(self) -> tuple[Appearance, ...]:
@@ -703,19 +709,29 @@ def _parse_cameras(raw: bytes) -> tuple[Camera, ...]:
     count, = cursor.unpack(struct.Struct("<H"))
     if not 0 < count <= CAMERA_LIMIT:
         raise FormatError(f"came: {count} cameras (1 to {CAMERA_LIMIT} allowed)")
-    cameras = []
-    for number in range(count):
-        width, height, fl_x, fl_y, cx, cy, *pose = cursor.unpack(CAMERA_STRUCT)
-        matrix = np.vstack([np.reshape(pose, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
-        lengths = np.linalg.norm(matrix[:3, :3], axis=0)
-        if max(map(abs, (fl_x, fl_y, cx, cy, *pose))) > BOX_LIMIT or lengths.min() < 0.5 or lengths.max() > 2.0:
-            raise FormatError(f"came: camera {number} lies absurdly far, or its axes are not of length 1")
-        try:
-            cameras.append(Camera(width, height, fl_x, fl_y, cx, cy, matrix))
-        except DatasetError as error:
-            raise FormatError(f"came: camera {number}: {error}") from error
+    cameras = tuple(_camera(number, cursor.unpack(CAMERA_STRUCT)) for number in range(count))
     cursor.finish()
-    return tuple(cameras)
+    return cameras
+
+
+def _parse_coded_cameras(body: bytes, raw_length: int) -> tuple[Camera, ...]:
+    told = decode_poses(body, CAMERA_LIMIT)
+    if raw_length != 2 + len(told) * CAMERA_STRUCT.size:
+        raise FormatError(f"came: claims {raw_length:,} bytes, not those of {len(told)} cameras")
+    return tuple(_camera(number, numbers) for number, numbers in enumerate(told))
+
+
+def _camera(number: int, numbers: tuple[Any, ...]) -> Camera:
+    """Of those of CAMERA_STRUCT."""
+    width, height, fl_x, fl_y, cx, cy, *pose = numbers
+    matrix = np.vstack([np.reshape(pose, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    if max(map(abs, (fl_x, fl_y, cx, cy, *pose))) > BOX_LIMIT or lengths.min() < 0.5 or lengths.max() > 2.0:
+        raise FormatError(f"came: camera {number} lies absurdly far, or its axes are not of length 1")
+    try:
+        return Camera(width, height, fl_x, fl_y, cx, cy, matrix)
+    except DatasetError as error:
+        raise FormatError(f"came: camera {number}: {error}") from error
 
 
 def _parse_appearances(raw: bytes, expected_hidden: int) -> tuple[Appearance, ...]:

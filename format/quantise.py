@@ -15,6 +15,7 @@ import numpy as np
 from kpc.format.cameras import Camera
 from kpc.format.errors import FormatError
 from kpc.format.motion import QuantisedMotion, places_reached, quantise_motion
+from kpc.format.poses import rigid, rounded
 from kpc.format.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
 from kpc.format.space import SpaceMapping
 from kpc.format.segments import PlaneGuide
@@ -128,8 +129,7 @@ def shortened(values: np.ndarray) -> np.ndarray:
 
 
 CAMERA_BITS = 16
-"""Significant bits of focal lengths and principal points, and places behind the point of axes: a picture of a thousand pixels is shifted
-or turned by a hundredth of one, and the 32 cameras of shelf_hand take 1,310 bytes in place of 1,534."""
+"""Significant bits of focal lengths and principal points: a picture of a thousand pixels is shifted by a hundredth of one."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def quantise_scene(scene: Scene, steps: Sequence[Mapping[str, np.ndarray | float
     return QuantisedScene(
         np.asarray(scene.aabb, np.float32), scene.clip, tuple(scales), round_decoder(scene.decoder),
         np.asarray(scene.occupancy, bool), np.asarray(scene.background, np.float32), float(scene.step),
-        tuple(round_camera(camera) for camera in scene.cameras), scene.mapping,
+        round_cameras(scene.cameras), scene.mapping,
         None if scene.motion is None else quantise_motion(scene.motion),
         tuple(Appearance(appearance.name, half(appearance.code, "appearances")) for appearance in scene.appearances),
     )
@@ -267,9 +267,15 @@ def half(weights: np.ndarray, what: str = "decoder") -> np.ndarray:
     return np.asarray(weights).astype(np.float16).astype(np.float32)
 
 
-def round_camera(camera: Camera) -> Camera:
-    """The camera with its numbers rounded to CAMERA_BITS, but for its place: that to float32, for nobody knows how far the origin is."""
+def round_cameras(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """Cameras with focal lengths and principal points rounded to CAMERA_BITS, and poses to turns and places, `kpc.format.poses`; where they
+    are more than those, to float32."""
+    lenses = tuple(_with_short_lens(camera) for camera in cameras)
+    if lenses and rigid(lenses):
+        return rounded(lenses)
+    return tuple(replace(camera, camera_to_world=camera.camera_to_world.astype(np.float32).astype(np.float64)) for camera in lenses)
+
+
+def _with_short_lens(camera: Camera) -> Camera:
     fl_x, fl_y, cx, cy = _to_bits(np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy]), CAMERA_BITS).tolist()
-    pose = camera.camera_to_world.astype(np.float32).astype(np.float64)
-    pose[:3, :3] = np.rint(pose[:3, :3] * 2.0**CAMERA_BITS) / 2.0**CAMERA_BITS
-    return replace(camera, fl_x=fl_x, fl_y=fl_y, cx=cx, cy=cy, camera_to_world=pose)
+    return replace(camera, fl_x=fl_x, fl_y=fl_y, cx=cx, cy=cy)

@@ -112,7 +112,7 @@ def chunks(data, partial):  # section 4
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
         if known:
-            if kind in (b"PLNE", b"OCCU", b"MOVE", b"DECO", b"HYBR") and codec == 2 or kind == b"MOVE" and codec == 3:
+            if kind in (b"PLNE", b"OCCU", b"MOVE", b"DECO", b"HYBR", b"came") and codec == 2 or kind == b"MOVE" and codec == 3:
                 require(raw <= 32768 * stored, "so much in too few bytes")
                 content = None if body is None else (raw, body, codec)
             else:
@@ -201,7 +201,7 @@ def decode(data, partial=False):
     expected = sum(s["channels"] for s in scene["scales"])
     scene |= hybrid_chunk(parts["HYBR"], expected) if "HYBR" in parts else decoder_chunk(parts["DECO"], expected)
     scene |= coded_occupancy_chunk(*parts["OCCU"][:2]) if isinstance(parts["OCCU"], tuple) else occupancy_chunk(Bytes(parts["OCCU"]))
-    scene["cameras"] = cameras_chunk(Bytes(parts["came"])) if parts.get("came") is not None else []
+    scene["cameras"] = cameras_chunk(parts["came"]) if parts.get("came") is not None else []
     scene["appearances"] = appearances_chunk(Bytes(parts["appe"]), scene["hidden"]) if parts.get("appe") is not None else {}
 
     for scale in scene["scales"]:
@@ -689,16 +689,45 @@ def coded_occupancy_chunk(raw_length, body):  # section 8, codec 2
         occupied[s, z, y, x] for z in range(nz) for y in range(ny) for x in range(nx) for s in range(slots)]}
 
 
-def cameras_chunk(chunk):  # section 9
-    count, = chunk.unpack("H")
-    require(1 <= count <= 4096, "number of cameras")
-    cameras = []
-    for _ in range(count):
-        width, height, *numbers = chunk.unpack("HH16f")
+def cameras_chunk(content):  # section 9
+    """`content`: the raw bytes, or with codec 2 their length, the stored bytes and the codec."""
+    if isinstance(content, tuple):
+        cameras = posed_cameras(Bytes(content[1]))
+        require(content[0] == 2 + 68 * len(cameras), "raw length")
+    else:
+        chunk = Bytes(content)
+        count, = chunk.unpack("H")
+        cameras = [chunk.unpack("HH16f") for _ in range(count)]
+        chunk.end()
+    require(1 <= len(cameras) <= 4096, "number of cameras")
+    for width, height, *numbers in cameras:
         require(width and height and all(abs(n) <= 2**30 for n in numbers) and min(numbers[:2]) > 0, "camera")
         axes = [[numbers[4 + 4 * row + column] for row in range(3)] for column in range(3)]
         require(all(0.5 <= math.hypot(*axis) <= 2 for axis in axes), "camera axes")
-        cameras.append((width, height, *numbers))
+    return cameras
+
+
+def posed_cameras(chunk):  # section 9, codec 2
+    count, lens_count, exponent, *corner = chunk.unpack("HHb3i")
+    require(1 <= count <= 4096 and lens_count in (1, count) and -126 <= exponent <= 30, "poses")
+    lenses, cameras = [chunk.unpack("HH4f") for _ in range(lens_count)], []
+    for number in range(count):
+        turn, place = (int.from_bytes(chunk.take(7), "little") for _ in range(2))
+        require(place < 1 << 54, "place")
+        q = [(turn >> 18 * i & 0x3FFFF) - 131072 for i in range(3)]
+        rest = 2 * 131071**2 - sum(a * a for a in q)
+        require(rest >= 0, "turn")
+        squares = [a * a for a in q]
+        q.insert(turn >> 54, math.sqrt(rest))
+        squares.insert(turn >> 54, rest)
+        (w, x, y, z), (_, xx, yy, zz) = q, squares
+        rows = [[131071**2 - (yy + zz), x * y - w * z, x * z + w * y], [x * y + w * z, 131071**2 - (xx + zz), y * z - w * x],
+                [x * z - w * y, y * z + w * x, 131071**2 - (xx + yy)]]
+        pose = []
+        for row in range(3):
+            at = corner[row] + (place >> 18 * row & 0x3FFFF)
+            pose += [f32(a / 131071**2) + 0.0 for a in rows[row]] + [f32(math.ldexp(at, exponent))]  # no 0 has a sign
+        cameras.append((*lenses[number if lens_count > 1 else 0], *pose))
     chunk.end()
     return cameras
 

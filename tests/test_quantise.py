@@ -7,7 +7,7 @@ from scenes import tiny_scene
 from kpc.format.cameras import Camera
 from kpc.format.errors import FormatError
 from kpc.format.quantise import (VALUE_LIMIT, QuantisedPlane, needed_texels, quantise_plane, quantise_scene,
-                                 round_camera, round_decoder)
+                                 round_cameras, round_decoder)
 from kpc.format.scene import TIME_PLANES, Decoder
 
 
@@ -163,11 +163,19 @@ def test_cameras_are_rounded_by_no_more_than_pictures_show():
     pose = tiny_scene().cameras[0].camera_to_world.copy()
     pose[:3, 3] += 5e5  # a survey's origin may be far away
     camera = Camera(4000, 48, 3001.07, 50.2, 1999.9, -24.3, pose)
-    rounded = round_camera(camera)
+    rounded, = round_cameras([camera])
     assert rounded.width == 4000 and rounded.fl_x == np.float32(rounded.fl_x)
     for name in ("fl_x", "fl_y", "cx", "cy"):
         assert abs(getattr(rounded, name) / getattr(camera, name) - 1) <= 2.0**-16
-    assert np.abs(rounded.camera_to_world - pose)[:3, :3].max() <= 2.0**-17
-    assert np.array_equal(rounded.camera_to_world[:3, 3], pose[:3, 3].astype(np.float32))
-    again = round_camera(rounded)
+    assert np.abs(rounded.camera_to_world - pose)[:3, :3].max() <= 1e-5
+    assert np.abs(rounded.camera_to_world - pose)[:3, 3].max() <= 2.0**-5  # as float32
+    again, = round_cameras([rounded])
     assert np.array_equal(again.camera_to_world, rounded.camera_to_world) and again.fl_x == rounded.fl_x
+
+
+def test_poses_that_are_more_than_turns_and_places_are_rounded_to_float32():
+    pose = np.diag([1.1, 0.9, -1.0, 1.0])
+    pose[:3, 3] = 0.1
+    rounded, = round_cameras([Camera(4, 3, 5.0, 5.0, 2.0, 1.5, pose)])
+    assert np.array_equal(rounded.camera_to_world, pose.astype(np.float32))
+    assert round_cameras(()) == ()

@@ -193,7 +193,7 @@ def _describe_chunk(entry: Entry, missing: bool, size: int) -> dict[str, Any]:
         "scale": entry.scale if is_plane else None,
         "plane": ALL_PLANES[entry.plane] if is_plane else None,
         "rows": [entry.row_start, entry.row_start + entry.row_count] if is_plane else None,
-        "codec": CODEC_NAMES.get(entry.codec, str(entry.codec)),
+        "codec": "packed" if entry.kind == "came" and entry.codec == CODEC_SYMBOLS else CODEC_NAMES.get(entry.codec, str(entry.codec)),
         "offset": entry.offset,
         "stored_bytes": entry.stored_length,
         "raw_bytes": entry.raw_length,

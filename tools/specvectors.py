@@ -32,13 +32,15 @@ from kpc.format.container import (
 )
 from kpc.format.errors import UsageError
 from kpc.format.file import (
-    APPEARANCE_LIMIT, AXIS_LIMIT, BOX_LIMIT, CAMERA_LIMIT, CHANNEL_LIMIT, DECODER_STRUCT, FRAME_LIMIT, HIDDEN_LIMIT, MOTION_LIMIT, MOTION_STRUCT,
+    APPEARANCE_LIMIT, AXIS_LIMIT, BOX_LIMIT, CAMERA_LIMIT, CAMERA_STRUCT, CHANNEL_LIMIT, DECODER_STRUCT, FRAME_LIMIT, HIDDEN_LIMIT, MOTION_LIMIT, MOTION_STRUCT,
     NAME_LIMIT, SAMPLE_LIMIT, SCALE_LIMIT, read, scene_chunks,
 )
 from kpc.format.midpoints import encode_midpoints
 from kpc.format.motion import QuantisedMotion
 from kpc.format.nodes import LORENZO, NEIGHBOURS
 from kpc.format.nodes import encode_with as encode_nodes_with
+from kpc.format.poses import BITS, LENS, NOTHING, ROOT, WORD
+from kpc.format.poses import HEAD as POSES_HEAD
 from kpc.format.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.rans import stream
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder
@@ -239,6 +241,24 @@ def coded_weights(scene: QuantisedScene) -> bytes:
     return pack(chunks, _value_count(scene))
 
 
+def posed(scene: QuantisedScene, body: bytes) -> bytes:
+    """A file of raw chunks with these cameras, as `told_poses` tells them."""
+    chunks = [replace(chunk, parts=[body]) if chunk.kind == "came" else chunk for chunk in scene_chunks(scene)]
+    came = next(number for number, chunk in enumerate(chunks) if chunk.kind == "came")
+    return claiming(chunks, came, _value_count(scene), 2 + struct.unpack_from("<H", body)[0] * CAMERA_STRUCT.size)
+
+
+def told_poses(exponent: int, corner: tuple[int, ...], turns: list[tuple[int, ...]], places: list[tuple[int, ...]], lenses: int = 1) -> bytes:
+    """The `came` chunk of such cameras under codec 2. `turns`: which number of a quaternion is left out, and the others."""
+    def word(numbers: tuple[int, ...], above: int = 0) -> bytes:
+        return sum(number << BITS * k for k, number in enumerate((*numbers, above))).to_bytes(WORD, "little")
+
+    told = (word(tuple(number + NOTHING for number in others), largest) + word(place)
+            for (largest, *others), place in zip(turns, places, strict=True))
+    kinds = (LENS.pack(64 + k, 48, 80.0, 80.5 + k, 32.0, 24.0) for k in range(lenses))
+    return POSES_HEAD.pack(len(turns), lenses, exponent, *corner) + b"".join(kinds) + b"".join(told)
+
+
 def all_zstd(scene: QuantisedScene) -> bytes:
     """A file all of whose chunks are zstd frames, also where raw ones would be smaller."""
     chunks = scene_chunks(scene)
@@ -331,6 +351,11 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
     index = Reader(packed).index
     coarse_ends = next(entry.offset for entry in index if entry.scale == 1)
     columns = in_columns(context_coded(dynamic, 8, segment_rows=4))
+    plain = _scene(dynamic=False, sizes=[(1, 2, 2, 2, 0)], cameras=1)
+    some = _noise((5, 6), 83).astype(int) * 500
+    poses = told_poses(-17, (-131072, 3, 99999), [(k % 4, *some[k, :3].tolist()) for k in range(5)],
+                       [tuple((some[k, 3:] + NOTHING).tolist()) for k in range(5)])
+    turns = [(largest, *others) for largest in range(4) for others in ((-ROOT, -ROOT, 0), (ROOT, 0, ROOT - 1), (0, 0, -NOTHING), (0, 0, 0))]
     return {
         "minimal": (encode(minimal, compress=False), False),
         "static": (encode(_scene(dynamic=False, sizes=[(3, 17, 13, 11, 0)])), False),
@@ -384,6 +409,11 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "weights": (coded_weights(dense), False),
         "weights-hybrid": (coded_weights(hybrid), False),
         "weights-prefix": (coded_weights(dense)[:Reader(coded_weights(dense)).index[4].offset], True),
+        "poses": (posed(plain, poses), False),
+        "poses-prefix": (posed(plain, poses)[:Reader(posed(plain, poses)).index[4].offset], True),
+        "poses-lenses": (posed(plain, told_poses(-24, (-5, 1 << 24, -7), 3 * [(0, 3, 4, 5)], [(1, 0, 2), (0, 9, 0), (4, 4, 0)], lenses=3)), False),
+        "poses-extremes": (posed(plain, told_poses(30, (-1, 0, -1), turns, [(k & 1, k >> 1 & 1, 0) for k in range(len(turns))])), False),
+        "poses-small": (posed(plain, told_poses(-126, (-(1 << 31), 0, (1 << 31) - 1), [(3, 0, 0, 0)], [((1 << BITS) - 1, 1, 0)])), False),
         "weights-extremes": (coded_weights(replace(dense, decoder=_extreme(dense.decoder))), False),
         "columns": (columns, False),
         "columns-prefix": (columns[:Reader(columns).index[9].offset], True),
@@ -565,6 +595,12 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         stored = [Chunk("DECO", [body]) if number == small_deco else chunk for number, chunk in enumerate(small_chunks)]
         return claiming(stored, small_deco, 24, length)
 
+    told_turn = told_poses(-10, (0, 1, 2), [(0, 1, 2, 3), (1, 4, 5, 6)], [(7, 8, 9), (0, 0, 0)])
+
+    def turned(body: bytes, length: int = 2 + 2 * CAMERA_STRUCT.size) -> bytes:
+        """A file with such cameras, which claim to stand for so many bytes."""
+        return claiming([*small_chunks[:3], Chunk("came", [body]), *small_chunks[3:]], 3, 24, length)
+
     def damaged_words(name: str, made: Callable[[bytes], bytes], body: bytes, state_at: int) -> dict[str, tuple[bytes, str, str]]:
         """Files, `made` of a body with state and words from `state_at` to its end, in which these are damaged."""
         last = len(body) - 1
@@ -666,6 +702,19 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "weights-range": (weighing(patched(small_weights, powers_at, "<b", 15)), broken, "no number of float16"),
         "weights-none": (weighing(small_weights[:powers_at + 3]), broken, "cut off within its words"),
         "weights-length": (weighing(small_weights, small_raw + 2), broken, "bytes of weights, not those"),
+        "poses-head": (turned(told_turn[:POSES_HEAD.size - 1]), broken, "cut off within its head"),
+        "poses-none": (turned(patched(told_turn, 0, "<H", 0)), broken, "0 cameras"),
+        "poses-many": (turned(patched(told_turn, 0, "<H", 4097)), broken, "4097 cameras"),
+        "poses-lenses": (turned(patched(told_turn, 2, "<H", 3)), broken, "3 lenses of 2 cameras"),
+        "poses-exponent": (turned(patched(told_turn, 4, "<b", 31)), broken, "multiples of 2^31"),
+        "poses-fine": (turned(patched(told_turn, 4, "<b", -127)), broken, "multiples of 2^-127"),
+        "poses-short": (turned(told_turn[:-1]), broken, "are not those of 2 cameras"),
+        "poses-long": (turned(told_turn + bytes(1)), broken, "are not those of 2 cameras"),
+        "poses-turn": (turned(told_poses(0, (0, 0, 0), 2 * [(0, -ROOT, ROOT, 1)], 2 * [(0, 0, 0)])), broken, "a turn or a place is none"),
+        "poses-place-bits": (turned(patched(told_turn, len(told_turn) - 1, "<B", 64)), broken, "a turn or a place is none"),
+        "poses-far": (turned(told_poses(30, (2, 0, 0), 2 * [(0, 0, 0, 0)], 2 * [(0, 0, 0)])), broken, "absurdly far"),
+        "poses-focal": (turned(patched(told_turn, POSES_HEAD.size + 4, "<f", 0.0)), broken, "focal length"),
+        "poses-length": (turned(told_turn, 2 + 68), broken, "claims 70 bytes"),
         "midpoints-elsewhere": (resealed(patched(told, small_entry + 16, "<H", CODEC_MIDPOINTS)), broken, "codec 3"),
         "no-decoder": (without(deco), broken, "0 DECO chunks"),
         "no-segment": (without(len(chunks) - 1), broken, "its segments hold 2 rows, not 3"),
