@@ -21,7 +21,8 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.encoder.curvature import SIDE
-from kpc.encoder.worth import LAM, bits_of_magnitudes, changes, others, worths
+from kpc.encoder.maps import told_texels
+from kpc.encoder.worth import LAM, bits_of_magnitudes, others, worths
 from kpc.format.blocks import (
     ENDS, FINENESSES, FREQUENCIES, LARGEST, PARTS, SIZES, USUAL, Blocks, around, blocks_of, coarser, cosines, decode_blocks, encode_blocks,
     end_context, foreseen_mean, largest_side, last_diagonal, level_context, quantisers, usual_end,
@@ -62,7 +63,7 @@ def in_blocks(
     """
     worth, known = worths(significant, plane.coded), plane.coded
     if identity:
-        known = known & changes((values - plane.offset) / step, worth)
+        known = told_texels((values - plane.offset) / step, worth, known)
     if not known.any():
         return None
     wanted = values[known].astype(np.float64)

@@ -25,7 +25,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from kpc.encoder.worth import ACROSS, ALONE, BESIDE, LAM, bits_of_magnitudes, changes, others, worths
+from kpc.encoder.maps import told_texels
+from kpc.encoder.worth import ACROSS, ALONE, BESIDE, LAM, bits_of_magnitudes, others, worths
 from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, quantise_plane, short_above
 from kpc.format.rans import compiled
 from kpc.format.segments import rows_of_segments
@@ -101,7 +102,7 @@ class _Search:
         known = np.ascontiguousarray(plane.coded)
         worth = worths(significant, known)
         if identity:
-            known = known & changes(self.wanted / self._finer, worth)
+            known = told_texels(self.wanted / self._finer, worth, known)
         self.known, self.worth = known, worth * np.float32(coarser**2)
         self.symbols = np.where(known[..., None], plane.symbols, np.int8(0))
         self.counts = np.zeros((2 * ACTIVITIES, TOLD_APART))

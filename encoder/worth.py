@@ -31,10 +31,6 @@ TOGETHER = 0.3
 """In what curvature says of two channels. What is left to chance in it, and bits that it takes to make up for others, make less of it
 better than all. At equal error of pictures files are smaller by 2.6 % (default scene), 3.5 % (liam) and 3 to 5 % (soldier) than without; with
 0.2 to 0.6 liam's by about as much, with 0.5 soldier's hardly."""
-UNCHANGED = 0.6
-"""Squared steps, as much as they are worth, in the mean over channels: a texel of a time plane that is nearer to 1 is taken for it. Room and
-liam: from 0.2 to 0.8 files are the same, half a percent smaller than where all channels have to be within a step, and identity is a third
-of the time planes in place of a quarter."""
 LEAST_WORTH = 0.03
 """Of an error, as a share of the channel's mean: what no ray met may yet be seen, and what lets light through may be made to hide what is
 behind. Soldier, held-out views: with 1e-4 squared errors are a tenth larger where steps are fine, and a third where they are coarse, most of
@@ -57,12 +53,6 @@ def bits_of_magnitudes(counts: np.ndarray, mean: np.ndarray, trust: float = 4.0)
     bits: np.ndarray = -np.log2(shares / shares.sum(1, keepdims=True))
     bits[:, 1:] += 1
     return bits
-
-
-def changes(away: np.ndarray, worth: np.ndarray) -> np.ndarray:
-    """(H, W) bool: the texels of a time plane that are worth telling, for how far they are from the identity, (H, W, M) in steps."""
-    far: np.ndarray = (worth * away**2).mean(axis=2) >= UNCHANGED
-    return far
 
 
 def cost(errors: np.ndarray, together: np.ndarray) -> float:
