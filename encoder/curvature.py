@@ -52,13 +52,13 @@ class Curvature:
     motion: np.ndarray | None = None
 
 
-def curvature(scene: Scene, probe: Probe, rays: int = RAYS) -> Curvature:
-    """Of a scene's planes, by a probe and by random rays of its cameras, as far as they pass where anything may be.
+def curvature(scene: Scene, probe: Probe, rays: int | None = None) -> Curvature:
+    """Of a scene's planes, by a probe and by random rays of its cameras, as far as they pass where anything may be; in all RAYS, if not said.
 
     Takes one copy of the planes and of their gradient per core, M numbers for SIDE^2 of them, and nothing that grows with `rays`.
     """
     renderer, rng = SceneRenderer(scene), np.random.default_rng(3)
-    field = renderer.field
+    field, rays = renderer.field, RAYS if rays is None else rays
     probe = probe.some(rng.permutation(np.flatnonzero(renderer.meets(*probe.rays)))[:rays])
     more = Probe.of_surfaces(scene, rays - len(probe.times), seed=2)
     learnt = [field.theta] if field.motion is None else [field.theta, field.motion]

@@ -22,6 +22,13 @@ def one_thread():
     numba.set_num_threads(before)
 
 
+@pytest.fixture
+def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures and planes are judged by a few rays, as many as tiny scenes need."""
+    monkeypatch.setattr("kpc.encoder.probe.PROBE_RAYS", 512)
+    monkeypatch.setattr("kpc.encoder.curvature.RAYS", 1 << 13)
+
+
 @pytest.fixture(scope="session")
 def moving(tmp_path_factory: pytest.TempPathFactory) -> "Dataset":
     """A moving object with alpha, seen once an instant."""

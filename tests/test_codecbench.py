@@ -73,7 +73,7 @@ def scene_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def few(monkeypatch: pytest.MonkeyPatch) -> None:
+def few(monkeypatch: pytest.MonkeyPatch, few_rays: None) -> None:
     """Here, and with little to do; what it does in processes of its own one test says."""
     def here(jobs: list[codecbench.Job], views: object, processes: int) -> list[Point | None]:
         codecbench._source.cache_clear()
@@ -84,7 +84,6 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
             codecbench._judge_by(None)
 
     monkeypatch.setattr(codecbench, "in_parallel", here)
-    monkeypatch.setattr("kpc.encoder.probe.PROBE_RAYS", 512)
     monkeypatch.setattr(codecbench, "TUNE_STEPS", 0)
     monkeypatch.setattr(codecbench, "RATES", (1e-3, 3.0, 4.0))
     monkeypatch.setattr(codecbench, "QUALITIES", (60, 70, 80, 90))

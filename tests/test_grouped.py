@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from kpc.encoder import kpenc, probe
+from kpc.encoder import kpenc
 from kpc.encoder.compress import Trade
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
@@ -28,7 +28,7 @@ from kpc.format.groups import Groups, Span, Timeline
 from kpc.format.scene import Clip
 from kpc.tools import joins, kpjoin
 
-pytestmark = pytest.mark.usefixtures("one_thread", "tiny")
+pytestmark = pytest.mark.usefixtures("one_thread", "few_rays", "tiny")
 FRAMES = 26
 
 
@@ -37,7 +37,6 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     config = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
                          occupancy_start=8, occupancy_every=4)  # fmt: skip
     monkeypatch.setitem(PRESETS, "draft", config)
-    monkeypatch.setattr(probe, "PROBE_RAYS", 512)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

@@ -12,7 +12,7 @@ from datasets import write_n3dv
 from scenes import tiny_scene
 
 import kpc
-from kpc.encoder import probe, profile
+from kpc.encoder import profile
 from kpc.encoder.ablations import ABLATIONS, changed_by
 from kpc.encoder.config import PRESETS
 from kpc.format.file import write
@@ -30,7 +30,7 @@ GROUPS = str(Path(__file__).parents[1] / "spec" / "vectors" / "valid" / "groups.
 
 
 @pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch, one_thread: None) -> None:
+def here(monkeypatch: pytest.MonkeyPatch, one_thread: None, few_rays: None) -> None:
     """In this process, with little to do. What would go to one of its own and come back is pickled, as it would be."""
 
     def alone(work: Callable[[Any], Any], job: Any) -> Any:
@@ -38,7 +38,6 @@ def here(monkeypatch: pytest.MonkeyPatch, one_thread: None) -> None:
         return pickle.loads(pickle.dumps(work(job)))
 
     monkeypatch.setattr(kpbench, "_alone", alone)
-    monkeypatch.setattr(probe, "PROBE_RAYS", 512)
     monkeypatch.setitem(PRESETS, "draft", SMALL)
 
 

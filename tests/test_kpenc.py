@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 
-from kpc.encoder import kpenc, probe
+from kpc.encoder import curvature, kpenc, probe
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import pixels
 from kpc.encoder.train import Trainer
@@ -26,7 +26,7 @@ from kpc.format import cli, file
 from kpc.format.scene import HybridDecoder
 from kpc.format.space import DeviceCoordinates
 
-pytestmark = pytest.mark.usefixtures("one_thread", "tiny", "heeded_signals")
+pytestmark = pytest.mark.usefixtures("one_thread", "few_rays", "tiny", "heeded_signals")
 TINY = dict(
     tune_steps=0,
     resolutions=(8, 16),
@@ -52,7 +52,6 @@ def heeded_signals() -> Iterator[None]:
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "draft", TrainConfig(**TINY))  # type: ignore[arg-type]
-    monkeypatch.setattr(probe, "PROBE_RAYS", 512)
 
 
 @pytest.fixture(scope="module")
@@ -300,6 +299,7 @@ def test_an_interrupted_run_resumes_to_the_same_file(
     monkeypatch.undo()
     monkeypatch.setitem(PRESETS, "draft", TrainConfig(**TINY))  # type: ignore[arg-type]
     monkeypatch.setattr(probe, "PROBE_RAYS", 512)
+    monkeypatch.setattr(curvature, "RAYS", 1 << 13)
     code, _, err = run(sets / "blender", "--resume")
     assert code == 0 and "resumed at step 13" in err
     assert output.read_bytes() == whole
@@ -733,8 +733,8 @@ def _failing_for(target: Path, error: BaseException) -> Callable[[Path, Path], N
 def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
     script = (
         f"import sys\n{preparation}\n"
-        "from kpc.encoder import kpenc, probe\nfrom kpc.encoder.config import PRESETS, TrainConfig\n"
-        f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nprobe.PROBE_RAYS = 512\nsys.exit(kpenc.main({argv!r}))"
+        "from kpc.encoder import curvature, kpenc, probe\nfrom kpc.encoder.config import PRESETS, TrainConfig\n"
+        f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nprobe.PROBE_RAYS = 512\ncurvature.RAYS = 1 << 13\nsys.exit(kpenc.main({argv!r}))"
     )
     return subprocess.Popen(
         [sys.executable, "-c", script],

@@ -17,7 +17,7 @@ from kpc.format.quantise import quantise_scene
 from kpc.format.scene import Decoder, Scene
 from kpc.player import reference
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
 SPARE = 0.05
 
 Rays = tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -13,7 +13,7 @@ import pytest
 import torch
 from scenes import SPACES, tiny_scene, varied
 
-from kpc.encoder import kpenc, model, probe, tuning
+from kpc.encoder import kpenc, model, tuning
 from kpc.encoder.compress import Trade
 from kpc.encoder.config import PRESETS, TrainConfig
 from kpc.encoder.evaluate import SceneRenderer
@@ -25,7 +25,7 @@ from kpc.format.quantise import quantise_scene
 from kpc.format.scene import Scene
 from kpc.player import reference
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
 TINY = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
                    occupancy_start=8, occupancy_every=4)  # fmt: skip
 
@@ -34,8 +34,7 @@ Kpenc = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture(autouse=True)
-def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(probe, "PROBE_RAYS", 512)
+def short_tuning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tuning, "RAYS", 256)
 
 

@@ -18,7 +18,7 @@ from kpc.format import file
 from kpc.format.quantise import QuantisedScene
 from kpc.format.scene import Decoder, Scene
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
 STEP = 0.2
 
 
