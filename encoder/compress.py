@@ -17,7 +17,7 @@ from kpc.encoder.occupancy import in_fewest_slots
 from kpc.encoder.probe import Measure, Measured, squares_of
 from kpc.encoder.search import TOLERANCE, cheapest, farthest, farthest_tuned
 from kpc.format import file
-from kpc.format.quantise import HALF_BITS, QuantisedScene, reached_by, round_decoder, short_above
+from kpc.format.quantise import HALF_BITS, QuantisedScene, reached_by, round_decoder, short_above, weights_of
 from kpc.format.scene import Scene
 
 FINEST, COARSEST = -13.0, 2.0
@@ -46,7 +46,7 @@ SLOTS_SHARE, MORE_CELLS = 0.05, 1 / 3
 """Of the error that coding may bring, how much of it fewer slots of the occupancy may; and by how many more cells, at most, players have to
 march. Soldier: 4 slots for 8 take 6.7 KB in place of 12.4, and a picture of 640x480 on two cores 80 ms in place of 64; so it is left to
 files that are to be small, from 0.4 dB of loss on."""
-DECODER_SHARE, FEWEST_BITS = 0.02, 4
+DECODER_SHARE, FEWEST_BITS = 0.02, 3
 """Of the error that coding may bring, how much fewer bits of the decoder's weights may; and the fewest. Default scene and room: 1.5 and 2.1 KB in place
 of 1.9 and 2.6 with 7 significant bits, 1.4 and 1.9 with 6; an error of a fiftieth planes undo with a fifth of a kilobyte."""
 LEAST_SIGNIFICANCE = 1e-6
@@ -166,11 +166,20 @@ def with_fewer_slots(scene: Scene, measure: Measure, error: float) -> Scene:
     return candidate if measure(candidate).error - measure(scene).error <= error else scene
 
 
-def decoder_bits(scene: Scene, measure: Measure, error: float) -> int:
-    """The fewest significant bits of the decoder's weights that add at most `error`, in squares of 8-bit levels."""
-    known = measure(scene).error
-    return next((bits for bits in range(FEWEST_BITS, HALF_BITS)
-                 if measure(replace(scene, decoder=round_decoder(scene.decoder, bits))).error - known <= error), HALF_BITS)
+def decoder_bits(scene: Scene, measure: Measure, error: float) -> dict[str, int]:
+    """Of each array of the decoder's weights, for `round_decoder`, the fewest bits with which all of them add at most `error`, in squares of
+    8-bit levels: first of all arrays alike, then of one after the other, those that take most first. None at all where HALF_BITS are too few."""
+    known, weights = measure(scene).error, weights_of(scene.decoder)
+
+    def enough(bits: dict[str, int]) -> bool:
+        return measure(replace(scene, decoder=round_decoder(scene.decoder, bits))).error - known <= error
+
+    alike = (dict.fromkeys(weights, count) for count in range(FEWEST_BITS, HALF_BITS + 1))
+    bits = next(filter(enough, alike), {})
+    for name in sorted(bits, key=lambda name: -weights[name].size):
+        while bits[name] > FEWEST_BITS and enough(fewer := bits | {name: bits[name] - 1}):
+            bits = fewer
+    return bits
 
 
 def relative_steps(significant: PerPlane) -> Steps:

@@ -7,7 +7,7 @@ judged by its own pictures.
 import math
 import zipfile
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,14 +27,14 @@ from kpc.encoder.motion import with_coarser_motion
 from kpc.encoder.probe import Measure, Measured, Probe
 from kpc.encoder.prune import Pruned, prune
 from kpc.encoder.search import TOLERANCE
-from kpc.encoder.tuning import tuned
+from kpc.encoder.tuning import spread, tuned
 from kpc.encoder.worth import Name
 from kpc.format import file
 from kpc.format.cameras import Camera
 from kpc.format.container import MAGIC
 from kpc.format.errors import FormatError, TrainingError, UsageError
 from kpc.format.motion import STEP
-from kpc.format.quantise import HALF_BITS, QuantisedPlane, QuantisedScene, quantise_scene, round_decoder
+from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_scene, round_decoder, short_above
 from kpc.format.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 
@@ -105,7 +105,7 @@ class Kept:
     Attributes:
         scene: as it is coded; `coded`: the file that holds just this scene, None where there is none.
         steps: of each plane, up to one factor. significant, together: as of `kpc.encoder.choice.quantise_by_cost`.
-        bits: significant ones of the decoder's weights.
+        bits: of the decoder's weights, as of `kpc.format.quantise.round_decoder`.
         pruned, spare_db: as of `Coded`.
     """
 
@@ -114,7 +114,7 @@ class Kept:
     steps: PerPlane
     significant: PerPlane
     together: PerPlane
-    bits: int = HALF_BITS
+    bits: Mapping[str, int] = field(default_factory=dict)
     pruned: Pruned | None = None
     spare_db: float = 0.0
 
@@ -174,6 +174,10 @@ def code(
             return replace(quantised, decoder=round_decoder(quantised.decoder, kept.bits))
 
         def tune(steps: PerPlane, reached: np.ndarray) -> QuantisedScene:
+            if model.coded is None:  # steps of a file were spread when it was made
+                factors = spread(kept.scene)
+                steps = [{name: short_above(step * np.float32(factors[s, name])) for name, step in scale.items()} for s, scale in enumerate(steps)]
+
             def choose(candidate: Scene, group: Sequence[Name]) -> QuantisedScene:
                 return chosen(candidate, steps, reached, kept.significant, group)
 

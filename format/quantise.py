@@ -230,18 +230,24 @@ def _reach(texels: int, cells: int) -> np.ndarray:
     return (((i + 1) * cells >= c * (texels - 1)) & ((i - 1) * cells <= (c + 1) * (texels - 1))).astype(np.float32)
 
 
-def round_decoder(decoder: AnyDecoder, bits: int = HALF_BITS) -> AnyDecoder:
-    """The decoder with its weights rounded to float16 (the density bias to float32), as float32 arrays; with fewer bits, those of an array
-    to as many as the largest of it has in so many.
+def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) -> AnyDecoder:
+    """The decoder with its weights rounded to float16 (the density bias to float32), as float32 arrays.
+
+    Args:
+        bits: of some of its arrays, at most HALF_BITS: the weights of each are rounded to as many places as its largest has in so many.
 
     Raises:
         FormatError: a weight is NaN, infinite or beyond float16's 65504.
     """
     if not np.isfinite(decoder.density_bias):
         raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
-    weights = {name: value if name == "density_bias" else half(_to_places(value, bits) if bits < HALF_BITS else value)
-               for name, value in vars(decoder).items()}
-    return replace(decoder, **weights | {"density_bias": float(np.float32(decoder.density_bias))})
+    shorter = {name: half(_to_places(value, bits[name]) if bits and name in bits else value) for name, value in weights_of(decoder).items()}
+    return replace(decoder, **shorter, density_bias=float(np.float32(decoder.density_bias)))
+
+
+def weights_of(decoder: AnyDecoder) -> dict[str, np.ndarray]:
+    """Its arrays: all but the density bias."""
+    return {name: value for name, value in vars(decoder).items() if name != "density_bias"}
 
 
 def _to_bits(values: np.ndarray, bits: int) -> np.ndarray:

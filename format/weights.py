@@ -1,8 +1,8 @@
 """Weights of decoders under codec 2: whole multiples of a power of two, told one after the other (spec, section 7).
 
 What they cost is how often each multiple comes, by magnitude, in its array. Neighbours in rows, or other colours, say next to nothing of them.
-At 0.15 dB of loss shelf_hand's take 1,113 bytes, where zstd made 1,460 of float16 rounded to so many significant bits each that it costs as little;
-at 2.5 dB 869 in place of 1,240. Room's take 1.9 KB at 0.1 dB, in place of 2.6 at 0.15. One number of bits serves all arrays.
+Where each array has as few bits as its errors allow (`kpc.encoder.compress.decoder_bits`) shelf_hand's take 0.8 to 1.1 KB from 2.5 to 0.1 dB of loss,
+where zstd makes 1.2 to 1.5 of float16 that is rounded weight by weight; room's 1.4 to 1.9 KB, in place of 2.0 to 2.6.
 """
 
 import math

@@ -13,12 +13,12 @@ from kpc.encoder.evaluate import as_wide_as, evenly_wide
 from kpc.encoder.probe import Probe
 from kpc.encoder.choice import quantise_by_cost
 from kpc.encoder.worth import Name
-from kpc.encoder.tuning import coded_in_groups, order, steps_after, steps_in_all, tuned
+from kpc.encoder.tuning import SPREAD, coded_in_groups, order, spread, steps_after, steps_in_all, tuned
 from kpc.format import file
 from kpc.format.quantise import QuantisedScene
 from kpc.format.scene import Decoder, Scene
 
-pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
+pytestmark = pytest.mark.usefixtures("one_thread")
 STEP = 0.2
 
 
@@ -42,6 +42,14 @@ def test_every_plane_has_its_turn_the_finest_first() -> None:
     assert [{s for s, _ in group} for group in groups] == [{s} for s in (2, 2, 2, 1, 1, 1, 0, 0, 0, 2, 1, 0)]
     assert sorted(plane for group in groups for plane in group) == sorted((s, name) for s in range(3) for name in scene.scales[s])
     assert order(tiny_scene(dynamic=False, scales=1)) == [[(0, "xy")], [(0, "xz")], [(0, "yz")]]
+
+
+def test_what_is_coded_first_is_coded_most_coarsely() -> None:
+    scene = tiny_scene(scales=2)
+    factors = spread(scene)
+    in_order = [factors[plane] for group in order(scene) for plane in group]
+    assert in_order == sorted(in_order, reverse=True) and len(in_order) == 12
+    assert in_order[0] == 1 / in_order[-1] == 2**SPREAD and factors[0, "xt"] == factors[0, "zt"]
 
 
 @pytest.mark.parametrize("make", [tiny_scene, partial(tiny_scene, dynamic=False), lambda: displaced(tiny_scene())])
