@@ -67,7 +67,7 @@ def test_sizes_at_equal_loss_beside_the_smallest_at_hand() -> None:
 
 @pytest.fixture
 def scene_file(tmp_path: Path) -> Path:
-    scene = tiny_scene(3)
+    scene = tiny_scene(3, channels=4)
     file.write(quantise_scene(scene, [{name: 0.002 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
     return tmp_path / "scene.kpc"
 
@@ -84,6 +84,7 @@ def few(monkeypatch: pytest.MonkeyPatch, few_rays: None) -> None:
             codecbench._judge_by(None)
 
     monkeypatch.setattr(codecbench, "in_parallel", here)
+    monkeypatch.setattr("kpc.encoder.model.TOLERANCE", 0.2)
     monkeypatch.setattr(codecbench, "TUNE_STEPS", 0)
     monkeypatch.setattr(codecbench, "RATES", (1e-3, 3.0, 4.0))
     monkeypatch.setattr(codecbench, "QUALITIES", (60, 70, 80, 90))
@@ -106,9 +107,9 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert len(ours["points"]) == 6  # no file has a thousandth of a bit
     for found in ours["points"]:
         assert found["size_bytes"] <= whole and sum(found["shares"].values()) == pytest.approx(1)
-        assert found["bits_per_parameter"] == pytest.approx(8 * found["size_bytes"] / tiny_scene(3).parameter_count)
+        assert found["bits_per_parameter"] == pytest.approx(8 * found["size_bytes"] / tiny_scene(3, channels=4).parameter_count)
     rates = [p["size_bytes"] for p in ours["points"][:2]]
-    assert rates[0] <= 3 * tiny_scene(3).parameter_count / 8 and rates[0] < rates[1]
+    assert rates[0] <= 3 * tiny_scene(3, channels=4).parameter_count / 8 and rates[0] < rates[1]
     for found, quality in zip(ours["points"][2:], (60, 70, 80, 90), strict=True):
         assert found["setting"] == f"quality {quality}"
         # A file's own rounding is not much finer; and errors leap where a plane of so few texels leaves the trellis for predictions.
@@ -179,7 +180,7 @@ def test_a_rival_that_is_tuned_comes_nearer_and_codes_every_plane_once(
     plain = codecbench.point(codecbench.Job(scene_file, Bytes().name, 4, 100))
     once, shapes[:] = sorted(shapes), ()
     tuned = codecbench.point(codecbench.Job(scene_file, "levels, tuned", 4, 100))
-    assert sorted(shapes) == once == sorted(plane.shape for scale in tiny_scene(3).scales for plane in scale.values())
+    assert sorted(shapes) == once == sorted(plane.shape for scale in tiny_scene(3, channels=4).scales for plane in scale.values())
     assert plain is not None and tuned is not None and tuned["agreement_db"] > plain["agreement_db"] + 0.2
     assert 0.8 * plain["size_bytes"] < tuned["size_bytes"] < 1.3 * plain["size_bytes"] and tuned["search_s"] > tuned["encode_s"]
 
