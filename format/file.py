@@ -289,6 +289,7 @@ def _cameras_chunk(cameras: tuple[Camera, ...]) -> Chunk:
     raw = struct.pack("<H", len(cameras)) + b"".join(
         CAMERA_STRUCT.pack(c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy, *np.ravel(c.camera_to_world[:3]))
         for c in cameras)
+    _parse_cameras(raw)
     told = encode_poses(cameras)
     return Chunk("came", [raw], coded={} if told is None else {CODEC_SYMBOLS: lambda: told}, symbol_count=len(raw))
 
