@@ -15,6 +15,7 @@ import numpy as np
 
 from kpc.format.cameras import Camera
 from kpc.format.errors import FormatError
+from kpc.format.rotations import quaternion_of
 
 HEAD = struct.Struct("<HHb3i")
 """count, lenses (one that all share, or one each), exponent, corner"""
@@ -101,7 +102,7 @@ def _poses(cameras: Sequence[Camera]) -> np.ndarray:
 def _as_words(poses: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
     """Exponent and (3,) int64 corner of places, and (N, 2) uint64: turns and places of (N, 3, 4) poses."""
     places = poses[:, :, 3]
-    low, extent, reach = places.min(0), float(np.ptp(places, axis=0).max()), float(np.abs(places).max())
+    extent, reach = float(np.ptp(places, axis=0).max()), float(np.abs(places).max())
     least = max(extent / ((1 << BITS) - 1), reach / EXACT, 2.0**FINEST)
     exponent = int(np.ceil(np.log2(least)))
     multiples = np.rint(np.ldexp(places, -exponent)).astype(np.int64)
@@ -110,7 +111,7 @@ def _as_words(poses: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
         multiples = np.rint(np.ldexp(places, -exponent)).astype(np.int64)
     corner = multiples.min(0)
 
-    quaternions = _quaternions(poses[:, :, :3])
+    quaternions = quaternion_of(poses[:, :, :3])
     largest = np.abs(quaternions).argmax(1)
     quaternions *= np.sign(quaternions[np.arange(len(poses)), largest])[:, None]
     others = quaternions[np.arange(4) != largest[:, None]].reshape(-1, 3)
@@ -128,18 +129,6 @@ def _joined(numbers: np.ndarray) -> np.ndarray:
 def _parted(words: np.ndarray) -> np.ndarray:
     """What `_joined` undoes, (N, 3) int64."""
     return (words[:, None] >> np.arange(0, 3 * BITS, BITS, dtype=np.uint64) & np.uint64((1 << BITS) - 1)).astype(np.int64)
-
-
-def _quaternions(axes: np.ndarray) -> np.ndarray:
-    """(N, 4), w x y z, unit, of (N, 3, 3) turns: row k of 4 q q^T over its length, where q_k is largest (Shepperd, J. Guidance and
-    Control 1, 1978)."""
-    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(axes, 0, -1)
-    products = np.array([[1 + a + e + i, h - f, c - g, d - b], [h - f, 1 + a - e - i, b + d, c + g],
-                         [c - g, b + d, 1 - a + e - i, f + h], [d - b, c + g, f + h, 1 - a - e + i]])
-    largest = np.diagonal(products).argmax(1)
-    rows = products[largest, :, np.arange(len(axes))]
-    unit: np.ndarray = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    return unit
 
 
 def _from_words(exponent: int, corner: np.ndarray, words: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from kpc.format.cameras import Camera, Shot, load_shots, save_shots
 from kpc.format.errors import DatasetError
+from kpc.format.rotations import quaternion_of, rotation_of
 
 GAP_S = 2.0
 """From one keyframe to the next where nothing else is said."""
@@ -153,29 +154,3 @@ def _hermite(ends: np.ndarray, speeds: np.ndarray, share: float) -> np.ndarray:
 
 def _nonzero(values: np.ndarray) -> np.ndarray:
     return np.where(values == 0, 1.0, values)
-
-
-def quaternion_of(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a (3, 3) rotation, w >= 0; of a matrix that is nearly one, of the nearest (Bar-Itzhack 2000).
-
-    It is the eigenvector of the largest eigenvalue of a symmetric matrix made of the rotation's entries.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    symmetric = np.array([
-        [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-        [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-        [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-        [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-    ])  # fmt: skip
-    quaternion = np.linalg.eigh(symmetric)[1][:, -1]
-    return np.asarray(quaternion if quaternion[0] >= 0 else -quaternion)
-
-
-def rotation_of(quaternion: np.ndarray) -> np.ndarray:
-    """The (3, 3) rotation of (w, x, y, z), of any length but 0."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip

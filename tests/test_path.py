@@ -12,7 +12,8 @@ from scenes import look_at
 
 from kpc.format.cameras import Camera, Shot, load_shots, save_shots
 from kpc.format.errors import DatasetError
-from kpc.player.path import GAP_S, CameraPath, quaternion_of, rotation_of
+from kpc.format.rotations import quaternion_of, rotation_of
+from kpc.player.path import GAP_S, CameraPath
 
 VIEWS = tuple(
     look_at((3 * math.cos(a), 0.7 + 0.2 * a, 3 * math.sin(a)), (0.1, 0.05, 0.05), 48, 36, 50.0 + 10 * a) for a in (0.0, 0.9, 2.1, 4.0)

@@ -7,15 +7,13 @@ from hypothesis import strategies as st
 
 from kpc.format.cameras import Camera
 from kpc.format.poses import decode_poses, encode_poses, rigid, rounded
+from kpc.format.rotations import rotation_of
 
 
 def camera(quaternion, place, lens=80.0):
     """A camera turned by a quaternion w x y z of any length."""
-    w, x, y, z = np.asarray(quaternion, np.float64) / np.linalg.norm(quaternion)
     pose = np.eye(4)
-    pose[:3, :3] = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
+    pose[:3, :3] = rotation_of(np.asarray(quaternion))
     pose[:3, 3] = place
     return Camera(64, 48, lens, lens, 32.0, 24.0, pose)
 

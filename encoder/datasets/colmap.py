@@ -26,6 +26,7 @@ from kpc.encoder.datasets.capture import (
     say_missing,
 )
 from kpc.format.errors import DatasetError
+from kpc.format.rotations import rotation_of
 
 MODELS = {
     "SIMPLE_PINHOLE": (0, "f cx cy"),
@@ -169,14 +170,7 @@ def _camera_to_world(where: str, pose: tuple[float, ...]) -> np.ndarray:
     length = math.hypot(*pose[:4])
     if not (all(map(math.isfinite, pose)) and 0 < length < math.inf):
         raise DatasetError(f"{where}: pose holds NaN, infinity or no rotation; remove the image or calibrate it anew")
-    w, x, y, z = (value / length for value in pose[:4])
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = rotation_of(np.array(pose[:4]) / length)  # which would overflow with some of them
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = rotation.T * [1, -1, -1]
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused with the other poses that are not finite
