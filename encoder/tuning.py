@@ -35,8 +35,8 @@ LEARNING_RATE, DECODER_LEARNING_RATE = 2e-3, 5e-4
 """At first; they fall to 0 along a line. With 5e-3 errors are 0.1 dB smaller, but planes, noisier, take 2 % more bytes."""
 
 SPREAD = 0.2
-"""Octaves of steps. At equal error of pictures files are 3 % smaller for it (room at 33 dB of agreement; 2 at 43 dB) or as large (shelf_hand at 38
-and 43 dB). With 0.3 shelf_hand's are 3 % smaller at 33 dB, but 3 larger at 43."""
+"""Octaves of steps. At equal error of pictures files of room are 3 % smaller at 33 dB of agreement (4 with 0.4), of shelf_hand as large at 38 dB (1 % larger
+with 0.4). With 0.3 room's are 2 % smaller at 43 dB, shelf_hand's 3 % smaller at 33 dB, but 3 larger at 43, where with 0.15 they are as large."""
 
 
 def order(scene: Scene) -> list[list[Name]]:
