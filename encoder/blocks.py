@@ -25,7 +25,7 @@ from kpc.encoder.maps import told_texels
 from kpc.encoder.worth import LAM, bits_of_magnitudes, others, worths
 from kpc.format.blocks import (
     ENDS, FINENESSES, FREQUENCIES, LARGEST, PARTS, SIZES, USUAL, Blocks, around, blocks_of, coarser, cosines, decode_blocks, encode_blocks,
-    end_context, foreseen_mean, largest_side, last_diagonal, level_context, quantisers, usual_end,
+    end_context, foreseen_mean, largest_side, last_diagonal, level_context, quantisers, sum_across,
 )
 from kpc.format.quantise import QuantisedPlane, quantise_plane, short_above
 from kpc.format.rans import compiled, inlined
@@ -189,6 +189,7 @@ def _search(wanted, worth, known, busy, levels, fineness, finer, basis, seen, fi
     end, end_before = np.zeros((BY + 1, BX + 1), np.int64), np.zeros((BY + 1, BX + 1), np.int64)
     mean = np.zeros((BY + 1, BX + 1))
     error, weight, curve, told = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N), np.int64)
+    right, bottom = np.zeros(N), np.zeros((BX, N))
     for m in range(M):
         moved = others(errors, together, m)
         for by in range(BY):
@@ -196,10 +197,13 @@ def _search(wanted, worth, known, busy, levels, fineness, finer, basis, seen, fi
                 Y, X, quantiser, block = by + 1, bx + 1, finer[fineness[by, bx]], levels[m, by, bx]
                 here, left, above, past = size[Y, X], size[Y, X - 1], size[Y - 1, X], before[Y, X]
                 mean[Y, X] = foreseen_mean(mean, by, bx)
-                foreseen = int(math.floor(mean[Y, X] / quantiser[0, 0] + 0.5))
                 here[:], end[Y, X] = 0, 0
                 if not busy[by, bx]:
                     continue
+                expected, beside, over = mean[Y, X], bx > 0 and busy[by, bx - 1], by > 0 and busy[by - 1, bx]
+                if beside or over:
+                    expected = sum_across(right, bottom[bx], beside, over) / 4 + expected / 2
+                foreseen = int(math.floor(expected / quantiser[0, 0] + 0.5))
                 if filled is not None:
                     _begin(filled[by * N : by * N + N, bx * N : bx * N + N, m], quantiser, basis, block)
                 _misses(block, quantiser, basis, error)
@@ -224,10 +228,11 @@ def _search(wanted, worth, known, busy, levels, fineness, finer, basis, seen, fi
                             block[i, j] = found
                         here[i, j] = abs(found - usual)
                 told[:] = here[:N, :N]
-                place = end_context(usual_end(end[Y, X - 1], end[Y - 1, X], end_before[Y, X]), N)
+                place = end_context(end[Y, X - 1], end[Y - 1, X], end_before[Y, X])
                 last = _trimmed(block, here, told, left, above, past, last_diagonal(told), quantiser, basis, seen, curve, error, weight, price,
                                 end_price[place])
                 end[Y, X], mean[Y, X] = last, block[0, 0] * quantiser[0, 0]
+                _edges(block, quantiser, basis, right, bottom[bx])
                 end_counts[place, last] += 1
                 for diagonal in range(last):
                     for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1):
@@ -268,6 +273,20 @@ def _misses(block, quantiser, basis, error):
         for j in range(len(block)):
             if block[i, j]:
                 _add(error, basis, i, j, block[i, j] * quantiser[i, j])
+
+
+@compiled()
+def _edges(block, quantiser, basis, right, bottom):
+    """What levels make in the last column and in the last row."""
+    N = len(basis)
+    right[:], bottom[:] = 0, 0
+    for i in range(N):
+        for j in range(N):
+            if block[i, j]:
+                factor = block[i, j] * quantiser[i, j]
+                for k in range(N):
+                    right[k] += factor * basis[j, N - 1] * basis[i, k]
+                    bottom[k] += factor * basis[i, N - 1] * basis[j, k]
 
 
 @inlined

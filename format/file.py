@@ -27,7 +27,7 @@ from kpc.format.cameras import Camera
 from kpc.format.cells import decode_cells, encode_cells
 from kpc.format.cli import written_aside
 from kpc.format.container import (
-    CODEC_MIDPOINTS, CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, AnySource, Chunk, Entry, Reader, open_source, pack,
+    CODEC_BORDERS, CODEC_MIDPOINTS, CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, AnySource, Chunk, Entry, Reader, open_source, pack,
 )
 from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.midpoints import decode_midpoints, encode_midpoints
@@ -37,7 +37,9 @@ from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.poses import decode_poses, encode_poses
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
-from kpc.format.segments import SegmentGuide, decode_coded, encode_coded, guide_at, guide_together, rows_of_segments, segment_guide
+from kpc.format.segments import (
+    SegmentGuide, codec_of, decode_coded, encode_coded, guide_at, guide_together, own_guide, rows_of_segments, segment_guide,
+)
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.format.weights import decode_weights, encode_weights
 
@@ -194,8 +196,9 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> l
     for _, number, of_plane, start, stop in sorted(segments):
         plane = scene.scales[number][ALL_PLANES[of_plane]]
         segment, coded = plane.symbols[start:stop], plane.coded[start:stop]
+        guide = own_guide(guide_at(plane.guide, start), segment, coded)
         chunks.append(Chunk("PLNE", encode_segment(segment, coded), number, of_plane, start, stop - start,
-                            {CODEC_SYMBOLS: partial(encode_coded, segment, coded, guide_at(plane.guide, start))}, segment.size))
+                            {codec_of(guide): partial(encode_coded, segment, coded, guide)}, segment.size))
     return chunks
 
 
@@ -402,13 +405,16 @@ class SceneReader(Reader):
         entry = self.index[number]
         plane = self.head.scales[entry.scale][ALL_PLANES[entry.plane]]
         texels, shape = entry.row_count * plane.columns, (entry.row_count, plane.columns, plane.channels)
-        if entry.codec != CODEC_SYMBOLS:
+        if entry.codec not in (CODEC_SYMBOLS, CODEC_BORDERS):
             payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * (1 + texels))
             return *self._parsed(lambda raw: decode_segment(raw, *shape), payload), None
         if entry.raw_length != texels * plane.channels:
             raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
                               f"{texels * plane.channels:,} of its rows")
-        return self._parsed(lambda body: (*decode_coded(body, *shape), segment_guide(body)), self._context_coded(number))
+        body = self._context_coded(number)
+        if codec_of(body) != entry.codec:
+            raise FormatError(f"{self.name}: chunk {number} (PLNE) uses codec {entry.codec}, but holds what that is not for")
+        return self._parsed(lambda body: (*decode_coded(body, *shape), segment_guide(body)), body)
 
     def mapping(self) -> SpaceMapping | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""

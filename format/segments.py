@@ -1,11 +1,12 @@
-"""Plane segments under codec 2, whichever way they are told: symbol by symbol (`kpc.format.symbols`) or in blocks (`kpc.format.blocks`)."""
+"""Plane segments under codecs 2 and 3, whichever way they are told: symbol by symbol (`kpc.format.symbols`) or in blocks (`kpc.format.blocks`)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from kpc.format.blocks import decode_blocks, holds_blocks
+from kpc.format.blocks import decode_blocks, goes_on_from_borders, holds_blocks
+from kpc.format.container import CODEC_BORDERS, CODEC_SYMBOLS
 from kpc.format.symbols import Guide, decode_symbols, encode_symbols, guide_of
 
 
@@ -53,11 +54,21 @@ def guide_together(guides: Mapping[int, SegmentGuide | None]) -> PlaneGuide | No
 
 
 def encode_coded(symbols: np.ndarray, coded: np.ndarray, guide: SegmentGuide | None = None) -> bytes:
-    """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: as their guide has it, if it does, else symbol by symbol."""
+    """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: as `own_guide` has it, if they have one, else symbol by symbol."""
+    return guide if isinstance(guide, bytes) else encode_symbols(symbols, coded, guide)
+
+
+def own_guide(guide: SegmentGuide | None, symbols: np.ndarray, coded: np.ndarray) -> SegmentGuide | None:
+    """A guide, unless it tells other symbols in blocks."""
     if not isinstance(guide, bytes):
-        return encode_symbols(symbols, coded, guide)
+        return guide
     told, where = decode_blocks(guide, *symbols.shape)
-    return guide if np.array_equal(told, symbols) and np.array_equal(where, coded) else encode_symbols(symbols, coded)
+    return guide if np.array_equal(told, symbols) and np.array_equal(where, coded) else None
+
+
+def codec_of(body: SegmentGuide | None) -> int:
+    """Of what `encode_coded` makes by a guide, or made."""
+    return CODEC_BORDERS if isinstance(body, bytes) and goes_on_from_borders(body) else CODEC_SYMBOLS
 
 
 def decode_coded(body: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:

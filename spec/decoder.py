@@ -112,7 +112,7 @@ def chunks(data, partial):  # section 4
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
         if known:
-            if kind in (b"PLNE", b"OCCU", b"MOVE", b"DECO", b"HYBR", b"came") and codec == 2 or kind == b"MOVE" and codec == 3:
+            if kind in (b"PLNE", b"OCCU", b"MOVE", b"DECO", b"HYBR", b"came") and codec == 2 or kind in (b"MOVE", b"PLNE") and codec == 3:
                 require(raw <= 32768 * stored, "so much in too few bytes")
                 content = None if body is None else (raw, body, codec)
             else:
@@ -220,7 +220,7 @@ def decode(data, partial=False):
             plane["held"] = True
             if isinstance(raw, tuple):
                 require(raw[0] == rows * plane["columns"] * channels, "number of symbols")
-                coded, symbols = context_coded(Bytes(raw[1]), rows, plane["columns"], channels)
+                coded, symbols = context_coded(Bytes(raw[1]), raw[2], rows, plane["columns"], channels)
             else:
                 coded, symbols = segment(Bytes(raw), rows, plane["columns"], channels)
             first = start * plane["columns"]
@@ -454,10 +454,11 @@ class Decisions:  # section 6, codec 2
         return coded
 
 
-def context_coded(chunk, H, W, channels):  # section 6, codec 2
+def context_coded(chunk, codec, H, W, channels):  # section 6, codecs 2 and 3
     """As `segment`."""
     set_count, flags = chunk.unpack("BB")
-    if flags in (6, 7):
+    require((flags in (14, 15)) == (codec == 3), "codec")
+    if flags in (6, 7, 14, 15):
         return in_blocks(chunk, set_count, flags, H, W, channels)
     require(set_count in (1, 2, 4, 8) and flags <= 5, "sets of weights or flags")
     has_map, lattice = flags % 2, flags // 2
@@ -538,13 +539,21 @@ LIKELY = [[27, 66, 61, 86, 79, 96, 118, 143, 168, 190, 206, 220, 230, 238, 243, 
           [19, 26, 24, 37, 37, 48, 67, 90, 120, 151, 179, 201, 217, 229, 235, 244],
           [110, 100, 90, 86, 82, 80, 87, 98, 117, 135, 160, 184, 204, 220, 230, 243]]
 LIKELY_MEANS = [243, 210, 220]
+AGREES = [134, 135, 138, 141, 152, 159, 164, 170, 178, 184, 190, 197, 205, 212, 218, 224, 229, 234, 239, 244]
+LOG2 = {4: 2, 8: 3, 16: 4}
 
 
-def in_blocks(chunk, N, flags, H, W, channels):  # section 6, codec 2, blocks
+def doublings(k):
+    """large, of a total."""
+    n = k.bit_length()
+    return n if n < 2 else 2 * n - 2 + (k >> n - 2) % 2
+
+
+def in_blocks(chunk, N, flags, H, W, channels):  # section 6, blocks
     """As `segment`."""
     Q, = chunk.unpack("B")
     require(N in (4, 8, 16) and (N == 4 or N <= 2 * min(H, W)) and Q > 0, "side of blocks or quantiser")
-    decisions = Decisions(chunk)
+    decisions, borders = Decisions(chunk), flags >= 14
     coded = decisions.map(H, W) if flags % 2 else {(y, x): 1 for y in range(H) for x in range(W)}
     BY, BX = -(-H // N), -(-W // N)
     told = {(b, d): any(coded.get((y, x)) for y in range(b * N, b * N + N) for x in range(d * N, d * N + N))
@@ -571,8 +580,7 @@ def in_blocks(chunk, N, flags, H, W, channels):  # section 6, codec 2, blocks
         quicker = 2 * (near(here, 0, 1) + near(here, 1, 0)) + near(here, 1, 1) + near(here, 0, 2) + near(here, 2, 0)
         beside = sum(near(block, *by) for block in ((b, d - 1), (b - 1, d)) for by in ((0, 0), (0, 1), (1, 0)))
         total = 3 * quicker + 2 * beside + 3 * size.get((c - 1, b, d, i, j), 0)
-        n = total.bit_length()
-        large = n if n < 2 else min(2 * n - 2 + (total >> n - 2) % 2, 15)
+        large = min(doublings(total), 15)
         quick = min(5 * (i + j) // N, 7) if i + j else 8
 
         def decided(k):
@@ -582,11 +590,38 @@ def in_blocks(chunk, N, flags, H, W, channels):  # section 6, codec 2, blocks
         if not decided(0):
             return 0
         m = decisions.magnitude(lambda k: decided(k + 1), 5, 12)
-        return m if decisions.decide(2048) else -m
+        return m if borders and i + j or decisions.decide(2048) else -m
+
+    def tell_signs(levels, q, end, beside, over):
+        """Make those levels negative that are. beside, over: what lies across the borders, None where nothing does."""
+        left, above = [8 * v for v in beside or [0] * N], [8 * v for v in over or [0] * N]
+        shift = 7 + LOG2[N]
+
+        def follow(i, j, c):
+            for k in range(N):
+                left[k] -= cosine(i, k) * (cosine(j, 0) * c + 64 >> 7) + (1 << shift - 1) >> shift
+                above[k] -= cosine(j, k) * (cosine(i, 0) * c + 64 >> 7) + (1 << shift - 1) >> shift
+
+        def pull(border, along, across):
+            return cosine(across, 0) * (sum(min(max(border[k], -4095), 4095) * cosine(along, k) for k in range(N)) >> 7)
+
+        follow(0, 0, min(max(levels[0, 0] * q[0, 0], -32768), 32767))
+        for i, j in [(i, diagonal - i) for diagonal in range(1, end) for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1)]:
+            if levels[i, j]:
+                c = min(levels[i, j] * q[i, j], 32767)
+                s = (pull(left, i, j) if beside else 0) + (pull(above, j, i) if over else 0)
+                if s:
+                    place = min(max(doublings(abs(s)) + doublings(c) - 2 * doublings(q[0, 0]) - 2 * LOG2[N] - 3, 0), 19)
+                    positive = decisions.by_counter(("sign", place), (256 * AGREES[place], 8)) == (s > 0)
+                else:
+                    positive = decisions.decide(2048)
+                if not positive:
+                    levels[i, j], c = -levels[i, j], -c
+                follow(i, j, c)
 
     symbols, size, end = [0] * (H * W * channels), {}, {}
     for c in range(channels):
-        mean = {}
+        mean, right, bottom = {}, {}, {}
         for b, d in told:
             q = {(i, j): max(Q * FINER[fine[b, d]] * COARSER[N][i] * COARSER[N][j] + 131072 >> 18, 1) for i in range(N) for j in range(N)}
             if b == 0 or d == 0:
@@ -596,25 +631,38 @@ def in_blocks(chunk, N, flags, H, W, channels):  # section 6, codec 2, blocks
                 mean[b, d] = min(max(left, above), max(min(left, above), left + above - mean[b - 1, d - 1]))
             if not told[b, d]:
                 continue
-            foreseen = (mean[b, d] + q[0, 0] // 2) // q[0, 0]
-            usual = end.get((c, b, d - 1), 0) + end.get((c, b - 1, d), 0) + 2 * end.get((c - 1, b, d), 0) + 2 >> 2
-            context = 0 if usual == 0 else 1 + (usual - 1) * 7 // (2 * N - 1)
-            end[c, b, d] = min(max(usual + decisions.error(("end", context), 6, 4), 0), 2 * N - 1)
+            beside, over = right.get((b, d - 1)), bottom.get((b - 1, d))
+            ends = end.get((c, b, d - 1), 0), end.get((c, b - 1, d), 0), end.get((c - 1, b, d), 0)
+            expected = mean[b, d]
+            if borders:
+                if beside or over:
+                    expected = sum(beside or over) * 4 + sum(over or beside) * 4 + expected >> 1
+                context = min(doublings(sum(ends)), 9)
+                end[c, b, d] = min(decisions.magnitude(lambda k: decisions.by_counter(("end", context, k)), 2, 4) - 1, 2 * N - 1)  # noqa: B023
+            else:
+                usual = ends[0] + ends[1] + 2 * ends[2] + 2 >> 2
+                context = 0 if usual == 0 else 1 + (usual - 1) * 7 // (2 * N - 1)
+                end[c, b, d] = min(max(usual + decisions.error(("end", context), 6, 4), 0), 2 * N - 1)
+            foreseen = (expected + q[0, 0] // 2) // q[0, 0]
             levels = {}
             for diagonal in range(end[c, b, d] - 1, -1, -1):
                 for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1):
                     levels[i, diagonal - i] = value = level(c, i, diagonal - i)
                     size[c, b, d, i, diagonal - i] = abs(value)
             levels[0, 0] = levels.get((0, 0), 0) + foreseen
+            if borders:
+                tell_signs(levels, q, end[c, b, d], beside, over)
             factors = {at: min(max(value * q[at], -32768), 32767) for at, value in levels.items()}
             mean[b, d] = factors[0, 0]
             down = [[sum(cosine(i, y) * factors.get((i, j), 0) for i in range(N)) + 64 >> 7 for j in range(N)] for y in range(N)]
-            shift = 10 + {4: 2, 8: 3, 16: 4}[N]
+            shift = 10 + LOG2[N]
+            v = [[min(max(sum(cosine(j, x) * down[y][j] for j in range(N)) + (1 << shift - 1) >> shift, -128), 127) for x in range(N)]
+                 for y in range(N)]
+            right[b, d], bottom[b, d] = [row[-1] for row in v], v[-1]
             for y in range(min(N, H - b * N)):
                 for x in range(min(N, W - d * N)):
                     if coded[b * N + y, d * N + x]:
-                        v = sum(cosine(j, x) * down[y][j] for j in range(N)) + (1 << shift - 1) >> shift
-                        symbols[((b * N + y) * W + d * N + x) * channels + c] = min(max(v, -128), 127)
+                        symbols[((b * N + y) * W + d * N + x) * channels + c] = v[y][x]
     decisions.end()
     return [coded[y, x] for y in range(H) for x in range(W)], symbols
 

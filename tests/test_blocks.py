@@ -11,6 +11,7 @@ from kpc.format import blocks, segments
 from kpc.format.blocks import (
     FINENESSES, HEAD, LARGEST, PARTS, SIDES, USUAL, Blocks, blocks_of, coarser, cosines, decode_blocks, encode_blocks, largest_side, quantisers,
 )
+from kpc.format.container import CODEC_BORDERS, CODEC_SYMBOLS
 from kpc.format.errors import FormatError
 from kpc.format.symbols import WEIGHTS, Guide, encode_symbols
 
@@ -63,6 +64,7 @@ def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(side: int, rows:
     for seed in range(4):
         told, coded = some(side, rows, columns, share, seed)
         symbols, where = decode_blocks(encode_blocks(told, coded), rows, columns, 3)
+        np.testing.assert_array_equal(symbols, decode_blocks(encode_blocks(told, coded, borders=False), rows, columns, 3)[0])
         np.testing.assert_array_equal(where, coded)
         exact = float_symbols(told, coded)
         # A rounded cosine errs by 1 / 256 of 1 at most, in each of two sums over levels; then half a symbol, and a 1 / 16 after the first sum.
@@ -74,13 +76,15 @@ def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(side: int, rows:
 
 @pytest.mark.parametrize(("side", "rows", "columns"), SIZES)
 @pytest.mark.parametrize("share", [0.6, 1.0])
-def test_the_spec_s_own_decoder_agrees(twin: ModuleType, side: int, rows: int, columns: int, share: float) -> None:
+@pytest.mark.parametrize("codec", [CODEC_SYMBOLS, CODEC_BORDERS])
+def test_the_spec_s_own_decoder_agrees(twin: ModuleType, codec: int, side: int, rows: int, columns: int, share: float) -> None:
     for seed in range(3):
         told, coded = some(side, rows, columns, share, seed + 10)
         told.levels[0, 0, 0, -1, -1], told.levels[-1, -1, -1, 0, -1] = -1, LARGEST  # the quickest alone, and the largest there is
-        body = encode_blocks(told, coded)
+        body = encode_blocks(told, coded, codec == CODEC_BORDERS)
+        assert segments.codec_of(body) == codec
         symbols, _ = decode_blocks(body, rows, columns, 3)
-        where, slow = twin.context_coded(twin.Bytes(body), rows, columns, 3)
+        where, slow = twin.context_coded(twin.Bytes(body), codec, rows, columns, 3)
         np.testing.assert_array_equal(np.reshape(where, coded.shape), coded)
         np.testing.assert_array_equal(np.reshape(slow, symbols.shape), symbols)
 
@@ -136,10 +140,11 @@ def test_a_guide_is_followed_only_where_symbols_are_its_own() -> None:
     told, coded = some(8, 20, 20, 0.8, 6)
     body = encode_blocks(told, coded)
     symbols, _ = decode_blocks(body, 20, 20, 3)
-    assert segments.encode_coded(symbols, coded, body) == body and segments.segment_guide(body) == body
+    assert segments.own_guide(body, symbols, coded) == segments.encode_coded(symbols, coded, body) == segments.segment_guide(body) == body
     moved = symbols.copy()
     moved[tuple(np.argwhere(coded)[0])] ^= 1
-    other = segments.encode_coded(moved, coded, body)
+    assert segments.own_guide(body, moved, coded) is None
+    other = segments.encode_coded(moved, coded)
     assert not blocks.holds_blocks(other)
     np.testing.assert_array_equal(segments.decode_coded(other, 20, 20, 3)[0], moved)
 

@@ -28,7 +28,7 @@ from kpc.format.blocks import FINENESSES, HEAD, Blocks, blocks_of, encode_blocks
 from kpc.format.cameras import Camera
 from kpc.format.cells import encode_cells
 from kpc.format.container import (
-    CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_ZSTD, ENTRY, HEADER, PLAIN_VERSION, VERSION, Chunk, Reader,
+    CODEC_BORDERS, CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_ZSTD, ENTRY, HEADER, PLAIN_VERSION, VERSION, Chunk, Reader,
 )
 from kpc.format.errors import UsageError
 from kpc.format.file import (
@@ -188,7 +188,8 @@ def around(scene: QuantisedScene, guide: Guide, segment_rows: int) -> QuantisedS
                                         for name, plane in scale.items()} for scale in scene.scales))
 
 
-def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *, segment_rows: int = 16) -> bytes:
+def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *, segment_rows: int = 16,
+              codec: int = CODEC_SYMBOLS) -> bytes:
     """A file all of whose planes are told in blocks of a side, or of smaller ones where a segment is small, with levels from noise, those of
     means as large as may be, quick ones small; levels grow and fall with `spread`."""
 
@@ -200,11 +201,14 @@ def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *
         levels = _noise((plane.symbols.shape[2], *grid, N, N), seed) / 128 * spread
         levels *= np.float32(1) / (1 + np.add.outer(np.arange(N), np.arange(N), dtype=np.float32)) ** 2
         fineness = np.abs(_noise(grid, seed + 1)).astype(np.int64) % FINENESSES
-        return encode_blocks(Blocks(np.trunc(levels).astype(np.int64), fineness, quantiser), coded)
+        return encode_blocks(Blocks(np.trunc(levels).astype(np.int64), fineness, quantiser), coded, codec == CODEC_BORDERS)
 
-    chunks = [_forced(chunk, body(chunk)) if chunk.kind == "PLNE" else replace(chunk, coded={})
+    chunks = [_forced(chunk, body(chunk), codec) if chunk.kind == "PLNE" else replace(chunk, coded={})
               for chunk in scene_chunks(scene, segment_rows=segment_rows)]
     return pack(chunks, _value_count(scene))
+
+
+on_from_borders = partial(in_blocks, codec=CODEC_BORDERS)
 
 
 def walked(symbols: np.ndarray, coded: np.ndarray, weights: np.ndarray, lattice: int) -> bytes:
@@ -393,6 +397,14 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "blocks-fine": (in_blocks(_scene(dynamic=False, sizes=[(2, 20, 17, 9, 0)]), 16, 1, 8196), False),
         "blocks-empty": (in_blocks(_painted(lambda shape, seed: np.zeros(shape), coded=False), 8, 64, 0), False),
         "blocks-one-texel": (in_blocks(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)]), 4, 64, 20), False),
+        "borders": (on_from_borders(dynamic, 16, 12, 60, segment_rows=4), False),
+        "borders-eight": (on_from_borders(_scene(dynamic=True, sizes=[(2, 20, 17, 9, 4)]), 8, 20, 100), False),
+        "borders-prefix": (on_from_borders(dynamic, 8, 64, 8)[:Reader(on_from_borders(dynamic, 8, 64, 8)).index[9].offset], True),
+        "borders-extremes": (on_from_borders(_scene(dynamic=True, sizes=[(2, 9, 6, 5, 4)]), 4, 255, 8196), False),
+        "borders-large": (on_from_borders(_scene(dynamic=False, sizes=[(2, 33, 20, 17, 0)]), 16, 255, 8196), False),
+        "borders-fine": (on_from_borders(_scene(dynamic=False, sizes=[(2, 20, 17, 9, 0)]), 16, 1, 8196), False),
+        "borders-empty": (on_from_borders(_painted(lambda shape, seed: np.zeros(shape), coded=False), 8, 64, 0), False),
+        "borders-one-texel": (on_from_borders(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)]), 4, 64, 20), False),
         "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
         "cells": (coded_grids(replace(dense, occupancy=rolling)), False),
         "cells-noise": (coded_grids(dense), False),
@@ -555,13 +567,15 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     small_chunks = scene_chunks(small)
     small_xy = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "PLNE")
 
-    def context(body: bytes) -> bytes:
+    def context(body: bytes, codec: int = CODEC_SYMBOLS) -> bytes:
         """A file whose first plane is so coded."""
-        told = [*small_chunks[:small_xy], _forced(small_chunks[small_xy], body), *small_chunks[small_xy + 1:]]
+        told = [*small_chunks[:small_xy], _forced(small_chunks[small_xy], body, codec), *small_chunks[small_xy + 1:]]
         return pack([chunk if number == small_xy else replace(chunk, coded={}) for number, chunk in enumerate(told)], 24)
 
     told = context(coarse)
-    in_four = encode_blocks(Blocks(np.trunc(_noise((2, 1, 1, 4, 4), 71) / 8).astype(np.int64), np.full((1, 1), 2), 40), whole)
+    four = Blocks(np.trunc(_noise((2, 1, 1, 4, 4), 71) / 8).astype(np.int64), np.full((1, 1), 2), 40)
+    in_four, from_borders = (encode_blocks(four, whole, borders) for borders in (False, True))
+    third = partial(context, codec=CODEC_BORDERS)
     small_entry = HEADER.size + ENTRY.size * small_xy
     state_at = 2 + WEIGHTS
     small_occu = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "OCCU")
@@ -669,6 +683,14 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "blocks-quantiser": (context(patched(in_four, 2, "<B", 0)), broken, "a quantiser of 0"),
         "blocks-head": (context(in_four[:2]), broken, "a quantiser of 0"),
         **damaged_words("blocks", context, in_four, HEAD),
+        "blocks-codec": (third(in_four), broken, "uses codec 3, but"),
+        "borders-codec": (context(from_borders), broken, "uses codec 2, but"),
+        "borders-flags": (third(patched(from_borders, 1, "<B", from_borders[1] | 16)), broken, "uses codec 3, but"),
+        "borders-side": (third(patched(from_borders, 0, "<B", 0)), broken, "unknown side of blocks"),
+        "borders-large": (third(patched(from_borders, 0, "<B", 16)), broken, "more than twice its 2 rows or columns"),
+        "borders-quantiser": (third(patched(from_borders, 2, "<B", 0)), broken, "a quantiser of 0"),
+        "borders-head": (third(from_borders[:2]), broken, "a quantiser of 0"),
+        **damaged_words("borders", third, from_borders, HEAD),
         **damaged_words("symbols", context, coarse, state_at),
         "symbols-bomb": (resealed(bomb_symbols), broken, "more than 15 bytes can hold"),
         "symbols-range": (context(walked(symbols + 200, whole, weights, ANY)), broken, "leaves its 8 bits"),
