@@ -53,6 +53,7 @@ TOLD_APART = 20
 
 def in_blocks(
     plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool, together: np.ndarray, side: int,
+    implied: np.ndarray | None = None,
 ) -> tuple[QuantisedPlane, int] | None:
     """A plane told in blocks of a side, or of smaller ones where a segment is small; and the bytes that takes. None where 8 bits are too few.
 
@@ -60,6 +61,7 @@ def in_blocks(
         plane: quantised to the nearest: what it leaves out stays so. values: (H, W, M) float32.
         step: (M,) for which bits are worth as much as `kpc.encoder.worth.LAM` says.
         significant, together: as of `kpc.encoder.trellis.on_trellis`.
+        implied: as of `kpc.format.blocks.encode_blocks`, for the plane.
     """
     worth, known = worths(significant, plane.coded), plane.coded
     if identity:
@@ -80,8 +82,9 @@ def in_blocks(
         own = slice(start, start + rows)
         there = np.ascontiguousarray(known[own])
         blocks = searched(wanted[own], worth[own], there, _own_blocks(together, start, rows), min(side, largest_side(*there.shape)), quantiser)
-        told[start] = encode_blocks(blocks, there)
-        symbols[own], _ = decode_blocks(told[start], *symbols[own].shape)
+        of_occupancy = None if implied is None else implied[own]
+        told[start] = encode_blocks(blocks, there, of_occupancy)
+        symbols[own], _ = decode_blocks(told[start], *symbols[own].shape, of_occupancy)
     return replace(finer, symbols=symbols, coded=known, guide=Told(told), starts=tuple(told)), sum(map(len, told.values()))
 
 

@@ -10,6 +10,7 @@ import os
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from kpc.encoder.blocks import in_blocks, step_in_blocks
 from kpc.encoder.curvature import PerPlane
 from kpc.encoder.trellis import THIN, on_trellis, step_on_trellis
 from kpc.encoder.worth import ALONE, Name, cost, worths
-from kpc.format.quantise import QuantisedPlane, QuantisedScene, quantise_scene
+from kpc.format.quantise import QuantisedPlane, QuantisedScene, needed_texels, quantise_scene
 from kpc.format.scene import TIME_PLANES, Scene
 from kpc.format.segments import Told, encode_coded, guide_at, rows_of_segments
 
@@ -47,10 +48,12 @@ def quantise_by_cost(
         thin: as of `kpc.encoder.trellis.on_trellis`. blocks: whether planes may be told in blocks.
     """
     quantised = quantise_scene(scene, steps, reached=reached)
+    implied = {(s, name): needed_texels(scene.occupancy, name, *plane.shape[:2]) for s, scale in enumerate(scene.scales)
+               for name, plane in scale.items() if name not in TIME_PLANES}
     matters = significant or [{name: np.ones(plane.shape, np.float32) for name, plane in scale.items()} for scale in scene.scales]
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the searches hold no lock
-        waiting = [{name: pool.submit(_cheapest if blocks else on_trellis, plane, planes[name], step[name], w[name], name in TIME_PLANES,
-                                      ALONE if together is None else together[s][name], thin)
+        waiting = [{name: pool.submit(partial(_cheapest, implied=implied.get((s, name))) if blocks else on_trellis, plane, planes[name], step[name], w[name],
+                                      name in TIME_PLANES, ALONE if together is None else together[s][name], thin)
                     for name, plane in scale.items() if only is None or (s, name) in only}
                    for s, (scale, planes, step, w) in enumerate(zip(quantised.scales, scene.scales, steps, matters, strict=True))]
         found = [{name: plane.result() for name, plane in scale.items()} for scale in waiting]
@@ -65,8 +68,10 @@ def step_asked_for(plane: QuantisedPlane) -> np.ndarray:
 
 def _cheapest(
     plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool, together: np.ndarray, thin: float,
+    implied: np.ndarray | None = None,
 ) -> QuantisedPlane:
-    """The plane that is quantised to the nearest, with the symbols that cost least; arguments as of `on_trellis`."""
+    """The plane that is quantised to the nearest, with the symbols that cost least. `implied`: which of its texels need no map to be told, None
+    where that is not known. Others as of `on_trellis`."""
     root = np.sqrt(worths(significant, plane.coded)) * plane.coded[..., None]
 
     def in_all(candidate: QuantisedPlane, size_bytes: int) -> float:
@@ -75,7 +80,7 @@ def _cheapest(
 
     tried = []
     for side in SIDES:
-        told = in_blocks(plane, values, step, significant, identity, together, side)
+        told = in_blocks(plane, values, step, significant, identity, together, side, implied)
         if told is None:
             break
         tried.append((in_all(*told), told[0]))
@@ -86,12 +91,12 @@ def _cheapest(
         steered = on_trellis(plane, values, step, significant, identity, together, thin)
         if not tried:
             return steered
-        tried.append((in_all(steered, _size(steered, identity)), steered))
+        tried.append((in_all(steered, _size(steered, identity, implied)), steered))
     return min(tried, key=lambda one: one[0])[1]
 
 
-def _size(plane: QuantisedPlane, identity: bool) -> int:
+def _size(plane: QuantisedPlane, identity: bool, implied: np.ndarray | None) -> int:
     """Bytes of its segments."""
     rows = rows_of_segments(len(plane.symbols), identity)
-    return sum(len(encode_coded(plane.symbols[start : start + rows], plane.coded[start : start + rows], guide_at(plane.guide, start)))
-               for start in range(0, len(plane.symbols), rows))  # fmt: skip
+    segments = [(slice(start, start + rows), guide_at(plane.guide, start)) for start in range(0, len(plane.symbols), rows)]
+    return sum(len(encode_coded(plane.symbols[own], plane.coded[own], guide, None if implied is None else implied[own])) for own, guide in segments)

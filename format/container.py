@@ -32,8 +32,8 @@ TOLD = ENTRY.size - 8
 """Bytes of an entry that version 2 tells: all but the offset, which follows from the lengths before it."""
 
 CODEC_RAW, CODEC_ZSTD, CODEC_SYMBOLS, CODEC_MIDPOINTS = range(4)
-CODEC_BORDERS = CODEC_MIDPOINTS
-"""Of planes what the other is of motion grids."""
+CODEC_THIRD = CODEC_MIDPOINTS
+"""Of planes, which have no midpoints."""
 ZSTD_LEVEL = 19
 
 LEAST_CHUNK = 8

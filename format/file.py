@@ -17,7 +17,7 @@ import struct
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -27,7 +27,7 @@ from kpc.format.cameras import Camera
 from kpc.format.cells import decode_cells, encode_cells
 from kpc.format.cli import written_aside
 from kpc.format.container import (
-    CODEC_BORDERS, CODEC_MIDPOINTS, CODEC_SYMBOLS, DEFAULT_BUDGET, EXPANSION_LIMIT, AnySource, Chunk, Entry, Reader, open_source, pack,
+    CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_THIRD, DEFAULT_BUDGET, EXPANSION_LIMIT, AnySource, Chunk, Entry, Reader, open_source, pack,
 )
 from kpc.format.errors import BudgetError, DatasetError, FormatError
 from kpc.format.midpoints import decode_midpoints, encode_midpoints
@@ -35,11 +35,9 @@ from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.nodes import decode_nodes, encode_nodes
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.poses import decode_poses, encode_poses
-from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene
+from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene, needed_texels
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
-from kpc.format.segments import (
-    SegmentGuide, codec_of, decode_coded, encode_coded, guide_at, guide_together, own_guide, rows_of_segments, segment_guide,
-)
+from kpc.format.segments import SegmentGuide, codec_of, decode_coded, form_of, guide_at, guide_together, rows_of_segments, segment_guide
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.format.weights import decode_weights, encode_weights
 
@@ -193,12 +191,13 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> l
         raise FormatError(f"scene: a number does not fit its field ({error})") from error
     segments = [(start / len(plane.symbols), number, ALL_PLANES.index(name), start, stop) for number, scale in enumerate(scene.scales)
                 for name, plane in scale.items() for start, stop in _segments_of(plane, name in TIME_PLANES, segment_rows)]
+    implied = [{name: needed_texels(scene.occupancy, name, *plane.coded.shape) for name, plane in scale.items()} for scale in scene.scales]
     for _, number, of_plane, start, stop in sorted(segments):
         plane = scene.scales[number][ALL_PLANES[of_plane]]
         segment, coded = plane.symbols[start:stop], plane.coded[start:stop]
-        guide = own_guide(guide_at(plane.guide, start), segment, coded)
+        form = form_of(segment, coded, guide_at(plane.guide, start), implied[number][ALL_PLANES[of_plane]][start:stop])
         chunks.append(Chunk("PLNE", encode_segment(segment, coded), number, of_plane, start, stop - start,
-                            {codec_of(guide): partial(encode_coded, segment, coded, guide)}, segment.size))
+                            dict([form]), segment.size))
     return chunks
 
 
@@ -405,7 +404,7 @@ class SceneReader(Reader):
         entry = self.index[number]
         plane = self.head.scales[entry.scale][ALL_PLANES[entry.plane]]
         texels, shape = entry.row_count * plane.columns, (entry.row_count, plane.columns, plane.channels)
-        if entry.codec not in (CODEC_SYMBOLS, CODEC_BORDERS):
+        if entry.codec not in (CODEC_SYMBOLS, CODEC_THIRD):
             payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * (1 + texels))
             return *self._parsed(lambda raw: decode_segment(raw, *shape), payload), None
         if entry.raw_length != texels * plane.channels:
@@ -413,8 +412,13 @@ class SceneReader(Reader):
                               f"{texels * plane.channels:,} of its rows")
         body = self._context_coded(number)
         if codec_of(body) != entry.codec:
-            raise FormatError(f"{self.name}: chunk {number} (PLNE) uses codec {entry.codec}, but holds what that is not for")
-        return self._parsed(lambda body: (*decode_coded(body, *shape), segment_guide(body)), body)
+            raise FormatError(f"{self.name}: chunk {number} (PLNE): codec {entry.codec} has no such number of sets of weights or flag")
+
+        def implied() -> np.ndarray:
+            rows = slice(entry.row_start, entry.row_start + entry.row_count)
+            return needed_texels(self.occupancy(), ALL_PLANES[entry.plane], plane.rows, plane.columns)[rows]
+
+        return self._parsed(lambda body: (*decode_coded(body, *shape, implied), segment_guide(body)), body)
 
     def mapping(self) -> SpaceMapping | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""
@@ -456,6 +460,10 @@ class SceneReader(Reader):
 
     def occupancy(self) -> np.ndarray:
         """The OCCU chunk: (slots, Nz, Ny, Nx) bool."""
+        return self._occupancy
+
+    @cached_property
+    def _occupancy(self) -> np.ndarray:
         number = self._only("OCCU")
         self._afford(8 * self.index[number].raw_length, "its occupancy grid")  # a byte for each bit
         if self.index[number].codec != CODEC_SYMBOLS:

@@ -1,13 +1,15 @@
 """Plane segments under codecs 2 and 3, whichever way they are told: symbol by symbol (`kpc.format.symbols`) or in blocks (`kpc.format.blocks`)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from kpc.format.blocks import decode_blocks, goes_on_from_borders, holds_blocks
-from kpc.format.container import CODEC_BORDERS, CODEC_SYMBOLS
-from kpc.format.symbols import Guide, decode_symbols, encode_symbols, guide_of
+from kpc.format.blocks import decode_blocks, holds_blocks
+from kpc.format.container import CODEC_SYMBOLS, CODEC_THIRD
+from kpc.format.errors import FormatError
+from kpc.format.symbols import IMPLIED, THIRD, Guide, decode_symbols, encode_symbols, guide_of, map_flags
 
 
 SEGMENT_ROWS, WHOLE = 32, 16
@@ -53,32 +55,50 @@ def guide_together(guides: Mapping[int, SegmentGuide | None]) -> PlaneGuide | No
     return known[0] if known and all(guide == known[0] for guide in known) else None
 
 
-def encode_coded(symbols: np.ndarray, coded: np.ndarray, guide: SegmentGuide | None = None) -> bytes:
-    """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: as `own_guide` has it, if they have one, else symbol by symbol."""
-    return guide if isinstance(guide, bytes) else encode_symbols(symbols, coded, guide)
+def encode_coded(symbols: np.ndarray, coded: np.ndarray, guide: SegmentGuide | None = None, implied: np.ndarray | None = None) -> bytes:
+    """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: as their guide has it, if it does, else symbol by symbol. `implied`:
+    `kpc.format.quantise.needed_texels`, if a reader knows them."""
+    return form_of(symbols, coded, guide, implied)[1]()
 
 
-def own_guide(guide: SegmentGuide | None, symbols: np.ndarray, coded: np.ndarray) -> SegmentGuide | None:
-    """A guide, unless it tells other symbols in blocks."""
-    if not isinstance(guide, bytes):
-        return guide
-    told, where = decode_blocks(guide, *symbols.shape)
-    return guide if np.array_equal(told, symbols) and np.array_equal(where, coded) else None
+def form_of(
+    symbols: np.ndarray, coded: np.ndarray, guide: SegmentGuide | None, implied: np.ndarray | None
+) -> tuple[int, Callable[[], bytes]]:
+    """The codec of what `encode_coded` makes, and what makes it."""
+    if isinstance(guide, bytes):
+        if _tells(guide, symbols, coded, implied):
+            return codec_of(guide), partial(bytes, guide)
+        guide = None
+    codec = CODEC_THIRD if map_flags(coded, implied) & THIRD else CODEC_SYMBOLS
+    return codec, partial(encode_symbols, symbols, coded, guide, implied)
 
 
-def codec_of(body: SegmentGuide | None) -> int:
-    """Of what `encode_coded` makes by a guide, or made."""
-    return CODEC_BORDERS if isinstance(body, bytes) and goes_on_from_borders(body) else CODEC_SYMBOLS
+def _tells(body: bytes, symbols: np.ndarray, coded: np.ndarray, implied: np.ndarray | None) -> bool:
+    """Whether blocks are of just these symbols."""
+    try:
+        told, where = decode_blocks(body, *symbols.shape, implied)
+    except FormatError:  # they were told by another occupancy
+        return False
+    return np.array_equal(told, symbols) and np.array_equal(where, coded)
 
 
-def decode_coded(body: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Undo `encode_coded`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels.
+def codec_of(body: bytes) -> int:
+    """Of what `encode_coded` made."""
+    return CODEC_THIRD if len(body) > 1 and body[1] & THIRD else CODEC_SYMBOLS
+
+
+def decode_coded(
+    body: bytes, rows: int, columns: int, channels: int, implied: Callable[[], np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Undo `encode_coded`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels. `implied`: what finds those, where
+    occupancy says which they are.
 
     Raises:
         FormatError: the body is cut, too long, or says what only a damaged one would.
     """
     decode = decode_blocks if holds_blocks(body) else decode_symbols
-    return decode(body, rows, columns, channels)
+    follows = implied is not None and len(body) > 1 and body[1] & IMPLIED
+    return decode(body, rows, columns, channels, implied() if follows else None)
 
 
 def segment_guide(body: bytes) -> SegmentGuide | None:

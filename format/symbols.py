@@ -1,4 +1,4 @@
-"""Plane segments under codec 2: every symbol predicted from its neighbours, the error coded in contexts (spec, section 6).
+"""Plane segments under codecs 2 and 3: every symbol predicted from its neighbours, the error coded in contexts (spec, section 6).
 
     C (1 byte) | flags (1 byte) | weights (9 C bytes) | rANS words: of the map, then of the symbols, channel by channel
 
@@ -45,8 +45,9 @@ ANY, TRELLIS, AROUND = range(3)
 """Lattices."""
 FLAT = 4
 """Neighbourhoods less active than that are flat."""
-MAP, LATTICE_BIT = 1, 1
-"""Flags: not all texels are coded; from this bit on, the lattice."""
+MAP, LATTICE_BIT, THIRD, IMPLIED = 1, 1, 8, 16
+"""Flags: a map tells which texels are coded; from this bit on, the lattice; codec 3; that has no map but occupancy, which implies one. With
+neither all texels are coded. Maps of space planes took 0.4 KB a file (shelf_hand, liam)."""
 
 UNARY, ESCAPES = 4, 7
 """Of `kpc.format.rans.integer`."""
@@ -84,41 +85,46 @@ class Guide:
         return isinstance(other, Guide) and np.array_equal(self.weights, other.weights)
 
 
-def encode_symbols(symbols: np.ndarray, coded: np.ndarray, guide: Guide | None = None) -> bytes:
+def encode_symbols(symbols: np.ndarray, coded: np.ndarray, guide: Guide | None = None, implied: np.ndarray | None = None) -> bytes:
     """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: by their guide, if they have one that they follow, else with as many
-    sets of weights as make it shortest."""
-    if guide is not None and (body := encode_with(guide.weights, symbols, coded, AROUND)) is not None:
+    sets of weights as make it shortest. `implied`: the map that needs not be told."""
+    if guide is not None and (body := encode_with(guide.weights, symbols, coded, AROUND, implied)) is not None:
         return body
     symbols, coded = np.array(symbols, order="C"), np.array(coded, order="C")  # compiled for this layout; and `walk` writes
     neighbours, lattice = neighbourhoods(symbols, coded), TRELLIS if follows_trellis(symbols, coded) else ANY
-    bodies = (encode_with(fitted(neighbours, count), symbols, coded, lattice) for count in SET_COUNTS)
+    bodies = (encode_with(fitted(neighbours, count), symbols, coded, lattice, implied) for count in SET_COUNTS)
     return min((body for body in bodies if body is not None), key=len)
 
 
-def encode_with(weights: np.ndarray, symbols: np.ndarray, coded: np.ndarray, lattice: int) -> bytes | None:
+def encode_with(
+    weights: np.ndarray, symbols: np.ndarray, coded: np.ndarray, lattice: int, implied: np.ndarray | None = None
+) -> bytes | None:
     """The same, with (C, WEIGHTS) int8 weights that are given, C is one of SET_COUNTS; None where symbols do not follow the lattice."""
     followed, coded = np.array(symbols, order="C"), np.array(coded, order="C")
     trace, at = np.empty(coded.size + int(coded.sum()) * symbols.shape[2] * MOST_DECISIONS, np.int16), 0
-    if has_map := not coded.all():
+    flags = map_flags(coded, implied)
+    if flags & MAP:
         _, at = walk_map(coded, 0, at, None, trace)
     _, at, fit = walk(followed, coded, lattice, weights, 0, at, None, trace, None)
     if not fit or not np.array_equal(followed, symbols):
         return None
-    return bytes([len(weights), MAP * has_map | lattice << LATTICE_BIT]) + weights.tobytes() + stream(trace[:at])
+    return bytes([len(weights), flags | lattice << LATTICE_BIT]) + weights.tobytes() + stream(trace[:at])
 
 
-def decode_symbols(body: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
+def decode_symbols(
+    body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Undo `encode_symbols`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels.
 
     Raises:
         FormatError: the body is cut, too long, or says what only a damaged one would.
     """
-    weights, lattice, has_map = _head(body)
+    weights, lattice = _head(body)
     state, words = opened(body[2 + weights.size:], "plane segment")
 
-    symbols, coded = np.zeros((rows, columns, channels), np.int8), np.ones((rows, columns), bool)
+    symbols, coded = np.zeros((rows, columns, channels), np.int8), untold_map(body[1], rows, columns, implied)
     at, fit = 0, True
-    if has_map:
+    if body[1] & MAP:
         state, at = walk_map(coded, state, at, words, None)
     if at <= len(words):
         state, at, fit = walk(symbols, coded, lattice, weights, state, at, words, None, None)
@@ -134,19 +140,45 @@ def guide_of(body: bytes) -> Guide | None:
     Raises:
         FormatError: as `decode_symbols`.
     """
-    weights, lattice, _ = _head(body)
+    weights, lattice = _head(body)
     return Guide(weights) if lattice == AROUND else None
 
 
-def _head(body: bytes) -> tuple[np.ndarray, int, bool]:
-    """Weights, lattice, and whether there is a map."""
-    if len(body) < 2 or body[0] not in SET_COUNTS or body[1] >> LATTICE_BIT > AROUND:
+def _head(body: bytes) -> tuple[np.ndarray, int]:
+    """Weights and lattice."""
+    lattice = body[1] >> LATTICE_BIT & 3 if len(body) > 1 and known_flags(body[1]) else AROUND + 1
+    if lattice > AROUND or body[0] not in SET_COUNTS:
         raise FormatError("plane segment: unknown number of sets of weights or flag")
     sets = body[0]
     if len(body) < 2 + WEIGHTS * sets:
         raise FormatError("plane segment: cut off within its weights")
     weights = np.frombuffer(body, np.int8, WEIGHTS * sets, 2).reshape(sets, WEIGHTS)
-    return weights, body[1] >> LATTICE_BIT, body[1] & MAP != 0
+    return weights, lattice
+
+
+def known_flags(flags: int) -> bool:
+    """Whether they can be, whatever the lattice."""
+    return flags < 2 * IMPLIED and (not flags & IMPLIED or flags & (THIRD | MAP) == THIRD)
+
+
+def map_flags(coded: np.ndarray, implied: np.ndarray | None) -> int:
+    """How the map of a segment is told: those flags. `implied`: by occupancy, None where that is not known."""
+    if coded.all():
+        return 0
+    return THIRD | IMPLIED if implied is not None and np.array_equal(coded, implied) else MAP
+
+
+def untold_map(flags: int, rows: int, columns: int, implied: np.ndarray | None) -> np.ndarray:
+    """(rows, columns) bool: the coded texels, or, where a map is told, room for it.
+
+    Raises:
+        FormatError: they follow from an occupancy that is not known.
+    """
+    if not flags & IMPLIED:
+        return np.ones((rows, columns), bool)
+    if implied is None:
+        raise FormatError("plane segment: which texels it tells follows from an occupancy that is not known")
+    return np.array(implied, order="C")
 
 
 def neighbourhoods(symbols: np.ndarray, coded: np.ndarray) -> np.ndarray:

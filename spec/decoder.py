@@ -220,7 +220,8 @@ def decode(data, partial=False):
             plane["held"] = True
             if isinstance(raw, tuple):
                 require(raw[0] == rows * plane["columns"] * channels, "number of symbols")
-                coded, symbols = context_coded(Bytes(raw[1]), raw[2], rows, plane["columns"], channels)
+                place = scene, name, plane["rows"], plane["columns"], start
+                coded, symbols = context_coded(Bytes(raw[1]), raw[2], rows, plane["columns"], channels, place)
             else:
                 coded, symbols = segment(Bytes(raw), rows, plane["columns"], channels)
             first = start * plane["columns"]
@@ -454,17 +455,45 @@ class Decisions:  # section 6, codec 2
         return coded
 
 
-def context_coded(chunk, codec, H, W, channels):  # section 6, codecs 2 and 3
-    """As `segment`."""
+def untold_map(flags, H, W, place):  # section 6, codec 3
+    implied = implied_map(*place) if flags & 16 else None
+    return {(y, x): 1 if implied is None else implied[y, x] for y in range(H) for x in range(W)}
+
+
+def implied_map(scene, name, rows, columns, start):
+    """{(y, x): 0 or 1}, y from row `start` of the plane on."""
+    nx, ny, nz = scene["cells"]
+    sizes = {"x": nx, "y": ny, "z": nz, "t": scene["slots"]}
+    seen = set()
+    for place, occupied in enumerate(scene["occupancy"]):
+        if occupied:
+            cell = {"t": place % scene["slots"], "x": place // scene["slots"] % nx, "y": place // scene["slots"] // nx % ny,
+                    "z": place // scene["slots"] // nx // ny}
+            seen.add((cell[name[1]], cell[name[0]]))
+
+    def reaches(cell, cells, texel, texels):
+        return (texel + 1) * cells >= cell * (texels - 1) and (texel - 1) * cells <= (cell + 1) * (texels - 1)
+
+    found = {(y - start, x): 0 for y in range(start, rows) for x in range(columns)}
+    for down, across in seen:
+        within = [x for x in range(columns) if reaches(across, sizes[name[0]], x, columns)]
+        for y in range(start, rows):
+            if reaches(down, sizes[name[1]], y, rows):
+                found |= {(y - start, x): 1 for x in within}
+    return found
+
+
+def context_coded(chunk, codec, H, W, channels, place=None):  # section 6, codecs 2 and 3
+    """As `segment`. place: of it, the arguments of `implied_map`."""
     set_count, flags = chunk.unpack("BB")
-    require((flags in (14, 15)) == (codec == 3), "codec")
-    if flags in (6, 7, 14, 15):
-        return in_blocks(chunk, set_count, flags, H, W, channels)
-    require(set_count in (1, 2, 4, 8) and flags <= 5, "sets of weights or flags")
-    has_map, lattice = flags % 2, flags // 2
+    lattice = flags // 2 % 4
+    require(flags < 32 and (flags & 8 > 0) == (codec == 3) and (flags & 16 == 0 or flags & 9 == 8), "flags")
+    if lattice == 3:
+        return in_blocks(chunk, set_count, flags, H, W, channels, place)
+    require(set_count in (1, 2, 4, 8), "sets of weights")
     sets = [chunk.unpack("9b") for _ in range(set_count)]
     decisions = Decisions(chunk)
-    coded = decisions.map(H, W) if has_map else {(y, x): 1 for y in range(H) for x in range(W)}
+    coded = decisions.map(H, W) if flags & 1 else untold_map(flags, H, W, place)
 
     symbols = [0] * (H * W * channels)
     cross = {}
@@ -549,12 +578,12 @@ def doublings(k):
     return n if n < 2 else 2 * n - 2 + (k >> n - 2) % 2
 
 
-def in_blocks(chunk, N, flags, H, W, channels):  # section 6, blocks
+def in_blocks(chunk, N, flags, H, W, channels, place):  # section 6, blocks
     """As `segment`."""
     Q, = chunk.unpack("B")
     require(N in (4, 8, 16) and (N == 4 or N <= 2 * min(H, W)) and Q > 0, "side of blocks or quantiser")
-    decisions, borders = Decisions(chunk), flags >= 14
-    coded = decisions.map(H, W) if flags % 2 else {(y, x): 1 for y in range(H) for x in range(W)}
+    decisions, borders = Decisions(chunk), flags & 8
+    coded = decisions.map(H, W) if flags & 1 else untold_map(flags, H, W, place)
     BY, BX = -(-H // N), -(-W // N)
     told = {(b, d): any(coded.get((y, x)) for y in range(b * N, b * N + N) for x in range(d * N, d * N + N))
             for b in range(BY) for d in range(BX)}

@@ -11,7 +11,7 @@ from kpc.format import blocks, segments
 from kpc.format.blocks import (
     FINENESSES, HEAD, LARGEST, PARTS, SIDES, USUAL, Blocks, blocks_of, coarser, cosines, decode_blocks, encode_blocks, largest_side, quantisers,
 )
-from kpc.format.container import CODEC_BORDERS, CODEC_SYMBOLS
+from kpc.format.container import CODEC_SYMBOLS, CODEC_THIRD
 from kpc.format.errors import FormatError
 from kpc.format.symbols import WEIGHTS, Guide, encode_symbols
 
@@ -76,12 +76,12 @@ def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(side: int, rows:
 
 @pytest.mark.parametrize(("side", "rows", "columns"), SIZES)
 @pytest.mark.parametrize("share", [0.6, 1.0])
-@pytest.mark.parametrize("codec", [CODEC_SYMBOLS, CODEC_BORDERS])
+@pytest.mark.parametrize("codec", [CODEC_SYMBOLS, CODEC_THIRD])
 def test_the_spec_s_own_decoder_agrees(twin: ModuleType, codec: int, side: int, rows: int, columns: int, share: float) -> None:
     for seed in range(3):
         told, coded = some(side, rows, columns, share, seed + 10)
         told.levels[0, 0, 0, -1, -1], told.levels[-1, -1, -1, 0, -1] = -1, LARGEST  # the quickest alone, and the largest there is
-        body = encode_blocks(told, coded, codec == CODEC_BORDERS)
+        body = encode_blocks(told, coded, borders=codec == CODEC_THIRD)
         assert segments.codec_of(body) == codec
         symbols, _ = decode_blocks(body, rows, columns, 3)
         where, slow = twin.context_coded(twin.Bytes(body), codec, rows, columns, 3)
@@ -140,11 +140,10 @@ def test_a_guide_is_followed_only_where_symbols_are_its_own() -> None:
     told, coded = some(8, 20, 20, 0.8, 6)
     body = encode_blocks(told, coded)
     symbols, _ = decode_blocks(body, 20, 20, 3)
-    assert segments.own_guide(body, symbols, coded) == segments.encode_coded(symbols, coded, body) == segments.segment_guide(body) == body
+    assert segments.encode_coded(symbols, coded, body) == body and segments.segment_guide(body) == body
     moved = symbols.copy()
     moved[tuple(np.argwhere(coded)[0])] ^= 1
-    assert segments.own_guide(body, moved, coded) is None
-    other = segments.encode_coded(moved, coded)
+    other = segments.encode_coded(moved, coded, body)
     assert not blocks.holds_blocks(other)
     np.testing.assert_array_equal(segments.decode_coded(other, 20, 20, 3)[0], moved)
 

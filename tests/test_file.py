@@ -15,7 +15,7 @@ from test_nodes import swaying
 
 import kpc
 from kpc.format.cameras import Camera
-from kpc.format.container import CODEC_MIDPOINTS, CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, HEADER, Reader, pack
+from kpc.format.container import CODEC_MIDPOINTS, CODEC_RAW, CODEC_SYMBOLS, CODEC_THIRD, CODEC_ZSTD, HEADER, Reader, pack
 from kpc.format.errors import BudgetError, FormatError
 from kpc.format.file import APPEARANCE_LIMIT, NAME_LIMIT, SceneReader, encode, read, scene_chunks, write
 from kpc.format.motion import STEP, QuantisedMotion
@@ -176,7 +176,7 @@ def test_files_without_context_coded_symbols_stay_readable():
     now = pack(chunks, sum(p.symbols.size for scale in scene.scales for p in scale.values()))
     before = pack([replace(chunk, coded={}) for chunk in chunks], Reader(now).header.value_count)
     assert {e.codec for e in Reader(before).index} == {CODEC_RAW, CODEC_ZSTD}
-    assert {e.codec for e in Reader(now).index if e.kind == "PLNE"} <= {CODEC_RAW, CODEC_SYMBOLS}
+    assert {e.codec for e in Reader(now).index if e.kind == "PLNE"} <= {CODEC_RAW, CODEC_SYMBOLS, CODEC_THIRD}
     assert len(now) < len(before)
     assert_same(read(before), scene)
     assert_same(read(now), scene)

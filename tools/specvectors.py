@@ -28,7 +28,7 @@ from kpc.format.blocks import FINENESSES, HEAD, Blocks, blocks_of, encode_blocks
 from kpc.format.cameras import Camera
 from kpc.format.cells import encode_cells
 from kpc.format.container import (
-    CODEC_BORDERS, CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_ZSTD, ENTRY, HEADER, PLAIN_VERSION, VERSION, Chunk, Reader,
+    CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_THIRD, CODEC_ZSTD, ENTRY, HEADER, PLAIN_VERSION, VERSION, Chunk, Reader,
 )
 from kpc.format.errors import UsageError
 from kpc.format.file import (
@@ -41,10 +41,11 @@ from kpc.format.nodes import LORENZO, NEIGHBOURS
 from kpc.format.nodes import encode_with as encode_nodes_with
 from kpc.format.poses import BITS, LENS, NOTHING, ROOT, WORD
 from kpc.format.poses import HEAD as POSES_HEAD
-from kpc.format.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.quantise import QuantisedPlane, QuantisedScene, needed_texels
 from kpc.format.rans import stream
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.space import Contraction, DeviceCoordinates
+from kpc.format.segments import codec_of
 from kpc.format.symbols import (
     ANY, AROUND, LATTICE_BIT, MOST_DECISIONS, TRELLIS, WEIGHTS, Guide, encode_with, follows_trellis, next_state, walk,
 )
@@ -151,11 +152,11 @@ def encode(scene: QuantisedScene, *, segment_rows: int = 16, compress: bool = Tr
 
 
 def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 16, weights: np.ndarray | None = None,
-                  flat: bool = False) -> bytes:
+                  flat: bool = False, implied: bool = False) -> bytes:
     """A file all of whose planes are context-coded, also where raw ones would be smaller, with so many sets of weights.
 
     The weights, if none are given, are no good ones but such as need no floating-point fit, and the largest and the smallest among
-    them. `flat`: symbols near to the scene's that are around predictions where it is flat.
+    them. `flat`: symbols near to the scene's that are around predictions where it is flat. `implied`: maps follow from occupancy.
     """
     if weights is None:
         weights = (_noise((sets, WEIGHTS), 61) / 4).astype(np.int8)
@@ -169,7 +170,8 @@ def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 1
             rows = slice(chunk.row_start, chunk.row_start + chunk.row_count)
             symbols, coded = plane.symbols[rows], plane.coded[rows]
             lattice = AROUND if flat else TRELLIS if follows_trellis(symbols, coded) else ANY
-            chunks.append(_forced(chunk, encode_with(weights, symbols, coded, lattice)))
+            body = encode_with(weights, symbols, coded, lattice, _needed(scene, chunk) if implied else None)
+            chunks.append(_forced(chunk, body, codec_of(body)))
         else:
             chunks.append(replace(chunk, coded={}))
     return pack(chunks, _value_count(scene))
@@ -189,9 +191,9 @@ def around(scene: QuantisedScene, guide: Guide, segment_rows: int) -> QuantisedS
 
 
 def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *, segment_rows: int = 16,
-              codec: int = CODEC_SYMBOLS) -> bytes:
+              codec: int = CODEC_SYMBOLS, implied: bool = False) -> bytes:
     """A file all of whose planes are told in blocks of a side, or of smaller ones where a segment is small, with levels from noise, those of
-    means as large as may be, quick ones small; levels grow and fall with `spread`."""
+    means as large as may be, quick ones small; levels grow and fall with `spread`. `implied`: maps follow from occupancy."""
 
     def body(chunk: Chunk) -> bytes:
         plane = scene.scales[chunk.scale][ALL_PLANES[chunk.plane]]
@@ -201,14 +203,32 @@ def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *
         levels = _noise((plane.symbols.shape[2], *grid, N, N), seed) / 128 * spread
         levels *= np.float32(1) / (1 + np.add.outer(np.arange(N), np.arange(N), dtype=np.float32)) ** 2
         fineness = np.abs(_noise(grid, seed + 1)).astype(np.int64) % FINENESSES
-        return encode_blocks(Blocks(np.trunc(levels).astype(np.int64), fineness, quantiser), coded, codec == CODEC_BORDERS)
+        return encode_blocks(Blocks(np.trunc(levels).astype(np.int64), fineness, quantiser), coded, _needed(scene, chunk) if implied else None,
+                             borders=codec == CODEC_THIRD)
 
     chunks = [_forced(chunk, body(chunk), codec) if chunk.kind == "PLNE" else replace(chunk, coded={})
               for chunk in scene_chunks(scene, segment_rows=segment_rows)]
     return pack(chunks, _value_count(scene))
 
 
-on_from_borders = partial(in_blocks, codec=CODEC_BORDERS)
+on_from_borders = partial(in_blocks, codec=CODEC_THIRD)
+
+
+def seen_through_slits(scene: QuantisedScene) -> QuantisedScene:
+    """The scene with few cells occupied, of whose planes those texels are coded that these need."""
+    sparse = replace(scene, occupancy=_noise((2 if scene.is_dynamic else 1, 5, 7, 6), 96) > 110)
+
+    def cut(name: str, plane: QuantisedPlane) -> QuantisedPlane:
+        coded = needed_texels(sparse.occupancy, name, *plane.coded.shape)
+        return replace(plane, symbols=plane.symbols * coded[..., None], coded=coded)
+
+    return replace(sparse, scales=tuple({name: cut(name, plane) for name, plane in scale.items()} for scale in scene.scales))
+
+
+def _needed(scene: QuantisedScene, chunk: Chunk) -> np.ndarray:
+    """Those texels of a segment."""
+    name = ALL_PLANES[chunk.plane]
+    return needed_texels(scene.occupancy, name, *scene.scales[chunk.scale][name].coded.shape)[chunk.row_start : chunk.row_start + chunk.row_count]
 
 
 def walked(symbols: np.ndarray, coded: np.ndarray, weights: np.ndarray, lattice: int) -> bytes:
@@ -398,6 +418,9 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "blocks-empty": (in_blocks(_painted(lambda shape, seed: np.zeros(shape), coded=False), 8, 64, 0), False),
         "blocks-one-texel": (in_blocks(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)]), 4, 64, 20), False),
         "borders": (on_from_borders(dynamic, 16, 12, 60, segment_rows=4), False),
+        "implied": (context_coded(seen_through_slits(_scene(dynamic=True, sizes=[(2, 11, 8, 9, 6), (3, 20, 13, 17, 6)])), 2, segment_rows=4,
+                                  implied=True), False),
+        "implied-borders": (on_from_borders(seen_through_slits(_scene(dynamic=True, sizes=[(2, 29, 21, 16, 5)])), 8, 20, 100, implied=True), False),
         "borders-eight": (on_from_borders(_scene(dynamic=True, sizes=[(2, 20, 17, 9, 4)]), 8, 20, 100), False),
         "borders-prefix": (on_from_borders(dynamic, 8, 64, 8)[:Reader(on_from_borders(dynamic, 8, 64, 8)).index[9].offset], True),
         "borders-extremes": (on_from_borders(_scene(dynamic=True, sizes=[(2, 9, 6, 5, 4)]), 4, 255, 8196), False),
@@ -574,8 +597,8 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
 
     told = context(coarse)
     four = Blocks(np.trunc(_noise((2, 1, 1, 4, 4), 71) / 8).astype(np.int64), np.full((1, 1), 2), 40)
-    in_four, from_borders = (encode_blocks(four, whole, borders) for borders in (False, True))
-    third = partial(context, codec=CODEC_BORDERS)
+    in_four, from_borders = (encode_blocks(four, whole, borders=borders) for borders in (False, True))
+    third = partial(context, codec=CODEC_THIRD)
     small_entry = HEADER.size + ENTRY.size * small_xy
     state_at = 2 + WEIGHTS
     small_occu = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "OCCU")
@@ -683,9 +706,11 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "blocks-quantiser": (context(patched(in_four, 2, "<B", 0)), broken, "a quantiser of 0"),
         "blocks-head": (context(in_four[:2]), broken, "a quantiser of 0"),
         **damaged_words("blocks", context, in_four, HEAD),
-        "blocks-codec": (third(in_four), broken, "uses codec 3, but"),
-        "borders-codec": (context(from_borders), broken, "uses codec 2, but"),
-        "borders-flags": (third(patched(from_borders, 1, "<B", from_borders[1] | 16)), broken, "uses codec 3, but"),
+        "blocks-codec": (third(in_four), broken, "codec 3 has no such"),
+        "borders-codec": (context(from_borders), broken, "codec 2 has no such"),
+        "borders-flags": (third(patched(from_borders, 1, "<B", from_borders[1] | 32)), broken, "or flag"),
+        "implied-codec": (context(patched(from_borders, 1, "<B", 7 | 16)), broken, "or flag"),
+        "implied-map": (third(patched(from_borders, 1, "<B", 15 | 16)), broken, "or flag"),
         "borders-side": (third(patched(from_borders, 0, "<B", 0)), broken, "unknown side of blocks"),
         "borders-large": (third(patched(from_borders, 0, "<B", 16)), broken, "more than twice its 2 rows or columns"),
         "borders-quantiser": (third(patched(from_borders, 2, "<B", 0)), broken, "a quantiser of 0"),
