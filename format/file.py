@@ -35,7 +35,7 @@ from kpc.format.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.nodes import decode_nodes, encode_nodes
 from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.poses import decode_poses, encode_poses
-from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene, needed_texels
+from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene, needed_rows, needed_texels, seen_along
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.segments import SegmentGuide, codec_of, decode_coded, form_of, guide_at, guide_together, rows_of_segments, segment_guide
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
@@ -386,6 +386,7 @@ class SceneReader(Reader):
             raise FormatError(f"{self.name}: the header claims {self.header.value_count:,} values, "
                               f"the scene {self.head.value_count:,}")
         self._beside: dict[str, int] = {}
+        self._seen: dict[str, np.ndarray] = {}
         self.planes_bytes = 0 if in_parts else 5 * self.head.value_count  # one int8 symbol and one float32 each
         if self.planes_bytes > memory_budget:
             raise BudgetError(f"{self.name}: needs {self.planes_bytes:,} bytes of memory, more than the budget of "
@@ -415,8 +416,8 @@ class SceneReader(Reader):
             raise FormatError(f"{self.name}: chunk {number} (PLNE): codec {entry.codec} has no such number of sets of weights or flag")
 
         def implied() -> np.ndarray:
-            rows = slice(entry.row_start, entry.row_start + entry.row_count)
-            return needed_texels(self.occupancy(), ALL_PLANES[entry.plane], plane.rows, plane.columns)[rows]
+            rows = range(entry.row_start, entry.row_start + entry.row_count)
+            return needed_rows(self._seen_along(ALL_PLANES[entry.plane]), plane.rows, plane.columns, rows)
 
         return self._parsed(lambda body: (*decode_coded(body, *shape, implied), segment_guide(body)), body)
 
@@ -461,6 +462,14 @@ class SceneReader(Reader):
     def occupancy(self) -> np.ndarray:
         """The OCCU chunk: (slots, Nz, Ny, Nx) bool."""
         return self._occupancy
+
+    def _seen_along(self, plane: str) -> np.ndarray:
+        """`kpc.format.quantise.seen_along` of the occupancy."""
+        if plane not in self._seen:
+            occupancy = self.occupancy()
+            self._afford(occupancy.size, "what its occupancy implies")
+            self._seen[plane] = seen_along(occupancy, plane)
+        return self._seen[plane]
 
     @cached_property
     def _occupancy(self) -> np.ndarray:

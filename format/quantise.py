@@ -215,19 +215,35 @@ def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) ->
     Args:
         occupancy: (slots, Nz, Ny, Nx) bool. plane: its name, such as "xy" or "zt".
     """
+    return needed_rows(seen_along(occupancy, plane), rows, columns, range(rows))
+
+
+def seen_along(occupancy: np.ndarray, plane: str) -> np.ndarray:
+    """(cells down, cells across) bool: where any cell is occupied, seen along the axes that a plane does not have."""
     axes = {"t": 0, "z": 1, "y": 2, "x": 3}
     across, down = axes[plane[0]], axes[plane[1]]
     others = tuple(axis for axis in range(4) if axis not in (across, down))
-    seen = occupancy.any(axis=others)  # the kept axes stay in the order t, z, y, x
-    seen = seen if down < across else seen.T
-    reach: np.ndarray = _reach(rows, seen.shape[0]) @ seen.astype(np.float32) @ _reach(columns, seen.shape[1]).T
-    return np.greater(reach, 0)
+    seen: np.ndarray = occupancy.any(axis=others)  # the kept axes stay in the order t, z, y, x
+    return seen if down < across else seen.T
 
 
-def _reach(texels: int, cells: int) -> np.ndarray:
-    """(texels, cells) float32, 1 where cell [c, c+1] / cells meets the closed support [i-1, i+1] / (texels-1)."""
-    i, c = np.arange(texels)[:, None], np.arange(cells)[None]
-    return (((i + 1) * cells >= c * (texels - 1)) & ((i - 1) * cells <= (c + 1) * (texels - 1))).astype(np.float32)
+def needed_rows(seen: np.ndarray, rows: int, columns: int, some: range) -> np.ndarray:
+    """Some rows of `needed_texels`, by `seen_along`. Takes no more memory than they do, and a row of cells."""
+    needed = np.empty((len(some), columns), bool)
+    (top, bottom), (left, right) = _reached_from(rows, seen.shape[0]), _reached_from(columns, seen.shape[1])
+    for number, row in enumerate(some):
+        counts = np.concatenate([[0], np.cumsum(seen[top[row] : bottom[row]].any(axis=0))])
+        needed[number] = counts[right] > counts[left]
+    return needed
+
+
+def _reached_from(texels: int, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """(texels,) int64: the first cell and the one after the last such that [c, c+1] / cells meets the closed support [i-1, i+1] / (texels-1)."""
+    i, apart = np.arange(texels), texels - 1
+    if apart == 0:
+        return np.zeros(1, np.int64), np.full(1, cells)
+    first, last = -(-(i - 1) * cells // apart) - 1, (i + 1) * cells // apart
+    return np.maximum(first, 0), np.minimum(last + 1, cells)
 
 
 def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) -> AnyDecoder:
