@@ -53,7 +53,7 @@ TOLD_APART = 20
 
 def in_blocks(
     plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool, together: np.ndarray, side: int,
-    implied: np.ndarray | None = None,
+    implied: np.ndarray | None = None, needed: np.ndarray | None = None,
 ) -> tuple[QuantisedPlane, int] | None:
     """A plane told in blocks of a side, or of smaller ones where a segment is small; and the bytes that takes. None where 8 bits are too few.
 
@@ -62,9 +62,12 @@ def in_blocks(
         step: (M,) for which bits are worth as much as `kpc.encoder.worth.LAM` says.
         significant, together: as of `kpc.encoder.trellis.on_trellis`.
         implied: as of `kpc.format.blocks.encode_blocks`, for the plane.
+        needed: of a time plane, (H, W) bool: the texels that are told. None: those of `kpc.encoder.maps`.
     """
     worth, known = worths(significant, plane.coded), plane.coded
-    if identity:
+    if needed is not None:
+        known = needed
+    elif identity:
         known = told_texels((values - plane.offset) / step, worth, known)
     if not known.any():
         return None

@@ -18,7 +18,7 @@ from kpc.encoder.blocks import in_blocks, step_in_blocks
 from kpc.encoder.curvature import PerPlane
 from kpc.encoder.trellis import THIN, on_trellis, step_on_trellis
 from kpc.encoder.worth import ALONE, Name, cost, worths
-from kpc.format.quantise import QuantisedPlane, QuantisedScene, needed_texels, quantise_scene
+from kpc.format.quantise import QuantisedPlane, QuantisedScene, needed_texels, quantise_scene, reached_by
 from kpc.format.scene import TIME_PLANES, Scene
 from kpc.format.segments import Told, encode_coded, guide_at, rows_of_segments
 
@@ -48,11 +48,11 @@ def quantise_by_cost(
         thin: as of `kpc.encoder.trellis.on_trellis`. blocks: whether planes may be told in blocks.
     """
     quantised = quantise_scene(scene, steps, reached=reached)
-    implied = {(s, name): needed_texels(scene.occupancy, name, *plane.shape[:2]) for s, scale in enumerate(scene.scales)
-               for name, plane in scale.items() if name not in TIME_PLANES}
+    implied, needed = ([{name: needed_texels(cells, name, *plane.shape[:2]) for name, plane in scale.items()} for scale in scene.scales]
+                       for cells in (scene.occupancy, reached_by(scene) if reached is None else reached))
     matters = significant or [{name: np.ones(plane.shape, np.float32) for name, plane in scale.items()} for scale in scene.scales]
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the searches hold no lock
-        waiting = [{name: pool.submit(partial(_cheapest, implied=implied.get((s, name))) if blocks else on_trellis, plane, planes[name], step[name], w[name],
+        waiting = [{name: pool.submit(partial(_cheapest, implied=implied[s][name], needed=needed[s][name]) if blocks else on_trellis, plane, planes[name], step[name], w[name],
                                       name in TIME_PLANES, ALONE if together is None else together[s][name], thin)
                     for name, plane in scale.items() if only is None or (s, name) in only}
                    for s, (scale, planes, step, w) in enumerate(zip(quantised.scales, scene.scales, steps, matters, strict=True))]
@@ -68,11 +68,11 @@ def step_asked_for(plane: QuantisedPlane) -> np.ndarray:
 
 def _cheapest(
     plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool, together: np.ndarray, thin: float,
-    implied: np.ndarray | None = None,
+    implied: np.ndarray, needed: np.ndarray,
 ) -> QuantisedPlane:
-    """The plane that is quantised to the nearest, with the symbols that cost least. `implied`: which of its texels need no map to be told, None
-    where that is not known. Others as of `on_trellis`."""
-    root = np.sqrt(worths(significant, plane.coded)) * plane.coded[..., None]
+    """The plane that is quantised to the nearest, with the symbols that cost least. `needed`: texels that anything occupied looks up; `implied`:
+    those of which a file need not say so. Others as of `on_trellis`."""
+    root = np.sqrt(worths(significant, plane.coded)) * needed[..., None]
 
     def in_all(candidate: QuantisedPlane, size_bytes: int) -> float:
         factor = COHERENT if isinstance(candidate.guide, Told) else 1
@@ -80,11 +80,12 @@ def _cheapest(
 
     tried = []
     for side in SIDES:
-        told = in_blocks(plane, values, step, significant, identity, together, side, implied)
-        if told is None:
+        found = [told for which in ((None, needed) if identity else (None,))
+                 if (told := in_blocks(plane, values, step, significant, identity, together, side, implied, which)) is not None]
+        if not found:
             break
-        tried.append((in_all(*told), told[0]))
-        bits = 8 * told[1] / (plane.coded.sum() * values.shape[2])
+        tried += [(in_all(*told), told[0]) for told in found]
+        bits = 8 * min(size for _, size in found) / (max(plane.coded.sum(), 1) * values.shape[2])
         if bits > MANY_BITS:
             break
     if not tried or bits > FEW_BITS:
@@ -95,8 +96,8 @@ def _cheapest(
     return min(tried, key=lambda one: one[0])[1]
 
 
-def _size(plane: QuantisedPlane, identity: bool, implied: np.ndarray | None) -> int:
+def _size(plane: QuantisedPlane, identity: bool, implied: np.ndarray) -> int:
     """Bytes of its segments."""
     rows = rows_of_segments(len(plane.symbols), identity)
     segments = [(slice(start, start + rows), guide_at(plane.guide, start)) for start in range(0, len(plane.symbols), rows)]
-    return sum(len(encode_coded(plane.symbols[own], plane.coded[own], guide, None if implied is None else implied[own])) for own, guide in segments)
+    return sum(len(encode_coded(plane.symbols[own], plane.coded[own], guide, implied[own])) for own, guide in segments)

@@ -168,8 +168,8 @@ class QuantisedScene:
     @property
     def identity_share(self) -> float:
         """Share of the time planes' texels that are exactly 1 in every channel; 1 for a static scene."""
-        coded = [p.coded for scale in self.scales for name, p in scale.items() if name in TIME_PLANES]
-        return 1.0 - sum(int(c.sum()) for c in coded) / sum(c.size for c in coded) if coded else 1.0
+        changed = [p.symbols.any(axis=2) for scale in self.scales for name, p in scale.items() if name in TIME_PLANES]
+        return 1.0 - sum(int(c.sum()) for c in changed) / sum(c.size for c in changed) if changed else 1.0
 
 
 def quantise_scene(scene: Scene, steps: Sequence[Mapping[str, np.ndarray | float]], *,
