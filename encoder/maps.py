@@ -1,4 +1,4 @@
-"""Which texels of a time plane are told: those that are worth what it takes to tell them, and to tell where they are.
+"""Which texels of a time plane are told, where a map says so: those that are worth what it takes to tell them, and to tell where they are.
 
 A texel that is not told is 1. Whether one is told costs bits too (`kpc.format.symbols.walk_map`), few where it is as those around it, many
 where it is alone. So those are sought that make least of

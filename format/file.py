@@ -37,7 +37,9 @@ from kpc.format.planes import decode_segment, encode_segment
 from kpc.format.poses import decode_poses, encode_poses
 from kpc.format.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene, needed_rows, needed_texels, seen_along
 from kpc.format.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
-from kpc.format.segments import SegmentGuide, codec_of, decode_coded, form_of, guide_at, guide_together, rows_of_segments, segment_guide
+from kpc.format.segments import (
+    SegmentGuide, codec_of, decode_coded, form_of, guide_at, guide_together, rows_of_segments, segment_guide, wants_occupancy,
+)
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.format.weights import decode_weights, encode_weights
 
@@ -415,10 +417,10 @@ class SceneReader(Reader):
         if codec_of(body) != entry.codec:
             raise FormatError(f"{self.name}: chunk {number} (PLNE): codec {entry.codec} has no such number of sets of weights or flag")
 
-        def implied() -> np.ndarray:
+        implied = None
+        if wants_occupancy(body):
             rows = range(entry.row_start, entry.row_start + entry.row_count)
-            return needed_rows(self._seen_along(ALL_PLANES[entry.plane]), plane.rows, plane.columns, rows)
-
+            implied = needed_rows(self._seen_along(ALL_PLANES[entry.plane]), plane.rows, plane.columns, rows)
         return self._parsed(lambda body: (*decode_coded(body, *shape, implied), segment_guide(body)), body)
 
     def mapping(self) -> SpaceMapping | None:

@@ -88,17 +88,21 @@ def codec_of(body: bytes) -> int:
 
 
 def decode_coded(
-    body: bytes, rows: int, columns: int, channels: int, implied: Callable[[], np.ndarray] | None = None
+    body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Undo `encode_coded`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels. `implied`: what finds those, where
-    occupancy says which they are.
+    """Undo `encode_coded`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels. `implied`: those, where the
+    body `wants_occupancy`.
 
     Raises:
         FormatError: the body is cut, too long, or says what only a damaged one would.
     """
     decode = decode_blocks if holds_blocks(body) else decode_symbols
-    follows = implied is not None and len(body) > 1 and body[1] & IMPLIED
-    return decode(body, rows, columns, channels, implied() if follows else None)
+    return decode(body, rows, columns, channels, implied)
+
+
+def wants_occupancy(body: bytes) -> bool:
+    """Whether occupancy says which texels are coded."""
+    return len(body) > 1 and body[1] & IMPLIED != 0
 
 
 def segment_guide(body: bytes) -> SegmentGuide | None:

@@ -108,6 +108,33 @@ def test_where_hardly_anything_changes_blocks_take_next_to_nothing() -> None:
     assert len(np.unique(symbols)) == 1 and len(encode_symbols(symbols, coded)) < 60
 
 
+def test_borders_say_what_a_smooth_plane_goes_on_as() -> None:
+    """Means and signs of blocks that go on from their neighbours take fewer bytes; those of noise take hardly more."""
+    v, u = np.mgrid[:96, :96] / 16
+    smooth = np.stack([60 * np.sin(1.3 * u + 0.7 * v + m) + 30 * np.cos(2.1 * v - u * m) for m in range(3)], axis=2)
+    noise = np.random.default_rng(4).normal(0, 40, smooth.shape)
+    sizes = []
+    for values in (smooth, noise):
+        basis = cosines(8) / (128 * np.sqrt(8))
+        factors = basis @ values.reshape(12, 8, 12, 8, 3).transpose(4, 0, 2, 1, 3) @ basis.T
+        levels = np.rint(factors * PARTS / quantisers(8, 48)[USUAL]).astype(np.int64)
+        told = Blocks(levels, np.full((12, 12), USUAL), 48)
+        sizes.append([len(encode_blocks(told, np.ones((96, 96), bool), borders=borders)) for borders in (False, True)])
+    assert sizes[0][1] < 0.9 * sizes[0][0] and sizes[1][1] < 1.01 * sizes[1][0]
+
+
+def test_a_map_that_is_implied_is_not_told() -> None:
+    told, coded = some(8, 37, 50, 0.6, 8)
+    body, longer = encode_blocks(told, coded, coded), encode_blocks(told, coded)
+    assert len(body) < len(longer) - 100
+    np.testing.assert_array_equal(decode_blocks(body, 37, 50, 3, coded)[0], decode_blocks(longer, 37, 50, 3)[0])
+    assert segments.encode_coded(*decode_blocks(body, 37, 50, 3, coded), body, coded) == body
+    with pytest.raises(FormatError, match="an occupancy that is not known"):
+        decode_blocks(body, 37, 50, 3)
+    other = segments.encode_coded(*decode_blocks(body, 37, 50, 3, coded), body, ~coded)  # a guide is no use then
+    assert not blocks.holds_blocks(other)
+
+
 def test_a_body_is_read_to_its_end_and_no_further() -> None:
     told, coded = some(8, 20, 20, 1.0, 5)
     body = encode_blocks(told, coded)

@@ -19,7 +19,7 @@ from kpc.format.container import CODEC_MIDPOINTS, CODEC_RAW, CODEC_SYMBOLS, CODE
 from kpc.format.errors import BudgetError, FormatError
 from kpc.format.file import APPEARANCE_LIMIT, NAME_LIMIT, SceneReader, encode, read, scene_chunks, write
 from kpc.format.motion import STEP, QuantisedMotion
-from kpc.format.quantise import QuantisedScene, quantise_scene
+from kpc.format.quantise import QuantisedScene, needed_texels, quantise_scene
 from kpc.format.scene import TIME_PLANES, Appearance
 from kpc.format.space import Contraction, DeviceCoordinates
 
@@ -168,6 +168,57 @@ def test_rows_in_time_may_differ_from_scale_to_scale():
     coarse, fine = quantised(scales=1, time=3), quantised(scales=1, time=11)
     scene = replace(quantised(scales=2), scales=(coarse.scales[0], fine.scales[0]))
     assert_same(read(encode(scene, segment_rows=4)), scene)
+
+
+def seen(scene: QuantisedScene) -> QuantisedScene:
+    """The scene, of whose space planes those texels are coded that its occupancy needs."""
+    def cut(name, plane):
+        coded = needed_texels(scene.occupancy, name, *plane.coded.shape)
+        return replace(plane, symbols=plane.symbols * coded[..., None], coded=coded)
+
+    return replace(scene, scales=tuple({name: plane if name in TIME_PLANES else cut(name, plane) for name, plane in scale.items()}
+                                       for scale in scene.scales))
+
+
+def test_maps_that_follow_from_occupancy_take_no_bytes():
+    scene = quantised(resolution=(30, 28, 26), time=6)
+    occupancy = np.zeros((1, 9, 10, 11), bool)
+    occupancy[0, 2:5, 3, 4:9] = occupancy[0, 4, 2:8, 5] = True
+    scene = seen(replace(scene, occupancy=occupancy))
+    data = encode(scene)
+    assert_same(read(data), scene)
+    assert encode(read(data)) == data
+    codecs = {entry.plane: entry.codec for entry in Reader(data).index if entry.kind == "PLNE"}
+    assert [codecs[plane] for plane in range(3)] == 3 * [CODEC_THIRD]
+
+    # Where planes hold more than that, or less, a map is told.
+    other = replace(scene, occupancy=np.roll(occupancy, 1, axis=(1, 2, 3)))
+    told = encode(other)
+    assert_same(read(told), other)
+    assert {entry.codec for entry in Reader(told).index if entry.kind == "PLNE"} == {CODEC_SYMBOLS}
+    assert len(told) > len(data) + 20
+
+    # A plane cannot be read by another occupancy than its own.
+    occu = next(number for number, entry in enumerate(Reader(data).index) if entry.kind == "OCCU")
+    chunks = scene_chunks(scene)
+    mixed = [chunk if number != occu else scene_chunks(other)[occu] for number, chunk in enumerate(chunks)]
+    with pytest.raises(FormatError, match="plane segment"):
+        read(pack(mixed, Reader(data).header.value_count))
+
+
+def test_what_occupancy_implies_counts_against_the_budget():
+    corner = np.indices((1, 1, 400, 500)).sum(0) < 500
+    data = encode(seen(replace(quantised(resolution=(30, 28, 26), dynamic=False), occupancy=corner)))
+    least = next(budget for budget in range(0, 4 << 20, 1000) if not refused(data, budget))
+    assert least > 2 * corner.size
+
+
+def refused(data: bytes, budget: int) -> bool:
+    try:
+        read(data, memory_budget=budget)
+    except BudgetError:
+        return True
+    return False
 
 
 def test_files_without_context_coded_symbols_stay_readable():

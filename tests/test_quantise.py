@@ -143,6 +143,13 @@ def test_needed_texels_cover_every_read_from_an_occupied_cell(seed, plane, rows,
             assert needed[int(y):int(np.ceil(y)) + 1, int(x):int(np.ceil(x)) + 1].all()
     if not occupancy.any():
         assert not needed.any()
+    # As the spec has it.
+    n, m = (shape[axis[plane[k]]] for k in (1, 0))
+    cells = {(cell[axis[plane[1]]], cell[axis[plane[0]]]) for cell in np.argwhere(occupancy)}
+    for i, j in np.ndindex(rows, columns):
+        assert needed[i, j] == any(
+            (i + 1) * n >= c * (rows - 1) and (i - 1) * n <= (c + 1) * (rows - 1)
+            and (j + 1) * m >= d * (columns - 1) and (j - 1) * m <= (d + 1) * (columns - 1) for c, d in cells)
 
 
 def test_decoder_weights_become_float16_and_refuse_what_it_cannot_hold():
