@@ -87,7 +87,7 @@ def in_blocks(
         blocks = searched(wanted[own], worth[own], there, _own_blocks(together, start, rows), min(side, largest_side(*there.shape)), quantiser)
         of_occupancy = None if implied is None else implied[own]
         told[start] = encode_blocks(blocks, there, of_occupancy)
-        symbols[own], _ = decode_blocks(told[start], *symbols[own].shape, of_occupancy)
+        symbols[own], _ = decode_blocks(told[start], *symbols[own].shape, implied=of_occupancy)
     return replace(finer, symbols=symbols, coded=known, guide=Told(told), starts=tuple(told)), sum(map(len, told.values()))
 
 

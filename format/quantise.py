@@ -223,7 +223,7 @@ def seen_along(occupancy: np.ndarray, plane: str) -> np.ndarray:
     axes = {"t": 0, "z": 1, "y": 2, "x": 3}
     across, down = axes[plane[0]], axes[plane[1]]
     others = tuple(axis for axis in range(4) if axis not in (across, down))
-    seen: np.ndarray = occupancy.any(axis=others)  # the kept axes stay in the order t, z, y, x
+    seen = np.asarray(occupancy.any(axis=others))  # the kept axes stay in the order t, z, y, x
     return seen if down < across else seen.T
 
 

@@ -76,7 +76,7 @@ def form_of(
 def _tells(body: bytes, symbols: np.ndarray, coded: np.ndarray, implied: np.ndarray | None) -> bool:
     """Whether blocks are of just these symbols."""
     try:
-        told, where = decode_blocks(body, *symbols.shape, implied)
+        told, where = decode_blocks(body, *symbols.shape, implied=implied)
     except FormatError:  # they were told by another occupancy
         return False
     return np.array_equal(told, symbols) and np.array_equal(where, coded)

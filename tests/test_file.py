@@ -209,7 +209,7 @@ def test_maps_that_follow_from_occupancy_take_no_bytes():
 def test_what_occupancy_implies_counts_against_the_budget():
     corner = np.indices((1, 1, 400, 500)).sum(0) < 500
     data = encode(seen(replace(quantised(resolution=(30, 28, 26), dynamic=False), occupancy=corner)))
-    least = next(budget for budget in range(0, 4 << 20, 1000) if not refused(data, budget))
+    least = next(budget for budget in range(0, 4 << 20, 10_000) if not refused(data, budget))
     assert least > 2 * corner.size
 
 
