@@ -10,7 +10,7 @@ from test_trellis import waves
 from kpc.encoder import blocks as search
 from kpc.encoder import choice
 from kpc.encoder.choice import quantise_by_cost, step_asked_for
-from kpc.encoder.trellis import on_trellis
+from kpc.encoder.trellis import THIN, on_trellis
 from kpc.encoder.worth import ALONE, cost
 from kpc.format import file
 from kpc.format.blocks import FINENESSES, USUAL
@@ -41,6 +41,19 @@ def test_what_hardly_changes_costs_less_in_blocks(step: float) -> None:
 
     gain = in_all(steered, choice._size(steered, False, np.ones((60, 70), bool))) / in_all(told, size)
     assert gain > {1.0: 0.9, 2.0: 1.0, 4.0: 1.1}[step]
+
+
+def test_a_time_plane_that_is_nearly_1_is_told_without_a_map_and_is_1_where_nothing_changes() -> None:
+    v, u = np.mgrid[:48, :96]
+    swell = np.exp(-((u - 24) ** 2 + (v - 20) ** 2) / 120)[..., None] * np.array([4.0, -3.0, 2.0])
+    values, steps, everywhere = (1 + swell).astype(np.float32), np.full(3, 1.0), np.ones((48, 96), bool)
+    rounded = quantise_plane(values, steps, identity=True)
+    found = choice._cheapest(rounded, values, steps, np.ones_like(values), True, ALONE, THIN, everywhere, everywhere)
+    assert isinstance(found.guide, Told) and found.coded.all()
+    assert (found.dequantise()[:, 64:] == 1).all()
+    mapped = in_blocks(values, 1.0, identity=True, side=16)[0]
+    assert not mapped.coded.all() and np.square(found.dequantise() - values).sum() < 0.7 * np.square(mapped.dequantise() - values).sum()
+    assert choice._size(found, True, everywhere) < choice._size(mapped, True, everywhere)
 
 
 def test_what_nobody_needs_changes_nothing() -> None:
