@@ -60,7 +60,9 @@ def quantise_by_cost(
         asked = quantised.scales[s][name], values, steps[s][name], matters[s][name], name in TIME_PLANES, beside, thin
         if not blocks:
             return on_trellis(*asked)
-        return _cheapest(*asked, *(needed_texels(cells, name, *values.shape[:2]) for cells in (scene.occupancy, reached)))
+        needed = needed_texels(reached, name, *values.shape[:2])
+        implied = needed if reached is scene.occupancy else needed_texels(scene.occupancy, name, *values.shape[:2])
+        return _cheapest(*asked, implied, needed)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the searches hold no lock
         searched = dict(zip(chosen, pool.map(found, chosen), strict=True))
