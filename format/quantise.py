@@ -16,6 +16,7 @@ from kpc.format.cameras import Camera
 from kpc.format.errors import FormatError
 from kpc.format.motion import QuantisedMotion, places_reached, quantise_motion
 from kpc.format.poses import rigid, rounded
+from kpc.format.rans import compiled
 from kpc.format.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
 from kpc.format.space import SpaceMapping
 from kpc.format.segments import PlaneGuide
@@ -224,26 +225,36 @@ def seen_along(occupancy: np.ndarray, plane: str) -> np.ndarray:
     across, down = axes[plane[0]], axes[plane[1]]
     others = tuple(axis for axis in range(4) if axis not in (across, down))
     seen = np.asarray(occupancy.any(axis=others))  # the kept axes stay in the order t, z, y, x
-    return seen if down < across else seen.T
+    return seen if down < across else np.ascontiguousarray(seen.T)
 
 
 def needed_rows(seen: np.ndarray, rows: int, columns: int, some: range) -> np.ndarray:
     """Some rows of `needed_texels`, by `seen_along`. Takes no more memory than they do, and a row of cells."""
     needed = np.empty((len(some), columns), bool)
-    (top, bottom), (left, right) = _reached_from(rows, seen.shape[0]), _reached_from(columns, seen.shape[1])
-    for number, row in enumerate(some):
-        counts = np.concatenate([[0], np.cumsum(seen[top[row] : bottom[row]].any(axis=0))])
-        needed[number] = counts[right] > counts[left]
+    _mark_met(seen, _reached_from(rows, seen.shape[0])[:, some.start : some.stop], _reached_from(columns, seen.shape[1]), needed)
     return needed
 
 
-def _reached_from(texels: int, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """(texels,) int64: the first cell and the one after the last such that [c, c+1] / cells meets the closed support [i-1, i+1] / (texels-1)."""
+@compiled()
+def _mark_met(seen, down, across, needed):
+    """Fill `needed`: whether any cell is seen from down[0] to before down[1] and from across[0] to before across[1]."""
+    for row in range(needed.shape[0]):
+        met = np.zeros(seen.shape[1], np.bool_)
+        for cells in range(down[0, row], down[1, row]):
+            met |= seen[cells]
+        for column in range(needed.shape[1]):
+            needed[row, column] = False
+            for cell in range(across[0, column], across[1, column]):
+                needed[row, column] |= met[cell]
+
+
+def _reached_from(texels: int, cells: int) -> np.ndarray:
+    """(2, texels) int64: the first cell and the one after the last such that [c, c+1] / cells meets the closed support [i-1, i+1] / (texels-1)."""
     i, apart = np.arange(texels), texels - 1
     if apart == 0:
-        return np.zeros(1, np.int64), np.full(1, cells)
+        return np.array([[0], [cells]])
     first, last = -(-(i - 1) * cells // apart) - 1, (i + 1) * cells // apart
-    return np.maximum(first, 0), np.minimum(last + 1, cells)
+    return np.stack([np.maximum(first, 0), np.minimum(last + 1, cells)])
 
 
 def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) -> AnyDecoder:
