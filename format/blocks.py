@@ -161,6 +161,22 @@ def decode_blocks(
     Raises:
         FormatError: the body is cut, too long, or says what only a damaged one would.
     """
+    symbols, coded, _ = _decoded(body, rows, columns, channels, implied, None)
+    return symbols, coded
+
+
+def blocks_in(body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None) -> Blocks:
+    """What `encode_blocks` was given, of a body that `decode_blocks` decodes; levels of blocks without a coded texel are 0."""
+    side = body[0]
+    levels = np.zeros((channels, *blocks_of(np.zeros((rows, columns), bool), side).shape, side, side), np.int64)
+    _, _, fineness = _decoded(body, rows, columns, channels, implied, levels)
+    return Blocks(levels, fineness, body[2])
+
+
+def _decoded(
+    body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None, levels: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Symbols, coded texels and how fine blocks are; `levels`, as of `Blocks`, are filled in."""
     if len(body) < HEAD or not holds_blocks(body) or body[0] not in SIDES or body[2] == 0:
         raise FormatError("plane segment: unknown side of blocks, or a quantiser of 0")
     side = body[0]
@@ -175,10 +191,10 @@ def decode_blocks(
     if at <= len(words):
         state, at = walk_fineness(fineness, busy, state, at, words, None)
     if at <= len(words):
-        borders = body[1] & THIRD != 0
-        state, at = walk_levels(None, fineness, busy, quantisers(side, body[2]), borders, state, at, words, None, symbols, cosines(side), coded)
+        borders, finer = body[1] & THIRD != 0, quantisers(side, body[2])
+        state, at = walk_levels(levels, fineness, busy, finer, borders, state, at, words, None, symbols, cosines(side), coded)
     ended(state, at, words, "plane segment")
-    return symbols, coded
+    return symbols, coded, fineness
 
 
 # --- the walk that encoder and decoder share
@@ -210,7 +226,8 @@ def walk_fineness(fineness, busy, state, at, words, trace):
 
 @compiled()
 def walk_levels(levels, fineness, busy, quantisers, borders, state, at, words, trace, symbols, cosines, coded):
-    """Code `levels` of blocks that are `busy`, or decode them into `symbols`: (state, at). `borders`: whether blocks go on from them."""
+    """Code `levels` of blocks that are `busy`, or decode what they make into `symbols`, and, where they are wanted, into `levels`: (state, at).
+    `borders`: whether blocks go on from them."""
     BY, BX = busy.shape
     N = len(cosines)
     M = 0
@@ -240,7 +257,7 @@ def walk_levels(levels, fineness, busy, quantisers, borders, state, at, words, t
                     expected = (PARTS >> 1) * sum_across(right, bottom[bx], beside, over) + expected >> 1
                 foreseen = (expected + (quantiser[0, 0] >> 1)) // quantiser[0, 0]
                 block[:] = 0
-                if levels is not None:
+                if levels is not None and words is None:
                     block[:] = levels[m, by, bx]
                     block[0, 0] -= foreseen
                 ends = end[Y, X - 1], end[Y - 1, X], end_before[Y, X]
@@ -269,6 +286,8 @@ def walk_levels(levels, fineness, busy, quantisers, borders, state, at, words, t
                 if borders:
                     begin_rest(rest, right, bottom[bx], beside, over)
                     state, at = walk_signs(block, end[Y, X], quantiser, cosines, rest, beside, over, sign_table, state, at, words, trace)
+                if levels is not None and words is not None:
+                    levels[m, by, bx] = block
                 if borders or symbols is not None:
                     rebuild(block, quantiser, cosines, columns)
                     right[:], bottom[bx] = block[:, N - 1], block[N - 1]

@@ -9,7 +9,8 @@ import pytest
 
 from kpc.format import blocks, segments
 from kpc.format.blocks import (
-    FINENESSES, HEAD, LARGEST, PARTS, SIDES, USUAL, Blocks, blocks_of, coarser, cosines, decode_blocks, encode_blocks, largest_side, quantisers,
+    FINENESSES, HEAD, LARGEST, PARTS, SIDES, USUAL, Blocks, blocks_in, blocks_of, coarser, cosines, decode_blocks, encode_blocks, largest_side,
+    quantisers,
 )
 from kpc.format.container import CODEC_SYMBOLS, CODEC_THIRD
 from kpc.format.errors import FormatError
@@ -66,6 +67,9 @@ def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(side: int, rows:
         symbols, where = decode_blocks(encode_blocks(told, coded), rows, columns, 3)
         np.testing.assert_array_equal(symbols, decode_blocks(encode_blocks(told, coded, borders=False), rows, columns, 3)[0])
         np.testing.assert_array_equal(where, coded)
+        for borders in (True, False):
+            body = encode_blocks(told, coded, borders=borders)
+            assert encode_blocks(blocks_in(body, rows, columns, 3), coded, borders=borders) == body
         exact = float_symbols(told, coded)
         # A rounded cosine errs by 1 / 256 of 1 at most, in each of two sums over levels; then half a symbol, and a 1 / 16 after the first sum.
         side_sum = np.abs(told.levels * quantisers(side, told.quantiser)[told.fineness] / PARTS).sum((3, 4)).max(initial=0)

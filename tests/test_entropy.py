@@ -1,22 +1,61 @@
 import json
 
 import numpy as np
+import pytest
 from scenes import tiny_scene
+from test_blocks import some
 from test_symbols import followed, textured
 
-from kpc.format.container import Chunk
+from kpc.format import blocks, symbols
 from kpc.format.file import write
 from kpc.format.quantise import quantise_scene
+from kpc.format.segments import encode_coded
 from kpc.format.symbols import SET_COUNTS, Guide, encode_symbols
 from kpc.tools import entropy, kpbench, results
 
 
+def in_blocks(side=8, rows=60, columns=92, share=0.7, by_occupancy=False):
+    """A segment."""
+    told, coded = some(side, rows, columns, share, seed=3)
+    implied = coded if by_occupancy else None
+    body = blocks.encode_blocks(told, coded, implied)
+    values, _ = blocks.decode_blocks(body, rows, columns, 3, implied)
+    return entropy.Segment(values, coded, coded if by_occupancy else ~coded, body, body)
+
+
 def test_with_nothing_changed_the_coder_is_the_coder():
-    symbols, coded = textured(20, 24, 3)
+    values, coded = textured(20, 24, 3)
     guide = Guide(np.int8([[3, -5, 8, 0, 1, -2, 4, 0, 1]]))
-    for symbols, guide in ((symbols, None), (followed(symbols, coded, guide), guide)):
-        segment = entropy.Segment(symbols, coded, guide, Chunk("PLNE", []))
-        assert entropy._bytes(segment, entropy._compiled({}), SET_COUNTS) == len(encode_symbols(symbols, coded, guide))
+    for values, guide in ((values, None), (followed(values, coded, guide), guide)):
+        for implied in (coded, ~coded):
+            body = encode_symbols(values, coded, guide, implied)
+            segment = entropy.Segment(values, coded, implied, guide, body)
+            assert entropy._bytes(segment, entropy._compiled(symbols, {}), SET_COUNTS) == len(body)
+
+
+@pytest.mark.parametrize("by_occupancy", [False, True])
+def test_with_nothing_changed_blocks_are_as_they_were(by_occupancy):
+    segment, walks = in_blocks(by_occupancy=by_occupancy), entropy._compiled(blocks, {})
+    assert entropy._bytes_in_blocks(segment, walks, borders=True) == len(segment.body)
+    told = blocks.blocks_in(segment.body, *segment.symbols.shape, segment.implied)
+    assert entropy._bytes_in_blocks(segment, walks, borders=False) == len(blocks.encode_blocks(told, segment.coded, borders=False))
+
+
+@pytest.mark.parametrize("idea", [name for name, idea in entropy.LEFT_OUT.items() if isinstance(idea, entropy.OfBlocks) and idea.changes])
+def test_what_is_left_out_of_blocks_changes_something(idea, monkeypatch):
+    monkeypatch.setattr(entropy, "njit", lambda function: function)  # as plain Python: compiling takes longer
+    segment = in_blocks(rows=60, columns=64, share=1.0)
+    assert entropy.LEFT_OUT[idea].has(segment)
+    assert entropy.LEFT_OUT[idea].sized()(segment) != len(segment.body)
+
+
+def test_a_map_is_told_where_occupancy_does_not():
+    segment, idea = in_blocks(by_occupancy=True), entropy.LEFT_OUT["maps that follow from occupancy"]
+    assert idea.has(segment) and not idea.has(in_blocks()) and not idea.has(in_blocks(share=1.0))
+    assert idea.sized()(segment) > len(segment.body)
+    values, coded = textured(20, 24, 3)
+    by_symbols = entropy.Segment(values, coded, coded, None, encode_coded(values, coded, None, coded))
+    assert idea.sized()(by_symbols) == len(encode_symbols(values, coded)) > len(by_symbols.body)
 
 
 def test_what_tables_would_take():

@@ -1,27 +1,30 @@
-"""What each idea of the entropy coder is worth, on the symbols of real files (`kpbench entropy`). It is lossless: bytes say it all.
+"""What each idea of the entropy coder is worth, on the planes of real files (`kpbench entropy`). It is lossless: bytes say it all.
 
-An idea is left out by compiling `kpc.format.symbols` once more with the one constant or function changed that holds it.
+An idea is left out by compiling `kpc.format.symbols` or `kpc.format.blocks` once more with the one constant or function changed that holds it, or
+by coding as the codec before it does. What does not have it counts as it is.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import process_time
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 from numba import njit
 
-from kpc.format import rans
-from kpc.format import symbols as module
-from kpc.format.container import Chunk, pack
+from kpc.format import blocks, rans, symbols
+from kpc.format.blocks import DECISIONS as LEVEL_DECISIONS
+from kpc.format.blocks import FREQUENCIES, HEAD, blocks_in, blocks_of, cosines, quantisers
+from kpc.format.container import pack
 from kpc.format.file import SceneReader, read, scene_chunks
+from kpc.format.quantise import needed_texels
 from kpc.format.rans import words_of
 from kpc.format.scene import ALL_PLANES
-from kpc.format.segments import Told
-from kpc.format.symbols import ANY, AROUND, MOST_DECISIONS, SET_COUNTS, TRELLIS, WEIGHTS, Guide, fitted
+from kpc.format.segments import SegmentGuide, encode_coded, guide_at
+from kpc.format.symbols import ANY, AROUND, MOST_DECISIONS, SET_COUNTS, TRELLIS, WEIGHTS, fitted
 
 DECODINGS = 5
 TABLE_BITS = 12
@@ -30,42 +33,55 @@ TABLE_BITS = 12
 
 @dataclass(frozen=True)
 class Segment:
-    """A plane segment that is told symbol by symbol: (H, W, M) int8 symbols, (H, W) bool coded texels, what the symbols follow, and the chunk
-    that stores it."""
+    """(H, W, M) int8 symbols of a plane segment, (H, W) bool coded texels, those that follow from occupancy, how it is told, and so told."""
 
     symbols: np.ndarray
     coded: np.ndarray
-    guide: Guide | None
-    chunk: Chunk
+    implied: np.ndarray
+    guide: SegmentGuide | None
+    body: bytes
+
+    @property
+    def is_in_blocks(self) -> bool:
+        return isinstance(self.guide, bytes)
+
+    @property
+    def tells_map(self) -> bool:
+        return not self.coded.all() and not np.array_equal(self.coded, self.implied)
+
+
+Sized = Callable[[Segment], int]
+"""Bytes of a segment."""
 
 
 def measure(scene: Path) -> dict[str, dict[str, float]]:
-    """For each idea left out, the bytes of all planes, `plane_bytes`; of what exists as a codec also `decode_ms`, on one core; and of the file
-    as it is, `file_bytes`, all that `kpc.format.file.read` does: `read_ms`. Of planes those that are told in blocks are left out."""
+    """For each idea left out that the file has, the bytes of all planes, `plane_bytes`; of what exists as a codec also `decode_ms`, on one core; and
+    of the file as it is, `file_bytes`, all that `kpc.format.file.read` does: `read_ms`."""
     quantised = read(scene)
     segments, chunks = [], scene_chunks(quantised)
-    left = {(s, ALL_PLANES.index(name)) for s, planes in enumerate(quantised.scales)
-            for name, plane in planes.items() if not isinstance(plane.guide, Told)}
     for chunk in chunks:
-        if chunk.kind == "PLNE" and (chunk.scale, chunk.plane) in left:
-            plane = quantised.scales[chunk.scale][ALL_PLANES[chunk.plane]]
-            rows = slice(chunk.row_start, chunk.row_start + chunk.row_count)
-            segments.append(Segment(plane.symbols[rows], plane.coded[rows], plane.guide, chunk))
+        if chunk.kind == "PLNE":
+            name = ALL_PLANES[chunk.plane]
+            plane = quantised.scales[chunk.scale][name]
+            rows, guide = slice(chunk.row_start, chunk.row_start + chunk.row_count), guide_at(plane.guide, chunk.row_start)
+            told = plane.symbols[rows], plane.coded[rows], needed_texels(quantised.occupancy, name, *plane.coded.shape)[rows]
+            segments.append(Segment(*told, guide, encode_coded(*told[:2], guide, told[2])))
     values = sum(plane.symbols.size for planes in quantised.scales for plane in planes.values())
     found = {
-        "nothing": _decoded(pack(chunks, values), left)
+        "nothing": _decoded(pack(chunks, values))
         | {"file_bytes": scene.stat().st_size, "read_ms": _median_ms(partial(read, scene.read_bytes()))},
-        "all of them: zstd": _decoded(pack([replace(chunk, coded={}) for chunk in chunks], values), left),
+        "all of them: zstd": _decoded(pack([replace(chunk, coded={}) if chunk.kind == "PLNE" else chunk for chunk in chunks], values)),
     }
-    for name, (changes, counts, size) in LEFT_OUT.items():
-        walks = _compiled(changes)
-        found[name] = {"plane_bytes": sum(_bytes(segment, walks, counts, size) for segment in segments)}
+    for name, idea in LEFT_OUT.items():
+        if any(map(idea.has, segments)):
+            size = idea.sized()
+            found[name] = {"plane_bytes": sum(size(one) if idea.has(one) else len(one.body) for one in segments)}
     return found
 
 
-def _decoded(data: bytes, left: Collection[tuple[int, int]]) -> dict[str, float]:
+def _decoded(data: bytes) -> dict[str, float]:
     reader = SceneReader(data)
-    planes = [number for number, entry in enumerate(reader.index) if entry.kind == "PLNE" and (entry.scale, entry.plane) in left]
+    planes = [number for number, entry in enumerate(reader.index) if entry.kind == "PLNE"]
     decode_ms = _median_ms(lambda: [reader.segment(number) for number in planes])
     return {"plane_bytes": sum(reader.index[n].stored_length for n in planes), "decode_ms": decode_ms}
 
@@ -83,7 +99,7 @@ def _median_ms(work: Callable[[], object]) -> float:
 # --- the coder, with something changed
 
 Walks = dict[str, Any]
-"""The names of `kpc.format.symbols`, its functions, and what they call of `kpc.format.rans`, compiled anew."""
+"""The names of a module, its functions, and what they call of `kpc.format.rans`, compiled anew."""
 
 
 @njit
@@ -98,35 +114,92 @@ def _note(bit, table, which, state, at, words, trace):
     return bit, state, at + 1
 
 
-def _compiled(changes: dict[str, Any]) -> Walks:
+@njit
+def _no_pull(rest, cosines, i, j, beside, over):
+    """In place of `pull_of`."""
+    return 0
+
+
+@njit
+def _frequency_alone(here, left, above, before, i, j, side):
+    """In place of `level_context`."""
+    return min(5 * (i + j) // side, FREQUENCIES - 2) if i + j else FREQUENCIES - 1
+
+
+@njit
+def _without_frequency(here, left, above, before, i, j, side):
+    context = blocks.level_context(here, left, above, before, i, j, side)
+    return context if i + j == 0 else context // FREQUENCIES * FREQUENCIES
+
+
+@njit
+def _without_before(here, left, above, before, i, j, side):
+    return blocks.level_context(here, left, above, np.zeros_like(before), i, j, side)
+
+
+@njit
+def _even_levels():
+    """In place of `level_counters`."""
+    return rans.counters(blocks.SIZES * FREQUENCIES * LEVEL_DECISIONS)
+
+
+@njit
+def _even_signs():
+    """In place of `sign_counters`."""
+    return rans.counters(len(blocks.AGREES))
+
+
+CALLERS = {
+    symbols: ("begin_row", "remember", "next_state", "next_place", "predict", "nearest", "foreseen", "meant", "told", "activity", "natural",
+              "integer", "walk_map", "walk"),
+    blocks: ("walk_signs", "walk_levels"),
+}
+"""What calls what may be changed, and that itself, each before those that call it."""
+
+
+def _compiled(module: ModuleType, changes: dict[str, Any]) -> Walks:
     names = vars(rans) | vars(module) | changes
-    for name in ("begin_row", "remember", "next_state", "next_place", "predict", "nearest", "foreseen", "meant", "told", "activity", "natural",
-                 "integer", "walk_map", "walk"):
+    for name in CALLERS[module]:
         if name not in changes:
             names[name] = njit(FunctionType(names[name].py_func.__code__, names, name))
     return names
 
 
 def _bytes(segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callable[[np.ndarray], float] | None = None) -> int:
-    """What the segment takes with the best number of sets of weights, or with none; with those of its guide, if it has one. `size` is of
-    a trace, else of its words."""
-    symbols, coded = np.ascontiguousarray(segment.symbols), np.ascontiguousarray(segment.coded)
-    neighbours, guide = module.neighbourhoods(symbols, coded), segment.guide
+    """What a segment takes that is told symbol by symbol, with the best number of sets of weights, or with none; with those of its guide, if it has
+    one. `size` is of a trace, else of its words."""
+    told, coded = np.ascontiguousarray(segment.symbols), np.ascontiguousarray(segment.coded)
+    neighbours, guide = symbols.neighbourhoods(told, coded), segment.guide
     trace = np.empty(coded.size + len(neighbours) * MOST_DECISIONS, np.int16)
-    if guide is not None:
+    if isinstance(guide, symbols.Guide):
         lattice, tried = AROUND, [guide.weights]
     else:
-        lattice = TRELLIS if module.follows_trellis(symbols, coded) else ANY
+        lattice = TRELLIS if symbols.follows_trellis(told, coded) else ANY
         tried = [fitted(neighbours, count) for count in counts] or [np.zeros((1, WEIGHTS), np.int8)]
     sizes = []
     for weights in tried:
         at = 0
-        if not coded.all():
+        if segment.tells_map:
             _, at = walks["walk_map"](coded, 0, at, None, trace)
             trace[:at] -= 8192 * (size is not None)  # counters of the map are others
-        _, at, _ = walks["walk"](symbols, coded, lattice, weights, 0, at, None, trace, None)
+        _, at, _ = walks["walk"](told, coded, lattice, weights, 0, at, None, trace, None)
         sizes.append(2 + (weights.size if counts or guide else 0) + (size(trace[:at]) if size else 2 * len(words_of(trace[:at]))))
     return round(min(sizes))
+
+
+def _bytes_in_blocks(segment: Segment, walks: Walks, borders: bool) -> int:
+    """What a segment takes that is told in blocks."""
+    assert isinstance(segment.guide, bytes)
+    told = blocks_in(segment.guide, *segment.symbols.shape, implied=segment.implied)
+    side, coded = told.levels.shape[-1], np.ascontiguousarray(segment.coded)
+    busy, at = blocks_of(coded, side), 0
+    trace = np.empty(coded.size + busy.size * (3 + blocks.MOST_END_DECISIONS * len(told.levels)) + told.levels.size * blocks.MOST_DECISIONS, np.int16)
+    if not coded.all() and not (borders and not segment.tells_map):  # without borders it is codec 2, which tells all maps
+        _, at = walks["walk_map"](coded, 0, at, None, trace)
+    _, at = walks["walk_fineness"](told.fineness.copy(), busy, 0, at, None, trace)
+    finer = quantisers(side, told.quantiser)
+    _, at = walks["walk_levels"](told.levels, told.fineness, busy, finer, borders, 0, at, None, trace, None, cosines(side), coded)
+    return HEAD + 2 * len(words_of(trace[:at]))
 
 
 def _tables(trace: np.ndarray) -> float:
@@ -139,12 +212,68 @@ def _tables(trace: np.ndarray) -> float:
     return float(bits + np.count_nonzero(trace > -10000)) / 8
 
 
-LEFT_OUT: dict[str, tuple[dict[str, Any], tuple[int, ...], Callable[[np.ndarray], float] | None]] = {
-    "one set of weights": ({}, (1,), None),
-    "no weights: mean of left and above": ({}, (), None),
-    "no contexts of activity": ({"_LOGARITHMS": np.zeros_like(module._LOGARITHMS)}, SET_COUNTS, None),
-    "no contexts of the fraction": ({"FRACTIONS": 1}, SET_COUNTS, None),
-    "no errors of channels before": ({"remember": _forget}, SET_COUNTS, None),
-    "stored tables for counters that learn": ({"adapt": _note}, SET_COUNTS, _tables),
+# --- what is left out
+
+
+@dataclass(frozen=True)
+class OfSymbols:
+    """An idea of what is told symbol by symbol: what changes in `kpc.format.symbols`, numbers of sets of weights to try, and how to measure if
+    not by words."""
+
+    changes: dict[str, Any]
+    counts: tuple[int, ...] = SET_COUNTS
+    size: Callable[[np.ndarray], float] | None = None
+
+    def has(self, segment: Segment) -> bool:
+        return not segment.is_in_blocks
+
+    def sized(self) -> Sized:
+        return partial(_bytes, walks=_compiled(symbols, self.changes), counts=self.counts, size=self.size)
+
+
+@dataclass(frozen=True)
+class OfBlocks:
+    """An idea of what is told in blocks: what changes in `kpc.format.blocks`, and whether blocks go on from borders."""
+
+    changes: dict[str, Any]
+    borders: bool = True
+
+    def has(self, segment: Segment) -> bool:
+        return segment.is_in_blocks
+
+    def sized(self) -> Sized:
+        return partial(_bytes_in_blocks, walks=_compiled(blocks, self.changes), borders=self.borders)
+
+
+class OfMaps:
+    """That what occupancy implies is not told."""
+
+    def has(self, segment: Segment) -> bool:
+        return not segment.tells_map and not segment.coded.all()
+
+    def sized(self) -> Sized:
+        return _with_map
+
+
+def _with_map(segment: Segment) -> int:
+    if isinstance(segment.guide, bytes):
+        return len(blocks.encode_blocks(blocks_in(segment.guide, *segment.symbols.shape, implied=segment.implied), segment.coded))
+    return len(encode_coded(segment.symbols, segment.coded, segment.guide))
+
+
+LEFT_OUT: dict[str, OfSymbols | OfBlocks | OfMaps] = {
+    "maps that follow from occupancy": OfMaps(),
+    "one set of weights": OfSymbols({}, (1,)),
+    "no weights: mean of left and above": OfSymbols({}, ()),
+    "no contexts of activity": OfSymbols({"_LOGARITHMS": np.zeros_like(symbols._LOGARITHMS)}),
+    "no contexts of the fraction": OfSymbols({"FRACTIONS": 1}),
+    "no errors of channels before": OfSymbols({"remember": _forget}),
+    "stored tables for counters that learn": OfSymbols({"adapt": _note}, size=_tables),
+    "blocks: nothing of borders": OfBlocks({}, borders=False),
+    "blocks: no signs by borders": OfBlocks({"pull_of": _no_pull}),
+    "blocks: no levels around": OfBlocks({"level_context": _frequency_alone}),
+    "blocks: no frequency": OfBlocks({"level_context": _without_frequency}),
+    "blocks: no channel before": OfBlocks({"level_context": _without_before}),
+    "blocks: counters that know nothing at first": OfBlocks({"level_counters": _even_levels, "sign_counters": _even_signs}),
 }
-"""Idea left out: what changes in `kpc.format.symbols`, numbers of sets of weights to try, and how to measure if not by words."""
+"""By what the tables call them."""
