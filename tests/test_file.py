@@ -19,9 +19,10 @@ from kpc.format.container import CODEC_MIDPOINTS, CODEC_RAW, CODEC_SYMBOLS, CODE
 from kpc.format.errors import BudgetError, FormatError
 from kpc.format.file import APPEARANCE_LIMIT, NAME_LIMIT, SceneReader, encode, read, scene_chunks, write
 from kpc.format.motion import STEP, QuantisedMotion
-from kpc.format.quantise import QuantisedScene, needed_texels, quantise_scene
+from kpc.format.quantise import QuantisedScene, quantise_scene
 from kpc.format.scene import TIME_PLANES, Appearance
 from kpc.format.space import Contraction, DeviceCoordinates
+from kpc.tools.specvectors import seen_through
 
 
 def quantised(step: float = 0.02, **options) -> QuantisedScene:
@@ -170,21 +171,11 @@ def test_rows_in_time_may_differ_from_scale_to_scale():
     assert_same(read(encode(scene, segment_rows=4)), scene)
 
 
-def seen(scene: QuantisedScene) -> QuantisedScene:
-    """The scene, of whose space planes those texels are coded that its occupancy needs."""
-    def cut(name, plane):
-        coded = needed_texels(scene.occupancy, name, *plane.coded.shape)
-        return replace(plane, symbols=plane.symbols * coded[..., None], coded=coded)
-
-    return replace(scene, scales=tuple({name: plane if name in TIME_PLANES else cut(name, plane) for name, plane in scale.items()}
-                                       for scale in scene.scales))
-
-
 def test_maps_that_follow_from_occupancy_take_no_bytes():
     scene = quantised(resolution=(30, 28, 26), time=6)
     occupancy = np.zeros((1, 9, 10, 11), bool)
     occupancy[0, 2:5, 3, 4:9] = occupancy[0, 4, 2:8, 5] = True
-    scene = seen(replace(scene, occupancy=occupancy))
+    scene = seen_through(scene, occupancy)
     data = encode(scene)
     assert_same(read(data), scene)
     assert encode(read(data)) == data
@@ -208,7 +199,7 @@ def test_maps_that_follow_from_occupancy_take_no_bytes():
 
 def test_what_occupancy_implies_counts_against_the_budget():
     corner = np.indices((1, 1, 400, 500)).sum(0) < 500
-    data = encode(seen(replace(quantised(resolution=(30, 28, 26), dynamic=False), occupancy=corner)))
+    data = encode(seen_through(quantised(resolution=(30, 28, 26), dynamic=False), corner))
     least = next(budget for budget in range(0, 4 << 20, 10_000) if not refused(data, budget))
     assert least > 2 * corner.size
 

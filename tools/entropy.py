@@ -187,10 +187,14 @@ def _bytes(segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callab
     return round(min(sizes))
 
 
+def _told(segment: Segment) -> blocks.Blocks:
+    rows, columns, channels = segment.symbols.shape
+    return blocks_in(segment.body, rows, columns, channels, segment.implied)
+
+
 def _bytes_in_blocks(segment: Segment, walks: Walks, borders: bool) -> int:
     """What a segment takes that is told in blocks."""
-    assert isinstance(segment.guide, bytes)
-    told = blocks_in(segment.guide, *segment.symbols.shape, implied=segment.implied)
+    told = _told(segment)
     side, coded = told.levels.shape[-1], np.ascontiguousarray(segment.coded)
     busy, at = blocks_of(coded, side), 0
     trace = np.empty(coded.size + busy.size * (3 + blocks.MOST_END_DECISIONS * len(told.levels)) + told.levels.size * blocks.MOST_DECISIONS, np.int16)
@@ -256,8 +260,8 @@ class OfMaps:
 
 
 def _with_map(segment: Segment) -> int:
-    if isinstance(segment.guide, bytes):
-        return len(blocks.encode_blocks(blocks_in(segment.guide, *segment.symbols.shape, implied=segment.implied), segment.coded))
+    if segment.is_in_blocks:
+        return len(blocks.encode_blocks(_told(segment), segment.coded))
     return len(encode_coded(segment.symbols, segment.coded, segment.guide))
 
 

@@ -214,15 +214,19 @@ def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *
 on_from_borders = partial(in_blocks, codec=CODEC_THIRD)
 
 
-def seen_through_slits(scene: QuantisedScene) -> QuantisedScene:
-    """The scene with few cells occupied, of whose planes those texels are coded that these need."""
-    sparse = replace(scene, occupancy=_noise((2 if scene.is_dynamic else 1, 5, 7, 6), 96) > 110)
-
+def seen_through(scene: QuantisedScene, occupancy: np.ndarray) -> QuantisedScene:
+    """The scene so occupied, of whose planes those texels are coded that this needs."""
     def cut(name: str, plane: QuantisedPlane) -> QuantisedPlane:
-        coded = needed_texels(sparse.occupancy, name, *plane.coded.shape)
+        coded = needed_texels(occupancy, name, *plane.coded.shape)
         return replace(plane, symbols=plane.symbols * coded[..., None], coded=coded)
 
-    return replace(sparse, scales=tuple({name: cut(name, plane) for name, plane in scale.items()} for scale in scene.scales))
+    scales = tuple({name: cut(name, plane) for name, plane in scale.items()} for scale in scene.scales)
+    return replace(scene, occupancy=occupancy, scales=scales)
+
+
+def seen_through_slits(scene: QuantisedScene) -> QuantisedScene:
+    """The same with few cells occupied."""
+    return seen_through(scene, _noise((2 if scene.is_dynamic else 1, 5, 7, 6), 96) > 110)
 
 
 def _needed(scene: QuantisedScene, chunk: Chunk) -> np.ndarray:
