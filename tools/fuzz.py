@@ -3,7 +3,8 @@
 Conformance vectors are taken apart, changed where it may hurt, and put together again with every length, offset and CRC32C right, so
 that a change reaches the code behind them. A reader must read the result or refuse it with a FormatError: anything else that is
 raised, more than HANG_S of computing and more memory than the budget are findings, which are written to -o as files. File number N of a
-seed is always the same, so that a run may be made in parts: --first 500000 --count 500000 is the second half of the one above.
+seed is always the same, so that a run may be made in parts: --first 500000 --count 500000 is the second half of the one above. After a change,
+--only borders,implied damages just the vectors whose names begin so.
 """
 
 import argparse
@@ -246,10 +247,10 @@ def _decompressed(body: bytes) -> bytes | None:
         return None
 
 
-def seeds() -> list[Taken]:
-    """The valid conformance vectors, taken apart, but for those that would take more time than all others together."""
+def seeds(only: tuple[str, ...] = ("",)) -> list[Taken]:
+    """The valid conformance vectors whose names begin so, taken apart, but for those that would take more time than all others together."""
     return [Taken.of(data) for path, data in specvectors.vectors().items()
-            if path.startswith("valid/") and path.endswith(".kpc") and Path(path).stem not in LONG]
+            if path.startswith("valid/") and path.endswith(".kpc") and Path(path).stem.startswith(only) and Path(path).stem not in LONG]
 
 
 def examined(data: bytes, budget: int = BUDGET) -> str:
@@ -298,11 +299,11 @@ def file_number(seed: int, number: int, starts: Sequence[Taken]) -> bytes:
     return mutated(rng, rng.choice(starts), starts)
 
 
-def _work(pipe: Connection, now: Any, seed: int, numbers: range, skipped: frozenset[int], budget: int) -> None:
+def _work(pipe: Connection, now: Any, seed: int, numbers: range, skipped: frozenset[int], budget: int, only: tuple[str, ...]) -> None:
     """Examine files; tell (next number, outcomes, findings) every so often. `now`: the number at hand, and since when, in
     seconds of computing and on the clock."""
     warnings.simplefilter("error")
-    starts = seeds()
+    starts = seeds(only)
     for taken in starts:
         examined(taken.together(), budget)  # compiled, imported, allocated
     _limit_memory(budget + SLACK)
@@ -346,8 +347,8 @@ def _computed_s(pid: int) -> float:
 
 
 def run(count: int, seed: int, processes: int, budget: int = BUDGET, say: Callable[[str], None] = lambda text: None,
-        first: int = 0) -> dict[str, Any]:
-    """Examine `count` files from number `first` on; how many were read, how many refused, and what was found, as [number, what]."""
+        first: int = 0, only: tuple[str, ...] = ("",)) -> dict[str, Any]:
+    """Examine `count` files from number `first` on, of the `seeds` of those names; how many were read, how many refused, and what was found, as [number, what]."""
     context, started, said = multiprocessing.get_context("spawn"), time.monotonic(), time.monotonic()
     tally: Counter[str] = Counter()
     findings: list[tuple[int, str]] = []
@@ -356,7 +357,7 @@ def run(count: int, seed: int, processes: int, budget: int = BUDGET, say: Callab
     def begin(numbers: range, skipped: frozenset[int]) -> None:
         ours, theirs = context.Pipe(duplex=False)
         now = context.Array("d", [-1.0, 300.0, time.monotonic()], lock=False)  # the first takes a while
-        process = context.Process(target=_work, args=(theirs, now, seed, numbers, skipped, budget), daemon=True)
+        process = context.Process(target=_work, args=(theirs, now, seed, numbers, skipped, budget, only), daemon=True)
         process.start()
         theirs.close()
         jobs[ours] = process, now, numbers, skipped
@@ -392,10 +393,10 @@ def run(count: int, seed: int, processes: int, budget: int = BUDGET, say: Callab
             "seconds": time.monotonic() - started, "outcomes": dict(tally), "findings": sorted(findings)}  # fmt: skip
 
 
-def keep(findings: Iterable[tuple[int, str]], seed: int, folder: Path) -> None:
+def keep(findings: Iterable[tuple[int, str]], seed: int, folder: Path, only: tuple[str, ...] = ("",)) -> None:
     """Write the files that were found."""
     folder.mkdir(parents=True, exist_ok=True)
-    starts = seeds()
+    starts = seeds(only)
     for number, _ in findings:
         (folder / f"{seed}-{number}.kpc").write_bytes(file_number(seed, number, starts))
 
@@ -410,16 +411,20 @@ def _command(argv: list[str]) -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first of them (default: %(default)s)")
     parser.add_argument("--processes", type=int, default=1, help="at a time (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="other files (default: %(default)s)")
+    parser.add_argument("--only", default="", metavar="NAME,...", help="vectors whose names begin so (default: all)")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write what is found here")
     options = parser.parse_args(argv)
     if min(options.count, options.processes) < 1:
         raise UsageError("--count and --processes must be positive")
     if options.first < 0:
         raise UsageError("--first must not be negative")
+    only = tuple(options.only.split(","))
+    if not seeds(only):
+        raise UsageError(f"--only {options.only}: no vector's name begins so")
     found = run(options.count, options.seed, options.processes, say=lambda text: print(text, file=sys.stderr, flush=True),
-                first=options.first)  # fmt: skip
+                first=options.first, only=only)  # fmt: skip
     if options.output is not None and found["findings"]:
-        keep(found["findings"], options.seed, options.output)
+        keep(found["findings"], options.seed, options.output, only)
     print(json.dumps(found, indent=1))
     if found["findings"]:
         raise KpcError(f"{len(found['findings'])} of {found['count']:,} files were neither read nor refused")

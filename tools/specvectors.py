@@ -426,6 +426,8 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
                                   implied=True), False),
         "implied-borders": (on_from_borders(seen_through_slits(_scene(dynamic=True, sizes=[(2, 29, 21, 16, 5)])), 8, 20, 100, implied=True), False),
         "borders-eight": (on_from_borders(_scene(dynamic=True, sizes=[(2, 20, 17, 9, 4)]), 8, 20, 100), False),
+        "borders-sparse": (on_from_borders(seen_through_slits(_scene(dynamic=False, sizes=[(3, 41, 38, 35, 0)])), 4, 24, 24), False),
+        "blocks-sparse": (in_blocks(seen_through_slits(_scene(dynamic=False, sizes=[(3, 41, 38, 35, 0)])), 4, 24, 24), False),
         "borders-prefix": (on_from_borders(dynamic, 8, 64, 8)[:Reader(on_from_borders(dynamic, 8, 64, 8)).index[9].offset], True),
         "borders-extremes": (on_from_borders(_scene(dynamic=True, sizes=[(2, 9, 6, 5, 4)]), 4, 255, 8196), False),
         "borders-large": (on_from_borders(_scene(dynamic=False, sizes=[(2, 33, 20, 17, 0)]), 16, 255, 8196), False),
