@@ -288,6 +288,12 @@ def foreseen(predicted, kind, odd):
 
 
 @inlined
+def context_of(active, part):
+    """Of a symbol, by how restless its surroundings are, and by where between symbols it is foreseen or which may follow."""
+    return active * FRACTIONS + part
+
+
+@inlined
 def next_place(place, value, error, kind):
     """After a symbol that an error made: by the one or, around predictions, by the other."""
     if kind == ANY:
@@ -340,7 +346,7 @@ def walk(symbols, coded, lattice, weights, state, at, words, trace, neighbours):
                 whole = foreseen(predicted, kind, odd)
                 fraction = predicted - (whole << 7)
                 part = min(odd if kind == AROUND else 3 * abs(fraction) >> 6 + kind, FRACTIONS - 1)
-                context = active * FRACTIONS + part
+                context = context_of(active, part)
                 sign = -1 if fraction < 0 else 1
                 error = sign * told(int(symbols[y, x, m]) - whole, kind, odd)
                 error, state, at = integer(error, table, context * DECISIONS, UNARY, ESCAPES, state, at, words, trace)

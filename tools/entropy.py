@@ -103,6 +103,17 @@ Walks = dict[str, Any]
 
 
 @njit
+def _by_part(active, part):
+    """In place of `context_of`."""
+    return part
+
+
+@njit
+def _by_activity(active, part):
+    return active * symbols.FRACTIONS
+
+
+@njit
 def _forget(cross, above, here, below, m):
     """In place of `remember`."""
 
@@ -168,7 +179,7 @@ def _compiled(module: ModuleType, changes: dict[str, Any]) -> Walks:
 def _bytes(segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callable[[np.ndarray], float] | None = None) -> int:
     """What a segment takes that is told symbol by symbol, with the best number of sets of weights, or with none; with those of its guide, if it has
     one. `size` is of a trace, else of its words."""
-    told, coded = np.ascontiguousarray(segment.symbols), np.ascontiguousarray(segment.coded)
+    told, coded = np.array(segment.symbols, order="C"), np.ascontiguousarray(segment.coded)  # `walk` writes
     neighbours, guide = symbols.neighbourhoods(told, coded), segment.guide
     trace = np.empty(coded.size + len(neighbours) * MOST_DECISIONS, np.int16)
     if isinstance(guide, symbols.Guide):
@@ -221,15 +232,16 @@ def _tables(trace: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class OfSymbols:
-    """An idea of what is told symbol by symbol: what changes in `kpc.format.symbols`, numbers of sets of weights to try, and how to measure if
-    not by words."""
+    """An idea of what is told symbol by symbol: what changes in `kpc.format.symbols`, numbers of sets of weights to try, how to measure if
+    not by words, and whether it says, too, which symbols may follow where those are around predictions: left out there, others would have been chosen."""
 
     changes: dict[str, Any]
     counts: tuple[int, ...] = SET_COUNTS
     size: Callable[[np.ndarray], float] | None = None
+    steers: bool = False
 
     def has(self, segment: Segment) -> bool:
-        return not segment.is_in_blocks
+        return not segment.is_in_blocks and not (self.steers and segment.guide is not None)
 
     def sized(self) -> Sized:
         return partial(_bytes, walks=_compiled(symbols, self.changes), counts=self.counts, size=self.size)
@@ -269,9 +281,9 @@ LEFT_OUT: dict[str, OfSymbols | OfBlocks | OfMaps] = {
     "maps that follow from occupancy": OfMaps(),
     "one set of weights": OfSymbols({}, (1,)),
     "no weights: mean of left and above": OfSymbols({}, ()),
-    "no contexts of activity": OfSymbols({"_LOGARITHMS": np.zeros_like(symbols._LOGARITHMS)}),
-    "no contexts of the fraction": OfSymbols({"FRACTIONS": 1}),
-    "no errors of channels before": OfSymbols({"remember": _forget}),
+    "no contexts of activity": OfSymbols({"context_of": _by_part}),
+    "no contexts of the fraction": OfSymbols({"context_of": _by_activity}),
+    "no errors of channels before": OfSymbols({"remember": _forget}, steers=True),
     "stored tables for counters that learn": OfSymbols({"adapt": _note}, size=_tables),
     "blocks: nothing of borders": OfBlocks({}, borders=False),
     "blocks: no signs by borders": OfBlocks({"pull_of": _no_pull}),
