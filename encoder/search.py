@@ -128,8 +128,14 @@ def farthest_tuned(
 
 
 def _where(known: Sequence[tuple[float, float]], wanted: float, slope: float) -> float:
-    """The place of a wanted value on the line through the two known (place, value) nearest to it; where there is but one, or that line is
-    steeper or flatter than the slope by more than a factor of three, on one through the latest with that slope."""
+    """The place of a wanted value between the farthest known (place, value) below it and the next above that; where it is not known on both sides, on
+    the line through the two nearest to it; where there is but one, or that line is steeper or flatter than the slope by more than a factor
+    of three, on one through the latest with that slope."""
+    below = max((point for point in known if point[1] <= wanted), key=lambda point: slope * point[0], default=None)
+    above = min((point for point in known if point[1] > wanted and below is not None and slope * (point[0] - below[0]) > 0),
+                key=lambda point: slope * point[0], default=None)
+    if below is not None and above is not None:
+        return below[0] + (wanted - below[1]) / (above[1] - below[1]) * (above[0] - below[0])
     nearest = sorted(known, key=lambda point: abs(point[1] - wanted))[:2]
     place, value = known[-1]
     if len(nearest) == 2 and nearest[0][0] != nearest[1][0]:

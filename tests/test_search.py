@@ -36,6 +36,13 @@ def test_rough_tunings_come_near_enough(noise: tuple[float, ...], tunings: int) 
     assert found is not None and 0.9 <= found.error <= 1 and len(seen) == tunings
 
 
+def test_once_too_little_and_too_much_are_known_it_is_sought_between() -> None:
+    _, seen = rough([0.7, 1.4, 1.35, 0.9])
+    assert seen[0].error < 0.9 and seen[1].error > 1 and seen[2].error > 1
+    assert seen[0].exponent < seen[2].exponent < seen[1].exponent
+    assert seen[0].exponent < seen[3].exponent < seen[2].exponent
+
+
 def test_the_best_of_rough_tunings_is_found() -> None:
     found, seen = rough([1.6, 0.4, 1.5, 0.7])
     assert found in seen and len(seen) == TUNINGS
