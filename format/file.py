@@ -343,10 +343,13 @@ def read(source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET,
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number, (decoded, coded, guide) in zip(segments, pool.map(reader.guided_segment, segments), strict=True):
             entry = reader.index[number]
-            plane = scales[entry.scale][ALL_PLANES[entry.plane]]
-            rows = slice(entry.row_start, entry.row_start + entry.row_count)
-            plane.symbols[rows], plane.coded[rows] = decoded, coded
-            guides.setdefault((entry.scale, ALL_PLANES[entry.plane]), {})[entry.row_start] = guide
+            name = ALL_PLANES[entry.plane]
+            plane, rows = scales[entry.scale][name], slice(entry.row_start, entry.row_start + entry.row_count)
+            if entry.row_count == len(plane.symbols):  # spares a copy
+                scales[entry.scale][name] = replace(plane, symbols=decoded, coded=coded)
+            else:
+                plane.symbols[rows], plane.coded[rows] = decoded, coded
+            guides.setdefault((entry.scale, name), {})[entry.row_start] = guide
     for (s, name), of_segments in guides.items():
         scales[s][name] = replace(scales[s][name], guide=guide_together(of_segments), starts=tuple(sorted(starts[s, name])))
     for number, entry in enumerate(reader.index):
