@@ -79,7 +79,7 @@ def test_the_command_counts_and_keeps_what_it_finds(monkeypatch, tmp_path, capsy
 
 
 def test_vectors_by_name():
-    assert 0 < len(fuzz.seeds(("borders", "implied"))) < len(fuzz.seeds()) / 4
+    assert 0 < len(fuzz.seeds("borders,implied")) < len(fuzz.seeds()) / 4
     assert fuzz.main(["--count", "1", "--only", "nothing-is-called-so"]) != 0
 
 
@@ -91,7 +91,7 @@ def test_other_errors_are_found_and_work_goes_on(monkeypatch):
     sent: list = []
     monkeypatch.setattr(fuzz, "_limit_memory", lambda more: monkeypatch.setattr(fuzz, "examined", breaks))
     pipe = type("Pipe", (), {"send": staticmethod(sent.append)})
-    fuzz._work(pipe, [0.0, 0.0, 0.0], 1, range(0, 3), frozenset({1}), fuzz.BUDGET, ("",))
+    fuzz._work(pipe, [0.0, 0.0, 0.0], 1, range(0, 3), frozenset({1}), fuzz.BUDGET, "")
     (following, tally, findings), = sent
     assert following == 3 and tally == {"finding": 2}
     assert findings == [(0, "ValueError: as it should not"), (2, "ValueError: as it should not")]

@@ -17,7 +17,7 @@ from numba import njit
 
 from kpc.format import blocks, rans, symbols
 from kpc.format.blocks import DECISIONS as LEVEL_DECISIONS
-from kpc.format.blocks import FREQUENCIES, HEAD, blocks_in, blocks_of, cosines, quantisers
+from kpc.format.blocks import FREQUENCIES, blocks_in
 from kpc.format.container import pack
 from kpc.format.file import SceneReader, read, scene_chunks
 from kpc.format.quantise import needed_texels
@@ -173,6 +173,8 @@ def _compiled(module: ModuleType, changes: dict[str, Any]) -> Walks:
     for name in CALLERS[module]:
         if name not in changes:
             names[name] = njit(FunctionType(names[name].py_func.__code__, names, name))
+    if module is blocks:
+        names["encode_blocks"] = FunctionType(blocks.encode_blocks.__code__, names)
     return names
 
 
@@ -204,17 +206,8 @@ def _told(segment: Segment) -> blocks.Blocks:
 
 
 def _bytes_in_blocks(segment: Segment, walks: Walks, borders: bool) -> int:
-    """What a segment takes that is told in blocks."""
-    told = _told(segment)
-    side, coded = told.levels.shape[-1], np.ascontiguousarray(segment.coded)
-    busy, at = blocks_of(coded, side), 0
-    trace = np.empty(coded.size + busy.size * (3 + blocks.MOST_END_DECISIONS * len(told.levels)) + told.levels.size * blocks.MOST_DECISIONS, np.int16)
-    if not coded.all() and not (borders and not segment.tells_map):  # without borders it is codec 2, which tells all maps
-        _, at = walks["walk_map"](coded, 0, at, None, trace)
-    _, at = walks["walk_fineness"](told.fineness.copy(), busy, 0, at, None, trace)
-    finer = quantisers(side, told.quantiser)
-    _, at = walks["walk_levels"](told.levels, told.fineness, busy, finer, borders, 0, at, None, trace, None, cosines(side), coded)
-    return HEAD + 2 * len(words_of(trace[:at]))
+    """What a segment takes that is told in blocks; codec 2, without borders, tells all maps."""
+    return len(walks["encode_blocks"](_told(segment), segment.coded, segment.implied if borders else None, borders))
 
 
 def _tables(trace: np.ndarray) -> float:

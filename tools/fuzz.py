@@ -247,10 +247,11 @@ def _decompressed(body: bytes) -> bytes | None:
         return None
 
 
-def seeds(only: tuple[str, ...] = ("",)) -> list[Taken]:
-    """The valid conformance vectors whose names begin so, taken apart, but for those that would take more time than all others together."""
+def seeds(only: str = "") -> list[Taken]:
+    """The valid conformance vectors whose names begin with one of `only`, separated by commas, taken apart, but for those that would take more time than all others together."""
+    begins = tuple(only.split(","))
     return [Taken.of(data) for path, data in specvectors.vectors().items()
-            if path.startswith("valid/") and path.endswith(".kpc") and Path(path).stem.startswith(only) and Path(path).stem not in LONG]
+            if path.startswith("valid/") and path.endswith(".kpc") and Path(path).stem.startswith(begins) and Path(path).stem not in LONG]
 
 
 def examined(data: bytes, budget: int = BUDGET) -> str:
@@ -299,7 +300,7 @@ def file_number(seed: int, number: int, starts: Sequence[Taken]) -> bytes:
     return mutated(rng, rng.choice(starts), starts)
 
 
-def _work(pipe: Connection, now: Any, seed: int, numbers: range, skipped: frozenset[int], budget: int, only: tuple[str, ...]) -> None:
+def _work(pipe: Connection, now: Any, seed: int, numbers: range, skipped: frozenset[int], budget: int, only: str) -> None:
     """Examine files; tell (next number, outcomes, findings) every so often. `now`: the number at hand, and since when, in
     seconds of computing and on the clock."""
     warnings.simplefilter("error")
@@ -347,8 +348,9 @@ def _computed_s(pid: int) -> float:
 
 
 def run(count: int, seed: int, processes: int, budget: int = BUDGET, say: Callable[[str], None] = lambda text: None,
-        first: int = 0, only: tuple[str, ...] = ("",)) -> dict[str, Any]:
-    """Examine `count` files from number `first` on, of the `seeds` of those names; how many were read, how many refused, and what was found, as [number, what]."""
+        first: int = 0, only: str = "") -> dict[str, Any]:
+    """Examine `count` files from number `first` on, made of some `seeds`; how many were read, how many refused, and what was found, as
+    [number, what]."""
     context, started, said = multiprocessing.get_context("spawn"), time.monotonic(), time.monotonic()
     tally: Counter[str] = Counter()
     findings: list[tuple[int, str]] = []
@@ -393,7 +395,7 @@ def run(count: int, seed: int, processes: int, budget: int = BUDGET, say: Callab
             "seconds": time.monotonic() - started, "outcomes": dict(tally), "findings": sorted(findings)}  # fmt: skip
 
 
-def keep(findings: Iterable[tuple[int, str]], seed: int, folder: Path, only: tuple[str, ...] = ("",)) -> None:
+def keep(findings: Iterable[tuple[int, str]], seed: int, folder: Path, only: str = "") -> None:
     """Write the files that were found."""
     folder.mkdir(parents=True, exist_ok=True)
     starts = seeds(only)
@@ -418,13 +420,12 @@ def _command(argv: list[str]) -> None:
         raise UsageError("--count and --processes must be positive")
     if options.first < 0:
         raise UsageError("--first must not be negative")
-    only = tuple(options.only.split(","))
-    if not seeds(only):
+    if options.only and not seeds(options.only):
         raise UsageError(f"--only {options.only}: no vector's name begins so")
     found = run(options.count, options.seed, options.processes, say=lambda text: print(text, file=sys.stderr, flush=True),
-                first=options.first, only=only)  # fmt: skip
+                first=options.first, only=options.only)  # fmt: skip
     if options.output is not None and found["findings"]:
-        keep(found["findings"], options.seed, options.output, only)
+        keep(found["findings"], options.seed, options.output, options.only)
     print(json.dumps(found, indent=1))
     if found["findings"]:
         raise KpcError(f"{len(found['findings'])} of {found['count']:,} files were neither read nor refused")
