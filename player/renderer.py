@@ -21,7 +21,7 @@ from kpc.player.cover import Cover
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
 from kpc.player.textures import (
-    FOLDED_AXIS, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four, planes_shape,
+    FOLDED_AXIS, LARGEST_FLOAT, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four, multiply, planes_shape,
 )
 
 REFINED = 2
@@ -55,8 +55,8 @@ PLACES_ALONG = 64
 COMPUTE_VERSION = 430
 TRIAL_AFTER, TRIALS = 8, 3
 """Marches until fragment and compute shaders are tried against each other, and pictures that each of them draws for that."""
-LARGEST_HALF, LARGEST_FLOAT = 65504.0, 3.4e38
-"""What float16 and float32 can hold."""
+LARGEST_HALF = 65504.0
+"""What float16 can hold."""
 ALL, ONLY_PROBES, ONLY_DOUBTED = range(3)
 """PIXELS of march.glsl."""
 MORE_THAN_A_RASTER = 1 << 20
@@ -157,11 +157,44 @@ class Folded:
             return Folded(refined, cut, planes, ctx.framebuffer([refined]), ctx.framebuffer([planes]))
 
     @property
-    def textures(self) -> list[moderngl.Texture]:
-        return [self.refined, self.rows, self.planes]
+    def memory_bytes(self) -> int:
+        return sum(_bytes_of(texture) for texture in (self.refined, self.rows, self.planes))
 
     def release(self) -> None:
-        for thing in (self.refine_into, self.fold_into, *self.textures):
+        for thing in (self.refine_into, self.fold_into, self.refined, self.rows, self.planes):
+            thing.release()
+
+
+@dataclass
+class FoldedInMemory:
+    """What folding takes where a processor draws: it multiplies arrays in a quarter of the time that it takes to draw their product."""
+
+    refined: np.ndarray
+    product: np.ndarray
+    planes: moderngl.Texture
+    refine_into: moderngl.Framebuffer
+
+    @staticmethod
+    def of(ctx: moderngl.Context, layout: Layout) -> "FoldedInMemory":
+        with room_on(ctx, "the folded planes"):
+            planes = _texture(ctx, layout.size)
+            refined, product = np.zeros((2, *layout.size[::-1], 4), np.float32)
+            return FoldedInMemory(refined, product, planes, ctx.framebuffer([planes]))
+
+    def keep(self) -> None:
+        """What was drawn into `refine_into` is the refined planes."""
+        self.planes.read_into(self.refined)
+
+    def fold(self, rows: np.ndarray, layout: Layout) -> None:
+        multiply(self.refined, rows, layout, self.product)
+        self.planes.write(self.product)
+
+    @property
+    def memory_bytes(self) -> int:
+        return self.refined.nbytes + self.product.nbytes + _bytes_of(self.planes)
+
+    def release(self) -> None:
+        for thing in (self.refine_into, self.planes):
             thing.release()
 
 
@@ -237,6 +270,7 @@ class Renderer:
         self.quality = quality
         self.compute = bool(compute)
         self._is_software = is_software(ctx)
+        self._folds_in_memory = self._is_software
         self._folds_in_half = not self._is_software
         self._marches_to_trial = TRIAL_AFTER if compute is None and tries_compute(ctx) else math.inf
         self.layout = Layout.of(scene)
@@ -246,7 +280,7 @@ class Renderer:
         self.folded_layout = finer if max(finer.size) <= most else self.layout
         with room_on(ctx, "the scene"):
             self._planes = _texture(ctx, self.layout.size)
-            self._folded: Folded | None = None
+            self._folded: Folded | FoldedInMemory | None = None
             self._rows = Rows(scene, self.layout) if scene.is_dynamic else None
             lines, width = self.layout.row_count(), 1 if self._rows is None else self._rows.width
             self._row_texture = _texture(ctx, (width, lines))
@@ -291,7 +325,7 @@ class Renderer:
     def release(self) -> None:
         """Give back all that the scene takes of the card."""
         self.ctx.detect_framebuffer(0).use()  # moderngl would bind again what it knows as bound, though it is gone
-        things: list[Target | Folded | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
+        things: list[Target | Folded | FoldedInMemory | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
         things = [self._planes, self._row_texture, self._cells, *self._targets.values()]
         things += [thing for pair in self._programs.values() for thing in reversed(pair)]
         things += [] if self._folded is None else [self._folded]
@@ -316,10 +350,11 @@ class Renderer:
     @property
     def memory_bytes(self) -> int:
         """Bytes of the textures and buffers that hold the scene and its pictures."""
-        textures = [self._planes, self._row_texture, *(self._folded.textures if self._folded else [])]
+        textures = [self._planes, self._row_texture]
         textures += [texture for target in self._targets.values() for texture in (target.seen, target.met)]
-        return sum(int(t.dtype[1]) * t.width * t.height * t.components for t in textures) + int(self.scene.occupancy[0].size) + (
-            0 if self._motion_texture is None else 16 * int(np.prod(self._motion_texture.size)))
+        folded = self._folded.memory_bytes if self._folded else 0
+        motion = 0 if self._motion_texture is None else 16 * int(np.prod(self._motion_texture.size))
+        return sum(map(_bytes_of, textures)) + folded + int(self.scene.occupancy[0].size) + motion
 
     def put(self, scale: int, plane: str, texels: np.ndarray, first: int = 0) -> None:
         """Replace rows of a space plane from row `first` on: `Layout.texels` of them. Writes to textures that are there."""
@@ -744,30 +779,40 @@ class Renderer:
             self._motion_time = time
 
     def _fold(self, time: float) -> moderngl.Texture:
-        if self._folded is None:
-            self._folded = Folded.of(self.ctx, self.folded_layout, self._row_texture.size, self._folds_in_half)
+        layout = self.folded_layout
+        if self._folded is None and self._folds_in_memory:
+            self._folded = FoldedInMemory.of(self.ctx, layout)
+        elif self._folded is None:
+            self._folded = Folded.of(self.ctx, layout, self._row_texture.size, self._folds_in_half)
         folded = self._folded
-        if time != self._folded_time and self._rows is not None:
-            if not self._is_refined:
-                self._planes.use(PLANES_UNIT)
-                self._draw_planes("refine.glsl", folded.refine_into)
-                self._is_refined = True
-            folded.rows.write(self._rows.at(time, self.folded_layout.refined))
+        if time == self._folded_time or self._rows is None:
+            return folded.planes
+        if not self._is_refined:
+            self._planes.use(PLANES_UNIT)
+            self._draw_planes("refine.glsl", folded.refine_into)
+            if isinstance(folded, FoldedInMemory):
+                folded.keep()
+            self._is_refined = True
+        rows = self._rows.at(time, layout.refined)
+        if isinstance(folded, FoldedInMemory):
+            folded.fold(rows, layout)
+        else:
+            folded.rows.write(rows)
             folded.refined.use(PLANES_UNIT)
             folded.rows.use(ROWS_UNIT)
-            self._draw_planes("fold.glsl", folded.fold_into)
-            self._folded_time = time
+            self._draw_planes("fold.glsl", folded.fold_into, folded_rows_texel=tuple(1 / side for side in folded.rows.size))
+        self._folded_time = time
         return folded.planes
 
-    def _draw_planes(self, name: str, into: moderngl.Framebuffer) -> None:
+    def _draw_planes(self, name: str, into: moderngl.Framebuffer, **more: object) -> None:
         """Draw each plane as it lies in the folded layout, by a shader that is told where that is and which rows go with it."""
         program, vertices = self._program(name, self.layout)
         _set(
             program,
             refined=PLANES_UNIT,
             refined_texel=tuple(1 / side for side in into.size),
-            largest=LARGEST_HALF if self.in_half else LARGEST_FLOAT,
-            folded_rows_texel=tuple(1 / side for side in self._folded.rows.size) if self._folded else None,
+            largest=LARGEST_HALF if self.in_half else float(LARGEST_FLOAT),
+            **more,
         )
         for source, block in zip(self.layout.blocks, self.folded_layout.blocks):
             axis, layers = FOLDED_AXIS[block.plane], self.layout.layers[block.scale]
@@ -817,6 +862,10 @@ def _texture(ctx: moderngl.Context, size: tuple[int, int], dtype: str = "f4") ->
     whole.clear()
     whole.release()
     return texture
+
+
+def _bytes_of(texture: moderngl.Texture) -> int:
+    return int(texture.dtype[1]) * texture.width * texture.height * texture.components
 
 
 def _set(program: moderngl.Program | moderngl.ComputeShader, **values: object) -> None:

@@ -5,12 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.format.grid import dilate, linear
+from kpc.format.rans import compiled
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder, Scene
 
 FOLDED_AXIS = {"xy": "x", "xz": "z", "yz": "y"}
 """Along which axis of a plane a row is folded into it: each axis once."""
 FARTHEST = 255
 """Distances are stored in a byte."""
+LARGEST_FLOAT = np.float32(3.4e38)
+"""What float32 can hold."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,27 @@ class Rows:
             share = np.float32(between / refined)
             finer[:, between::refined] = out if between == 0 else (1 - share) * out[:, :-1] + share * out[:, 1:]
         return finer
+
+
+def multiply(refined: np.ndarray, rows: np.ndarray, layout: Layout, product: np.ndarray) -> None:
+    """fold.glsl by the processor: write a refined atlas, (height, width, 4) float32, times the `Rows` of a time into `product`."""
+    for block in layout.blocks:
+        axis, layers = FOLDED_AXIS[block.plane], layout.layers[block.scale]
+        first = layout.first_row("xyz".index(axis), block.scale)
+        part = slice(block.y, block.y + block.height), slice(block.x, block.x + layers * block.width)
+        _multiply(refined[part], rows[first : first + layers], block.width, axis == block.plane[1], product[part])
+
+
+@compiled()
+def _multiply(plane, rows, width, upright, product):
+    """Of one plane; `upright`: the row runs along its rows. Numbers that overflow come out as the largest there is."""
+    for y in range(plane.shape[0]):
+        for layer in range(len(rows)):
+            for x in range(width):
+                along, column = y if upright else x, layer * width + x
+                for channel in range(4):
+                    number = plane[y, column, channel] * rows[layer, along, channel]
+                    product[y, column, channel] = min(max(number, -LARGEST_FLOAT), LARGEST_FLOAT)
 
 
 def distances(occupied: np.ndarray) -> np.ndarray:

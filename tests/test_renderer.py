@@ -262,6 +262,19 @@ def test_a_decoder_too_large_for_a_shader_is_refused() -> None:
         Renderer(gl.context(), replace(scene, decoder=wide))
 
 
+@pytest.mark.parametrize("factor", [1.0, 1e20])  # and beyond what float32 can hold
+def test_a_processor_folds_as_shaders_do(factor: float) -> None:
+    scene = tiny_scene(4)
+    larger = [{name: np.float32(factor) * plane for name, plane in scale.items()} for scale in scene.scales]
+    planes = []
+    for in_memory in (False, True):
+        renderer = Renderer(gl.context(), replace(scene, scales=tuple(larger)), FOLDED)
+        renderer._folds_in_memory, renderer._folds_in_half = in_memory, False
+        renderer.march(CAMERAS["outside"], 0.3)
+        planes.append(np.frombuffer(renderer.march(CAMERAS["outside"], 0.7) and renderer._folded.planes.read(), np.float32))
+    assert np.array_equal(*planes) and np.abs(planes[0]).max() > min(factor / 10, 3e38)
+
+
 def test_planes_that_fit_only_unrefined_are_folded_so(monkeypatch: pytest.MonkeyPatch) -> None:
     ctx, scene = gl.context(), tiny_scene(4)
     monkeypatch.setitem(ctx.info, "GL_MAX_TEXTURE_SIZE", max(Renderer(ctx, scene).layout.size))
