@@ -4,7 +4,7 @@ import contextlib
 import math
 import time as clock
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
@@ -20,8 +20,9 @@ from kpc.player import shader
 from kpc.player.cover import Cover
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
+from kpc.player.thin import Thinning
 from kpc.player.textures import (
-    FOLDED_AXIS, LARGEST_FLOAT, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four, multiply, planes_shape,
+    FOLDED_AXIS, LARGEST_FLOAT, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four, multiplied, planes_shape,
 )
 
 REFINED = 2
@@ -169,29 +170,40 @@ class Folded:
 class FoldedInMemory:
     """What folding takes where a processor draws: it multiplies arrays in a quarter of the time that it takes to draw their product."""
 
+    layout: Layout
     refined: np.ndarray
-    product: np.ndarray
     planes: moderngl.Texture
     refine_into: moderngl.Framebuffer
+    thinning: Thinning | None
+    room: np.ndarray
+    """For the product of any of the planes."""
+    rows: np.ndarray = field(default_factory=lambda: np.empty(0, np.float32))
 
     @staticmethod
-    def of(ctx: moderngl.Context, layout: Layout) -> "FoldedInMemory":
+    def of(ctx: moderngl.Context, layout: Layout, scene: Scene) -> "FoldedInMemory":
         with room_on(ctx, "the folded planes"):
             planes = _texture(ctx, layout.size)
-            refined, product = np.zeros((2, *layout.size[::-1], 4), np.float32)
-            return FoldedInMemory(refined, product, planes, ctx.framebuffer([planes]))
+            refined = np.zeros((*layout.size[::-1], 4), np.float32)
+            most = max(4 * layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
+            room = np.empty(most, np.float32)
+            return FoldedInMemory(layout, refined, planes, ctx.framebuffer([planes]), Thinning.of(scene, layout), room)
 
     def keep(self) -> None:
         """What was drawn into `refine_into` is the refined planes."""
         self.planes.read_into(self.refined)
+        if self.thinning is not None:
+            self.thinning.keep(self.refined)
 
-    def fold(self, rows: np.ndarray, layout: Layout) -> None:
-        multiply(self.refined, rows, layout, self.product)
-        self.planes.write(self.product)
+    def fold(self, rows: np.ndarray) -> None:
+        self.rows = rows
+        for block in self.layout.blocks:
+            product = multiplied(self.refined, rows, self.layout, block, self.room)
+            self.planes.write(product, viewport=(block.x, block.y, product.shape[1], block.height))
 
     @property
     def memory_bytes(self) -> int:
-        return self.refined.nbytes + self.product.nbytes + _bytes_of(self.planes)
+        kept = [] if self.thinning is None else self.thinning.planes
+        return self.refined.nbytes + self.rows.nbytes + self.room.nbytes + _bytes_of(self.planes) + sum(plane.nbytes for plane in kept)
 
     def release(self) -> None:
         for thing in (self.refine_into, self.planes):
@@ -292,7 +304,7 @@ class Renderer:
             nz, ny, nx = scene.occupancy.shape[1:]
             self._cells = ctx.texture3d((nx, ny, nz), 1, alignment=1, dtype="u1")
             self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        self._distances: dict[int, bytes] = {}
+        self._distances: dict[int, np.ndarray] = {}
         self._covers: dict[int, Cover] = {}
         weights = decoder_arrays(scene.decoder, scene, self.layout)
         if sum(map(len, weights.values())) > CONSTANTS:
@@ -310,6 +322,7 @@ class Renderer:
         for block in self.layout.blocks:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
         self._slot: int | None = None
+        self._cells_written: tuple[object, ...] | None = None
         self._programs: dict[tuple[object, ...], tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]] = {}
         self._targets: dict[tuple[Part, tuple[int, int], int], Target] = {}
         self.check()
@@ -360,12 +373,13 @@ class Renderer:
         """Replace rows of a space plane from row `first` on: `Layout.texels` of them. Writes to textures that are there."""
         block = self.layout.block(scale, plane)
         self._planes.write(texels, viewport=(block.x, block.y + first, texels.shape[1], texels.shape[0]))
-        self._folded_time, self._is_refined = None, False
+        self._folded_time = self._cells_written = None
+        self._is_refined = False
         self._shots.clear()
 
     def refresh(self) -> None:
         """Look at the scene's time planes anew: some of their rows have changed."""
-        self._rows_time = self._motion_time = self._folded_time = None
+        self._rows_time = self._motion_time = self._folded_time = self._cells_written = None
         self._shots.clear()
 
     def render(
@@ -441,13 +455,13 @@ class Renderer:
             camera = camera.resized(*(across * side for side in size))
         elif quality.resolution < 1:
             camera = camera.resized(*(max(1, round(side * quality.resolution)) for side in size))
-        self._occupy(slot_at(scene, time))
         folded, displaced = moving and quality.folded, moving and self._motion_texture is not None
         if displaced:
             self._displace(time)
         if moving and not folded:
             self._cut(time)
         planes = self._fold(time) if folded else self._planes
+        self._occupy(slot_at(scene, time), time if folded else None)
         raster = (camera.width, camera.height)
         layout = self.folded_layout if folded else self.layout
         drawn = min(quality.scales or layout.scales, layout.scales)
@@ -759,13 +773,19 @@ class Renderer:
         entry = self._programs[key] = program, vertices
         return entry
 
-    def _occupy(self, slot: int) -> None:
-        if slot == self._slot:
+    def _occupy(self, slot: int, time: float | None) -> None:
+        """Have rays stop in the cells of a slot; at a `time` that planes are folded for, without those that `quality` has them pass by."""
+        thinning = self._folded.thinning if isinstance(self._folded, FoldedInMemory) and time is not None and self.quality.thin else None
+        cells = slot, thinning and time, thinning and self.quality.thin
+        if cells == self._cells_written:
             return
         if slot not in self._distances:
-            self._distances[slot] = distances(self.scene.occupancy[slot]).tobytes()
-        self._cells.write(self._distances[slot])
-        self._slot = slot
+            self._distances[slot] = distances(self.scene.occupancy[slot])
+        free = self._distances[slot]
+        if thinning is not None:
+            free = np.where(thinning.empty(slot, self._folded.rows, time, self.quality.thin), np.uint8(1), free)
+        self._cells.write(free.tobytes())
+        self._slot, self._cells_written = slot, cells
 
     def _cut(self, time: float) -> None:
         if time != self._rows_time and self._rows is not None:
@@ -781,7 +801,7 @@ class Renderer:
     def _fold(self, time: float) -> moderngl.Texture:
         layout = self.folded_layout
         if self._folded is None and self._folds_in_memory:
-            self._folded = FoldedInMemory.of(self.ctx, layout)
+            self._folded = FoldedInMemory.of(self.ctx, layout, self.scene)
         elif self._folded is None:
             self._folded = Folded.of(self.ctx, layout, self._row_texture.size, self._folds_in_half)
         folded = self._folded
@@ -795,7 +815,7 @@ class Renderer:
             self._is_refined = True
         rows = self._rows.at(time, layout.refined)
         if isinstance(folded, FoldedInMemory):
-            folded.fold(rows, layout)
+            folded.fold(rows)
         else:
             folded.rows.write(rows)
             folded.refined.use(PLANES_UNIT)

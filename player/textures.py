@@ -7,6 +7,7 @@ import numpy as np
 from kpc.format.grid import dilate, linear
 from kpc.format.rans import compiled
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder, Scene
+from kpc.player.cores import share_out
 
 FOLDED_AXIS = {"xy": "x", "xz": "z", "yz": "y"}
 """Along which axis of a plane a row is folded into it: each axis once."""
@@ -134,13 +135,19 @@ class Rows:
         return finer
 
 
-def multiply(refined: np.ndarray, rows: np.ndarray, layout: Layout, product: np.ndarray) -> None:
-    """fold.glsl by the processor: write a refined atlas, (height, width, 4) float32, times the `Rows` of a time into `product`."""
-    for block in layout.blocks:
-        axis, layers = FOLDED_AXIS[block.plane], layout.layers[block.scale]
-        first = layout.first_row("xyz".index(axis), block.scale)
-        part = slice(block.y, block.y + block.height), slice(block.x, block.x + layers * block.width)
-        _multiply(refined[part], rows[first : first + layers], block.width, axis == block.plane[1], product[part])
+def multiplied(refined: np.ndarray, rows: np.ndarray, layout: Layout, block: Block, room: np.ndarray) -> np.ndarray:
+    """fold.glsl by the processor: a block of a refined atlas, (height, width, 4) float32, times the `Rows` of a time. In `room`, for as many
+    numbers."""
+    axis, layers = FOLDED_AXIS[block.plane], layout.layers[block.scale]
+    first, upright = layout.first_row("xyz".index(axis), block.scale), axis == block.plane[1]
+    plane = refined[block.y : block.y + block.height, block.x : block.x + layers * block.width]
+    product = room[: plane.size].reshape(plane.shape)
+
+    def multiply(part: slice) -> None:
+        _multiply(plane[part], rows[first : first + layers, part if upright else slice(None)], block.width, upright, product[part])
+
+    share_out(multiply, block.height)
+    return product
 
 
 @compiled()
