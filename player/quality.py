@@ -36,9 +36,10 @@ class Quality:
         tolerance: while the clip plays, a picture is predicted from the one before. One pixel of each block of sixteen is marched,
             all by turns; blocks where that differs from the prediction by more than this, of the full range, or a neighbour's by
             twice as much, are marched whole. 0: no picture follows another.
-        bend: a picture that follows no other is marched with half of the rays across and up first, and those with half of them, as long as there
-            is one for each texel; blocks where colours bend by more than this, of the full range, from ray to ray are marched whole, others
-            interpolated. 0: all pixels are marched.
+        blur: a picture that follows no other is marched with half of the rays across and up first, and those with half of them, as long as there
+            is one for each texel, and the others are interpolated. Blocks that are off the most by that are marched whole, until what
+            is left is at most this, of the full range: the root of the mean of its squares over the picture, as far as bends tell
+            (bent.glsl). 0: all pixels are marched.
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated.
         thin: where a processor folds, rays pass by occupied cells that are empty at the time: a step at their corners has less alpha than
             this. 0: they stop in all.
@@ -54,30 +55,28 @@ class Quality:
     termination: float = TERMINATION
     share: float = math.inf
     tolerance: float = 0.0
-    bend: float = 0.0
+    blur: float = 0.0
     resolution: float = 1.0
     thin: float = 0.0
     across: int = 1
     scales: int | None = None
 
     def __post_init__(self) -> None:
-        marchable = self.step >= 1 and self.share > 0 and 0 < self.termination < 1 and 0 < self.resolution <= 1 and self.tolerance >= 0 and self.bend >= 0 and 0 <= self.thin < 1 and self.across >= 1
+        marchable = self.step >= 1 and self.share > 0 and 0 < self.termination < 1 and 0 < self.resolution <= 1 and self.tolerance >= 0 and self.blur >= 0 and 0 <= self.thin < 1 and self.across >= 1
         if not marchable or self.scales is not None and self.scales < 1:
             raise ValueError(f"no picture can be drawn with {self}")
 
 
-BEND = 50 / 255
-"""Of a picture of 640x480 that follows none: time of that without, and PSNR with and without. shelf_hand 0.16, 48.2 instead of 54.2 dB; fox, in
-contracted space, 0.19, 44.9 (55.0); soldier 0.79, 52.3 (58.0); room, full of fine patterns, 0.89, 42.9 (45.0). With 20 / 255: 0.25, 52.4;
-0.43, 51.0; 1.05, 56.7; 1.02, 44.6."""
+BLUR = 1.6 / 255
+"""44 dB."""
 
 LADDER: dict[str, Quality] = {
-    "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, tolerance=5 / 255, bend=BEND, thin=1 / 32, resolution=0.5),
-    "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, bend=BEND, thin=1 / 32, resolution=0.5),
-    "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, bend=BEND, thin=1 / 32, resolution=0.75),
-    "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, bend=BEND, thin=1 / 32, across=4),
-    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, tolerance=5 / 255, bend=BEND, thin=1 / 32, across=4),
-    "fine": Quality(folded=True, termination=1 / 64, share=3.0, bend=BEND / 4, thin=1 / 256, across=4),
+    "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, resolution=0.5),
+    "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, resolution=0.5),
+    "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, resolution=0.75),
+    "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, across=4),
+    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, across=4),
+    "fine": Quality(folded=True, termination=1 / 64, share=3.0, blur=BLUR / 4, thin=1 / 256, across=4),
     "finer": Quality(folded=True, across=4),
     "reference": Quality(),
 }

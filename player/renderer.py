@@ -41,8 +41,8 @@ MOVED_TOLERANCE = 0.8
 """Of a quality's tolerance while the camera moves: what is interpolated errs in thin places, too thin for probes to meet them all.
 Turning by a degree a frame, liam is then 42.2 dB from the reference instead of 40.8, in 7 % more time; room 44.2 and 42.6, 15 %."""
 MOST_DOUBTED, ALONE_FOR = 0.6, 8
-"""Where more than such a share of what a picture of its own took to march is in doubt, following costs a processor more than it saves: so
-many pictures then follow no other, before the next one does again."""
+"""Where more than such a share of what a picture of its own took to march is in doubt, following costs a processor more than it saves: this
+picture and so many after it then follow no other, before the next one does again."""
 TARGETS_KEPT = 24
 MOST_COVERED = 0.8
 """Share of a picture beyond which all of it is drawn."""
@@ -58,6 +58,11 @@ TRIAL_AFTER, TRIALS = 8, 3
 """Marches until fragment and compute shaders are tried against each other, and pictures that each of them draws for that."""
 LARGEST_HALF = 65504.0
 """What float16 can hold."""
+Bounds = tuple[float, float, float, float]
+"""Left, bottom, right and top of a part of a picture, as shares of its sides."""
+EVERYWHERE: Bounds = (0.0, 0.0, 1.0, 1.0)
+BEARABLE_ALONE = 4.0
+"""What a block may miss by, in squares, to what blocks may in the mean: most bend by much less than those that bend most."""
 ALL, ONLY_PROBES, ONLY_DOUBTED = range(3)
 """PIXELS of march.glsl."""
 MORE_THAN_A_RASTER = 1 << 20
@@ -117,11 +122,13 @@ SPREAD = Tiles(64, 20)
 
 @dataclass
 class Target:
-    """What a march draws into: rgb and opacity; sum of weight t, and samples. Row 0 is the bottom of the picture."""
+    """What a march draws into: rgb and opacity; sum of weight t, and samples. Row 0 is the bottom of the picture. All but what touches `drawn`
+    is as rays see it that meet nothing."""
 
     seen: moderngl.Texture
     met: moderngl.Texture
     framebuffer: moderngl.Framebuffer
+    drawn: Bounds = EVERYWHERE
 
     @staticmethod
     def of(ctx: moderngl.Context, size: tuple[int, int]) -> "Target":
@@ -473,6 +480,7 @@ class Renderer:
         stride = scene.step * quality.step
 
         def draw(target: Target, camera: Camera = camera, pixels: int = ALL, points: int = 0, **more: object) -> None:
+            target.drawn = target.drawn if pixels == ONLY_DOUBTED else EVERYWHERE
             march, vertices = self._program(
                 program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels,
                 compute=self.compute and program == "march.glsl",
@@ -525,50 +533,70 @@ class Renderer:
         self.compute = chosen
         return seconds[True] < seconds[False]
 
-    def _draw_all(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> float:
-        """March all pixels that may see something, and tell their share."""
+    def _draw_all(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> tuple[float, Bounds]:
+        """March all pixels that may see something; tell their share, and about where they are."""
         blocks = self._covered(camera)
         if blocks is None:
             draw(target, camera)
-            return 1.0
+            return 1.0, EVERYWHERE
+        rows, columns = blocks.shape
+        left, bottom, right, top = _bounds(blocks)
         self._empty(target)
+        target.drawn = left / columns, bottom / rows, right / columns, top / rows
         covered = self._target(part, blocks.shape[::-1], DOUBTS)
         covered.seen.write(np.repeat(blocks[..., None], 4, axis=-1).astype(np.float32))
         self._draw_doubted(draw, target, camera, covered)
-        return float(blocks.mean())
+        return float(blocks.mean()), target.drawn
 
     def _draw_alone(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> float:
         """A picture that follows no other. Tells the share of its pixels that were marched, where a processor draws."""
-        spanned = self._texels_spanned(camera) if self.quality.bend else math.inf
-        return self._draw_coarse_to_fine(draw, part, target, camera, spanned)
+        spanned = self._texels_spanned(camera) if self.quality.blur else math.inf
+        return self._draw_coarse_to_fine(draw, part, target, camera, spanned, self.quality.blur**2)[0]
 
-    def _draw_coarse_to_fine(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera, spanned: float) -> float:
-        """March a coarser picture, itself drawn so, stretch it, and march pixel by pixel those blocks of it in which colours bend; all
-        where the coarser one's pixels would span more than a texel, as this one's `spanned`. Tells as `_draw_alone`."""
+    def _draw_coarse_to_fine(
+        self, draw: Callable[..., None], part: Part, target: Target, camera: Camera, spanned: float, bearable: float
+    ) -> tuple[float, Bounds]:
+        """March a coarser picture, itself drawn so, stretch it, and march pixel by pixel those blocks of it that would be off the most, until
+        the mean of squares of what is left is `bearable`; all where the coarser one's pixels would span more than a texel, as this
+        one's `spanned`. Tells as `_draw_all`."""
         size = camera.width, camera.height
         if min(size) < COARSER * BLOCK or COARSER * spanned > 1:
             return self._draw_all(draw, part, target, camera)
         fewer = camera.resized(*(-(-side // COARSER) for side in size))
-        coarse = self._target(part, (fewer.width, fewer.height), COARSE)
-        marched = self._draw_coarse_to_fine(draw, part, coarse, fewer, COARSER * spanned)
+        coarse, left_for_it = self._target(part, (fewer.width, fewer.height), COARSE), bearable / COARSER**2
+        marched, bounds = self._draw_coarse_to_fine(draw, part, coarse, fewer, COARSER * spanned, left_for_it)
         doubts = self._target(part, (-(-size[0] // BLOCK), -(-size[1] // BLOCK)), DOUBTS)
         bent, vertices = self._program("bent.glsl", self.layout)
-        _set(bent, seen_coarse=SEEN_UNIT, size=tuple(map(float, size)), most=self.quality.bend)
+        _set(bent, seen_coarse=SEEN_UNIT, size=tuple(map(float, size)))
         coarse.seen.use(SEEN_UNIT)
         self._draw(doubts.framebuffer, vertices)
-        self._stretch(coarse, target)
-        self._draw_doubted(draw, target, camera, doubts)
-        return marched / COARSER**2 + self._share_of(doubts)
+        most, share = self._most_missed(doubts, bearable - left_for_it)
+        if bounds != EVERYWHERE:
+            self._empty(target)
+        self._stretch(coarse, target, bounds)
+        self._draw_doubted(draw, target, camera, doubts, most)
+        return marched / COARSER**2 + share, bounds
+
+    def _most_missed(self, missed: Target, bearable: float) -> tuple[float, float]:
+        """By how much a block may be off, that all which are off by no more may stay so; and the share of the others. A graphics card is
+        not waited for: there the share counts as 0, and what is bearable counts for each block, not for their mean."""
+        if not self._is_software:
+            return BEARABLE_ALONE * bearable, 0.0
+        errors = np.sort(np.frombuffer(missed.seen.read(), np.float32)[::4])
+        kept = int(np.searchsorted(np.cumsum(errors, dtype=np.float64), bearable * len(errors), side="right"))
+        return float(errors[kept - 1]) if kept else -1.0, 1.0 - kept / len(errors)
 
     def _share_of(self, doubts: Target) -> float:
         """Of blocks that are set; 0 where no processor draws: a graphics card would have to be waited for."""
         return float(np.frombuffer(doubts.seen.read(), np.float32).mean()) if self._is_software else 0.0  # four channels alike
 
-    def _draw_doubted(self, draw: Callable[..., None], target: Target, camera: Camera, doubts: Target) -> None:
-        """March the blocks of a target that are set."""
+    def _draw_doubted(
+        self, draw: Callable[..., None], target: Target, camera: Camera, doubts: Target, bearable: float = 0.5
+    ) -> None:
+        """March the blocks of a target whose doubt is more than `bearable`."""
         doubts.seen.use(DOUBTS_UNIT)
         size = float(camera.width), float(camera.height)
-        draw(target, camera, ONLY_DOUBTED, math.prod(doubts.seen.size), doubts=DOUBTS_UNIT, size=size)
+        draw(target, camera, ONLY_DOUBTED, math.prod(doubts.seen.size), doubts=DOUBTS_UNIT, size=size, bearable=bearable)
 
     def _followed(self, draw: Callable[..., None], part: Part, before: Shot | None, shot: Shot) -> Target:
         """Draw what the picture before does not tell: its probes, and the blocks in which they are not as predicted."""
@@ -583,6 +611,7 @@ class Renderer:
         if moved:
             shot = replace(shot, number=PICTURE + OTHER_PICTURE - before.number)
             picture = self._predicted(picture, self._target(part, size, shot.number), before.camera, camera)
+        picture.drawn = EVERYWHERE
         blocks = tuple(-(-side // BLOCK) for side in size)
         tiles = self._tiles
         raster = tiles.raster(blocks) if tiles else blocks
@@ -602,7 +631,9 @@ class Renderer:
         _set(doubt, seen_predicted=SEEN_UNIT, tolerance=shot.quality.tolerance * (MOVED_TOLERANCE if moved else 1.0), **common)
         self._draw(doubts.framebuffer, vertices)
         if self._share_of(doubts) > MOST_DOUBTED * before.marched:
-            shot = replace(shot, alone=ALONE_FOR)
+            marched = self._draw_alone(draw, part, picture, camera)
+            self._shots[part, size] = replace(shot, marched=marched, alone=ALONE_FOR)
+            return picture
         settle, vertices = self._program("settle.glsl", self.layout)
         _set(settle, **common)
         self._draw(picture.framebuffer, vertices, points=math.prod(blocks))
@@ -645,21 +676,23 @@ class Renderer:
         marched.seen.use(SEEN_UNIT)
         marched.met.use(MET_UNIT)
         self._draw(target.framebuffer, vertices)
+        target.drawn = EVERYWHERE
         return target
 
-    def _stretch(self, marched: Target, target: Target) -> Target:
-        """A picture in a larger one."""
+    def _stretch(self, marched: Target, target: Target, bounds: Bounds = EVERYWHERE) -> Target:
+        """A picture in a larger one: as much as touches `bounds`."""
         program, vertices = self._program("upscale.glsl", self.layout)
         _set(program, seen_small=SEEN_UNIT, met_small=MET_UNIT, size=tuple(map(float, target.seen.size)))
         marched.seen.use(SEEN_UNIT)
         marched.met.use(MET_UNIT)
-        self._draw(target.framebuffer, vertices)
+        self._draw(target.framebuffer, vertices, within=bounds)
+        target.drawn = bounds
         return target
 
     def _empty(self, target: Target) -> None:
-        """Draw what rays see that meet nothing."""
+        """Draw what rays see that meet nothing, over what was drawn."""
         nothing, vertices = self._program("nothing.glsl", self.layout)
-        self._draw(target.framebuffer, vertices)
+        self._draw(target.framebuffer, vertices, within=target.drawn)
 
     def _covered(self, camera: Camera) -> np.ndarray | None:
         """`Cover.blocks` of what is occupied now, where drawing only those is quicker: by a processor, and of less than MOST_COVERED."""
@@ -691,15 +724,17 @@ class Renderer:
         viewport: tuple[int, int, int, int] | None = None,
         over: bool = False,
         points: int = 0,
+        within: Bounds = EVERYWHERE,
     ) -> None:
-        """All over a viewport, or so many points; `over` what is there, by alpha."""
+        """All over a viewport, or so many points; `over` what is there, by alpha; of pixels that touch `within`, and those next to them."""
         self.ctx.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         if over:
             self.ctx.enable(moderngl.BLEND)
             self.ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
         framebuffer.use()
         framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
-        framebuffer.scissor = None
+        left, bottom, right, top = (int(side * share) for side, share in zip(2 * framebuffer.size, within))
+        framebuffer.scissor = None if within == EVERYWHERE else (left - 1, bottom - 1, right - left + 3, top - bottom + 3)
         self.ctx.enable(moderngl.PROGRAM_POINT_SIZE)
         vertices.render(moderngl.POINTS if points else moderngl.TRIANGLES, vertices=points or 3)
 

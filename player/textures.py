@@ -13,6 +13,8 @@ FOLDED_AXIS = {"xy": "x", "xz": "z", "yz": "y"}
 """Along which axis of a plane a row is folded into it: each axis once."""
 FARTHEST = 255
 """Distances are stored in a byte."""
+WORTH_SHARING = 1 << 19
+"""Numbers to multiply: a millisecond's work, or two, of one core."""
 LARGEST_FLOAT = np.float32(3.4e38)
 """What float32 can hold."""
 
@@ -146,7 +148,10 @@ def multiplied(refined: np.ndarray, rows: np.ndarray, layout: Layout, block: Blo
     def multiply(part: slice) -> None:
         _multiply(plane[part], rows[first : first + layers, part if upright else slice(None)], block.width, upright, product[part])
 
-    share_out(multiply, block.height)
+    if plane.size < WORTH_SHARING:
+        multiply(slice(None))
+    else:
+        share_out(multiply, block.height)
     return product
 
 

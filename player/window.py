@@ -568,7 +568,7 @@ class Player:
             self._picture(dial.pace.scale, dial.rung)
             self._is_paced = True
             drawn, resting = self.renderer.quality, LADDER[dial.resting]
-            is_whole = self.raster == self.canvas.size and not (drawn.tolerance or drawn.bend) and drawn.across == resting.across
+            is_whole = self.raster == self.canvas.size and not (drawn.tolerance or drawn.blur) and drawn.across == resting.across
             self._is_sharp = is_whole and dial.rung == dial.resting
         elif not self._is_sharp and now - self._moved > SHARPEN_AFTER_S:
             self._sharpen()
@@ -611,7 +611,7 @@ class Player:
         rays through a pixel of that alone: before, more pixels tell more."""
         quality = LADDER[rung]
         if still:
-            quality = replace(quality, tolerance=0.0, bend=0.0)
+            quality = replace(quality, tolerance=0.0, blur=0.0)
         elif is_software(self.ctx):
             quality = replace(quality, across=1)
         self.renderer.quality = replace(quality, folded=quality.folded and not self.exact)

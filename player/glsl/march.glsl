@@ -46,7 +46,8 @@ uniform vec4 appearance[(HIDDEN + 3) / 4];  // the code to show, padded
 #if PIXELS
 uniform vec2 size;                  // of the picture
 uniform int turn;                   // of the probes
-uniform sampler2D doubts;           // a texel a block
+uniform sampler2D doubts;           // a texel a block, to be marched if more than
+uniform float bearable;
 #endif
 uniform float height;
 uniform vec4 lens;
@@ -303,7 +304,7 @@ void main() {
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(at, imageSize(seen_picture)))) return;
 #if PIXELS == 2
-    if (textureLod(doubts, (floor(vec2(at) / BLOCK) + 0.5) / ceil(size / BLOCK), 0.0).r < 0.5) return;
+    if (textureLod(doubts, (floor(vec2(at) / BLOCK) + 0.5) / ceil(size / BLOCK), 0.0).r <= bearable) return;
 #endif
     vec4 seen, met;
     march(vec2(at) + 0.5, seen, met);
