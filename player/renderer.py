@@ -20,10 +20,10 @@ from kpc.player import shader
 from kpc.player.cover import Cover
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
-from kpc.player.thin import Thinning
 from kpc.player.textures import (
     FOLDED_AXIS, LARGEST_FLOAT, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four, multiplied, planes_shape,
 )
+from kpc.player.thin import Thinning
 
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""

@@ -25,6 +25,7 @@ from kpc.format.scene import ALL_PLANES, Scene
 from kpc.player.prefetch import Playhead, fetching_order, least_room, worth_holding
 from kpc.player.renderer import REFINED, Renderer
 from kpc.player.textures import Layout, Rows
+from kpc.player.thin import Thinning
 
 RUN_BYTES, RUN_CHUNKS = 1 << 18, 256
 """Fetched with one request at most, so that a playhead that jumps does not wait long."""
@@ -197,13 +198,14 @@ class Stream:
 
     @property
     def fixed_bytes(self) -> int:
-        """What the scene takes but for its segments of time: textures, folded ones included; occupancy and its distances; motion;
+        """What the scene takes but for its segments of time: textures, and what folding and thinning take; occupancy and its distances; motion;
         planes that wait to be uploaded, and one in the making; what the source holds."""
         scene, layout = self.scene, self._layout
-        atlases = [layout.size, *([Layout.of(scene, REFINED).size] if scene.is_dynamic else [])]
-        texels = sum(width * height for width, height in atlases)
+        texels = layout.size[0] * layout.size[1]
         if scene.is_dynamic:
-            texels += Rows(scene, layout).width * layout.row_count()
+            finer = Layout.of(scene, REFINED)
+            texels += 2 * finer.size[0] * finer.size[1] + (1 + REFINED) * Rows(scene, layout).width * layout.row_count()
+            texels += 0 if Thinning.of(scene, finer) is None else 2 * layout.size[0] * layout.size[1]
         largest = max(layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
         motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
         decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw
