@@ -440,7 +440,13 @@ class Renderer:
         target.seen.use(SEEN_UNIT)
         target.met.use(MET_UNIT)
         without.seen.use(WITHOUT_UNIT)
-        self._draw(screen, vertices, over=share < 1)
+        bounds = target.drawn if view == Look.COLOUR.value and share == 1 else EVERYWHERE
+        if bounds != EVERYWHERE:
+            screen.scissor = None
+            screen.clear(*self.scene.background, 1.0)
+            beyond = 3 / np.array(target.seen.size)  # pixels that its edge, its pixels and those in between reach
+            bounds = (*(bounds[:2] - beyond), *(bounds[2:] + beyond))
+        self._draw(screen, vertices, over=share < 1, within=bounds)
 
     def march(
         self, camera: Camera, time: float, *, part: Part = Part.FULL, program: str = "march.glsl",
@@ -569,9 +575,10 @@ class Renderer:
         bent, vertices = self._program("bent.glsl", self.layout)
         _set(bent, seen_coarse=SEEN_UNIT, size=tuple(map(float, size)))
         coarse.seen.use(SEEN_UNIT)
-        self._draw(doubts.framebuffer, vertices)
+        doubts.framebuffer.clear()
+        self._draw(doubts.framebuffer, vertices, within=bounds)
         most, share = self._most_missed(doubts, bearable - left_for_it)
-        if bounds != EVERYWHERE:
+        if bounds not in (EVERYWHERE, target.drawn):
             self._empty(target)
         self._stretch(coarse, target, bounds)
         self._draw_doubted(draw, target, camera, doubts, most)
@@ -737,6 +744,7 @@ class Renderer:
         framebuffer.scissor = None if within == EVERYWHERE else (left - 1, bottom - 1, right - left + 3, top - bottom + 3)
         self.ctx.enable(moderngl.PROGRAM_POINT_SIZE)
         vertices.render(moderngl.POINTS if points else moderngl.TRIANGLES, vertices=points or 3)
+        framebuffer.scissor = None  # or what is cleared next would be no more than this
 
     def _target(self, part: Part, size: tuple[int, int], number: int = 0) -> Target:
         """A target of this size; the few last used are kept."""

@@ -344,6 +344,16 @@ def test_what_was_drawn_before_is_gone() -> None:
                 alone._covered = lambda camera: None  # all of the picture
                 assert psnr(renderer.render(camera, time).rgb, alone.render(camera, time).rgb) > (60 if quality is blurred else 40)
 
+    shown = []
+    for screen in (gl.context().simple_framebuffer((201, 97)), gl.context().simple_framebuffer((201, 97))):
+        renderer, cameras = Renderer(gl.context(), scene, blurred), [look_at((x, 1.0, 3.0), (0.3, 0.2, 0.0), 96, 64, 70.0) for x in (9.0, -2.0, 2.0)]
+        if shown:  # all of it, and nothing before
+            renderer._covered, cameras = lambda camera: None, cameras[-1:]
+        for camera in cameras:
+            renderer.show(screen, camera, 0.3)
+        shown.append(np.frombuffer(screen.read(), np.uint8).astype(int))
+    assert np.abs(shown[0] - shown[1]).max() <= 1 and len(np.unique(shown[0])) > 50
+
 
 def test_each_texel_is_met_by_a_ray() -> None:
     """A picture with less than a ray a texel goes before none."""
