@@ -52,6 +52,9 @@ Run = tuple[Path, dict[str, Any]]
 
 WARM_UP = 3
 """Frames drawn before those that are timed."""
+TURN = 4
+"""Frames that each quality draws before the next has its turn. After one that is another's, caches hold nothing of what it needs: in a turn of one,
+as no clip is played, the pictures that are drawn soonest lose the most."""
 MIDDLE, LEAD_IN = 0.5, 24
 """The time in the clip at which pictures are compared, and how many frames are played up to there: more than the turns of probes."""
 COMPARED = 640 * 480
@@ -349,9 +352,10 @@ def _play_once(job: Play) -> dict[str, results.Record]:
                      "first_render_ms": 1e3 * (shown - uploaded)}  # fmt: skip
             found[name, way] = {"way": way, "context_ms": 1e3 * (opened - begun), **parts, "first_frame_ms": sum(parts.values())}
     took: dict[tuple[str, str], list[tuple[float, float]]] = {key: [] for key in renderers}
-    for time in _frame_times(scene, WARM_UP + job.frames, 1.0):
+    times = _frame_times(scene, WARM_UP + job.frames, 1.0)
+    for first in range(0, len(times), TURN):
         for key, renderer in renderers.items():
-            took[key].append(draw(renderer, float(time)))
+            took[key] += [draw(renderer, float(time)) for time in times[first : first + TURN]]
     median = {key: float(np.median(each[WARM_UP:], axis=0)[0]) for key, each in took.items()}
     best = {name: found[name, min(ways, key=lambda way: median[name, way])] for name in LADDER}
     for name in LADDER:
