@@ -68,7 +68,9 @@ class Quality:
 
 
 BLUR = 1.6 / 255
-"""44 dB."""
+"""44 dB. Of a picture of 640x480 that follows none: time of that without, and PSNR with and without. shelf_hand 0.15, 47.8 instead of 53.4 dB;
+soldier 0.53, 45.5 (54.4); liam 0.75, 40.2 (42.9); room, full of fine patterns, 0.84, 41.1 (45.0). With half of it: 0.18, 49.9; 0.75, 50.0;
+0.90, 42.0; 0.95, 43.8."""
 
 LADDER: dict[str, Quality] = {
     "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, resolution=0.5),

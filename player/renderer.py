@@ -209,8 +209,8 @@ class FoldedInMemory:
 
     @property
     def memory_bytes(self) -> int:
-        kept = [] if self.thinning is None else self.thinning.planes
-        return self.refined.nbytes + self.rows.nbytes + self.room.nbytes + _bytes_of(self.planes) + sum(plane.nbytes for plane in kept)
+        thinning = 0 if self.thinning is None else self.thinning.memory_bytes
+        return self.refined.nbytes + self.rows.nbytes + self.room.nbytes + thinning + _bytes_of(self.planes)
 
     def release(self) -> None:
         for thing in (self.refine_into, self.planes):
