@@ -159,6 +159,10 @@ def test_player_measures_every_quality(tmp_path: Path, capsys: pytest.CaptureFix
             assert record["accuracy"]["psnr"] > 50 and record["accuracy"]["within_one_level"] > 0.999
             assert record["accuracy"]["psnr_turning"] > 50 and run["times_reference"] == 1
             assert record["accuracy"]["psnr_least"] == record["accuracy"]["psnr_least_turning"] == 100
+            most, folding = record["accuracy"]["folding_most"], record["accuracy"]["folding_psnr"]
+            assert (most < 1e-5 and folding == 100) if record["name"] == "still" else 1 / 255 < most < 0.5 and 30 < folding < 90
+        else:
+            assert "folding_psnr" not in record["accuracy"]
         if record["settings"]["quality"] == DEFAULT:
             assert min(record["accuracy"]["psnr_least"], record["accuracy"]["psnr_least_turning"]) > 35
     assert plot.main([str(out), "-o", str(tmp_path / "player.svg")]) == 0

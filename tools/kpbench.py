@@ -416,14 +416,17 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
     """The renderer's name, and how near the pictures of each quality come to the reference's while the clip plays up to its middle:
     from one camera, and PSNR from one that turns around the scene by a degree a frame, too.
 
-    The last picture is compared with the reference itself, the worst of all ("least") is found by the rung of that name.
+    The last picture is compared with the reference itself, the worst of all ("least") is found by the rung of that name. So is what
+    folding alone costs in the worst of all pictures of both, which is told with the reference.
     """
     from kpc.player import offscreen, reference
     from kpc.player.orbit import Rig, fitted, orbit
+    from kpc.player.quality import Quality
     from kpc.player.renderer import Renderer
 
     ctx = offscreen.open_context()
     scene = file.read(job.scene).dequantise()
+    folding, folding_psnr, folding_most = Renderer(ctx, scene, Quality(folded=True)), [], 0.0
     times = _frame_times(scene, LEAD_IN, MIDDLE)
     smaller = min(1.0, (COMPARED / (job.size[0] * job.size[1])) ** 0.5)
     size = round(smaller * job.size[0]), round(smaller * job.size[1])
@@ -438,6 +441,9 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
             drawn = {name: renderer.render(camera, float(time)) for name, renderer in renderers.items()}
             for name, picture in drawn.items():
                 each[name].append(psnr(np.clip(picture.rgb, 0, 1), exact))
+            off = np.clip(folding.render(camera, float(time)).rgb, 0, 1) - exact
+            folding_psnr.append(psnr(off, 0))
+            folding_most = max(folding_most, float(np.abs(off).max()))
         wanted = np.clip(reference.render(scene, camera, MIDDLE).rgb, 0, 1)
         for name, picture in drawn.items():
             difference = np.clip(picture.rgb, 0, 1) - wanted
@@ -447,6 +453,7 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
                 found[name]["samples_per_ray"] = float(picture.samples.mean())
         for renderer in renderers.values():
             renderer.release()
+    found["reference"] |= {"folding_psnr": min(folding_psnr), "folding_most": folding_most}
     return offscreen.describe(ctx), found
 
 

@@ -43,8 +43,8 @@ def _number(key: str, text: str, unit: float = 1.0) -> Callable[[Record], str]:
     return cell
 
 
-def _accuracy(key: str, text: str) -> Callable[[Record], str]:
-    return lambda record: text.format(record["accuracy"][key])
+def _accuracy(key: str, text: str, unit: float = 1.0) -> Callable[[Record], str]:
+    return lambda record: text.format(record["accuracy"][key] / unit) if key in record["accuracy"] else "-"
 
 
 def _ratio(key: str, other: str, text: str, unit: float = 1.0) -> Callable[[Record], str]:
@@ -233,6 +233,8 @@ COLUMNS: dict[str, list[Column]] = {
         ("worst frame", _accuracy("psnr_least", "{:.1f}")),
         ("turning", _accuracy("psnr_turning", "{:.1f}")),
         ("within 1/255", _accuracy("within_one_level", "{:.2%}")),
+        ("folding alone: worst frame dB", _accuracy("folding_psnr", "{:.1f}")),
+        ("largest error, of 255", _accuracy("folding_most", "{:.0f}", 1 / 255)),
     ],
     "stream": [
         ("scene", lambda r: r["name"]),
