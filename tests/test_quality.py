@@ -331,6 +331,28 @@ def test_interpolated_pixels_are_off_by_no_more_than_may_be(size: tuple[int, int
     assert np.abs(pictures[0.01].opacity - whole.opacity).mean() < 0.01
 
 
+@pytest.mark.parametrize("size", [(40, 28), (41, 27), (8, 9)])
+def test_how_far_blocks_are_off_is_told_by_bends(size: tuple[int, int]) -> None:
+    renderer, few = Renderer(gl.context(), tiny_scene(4)), tuple(-(-side // 2) for side in size)
+    blocks = tuple(-(-side // 4) for side in size)
+    rays, missed = renderer._target(Part.FULL, few, module.COARSE), renderer._target(Part.FULL, blocks, module.DOUBTS)
+    colours = np.random.default_rng(7).random((few[1], few[0], 4), np.float32)
+    rays.seen.write(colours)
+    rays.seen.use(module.SEEN_UNIT)
+    bent, vertices = renderer._program("bent.glsl", renderer.layout)
+    module._set(bent, seen_coarse=module.SEEN_UNIT, size=tuple(map(float, size)))
+    renderer._draw(missed.framebuffer, vertices)
+    got = np.frombuffer(missed.seen.read(), np.float32).reshape(blocks[1], blocks[0], 4)
+
+    padded = np.pad(colours[..., :3].astype(float), ((1, 1), (1, 1), (0, 0)), "edge")
+    here = padded[1:-1, 1:-1]
+    bends = np.abs(padded[1:-1, :-2] + padded[1:-1, 2:] - 2 * here) + np.abs(padded[:-2, 1:-1] + padded[2:, 1:-1] - 2 * here)
+    columns, rows = (np.minimum((2 * np.arange(2 * n) + 1) * fewer // side, fewer - 1) for n, fewer, side in zip(blocks, few, size))
+    squares = np.mean((bends / 8) ** 2, axis=2)[rows[:, None], columns]
+    wanted = squares.reshape(blocks[1], 2, blocks[0], 2).mean((1, 3))
+    np.testing.assert_allclose(got, np.repeat(wanted[..., None], 4, axis=2), rtol=1e-4)
+
+
 def test_what_was_drawn_before_is_gone() -> None:
     """A processor draws, and empties, only where there is something."""
     scene = tiny_scene(4, resolution=(33, 17, 17))
