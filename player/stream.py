@@ -205,7 +205,7 @@ class Stream:
         if scene.is_dynamic:
             finer = Layout.of(scene, REFINED)
             texels += 2 * finer.size[0] * finer.size[1] + (1 + REFINED) * Rows(scene, layout).width * layout.row_count()
-            texels += 0 if Thinning.of(scene, finer) is None else 2 * layout.size[0] * layout.size[1]
+            texels += 2 * layout.size[0] * layout.size[1] if Thinning.serves(scene) else 0
         largest = max(layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
         motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
         decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw

@@ -30,6 +30,11 @@ class Block:
     width: int
     height: int
 
+    @property
+    def upright(self) -> bool:
+        """Whether the row that is folded into the plane runs along its rows, else along its columns."""
+        return FOLDED_AXIS[self.plane] == self.plane[1]
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -98,6 +103,15 @@ class Layout:
     def block(self, scale: int, plane: str) -> Block:
         return self.blocks[3 * scale + SPACE_PLANES.index(plane)]
 
+    def part(self, block: Block) -> tuple[slice, slice]:
+        """Where a block lies in an atlas that is an array of (height, width)."""
+        return slice(block.y, block.y + block.height), slice(block.x, block.x + self.layers[block.scale] * block.width)
+
+    def lines(self, block: Block) -> slice:
+        """The lines of the rows' texture that are folded into a block, a layer each."""
+        first = self.first_row("xyz".index(FOLDED_AXIS[block.plane]), block.scale)
+        return slice(first, first + self.layers[block.scale])
+
     def row_count(self) -> int:
         return 3 * self.features
 
@@ -140,13 +154,11 @@ class Rows:
 def multiplied(refined: np.ndarray, rows: np.ndarray, layout: Layout, block: Block, room: np.ndarray) -> np.ndarray:
     """fold.glsl by the processor: a block of a refined atlas, (height, width, 4) float32, times the `Rows` of a time. In `room`, for as many
     numbers."""
-    axis, layers = FOLDED_AXIS[block.plane], layout.layers[block.scale]
-    first, upright = layout.first_row("xyz".index(axis), block.scale), axis == block.plane[1]
-    plane = refined[block.y : block.y + block.height, block.x : block.x + layers * block.width]
+    plane, row = refined[layout.part(block)], rows[layout.lines(block)]
     product = room[: plane.size].reshape(plane.shape)
 
     def multiply(part: slice) -> None:
-        _multiply(plane[part], rows[first : first + layers, part if upright else slice(None)], block.width, upright, product[part])
+        _multiply(plane[part], row[:, part] if block.upright else row, block.width, block.upright, product[part])
 
     if plane.size < WORTH_SHARING:
         multiply(slice(None))

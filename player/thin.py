@@ -16,7 +16,7 @@ from kpc.format.rans import compiled
 from kpc.format.scene import LOG_DENSITY_LIMIT, SPACE_PLANES, Decoder, Scene
 from kpc.format.space import Contraction
 from kpc.player.cores import share_out
-from kpc.player.textures import FOLDED_AXIS, Layout, decoder_arrays
+from kpc.player.textures import Layout, decoder_arrays
 
 TEXELS_A_CELL = 2.0
 """Along an edge of a cell, of the finest scale: between corners farther apart there may be something that they do not see."""
@@ -58,13 +58,13 @@ class Thinning:
         self._corners: Corners | None = None
 
     @staticmethod
-    def of(scene: Scene, layout: Layout) -> "Thinning | None":
-        """None where it would not pay, one slot holding always, or where corners tell too little of what is between them."""
+    def serves(scene: Scene) -> bool:
+        """Not where it would not pay, one slot holding always, nor where corners tell too little of what is between them."""
         finest = scene.scales[-1]
         texels = np.array([*finest["xy"].shape[1::-1], finest["xz"].shape[0]]) - 1
         fine = bool((texels <= TEXELS_A_CELL * np.array(scene.occupancy.shape[:0:-1])).all())
         told = fine and isinstance(scene.decoder, Decoder) and not isinstance(scene.mapping, Contraction)
-        return Thinning(scene, layout) if told and scene.is_dynamic and len(scene.occupancy) > 1 else None
+        return told and scene.is_dynamic and len(scene.occupancy) > 1
 
     @property
     def memory_bytes(self) -> int:
@@ -74,10 +74,9 @@ class Thinning:
         """Take over planes from an atlas, (height, width, 4), of the layout."""
         self.planes = []
         for block in self._layout.blocks:
-            layers, every = self._layout.layers[block.scale], self._layout.refined
-            part = refined[block.y : block.y + block.height, block.x : block.x + layers * block.width]
-            part = part.reshape(block.height, layers, block.width, 4).swapaxes(1, 2)
-            part = part[::every] if FOLDED_AXIS[block.plane] == block.plane[1] else part[:, ::every]
+            every, part = self._layout.refined, refined[self._layout.part(block)]
+            part = part.reshape(block.height, -1, block.width, 4).swapaxes(1, 2)
+            part = part[::every] if block.upright else part[:, ::every]
             self.planes.append(np.ascontiguousarray(part).reshape(*part.shape[:2], -1))
         self._folded = [np.empty_like(plane) for plane in self.planes]
 
@@ -101,11 +100,9 @@ class Thinning:
         scene, layout = self._scene, self._layout
         places, out = places.copy(), np.full(len(places), scene.decoder.density_bias, np.float32)
         for block, plane, folded in zip(layout.blocks, self.planes, self._folded, strict=True):
-            axis, layers = FOLDED_AXIS[block.plane], layout.layers[block.scale]
-            first, upright = layout.first_row("xyz".index(axis), block.scale), axis == block.plane[1]
-            row = rows[first : first + layers, :: layout.refined].swapaxes(0, 1)[: len(plane) if upright else plane.shape[1]]
+            row = rows[layout.lines(block), :: layout.refined].swapaxes(0, 1)[: plane.shape[0 if block.upright else 1]]
             row = row.reshape(len(row), -1)
-            np.multiply(plane, row[:, None] if upright else row, out=folded)
+            np.multiply(plane, row[:, None] if block.upright else row, out=folded)
         offsets = None if scene.motion is None else linear(scene.motion, time)
 
         def add(part: slice) -> None:

@@ -25,7 +25,8 @@ def moving(channels: int = 8, resolution: tuple[int, int, int] = (24, 20, 16)) -
 
 
 def thinning_of(scene: Scene, refined: int) -> Thinning:
-    thinning, layout = Thinning.of(scene, Layout.of(scene, refined)), Layout.of(scene, refined)
+    layout = Layout.of(scene, refined)
+    thinning = Thinning(scene, layout)
     renderer = Renderer(gl.context(), scene, FOLDED)
     renderer.folded_layout = layout
     renderer.march(CAMERA, 0.0)
@@ -118,10 +119,9 @@ def test_planes_that_arrive_later_count() -> None:
 
 
 def test_scenes_that_it_would_not_serve_keep_their_cells() -> None:
-    layout = Layout.of(moving())
-    assert Thinning.of(moving(), layout) is not None
+    assert Thinning.serves(moving())
     one_slot = replace(moving(), occupancy=moving().occupancy[:1])
     fine = moving(resolution=(40, 20, 16))  # more than two texels a cell
     for scene in (one_slot, fine, SPACES["hybrid"](moving()), SPACES["contracted"](moving())):
-        assert Thinning.of(scene, Layout.of(scene)) is None
+        assert not Thinning.serves(scene)
         Renderer(gl.context(), scene, replace(FOLDED, thin=1 / 100)).render(CAMERA, 0.5)
