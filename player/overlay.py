@@ -4,9 +4,9 @@ import ctypes
 
 import moderngl
 import numpy as np
-from imgui_bundle import imgui
 
 from kpc.player import shader
+from kpc.player.desktop import imgui
 
 _VERTEX = f"""{shader.GL33}
 uniform vec2 display;
@@ -49,6 +49,7 @@ class Overlay:
         self._indices = ctx.buffer(reserve=1 << 16, dynamic=True)
         self._textures: dict[int, moderngl.Texture] = {}
         self._array = self._bind()
+        self._pixels = (0, 0)
 
     def begin(
         self, window: tuple[int, int], framebuffer: tuple[int, int], content_scale: float, seconds: float
@@ -57,6 +58,7 @@ class Overlay:
 
         Sizes are in screen units and in pixels; `content_scale` is how large the system draws its text.
         """
+        self._pixels = framebuffer
         ratio = framebuffer[0] / max(window[0], 1), framebuffer[1] / max(window[1], 1)
         self.io.display_size = imgui.ImVec2(*window)
         self.io.display_framebuffer_scale = imgui.ImVec2(*ratio)
@@ -69,7 +71,7 @@ class Overlay:
         imgui.render()
         data = imgui.get_draw_data()
         self._update_textures()
-        width, height = framebuffer.size
+        width, height = self._pixels  # for a window's own, moderngl keeps the size that it began with
         framebuffer.use()
         framebuffer.viewport = (0, 0, width, height)
         display = self._program["display"]
@@ -130,12 +132,12 @@ class Overlay:
         status = imgui.ImTextureStatus
         for wanted in imgui.get_platform_io().textures:
             if wanted.status == status.want_create:
-                texture = self.ctx.texture((wanted.width, wanted.height), 4, _pixels(wanted).tobytes())
+                texture = self.ctx.texture((wanted.width, wanted.height), 4, _texels(wanted).tobytes())
                 self._textures[texture.glo] = texture
                 wanted.set_tex_id(texture.glo)
                 wanted.status = status.ok
             elif wanted.status == status.want_updates:
-                self._textures[wanted.tex_id].write(_pixels(wanted).tobytes())
+                self._textures[wanted.tex_id].write(_texels(wanted).tobytes())
                 wanted.status = status.ok
             elif wanted.status == status.want_destroy and wanted.unused_frames > 0:
                 self._textures.pop(wanted.tex_id).release()
@@ -143,7 +145,7 @@ class Overlay:
                 wanted.status = status.destroyed
 
 
-def _pixels(texture: imgui.ImTextureData) -> np.ndarray:
+def _texels(texture: imgui.ImTextureData) -> np.ndarray:
     return np.asarray(texture.get_pixels_array())
 
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, TypeVar
 
 import moderngl
 import numpy as np
-from imgui_bundle import imgui
 
 from kpc.format.errors import DatasetError
 from kpc.format.scene import HybridDecoder, Scene
 from kpc.player.controls import SPEEDS
+from kpc.player.desktop import imgui
 from kpc.player.dial import RUNGS
 from kpc.player.preferences import TARGET_FPS
 from kpc.player.quality import LADDER

@@ -71,7 +71,7 @@ _IS_RIGHT: dict[str, Callable[[Any], bool]] = {
 
 def place() -> Path:
     """The file: under $XDG_CONFIG_HOME or ~/.config, ~/Library/Application Support, or %APPDATA%."""
-    from imgui_bundle import hello_imgui
+    from kpc.player.desktop import hello_imgui
 
     return Path(hello_imgui.ini_folder_location(hello_imgui.IniFolderType.app_user_config_folder)) / "kpc" / "player.json"
 

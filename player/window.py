@@ -10,10 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import glfw
 import moderngl
 import numpy as np
-from imgui_bundle import imgui
 
 from kpc.format.cameras import Camera
 from kpc.format.container import open_source
@@ -22,6 +20,7 @@ from kpc.format.media import write_image
 from kpc.format.scene import Scene
 from kpc.player import panels
 from kpc.player.controls import Playback, View, Wardrobe
+from kpc.player.desktop import glfw, imgui
 from kpc.player.dial import RUNGS, dial_for
 from kpc.player.orbit import Rig, presets
 from kpc.player.overlay import Overlay
@@ -537,9 +536,6 @@ class Player:
 
     def _resize(self, pixels: tuple[int, int]) -> None:
         """The canvas holds the last picture of the scene, so that the controls can change over it."""
-        self.ctx.screen.use()
-        self.ctx.viewport = (0, 0, *pixels)
-        self.screen = self.ctx.detect_framebuffer(0)
         self._canvas_texture = self.ctx.texture(pixels, 4)
         self.canvas = self.ctx.framebuffer([self._canvas_texture])
         red, green, blue = map(float, self.scene.background)
@@ -660,8 +656,8 @@ class Player:
 
     def _finish(self) -> None:
         """The canvas, and the controls over it, on the screen."""
-        self.ctx.copy_framebuffer(self.screen, self.canvas)
-        self.overlay.draw(self.screen)
+        self.ctx.copy_framebuffer(self.ctx.screen, self.canvas)
+        self.overlay.draw(self.ctx.screen)
 
     # --- events
 

@@ -6,9 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import glfw
 import numpy as np
-from imgui_bundle import imgui
 from pytest import approx, raises
 
 from kpc.format import groups
@@ -17,6 +15,7 @@ from kpc.format.errors import DisplayError
 from kpc.format.media import read_image, read_video
 from kpc.player import kpplay, panels
 from kpc.player import window as window_module
+from kpc.player.desktop import glfw, imgui
 from kpc.player.dial import RUNGS
 from kpc.player.path import CameraPath
 from kpc.player.preferences import Preferences, place
@@ -228,18 +227,34 @@ def follow_a_path(player: Player, press: Callable[..., None]) -> None:
         assert frames[0].shape == (*player.canvas.size[::-1], 3)
 
     press(glfw.KEY_O)
-    glfw.set_window_size(player.window.handle, 300, 240)
+    glfw.set_window_size(player.window.handle, 420, 330)
     time.sleep(0.05)
     until = time.monotonic() + 20
     while player.film is not None and time.monotonic() < until:
         glfw.poll_events()
         player.frame()
-    assert player.film is None and player.canvas.size == (300, 240)
+    assert player.film is None and player.canvas.size == (420, 330)
+    reach_into_corners(player)
     Path("nowhere").touch()
     player.folder = Path("nowhere")  # no folder: what goes wrong is told, and nothing ends
     press(glfw.KEY_P)
-    assert player.notice_is_error and "nowhere" in player.notice
+    assert player.notice_is_error and "nowhere" in player.notice, player.notice
     player.folder = Path()
+
+
+def reach_into_corners(player: Player) -> None:
+    """As the controls do of a window that is larger than it was: in its top left, and all along its bottom."""
+    player.frame()
+    player._begin(0.0)
+    panels.show(player)
+    player._finish()
+    width, height = player.canvas.size
+    screen = np.frombuffer(player.ctx.screen.read(viewport=(0, 0, width, height), alignment=1), np.uint8).reshape(height, width, 3)[::-1]
+    assert player.ctx.error in ("GL_NO_ERROR", "GL_INVALID_OPERATION")  # moderngl reads from an attachment that no window's own has
+    over = np.any(screen != player._pixels(), axis=2)
+    top, left = over.any(1).argmax(), over.any(0).argmax()
+    bottom, right = height - over.any(1)[::-1].argmax(), width - over.any(0)[::-1].argmax()
+    assert top < 16 and left < 16 and bottom > height - 16 and right > width - 60, (top, left, bottom, right)
 
 
 def see_every_pixel_once(window: Window, player: Player) -> None:

@@ -3,8 +3,10 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -51,10 +53,34 @@ def display() -> Iterator[str]:
         server.wait()
 
 
-def kpplay(*arguments: object, display: str | None = None) -> subprocess.CompletedProcess[str]:
-    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")} | (
+@pytest.fixture(scope="module")
+def wayland(display: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """The environment of a compositor that offers no X server, two pixels to each of its units. It has a window of one, for its keys and pointer:
+    without any, glfw stumbles."""
+    if shutil.which("weston") is None:
+        pytest.skip("no weston (Debian: apt install weston)")
+    folder = tmp_path_factory.mktemp("wayland")
+    folder.chmod(0o700)
+    told = {"XDG_RUNTIME_DIR": str(folder), "WAYLAND_DISPLAY": "kpc"}
+    command = ["weston", "--backend=x11-backend.so", "--socket=kpc", "--width=400", "--height=300", "--scale=2", "--idle-time=0"]
+    server = subprocess.Popen(command, env={**os.environ, **told, "DISPLAY": display}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        for _ in range(100):
+            if (folder / "kpc").exists() or server.poll() is not None:
+                break
+            time.sleep(0.1)
+        if not (folder / "kpc").exists():
+            pytest.skip("weston does not start")
+        yield told
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def kpplay(*arguments: object, display: str | None = None, told: Mapping[str, str] = MappingProxyType({})) -> subprocess.CompletedProcess[str]:
+    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "PYGLFW_LIBRARY")} | (
         {"DISPLAY": display} if display else {}
-    )
+    ) | dict(told)  # fmt: skip
     command = [sys.executable, "-W", "error", "-m", "kpc.player.kpplay", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, env=env, timeout=60, check=False)
 
@@ -69,6 +95,16 @@ def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> No
     assert np.abs(picture[:20, -20:] - background).max() <= 1  # the corner is empty
     assert np.abs(picture[150:170, 260:280] - background).max() > 20  # the scene
     assert picture[12:100, 12:100].mean() < 180  # the HUD
+
+
+@pytest.mark.parametrize("session", [{}, {"XDG_SESSION_TYPE": "wayland"}], ids=["untold", "told"])
+def test_plays_where_there_is_no_x_server(scene_file: Path, wayland: dict[str, str], session: dict[str, str], tmp_path: Path) -> None:
+    shot = tmp_path / "shot.png"
+    done = kpplay(scene_file, "--size", "300x200", "--frames", 20, "--screenshot", shot, told={**wayland, **session})
+    assert done.returncode == 0 and done.stdout == "" and "Traceback" not in done.stderr, done.stderr
+    picture = read_image(shot).astype(int)
+    assert picture.shape == (400, 600, 3)  # what the compositor counts
+    assert picture[24:200, 24:200].mean() < 180  # the HUD
 
 
 def test_plays_from_a_server(scene_file: Path, display: str, tmp_path: Path) -> None:
@@ -150,4 +186,4 @@ def test_every_key_and_drag(scene_file: Path, display: str, tmp_path: Path) -> N
     assert reset == "kpplay: the graphics card was reset; start kpplay anew, or update the graphics driver"
     assert unwritten.startswith("kpplay: settings are not remembered")
     saved = list(tmp_path.glob("tiny-*.png"))
-    assert len(saved) == 1 and read_image(saved[0]).shape == (240, 300, 3)
+    assert len(saved) == 1 and read_image(saved[0]).shape == (330, 420, 3)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import glfw
 import moderngl
 import numpy as np
 
@@ -16,6 +15,7 @@ from kpc.format.container import open_source
 from kpc.format.memory import peak_memory_bytes
 from kpc.player import offscreen
 from kpc.player.controls import Pace
+from kpc.player.desktop import glfw
 from kpc.player.preferences import Preferences
 from kpc.player.reel import Reel
 from kpc.player.window import Player, Window
