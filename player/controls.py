@@ -188,6 +188,9 @@ class Pace:
     known of a raster is forgotten when it has not been drawn for OLD pictures; all is, when times are EXCEPTION times what was
     expected, or as many times less, for AGREED pictures on end.
 
+    The first picture on a raster follows no other, as the next ones may, and textures are made for it: it counts only where it takes HOPELESS
+    times the budget. And no picture counts as longer than the one before it: what one alone has to do tells little of the next.
+
     Attributes:
         budget_s: seconds a picture may take.
         scale: in [LEAST, 1], a power of STEP: the card is asked for few different rasters, and keeps them.
@@ -196,8 +199,9 @@ class Pace:
     STEP = 2**0.25
     LEAST = STEP**-12
     SLACK = 0.5
-    """Steps that the raster may be too large before it shrinks. It grows by one, after UP_AFTER pictures that left room for it."""
-    UP_AFTER = 3
+    """Steps that the raster may be too large before it shrinks. It grows by one, after UP_AFTER pictures on end that left room for it; after
+    twice as many for each time that it shrank from there, up to MOST_PATIENCE."""
+    UP_AFTER, MOST_PATIENCE = 3, 96
     MOST_DOWN = 3
     """Steps after one picture."""
     FRESH = 0.25
@@ -207,7 +211,8 @@ class Pace:
     EXCEPTION = 4.0
     """A picture that takes so many times as long as the last counts as if it took no longer than that."""
     AGREED = 4
-    OLD = 600
+    HOPELESS = 8.0
+    OLD = 300
 
     budget_s: float
     scale: float = 1.0
@@ -216,8 +221,14 @@ class Pace:
     _drawn: dict[int, int] = field(default_factory=dict, repr=False)
     """The number of the last picture on it."""
     _number: int = field(default=0, repr=False)
+    _patience: dict[int, int] = field(default_factory=dict, repr=False)
+    """Of a raster: how many pictures on a coarser one must leave room for it."""
     _spare: int = field(default=0, repr=False)
     """Pictures on end that left room for a finer raster."""
+    _on: int | None = field(default=None, repr=False)
+    """The raster of the last picture."""
+    _last: float | None = field(default=None, repr=False)
+    """Its time, if it was not the first one there."""
     _odd: int = field(default=0, repr=False)
     """Pictures on end that took a time of another order."""
 
@@ -229,20 +240,29 @@ class Pace:
     def saw(self, seconds: float, budget_s: float | None = None) -> None:
         """Take in how long a picture took at the present scale, and may take."""
         steps, budget = -round(math.log(self.scale, self.STEP)), budget_s or self.budget_s
+        if steps != self._on:
+            self._on, self._last = steps, None
+            if seconds < self.HOPELESS * budget:
+                return
+        before, self._last = self._last, seconds
+        if before is None and seconds < self.HOPELESS * budget:
+            return
+        seconds = min(seconds, before or seconds)
         self._take_in(steps, max(seconds, 1e-6))
         fixed, growing = self._fit()
         # where what no raster changes takes most of the time, a coarser one does more harm than good
         wanted = -math.log(max(budget - fixed, 0.5 * fixed) / growing, self.STEP) / 2
         self._spare = self._spare + 1 if wanted <= steps - 1 else 0
-        if self._spare == self.UP_AFTER:
+        if self._spare >= self._patience.get(steps - 1, self.UP_AFTER):
             steps, self._spare = steps - 1, 0
         elif wanted > steps + self.SLACK:
+            self._patience[steps] = min(2 * self._patience.get(steps, self.UP_AFTER), self.MOST_PATIENCE)
             steps = min(math.ceil(wanted), steps + self.MOST_DOWN)
         self.scale = min(max(self.STEP**-steps, self.LEAST), 1.0)
 
     def forget(self) -> None:
         """What follows has nothing to do with what was."""
-        self._times, self._drawn, self._odd = {}, {}, 0
+        self._times, self._drawn, self._patience, self._odd = {}, {}, {}, 0
 
     def _take_in(self, steps: int, seconds: float) -> None:
         if self._times:

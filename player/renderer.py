@@ -48,9 +48,9 @@ MOST_COVERED = 0.8
 """Share of a picture beyond which all of it is drawn."""
 PIXELS_MARCHED = 1 << 22
 """Of a raster with several rays a pixel, at most: 100 MB."""
-FOLLOWS_S = 0.2
-"""A picture so much later in the clip than the one before has too little in common with it to follow it; nor does one follow at
-the same time: while the clip stands still, pictures are whole."""
+JUMP_S = 0.2
+"""Of the clip between a picture and the next: what the one has in common with the other says nothing of those that come then. It still follows:
+half of the clip later, pictures of room and liam take 0.3 of the time of those that follow none, and are as near to the reference."""
 PLACES_ALONG = 64
 """Of a ray, to look at how many texels a pixel spans."""
 COMPUTE_VERSION = 430
@@ -639,8 +639,8 @@ class Renderer:
         _set(doubt, seen_predicted=SEEN_UNIT, tolerance=shot.quality.tolerance * (MOVED_TOLERANCE if moved else 1.0), **common)
         self._draw(doubts.framebuffer, vertices)
         if self._share_of(doubts) > MOST_DOUBTED * before.marched:
-            marched = self._draw_alone(draw, part, picture, camera)
-            self._shots[part, size] = replace(shot, marched=marched, alone=ALONE_FOR)
+            marched, jumped = self._draw_alone(draw, part, picture, camera), self._since_s(shot, before) > JUMP_S
+            self._shots[part, size] = replace(shot, marched=marched, alone=0 if jumped else ALONE_FOR)
             return picture
         settle, vertices = self._program("settle.glsl", self.layout)
         _set(settle, **common)
@@ -655,9 +655,11 @@ class Renderer:
         return SPREAD if self._is_software and not self.compute else None
 
     def _follows(self, shot: Shot, before: Shot) -> bool:
-        """Whether a picture shows the same as the one before, a little later."""
-        since_s = abs(shot.time - before.time) * self.scene.clip.duration_s
-        return 0 < since_s < FOLLOWS_S and (shot.appearance, shot.quality) == (before.appearance, before.quality)
+        """Whether a picture shows the same as the one before, at another time: while the clip stands still, pictures are whole."""
+        return self._since_s(shot, before) > 0 and (shot.appearance, shot.quality) == (before.appearance, before.quality)
+
+    def _since_s(self, shot: Shot, before: Shot) -> float:
+        return abs(shot.time - before.time) * self.scene.clip.duration_s
 
     def _predicted(self, old: Target, new: Target, before: Camera, now: Camera) -> Target:
         """A picture as it was before, seen from where the camera is now."""

@@ -166,13 +166,25 @@ def test_the_pace_asks_for_few_rasters_and_stands_still_in_noise() -> None:
     assert {round(4 * math.log2(scale), 9) % 1 for scale in scales} == {0.0}
 
 
-@pytest.mark.parametrize(("fixed_s", "low", "high"), [(0.02, 0.34, 0.43), (0.05, 0.24, 0.5), (0.2, 0.4, 1.0)])
+@pytest.mark.parametrize(("fixed_s", "low", "high"), [(0.02, 0.34, 0.43), (0.05, 0.24, 0.5), (0.2, 0.35, 1.0)])
 def test_a_raster_gets_no_coarser_than_helps(fixed_s: float, low: float, high: float) -> None:
     rng, pace, scales = np.random.default_rng(0), Pace(1 / 15), []
     for _ in range(300):
         pace.saw((fixed_s + 0.3 * pace.scale**2) * float(np.exp(rng.normal(0, 0.1))))
         scales.append(pace.scale)
     assert low <= np.median(scales[100:]) <= high and np.std(scales[100:]) < 0.2 * high
+
+
+@pytest.mark.parametrize("whole", [1.0, 3.0, 5.0])
+def test_the_pace_is_that_of_pictures_that_follow_one_another(whole: float) -> None:
+    """What follows none takes so many times as long: the first on a raster, and one a lap."""
+    rng, pace, scales, raster = np.random.default_rng(0), Pace.of(software=True), [], None
+    for number in range(600):
+        follows = pace.scale == raster and number % 40
+        scales.append(raster := pace.scale)
+        pace.saw(0.15 * pace.scale**2 * (1.0 if follows else whole) * float(np.exp(rng.normal(0, 0.1))))
+    assert 0.55 < min(scales[100:]) and max(scales[100:]) < 0.8  # 1 / 15 s
+    assert sum(a != b for a, b in zip(scales[100:], scales[101:])) <= 6
 
 
 def test_a_processor_begins_coarsely() -> None:
