@@ -51,6 +51,8 @@ PIXELS_MARCHED = 1 << 22
 JUMP_S = 0.2
 """Of the clip between a picture and the next: what the one has in common with the other says nothing of those that come then. It still follows:
 half of the clip later, pictures of room and liam take 0.3 of the time of those that follow none, and are as near to the reference."""
+LATELY = 2
+"""Pictures since one, that may be followed: itself the last, or but for a small one that statistics are taken from."""
 PLACES_ALONG = 64
 """Of a ray, to look at how many texels a pixel spans."""
 COMPUTE_VERSION = 430
@@ -85,13 +87,14 @@ class Look(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A picture that others may follow: what it shows, how finely, the turn of its probes, which target holds it, the share of its pixels
-    that was marched for the last that followed none, and how many after it are not to follow either."""
+    """A picture that others may follow: what it shows, how finely, which of all it is, the turn of its probes, which target holds it, the
+    share of its pixels that was marched for the last that followed none, and how many after it are not to follow either."""
 
     camera: Camera
     time: float
     appearance: bytes
     quality: Quality
+    count: int
     turn: int = 0
     number: int = PICTURE
     marched: float = 1.0
@@ -323,6 +326,7 @@ class Renderer:
         self._decoder = shader.constants(weights)
         self._shots: dict[tuple[Part, tuple[int, int]], Shot] = {}
         """Of each part and size, the last picture if the next may follow it."""
+        self._pictures = 0
         self._rows_time: float | None = None
         self._motion_time: float | None = None
         self._folded_time: float | None = None
@@ -514,9 +518,11 @@ class Renderer:
             else:
                 self._draw(target.framebuffer, vertices, points=points)
 
+        self._pictures += 1
         before = self._shots.pop((part, raster), None)
+        before = before if before is not None and self._pictures - before.count <= LATELY else None
         if program == "march.glsl" and quality.tolerance:
-            target = self._followed(draw, part, before, Shot(camera, time, code.tobytes(), quality))
+            target = self._followed(draw, part, before, Shot(camera, time, code.tobytes(), quality, self._pictures))
         elif program == "march.glsl":
             self._draw_alone(draw, part, target := self._target(part, raster), camera)
         else:

@@ -119,9 +119,9 @@ def test_while_a_clip_plays_only_what_has_changed_is_marched_again(space: str, s
     target.framebuffer.clear(9.0, 9.0, 9.0, 9.0)
     target.drawn = module.EVERYWHERE
     assert np.abs(renderer.render(camera, 0.51).rgb - whole.render(camera, 0.51).rgb).max() < 1e-5
-    # Pictures after a jump, at the same time, and of another size follow none.
-    renderer.quality = FOLLOWING
-    for time, other in ((0.95, camera), (0.0, camera), (0.0, camera), (0.01, camera.resized(20, 30))):
+    # Pictures after a jump follow, too; at the same time, and of another size, they follow none.
+    assert psnr(renderer.render(camera, 0.95).rgb, whole.render(camera, 0.95).rgb) > 40
+    for time, other in ((0.95, camera), (0.96, camera.resized(20, 30))):
         assert np.abs(renderer.render(other, time).rgb - whole.render(other, time).rgb).max() < 1e-5
 
 
@@ -253,6 +253,25 @@ def test_what_is_drawn_in_between_is_not_followed() -> None:
     renderer.march(CAMERA, 0.4, program="cells.glsl")
     renderer.quality = FOLLOWING
     assert np.abs(renderer.render(CAMERA, 0.41).rgb - whole.render(CAMERA, 0.41).rgb).max() < 1e-5
+
+
+@pytest.mark.parametrize("others", [module.LATELY - 1, module.LATELY])
+def test_a_picture_of_some_time_ago_is_not_followed(others: int) -> None:
+    renderer, whole = Renderer(gl.context(), tiny_scene(4), FOLLOWING), Renderer(gl.context(), tiny_scene(4))
+    renderer.render(CAMERA, 0.4)
+    for k in range(others):
+        renderer.render(CAMERA.resized(20, 30), 0.41 + 0.01 * k)
+    is_whole = np.abs(renderer.render(CAMERA, 0.5).rgb - whole.render(CAMERA, 0.5).rgb).max() < 1e-5
+    assert is_whole == (others >= module.LATELY)
+
+
+def test_after_a_jump_only_what_follows_badly_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_DOUBTED", 0.0)
+    renderer = Renderer(gl.context(), tiny_scene(4), LADDER["balanced"])
+    for time, alone in ((0.1, 0), (0.9, 0), (0.91, module.ALONE_FOR), (0.92, module.ALONE_FOR - 1)):
+        renderer.render(CAMERA, time)
+        (shot,) = renderer._shots.values()
+        assert shot.alone == alone
 
 
 def test_what_moves_and_what_stays_follow_each_their_own() -> None:
