@@ -149,6 +149,16 @@ def test_long_playback_makes_nothing_anew(scene_file: Path, display: str) -> Non
     assert "made on the card" in done.stderr and record["renderer"]
 
 
+def test_a_window_that_is_left_to_itself_is_measured(scene_file: Path, display: str) -> None:
+    command = [sys.executable, "-m", "kpc.tools.kpbench", "window", str(scene_file), "--size", "320x240", "--seconds", "1", "--turn", "20"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "DISPLAY": display}, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    (record,) = json.loads(done.stdout)
+    (run,) = record["repeats"]
+    assert run["raster"] == "320x240" and run["raster_share"] == 1 and run["psnr"] >= run["psnr_least"] > 30, run  # so small a scene needs no less
+    assert 5 < run["fps"] and "degrees a second" in done.stderr
+
+
 def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
     done = kpplay(scene_file)
     assert done.returncode == 1 and done.stderr.count("\n") == 1

@@ -406,6 +406,19 @@ def _steady(options: argparse.Namespace, origin: results.Record) -> Iterator[res
         yield record | {"seed": None, "renderer": repeats[0].pop("renderer"), "repeats": repeats}
 
 
+def _window(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
+    """A record a scene: what a window that is left to itself plays at."""
+    from kpc.tools import pacing
+
+    for source in options.scenes:
+        settings = {"size": "{}x{}".format(*options.size), "seconds": options.seconds, "turn": options.turn}
+        record = _record("window", source, origin, settings)
+        print(f"kpbench: {record['name']}", file=sys.stderr)
+        job = pacing.Pacing(source, options.size, options.seconds, options.turn)
+        repeats = [_alone(pacing.measure, job) for _ in range(options.repeats)]
+        yield record | {"seed": None, "renderer": repeats[0].pop("renderer"), "repeats": repeats}
+
+
 def _renderer(_: None) -> str:
     from kpc.player import offscreen
 
@@ -519,7 +532,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|groups|player|stream|steady|codec|entropy")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|groups|player|stream|window|steady|codec|entropy")
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
@@ -578,6 +591,14 @@ def _parser() -> argparse.ArgumentParser:
     steady.add_argument("--frames", type=_positive, default=10_000, help="to draw (default: 10000)")
     steady.set_defaults(measure=_steady)
 
+    window = kinds.add_parser("window", help="playback in a window that is left to itself", description="On how fine a raster, and how "
+                              "often, a window draws scenes as they play, and how near that is to exact pictures. Wants a display.")  # fmt: skip
+    window.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
+    window.add_argument("--size", type=_size, default=(800, 600), metavar="WxH", help="of the window (default: 800x600)")
+    window.add_argument("--seconds", type=_positive, default=20, metavar="S", help="to look at (default: 20)")
+    window.add_argument("--turn", type=float, default=0.0, metavar="DEGREES", help="a second, around the scene meanwhile (default: 0)")
+    window.set_defaults(measure=_window)
+
     codec = kinds.add_parser("codec", help="rate against distortion, beside general tools",
                              description="Code each scene at several rates, and its planes with what a user has at hand: "
                                          "kpc.tools.rivals. With --out FILE.json also FILE.csv and FILE.svg.")  # fmt: skip
@@ -596,9 +617,9 @@ def _parser() -> argparse.ArgumentParser:
     entropy.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
     entropy.set_defaults(measure=_entropy)
 
-    for kind in (encode, curve, ablate, step, player, stream, steady):
+    for kind in (encode, curve, ablate, step, player, stream, window, steady):
         kind.add_argument("--repeats", type=_positive, default=1, help="of each run (default: 1)")
-    for kind in (encode, curve, ablate, step, groups, player, stream, steady, codec, entropy):
+    for kind in (encode, curve, ablate, step, groups, player, stream, window, steady, codec, entropy):
         kind.add_argument("--out", type=Path, metavar="FILE", help="write the records there instead of to stdout")
     return parser
 

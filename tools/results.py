@@ -259,6 +259,17 @@ COLUMNS: dict[str, list[Column]] = {
         ("MB at last", _number("last_bytes", "{:.1f}", 1e6)),
         ("KB more in 1,000 frames", _number("bytes_per_1000_frames", "{:.1f}", 1e3)),
     ],
+    "window": [
+        ("scene", lambda r: r["name"]),
+        ("window", lambda r: r["settings"]["size"]),
+        ("degrees a second", lambda r: f"{r['settings']['turn']:g}"),
+        ("fps", _number("fps", "{:.0f}")),
+        ("95% ms", _number("frame_ms_p95", "{:.0f}")),
+        ("raster", lambda r: r["repeats"][0]["raster"]),
+        ("changes a minute", _number("rasters_a_minute", "{:.0f}")),
+        ("dB to the exact path", _number("psnr", "{:.1f}")),
+        ("at least", _number("psnr_least", "{:.1f}")),
+    ],
     "codec": [
         ("scene", lambda r: r["name"]),
         ("coder", lambda r: r["coder"]),
@@ -297,6 +308,7 @@ COLUMNS: dict[str, list[Column]] = {
 TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
           "step": "A step of training", "gpu": "A step of training", "player": "Playing", "stream": "Playing while it arrives",
           "groups": "A clip in groups",
+          "window": "Playing in a window that is left to itself",
           "steady": "Playing for long, all controls shown",
           "codec": "Coding, beside what is at hand", "entropy": "Entropy coding of planes, one idea left out; one core"}
 
