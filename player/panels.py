@@ -65,6 +65,8 @@ PANEL_EM = 19.0
 """Width of the panels on the right."""
 ROWS_SHOWN = 8
 """Keyframes that are seen without scrolling."""
+LEAST_TOLD_EM = 12.0
+"""What is told of the stream stands beside the panel on the left where so much is free there, else over it."""
 REFRESH_S = 0.5
 """Pictures of time planes follow what arrives no sooner."""
 ACCENT, ERROR = imgui.ImVec4(0.95, 0.62, 0.25, 1.0), imgui.ImVec4(1.0, 0.45, 0.38, 1.0)
@@ -77,12 +79,13 @@ def show(player: "Player") -> None:
     """Build all that is to be shown in this frame."""
     width, height = player.window.size
     em = imgui.get_font_size()
-    bottom = height - 0.8 * em
+    bottom, free = height - 0.8 * em, (0.0, float(width))
     if player.show_hud:
         bottom = _transport(player, bottom)
         if player.show_planes and player.scene.is_dynamic:
             bottom = _time_planes(player, bottom - 0.4 * em)
-        _status(player, bottom - 1.2 * em)
+        right = _status(player, bottom - 1.2 * em)
+        free = (right, float(width)) if width - right > LEAST_TOLD_EM * em else free
         top = _graphs(player, 0.8 * em) if player.show_graphs else 0.8 * em
         if player.show_path:
             _camera_path(player, top, bottom - 0.4 * em)
@@ -91,13 +94,13 @@ def show(player: "Player") -> None:
     if player.show_keys:
         _key_list(player)
     if clock.monotonic() < player.notice_until:
-        _say("notice", player.notice, width, bottom - 0.8 * em, 1.0, ERROR if player.notice_is_error else None)
+        _say("notice", player.notice, (0.0, float(width)), bottom - 0.8 * em, 1.0, ERROR if player.notice_is_error else None)
     if (message := player.stream.message) is not None:
-        _say("stream", message, width, 0.8 * em, 0.0)
+        _say("stream", message, free, 0.8 * em, 0.0)
 
 
-def _status(player: "Player", bottom: float) -> None:
-    """On the left: how fast, what of the scene, how finely, from where."""
+def _status(player: "Player", bottom: float) -> float:
+    """On the left: how fast, what of the scene, how finely, from where. Where it ends."""
     em, stream = imgui.get_font_size(), player.stream
     _place(0.8 * em, 0.8 * em, most_height=bottom - 0.8 * em)
     with _panel("status", scrolls=True):
@@ -130,6 +133,7 @@ def _status(player: "Player", bottom: float) -> None:
         player.show_path = _toggle("path", player.show_path)
         imgui.same_line()
         player.show_keys = _toggle("keys", player.show_keys)
+        return imgui.get_window_pos().x + imgui.get_window_width()
 
 
 def _quality(player: "Player") -> None:
@@ -361,7 +365,7 @@ def _filming(player: "Player") -> None:
     name = film.path if len(str(film.path)) < 60 else f".../{film.path.name}"
     what = "finishing" if film.is_ending else "filming the path" if player.is_filming_path else "filming"
     share = f" of {player.path.end_s - player.path.start_s:.1f}" if player.is_filming_path else ""
-    _say("film", f"{what}: {film.duration_s:.1f}{share} s, {name}", width, 0.06 * player.window.size[1], 0.0, ACCENT)
+    _say("film", f"{what}: {film.duration_s:.1f}{share} s, {name}", (0.0, float(width)), 0.06 * player.window.size[1], 0.0, ACCENT)
 
 
 def _key_list(player: "Player") -> None:
@@ -423,11 +427,11 @@ def _place(
         imgui.set_next_window_size_constraints(imgui.ImVec2(least_width, 0), imgui.ImVec2(1e5, max(most_height, 1.0)))
 
 
-def _say(name: str, text: str, width: float, y: float, pivot: float, colour: imgui.ImVec4 | None = None) -> None:
-    """A message in the middle of the window's width, wrapped; `pivot` of its height lies at `y`."""
-    _place(width / 2, y, 0.5, pivot)
+def _say(name: str, text: str, across: tuple[float, float], y: float, pivot: float, colour: imgui.ImVec4 | None = None) -> None:
+    """A message in the middle of what is between two places across the window, wrapped; `pivot` of its height lies at `y`."""
+    _place(sum(across) / 2, y, 0.5, pivot)
     with _panel(name, imgui.WindowFlags_.no_inputs):
-        imgui.push_text_wrap_pos(0.88 * width)
+        imgui.push_text_wrap_pos(0.88 * (across[1] - across[0]))
         if colour is not None:
             imgui.push_style_color(imgui.Col_.text, colour)
         imgui.text(text)
