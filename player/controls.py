@@ -212,6 +212,9 @@ class Pace:
     """A picture that takes so many times as long as the last counts as if it took no longer than that."""
     AGREED = 4
     HOPELESS = 8.0
+    UNLIKE = 1.25
+    """A raster takes at most so many times as long as the next known one and as it would in proportion to its pixels, or as much less: what differs
+    more says that all rasters take another time by now."""
     OLD = 300
 
     budget_s: float
@@ -273,6 +276,11 @@ class Pace:
             self.forget()
         self._number += 1
         self._drawn[steps] = self._number
+        if steps not in self._times and self._times:
+            near = min(self._times, key=lambda step: abs(step - steps))
+            alike, in_proportion = self._times[near], self._times[near] * self.STEP ** (2 * (near - steps))
+            likely = min(max(seconds, min(alike, in_proportion) / self.UNLIKE), max(alike, in_proportion) * self.UNLIKE)
+            self._times = {step: time * seconds / likely for step, time in self._times.items()}
         before = self._times.setdefault(steps, seconds)
         changed = 1.0 + self.FRESH * (min(seconds / before, self.EXCEPTION) - 1.0)
         known = (step for step, number in self._drawn.items() if self._number - number < self.OLD)

@@ -187,5 +187,16 @@ def test_the_pace_is_that_of_pictures_that_follow_one_another(whole: float) -> N
     assert sum(a != b for a, b in zip(scales[100:], scales[101:])) <= 6
 
 
+@pytest.mark.parametrize("slow", [2.0, 3.5, 6.0])
+@pytest.mark.parametrize("pictures", [3, 5, 8, 12])
+def test_a_slow_start_does_not_last(slow: float, pictures: int) -> None:
+    """As while a scene is read beside the first pictures."""
+    pace, raster = Pace.of(software=True), None
+    for number in range(100):
+        whole, raster = (1.0 if pace.scale == raster else 3.0), pace.scale
+        pace.saw((0.015 + 0.12 * pace.scale**2) * whole * (slow if number < pictures else 1.0))
+    assert 0.55 < pace.scale < 0.75
+
+
 def test_a_processor_begins_coarsely() -> None:
     assert Pace.of(software=True).scale < 0.5 and Pace.of(software=False).scale == 1.0
