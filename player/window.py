@@ -580,7 +580,7 @@ class Player:
             self._measure()
         width, height = (max(1, round(side * scale)) for side in self.canvas.size)
         self.raster = (width, height)
-        self._show(self.canvas, self.view.camera(width, height))
+        self._show(self.canvas, self.view.camera(*self.canvas.size).resized(width, height))  # the same view, however sides are rounded
 
     def _sharpen(self) -> None:
         """Draw the next rows of the picture as finely as it is to be, from above, so many as do not keep the controls waiting."""

@@ -130,6 +130,7 @@ def main(scene_file: str) -> None:
     assert player.notice_is_error and not player.riding  # there is no path yet
     follow_a_path(player, press)
     see_every_pixel_once(window, player)
+    see_the_same_however_coarsely(player)
     come_to_rest(player)
     run_out_of_room(player)
     drop_files(window, player, Path(scene_file))
@@ -255,6 +256,17 @@ def reach_into_corners(player: Player) -> None:
     top, left = over.any(1).argmax(), over.any(0).argmax()
     bottom, right = height - over.any(1)[::-1].argmax(), width - over.any(0)[::-1].argmax()
     assert top < 16 and left < 16 and bottom > height - 16 and right > width - 60, (top, left, bottom, right)
+
+
+def see_the_same_however_coarsely(player: Player) -> None:
+    show, whole, seen = player._show, player.view.camera(*player.canvas.size), []
+    player._show = lambda target, camera: seen.append(camera)  # type: ignore[method-assign]
+    for scale in (0.125, 0.297, 0.42, 0.841):
+        player._picture(scale, "fast")
+    player._show = show  # type: ignore[method-assign]
+    for camera in seen:
+        assert len(seen) == 4 and (camera.fl_x / camera.width, camera.cx / camera.width) == approx((whole.fl_x / whole.width, whole.cx / whole.width))
+        assert (camera.fl_y / camera.height, camera.cy / camera.height) == approx((whole.fl_y / whole.height, whole.cy / whole.height))
 
 
 def see_every_pixel_once(window: Window, player: Player) -> None:
