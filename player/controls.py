@@ -188,8 +188,9 @@ class Pace:
     known of a raster is forgotten when it has not been drawn for OLD pictures; all is, when times are EXCEPTION times what was
     expected, or as many times less, for AGREED pictures on end.
 
-    The first picture on a raster follows no other, as the next ones may, and textures are made for it: it counts only where it takes HOPELESS
-    times the budget. And no picture counts as longer than the one before it: what one alone has to do tells little of the next.
+    The first picture on a raster follows no other, as the next ones may, and textures are made for it; and the later a picture comes, the more
+    the next has to draw. So the first NEW ones count only where they take HOPELESS times the budget. And no picture counts as longer than
+    the one before it: what one alone has to do tells little of the next.
 
     Attributes:
         budget_s: seconds a picture may take.
@@ -211,7 +212,7 @@ class Pace:
     EXCEPTION = 4.0
     """A picture that takes so many times as long as the last counts as if it took no longer than that."""
     AGREED = 4
-    HOPELESS = 8.0
+    NEW, HOPELESS = 4, 8.0
     UNLIKE = 1.25
     """A raster takes at most so many times as long as the next known one and as it would in proportion to its pixels, or as much less: what differs
     more says that all rasters take another time by now."""
@@ -230,8 +231,10 @@ class Pace:
     """Pictures on end that left room for a finer raster."""
     _on: int | None = field(default=None, repr=False)
     """The raster of the last picture."""
-    _last: float | None = field(default=None, repr=False)
-    """Its time, if it was not the first one there."""
+    _since: int = field(default=0, repr=False)
+    """Pictures on it, since another."""
+    _last: float = field(default=0.0, repr=False)
+    """The time of the last picture."""
     _odd: int = field(default=0, repr=False)
     """Pictures on end that took a time of another order."""
 
@@ -243,14 +246,12 @@ class Pace:
     def saw(self, seconds: float, budget_s: float | None = None) -> None:
         """Take in how long a picture took at the present scale, and may take."""
         steps, budget = -round(math.log(self.scale, self.STEP)), budget_s or self.budget_s
-        if steps != self._on:
-            self._on, self._last = steps, None
-            if seconds < self.HOPELESS * budget:
+        self._since = self._since + 1 if steps == self._on else 1
+        self._on, before, self._last = steps, self._last, seconds
+        if seconds < self.HOPELESS * budget:
+            if self._since <= self.NEW:
                 return
-        before, self._last = self._last, seconds
-        if before is None and seconds < self.HOPELESS * budget:
-            return
-        seconds = min(seconds, before or seconds)
+            seconds = min(seconds, before)
         self._take_in(steps, max(seconds, 1e-6))
         fixed, growing = self._fit()
         # where what no raster changes takes most of the time, a coarser one does more harm than good
