@@ -200,11 +200,11 @@ class Pace:
     STEP = 2**0.25
     LEAST = STEP**-12
     SLACK = 0.5
-    """Steps that the raster may be too large before it shrinks. It grows by one, after UP_AFTER pictures on end that left room for it; after
+    """Steps that the raster may be too large before it shrinks. It grows after UP_AFTER pictures on end that left room for a finer one; after
     twice as many for each time that it shrank from there, up to MOST_PATIENCE."""
     UP_AFTER, MOST_PATIENCE = 3, 96
-    MOST_DOWN = 3
-    """Steps after one picture."""
+    MOST_AT_ONCE = 3
+    """Steps down or up."""
     FRESH = 0.25
     """Share of the last picture in the mean time of its raster."""
     AT_NOTHING = 0.5
@@ -258,10 +258,12 @@ class Pace:
         wanted = -math.log(max(budget - fixed, 0.5 * fixed) / growing, self.STEP) / 2
         self._spare = self._spare + 1 if wanted <= steps - 1 else 0
         if self._spare >= self._patience.get(steps - 1, self.UP_AFTER):
-            steps, self._spare = steps - 1, 0
+            finer = range(max(math.ceil(wanted), steps - self.MOST_AT_ONCE), steps)
+            steps = next(step for step in finer if self._spare >= self._patience.get(step, self.UP_AFTER))
+            self._spare = 0
         elif wanted > steps + self.SLACK:
             self._patience[steps] = min(2 * self._patience.get(steps, self.UP_AFTER), self.MOST_PATIENCE)
-            steps = min(math.ceil(wanted), steps + self.MOST_DOWN)
+            steps = min(math.ceil(wanted), steps + self.MOST_AT_ONCE)
         self.scale = min(max(self.STEP**-steps, self.LEAST), 1.0)
 
     def forget(self) -> None:
