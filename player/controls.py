@@ -189,8 +189,8 @@ class Pace:
     expected, or as many times less, for AGREED pictures on end.
 
     The first picture on a raster follows no other, as the next ones may, and textures are made for it; and the later a picture comes, the more
-    the next has to draw. So the first NEW ones count only where they take HOPELESS times the budget. And no picture counts as longer than
-    the one before it: what one alone has to do tells little of the next.
+    the next has to draw. So the first NEW ones count only where one takes HOPELESS times the budget, or two on end LATE times. And no
+    picture counts as longer than the one before it: what one alone has to do tells little of the next.
 
     Attributes:
         budget_s: seconds a picture may take.
@@ -212,7 +212,7 @@ class Pace:
     EXCEPTION = 4.0
     """A picture that takes so many times as long as the last counts as if it took no longer than that."""
     AGREED = 4
-    NEW, HOPELESS = 4, 8.0
+    NEW, LATE, HOPELESS = 4, 2.5, 8.0
     UNLIKE = 1.25
     """A raster takes at most so many times as long as the next known one and as it would in proportion to its pixels, or as much less: what differs
     more says that all rasters take another time by now."""
@@ -249,9 +249,9 @@ class Pace:
         self._since = self._since + 1 if steps == self._on else 1
         self._on, before, self._last = steps, self._last, seconds
         if seconds < self.HOPELESS * budget:
-            if self._since <= self.NEW:
+            seconds = min(seconds, before if self._since > 1 else 0.0)
+            if self._since <= self.NEW and seconds < self.LATE * budget:
                 return
-            seconds = min(seconds, before)
         self._take_in(steps, max(seconds, 1e-6))
         fixed, growing = self._fit()
         # where what no raster changes takes most of the time, a coarser one does more harm than good

@@ -198,5 +198,18 @@ def test_a_slow_start_does_not_last(slow: float, pictures: int) -> None:
     assert 0.55 < pace.scale < 0.75
 
 
+@pytest.mark.parametrize("settled", [1, 2, 5, 50])
+def test_slowness_is_met_soon(settled: int) -> None:
+    """As where a camera begins to turn, and pictures cannot follow: on a raster that is new as on one that is not."""
+    pace = Pace(1 / 15, 0.5)
+    for _ in range(settled):
+        pace.saw(0.05)
+    scales = []
+    for _ in range(12):
+        pace.saw(0.8 * pace.scale**2)
+        scales.append(pace.scale)
+    assert scales[0] == pytest.approx(0.5) and scales[2] < 0.49 and scales[-1] < 0.36
+
+
 def test_a_processor_begins_coarsely() -> None:
     assert Pace.of(software=True).scale < 0.5 and Pace.of(software=False).scale == 1.0
