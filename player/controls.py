@@ -281,8 +281,8 @@ class Pace:
         self._drawn[steps] = self._number
         if steps not in self._times and self._times:
             near = min(self._times, key=lambda step: abs(step - steps))
-            alike, in_proportion = self._times[near], self._times[near] * self.STEP ** (2 * (near - steps))
-            likely = min(max(seconds, min(alike, in_proportion) / self.UNLIKE), max(alike, in_proportion) * self.UNLIKE)
+            least, most = sorted((self._times[near], self._times[near] * self.STEP ** (2 * (near - steps))))
+            likely = min(max(seconds, least / self.UNLIKE), most * self.UNLIKE)
             self._times = {step: time * seconds / likely for step, time in self._times.items()}
         before = self._times.setdefault(steps, seconds)
         changed = 1.0 + self.FRESH * (min(seconds / before, self.EXCEPTION) - 1.0)

@@ -79,13 +79,14 @@ def show(player: "Player") -> None:
     """Build all that is to be shown in this frame."""
     width, height = player.window.size
     em = imgui.get_font_size()
-    bottom, free = height - 0.8 * em, (0.0, float(width))
+    bottom = height - 0.8 * em
+    across = free = 0.0, float(width)
     if player.show_hud:
         bottom = _transport(player, bottom)
         if player.show_planes and player.scene.is_dynamic:
             bottom = _time_planes(player, bottom - 0.4 * em)
         right = _status(player, bottom - 1.2 * em)
-        free = (right, float(width)) if width - right > LEAST_TOLD_EM * em else free
+        free = (right, float(width)) if width - right > LEAST_TOLD_EM * em else across
         top = _graphs(player, 0.8 * em) if player.show_graphs else 0.8 * em
         if player.show_path:
             _camera_path(player, top, bottom - 0.4 * em)
@@ -94,7 +95,7 @@ def show(player: "Player") -> None:
     if player.show_keys:
         _key_list(player)
     if clock.monotonic() < player.notice_until:
-        _say("notice", player.notice, (0.0, float(width)), bottom - 0.8 * em, 1.0, ERROR if player.notice_is_error else None)
+        _say("notice", player.notice, across, bottom - 0.8 * em, 1.0, ERROR if player.notice_is_error else None)
     if (message := player.stream.message) is not None:
         _say("stream", message, free, 0.8 * em, 0.0)
 

@@ -645,8 +645,8 @@ class Renderer:
         _set(doubt, seen_predicted=SEEN_UNIT, tolerance=shot.quality.tolerance * (MOVED_TOLERANCE if moved else 1.0), **common)
         self._draw(doubts.framebuffer, vertices)
         if self._share_of(doubts) > MOST_DOUBTED * before.marched:
-            marched, jumped = self._draw_alone(draw, part, picture, camera), self._since_s(shot, before) > JUMP_S
-            self._shots[part, size] = replace(shot, marched=marched, alone=0 if jumped else ALONE_FOR)
+            marched = self._draw_alone(draw, part, picture, camera)
+            self._shots[part, size] = replace(shot, marched=marched, alone=0 if self._since_s(shot, before) > JUMP_S else ALONE_FOR)
             return picture
         settle, vertices = self._program("settle.glsl", self.layout)
         _set(settle, **common)

@@ -400,10 +400,7 @@ def _steady(options: argparse.Namespace, origin: results.Record) -> Iterator[res
 
     for source in options.scenes:
         record = _record("steady", source, origin, {"size": "{}x{}".format(*options.size), "frames": options.frames})
-        print(f"kpbench: {record['name']}", file=sys.stderr)
-        job = steady.Steady(source, options.size, options.frames)
-        repeats = [_alone(steady.measure, job) for _ in range(options.repeats)]
-        yield record | {"seed": None, "renderer": repeats[0].pop("renderer"), "repeats": repeats}
+        yield _in_window(record, options.repeats, steady.measure, steady.Steady(source, options.size, options.frames))
 
 
 def _window(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
@@ -412,11 +409,15 @@ def _window(options: argparse.Namespace, origin: results.Record) -> Iterator[res
 
     for source in options.scenes:
         settings = {"size": "{}x{}".format(*options.size), "seconds": options.seconds, "turn": options.turn}
-        record = _record("window", source, origin, settings)
-        print(f"kpbench: {record['name']}", file=sys.stderr)
         job = pacing.Pacing(source, options.size, options.seconds, options.turn)
-        repeats = [_alone(pacing.measure, job) for _ in range(options.repeats)]
-        yield record | {"seed": None, "renderer": repeats[0].pop("renderer"), "repeats": repeats}
+        yield _in_window(_record("window", source, origin, settings), options.repeats, pacing.measure, job)
+
+
+def _in_window(record: results.Record, repeats: int, measure: Callable[[Any], results.Record], job: object) -> results.Record:
+    """A record with what was measured, each time in a process of its own."""
+    print(f"kpbench: {record['name']}", file=sys.stderr)
+    found = [_alone(measure, job) for _ in range(repeats)]
+    return record | {"seed": None, "renderer": found[0].pop("renderer"), "repeats": found}
 
 
 def _renderer(_: None) -> str:

@@ -1,6 +1,7 @@
 """What kpbench measures of a window that is left to itself: how often it shows a picture, on how fine a raster, and how near to the exact one."""
 
 import math
+import statistics
 import time as clock
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,13 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from kpc.format.container import open_source
 from kpc.format.fidelity import psnr
 from kpc.player import offscreen
 from kpc.player.desktop import glfw
 from kpc.player.preferences import Preferences
-from kpc.player.reel import Reel
-from kpc.player.window import Player, Window
+from kpc.tools.steady import in_window
 
 LEAD_IN_S = 5.0
 """Until the raster has settled."""
@@ -39,11 +38,7 @@ def measure(job: Pacing) -> dict[str, Any]:
     Raises:
         DisplayError: there is no display.
     """
-    window = Window("kpbench window", job.size)
-    stream = Reel(open_source(str(job.scene)))
-    try:
-        glfw.swap_interval(0)
-        player = Player(window, stream, Preferences())
+    with in_window(job.scene, job.size, Preferences()) as player:
         began = now = clock.perf_counter()
         seconds: list[float] = []
         rasters: list[tuple[int, int]] = []
@@ -59,14 +54,14 @@ def measure(job: Pacing) -> dict[str, Any]:
             seconds.append(clock.perf_counter() - now)
             rasters.append(player.raster)
             if now - began - LEAD_IN_S >= job.seconds * len(kept) / COMPARED:
-                kept.append((player.view, player.playback.time, player._pixels() / 255))
+                kept.append((player.view, player.playback.time, player._pixels()))
         each = []
         for player.view, player.playback.time, shown in kept:
             player._picture(1.0, "reference", still=True)
-            each.append(psnr(shown - player._pixels() / 255, 0))
-        middle = sorted(rasters)[len(rasters) // 2]
+            each.append(psnr(shown / 255, player._pixels() / 255))
+        middle = statistics.median_high(rasters)
         return {
-            "renderer": offscreen.describe(window.ctx),
+            "renderer": offscreen.describe(player.ctx),
             "fps": len(seconds) / sum(seconds),
             "frame_ms_p95": 1e3 * float(np.percentile(seconds, 95)),
             "raster": "{}x{}".format(*middle),
@@ -75,6 +70,3 @@ def measure(job: Pacing) -> dict[str, Any]:
             "psnr": float(np.mean(each)),
             "psnr_least": min(each),
         }
-    finally:
-        stream.close()
-        window.close()

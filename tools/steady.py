@@ -1,9 +1,10 @@
 """What kpbench measures of long playback: that it takes no more memory the longer it lasts, and makes nothing anew on the card."""
 
+import contextlib
 import os
 import time as clock
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,11 +45,8 @@ def measure(job: Steady) -> dict[str, Any]:
     Raises:
         DisplayError: there is no display.
     """
-    window = Window("kpbench steady", job.size)
-    stream = Reel(open_source(str(job.scene)))
-    try:
-        glfw.swap_interval(0)
-        player = Player(window, stream, Preferences(graphs=True, planes=True))
+    with in_window(job.scene, job.size, Preferences(graphs=True, planes=True)) as player:
+        window, stream = player.window, player.stream
         player.show_path = True
         player.dial.pace = Pace(budget_s=3600.0)  # the raster stays as it is, however busy the machine
         for _ in range(2):
@@ -69,7 +67,6 @@ def measure(job: Steady) -> dict[str, Any]:
                 numbers.append(number)
                 held.append(memory_bytes())
         seconds = clock.perf_counter() - started
-        player.close()
         slope = float(np.polyfit(numbers, held, 1)[0]) if len(held) > 1 else 0.0
         return {
             "renderer": offscreen.describe(window.ctx),
@@ -83,9 +80,19 @@ def measure(job: Steady) -> dict[str, Any]:
             "made": dict(made),
             "gpu_memory_bytes": player.renderer.memory_bytes,
         }
-    finally:
-        stream.close()
-        window.close()
+
+
+@contextlib.contextmanager
+def in_window(scene: Path, size: tuple[int, int], preferences: Preferences) -> Iterator[Player]:
+    """A player that waits for no screen.
+
+    Raises:
+        DisplayError: there is no display.
+    """
+    with contextlib.closing(Window("kpbench", size)) as window, contextlib.closing(Reel(open_source(str(scene)))) as stream:
+        glfw.swap_interval(0)
+        with contextlib.closing(Player(window, stream, preferences)) as player:
+            yield player
 
 
 def count_makers(ctx: moderngl.Context) -> Counter[str]:
