@@ -263,6 +263,17 @@ def _bounds(blocks: np.ndarray) -> tuple[int, int, int, int]:
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
+def _shares(blocks: tuple[int, int, int, int], count: tuple[int, int]) -> Bounds:
+    """A rectangle of (columns, rows) of blocks, as a part of the picture."""
+    left, bottom, right, top = blocks
+    return left / count[0], bottom / count[1], right / count[0], top / count[1]
+
+
+def _around(one: Bounds, other: Bounds) -> Bounds:
+    """The least rectangle that holds both."""
+    return min(one[0], other[0]), min(one[1], other[1]), max(one[2], other[2]), max(one[3], other[3])
+
+
 def is_software(ctx: moderngl.Context) -> bool:
     """Whether a processor stands in for a graphics card."""
     return any(word in ctx.info["GL_RENDERER"].lower() for word in SOFTWARE)
@@ -317,6 +328,7 @@ class Renderer:
             self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._distances: dict[int, np.ndarray] = {}
         self._covers: dict[int, Cover] = {}
+        self._view_covered: tuple[object, np.ndarray | None] | None = None
         weights = decoder_arrays(scene.decoder, scene, self.layout)
         if sum(map(len, weights.values())) > CONSTANTS:
             raise DisplayError(
@@ -552,10 +564,8 @@ class Renderer:
         if blocks is None:
             draw(target, camera)
             return 1.0, EVERYWHERE
-        rows, columns = blocks.shape
-        left, bottom, right, top = _bounds(blocks)
         self._empty(target)
-        target.drawn = left / columns, bottom / rows, right / columns, top / rows
+        target.drawn = _shares(_bounds(blocks), blocks.shape[::-1])
         covered = self._target(part, blocks.shape[::-1], DOUBTS)
         covered.seen.write(np.repeat(blocks[..., None], 4, axis=-1).astype(np.float32))
         self._draw_doubted(draw, target, camera, covered)
@@ -621,36 +631,38 @@ class Renderer:
             return picture
         shot = replace(shot, turn=before.turn + 1, number=before.number, marched=before.marched)
         picture = self._target(part, size, before.number)
+        blocks = tuple(-(-side // BLOCK) for side in size)
+        covered = self._covered(camera)
+        within = (0, 0, *blocks) if covered is None else _bounds(covered)
+        bounds = EVERYWHERE if covered is None else _shares(within, blocks)
         moved = _lens_of(camera) != _lens_of(before.camera)
         if moved:
             shot = replace(shot, number=PICTURE + OTHER_PICTURE - before.number)
-            picture = self._predicted(picture, self._target(part, size, shot.number), before.camera, camera)
-        picture.drawn = EVERYWHERE
-        blocks = tuple(-(-side // BLOCK) for side in size)
+            picture = self._predicted(picture, self._target(part, size, shot.number), before.camera, camera, bounds)
+        picture.drawn = bounds = _around(picture.drawn, bounds)
         tiles = self._tiles
         raster = tiles.raster(blocks) if tiles else blocks
         probes, doubts = self._target(part, raster, PROBES), self._target(part, blocks, DOUBTS)
         common = {"size": tuple(map(float, size)), "turn": shot.turn, "raster": tuple(map(float, raster)),
                   "seen_probes": SEEN_PROBES_UNIT, "met_probes": MET_PROBES_UNIT}  # fmt: skip
-        bounds = 0, 0, *blocks
-        if (covered := self._covered(camera)) is not None:
+        if covered is not None:
             self._empty(probes)
-            bounds = _bounds(covered)
         squares = math.prod(tiles.squares(blocks)) if tiles else 0
-        draw(probes, camera, ONLY_PROBES, squares, bounds=tuple(map(float, bounds)), **common)
+        draw(probes, camera, ONLY_PROBES, squares, bounds=tuple(map(float, within)), **common)
         probes.seen.use(SEEN_PROBES_UNIT)
         probes.met.use(MET_PROBES_UNIT)
         picture.seen.use(SEEN_UNIT)
         doubt, vertices = self._program("doubt.glsl", self.layout, moved=moved)
         _set(doubt, seen_predicted=SEEN_UNIT, tolerance=shot.quality.tolerance * (MOVED_TOLERANCE if moved else 1.0), **common)
-        self._draw(doubts.framebuffer, vertices)
+        doubts.framebuffer.clear()
+        self._draw(doubts.framebuffer, vertices, within=bounds)
         if self._share_of(doubts) > MOST_DOUBTED * before.marched:
             marched = self._draw_alone(draw, part, picture, camera)
             self._shots[part, size] = replace(shot, marched=marched, alone=0 if self._since_s(shot, before) > JUMP_S else ALONE_FOR)
             return picture
         settle, vertices = self._program("settle.glsl", self.layout)
         _set(settle, **common)
-        self._draw(picture.framebuffer, vertices, points=math.prod(blocks))
+        self._draw(picture.framebuffer, vertices, points=math.prod(blocks), within=bounds)
         self._draw_doubted(draw, picture, camera, doubts)
         self._shots[part, size] = shot
         return picture
@@ -667,15 +679,18 @@ class Renderer:
     def _since_s(self, shot: Shot, before: Shot) -> float:
         return abs(shot.time - before.time) * self.scene.clip.duration_s
 
-    def _predicted(self, old: Target, new: Target, before: Camera, now: Camera) -> Target:
-        """A picture as it was before, seen from where the camera is now."""
+    def _predicted(self, old: Target, new: Target, before: Camera, now: Camera, bounds: Bounds = EVERYWHERE) -> Target:
+        """A picture as it was before, seen from where the camera is now: as much as touches `bounds`."""
         predict, vertices = self._program("predict.glsl", self.layout)
         lens_before = {f"{name}_before": value for name, value in _lens_of(before).items()}
         size = tuple(map(float, new.seen.size))
         _set(predict, seen_before=SEEN_UNIT, met_before=MET_UNIT, size=size, **_lens_of(now), **lens_before)
         old.seen.use(SEEN_UNIT)
         old.met.use(MET_UNIT)
-        self._draw(new.framebuffer, vertices)
+        if bounds not in (EVERYWHERE, new.drawn):
+            self._empty(new)
+        self._draw(new.framebuffer, vertices, within=bounds)
+        new.drawn = bounds
         return new
 
     def _scales_shared(self) -> int:
@@ -716,8 +731,11 @@ class Renderer:
             return None
         if self._slot not in self._covers:
             self._covers[self._slot] = Cover.of(self.scene.occupancy[self._slot], self.scene.aabb)
-        blocks = self._covers[self._slot].blocks(camera, BLOCK)
-        return None if blocks is None or blocks.mean() > MOST_COVERED else blocks
+        view = self._slot, camera.width, _lens_of(camera)
+        if self._view_covered is None or self._view_covered[0] != view:
+            blocks = self._covers[self._slot].blocks(camera, BLOCK)
+            self._view_covered = view, None if blocks is None or blocks.mean() > MOST_COVERED else blocks
+        return self._view_covered[1]
 
     def rays_across(self, camera: Camera) -> int:
         """As many as a pixel spans texels, as far as `quality` and PIXELS_MARCHED allow. One where space is mapped: there texels differ."""

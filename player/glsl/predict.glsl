@@ -25,9 +25,9 @@ const float AROUND = 2.0;   // pixels across and up
 
 // How far from the eye of now that is which was seen at `fragment` before.
 float distance_at(vec2 fragment, out float samples) {
-    vec2 at = (floor(clamp(fragment, vec2(0.0), size - 0.5)) + 0.5) / size;
-    float opacity = textureLod(seen_before, at, 0.0).a;
-    vec4 sums = textureLod(met_before, at, 0.0);
+    ivec2 at = ivec2(clamp(fragment, vec2(0.0), size - 0.5));
+    float opacity = texelFetch(seen_before, at, 0).a;
+    vec4 sums = texelFetch(met_before, at, 0);
     samples = sums.y;
     if (opacity <= 0.0) return NOWHERE;
     return length(eye_before + sums.x / opacity * camera_direction(fragment, height, lens_before, axes_before) - eye);
