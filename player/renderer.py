@@ -147,6 +147,25 @@ class Target:
 
 
 @dataclass
+class Canvas:
+    """What is shown of a picture that is to be enlarged. In bytes: twelve of those a processor reads in less than half of the time that it
+    takes for five filtered vectors of floats."""
+
+    shown: moderngl.Texture
+    framebuffer: moderngl.Framebuffer
+
+    @staticmethod
+    def of(ctx: moderngl.Context, size: tuple[int, int]) -> "Canvas":
+        with room_on(ctx, f"a picture of {size[0]}x{size[1]}"):
+            shown = ctx.texture(size, 4)
+            return Canvas(shown, ctx.framebuffer([shown]))
+
+    def release(self) -> None:
+        self.framebuffer.release()
+        self.shown.release()
+
+
+@dataclass
 class Folded:
     """What folding takes: the planes as fine as they are to be written, the rows likewise, and where their product goes."""
 
@@ -349,6 +368,7 @@ class Renderer:
         self._cells_written: tuple[object, ...] | None = None
         self._programs: dict[tuple[object, ...], tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]] = {}
         self._targets: dict[tuple[Part, tuple[int, int], int], Target] = {}
+        self._canvas: Canvas | None = None
         self.check()
 
     def check(self) -> None:
@@ -362,15 +382,16 @@ class Renderer:
     def release(self) -> None:
         """Give back all that the scene takes of the card."""
         self.ctx.detect_framebuffer(0).use()  # moderngl would bind again what it knows as bound, though it is gone
-        things: list[Target | Folded | FoldedInMemory | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
+        things: list[Target | Canvas | Folded | FoldedInMemory | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
         things = [self._planes, self._row_texture, self._cells, *self._targets.values()]
         things += [thing for pair in self._programs.values() for thing in reversed(pair)]
         things += [] if self._folded is None else [self._folded]
-        things += [] if self._motion_texture is None else [self._motion_texture]
+        things += [thing for thing in (self._canvas, self._motion_texture) if thing is not None]
         for thing in things:
             thing.release()
         self._targets.clear()
         self._programs.clear()
+        self._canvas = None
 
     @property
     def in_half(self) -> bool:
@@ -389,6 +410,7 @@ class Renderer:
         """Bytes of the textures and buffers that hold the scene and its pictures."""
         textures = [self._planes, self._row_texture]
         textures += [texture for target in self._targets.values() for texture in (target.seen, target.met)]
+        textures += [self._canvas.shown] if self._canvas else []
         folded = self._folded.memory_bytes if self._folded else 0
         motion = 0 if self._motion_texture is None else 16 * int(np.prod(self._motion_texture.size))
         return sum(map(_bytes_of, textures)) + folded + int(self.scene.occupancy[0].size) + motion
@@ -443,27 +465,47 @@ class Renderer:
         without, view = target, Look.COLOUR.value if look is Look.OCCUPANCY else look.value
         if part is Part.DYNAMIC and look is Look.COLOUR:
             without, view = self.march(camera, time, part=Part.STATIC, appearance=appearance), 1
+        bounds = target.drawn if view == Look.COLOUR.value and share == 1 else EVERYWHERE
+        if bounds != EVERYWHERE:
+            beyond = 3 / np.array(target.seen.size)  # pixels that its edge, its pixels and those in between reach
+            bounds = (*(bounds[:2] - beyond), *(bounds[2:] + beyond))
+        canvas = None if target.seen.size == screen.size else self._canvas_of(target.seen.size)
+        into = canvas.framebuffer if canvas else screen
         present, vertices = self._program("present.glsl", self.layout, view=view)
         _set(
             present,
             seen=SEEN_UNIT,
             met=MET_UNIT,
             without=WITHOUT_UNIT,
-            viewport=tuple(map(float, screen.size)),
+            viewport=tuple(map(float, into.size)),
             depths=depths,
             most_samples=most_samples,
-            share=share,
+            share=1.0 if canvas else share,
         )
         target.seen.use(SEEN_UNIT)
         target.met.use(MET_UNIT)
         without.seen.use(WITHOUT_UNIT)
-        bounds = target.drawn if view == Look.COLOUR.value and share == 1 else EVERYWHERE
+        self._show_on(into, vertices, bounds, over=not canvas and share < 1)
+        if canvas:
+            enlarge, vertices = self._program("enlarge.glsl", self.layout)
+            _set(enlarge, shown_small=SEEN_UNIT, viewport=tuple(map(float, screen.size)), share=share)
+            canvas.shown.use(SEEN_UNIT)
+            self._show_on(screen, vertices, bounds, over=share < 1)
+
+    def _show_on(self, screen: moderngl.Framebuffer, vertices: moderngl.VertexArray, bounds: Bounds, over: bool) -> None:
+        """Draw what touches `bounds`, and what rays see that meet nothing around it."""
         if bounds != EVERYWHERE:
             screen.scissor = None
             screen.clear(*self.scene.background, 1.0)
-            beyond = 3 / np.array(target.seen.size)  # pixels that its edge, its pixels and those in between reach
-            bounds = (*(bounds[:2] - beyond), *(bounds[2:] + beyond))
-        self._draw(screen, vertices, over=share < 1, within=bounds)
+        self._draw(screen, vertices, over=over, within=bounds)
+
+    def _canvas_of(self, size: tuple[int, int]) -> Canvas:
+        """One of this size; the last one is kept."""
+        if self._canvas is None or self._canvas.shown.size != size:
+            if self._canvas is not None:
+                self._canvas.release()
+            self._canvas = Canvas.of(self.ctx, size)
+        return self._canvas
 
     def march(
         self, camera: Camera, time: float, *, part: Part = Part.FULL, program: str = "march.glsl",

@@ -5,9 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import gl
+import moderngl
 import numpy as np
 import pytest
+from PIL import Image
 from scenes import SPACES, displaced, hybrid, look_at, surrounded, tiny_scene, varied
+from test_glsl import cubic
 
 from kpc.encoder.prune import without
 from kpc.format import file
@@ -325,3 +328,31 @@ def test_conformance_files_are_drawn_at_every_quality(name: str) -> None:
         assert np.isfinite(drawn.rgb).all()
     check(drawn, render(scene, camera, 0.4))
     renderer.release()
+
+
+def test_a_small_picture_is_enlarged_by_more_than_straight_lines() -> None:
+    """A screen of four times the pixels shows what the cubic makes of the small picture."""
+    ctx, scene, camera = gl.context(), tiny_scene(4), CAMERAS["outside"]
+    renderer, screens = Renderer(ctx, scene), {}
+    for scale in (1, 2):
+        screens[scale] = ctx.simple_framebuffer((camera.width * scale, camera.height * scale), 4)
+        renderer.show(screens[scale], camera, 0.62)
+    small, large = (shown_on(screen) for screen in screens.values())
+    x, y = ((np.arange(2 * n) + 0.5) / (2 * n) for n in (camera.width, camera.height))
+    places = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    wanted = cubic(small, *places.T).reshape(large.shape).clip(0, 1)
+    assert np.abs(large - wanted).max() < 1.01 / 255
+
+    straight = np.asarray(Image.fromarray((255 * small).round().astype(np.uint8)).resize(screens[2].size, Image.Resampling.BILINEAR)) / 255
+    assert np.abs(straight - wanted).max() > 4 / 255
+
+    for share in (0.25, 1.0):  # and over what is there
+        screens[2].clear(0.2, 0.4, 0.6, 1.0)
+        renderer.show(screens[2], camera, 0.62, share=share)
+        np.testing.assert_allclose(shown_on(screens[2]), share * large + (1 - share) * np.array([0.2, 0.4, 0.6]), atol=1.5 / 255)
+
+
+def shown_on(screen: moderngl.Framebuffer) -> np.ndarray:
+    """(height, width, 3) float64 in [0, 1], the lowest row first."""
+    width, height = screen.size
+    return np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(height, width, 3) / 255

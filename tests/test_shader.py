@@ -54,7 +54,7 @@ def test_a_missing_file_is_named() -> None:
         shader.compose("a", written={"a": '#include "nowhere.glsl"'})
 
 
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "refine.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "average.glsl", "nothing.glsl", "predict.glsl", "doubt.glsl", "settle.glsl",
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "refine.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "enlarge.glsl", "average.glsl", "nothing.glsl", "predict.glsl", "doubt.glsl", "settle.glsl",
                                   *chain(*VERTICES.values()), "fullscreen.glsl"])  # fmt: skip
 def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
     scene = tiny_scene(0)
@@ -99,7 +99,7 @@ def test_constants_are_exact() -> None:
 @pytest.mark.parametrize("space", ["box", "contracted", "ndc", "hybrid"])
 @pytest.mark.parametrize("rows", [0, 1])
 @pytest.mark.parametrize("motion", [0, 1])
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "refine.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "average.glsl", "nothing.glsl", "predict.glsl", "doubt.glsl", "settle.glsl"])
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "refine.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "enlarge.glsl", "average.glsl", "nothing.glsl", "predict.glsl", "doubt.glsl", "settle.glsl"])
 def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, rows: int, space: str) -> None:
     ctx = gl.context()
     if "GL_ARB_ES3_compatibility" not in ctx.extensions:
