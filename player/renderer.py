@@ -461,10 +461,10 @@ class Renderer:
             target = self.march(camera, time, part=Part.STATIC, program="cells.glsl")
         else:
             shown = Part.STATIC if part is Part.STATIC else Part.FULL
-            target = self.march(camera, time, part=shown, appearance=appearance)
+            target = self.march(camera, time, part=shown, appearance=appearance, small=True)
         without, view = target, Look.COLOUR.value if look is Look.OCCUPANCY else look.value
         if part is Part.DYNAMIC and look is Look.COLOUR:
-            without, view = self.march(camera, time, part=Part.STATIC, appearance=appearance), 1
+            without, view = self.march(camera, time, part=Part.STATIC, appearance=appearance, small=True), 1
         bounds = target.drawn if view == Look.COLOUR.value and share == 1 else EVERYWHERE
         if bounds != EVERYWHERE:
             beyond = 3 / np.array(target.seen.size)  # pixels that its edge, its pixels and those in between reach
@@ -509,11 +509,12 @@ class Renderer:
 
     def march(
         self, camera: Camera, time: float, *, part: Part = Part.FULL, program: str = "march.glsl",
-        appearance: np.ndarray | None = None,
+        appearance: np.ndarray | None = None, small: bool = False,
     ) -> Target:
         """Draw into a target of the camera's size, which stays valid until the next march of the same part and size.
 
-        Where `quality` asks for a lower resolution or several rays a pixel, into a smaller or larger one first.
+        Where `quality` asks for a lower resolution or several rays a pixel, into a smaller or larger one first; `small`: a smaller one is left
+        so.
 
         `part` is FULL or STATIC. `program` is march.glsl or another that takes a subset of its uniforms. `appearance` as in
         `reference.code_of`.
@@ -581,7 +582,7 @@ class Renderer:
             self._draw_alone(draw, part, target := self._target(part, raster), camera)
         else:
             draw(target := self._target(part, raster))
-        if raster == size:
+        if raster == size or small and across == 1:
             return target
         return self._resampled(target, self._target(part, size), across)
 
