@@ -367,7 +367,7 @@ def test_how_far_blocks_are_off_is_told_by_bends(size: tuple[int, int]) -> None:
     here = padded[1:-1, 1:-1]
     bends = np.abs(padded[1:-1, :-2] + padded[1:-1, 2:] - 2 * here) + np.abs(padded[:-2, 1:-1] + padded[2:, 1:-1] - 2 * here)
     columns, rows = (np.minimum((2 * np.arange(2 * n) + 1) * fewer // side, fewer - 1) for n, fewer, side in zip(blocks, few, size))
-    squares = np.mean(bends**2 / 96, axis=2)[rows[:, None], columns]
+    squares = np.mean((bends / 8) ** 2, axis=2)[rows[:, None], columns]
     wanted = squares.reshape(blocks[1], 2, blocks[0], 2).mean((1, 3))
     np.testing.assert_allclose(got, np.repeat(wanted[..., None], 4, axis=2), rtol=1e-4)
 

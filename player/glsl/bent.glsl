@@ -1,13 +1,11 @@
 // How far colours of blocks of a picture are off, in the mean of squares, where a cubic interpolates them from a march of fewer rays: a
-// 96th of the squares of what colours bend by from one of those rays to the next. Of blocks of pictures of soldier, room and liam of 640x480 and
-// 800x600, squares of bends sum up to 79 to 159 times those of errors; of 320x240, where rays are too far apart for that, to 42 to 77.
+// 64th of the squares of what colours bend by from one of those rays to the next. Of pictures of soldier, room and liam, squares of bends sum up
+// to 79 to 159 times those of errors at 640x480 and 800x600, and to 42 to 77 at 320x240, where rays are too far apart for a cubic.
 
 #include "probes.glsl"
 
 uniform sampler2D seen_coarse;
 uniform vec2 size;  // of the picture, pixels
-
-const float BENDS = 96.0;
 
 layout(location = 0) out vec4 missed;
 
@@ -21,5 +19,5 @@ void main() {
          + abs(texelFetch(seen_coarse, ivec2(at.x, max(at.y - 1.0, 0.0)), 0).rgb + texelFetch(seen_coarse, ivec2(at.x, min(at.y + 1.0, last.y)), 0).rgb - here);
     squares += bend * bend;
 #end
-    missed = vec4(dot(squares, vec3(1.0 / (3.0 * 4.0 * BENDS))));
+    missed = vec4(dot(squares, vec3(1.0 / (3.0 * 4.0 * 64.0))));
 }
