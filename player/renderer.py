@@ -744,7 +744,7 @@ class Renderer:
     def _resampled(self, marched: Target, target: Target, across: int) -> Target:
         """A picture of one size in another: the mean of `across` rays across a pixel, or stretched."""
         if across == 1:
-            return self._stretch(marched, target)
+            return self._stretch(marched, target, cubic=True)
         program, vertices = self._program("average.glsl", self.layout)
         _set(program, seen_fine=SEEN_UNIT, met_fine=MET_UNIT, across=across)
         marched.seen.use(SEEN_UNIT)
@@ -753,9 +753,9 @@ class Renderer:
         target.drawn = EVERYWHERE
         return target
 
-    def _stretch(self, marched: Target, target: Target, bounds: Bounds = EVERYWHERE) -> Target:
+    def _stretch(self, marched: Target, target: Target, bounds: Bounds = EVERYWHERE, cubic: bool = False) -> Target:
         """A picture in a larger one: as much as touches `bounds`."""
-        program, vertices = self._program("upscale.glsl", self.layout)
+        program, vertices = self._program("upscale.glsl", self.layout, cubic=cubic)
         _set(program, seen_small=SEEN_UNIT, met_small=MET_UNIT, size=tuple(map(float, target.seen.size)))
         marched.seen.use(SEEN_UNIT)
         marched.met.use(MET_UNIT)
@@ -829,12 +829,12 @@ class Renderer:
 
     def _program(
         self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
-        shared: int = 0, pixels: int = ALL, moved: bool = False, view: int = 0,
+        shared: int = 0, pixels: int = ALL, moved: bool = False, cubic: bool = False, view: int = 0,
         compute: bool = False,
     ) -> tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
         tiles = self._tiles
-        key = name, layout.refined, rows, displaced, drawn, shared, pixels, moved, view, compute, tiles
+        key = name, layout.refined, rows, displaced, drawn, shared, pixels, moved, cubic, view, compute, tiles
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
@@ -850,6 +850,7 @@ class Renderer:
             "SHARED": shared,
             "PIXELS": pixels,
             "MOVED": int(moved),
+            "CUBIC": int(cubic),
             "VIEW": view,
             "COMPUTE": int(compute),
             "TILE": tiles.tile if tiles else MORE_THAN_A_RASTER,

@@ -58,7 +58,7 @@ def test_compute_shaders_draw_the_same(space: str) -> None:
         for name, renderer.quality in qualities.items():
             pictures[name, renderer.compute] = renderer.render(camera, 0.3)
     renderer.check()
-    assert psnr(pictures["bent", False].rgb, pictures["bent", True].rgb) > 40  # blocks that bend by just so much, as along an edge, may go either way
+    assert psnr(pictures["bent", False].rgb, pictures["bent", True].rgb) > 50  # a block that bends by just so much may go either way
     for name in ("reference", "balanced", "fine"):
         one, other = pictures[name, False], pictures[name, True]
         assert np.mean(np.abs(one.rgb - other.rgb).max(axis=2) < 1 / 255) > 0.999 and psnr(one.rgb, other.rgb) > 55, name
@@ -346,7 +346,7 @@ def test_interpolated_pixels_are_off_by_no_more_than_may_be(size: tuple[int, int
     # Cells end this scene abruptly: of edges so sharp bends tell less than half, and slivers are met by no coarser ray at all.
     assert all(off[blur] < 4 * blur + 1.5e-3 for blur in blurs)
     assert list(off.values()) == sorted(off.values()) and all(shares[more] <= shares[less] for less, more in zip(blurs[1:], blurs[2:]))
-    assert off[1.0] > (4 if software else 1) * off[0.002] and (not software or shares[1e-6] > 2 * shares[1.0])
+    assert off[1.0] > 4 * off[0.002] and (not software or shares[1e-6] > 2 * shares[1.0])
     assert np.abs(pictures[0.01].opacity - whole.opacity).mean() < 0.01
 
 

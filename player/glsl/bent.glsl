@@ -1,6 +1,6 @@
-// How far colours of blocks of a picture are off, in the mean of squares, where a cubic interpolates them from a march of fewer rays: a
-// 64th of the squares of what colours bend by from one of those rays to the next. Of pictures of soldier, room and liam, squares of bends sum up
-// to 79 to 159 times those of errors at 640x480 and 800x600, and to 42 to 77 at 320x240, where rays are too far apart for a cubic.
+// How far colours of blocks of a picture are off, in the mean of squares, where they are interpolated from a march of fewer rays: an
+// eighth of what colours bend by from one of those rays to the next. Of a parabola that is exact, between its rays. Of an edge it is
+// not, but of all blocks of a picture, of soldier, room and liam, squares of bends sum up to 62 to 75 times those of errors.
 
 #include "probes.glsl"
 

@@ -1,4 +1,6 @@
-// A picture of a march stretched to a larger one: colours by a cubic, and by straight lines what is divided by one another.
+// A picture of a march stretched to a larger one, by straight lines.
+//
+// CUBIC: 1 where colours are by a cubic, for what is shown as it is. Where what is off is marched again, it would take longer than it spares.
 
 #include "cubic.glsl"
 
@@ -11,6 +13,9 @@ layout(location = 1) out vec4 met;
 
 void main() {
     vec2 at = gl_FragCoord.xy / size;
-    seen = vec4(clamp(cubic(seen_small, at), 0.0, 1.0), textureLod(seen_small, at, 0.0).a);
+    seen = textureLod(seen_small, at, 0.0);
+#if CUBIC
+    seen.rgb = clamp(cubic(seen_small, at), 0.0, 1.0);
+#endif
     met = textureLod(met_small, at, 0.0);
 }
