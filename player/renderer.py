@@ -897,7 +897,7 @@ class Renderer:
             self._distances[slot] = distances(self.scene.occupancy[slot])
         free = self._distances[slot]
         if thinning is not None:
-            free = np.where(thinning.empty(slot, self._folded.rows, time, self.quality.thin), np.uint8(1), free)
+            free = free | thinning.empty(slot, self._folded.rows, time, self.quality.thin)  # 0 in what is occupied, 1 in what is so and empty
         self._cells.write(free.tobytes())
         self._slot, self._cells_written = slot, cells
 

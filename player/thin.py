@@ -24,11 +24,9 @@ TEXELS_A_CELL = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """Those of the occupied cells of a slot: where they are, in [0, 1]^3, and their numbers in a (Nz + 1, Ny + 1, Nx + 1) grid; and the cells,
-    z, y, x."""
+    """Those of the occupied cells of a slot: where they are, in [0, 1]^3, and their numbers in a (Nz + 1, Ny + 1, Nx + 1) grid."""
 
     slot: int
-    cells: np.ndarray
     places: np.ndarray
     number: np.ndarray
 
@@ -38,7 +36,7 @@ class Corners:
         for z, y, x in np.ndindex(2, 2, 2):
             at[z : z + len(occupied), y : y + occupied.shape[1], x : x + occupied.shape[2]] |= occupied
         places = np.argwhere(at)[:, ::-1] / np.array(occupied.shape[::-1])
-        return Corners(slot, np.argwhere(occupied).astype(np.int32), places.astype(np.float32), np.flatnonzero(at))
+        return Corners(slot, places.astype(np.float32), np.flatnonzero(at))
 
 
 class Thinning:
@@ -52,7 +50,7 @@ class Thinning:
         self._scene, self._layout = scene, layout
         self.planes: list[np.ndarray] = []
         self._folded: list[np.ndarray] = []
-        self._log_density = np.empty([side + 1 for side in scene.occupancy.shape[1:]], np.float32)
+        self._log_density = np.zeros([side + 1 for side in scene.occupancy.shape[1:]], np.float32)
         weights = decoder_arrays(scene.decoder, scene, layout)["density_weight"]
         self._weights = [part.reshape(-1) for part in np.split(weights, layout.first_layers[1:])]
         self._corners: Corners | None = None
@@ -84,16 +82,18 @@ class Thinning:
         """(Nz, Ny, Nx) bool: cells of a slot at whose corners a step of the scene has less than this alpha. `rows`: `Rows.at` the time, refined
         as the layout."""
         occupied = self._scene.occupancy[slot]
-        out = np.zeros_like(occupied)
         limit = math.log(-math.log1p(-alpha) * self._scene.extent / self._scene.step)
         if limit <= -LOG_DENSITY_LIMIT:  # no density is less
-            return out
+            return np.zeros_like(occupied)
         if self._corners is None or self._corners.slot != slot:
             self._corners = Corners.of(slot, occupied)
         corners = self._corners
         self._log_density.reshape(-1)[corners.number] = self.log_densities(corners.places, rows, time)
-        share_out(lambda part: _compare(corners.cells[part], self._log_density, limit, out), len(corners.cells))
-        return out
+        # Of other corners it holds what once was there: no occupied cell has one.
+        along_z = np.maximum(self._log_density[:-1], self._log_density[1:])
+        along_y = np.maximum(along_z[:, :-1], along_z[:, 1:])
+        empty: np.ndarray = np.maximum(along_y[..., :-1], along_y[..., 1:]) < limit
+        return np.logical_and(empty, occupied, out=empty)
 
     def log_densities(self, places: np.ndarray, rows: np.ndarray, time: float) -> np.ndarray:
         """The log of the density at places (N, 3) in [0, 1]^3, float32: (N,)."""
@@ -157,14 +157,3 @@ def _add_scale(places, xy, xz, yz, weights, out):
             in_yz = c0 * of_yz[c + m] + c1 * of_yz[c + m + along_y] + c2 * of_yz[c + m + up_z_of_y] + c3 * of_yz[c + m + along_y + up_z_of_y]
             log_density += in_xy * in_xz * in_yz * weights[m]
         out[n] += log_density
-
-
-@compiled()
-def _compare(cells, log_density, limit, empty):
-    """Set in `empty` the cells at none of whose corners the log of the density is as much as `limit`."""
-    for n in range(len(cells)):
-        z, y, x = cells[n]
-        below = True
-        for corner in range(8):
-            below = below and log_density[z + (corner >> 2), y + (corner >> 1 & 1), x + (corner & 1)] < limit
-        empty[z, y, x] = below
