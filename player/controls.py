@@ -241,7 +241,7 @@ class Pace:
     @staticmethod
     def of(software: bool) -> "Pace":
         """For a processor that stands in for a graphics card, or for one: the first picture comes soon, if coarsely."""
-        return Pace(1 / 20, Pace.STEP**-8) if software else Pace(1 / 50)
+        return Pace(1 / 15, Pace.STEP**-8) if software else Pace(1 / 50)
 
     def saw(self, seconds: float, budget_s: float | None = None) -> None:
         """Take in how long a picture took at the present scale, and may take."""
