@@ -40,7 +40,7 @@ class Quality:
             is one for each texel, and the others are interpolated. Blocks that are off the most by that are marched whole, until what
             is left is at most this, of the full range: the root of the mean of its squares over the picture, as far as bends tell
             (bent.glsl). 0: all pixels are marched.
-        resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated.
+        resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated, by a cubic (cubic.glsl).
         thin: where a processor folds, rays pass by occupied cells that are empty at the time: a step at their corners has less alpha than
             this. 0: they stop in all.
         across: rays across a pixel, at most: as many as it spans texels of the finest scale, and their mean is its colour. What is far
