@@ -458,7 +458,7 @@ class Renderer:
         remains.
         """
         if look is Look.OCCUPANCY:
-            target = self.march(camera, time, part=Part.STATIC, program="cells.glsl")
+            target = self.march(camera, time, part=Part.STATIC, program="cells.glsl", small=True)
         else:
             shown = Part.STATIC if part is Part.STATIC else Part.FULL
             target = self.march(camera, time, part=shown, appearance=appearance, small=True)
@@ -638,8 +638,6 @@ class Renderer:
         doubts.framebuffer.clear()
         self._draw(doubts.framebuffer, vertices, within=bounds)
         most, share = self._most_missed(doubts, bearable - left_for_it)
-        if bounds not in (EVERYWHERE, target.drawn):
-            self._empty(target)
         self._stretch(coarse, target, bounds)
         self._draw_doubted(draw, target, camera, doubts, most)
         return marched / COARSER**2 + share, bounds
@@ -730,10 +728,8 @@ class Renderer:
         _set(predict, seen_before=SEEN_UNIT, met_before=MET_UNIT, size=size, **_lens_of(now), **lens_before)
         old.seen.use(SEEN_UNIT)
         old.met.use(MET_UNIT)
-        if bounds not in (EVERYWHERE, new.drawn):
-            self._empty(new)
+        self._confine(new, bounds)
         self._draw(new.framebuffer, vertices, within=bounds)
-        new.drawn = bounds
         return new
 
     def _scales_shared(self) -> int:
@@ -755,13 +751,19 @@ class Renderer:
 
     def _stretch(self, marched: Target, target: Target, bounds: Bounds = EVERYWHERE, cubic: bool = False) -> Target:
         """A picture in a larger one: as much as touches `bounds`."""
+        self._confine(target, bounds)
         program, vertices = self._program("upscale.glsl", self.layout, cubic=cubic)
         _set(program, seen_small=SEEN_UNIT, met_small=MET_UNIT, size=tuple(map(float, target.seen.size)))
         marched.seen.use(SEEN_UNIT)
         marched.met.use(MET_UNIT)
         self._draw(target.framebuffer, vertices, within=bounds)
-        target.drawn = bounds
         return target
+
+    def _confine(self, target: Target, bounds: Bounds) -> None:
+        """Leave what rays see that meet nothing wherever a target is not to be drawn, which is all but `bounds`."""
+        if bounds not in (EVERYWHERE, target.drawn):
+            self._empty(target)
+        target.drawn = bounds
 
     def _empty(self, target: Target) -> None:
         """Draw what rays see that meet nothing, over what was drawn."""

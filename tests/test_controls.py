@@ -178,12 +178,12 @@ def test_a_raster_gets_no_coarser_than_helps(fixed_s: float, low: float, high: f
 @pytest.mark.parametrize("whole", [1.0, 3.0, 5.0])
 def test_the_pace_is_that_of_pictures_that_follow_one_another(whole: float) -> None:
     """What follows none takes so many times as long: the first on a raster, and one a lap."""
-    rng, pace, scales, raster = np.random.default_rng(0), Pace(1 / 15, Pace.of(software=True).scale), [], None
+    rng, pace, scales, raster = np.random.default_rng(0), Pace.of(software=True), [], None
     for number in range(600):
         follows = pace.scale == raster and number % 40
         scales.append(raster := pace.scale)
         pace.saw(0.15 * pace.scale**2 * (1.0 if follows else whole) * float(np.exp(rng.normal(0, 0.1))))
-    assert 0.55 < min(scales[100:]) and max(scales[100:]) < 0.8
+    assert 0.55 < min(scales[100:]) and max(scales[100:]) < 0.8  # 1 / 15 s
     assert sum(a != b for a, b in zip(scales[100:], scales[101:])) <= 6
 
 
@@ -191,7 +191,7 @@ def test_the_pace_is_that_of_pictures_that_follow_one_another(whole: float) -> N
 @pytest.mark.parametrize("pictures", [3, 5, 8, 12])
 def test_a_slow_start_does_not_last(slow: float, pictures: int) -> None:
     """As while a scene is read beside the first pictures."""
-    pace, raster = Pace(1 / 15, Pace.of(software=True).scale), None
+    pace, raster = Pace.of(software=True), None
     for number in range(100):
         whole, raster = (1.0 if pace.scale == raster else 3.0), pace.scale
         pace.saw((0.015 + 0.12 * pace.scale**2) * whole * (slow if number < pictures else 1.0))

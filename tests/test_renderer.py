@@ -34,6 +34,12 @@ CAMERAS = {
 FOLDED = Quality(folded=True, termination=1 / 64)
 
 
+def shown_on(screen: moderngl.Framebuffer) -> np.ndarray:
+    """(height, width, 3) float64 in [0, 1], the top row first."""
+    width, height = screen.size
+    return np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(height, width, 3)[::-1] / 255
+
+
 def check(got: Rendering, wanted: Rendering) -> None:
     """Within 1/255 at 99.9 % of the pixels, PSNR at least 50 dB; depth and samples go with them."""
     error = np.abs(got.rgb - wanted.rgb)
@@ -122,7 +128,7 @@ def test_an_appearance_comes_to_the_screen(part: Part) -> None:
     screen, renderer, camera = ctx.framebuffer([ctx.texture((64, 48), 4)]), Renderer(ctx, scene), CAMERAS["outside"]
     for code in (None, scene.appearance("dusk.jpg")):
         renderer.show(screen, camera, 0.62, part=part, appearance=code)
-        shown = np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(48, 64, 3)[::-1] / 255
+        shown = shown_on(screen)
         assert np.abs(shown - renderer.render(camera, 0.62, part=part, appearance=code).rgb.clip(0, 1)).max() < 1 / 255
 
 
@@ -140,7 +146,7 @@ def test_a_share_of_a_picture_goes_over_what_is_there(share: float) -> None:
     assert np.abs(shown[..., :3] - (1 - share) * pictures[0] - share * pictures[1]).max() < 1.5 / 255
     assert (shown[..., 3] == 1).all()
     renderer.show(screen, camera, 0.62)  # and what comes next covers it
-    shown = np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(48, 64, 3)[::-1] / 255
+    shown = shown_on(screen)
     assert np.abs(shown - pictures[1]).max() < 1 / 255
 
 
@@ -211,9 +217,7 @@ def test_shows_every_look_and_part_on_a_screen_of_another_size(space: str) -> No
     for look in Look:
         for part in Part:
             renderer.show(screen, CAMERAS["outside"], 0.62, part=part, look=look, depths=(2.0, 4.0), most_samples=20.0)
-            pictures[look, part] = np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(50, 70, 3)[
-                ::-1
-            ]
+            pictures[look, part] = 255 * shown_on(screen)
     renderer.check()
     for (look, part), picture in pictures.items():
         assert picture.std() > 3, (look, part)
@@ -350,9 +354,3 @@ def test_a_small_picture_is_enlarged_by_more_than_straight_lines() -> None:
         screens[2].clear(0.2, 0.4, 0.6, 1.0)
         renderer.show(screens[2], camera, 0.62, share=share)
         np.testing.assert_allclose(shown_on(screens[2]), share * large + (1 - share) * np.array([0.2, 0.4, 0.6]), atol=1.5 / 255)
-
-
-def shown_on(screen: moderngl.Framebuffer) -> np.ndarray:
-    """(height, width, 3) float64 in [0, 1], the lowest row first."""
-    width, height = screen.size
-    return np.frombuffer(screen.read(components=3, alignment=1), np.uint8).reshape(height, width, 3) / 255
