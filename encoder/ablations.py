@@ -21,7 +21,6 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "edges never let be": lambda c: replace(c, edges_from=1.0),
     "no distortion loss": lambda c: replace(c, distortion=0.0),
     "rays drawn evenly": lambda c: replace(c, temporal_start=1.0, object_rays=0.0),
-    "what may move is emptied": lambda c: replace(c, movers_stay_open=False),
     "no appearances": lambda c: replace(c, appearance="none"),
     "no motion grid": lambda c: replace(c, motion_cells=0),
     "planes added up": lambda c: replace(c, summed=True, sparse_transients=0.0),

@@ -125,19 +125,6 @@ def seen_cells(
     Where fewer cameras than that exist, all of them must see a cell. Nothing is within CLEAR of the way from a camera to the
     point all of them look at, in any direction: a camera that moves would else carry each of its pictures before it.
     """
-    cameras = _distinct_cameras(pictures)
-    focus = _focus(pictures, cameras)
-    poses = pictures.camera_to_world[cameras, :3].astype(np.float64)
-    near = np.array([depth_limit(pictures, p) for p in cameras])
-    clear = np.zeros(len(cameras)) if focus is None else CLEAR * np.linalg.norm(focus - poses[:, :, 3], axis=1)
-    sizes = np.stack([pictures.width[cameras], pictures.height[cameras]], axis=1)
-    intrinsics = pictures.intrinsics[cameras].astype(np.float64)
-    count, blocked = _views(cell_centres(aabb, shape, mapping), poses, intrinsics, sizes, near, clear)
-    return ((count >= min(at_least, len(cameras))) & ~blocked).reshape(shape)
-
-
-def cell_centres(aabb: np.ndarray, shape: tuple[int, int, int], mapping: SpaceMapping | None = None) -> np.ndarray:
-    """(N, 3) float64 in the world: the middles of the cells of an (Nz, Ny, Nx) grid over what the planes cover, x fastest."""
     nz, ny, nx = shape
     low, edges = (np.zeros(3), np.ones(3)) if isinstance(mapping, Contraction) else (aabb[0], aabb[1] - aabb[0])
     axes = [low[a] + (np.arange(n) + 0.5) / n * edges[a] for a, n in enumerate((nx, ny, nz))]
@@ -147,26 +134,15 @@ def cell_centres(aabb: np.ndarray, shape: tuple[int, int, int], mapping: SpaceMa
         centres = expand(centres, aabb)
     elif mapping is not None:
         centres = mapping.expand(centres)
-    return centres.astype(np.float64)
-
-
-def depth_limit(pictures: Pictures, p: int) -> float:
-    """The depth from which on a picture may show something: a little before its near plane, where that is known."""
-    near = float(pictures.near[p])
-    return 0.9 * near if np.isfinite(near) and near > 0 else 0.0
-
-
-@njit(inline="always")
-def projected(point, pose, intrinsics):
-    """Column and row at which a camera sees a point (3,), and its depth; straight lenses. `pose` (3, 4) is camera-to-world."""
-    x, y, z = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
-    depth = -(x * pose[0, 2] + y * pose[1, 2] + z * pose[2, 2])
-    fx, fy, cx, cy = intrinsics
-    if not depth > 0:
-        return np.nan, np.nan, depth
-    i = cx + fx * (x * pose[0, 0] + y * pose[1, 0] + z * pose[2, 0]) / depth
-    j = cy - fy * (x * pose[0, 1] + y * pose[1, 1] + z * pose[2, 1]) / depth
-    return i, j, depth
+    cameras = _distinct_cameras(pictures)
+    focus = _focus(pictures, cameras)
+    poses = pictures.camera_to_world[cameras, :3].astype(np.float64)
+    near = np.where(np.isfinite(pictures.near[cameras]), pictures.near[cameras], 0.0)
+    clear = np.zeros(len(cameras)) if focus is None else CLEAR * np.linalg.norm(focus - poses[:, :, 3], axis=1)
+    sizes = np.stack([pictures.width[cameras], pictures.height[cameras]], axis=1)
+    intrinsics = pictures.intrinsics[cameras].astype(np.float64)
+    count, blocked = _views(centres.astype(np.float64), poses, intrinsics, sizes, 0.9 * near, clear)
+    return ((count >= min(at_least, len(cameras))) & ~blocked).reshape(shape)
 
 
 @njit(parallel=True, cache=True)
@@ -180,9 +156,12 @@ def _views(points, poses, intrinsics, sizes, near, clear):
             x, y, z = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
             if x * x + y * y + z * z < clear[c] * clear[c]:
                 blocked[n] = True
-            i, j, depth = projected(points[n], pose, intrinsics[c])
-            if not depth > near[c]:
+            depth = -(x * pose[0, 2] + y * pose[1, 2] + z * pose[2, 2])
+            if not depth > max(near[c], 0.0):
                 continue
+            fx, fy, cx, cy = intrinsics[c]
+            i = cx + fx * (x * pose[0, 0] + y * pose[1, 0] + z * pose[2, 0]) / depth
+            j = cy - fy * (x * pose[0, 1] + y * pose[1, 1] + z * pose[2, 1]) / depth
             width, height = sizes[c]
             margin = 0.02 * width  # a cell whose centre is just outside still shows an edge
             count[n] += -margin < i < width + margin and -margin < j < height + margin

@@ -169,12 +169,6 @@ class TrainConfig:
     takes 9.3 samples a ray instead of 15.5; with 16 parts, 10.5."""
     occupancy_split_every: int = 512
     """Steps between two looks at the parts of the clip."""
-    movers_stay_open: bool = True
-    """Where cameras stand still, rays take samples in all cells where something may move (`kpc.encoder.movers`), whatever those hold.
-    Else cells on the way of what is fast are emptied before the planes have found it, and no ray sees that they were wrong: of the default
-    scene's ball half of its way at step 128, and nothing was filled again in the next thousand steps. Held-out PSNR of the default scene
-    (`fast`, seeds 0 to 3, one thread or two): six runs without this 32.7 to 34.9 dB, 34.1 on average; four with it 34.3 to 35.0, 34.6 on
-    average. Of what moves alone: 22.9 to 26.1 dB, and 25.4 to 26.2."""
     occupancy_alpha: float = 1e-2
     """A cell is empty if a step through it absorbs less than this."""
 

@@ -130,7 +130,7 @@ def _tile_weights(
             band = np.stack([faded(pixels.picture(int(p), row, min(row + rows, height))) for p in near])
             changes = largest_change(band, WINDOW)[start - first :][: len(some)]
             usable = np.stack([dataset.usable(int(p))[row : row + rows] for p in some])
-            yield some, row, tile_means(np.maximum(changes, np.uint8(round(255 * floor))), usable, tile)
+            yield some, row, _tile_means(np.maximum(changes, np.uint8(round(255 * floor))), usable, tile)
 
 
 def largest_change(pictures: np.ndarray, radius: int) -> np.ndarray:
@@ -164,7 +164,7 @@ def faded(picture: np.ndarray) -> np.ndarray:
     return np.concatenate([((picture[..., :3] * alpha + 127) // 255).astype(np.uint8), picture[..., 3:]], axis=2)
 
 
-def tile_means(values: np.ndarray, usable: np.ndarray, tile: int) -> np.ndarray:
+def _tile_means(values: np.ndarray, usable: np.ndarray, tile: int) -> np.ndarray:
     """(K, H, W) uint8 to the rounded means over the usable pixels of each tile, at least 1; 0 where there are none."""
     count, height, width = values.shape
     tall, wide = -(-height // tile), -(-width // tile)

@@ -40,17 +40,14 @@ class OccupancyGrid:
     """Where density is (Instant-NGP, arXiv:2201.05989, appendix E), cut down to where it has been seen to matter.
 
     A cell is occupied while its density could absorb something and it, or a neighbour, has lately given a ray some of its
-    colour. The second condition empties what lies hidden behind surfaces, where the planes' products are arbitrary. What is empty is
-    filled again from its neighbours alone, since no ray takes samples there: cells that something has yet to be found in are open
-    (`kpc.encoder.movers`).
+    colour. The second condition empties what lies hidden behind surfaces, where the planes' products are arbitrary.
 
     Attributes:
         log_density: (Nz, Ny, Nx) float32, decaying maximum of the samples taken in a cell.
         peak: (Nz, Ny, Nx) float32, decaying maximum of the weights that training rays have found in a cell.
         occupied: (Nz, Ny, Nx) bool; cells that too few cameras see are never occupied.
-        open: (slots, Nz, Ny, Nx) bool, cells in which rays take samples while each slot of the clip lasts, whatever they hold.
-        marched: (slots, Nz, Ny, Nx) bool, the open cells, and of the occupied ones those in which rays take samples while each slot of
-            the clip lasts: all until `split`.
+        marched: (slots, Nz, Ny, Nx) bool, of the occupied cells those in which rays take samples while each slot of the clip
+            lasts: one slot until `split`.
     """
 
     DENSITY_DECAY = 0.05
@@ -63,37 +60,35 @@ class OccupancyGrid:
     PEAK_LEAST = 2e-3
     """A cell whose peak is below gives less than half an 8-bit level to any ray."""
 
-    def __init__(self, seen: np.ndarray, threshold: float, open_cells: np.ndarray | None = None) -> None:
-        """`threshold`: log density, per longest edge of the box, below which a cell counts as empty. `open_cells`: as `open`, as far as
-        they are seen; None for none."""
+    def __init__(self, seen: np.ndarray, threshold: float) -> None:
+        """`threshold`: log density, per longest edge of the box, below which a cell counts as empty."""
         self.seen = seen
-        self.open = np.zeros((1, *seen.shape), bool) if open_cells is None else open_cells & seen
         self.threshold = threshold
         self.log_density = np.full(seen.shape, -np.inf, np.float32)
         self.peak = np.ones(seen.shape, np.float32)
         self.occupied = seen.copy()
+        self.marched = self.occupied[None]
         self._dense = np.ones((1, *seen.shape), bool)
         self._known = False
-        self._march()
 
     def update(self, density_at: DensityAt, peaks: np.ndarray, rng: np.random.Generator) -> None:
         """Take in the peaks since the last update, look at the density anew, and decide what is occupied.
 
-        Looked at: at first all that is seen, then what is occupied or open and a random sixteenth of the rest, at LOOKS random
+        Looked at: at first all that is seen, then what is occupied and a random sixteenth of the rest, at LOOKS random
         points and times a cell.
         """
         np.maximum(self.peak * np.float32(self.PEAK_DECAY), peaks, out=self.peak)
         matters = dilate(self.peak > self.PEAK_LEAST) & self.seen
         chosen = matters
         if self._known:
-            chosen = matters & (self.occupied | self.open.any(0) | (rng.random(self.seen.shape, dtype=np.float32) < 1 / 16))
+            chosen = matters & (self.occupied | (rng.random(self.seen.shape, dtype=np.float32) < 1 / 16))
         self._known = True
         self.log_density -= self.DENSITY_DECAY
         cells = np.argwhere(chosen)
         for _ in range(self.LOOKS):
             self.log_density[chosen] = np.maximum(self.log_density[chosen], self._look(density_at, cells, rng, 0.0, 1.0))
         self.occupied = matters & (self.log_density > self._least())
-        self._march()
+        self.marched = self._dense & self.occupied
 
     def split(self, density_at: DensityAt, slots: int, rng: np.random.Generator) -> None:
         """From now on march, in each of `slots` equal parts of the clip, only where density is or was close by.
@@ -102,7 +97,7 @@ class OccupancyGrid:
         beside it, the cell or a neighbour: what is learnt can go on moving until the next split.
         """
         self._dense = dilate(self.over_time(density_at, rng, slots, self.LOOKS), SPACE_AND_TIME)
-        self._march()
+        self.marched = self._dense & self.occupied
 
     def state(self) -> dict[str, Any]:
         return {"log_density": torch.from_numpy(self.log_density), "peak": torch.from_numpy(self.peak),
@@ -111,11 +106,8 @@ class OccupancyGrid:
     def load(self, state: dict[str, Any]) -> None:
         names = ("log_density", "peak", "occupied", "dense")
         self.log_density, self.peak, self.occupied, self._dense = (state[name].cpu().numpy() for name in names)
-        self._march()
+        self.marched = self._dense & self.occupied
         self._known = bool(state["known"])
-
-    def _march(self) -> None:
-        self.marched = self._dense & self.occupied | self.open
 
     def _least(self) -> float:
         """The log density that fills a cell. While all is thin it is the average: an empty grid could never be filled again."""

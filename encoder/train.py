@@ -19,7 +19,6 @@ from kpc.encoder.config import TrainConfig
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field import Field, HybridField, SummedField, appearance_priors, motion_nodes, motion_priors, plan_layout, priors
 from kpc.encoder.importance import TileWeights, cameras_stand_still
-from kpc.encoder.movers import moving_cells
 from kpc.encoder.occupancy import OccupancyGrid, grid_shape
 from kpc.encoder.optimisers import FusedOptimiser, PlainOptimiser, log_densities
 from kpc.encoder.proposals import Proposals
@@ -71,11 +70,8 @@ class Trainer:
             torch.nn.init.zeros_(self.field.w1)
         shape = grid_shape(self.aabb, config.cells_across)
         threshold = math.log(-math.log(1 - config.occupancy_alpha) * steps_across)
+        self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape, mapping), threshold)
         self.slots = min(config.occupancy_slots, dataset.clip.frame_count) if dataset.is_dynamic else 1
-        self._can_weigh = cameras_stand_still(dataset)
-        may_move = self._can_weigh and config.movers_stay_open
-        open_cells = moving_cells(dataset, self.aabb, shape, self.slots, mapping) if may_move else None
-        self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape, mapping), threshold, open_cells)
         on_cpu = self.device.type == "cpu"
         proposals = Proposals(config, self.aabb, dataset.clip, dataset.is_dynamic).to(self.device) if config.proposals else None
         self.optimiser: FusedOptimiser | PlainOptimiser = (
@@ -91,6 +87,7 @@ class Trainer:
         # Objects with alpha are shown on white. Elsewhere what the box leaves open is grey: the least wrong guess.
         self.background = np.full(3, 1.0 if dataset.has_alpha else 0.5, np.float32)
         self._weights: TileWeights | None = None
+        self._can_weigh = cameras_stand_still(dataset)
         self._steady_rays, self._steady_s = 0, 0.0
 
     def run(
