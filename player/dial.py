@@ -117,8 +117,15 @@ class Dial:
 
 
 def dial_for(software: bool, quality: str | None, target_fps: float | None) -> Dial:
-    """Where a device begins: a processor on the ladder's knee and coarsely, a graphics card on the reference."""
-    dial = Dial(quality or (DEFAULT if software else RUNGS[-1]), Pace.of(software))
+    """Where a device begins: a processor on the ladder's knee and coarsely, a graphics card on the reference.
+
+    Cards differ a hundredfold, so one for which nothing is asked moves by itself from there: of a card too slow for the reference, a
+    lower rung shows more than a coarser raster does.
+    """
+    pace = Pace.of(software)
+    dial = Dial(quality or (DEFAULT if software else RUNGS[-1]), pace)
+    if target_fps is None and quality is None and not software:
+        target_fps = 1 / pace.budget_s
     if target_fps is not None:
         dial.hold(target_fps)
     return dial

@@ -79,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--target-fps", type=cli.frame_rate(*TARGET_FPS), metavar="F",
-        help="hold so many frames a second by moving the quality (default: as it was; else do not)",
+        help="hold so many frames a second by moving the quality (default: as it was; else a graphics card holds 50)",
     )
     parser.add_argument("--path", metavar="JSON", help="a camera path, as saved before, for J to follow")
     parser.add_argument(

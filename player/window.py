@@ -218,7 +218,7 @@ class Player:
         self.ctx = window.ctx
         self.device = self.ctx.info["GL_RENDERER"]
         self.dial = dial_for(is_software(self.ctx), preferences.quality, preferences.target_fps)
-        self.target_fps = preferences.target_fps or FILM_FPS
+        self.target_fps = preferences.target_fps or (1 / self.dial.target_s if self.dial.target_s else FILM_FPS)
         if not stream.is_drawn:
             stream.draw_with(self._make_renderer)
         self.overlay = Overlay(self.ctx)
@@ -270,7 +270,7 @@ class Player:
         self.view, self.playback, self.path, self.part, self.look = (
             before.view, before.playback, before.path, before.part, before.look
         )  # fmt: skip
-        self.dial, self.exact = before.dial, before.exact
+        self.dial, self.target_fps, self.exact = before.dial, before.target_fps, before.exact
         self.wardrobe.wear(before.wardrobe.number)
         self.show_hud, self.show_path = before.show_hud, before.show_path
         self.complain("the graphics card was reset; the scene is there again")

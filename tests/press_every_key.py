@@ -152,6 +152,7 @@ def main(scene_file: str) -> None:
     assert told is not None and told.startswith("saved ") and len(list(read_video(player.film.path))) >= 1
     go_through_groups(window, scene_file)
     stand_where_groups_are_mixed(window, scene_file)
+    begin_on_a_card(window, scene_file)
     stream.close()
     window.close()
     lose_the_card(scene_file)
@@ -437,6 +438,20 @@ def lose_the_card(scene_file: str) -> None:
     window_module._reset_status, kpplay.MOST_RESETS = reset_by(99), 1
     assert kpplay.main([scene_file, "--size", "300x200", "--frames", "4"]) == 1 and len(made) == kpplay.MOST_RESETS + 1
     window_module._reset_status = real
+
+
+def begin_on_a_card(window: Window, scene_file: str) -> None:
+    """A graphics card holds a rate from the reference on, as long as nothing else is asked for; the control shows it, and it is remembered."""
+    real, window_module.is_software = window_module.is_software, lambda ctx: False
+    for asked, quality, fps in ((Preferences(), RUNGS[-1], 50.0), (Preferences(quality="fine"), "fine", None)):
+        reel = Reel(open_source(scene_file))
+        player = Player(window, reel, asked)
+        assert player.preferences().quality == player.dial.rung == quality
+        assert player.preferences().target_fps == approx(fps) if fps else player.dial.target_s is None
+        assert player.target_fps == approx(fps or window_module.FILM_FPS)
+        player.close()
+        reel.close()
+    window_module.is_software = real
 
 
 def remember(scene_file: str) -> None:

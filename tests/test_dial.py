@@ -92,6 +92,17 @@ def test_by_hand_it_stays_and_a_still_picture_is_no_coarser_than_asked_for() -> 
 
 
 def test_where_a_device_begins() -> None:
-    assert dial_for(True, None, None).rung == DEFAULT and dial_for(False, None, None).rung == RUNGS[-1]
+    assert dial_for(True, None, None).rung == DEFAULT and dial_for(True, None, None).target_s is None
     dial = dial_for(True, RUNGS[1], 25.0)  # a processor begins with a coarse raster
     assert (dial.rung, dial.resting) == (RUNGS[0], RUNGS[1]) and dial.target_s == pytest.approx(0.04)
+    asked = dial_for(False, RUNGS[-2], None)
+    assert asked.rung == RUNGS[-2] and asked.target_s is None
+
+
+@pytest.mark.parametrize("finest", RUNGS)
+def test_a_card_begins_on_the_reference_and_keeps_its_raster_as_long_as_a_lower_rung_is_in_time(finest: str) -> None:
+    dial = dial_for(False, None, None)
+    assert dial.rung == RUNGS[-1]
+    load = 20.0 * 0.8 / COSTS_MS[finest]  # a card that draws this rung in 16 ms
+    turns(dial, 100, load)
+    assert set(turns(dial, 100, load)) == {finest} and dial.pace.scale == 1.0 and dial.resting == RUNGS[-1]
