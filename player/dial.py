@@ -16,15 +16,18 @@ GUESS = 1.5
 """How much longer the next rung takes, until it has been tried."""
 UNSETTLED = 1
 """Pictures after a move that do not count: shaders are compiled, textures made."""
+HOPELESS, FAR = 4.0, 2
+"""Two pictures on end that take so many times as long as they may are enough, from the first on, and so many rungs are left at once."""
 
 
 @dataclass
 class Dial:
     """Which rung of LADDER pictures are drawn on while something moves, and how finely below the lowest one.
 
-    With `target_s` it moves by itself. It goes down when the median of the last DOWN_AFTER pictures is too slow. It goes up when
-    that of UP_AFTER leaves room for what the finer rung takes, which it learns whenever it moves: so it does not try again what it
-    knows to be too slow, and does not flicker between two rungs. Below the fastest rung the raster gets coarser (`Pace`).
+    With `target_s` it moves by itself. It goes down when the median of the last DOWN_AFTER pictures is too slow, sooner where that is
+    hopeless. It goes up when that of UP_AFTER leaves room for what the finer rung takes, which it learns whenever it moves: so it does
+    not try again what it knows to be too slow, and does not flicker between two rungs. Below the fastest rung the raster gets coarser
+    (`Pace`).
 
     Attributes:
         chosen: the rung that was set by hand, and what a picture that stands still is drawn on at least.
@@ -39,6 +42,8 @@ class Dial:
     rung: str = field(init=False)
     _seen: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=UP_AFTER))
     _skipped: int = field(init=False, default=0)
+    _hopeless: int = field(init=False, default=0)
+    """Pictures on end."""
     _growth: dict[str, float] = field(init=False, default_factory=dict)
     """By rung, how many times as long the next finer one takes."""
     _left: tuple[str, float] | None = field(init=False, default=None)
@@ -74,6 +79,11 @@ class Dial:
 
     def saw(self, seconds: float) -> None:
         """Take in how long a picture took, on `rung` and at the present scale."""
+        is_hopeless = self.target_s is not None and self.rung != RUNGS[0] and seconds > HOPELESS * self.target_s
+        self._hopeless = self._hopeless + 1 if is_hopeless else 0
+        if self._hopeless == 2:
+            self._move(-FAR, seconds)
+            return
         if self._skipped < UNSETTLED:
             self._skipped += 1
             return
@@ -105,15 +115,16 @@ class Dial:
         self._restart()
 
     def _learn(self, seconds: float) -> None:
-        """How the rung it is on compares with the one it came from."""
+        """How the rung it is on compares with the one it came from, if that is the next."""
         if self._left is not None:
-            (lower, fast), (_, slow) = sorted((self._left, (self.rung, seconds)), key=lambda pair: RUNGS.index(pair[0]))
-            self._growth[lower] = max(slow / max(fast, 1e-6), 1.0)
+            (lower, fast), (upper, slow) = sorted((self._left, (self.rung, seconds)), key=lambda pair: RUNGS.index(pair[0]))
+            if upper == climbed(lower, 1):
+                self._growth[lower] = max(slow / max(fast, 1e-6), 1.0)
             self._left = None
 
     def _restart(self) -> None:
         self._seen.clear()
-        self._skipped = 0
+        self._skipped = self._hopeless = 0
 
 
 def dial_for(software: bool, quality: str | None, target_fps: float | None) -> Dial:
