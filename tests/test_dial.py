@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kpc.player.controls import Pace
-from kpc.player.dial import RUNGS, TOO_SLOW, Dial, dial_for
+from kpc.player.dial import NOT_FOR_CARDS, RUNGS, TOO_SLOW, Dial, dial_for
 from kpc.player.quality import DEFAULT
 
 GROWTH = 1.6
@@ -99,7 +99,7 @@ def test_where_a_device_begins() -> None:
     assert asked.rung == RUNGS[-2] and asked.target_s is None
 
 
-@pytest.mark.parametrize("finest", RUNGS)
+@pytest.mark.parametrize("finest", [rung for rung in RUNGS if rung not in NOT_FOR_CARDS])
 def test_a_card_begins_on_the_reference_and_keeps_its_raster_as_long_as_a_lower_rung_is_in_time(finest: str) -> None:
     dial = dial_for(False, None, None)
     assert dial.rung == RUNGS[-1]
@@ -123,3 +123,15 @@ def test_what_was_passed_over_is_tried_again_once() -> None:
     assert set(turns(dial, 2, load=10.0)) == {RUNGS[-1]} and dial.rung == RUNGS[-3]
     turns(dial, 200)
     assert set(turns(dial, 500)) == {RUNGS[4]}
+
+
+@pytest.mark.parametrize("rung", sorted(NOT_FOR_CARDS))
+def test_a_card_is_not_moved_to_what_takes_it_longer_than_the_next_finer_rung(rung: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    below, above = (RUNGS[RUNGS.index(rung) + way] for way in (-1, 1))
+    monkeypatch.setitem(COSTS_MS, rung, 1.9 * COSTS_MS[below])
+    monkeypatch.setitem(COSTS_MS, above, 1.1 * COSTS_MS[below])
+    for start in (RUNGS[-1], below):
+        dial = dial_for(False, start, 1e3 / COSTS_MS[above] * 0.6)
+        assert rung not in turns(dial, 300) and set(turns(dial, 300)) == {above}
+    by_hand = dial_for(False, rung, None)
+    assert set(turns(by_hand, 50)) == {rung}
