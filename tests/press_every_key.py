@@ -449,6 +449,8 @@ def begin_on_a_card(window: Window, scene_file: str) -> None:
         assert player.preferences().quality == player.dial.rung == quality
         assert player.preferences().target_fps == approx(fps) if fps else player.dial.target_s is None
         assert player.target_fps == approx(fps or window_module.FILM_FPS)
+        player.target_fps = 42.0
+        assert Player(window, reel, asked, before=player).target_fps == 42.0
         player.close()
         reel.close()
     window_module.is_software = real
