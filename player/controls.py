@@ -13,6 +13,8 @@ STEEPEST = math.radians(1.0)
 """Orbiting stops this far from looking straight up or down."""
 FADE_S = 0.4
 """From one appearance to the next."""
+CARD_FPS = 50.0
+"""Pictures a second that a graphics card is to come up with where nothing else is asked for."""
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 
@@ -241,7 +243,7 @@ class Pace:
     @staticmethod
     def of(software: bool) -> "Pace":
         """For a processor that stands in for a graphics card, or for one: the first picture comes soon, if coarsely."""
-        return Pace(1 / 15, Pace.STEP**-8) if software else Pace(1 / 50)
+        return Pace(1 / 15, Pace.STEP**-8) if software else Pace(1 / CARD_FPS)
 
     def saw(self, seconds: float, budget_s: float | None = None) -> None:
         """Take in how long a picture took at the present scale, and may take."""

@@ -4,7 +4,7 @@ import statistics
 from collections import deque
 from dataclasses import dataclass, field
 
-from kpc.player.controls import Pace
+from kpc.player.controls import CARD_FPS, Pace
 from kpc.player.quality import DEFAULT, LADDER, climbed
 
 RUNGS = tuple(LADDER)
@@ -116,20 +116,14 @@ class Dial:
 
     def _move(self, rungs: int, seconds: float) -> None:
         self._left = self.rung, seconds
-        for _ in range(abs(rungs)):
-            self.rung = self._next(self.rung, 1 if rungs > 0 else -1)
+        self.rung = climbed(self.rung, rungs, self.passed_over)
         self._restart()
-
-    def _next(self, rung: str, way: int) -> str:
-        """The next finer rung, or the next faster one for -1."""
-        rung = climbed(rung, way)
-        return climbed(rung, way) if rung in self.passed_over else rung
 
     def _learn(self, seconds: float) -> None:
         """How the rung it is on compares with the one it came from, if that is the next."""
         if self._left is not None:
             (lower, fast), (upper, slow) = sorted((self._left, (self.rung, seconds)), key=lambda pair: RUNGS.index(pair[0]))
-            if upper == self._next(lower, 1):
+            if upper == climbed(lower, 1, self.passed_over):
                 self._growth[lower] = max(slow / max(fast, 1e-6), 1.0)
             self._left = None
 
@@ -144,10 +138,11 @@ def dial_for(software: bool, quality: str | None, target_fps: float | None) -> D
     Cards differ a hundredfold, so one for which nothing is asked moves by itself from there: of a card too slow for the reference, a
     lower rung shows more than a coarser raster does.
     """
-    pace = Pace.of(software)
-    dial = Dial(quality or (DEFAULT if software else RUNGS[-1]), pace, passed_over=frozenset() if software else NOT_FOR_CARDS)
-    if target_fps is None and quality is None and not software:
-        target_fps = 1 / pace.budget_s
+    if software:
+        dial = Dial(quality or DEFAULT, Pace.of(software))
+    else:
+        dial = Dial(quality or RUNGS[-1], Pace.of(software), passed_over=NOT_FOR_CARDS)
+        target_fps = target_fps or (CARD_FPS if quality is None else None)
     if target_fps is not None:
         dial.hold(target_fps)
     return dial

@@ -21,6 +21,7 @@ from kpc.format import cli
 from kpc.format.container import DEFAULT_BUDGET, open_source
 from kpc.format.errors import ContextLostError, UsageError
 from kpc.player import preferences
+from kpc.player.controls import CARD_FPS
 from kpc.player.orbit import Rig
 from kpc.player.path import CameraPath
 from kpc.player.preferences import TARGET_FPS, WINDOW_SIDES, Preferences
@@ -79,7 +80,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--target-fps", type=cli.frame_rate(*TARGET_FPS), metavar="F",
-        help="hold so many frames a second by moving the quality (default: as it was; else a graphics card holds 50)",
+        help="hold so many frames a second by moving the quality "
+        f"(default: as it was; else a graphics card holds {CARD_FPS:.0f})",
     )
     parser.add_argument("--path", metavar="JSON", help="a camera path, as saved before, for J to follow")
     parser.add_argument(

@@ -15,6 +15,7 @@ Measured and left out, for a processor that draws gains nothing from them (room,
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from kpc.format.scene import TERMINATION
@@ -88,7 +89,7 @@ DEFAULT = "balanced"
 """The fastest rung that stays within 40 dB of the reference on all scenes of docs/bench/player.json."""
 
 
-def climbed(name: str, rungs: int) -> str:
-    """The name so many rungs up the ladder from `name`, or at its end."""
-    names = list(LADDER)
+def climbed(name: str, rungs: int, passed_over: Collection[str] = ()) -> str:
+    """The name so many rungs up the ladder from `name`, or at its end; some do not count."""
+    names = [rung for rung in LADDER if rung == name or rung not in passed_over]
     return names[min(max(names.index(name) + rungs, 0), len(names) - 1)]

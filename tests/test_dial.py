@@ -111,14 +111,13 @@ def test_a_card_begins_on_the_reference_and_keeps_its_raster_as_long_as_a_lower_
 def test_a_card_far_too_slow_is_not_waited_for_on_every_rung() -> None:
     dial, load, taken = dial_for(False, None, None), 4.0, []
     while dial.rung != RUNGS[0]:  # of 16 ms; the reference takes 429
-        rung = dial.rung
-        taken.append(1e-3 * COSTS_MS[rung] * load)
+        taken.append(1e-3 * COSTS_MS[dial.rung] * load)
         turns(dial, 1, load)
     assert sum(taken) < 2.0  # four pictures on each rung would take 4.3 s
     assert set(turns(dial, 100, load)) == {RUNGS[0]} and dial.pace.scale == 1.0
 
 
-def test_what_was_passed_over_is_tried_again_once() -> None:
+def test_a_rung_that_was_left_out_on_the_way_down_is_tried_again() -> None:
     dial = held(1e3 / COSTS_MS[RUNGS[4]] * 0.8, start=RUNGS[-1])
     assert set(turns(dial, 2, load=10.0)) == {RUNGS[-1]} and dial.rung == RUNGS[-3]
     turns(dial, 200)
