@@ -44,6 +44,8 @@ class Quality:
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated, by a cubic (cubic.glsl).
         thin: where a processor folds, rays pass by occupied cells that are empty at the time: a step at their corners has less alpha than
             this. 0: they stop in all.
+        baked: where a processor folds a scene that `Baking` serves, let samples look up a grid of what the planes come to, at the corners of
+            their texels. Then no picture follows another, and rays stop in all occupied cells: finding out takes longer than looking up.
         across: rays across a pixel, at most: as many as it spans texels of the finest scale, and their mean is its colour. What is far
             away else shimmers. Room in a picture so small that a pixel spans three texels is 30.0 dB from that of 36 rays a pixel,
             and 40.3 with 2 x 2; prefiltered planes of half and a quarter of the resolution gave 33.4 and 29.9 (products of means are
@@ -59,6 +61,7 @@ class Quality:
     blur: float = 0.0
     resolution: float = 1.0
     thin: float = 0.0
+    baked: bool = False
     across: int = 1
     scales: int | None = None
 
@@ -74,11 +77,11 @@ soldier 0.53, 45.5 (54.4); liam 0.75, 40.2 (42.9); room, full of fine patterns, 
 0.90, 42.0; 0.95, 43.8."""
 
 LADDER: dict[str, Quality] = {
-    "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, resolution=0.5),
-    "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, resolution=0.5),
-    "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, resolution=0.75),
-    "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, across=4),
-    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, across=4),
+    "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=True, resolution=0.5),
+    "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=True, resolution=0.5),
+    "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=True, resolution=0.75),
+    "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=True, across=4),
+    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=True, across=4),
     "fine": Quality(folded=True, termination=1 / 64, share=3.0, blur=BLUR / 4, thin=1 / 256, across=4),
     "finer": Quality(folded=True, across=4),
     "reference": Quality(),

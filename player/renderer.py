@@ -17,6 +17,7 @@ from kpc.format.grid import linear
 from kpc.format.scene import SPACE_PLANES, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
+from kpc.player.bake import Baking
 from kpc.player.cover import Cover
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
@@ -28,12 +29,12 @@ from kpc.player.thin import Thinning
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
 PLANES_UNIT, ROWS_UNIT, CELLS_UNIT, MOTION_UNIT = 0, 1, 2, 3
-DOUBTS_UNIT = 4
+DOUBTS_UNIT, BAKED_UNIT, RANGES_UNIT = 4, 5, 6
 SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
 SEEN_PROBES_UNIT, MET_PROBES_UNIT = 2, 3
 BLOCK = 4
 """Pixels a side of a block of probes.glsl."""
-PICTURE, OTHER_PICTURE, PROBES, DOUBTS, COARSE = range(5)
+PICTURE, OTHER_PICTURE, PROBES, DOUBTS, COARSE, COVERED = range(6)
 """The targets of a part and size: pictures take turns while the camera moves."""
 COARSER = 2
 """Pixels a side to one of the picture that is marched before, as long as that has a ray for each texel: it then meets all there is."""
@@ -204,6 +205,8 @@ class FoldedInMemory:
     planes: moderngl.Texture
     refine_into: moderngl.Framebuffer
     thinning: Thinning | None
+    baking: Baking | None
+    baked: moderngl.Texture3D | None
     room: np.ndarray
     """For the product of any of the planes."""
     rows: np.ndarray = field(default_factory=lambda: np.empty(0, np.float32))
@@ -216,13 +219,21 @@ class FoldedInMemory:
             most = max(4 * layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
             room = np.empty(most, np.float32)
             thinning = Thinning(scene, layout) if Thinning.serves(scene) else None
-            return FoldedInMemory(layout, refined, planes, ctx.framebuffer([planes]), thinning, room)
+            baking = Baking(scene, layout) if Baking.serves(scene) else None
+            baked = None if baking is None else _volume(ctx, baking.grid.shape[2::-1])
+            return FoldedInMemory(layout, refined, planes, ctx.framebuffer([planes]), thinning, baking, baked, room)
 
     def keep(self) -> None:
         """What was drawn into `refine_into` is the refined planes."""
         self.planes.read_into(self.refined)
         if self.thinning is not None:
             self.thinning.keep(self.refined)
+        if self.baking is not None:
+            self.baking.keep(self.refined)
+
+    def bake(self, time: float) -> None:
+        self.baking.bake(time)
+        self.baked.write(self.baking.grid)
 
     def fold(self, rows: np.ndarray) -> None:
         self.rows = rows
@@ -233,11 +244,13 @@ class FoldedInMemory:
     @property
     def memory_bytes(self) -> int:
         thinning = 0 if self.thinning is None else self.thinning.memory_bytes
-        return self.refined.nbytes + self.rows.nbytes + self.room.nbytes + thinning + _bytes_of(self.planes)
+        baking = 0 if self.baking is None else self.baking.memory_bytes + self.baking.grid.nbytes  # and its texture
+        return self.refined.nbytes + self.rows.nbytes + self.room.nbytes + thinning + baking + _bytes_of(self.planes)
 
     def release(self) -> None:
-        for thing in (self.refine_into, self.planes):
-            thing.release()
+        for thing in (self.refine_into, self.planes, self.baked):
+            if thing is not None:
+                thing.release()
 
 
 @contextlib.contextmanager
@@ -325,6 +338,7 @@ class Renderer:
         self._is_software = is_software(ctx)
         self._folds_in_memory = self._is_software
         self._folds_in_half = not self._is_software
+        self._can_bake = self._folds_in_memory and Baking.serves(scene)
         self._marches_to_trial = TRIAL_AFTER if compute is None and tries_compute(ctx) else math.inf
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
@@ -339,15 +353,15 @@ class Renderer:
             self._row_texture = _texture(ctx, (width, lines))
             self._motion_texture: moderngl.Texture3D | None = None
             if scene.motion is not None:
-                self._motion_texture = ctx.texture3d(scene.motion.shape[3:0:-1], 4, dtype="f4")
-                self._motion_texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
-                self._motion_texture.repeat_x = self._motion_texture.repeat_y = self._motion_texture.repeat_z = False
+                self._motion_texture = _volume(ctx, scene.motion.shape[3:0:-1])
             nz, ny, nx = scene.occupancy.shape[1:]
             self._cells = ctx.texture3d((nx, ny, nz), 1, alignment=1, dtype="u1")
             self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._distances: dict[int, np.ndarray] = {}
         self._covers: dict[int, Cover] = {}
-        self._view_covered: tuple[object, np.ndarray | None] | None = None
+        self._view_ranges: tuple[object, np.ndarray | None] | None = None
+        self._ranged: tuple[Target, tuple[float, float]] | None = None
+        """Baked: `Cover.ranges` of the picture that is being drawn, and how many of its blocks there are to a picture's sides."""
         weights = decoder_arrays(scene.decoder, scene, self.layout)
         if sum(map(len, weights.values())) > CONSTANTS:
             raise DisplayError(
@@ -361,6 +375,7 @@ class Renderer:
         self._rows_time: float | None = None
         self._motion_time: float | None = None
         self._folded_time: float | None = None
+        self._baked_time: float | None = None
         self._is_refined = False
         for block in self.layout.blocks:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
@@ -399,8 +414,15 @@ class Renderer:
         return self.quality.folded and self._rows is not None and self._folds_in_half
 
     @property
+    def bakes(self) -> bool:
+        """Whether samples look up a grid that planes are baked into, where something moves."""
+        return self._can_bake and self.quality.folded and self.quality.baked and self.quality.scales is None
+
+    @property
     def texels_a_sample(self) -> float:
-        """Look-ups in planes and rows that a sample takes, each of four channels with its neighbours."""
+        """Look-ups in planes and rows, or in a grid of what they come to, that a sample takes, each of four channels with its neighbours."""
+        if self.bakes:
+            return 1.0
         layers, shared = self.layout.layers, self._scales_shared()
         planes = 3 if self.quality.folded or self._rows is None else 6
         return float(planes * sum(count / 2 if scale < shared else count for scale, count in enumerate(layers)))
@@ -419,13 +441,15 @@ class Renderer:
         """Replace rows of a space plane from row `first` on: `Layout.texels` of them. Writes to textures that are there."""
         block = self.layout.block(scale, plane)
         self._planes.write(texels, viewport=(block.x, block.y + first, texels.shape[1], texels.shape[0]))
-        self._folded_time = self._cells_written = None
+        self._folded_time = self._baked_time = self._cells_written = None
         self._is_refined = False
         self._shots.clear()
 
     def refresh(self) -> None:
         """Look at the scene's time planes anew: some of their rows have changed."""
-        self._rows_time = self._motion_time = self._folded_time = self._cells_written = None
+        self._rows_time = self._motion_time = self._folded_time = self._baked_time = self._cells_written = None
+        if isinstance(self._folded, FoldedInMemory) and self._folded.baking is not None:
+            self._folded.baking.refresh()
         self._shots.clear()
 
     def render(
@@ -533,12 +557,13 @@ class Renderer:
             self._displace(time)
         if moving and not folded:
             self._cut(time)
-        planes = self._fold(time) if folded else self._planes
-        self._occupy(slot_at(scene, time), time if folded else None)
+        baked = folded and self.bakes
+        planes = self._planes if not folded else self._bake(time) if baked else self._fold(time)
+        self._occupy(slot_at(scene, time), time if folded and not baked else None)
         raster = (camera.width, camera.height)
         layout = self.folded_layout if folded else self.layout
         drawn = min(quality.scales or layout.scales, layout.scales)
-        shared = 0 if isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
+        shared = 0 if baked or isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
         self._marches_to_trial -= 1
         if self._marches_to_trial == 0:
             self.compute = self.is_compute_faster(camera, time)
@@ -548,7 +573,7 @@ class Renderer:
         def draw(target: Target, camera: Camera = camera, pixels: int = ALL, points: int = 0, **more: object) -> None:
             target.drawn = target.drawn if pixels == ONLY_DOUBTED else EVERYWHERE
             march, vertices = self._program(
-                program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels,
+                program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels, baked=baked,
                 compute=self.compute and program == "march.glsl",
             )  # fmt: skip
             _set(
@@ -560,7 +585,11 @@ class Renderer:
                 **_lens_of(camera),
                 **more,
             )
-            planes.use(PLANES_UNIT)
+            if baked and self._ranged is not None:
+                ranges, blocks = self._ranged
+                _set(march, to_ranges=(blocks[0] / camera.width / ranges.seen.width, blocks[1] / camera.height / ranges.seen.height))
+                ranges.seen.use(RANGES_UNIT)
+            planes.use(BAKED_UNIT if baked else PLANES_UNIT)
             self._row_texture.use(ROWS_UNIT)
             if self._motion_texture is not None:
                 self._motion_texture.use(MOTION_UNIT)
@@ -576,7 +605,7 @@ class Renderer:
         self._pictures += 1
         before = self._shots.pop((part, raster), None)
         before = before if before is not None and self._pictures - before.count <= LATELY else None
-        if program == "march.glsl" and quality.tolerance:
+        if program == "march.glsl" and quality.tolerance and not baked:
             target = self._followed(draw, part, before, Shot(camera, time, code.tobytes(), quality, self._pictures))
         elif program == "march.glsl":
             self._draw_alone(draw, part, target := self._target(part, raster), camera)
@@ -603,14 +632,17 @@ class Renderer:
 
     def _draw_all(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> tuple[float, Bounds]:
         """March all pixels that may see something; tell their share, and about where they are."""
-        blocks = self._covered(camera)
+        blocks, ranges = self._covered(camera), self._ranges(camera)
+        if ranges is None:
+            ranges = np.array([[[0.0, LARGEST_FLOAT]]], np.float32)
+        covered = self._target(part, ranges.shape[1::-1], COVERED)
+        covered.seen.write(np.dstack([ranges[..., 1:] > 0, ranges, ranges[..., :1]]).astype(np.float32))
+        self._ranged = covered, (camera.width / BLOCK, camera.height / BLOCK)
         if blocks is None:
             draw(target, camera)
             return 1.0, EVERYWHERE
         self._empty(target)
         target.drawn = _shares(_bounds(blocks), blocks.shape[::-1])
-        covered = self._target(part, blocks.shape[::-1], DOUBTS)
-        covered.seen.write(np.repeat(blocks[..., None], 4, axis=-1).astype(np.float32))
         self._draw_doubted(draw, target, camera, covered)
         return float(blocks.mean()), target.drawn
 
@@ -770,17 +802,22 @@ class Renderer:
         nothing, vertices = self._program("nothing.glsl", self.layout)
         self._draw(target.framebuffer, vertices, within=target.drawn)
 
-    def _covered(self, camera: Camera) -> np.ndarray | None:
-        """`Cover.blocks` of what is occupied now, where drawing only those is quicker: by a processor, and of less than MOST_COVERED."""
+    def _ranges(self, camera: Camera) -> np.ndarray | None:
+        """`Cover.ranges` of what is occupied now, for a processor."""
         if not self._is_software or self.scene.mapping is not None or self._slot is None:
             return None
         if self._slot not in self._covers:
             self._covers[self._slot] = Cover.of(self.scene.occupancy[self._slot], self.scene.aabb)
         view = self._slot, camera.width, _lens_of(camera)
-        if self._view_covered is None or self._view_covered[0] != view:
-            blocks = self._covers[self._slot].blocks(camera, BLOCK)
-            self._view_covered = view, None if blocks is None or blocks.mean() > MOST_COVERED else blocks
-        return self._view_covered[1]
+        if self._view_ranges is None or self._view_ranges[0] != view:
+            self._view_ranges = view, self._covers[self._slot].ranges(camera, BLOCK)
+        return self._view_ranges[1]
+
+    def _covered(self, camera: Camera) -> np.ndarray | None:
+        """(rows, columns) bool: blocks of a picture that may show anything, where drawing only those is quicker: less than MOST_COVERED."""
+        ranges = self._ranges(camera)
+        blocks = None if ranges is None else ranges[..., 1] > 0
+        return None if blocks is None or blocks.mean() > MOST_COVERED else blocks
 
     def rays_across(self, camera: Camera) -> int:
         """As many as a pixel spans texels, as far as `quality` and PIXELS_MARCHED allow. One where space is mapped: there texels differ."""
@@ -832,11 +869,11 @@ class Renderer:
     def _program(
         self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
         shared: int = 0, pixels: int = ALL, moved: bool = False, cubic: bool = False, view: int = 0,
-        compute: bool = False,
+        compute: bool = False, baked: bool = False,
     ) -> tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
         tiles = self._tiles
-        key = name, layout.refined, rows, displaced, drawn, shared, pixels, moved, cubic, view, compute, tiles
+        key = name, layout.refined, rows, displaced, drawn, shared, pixels, moved, cubic, view, compute, baked, tiles
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
@@ -849,6 +886,7 @@ class Renderer:
             "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
             "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
             "MOTION": int(displaced),
+            "BAKED": int(baked),
             "SHARED": shared,
             "PIXELS": pixels,
             "MOVED": int(moved),
@@ -875,6 +913,9 @@ class Renderer:
             rows=ROWS_UNIT,
             cells=CELLS_UNIT,
             motion=MOTION_UNIT,
+            baked=BAKED_UNIT,
+            ranges=RANGES_UNIT,
+            corners=tuple(map(float, scene.scales[-1]["xy"].shape[1::-1])) + (float(scene.scales[-1]["xz"].shape[0]),),
             nodes=(1.0, 1.0, 1.0) if self._motion_texture is None else tuple(map(float, self._motion_texture.size)),
             rows_texel=(1 / self._row_texture.width, 1 / self._row_texture.height),
             cell_count=tuple(map(float, scene.occupancy.shape[:0:-1])),
@@ -900,7 +941,7 @@ class Renderer:
         free = self._distances[slot]
         if thinning is not None:
             free = free | thinning.empty(slot, self._folded.rows, time, self.quality.thin)  # 0 in what is occupied, 1 in what is so and empty
-        self._cells.write(free.tobytes())
+        self._cells.write(free)
         self._slot, self._cells_written = slot, cells
 
     def _cut(self, time: float) -> None:
@@ -914,22 +955,24 @@ class Renderer:
             self._motion_texture.write(np.concatenate([offsets, offsets[..., :1]], axis=-1))  # RGBA: RGB is seldom native
             self._motion_time = time
 
-    def _fold(self, time: float) -> moderngl.Texture:
-        layout = self.folded_layout
+    def _refined(self) -> Folded | FoldedInMemory:
+        """What folding takes, with planes as they are now."""
         if self._folded is None and self._folds_in_memory:
-            self._folded = FoldedInMemory.of(self.ctx, layout, self.scene)
+            self._folded = FoldedInMemory.of(self.ctx, self.folded_layout, self.scene)
         elif self._folded is None:
-            self._folded = Folded.of(self.ctx, layout, self._row_texture.size, self._folds_in_half)
-        folded = self._folded
-        if time == self._folded_time or self._rows is None:
-            return folded.planes
+            self._folded = Folded.of(self.ctx, self.folded_layout, self._row_texture.size, self._folds_in_half)
         if not self._is_refined:
             self._planes.use(PLANES_UNIT)
-            self._draw_planes("refine.glsl", folded.refine_into)
-            if isinstance(folded, FoldedInMemory):
-                folded.keep()
+            self._draw_planes("refine.glsl", self._folded.refine_into)
+            if isinstance(self._folded, FoldedInMemory):
+                self._folded.keep()
             self._is_refined = True
-        rows = self._rows.at(time, layout.refined)
+        return self._folded
+
+    def _fold(self, time: float) -> moderngl.Texture:
+        if time == self._folded_time or self._rows is None:
+            return self._refined().planes
+        folded, rows = self._refined(), self._rows.at(time, self.folded_layout.refined)
         if isinstance(folded, FoldedInMemory):
             folded.fold(rows)
         else:
@@ -939,6 +982,13 @@ class Renderer:
             self._draw_planes("fold.glsl", folded.fold_into, folded_rows_texel=tuple(1 / side for side in folded.rows.size))
         self._folded_time = time
         return folded.planes
+
+    def _bake(self, time: float) -> moderngl.Texture3D:
+        folded = self._refined()
+        if time != self._baked_time:
+            folded.bake(time)
+            self._baked_time = time
+        return folded.baked
 
     def _draw_planes(self, name: str, into: moderngl.Framebuffer, **more: object) -> None:
         """Draw each plane as it lies in the folded layout, by a shader that is told where that is and which rows go with it."""
@@ -997,6 +1047,14 @@ def _texture(ctx: moderngl.Context, size: tuple[int, int], dtype: str = "f4") ->
     whole = ctx.framebuffer([texture])
     whole.clear()
     whole.release()
+    return texture
+
+
+def _volume(ctx: moderngl.Context, size: tuple[int, int, int]) -> moderngl.Texture3D:
+    """A texture of float32 vectors of four, filtered, clamped at its faces."""
+    texture = ctx.texture3d(size, 4, dtype="f4")
+    texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+    texture.repeat_x = texture.repeat_y = texture.repeat_z = False
     return texture
 
 

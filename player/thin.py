@@ -70,12 +70,7 @@ class Thinning:
 
     def keep(self, refined: np.ndarray) -> None:
         """Take over planes from an atlas, (height, width, 4), of the layout."""
-        self.planes = []
-        for block in self._layout.blocks:
-            every, part = self._layout.refined, refined[self._layout.part(block)]
-            part = part.reshape(block.height, -1, block.width, 4).swapaxes(1, 2)
-            part = part[::every] if block.upright else part[:, ::every]
-            self.planes.append(np.ascontiguousarray(part).reshape(*part.shape[:2], -1))
+        self.planes = [self._layout.unrefined(refined, block) for block in self._layout.blocks]
         self._folded = [np.empty_like(plane) for plane in self.planes]
 
     def empty(self, slot: int, rows: np.ndarray, time: float, alpha: float) -> np.ndarray:

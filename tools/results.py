@@ -1,13 +1,14 @@
-"""Tables of benchmark records, and the block of README.md that holds them.
+"""Tables of benchmark records, and the documents that hold them.
 
-python -m kpc.tools.results docs/bench/*.json                       print the tables as Markdown
-python -m kpc.tools.results docs/bench/*.json --readme README.md    rewrite the block between the markers
+python -m kpc.tools.results docs/bench/*.json                                        print the tables as Markdown
+python -m kpc.tools.results docs/bench/*.json --into README.md docs/measured.md      rewrite those between the documents' markers
 
-Numbers in documents come from here, never from a keyboard. A cell is the median over the repeats of a run.
+Tables in documents come from here, never from a keyboard. A cell is the median over the repeats of a run.
 """
 
 import argparse
 import json
+import re
 import statistics
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -23,8 +24,10 @@ LOSSES_DB = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 Record = dict[str, Any]
 Column = tuple[str, Callable[[Record], str]]
 
-BEGIN = "<!-- results: begin; written by `python -m kpc.tools.results docs/bench/*.json --readme README.md` -->"
-END = "<!-- results: end -->"
+MARKED = re.compile(r"(<!-- (\w+): begin\b[^\n]*-->)(.*?)(<!-- \2: end -->)", re.DOTALL)
+"""In a document: a name, and what stands between its markers."""
+MARKER = re.compile(r"<!-- \w+: (?:begin|end)\b")
+GLANCED_AT = "640x480"
 
 
 def median(record: Record, key: str) -> float | None:
@@ -325,36 +328,60 @@ def aligned(table: Sequence[Sequence[str]]) -> str:
     return "\n".join("  ".join(text.ljust(width) for text, width in zip(row, widths)).rstrip() for row in table)
 
 
-def markdown(records: Sequence[Record], brief: bool = False) -> str:
-    """Tables of all records, one for each kind and machine, and below each where its numbers come from. `brief`: of the qualities of
-    playing only the default and the reference."""
-    if brief:
-        records = [record for record in records if record["kind"] != "player"
-                   or record["settings"]["quality"] in (record["settings"]["default"], "reference")]  # fmt: skip
-    parts = []
-    for kind, title in TITLES.items():
-        ours = [record for record in records if record["kind"] == kind]
-        for place in dict.fromkeys(map(_place, ours)):
-            here = [record for record in ours if _place(record) == place]
-            head, *rows = cells(kind, here)
-            lines = _lines(head, rows)
-            runs = sorted({len(record["repeats"]) for record in here})
-            commits = ", ".join(dict.fromkeys(_short(record["commit"]) for record in here))
-            parts.append(f"**{title}** on {place}:")
-            parts.append(lines)
-            if kind == "codec":
-                parts.append("At equal loss: size, and how much smaller that is than the smallest of what is at hand:")
-                head, *rows = _loss_table(here)
-                parts.append(_lines(head, rows))
-                parts.append("By `--quality`, size and PSNR loss:")
-                head, *rows = _quality_table(here)
-                parts.append(_lines(head, rows))
-            parts.append(
-                f"Commit {commits}; median of {' or '.join(map(str, runs))} run{'s' * (runs != [1])}; "
-                + "; ".join(dict.fromkeys(f"`{record['command']}`" for record in here))
-                + "."
-            )
+def markdown(records: Sequence[Record]) -> str:
+    """Tables of all records, one for each kind and machine, and below each where its numbers come from."""
+    return "\n\n".join(tables(kind, records) for kind in TITLES if any(record["kind"] == kind for record in records))
+
+
+def tables(kind: str, records: Iterable[Record]) -> str:
+    """Those of one kind."""
+    parts, ours = [], [record for record in records if record["kind"] == kind]
+    for place in dict.fromkeys(map(_place, ours)):
+        here = [record for record in ours if _place(record) == place]
+        head, *rows = cells(kind, here)
+        runs = sorted({len(record["repeats"]) for record in here})
+        commits = ", ".join(dict.fromkeys(_short(record["commit"]) for record in here))
+        parts += [f"**{TITLES[kind]}** on {place}:", _lines(head, rows)]
+        if kind == "codec":
+            parts.append("At equal loss: size, and how much smaller that is than the smallest of what is at hand:")
+            head, *rows = _loss_table(here)
+            parts.append(_lines(head, rows))
+            parts.append("By `--quality`, size and PSNR loss:")
+            head, *rows = _quality_table(here)
+            parts.append(_lines(head, rows))
+        parts.append(
+            f"Commit {commits}; median of {' or '.join(map(str, runs))} run{'s' * (runs != [1])}; "
+            + "; ".join(dict.fromkeys(f"`{record['command']}`" for record in here))
+            + "."
+        )
     return "\n\n".join(parts)
+
+
+def glance(records: Sequence[Record]) -> str:
+    """A line a scene: what its file is, of the encoding that the player's file is named after, and how fast a processor plays it."""
+    encoded = {
+        f"{record['name']}-{record['settings']['preset']}": record
+        for record in records
+        if record["kind"] == "encode" and record["settings"].get("psnr_db") is None
+    }
+    played = {
+        record["name"]: record
+        for record in records
+        if record["kind"] == "player" and is_brief(record) and record["settings"]["size"] == GLANCED_AT
+        and record["settings"]["quality"] == record["settings"]["default"] and "llvmpipe" in record["renderer"]
+    }  # fmt: skip
+    rows = [
+        [*(cell(encoded[name]) for _, cell in COLUMNS["encode"][:5]), f"{median(encoded[name], 'encode_s') / 60:.0f}",
+         str(encoded[name]["machine"]["cores"]), *(cell(played[name]) for cell in (_number("fps", "{:.0f}"), _accuracy("psnr", "{:.0f}")))]
+        for name in played if name in encoded
+    ]  # fmt: skip
+    head = [*(name for name, _ in COLUMNS["encode"][:5]), "encoded in minutes", "on cores", f"fps at {GLANCED_AT}", "dB to exact ones"]
+    return _lines(head, rows)
+
+
+def is_brief(record: Record) -> bool:
+    """Whether documents show it: of the qualities of playing, only the default and the reference."""
+    return record["kind"] != "player" or record["settings"]["quality"] in (record["settings"]["default"], "reference")
 
 
 def _lines(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -393,19 +420,26 @@ def load(paths: Iterable[Path]) -> list[Record]:
     return records
 
 
-def rewrite(readme: Path, block: str) -> None:
-    """Put `block` between the markers of `readme`.
+def rewrite(document: Path, records: Sequence[Record]) -> set[str]:
+    """Put the tables of each kind of record, and what is seen at a glance, between the markers of that name. Tells which it has.
 
     Raises:
-        FormatError: the markers are not there, once each and in order.
+        FormatError: its markers are not pairs, or name something else.
     """
-    text = readme.read_text()
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end or BEGIN in after or END in after:
-        raise FormatError(f"{readme}: needs the lines {BEGIN} and {END}, once each and in this order")
-    with cli.written_aside(readme) as aside:
-        aside.write_text(f"{before}{BEGIN}\n\n{block}\n\n{END}{after}")
+    text = document.read_text()
+    names = [name for _, name, _, _ in MARKED.findall(text)]
+    known = {*TITLES, "glance"}
+    if not names or len(MARKER.findall(text)) != 2 * len(names) or len({*names}) < len(names) or not known.issuperset(names):
+        raise FormatError(f"{document}: needs lines such as <!-- encode: begin --> and <!-- encode: end -->, a pair a name of {sorted(known)}")
+    shown = [record for record in records if is_brief(record)]
+
+    def filled(found: re.Match[str]) -> str:
+        name = found[2]
+        return f"{found[1]}\n\n{glance(shown) if name == 'glance' else tables(name, shown)}\n\n{found[4]}"
+
+    with cli.written_aside(document) as aside:
+        aside.write_text(MARKED.sub(filled, text))
+    return {*names}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -415,14 +449,18 @@ def main(argv: list[str] | None = None) -> int:
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser("results", description="Tables of benchmark records, as Markdown.")
     parser.add_argument("records", type=Path, nargs="+", help="files that kpbench --out wrote")
-    parser.add_argument("--readme", type=Path, help="rewrite the block between this file's markers instead of printing")
+    parser.add_argument("--into", type=Path, nargs="+", default=[], help="rewrite those between these files' markers instead of printing")
     options = parser.parse_args(argv)
     records = load(options.records)
-    if options.readme is None:
+    if not options.into:
         print(markdown(records))
-    else:
-        rewrite(options.readme, markdown(records, brief=True))
-        print(options.readme)
+        return
+    missing = {record["kind"] for record in records}
+    for document in options.into:
+        missing -= rewrite(document, records)
+        print(document)
+    if missing:
+        raise FormatError(f"{', '.join(map(str, options.into))}: no place for tables of {', '.join(sorted(missing))}")
 
 
 if __name__ == "__main__":
