@@ -17,7 +17,7 @@ from kpc.format.grid import linear
 from kpc.format.scene import SPACE_PLANES, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
-from kpc.player.bake import Baking
+from kpc.player.bake import Baking, corners_of
 from kpc.player.cover import Cover
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
@@ -29,12 +29,12 @@ from kpc.player.thin import Thinning
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
 PLANES_UNIT, ROWS_UNIT, CELLS_UNIT, MOTION_UNIT = 0, 1, 2, 3
-DOUBTS_UNIT, BAKED_UNIT, RANGES_UNIT = 4, 5, 6
+DOUBTS_UNIT, BAKED_UNIT = 4, 5
 SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
 SEEN_PROBES_UNIT, MET_PROBES_UNIT = 2, 3
 BLOCK = 4
 """Pixels a side of a block of probes.glsl."""
-PICTURE, OTHER_PICTURE, PROBES, DOUBTS, COARSE, COVERED = range(6)
+PICTURE, OTHER_PICTURE, PROBES, DOUBTS, COARSE = range(5)
 """The targets of a part and size: pictures take turns while the camera moves."""
 COARSER = 2
 """Pixels a side to one of the picture that is marched before, as long as that has a ray for each texel: it then meets all there is."""
@@ -359,9 +359,7 @@ class Renderer:
             self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._distances: dict[int, np.ndarray] = {}
         self._covers: dict[int, Cover] = {}
-        self._view_ranges: tuple[object, np.ndarray | None] | None = None
-        self._ranged: tuple[Target, tuple[float, float]] | None = None
-        """Baked: `Cover.ranges` of the picture that is being drawn, and how many of its blocks there are to a picture's sides."""
+        self._view_covered: tuple[object, np.ndarray | None] | None = None
         weights = decoder_arrays(scene.decoder, scene, self.layout)
         if sum(map(len, weights.values())) > CONSTANTS:
             raise DisplayError(
@@ -585,10 +583,6 @@ class Renderer:
                 **_lens_of(camera),
                 **more,
             )
-            if baked and self._ranged is not None:
-                ranges, blocks = self._ranged
-                _set(march, to_ranges=(blocks[0] / camera.width / ranges.seen.width, blocks[1] / camera.height / ranges.seen.height))
-                ranges.seen.use(RANGES_UNIT)
             planes.use(BAKED_UNIT if baked else PLANES_UNIT)
             self._row_texture.use(ROWS_UNIT)
             if self._motion_texture is not None:
@@ -632,17 +626,14 @@ class Renderer:
 
     def _draw_all(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> tuple[float, Bounds]:
         """March all pixels that may see something; tell their share, and about where they are."""
-        blocks, ranges = self._covered(camera), self._ranges(camera)
-        if ranges is None:
-            ranges = np.array([[[0.0, LARGEST_FLOAT]]], np.float32)
-        covered = self._target(part, ranges.shape[1::-1], COVERED)
-        covered.seen.write(np.dstack([ranges[..., 1:] > 0, ranges, ranges[..., :1]]).astype(np.float32))
-        self._ranged = covered, (camera.width / BLOCK, camera.height / BLOCK)
+        blocks = self._covered(camera)
         if blocks is None:
             draw(target, camera)
             return 1.0, EVERYWHERE
         self._empty(target)
         target.drawn = _shares(_bounds(blocks), blocks.shape[::-1])
+        covered = self._target(part, blocks.shape[::-1], DOUBTS)
+        covered.seen.write(np.repeat(blocks[..., None], 4, axis=-1).astype(np.float32))
         self._draw_doubted(draw, target, camera, covered)
         return float(blocks.mean()), target.drawn
 
@@ -802,22 +793,17 @@ class Renderer:
         nothing, vertices = self._program("nothing.glsl", self.layout)
         self._draw(target.framebuffer, vertices, within=target.drawn)
 
-    def _ranges(self, camera: Camera) -> np.ndarray | None:
-        """`Cover.ranges` of what is occupied now, for a processor."""
+    def _covered(self, camera: Camera) -> np.ndarray | None:
+        """`Cover.blocks` of what is occupied now, where drawing only those is quicker: by a processor, and of less than MOST_COVERED."""
         if not self._is_software or self.scene.mapping is not None or self._slot is None:
             return None
         if self._slot not in self._covers:
             self._covers[self._slot] = Cover.of(self.scene.occupancy[self._slot], self.scene.aabb)
         view = self._slot, camera.width, _lens_of(camera)
-        if self._view_ranges is None or self._view_ranges[0] != view:
-            self._view_ranges = view, self._covers[self._slot].ranges(camera, BLOCK)
-        return self._view_ranges[1]
-
-    def _covered(self, camera: Camera) -> np.ndarray | None:
-        """(rows, columns) bool: blocks of a picture that may show anything, where drawing only those is quicker: less than MOST_COVERED."""
-        ranges = self._ranges(camera)
-        blocks = None if ranges is None else ranges[..., 1] > 0
-        return None if blocks is None or blocks.mean() > MOST_COVERED else blocks
+        if self._view_covered is None or self._view_covered[0] != view:
+            blocks = self._covers[self._slot].blocks(camera, BLOCK)
+            self._view_covered = view, None if blocks is None or blocks.mean() > MOST_COVERED else blocks
+        return self._view_covered[1]
 
     def rays_across(self, camera: Camera) -> int:
         """As many as a pixel spans texels, as far as `quality` and PIXELS_MARCHED allow. One where space is mapped: there texels differ."""
@@ -914,8 +900,7 @@ class Renderer:
             cells=CELLS_UNIT,
             motion=MOTION_UNIT,
             baked=BAKED_UNIT,
-            ranges=RANGES_UNIT,
-            corners=tuple(map(float, scene.scales[-1]["xy"].shape[1::-1])) + (float(scene.scales[-1]["xz"].shape[0]),),
+            corners=tuple(map(float, corners_of(scene)[::-1])),
             nodes=(1.0, 1.0, 1.0) if self._motion_texture is None else tuple(map(float, self._motion_texture.size)),
             rows_texel=(1 / self._row_texture.width, 1 / self._row_texture.height),
             cell_count=tuple(map(float, scene.occupancy.shape[:0:-1])),

@@ -7,7 +7,7 @@
 // NDC: 1 where all this is in device coordinates. DRAWN: how many scales count. SHARED: how many, from
 // the coarsest on, are looked up once for two samples, in the middle between them; the next gives their slope.
 // PIXELS: 0 all are marched; 1 the probes (probes.glsl), as in tiles.glsl; 2 blocks in doubt (blocks.glsl).
-// BAKED: 1 where a grid holds what the planes come to, and blocks tell where on their way rays may meet anything.
+// BAKED: 1 where a grid holds what the planes come to.
 // COMPUTE: 1 for a compute shader (GL 4.3).
 
 #include "ray.glsl"
@@ -30,8 +30,6 @@ uniform sampler3D motion;
 #if BAKED
 uniform sampler3D baked;            // logits of the colour and log densities, corner-aligned over the planes, at
 uniform vec3 corners;               // so many along x, y, z
-uniform sampler2D ranges;           // of a block in gb: how far away anything is, at least and at most
-uniform vec2 to_ranges;             // pixels to shares of that texture
 #endif
 uniform vec2 rows_texel;            // 1 / size of the texture
 uniform vec3 cell_count;
@@ -255,11 +253,6 @@ void march(vec2 fragment, out vec4 seen, out vec4 met) {
 #endif
     Path path = path_of(eye, camera_direction(fragment, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
-#if BAKED
-    vec2 range = textureLod(ranges, fragment * to_ranges, 0.0).gb;
-    walk.k = max(floor((range.x - walk.near) / stride - 0.5), 0.0);
-    walk.far = min(walk.far, range.y);
-#endif
     Met sum = Met(vec3(0.0), 1.0, 0.0, 0.0);
     Place place;
     bool more = to_occupied(walk, cells, place);
