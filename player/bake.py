@@ -15,9 +15,10 @@ from kpc.format.rans import compiled, inlined
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.player.cores import share_out
 from kpc.player.textures import Layout
+from kpc.player.thin import Corners, displace
 
-MOST_CORNERS = 1 << 18
-"""Of a grid, 4 MB; more take longer to bake than to look up in planes."""
+MOST_CORNERS = 1 << 20
+"""Of a grid, 16 MB."""
 VECTOR = 16
 """Channels come in multiples of so many: as many floats as the widest processors multiply at once."""
 LARGEST = np.float32(1e30)
@@ -25,10 +26,11 @@ LARGEST = np.float32(1e30)
 
 
 class Baking:
-    """The grid of a scene, baked anew for each picture.
+    """The grid of a scene, baked anew for each picture, as far as samples look at it.
 
     Attributes:
-        grid: (Nz, Ny, Nx, 4) float32, corner-aligned over [0, 1]^3: logits of red, green and blue, log density.
+        grid: (Nz, Ny, Nx, 4) float32, corner-aligned over [0, 1]^3: logits of red, green and blue, log density. Anything finite where no
+            sample looks.
     """
 
     def __init__(self, scene: Scene, layout: Layout) -> None:
@@ -36,6 +38,8 @@ class Baking:
         self.grid = np.zeros((*corners_of(scene), 4), np.float32)
         self._channels = [scale["xy"].shape[2] for scale in scene.scales]
         self._planes: dict[str, np.ndarray] = {}
+        self._spans: dict[tuple[int, int], np.ndarray] = {}
+        self._corners: Corners | None = None
         self._time_planes: dict[str, list[np.ndarray]] | None = None
         """Of all scales, at corners along their axes of space."""
         weights = np.concatenate([scene.decoder.b2, scene.decoder.density_weight[None]])
@@ -59,28 +63,73 @@ class Baking:
             planes[block.plane].append(self._at_corners(self._at_corners(plane, 0, block.plane[1]), 1, block.plane[0]))
         self._planes = {name: _filled(np.concatenate(parts, axis=2)) for name, parts in planes.items()}
 
-    def bake(self, time: float) -> None:
-        """Fill the grid."""
+    def bake(self, slot: int, time: float) -> None:
+        """Fill the grid as far as samples in occupied cells of a slot look at it, as of a time in it."""
+        row = self._row(time)
+        if (slot, row) not in self._spans:
+            self._spans[slot, row] = _spans(self._reached(slot, row))
+        spans = self._spans[slot, row]
         along_x, along_y, along_z = (self._rows(name, time) for name in TIME_PLANES)
         bias = np.float32(self._scene.decoder.density_bias)
-        xy, xz, yz = self._planes["xy"] * along_x, self._planes["xz"], self._planes["yz"]
+        xz, yz = self._planes["xz"], self._planes["yz"]
+        with np.errstate(over="ignore", invalid="ignore"):  # bounded below
+            xy = self._planes["xy"] * along_x
 
         def fill(part: slice) -> None:
-            _fill(xy, xz[part], yz[part], along_y, along_z[part], self._weights, bias, self.grid[part])
+            _fill(spans[part], xy, xz, yz, along_y, along_z, self._weights, bias, self.grid)
 
-        share_out(fill, len(self.grid))
+        share_out(fill, len(spans))
 
     def refresh(self) -> None:
         """Look at the scene's time planes anew: some of their rows have changed."""
         self._time_planes = None
 
     def _rows(self, name: str, time: float) -> np.ndarray:
-        """(N, M) of a time plane of all scales, at a time."""
+        """(N, M) of the rows of all scales at a time, at corners."""
         if self._time_planes is None:
             self._time_planes = {
                 name: [self._at_corners(scale[name], 1, name[0]) for scale in self._scene.scales] for name in TIME_PLANES
             }
-        return _filled(np.concatenate([linear(plane, time) for plane in self._time_planes[name]], axis=1))
+        rows = [linear(plane, time) for plane in self._time_planes[name]]
+        return np.concatenate([*rows, np.zeros((len(rows[0]), self._weights.shape[1] - sum(self._channels)), np.float32)], axis=1)
+
+    def _row(self, time: float) -> int:
+        """Of the motion grid, the last but at its end."""
+        rows = 1 if self._scene.motion is None else len(self._scene.motion)
+        return min(int(time * (rows - 1)), max(rows - 2, 0))
+
+    def _reached(self, slot: int, row: int) -> np.ndarray:
+        """(Nz, Ny, Nx) bool: corners of the grid that samples in occupied cells of a slot look at, between a row of the motion grid and the
+        next. There places move evenly in time, and between its nodes in space, where cells are cut: so the corners of the parts bound what
+        they reach."""
+        motion = self._scene.motion
+        reached = np.zeros(self.grid.shape[:3], bool)
+        if self._corners is None or self._corners.slot != slot:
+            self._corners = self._cut_corners(slot)
+        corners = self._corners
+        texels = np.array(reached.shape[::-1], np.float32) - 1
+
+        def places_at(row: int) -> np.ndarray:
+            places = corners.places.copy()
+            if motion is not None:
+                share_out(lambda part: displace(places[part], motion[row]), len(places))
+            return np.multiply(places, texels, out=places)
+
+        one = places_at(row)
+        other = one if motion is None or row + 1 == len(motion) else places_at(row + 1)
+        share_out(lambda part: _reach(corners.of_cells[part], one, other, reached), len(corners.of_cells))
+        return reached
+
+    def _cut_corners(self, slot: int) -> Corners:
+        """Of the occupied cells of a slot, cut where nodes of the motion grid lie."""
+        occupied, motion = self._scene.occupancy[slot], self._scene.motion
+        lines = []
+        for axis, side in enumerate(occupied.shape):
+            faces = np.arange(side + 1) / side
+            lines.append(faces if motion is None else np.union1d(faces, np.linspace(0, 1, motion.shape[1 + axis])))
+            cell = np.searchsorted(faces, (lines[-1][1:] + lines[-1][:-1]) / 2) - 1
+            occupied = occupied.take(cell, axis)
+        return Corners.of(slot, occupied, lines[::-1])
 
     def _at_corners(self, array: np.ndarray, axis: int, along: str) -> np.ndarray:
         """An array that is corner-aligned along one of its axes, there as fine as the grid is along x, y or z."""
@@ -108,27 +157,48 @@ def bounded(value):
     return min(max(value, -LARGEST), LARGEST) if value == value else np.float32(0)
 
 
+def _spans(reached: np.ndarray) -> np.ndarray:
+    """(N, 4) of z, y, the first x and the one behind the last, of each row along x in which anything is set."""
+    z, y = np.nonzero(reached.any(2))
+    rows = reached[z, y]
+    return np.stack([z, y, rows.argmax(1), rows.shape[1] - rows[:, ::-1].argmax(1)], axis=1)
+
+
+@compiled()
+def _reach(cells, one, other, reached):
+    """Set what cells look at whose eight corners, (N, 8), are at these places, (M, 3) in texels, or at the others, or in between."""
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for n in range(len(cells)):
+        for axis in range(3):
+            least, most = one[cells[n, 0], axis], one[cells[n, 0], axis]
+            for corner in cells[n]:
+                least = min(least, one[corner, axis], other[corner, axis])
+                most = max(most, one[corner, axis], other[corner, axis])
+            low[axis], high[axis] = int(least), int(most) + 2
+        reached[low[2] : high[2], low[1] : high[1], low[0] : high[0]] = True
+
+
 @compiled(fastmath={"contract", "reassoc"})
-def _fill(xy, xz, yz, along_y, along_z, weights, bias, grid):
-    """Planes (rows, columns, M), `xy` times its row; the others' rows apart, (N, M); `weights` (4, M)."""
+def _fill(spans, xy, xz, yz, along_y, along_z, weights, bias, grid):
+    """The corners of some spans. Planes (rows, columns, M), `xy` times its row; the others' rows apart, (N, M); `weights` (4, M)."""
     ny, nx, channels = xy.shape
     of_xy, of_xz, here = xy.ravel(), xz.ravel(), np.empty(4 * channels, np.float32)
     # Unsigned, so that no place counts from an array's end: that would keep the loop over channels from being one of vectors.
     count = np.uint64(channels)
     green_at, blue_at, density_at = count, np.uint64(2) * count, np.uint64(3) * count
-    for z in range(len(grid)):
-        for y in range(ny):
-            for of in range(4):
-                for m in range(channels):
-                    here[of * channels + m] = yz[z, y, m] * along_y[y, m] * along_z[z, m] * weights[of, m]
-            for x in range(nx):
-                at_xy, at_xz = np.uint64(channels * (y * nx + x)), np.uint64(channels * (z * nx + x))
-                red, green, blue, log_density = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-                for m in range(count):
-                    feature = of_xy[at_xy + m] * of_xz[at_xz + m]
-                    red += feature * here[m]
-                    green += feature * here[green_at + m]
-                    blue += feature * here[blue_at + m]
-                    log_density += feature * here[density_at + m]
-                corner = grid[z, y, x]
-                corner[0], corner[1], corner[2], corner[3] = bounded(red), bounded(green), bounded(blue), bounded(log_density + bias)
+    for n in range(len(spans)):
+        z, y, first, end = spans[n]
+        for of in range(4):
+            for m in range(channels):
+                here[of * channels + m] = yz[z, y, m] * along_y[y, m] * along_z[z, m] * weights[of, m]
+        for x in range(first, end):
+            at_xy, at_xz = np.uint64(channels * (y * nx + x)), np.uint64(channels * (z * nx + x))
+            red, green, blue, log_density = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+            for m in range(count):
+                feature = of_xy[at_xy + m] * of_xz[at_xz + m]
+                red += feature * here[m]
+                green += feature * here[green_at + m]
+                blue += feature * here[blue_at + m]
+                log_density += feature * here[density_at + m]
+            corner = grid[z, y, x]
+            corner[0], corner[1], corner[2], corner[3] = bounded(red), bounded(green), bounded(blue), bounded(log_density + bias)

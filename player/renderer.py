@@ -231,8 +231,8 @@ class FoldedInMemory:
         if self.baking is not None:
             self.baking.keep(self.refined)
 
-    def bake(self, time: float) -> None:
-        self.baking.bake(time)
+    def bake(self, slot: int, time: float) -> None:
+        self.baking.bake(slot, time)
         self.baked.write(self.baking.grid)
 
     def fold(self, rows: np.ndarray) -> None:
@@ -357,6 +357,7 @@ class Renderer:
             nz, ny, nx = scene.occupancy.shape[1:]
             self._cells = ctx.texture3d((nx, ny, nz), 1, alignment=1, dtype="u1")
             self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        self._middle, self._finest_texel = scene.aabb.mean(0), scene.extent / _texels_across(scene.scales[-1])
         self._distances: dict[int, np.ndarray] = {}
         self._covers: dict[int, Cover] = {}
         self._view_covered: tuple[object, np.ndarray | None] | None = None
@@ -566,6 +567,7 @@ class Renderer:
         if self._marches_to_trial == 0:
             self.compute = self.is_compute_faster(camera, time)
         code = code_of(scene, appearance)
+        code_vectors = _vectors(code)
         stride = scene.step * quality.step
 
         def draw(target: Target, camera: Camera = camera, pixels: int = ALL, points: int = 0, **more: object) -> None:
@@ -579,7 +581,7 @@ class Renderer:
                 stride=stride,
                 tau=stride / scene.extent,
                 termination=quality.termination,
-                appearance=_vectors(code),
+                appearance=code_vectors,
                 **_lens_of(camera),
                 **more,
             )
@@ -816,8 +818,8 @@ class Renderer:
         """By a pixel, of the finest scale: in the middle of the box; where space is mapped, the most along the ray in the picture's middle."""
         if self.scene.mapping is not None:
             return texels_spanned(self.scene, camera)
-        away = np.linalg.norm(self.scene.aabb.mean(0) - camera.camera_to_world[:3, 3])
-        return float(away / min(camera.fl_x, camera.fl_y) / (self.scene.extent / _texels_across(self.scene.scales[-1])))
+        away = math.dist(self._middle, camera.camera_to_world[:3, 3])
+        return away / min(camera.fl_x, camera.fl_y) / self._finest_texel
 
     def _draw(
         self,
@@ -971,7 +973,7 @@ class Renderer:
     def _bake(self, time: float) -> moderngl.Texture3D:
         folded = self._refined()
         if time != self._baked_time:
-            folded.bake(time)
+            folded.bake(slot_at(self.scene, time), time)
             self._baked_time = time
         return folded.baked
 

@@ -7,6 +7,7 @@ it half of the 39 that marching 320 x 240 pixels took.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,19 +25,31 @@ TEXELS_A_CELL = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """Those of the occupied cells of a slot: where they are, in [0, 1]^3, and their numbers in a (Nz + 1, Ny + 1, Nx + 1) grid."""
+    """Those of the occupied cells of a slot.
+
+    Attributes:
+        places: (M, 3) float32 in [0, 1]^3.
+        number: (M,), which they are of a (Nz + 1, Ny + 1, Nx + 1) grid.
+        of_cells: (N, 8) int32, which of them each cell has.
+    """
 
     slot: int
     places: np.ndarray
     number: np.ndarray
+    of_cells: np.ndarray
 
     @staticmethod
-    def of(slot: int, occupied: np.ndarray) -> "Corners":
+    def of(slot: int, occupied: np.ndarray, lines: Sequence[np.ndarray] | None = None) -> "Corners":
+        """Of a (Nz, Ny, Nx) bool grid of even cells, or whose faces are at `lines` along x, y and z."""
+        lines = lines or [np.arange(side + 1) / side for side in occupied.shape[::-1]]
         at = np.zeros([side + 1 for side in occupied.shape], bool)
         for z, y, x in np.ndindex(2, 2, 2):
             at[z : z + len(occupied), y : y + occupied.shape[1], x : x + occupied.shape[2]] |= occupied
-        places = np.argwhere(at)[:, ::-1] / np.array(occupied.shape[::-1])
-        return Corners(slot, places.astype(np.float32), np.flatnonzero(at))
+        number, which = np.flatnonzero(at), np.zeros(at.shape, np.int32)
+        which.reshape(-1)[number] = np.arange(len(number))
+        places = [line[at_line] for line, at_line in zip(lines, np.nonzero(at)[::-1])]
+        around = [which[z:, y:, x:][: len(occupied), : occupied.shape[1], : occupied.shape[2]][occupied] for z, y, x in np.ndindex(2, 2, 2)]
+        return Corners(slot, np.stack(places, axis=1).astype(np.float32), number, np.stack(around, axis=1))
 
 
 class Thinning:
@@ -102,7 +115,7 @@ class Thinning:
 
         def add(part: slice) -> None:
             if offsets is not None:
-                _displace(places[part], offsets)
+                displace(places[part], offsets)
             for scale, weights in enumerate(self._weights):
                 _add_scale(places[part], *self._folded[len(SPACE_PLANES) * scale : len(SPACE_PLANES) * (scale + 1)], weights, out[part])
 
@@ -111,7 +124,7 @@ class Thinning:
 
 
 @compiled()
-def _displace(places, offsets):
+def displace(places, offsets):
     """`kpc.format.motion.moved`, in place."""
     nz, ny, nx = offsets.shape[:3]
     one = np.float32(1)

@@ -27,21 +27,26 @@ def context() -> moderngl.Context:
     return found
 
 
-def evaluate(glsl: str, expression: str, *inputs: np.ndarray, **defines: int) -> np.ndarray:
+def evaluate(glsl: str, expression: str, *inputs: np.ndarray, grid: np.ndarray | None = None, **defines: int) -> np.ndarray:
     """(N, 4) float32: `expression`, a vec4, at each of N places, N a multiple of 256; inputs (N, 4) are called a, b, c, d there.
 
-    `glsl`: what comes before main, `#include`s for the most part.
+    `glsl`: what comes before main, `#include`s for the most part. `grid`: (Nz, Ny, Nx, 4), a filtered sampler3D of that name.
     """
     ctx, names = context(), "abcd"[: len(inputs)]
     size = (256, len(inputs[0]) // 256)
     fetch = "".join(f"vec4 {n} = texelFetch(from_{n}, ivec2(gl_FragCoord.xy), 0); " for n in names)
-    text = "".join(f"uniform sampler2D from_{n};\n" for n in names) + glsl
+    text = "".join(f"uniform sampler2D from_{n};\n" for n in names) + "uniform sampler3D grid;\n" * (grid is not None) + glsl
     program = shader.build(ctx, "main", {"CONTRACTED": 0, "NDC": 0, **defines},
                            {"main": f"{text}\nout vec4 o;\nvoid main() {{ {fetch} o = {expression}; }}\n"})  # fmt: skip
     textures = [ctx.texture(size, 4, np.ascontiguousarray(array, np.float32), dtype="f4") for array in inputs]
     for unit, (name, texture) in enumerate(zip(names, textures, strict=True)):
         texture.use(unit)
         program[f"from_{name}"] = unit
+    if grid is not None:
+        volume = ctx.texture3d(grid.shape[2::-1], 4, np.ascontiguousarray(grid, np.float32), dtype="f4")
+        volume.filter, volume.repeat_x, volume.repeat_y, volume.repeat_z = (moderngl.LINEAR, moderngl.LINEAR), False, False, False
+        volume.use(len(inputs))
+        program["grid"] = len(inputs)
     target = ctx.framebuffer([ctx.texture(size, 4, dtype="f4")])
     target.use()
     ctx.vertex_array(program, []).render(moderngl.TRIANGLES, vertices=3)

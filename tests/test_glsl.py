@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scenes import look_at
 
+from kpc.format.motion import moved
 from kpc.format.scene import LOG_DENSITY_LIMIT
 from kpc.format.space import Contraction, contract
 from kpc.player.reference import sigmoid
@@ -112,3 +113,13 @@ def test_colours_between_pixels() -> None:
     # A place in float32 errs by up to 2^-17 of a pixel, and colours turn by less than three times as much.
     np.testing.assert_allclose(got[:, :3], wanted, atol=1e-4)
     np.testing.assert_allclose(got[0, :3], picture[0, :3], atol=1e-6)
+
+
+@pytest.mark.parametrize("nodes", [(4, 3, 5), (2, 2, 2)])
+def test_places_are_moved(nodes: tuple[int, int, int]) -> None:
+    rng = np.random.default_rng(9)
+    u, offsets = rng.random((N, 3), np.float32), rng.uniform(-0.3, 0.3, (*nodes, 3)).astype(np.float32)
+    grid = np.concatenate([offsets, np.zeros((*nodes, 1))], axis=-1)
+    counts = "vec3({}.0, {}.0, {}.0)".format(*nodes[::-1])
+    got = gl.evaluate('#include "motion.glsl"\n', f"vec4(moved(grid, {counts}, a.xyz), 0.0)", columns(*u.T), grid=grid)[:, :3]
+    np.testing.assert_allclose(got, moved(u, offsets), atol=2e-6)

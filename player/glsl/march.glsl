@@ -13,6 +13,7 @@
 #include "ray.glsl"
 #include "space.glsl"
 #include "occupancy.glsl"
+#include "nodes.glsl"
 #include "motion.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
@@ -28,7 +29,7 @@ uniform sampler2D rows;
 uniform usampler3D cells;
 uniform sampler3D motion;
 #if BAKED
-uniform sampler3D baked;            // logits of the colour and log densities, corner-aligned over the planes, at
+uniform sampler3D baked;            // logits of the colour, and log densities, at
 uniform vec3 corners;               // so many along x, y, z
 #endif
 uniform vec2 rows_texel;            // 1 / size of the texture
@@ -187,7 +188,7 @@ vec4 logits_of_scale_##scale(vec3 u) {
 // Of the scales from SHARED on.
 vec4 logits_of(vec3 u) {
 #if BAKED
-    return textureLod(baked, (u * (corners - 1.0) + 0.5) / corners, 0.0);
+    return at_nodes(baked, corners, u);
 #else
     vec4 sum = vec4(0.0);
 #unroll scale SCALES
