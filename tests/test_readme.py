@@ -1,4 +1,4 @@
-"""What README.md shows must work."""
+"""What README.md and docs/measured.md show must work."""
 
 import importlib
 import re
@@ -16,12 +16,12 @@ from kpc.format.media import read_image
 from kpc.format.quantise import quantise_scene
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
+README, MEASURED = ((ROOT / name).read_text() for name in ("README.md", "docs/measured.md"))
 PICTURE_LIMIT = 200_000
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+def blocks(language: str, text: str = README) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize("example", blocks("python"))
@@ -38,7 +38,7 @@ def test_python_examples_run(example: str, tmp_path: Path, monkeypatch: pytest.M
 
 def test_every_option_of_every_command_exists(capsys: pytest.CaptureFixture[str]) -> None:
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    lines = [shlex.split(line) for block in blocks("sh") for line in block.splitlines()]
+    lines = [shlex.split(line) for block in blocks("sh", README + MEASURED) for line in block.splitlines()]
     commands = [line for line in lines if line[0] in scripts or line[:2] == ["python", "-m"]]
     assert {line[0] for line in commands} == {*scripts, "python"}
     for name, *arguments in commands:
@@ -63,9 +63,13 @@ def test_keys_are_those_of_the_player() -> None:
     assert "".join(f"| {key} | {meaning} |\n" for key, meaning in KEYS) in README
 
 
-def test_links_lead_somewhere_and_pictures_are_small() -> None:
-    for target in re.findall(r"\]\(([^)]+)\)", README):
+@pytest.mark.parametrize(("text", "folder"), [(README, ROOT), (MEASURED, ROOT / "docs")], ids=["readme", "measured"])
+def test_links_lead_somewhere_and_pictures_are_small(text: str, folder: Path) -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", text):
         if not target.startswith("https://"):
-            assert (ROOT / target).is_file(), target
-    for target in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README):
-        assert (ROOT / target).stat().st_size < PICTURE_LIMIT
+            path, _, section = target.partition("#")
+            assert (folder / path).exists(), target
+            titles = [line.lstrip("# ").lower().replace(" ", "-") for line in (folder / path).read_text().splitlines() if line.startswith("#")] if section else []
+            assert not section or section in titles, target
+    for target in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):
+        assert (folder / target).stat().st_size < PICTURE_LIMIT

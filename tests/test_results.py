@@ -39,31 +39,53 @@ def test_tables_are_split_by_machine_and_say_where_they_come_from() -> None:
     assert "64 cores" in second and "Commit fffffffff+dirty; median of 1 run;" in second
 
 
-def test_in_brief_only_the_default_quality_and_the_reference_are_shown() -> None:
-    accuracy = dict.fromkeys(("samples_per_ray", "psnr", "psnr_least", "psnr_turning", "within_one_level"), 0.5)
-    each = [
-        encode_record("room", [30.0], kind="player", accuracy=accuracy,
-                      settings={"quality": quality, "default": "balanced", "size": "320x240"})
+def player_records(name: str, size: str = "320x240", renderer: str = "llvmpipe") -> list[results.Record]:
+    accuracy = dict.fromkeys(("samples_per_ray", "psnr_least", "psnr_turning", "within_one_level"), 0.5) | {"psnr": 41.6}
+    return [
+        encode_record(name, [30.0], kind="player", accuracy=accuracy, renderer=renderer, repeats=[{"fps": 31.4}],
+                      settings={"quality": quality, "default": "balanced", "size": size})
         for quality in ("fast", "balanced", "fine", "reference")
     ]  # fmt: skip
-    every, few = (results.markdown([*each, encode_record("liam", [1.0])], brief) for brief in (False, True))
+
+
+def test_documents_show_only_the_default_quality_and_the_reference() -> None:
+    each = [*player_records("room"), encode_record("liam", [1.0])]
+    document = "".join(f"<!-- {kind}: begin -->\n<!-- {kind}: end -->\n" for kind in ("player", "encode"))
+    every, few = results.markdown(each), results.written(document, each)
     assert every.count("| room |") == 4 and few.count("| room |") == 2 and few.count("| liam |") == 1
     assert "| balanced (default) |" in few and "| reference |" in few
 
 
-def test_the_block_of_a_readme_is_rewritten_and_nothing_else(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    readme, records = tmp_path / "README.md", tmp_path / "a.json"
-    readme.write_text(f"before\n\n{results.BEGIN}\nold\n{results.END}\n\nafter\n")
+def test_at_a_glance_each_scene_that_a_processor_plays_is_beside_its_encoding() -> None:
+    scene, asked = encode_record("room", [30.0]), encode_record("room", [20.0], settings={"preset": "fast", "psnr_db": 20.0})
+    played = [player_records("room-fast", "640x480"), player_records("room-fast"), player_records("room-fast", "640x480", "NVIDIA"),
+              player_records("fox-fast", "640x480")]  # fmt: skip
+    head, _, *rows = results.glance([scene, asked, *(record for records in played for record in records)]).splitlines()
+    assert rows == ["| room | fast | 30.00 | 0.900 | 346 | 2 | 2 | 31 | 42 |"] and head.count("|") == rows[0].count("|")
+
+
+def test_what_is_between_a_documents_markers_is_rewritten_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    readme, tables, records = tmp_path / "README.md", tmp_path / "tables.md", tmp_path / "a.json"
+    before, after = "before\n\n<!-- glance: begin; a word -->", "<!-- glance: end -->\n\nafter\n"
+    readme.write_text(f"{before}\nold\n{after}")
+    tables.write_text("<!-- step: begin -->\nold <!-- step: end -->\n<!-- encode: begin --><!-- encode: end -->")
     records.write_text(json.dumps([encode_record("room", [30.0])]))
     for _ in range(2):
-        assert results.main([str(records), "--readme", str(readme)]) == 0
+        assert results.main([str(records), "--into", str(readme), str(tables)]) == 0
+        assert capsys.readouterr().out == f"{readme}\n{tables}\n"
     text = readme.read_text()
-    assert text.startswith(f"before\n\n{results.BEGIN}\n\n**Encoding**") and text.endswith(
-        f"\n\n{results.END}\n\nafter\n"
-    )
-    assert "old" not in text and text.count("| room |") == 1
+    assert text.startswith(f"{before}\n\n| dataset |") and text.endswith(f"\n\n{after}") and "old" not in text
+    text = tables.read_text()
+    assert text.startswith("<!-- step: begin -->\n\n\n\n<!-- step: end -->\n<!-- encode: begin -->\n\n**Encoding**") and text.count("| room |") == 1
+
+
+def test_records_without_a_place_are_named_and_nothing_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document, records = tmp_path / "a.md", tmp_path / "a.json"
+    document.write_text("<!-- step: begin --><!-- step: end -->")
+    records.write_text(json.dumps([encode_record("room", [30.0])]))
+    assert results.main([str(records), "--into", str(document)]) == 1
+    assert "no place for tables of encode" in capsys.readouterr().err
+    assert document.read_text() == "<!-- step: begin --><!-- step: end -->"
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1]", '[{"kind": "other"}]', '[{"kind": "encode"}]'])
@@ -74,18 +96,17 @@ def test_other_files_are_refused_by_name(tmp_path: Path, text: str) -> None:
         results.load([path])
 
 
-def test_a_readme_without_markers_is_left_alone(tmp_path: Path) -> None:
-    readme = tmp_path / "README.md"
-    for text in ("nothing", f"{results.END}{results.BEGIN}", results.BEGIN, f"{results.BEGIN}{results.END}" * 2):
-        readme.write_text(text)
-        with pytest.raises(FormatError, match="needs the lines"):
-            results.rewrite(readme, "new")
-        assert readme.read_text() == text
+@pytest.mark.parametrize("text", ["nothing", "<!-- encode: end --><!-- encode: begin -->", "<!-- encode: begin -->",
+                                  "<!-- encode: begin --><!-- encode: end -->" * 2, "<!-- other: begin --><!-- other: end -->"])  # fmt: skip
+def test_documents_without_a_pair_of_markers_a_name_are_refused(tmp_path: Path, text: str) -> None:
+    document = tmp_path / "a.md"
+    document.write_text(text)
+    with pytest.raises(FormatError, match="needs lines such as"):
+        results.names_in(document)
 
 
-def test_committed_records_make_the_tables_of_the_readme() -> None:
+@pytest.mark.parametrize("document", ["README.md", "docs/measured.md"])
+def test_committed_records_make_the_tables_of_the_documents(document: str) -> None:
     root = Path(__file__).parent.parent
-    files = sorted((root / "docs" / "bench").glob("*.json"))
-    if not files:
-        pytest.skip("docs/bench holds no records yet")
-    assert results.markdown(results.load(files), brief=True) in (root / "README.md").read_text()
+    text = (root / document).read_text()
+    assert results.written(text, results.load(sorted((root / "docs" / "bench").glob("*.json")))) == text

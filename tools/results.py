@@ -420,26 +420,28 @@ def load(paths: Iterable[Path]) -> list[Record]:
     return records
 
 
-def rewrite(document: Path, records: Sequence[Record]) -> set[str]:
-    """Put the tables of each kind of record, and what is seen at a glance, between the markers of that name. Tells which it has.
+def names_in(document: Path) -> set[str]:
+    """What a document has markers for.
 
     Raises:
-        FormatError: its markers are not pairs, or name something else.
+        FormatError: they are not pairs, or name something else.
     """
-    text = document.read_text()
+    text, known = document.read_text(), {*TITLES, "glance"}
     names = [name for _, name, _, _ in MARKED.findall(text)]
-    known = {*TITLES, "glance"}
     if not names or len(MARKER.findall(text)) != 2 * len(names) or len({*names}) < len(names) or not known.issuperset(names):
         raise FormatError(f"{document}: needs lines such as <!-- encode: begin --> and <!-- encode: end -->, a pair a name of {sorted(known)}")
+    return {*names}
+
+
+def written(text: str, records: Sequence[Record]) -> str:
+    """A document with the tables of each kind of record, and what is seen at a glance, between the markers of that name."""
     shown = [record for record in records if is_brief(record)]
 
     def filled(found: re.Match[str]) -> str:
         name = found[2]
         return f"{found[1]}\n\n{glance(shown) if name == 'glance' else tables(name, shown)}\n\n{found[4]}"
 
-    with cli.written_aside(document) as aside:
-        aside.write_text(MARKED.sub(filled, text))
-    return {*names}
+    return MARKED.sub(filled, text)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -455,12 +457,14 @@ def _command(argv: list[str]) -> None:
     if not options.into:
         print(markdown(records))
         return
-    missing = {record["kind"] for record in records}
-    for document in options.into:
-        missing -= rewrite(document, records)
-        print(document)
+    missing = {record["kind"] for record in records}.difference(*map(names_in, options.into))
     if missing:
         raise FormatError(f"{', '.join(map(str, options.into))}: no place for tables of {', '.join(sorted(missing))}")
+    for document in options.into:
+        text = written(document.read_text(), records)
+        with cli.written_aside(document) as aside:
+            aside.write_text(text)
+        print(document)
 
 
 if __name__ == "__main__":
