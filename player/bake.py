@@ -1,9 +1,12 @@
 """A scene of few texels at one time as one grid: what its planes come to at the corners of the finest scale's texels.
 
-A sample then takes one look-up in place of one in each plane, layer by layer: of `soldier` 39. Where colours are the same from all sides,
-that grid holds all there is: the logits of the colour, and the log of the density. At its corners it is exact, folding errs in it nowhere.
-In between products of three planes are of the second degree, and the grid is of the first. So soldier's pictures are 45 dB from exact
-ones, where folded planes come to 62.
+Where colours are the same from all sides, such a grid holds all there is, the logits of the colour and the log of the density, and a sample takes
+one look-up in it, in place of one in each plane for every four channels: of `soldier` 36. At corners it is exact, and folding errs nowhere. In
+between it is of the first degree, where products of three planes are of the second: pictures of soldier are 45 dB (`fast`, 80 texels high) and
+50 (`balanced`, 128) from exact ones, where folded planes come to 62 and 67. The grid must have its corners where texels do: one of four fifths as
+many along each axis comes to 37 dB.
+
+A processor looks that up while it draws, and bakes 490,000 corners in 3.5 ms: soldier, `balanced`, takes it 0.6 of the time that it takes by planes.
 """
 
 import math

@@ -232,6 +232,7 @@ class FoldedInMemory:
             self.baking.keep(self.refined)
 
     def bake(self, slot: int, time: float) -> None:
+        assert self.baking is not None and self.baked is not None
         self.baking.bake(slot, time)
         self.baked.write(self.baking.grid)
 
@@ -972,6 +973,7 @@ class Renderer:
 
     def _bake(self, time: float) -> moderngl.Texture3D:
         folded = self._refined()
+        assert isinstance(folded, FoldedInMemory) and folded.baked is not None
         if time != self._baked_time:
             folded.bake(slot_at(self.scene, time), time)
             self._baked_time = time
