@@ -27,9 +27,9 @@ def one_sided(scene: Scene) -> Scene:
 
 def uneven() -> Scene:
     """Scales of other channels, rows of time and sizes; the first is the finer one along y."""
-    coarse, fine = tiny_scene(1, channels=3, resolution=(12, 44, 10), time=4), tiny_scene(2, channels=19, resolution=(23, 20, 15), time=7)
+    coarse, fine = tiny_scene(1, channels=13, resolution=(12, 44, 10), time=4), tiny_scene(2, channels=19, resolution=(23, 20, 15), time=7)
     scales = coarse.scales[-1], fine.scales[-1]
-    rng, features = np.random.default_rng(3), 22
+    rng, features = np.random.default_rng(3), 32
     decoder = replace(fine.decoder, density_weight=rng.normal(0, 0.8, features).astype(np.float32),
                       w2=np.zeros((3, features, 16), np.float32), b2=rng.normal(0, 0.4, (3, features)).astype(np.float32))  # fmt: skip
     return replace(fine, scales=scales, decoder=decoder)
@@ -37,7 +37,7 @@ def uneven() -> Scene:
 
 def flat() -> Scene:
     """Of one texel along z."""
-    scene = tiny_scene(5, scales=1, resolution=(9, 20, 2))
+    scene = tiny_scene(5, scales=1, channels=30, resolution=(9, 20, 2))
     planes = {name: plane[:1] if name in ("xz", "yz") else plane[:, :1] if name == "zt" else plane for name, plane in scene.scales[0].items()}
     return one_sided(replace(scene, scales=(planes,)))
 
@@ -49,7 +49,7 @@ def baking_of(scene: Scene, refined: int = 2) -> Baking:
     return renderer._folded.baking
 
 
-SCENES = {"even": lambda: one_sided(tiny_scene(4)), "uneven": uneven, "flat": flat, "displaced": lambda: displaced(one_sided(tiny_scene(4)))}
+SCENES = {"even": lambda: one_sided(tiny_scene(4, channels=16)), "uneven": uneven, "flat": flat, "displaced": lambda: displaced(one_sided(tiny_scene(4, channels=16)))}
 
 
 @pytest.mark.parametrize("refined", [1, 2])
@@ -73,7 +73,7 @@ def test_corners_hold_what_a_sample_there_finds(make, refined: int) -> None:
 @pytest.mark.parametrize("most", [0.0, 0.05, 0.6])
 def test_no_corner_that_is_looked_at_is_missed(most: float) -> None:
     """Nodes of the motion grid lie amid cells, too, and places beyond those of a cell's corners there."""
-    scene, rng = one_sided(tiny_scene(4, resolution=(93, 79, 81))), np.random.default_rng(1)
+    scene, rng = one_sided(tiny_scene(4, channels=16, resolution=(93, 79, 81))), np.random.default_rng(1)
     scene = replace(scene, motion=rng.uniform(-most, most, (6, 6, 4, 6, 3)).astype(np.float32))
     scene.occupancy[:] = rng.random(scene.occupancy.shape) < 0.01
     baking, texels = baking_of(scene), np.array(corners_of(scene)[::-1]) - 1
@@ -92,7 +92,7 @@ def test_no_corner_that_is_looked_at_is_missed(most: float) -> None:
 
 
 def test_what_overflows_is_finite() -> None:
-    scene = one_sided(tiny_scene(4))
+    scene = one_sided(tiny_scene(4, channels=16))
     for value in (3e38, -3e38, 1e-38):
         for name in SPACE_PLANES:
             scene.scales[1][name][:] = value
@@ -103,7 +103,7 @@ def test_what_overflows_is_finite() -> None:
 
 def test_where_products_are_of_the_first_degree_pictures_are_those_of_folded_planes() -> None:
     """One plane that varies, of one scale: in between corners as the planes themselves."""
-    scene = one_sided(tiny_scene(4, scales=1))
+    scene = one_sided(tiny_scene(4, scales=1, channels=32))
     for name in ("xz", "yz"):
         scene.scales[0][name][:] = 1.0
     for name in ("yt", "zt"):
@@ -119,7 +119,7 @@ def test_where_products_are_of_the_first_degree_pictures_are_those_of_folded_pla
 @pytest.mark.parametrize("space", ["box", "displaced", "ndc", "contracted"])
 def test_pictures_are_near_those_of_the_reference(space: str) -> None:
     """Of a scene of 24 texels, smooth over six; nearer than to those of another time. What is exact, or static, looks up planes."""
-    scene = SPACES[space](one_sided(tiny_scene(4)))
+    scene = SPACES[space](one_sided(tiny_scene(4, channels=16)))
     renderer = Renderer(gl.context(), scene, BAKED)
     assert renderer.bakes == renderer._is_software
     for time in (0.1, 0.5, 0.9):
@@ -134,7 +134,7 @@ def test_pictures_are_near_those_of_the_reference(space: str) -> None:
 
 
 def test_a_picture_hangs_on_none_before_it() -> None:
-    scene = displaced(one_sided(tiny_scene(4)))
+    scene = displaced(one_sided(tiny_scene(4, channels=16)))
     renderer = Renderer(gl.context(), scene, LADDER["balanced"])
     for time in (0.1, 0.11, 0.7, 0.12):
         got = renderer.render(CAMERA, time)
@@ -145,7 +145,7 @@ def test_a_picture_hangs_on_none_before_it() -> None:
 
 def test_planes_that_arrive_later_count() -> None:
     """As they do while a scene streams: space planes are put row by row, time planes change in place."""
-    scene = one_sided(tiny_scene(4))
+    scene = one_sided(tiny_scene(4, channels=16))
     early = replace(scene, scales=tuple({name: plane.copy() for name, plane in scale.items()} for scale in scene.scales))
     for scale in early.scales:
         for name in scale:
@@ -164,10 +164,10 @@ def test_planes_that_arrive_later_count() -> None:
 
 
 def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
-    assert Baking.serves(one_sided(tiny_scene()))
-    fine = one_sided(tiny_scene(channels=1, resolution=(128, 128, 80)))
+    assert Baking.serves(one_sided(tiny_scene(channels=16)))
+    fine = one_sided(tiny_scene(scales=1, channels=30, resolution=(128, 128, 80)))
     assert np.prod(corners_of(fine)) > MOST_CORNERS
-    for scene in (tiny_scene(), one_sided(tiny_scene(dynamic=False)), fine, SPACES["hybrid"](tiny_scene())):
+    for scene in (tiny_scene(channels=16), one_sided(tiny_scene(channels=16, dynamic=False)), one_sided(tiny_scene()), fine, SPACES["hybrid"](tiny_scene(channels=16))):
         assert not Baking.serves(scene)
         got, wanted = (Renderer(gl.context(), scene, quality).render(CAMERA, 0.5) for quality in (BAKED, FOLDED))
         np.testing.assert_array_equal(got.rgb, wanted.rgb)
