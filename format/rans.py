@@ -13,7 +13,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from kpc.format import compiling
 from kpc.format.errors import FormatError
+
+compiling.watch()
 
 LOWEST_STATE = 1 << 16
 """The state lies in [2^16, 2^32) between decisions. An encoder begins at 2^16, so there a decoder must end."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kpc.format.compiling import NOTICE, WATCH
 from kpc.format.container import DEFAULT_BUDGET, Reader, RemoteSource, Source
 from kpc.format.errors import BudgetError, FormatError, InterruptedRead, KpcError
 from kpc.format.file import SceneReader
@@ -225,6 +226,8 @@ class Stream:
             return f"no more of the scene will come: {self._failure}"
         if self._trouble is not None:
             return self._trouble
+        if self._stalled and WATCH.is_under_way:
+            return NOTICE
         if self._stalled:
             return f"waiting for the scene, {self.rate / 1e3:,.0f} KB/s"
         return None
