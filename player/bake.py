@@ -46,8 +46,6 @@ class Baking:
         self._planes: dict[str, np.ndarray] = {}
         self._spans: dict[tuple[int, int], np.ndarray] = {}
         self._corners: Corners | None = None
-        self._time_planes: dict[str, list[np.ndarray]] | None = None
-        """Of all scales, at corners along their axes of space."""
         weights = np.concatenate([scene.decoder.b2, scene.decoder.density_weight[None]])
         self._weights = _filled(weights.astype(np.float32))
 
@@ -88,17 +86,9 @@ class Baking:
 
         share_out(fill, len(spans))
 
-    def refresh(self) -> None:
-        """Look at the scene's time planes anew: some of their rows have changed."""
-        self._time_planes = None
-
     def _rows(self, name: str, time: float) -> np.ndarray:
-        """(N, M) of the rows of all scales at a time, at corners."""
-        if self._time_planes is None:
-            self._time_planes = {
-                name: [self._at_corners(scale[name], 1, name[0]) for scale in self._scene.scales] for name in TIME_PLANES
-            }
-        rows = [linear(plane, time) for plane in self._time_planes[name]]
+        """(N, M) of the rows of all scales at a time, at corners. Of a scene that still arrives no more of a time plane is there."""
+        rows = [self._at_corners(linear(scale[name], time), 0, name[0]) for scale in self._scene.scales]
         return np.concatenate([*rows, np.zeros((len(rows[0]), self._weights.shape[1] - sum(self._channels)), np.float32)], axis=1)
 
     def _row(self, time: float) -> int:

@@ -448,8 +448,6 @@ class Renderer:
     def refresh(self) -> None:
         """Look at the scene's time planes anew: some of their rows have changed."""
         self._rows_time = self._motion_time = self._folded_time = self._baked_time = self._cells_written = None
-        if isinstance(self._folded, FoldedInMemory) and self._folded.baking is not None:
-            self._folded.baking.refresh()
         self._shots.clear()
 
     def render(

@@ -23,6 +23,7 @@ from kpc.format.errors import BudgetError
 from kpc.format.scene import Scene
 from kpc.player import stream as module
 from kpc.player.prefetch import Playhead
+from kpc.player.bake import Baking
 from kpc.player.quality import Quality
 from kpc.player.renderer import Renderer
 from kpc.player.stream import Stream
@@ -72,16 +73,21 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("folded", [False, True])
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("space", [*SPACES, "baked"])
 def test_once_all_is_there_it_is_the_same_picture(space: str, folded: bool, watched: Callable[..., Stream], tmp_path: Path) -> None:
-    data = coded(SPACES[space](tiny_scene(4, time=10)))
+    scene, quality = SPACES["displaced" if space == "baked" else space](tiny_scene(4, channels=16, time=10)), Quality(folded=folded)
+    if space == "baked":
+        scene = replace(scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2))
+        quality = Quality(folded=folded, baked=True)
+        assert Baking.serves(scene)
+    data = coded(scene)
     (tmp_path / "scene.kpc").write_bytes(data)
     whole = kpc.load(data)
-    wanted = Renderer(gl.context(), whole, Quality(folded=folded))
+    wanted = Renderer(gl.context(), whole, quality)
     with serving(tmp_path) as url:
         for source in (str(tmp_path / "scene.kpc"), f"{url}/scene.kpc"):
             stream = watched(source)
-            renderer = Renderer(gl.context(), stream.scene, Quality(folded=folded))
+            renderer = Renderer(gl.context(), stream.scene, quality)
             picture(renderer, whole, 0.3)  # whatever is there
             until(lambda stream=stream: stream.is_settled, stream, renderer)
             assert stream.share_here == 1 and stream.can_show(0.3) and stream.message is None
