@@ -8,6 +8,8 @@ import numpy as np
 from kpc.format.cameras import Camera
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates
+from kpc.player.renderer import Renderer
+from kpc.player.textures import Layout
 
 
 def tiny_scene(seed: int = 0, dynamic: bool = True, scales: int = 2, channels: int = 8,
@@ -100,6 +102,22 @@ SPACES: dict[str, Callable[[Scene], Scene]] = {
     "hybrid": hybrid,
 }
 """What there is besides a plain box and the explicit decoder."""
+
+
+def without_planes(scene: Scene) -> Scene:
+    """A scene of whose planes nothing is there yet: all are 1."""
+    return replace(scene, scales=tuple({name: np.ones_like(plane) for name, plane in scale.items()} for scale in scene.scales))
+
+
+def bring(renderer: Renderer, early: Scene, scene: Scene) -> None:
+    """Have planes arrive, as they do while a scene streams: space planes are put row by row, time planes change in place."""
+    for number, scale in enumerate(scene.scales):
+        for name in SPACE_PLANES:
+            renderer.put(number, name, Layout.texels(scale[name][3:]), 3)
+            renderer.put(number, name, Layout.texels(scale[name][:3]))
+        for name in TIME_PLANES:
+            early.scales[number][name][:] = scale[name]
+    renderer.refresh()
 
 
 def look_at(eye: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int,

@@ -5,11 +5,11 @@ from dataclasses import replace
 import gl
 import numpy as np
 import pytest
-from scenes import SPACES, displaced, look_at, tiny_scene
+from scenes import SPACES, bring, displaced, look_at, tiny_scene, without_planes
 
 from kpc.format.grid import linear
 from kpc.format.motion import moved
-from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Scene
+from kpc.format.scene import SPACE_PLANES, Scene
 from kpc.player.bake import LARGEST, MOST_CORNERS, Baking, corners_of
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Moment, Part, features, render, slot_at
@@ -144,22 +144,11 @@ def test_a_picture_hangs_on_none_before_it() -> None:
 
 
 def test_planes_that_arrive_later_count() -> None:
-    """As they do while a scene streams: space planes are put row by row, time planes change in place."""
     scene = one_sided(tiny_scene(4, channels=16))
-    early = replace(scene, scales=tuple({name: plane.copy() for name, plane in scale.items()} for scale in scene.scales))
-    for scale in early.scales:
-        for name in scale:
-            scale[name][:] = 1.0
+    early = without_planes(scene)
     renderer, whole = Renderer(gl.context(), early, BAKED), Renderer(gl.context(), scene, BAKED)
     renderer.render(CAMERA, 0.5)
-    for number, scale in enumerate(scene.scales):
-        for name in SPACE_PLANES:
-            renderer.put(number, name, Layout.texels(scale[name][3:]), 3)
-            renderer.put(number, name, Layout.texels(scale[name][:3]))
-    for scale, told in zip(early.scales, scene.scales):
-        for name in TIME_PLANES:
-            scale[name][:] = told[name]
-    renderer.refresh()
+    bring(renderer, early, scene)
     np.testing.assert_array_equal(renderer.render(CAMERA, 0.5).rgb, whole.render(CAMERA, 0.5).rgb)
 
 

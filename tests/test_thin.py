@@ -5,9 +5,9 @@ from dataclasses import replace
 import gl
 import numpy as np
 import pytest
-from scenes import SPACES, displaced, look_at, tiny_scene
+from scenes import SPACES, bring, displaced, look_at, tiny_scene, without_planes
 
-from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Scene
+from kpc.format.scene import Scene
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Moment, Part, features, render, slot_at
 from kpc.player.renderer import Renderer
@@ -96,23 +96,12 @@ def test_rays_pass_by_what_is_empty_and_pictures_stay(space: str) -> None:
 
 
 def test_planes_that_arrive_later_count() -> None:
-    """As they do while a scene streams: space planes are put row by row, time planes change in place."""
     scene = moving()
-    early = replace(scene, scales=tuple({name: plane.copy() for name, plane in scale.items()} for scale in scene.scales))
-    for scale in early.scales:
-        for name in scale:
-            scale[name][:] = 1.0
+    early = without_planes(scene)
     quality = replace(FOLDED, thin=1 / 100)
     renderer, whole = Renderer(gl.context(), early, quality), Renderer(gl.context(), scene, quality)
     renderer.render(CAMERA, 0.5)
-    for number, scale in enumerate(scene.scales):
-        for name in SPACE_PLANES:
-            renderer.put(number, name, Layout.texels(scale[name][3:]), 3)
-            renderer.put(number, name, Layout.texels(scale[name][:3]))
-    for scale, told in zip(early.scales, scene.scales):
-        for name in TIME_PLANES:
-            scale[name][:] = told[name]
-    renderer.refresh()
+    bring(renderer, early, scene)
     got, wanted = renderer.render(CAMERA, 0.5), whole.render(CAMERA, 0.5)
     np.testing.assert_array_equal(got.samples, wanted.samples)
     np.testing.assert_array_equal(got.rgb, wanted.rgb)
