@@ -20,7 +20,7 @@ class Watch(event.Listener):
         self._begun = self._spent = 0.0
         self._told = False
 
-    def on_start(self, event: event.Event) -> None:
+    def on_start(self, _: event.Event) -> None:
         with self._lock:
             if self._depth == 0:
                 self._begun = time.monotonic()
@@ -30,7 +30,7 @@ class Watch(event.Listener):
         if tells:
             print(NOTICE, file=sys.stderr)
 
-    def on_end(self, event: event.Event) -> None:
+    def on_end(self, _: event.Event) -> None:
         with self._lock:
             self._depth -= 1
             if self._depth == 0:
@@ -47,4 +47,5 @@ WATCH = Watch()
 
 
 def watch() -> None:
+    """Have numba tell WATCH."""
     event.register("numba:compile", WATCH)

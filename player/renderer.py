@@ -22,7 +22,7 @@ from kpc.player.cover import Cover
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
 from kpc.player.textures import (
-    LARGEST_FLOAT, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled_to_four, multiplied, planes_shape,
+    LARGEST_FLOAT, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled, multiplied, planes_shape,
 )
 from kpc.player.thin import Thinning
 
@@ -245,7 +245,7 @@ class FoldedInMemory:
     @property
     def memory_bytes(self) -> int:
         thinning = 0 if self.thinning is None else self.thinning.memory_bytes
-        baking = 0 if self.baking is None else self.baking.memory_bytes + self.baking.grid.nbytes  # and its texture
+        baking = 0 if self.baking is None else self.baking.memory_bytes
         return self.refined.nbytes + self.rows.nbytes + self.room.nbytes + thinning + baking + _bytes_of(self.planes)
 
     def release(self) -> None:
@@ -971,7 +971,7 @@ class Renderer:
 
     def _bake(self, time: float) -> moderngl.Texture3D:
         folded = self._refined()
-        assert isinstance(folded, FoldedInMemory) and folded.baked is not None
+        assert isinstance(folded, FoldedInMemory)
         if time != self._baked_time:
             folded.bake(slot_at(self.scene, time), time)
             self._baked_time = time
@@ -1061,7 +1061,7 @@ def _set(program: moderngl.Program | moderngl.ComputeShader, **values: object) -
 
 def _vectors(code: np.ndarray) -> list[tuple[float, ...]]:
     """A code as a uniform array of vec4s, padded with 0."""
-    return [tuple(map(float, vector)) for vector in filled_to_four(code, 0).reshape(-1, 4)]
+    return [tuple(map(float, vector)) for vector in filled(code, 0).reshape(-1, 4)]
 
 
 def _lens_of(camera: Camera) -> dict[str, object]:

@@ -92,7 +92,7 @@ class Layout:
     def texels(plane: np.ndarray) -> np.ndarray:
         """(rows, layers * columns, 4) float32: a (rows, columns, M) plane as it lies in its block."""
         rows, columns, _ = plane.shape
-        padded = filled_to_four(plane.astype(np.float32), 2)
+        padded = filled(plane.astype(np.float32), 2)
         return np.ascontiguousarray(padded.reshape(rows, columns, -1, 4).swapaxes(1, 2)).reshape(rows, -1, 4)
 
     def place(self, block: Block) -> tuple[float, float, float, float]:
@@ -239,12 +239,12 @@ def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[st
     arrays = {"density_bias": np.array([decoder.density_bias, 0, 0, 0])}
     if isinstance(decoder, HybridDecoder):
         arrays |= {
-            "from_features": filled_to_four(spread(decoder.v), 0),
-            "from_features_bias": filled_to_four(decoder.v_bias, 0),
-            "density_weight": filled_to_four(decoder.density_weight, 0),
+            "from_features": filled(spread(decoder.v), 0),
+            "from_features_bias": filled(decoder.v_bias, 0),
+            "density_weight": filled(decoder.density_weight, 0),
             "w1": _direction_layer(decoder),
-            "passed_on": filled_to_four(filled_to_four(decoder.u, 0), 1),
-            "w2": filled_to_four(decoder.w2, 1),
+            "passed_on": filled(filled(decoder.u, 0), 1),
+            "w2": filled(decoder.w2, 1),
             "b2": np.append(decoder.b2, 0),
         }
     else:
@@ -272,11 +272,11 @@ def block_arrays(scene: Scene, layout: Layout) -> dict[str, np.ndarray]:
 
 def _direction_layer(decoder: AnyDecoder) -> np.ndarray:
     """w1 and b1, (H, 12), H filled up to a multiple of four."""
-    return filled_to_four(np.concatenate([decoder.w1, decoder.b1[:, None], np.zeros((len(decoder.b1), 2))], axis=1), 0)
+    return filled(np.concatenate([decoder.w1, decoder.b1[:, None], np.zeros((len(decoder.b1), 2))], axis=1), 0)
 
 
-def filled_to_four(array: np.ndarray, axis: int) -> np.ndarray:
-    """With zeros added along an axis up to a multiple of four."""
+def filled(array: np.ndarray, axis: int, multiple: int = 4) -> np.ndarray:
+    """With zeros added along an axis up to a multiple of four, or of another number."""
     ends = [(0, 0)] * array.ndim
-    ends[axis] = 0, -array.shape[axis] % 4
+    ends[axis] = 0, -array.shape[axis] % multiple
     return np.pad(array, ends)

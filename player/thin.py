@@ -30,13 +30,11 @@ class Corners:
     Attributes:
         places: (M, 3) float32 in [0, 1]^3.
         number: (M,), which they are of a (Nz + 1, Ny + 1, Nx + 1) grid.
-        of_cells: (N, 8) int32, which of them each cell has.
     """
 
     slot: int
     places: np.ndarray
     number: np.ndarray
-    of_cells: np.ndarray
 
     @staticmethod
     def of(slot: int, occupied: np.ndarray, lines: Sequence[np.ndarray] | None = None) -> "Corners":
@@ -45,22 +43,20 @@ class Corners:
         at = np.zeros([side + 1 for side in occupied.shape], bool)
         for z, y, x in np.ndindex(2, 2, 2):
             at[z : z + len(occupied), y : y + occupied.shape[1], x : x + occupied.shape[2]] |= occupied
-        number, which = np.flatnonzero(at), np.zeros(at.shape, np.int32)
-        which.reshape(-1)[number] = np.arange(len(number))
         places = [line[at_line] for line, at_line in zip(lines, np.nonzero(at)[::-1])]
-        around = [which[z:, y:, x:][: len(occupied), : occupied.shape[1], : occupied.shape[2]][occupied] for z, y, x in np.ndindex(2, 2, 2)]
-        return Corners(slot, np.stack(places, axis=1).astype(np.float32), number, np.stack(around, axis=1))
+        return Corners(slot, np.stack(places, axis=1).astype(np.float32), np.flatnonzero(at))
 
 
 class Thinning:
     """The densities of a scene at the corners of its occupied cells, from planes as they lie in a refined atlas.
 
     Attributes:
-        planes: (rows, columns, 4 layers) float32, of each of the layout's blocks.
+        planes: (rows, columns, 4 layers) float32, of each of the layout's blocks, once there was need of them.
     """
 
     def __init__(self, scene: Scene, layout: Layout) -> None:
         self._scene, self._layout = scene, layout
+        self._atlas = np.empty(0)
         self.planes: list[np.ndarray] = []
         self._folded: list[np.ndarray] = []
         self._log_density = np.zeros([side + 1 for side in scene.occupancy.shape[1:]], np.float32)
@@ -82,9 +78,8 @@ class Thinning:
         return 2 * sum(plane.nbytes for plane in self.planes) + self._log_density.nbytes
 
     def keep(self, refined: np.ndarray) -> None:
-        """Take over planes from an atlas, (height, width, 4), of the layout."""
-        self.planes = [self._layout.unrefined(refined, block) for block in self._layout.blocks]
-        self._folded = [np.empty_like(plane) for plane in self.planes]
+        """Take planes from an atlas, (height, width, 4), of the layout, from now on, and as they are when next needed."""
+        self._atlas, self.planes = refined, []
 
     def empty(self, slot: int, rows: np.ndarray, time: float, alpha: float) -> np.ndarray:
         """(Nz, Ny, Nx) bool: cells of a slot at whose corners a step of the scene has less than this alpha. `rows`: `Rows.at` the time, refined
@@ -106,6 +101,9 @@ class Thinning:
     def log_densities(self, places: np.ndarray, rows: np.ndarray, time: float) -> np.ndarray:
         """The log of the density at places (N, 3) in [0, 1]^3, float32: (N,)."""
         scene, layout = self._scene, self._layout
+        if not self.planes:
+            self.planes = [layout.unrefined(self._atlas, block) for block in layout.blocks]
+            self._folded = [np.empty_like(plane) for plane in self.planes]
         places, out = places.copy(), np.full(len(places), scene.decoder.density_bias, np.float32)
         for block, plane, folded in zip(layout.blocks, self.planes, self._folded, strict=True):
             row = rows[layout.lines(block), :: layout.refined].swapaxes(0, 1)[: plane.shape[0 if block.upright else 1]]

@@ -9,6 +9,7 @@ import pytest
 from kpc.format.errors import DisplayError
 from kpc.player import shader
 from kpc.player.offscreen import open_context
+from kpc.player.renderer import _volume as volume_of
 
 
 @functools.cache
@@ -43,8 +44,8 @@ def evaluate(glsl: str, expression: str, *inputs: np.ndarray, grid: np.ndarray |
         texture.use(unit)
         program[f"from_{name}"] = unit
     if grid is not None:
-        volume = ctx.texture3d(grid.shape[2::-1], 4, np.ascontiguousarray(grid, np.float32), dtype="f4")
-        volume.filter, volume.repeat_x, volume.repeat_y, volume.repeat_z = (moderngl.LINEAR, moderngl.LINEAR), False, False, False
+        volume = volume_of(ctx, grid.shape[2::-1])
+        volume.write(np.ascontiguousarray(grid, np.float32))
         volume.use(len(inputs))
         program["grid"] = len(inputs)
     target = ctx.framebuffer([ctx.texture(size, 4, dtype="f4")])

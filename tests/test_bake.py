@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scenes import SPACES, bring, displaced, look_at, tiny_scene, without_planes
 
-from kpc.format.grid import linear
+from kpc.format.grid import linear, tap
 from kpc.format.motion import moved
 from kpc.format.scene import SPACE_PLANES, Scene
-from kpc.player.bake import LARGEST, MOST_CORNERS, Baking, corners_of
+from kpc.player.bake import LARGEST, MOST_CORNERS, SPANS_KEPT, Baking, corners_of
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Moment, Part, features, render, slot_at
 from kpc.player.renderer import Renderer
@@ -42,6 +42,11 @@ def flat() -> Scene:
     return one_sided(replace(scene, scales=(planes,)))
 
 
+def row_of(scene: Scene, time: float) -> int:
+    """Of the motion grid, the one before a time."""
+    return 0 if scene.motion is None else int(tap(np.float32(time), len(scene.motion))[0])
+
+
 def baking_of(scene: Scene, refined: int = 2) -> Baking:
     renderer = Renderer(gl.context(), scene, BAKED)
     renderer.folded_layout = Layout.of(scene, refined)
@@ -65,7 +70,7 @@ def test_corners_hold_what_a_sample_there_finds(make, refined: int) -> None:
         baking.bake(slot_at(scene, time), time)
         wanted = features(still, Moment.of(still, time), at.astype(np.float32)) @ weights.T
         wanted[:, 3] += decoder.density_bias
-        reached = baking._reached(slot_at(scene, time), baking._row(time)).reshape(-1)
+        reached = baking._reached(slot_at(scene, time), row_of(scene, time)).reshape(-1)
         np.testing.assert_allclose(baking.grid.reshape(-1, 4)[reached], wanted[reached], rtol=1e-4, atol=1e-4)
         assert reached.mean() > 0.2
 
@@ -83,7 +88,7 @@ def test_no_corner_that_is_looked_at_is_missed(most: float) -> None:
         u = ((cells[rng.integers(0, len(cells), 20_000)] + rng.random((20_000, 3))) / scene.occupancy.shape[:0:-1]).astype(np.float32)
         position = moved(u, linear(scene.motion, time)) * texels
         first = np.minimum(position.astype(int), texels - 1)
-        reached = baking._reached(slot, baking._row(time))
+        reached = baking._reached(slot, row_of(scene, time))
         for offset in np.ndindex(2, 2, 2):
             counts = (np.abs(position - first - offset) < 1 - 1e-3).all(1)
             x, y, z = (first + offset)[counts].T
@@ -131,6 +136,17 @@ def test_pictures_are_near_those_of_the_reference(space: str) -> None:
     renderer.quality = LADDER["reference"]
     exact = renderer.render(CAMERA, 0.9)
     np.testing.assert_array_equal(exact.rgb, Renderer(gl.context(), scene, LADDER["reference"]).render(CAMERA, 0.9).rgb)
+
+
+def test_what_it_takes_is_bounded_however_long_the_clip() -> None:
+    scene, rows = one_sided(tiny_scene(4, channels=16)), SPANS_KEPT + 30
+    scene = replace(scene, motion=np.random.default_rng(0).uniform(-0.1, 0.1, (rows, 3, 2, 4, 3)).astype(np.float32))
+    baking = baking_of(scene)
+    for time in np.linspace(0, 1, 2 * rows):
+        baking.bake(slot_at(scene, time), float(time))
+    tables = sum(spans.nbytes for spans in baking._spans.values())
+    planes = sum(plane.nbytes for plane in baking._planes.values())
+    assert len(baking._spans) == SPANS_KEPT and 2 * baking.grid.nbytes + planes + tables <= baking.memory_bytes < 4 * (2 * baking.grid.nbytes + planes)
 
 
 def test_a_picture_hangs_on_none_before_it() -> None:

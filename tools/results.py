@@ -367,15 +367,15 @@ def glance(records: Sequence[Record]) -> str:
     played = {
         record["name"]: record
         for record in records
-        if record["kind"] == "player" and is_brief(record) and record["settings"]["size"] == GLANCED_AT
+        if record["kind"] == "player" and record["settings"]["size"] == GLANCED_AT
         and record["settings"]["quality"] == record["settings"]["default"] and "llvmpipe" in record["renderer"]
     }  # fmt: skip
     rows = [
-        [*(cell(encoded[name]) for _, cell in COLUMNS["encode"][:5]), f"{median(encoded[name], 'encode_s') / 60:.0f}",
+        [*(cell(encoded[name]) for _, cell in _ENCODED), _number("encode_s", "{:.0f}", 60.0)(encoded[name]),
          str(encoded[name]["machine"]["cores"]), *(cell(played[name]) for cell in (_number("fps", "{:.0f}"), _accuracy("psnr", "{:.0f}")))]
         for name in played if name in encoded
     ]  # fmt: skip
-    head = [*(name for name, _ in COLUMNS["encode"][:5]), "encoded in minutes", "on cores", f"fps at {GLANCED_AT}", "dB to exact ones"]
+    head = [*(name for name, _ in _ENCODED), "encoded in minutes", "on cores", f"fps at {GLANCED_AT}", "dB to exact ones"]
     return _lines(head, rows)
 
 

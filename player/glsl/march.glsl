@@ -187,9 +187,6 @@ vec4 logits_of_scale_##scale(vec3 u) {
 
 // Of the scales from SHARED on.
 vec4 logits_of(vec3 u) {
-#if BAKED
-    return at_nodes(baked, corners, u);
-#else
     vec4 sum = vec4(0.0);
 #unroll scale SCALES
 #if scale >= SHARED && scale < DRAWN
@@ -197,14 +194,10 @@ vec4 logits_of(vec3 u) {
 #endif
 #end
     return sum;
-#endif
 }
 
 // Of those before.
 vec4 shared_logits_of(vec3 u) {
-#if BAKED
-    return vec4(0.0);
-#endif
     vec4 sum = vec4(vec3(0.0), density_bias[0].x);
 #unroll scale SHARED
     sum += logits_of_scale_##scale(u);
@@ -288,6 +281,8 @@ void march(vec2 fragment, out vec4 seen, out vec4 met) {
             float thickness = thickness_at(walk, place);
 #if HYBRID
             vec4 logits = hybrid_logits_of(u, sum.trans, thickness);
+#elif BAKED
+            vec4 logits = at_nodes(baked, corners, u);
 #else
             vec4 logits = shared_logits_of(u) + logits_of(u);
 #endif
