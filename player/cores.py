@@ -1,19 +1,49 @@
 """Work on arrays, shared out among a processor's cores. For compiled functions, which let others run meanwhile."""
 
 import os
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 CORES = os.cpu_count() or 1
+WORKERS = min(CORES, 8)
+"""Of `from_both_ends`, each of which may need arrays of its own."""
+PARTS_EACH = 6
+"""Of work that is not even, so that all are busy to the end."""
 _POOL = ThreadPoolExecutor(CORES, thread_name_prefix="cores")
 
 
 def share_out(work: Callable[[slice], object], count: int) -> None:
     """Call `work` for parts of range(count), one for each core, and wait for all."""
-    ends = [count * part // CORES for part in range(CORES + 1)]
-    parts = [slice(*part) for part in zip(ends, ends[1:]) if part[0] < part[1]]
+    parts = _parts(count, CORES)
     others = [_POOL.submit(work, part) for part in parts[1:]]
     for part in parts[:1]:
         work(part)
     for other in others:
         other.result()
+
+
+def from_both_ends(work: Callable[[int, slice], object], count: int, least: int) -> None:
+    """Call `work` with the number of a worker, below WORKERS, and a part of range(count), of at least so many, until nothing is left. Workers take
+    what is next from one end or the other: what one does has neighbours that it has done."""
+    parts = deque(_parts(count, max(1, min(WORKERS * PARTS_EACH, count // least))))
+
+    def run(worker: int) -> None:
+        take = parts.pop if worker % 2 else parts.popleft
+        while True:
+            try:
+                part = take()
+            except IndexError:
+                return
+            work(worker, part)
+
+    others = [_POOL.submit(run, worker) for worker in range(1, min(WORKERS, len(parts)))]
+    run(0)
+    for other in others:
+        other.result()
+
+
+def _parts(count: int, most: int) -> list[slice]:
+    """Of range(count), about even, as many as there can be."""
+    ends = [count * part // most for part in range(most + 1)]
+    return [slice(*part) for part in zip(ends, ends[1:]) if part[0] < part[1]]

@@ -17,7 +17,7 @@ from kpc.format.grid import linear
 from kpc.format.scene import SPACE_PLANES, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
-from kpc.player.bake import Baking, corners_of
+from kpc.player.bake import Baking
 from kpc.player.cover import Cover
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
@@ -29,7 +29,7 @@ from kpc.player.thin import Thinning
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
 PLANES_UNIT, ROWS_UNIT, CELLS_UNIT, MOTION_UNIT = 0, 1, 2, 3
-DOUBTS_UNIT, BAKED_UNIT = 4, 5
+DOUBTS_UNIT = 4
 SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
 SEEN_PROBES_UNIT, MET_PROBES_UNIT = 2, 3
 BLOCK = 4
@@ -206,7 +206,6 @@ class FoldedInMemory:
     refine_into: moderngl.Framebuffer
     thinning: Thinning | None
     baking: Baking | None
-    baked: moderngl.Texture3D | None
     room: np.ndarray
     """For the product of any of the planes."""
     rows: np.ndarray = field(default_factory=lambda: np.empty(0, np.float32))
@@ -220,8 +219,7 @@ class FoldedInMemory:
             room = np.empty(most, np.float32)
             thinning = Thinning(scene, layout) if Thinning.serves(scene) else None
             baking = Baking(scene, layout) if Baking.serves(scene) else None
-            baked = None if baking is None else _volume(ctx, baking.grid.shape[2::-1])
-            return FoldedInMemory(layout, refined, planes, ctx.framebuffer([planes]), thinning, baking, baked, room)
+            return FoldedInMemory(layout, refined, planes, ctx.framebuffer([planes]), thinning, baking, room)
 
     def keep(self) -> None:
         """What was drawn into `refine_into` is the refined planes."""
@@ -230,11 +228,6 @@ class FoldedInMemory:
             self.thinning.keep(self.refined)
         if self.baking is not None:
             self.baking.keep(self.refined)
-
-    def bake(self, slot: int, time: float) -> None:
-        assert self.baking is not None and self.baked is not None
-        self.baking.bake(slot, time)
-        self.baked.write(self.baking.grid)
 
     def fold(self, rows: np.ndarray) -> None:
         self.rows = rows
@@ -249,9 +242,8 @@ class FoldedInMemory:
         return self.refined.nbytes + self.rows.nbytes + self.room.nbytes + thinning + baking + _bytes_of(self.planes)
 
     def release(self) -> None:
-        for thing in (self.refine_into, self.planes, self.baked):
-            if thing is not None:
-                thing.release()
+        for thing in (self.refine_into, self.planes):
+            thing.release()
 
 
 @contextlib.contextmanager
@@ -375,7 +367,6 @@ class Renderer:
         self._rows_time: float | None = None
         self._motion_time: float | None = None
         self._folded_time: float | None = None
-        self._baked_time: float | None = None
         self._is_refined = False
         for block in self.layout.blocks:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
@@ -415,7 +406,7 @@ class Renderer:
 
     @property
     def bakes(self) -> bool:
-        """Whether samples look up a grid that planes are baked into, where something moves."""
+        """Whether a processor marches what moves itself, over a grid that planes are baked into."""
         return self._can_bake and self.quality.folded and self.quality.baked and self.quality.scales is None
 
     @property
@@ -441,13 +432,15 @@ class Renderer:
         """Replace rows of a space plane from row `first` on: `Layout.texels` of them. Writes to textures that are there."""
         block = self.layout.block(scale, plane)
         self._planes.write(texels, viewport=(block.x, block.y + first, texels.shape[1], texels.shape[0]))
-        self._folded_time = self._baked_time = self._cells_written = None
+        self._folded_time = self._cells_written = None
         self._is_refined = False
         self._shots.clear()
 
     def refresh(self) -> None:
         """Look at the scene's time planes anew: some of their rows have changed."""
-        self._rows_time = self._motion_time = self._folded_time = self._baked_time = self._cells_written = None
+        self._rows_time = self._motion_time = self._folded_time = self._cells_written = None
+        if isinstance(self._folded, FoldedInMemory) and self._folded.baking is not None:
+            self._folded.baking.forget()
         self._shots.clear()
 
     def render(
@@ -550,18 +543,27 @@ class Renderer:
             camera = camera.resized(*(across * side for side in size))
         elif quality.resolution < 1:
             camera = camera.resized(*(max(1, round(side * quality.resolution)) for side in size))
+        if moving and self.bakes and program == "march.glsl":
+            target = self._march_baked(part, camera, time)
+        else:
+            target = self._march_planes(part, camera, time, program, appearance)
+        if target.seen.size == size or small and across == 1:
+            return target
+        return self._resampled(target, self._target(part, size), across)
+
+    def _march_planes(self, part: Part, camera: Camera, time: float, program: str, appearance: np.ndarray | None) -> Target:
+        """A picture for which samples look up planes; it may follow the one before."""
+        quality, scene, moving = self.quality, self.scene, part is Part.FULL and self._rows is not None
         folded, displaced = moving and quality.folded, moving and self._motion_texture is not None
         if displaced:
             self._displace(time)
         if moving and not folded:
             self._cut(time)
-        baked = folded and self.bakes
-        planes = self._planes if not folded else self._bake(time) if baked else self._fold(time)
-        self._occupy(slot_at(scene, time), time if folded and not baked else None)
-        raster = (camera.width, camera.height)
+        planes = self._fold(time) if folded else self._planes
+        self._occupy(slot_at(scene, time), time if folded else None)
         layout = self.folded_layout if folded else self.layout
         drawn = min(quality.scales or layout.scales, layout.scales)
-        shared = 0 if baked or isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
+        shared = 0 if isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
         self._marches_to_trial -= 1
         if self._marches_to_trial == 0:
             self.compute = self.is_compute_faster(camera, time)
@@ -572,7 +574,7 @@ class Renderer:
         def draw(target: Target, camera: Camera = camera, pixels: int = ALL, points: int = 0, **more: object) -> None:
             target.drawn = target.drawn if pixels == ONLY_DOUBTED else EVERYWHERE
             march, vertices = self._program(
-                program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels, baked=baked,
+                program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels,
                 compute=self.compute and program == "march.glsl",
             )  # fmt: skip
             _set(
@@ -584,7 +586,7 @@ class Renderer:
                 **_lens_of(camera),
                 **more,
             )
-            planes.use(BAKED_UNIT if baked else PLANES_UNIT)
+            planes.use(PLANES_UNIT)
             self._row_texture.use(ROWS_UNIT)
             if self._motion_texture is not None:
                 self._motion_texture.use(MOTION_UNIT)
@@ -597,18 +599,36 @@ class Renderer:
             else:
                 self._draw(target.framebuffer, vertices, points=points)
 
+        raster = (camera.width, camera.height)
         self._pictures += 1
         before = self._shots.pop((part, raster), None)
         before = before if before is not None and self._pictures - before.count <= LATELY else None
-        if program == "march.glsl" and quality.tolerance and not baked:
-            target = self._followed(draw, part, before, Shot(camera, time, code.tobytes(), quality, self._pictures))
-        elif program == "march.glsl":
-            self._draw_alone(draw, part, target := self._target(part, raster), camera)
+        if program == "march.glsl" and quality.tolerance:
+            return self._followed(draw, part, before, Shot(camera, time, code.tobytes(), quality, self._pictures))
+        target = self._target(part, raster)
+        if program == "march.glsl":
+            self._draw_alone(draw, part, target, camera)
         else:
-            draw(target := self._target(part, raster))
-        if raster == size or small and across == 1:
-            return target
-        return self._resampled(target, self._target(part, size), across)
+            draw(target)
+        return target
+
+    def _march_baked(self, part: Part, camera: Camera, time: float) -> Target:
+        """A picture that a processor marches itself, through a grid of what planes come to."""
+        folded, raster = self._refined(), (camera.width, camera.height)
+        assert isinstance(folded, FoldedInMemory) and folded.baking is not None
+        target, self._slot = self._target(part, raster), slot_at(self.scene, time)
+        self._shots.pop((part, raster), None)
+        count, covered = (-(-camera.height // BLOCK), -(-camera.width // BLOCK)), self._covered(camera)
+        blocks = np.argwhere(np.ones(count, bool) if covered is None else covered)
+        self._confine(target, EVERYWHERE if covered is None else _shares(_bounds(covered), count[::-1]))
+        if len(blocks):
+            step, free = self.scene.step * self.quality.step, self._free(self._slot)
+            seen, met = folded.baking.march(camera, time, free, blocks, BLOCK, step, self.quality.termination)
+            row, column = blocks.min(0)
+            place = int(BLOCK * column), int(BLOCK * row), seen.shape[1], seen.shape[0]
+            target.seen.write(seen, place)
+            target.met.write(met, place)
+        return target
 
     def is_compute_faster(self, camera: Camera, time: float) -> bool:
         """Draw a picture by fragment and by compute shaders, a few times each, and compare the best of their times."""
@@ -856,11 +876,11 @@ class Renderer:
     def _program(
         self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
         shared: int = 0, pixels: int = ALL, moved: bool = False, cubic: bool = False, view: int = 0,
-        compute: bool = False, baked: bool = False,
+        compute: bool = False,
     ) -> tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
         tiles = self._tiles
-        key = name, layout.refined, rows, displaced, drawn, shared, pixels, moved, cubic, view, compute, baked, tiles
+        key = name, layout.refined, rows, displaced, drawn, shared, pixels, moved, cubic, view, compute, tiles
         if key in self._programs:
             return self._programs[key]
         scene = self.scene
@@ -873,7 +893,6 @@ class Renderer:
             "CONTRACTED": int(isinstance(scene.mapping, Contraction)),
             "NDC": int(isinstance(scene.mapping, DeviceCoordinates)),
             "MOTION": int(displaced),
-            "BAKED": int(baked),
             "SHARED": shared,
             "PIXELS": pixels,
             "MOVED": int(moved),
@@ -900,8 +919,6 @@ class Renderer:
             rows=ROWS_UNIT,
             cells=CELLS_UNIT,
             motion=MOTION_UNIT,
-            baked=BAKED_UNIT,
-            corners=tuple(map(float, corners_of(scene)[::-1])),
             nodes=(1.0, 1.0, 1.0) if self._motion_texture is None else tuple(map(float, self._motion_texture.size)),
             rows_texel=(1 / self._row_texture.width, 1 / self._row_texture.height),
             cell_count=tuple(map(float, scene.occupancy.shape[:0:-1])),
@@ -920,15 +937,20 @@ class Renderer:
         """Have rays stop in the cells of a slot; at a `time` that planes are folded for, without those that `quality` has them pass by."""
         thinning = self._folded.thinning if isinstance(self._folded, FoldedInMemory) and time is not None and self.quality.thin else None
         cells = slot, thinning and time, thinning and self.quality.thin
+        self._slot = slot
         if cells == self._cells_written:
             return
-        if slot not in self._distances:
-            self._distances[slot] = distances(self.scene.occupancy[slot])
-        free = self._distances[slot]
+        free = self._free(slot)
         if thinning is not None:
             free = free | thinning.empty(slot, self._folded.rows, time, self.quality.thin)  # 0 in what is occupied, 1 in what is so and empty
         self._cells.write(free)
-        self._slot, self._cells_written = slot, cells
+        self._cells_written = cells
+
+    def _free(self, slot: int) -> np.ndarray:
+        """How far around each cell of a slot all is empty."""
+        if slot not in self._distances:
+            self._distances[slot] = distances(self.scene.occupancy[slot])
+        return self._distances[slot]
 
     def _cut(self, time: float) -> None:
         if time != self._rows_time and self._rows is not None:
@@ -968,14 +990,6 @@ class Renderer:
             self._draw_planes("fold.glsl", folded.fold_into, folded_rows_texel=tuple(1 / side for side in folded.rows.size))
         self._folded_time = time
         return folded.planes
-
-    def _bake(self, time: float) -> moderngl.Texture3D:
-        folded = self._refined()
-        assert isinstance(folded, FoldedInMemory)
-        if time != self._baked_time:
-            folded.bake(slot_at(self.scene, time), time)
-            self._baked_time = time
-        return folded.baked
 
     def _draw_planes(self, name: str, into: moderngl.Framebuffer, **more: object) -> None:
         """Draw each plane as it lies in the folded layout, by a shader that is told where that is and which rows go with it."""

@@ -7,7 +7,6 @@ it half of the 39 that marching 320 x 240 pixels took.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,14 +36,13 @@ class Corners:
     number: np.ndarray
 
     @staticmethod
-    def of(slot: int, occupied: np.ndarray, lines: Sequence[np.ndarray] | None = None) -> "Corners":
-        """Of a (Nz, Ny, Nx) bool grid of even cells, or whose faces are at `lines` along x, y and z."""
-        lines = lines or [np.arange(side + 1) / side for side in occupied.shape[::-1]]
+    def of(slot: int, occupied: np.ndarray) -> "Corners":
+        """Of a (Nz, Ny, Nx) bool grid."""
         at = np.zeros([side + 1 for side in occupied.shape], bool)
         for z, y, x in np.ndindex(2, 2, 2):
             at[z : z + len(occupied), y : y + occupied.shape[1], x : x + occupied.shape[2]] |= occupied
-        places = [line[at_line] for line, at_line in zip(lines, np.nonzero(at)[::-1])]
-        return Corners(slot, np.stack(places, axis=1).astype(np.float32), np.flatnonzero(at))
+        places = np.argwhere(at)[:, ::-1] / np.array(occupied.shape[::-1])
+        return Corners(slot, places.astype(np.float32), np.flatnonzero(at))
 
 
 class Thinning:
@@ -113,7 +111,7 @@ class Thinning:
 
         def add(part: slice) -> None:
             if offsets is not None:
-                displace(places[part], offsets)
+                _displace(places[part], offsets)
             for scale, weights in enumerate(self._weights):
                 _add_scale(places[part], *self._folded[len(SPACE_PLANES) * scale : len(SPACE_PLANES) * (scale + 1)], weights, out[part])
 
@@ -122,7 +120,7 @@ class Thinning:
 
 
 @compiled()
-def displace(places, offsets):
+def _displace(places, offsets):
     """`kpc.format.motion.moved`, in place."""
     nz, ny, nx = offsets.shape[:3]
     one = np.float32(1)

@@ -7,13 +7,11 @@
 // NDC: 1 where all this is in device coordinates. DRAWN: how many scales count. SHARED: how many, from
 // the coarsest on, are looked up once for two samples, in the middle between them; the next gives their slope.
 // PIXELS: 0 all are marched; 1 the probes (probes.glsl), as in tiles.glsl; 2 blocks in doubt (blocks.glsl).
-// BAKED: 1 where a grid holds what the planes come to.
 // COMPUTE: 1 for a compute shader (GL 4.3).
 
 #include "ray.glsl"
 #include "space.glsl"
 #include "occupancy.glsl"
-#include "nodes.glsl"
 #include "motion.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
@@ -28,10 +26,6 @@ uniform sampler2D planes;
 uniform sampler2D rows;
 uniform usampler3D cells;
 uniform sampler3D motion;
-#if BAKED
-uniform sampler3D baked;            // logits of the colour, and log densities, at
-uniform vec3 corners;               // so many along x, y, z
-#endif
 uniform vec2 rows_texel;            // 1 / size of the texture
 uniform vec3 cell_count;
 uniform vec3 nodes;                 // MOTION: of its grid along x, y, z
@@ -281,8 +275,6 @@ void march(vec2 fragment, out vec4 seen, out vec4 met) {
             float thickness = thickness_at(walk, place);
 #if HYBRID
             vec4 logits = hybrid_logits_of(u, sum.trans, thickness);
-#elif BAKED
-            vec4 logits = at_nodes(baked, corners, u);
 #else
             vec4 logits = shared_logits_of(u) + logits_of(u);
 #endif

@@ -1,0 +1,324 @@
+"""Marching by a processor itself, through a grid of what a scene's planes come to at the corners of texels, which it bakes as rays come by.
+
+The march is that of march.glsl (normative text and readable twin: kpc.player.reference), in float32. Rays go side by side, LANES of them: each
+round, all look at the cell that their next sample lies in; those of which it is empty pass by it, the others take their sample; those that are
+done make room. So one ray waits for memory, or for numbers, while others go on, and most loops are over vectors: a driver that draws by a
+processor has rays of a square wait for each other instead.
+
+A corner is baked when a sample first looks at it. Where a picture of `soldier` looks at 80,000 of its 490,000 corners, samples of the slot may look
+at 290,000.
+"""
+
+import math
+
+import numpy as np
+
+from kpc.format.rans import compiled
+from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION
+from kpc.player.reference import PARALLEL
+
+LANES = 256
+"""Rays side by side: what they hold fits the nearest cache."""
+VECTOR = 16
+"""Channels come in multiples of so many: as many floats as the widest processors multiply at once."""
+LARGEST = np.float32(1e30)
+"""What values are cut off at: a density is clamped far before, a colour is 0 or 1."""
+AROUND = 8
+BAKED, WHOLE = 1, 2
+"""Of a corner: it is baked; the seven that follow it along x, y and z are, too."""
+
+DONE = -1
+"""In place of how far all is empty around a ray's cell."""
+RATE_X, RATE_Y, RATE_Z, NEAR, FAR, STEP, TRANS, RED, GREEN, BLUE, DEPTH, SAMPLES, T, X, Y, Z = range(16)
+KEPT = SAMPLES + 1
+"""Of each ray, as march.glsl has it; t and place of the sample it is at are made anew each round."""
+AT_X, AT_Y, AT_Z, PART_X, PART_Y, PART_Z, LOGIT_RED, LOGIT_GREEN, LOGIT_BLUE, LOG_DENSITY = range(10)
+"""Of each sample: its place, its share of the way to the next node or corner, and what it looks up there, or makes of that."""
+
+F, I, U = np.float32, np.int32, np.uint64
+"""Numbers count from no array's end where they are unsigned, which lets loops be of vectors."""
+ZERO, HALF, ONE = F(0), F(0.5), F(1)
+EPSILON, ALMOST, FARTHEST, LIMIT, END = F(PARALLEL), F(1e-3), F(1e6), F(LOG_DENSITY_LIMIT), F(TERMINATION)
+LOG2_E, MOST_DOUBLINGS = F(1 / math.log(2)), 126
+E1, E2, E3, E4, E5 = (F(math.log(2) ** power / math.factorial(power)) for power in range(1, 6))
+
+_FAST = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
+_part = compiled(forceinline=True, _nrt=False, **_FAST)
+"""Of `cast`: what makes no array."""
+
+
+@compiled(**_FAST)
+def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termination, background, free, motion, planes, rows, weights, bias, grid, known, seen, met):
+    """March the pixels of blocks.
+
+    Arrays are float32 but for `blocks`, (N, 2) int64 of row and column, each of `side` x `side` pixels, rows from below; `free`, (Nz, Ny, Nx)
+    uint8, as occupancy.glsl has it; and `known`, (Nz, Ny, Nx) uint8 of corners, BAKED or WHOLE.
+
+    `origin`: column and row of the pixel that comes first in `seen`, rgb and opacity, and `met`, sum of weight t and samples. `size`: of the
+    picture. `lens`, `axes` and the rest as in march.glsl; `start`: the eye in [0, 1]^3 over the box, of edges `box`. `motion`: (Nz, Ny, Nx, 4),
+    or of no nodes. `planes`: xy, xz, yz at corners, (rows, columns, M), `rows` of the time planes along x, y, z, (N, M), `weights` (4, M) and
+    `bias`: what is summed up to three logits and the log of the density. `grid`: (Nz, Ny, Nx, 4) of those at corners that are `known`.
+    """
+    rays, samples = np.empty((16, LANES), np.float32), np.empty((10, LANES), np.float32)
+    pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.empty(LANES, np.int32)
+    wanted = np.empty(AROUND * LANES, np.int32)
+    at_once = LANES // (side * side)
+    for first in range(0, len(blocks), at_once):
+        count = _begin(blocks[first : first + at_once], side, size, lens, axes, start, box, rays, pixel)
+        while count > 0:
+            _look(count, start, stride, free, rays, cell, around)
+            _pass_by(count, stride, free, rays, around)
+            found = _stopped(count, rays, around, samples, of_ray)
+            if found > 0:
+                if motion.size > 0:
+                    _displace(found, motion, samples, cell)
+                _find(found, grid, samples, cell)
+                _bake(_wanted(found, grid, known, cell, wanted), wanted, planes, rows, weights, bias, grid)
+                _look_up(found, grid, samples, cell)
+                _shade(found, tau, samples)
+                _add(found, termination, samples, of_ray, rays, around)
+            count = _end(count, termination, background, origin, size, rays, pixel, around, seen, met)
+
+
+@_part
+def _exp(x):
+    """As a power of two, by Taylor's series around whole ones: off by 2.4e-6 of itself at most. The library's is not one of vectors."""
+    y = min(max(x * LOG2_E, F(-MOST_DOUBLINGS)), F(MOST_DOUBLINGS))
+    whole = I(y + F(MOST_DOUBLINGS + 0.5)) - I(MOST_DOUBLINGS)
+    e = y - F(whole)
+    return (ONE + e * (E1 + e * (E2 + e * (E3 + e * (E4 + e * E5))))) * I((whole + I(127)) << I(23)).view(np.float32)
+
+
+@_part
+def _within(x, most):
+    return min(max(x, ZERO), most)
+
+
+@_part
+def _slanted(x):
+    return x if abs(x) >= EPSILON else -EPSILON if x < ZERO else EPSILON
+
+
+@_part
+def _begin(blocks, side, size, lens, axes, start, box, rays, pixel):
+    """Rays of the pixels of blocks: how many."""
+    width, height = size
+    count = 0
+    for n in range(len(blocks)):
+        for within in range(side * side):
+            row, column = blocks[n, 0] * side + within // side, blocks[n, 1] * side + within % side
+            if row < height and column < width:
+                pixel[count] = row * width + column
+                rays[X, count], rays[Y, count] = F(column) + HALF, F(height - row) - HALF
+                count += 1
+    for i in range(U(count)):
+        right, up = (rays[X, i] - lens[2]) / lens[0], (lens[3] - rays[Y, i]) / lens[1]
+        x = axes[0, 0] * right + axes[0, 1] * up - axes[0, 2]
+        y = axes[1, 0] * right + axes[1, 1] * up - axes[1, 2]
+        z = axes[2, 0] * right + axes[2, 1] * up - axes[2, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        x, y, z = _slanted(x / length) / box[0], _slanted(y / length) / box[1], _slanted(z / length) / box[2]
+        x_low, y_low, z_low = -start[0] / x, -start[1] / y, -start[2] / z
+        x_high, y_high, z_high = (ONE - start[0]) / x, (ONE - start[1]) / y, (ONE - start[2]) / z
+        rays[NEAR, i] = max(max(min(x_low, x_high), min(y_low, y_high)), max(min(z_low, z_high), ZERO))
+        rays[FAR, i] = min(min(max(x_low, x_high), max(y_low, y_high)), max(z_low, z_high))
+        rays[RATE_X, i], rays[RATE_Y, i], rays[RATE_Z, i] = x, y, z
+        rays[STEP, i], rays[TRANS, i] = ZERO, ONE
+        rays[RED, i], rays[GREEN, i], rays[BLUE, i], rays[DEPTH, i], rays[SAMPLES, i] = ZERO, ZERO, ZERO, ZERO, ZERO
+    return count
+
+
+@_part
+def _look(count, start, stride, free, rays, cell, around):
+    """Where next samples lie, and how far around their cells all is empty."""
+    nz, ny, nx = free.shape
+    of_free = free.reshape(-1)
+    for i in range(U(count)):
+        t = rays[NEAR, i] + (rays[STEP, i] + HALF) * stride
+        x, y, z = start[0] + t * rays[RATE_X, i], start[1] + t * rays[RATE_Y, i], start[2] + t * rays[RATE_Z, i]
+        rays[T, i], rays[X, i], rays[Y, i], rays[Z, i] = t, x, y, z
+        row = I(_within(z * F(nz), F(nz - 1))) * I(ny) + I(_within(y * F(ny), F(ny - 1)))
+        cell[i] = row * I(nx) + I(_within(x * F(nx), F(nx - 1)))
+    for i in range(U(count)):
+        around[i] = of_free[U(cell[i])]
+
+
+@_part
+def _leave(x, rate, reach, count):
+    """How far, in t, it is from x to the faces of the block that reaches `reach` cells from that of x, of `count`, in both directions."""
+    cell = F(I(_within(x * count, count - ONE)))
+    return ((cell + (reach if rate > ZERO else ONE - reach)) / count - x) / rate
+
+
+@_part
+def _pass_by(count, stride, free, rays, around):
+    """Move on to the first sample behind what is empty."""
+    nz, ny, nx = free.shape
+    for i in range(U(count)):
+        reach = F(around[i])
+        leave_x = _leave(rays[X, i], rays[RATE_X, i], reach, F(nx))
+        leave_y = _leave(rays[Y, i], rays[RATE_Y, i], reach, F(ny))
+        leave_z = _leave(rays[Z, i], rays[RATE_Z, i], reach, F(nz))
+        steps = min(min(leave_x, min(leave_y, leave_z)) / stride - ALMOST, FARTHEST)
+        further = rays[STEP, i] + F(max(I(steps), I(0))) + ONE
+        rays[STEP, i] = further if around[i] > 0 else rays[STEP, i]
+
+
+@_part
+def _stopped(count, rays, around, samples, of_ray):
+    """Rays that take a sample: how many. Those beyond the box are done."""
+    found = 0
+    for i in range(U(count)):
+        if not rays[T, i] < rays[FAR, i]:
+            around[i] = DONE
+        elif around[i] == 0:
+            of_ray[found] = i
+            samples[AT_X, found], samples[AT_Y, found], samples[AT_Z, found] = rays[X, i], rays[Y, i], rays[Z, i]
+            found += 1
+    return found
+
+
+@_part
+def _find(found, grid, samples, cell):
+    """In a grid with nodes at all corners and faces of [0, 1]^3: the one before each sample, and its share of the way to the next."""
+    nz, ny, nx = grid.shape[:3]
+    for j in range(U(found)):
+        x, y, z = _within(samples[AT_X, j], ONE), _within(samples[AT_Y, j], ONE), _within(samples[AT_Z, j], ONE)
+        samples[AT_X, j], samples[AT_Y, j], samples[AT_Z, j] = x, y, z
+        x, y, z = x * F(nx - 1), y * F(ny - 1), z * F(nz - 1)
+        column, row, layer = min(I(x), I(max(nx - 2, 0))), min(I(y), I(max(ny - 2, 0))), min(I(z), I(max(nz - 2, 0)))
+        samples[PART_X, j], samples[PART_Y, j], samples[PART_Z, j] = x - F(column), y - F(row), z - F(layer)
+        cell[j] = (layer * I(ny) + row) * I(nx) + column
+
+
+@_part
+def _interpolated(into, add, channels, found, grid, samples, cell):
+    """What a grid of four channels holds at each sample, in between nodes, in or added to its lines from `into` on."""
+    nz, ny, nx = grid.shape[:3]
+    of_grid = grid.reshape(-1)
+    right, up, back = U(4 if nx > 1 else 0), U(4 * nx if ny > 1 else 0), U(4 * nx * ny if nz > 1 else 0)
+    for j in range(U(found)):
+        x, y, z = samples[PART_X, j], samples[PART_Y, j], samples[PART_Z, j]
+        here, above, behind, both = (ONE - y) * (ONE - z), y * (ONE - z), (ONE - y) * z, y * z
+        a, b, c, d, e, f, g, h = (ONE - x) * here, x * here, (ONE - x) * above, x * above, (ONE - x) * behind, x * behind, (ONE - x) * both, x * both
+        at = U(4) * U(cell[j])
+        for channel in range(channels):
+            at_up, at_back = at + up, at + back
+            at_both = at_up + back
+            value = a * of_grid[at] + b * of_grid[at + right] + c * of_grid[at_up] + d * of_grid[at_up + right]
+            value += e * of_grid[at_back] + f * of_grid[at_back + right] + g * of_grid[at_both] + h * of_grid[at_both + right]
+            samples[into + channel, j] = samples[into + channel, j] + value if add else value
+            at += U(1)
+
+
+@_part
+def _displace(found, motion, samples, cell):
+    """`kpc.format.motion.moved`; places still to be clamped."""
+    _find(found, motion, samples, cell)
+    _interpolated(AT_X, True, 3, found, motion, samples, cell)
+
+
+@_part
+def _wanted(found, grid, known, cell, wanted):
+    """Corners around samples that are not known yet, and count as known from now on: how many."""
+    nz, ny, nx = grid.shape[:3]
+    of_known, count = known.reshape(-1), 0
+    right, up, back = U(1 if nx > 1 else 0), U(nx if ny > 1 else 0), U(nx * ny if nz > 1 else 0)
+    for j in range(U(found)):
+        first = U(cell[j])
+        if of_known[first] & WHOLE:
+            continue
+        for number in range(AROUND):
+            corner = first + (right if number & 1 else U(0)) + (up if number & 2 else U(0)) + (back if number & 4 else U(0))
+            if not of_known[corner]:
+                wanted[count] = corner
+                count += 1
+            of_known[corner] |= BAKED
+        of_known[first] |= WHOLE
+    return count
+
+
+@_part
+def _bounded(value):
+    """Finite, whatever it was."""
+    return min(max(value, -LARGEST), LARGEST) if value == value else ZERO
+
+
+@_part
+def _bake(count, wanted, planes, rows, weights, bias, grid):
+    """Fill corners of the grid."""
+    ny, nx = grid.shape[1:3]
+    of_xy, of_xz, of_yz = planes[0].reshape(-1), planes[1].reshape(-1), planes[2].reshape(-1)
+    along_x, along_y, along_z = rows[0].reshape(-1), rows[1].reshape(-1), rows[2].reshape(-1)
+    weight, channels, of_grid = weights.reshape(-1), U(weights.shape[1]), grid.reshape(-1)
+    green_at, blue_at, density_at = channels, U(2) * channels, U(3) * channels
+    for j in range(count):
+        line, x = divmod(wanted[j], I(nx))
+        z, y = divmod(line, I(ny))
+        xy, xz, yz = channels * U(y * I(nx) + x), channels * U(z * I(nx) + x), channels * U(line)
+        at_x, at_y, at_z = channels * U(x), channels * U(y), channels * U(z)
+        red, green, blue, log_density = ZERO, ZERO, ZERO, bias
+        for m in range(channels):
+            feature = of_xy[xy + m] * of_xz[xz + m] * of_yz[yz + m] * along_x[at_x + m] * along_y[at_y + m] * along_z[at_z + m]
+            red += feature * weight[m]
+            green += feature * weight[green_at + m]
+            blue += feature * weight[blue_at + m]
+            log_density += feature * weight[density_at + m]
+        at = U(4) * U(wanted[j])
+        of_grid[at], of_grid[at + U(1)], of_grid[at + U(2)] = _bounded(red), _bounded(green), _bounded(blue)
+        of_grid[at + U(3)] = _bounded(log_density)
+
+
+@_part
+def _look_up(found, grid, samples, cell):
+    _interpolated(LOGIT_RED, False, 4, found, grid, samples, cell)
+
+
+@_part
+def _shade(found, tau, samples):
+    """Colours and alphas in place of logits and log densities."""
+    for j in range(U(found)):
+        density = _exp(min(max(samples[LOG_DENSITY, j], -LIMIT), LIMIT))
+        samples[LOG_DENSITY, j] = ONE - _exp(-density * tau)
+        samples[LOGIT_RED, j] = ONE / (ONE + _exp(-samples[LOGIT_RED, j]))
+        samples[LOGIT_GREEN, j] = ONE / (ONE + _exp(-samples[LOGIT_GREEN, j]))
+        samples[LOGIT_BLUE, j] = ONE / (ONE + _exp(-samples[LOGIT_BLUE, j]))
+
+
+@_part
+def _add(found, termination, samples, of_ray, rays, around):
+    """Each sample to its ray, which goes on by a step, or is done."""
+    for j in range(U(found)):
+        i = U(of_ray[j])
+        weight = rays[TRANS, i] * samples[LOG_DENSITY, j]
+        rays[RED, i] += weight * samples[LOGIT_RED, j]
+        rays[GREEN, i] += weight * samples[LOGIT_GREEN, j]
+        rays[BLUE, i] += weight * samples[LOGIT_BLUE, j]
+        rays[DEPTH, i] += weight * rays[T, i]
+        rays[SAMPLES, i] += ONE
+        rays[STEP, i] += ONE
+        rays[TRANS, i] -= weight
+        if rays[TRANS, i] < termination:
+            around[i] = DONE
+
+
+@_part
+def _end(count, termination, background, origin, size, rays, pixel, around, seen, met):
+    """Write what rays that are done have seen, and put others in their place: how many are left."""
+    for done in range(count - 1, -1, -1):
+        if around[done] != DONE:
+            continue
+        trans, share = rays[TRANS, done], ONE
+        if trans < termination and termination > END:  # sooner than the format says: the rest is like what was met
+            share, trans = ONE / (ONE - trans), ZERO
+        row, column = divmod(pixel[done], I(size[0]))
+        row, column = row - I(origin[1]), column - I(origin[0])
+        for channel in range(3):
+            seen[row, column, channel] = share * rays[RED + channel, done] + trans * background[channel]
+        seen[row, column, 3] = ONE - trans
+        met[row, column, 0], met[row, column, 1] = share * rays[DEPTH, done], rays[SAMPLES, done]
+        count -= 1
+        for line in range(KEPT):
+            rays[line, done] = rays[line, count]
+        pixel[done] = pixel[count]
+    return count
