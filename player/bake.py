@@ -12,11 +12,12 @@ import math
 import numpy as np
 
 from kpc.format.cameras import Camera
-from kpc.format.grid import linear
+from kpc.format.grid import linear, tap
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
-from kpc.player.cast import VECTOR, cast
+from kpc.player.cast import cast
 from kpc.player.cores import WORKERS, from_both_ends
 from kpc.player.textures import Layout, filled
+from kpc.player.vectors import WIDE
 
 MOST_CORNERS = 1 << 20
 """Of a grid, 16 MB."""
@@ -44,10 +45,13 @@ class Baking:
         self._atlas = np.empty(0)
         self._planes: tuple[np.ndarray, ...] = ()
         self._time: float | None = None
+        self._cut: dict[tuple[str, int], np.ndarray] = {}
+        """Rows of time planes at corners, of the two instants around the time."""
         weights = np.concatenate([scene.decoder.b2, scene.decoder.density_weight[None]])
-        self._weights = filled(weights.astype(np.float32), 1, VECTOR)
+        self._weights = filled(weights.astype(np.float32), 1, WIDE)
         self._rows: tuple[np.ndarray, ...] = ()
-        self._motion = np.empty((0, 0, 0, 4), np.float32)
+        self._motion = np.zeros((0, 0, 0, 4) if scene.motion is None else (*scene.motion.shape[1:4], 4), np.float32)
+        self._room = np.empty(0, np.float32)
 
     @staticmethod
     def serves(scene: Scene) -> bool:
@@ -62,7 +66,7 @@ class Baking:
         """What grid and planes take."""
         nz, ny, nx = corners_of(scene)
         channels = sum(scale["xy"].shape[2] for scale in scene.scales)
-        channels += -channels % VECTOR
+        channels += -channels % WIDE
         return (16 + WORKERS) * nz * ny * nx + 4 * channels * (ny * nx + nz * nx + nz * ny)
 
     @property
@@ -75,7 +79,7 @@ class Baking:
 
     def forget(self) -> None:
         """Rows of time planes are others now."""
-        self._time = None
+        self._time, self._cut = None, {}
 
     def march(
         self, camera: Camera, time: float, free: np.ndarray, blocks: np.ndarray, side: int, step: float, termination: float
@@ -88,14 +92,13 @@ class Baking:
             blocks: (N, 2) of row and column, rows from below, each of `side` x `side` pixels; at least one.
             step: world units.
 
-        Returns: (h, w, 4) rgb and opacity, (h, w, 2) sum of weight t and samples, float32, row 0 at the bottom.
+        Returns: (h, w, 4) rgb and opacity, (h, w, 2) sum of weight t and samples, float32, row 0 at the bottom; valid until the next march.
         """
         self._go_to(time)
         scene, size = self._scene, (camera.width, camera.height)
         bottom, left = side * blocks.min(0)
         top, right = np.minimum(side * (blocks.max(0) + 1), size[::-1])
-        seen, met = np.empty((top - bottom, right - left, 4), np.float32), np.zeros((top - bottom, right - left, 2), np.float32)
-        seen[:] = *scene.background, 0.0
+        seen, met = self._pictures(top - bottom, right - left)
         low, box = scene.aabb[0], scene.aabb[1] - scene.aabb[0]
         pose = camera.camera_to_world
         lens, axes, start, edges, background = (
@@ -106,20 +109,31 @@ class Baking:
 
         def work(worker: int, part: slice) -> None:
             cast(
-                blocks[part], side, (left, bottom), size, lens, axes, start, edges, stride, tau, least, background, free, self._motion,
-                self._planes, self._rows, self._weights, bias, self.grid, self._known[worker], seen, met,
+                blocks[part], side, (left, bottom), size, lens, axes, start, edges, stride, tau, least, background,
+                free.reshape(-1), free.shape[::-1], self._motion.reshape(-1, 4), self._motion.shape[2::-1],
+                self._planes, self._rows, self._weights, bias,
+                self.grid.reshape(-1, 4), self._known[worker].reshape(-1), self.grid.shape[2::-1], seen, met,
             )  # fmt: skip
 
         from_both_ends(work, len(blocks), BLOCKS_AT_ONCE)
+        return seen, met
+
+    def _pictures(self, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+        """What `march` returns, as rays see it that meet nothing; valid until the next."""
+        pixels = height * width
+        if self._room.size < 6 * pixels:
+            self._room = np.empty(6 * pixels, np.float32)
+        seen, met = self._room[: 4 * pixels].reshape(height, width, 4), self._room[4 * pixels : 6 * pixels].reshape(height, width, 2)
+        seen[:], met[:] = (*self._scene.background, 0.0), 0.0
         return seen, met
 
     def _go_to(self, time: float) -> None:
         if not self._planes:
             self._planes = self._planes_at_corners()
         if time != self._time:
-            self._rows = tuple(self._row(name, time) for name in TIME_PLANES)
+            self._rows = self._rows_at(time)
             if self._scene.motion is not None:
-                self._motion = filled(linear(self._scene.motion, time).astype(np.float32), 3)
+                self._motion[..., :3] = linear(self._scene.motion, time)
             self._known[:] = 0
             self._time = time
 
@@ -127,21 +141,29 @@ class Baking:
         planes: dict[str, list[np.ndarray]] = {name: [] for name in SPACE_PLANES}
         for block in self._layout.blocks:
             plane = self._layout.unrefined(self._atlas, block)[..., : self._channels[block.scale]]
-            planes[block.plane].append(self._at_corners(self._at_corners(plane, 0, block.plane[1]), 1, block.plane[0]))
-        return tuple(np.ascontiguousarray(filled(np.concatenate(parts, axis=2), 2, VECTOR)) for parts in planes.values())
+            across = self._at_corners(plane.swapaxes(0, 1), block.plane[0])
+            planes[block.plane].append(self._at_corners(across.swapaxes(0, 1), block.plane[1]))
+        together = (filled(np.concatenate(parts, axis=2), 2, WIDE) for parts in planes.values())
+        return tuple(np.ascontiguousarray(plane).reshape(-1, plane.shape[2]) for plane in together)
 
-    def _row(self, name: str, time: float) -> np.ndarray:
-        """(N, M) of the rows of all scales at a time, at corners. Of a scene that still arrives no more of a time plane is there."""
-        rows = [self._at_corners(linear(scale[name], time), 0, name[0]) for scale in self._scene.scales]
-        return filled(np.concatenate(rows, axis=1).astype(np.float32), 1, VECTOR)
+    def _rows_at(self, time: float) -> tuple[np.ndarray, ...]:
+        """(N, M) of the rows of all scales at a time, at corners, along x, y and z."""
+        instants = len(self._scene.scales[0][TIME_PLANES[0]])
+        before, share = tap(np.asarray(time, np.float32), instants)
+        around = int(before), min(int(before) + 1, instants - 1)
+        self._cut = {(name, n): self._cut[name, n] if (name, n) in self._cut else self._row(name, n) for name in TIME_PLANES for n in around}
+        return tuple((1 - share) * self._cut[name, around[0]] + share * self._cut[name, around[1]] for name in TIME_PLANES)
 
-    def _at_corners(self, array: np.ndarray, axis: int, along: str) -> np.ndarray:
-        """An array that is corner-aligned along one of its axes, there as fine as the grid is along x, y or z."""
-        count = self.grid.shape["zyx".index(along)]
-        if array.shape[axis] == count:
-            return array
-        at = np.linspace(0, 1, count, dtype=np.float32) if count > 1 else np.zeros(1, np.float32)
-        return np.moveaxis(linear(np.moveaxis(array, axis, 0), at), 0, axis)
+    def _row(self, name: str, instant: int) -> np.ndarray:
+        rows = [self._at_corners(np.asarray(scale[name][instant], np.float32), name[0]) for scale in self._scene.scales]
+        return filled(np.concatenate(rows, axis=1), 1, WIDE)
+
+    def _at_corners(self, row: np.ndarray, axis: str) -> np.ndarray:
+        """A (size, ...) array that is corner-aligned along x, y or z, as fine as the grid is there."""
+        count = self.grid.shape["zyx".index(axis)]
+        if len(row) == count:
+            return row
+        return linear(row, np.linspace(0, 1, count, dtype=np.float32))
 
 
 def corners_of(scene: Scene) -> tuple[int, int, int]:

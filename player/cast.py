@@ -16,13 +16,10 @@ import numpy as np
 from kpc.format.rans import compiled
 from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION
 from kpc.player.reference import PARALLEL
+from kpc.player.vectors import WIDE, combine, interpolate
 
 LANES = 256
 """Rays side by side: what they hold fits the nearest cache."""
-VECTOR = 16
-"""Channels come in multiples of so many: as many floats as the widest processors multiply at once."""
-LARGEST = np.float32(1e30)
-"""What values are cut off at: a density is clamped far before, a colour is 0 or 1."""
 AROUND = 8
 BAKED, WHOLE = 1, 2
 """Of a corner: it is baked; the seven that follow it along x, y and z are, too."""
@@ -32,8 +29,10 @@ DONE = -1
 RATE_X, RATE_Y, RATE_Z, NEAR, FAR, STEP, TRANS, RED, GREEN, BLUE, DEPTH, SAMPLES, T, X, Y, Z = range(16)
 KEPT = SAMPLES + 1
 """Of each ray, as march.glsl has it; t and place of the sample it is at are made anew each round."""
-AT_X, AT_Y, AT_Z, PART_X, PART_Y, PART_Z, LOGIT_RED, LOGIT_GREEN, LOGIT_BLUE, LOG_DENSITY = range(10)
-"""Of each sample: its place, its share of the way to the next node or corner, and what it looks up there, or makes of that."""
+AT_X, AT_Y, AT_Z, PART_X, PART_Y, PART_Z, LOOKED_UP = range(7)
+"""Of each sample: its place, its share of the way to the next node or corner, and the first of four that it looks up there. Of corners those are ..."""
+LOGIT_RED, LOGIT_GREEN, LOGIT_BLUE, LOG_DENSITY = range(LOOKED_UP, LOOKED_UP + 4)
+"""... or what becomes of them: colours, and alpha."""
 
 F, I, U = np.float32, np.int32, np.uint64
 """Numbers count from no array's end where they are unsigned, which lets loops be of vectors."""
@@ -48,36 +47,44 @@ _part = compiled(forceinline=True, _nrt=False, **_FAST)
 
 
 @compiled(**_FAST)
-def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termination, background, free, motion, planes, rows, weights, bias, grid, known, seen, met):
+def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termination, background, free, cells, motion, nodes, planes, rows, weights, bias, grid, known, corners, seen, met):
     """March the pixels of blocks.
 
-    Arrays are float32 but for `blocks`, (N, 2) int64 of row and column, each of `side` x `side` pixels, rows from below; `free`, (Nz, Ny, Nx)
-    uint8, as occupancy.glsl has it; and `known`, (Nz, Ny, Nx) uint8 of corners, BAKED or WHOLE.
+    `blocks`: (N, 2) int64 of row and column, each of `side` x `side` pixels, rows from below. `origin`: column and row of the pixel that comes
+    first in `seen`, (h, w, 4) of rgb and opacity, and `met`, (h, w, 2), sum of weight t and samples. `size`: of the picture.
+    `lens`, `axes` and the rest as in march.glsl; `start`: the eye in [0, 1]^3 over the box, of edges `box`.
 
-    `origin`: column and row of the pixel that comes first in `seen`, rgb and opacity, and `met`, sum of weight t and samples. `size`: of the
-    picture. `lens`, `axes` and the rest as in march.glsl; `start`: the eye in [0, 1]^3 over the box, of edges `box`. `motion`: (Nz, Ny, Nx, 4),
-    or of no nodes. `planes`: xy, xz, yz at corners, (rows, columns, M), `rows` of the time planes along x, y, z, (N, M), `weights` (4, M) and
-    `bias`: what is summed up to three logits and the log of the density. `grid`: (Nz, Ny, Nx, 4) of those at corners that are `known`.
+    Grids lie flat, x fastest; how many there are along x, y, z comes behind them: `free`, (N,) uint8, as occupancy.glsl has it; `motion`, (N, 4),
+    of no nodes where nothing is displaced; `grid`, (N, 4) of logits and log densities at those corners that are `known`, (N,) uint8 of BAKED and
+    WHOLE. The others are baked from `planes`, xy, xz, yz at corners, (rows * columns, M), `rows` of the time planes along x, y, z, (N, M),
+    `weights`, (4, M), and `bias`.
     """
-    rays, samples = np.empty((16, LANES), np.float32), np.empty((10, LANES), np.float32)
-    pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.empty(LANES, np.int32)
+    rays, samples = np.zeros((16, LANES), np.float32), np.zeros((10, LANES), np.float32)
+    pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
     wanted = np.empty(AROUND * LANES, np.int32)
-    at_once = LANES // (side * side)
-    for first in range(0, len(blocks), at_once):
-        count = _begin(blocks[first : first + at_once], side, size, lens, axes, start, box, rays, pixel)
-        while count > 0:
-            _look(count, start, stride, free, rays, cell, around)
-            _pass_by(count, stride, free, rays, around)
-            found = _stopped(count, rays, around, samples, of_ray)
-            if found > 0:
-                if motion.size > 0:
-                    _displace(found, motion, samples, cell)
-                _find(found, grid, samples, cell)
-                _bake(_wanted(found, grid, known, cell, wanted), wanted, planes, rows, weights, bias, grid)
-                _look_up(found, grid, samples, cell)
-                _shade(found, tau, samples)
-                _add(found, termination, samples, of_ray, rays, around)
-            count = _end(count, termination, background, origin, size, rays, pixel, around, seen, met)
+    taken, count = 0, 0
+    while taken < len(blocks) or count > 0:
+        while taken < len(blocks) and count + side * side <= LANES:
+            count = _begin(blocks[taken], side, size, lens, axes, start, box, count, rays, pixel)
+            taken += 1
+        _look(count, start, stride, free, cells, rays, cell, around)
+        _pass_by(count, stride, cells, rays, around)
+        found = _stopped(count, rays, around, samples, of_ray)
+        if found > 0:
+            if len(motion) > 0:
+                _displace(found, motion, nodes, samples, cell)
+            _find(found, corners, samples, cell)
+            _bake(_wanted(found, known, corners, cell, wanted), wanted, planes, rows, weights, bias, grid, corners)
+            _look_up(found, grid, corners, samples, cell)
+            _shade(found, tau, samples)
+            _add(found, termination, samples, of_ray, rays, around)
+        count = _end(count, termination, background, origin, size, rays, pixel, around, seen, met)
+
+
+@_part
+def _whole(count):
+    """Up to a multiple of WIDE: what is left over would be done one by one. Lanes beyond `count` hold what was there before."""
+    return U((count + WIDE - 1) // WIDE * WIDE)
 
 
 @_part
@@ -100,18 +107,17 @@ def _slanted(x):
 
 
 @_part
-def _begin(blocks, side, size, lens, axes, start, box, rays, pixel):
-    """Rays of the pixels of blocks: how many."""
+def _begin(block, side, size, lens, axes, start, box, count, rays, pixel):
+    """The rays of a block beside those there are: how many these are then."""
     width, height = size
-    count = 0
-    for n in range(len(blocks)):
-        for within in range(side * side):
-            row, column = blocks[n, 0] * side + within // side, blocks[n, 1] * side + within % side
-            if row < height and column < width:
-                pixel[count] = row * width + column
-                rays[X, count], rays[Y, count] = F(column) + HALF, F(height - row) - HALF
-                count += 1
-    for i in range(U(count)):
+    first = count
+    for within in range(side * side):
+        row, column = block[0] * side + within // side, block[1] * side + within % side
+        if row < height and column < width:
+            pixel[count] = row * width + column
+            rays[X, count], rays[Y, count] = F(column) + HALF, F(height - row) - HALF
+            count += 1
+    for i in range(U(first), U(count)):
         right, up = (rays[X, i] - lens[2]) / lens[0], (lens[3] - rays[Y, i]) / lens[1]
         x = axes[0, 0] * right + axes[0, 1] * up - axes[0, 2]
         y = axes[1, 0] * right + axes[1, 1] * up - axes[1, 2]
@@ -129,18 +135,17 @@ def _begin(blocks, side, size, lens, axes, start, box, rays, pixel):
 
 
 @_part
-def _look(count, start, stride, free, rays, cell, around):
+def _look(count, start, stride, free, cells, rays, cell, around):
     """Where next samples lie, and how far around their cells all is empty."""
-    nz, ny, nx = free.shape
-    of_free = free.reshape(-1)
-    for i in range(U(count)):
+    nx, ny, nz = cells
+    for i in range(_whole(count)):
         t = rays[NEAR, i] + (rays[STEP, i] + HALF) * stride
         x, y, z = start[0] + t * rays[RATE_X, i], start[1] + t * rays[RATE_Y, i], start[2] + t * rays[RATE_Z, i]
         rays[T, i], rays[X, i], rays[Y, i], rays[Z, i] = t, x, y, z
         row = I(_within(z * F(nz), F(nz - 1))) * I(ny) + I(_within(y * F(ny), F(ny - 1)))
         cell[i] = row * I(nx) + I(_within(x * F(nx), F(nx - 1)))
     for i in range(U(count)):
-        around[i] = of_free[U(cell[i])]
+        around[i] = free[U(cell[i])]
 
 
 @_part
@@ -151,10 +156,10 @@ def _leave(x, rate, reach, count):
 
 
 @_part
-def _pass_by(count, stride, free, rays, around):
+def _pass_by(count, stride, cells, rays, around):
     """Move on to the first sample behind what is empty."""
-    nz, ny, nx = free.shape
-    for i in range(U(count)):
+    nx, ny, nz = cells
+    for i in range(_whole(count)):
         reach = F(around[i])
         leave_x = _leave(rays[X, i], rays[RATE_X, i], reach, F(nx))
         leave_y = _leave(rays[Y, i], rays[RATE_Y, i], reach, F(ny))
@@ -179,10 +184,17 @@ def _stopped(count, rays, around, samples, of_ray):
 
 
 @_part
-def _find(found, grid, samples, cell):
+def _strides(nodes):
+    """From a node to the next along x, y, z, where there is one."""
+    nx, ny, nz = nodes
+    return U(1 if nx > 1 else 0), U(nx if ny > 1 else 0), U(nx * ny if nz > 1 else 0)
+
+
+@_part
+def _find(found, nodes, samples, cell):
     """In a grid with nodes at all corners and faces of [0, 1]^3: the one before each sample, and its share of the way to the next."""
-    nz, ny, nx = grid.shape[:3]
-    for j in range(U(found)):
+    nx, ny, nz = nodes
+    for j in range(_whole(found)):
         x, y, z = _within(samples[AT_X, j], ONE), _within(samples[AT_Y, j], ONE), _within(samples[AT_Z, j], ONE)
         samples[AT_X, j], samples[AT_Y, j], samples[AT_Z, j] = x, y, z
         x, y, z = x * F(nx - 1), y * F(ny - 1), z * F(nz - 1)
@@ -192,92 +204,58 @@ def _find(found, grid, samples, cell):
 
 
 @_part
-def _interpolated(into, add, channels, found, grid, samples, cell):
-    """What a grid of four channels holds at each sample, in between nodes, in or added to its lines from `into` on."""
-    nz, ny, nx = grid.shape[:3]
-    of_grid = grid.reshape(-1)
-    right, up, back = U(4 if nx > 1 else 0), U(4 * nx if ny > 1 else 0), U(4 * nx * ny if nz > 1 else 0)
+def _look_up(found, grid, nodes, samples, cell):
+    """What a grid holds at each sample, in between nodes."""
+    right, up, back = _strides(nodes)
     for j in range(U(found)):
         x, y, z = samples[PART_X, j], samples[PART_Y, j], samples[PART_Z, j]
-        here, above, behind, both = (ONE - y) * (ONE - z), y * (ONE - z), (ONE - y) * z, y * z
-        a, b, c, d, e, f, g, h = (ONE - x) * here, x * here, (ONE - x) * above, x * above, (ONE - x) * behind, x * behind, (ONE - x) * both, x * both
-        at = U(4) * U(cell[j])
-        for channel in range(channels):
-            at_up, at_back = at + up, at + back
-            at_both = at_up + back
-            value = a * of_grid[at] + b * of_grid[at + right] + c * of_grid[at_up] + d * of_grid[at_up + right]
-            value += e * of_grid[at_back] + f * of_grid[at_back + right] + g * of_grid[at_both] + h * of_grid[at_both + right]
-            samples[into + channel, j] = samples[into + channel, j] + value if add else value
-            at += U(1)
+        interpolate(grid, U(cell[j]), right, up, back, x, y, z, samples, U(LOOKED_UP), j)
 
 
 @_part
-def _displace(found, motion, samples, cell):
+def _displace(found, motion, nodes, samples, cell):
     """`kpc.format.motion.moved`; places still to be clamped."""
-    _find(found, motion, samples, cell)
-    _interpolated(AT_X, True, 3, found, motion, samples, cell)
+    _find(found, nodes, samples, cell)
+    _look_up(found, motion, nodes, samples, cell)
+    for j in range(_whole(found)):
+        samples[AT_X, j] += samples[LOOKED_UP, j]
+        samples[AT_Y, j] += samples[LOOKED_UP + 1, j]
+        samples[AT_Z, j] += samples[LOOKED_UP + 2, j]
 
 
 @_part
-def _wanted(found, grid, known, cell, wanted):
+def _wanted(found, known, corners, cell, wanted):
     """Corners around samples that are not known yet, and count as known from now on: how many."""
-    nz, ny, nx = grid.shape[:3]
-    of_known, count = known.reshape(-1), 0
-    right, up, back = U(1 if nx > 1 else 0), U(nx if ny > 1 else 0), U(nx * ny if nz > 1 else 0)
+    count, (right, up, back) = 0, _strides(corners)
     for j in range(U(found)):
         first = U(cell[j])
-        if of_known[first] & WHOLE:
+        if known[first] & WHOLE:
             continue
         for number in range(AROUND):
             corner = first + (right if number & 1 else U(0)) + (up if number & 2 else U(0)) + (back if number & 4 else U(0))
-            if not of_known[corner]:
+            if not known[corner]:
                 wanted[count] = corner
                 count += 1
-            of_known[corner] |= BAKED
-        of_known[first] |= WHOLE
+            known[corner] |= BAKED
+        known[first] |= WHOLE
     return count
 
 
 @_part
-def _bounded(value):
-    """Finite, whatever it was."""
-    return min(max(value, -LARGEST), LARGEST) if value == value else ZERO
-
-
-@_part
-def _bake(count, wanted, planes, rows, weights, bias, grid):
+def _bake(count, wanted, planes, rows, weights, bias, grid, corners):
     """Fill corners of the grid."""
-    ny, nx = grid.shape[1:3]
-    of_xy, of_xz, of_yz = planes[0].reshape(-1), planes[1].reshape(-1), planes[2].reshape(-1)
-    along_x, along_y, along_z = rows[0].reshape(-1), rows[1].reshape(-1), rows[2].reshape(-1)
-    weight, channels, of_grid = weights.reshape(-1), U(weights.shape[1]), grid.reshape(-1)
-    green_at, blue_at, density_at = channels, U(2) * channels, U(3) * channels
+    nx, ny, _ = corners
     for j in range(count):
         line, x = divmod(wanted[j], I(nx))
         z, y = divmod(line, I(ny))
-        xy, xz, yz = channels * U(y * I(nx) + x), channels * U(z * I(nx) + x), channels * U(line)
-        at_x, at_y, at_z = channels * U(x), channels * U(y), channels * U(z)
-        red, green, blue, log_density = ZERO, ZERO, ZERO, bias
-        for m in range(channels):
-            feature = of_xy[xy + m] * of_xz[xz + m] * of_yz[yz + m] * along_x[at_x + m] * along_y[at_y + m] * along_z[at_z + m]
-            red += feature * weight[m]
-            green += feature * weight[green_at + m]
-            blue += feature * weight[blue_at + m]
-            log_density += feature * weight[density_at + m]
-        at = U(4) * U(wanted[j])
-        of_grid[at], of_grid[at + U(1)], of_grid[at + U(2)] = _bounded(red), _bounded(green), _bounded(blue)
-        of_grid[at + U(3)] = _bounded(log_density)
-
-
-@_part
-def _look_up(found, grid, samples, cell):
-    _interpolated(LOGIT_RED, False, 4, found, grid, samples, cell)
+        factors = planes[0][y * I(nx) + x], planes[1][z * I(nx) + x], planes[2][line], rows[0][x], rows[1][y], rows[2][z]
+        combine(factors, weights, bias, grid, U(wanted[j]))
 
 
 @_part
 def _shade(found, tau, samples):
     """Colours and alphas in place of logits and log densities."""
-    for j in range(U(found)):
+    for j in range(_whole(found)):
         density = _exp(min(max(samples[LOG_DENSITY, j], -LIMIT), LIMIT))
         samples[LOG_DENSITY, j] = ONE - _exp(-density * tau)
         samples[LOGIT_RED, j] = ONE / (ONE + _exp(-samples[LOGIT_RED, j]))

@@ -1,0 +1,132 @@
+"""What numba has no types for, vectors, for `kpc.player.cast`: sums over neighbours and over channels, in LLVM's own terms.
+
+Left to itself, numba makes vectors of loops alone. Four channels are too few for one: it takes them number by number, at four times the cost; and it
+sums up the vectors of a dot product one by one. LLVM makes what it is told here fit whatever vectors a processor has.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+CHANNELS = 4
+"""Of a grid: all of a node's at once."""
+WIDE = 16
+"""Features at once: as many floats as the widest processors multiply."""
+LARGEST = 1e30
+"""What sums are cut off at."""
+
+_INDEX, _LANE = ir.IntType(64), ir.IntType(32)
+_CONTRACT = ["contract"]
+
+
+@intrinsic
+def interpolate(_: Any, grid: Any, first: Any, right: Any, up: Any, back: Any, x: Any, y: Any, z: Any, into: Any, line: Any, column: Any) -> Any:
+    """into[line + c, column] = the sum over the eight nodes around of their weights times grid[node, c], c = 0 to 3.
+
+    `grid`, (N, 4) float32; `first`, the node before along all axes, `right`, `up`, `back` from it to the next along x, y, z, uint64; x, y, z,
+    float32 shares of the way to those; `into`, (lines, columns) float32; `line`, `column`, uint64.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        grid, first, right, up, back, x, y, z, into, line, column = arguments
+        nodes, out = _array(context, builder, signature, arguments, 0), _array(context, builder, signature, arguments, 8)
+        one = ir.Constant(ir.FloatType(), 1.0)
+        ways = [(step, builder.fsub(one, share), share) for step, share in ((right, x), (up, y), (back, z))]
+        terms = []
+        for number in range(1 << len(ways)):
+            node, weight = first, one
+            for bit, (step, near, far) in enumerate(ways):
+                node = builder.add(node, step) if number >> bit & 1 else node
+                weight = builder.fmul(weight, far if number >> bit & 1 else near)
+            values = _load(builder, nodes.data, builder.mul(node, _INDEX(CHANNELS)), CHANNELS)
+            terms.append(builder.fmul(values, _spread(builder, weight, CHANNELS), flags=_CONTRACT))
+        total = reduce(lambda sum, term: builder.fadd(sum, term, flags=_CONTRACT), terms)
+        columns = builder.extract_value(out.shape, 1)
+        for channel in range(CHANNELS):
+            at = builder.add(builder.mul(builder.add(line, _INDEX(channel)), columns), column)
+            builder.store(builder.extract_element(total, _LANE(channel)), builder.gep(out.data, [at]))
+        return context.get_dummy_value()
+
+    return types.void(grid, first, right, up, back, x, y, z, into, line, column), generate
+
+
+@intrinsic
+def combine(_: Any, factors: Any, weights: Any, bias: Any, into: Any, row: Any) -> Any:
+    """into[row, c] = the sum over m of weights[c, m] and the product of all factors[m], c = 0 to 3, to the last of them `bias` added. Finite: cut
+    off at LARGEST, 0 where it is not a number.
+
+    `factors`, a tuple of (M,) float32, `weights`, (4, M), M a multiple of WIDE; `into`, (N, 4) float32; `row`, uint64.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        _, _, bias, _, row = arguments
+        tuples = cgutils.unpack_tuple(builder, arguments[0])
+        arrays = [context.make_array(signature.args[0].dtype)(context, builder, factor) for factor in tuples]
+        weights, out = (_array(context, builder, signature, arguments, n) for n in (1, 3))
+        count = builder.extract_value(arrays[0].shape, 0)
+        nothing = _constant(0.0, WIDE)
+        sums = [cgutils.alloca_once_value(builder, nothing) for _ in range(CHANNELS)]
+        for sum_ in sums:  # once a call, where the line above is once a function
+            builder.store(nothing, sum_)
+        with cgutils.for_range_slice(builder, _INDEX(0), count, _INDEX(WIDE), inc=True) as (m, _):
+            feature = reduce(builder.fmul, (_load(builder, array.data, m, WIDE) for array in arrays))
+            for channel, sum_ in enumerate(sums):
+                weight = _load(builder, weights.data, builder.add(builder.mul(count, _INDEX(channel)), m), WIDE)
+                builder.store(builder.fadd(builder.load(sum_), builder.fmul(feature, weight, flags=_CONTRACT), flags=_CONTRACT), sum_)
+        total = _sums(builder, [builder.load(sum_) for sum_ in sums])
+        total = builder.fadd(total, builder.insert_element(_constant(0.0, CHANNELS), bias, _LANE(CHANNELS - 1)))
+        is_number = builder.fcmp_ordered("ord", total, total)
+        for limit, keeps in ((LARGEST, "<"), (-LARGEST, ">")):
+            total = builder.select(builder.fcmp_ordered(keeps, total, _constant(limit, CHANNELS)), total, _constant(limit, CHANNELS))
+        _store(builder, builder.select(is_number, total, _constant(0.0, CHANNELS)), out.data, builder.mul(row, _INDEX(CHANNELS)))
+        return context.get_dummy_value()
+
+    return types.void(factors, weights, bias, into, row), generate
+
+
+def _sums(builder: Any, vectors: Sequence[Any]) -> Any:
+    """Of the numbers of each of four vectors, as one of four."""
+    halves: Callable[[Any, int], Any]
+    halves = lambda vector, half: builder.fadd(_picked(builder, vector, vector, range(half)), _picked(builder, vector, vector, range(half, 2 * half)))
+    for half in (WIDE // 2, WIDE // 4):
+        vectors = [halves(vector, half) for vector in vectors]
+    pairs = [builder.fadd(_picked(builder, a, b, (0, 4, 1, 5)), _picked(builder, a, b, (2, 6, 3, 7))) for a, b in (vectors[:2], vectors[2:])]
+    return builder.fadd(_picked(builder, *pairs, (0, 1, 4, 5)), _picked(builder, *pairs, (2, 3, 6, 7)))
+
+
+def _array(context: Any, builder: Any, signature: Any, arguments: Sequence[Any], number: int) -> Any:
+    return context.make_array(signature.args[number])(context, builder, arguments[number])
+
+
+def _floats(count: int) -> ir.VectorType:
+    return ir.VectorType(ir.FloatType(), count)
+
+
+def _constant(value: float, count: int) -> ir.Constant:
+    return ir.Constant(_floats(count), [value] * count)
+
+
+def _load(builder: Any, data: Any, at: Any, count: int) -> Any:
+    vector = builder.load(builder.bitcast(builder.gep(data, [at]), _floats(count).as_pointer()))
+    vector.align = 4
+    return vector
+
+
+def _store(builder: Any, vector: Any, data: Any, at: Any) -> None:
+    builder.store(vector, builder.bitcast(builder.gep(data, [at]), vector.type.as_pointer())).align = 4
+
+
+def _spread(builder: Any, value: Any, count: int) -> Any:
+    """A vector of so many of one number."""
+    vector = builder.insert_element(ir.Constant(_floats(count), ir.Undefined), value, _LANE(0))
+    return _picked(builder, vector, vector, [0] * count)
+
+
+def _picked(builder: Any, one: Any, other: Any, lanes: Sequence[int] | range) -> Any:
+    """The numbers of a vector and another, counted through, that these are."""
+    return builder.shuffle_vector(one, other, ir.Constant(ir.VectorType(_LANE, len(lanes)), list(lanes)))
