@@ -56,8 +56,8 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
 
     Grids lie flat, x fastest; how many there are along x, y, z comes behind them: `free`, (N,) uint8, as occupancy.glsl has it; `motion`, (N, 4),
     of no nodes where nothing is displaced; `grid`, (N, 4) of logits and log densities at those corners that are `known`, (N,) uint8 of BAKED and
-    WHOLE. The others are baked from `planes`, xy, xz, yz at corners, (rows * columns, M), `rows` of the time planes along x, y, z, (N, M),
-    `weights`, (4, M), and `bias`.
+    WHOLE. The others are baked from `planes`, xy, xz, yz at corners, (rows * columns, M) int16, `rows` of the time planes along x, y, z, (N, M),
+    `weights`, (4, M), which make up for the planes' steps, and `bias`.
     """
     rays, samples = np.zeros((16, LANES), np.float32), np.zeros((10, LANES), np.float32)
     pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
@@ -248,8 +248,8 @@ def _bake(count, wanted, planes, rows, weights, bias, grid, corners):
     for j in range(count):
         line, x = divmod(wanted[j], I(nx))
         z, y = divmod(line, I(ny))
-        factors = planes[0][y * I(nx) + x], planes[1][z * I(nx) + x], planes[2][line], rows[0][x], rows[1][y], rows[2][z]
-        combine(factors, weights, bias, grid, U(wanted[j]))
+        in_planes, in_rows = (planes[0][y * I(nx) + x], planes[1][z * I(nx) + x], planes[2][line]), (rows[0][x], rows[1][y], rows[2][z])
+        combine(in_planes, in_rows, weights, bias, grid, U(wanted[j]))
 
 
 @_part

@@ -619,7 +619,7 @@ class Renderer:
         target, self._slot = self._target(part, raster), slot_at(self.scene, time)
         self._shots.pop((part, raster), None)
         count, covered = (-(-camera.height // BLOCK), -(-camera.width // BLOCK)), self._covered(camera)
-        blocks = np.argwhere(np.ones(count, bool) if covered is None else covered)
+        blocks = np.ascontiguousarray(np.argwhere(np.ones(count, bool) if covered is None else covered))
         self._confine(target, EVERYWHERE if covered is None else _shares(_bounds(covered), count[::-1]))
         if len(blocks):
             step, free = self.scene.step * self.quality.step, self._free(self._slot)

@@ -20,7 +20,7 @@ WIDE = 16
 LARGEST = 1e30
 """What sums are cut off at."""
 
-_INDEX, _LANE = ir.IntType(64), ir.IntType(32)
+_INDEX, _LANE, _SHORT, _FLOAT = ir.IntType(64), ir.IntType(32), ir.IntType(16), ir.FloatType()
 _CONTRACT = ["contract"]
 
 
@@ -35,7 +35,7 @@ def interpolate(_: Any, grid: Any, first: Any, right: Any, up: Any, back: Any, x
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
         grid, first, right, up, back, x, y, z, into, line, column = arguments
         nodes, out = _array(context, builder, signature, arguments, 0), _array(context, builder, signature, arguments, 8)
-        one = ir.Constant(ir.FloatType(), 1.0)
+        one = ir.Constant(_FLOAT, 1.0)
         ways = [(step, builder.fsub(one, share), share) for step, share in ((right, x), (up, y), (back, z))]
         terms = []
         for number in range(1 << len(ways)):
@@ -56,25 +56,29 @@ def interpolate(_: Any, grid: Any, first: Any, right: Any, up: Any, back: Any, x
 
 
 @intrinsic
-def combine(_: Any, factors: Any, weights: Any, bias: Any, into: Any, row: Any) -> Any:
-    """into[row, c] = the sum over m of weights[c, m] and the product of all factors[m], c = 0 to 3, to the last of them `bias` added. Finite: cut
-    off at LARGEST, 0 where it is not a number.
+def combine(_: Any, wholes: Any, factors: Any, weights: Any, bias: Any, into: Any, row: Any) -> Any:
+    """into[row, c] = the sum over m of weights[c, m] times the product of all wholes[m] and factors[m], c = 0 to 3, to the last of them `bias`
+    added. Finite: cut off at LARGEST, 0 where it is not a number.
 
-    `factors`, a tuple of (M,) float32, `weights`, (4, M), M a multiple of WIDE; `into`, (N, 4) float32; `row`, uint64.
+    `wholes`, a tuple of (M,) int16, `factors`, of (M,) float32, `weights`, (4, M) float32, M a multiple of WIDE; `into`, (N, 4) float32; `row`,
+    uint64.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        _, _, bias, _, row = arguments
-        tuples = cgutils.unpack_tuple(builder, arguments[0])
-        arrays = [context.make_array(signature.args[0].dtype)(context, builder, factor) for factor in tuples]
-        weights, out = (_array(context, builder, signature, arguments, n) for n in (1, 3))
-        count = builder.extract_value(arrays[0].shape, 0)
+        wholes, factors = (
+            [context.make_array(kind.dtype)(context, builder, array) for array in cgutils.unpack_tuple(builder, arrays)]
+            for kind, arrays in zip(signature.args[:2], arguments[:2], strict=True)
+        )
+        _, _, _, bias, _, row = arguments
+        weights, out = (_array(context, builder, signature, arguments, n) for n in (2, 4))
+        count = builder.extract_value(factors[0].shape, 0)
         nothing = _constant(0.0, WIDE)
         sums = [cgutils.alloca_once_value(builder, nothing) for _ in range(CHANNELS)]
         for sum_ in sums:  # once a call, where the line above is once a function
             builder.store(nothing, sum_)
         with cgutils.for_range_slice(builder, _INDEX(0), count, _INDEX(WIDE), inc=True) as (m, _):
-            feature = reduce(builder.fmul, (_load(builder, array.data, m, WIDE) for array in arrays))
+            of_wholes = [builder.sitofp(_load(builder, array.data, m, WIDE, _SHORT), _vector(WIDE)) for array in wholes]
+            feature = reduce(builder.fmul, [*of_wholes, *(_load(builder, array.data, m, WIDE) for array in factors)])
             for channel, sum_ in enumerate(sums):
                 weight = _load(builder, weights.data, builder.add(builder.mul(count, _INDEX(channel)), m), WIDE)
                 builder.store(builder.fadd(builder.load(sum_), builder.fmul(feature, weight, flags=_CONTRACT), flags=_CONTRACT), sum_)
@@ -86,7 +90,7 @@ def combine(_: Any, factors: Any, weights: Any, bias: Any, into: Any, row: Any) 
         _store(builder, builder.select(is_number, total, _constant(0.0, CHANNELS)), out.data, builder.mul(row, _INDEX(CHANNELS)))
         return context.get_dummy_value()
 
-    return types.void(factors, weights, bias, into, row), generate
+    return types.void(wholes, factors, weights, bias, into, row), generate
 
 
 def _sums(builder: Any, vectors: Sequence[Any]) -> Any:
@@ -103,17 +107,17 @@ def _array(context: Any, builder: Any, signature: Any, arguments: Sequence[Any],
     return context.make_array(signature.args[number])(context, builder, arguments[number])
 
 
-def _floats(count: int) -> ir.VectorType:
-    return ir.VectorType(ir.FloatType(), count)
+def _vector(count: int, kind: Any = _FLOAT) -> ir.VectorType:
+    return ir.VectorType(kind, count)
 
 
 def _constant(value: float, count: int) -> ir.Constant:
-    return ir.Constant(_floats(count), [value] * count)
+    return ir.Constant(_vector(count), [value] * count)
 
 
-def _load(builder: Any, data: Any, at: Any, count: int) -> Any:
-    vector = builder.load(builder.bitcast(builder.gep(data, [at]), _floats(count).as_pointer()))
-    vector.align = 4
+def _load(builder: Any, data: Any, at: Any, count: int, kind: Any = _FLOAT) -> Any:
+    vector = builder.load(builder.bitcast(builder.gep(data, [at]), _vector(count, kind).as_pointer()))
+    vector.align = 2 if kind is _SHORT else 4
     return vector
 
 
@@ -123,10 +127,10 @@ def _store(builder: Any, vector: Any, data: Any, at: Any) -> None:
 
 def _spread(builder: Any, value: Any, count: int) -> Any:
     """A vector of so many of one number."""
-    vector = builder.insert_element(ir.Constant(_floats(count), ir.Undefined), value, _LANE(0))
+    vector = builder.insert_element(ir.Constant(_vector(count), ir.Undefined), value, _LANE(0))
     return _picked(builder, vector, vector, [0] * count)
 
 
 def _picked(builder: Any, one: Any, other: Any, lanes: Sequence[int] | range) -> Any:
     """The numbers of a vector and another, counted through, that these are."""
-    return builder.shuffle_vector(one, other, ir.Constant(ir.VectorType(_LANE, len(lanes)), list(lanes)))
+    return builder.shuffle_vector(one, other, ir.Constant(_vector(len(lanes), _LANE), list(lanes)))
