@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from kpc.format.cameras import Camera
-from kpc.format.grid import linear, tap
+from kpc.format.grid import linear
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.player.cast import cast
 from kpc.player.cores import WORKERS, from_both_ends
@@ -47,8 +47,7 @@ class Baking:
         self._atlas = np.empty(0)
         self._planes: tuple[np.ndarray, ...] = ()
         self._time: float | None = None
-        self._cut: dict[tuple[str, int], np.ndarray] = {}
-        """Rows of time planes at corners, of the two instants around the time."""
+        self._places = {axis: np.linspace(0, 1, count, dtype=np.float32) for axis, count in zip("zyx", self.grid.shape)}
         weights = np.concatenate([scene.decoder.b2, scene.decoder.density_weight[None]])
         self._weights = self._weights_in_steps = filled(weights.astype(np.float32), 1, WIDE)
         self._rows: tuple[np.ndarray, ...] = ()
@@ -81,11 +80,11 @@ class Baking:
 
     def forget(self) -> None:
         """Rows of time planes are others now."""
-        self._time, self._cut = None, {}
+        self._time = None
 
     def march(
         self, camera: Camera, time: float, free: np.ndarray, blocks: np.ndarray, side: int, step: float, termination: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
         """What march.glsl gives of some blocks of a picture, in the least rectangle that holds them; elsewhere what rays see that meet nothing.
 
         Args:
@@ -94,13 +93,14 @@ class Baking:
             blocks: (N, 2) of row and column, rows from below, each of `side` x `side` pixels; at least one.
             step: world units.
 
-        Returns: (h, w, 4) rgb and opacity, (h, w, 2) sum of weight t and samples, float32, row 0 at the bottom; valid until the next march.
+        Returns: (h, w, 4) rgb and opacity, (h, w, 2) sum of weight t and samples, float32, row 0 at the bottom, valid until the next march; column
+            and row of their first pixel.
         """
         self._go_to(time)
         scene, size = self._scene, (camera.width, camera.height)
-        bottom, left = side * blocks.min(0)
+        bottom, left = (int(first) for first in side * blocks.min(0))
         top, right = np.minimum(side * (blocks.max(0) + 1), size[::-1])
-        seen, met = self._pictures(top - bottom, right - left)
+        seen, met = self._pictures(int(top) - bottom, int(right) - left)
         low, box = scene.aabb[0], scene.aabb[1] - scene.aabb[0]
         pose = camera.camera_to_world
         lens, axes, start, edges, background = (
@@ -118,7 +118,7 @@ class Baking:
             )  # fmt: skip
 
         from_both_ends(work, len(blocks), BLOCKS_AT_ONCE)
-        return seen, met
+        return seen, met, (left, bottom)
 
     def _pictures(self, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
         """What `march` returns, as rays see it that meet nothing; valid until the next."""
@@ -133,7 +133,7 @@ class Baking:
         if not self._planes:
             self._take_planes()
         if time != self._time:
-            self._rows = self._rows_at(time)
+            self._rows = tuple(self._row(name, time) for name in TIME_PLANES)
             if self._scene.motion is not None:
                 self._motion[..., :3] = linear(self._scene.motion, time)
             self._known[:] = 0
@@ -156,24 +156,17 @@ class Baking:
         self._planes = tuple(taken)
         self._weights_in_steps = np.clip(weights, -LARGEST, LARGEST).astype(np.float32)
 
-    def _rows_at(self, time: float) -> tuple[np.ndarray, ...]:
-        """(N, M) of the rows of all scales at a time, at corners, along x, y and z."""
-        instants = len(self._scene.scales[0][TIME_PLANES[0]])
-        before, share = tap(np.asarray(time, np.float32), instants)
-        around = int(before), min(int(before) + 1, instants - 1)
-        self._cut = {(name, n): self._cut[name, n] if (name, n) in self._cut else self._row(name, n) for name in TIME_PLANES for n in around}
-        return tuple((1 - share) * self._cut[name, around[0]] + share * self._cut[name, around[1]] for name in TIME_PLANES)
-
-    def _row(self, name: str, instant: int) -> np.ndarray:
-        rows = [self._at_corners(np.asarray(scale[name][instant], np.float32), name[0]) for scale in self._scene.scales]
-        return filled(np.concatenate(rows, axis=1), 1, WIDE)
+    def _row(self, name: str, time: float) -> np.ndarray:
+        """(N, M) of the rows of all scales at a time, at corners. Of a scene that still arrives no more of a time plane is there."""
+        parts = [self._at_corners(linear(scale[name], time), name[0]) for scale in self._scene.scales]
+        row = np.zeros((len(parts[0]), self._weights.shape[1]), np.float32)
+        np.concatenate(parts, axis=1, out=row[:, : sum(self._channels)])
+        return row
 
     def _at_corners(self, row: np.ndarray, axis: str) -> np.ndarray:
         """A (size, ...) array that is corner-aligned along x, y or z, as fine as the grid is there."""
-        count = self.grid.shape["zyx".index(axis)]
-        if len(row) == count:
-            return row
-        return linear(row, np.linspace(0, 1, count, dtype=np.float32))
+        places = self._places[axis]
+        return row if len(row) == len(places) else linear(row, places)
 
 
 def corners_of(scene: Scene) -> tuple[int, int, int]:

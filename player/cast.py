@@ -18,8 +18,8 @@ from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION
 from kpc.player.reference import PARALLEL
 from kpc.player.vectors import WIDE, combine, interpolate
 
-LANES = 256
-"""Rays side by side: what they hold fits the nearest cache."""
+LANES = 512
+"""Rays side by side. With 256 a picture takes 1.05 of the time, with 128 1.1; what they hold fits the two nearest caches."""
 AROUND = 8
 BAKED, WHOLE = 1, 2
 """Of a corner: it is baked; the seven that follow it along x, y and z are, too."""
@@ -61,7 +61,7 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
     """
     rays, samples = np.zeros((16, LANES), np.float32), np.zeros((10, LANES), np.float32)
     pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
-    wanted = np.empty(AROUND * LANES, np.int32)
+    wanted = np.empty(AROUND * LANES + 1, np.int32)
     taken, count = 0, 0
     while taken < len(blocks) or count > 0:
         while taken < len(blocks) and count + side * side <= LANES:
@@ -172,14 +172,13 @@ def _pass_by(count, stride, cells, rays, around):
 @_part
 def _stopped(count, rays, around, samples, of_ray):
     """Rays that take a sample: how many. Those beyond the box are done."""
-    found = 0
+    found = U(0)
     for i in range(U(count)):
-        if not rays[T, i] < rays[FAR, i]:
-            around[i] = DONE
-        elif around[i] == 0:
-            of_ray[found] = i
-            samples[AT_X, found], samples[AT_Y, found], samples[AT_Z, found] = rays[X, i], rays[Y, i], rays[Z, i]
-            found += 1
+        inside, is_free = rays[T, i] < rays[FAR, i], around[i] > 0
+        around[i] = around[i] if inside else I(DONE)
+        of_ray[found] = i
+        samples[AT_X, found], samples[AT_Y, found], samples[AT_Z, found] = rays[X, i], rays[Y, i], rays[Z, i]
+        found += U(inside & ~is_free)  # a branch would often be foretold wrongly
     return found
 
 
@@ -226,16 +225,15 @@ def _displace(found, motion, nodes, samples, cell):
 @_part
 def _wanted(found, known, corners, cell, wanted):
     """Corners around samples that are not known yet, and count as known from now on: how many."""
-    count, (right, up, back) = 0, _strides(corners)
+    count, (right, up, back) = U(0), _strides(corners)
     for j in range(U(found)):
         first = U(cell[j])
         if known[first] & WHOLE:
             continue
         for number in range(AROUND):
             corner = first + (right if number & 1 else U(0)) + (up if number & 2 else U(0)) + (back if number & 4 else U(0))
-            if not known[corner]:
-                wanted[count] = corner
-                count += 1
+            wanted[count] = corner
+            count += U(known[corner] == 0)
             known[corner] |= BAKED
         known[first] |= WHOLE
     return count
@@ -246,10 +244,12 @@ def _bake(count, wanted, planes, rows, weights, bias, grid, corners):
     """Fill corners of the grid."""
     nx, ny, _ = corners
     for j in range(count):
-        line, x = divmod(wanted[j], I(nx))
-        z, y = divmod(line, I(ny))
-        in_planes, in_rows = (planes[0][y * I(nx) + x], planes[1][z * I(nx) + x], planes[2][line]), (rows[0][x], rows[1][y], rows[2][z])
-        combine(in_planes, in_rows, weights, bias, grid, U(wanted[j]))
+        at = np.uint32(wanted[j])
+        line = at // np.uint32(nx)
+        z = line // np.uint32(ny)
+        x, y = at - line * np.uint32(nx), line - z * np.uint32(ny)
+        in_planes = planes[0][U(y) * U(nx) + U(x)], planes[1][U(z) * U(nx) + U(x)], planes[2][U(line)]
+        combine(in_planes, (rows[0][U(x)], rows[1][U(y)], rows[2][U(z)]), weights, bias, grid, U(at))
 
 
 @_part

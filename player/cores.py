@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 CORES = os.cpu_count() or 1
 WORKERS = min(CORES, 8)
 """Of `from_both_ends`, each of which may need arrays of its own."""
-PARTS_EACH = 16
+PARTS_EACH = 8
 """Of work that is not even, so that all are busy to the end."""
 _POOL = ThreadPoolExecutor(CORES, thread_name_prefix="cores")
 

@@ -623,9 +623,8 @@ class Renderer:
         self._confine(target, EVERYWHERE if covered is None else _shares(_bounds(covered), count[::-1]))
         if len(blocks):
             step, free = self.scene.step * self.quality.step, self._free(self._slot)
-            seen, met = folded.baking.march(camera, time, free, blocks, BLOCK, step, self.quality.termination)
-            row, column = blocks.min(0)
-            place = int(BLOCK * column), int(BLOCK * row), seen.shape[1], seen.shape[0]
+            seen, met, first = folded.baking.march(camera, time, free, blocks, BLOCK, step, self.quality.termination)
+            place = (*first, *seen.shape[1::-1])
             target.seen.write(seen, place)
             target.met.write(met, place)
         return target

@@ -109,7 +109,7 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     blocks = shader.constants(block_arrays(scene, layout))
-    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "SHARED": int(space == "box"), "BAKED": int(space in ("contracted", "ndc") and not rows), "PIXELS": rows + motion, "MOVED": motion, "CUBIC": motion, "VIEW": rows + 2 * motion, "COMPUTE": 0, "TILE": 64, "SQUARE": 20,
+    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "SHARED": int(space == "box"), "PIXELS": rows + motion, "MOVED": motion, "CUBIC": motion, "VIEW": rows + 2 * motion, "COMPUTE": 0, "TILE": 64, "SQUARE": 20,
                "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion, "APPEARANCE": rows}  # fmt: skip
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights, "plane_blocks": blocks})
     for where in VERTICES.get(name, ["fullscreen.glsl"]):
