@@ -18,7 +18,7 @@ FORBIDDEN = {
         "OpenGL",
     },
     "encoder": {"kpc.player", "kpc.tools", "moderngl", "glfw", "imgui_bundle", "OpenGL"},
-    "player": {"kpc.encoder", "kpc.tools", "torch", "numba"},
+    "player": {"kpc.encoder", "kpc.tools", "torch"},
     "tools": set(),
 }
 VIEWERS = ("format", "player")

@@ -1,0 +1,57 @@
+"""Sums in LLVM's own terms, against numpy."""
+
+import numpy as np
+import pytest
+from numba import njit
+
+from kpc.player.vectors import LARGEST, WIDE, combine, interpolate
+
+
+@njit
+def interpolated(grid, first, steps, shares, into):
+    for n in range(len(first)):
+        interpolate(grid, first[n], steps[0], steps[1], steps[2], shares[n, 0], shares[n, 1], shares[n, 2], into, np.uint64(1), np.uint64(n))
+
+
+@njit
+def combined(wholes, factors, weights, bias, into):
+    combine(wholes, factors, weights, bias, into, np.uint64(1))
+
+
+@pytest.mark.parametrize("shape", [(4, 5, 3), (2, 2, 2), (3, 1, 1)])
+def test_neighbours_are_weighted_as_they_should(shape: tuple[int, int, int]) -> None:
+    """Against the sum over all nodes of products of hat functions; along an axis of one node there is no next."""
+    rng, count = np.random.default_rng(0), 500
+    values = rng.normal(size=(*shape, 4)).astype(np.float32)
+    nz, ny, nx = shape
+    steps = np.array([int(nx > 1), nx * (ny > 1), nx * ny * (nz > 1)], np.uint64)
+    at = rng.random((count, 3)).astype(np.float32) * (np.array([nx, ny, nz]) - 1)
+    first = np.minimum(at.astype(int), np.maximum(np.array([nx, ny, nz]) - 2, 0))
+    into = np.full((6, count), np.nan, np.float32)
+    interpolated(values.reshape(-1, 4), (first @ [1, nx, nx * ny]).astype(np.uint64), steps, (at - first).astype(np.float32), into)
+    hats = [np.maximum(1 - np.abs(at[:, [axis]].astype(np.float64) - np.arange(n)), 0) for axis, n in enumerate((nx, ny, nz))]
+    wanted = np.einsum("zyxc,nx,ny,nz->cn", values.astype(np.float64), *hats)
+    np.testing.assert_allclose(into[1:5], wanted, atol=1e-5)
+    assert np.isnan(into[[0, 5]]).all()
+
+
+@pytest.mark.parametrize("vectors", [1, 2, 3, 5])
+def test_products_are_summed_up(vectors: int) -> None:
+    rng, count = np.random.default_rng(vectors), WIDE * vectors
+    wholes = tuple(rng.integers(-32767, 32768, count).astype(np.int16) for _ in range(3))
+    factors = tuple(rng.normal(size=count).astype(np.float32) for _ in range(2))
+    weights, into = (rng.normal(size=(4, count)) * 1e-13).astype(np.float32), np.full((3, 4), np.nan, np.float32)
+    for _ in range(2):  # sums begin anew each time
+        combined(wholes, factors, weights, np.float32(0.25), into)
+    wanted = weights.astype(np.float64) @ np.prod([array.astype(np.float64) for array in (*wholes, *factors)], axis=0)
+    np.testing.assert_allclose(into[1], wanted + [0, 0, 0, 0.25], rtol=1e-4, atol=1e-4)
+    assert np.isnan(into[[0, 2]]).all()
+
+
+@pytest.mark.parametrize("value, wanted", [(3e38, LARGEST), (-3e38, -LARGEST), (np.inf, LARGEST), (np.nan, 0.0)])
+def test_sums_are_finite(value: float, wanted: float) -> None:
+    ones, into = np.ones(WIDE, np.int16), np.zeros((3, 4), np.float32)
+    weights = np.zeros((4, WIDE), np.float32)
+    weights[:, 0] = 1.0
+    combined((ones,), (np.full(WIDE, value, np.float32),), np.where(weights > 0, weights, 0 if np.isfinite(value) else 1).astype(np.float32), np.float32(0), into)
+    assert (into[1] == np.float32(wanted)).all()
