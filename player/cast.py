@@ -62,7 +62,7 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
     rays, samples = np.zeros((16, LANES), np.float32), np.zeros((10, LANES), np.float32)
     pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
     wanted = np.empty(AROUND * LANES + 1, np.int32)
-    taken, count = 0, 0
+    taken, count = np.int64(0), np.int64(0)  # a plain 0 would be a type of its own, for which parts are compiled once more
     while taken < len(blocks) or count > 0:
         while taken < len(blocks) and count + side * side <= LANES:
             count = _begin(blocks[taken], side, size, lens, axes, start, box, count, rays, pixel)

@@ -44,8 +44,8 @@ class Quality:
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated, by a cubic (cubic.glsl).
         thin: where a processor folds, rays pass by occupied cells that are empty at the time: a step at their corners has less alpha than
             this. 0: they stop in all.
-        baked: where a processor folds a scene that `Baking` serves, let samples look up a grid of what the planes come to, at the corners of
-            their texels. Then no picture follows another, and rays stop in all occupied cells: finding out which are empty takes longer than looking up.
+        baked: let a processor that would draw march a scene that `Baking` serves itself, through a grid of what the planes come to at the corners
+            of their texels. Then all pixels are marched, no picture follows another, and rays stop in all occupied cells.
         across: rays across a pixel, at most: as many as it spans texels of the finest scale, and their mean is its colour. What is far
             away else shimmers. Room in a picture so small that a pixel spans three texels is 30.0 dB from that of 36 rays a pixel,
             and 40.3 with 2 x 2; prefiltered planes of half and a quarter of the resolution gave 33.4 and 29.9 (products of means are
