@@ -186,7 +186,7 @@ def test_planes_that_arrive_later_count() -> None:
 
 def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
     assert Baking.serves(one_sided(tiny_scene(channels=16)))
-    fine = one_sided(tiny_scene(scales=1, channels=30, resolution=(128, 128, 80)))
+    fine = one_sided(tiny_scene(scales=1, channels=30, resolution=(200, 180, 120)))
     assert np.prod(corners_of(fine)) > MOST_CORNERS
     mapped = [SPACES[space](one_sided(tiny_scene(channels=16))) for space in ("ndc", "contracted")]
     for scene in (*mapped, tiny_scene(channels=16), one_sided(tiny_scene(channels=16, dynamic=False)), one_sided(tiny_scene()), fine, SPACES["hybrid"](tiny_scene(channels=16))):
