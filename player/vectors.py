@@ -4,7 +4,7 @@ Left to itself, numba makes vectors of loops alone. Four channels are too few fo
 sums up the vectors of a dot product one by one. LLVM makes what it is told here fit whatever vectors a processor has.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
@@ -95,12 +95,12 @@ def combine(_: Any, wholes: Any, factors: Any, weights: Any, bias: Any, into: An
 
 def _sums(builder: Any, vectors: Sequence[Any]) -> Any:
     """Of the numbers of each of four vectors, as one of four."""
-    halves: Callable[[Any, int], Any]
-    halves = lambda vector, half: builder.fadd(_picked(builder, vector, vector, range(half)), _picked(builder, vector, vector, range(half, 2 * half)))
     for half in (WIDE // 2, WIDE // 4):
-        vectors = [halves(vector, half) for vector in vectors]
-    pairs = [builder.fadd(_picked(builder, a, b, (0, 4, 1, 5)), _picked(builder, a, b, (2, 6, 3, 7))) for a, b in (vectors[:2], vectors[2:])]
-    return builder.fadd(_picked(builder, *pairs, (0, 1, 4, 5)), _picked(builder, *pairs, (2, 3, 6, 7)))
+        halves = range(half), range(half, 2 * half)
+        vectors = [builder.fadd(*(_picked(builder, vector, vector, lanes) for lanes in halves)) for vector in vectors]
+    a, b, c, d = vectors
+    one, other = (builder.fadd(_picked(builder, x, y, (0, 4, 1, 5)), _picked(builder, x, y, (2, 6, 3, 7))) for x, y in ((a, b), (c, d)))
+    return builder.fadd(_picked(builder, one, other, (0, 1, 4, 5)), _picked(builder, one, other, (2, 3, 6, 7)))
 
 
 def _array(context: Any, builder: Any, signature: Any, arguments: Sequence[Any], number: int) -> Any:
