@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from kpc.format.cameras import Camera
-from kpc.format.grid import linear
+from kpc.format.grid import linear, tap
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.player.cast import cast
 from kpc.player.cores import WORKERS, from_both_ends
@@ -51,12 +51,15 @@ class Baking:
         self._atlas = np.empty(0)
         self._planes: tuple[np.ndarray, ...] = ()
         self._time: float | None = None
+        self._cut: dict[tuple[str, int, int], np.ndarray] = {}
+        """Rows of time planes at corners, by plane, scale and number."""
         self._places = {axis: np.linspace(0, 1, count, dtype=np.float32) for axis, count in zip("zyx", self.grid.shape)}
         weights = np.concatenate([scene.decoder.b2, scene.decoder.density_weight[None]])
         self._weights = self._weights_in_steps = filled(weights.astype(np.float32), 1, WIDE)
         self._rows: tuple[np.ndarray, ...] = ()
         self._motion = np.zeros((0, 0, 0, 4) if scene.motion is None else (*scene.motion.shape[1:4], 4), np.float32)
-        self._room = np.empty(0, np.float32)
+        self._room, self._nothing = np.empty((6, 0), np.float32), np.empty(0, np.float32)
+        """For as many pixels as a picture has had yet: what is seen and met; what is seen of rays that meet nothing."""
 
     @staticmethod
     def serves(scene: Scene) -> bool:
@@ -84,7 +87,7 @@ class Baking:
 
     def forget(self) -> None:
         """Rows of time planes are others now."""
-        self._time = None
+        self._time, self._cut = None, {}
 
     def march(
         self, camera: Camera, time: float, free: np.ndarray, blocks: np.ndarray, side: int, step: float, termination: float
@@ -125,19 +128,20 @@ class Baking:
         return seen, met, (left, bottom)
 
     def _pictures(self, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-        """What `march` returns, as rays see it that meet nothing; valid until the next."""
+        """What `march` returns, as rays see it that meet nothing."""
         pixels = height * width
-        if self._room.size < 6 * pixels:
-            self._room = np.empty(6 * pixels, np.float32)
-        seen, met = self._room[: 4 * pixels].reshape(height, width, 4), self._room[4 * pixels : 6 * pixels].reshape(height, width, 2)
-        seen[:], met[:] = (*self._scene.background, 0.0), 0.0
-        return seen, met
+        if self._room.shape[1] < pixels:
+            self._room = np.empty((6, pixels), np.float32)
+            self._nothing = np.tile(np.append(self._scene.background, 0).astype(np.float32), pixels)
+        seen, met = np.split(self._room.reshape(-1)[: 6 * pixels], [4 * pixels])
+        seen[:], met[:] = self._nothing[: seen.size], 0.0
+        return seen.reshape(height, width, 4), met.reshape(height, width, 2)
 
     def _go_to(self, time: float) -> None:
         if not self._planes:
             self._take_planes()
         if time != self._time:
-            self._rows = tuple(self._row(name, time) for name in TIME_PLANES)
+            self._rows = self._rows_at(time)
             if self._scene.motion is not None:
                 self._motion[..., :3] = linear(self._scene.motion, time)
             self._known[:] = 0
@@ -160,12 +164,25 @@ class Baking:
         self._planes = tuple(taken)
         self._weights_in_steps = np.clip(weights, -LARGEST, LARGEST).astype(np.float32)
 
-    def _row(self, name: str, time: float) -> np.ndarray:
-        """(N, M) of the rows of all scales at a time, at corners. Of a scene that still arrives no more of a time plane is there."""
-        parts = [self._at_corners(linear(scale[name], time), name[0]) for scale in self._scene.scales]
-        row = np.zeros((len(parts[0]), self._weights.shape[1]), np.float32)
-        np.concatenate(parts, axis=1, out=row[:, : sum(self._channels)])
-        return row
+    def _rows_at(self, time: float) -> tuple[np.ndarray, ...]:
+        """(N, M) of the rows of all scales at a time, at corners, along x, y and z. What is made of the rows before and after stays until there
+        are others."""
+        scales, kept, rows = self._scene.scales, self._cut, []
+        self._cut = {}
+        taps = {count: tap(np.float32(time), count) for count in {len(scale[TIME_PLANES[0]]) for scale in scales}}
+        for name in TIME_PLANES:
+            row = np.zeros((len(self._places[name[0]]), self._weights.shape[1]), np.float32)
+            first = 0
+            for number, (scale, channels) in enumerate(zip(scales, self._channels, strict=True)):
+                plane = scale[name]  # of a scene that still arrives, no more of which may be there than single rows
+                before, share = taps[len(plane)]
+                for instant, weight in ((int(before), 1 - share), (min(int(before) + 1, len(plane) - 1), share)):
+                    key = name, number, instant
+                    self._cut[key] = kept[key] if key in kept else self._at_corners(np.asarray(plane[instant], np.float32), name[0])
+                    row[:, first : first + channels] += weight * self._cut[key]
+                first += channels
+            rows.append(row)
+        return tuple(rows)
 
     def _at_corners(self, row: np.ndarray, axis: str) -> np.ndarray:
         """A (size, ...) array that is corner-aligned along x, y or z, as fine as the grid is there."""
