@@ -3,7 +3,7 @@
 Where colours have no sides, a grid of what planes come to at the corners of the finest scale's texels holds all there is, the logits of the colour
 and the log of the density, and a sample takes one look-up in it, in place of one in each plane for every four channels: of `soldier` 36. At
 corners it is exact, and folding errs nowhere. In between it is of the first degree, where products of three planes are of the second: pictures of
-soldier are 49 dB (`fast`, 80 texels high) and 52 (`balanced`, 128) from exact ones, where folded planes come to 62 and 67. The grid must have its
+soldier are 49 dB (`fast`, 80 texels high) and 53 (`balanced`, 128) from exact ones, where folded planes come to 62 and 67. The grid must have its
 corners where texels do: one of four fifths as many along each axis comes to 37 dB.
 
 `cast` bakes a corner when a sample first looks at it, and marches. Soldier, `balanced`, takes it 0.3 of the time that planes take at 320x240, and half at

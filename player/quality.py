@@ -45,7 +45,8 @@ class Quality:
         thin: where a processor folds, rays pass by occupied cells that are empty at the time: a step at their corners has less alpha than
             this. 0: they stop in all.
         baked: let a processor that would draw march a scene that `Baking` serves itself, through a grid of what the planes come to at the corners
-            of their texels. Then all pixels are marched, no picture follows another, and rays stop in all occupied cells.
+            of their texels. Then all pixels are marched, no picture follows another, rays stop in all occupied cells, and end once their
+            transmittance falls below this: of soldier's 53.7 dB, 1 / 16 costs 1, 1 / 8 costs 4. 0: it marches none.
         across: rays across a pixel, at most: as many as it spans texels of the finest scale, and their mean is its colour. What is far
             away else shimmers. Room in a picture so small that a pixel spans three texels is 30.0 dB from that of 36 rays a pixel,
             and 40.3 with 2 x 2; prefiltered planes of half and a quarter of the resolution gave 33.4 and 29.9 (products of means are
@@ -61,12 +62,12 @@ class Quality:
     blur: float = 0.0
     resolution: float = 1.0
     thin: float = 0.0
-    baked: bool = False
+    baked: float = 0.0
     across: int = 1
     scales: int | None = None
 
     def __post_init__(self) -> None:
-        marchable = self.step >= 1 and self.share > 0 and 0 < self.termination < 1 and 0 < self.resolution <= 1 and self.tolerance >= 0 and self.blur >= 0 and 0 <= self.thin < 1 and self.across >= 1
+        marchable = self.step >= 1 and self.share > 0 and 0 < self.termination < 1 and 0 < self.resolution <= 1 and self.tolerance >= 0 and self.blur >= 0 and 0 <= self.thin < 1 and 0 <= self.baked < 1 and self.across >= 1
         if not marchable or self.scales is not None and self.scales < 1:
             raise ValueError(f"no picture can be drawn with {self}")
 
@@ -77,11 +78,11 @@ soldier 0.53, 45.5 (54.4); liam 0.75, 40.2 (42.9); room, full of fine patterns, 
 0.90, 42.0; 0.95, 43.8."""
 
 LADDER: dict[str, Quality] = {
-    "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=True, resolution=0.5),
-    "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=True, resolution=0.5),
-    "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=True, resolution=0.75),
-    "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=True, across=4),
-    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=True, across=4),
+    "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, resolution=0.5),
+    "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, resolution=0.5),
+    "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, resolution=0.75),
+    "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, across=4),
+    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 16, across=4),
     "fine": Quality(folded=True, termination=1 / 64, share=3.0, blur=BLUR / 4, thin=1 / 256, across=4),
     "finer": Quality(folded=True, across=4),
     "reference": Quality(),

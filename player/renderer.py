@@ -407,7 +407,7 @@ class Renderer:
     @property
     def bakes(self) -> bool:
         """Whether a processor marches what moves itself, over a grid that planes are baked into."""
-        return self._can_bake and self.quality.folded and self.quality.baked and self.quality.scales is None
+        return self._can_bake and self.quality.folded and self.quality.baked > 0 and self.quality.scales is None
 
     @property
     def texels_a_sample(self) -> float:
@@ -623,7 +623,7 @@ class Renderer:
         self._confine(target, EVERYWHERE if covered is None else _shares(_bounds(covered), count[::-1]))
         if len(blocks):
             step, free = self.scene.step * self.quality.step, self._free(self._slot)
-            seen, met, first = folded.baking.march(camera, time, free, blocks, BLOCK, step, self.quality.termination)
+            seen, met, first = folded.baking.march(camera, time, free, blocks, BLOCK, step, self.quality.baked)
             place = (*first, *seen.shape[1::-1])
             target.seen.write(seen, place)
             target.met.write(met, place)

@@ -8,7 +8,7 @@ import pytest
 from scenes import SPACES, bring, displaced, look_at, tiny_scene, without_planes
 
 from kpc.format.cameras import Camera
-from kpc.format.scene import SPACE_PLANES, Scene
+from kpc.format.scene import SPACE_PLANES, TERMINATION, Scene
 from kpc.player.bake import MOST_CORNERS, Baking, corners_of
 from kpc.player.cast import BAKED as CORNER_BAKED
 from kpc.player.quality import LADDER, Quality
@@ -18,7 +18,7 @@ from kpc.player.textures import Layout
 from kpc.player.vectors import LARGEST
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
-FOLDED, BAKED = Quality(folded=True), Quality(folded=True, baked=True)
+FOLDED, BAKED = Quality(folded=True), Quality(folded=True, baked=TERMINATION)
 
 
 def one_sided(scene: Scene) -> Scene:
@@ -136,6 +136,8 @@ def test_qualities_mean_what_they_mean_for_planes(change: dict[str, float]) -> N
     camera = look_at((4.8, 2.0, 4.4), (0.1, 0.05, 0.05), 61, 45, 60.0) if "across" in change else CAMERA
     assert Baking.serves(scene)
     renderers = [Renderer(gl.context(), scene, replace(quality, **change)) for quality in (BAKED, FOLDED)]
+    if "termination" in change:
+        renderers[0].quality = replace(BAKED, baked=change["termination"])
     assert renderers[0].rays_across(camera) > 1 or "across" not in change
     got, wanted = (renderer.render(camera, 0.6) for renderer in renderers)
     np.testing.assert_allclose(got.rgb, wanted.rgb, atol=2e-3)

@@ -78,7 +78,7 @@ def test_once_all_is_there_it_is_the_same_picture(space: str, folded: bool, watc
     scene, quality = SPACES["displaced" if space == "baked" else space](tiny_scene(4, channels=16, time=10)), Quality(folded=folded)
     if space == "baked":
         scene = replace(scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2))
-        quality = Quality(folded=folded, baked=True)
+        quality = Quality(folded=folded, baked=1 / 16)
         assert Baking.serves(scene)
     data = coded(scene)
     (tmp_path / "scene.kpc").write_bytes(data)
