@@ -109,7 +109,7 @@ def _status(player: "Player", bottom: float) -> float:
         imgui.text_disabled("{}x{} of {}x{}".format(*player.raster, *player.canvas.size))
         imgui.text_disabled(f"{player.samples:.1f} samples a ray, {player.renderer.memory_bytes / 1e6:.0f} MB")
         imgui.text_disabled(player.device.split("(")[0].strip()[:32])
-        imgui.text_disabled(f"{'compute' if player.renderer.compute else 'fragment'} shaders")
+        imgui.text_disabled(f"by {player.renderer.marched_by}")
         if isinstance(player.scene.decoder, HybridDecoder):
             imgui.text_disabled("hybrid decoder: plays slower")
         if not stream.is_settled:

@@ -410,6 +410,11 @@ class Renderer:
         return self._can_bake and self.quality.folded and self.quality.baked > 0 and self.quality.scales is None
 
     @property
+    def marched_by(self) -> str:
+        """What marches a picture of what moves, for people to read."""
+        return "the processor itself" if self.bakes else f"{'compute' if self.compute else 'fragment'} shaders"
+
+    @property
     def texels_a_sample(self) -> float:
         """Look-ups in planes and rows, or in a grid of what they come to, that a sample takes, each of four channels with its neighbours."""
         if self.bakes:

@@ -150,6 +150,7 @@ def test_pictures_are_near_those_of_the_reference(space: str) -> None:
     scene = SPACES[space](one_sided(tiny_scene(4, channels=16)))
     renderer = Renderer(gl.context(), scene, BAKED)
     assert renderer.bakes == renderer._is_software
+    assert renderer.marched_by == ("the processor itself" if renderer.bakes else "fragment shaders")
     for time in (0.1, 0.5, 0.9):
         got, wanted = renderer.render(CAMERA, time), render(scene, CAMERA, time)
         assert -10 * np.log10(np.mean((got.rgb - wanted.rgb) ** 2)) > 40
@@ -157,6 +158,7 @@ def test_pictures_are_near_those_of_the_reference(space: str) -> None:
     still = renderer.render(CAMERA, 0.9, part=Part.STATIC)
     np.testing.assert_array_equal(still.rgb, Renderer(gl.context(), scene, FOLDED).render(CAMERA, 0.9, part=Part.STATIC).rgb)
     renderer.quality = LADDER["reference"]
+    assert renderer.marched_by == "fragment shaders"
     exact = renderer.render(CAMERA, 0.9)
     np.testing.assert_array_equal(exact.rgb, Renderer(gl.context(), scene, LADDER["reference"]).render(CAMERA, 0.9).rgb)
 
