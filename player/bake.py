@@ -190,6 +190,18 @@ class Baking:
         return row if len(row) == len(places) else linear(row, places)
 
 
+def rehearse() -> None:
+    """Have `cast` compiled, which takes five seconds, or loaded, before a picture waits for it: march no block of nothing."""
+    whole, one, zero = (1, 1, 1), np.float32(1), np.zeros
+    planes, rows = (zero((1, WIDE), np.int16),) * len(SPACE_PLANES), (zero((1, WIDE), np.float32),) * len(TIME_PLANES)
+    three, four = zero(3, np.float32), zero((1, 4), np.float32)
+    cast(
+        zero((0, 2), np.int64), 1, (0, 0), (1, 1), four[0], zero((3, 3), np.float32), three, three, one, one, one, three,
+        zero(1, np.uint8), whole, four, whole, planes, rows, zero((4, WIDE), np.float32), one,
+        four, zero(1, np.uint8), whole, zero((1, 1, 4), np.float32), zero((1, 1, 2), np.float32),
+    )  # fmt: skip
+
+
 def corners_of(scene: Scene) -> tuple[int, int, int]:
     """(Nz, Ny, Nx) of the grid: those of the finest scale's texels."""
     return tuple(max(scale[plane].shape[axis] for scale in scene.scales) for plane, axis in (("xz", 0), ("xy", 0), ("xy", 1)))

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import threading
 import time as clock
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -17,7 +18,7 @@ from kpc.format.grid import linear
 from kpc.format.scene import SPACE_PLANES, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
-from kpc.player.bake import Baking
+from kpc.player.bake import Baking, rehearse
 from kpc.player.cover import Cover
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
@@ -332,6 +333,8 @@ class Renderer:
         self._folds_in_memory = self._is_software
         self._folds_in_half = not self._is_software
         self._can_bake = self._folds_in_memory and Baking.serves(scene)
+        if self.bakes:  # until then there is much else to do, decoding for one
+            threading.Thread(target=rehearse, name="rehearsing", daemon=True).start()
         self._marches_to_trial = TRIAL_AFTER if compute is None and tries_compute(ctx) else math.inf
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]

@@ -9,8 +9,9 @@ from scenes import SPACES, bring, displaced, look_at, tiny_scene, without_planes
 
 from kpc.format.cameras import Camera
 from kpc.format.scene import SPACE_PLANES, TERMINATION, Scene
-from kpc.player.bake import MOST_CORNERS, Baking, corners_of
+from kpc.player.bake import MOST_CORNERS, Baking, corners_of, rehearse
 from kpc.player.cast import BAKED as CORNER_BAKED
+from kpc.player.cast import cast
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Moment, Part, features, render
 from kpc.player.renderer import Renderer
@@ -197,3 +198,12 @@ def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
         assert not Baking.serves(scene)
         got, wanted = (Renderer(gl.context(), scene, quality).render(CAMERA, 0.5) for quality in (BAKED, FOLDED))
         np.testing.assert_array_equal(got.rgb, wanted.rgb)
+
+
+def test_what_is_rehearsed_is_what_pictures_need() -> None:
+    """Whether or not anything is displaced."""
+    rehearse()
+    before = list(cast.signatures)
+    for make in SCENES.values():
+        baking_of(make(), time=0.3)
+    assert cast.signatures == before and len(before) == 1
