@@ -263,6 +263,7 @@ void march(vec2 fragment, out vec4 seen, out vec4 met) {
             vec4 shared_logits = shared_logits_of(0.5 * (u + next_u));
             // How they go on from half a sample to the next, if the pair before was the one just before.
             vec4 slope = walk.k == pair_k ? 0.25 * (shared_logits - shared_before) : vec4(0.0);
+            slope /= 1.0 + abs(slope);  // steep ones seldom go on
             shared_before = shared_logits;
             vec4 next_logits = shared_logits + slope + logits_of(next_u);
             add_sample(sum, shared_logits - slope + logits_of(u), thickness_at(walk, place), world_distance(path, place.t));
