@@ -83,7 +83,7 @@ LADDER: dict[str, Quality] = {
     "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, resolution=0.5),
     "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, resolution=0.75),
     "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, across=4),
-    "balanced": Quality(folded=True, termination=1 / 32, share=3.5, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 16, across=4),
+    "balanced": Quality(folded=True, termination=1 / 16, share=3.5, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 16, across=4),
     "fine": Quality(folded=True, termination=1 / 64, share=3.5, blur=BLUR / 4, thin=1 / 256, across=4),
     "finer": Quality(folded=True, across=4),
     "reference": Quality(),
