@@ -33,8 +33,8 @@ class Quality:
         step: distance between samples, in steps of the scene.
         termination: a ray ends once its transmittance falls below this. Where that is more than the format's TERMINATION, what
             is left of its light counts as what it has met so far.
-        share: scales whose texels are at least so many steps long are looked up once for two samples, in the middle between them. Where those of
-            room, 3.4 steps long, were, pictures took 0.95 (320x240) and 0.85 (640x480) of the time, and the worst was 38 dB from exact, not 44.
+        share: scales whose texels are at least so many steps long are looked up once for two samples, in the middle between them. Where
+            those of room are, 3.4 steps long, pictures take 0.95 (320x240) and 0.85 (640x480) of the time, and the worst is 38 dB from exact, not 44.
         tolerance: while the clip plays, a picture is predicted from the one before. One pixel of each block of sixteen is marched,
             all by turns; blocks where that differs from the prediction by more than this, of the full range, or a neighbour's by
             twice as much, are marched whole. 0: no picture follows another.
@@ -83,8 +83,8 @@ LADDER: dict[str, Quality] = {
     "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, resolution=0.5),
     "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, resolution=0.75),
     "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, across=4),
-    "balanced": Quality(folded=True, termination=1 / 16, share=3.5, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 16, across=4),
-    "fine": Quality(folded=True, termination=1 / 64, share=3.5, blur=BLUR / 4, thin=1 / 256, across=4),
+    "balanced": Quality(folded=True, termination=1 / 32, share=3.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 16, across=4),
+    "fine": Quality(folded=True, termination=1 / 64, share=3.0, blur=BLUR / 4, thin=1 / 256, across=4),
     "finer": Quality(folded=True, across=4),
     "reference": Quality(),
 }
