@@ -110,9 +110,11 @@ class Baking:
         seen, met = self._pictures(int(top) - bottom, int(right) - left)
         low, box = scene.aabb[0], scene.aabb[1] - scene.aabb[0]
         pose = camera.camera_to_world
-        lens, axes, start, edges, background = (
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a box without a volume, a camera at the end of the world: no ray meets a thing
+            start = np.asarray((pose[:3, 3] - low) / box, np.float32)
+        lens, axes, edges, background = (
             np.ascontiguousarray(array, np.float32)
-            for array in ((camera.fl_x, camera.fl_y, camera.cx, camera.cy), pose[:3, :3], (pose[:3, 3] - low) / box, box, scene.background)
+            for array in ((camera.fl_x, camera.fl_y, camera.cx, camera.cy), pose[:3, :3], box, scene.background)
         )
         stride, tau, least, bias = map(np.float32, (step, step / scene.extent, termination, scene.decoder.density_bias))
 

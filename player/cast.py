@@ -59,7 +59,7 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
     WHOLE. The others are baked from `planes`, xy, xz, yz at corners, (rows * columns, M) int16, `rows` of the time planes along x, y, z, (N, M),
     `weights`, (4, M), which make up for the planes' steps, and `bias`.
     """
-    rays, samples = np.zeros((16, LANES), np.float32), np.zeros((10, LANES), np.float32)
+    rays, samples = np.zeros((Z + 1, LANES), np.float32), np.zeros((LOG_DENSITY + 1, LANES), np.float32)
     pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
     wanted = np.empty(AROUND * LANES + 1, np.int32)
     taken, count = np.int64(0), np.int64(0)  # a plain 0 would be a type of its own, for which parts are compiled once more
@@ -84,7 +84,7 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
 @_part
 def _whole(count):
     """Up to a multiple of WIDE: what is left over would be done one by one. Lanes beyond `count` hold what was there before."""
-    return U((count + WIDE - 1) // WIDE * WIDE)
+    return (U(count) + U(WIDE - 1)) // U(WIDE) * U(WIDE)
 
 
 @_part
@@ -98,7 +98,9 @@ def _exp(x):
 
 @_part
 def _within(x, most):
-    return min(max(x, ZERO), most)
+    """From 0 to `most`; 0 where it is not a number: what is not may not become a place in an array."""
+    x = x if x > ZERO else ZERO
+    return x if x < most else most
 
 
 @_part

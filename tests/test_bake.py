@@ -5,13 +5,14 @@ from dataclasses import replace
 import gl
 import numpy as np
 import pytest
+from numba import njit
 from scenes import SPACES, bring, displaced, look_at, tiny_scene, without_planes
 
 from kpc.format.cameras import Camera
 from kpc.format.scene import SPACE_PLANES, TERMINATION, Scene
 from kpc.player.bake import MOST_CORNERS, Baking, corners_of, rehearse
 from kpc.player.cast import BAKED as CORNER_BAKED
-from kpc.player.cast import cast
+from kpc.player.cast import _FAST, _within, cast
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Moment, Part, features, render
 from kpc.player.renderer import Renderer
@@ -20,6 +21,14 @@ from kpc.player.vectors import LARGEST
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
 FOLDED, BAKED = Quality(folded=True), Quality(folded=True, baked=TERMINATION)
+
+
+@njit(**_FAST)
+def clamped(places, most):
+    out = np.empty_like(places)
+    for i in range(len(places)):
+        out[i] = _within(places[i], most)
+    return out
 
 
 def one_sided(scene: Scene) -> Scene:
@@ -129,6 +138,19 @@ def test_where_a_grid_holds_all_there_is_pictures_are_those_of_the_reference(whe
         assert np.mean(np.abs(got.depth[both] - wanted.depth[both]) < 2 * scene.step) > 0.99 if both.any() else True
     if view.width > 1:
         assert (wanted.opacity.max() > 0.1) == (view is not VIEWS["beside it"])
+
+
+@pytest.mark.parametrize("edges", [(0.0, 1.0, 1.0), (1.0, 1.0, 1e-6)])
+def test_boxes_without_a_volume_show_the_background(edges: tuple[float, float, float]) -> None:
+    scene = replace(displaced(one_sided(tiny_scene(4, channels=16))), aabb=np.array([[0, 0, 0], edges], np.float32))
+    for camera in (CAMERA, look_at((0.0, 0.0, 0.0), (1.0, 0.4, 0.3), 33, 21, 30.0)):
+        got = Renderer(gl.context(), scene, BAKED).render(camera, 1.0)
+        assert np.isfinite(got.rgb).all() and np.abs(got.rgb - scene.background).max() < 0.02
+
+
+def test_what_is_no_number_is_no_place_in_an_array() -> None:
+    places = np.array([np.nan, -np.inf, -1.0, 0.0, 2.5, 7.0, np.inf] * 5, np.float32)  # more than vectors hold
+    np.testing.assert_array_equal(clamped(places, np.float32(5)), np.float32([0, 0, 0, 0, 2.5, 5, 5] * 5))
 
 
 @pytest.mark.parametrize("change", [{"step": 2.0}, {"termination": 1 / 16}, {"across": 4}, {"resolution": 0.5}])
