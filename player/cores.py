@@ -2,8 +2,9 @@
 
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 CORES = os.cpu_count() or 1
 WORKERS = min(CORES, 8)
@@ -15,12 +16,7 @@ _POOL = ThreadPoolExecutor(CORES, thread_name_prefix="cores")
 
 def share_out(work: Callable[[slice], object], count: int) -> None:
     """Call `work` for parts of range(count), one for each core, and wait for all."""
-    parts = _parts(count, CORES)
-    others = [_POOL.submit(work, part) for part in parts[1:]]
-    for part in parts[:1]:
-        work(part)
-    for other in others:
-        other.result()
+    _at_once(work, _parts(count, CORES))
 
 
 def from_both_ends(work: Callable[[int, slice], object], count: int, least: int) -> None:
@@ -37,8 +33,14 @@ def from_both_ends(work: Callable[[int, slice], object], count: int, least: int)
                 return
             work(worker, part)
 
-    others = [_POOL.submit(run, worker) for worker in range(1, min(WORKERS, len(parts)))]
-    run(0)
+    _at_once(run, range(min(WORKERS, len(parts))))
+
+
+def _at_once(work: Callable[[Any], object], things: Sequence[Any]) -> None:
+    """Call `work` for each, the first by this thread, and wait for all."""
+    others = [_POOL.submit(work, thing) for thing in things[1:]]
+    for thing in things[:1]:
+        work(thing)
     for other in others:
         other.result()
 
