@@ -11,14 +11,14 @@ corners where texels do: one of four fifths as many along each axis comes to 37 
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
-from kpc.format.cameras import Camera
 from kpc.format.grid import linear, tap
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
-from kpc.player.cast import cast
-from kpc.player.cores import WORKERS, from_both_ends
+from kpc.player.cores import WORKERS
+from kpc.player.marching import Marching, in_steps
 from kpc.player.textures import Layout, filled
 from kpc.player.vectors import LARGEST, WIDE
 
@@ -28,13 +28,9 @@ of 640x480 0.3; three times as fine, half and a third."""
 LEAST_LOOKED_UP = 24
 """Texels that a sample takes of planes, where a grid pays. The default scene, its colours made the same from all sides, takes 12, and what rests can
 follow the picture before: baked, a picture of 320x240 took 1.15 of the time, one of 640x480 1.7, and both were 3 to 4 dB farther from exact ones."""
-MOST_STEPS = 32767
-"""Of a plane's channel, from 0: half the bytes of float32, which a processor's caches hold the more of, and 1e-4 off in a picture's colours."""
-BLOCKS_AT_ONCE = 16
-"""That a core takes, at least."""
 
 
-class Baking:
+class Baking(Marching):
     """The grid of a scene at a time, as far as samples have looked at it.
 
     Attributes:
@@ -43,23 +39,19 @@ class Baking:
     """
 
     def __init__(self, scene: Scene, layout: Layout) -> None:
-        self._scene, self._layout = scene, layout
+        super().__init__(scene)
+        self._layout = layout
         self.grid = np.zeros((*corners_of(scene), 4), np.float32)
         self._known = np.zeros((WORKERS, *self.grid.shape[:3]), np.uint8)
         """Corners that hold what they are to, as far as each worker knows."""
         self._channels = [scale["xy"].shape[2] for scale in scene.scales]
-        self._atlas = np.empty(0)
         self._planes: tuple[np.ndarray, ...] = ()
-        self._time: float | None = None
         self._cut: dict[tuple[str, int, int], np.ndarray] = {}
         """Rows of time planes at corners, by plane, scale and number."""
         self._places = {axis: np.linspace(0, 1, count, dtype=np.float32) for axis, count in zip("zyx", self.grid.shape)}
         weights = np.concatenate([scene.decoder.b2, scene.decoder.density_weight[None]])
         self._weights = self._weights_in_steps = filled(weights.astype(np.float32), 1, WIDE)
         self._rows: tuple[np.ndarray, ...] = ()
-        self._motion = np.zeros((0, 0, 0, 4) if scene.motion is None else (*scene.motion.shape[1:4], 4), np.float32)
-        self._room, self._nothing = np.empty((6, 0), np.float32), np.empty(0, np.float32)
-        """For as many pixels as a picture has had yet: what is seen and met; what is seen of rays that meet nothing."""
 
     @staticmethod
     def serves(scene: Scene) -> bool:
@@ -77,94 +69,41 @@ class Baking:
         channels += -channels % WIDE
         return (16 + WORKERS) * nz * ny * nx + 2 * channels * (ny * nx + nz * nx + nz * ny)
 
-    @property
-    def memory_bytes(self) -> int:
-        return self.bytes_for(self._scene)
-
-    def keep(self, refined: np.ndarray) -> None:
-        """Take planes from an atlas, (height, width, 4), of the layout, from now on, and as they are when next needed."""
-        self._atlas, self._planes, self._time = refined, (), None
-
-    def forget(self) -> None:
-        """Rows of time planes are others now."""
-        self._time, self._cut = None, {}
-
-    def march(
-        self, camera: Camera, time: float, free: np.ndarray, blocks: np.ndarray, side: int, step: float, termination: float
-    ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-        """What march.glsl gives of some blocks of a picture, in the least rectangle that holds them; elsewhere what rays see that meet nothing.
-
-        Args:
-            time: in [0, 1].
-            free: (Nz, Ny, Nx) uint8, `kpc.player.textures.distances` to what is occupied at the time.
-            blocks: (N, 2) of row and column, rows from below, each of `side` x `side` pixels; at least one.
-            step: world units.
-
-        Returns: (h, w, 4) rgb and opacity, (h, w, 2) sum of weight t and samples, float32, row 0 at the bottom, valid until the next march; column
-            and row of their first pixel.
-        """
-        self._go_to(time)
-        scene, size = self._scene, (camera.width, camera.height)
-        bottom, left = (int(first) for first in side * blocks.min(0))
-        top, right = np.minimum(side * (blocks.max(0) + 1), size[::-1])
-        seen, met = self._pictures(int(top) - bottom, int(right) - left)
-        low, box = scene.aabb[0], scene.aabb[1] - scene.aabb[0]
-        pose = camera.camera_to_world
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a box without a volume, a camera at the end of the world: no ray meets a thing
-            start = np.asarray((pose[:3, 3] - low) / box, np.float32)
-        lens, axes, edges, background = (
-            np.ascontiguousarray(array, np.float32)
-            for array in ((camera.fl_x, camera.fl_y, camera.cx, camera.cy), pose[:3, :3], box, scene.background)
-        )
-        stride, tau, least, bias = map(np.float32, (step, step / scene.extent, termination, scene.decoder.density_bias))
-
-        def work(worker: int, part: slice) -> None:
-            cast(
-                blocks[part], side, (left, bottom), size, lens, axes, start, edges, stride, tau, least, background,
-                free.reshape(-1), free.shape[::-1], self._motion.reshape(-1, 4), self._motion.shape[2::-1],
-                self._planes, self._rows, self._weights_in_steps, bias,
-                self.grid.reshape(-1, 4), self._known[worker].reshape(-1), self.grid.shape[2::-1], seen, met,
-            )  # fmt: skip
-
-        from_both_ends(work, len(blocks), BLOCKS_AT_ONCE)
-        return seen, met, (left, bottom)
-
-    def _pictures(self, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-        """What `march` returns, as rays see it that meet nothing."""
-        pixels = height * width
-        if self._room.shape[1] < pixels:
-            self._room = np.empty((6, pixels), np.float32)
-            self._nothing = np.tile(np.append(self._scene.background, 0).astype(np.float32), pixels)
-        seen, met = np.split(self._room.reshape(-1)[: 6 * pixels], [4 * pixels])
-        seen[:], met[:] = self._nothing[: seen.size], 0.0
-        return seen.reshape(height, width, 4), met.reshape(height, width, 2)
-
-    def _go_to(self, time: float) -> None:
-        if not self._planes:
-            self._take_planes()
-        if time != self._time:
-            self._rows = self._rows_at(time)
-            if self._scene.motion is not None:
-                self._motion[..., :3] = linear(self._scene.motion, time)
-            self._known[:] = 0
-            self._time = time
-
-    def _take_planes(self) -> None:
+    def keep(self, atlas: np.ndarray) -> None:
         """As whole numbers: each channel of each plane in steps of its own, by the product of which the weights are the larger."""
         planes: dict[str, list[np.ndarray]] = {name: [] for name in SPACE_PLANES}
         for block in self._layout.blocks:
-            plane = self._layout.unrefined(self._atlas, block)[..., : self._channels[block.scale]]
+            plane = self._layout.plane(atlas, block)[..., : self._channels[block.scale]]
             across = self._at_corners(plane.swapaxes(0, 1), block.plane[0])
             planes[block.plane].append(self._at_corners(across.swapaxes(0, 1), block.plane[1]))
         weights, taken = self._weights.astype(np.float64), []
         for parts in planes.values():
             plane = filled(np.concatenate(parts, axis=2), 2, WIDE)
-            plane = plane.reshape(-1, plane.shape[2])
-            step = np.abs(plane).max(0) / np.float32(MOST_STEPS)
-            taken.append(np.rint(np.divide(plane, step, out=np.zeros_like(plane), where=step > 0)).astype(np.int16))
+            whole, step = in_steps(plane.reshape(-1, plane.shape[2]))
+            taken.append(whole)
             weights = weights * step
         self._planes = tuple(taken)
         self._weights_in_steps = np.clip(weights, -LARGEST, LARGEST).astype(np.float32)
+        self.forget()
+
+    def forget(self) -> None:
+        super().forget()
+        self._cut = {}
+
+    def _prepare(self, time: float | None) -> None:
+        assert time is not None
+        self._rows = self._rows_at(time)
+        self._known[:] = 0
+
+    def _looked_at(self, worker: int) -> tuple[Any, Any]:
+        bias, corners = np.float32(self._scene.decoder.density_bias), self.grid.shape[2::-1]
+        return (self._planes, self._rows, self._weights_in_steps, bias, self.grid.reshape(-1, 4), self._known[worker].reshape(-1), corners), None
+
+    @staticmethod
+    def rehearsed() -> tuple[Any, Any]:
+        planes, rows = (np.zeros((1, WIDE), np.int16),) * len(SPACE_PLANES), (np.zeros((1, WIDE), np.float32),) * len(TIME_PLANES)
+        weights, grid, known = np.zeros((4, WIDE), np.float32), np.zeros((1, 4), np.float32), np.zeros(1, np.uint8)
+        return (planes, rows, weights, np.float32(0), grid, known, (1, 1, 1)), None
 
     def _rows_at(self, time: float) -> tuple[np.ndarray, ...]:
         """(N, M) of the rows of all scales at a time, at corners, along x, y and z. What is made of the rows before and after stays until there
@@ -190,18 +129,6 @@ class Baking:
         """A (size, ...) array that is corner-aligned along x, y or z, as fine as the grid is there."""
         places = self._places[axis]
         return row if len(row) == len(places) else linear(row, places)
-
-
-def rehearse() -> None:
-    """Have `cast` compiled, which takes five seconds, or loaded, before a picture waits for it: march no block of nothing."""
-    whole, one, zero = (1, 1, 1), np.float32(1), np.zeros
-    planes, rows = (zero((1, WIDE), np.int16),) * len(SPACE_PLANES), (zero((1, WIDE), np.float32),) * len(TIME_PLANES)
-    three, four = zero(3, np.float32), zero((1, 4), np.float32)
-    cast(
-        zero((0, 2), np.int64), 1, (0, 0), (1, 1), four[0], zero((3, 3), np.float32), three, three, one, one, one, three,
-        zero(1, np.uint8), whole, four, whole, planes, rows, zero((4, WIDE), np.float32), one,
-        four, zero(1, np.uint8), whole, zero((1, 1, 4), np.float32), zero((1, 1, 2), np.float32),
-    )  # fmt: skip
 
 
 def corners_of(scene: Scene) -> tuple[int, int, int]:

@@ -16,7 +16,7 @@ import numpy as np
 from kpc.format.rans import compiled
 from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION
 from kpc.player.reference import PARALLEL
-from kpc.player.vectors import WIDE, combine, interpolate
+from kpc.player.vectors import CHANNELS, WIDE, combine, interpolate, weigh
 
 LANES = 512
 """Rays side by side. With 256 a picture takes 1.05 of the time, with 128 1.1; what they hold fits the two nearest caches."""
@@ -47,7 +47,7 @@ _part = compiled(forceinline=True, _nrt=False, **_FAST)
 
 
 @compiled(**_FAST)
-def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termination, background, free, cells, motion, nodes, planes, rows, weights, bias, grid, known, corners, seen, met):
+def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termination, background, free, cells, motion, nodes, baked, looked_up, seen, met):
     """March the pixels of blocks.
 
     `blocks`: (N, 2) int64 of row and column, each of `side` x `side` pixels, rows from below. `origin`: column and row of the pixel that comes
@@ -55,13 +55,24 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
     `lens`, `axes` and the rest as in march.glsl; `start`: the eye in [0, 1]^3 over the box, of edges `box`.
 
     Grids lie flat, x fastest; how many there are along x, y, z comes behind them: `free`, (N,) uint8, as occupancy.glsl has it; `motion`, (N, 4),
-    of no nodes where nothing is displaced; `grid`, (N, 4) of logits and log densities at those corners that are `known`, (N,) uint8 of BAKED and
-    WHOLE. The others are baked from `planes`, xy, xz, yz at corners, (rows * columns, M) int16, `rows` of the time planes along x, y, z, (N, M),
-    `weights`, (4, M), which make up for the planes' steps, and `bias`.
+    of no nodes where nothing is displaced.
+
+    One of two is None. `baked`: `grid`, (N, 4) of logits and log densities at those corners that are `known`, (N,) uint8 of BAKED and WHOLE, and
+    how many `corners` there are. The others are baked from `planes`, xy, xz, yz at corners, (rows * columns, M) int16, `rows` of the time planes
+    along x, y, z, (N, M), `weights`, (4, M), which make up for the planes' steps, and `bias`.
+
+    `looked_up`: of samples, `planes` and `rows` as `vectors.weigh` has them; `firsts`, (scales, 6) int64, where xy, xz, yz and the rows of x, y, z
+    begin; `sizes`, (scales, 4) int64, of texels along x, y, z, and channels, and a decoder as in spec section 4: `w1`, (H, 9), `b1`, with the code of
+    an appearance, `w2`, (H, 3 F), and `b2` and the density's weights, (4 F,), which make up for the planes' steps, and `bias`.
     """
     rays, samples = np.zeros((Z + 1, LANES), np.float32), np.zeros((LOG_DENSITY + 1, LANES), np.float32)
     pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
     wanted = np.empty(AROUND * LANES + 1, np.int32)
+    if looked_up is not None:
+        _, _, _, _, w1, b1, w2, of_all, bias = looked_up
+        weights = np.empty((LANES, len(of_all)), np.float32)
+        weights[:] = of_all
+    kept, texels = np.arange(LANES).astype(np.int32), np.zeros((6, LANES), np.int32)
     taken, count = np.int64(0), np.int64(0)  # a plain 0 would be a type of its own, for which parts are compiled once more
     while taken < len(blocks) or count > 0:
         while taken < len(blocks) and count + side * side <= LANES:
@@ -73,12 +84,19 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
         if found > 0:
             if len(motion) > 0:
                 _displace(found, motion, nodes, samples, cell)
-            _find(found, corners, samples, cell)
-            _bake(_wanted(found, known, corners, cell, wanted), wanted, planes, rows, weights, bias, grid, corners)
-            _look_up(found, grid, corners, samples, cell)
+            if baked is not None:
+                planes, rows, weights, bias, grid, known, corners = baked
+                _find(found, corners, samples, cell)
+                _bake(_wanted(found, known, corners, cell, wanted), wanted, planes, rows, weights, bias, grid, corners)
+                _look_up(found, grid, corners, samples, cell)
+            if looked_up is not None:
+                planes, rows, firsts, sizes, w1, b1, w2, of_all, bias = looked_up
+                if len(b1) > 0:
+                    _face(found, box, of_ray, rays, kept, w1, b1, w2, of_all, weights)
+                _weigh(found, planes, rows, firsts, sizes, weights, bias, of_ray, kept, samples, texels)
             _shade(found, tau, samples)
             _add(found, termination, samples, of_ray, rays, around)
-        count = _end(count, termination, background, origin, size, rays, pixel, around, seen, met)
+        count = _end(count, termination, background, origin, size, rays, pixel, kept, around, seen, met)
 
 
 @_part
@@ -90,7 +108,9 @@ def _whole(count):
 @_part
 def _exp(x):
     """As a power of two, by Taylor's series around whole ones: off by 2.4e-6 of itself at most. The library's is not one of vectors."""
-    y = min(max(x * LOG2_E, F(-MOST_DOUBLINGS)), F(MOST_DOUBLINGS))
+    y = x * LOG2_E
+    y = y if y > F(-MOST_DOUBLINGS) else F(-MOST_DOUBLINGS)  # where it is not a number, too
+    y = y if y < F(MOST_DOUBLINGS) else F(MOST_DOUBLINGS)
     whole = I(y + F(MOST_DOUBLINGS + 0.5)) - I(MOST_DOUBLINGS)
     e = y - F(whole)
     return (ONE + e * (E1 + e * (E2 + e * (E3 + e * (E4 + e * E5))))) * I((whole + I(127)) << I(23)).view(np.float32)
@@ -255,6 +275,53 @@ def _bake(count, wanted, planes, rows, weights, bias, grid, corners):
 
 
 @_part
+def _face(found, box, of_ray, rays, kept, w1, b1, w2, of_all, weights):
+    """Weights of features for colours as seen along rays that take their first sample."""
+    for j in range(U(found)):
+        i = U(of_ray[j])
+        if rays[SAMPLES, i] > ZERO:
+            continue
+        x, y, z, row = rays[RATE_X, i] * box[0], rays[RATE_Y, i] * box[1], rays[RATE_Z, i] * box[2], U(kept[i])
+        for m in range(U(len(of_all))):
+            weights[row, m] = of_all[m]
+        for h in range(U(len(b1))):
+            sum_ = b1[h] + w1[h, 0] * x + w1[h, 1] * y + w1[h, 2] * z
+            sum_ += w1[h, 3] * x * x + w1[h, 4] * y * y + w1[h, 5] * z * z + w1[h, 6] * x * y + w1[h, 7] * y * z + w1[h, 8] * z * x
+            if sum_ > ZERO:
+                for m in range(U(len(of_all))):
+                    weights[row, m] += sum_ * w2[h, m]
+
+
+@_part
+def _weigh(found, planes, rows, firsts, sizes, weights, bias, of_ray, kept, samples, texels):
+    """Logits and log densities from planes and rows."""
+    flat, each = weights.reshape(-1), U(weights.shape[1])
+    for j in range(_whole(found)):
+        samples[AT_X, j], samples[AT_Y, j], samples[AT_Z, j] = _within(samples[AT_X, j], ONE), _within(samples[AT_Y, j], ONE), _within(samples[AT_Z, j], ONE)
+        samples[LOGIT_RED, j], samples[LOGIT_GREEN, j], samples[LOGIT_BLUE, j], samples[LOG_DENSITY, j] = ZERO, ZERO, ZERO, bias
+    for group in range(U(len(sizes))):
+        nx, ny, nz = sizes[group, 0], sizes[group, 1], sizes[group, 2]
+        for j in range(_whole(found)):
+            x, y, z = samples[AT_X, j] * F(nx - 1), samples[AT_Y, j] * F(ny - 1), samples[AT_Z, j] * F(nz - 1)
+            column, row, layer = min(I(x), I(nx - 2)), min(I(y), I(ny - 2)), min(I(z), I(nz - 2))
+            samples[PART_X, j], samples[PART_Y, j], samples[PART_Z, j] = x - F(column), y - F(row), z - F(layer)
+            texels[0, j], texels[1, j], texels[2, j] = row * I(nx) + column, layer * I(nx) + column, layer * I(ny) + row
+            texels[3, j], texels[4, j], texels[5, j] = column, row, layer
+        xy, xz, yz, of_x, of_y, of_z = firsts[group, 0], firsts[group, 1], firsts[group, 2], firsts[group, 3], firsts[group, 4], firsts[group, 5]
+        up, up_yz = U(WIDE * nx), U(WIDE * ny)
+        for j in range(U(found)):
+            weigh(
+                planes,
+                (U(xy) + U(WIDE) * U(texels[0, j]), U(xz) + U(WIDE) * U(texels[1, j]), U(yz) + U(WIDE) * U(texels[2, j])),
+                (up, up, up_yz),
+                rows,
+                (U(of_x) + U(WIDE) * U(texels[3, j]), U(of_y) + U(WIDE) * U(texels[4, j]), U(of_z) + U(WIDE) * U(texels[5, j])),
+                (samples[PART_X, j], samples[PART_Y, j], samples[PART_Z, j]),
+                flat, U(kept[U(of_ray[j])]) * each + group * U(WIDE * CHANNELS), samples, U(LOGIT_RED), j,
+            )  # fmt: skip
+
+
+@_part
 def _shade(found, tau, samples):
     """Colours and alphas in place of logits and log densities."""
     for j in range(_whole(found)):
@@ -283,7 +350,7 @@ def _add(found, termination, samples, of_ray, rays, around):
 
 
 @_part
-def _end(count, termination, background, origin, size, rays, pixel, around, seen, met):
+def _end(count, termination, background, origin, size, rays, pixel, kept, around, seen, met):
     """Write what rays that are done have seen, and put others in their place: how many are left."""
     for done in range(count - 1, -1, -1):
         if around[done] != DONE:
@@ -301,4 +368,5 @@ def _end(count, termination, background, origin, size, rays, pixel, around, seen
         for line in range(KEPT):
             rays[line, done] = rays[line, count]
         pixel[done] = pixel[count]
+        kept[done], kept[count] = kept[count], kept[done]
     return count

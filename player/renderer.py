@@ -18,8 +18,10 @@ from kpc.format.grid import linear
 from kpc.format.scene import SPACE_PLANES, HybridDecoder, Scene
 from kpc.format.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player import shader
-from kpc.player.bake import Baking, rehearse
+from kpc.player.bake import Baking
 from kpc.player.cover import Cover
+from kpc.player.lookup import Lookup
+from kpc.player.marching import Marching, probes_of, rehearse
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
 from kpc.player.textures import (
@@ -205,42 +207,30 @@ class FoldedInMemory:
     refined: np.ndarray
     planes: moderngl.Texture
     refine_into: moderngl.Framebuffer
-    thinning: Thinning | None
-    baking: Baking | None
     room: np.ndarray
     """For the product of any of the planes."""
-    rows: np.ndarray = field(default_factory=lambda: np.empty(0, np.float32))
 
     @staticmethod
-    def of(ctx: moderngl.Context, layout: Layout, scene: Scene) -> "FoldedInMemory":
+    def of(ctx: moderngl.Context, layout: Layout) -> "FoldedInMemory":
         with room_on(ctx, "the folded planes"):
             planes = _texture(ctx, layout.size)
             refined = np.zeros((*layout.size[::-1], 4), np.float32)
             most = max(4 * layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
             room = np.empty(most, np.float32)
-            thinning = Thinning(scene, layout) if Thinning.serves(scene) else None
-            baking = Baking(scene, layout) if Baking.serves(scene) else None
-            return FoldedInMemory(layout, refined, planes, ctx.framebuffer([planes]), thinning, baking, room)
+            return FoldedInMemory(layout, refined, planes, ctx.framebuffer([planes]), room)
 
     def keep(self) -> None:
         """What was drawn into `refine_into` is the refined planes."""
         self.planes.read_into(self.refined)
-        if self.thinning is not None:
-            self.thinning.keep(self.refined)
-        if self.baking is not None:
-            self.baking.keep(self.refined)
 
     def fold(self, rows: np.ndarray) -> None:
-        self.rows = rows
         for block in self.layout.blocks:
             product = multiplied(self.refined, rows, self.layout, block, self.room)
             self.planes.write(product, viewport=(block.x, block.y, product.shape[1], block.height))
 
     @property
     def memory_bytes(self) -> int:
-        thinning = 0 if self.thinning is None else self.thinning.memory_bytes
-        baking = 0 if self.baking is None else self.baking.memory_bytes
-        return self.refined.nbytes + self.rows.nbytes + self.room.nbytes + thinning + baking + _bytes_of(self.planes)
+        return self.refined.nbytes + self.room.nbytes + _bytes_of(self.planes)
 
     def release(self) -> None:
         for thing in (self.refine_into, self.planes):
@@ -305,6 +295,11 @@ def is_software(ctx: moderngl.Context) -> bool:
     return any(word in ctx.info["GL_RENDERER"].lower() for word in SOFTWARE)
 
 
+def marches_itself(ctx: moderngl.Context) -> bool:
+    """Whether a processor that stands in for a graphics card marches what it can itself."""
+    return is_software(ctx)
+
+
 def tries_compute(ctx: moderngl.Context) -> bool:
     """Whether there is a choice between fragment and compute shaders."""
     return ctx.version_code >= COMPUTE_VERSION and not is_software(ctx)
@@ -317,6 +312,8 @@ class Renderer:
         quality: how finely to draw; may be set at any time.
         compute: whether a compute shader marches, else a fragment shader. Unless told, graphics cards try both once, where they
             have both, and keep to the faster; a processor that stands in for one is never faster by compute shaders.
+        casts: whether a processor that stands in for a graphics card marches what it can itself (`kpc.player.marching`), unless `quality` asks for
+            what is exact.
 
     Raises:
         DisplayError: the scene does not fit the card, or a shader does not compile.
@@ -332,9 +329,10 @@ class Renderer:
         self._is_software = is_software(ctx)
         self._folds_in_memory = self._is_software
         self._folds_in_half = not self._is_software
-        self._can_bake = self._folds_in_memory and Baking.serves(scene)
-        if self.bakes:  # until then there is much else to do, decoding for one
-            threading.Thread(target=rehearse, name="rehearsing", daemon=True).start()
+        self.casts = marches_itself(ctx)
+        marching = self._marching_kind(scene.is_dynamic)
+        if marching is not None:  # until it is needed there is much else to do, decoding for one
+            threading.Thread(target=rehearse, args=(marching,), name="rehearsing", daemon=True).start()
         self._marches_to_trial = TRIAL_AFTER if compute is None and tries_compute(ctx) else math.inf
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
@@ -371,10 +369,16 @@ class Renderer:
         self._motion_time: float | None = None
         self._folded_time: float | None = None
         self._is_refined = False
+        self._in_memory: dict[type[Marching | Thinning], Any] = {}
+        """What works on planes in memory, and ..."""
+        self._stale: set[type[Marching | Thinning]] = set()
+        """... which of it has planes as they were."""
+        self._cells_written: np.ndarray | None = None
+        self._thinned: tuple[object, np.ndarray] | None = None
+        """The last cells that were thinned, and of what."""
         for block in self.layout.blocks:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
         self._slot: int | None = None
-        self._cells_written: tuple[object, ...] | None = None
         self._programs: dict[tuple[object, ...], tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]] = {}
         self._targets: dict[tuple[Part, tuple[int, int], int], Target] = {}
         self._canvas: Canvas | None = None
@@ -407,21 +411,25 @@ class Renderer:
         """Whether samples look up float16: planes that were folded on a graphics card."""
         return self.quality.folded and self._rows is not None and self._folds_in_half
 
-    @property
-    def bakes(self) -> bool:
-        """Whether a processor marches what moves itself, over a grid that planes are baked into."""
-        return self._can_bake and self.quality.folded and self.quality.baked > 0 and self.quality.scales is None
+    def _marching_kind(self, moving: bool) -> type[Marching] | None:
+        """How a processor marches a picture itself, of what moves or what is static; None where shaders do."""
+        if not self.casts or not self.quality.folded or self.quality.scales is not None:
+            return None
+        if moving and self.quality.baked > 0 and Baking.serves(self.scene):
+            return Baking
+        return Lookup if Lookup.serves(self.scene) else None
 
     @property
     def marched_by(self) -> str:
         """What marches a picture of what moves, for people to read."""
-        return "the processor itself" if self.bakes else f"{'compute' if self.compute else 'fragment'} shaders"
+        by_itself = self._marching_kind(moving=self._rows is not None) is not None
+        return "the processor itself" if by_itself else f"{'compute' if self.compute else 'fragment'} shaders"
 
     @property
     def texels_a_sample(self) -> float:
-        """Look-ups in planes and rows, or in a grid of what they come to, that a sample takes, each of four channels with its neighbours."""
-        if self.bakes:
-            return 1.0
+        """Look-ups in textures of planes and rows that a sample takes, each of four channels with its neighbours; 0 where there are no textures."""
+        if self._marching_kind(moving=self._rows is not None) is not None:
+            return 0.0
         layers, shared = self.layout.layers, self._scales_shared()
         planes = 3 if self.quality.folded or self._rows is None else 6
         return float(planes * sum(count / 2 if scale < shared else count for scale, count in enumerate(layers)))
@@ -433,6 +441,7 @@ class Renderer:
         textures += [texture for target in self._targets.values() for texture in (target.seen, target.met)]
         textures += [self._canvas.shown] if self._canvas else []
         folded = self._folded.memory_bytes if self._folded else 0
+        folded += sum(thing.memory_bytes for thing in self._in_memory.values())
         motion = 0 if self._motion_texture is None else 16 * int(np.prod(self._motion_texture.size))
         return sum(map(_bytes_of, textures)) + folded + int(self.scene.occupancy[0].size) + motion
 
@@ -440,15 +449,17 @@ class Renderer:
         """Replace rows of a space plane from row `first` on: `Layout.texels` of them. Writes to textures that are there."""
         block = self.layout.block(scale, plane)
         self._planes.write(texels, viewport=(block.x, block.y + first, texels.shape[1], texels.shape[0]))
-        self._folded_time = self._cells_written = None
+        self._folded_time = self._thinned = None
         self._is_refined = False
+        self._stale = set(self._in_memory)
         self._shots.clear()
 
     def refresh(self) -> None:
         """Look at the scene's time planes anew: some of their rows have changed."""
-        self._rows_time = self._motion_time = self._folded_time = self._cells_written = None
-        if isinstance(self._folded, FoldedInMemory) and self._folded.baking is not None:
-            self._folded.baking.forget()
+        self._rows_time = self._motion_time = self._folded_time = self._thinned = None
+        for marching in self._in_memory.values():
+            if isinstance(marching, Marching):
+                marching.forget()
         self._shots.clear()
 
     def render(
@@ -551,62 +562,29 @@ class Renderer:
             camera = camera.resized(*(across * side for side in size))
         elif quality.resolution < 1:
             camera = camera.resized(*(max(1, round(side * quality.resolution)) for side in size))
-        if moving and self.bakes and program == "march.glsl":
+        marching = self._marching_kind(moving) if program == "march.glsl" else None
+        if marching is Baking:
             target = self._march_baked(part, camera, time)
         else:
-            target = self._march_planes(part, camera, time, program, appearance)
+            target = self._march_planes(part, camera, time, program, appearance, marching)
         if target.seen.size == size or small and across == 1:
             return target
         return self._resampled(target, self._target(part, size), across)
 
-    def _march_planes(self, part: Part, camera: Camera, time: float, program: str, appearance: np.ndarray | None) -> Target:
+    def _march_planes(
+        self, part: Part, camera: Camera, time: float, program: str, appearance: np.ndarray | None, marching: type[Marching] | None
+    ) -> Target:
         """A picture for which samples look up planes; it may follow the one before."""
         quality, scene, moving = self.quality, self.scene, part is Part.FULL and self._rows is not None
-        folded, displaced = moving and quality.folded, moving and self._motion_texture is not None
-        if displaced:
-            self._displace(time)
-        if moving and not folded:
-            self._cut(time)
-        planes = self._fold(time) if folded else self._planes
-        self._occupy(slot_at(scene, time), time if folded else None)
-        layout = self.folded_layout if folded else self.layout
-        drawn = min(quality.scales or layout.scales, layout.scales)
-        shared = 0 if isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
+        code, thin = code_of(scene, appearance), moving and quality.folded
+        free = self._free_at(slot_at(scene, time), time if thin else None)
         self._marches_to_trial -= 1
         if self._marches_to_trial == 0:
             self.compute = self.is_compute_faster(camera, time)
-        code = code_of(scene, appearance)
-        code_vectors = _vectors(code)
-        stride = scene.step * quality.step
-
-        def draw(target: Target, camera: Camera = camera, pixels: int = ALL, points: int = 0, **more: object) -> None:
-            target.drawn = target.drawn if pixels == ONLY_DOUBTED else EVERYWHERE
-            march, vertices = self._program(
-                program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels,
-                compute=self.compute and program == "march.glsl",
-            )  # fmt: skip
-            _set(
-                march,
-                stride=stride,
-                tau=stride / scene.extent,
-                termination=quality.termination,
-                appearance=code_vectors,
-                **_lens_of(camera),
-                **more,
-            )
-            planes.use(PLANES_UNIT)
-            self._row_texture.use(ROWS_UNIT)
-            if self._motion_texture is not None:
-                self._motion_texture.use(MOTION_UNIT)
-            self._cells.use(CELLS_UNIT)
-            if isinstance(march, moderngl.ComputeShader):
-                target.seen.bind_to_image(SEEN_UNIT, read=False)
-                target.met.bind_to_image(MET_UNIT, read=False)
-                march.run(*(-(-side // GROUP) for side in target.seen.size))
-                self.ctx.memory_barrier()
-            else:
-                self._draw(target.framebuffer, vertices, points=points)
-
+        if marching is None:
+            draw = self._by_shaders(program, time, moving, free, code)
+        else:
+            draw = self._by_processor(self._kept(marching), time if moving else None, free, code, quality.termination)
         raster = (camera.width, camera.height)
         self._pictures += 1
         before = self._shots.pop((part, raster), None)
@@ -617,25 +595,113 @@ class Renderer:
         if program == "march.glsl":
             self._draw_alone(draw, part, target, camera)
         else:
-            draw(target)
+            draw(target, camera)
         return target
 
+    def _by_shaders(self, program: str, time: float, moving: bool, free: np.ndarray, code: np.ndarray) -> Callable[..., None]:
+        """What draws all, probes, or doubted blocks of a picture into a target."""
+        quality, scene = self.quality, self.scene
+        folded, displaced = moving and quality.folded, moving and self._motion_texture is not None
+        if displaced:
+            self._displace(time)
+        if moving and not folded:
+            self._cut(time)
+        planes = self._fold(time) if folded else self._planes
+        if free is not self._cells_written:
+            self._cells.write(free)
+            self._cells_written = free
+        layout = self.folded_layout if folded else self.layout
+        drawn = min(quality.scales or layout.scales, layout.scales)
+        shared = 0 if isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
+        code_vectors, stride = _vectors(code), scene.step * quality.step
+
+        def draw(
+            target: Target, camera: Camera, pixels: int = ALL, points: int = 0, doubts: Target | None = None, bearable: float = 0.0, **more: object
+        ) -> None:
+            march, vertices = self._program(
+                program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels,
+                compute=self.compute and program == "march.glsl",
+            )  # fmt: skip
+            _set(
+                march,
+                stride=stride,
+                tau=stride / scene.extent,
+                termination=quality.termination,
+                appearance=code_vectors,
+                doubts=DOUBTS_UNIT,
+                bearable=bearable,
+                size=(float(camera.width), float(camera.height)),
+                **_lens_of(camera),
+                **more,
+            )
+            planes.use(PLANES_UNIT)
+            self._row_texture.use(ROWS_UNIT)
+            if self._motion_texture is not None:
+                self._motion_texture.use(MOTION_UNIT)
+            self._cells.use(CELLS_UNIT)
+            if doubts is not None:
+                doubts.seen.use(DOUBTS_UNIT)
+            if isinstance(march, moderngl.ComputeShader):
+                target.seen.bind_to_image(SEEN_UNIT, read=False)
+                target.met.bind_to_image(MET_UNIT, read=False)
+                march.run(*(-(-side // GROUP) for side in target.seen.size))
+                self.ctx.memory_barrier()
+            else:
+                self._draw(target.framebuffer, vertices, points=points)
+
+        return draw
+
+    def _by_processor(self, marching: Marching, time: float | None, free: np.ndarray, code: np.ndarray, termination: float) -> Callable[..., None]:
+        """As `_by_shaders`."""
+        marching.go_to(time, code)
+
+        def march(camera: Camera, blocks: np.ndarray, side: int, first: tuple[int, int], seen: np.ndarray, met: np.ndarray) -> None:
+            marching.march(camera, free, blocks, side, self.scene.step * self.quality.step, termination, first, seen, met)
+
+        def draw(
+            target: Target, camera: Camera, pixels: int = ALL, points: int = 0, doubts: Target | None = None, bearable: float = 0.0,
+            turn: int = 0, bounds: Bounds = EVERYWHERE, **_: object,
+        ) -> None:  # fmt: skip
+            size, count = (camera.width, camera.height), (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
+            if pixels == ONLY_PROBES:
+                left, bottom, right, top = map(int, bounds)
+                at = probes_of(turn, left, bottom, right, top, size)
+                rows, columns = at[..., 0], at[..., 1]
+                seen, met = marching.room(size)
+                march(camera, at.reshape(-1, 2), 1, (0, 0), seen, met)
+                _write(target, (left, bottom), seen[rows, columns], met[rows, columns])
+                return
+            blocks = np.ones(count, bool) if doubts is None else _first_channel(doubts).reshape(count) > bearable
+            if not blocks.any():
+                return
+            left, bottom, right, top = (min(BLOCK * end, side) for end, side in zip(_bounds(blocks), 2 * size))
+            seen, met = marching.room((right - left, top - bottom))
+            if doubts is not None:
+                _read_into(target, (left, bottom), seen, met)
+            march(camera, np.argwhere(blocks), BLOCK, (left, bottom), seen, met)
+            _write(target, (left, bottom), seen, met)
+
+        return draw
+
     def _march_baked(self, part: Part, camera: Camera, time: float) -> Target:
-        """A picture that a processor marches itself, through a grid of what planes come to."""
-        folded, raster = self._refined(), (camera.width, camera.height)
-        assert isinstance(folded, FoldedInMemory) and folded.baking is not None
-        target, self._slot = self._target(part, raster), slot_at(self.scene, time)
-        self._shots.pop((part, raster), None)
-        count, covered = (-(-camera.height // BLOCK), -(-camera.width // BLOCK)), self._covered(camera)
-        blocks = np.ascontiguousarray(np.argwhere(np.ones(count, bool) if covered is None else covered))
-        self._confine(target, EVERYWHERE if covered is None else _shares(_bounds(covered), count[::-1]))
-        if len(blocks):
-            step, free = self.scene.step * self.quality.step, self._free(self._slot)
-            seen, met, first = folded.baking.march(camera, time, free, blocks, BLOCK, step, self.quality.baked)
-            place = (*first, *seen.shape[1::-1])
-            target.seen.write(seen, place)
-            target.met.write(met, place)
+        """A picture that a processor marches itself, through a grid of what planes come to: all of what may see something."""
+        target, self._slot = self._target(part, (camera.width, camera.height)), slot_at(self.scene, time)
+        self._shots.pop((part, target.seen.size), None)
+        draw = self._by_processor(self._kept(Baking), time, self._free(self._slot), np.empty(0, np.float32), self.quality.baked)
+        self._draw_all(draw, part, target, camera)
         return target
+
+    def _kept(self, kind: type) -> Any:
+        """What works on planes in memory, with planes as they are now."""
+        if kind not in self._in_memory:
+            self._in_memory[kind] = kind(self.scene, self.layout)
+            self._stale.add(kind)
+        if kind in self._stale:
+            atlas = np.frombuffer(self._planes.read(), np.float32).reshape(*self.layout.size[::-1], 4)
+            for stale in self._stale:
+                self._in_memory[stale].keep(atlas)
+            self._stale.clear()
+        return self._in_memory[kind]
 
     def is_compute_faster(self, camera: Camera, time: float) -> bool:
         """Draw a picture by fragment and by compute shaders, a few times each, and compare the best of their times."""
@@ -698,21 +764,19 @@ class Renderer:
         not waited for: there the share counts as 0, and what is bearable counts for each block, not for their mean."""
         if not self._is_software:
             return BEARABLE_ALONE * bearable, 0.0
-        errors = np.sort(np.frombuffer(missed.seen.read(), np.float32)[::4])
+        errors = np.sort(_first_channel(missed))
         kept = int(np.searchsorted(np.cumsum(errors, dtype=np.float64), bearable * len(errors), side="right"))
         return float(errors[kept - 1]) if kept else -1.0, 1.0 - kept / len(errors)
 
     def _share_of(self, doubts: Target) -> float:
         """Of blocks that are set; 0 where no processor draws: a graphics card would have to be waited for."""
-        return float(np.frombuffer(doubts.seen.read(), np.float32).mean()) if self._is_software else 0.0  # four channels alike
+        return float(_first_channel(doubts).mean()) if self._is_software else 0.0
 
     def _draw_doubted(
         self, draw: Callable[..., None], target: Target, camera: Camera, doubts: Target, bearable: float = 0.5
     ) -> None:
         """March the blocks of a target whose doubt is more than `bearable`."""
-        doubts.seen.use(DOUBTS_UNIT)
-        size = float(camera.width), float(camera.height)
-        draw(target, camera, ONLY_DOUBTED, math.prod(doubts.seen.size), doubts=DOUBTS_UNIT, size=size, bearable=bearable)
+        draw(target, camera, ONLY_DOUBTED, math.prod(doubts.seen.size), doubts, bearable=bearable)
 
     def _followed(self, draw: Callable[..., None], part: Part, before: Shot | None, shot: Shot) -> Target:
         """Draw what the picture before does not tell: its probes, and the blocks in which they are not as predicted."""
@@ -735,12 +799,13 @@ class Renderer:
         tiles = self._tiles
         raster = tiles.raster(blocks) if tiles else blocks
         probes, doubts = self._target(part, raster, PROBES), self._target(part, blocks, DOUBTS)
-        common = {"size": tuple(map(float, size)), "turn": shot.turn, "raster": tuple(map(float, raster)),
+        common = {"turn": shot.turn, "raster": tuple(map(float, raster)),
                   "seen_probes": SEEN_PROBES_UNIT, "met_probes": MET_PROBES_UNIT}  # fmt: skip
         if covered is not None:
             self._empty(probes)
         squares = math.prod(tiles.squares(blocks)) if tiles else 0
         draw(probes, camera, ONLY_PROBES, squares, bounds=tuple(map(float, within)), **common)
+        common["size"] = tuple(map(float, size))
         probes.seen.use(SEEN_PROBES_UNIT)
         probes.met.use(MET_PROBES_UNIT)
         picture.seen.use(SEEN_UNIT)
@@ -762,7 +827,7 @@ class Renderer:
     @property
     def _tiles(self) -> Tiles | None:
         """How probes lie; None: side by side."""
-        return SPREAD if self._is_software and not self.compute else None
+        return SPREAD if self._is_software and not self.compute and self._marching_kind(moving=True) is None else None
 
     def _follows(self, shot: Shot, before: Shot) -> bool:
         """Whether a picture shows the same as the one before, at another time: while the clip stands still, pictures are whole."""
@@ -940,18 +1005,16 @@ class Renderer:
         entry = self._programs[key] = program, vertices
         return entry
 
-    def _occupy(self, slot: int, time: float | None) -> None:
-        """Have rays stop in the cells of a slot; at a `time` that planes are folded for, without those that `quality` has them pass by."""
-        thinning = self._folded.thinning if isinstance(self._folded, FoldedInMemory) and time is not None and self.quality.thin else None
-        cells = slot, thinning and time, thinning and self.quality.thin
+    def _free_at(self, slot: int, time: float | None) -> np.ndarray:
+        """How far around each cell all is empty: of a slot; at a `time`, 1 in those, too, that `quality` has rays pass by then."""
         self._slot = slot
-        if cells == self._cells_written:
-            return
-        free = self._free(slot)
-        if thinning is not None:
-            free = free | thinning.empty(slot, self._folded.rows, time, self.quality.thin)  # 0 in what is occupied, 1 in what is so and empty
-        self._cells.write(free)
-        self._cells_written = cells
+        if time is None or not self.quality.thin or not self._is_software or not Thinning.serves(self.scene) or self._rows is None:
+            return self._free(slot)
+        key = slot, time, self.quality.thin
+        if self._thinned is None or self._thinned[0] != key:
+            empty = self._kept(Thinning).empty(slot, self._rows.at(time), time, self.quality.thin)
+            self._thinned = key, self._free(slot) | empty  # 0 in what is occupied, 1 in what is so and empty
+        return self._thinned[1]
 
     def _free(self, slot: int) -> np.ndarray:
         """How far around each cell of a slot all is empty."""
@@ -973,7 +1036,7 @@ class Renderer:
     def _refined(self) -> Folded | FoldedInMemory:
         """What folding takes, with planes as they are now."""
         if self._folded is None and self._folds_in_memory:
-            self._folded = FoldedInMemory.of(self.ctx, self.folded_layout, self.scene)
+            self._folded = FoldedInMemory.of(self.ctx, self.folded_layout)
         elif self._folded is None:
             self._folded = Folded.of(self.ctx, self.folded_layout, self._row_texture.size, self._folds_in_half)
         if not self._is_refined:
@@ -1100,6 +1163,24 @@ def _frame_of(mapping: SpaceMapping | None) -> dict[str, object]:
     if not isinstance(mapping, DeviceCoordinates):
         return {}
     return {"frame": tuple(mapping.frame.T.ravel()), "near": mapping.near, "baseline": mapping.baseline}
+
+
+def _first_channel(target: Target) -> np.ndarray:
+    """Of each of a small target's texels, the first channel of what is seen."""
+    return np.frombuffer(target.seen.read(), np.float32)[::4]
+
+
+def _read_into(target: Target, first: tuple[int, int], seen: np.ndarray, met: np.ndarray) -> None:
+    """A part of a target from column and row `first` on."""
+    for number, array in enumerate((seen, met)):
+        place = (*first, *array.shape[1::-1])
+        target.framebuffer.read_into(array, place, components=array.shape[2], attachment=number, alignment=4, dtype="f4")
+
+
+def _write(target: Target, first: tuple[int, int], seen: np.ndarray, met: np.ndarray) -> None:
+    """Into a part of a target from column and row `first` on."""
+    for texture, array in ((target.seen, seen), (target.met, met)):
+        texture.write(np.ascontiguousarray(array), (*first, *array.shape[1::-1]))
 
 
 def _read(target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

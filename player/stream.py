@@ -24,6 +24,7 @@ from kpc.format.partial import PartialScene, hold, runs
 from kpc.format.quantise import dequantised
 from kpc.format.scene import ALL_PLANES, Scene
 from kpc.player.bake import Baking
+from kpc.player.lookup import Lookup
 from kpc.player.prefetch import Playhead, fetching_order, least_room, worth_holding
 from kpc.player.renderer import REFINED, Renderer
 from kpc.player.textures import Layout, Rows
@@ -200,7 +201,7 @@ class Stream:
 
     @property
     def fixed_bytes(self) -> int:
-        """What the scene takes but for its segments of time: textures, and what folding, thinning and baking take; occupancy and its distances; motion;
+        """What the scene takes but for its segments of time: textures, and what folding, thinning and marching by a processor take; occupancy and its distances; motion;
         planes that wait to be uploaded, and one in the making; what the source holds."""
         scene, layout = self.scene, self._layout
         texels = layout.size[0] * layout.size[1]
@@ -208,13 +209,13 @@ class Stream:
             finer = Layout.of(scene, REFINED)
             texels += 2 * finer.size[0] * finer.size[1] + (1 + REFINED) * Rows(scene, layout).width * layout.row_count()
             texels += 2 * layout.size[0] * layout.size[1] if Thinning.serves(scene) else 0
-        baking = Baking.bytes_for(scene) if Baking.serves(scene) else 0
+        marching = sum(kind.bytes_for(scene) for kind in (Baking, Lookup) if kind.serves(scene))
         largest = max(layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
         motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
         decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw
         whole = isinstance(self.source, RemoteSource) and not self.source.has_ranges
         source = self.source.size if whole else 2 * (RUN_BYTES + max(entry.stored_length for entry in self._reader.index))
-        return 16 * texels + baking + 2 * scene.occupancy.nbytes + motion + decoding + source
+        return 16 * texels + marching + 2 * scene.occupancy.nbytes + motion + decoding + source
 
     @property
     def failure(self) -> str | None:

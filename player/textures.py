@@ -107,10 +107,9 @@ class Layout:
         """Where a block lies in an atlas that is an array of (height, width)."""
         return slice(block.y, block.y + block.height), slice(block.x, block.x + self.layers[block.scale] * block.width)
 
-    def unrefined(self, atlas: np.ndarray, block: Block) -> np.ndarray:
-        """(rows, columns, 4 layers): the plane of a block in an atlas of (height, width, 4), as fine as the scene has it."""
+    def plane(self, atlas: np.ndarray, block: Block) -> np.ndarray:
+        """(rows, columns, 4 layers): the plane of a block in an atlas of (height, width, 4)."""
         plane = atlas[self.part(block)].reshape(block.height, -1, block.width, 4).swapaxes(1, 2)
-        plane = plane[:: self.refined] if block.upright else plane[:, :: self.refined]
         return np.ascontiguousarray(plane).reshape(*plane.shape[:2], -1)
 
     def lines(self, block: Block) -> slice:

@@ -46,15 +46,14 @@ class Corners:
 
 
 class Thinning:
-    """The densities of a scene at the corners of its occupied cells, from planes as they lie in a refined atlas.
+    """The densities of a scene at the corners of its occupied cells, from its planes.
 
     Attributes:
-        planes: (rows, columns, 4 layers) float32, of each of the layout's blocks, once there was need of them.
+        planes: (rows, columns, 4 layers) float32, of each of the layout's blocks.
     """
 
     def __init__(self, scene: Scene, layout: Layout) -> None:
         self._scene, self._layout = scene, layout
-        self._atlas = np.empty(0)
         self.planes: list[np.ndarray] = []
         self._folded: list[np.ndarray] = []
         self._log_density = np.zeros([side + 1 for side in scene.occupancy.shape[1:]], np.float32)
@@ -75,13 +74,13 @@ class Thinning:
     def memory_bytes(self) -> int:
         return 2 * sum(plane.nbytes for plane in self.planes) + self._log_density.nbytes
 
-    def keep(self, refined: np.ndarray) -> None:
-        """Take planes from an atlas, (height, width, 4), of the layout, from now on, and as they are when next needed."""
-        self._atlas, self.planes = refined, []
+    def keep(self, atlas: np.ndarray) -> None:
+        """Take planes from an atlas, (height, width, 4), of the layout, from now on."""
+        self.planes = [self._layout.plane(atlas, block) for block in self._layout.blocks]
+        self._folded = [np.empty_like(plane) for plane in self.planes]
 
     def empty(self, slot: int, rows: np.ndarray, time: float, alpha: float) -> np.ndarray:
-        """(Nz, Ny, Nx) bool: cells of a slot at whose corners a step of the scene has less than this alpha. `rows`: `Rows.at` the time, refined
-        as the layout."""
+        """(Nz, Ny, Nx) bool: cells of a slot at whose corners a step of the scene has less than this alpha. `rows`: `Rows.at` the time."""
         occupied = self._scene.occupancy[slot]
         limit = math.log(-math.log1p(-alpha) * self._scene.extent / self._scene.step)
         if limit <= -LOG_DENSITY_LIMIT:  # no density is less
@@ -99,12 +98,9 @@ class Thinning:
     def log_densities(self, places: np.ndarray, rows: np.ndarray, time: float) -> np.ndarray:
         """The log of the density at places (N, 3) in [0, 1]^3, float32: (N,)."""
         scene, layout = self._scene, self._layout
-        if not self.planes:
-            self.planes = [layout.unrefined(self._atlas, block) for block in layout.blocks]
-            self._folded = [np.empty_like(plane) for plane in self.planes]
         places, out = places.copy(), np.full(len(places), scene.decoder.density_bias, np.float32)
         for block, plane, folded in zip(layout.blocks, self.planes, self._folded, strict=True):
-            row = rows[layout.lines(block), :: layout.refined].swapaxes(0, 1)[: plane.shape[0 if block.upright else 1]]
+            row = rows[layout.lines(block)].swapaxes(0, 1)[: plane.shape[0 if block.upright else 1]]
             row = row.reshape(len(row), -1)
             np.multiply(plane, row[:, None] if block.upright else row, out=folded)
         offsets = None if scene.motion is None else linear(scene.motion, time)

@@ -97,6 +97,37 @@ def varied(scene: Scene, names: tuple[str, ...] = ("dawn.jpg", "noon.jpg", "dusk
     return replace(scene, appearances=tuple(Appearance(name, code) for name, code in zip(names, codes, strict=True)))
 
 
+def one_sided(scene: Scene) -> Scene:
+    """Its colours the same from all sides."""
+    return replace(scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2))
+
+
+def uneven() -> Scene:
+    """Scales of other channels, rows of time and sizes; the first is the finer one along y."""
+    coarse, fine = tiny_scene(1, channels=13, resolution=(12, 44, 10), time=4), tiny_scene(2, channels=19, resolution=(23, 20, 15), time=7)
+    scales = coarse.scales[-1], fine.scales[-1]
+    rng, features = np.random.default_rng(3), 32
+    decoder = replace(fine.decoder, density_weight=rng.normal(0, 0.8, features).astype(np.float32),
+                      w2=np.zeros((3, features, 16), np.float32), b2=rng.normal(0, 0.4, (3, features)).astype(np.float32))  # fmt: skip
+    return replace(fine, scales=scales, decoder=decoder)
+
+
+def flat() -> Scene:
+    """Of one texel along z."""
+    scene = tiny_scene(5, scales=1, channels=30, resolution=(9, 20, 2))
+    planes = {name: plane[:1] if name in ("xz", "yz") else plane[:, :1] if name == "zt" else plane for name, plane in scene.scales[0].items()}
+    return one_sided(replace(scene, scales=(planes,)))
+
+
+def of_first_degree(scene: Scene) -> Scene:
+    """Of one scale, in which one plane varies, and rows of time planes are the same all along their axes: so that a grid holds all there is."""
+    for name in ("xz", "yz"):
+        scene.scales[0][name][:] = 1.0
+    for name in ("xt", "yt", "zt"):
+        scene.scales[0][name][:] = scene.scales[0][name][:, :1]
+    return scene
+
+
 SPACES: dict[str, Callable[[Scene], Scene]] = {
     "box": lambda scene: scene, "contracted": surrounded, "displaced": displaced, "ndc": faced,
     "hybrid": hybrid,

@@ -10,11 +10,18 @@ from scenes import SPACES, look_at, tiny_scene, varied
 from kpc.format.cameras import Camera
 from kpc.format.scene import SPACE_PLANES, TERMINATION, TIME_PLANES, Scene
 from kpc.player import renderer as module
+from kpc.player.marching import probes_of
 from kpc.player.quality import DEFAULT, LADDER, Quality, climbed
 from kpc.player.reference import Part, box_range, render
 from kpc.player.renderer import COMPUTE_VERSION, TRIAL_AFTER, Renderer
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
+
+
+@pytest.fixture(autouse=True, params=[False, True], ids=["shaders", "processor"])
+def who_marches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a processor would march itself, shaders march elsewhere."""
+    monkeypatch.setattr(module, "marches_itself", lambda ctx: request.param and module.is_software(ctx))
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -140,6 +147,8 @@ def test_every_pixel_is_a_probe_by_turns() -> None:
         column, row = places[:, :2].astype(int).T
         assert (column // 4 == x).all() and (row // 4 == y).all()
         np.add.at(seen, (row, column), 1)
+        by_processor = probes_of(turn, 0, 0, 16, 16, (63, 62)).swapaxes(0, 1).reshape(-1, 2)
+        np.testing.assert_array_equal(by_processor, np.stack([row, column], 1))
     assert (seen[:60, :60] == 1).all() and (seen > 0).all()
 
 
@@ -517,6 +526,7 @@ def test_folded_planes_in_half_floats_are_near_those_in_floats(monkeypatch: pyte
     """On graphics cards; a processor is told here that it is one."""
     ctx, scene = gl.context(), tiny_scene(4)
     exact = Renderer(ctx, scene, LADDER["finer"])
+    exact.casts = False
     monkeypatch.setattr(module, "is_software", lambda ctx: False)
     half = Renderer(ctx, scene, LADDER["finer"], compute=False)
     assert (exact.in_half, half.in_half) == (False, True)

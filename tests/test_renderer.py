@@ -276,7 +276,7 @@ def test_a_processor_folds_as_shaders_do(factor: float) -> None:
     planes = []
     for in_memory in (False, True):
         renderer = Renderer(gl.context(), replace(scene, scales=tuple(larger)), FOLDED)
-        renderer._folds_in_memory, renderer._folds_in_half = in_memory, False
+        renderer._folds_in_memory, renderer._folds_in_half, renderer.casts = in_memory, False, False
         renderer.march(CAMERAS["outside"], 0.3)
         planes.append(np.frombuffer(renderer.march(CAMERAS["outside"], 0.7) and renderer._folded.planes.read(), np.float32))
     assert np.array_equal(*planes) and np.abs(planes[0]).max() > min(factor / 10, 3e38)
@@ -286,6 +286,7 @@ def test_planes_that_fit_only_unrefined_are_folded_so(monkeypatch: pytest.Monkey
     ctx, scene = gl.context(), tiny_scene(4)
     monkeypatch.setitem(ctx.info, "GL_MAX_TEXTURE_SIZE", max(Renderer(ctx, scene).layout.size))
     renderer = Renderer(ctx, scene, FOLDED)
+    renderer.casts = False
     assert renderer.folded_layout is renderer.layout
     error = renderer.render(CAMERAS["outside"], 0.7).rgb - render(scene, CAMERAS["outside"], 0.7).rgb
     assert -10 * np.log10(np.mean(error**2)) > 40

@@ -8,6 +8,7 @@ import pytest
 from scenes import SPACES, bring, displaced, look_at, tiny_scene, without_planes
 
 from kpc.format.scene import Scene
+from kpc.player import renderer as module
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Moment, Part, features, render, slot_at
 from kpc.player.renderer import Renderer
@@ -24,14 +25,14 @@ def moving(channels: int = 8, resolution: tuple[int, int, int] = (24, 20, 16)) -
     return replace(scene, decoder=replace(scene.decoder, density_weight=3 * scene.decoder.density_weight, density_bias=-13.0))
 
 
-def thinning_of(scene: Scene, refined: int) -> Thinning:
-    layout = Layout.of(scene, refined)
-    thinning = Thinning(scene, layout)
+def thinning_of(scene: Scene) -> Thinning:
     renderer = Renderer(gl.context(), scene, FOLDED)
-    renderer.folded_layout = layout
-    renderer.march(CAMERA, 0.0)
-    thinning.keep(renderer._folded.refined)
-    return thinning
+    return renderer._kept(Thinning)
+
+
+@pytest.fixture(autouse=True, params=[False, True], ids=["shaders", "processor"])
+def who_marches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "marches_itself", lambda ctx: request.param and module.is_software(ctx))
 
 
 def densities_of_folded(scene: Scene, places: np.ndarray, time: float) -> np.ndarray:
@@ -45,20 +46,19 @@ def densities_of_folded(scene: Scene, places: np.ndarray, time: float) -> np.nda
     return features(replace(scene, scales=scales), folded, places) @ scene.decoder.density_weight + scene.decoder.density_bias
 
 
-@pytest.mark.parametrize("refined", [1, 2])
 @pytest.mark.parametrize("scene", [moving(), moving(5, (9, 20, 1)), displaced(moving())], ids=["even", "odd", "displaced"])
-def test_densities_are_those_of_folded_planes(scene: Scene, refined: int) -> None:
-    rng, thinning = np.random.default_rng(3), thinning_of(scene, refined)
+def test_densities_are_those_of_folded_planes(scene: Scene) -> None:
+    rng, thinning = np.random.default_rng(3), thinning_of(scene)
     rows = Rows(scene, Layout.of(scene))
     for time in (0.0, 0.37, 1.0):
         places = np.concatenate([rng.random((1 << 16, 3), np.float32), np.eye(3, dtype=np.float32), np.ones((1, 3), np.float32)])
-        got, wanted = thinning.log_densities(places, rows.at(time, refined), time), densities_of_folded(scene, places, time)
+        got, wanted = thinning.log_densities(places, rows.at(time), time), densities_of_folded(scene, places, time)
         np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-4 * np.abs(wanted).max())
 
 
 def test_a_cell_is_empty_whose_corners_are() -> None:
     scene = moving()
-    thinning, rows = thinning_of(scene, 2), Rows(scene, Layout.of(scene))
+    thinning, rows = thinning_of(scene), Rows(scene, Layout.of(scene))
     for time in (0.1, 0.2, 0.9):
         slot = slot_at(scene, time)
         occupied = scene.occupancy[slot]
@@ -67,7 +67,7 @@ def test_a_cell_is_empty_whose_corners_are() -> None:
         alpha = (1 - np.exp(-sigma * scene.step / scene.extent)).reshape([side + 1 for side in occupied.shape])
         most = np.max([alpha[z : z + 8, y : y + 10, x : x + 12] for z, y, x in np.ndindex(2, 2, 2)], axis=0)
         for limit in (1e-6, 0.004, 0.03, 0.5, 0.9):
-            empty = thinning.empty(slot, rows.at(time, 2), time, limit)
+            empty = thinning.empty(slot, rows.at(time), time, limit)
             clear = np.abs(most / limit - 1) > 0.01
             assert np.array_equal(empty[clear], (occupied & (most < limit))[clear]) and clear.mean() > 0.9
             assert empty.any() or limit < 0.03
@@ -76,7 +76,7 @@ def test_a_cell_is_empty_whose_corners_are() -> None:
 def test_nothing_is_empty_where_no_density_is_less() -> None:
     scene = moving()
     scene = replace(scene, decoder=replace(scene.decoder, density_bias=-100.0))
-    empty = thinning_of(scene, 2).empty(0, Rows(scene, Layout.of(scene)).at(0.0, 2), 0.0, 1e-12)
+    empty = thinning_of(scene).empty(0, Rows(scene, Layout.of(scene)).at(0.0), 0.0, 1e-12)
     assert not empty.any()
 
 

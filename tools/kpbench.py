@@ -373,7 +373,7 @@ def _play_once(job: Play) -> dict[str, results.Record]:
             "gpu_memory_bytes": renderer.memory_bytes,
             "peak_memory_bytes": peak_memory_bytes(),
         }
-        if renderer.quality.tolerance == 0 and renderer.rays_across(camera) == 1:  # all that a picture shows has been marched for it
+        if renderer.quality.tolerance == 0 and renderer.rays_across(camera) == 1 and renderer.texels_a_sample:  # all it shows has been marched for it
             texels = renderer.texels_a_sample * float(renderer.render(camera, 1.0).samples.sum())
             peak = texel_rate(ctx, key[1] == "compute", "f2" if renderer.in_half else "f4")
             best[name] |= {"texels_a_frame": texels, "share_of_texel_rate": texels / (1e-3 * median[key]) / peak}
@@ -441,6 +441,7 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
     ctx = offscreen.open_context()
     scene = file.read(job.scene).dequantise()
     folding, folding_psnr, folding_most = Renderer(ctx, scene, Quality(folded=True)), [], 0.0
+    folding.casts = False  # a processor that marches itself folds nothing
     times = _frame_times(scene, LEAD_IN, MIDDLE)
     smaller = min(1.0, (COMPARED / (job.size[0] * job.size[1])) ** 0.5)
     size = round(smaller * job.size[0]), round(smaller * job.size[1])
