@@ -100,7 +100,7 @@ class Baking(Marching):
         return (self._planes, self._rows, self._weights_in_steps, bias, self.grid.reshape(-1, 4), self._known[worker].reshape(-1), corners), None
 
     @staticmethod
-    def rehearsed() -> tuple[Any, Any]:
+    def rehearsed(scene: Scene) -> tuple[Any, Any]:
         planes, rows = (np.zeros((1, WIDE), np.int16),) * len(SPACE_PLANES), (np.zeros((1, WIDE), np.float32),) * len(TIME_PLANES)
         weights, grid, known = np.zeros((4, WIDE), np.float32), np.zeros((1, 4), np.float32), np.zeros(1, np.uint8)
         return (planes, rows, weights, np.float32(0), grid, known, (1, 1, 1)), None

@@ -16,7 +16,7 @@ import numpy as np
 from kpc.format.rans import compiled
 from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION
 from kpc.player.reference import PARALLEL
-from kpc.player.vectors import CHANNELS, WIDE, combine, interpolate, weigh
+from kpc.player.vectors import CHANNELS, NARROW, WIDE, combine, interpolate, weigh
 
 LANES = 512
 """Rays side by side. With 256 a picture takes 1.05 of the time, with 128 1.1; what they hold fits the two nearest caches."""
@@ -61,18 +61,19 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
     how many `corners` there are. The others are baked from `planes`, xy, xz, yz at corners, (rows * columns, M) int16, `rows` of the time planes
     along x, y, z, (N, M), `weights`, (4, M), which make up for the planes' steps, and `bias`.
 
-    `looked_up`: of samples, `planes` and `rows` as `vectors.weigh` has them; `firsts`, (scales, 6) int64, where xy, xz, yz and the rows of x, y, z
-    begin; `sizes`, (scales, 4) int64, of texels along x, y, z, and channels, and a decoder as in spec section 4: `w1`, (H, 9), `b1`, with the code of
-    an appearance, `w2`, (H, 3 F), and `b2` and the density's weights, (4 F,), which make up for the planes' steps, and `bias`.
+    `looked_up`: of samples, `halves`, `planes` and `rows` as `vectors.weigh` has them; `firsts`, (groups, 6) int64, where xy, xz, yz and the rows of x, y, z
+    begin; `sizes`, (groups, 3) int64, of texels along x, y, z, at least two; and of the decoder `w1`, (H, 9), `b1`, with the code of an appearance,
+    `w2`, (H, 4 F), 0 for the density, and `b2` and the density's weights, (4 F,), all of which make up for the planes' steps, and `bias`.
     """
     rays, samples = np.zeros((Z + 1, LANES), np.float32), np.zeros((LOG_DENSITY + 1, LANES), np.float32)
     pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
     wanted = np.empty(AROUND * LANES + 1, np.int32)
+    texels, kept = np.zeros((6, LANES), np.int32), np.zeros(LANES, np.int32)
     if looked_up is not None:
-        _, _, _, _, w1, b1, w2, of_all, bias = looked_up
-        weights = np.empty((LANES, len(of_all)), np.float32)
-        weights[:] = of_all
-    kept, texels = np.arange(LANES).astype(np.int32), np.zeros((6, LANES), np.int32)
+        of_all, weights = looked_up[8], looked_up[8].reshape(1, -1)
+        if len(looked_up[6]) > 0:  # each ray's own
+            weights = np.empty((LANES, len(of_all)), np.float32)
+            kept[:] = np.arange(LANES)
     taken, count = np.int64(0), np.int64(0)  # a plain 0 would be a type of its own, for which parts are compiled once more
     while taken < len(blocks) or count > 0:
         while taken < len(blocks) and count + side * side <= LANES:
@@ -90,10 +91,10 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
                 _bake(_wanted(found, known, corners, cell, wanted), wanted, planes, rows, weights, bias, grid, corners)
                 _look_up(found, grid, corners, samples, cell)
             if looked_up is not None:
-                planes, rows, firsts, sizes, w1, b1, w2, of_all, bias = looked_up
+                halves, planes, rows, firsts, sizes, w1, b1, w2, of_all, bias = looked_up
                 if len(b1) > 0:
                     _face(found, box, of_ray, rays, kept, w1, b1, w2, of_all, weights)
-                _weigh(found, planes, rows, firsts, sizes, weights, bias, of_ray, kept, samples, texels)
+                _weigh(found, halves, planes, rows, firsts, sizes, weights, bias, of_ray, kept, samples, texels)
             _shade(found, tau, samples)
             _add(found, termination, samples, of_ray, rays, around)
         count = _end(count, termination, background, origin, size, rays, pixel, kept, around, seen, met)
@@ -293,9 +294,9 @@ def _face(found, box, of_ray, rays, kept, w1, b1, w2, of_all, weights):
 
 
 @_part
-def _weigh(found, planes, rows, firsts, sizes, weights, bias, of_ray, kept, samples, texels):
+def _weigh(found, halves, planes, rows, firsts, sizes, weights, bias, of_ray, kept, samples, texels):
     """Logits and log densities from planes and rows."""
-    flat, each = weights.reshape(-1), U(weights.shape[1])
+    flat, each, wide = weights.reshape(-1), U(weights.shape[1]), U(NARROW * len(halves))
     for j in range(_whole(found)):
         samples[AT_X, j], samples[AT_Y, j], samples[AT_Z, j] = _within(samples[AT_X, j], ONE), _within(samples[AT_Y, j], ONE), _within(samples[AT_Z, j], ONE)
         samples[LOGIT_RED, j], samples[LOGIT_GREEN, j], samples[LOGIT_BLUE, j], samples[LOG_DENSITY, j] = ZERO, ZERO, ZERO, bias
@@ -308,16 +309,16 @@ def _weigh(found, planes, rows, firsts, sizes, weights, bias, of_ray, kept, samp
             texels[0, j], texels[1, j], texels[2, j] = row * I(nx) + column, layer * I(nx) + column, layer * I(ny) + row
             texels[3, j], texels[4, j], texels[5, j] = column, row, layer
         xy, xz, yz, of_x, of_y, of_z = firsts[group, 0], firsts[group, 1], firsts[group, 2], firsts[group, 3], firsts[group, 4], firsts[group, 5]
-        up, up_yz = U(WIDE * nx), U(WIDE * ny)
+        up, up_yz = wide * U(nx), wide * U(ny)
         for j in range(U(found)):
             weigh(
                 planes,
-                (U(xy) + U(WIDE) * U(texels[0, j]), U(xz) + U(WIDE) * U(texels[1, j]), U(yz) + U(WIDE) * U(texels[2, j])),
+                (U(xy) + wide * U(texels[0, j]), U(xz) + wide * U(texels[1, j]), U(yz) + wide * U(texels[2, j])),
                 (up, up, up_yz),
                 rows,
-                (U(of_x) + U(WIDE) * U(texels[3, j]), U(of_y) + U(WIDE) * U(texels[4, j]), U(of_z) + U(WIDE) * U(texels[5, j])),
+                (U(of_x) + wide * U(texels[3, j]), U(of_y) + wide * U(texels[4, j]), U(of_z) + wide * U(texels[5, j])),
                 (samples[PART_X, j], samples[PART_Y, j], samples[PART_Z, j]),
-                flat, U(kept[U(of_ray[j])]) * each + group * U(WIDE * CHANNELS), samples, U(LOGIT_RED), j,
+                flat, U(kept[U(of_ray[j])]) * each + group * wide * U(CHANNELS), halves, samples, U(LOGIT_RED), j,
             )  # fmt: skip
 
 

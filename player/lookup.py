@@ -9,24 +9,25 @@ from kpc.format.grid import linear
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.player.marching import Marching, in_steps
 from kpc.player.textures import Layout, filled
-from kpc.player.vectors import CHANNELS, LARGEST, WIDE
+from kpc.player.vectors import CHANNELS, NARROW, LARGEST, WIDE
 
 
 class Lookup(Marching):
     """The planes of a scene in whole numbers, and the rows of a time.
 
-    Channels go in groups of WIDE: all texels of a plane have those of the first, then all have those of the next.
+    Channels go in groups, of NARROW where no scale has more, else of WIDE: all texels of a plane have those of the first, then all have those of the next.
     """
 
     def __init__(self, scene: Scene, layout: Layout) -> None:
         super().__init__(scene)
         self._layout, decoder = layout, scene.decoder
         self._channels = [scale["xy"].shape[2] for scale in scene.scales]
-        groups = [_groups(channels) for channels in self._channels]
+        self._wide = _wide(scene)
+        groups = [-(-channels // self._wide) for channels in self._channels]
         self._first_group = np.cumsum([0, *groups])
         self._sizes = np.repeat([_texels(scale) for scale in scene.scales], groups, axis=0)
         nx, ny, nz = self._sizes.T
-        planes, rows = WIDE * np.stack([nx * ny, nx * nz, ny * nz], axis=1), WIDE * self._sizes
+        planes, rows = self._wide * np.stack([nx * ny, nx * nz, ny * nz], axis=1), self._wide * self._sizes
         self._firsts = np.concatenate([_starts(planes), _starts(rows)], axis=1)
         self._planes, self._rows = np.zeros(int(planes.sum()), np.int16), np.ones(int(rows.sum()), np.float32)
         hidden = len(decoder.b1) if decoder.w2.any() else 0
@@ -45,7 +46,8 @@ class Lookup(Marching):
         taken = 0
         for scale in scene.scales:
             nx, ny, nz = _texels(scale)
-            taken += WIDE * _groups(scale["xy"].shape[2]) * (2 * (nx * ny + nx * nz + ny * nz) + 4 * (nx + ny + nz))
+            channels = scale["xy"].shape[2]
+            taken += (channels + -channels % _wide(scene)) * (2 * (nx * ny + nx * nz + ny * nz) + 4 * (nx + ny + nz))
         return taken
 
     def keep(self, atlas: np.ndarray) -> None:
@@ -74,30 +76,32 @@ class Lookup(Marching):
     def _looked_at(self, worker: int) -> tuple[Any, Any]:
         b1 = self._b1 + self._code if len(self._b1) else self._b1
         bias = np.float32(self._scene.decoder.density_bias)
-        return None, (self._planes, self._rows, self._firsts, self._sizes, self._w1, b1, self._w2_in_steps, self._weights_in_steps, bias)
+        halves = tuple(range(0, self._wide, NARROW))
+        return None, (halves, self._planes, self._rows, self._firsts, self._sizes, self._w1, b1, self._w2_in_steps, self._weights_in_steps, bias)
 
     @staticmethod
-    def rehearsed() -> tuple[Any, Any]:
-        planes, flat, sizes = np.zeros(WIDE, np.int16), np.zeros(WIDE, np.float32), np.zeros((1, 3), np.int64)
-        return None, (planes, flat, np.zeros((1, 6), np.int64), sizes, np.zeros((1, 9), np.float32), flat, np.zeros((1, 1), np.float32), flat, np.float32(0))
+    def rehearsed(scene: Scene) -> tuple[Any, Any]:
+        halves, flat, of_two = tuple(range(0, _wide(scene), NARROW)), np.zeros(1, np.float32), np.zeros((1, 1), np.float32)
+        places = np.zeros((1, 1), np.int64)
+        return None, (halves, np.zeros(1, np.int16), flat, places, places, of_two, flat, of_two, flat, np.float32(0))
 
     def _put(self, into: np.ndarray, scale: int, which: int, texels: np.ndarray) -> None:
         """(..., channels) where it lies."""
         for number, group in enumerate(range(self._first_group[scale], self._first_group[scale + 1])):
-            part = filled(texels[..., WIDE * number : WIDE * (number + 1)], texels.ndim - 1, WIDE)
+            part = filled(texels[..., self._wide * number : self._wide * (number + 1)], texels.ndim - 1, self._wide)
             first = self._firsts[group, which]
             into[first : first + part.size] = part.reshape(-1)
 
     def _as_it_lies(self, weights: np.ndarray) -> np.ndarray:
         """(..., CHANNELS, F) float64 as (..., CHANNELS F): each group's features of each of the channels."""
-        parts = [filled(part, part.ndim - 1, WIDE) for part in np.split(weights, np.cumsum(self._channels)[:-1], axis=-1)]
+        parts = [filled(part, part.ndim - 1, self._wide) for part in np.split(weights, np.cumsum(self._channels)[:-1], axis=-1)]
         whole = np.concatenate(parts, axis=-1).astype(np.float64)
-        grouped = whole.reshape(*whole.shape[:-1], whole.shape[-1] // WIDE, WIDE).swapaxes(-3, -2)
+        grouped = whole.reshape(*whole.shape[:-1], whole.shape[-1] // self._wide, self._wide).swapaxes(-3, -2)
         return np.ascontiguousarray(grouped).reshape(*whole.shape[:-2], math.prod(whole.shape[-2:]))
 
 
-def _groups(channels: int) -> int:
-    return -(-channels // WIDE)
+def _wide(scene: Scene) -> int:
+    return NARROW if all(scale["xy"].shape[2] <= NARROW for scale in scene.scales) else WIDE
 
 
 def _texels(scale: Any) -> tuple[int, int, int]:

@@ -72,7 +72,7 @@ class Marching(ABC):
 
     @staticmethod
     @abstractmethod
-    def rehearsed() -> tuple[Any, Any]:
+    def rehearsed(scene: Scene) -> tuple[Any, Any]:
         """Of the same types as `_looked_at`."""
 
     def room(self, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -125,13 +125,13 @@ def in_steps(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return whole, step.astype(np.float64)
 
 
-def rehearse(kind: type[Marching]) -> None:
-    """Have `cast` compiled for a kind of marching, which takes five seconds, or loaded, before a picture waits for it: march no block of nothing."""
+def rehearse(kind: type[Marching], scene: Scene) -> None:
+    """Have `cast` compiled for a kind of marching and scene, which takes five seconds, or loaded, before a picture waits for it: march no block of nothing."""
     size, nothing = (1, 1), np.zeros((0, 2), np.int64)
     one, three, four = np.float32(1), np.zeros(3, np.float32), np.zeros((1, 4), np.float32)
     cast(
         nothing, 1, (0, 0), size, four[0], np.zeros((3, 3), np.float32), three, three, one, one, one, three,
-        np.zeros(1, np.uint8), (1, 1, 1), four, (1, 1, 1), *kind.rehearsed(), np.zeros((1, 1, 4), np.float32), np.zeros((1, 1, 2), np.float32),
+        np.zeros(1, np.uint8), (1, 1, 1), four, (1, 1, 1), *kind.rehearsed(scene), np.zeros((1, 1, 4), np.float32), np.zeros((1, 1, 2), np.float32),
     )  # fmt: skip
 
 

@@ -69,8 +69,8 @@ Bounds = tuple[float, float, float, float]
 EVERYWHERE: Bounds = (0.0, 0.0, 1.0, 1.0)
 BEARABLE_ALONE = 4.0
 """What a block may miss by, in squares, to what blocks may in the mean: most bend by much less than those that bend most."""
-ALL, ONLY_PROBES, ONLY_DOUBTED = range(3)
-"""PIXELS of march.glsl."""
+ALL, ONLY_PROBES, ONLY_DOUBTED, ONLY_COVERED = range(4)
+"""Pixels to march: PIXELS of march.glsl; the last, blocks that are told and no more than what is not seen there, are as those in doubt to it."""
 MORE_THAN_A_RASTER = 1 << 20
 """SQUARE of tiles.glsl, where probes lie side by side."""
 GROUP = 8
@@ -332,7 +332,7 @@ class Renderer:
         self.casts = marches_itself(ctx)
         marching = self._marching_kind(scene.is_dynamic)
         if marching is not None:  # until it is needed there is much else to do, decoding for one
-            threading.Thread(target=rehearse, args=(marching,), name="rehearsing", daemon=True).start()
+            threading.Thread(target=rehearse, args=(marching, scene), name="rehearsing", daemon=True).start()
         self._marches_to_trial = TRIAL_AFTER if compute is None and tries_compute(ctx) else math.inf
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
@@ -616,8 +616,12 @@ class Renderer:
         code_vectors, stride = _vectors(code), scene.step * quality.step
 
         def draw(
-            target: Target, camera: Camera, pixels: int = ALL, points: int = 0, doubts: Target | None = None, bearable: float = 0.0, **more: object
-        ) -> None:
+            target: Target, camera: Camera, pixels: int = ALL, points: int = 0, doubts: Target | None = None, bearable: float = 0.0,
+            covered: np.ndarray | None = None, **more: object,
+        ) -> None:  # fmt: skip
+            if covered is not None and doubts is not None:
+                doubts.seen.write(np.repeat(covered[..., None], 4, axis=-1).astype(np.float32))
+                pixels = ONLY_DOUBTED
             march, vertices = self._program(
                 program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels,
                 compute=self.compute and program == "march.glsl",
@@ -660,7 +664,7 @@ class Renderer:
 
         def draw(
             target: Target, camera: Camera, pixels: int = ALL, points: int = 0, doubts: Target | None = None, bearable: float = 0.0,
-            turn: int = 0, bounds: Bounds = EVERYWHERE, **_: object,
+            covered: np.ndarray | None = None, turn: int = 0, bounds: Bounds = EVERYWHERE, **_: object,
         ) -> None:  # fmt: skip
             size, count = (camera.width, camera.height), (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
             if pixels == ONLY_PROBES:
@@ -671,13 +675,17 @@ class Renderer:
                 march(camera, at.reshape(-1, 2), 1, (0, 0), seen, met)
                 _write(target, (left, bottom), seen[rows, columns], met[rows, columns])
                 return
-            blocks = np.ones(count, bool) if doubts is None else _first_channel(doubts).reshape(count) > bearable
+            blocks = covered
+            if blocks is None:
+                blocks = np.ones(count, bool) if doubts is None else _first_channel(doubts).reshape(count) > bearable
             if not blocks.any():
                 return
             left, bottom, right, top = (min(BLOCK * end, side) for end, side in zip(_bounds(blocks), 2 * size))
             seen, met = marching.room((right - left, top - bottom))
-            if doubts is not None:
+            if pixels == ONLY_DOUBTED:
                 _read_into(target, (left, bottom), seen, met)
+            elif pixels == ONLY_COVERED:
+                seen[:], met[:] = (*self.scene.background, 0.0), 0.0
             march(camera, np.argwhere(blocks), BLOCK, (left, bottom), seen, met)
             _write(target, (left, bottom), seen, met)
 
@@ -726,9 +734,7 @@ class Renderer:
             return 1.0, EVERYWHERE
         self._empty(target)
         target.drawn = _shares(_bounds(blocks), blocks.shape[::-1])
-        covered = self._target(part, blocks.shape[::-1], DOUBTS)
-        covered.seen.write(np.repeat(blocks[..., None], 4, axis=-1).astype(np.float32))
-        self._draw_doubted(draw, target, camera, covered)
+        draw(target, camera, ONLY_COVERED, blocks.size, self._target(part, blocks.shape[::-1], DOUBTS), 0.5, covered=blocks)
         return float(blocks.mean()), target.drawn
 
     def _draw_alone(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> float:

@@ -17,7 +17,7 @@ CHANNELS = 4
 """Of a grid: all of a node's at once."""
 WIDE = 16
 """Features at once: as many floats as the widest processors multiply."""
-HALF = 8
+NARROW = 8
 """Of them: samples take 0.8 of the time by halves, which leave room in the registers for all that is at work."""
 LARGEST = 1e30
 """What sums are cut off at."""
@@ -97,50 +97,53 @@ def combine(_: Any, wholes: Any, factors: Any, weights: Any, bias: Any, into: An
 
 @intrinsic
 def weigh(
-    _: Any, planes: Any, texels: Any, ups: Any, rows: Any, starts: Any, shares: Any, weights: Any, first: Any, into: Any, line: Any, column: Any
+    _: Any, planes: Any, texels: Any, ups: Any, rows: Any, starts: Any, shares: Any, weights: Any, first: Any, halves: Any, into: Any,
+    line: Any, column: Any,
 ) -> Any:  # fmt: skip
-    """into[line + c, column] += the sum over m of weights[first + WIDE c + m] times the product of all planes and rows, c = 0 to 3, m below WIDE.
+    """into[line + c, column] += the sum over m of weights[first + wide c + m] times the product of all planes and rows, c = 0 to 3, m below wide.
 
-    `planes`, (N,) int16, and `rows`, (N,) float32, hold WIDE numbers for each texel. Of the planes xy, xz and yz: `texels`, where that before a place
+    `halves`, (0,) or (0, NARROW), tells by its length how `wide` is what is there for each texel, NARROW or WIDE numbers, of `planes`, (N,) int16, and
+    `rows`, (N,) float32. Of the planes xy, xz and yz: `texels`, where that before a place
     begins, the next along the first axis following it, and `ups`, how far from it the next along the second begins. Of the rows along x, y and z:
     `starts`. `shares`, float32, of the way to the next along x, y, z. `weights`, (N,) float32; `into`, (lines, columns) float32. All places uint64; of
     threes, tuples.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        planes, rows, weights, out = (_array(context, builder, signature, arguments, n) for n in (0, 3, 6, 8))
+        planes, rows, weights, out = (_array(context, builder, signature, arguments, n) for n in (0, 3, 6, 9))
         texels, ups, starts, shares = (cgutils.unpack_tuple(builder, arguments[n]) for n in (1, 2, 4, 5))
-        first, line, column = (arguments[n] for n in (7, 9, 10))
+        first, line, column = (arguments[n] for n in (7, 10, 11))
+        wide = NARROW * len(signature.args[8])
         one = ir.Constant(_FLOAT, 1.0)
         corners = []
         for texel, up, axes in zip(texels, ups, ((0, 1), (0, 2), (1, 2)), strict=True):
-            above, next_ = builder.add(texel, up), _INDEX(WIDE)
+            above, next_ = builder.add(texel, up), _INDEX(wide)
             places = texel, builder.add(texel, next_), above, builder.add(above, next_)
             across, along = ((builder.fsub(one, shares[axis]), shares[axis]) for axis in axes)
-            factors = [_spread(builder, builder.fmul(x, y), HALF) for y in along for x in across]
+            factors = [_spread(builder, builder.fmul(x, y), NARROW) for y in along for x in across]
             corners.append(list(zip(places, factors, strict=True)))
-        ways, sums = [_spread(builder, share, HALF) for share in shares], [_constant(0.0, HALF)] * CHANNELS
-        for half in range(0, WIDE, HALF):
+        ways, sums = [_spread(builder, share, NARROW) for share in shares], [_constant(0.0, NARROW)] * CHANNELS
+        for half in range(0, wide, NARROW):
             m, factors = _INDEX(half), []
             for plane in corners:
-                wholes = [_load(builder, planes.data, builder.add(place, m), HALF, _SHORT) for place, _ in plane]
-                floats = [builder.sitofp(whole, _vector(HALF)) for whole in wholes]
+                wholes = [_load(builder, planes.data, builder.add(place, m), NARROW, _SHORT) for place, _ in plane]
+                floats = [builder.sitofp(whole, _vector(NARROW)) for whole in wholes]
                 factors.append(_sum(builder, [builder.fmul(x, factor, flags=_CONTRACT) for x, (_, factor) in zip(floats, plane, strict=True)]))
             for start, way in zip(starts, ways, strict=True):
-                before, behind = (_load(builder, rows.data, builder.add(start, _INDEX(half + further)), HALF) for further in (0, WIDE))
+                before, behind = (_load(builder, rows.data, builder.add(start, _INDEX(half + further)), NARROW) for further in (0, wide))
                 factors.append(_sum(builder, [before, builder.fmul(way, builder.fsub(behind, before), flags=_CONTRACT)]))
             feature = reduce(builder.fmul, factors)
             for c in range(CHANNELS):
-                weight = _load(builder, weights.data, builder.add(first, _INDEX(WIDE * c + half)), HALF)
+                weight = _load(builder, weights.data, builder.add(first, _INDEX(wide * c + half)), NARROW)
                 sums[c] = _sum(builder, [sums[c], builder.fmul(feature, weight, flags=_CONTRACT)])
-        total = _sums(builder, sums, HALF)
+        total = _sums(builder, sums, NARROW)
         columns = builder.extract_value(out.shape, 1)
         for c in range(CHANNELS):
             place = builder.gep(out.data, [builder.add(builder.mul(builder.add(line, _INDEX(c)), columns), column)])
             builder.store(builder.fadd(builder.load(place), builder.extract_element(total, _LANE(c))), place)
         return context.get_dummy_value()
 
-    return types.void(planes, texels, ups, rows, starts, shares, weights, first, into, line, column), generate
+    return types.void(planes, texels, ups, rows, starts, shares, weights, first, halves, into, line, column), generate
 
 
 def _sum(builder: Any, terms: Sequence[Any]) -> Any:

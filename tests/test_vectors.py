@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from kpc.player.vectors import LARGEST, WIDE, combine, interpolate, weigh
+from kpc.player.vectors import NARROW, LARGEST, WIDE, combine, interpolate, weigh
 
 
 @njit
@@ -19,12 +19,12 @@ def combined(wholes, factors, weights, bias, into):
 
 
 @njit
-def weighed(planes, texels, ups, rows, starts, shares, weights, into):
+def weighed(planes, texels, ups, rows, starts, shares, weights, halves, into):
     for n in range(len(texels)):
         at, from_, way = texels[n], starts[n], shares[n]
         weigh(
             planes, (at[0], at[1], at[2]), (ups[0], ups[1], ups[2]), rows, (from_[0], from_[1], from_[2]), (way[0], way[1], way[2]), weights,
-            np.uint64(3), into, np.uint64(1), np.uint64(n),
+            np.uint64(3), halves, into, np.uint64(1), np.uint64(n),
         )  # fmt: skip
 
 
@@ -58,25 +58,27 @@ def test_products_are_summed_up(vectors: int) -> None:
     assert np.isnan(into[[0, 2]]).all()
 
 
-def test_samples_of_planes_are_products_of_what_is_between_texels() -> None:
+@pytest.mark.parametrize("halves", [(0,), (0, NARROW)])
+def test_samples_of_planes_are_products_of_what_is_between_texels(halves: tuple[int, ...]) -> None:
     """Of planes of other sizes, which lie one after the other, and of rows."""
+    wide = NARROW * len(halves)
     rng, count, (nx, ny, nz) = np.random.default_rng(4), 300, (5, 3, 4)
-    planes = [rng.integers(-32767, 32768, (*shape, WIDE)).astype(np.int16) for shape in ((ny, nx), (nz, nx), (nz, ny))]
-    rows = [rng.normal(size=(n, WIDE)).astype(np.float32) for n in (nx, ny, nz)]
-    weights = (1e-13 * rng.normal(size=3 + 4 * WIDE)).astype(np.float32)
+    planes = [rng.integers(-32767, 32768, (*shape, wide)).astype(np.int16) for shape in ((ny, nx), (nz, nx), (nz, ny))]
+    rows = [rng.normal(size=(n, wide)).astype(np.float32) for n in (nx, ny, nz)]
+    weights = (1e-13 * rng.normal(size=3 + 4 * wide)).astype(np.float32)
     at = rng.random((count, 3)).astype(np.float32) * (np.array([nx, ny, nz]) - 1)
     first = np.minimum(at.astype(int), np.array([nx, ny, nz]) - 2)
     (x, y, z), shares = first.T, (at - first).astype(np.float32)
     firsts = [np.cumsum([0, *(part.size for part in parts)])[:3] for parts in (planes, rows)]
-    texels = firsts[0] + WIDE * np.stack([y * nx + x, z * nx + x, z * ny + y], 1)
-    starts = firsts[1] + WIDE * first
+    texels = firsts[0] + wide * np.stack([y * nx + x, z * nx + x, z * ny + y], 1)
+    starts = firsts[1] + wide * first
     into = np.full((6, count), 0.5, np.float32)
-    flat, ups = [np.concatenate([part.reshape(-1) for part in parts]) for parts in (planes, rows)], np.uint64([WIDE * nx, WIDE * nx, WIDE * ny])
-    weighed(flat[0], texels.astype(np.uint64), ups, flat[1], starts.astype(np.uint64), shares, weights, into)
+    flat, ups = [np.concatenate([part.reshape(-1) for part in parts]) for parts in (planes, rows)], np.uint64([wide * nx, wide * nx, wide * ny])
+    weighed(flat[0], texels.astype(np.uint64), ups, flat[1], starts.astype(np.uint64), shares, weights, halves, into)
     hats = [np.maximum(1 - np.abs(at[:, [axis]].astype(np.float64) - np.arange(n)), 0) for axis, n in enumerate((nx, ny, nz))]
     parts = [np.einsum("yxc,ny,nx->nc", plane.astype(np.float64), hats[b], hats[a]) for plane, (a, b) in zip(planes, ((0, 1), (0, 2), (1, 2)), strict=True)]
     parts += [np.einsum("xc,nx->nc", row.astype(np.float64), hat) for row, hat in zip(rows, hats, strict=True)]
-    wanted = 0.5 + weights[3:].reshape(4, WIDE).astype(np.float64) @ np.prod(parts, axis=0).T
+    wanted = 0.5 + weights[3:].reshape(4, wide).astype(np.float64) @ np.prod(parts, axis=0).T
     np.testing.assert_allclose(into[1:5], wanted, rtol=1e-3, atol=1e-3)
     assert (into[[0, 5]] == 0.5).all() and np.abs(wanted - 0.5).max() > 0.5
 
