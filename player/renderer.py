@@ -330,6 +330,7 @@ class Renderer:
         self._folds_in_memory = self._is_software
         self._folds_in_half = not self._is_software
         self.casts = marches_itself(ctx)
+        self._served_by = [kind for kind in (Baking, Lookup) if kind.serves(scene)]
         marching = self._marching_kind(scene.is_dynamic)
         if marching is not None:  # until it is needed there is much else to do, decoding for one
             threading.Thread(target=rehearse, args=(marching, scene), name="rehearsing", daemon=True).start()
@@ -415,9 +416,8 @@ class Renderer:
         """How a processor marches a picture itself, of what moves or what is static; None where shaders do."""
         if not self.casts or not self.quality.folded or self.quality.scales is not None:
             return None
-        if moving and self.quality.baked > 0 and Baking.serves(self.scene):
-            return Baking
-        return Lookup if Lookup.serves(self.scene) else None
+        kinds = [kind for kind in self._served_by if kind is not Baking or moving and self.quality.baked > 0]
+        return kinds[0] if kinds else None
 
     @property
     def marched_by(self) -> str:

@@ -275,7 +275,9 @@ def _direction_layer(decoder: AnyDecoder) -> np.ndarray:
 
 
 def filled(array: np.ndarray, axis: int, multiple: int = 4) -> np.ndarray:
-    """With zeros added along an axis up to a multiple of four, or of another number."""
+    """With zeros added along an axis up to a multiple of four, or of another number; itself where that is so already."""
+    if array.shape[axis] % multiple == 0:
+        return array
     ends = [(0, 0)] * array.ndim
     ends[axis] = 0, -array.shape[axis] % multiple
     return np.pad(array, ends)
