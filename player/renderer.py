@@ -1,11 +1,10 @@
 """Rendering with OpenGL 3.3: a scene becomes textures once, then each picture is one pass of `glsl/march.glsl`."""
 
-import contextlib
 import math
 import threading
 import time as clock
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -24,6 +23,7 @@ from kpc.player.lookup import Lookup
 from kpc.player.marching import Marching, probes_of, rehearse
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
+from kpc.player.targets import EVERYWHERE, Bounds, Canvas, Target, first_channel, read, read_into, room_on, write
 from kpc.player.textures import (
     LARGEST_FLOAT, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled, multiplied, planes_shape,
 )
@@ -64,9 +64,6 @@ TRIAL_AFTER, TRIALS = 8, 3
 """Marches until fragment and compute shaders are tried against each other, and pictures that each of them draws for that."""
 LARGEST_HALF = 65504.0
 """What float16 can hold."""
-Bounds = tuple[float, float, float, float]
-"""Left, bottom, right and top of a part of a picture, as shares of its sides."""
-EVERYWHERE: Bounds = (0.0, 0.0, 1.0, 1.0)
 BEARABLE_ALONE = 4.0
 """What a block may miss by, in squares, to what blocks may in the mean: most bend by much less than those that bend most."""
 ALL, ONLY_PROBES, ONLY_DOUBTED, ONLY_COVERED = range(4)
@@ -125,48 +122,6 @@ class Tiles:
 SPREAD = Tiles(64, 20)
 """Where a processor draws: a raster of probes that is almost as large as the picture. One of a texel a block takes two cores, of room at 320x240,
 0.87 of the time that it takes one of them."""
-
-
-@dataclass
-class Target:
-    """What a march draws into: rgb and opacity; sum of weight t, and samples. Row 0 is the bottom of the picture. All but what touches `drawn`
-    is as rays see it that meet nothing."""
-
-    seen: moderngl.Texture
-    met: moderngl.Texture
-    framebuffer: moderngl.Framebuffer
-    drawn: Bounds = EVERYWHERE
-
-    @staticmethod
-    def of(ctx: moderngl.Context, size: tuple[int, int]) -> "Target":
-        with room_on(ctx, f"a picture of {size[0]}x{size[1]}"):
-            seen, met = ctx.texture(size, 4, dtype="f4"), ctx.texture(size, 2, dtype="f4")
-            for texture in (seen, met):
-                texture.repeat_x = texture.repeat_y = False
-            return Target(seen, met, ctx.framebuffer([seen, met]))
-
-    def release(self) -> None:
-        for thing in (self.framebuffer, self.seen, self.met):
-            thing.release()
-
-
-@dataclass
-class Canvas:
-    """What is shown of a picture that is to be enlarged. In bytes: twelve of those a processor reads in less than half of the time that it
-    takes for five filtered vectors of floats."""
-
-    shown: moderngl.Texture
-    framebuffer: moderngl.Framebuffer
-
-    @staticmethod
-    def of(ctx: moderngl.Context, size: tuple[int, int]) -> "Canvas":
-        with room_on(ctx, f"a picture of {size[0]}x{size[1]}"):
-            shown = ctx.texture(size, 4)
-            return Canvas(shown, ctx.framebuffer([shown]))
-
-    def release(self) -> None:
-        self.framebuffer.release()
-        self.shown.release()
 
 
 @dataclass
@@ -235,18 +190,6 @@ class FoldedInMemory:
     def release(self) -> None:
         for thing in (self.refine_into, self.planes):
             thing.release()
-
-
-@contextlib.contextmanager
-def room_on(ctx: moderngl.Context, what: str) -> Iterator[None]:
-    """Turns what moderngl raises while `what` is made into a DisplayError."""
-    try:
-        yield
-    except moderngl.Error as error:
-        name = ctx.info["GL_RENDERER"]
-        raise DisplayError(
-            f"{name} has no room for {what} ({error}); close other programs or use a smaller size"
-        ) from error
 
 
 def _texels_across(scale: Mapping[str, np.ndarray]) -> int:
@@ -467,9 +410,9 @@ class Renderer:
     ) -> Rendering:
         """What `kpc.player.reference.render` gives, by OpenGL."""
         target = self.march(camera, time, part=Part.STATIC if part is Part.STATIC else Part.FULL, appearance=appearance)
-        rgb, depth, opacity, samples = _read(target)
+        rgb, depth, opacity, samples = read(target)
         if part is Part.DYNAMIC:
-            rgb = np.abs(rgb - _read(self.march(camera, time, part=Part.STATIC, appearance=appearance))[0])
+            rgb = np.abs(rgb - read(self.march(camera, time, part=Part.STATIC, appearance=appearance))[0])
         self.check()
         return Rendering(rgb, depth, opacity, samples)
 
@@ -556,7 +499,7 @@ class Renderer:
         if not 0.0 <= time <= 1.0:
             raise ValueError(f"time {time} lies outside [0, 1]")
         moving = part is Part.FULL and self._rows is not None
-        quality, scene, size = self.quality, self.scene, (camera.width, camera.height)
+        quality, size = self.quality, (camera.width, camera.height)
         across = self.rays_across(camera)
         if across > 1:
             camera = camera.resized(*(across * side for side in size))
@@ -673,21 +616,21 @@ class Renderer:
                 rows, columns = at[..., 0], at[..., 1]
                 seen, met = marching.room(size)
                 march(camera, at.reshape(-1, 2), 1, (0, 0), seen, met)
-                _write(target, (left, bottom), seen[rows, columns], met[rows, columns])
+                write(target, (left, bottom), seen[rows, columns], met[rows, columns])
                 return
             blocks = covered
             if blocks is None:
-                blocks = np.ones(count, bool) if doubts is None else _first_channel(doubts).reshape(count) > bearable
+                blocks = np.ones(count, bool) if doubts is None else first_channel(doubts).reshape(count) > bearable
             if not blocks.any():
                 return
             left, bottom, right, top = (min(BLOCK * end, side) for end, side in zip(_bounds(blocks), 2 * size))
             seen, met = marching.room((right - left, top - bottom))
             if pixels == ONLY_DOUBTED:
-                _read_into(target, (left, bottom), seen, met)
+                read_into(target, (left, bottom), seen, met)
             elif pixels == ONLY_COVERED:
                 seen[:], met[:] = (*self.scene.background, 0.0), 0.0
             march(camera, np.argwhere(blocks), BLOCK, (left, bottom), seen, met)
-            _write(target, (left, bottom), seen, met)
+            write(target, (left, bottom), seen, met)
 
         return draw
 
@@ -770,13 +713,13 @@ class Renderer:
         not waited for: there the share counts as 0, and what is bearable counts for each block, not for their mean."""
         if not self._is_software:
             return BEARABLE_ALONE * bearable, 0.0
-        errors = np.sort(_first_channel(missed))
+        errors = np.sort(first_channel(missed))
         kept = int(np.searchsorted(np.cumsum(errors, dtype=np.float64), bearable * len(errors), side="right"))
         return float(errors[kept - 1]) if kept else -1.0, 1.0 - kept / len(errors)
 
     def _share_of(self, doubts: Target) -> float:
         """Of blocks that are set; 0 where no processor draws: a graphics card would have to be waited for."""
-        return float(_first_channel(doubts).mean()) if self._is_software else 0.0
+        return float(first_channel(doubts).mean()) if self._is_software else 0.0
 
     def _draw_doubted(
         self, draw: Callable[..., None], target: Target, camera: Camera, doubts: Target, bearable: float = 0.5
@@ -1169,31 +1112,3 @@ def _frame_of(mapping: SpaceMapping | None) -> dict[str, object]:
     if not isinstance(mapping, DeviceCoordinates):
         return {}
     return {"frame": tuple(mapping.frame.T.ravel()), "near": mapping.near, "baseline": mapping.baseline}
-
-
-def _first_channel(target: Target) -> np.ndarray:
-    """Of each of a small target's texels, the first channel of what is seen."""
-    return np.frombuffer(target.seen.read(), np.float32)[::4]
-
-
-def _read_into(target: Target, first: tuple[int, int], seen: np.ndarray, met: np.ndarray) -> None:
-    """A part of a target from column and row `first` on."""
-    for number, array in enumerate((seen, met)):
-        place = (*first, *array.shape[1::-1])
-        target.framebuffer.read_into(array, place, components=array.shape[2], attachment=number, alignment=4, dtype="f4")
-
-
-def _write(target: Target, first: tuple[int, int], seen: np.ndarray, met: np.ndarray) -> None:
-    """Into a part of a target from column and row `first` on."""
-    for texture, array in ((target.seen, seen), (target.met, met)):
-        texture.write(np.ascontiguousarray(array), (*first, *array.shape[1::-1]))
-
-
-def _read(target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """rgb, depth, opacity and samples of a finished march, top row first."""
-    width, height = target.framebuffer.size
-    seen = np.frombuffer(target.seen.read(), np.float32).reshape(height, width, 4)[::-1]
-    met = np.frombuffer(target.met.read(), np.float32).reshape(height, width, 2)[::-1]
-    opacity = seen[..., 3].copy()
-    depth = np.divide(met[..., 0], opacity, out=np.full_like(opacity, np.inf), where=opacity > 0)
-    return seen[..., :3].copy(), depth, opacity, met[..., 1].astype(np.int32)

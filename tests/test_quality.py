@@ -204,7 +204,7 @@ def test_a_picture_is_predicted_from_where_its_places_were_seen() -> None:
     cameras = [look_at((2.4 + x, 1.0, 2.2 - x), (0.1 + x, 0.05, 0.05 - x), 128, 96, 1000.0) for x in (0.0, 0.02)]
     old, new = (whole._target(Part.FULL, (128, 96), number) for number in (module.PICTURE, module.OTHER_PICTURE))
     before = whole.render(cameras[0], 0.5).rgb
-    predicted = module._read(whole._predicted(old, new, *cameras))
+    predicted = module.read(whole._predicted(old, new, *cameras))
     wanted = whole.render(cameras[1], 0.5)
     assert psnr(predicted[0], wanted.rgb) > psnr(before, wanted.rgb) + 10
     both = (predicted[2] > 0.9) & (wanted.opacity > 0.9)
