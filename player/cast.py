@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 
+from kpc.format import space
 from kpc.format.rans import compiled
 from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION
 from kpc.player.reference import PARALLEL
@@ -27,18 +28,20 @@ BAKED, WHOLE = 1, 2
 
 DONE = -1
 """In place of how far all is empty around a ray's cell."""
-RATE_X, RATE_Y, RATE_Z, NEAR, FAR, STEP, TRANS, RED, GREEN, BLUE, DEPTH, SAMPLES, T, X, Y, Z = range(16)
+RATE_X, RATE_Y, RATE_Z, NEAR, FAR, STEP, TRANS, RED, GREEN, BLUE, DEPTH, SAMPLES, T, X, Y, Z, STRETCH = range(17)
 KEPT = SAMPLES + 1
-"""Of each ray, as march.glsl has it; t and place of the sample it is at are made anew each round."""
-AT_X, AT_Y, AT_Z, PART_X, PART_Y, PART_Z, LOOKED_UP = range(7)
-"""Of each sample: its place, its share of the way to the next node or corner, and the first of four that it looks up there. Of corners those are ..."""
+"""Of each ray, as march.glsl has it, FAR in t. What is told of the sample it is at is made anew each round: t, the place, what its step counts."""
+AT_X, AT_Y, AT_Z, PART_X, PART_Y, PART_Z, COUNTS, LOOKED_UP = range(8)
+"""Of each sample: its place, its share of the way to the next node or corner, what its step counts for the density, and the first of four that it looks up there. Of corners those are ..."""
 LOGIT_RED, LOGIT_GREEN, LOGIT_BLUE, LOG_DENSITY = range(LOOKED_UP, LOOKED_UP + 4)
 """... or what becomes of them: colours, and alpha."""
 
 F, I, U = np.float32, np.int32, np.uint64
 """Numbers count from no array's end where they are unsigned, which lets loops be of vectors."""
-ZERO, HALF, ONE = F(0), F(0.5), F(1)
+ZERO, HALF, ONE, TWO, FOUR, TINY = F(0), F(0.5), F(1), F(2), F(4), F(1e-30)
 EPSILON, ALMOST, FARTHEST, LIMIT, END = F(PARALLEL), F(1e-3), F(1e6), F(LOG_DENSITY_LIMIT), F(TERMINATION)
+LAST = F(2 - 1 / space.FAR)
+"""Where a ray in contracted space ends, in s over `even`."""
 LOG2_E, MOST_DOUBLINGS = F(1 / math.log(2)), 126
 E1, E2, E3, E4, E5 = (F(math.log(2) ** power / math.factorial(power)) for power in range(1, 6))
 
@@ -48,12 +51,13 @@ _part = compiled(forceinline=True, _nrt=False, **_FAST)
 
 
 @compiled(**_FAST)
-def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termination, background, free, cells, motion, nodes, baked, looked_up, seen, met):
+def cast(blocks, side, origin, size, lens, axes, start, box, even, stride, tau, termination, background, free, cells, motion, nodes, baked, looked_up, seen, met):
     """March the pixels of blocks.
 
     `blocks`: (N, 2) int64 of row and column, each of `side` x `side` pixels, rows from below. `origin`: column and row of the pixel that comes
     first in `seen`, (h, w, 4) of rgb and opacity, and `met`, (h, w, 2), sum of weight t and samples. `size`: of the picture.
-    `lens`, `axes` and the rest as in march.glsl; `start`: the eye in [0, 1]^3 over the box, of edges `box`.
+    `lens`, `axes` and the rest as in march.glsl; `start`: the eye in [0, 1]^3 over the box, of edges `box`. Where space is contracted `even` is how far
+    along a ray steps are even, else None; then `box` are half edges, in which the eye is so far from its middle.
 
     Grids lie flat, x fastest; how many there are along x, y, z comes behind them: `free`, (N,) uint8, as occupancy.glsl has it; `motion`, (N, 4),
     of no nodes where nothing is displaced.
@@ -66,7 +70,7 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
     begin; `sizes`, (groups, 3) int64, of texels along x, y, z, at least two; and of the decoder `w1`, (H, 9), `b1`, with the code of an appearance,
     `w2`, (H, 4 F), 0 for the density, and `b2` and the density's weights, (4 F,), all of which make up for the planes' steps, and `bias`.
     """
-    rays, samples = np.zeros((Z + 1, LANES), np.float32), np.zeros((LOG_DENSITY + 1, LANES), np.float32)
+    rays, samples = np.zeros((STRETCH + 1, LANES), np.float32), np.zeros((LOG_DENSITY + 1, LANES), np.float32)
     pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
     wanted = np.empty(AROUND * LANES + 1, np.int32)
     texels, kept = np.zeros((6, LANES), np.int32), np.zeros(LANES, np.int32)
@@ -78,11 +82,14 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
     taken, count = np.int64(0), np.int64(0)  # a plain 0 would be a type of its own, for which parts are compiled once more
     while taken < len(blocks) or count > 0:
         while taken < len(blocks) and count + side * side <= LANES:
-            count = _begin(blocks[taken], side, size, lens, axes, start, box, count, rays, pixel)
+            count = _begin(blocks[taken], side, size, lens, axes, start, box, even, count, rays, pixel)
             taken += 1
-        _look(count, start, stride, free, cells, rays, cell, around)
-        _pass_by(count, stride, cells, rays, around)
-        found = _stopped(count, rays, around, samples, of_ray)
+        _look(count, start, even, stride, free, cells, rays, cell, around)
+        if even is None:
+            _pass_by(count, stride, cells, rays, around)
+        else:
+            _pass_by_contracted(count, start, even, stride, cells, rays, around)
+        found = _stopped(count, even, rays, around, samples, of_ray)
         if found > 0:
             if len(motion) > 0:
                 _displace(found, motion, nodes, samples, cell)
@@ -96,7 +103,7 @@ def cast(blocks, side, origin, size, lens, axes, start, box, stride, tau, termin
                 if len(b1) > 0:
                     _face(found, box, of_ray, rays, kept, w1, b1, w2, of_all, weights)
                 _weigh(found, halves, planes, rows, firsts, sizes, weights, bias, of_ray, kept, samples, texels)
-            _shade(found, tau, samples)
+            _shade(found, even, tau, samples)
             _add(found, termination, samples, of_ray, rays, around)
         count = _end(count, termination, background, origin, size, rays, pixel, kept, around, seen, met)
 
@@ -131,7 +138,22 @@ def _slanted(x):
 
 
 @_part
-def _begin(block, side, size, lens, axes, start, box, count, rays, pixel):
+def _largest(x, y, z):
+    return max(abs(x), max(abs(y), abs(z)))
+
+
+@_part
+def _distance(s, even):
+    return s if s <= even else even / (TWO - s / even)
+
+
+@_part
+def _progress(t, even):
+    return t if t <= even else even * (TWO - even / t)
+
+
+@_part
+def _begin(block, side, size, lens, axes, start, box, even, count, rays, pixel):
     """The rays of a block beside those there are: how many these are then."""
     width, height = size
     first = count
@@ -148,23 +170,34 @@ def _begin(block, side, size, lens, axes, start, box, count, rays, pixel):
         z = axes[2, 0] * right + axes[2, 1] * up - axes[2, 2]
         length = np.sqrt(x * x + y * y + z * z)
         x, y, z = _slanted(x / length) / box[0], _slanted(y / length) / box[1], _slanted(z / length) / box[2]
+        rays[RATE_X, i], rays[RATE_Y, i], rays[RATE_Z, i] = x, y, z
+        rays[STEP, i], rays[TRANS, i] = ZERO, ONE
+        rays[RED, i], rays[GREEN, i], rays[BLUE, i], rays[DEPTH, i], rays[SAMPLES, i] = ZERO, ZERO, ZERO, ZERO, ZERO
+        if even is not None:
+            rays[NEAR, i], rays[FAR, i] = ZERO, _distance(LAST * even, even)
+            continue
         x_low, y_low, z_low = -start[0] / x, -start[1] / y, -start[2] / z
         x_high, y_high, z_high = (ONE - start[0]) / x, (ONE - start[1]) / y, (ONE - start[2]) / z
         rays[NEAR, i] = max(max(min(x_low, x_high), min(y_low, y_high)), max(min(z_low, z_high), ZERO))
         rays[FAR, i] = min(min(max(x_low, x_high), max(y_low, y_high)), max(z_low, z_high))
-        rays[RATE_X, i], rays[RATE_Y, i], rays[RATE_Z, i] = x, y, z
-        rays[STEP, i], rays[TRANS, i] = ZERO, ONE
-        rays[RED, i], rays[GREEN, i], rays[BLUE, i], rays[DEPTH, i], rays[SAMPLES, i] = ZERO, ZERO, ZERO, ZERO, ZERO
     return count
 
 
 @_part
-def _look(count, start, stride, free, cells, rays, cell, around):
+def _look(count, start, even, stride, free, cells, rays, cell, around):
     """Where next samples lie, and how far around their cells all is empty."""
     nx, ny, nz = cells
     for i in range(_whole(count)):
         t = rays[NEAR, i] + (rays[STEP, i] + HALF) * stride
+        if even is not None:
+            t = _distance(min(t, LAST * even), even)
         x, y, z = start[0] + t * rays[RATE_X, i], start[1] + t * rays[RATE_Y, i], start[2] + t * rays[RATE_Z, i]
+        if even is not None:
+            radius = max(_largest(x, y, z), ONE)
+            shrunk = F(0.25) * (TWO - ONE / radius) / radius
+            x, y, z = x * shrunk + HALF, y * shrunk + HALF, z * shrunk + HALF
+            stretch = max(t / even, ONE) / radius
+            rays[STRETCH, i] = stretch * stretch
         rays[T, i], rays[X, i], rays[Y, i], rays[Z, i] = t, x, y, z
         row = I(_within(z * F(nz), F(nz - 1))) * I(ny) + I(_within(y * F(ny), F(ny - 1)))
         cell[i] = row * I(nx) + I(_within(x * F(nx), F(nx - 1)))
@@ -177,6 +210,19 @@ def _leave(x, rate, reach, count):
     """How far, in t, it is from x to the faces of the block that reaches `reach` cells from that of x, of `count`, in both directions."""
     cell = F(I(_within(x * count, count - ONE)))
     return ((cell + (reach if rate > ZERO else ONE - reach)) / count - x) / rate
+
+
+@_part
+def _sides(u, reach, count):
+    """Of the block that reaches `reach` cells from that of u, in the cube [-2, 2]^3."""
+    cell = F(I(_within(u * count, count - ONE)))
+    return FOUR * (cell + ONE - reach) / count - TWO, FOUR * (cell + reach) / count - TWO
+
+
+@_part
+def _straight(y, rate, low, high):
+    """How far, in t, it is to them from y within the box, as far as that reaches."""
+    return ((min(high, ONE) if rate > ZERO else max(low, -ONE)) - y) / rate
 
 
 @_part
@@ -194,7 +240,33 @@ def _pass_by(count, stride, cells, rays, around):
 
 
 @_part
-def _stopped(count, rays, around, samples, of_ray):
+def _pass_by_contracted(count, start, even, stride, cells, rays, around):
+    """As `_pass_by`; `way_out` of occupancy.glsl, a bound from below, has the reasons."""
+    nx, ny, nz = cells
+    for i in range(_whole(count)):
+        t, reach = rays[T, i], F(around[i])
+        vx, vy, vz = rays[RATE_X, i], rays[RATE_Y, i], rays[RATE_Z, i]
+        x, y, z = start[0] + t * vx, start[1] + t * vy, start[2] + t * vz
+        x_low, x_high = _sides(rays[X, i], reach, F(nx))
+        y_low, y_high = _sides(rays[Y, i], reach, F(ny))
+        z_low, z_high = _sides(rays[Z, i], reach, F(nz))
+        straight = min(_straight(x, vx, x_low, x_high), min(_straight(y, vy, y_low, y_high), _straight(z, vz, z_low, z_high)))
+        at_x, at_y, at_z = FOUR * rays[X, i] - TWO, FOUR * rays[Y, i] - TWO, FOUR * rays[Z, i] - TWO
+        margin = max(min(min(min(at_x - x_low, x_high - at_x), min(at_y - y_low, y_high - at_y)), min(at_z - z_low, z_high - at_z)), ZERO)
+        speed = _largest(vx, vy, vz)
+        turn = _largest(start[1] * vz - start[2] * vy, start[2] * vx - start[0] * vz, start[0] * vy - start[1] * vx)
+        nearest = _largest(at_x, at_y, at_z) - margin
+        bound = F(4 / 3) * speed
+        closer = min(bound, (speed + TWO * turn) * (TWO - nearest) * (TWO - nearest))
+        bent = margin / max(closer if nearest > ONE else bound, TINY)
+        way = straight if _largest(x, y, z) < ONE else bent
+        steps = min((_progress(t + way, even) - _progress(t, even)) / stride - ALMOST, FARTHEST)
+        further = rays[STEP, i] + F(max(I(steps), I(0))) + ONE
+        rays[STEP, i] = further if around[i] > 0 else rays[STEP, i]
+
+
+@_part
+def _stopped(count, even, rays, around, samples, of_ray):
     """Rays that take a sample: how many. Those beyond the box are done."""
     found = U(0)
     for i in range(U(count)):
@@ -202,6 +274,8 @@ def _stopped(count, rays, around, samples, of_ray):
         around[i] = around[i] if inside else I(DONE)
         of_ray[found] = i
         samples[AT_X, found], samples[AT_Y, found], samples[AT_Z, found] = rays[X, i], rays[Y, i], rays[Z, i]
+        if even is not None:
+            samples[COUNTS, found] = rays[STRETCH, i]
         found += U(inside & ~is_free)  # a branch would often be foretold wrongly
     return found
 
@@ -324,11 +398,12 @@ def _weigh(found, halves, planes, rows, firsts, sizes, weights, bias, of_ray, ke
 
 
 @_part
-def _shade(found, tau, samples):
+def _shade(found, even, tau, samples):
     """Colours and alphas in place of logits and log densities."""
     for j in range(_whole(found)):
         density = _exp(min(max(samples[LOG_DENSITY, j], -LIMIT), LIMIT))
-        samples[LOG_DENSITY, j] = ONE - _exp(-density * tau)
+        thickness = tau if even is None else tau * samples[COUNTS, j]
+        samples[LOG_DENSITY, j] = ONE - _exp(-density * thickness)
         samples[LOGIT_RED, j] = ONE / (ONE + _exp(-samples[LOGIT_RED, j]))
         samples[LOGIT_GREEN, j] = ONE / (ONE + _exp(-samples[LOGIT_GREEN, j]))
         samples[LOGIT_BLUE, j] = ONE / (ONE + _exp(-samples[LOGIT_BLUE, j]))

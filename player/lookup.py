@@ -7,6 +7,7 @@ import numpy as np
 
 from kpc.format.grid import linear
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
+from kpc.format.space import DeviceCoordinates
 from kpc.player.marching import Marching, in_steps
 from kpc.player.textures import Layout, filled
 from kpc.player.vectors import CHANNELS, NARROW, LARGEST, WIDE
@@ -38,8 +39,8 @@ class Lookup(Marching):
 
     @staticmethod
     def serves(scene: Scene) -> bool:
-        """Of the explicit decoder, in a box."""
-        return isinstance(scene.decoder, Decoder) and scene.mapping is None
+        """Of the explicit decoder, but for device coordinates."""
+        return isinstance(scene.decoder, Decoder) and not isinstance(scene.mapping, DeviceCoordinates)
 
     @staticmethod
     def bytes_for(scene: Scene) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 from kpc.format.cameras import Camera
 from kpc.format.grid import linear
 from kpc.format.scene import Scene
+from kpc.format.space import Contraction
 from kpc.player.cast import cast
 from kpc.player.cores import from_both_ends
 
@@ -99,23 +100,29 @@ class Marching(ABC):
         scene, size = self._scene, (camera.width, camera.height)
         low, box = scene.aabb[0], scene.aabb[1] - scene.aabb[0]
         pose = camera.camera_to_world
+        even = _even(scene)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a box without a volume, a camera at the end of the world: no ray meets a thing
-            start = np.asarray((pose[:3, 3] - low) / box, np.float32)
-        lens, axes, edges, background = (
+            start = (pose[:3, 3] - low) / box if even is None else (pose[:3, 3] - scene.aabb.mean(0)) / (box := 0.5 * box)
+        lens, axes, begin, edges, background = (
             np.ascontiguousarray(array, np.float32)
-            for array in ((camera.fl_x, camera.fl_y, camera.cx, camera.cy), pose[:3, :3], box, scene.background)
+            for array in ((camera.fl_x, camera.fl_y, camera.cx, camera.cy), pose[:3, :3], start, box, scene.background)
         )
         stride, tau, least = map(np.float32, (step, step / scene.extent, termination))
         motion = self._motion
 
         def work(worker: int, part: slice) -> None:
             cast(
-                blocks[part], side, first, size, lens, axes, start, edges, stride, tau, least, background,
+                blocks[part], side, first, size, lens, axes, begin, edges, even, stride, tau, least, background,
                 free.reshape(-1), free.shape[::-1], motion.reshape(-1, 4), motion.shape[2::-1], *self._looked_at(worker), seen, met,
             )  # fmt: skip
 
         blocks = np.ascontiguousarray(blocks)
         from_both_ends(work, len(blocks), PIXELS_AT_ONCE // side**2)
+
+
+def _even(scene: Scene) -> np.float32 | None:
+    """Of contracted space."""
+    return np.float32(scene.mapping.even) if isinstance(scene.mapping, Contraction) else None
 
 
 def in_steps(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -130,7 +137,7 @@ def rehearse(kind: type[Marching], scene: Scene) -> None:
     size, nothing = (1, 1), np.zeros((0, 2), np.int64)
     one, three, four = np.float32(1), np.zeros(3, np.float32), np.zeros((1, 4), np.float32)
     cast(
-        nothing, 1, (0, 0), size, four[0], np.zeros((3, 3), np.float32), three, three, one, one, one, three,
+        nothing, 1, (0, 0), size, four[0], np.zeros((3, 3), np.float32), three, three, _even(scene), one, one, one, three,
         np.zeros(1, np.uint8), (1, 1, 1), four, (1, 1, 1), *kind.rehearsed(scene), np.zeros((1, 1, 4), np.float32), np.zeros((1, 1, 2), np.float32),
     )  # fmt: skip
 
