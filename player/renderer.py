@@ -67,7 +67,7 @@ LARGEST_HALF = 65504.0
 BEARABLE_ALONE = 4.0
 """What a block may miss by, in squares, to what blocks may in the mean: most bend by much less than those that bend most."""
 ALL, ONLY_PROBES, ONLY_DOUBTED, ONLY_COVERED = range(4)
-"""Pixels to march: PIXELS of march.glsl; the last, blocks that are told and no more than what is not seen there, are as those in doubt to it."""
+"""Which pixels to march: PIXELS of march.glsl, to which blocks that cover something are as those in doubt."""
 MORE_THAN_A_RASTER = 1 << 20
 """SQUARE of tiles.glsl, where probes lie side by side."""
 GROUP = 8
@@ -274,6 +274,7 @@ class Renderer:
         self._folds_in_half = not self._is_software
         self.casts = marches_itself(ctx)
         self._served_by = [kind for kind in (Baking, Lookup) if kind.serves(scene)]
+        self._thins = self._is_software and Thinning.serves(scene)
         marching = self._marching_kind(scene.is_dynamic)
         if marching is not None:  # until it is needed there is much else to do, decoding for one
             threading.Thread(target=rehearse, args=(marching, scene), name="rehearsing", daemon=True).start()
@@ -348,6 +349,7 @@ class Renderer:
             thing.release()
         self._targets.clear()
         self._programs.clear()
+        self._in_memory.clear()
         self._canvas = None
 
     @property
@@ -565,6 +567,8 @@ class Renderer:
             if covered is not None and doubts is not None:
                 doubts.seen.write(np.repeat(covered[..., None], 4, axis=-1).astype(np.float32))
                 pixels = ONLY_DOUBTED
+            elif pixels == ALL:
+                target.drawn = EVERYWHERE
             march, vertices = self._program(
                 program, layout, rows=moving and not folded, displaced=displaced, drawn=drawn, shared=shared, pixels=pixels,
                 compute=self.compute and program == "march.glsl",
@@ -627,7 +631,9 @@ class Renderer:
             seen, met = marching.room((right - left, top - bottom))
             if pixels == ONLY_DOUBTED:
                 read_into(target, (left, bottom), seen, met)
-            elif pixels == ONLY_COVERED:
+            elif pixels == ALL:
+                target.drawn = EVERYWHERE
+            else:
                 seen[:], met[:] = (*self.scene.background, 0.0), 0.0
             march(camera, np.argwhere(blocks), BLOCK, (left, bottom), seen, met)
             write(target, (left, bottom), seen, met)
@@ -957,7 +963,7 @@ class Renderer:
     def _free_at(self, slot: int, time: float | None) -> np.ndarray:
         """How far around each cell all is empty: of a slot; at a `time`, 1 in those, too, that `quality` has rays pass by then."""
         self._slot = slot
-        if time is None or not self.quality.thin or not self._is_software or not Thinning.serves(self.scene) or self._rows is None:
+        if time is None or not self.quality.thin or not self._thins or self._rows is None:
             return self._free(slot)
         key = slot, time, self.quality.thin
         if self._thinned is None or self._thinned[0] != key:

@@ -132,6 +132,21 @@ def test_while_a_clip_plays_only_what_has_changed_is_marched_again(space: str, s
         assert np.abs(renderer.render(other, time).rgb - whole.render(other, time).rgb).max() < 1e-5
 
 
+@pytest.mark.parametrize("rung", ["balanced", "fine", "reference"])
+def test_what_was_seen_from_far_away_is_whole_from_near(rung: str) -> None:
+    """Of a picture's targets, as much is shown as was drawn into them."""
+    ctx, scene = gl.context(), tiny_scene(4)
+    renderer, shown = Renderer(ctx, scene, LADDER[rung]), []
+    far, near = look_at((24.0, 10.0, 22.0), (0.1, 0.05, 0.05), 64, 48, 70.0), look_at((0.9, 0.5, 0.8), (0.1, 0.05, 0.05), 64, 48, 40.0)
+    for drawer, cameras in ((renderer, (far, near)), (Renderer(ctx, scene, LADDER[rung]), (near,))):
+        screen = ctx.simple_framebuffer((64, 48), 4)
+        for camera in cameras:
+            drawer.show(screen, camera, 0.4)
+        shown.append(np.frombuffer(screen.read(components=3), np.uint8).astype(int))
+    assert renderer._covered(near) is None and (not renderer._is_software or renderer._covered(far) is not None)
+    assert np.abs(shown[0] - shown[1]).max() <= 1 and np.ptp(shown[0]) > 50
+
+
 def test_where_nothing_changes_nothing_but_probes_is_marched() -> None:
     renderer = Renderer(gl.context(), tiny_scene(4), FOLLOWING)
     first, *_, last = (renderer.render(CAMERA, time, part=Part.STATIC).rgb for time in (0.4, 0.41, 0.42, 0.43))
