@@ -68,17 +68,15 @@ def cast(blocks, side, origin, size, lens, axes, start, box, even, stride, tau, 
 
     `looked_up`: of samples, `halves`, `planes` and `rows` as `vectors.weigh` has them; `firsts`, (groups, 6) int64, where xy, xz, yz and the rows of x, y, z
     begin; `sizes`, (groups, 3) int64, of texels along x, y, z, at least two; and of the decoder `w1`, (H, 9), `b1`, with the code of an appearance,
-    `w2`, (H, 4 F), 0 for the density, and `b2` and the density's weights, (4 F,), all of which make up for the planes' steps, and `bias`.
+    `w2`, (H, 4 F), 0 for the density, and `b2` and the density's weights, (4 F,), all of which make up for the planes' steps, and `bias`; and room for `weights`, (LANES, 4 F) as rays see them, or, where colours have no sides,
+    (1, 4 F), those of all.
     """
     rays, samples = np.zeros((STRETCH + 1, LANES), np.float32), np.zeros((LOG_DENSITY + 1, LANES), np.float32)
     pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
     wanted = np.empty(AROUND * LANES + 1, np.int32)
     texels, kept = np.zeros((6, LANES), np.int32), np.zeros(LANES, np.int32)
-    if looked_up is not None:
-        of_all, weights = looked_up[8], looked_up[8].reshape(1, -1)
-        if len(looked_up[6]) > 0:  # each ray's own
-            weights = np.empty((LANES, len(of_all)), np.float32)
-            kept[:] = np.arange(LANES)
+    if looked_up is not None and len(looked_up[6]) > 0:
+        kept[:] = np.arange(LANES)  # each ray's own weights
     taken, count = np.int64(0), np.int64(0)  # a plain 0 would be a type of its own, for which parts are compiled once more
     while taken < len(blocks) or count > 0:
         while taken < len(blocks) and count + side * side <= LANES:
@@ -99,7 +97,7 @@ def cast(blocks, side, origin, size, lens, axes, start, box, even, stride, tau, 
                 _bake(_wanted(found, known, corners, cell, wanted), wanted, planes, rows, weights, bias, grid, corners)
                 _look_up(found, grid, corners, samples, cell)
             if looked_up is not None:
-                halves, planes, rows, firsts, sizes, w1, b1, w2, of_all, bias = looked_up
+                halves, planes, rows, firsts, sizes, w1, b1, w2, of_all, bias, weights = looked_up
                 if len(b1) > 0:
                     _face(found, box, of_ray, rays, kept, w1, b1, w2, of_all, weights)
                 _weigh(found, halves, planes, rows, firsts, sizes, weights, bias, of_ray, kept, samples, texels)

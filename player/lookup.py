@@ -8,6 +8,8 @@ import numpy as np
 from kpc.format.grid import linear
 from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.format.space import DeviceCoordinates
+from kpc.player.cast import LANES
+from kpc.player.cores import WORKERS
 from kpc.player.marching import Marching, in_steps
 from kpc.player.textures import Layout, filled
 from kpc.player.vectors import CHANNELS, NARROW, LARGEST, WIDE
@@ -36,6 +38,8 @@ class Lookup(Marching):
         w2 = np.moveaxis(decoder.w2, 2, 0)[:hidden]
         self._w2 = self._w2_in_steps = self._as_it_lies(np.concatenate([w2, np.zeros_like(w2[:, :1])], axis=1))
         self._weights = self._weights_in_steps = self._as_it_lies(np.concatenate([decoder.b2, decoder.density_weight[None]]))
+        self._seen_from = np.zeros((WORKERS, LANES if hidden else 0, len(self._weights)), np.float32)
+        """Each worker's room for weights as its rays see them."""
 
     @staticmethod
     def serves(scene: Scene) -> bool:
@@ -48,7 +52,7 @@ class Lookup(Marching):
         for scale in scene.scales:
             nx, ny, nz = _texels(scale)
             channels = scale["xy"].shape[2]
-            taken += (channels + -channels % _wide(scene)) * (2 * (nx * ny + nx * nz + ny * nz) + 4 * (nx + ny + nz))
+            taken += (channels + -channels % _wide(scene)) * (2 * (nx * ny + nx * nz + ny * nz) + 4 * (nx + ny + nz) + 4 * CHANNELS * WORKERS * LANES)
         return taken
 
     def keep(self, atlas: np.ndarray) -> None:
@@ -78,13 +82,16 @@ class Lookup(Marching):
         b1 = self._b1 + self._code if len(self._b1) else self._b1
         bias = np.float32(self._scene.decoder.density_bias)
         halves = tuple(range(0, self._wide, NARROW))
-        return None, (halves, self._planes, self._rows, self._firsts, self._sizes, self._w1, b1, self._w2_in_steps, self._weights_in_steps, bias)
+        weights = self._seen_from[worker] if len(b1) else self._weights_in_steps[None]
+        return None, (
+            halves, self._planes, self._rows, self._firsts, self._sizes, self._w1, b1, self._w2_in_steps, self._weights_in_steps, bias, weights,
+        )  # fmt: skip
 
     @staticmethod
     def rehearsed(scene: Scene) -> tuple[Any, Any]:
         halves, flat, of_two = tuple(range(0, _wide(scene), NARROW)), np.zeros(1, np.float32), np.zeros((1, 1), np.float32)
         places = np.zeros((1, 1), np.int64)
-        return None, (halves, np.zeros(1, np.int16), flat, places, places, of_two, flat, of_two, flat, np.float32(0))
+        return None, (halves, np.zeros(1, np.int16), flat, places, places, of_two, flat, of_two, flat, np.float32(0), of_two)
 
     def _put(self, into: np.ndarray, scale: int, which: int, texels: np.ndarray) -> None:
         """(..., channels) where it lies."""
