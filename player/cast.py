@@ -75,8 +75,12 @@ def cast(blocks, side, origin, size, lens, axes, start, box, even, stride, tau, 
     pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
     wanted = np.empty(AROUND * LANES + 1, np.int32)
     texels, kept = np.zeros((6, LANES), np.int32), np.zeros(LANES, np.int32)
-    if looked_up is not None and len(looked_up[6]) > 0:
-        kept[:] = np.arange(LANES)  # each ray's own weights
+    if baked is not None:
+        planes, rows, weights, bias, grid, known, corners = baked
+    if looked_up is not None:
+        halves, planes, rows, firsts, sizes, w1, b1, w2, of_all, bias, weights = looked_up
+        if len(b1) > 0:
+            kept[:] = np.arange(LANES)  # each ray's own weights
     taken, count = np.int64(0), np.int64(0)  # a plain 0 would be a type of its own, for which parts are compiled once more
     while taken < len(blocks) or count > 0:
         while taken < len(blocks) and count + side * side <= LANES:
@@ -92,12 +96,10 @@ def cast(blocks, side, origin, size, lens, axes, start, box, even, stride, tau, 
             if len(motion) > 0:
                 _displace(found, motion, nodes, samples, cell)
             if baked is not None:
-                planes, rows, weights, bias, grid, known, corners = baked
                 _find(found, corners, samples, cell)
                 _bake(_wanted(found, known, corners, cell, wanted), wanted, planes, rows, weights, bias, grid, corners)
                 _look_up(found, grid, corners, samples, cell)
             if looked_up is not None:
-                halves, planes, rows, firsts, sizes, w1, b1, w2, of_all, bias, weights = looked_up
                 if len(b1) > 0:
                     _face(found, box, of_ray, rays, kept, w1, b1, w2, of_all, weights)
                 _weigh(found, halves, planes, rows, firsts, sizes, weights, bias, of_ray, kept, samples, texels)

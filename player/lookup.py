@@ -12,7 +12,7 @@ from kpc.player.cast import LANES
 from kpc.player.cores import WORKERS
 from kpc.player.marching import Marching, in_steps
 from kpc.player.textures import Layout, filled
-from kpc.player.vectors import CHANNELS, NARROW, LARGEST, WIDE
+from kpc.player.vectors import CHANNELS, LARGEST, NARROW, WIDE
 
 
 class Lookup(Marching):

@@ -15,6 +15,8 @@ from kpc.player.cores import from_both_ends
 
 MOST_STEPS = 32767
 """Of a plane's channel, from 0: half the bytes of float32, which a processor's caches hold the more of, and 1e-4 off in a picture's colours."""
+BLOCK = 4
+"""Pixels a side of a block of probes.glsl."""
 PIXELS_AT_ONCE = 256
 """That a core takes, at least."""
 
@@ -147,4 +149,4 @@ def probes_of(turn: int, left: int, bottom: int, right: int, top: int, size: tup
     rows, columns = np.mgrid[bottom:top, left:right]
     k = turn + 3 * columns + 5 * rows & 15
     x, y = 2 * ((k ^ k >> 1) & 1) + ((k >> 2 ^ k >> 3) & 1), 2 * (k & 1) + (k >> 2 & 1)
-    return np.stack([np.minimum(4 * rows + y, size[1] - 1), np.minimum(4 * columns + x, size[0] - 1)], axis=-1)
+    return np.stack([np.minimum(BLOCK * rows + y, size[1] - 1), np.minimum(BLOCK * columns + x, size[0] - 1)], axis=-1)

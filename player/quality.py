@@ -44,7 +44,7 @@ class Quality:
             is left is at most this, of the full range: the root of the mean of its squares over the picture, as far as bends tell
             (bent.glsl). 0: all pixels are marched.
         resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated, by a cubic (cubic.glsl).
-        thin: where a processor folds, rays pass by occupied cells that are empty at the time: a step at their corners has less alpha than
+        thin: where a processor draws, rays pass by occupied cells that are empty at the time: a step at their corners has less alpha than
             this. 0: they stop in all.
         baked: let a processor that would draw march a scene that `Baking` serves itself, through a grid of what the planes come to at the corners
             of their texels. Then all pixels are marched, no picture follows another, rays stop in all occupied cells, and end once their

@@ -20,7 +20,7 @@ from kpc.player import shader
 from kpc.player.bake import Baking
 from kpc.player.cover import Cover
 from kpc.player.lookup import Lookup
-from kpc.player.marching import Marching, probes_of, rehearse
+from kpc.player.marching import BLOCK, Marching, probes_of, rehearse
 from kpc.player.quality import LADDER, Quality
 from kpc.player.reference import Part, Rendering, code_of, places, sample_range, slot_at
 from kpc.player.targets import EVERYWHERE, Bounds, Canvas, Target, first_channel, read, read_into, room_on, write
@@ -35,8 +35,6 @@ PLANES_UNIT, ROWS_UNIT, CELLS_UNIT, MOTION_UNIT = 0, 1, 2, 3
 DOUBTS_UNIT = 4
 SEEN_UNIT, MET_UNIT, WITHOUT_UNIT = 0, 1, 2
 SEEN_PROBES_UNIT, MET_PROBES_UNIT = 2, 3
-BLOCK = 4
-"""Pixels a side of a block of probes.glsl."""
 PICTURE, OTHER_PICTURE, PROBES, DOUBTS, COARSE = range(5)
 """The targets of a part and size: pictures take turns while the camera moves."""
 COARSER = 2
@@ -642,9 +640,9 @@ class Renderer:
 
     def _march_baked(self, part: Part, camera: Camera, time: float) -> Target:
         """A picture that a processor marches itself, through a grid of what planes come to: all of what may see something."""
-        target, self._slot = self._target(part, (camera.width, camera.height)), slot_at(self.scene, time)
+        target, free = self._target(part, (camera.width, camera.height)), self._free_at(slot_at(self.scene, time), None)
         self._shots.pop((part, target.seen.size), None)
-        draw = self._by_processor(self._kept(Baking), time, self._free(self._slot), np.empty(0, np.float32), self.quality.baked)
+        draw = self._by_processor(self._kept(Baking), time, free, np.empty(0, np.float32), self.quality.baked)
         self._draw_all(draw, part, target, camera)
         return target
 
@@ -760,12 +758,12 @@ class Renderer:
             self._empty(probes)
         squares = math.prod(tiles.squares(blocks)) if tiles else 0
         draw(probes, camera, ONLY_PROBES, squares, bounds=tuple(map(float, within)), **common)
-        common["size"] = tuple(map(float, size))
         probes.seen.use(SEEN_PROBES_UNIT)
         probes.met.use(MET_PROBES_UNIT)
         picture.seen.use(SEEN_UNIT)
         doubt, vertices = self._program("doubt.glsl", self.layout, moved=moved)
-        _set(doubt, seen_predicted=SEEN_UNIT, tolerance=shot.quality.tolerance * (MOVED_TOLERANCE if moved else 1.0), **common)
+        tolerance = shot.quality.tolerance * (MOVED_TOLERANCE if moved else 1.0)
+        _set(doubt, seen_predicted=SEEN_UNIT, tolerance=tolerance, size=tuple(map(float, size)), **common)
         doubts.framebuffer.clear()
         self._draw(doubts.framebuffer, vertices, within=bounds)
         if self._share_of(doubts) > MOST_DOUBTED * before.marched:
@@ -773,7 +771,7 @@ class Renderer:
             self._shots[part, size] = replace(shot, marched=marched, alone=0 if self._since_s(shot, before) > JUMP_S else ALONE_FOR)
             return picture
         settle, vertices = self._program("settle.glsl", self.layout)
-        _set(settle, **common)
+        _set(settle, size=tuple(map(float, size)), **common)
         self._draw(picture.framebuffer, vertices, points=math.prod(blocks), within=bounds)
         self._draw_doubted(draw, picture, camera, doubts)
         self._shots[part, size] = shot

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from kpc.player.vectors import NARROW, LARGEST, WIDE, combine, interpolate, weigh
+from kpc.player.vectors import LARGEST, NARROW, WIDE, combine, interpolate, weigh
 
 
 @njit
