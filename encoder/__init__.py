@@ -6,7 +6,7 @@ import sys
 def main(argv: list[str] | None = None) -> int:
     """`kpenc`, or one line on how to get it where only the viewer is installed."""
     try:
-        from kpc.encoder import kpenc
+        from kpc.encoder.cli import kpenc
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise

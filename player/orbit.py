@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kpc.format.cameras import Camera
-from kpc.format.scene import Scene
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.scene import Scene
 
 SURROUND_GAP = math.radians(160)
 """Cameras that leave no wider gap around their focus are a ring."""

@@ -18,7 +18,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from kpc.format.scene import TERMINATION
+from kpc.format.scene.scene import TERMINATION
 
 
 @dataclass(frozen=True)

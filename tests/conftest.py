@@ -25,8 +25,8 @@ def one_thread():
 @pytest.fixture
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures and planes are judged by a few rays, as many as tiny scenes need."""
-    monkeypatch.setattr("kpc.encoder.probe.PROBE_RAYS", 512)
-    monkeypatch.setattr("kpc.encoder.curvature.RAYS", 1 << 13)
+    monkeypatch.setattr("kpc.encoder.evaluation.validation_rays.PROBE_RAYS", 512)
+    monkeypatch.setattr("kpc.encoder.rdo.curvature.RAYS", 1 << 13)
 
 
 @pytest.fixture(scope="session")

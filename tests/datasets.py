@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from kpc.format.cameras import Camera
-from kpc.format.media import write_image, write_video
+from kpc.format.scene.cameras import Camera
+from kpc.format.common.media import write_image, write_video
 
 FPS = 8.0
 

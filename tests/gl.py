@@ -6,10 +6,10 @@ import moderngl
 import numpy as np
 import pytest
 
-from kpc.format.errors import DisplayError
-from kpc.player import shader
-from kpc.player.offscreen import open_context
-from kpc.player.renderer import _volume as volume_of
+from kpc.format.common.errors import DisplayError
+from kpc.player.gl import shader
+from kpc.player.gl.offscreen import open_context
+from kpc.player.gl.renderer import _volume as volume_of
 
 
 @functools.cache

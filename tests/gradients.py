@@ -7,11 +7,11 @@ import torch
 from scenes import displaced, surrounded, tiny_scene
 from torch import Tensor
 
-from kpc.encoder import kernels
-from kpc.encoder.field import Blend, Field, corners_of
-from kpc.encoder.optimisers import motion_of, sample_capacity
-from kpc.encoder.render import Rays, render_reference
-from kpc.format.scene import Scene
+from kpc.encoder.field import kernels
+from kpc.encoder.field.field import Blend, Field, corners_of
+from kpc.encoder.training.optimisers import motion_of, sample_capacity
+from kpc.encoder.field.render import Rays, render_reference
+from kpc.format.scene.scene import Scene
 
 
 KINDS = [(True, False, False), (True, False, True), (False, False, False), (True, True, False), (True, True, True),

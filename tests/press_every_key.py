@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 from pytest import approx, raises
 
-from kpc.format import groups
-from kpc.format.container import open_source
-from kpc.format.errors import DisplayError
-from kpc.format.media import read_image, read_video
-from kpc.player import kpplay, panels
-from kpc.player import window as window_module
-from kpc.player.desktop import glfw, imgui
-from kpc.player.dial import RUNGS
-from kpc.player.path import CameraPath
-from kpc.player.preferences import Preferences, place
+from kpc.format.container import groups
+from kpc.format.container.container import open_source
+from kpc.format.common.errors import DisplayError
+from kpc.format.common.media import read_image, read_video
+from kpc.player.app import kpplay, panels
+from kpc.player.app import window as window_module
+from kpc.player.app.desktop import glfw, imgui
+from kpc.player.app.quality_controller import RUNGS
+from kpc.player.app.camera_paths import CameraPath
+from kpc.player.app.preferences import Preferences, place
 from kpc.player.quality import DEFAULT, climbed
-from kpc.player.reel import Reel
-from kpc.player.reference import Part
-from kpc.player.renderer import Look
-from kpc.player.window import Player, Window
+from kpc.player.streaming.group_playback import Reel
+from kpc.player.cpu.reference import Part
+from kpc.player.gl.renderer import Look
+from kpc.player.app.window import Player, Window
 
 
 def main(scene_file: str) -> None:

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from kpc.format.cameras import Camera
-from kpc.format.scene import SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder, Scene
-from kpc.format.space import Contraction, DeviceCoordinates
-from kpc.player.renderer import Renderer
-from kpc.player.textures import Layout
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder, Scene
+from kpc.format.scene.space import Contraction, DeviceCoordinates
+from kpc.player.gl.renderer import Renderer
+from kpc.player.gl.textures import Layout
 
 
 def tiny_scene(seed: int = 0, dynamic: bool = True, scales: int = 2, channels: int = 8,

@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import pytest
 
-from kpc.format import cli
-from kpc.format.errors import FormatError, UsageError
+from kpc.format.common import cli
+from kpc.format.common.errors import FormatError, UsageError
 
 
 def raising(error: BaseException, cause: BaseException | None = None) -> Callable[[list[str]], None]:

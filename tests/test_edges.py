@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scenes import tiny_scene
 
-from kpc.format.errors import BudgetError
-from kpc.format.file import encode, read
-from kpc.format.motion import QuantisedMotion
-from kpc.format.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_scene
-from kpc.format.scene import SPACE_PLANES, Scene
-from kpc.format.symbols import ANY, WEIGHTS, decode_symbols, encode_with
+from kpc.format.common.errors import BudgetError
+from kpc.format.container.scene_io import encode, read
+from kpc.format.scene.motion import QuantisedMotion
+from kpc.format.coding.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_scene
+from kpc.format.scene.scene import SPACE_PLANES, Scene
+from kpc.format.coding.predictive import ANY, WEIGHTS, decode_symbols, encode_with
 
 
 def quantised(scene: Scene, step: float) -> QuantisedScene:

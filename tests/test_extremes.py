@@ -13,19 +13,19 @@ import pytest
 import torch
 from gradients import backpropagate, misty, rays_at, reference_gradients
 
-from kpc.encoder import kernels
-from kpc.encoder.box import find_box
-from kpc.encoder.config import TrainConfig
+from kpc.encoder.field import kernels
+from kpc.encoder.field.bounds import find_box
+from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluate import SceneRenderer, evaluate
-from kpc.encoder.field import Field, Layout, priors
-from kpc.encoder.kpenc import to_scene
-from kpc.encoder.optimisers import add_priors
-from kpc.encoder.render import Rays
-from kpc.encoder.train import Report, Trainer
-from kpc.format.errors import DatasetError
-from kpc.format.media import write_image
-from kpc.format.scene import LOG_DENSITY_LIMIT, TERMINATION, Scene
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate
+from kpc.encoder.field.field import Field, Layout, priors
+from kpc.encoder.cli.kpenc import to_scene
+from kpc.encoder.training.optimisers import add_priors
+from kpc.encoder.field.render import Rays
+from kpc.encoder.training.train import Report, Trainer
+from kpc.format.common.errors import DatasetError
+from kpc.format.common.media import write_image
+from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION, Scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = TrainConfig(

@@ -10,10 +10,10 @@ import gl
 import pytest
 from scenes import tiny_scene
 
-from kpc.format.cameras import load_shots
-from kpc.format.file import write
-from kpc.format.media import read_image
-from kpc.format.quantise import quantise_scene
+from kpc.format.scene.cameras import load_shots
+from kpc.format.container.scene_io import write
+from kpc.format.common.media import read_image
+from kpc.format.coding.quantise import quantise_scene
 
 ROOT = Path(__file__).parent.parent
 README, MEASURED = ((ROOT / name).read_text() for name in ("README.md", "docs/measured.md"))
@@ -58,7 +58,7 @@ def test_the_camera_file_shown_can_be_read(tmp_path: Path) -> None:
 
 
 def test_keys_are_those_of_the_player() -> None:
-    from kpc.player.panels import KEYS
+    from kpc.player.app.panels import KEYS
 
     assert "".join(f"| {key} | {meaning} |\n" for key, meaning in KEYS) in README
 

@@ -12,11 +12,15 @@ import numpy as np
 import pytest
 from scenes import SPACES, tiny_scene
 
-from kpc.format import container, errors, file, groups, planes, poses
-from kpc.format.scene import ALL_PLANES, LOG_DENSITY_LIMIT, TERMINATION
-from kpc.format.space import FAR, FORWARD, LEAST_DISPARITY
-from kpc.player import reference
-from kpc.tools import specvectors
+from kpc.format.coding import poses, raw_planes
+
+from kpc.format.common import errors
+
+from kpc.format.container import container, groups, scene_io
+from kpc.format.scene.scene import ALL_PLANES, LOG_DENSITY_LIMIT, TERMINATION
+from kpc.format.scene.space import FAR, FORWARD, LEAST_DISPARITY
+from kpc.player.cpu import reference
+from kpc.tools.vectors import specvectors
 
 SPEC = Path(__file__).parent.parent / "spec"
 PAGE = (SPEC / "kpc-format.md").read_text()
@@ -66,8 +70,8 @@ def same(layout: str, expected: struct.Struct) -> bool:
 
 
 @pytest.mark.parametrize("number, structures", [
-    (3, [container.HEADER]), (4, [container.ENTRY]), (5, [file.SCENE_STRUCT, file.SCALE_STRUCT, file.WARP_STRUCT, file.NDC_STRUCT, file.MOTION_STRUCT]),
-    (7, [file.DECODER_STRUCT, file.HYBRID_STRUCT]), (8, [file.OCCUPANCY_STRUCT]), (9, [file.CAMERA_STRUCT, poses.HEAD, file.APPEARANCE_STRUCT]),
+    (3, [container.HEADER]), (4, [container.ENTRY]), (5, [scene_io.SCENE_STRUCT, scene_io.SCALE_STRUCT, scene_io.WARP_STRUCT, scene_io.NDC_STRUCT, scene_io.MOTION_STRUCT]),
+    (7, [scene_io.DECODER_STRUCT, scene_io.HYBRID_STRUCT]), (8, [scene_io.OCCUPANCY_STRUCT]), (9, [scene_io.CAMERA_STRUCT, poses.HEAD, scene_io.APPEARANCE_STRUCT]),
 ])
 def test_byte_tables_are_the_code_s_structures(number, structures):
     tables = layouts(section(number))
@@ -79,17 +83,17 @@ def test_byte_tables_are_the_code_s_structures(number, structures):
 def test_sizes_in_the_text():
     assert f"{container.HEADER.size} bytes." in section(3)
     assert f"One entry of {container.ENTRY.size} bytes" in section(4)
-    assert f"begins with {file.SCENE_STRUCT.size} bytes" in section(5)
-    assert f"coarse to fine, {file.SCALE_STRUCT.size} bytes" in section(5)
-    assert f"the part that\nkeeps its shape. {file.WARP_STRUCT.size} bytes" in section(5)
-    assert f"from these {file.NDC_STRUCT.size} bytes" in section(5)
-    assert f"may have one. It begins with {file.MOTION_STRUCT.size} bytes" in section(5)
-    assert f"each camera {file.CAMERA_STRUCT.size} bytes" in section(9) and f"first {poses.LENS.size} of the" in section(9)
+    assert f"begins with {scene_io.SCENE_STRUCT.size} bytes" in section(5)
+    assert f"coarse to fine, {scene_io.SCALE_STRUCT.size} bytes" in section(5)
+    assert f"the part that\nkeeps its shape. {scene_io.WARP_STRUCT.size} bytes" in section(5)
+    assert f"from these {scene_io.NDC_STRUCT.size} bytes" in section(5)
+    assert f"may have one. It begins with {scene_io.MOTION_STRUCT.size} bytes" in section(5)
+    assert f"each camera {scene_io.CAMERA_STRUCT.size} bytes" in section(9) and f"first {poses.LENS.size} of the" in section(9)
 
 
 def test_limits_are_the_code_s():
     rows = dict(re.findall(r"^\| ([A-Z_]+) \| (\d+) \|", section(12), re.M))
-    code = {name: int(value) for module in (container, file) for name, value in vars(module).items()
+    code = {name: int(value) for module in (container, scene_io) for name, value in vars(module).items()
             if name.endswith("_LIMIT") and name != "HEAD_LIMIT"}
     assert {name: int(value) for name, value in rows.items()} == code
 
@@ -101,16 +105,16 @@ def test_names_and_numbers_are_the_code_s():
     assert container.READABLE_VERSIONS == (0, container.PLAIN_VERSION, container.VERSION)
     assert f"content size, {container.TOLD} x chunk_count" in section(4)
     assert f"at least {container.HEADER.size} + {container.LEAST_CHUNK} chunk_count" in section(3)
-    assert set(re.findall(r"^\| ([A-Za-z]{4}) \| [01]", section(4), re.M)) == file.KNOWN_KINDS | {file.GROUP_KIND}
+    assert set(re.findall(r"^\| ([A-Za-z]{4}) \| [01]", section(4), re.M)) == scene_io.KNOWN_KINDS | {scene_io.GROUP_KIND}
     numbered = ", ".join(f"{number} `{name}`" for number, name in enumerate(ALL_PLANES))
     assert numbered in section(4)
     filters = re.findall(r"^\| (\d) \| r\[y, x\]", section(6), re.M)
-    assert [int(f) for f in filters] == list(range(planes.FILTER_COUNT))
+    assert [int(f) for f in filters] == list(range(raw_planes.FILTER_COUNT))
     assert f"T < 1/{1 / TERMINATION:.0f}" in section(11)
     assert f"(2 - 1/{FAR:.0f}) even" in section(11) and f"farther than {FAR:.0f} even" in section(11)
-    assert f"**Mapping {file.CONTRACTED}, contraction:" in section(5)
-    assert f"**Mapping {file.DEVICE_COORDINATES}, device coordinates:" in section(5)
-    assert f"less than {file.FRAME_TOLERANCE:.4f}" in section(5)
+    assert f"**Mapping {scene_io.CONTRACTED}, contraction:" in section(5)
+    assert f"**Mapping {scene_io.DEVICE_COORDINATES}, device coordinates:" in section(5)
+    assert f"less than {scene_io.FRAME_TOLERANCE:.4f}" in section(5)
     assert f"e, {poses.FINEST} to {poses.COARSEST}" in section(9) and f"D = {poses.ROOT}^2" in section(9)
     assert f"a[i] - {poses.NOTHING}" in section(9) and f"2^{poses.BITS} p[1]" in section(9)
     assert f"if c <= {FORWARD:.4f}" in section(11) and f"{1 - LEAST_DISPARITY}" in section(11)
@@ -186,7 +190,7 @@ def test_invalid_vectors_are_refused_as_is_written(path, twin):
 def read_all(path: Path) -> None:
     opened = groups.Groups(path)
     for number in range(len(opened)):
-        file.read(opened.open(number))
+        scene_io.read(opened.open(number))
 
 
 @pytest.mark.parametrize("path", GROUPED, ids=lambda p: p.stem)
@@ -199,7 +203,7 @@ def test_vectors_of_groups_hold_the_vectors_that_they_say(path, twin):
     for number, (group, (*_, content)) in enumerate(zip(expected["groups"], theirs, strict=True)):
         if group["scene"] is not None:
             assert content == path.with_name(f"{group['scene']}.kpc").read_bytes()
-            assert file.read(opened.open(number)).clip.frame_count == scenes[number]["frame_count"]
+            assert scene_io.read(opened.open(number)).clip.frame_count == scenes[number]["frame_count"]
     assert len(scenes) == sum(group["scene"] is not None for group in expected["groups"])
     for moment in expected["times"]:
         number, time_in_it = opened.timeline.at(moment["time"])
@@ -243,7 +247,7 @@ def test_a_file_may_have_so_many_chunks_and_no_more(twin, monkeypatch):
     assert len(container.Reader(data).index) == 65536
     plain = twin.hashes(twin.decode(path.read_bytes()))
     assert twin.hashes(twin.decode(data)) == plain
-    assert file.encode(file.read(data)) == file.encode(file.read(path))
+    assert scene_io.encode(scene_io.read(data)) == scene_io.encode(scene_io.read(path))
     with pytest.raises(errors.FormatError, match="65537 chunks are more"):
         container.pack([*known, *empty, *empty[:1]], reader.header.value_count, compress=False)
     full = [container.Chunk("note", [bytes(8)])] * len(empty)  # as many in a file of version 2 are no smaller than this
@@ -263,8 +267,8 @@ def test_a_file_may_have_so_many_chunks_and_no_more(twin, monkeypatch):
 def test_valid_vectors_cover_every_kind_under_every_codec():
     found = {(entry.kind, entry.codec) for path in VALID + GROUPED
              for entry in container.Reader(path.read_bytes(), allow_partial=True).index}
-    codecs = {kind: {0, 1, 2} if kind in ("PLNE", "OCCU", "MOVE", "DECO", "HYBR") else {0, 1} for kind in file.KNOWN_KINDS}
-    assert found >= {(kind, codec) for kind, known in codecs.items() for codec in known} | {(file.GROUP_KIND, 0)}
+    codecs = {kind: {0, 1, 2} if kind in ("PLNE", "OCCU", "MOVE", "DECO", "HYBR") else {0, 1} for kind in scene_io.KNOWN_KINDS}
+    assert found >= {(kind, codec) for kind, known in codecs.items() for codec in known} | {(scene_io.GROUP_KIND, 0)}
 
 
 def test_valid_vectors_cover_every_context_and_size_of_errors(twin, monkeypatch):
@@ -304,11 +308,11 @@ def assert_described(found: dict, expected: dict) -> None:
 
 @pytest.mark.parametrize("space", SPACES)
 def test_the_twin_renders_a_scene_as_the_reference_does(twin, space):
-    from kpc.format.quantise import quantise_scene
+    from kpc.format.coding.quantise import quantise_scene
 
     scene = SPACES[space](tiny_scene(scales=1, channels=4, resolution=(10, 8, 6), time=4))
-    data = file.encode(quantise_scene(scene, [{name: 0.01 for name in scene.scales[0]}]))
-    decoded = file.read(data).dequantise()
+    data = scene_io.encode(quantise_scene(scene, [{name: 0.01 for name in scene.scales[0]}]))
+    decoded = scene_io.read(data).dequantise()
     slow = twin.decode(data)
     camera = scene.cameras[0].resized(8, 6)
     origins, directions = camera.rays()

@@ -9,7 +9,7 @@ clip=out/default scene=out/default.kpc
 
 if [ ! -f "$clip/gt/cameras.json" ]; then  # written last: what is there is whole
     echo "filming the default scene with twelve cameras: $clip" >&2
-    "$bin/python" -m kpc.tools.scenegen "$clip"
+    "$bin/python" -m kpc.tools.dev.scenegen "$clip"
 fi
 
 echo "encoding it: $scene (about three minutes of training on two cores)" >&2
@@ -23,7 +23,7 @@ else
     backend=reference frames=12 size=128x96
 fi
 "$bin/kprender" "$scene" --backend "$backend" --cameras "$clip/gt/cameras.json" --depth -o out/views
-"$bin/python" -m kpc.tools.contactsheet "$clip/gt" out/views -o out/contactsheet.png
+"$bin/python" -m kpc.tools.cli.contactsheet "$clip/gt" out/views -o out/contactsheet.png
 "$bin/kprender" "$scene" --backend "$backend" --orbit "$frames" --size "$size" -o out/orbit.mp4
 
 echo "look at out/contactsheet.png and out/orbit.mp4; play with: $bin/kpplay $scene"

@@ -37,8 +37,8 @@ install_kpc() {
 has_opengl() {
     .venv/bin/python - <<'PYTHON'
 import sys
-from kpc.format.errors import DisplayError
-from kpc.player.offscreen import open_context
+from kpc.format.common.errors import DisplayError
+from kpc.player.gl.offscreen import open_context
 try:
     open_context()
 except DisplayError as error:

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.format.errors import DatasetError
-from kpc.format.media import IMAGE_SUFFIXES, VideoInfo, image_size
+from kpc.format.common.errors import DatasetError
+from kpc.format.common.media import IMAGE_SUFFIXES, VideoInfo, image_size
 
 HOLD_OUT_EVERY = 8
 """Where neither the dataset nor the user names test images, every eighth is one (LLFF's custom, arXiv:1905.00889)."""

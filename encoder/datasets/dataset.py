@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets import blender, colmap, llff, nerfstudio
+from kpc.encoder.datasets.layouts import blender, colmap, llff, nerfstudio
 from kpc.encoder.datasets.capture import Capture, View
 from kpc.encoder.datasets.masks import FOLDER, Masks, find_masks, load_masks
-from kpc.encoder.datasets.pixels import PixelCache, build_cache, fingerprint_of, open_cache
-from kpc.format.cameras import Camera
-from kpc.format.errors import DatasetError, MediaError
-from kpc.format.media import read_image, read_video
-from kpc.format.progress import Progress
-from kpc.format.scene import Clip
-from kpc.format.space import DeviceCoordinates, SpaceMapping
+from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
+from kpc.format.scene.cameras import Camera
+from kpc.format.common.errors import DatasetError, MediaError
+from kpc.format.common.media import read_image, read_video
+from kpc.format.common.progress import Progress
+from kpc.format.scene.scene import Clip
+from kpc.format.scene.space import DeviceCoordinates, SpaceMapping
 
 LAYOUTS = (llff, blender, nerfstudio, colmap)
 """The first that recognises a folder reads it: what a sparse model was exported to goes before the model."""

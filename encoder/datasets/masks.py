@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from kpc.encoder.datasets.capture import View, is_file, some
-from kpc.encoder.datasets.pixels import PixelCache, build_cache, fingerprint_of, open_cache
-from kpc.format.errors import DatasetError
-from kpc.format.media import image_size, read_image
-from kpc.format.progress import Progress
+from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
+from kpc.format.common.errors import DatasetError
+from kpc.format.common.media import image_size, read_image
+from kpc.format.common.progress import Progress
 
 FOLDER = "masks"
 

@@ -9,15 +9,15 @@
 import os
 from typing import TYPE_CHECKING, BinaryIO
 
-from kpc.format.cameras import Camera
-from kpc.format.errors import KpcError
-from kpc.format.scene import Scene
+from kpc.format.scene.cameras import Camera
+from kpc.format.common.errors import KpcError
+from kpc.format.scene.scene import Scene
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from kpc.format.groups import LongScene
-    from kpc.player.reference import Rendering
+    from kpc.format.container.groups import LongScene
+    from kpc.player.cpu.reference import Rendering
 
 __all__ = ["Camera", "KpcError", "Scene", "load", "render"]
 
@@ -36,7 +36,7 @@ def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int =
         FormatError: the file is damaged, hostile or of an unknown version; BudgetError if it is too large.
         NetworkError: the server of a URL does not give it.
     """
-    from kpc.format import groups
+    from kpc.format.container import groups
 
     return groups.load(path, memory_budget)
 
@@ -52,7 +52,7 @@ def render(scene: "Scene | LongScene", camera: Camera, time: float, appearance: 
     Returns:
         `.rgb` (H, W, 3) float32 in [0, 1], `.depth` (H, W), `.opacity` (H, W).
     """
-    from kpc.player import reference
+    from kpc.player.cpu import reference
 
     parts = scene.mixed(time) if appearance is None else [(*scene.at(time), 1.0)]
     return reference.mixed([(reference.render(shown, camera, t, appearance=appearance), share) for shown, t, share in parts])

@@ -1,0 +1,115 @@
+"""A finished checkpoint, or a .kpc file, coded anew: no pictures, no training."""
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from kpc.encoder.rdo import codec_model
+from kpc.encoder.rdo.rate_control import Trade
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.cli.grouped import share_of
+from kpc.encoder.cli.options import Options
+from kpc.format.container import groups, scene_io
+from kpc.format.container.container import MAGIC
+from kpc.format.common.errors import TrainingError, UsageError
+
+JUDGED_BY = ("training views", "views of its own, taken to be right to 30 dB")
+"""What losses are measured on: those of a checkpoint, and those of a file."""
+
+
+def recode(options: Options) -> dict[str, Any]:
+    """Write the .kpc file that `options.trade` asks for; what came of it, as a dictionary that JSON can hold.
+
+    Raises:
+        UsageError, TrainingError, FormatError: the source cannot be used (`kpc.encoder.rdo.codec_model.load`), or takes more than it may.
+    """
+    started = time.monotonic()
+    check_outputs(options)
+    is_coded = codec_model.begins_with(options.source, MAGIC)
+    if is_coded and options.trade.psnr_db is not None:
+        raise UsageError(f"--psnr: {options.source} does not know what was filmed; give its checkpoint, or --quality")
+    if is_coded and not (clip := groups.Groups(options.source)).is_single:
+        return _recode_groups(options, clip) | {"encode_s": time.monotonic() - started}
+    source = codec_model.load(options.source)
+    coded = codec_model.code(source, options.trade, TrainConfig().prune_share, _tune_steps(options), shown=True)
+    size = scene_io.save(coded.data, options.output)
+    return {
+        "file": str(options.output), "source": str(options.source),
+        **figures(coded, size, options.trade, JUDGED_BY[is_coded]),
+        "encode_s": time.monotonic() - started,
+    }  # fmt: skip
+
+
+def _tune_steps(options: Options) -> int:
+    return TrainConfig().tune_steps if options.tune_steps is None else options.tune_steps
+
+
+def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
+    """Each group by itself; the coded ones are in memory together."""
+    spans, parts, found = source.timeline.spans, [], []
+    for number, span in enumerate(spans):
+        trade = share_of(options, number, spans).trade
+        reader = source.open(number)
+        scene = replace(scene_io.read(reader), cameras=reader.cameras() or source.cameras())
+        coded = codec_model.code(codec_model.model_of(scene), trade, TrainConfig().prune_share, _tune_steps(options), shown=True)
+        parts.append(groups.Part.of(coded.data, span.start))
+        found.append(figures(coded, coded.size_bytes, trade, JUDGED_BY[1]))
+    size = groups.write(parts, options.output)
+    return {"file": str(options.output), "source": str(options.source), **together(found, spans, size, options.trade)}
+
+
+def together(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size: int, trade: Trade) -> dict[str, Any]:
+    """`figures` of a clip whose groups have those found: sums, and means over frames."""
+    frames, parameters = [span.count for span in spans], sum(one["parameters"] for one in found)
+    means = {}
+    for key in ("probe_psnr", "probe_loss_db", "agreement_db", "identity_share"):
+        known = [(one[key], count) for one, count in zip(found, frames, strict=True) if one[key] is not None]
+        means[key] = sum(value * count for value, count in known) / sum(count for _, count in known) if known else None
+    name, value = trade.bound
+    return {
+        "trade": name, "asked": value, "judged_by": found[0]["judged_by"], **means, "size_bytes": size, "parameters": parameters,
+        "bits_per_parameter": 8 * size / parameters,
+    }  # fmt: skip
+
+
+def figures(coded: codec_model.Coded, size: int, trade: Trade, judged_by: str) -> dict[str, Any]:
+    """What is said of every file that is written."""
+    name, value = trade.bound
+    return {
+        "trade": name, "asked": value, "judged_by": judged_by,
+        "probe_psnr": coded.psnr, "probe_loss_db": coded.loss_db, "agreement_db": coded.agreement_db,
+        "size_bytes": size, "parameters": coded.scene.parameter_count,
+        "bits_per_parameter": 8 * size / coded.scene.parameter_count,
+        "identity_share": coded.scene.identity_share if coded.scene.is_dynamic else None,
+    }
+
+
+def reached(result: dict[str, Any]) -> str:
+    """In words, what was asked for and what that gave."""
+    name, asked = result["trade"], result["asked"]
+    said = {"max_loss_db": f"at most {asked:g} dB of loss", "target_bytes": f"at most {asked:,.0f} bytes",
+            "quality": f"quality {asked:g}", "lam": f"lam {asked:g}", "psnr_db": f"at least {asked:g} dB"}[name]  # fmt: skip
+    lost = f"{result['probe_loss_db']:.3f} dB of loss on {result['judged_by']}"
+    at = f"{result['probe_psnr']:.2f} dB, " if name == "psnr_db" else ""
+    return (f"asked for {said}; reached {result['size_bytes']:,} bytes, {at}{lost}, "
+            f"{result['agreement_db']:.1f} dB against the uncoded pictures")
+
+
+def check_outputs(options: Options) -> None:
+    """Find out before hours of training whether the files can be written after them."""
+    if options.output.exists() and options.source.is_file() and options.output.samefile(options.source):
+        raise UsageError(f"{options.output}: is what is to be coded; write elsewhere with -o")
+    for output in filter(None, (options.output, options.keep_checkpoint)):
+        _check_place(output)
+
+
+def _check_place(output: Path) -> None:
+    if output.is_dir():
+        raise UsageError(f"{output}: is a folder; name a file such as {output / 'scene.kpc'}")
+    if not output.parent.is_dir():
+        raise UsageError(f"{output.parent}: no such folder; make it first")
+    if not os.access(output.parent, os.W_OK):
+        raise TrainingError(f"{output.parent}: no permission to write there; choose another place with -o")

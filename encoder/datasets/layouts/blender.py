@@ -1,0 +1,36 @@
+"""NeRF-synthetic and D-NeRF: `transforms_{train,val,test}.json` with `camera_angle_x`, optional `time`, straight alpha.
+
+(https://github.com/bmild/nerf, https://github.com/albertpumarola/D-NeRF)
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from kpc.encoder.datasets.capture import Capture, find_image, held_out, say_missing
+from kpc.encoder.datasets.layouts.transforms import frame_rate, frame_view, load_transforms
+
+
+def recognise(path: Path) -> bool:
+    return (path / "transforms_train.json").is_file()
+
+
+def read(path: Path, holdout: str | None) -> Capture:
+    """Trains on the train split, tests on the test split (val where there is no other); holdout "none" trains on all.
+
+    Raises:
+        DatasetError, MediaError: a split or an image cannot be used.
+    """
+    splits = [s for s in ("train", "test", "val") if (path / f"transforms_{s}.json").is_file()]
+    if "test" in splits and "val" in splits and holdout is None:
+        splits.remove("val")
+    views, fps = [], None
+    for split in splits:
+        file = path / f"transforms_{split}.json"
+        document = load_transforms(file)
+        names = [frame["file_path"] for frame in document["frames"]]
+        images = [find_image(path, file, name) for name in names]
+        say_missing(file, [name for name, image in zip(names, images) if image is None], len(names))
+        views += [frame_view(file, n, document, image, split != "train") for n, image in enumerate(images) if image]
+        fps = fps or frame_rate(file, document)
+    tests = held_out(path, [str(v.file.relative_to(path)) for v in views], holdout, [v.is_test for v in views])
+    return Capture("Blender", tuple(replace(v, is_test=t) for v, t in zip(views, tests)), fps)

@@ -1,0 +1,76 @@
+"""LLFF and Neural 3D Video: `poses_bounds.npy` beside `cam*.mp4`, or beside `images/`.
+
+Row n of `poses_bounds.npy` belongs to the n-th file in natural order: 15 numbers are a 3x5 matrix by rows with columns
+[down right backwards centre | (h w f)], then come near and far depth. (https://github.com/Fyusion/LLFF)
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from kpc.encoder.datasets.capture import (
+    HOLD_OUT_EVERY,
+    Capture,
+    View,
+    check_pose,
+    fit_intrinsics,
+    held_out,
+    natural_key,
+)
+from kpc.format.common.errors import DatasetError
+from kpc.format.common.media import IMAGE_SUFFIXES, VIDEO_SUFFIXES, image_size, probe
+
+POSES = "poses_bounds.npy"
+
+
+def recognise(path: Path) -> bool:
+    return (path / POSES).is_file()
+
+
+def read(path: Path, holdout: str | None) -> Capture:
+    """Videos if there are any, else `images/`. Held out by default: the first video, or every eighth image.
+
+    Raises:
+        DatasetError: as many poses as files are needed, finite, with a positive focal length and 0 < near < far.
+        MediaError: a file cannot be read.
+    """
+    videos = [f for f in path.iterdir() if f.suffix.lower() in VIDEO_SUFFIXES]
+    files = [f for f in videos if f.name.lower().startswith("cam")] or videos
+    is_video = bool(files)
+    if not files and (path / "images").is_dir():
+        files = [f for f in (path / "images").iterdir() if f.suffix.lower() in IMAGE_SUFFIXES]
+    if not files:
+        raise DatasetError(f"{path}: {POSES}, but neither cam*.mp4 nor images/ beside it; copy the videos there")
+    files.sort(key=lambda file: natural_key(file.name))
+    rows = _read_poses(path / POSES)
+    kind = "videos" if is_video else "images"
+    if len(rows) != len(files):
+        raise DatasetError(f"{path / POSES}: {len(rows)} poses for {len(files)} {kind}; remove what does not match")
+    default = [k == 0 if is_video else k % HOLD_OUT_EVERY == 0 for k in range(len(files))]
+    tests = held_out(path, [str(f.relative_to(path)) for f in files], holdout, default)
+    views = tuple(_view(path, number, *item) for number, item in enumerate(zip(files, rows, tests)))
+    fps = views[0].video.fps if views[0].video else None
+    return Capture("N3DV" if is_video else "LLFF", views, fps)
+
+
+def _view(path: Path, number: int, file: Path, row: np.ndarray, is_test: bool) -> View:
+    where = f"{path / POSES} row {number}"
+    down, right, backwards, centre, (h, w, focal) = row[:15].reshape(3, 5).T
+    near, far = row[15:]
+    pose = check_pose(where, np.stack([right, -down, backwards, centre], axis=1))
+    if not 0 < near < far < np.inf:
+        raise DatasetError(f"{where}: near {near:g} and far {far:g} are not 0 < near < far; calibrate anew")
+    video = probe(file) if file.suffix.lower() in VIDEO_SUFFIXES else None
+    width, height, has_alpha = (video.width, video.height, False) if video else image_size(file)
+    intrinsics = fit_intrinsics(where, file, (focal, focal, w / 2, h / 2), (w, h), (width, height))
+    return View(file, video, None, is_test, width, height, has_alpha, intrinsics, (0.0,) * 4, pose, near, far)
+
+
+def _read_poses(file: Path) -> np.ndarray:
+    try:
+        rows = np.load(file, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise DatasetError(f"{file}: not a numpy array ({error}); copy it anew") from error
+    if rows.ndim != 2 or rows.shape[1] != 17 or not np.issubdtype(rows.dtype, np.number) or np.iscomplexobj(rows):
+        raise DatasetError(f"{file}: holds {rows.dtype} {rows.shape}, not N x 17 numbers; export it anew")
+    return rows.astype(np.float64)

@@ -1,0 +1,54 @@
+"""nerfstudio and instant-ngp: one `transforms.json` with full intrinsics, optional distortion, time and split.
+
+(https://docs.nerf.studio/quickstart/data_conventions.html)
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from kpc.encoder.datasets.capture import HOLD_OUT_EVERY, Capture, find_image, held_out, natural_key, say_missing
+from kpc.encoder.datasets.layouts.transforms import frame_rate, frame_view, load_transforms
+from kpc.format.common.errors import DatasetError
+
+
+def recognise(path: Path) -> bool:
+    return (path / "transforms.json").is_file()
+
+
+def read(path: Path, holdout: str | None) -> Capture:
+    """Split by `train_filenames` and `test_filenames` (or `val_filenames`); else every eighth existing image tests.
+
+    Raises:
+        DatasetError, MediaError: the JSON or an image cannot be used.
+    """
+    file = path / "transforms.json"
+    document = load_transforms(file)
+    frames = sorted(enumerate(document["frames"]), key=lambda item: natural_key(item[1]["file_path"]))
+    found = [(number, find_image(path, file, frame["file_path"])) for number, frame in frames]
+    say_missing(file, [document["frames"][n]["file_path"] for n, image in found if image is None], len(found))
+    there = [(number, image) for number, image in found if image is not None]
+    names = [os.path.normpath(document["frames"][n]["file_path"]) for n, _ in there]
+    train, test = _listed(file, document, "train_filenames"), _listed(file, document, "test_filenames")
+    if test is None:
+        test = _listed(file, document, "val_filenames")
+    if train is None and test is None:
+        default = [k % HOLD_OUT_EVERY == 0 for k in range(len(there))]
+    else:
+        default = [name in test if test is not None else name not in (train or ()) for name in names]
+    tests = held_out(path, [str(image.relative_to(path)) for _, image in there], holdout, default)
+    views = tuple(
+        frame_view(file, number, document, image, is_test)
+        for (number, image), name, is_test in zip(there, names, tests)
+        if is_test or train is None or name in train or holdout is not None
+    )
+    return Capture("nerfstudio", views, frame_rate(file, document))
+
+
+def _listed(file: Path, document: dict[str, Any], key: str) -> frozenset[str] | None:
+    names = document.get(key)
+    if names is None:
+        return None
+    if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+        raise DatasetError(f"{file}: {key} is not a list of names; export it anew")
+    return frozenset(os.path.normpath(name) for name in names)

@@ -1,0 +1,233 @@
+"""How good a scene is: pictures rendered on the CPU, PSNR and SSIM against the held-out ones."""
+
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+import torch
+from torch.nn.functional import conv2d
+
+from kpc.encoder.field import kernels
+from kpc.encoder.field.appearances import FIT_RAYS, fitted_code
+from kpc.encoder.datasets import Dataset, rays
+from kpc.encoder.field.field import Field
+from kpc.encoder.training.optimisers import sample_capacity
+from kpc.encoder.field.render import Rays, marched, sample_counts, shade
+from kpc.format.common.fidelity import psnr
+from kpc.format.scene.scene import AnyDecoder, Decoder, Scene
+from kpc.format.scene.space import Contraction
+
+WHITE = np.ones(3, np.float32)
+
+RAYS_AT_ONCE = 1 << 16
+
+
+class SceneRenderer:
+    """Renders rays of a scene with the kernels; the same pictures as `kpc.player.cpu.reference`, much faster."""
+
+    def __init__(self, scene: Scene, field: Field | None = None) -> None:
+        """`field`: of which the scene is but the surroundings, where no scene can hold it."""
+        self.scene, self.field = scene, field or Field.from_scene(evenly_wide(scene))
+
+    def rgb(
+        self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(N, 3) float32 colours of (N, 3) origins, (N, 3) unit directions and (N,) times; rays as `datasets.rays` makes them.
+        `codes`: (N, H) of their appearances, None for the average."""
+        return self.render(origins, directions, times, codes)[0]
+
+    def codes(self, appearances: np.ndarray | None) -> np.ndarray | None:
+        """(N, H) the codes of appearances by their numbers (N,), None for None."""
+        return None if appearances is None else np.stack([a.code for a in self.scene.appearances])[appearances]
+
+    def render(
+        self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Colours (N, 3), opacities (N,), mean depths (N,) along the same rays, as those measure, float32. `codes` as in `rgb`."""
+        draw = self._marched if type(self.field) is Field else self._composited
+        out = []
+        for start in range(0, len(origins), RAYS_AT_ONCE):
+            some = slice(start, start + RAYS_AT_ONCE)
+            rays = (np.ascontiguousarray(a[some], np.float32) for a in (origins, directions, times))
+            with torch.no_grad():
+                out.append(draw(*rays, None if codes is None else torch.from_numpy(codes[some])))
+        colours, opacities, depths = (np.concatenate(parts) for parts in zip(*out, strict=True))
+        return colours, opacities, depths
+
+    def _marched(
+        self, o: np.ndarray, d: np.ndarray, t: np.ndarray, codes: torch.Tensor | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        scene, field, layout = self.scene, self.field, self.field.layout
+        basis = field.basis(torch.from_numpy(d), codes).numpy()
+        colours, opacities, depths, _ = kernels.render(
+            field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
+            layout.channels, scene.motion, scene.aabb, kernels.even_of(scene.mapping), scene.occupancy.view(np.uint8),
+            np.float32(scene.step), np.float32(scene.extent), o, d, t, basis, np.arange(len(o)), scene.background,
+            sample_capacity(scene.aabb, scene.step, scene.mapping), 8 * numba.get_num_threads(),
+        )
+        return colours, opacities, depths
+
+    def _composited(
+        self, o: np.ndarray, d: np.ndarray, t: np.ndarray, codes: torch.Tensor | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        scene = self.scene
+        batch = self.batch(o, d, t)
+        samples, met = marched(self.field, batch, scene)
+        along = samples.s.numpy() if not isinstance(scene.mapping, Contraction) else scene.mapping.distance(samples.s.numpy())
+        depths = np.bincount(samples.ray.numpy(), met.weights.numpy() * along, len(o)).astype(np.float32)
+        opacities = met.opacity.numpy()
+        return shade(self.field, batch, met, codes).numpy(), opacities, depths / np.maximum(opacities, np.float32(1e-6))
+
+    def meets(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether rays pass where anything may be. The others show the background, whatever planes hold."""
+        scene = self.scene
+        met: np.ndarray = sample_counts(self.batch(origins, directions, times), scene.aabb, scene.occupancy, scene.step, scene.mapping) > 0
+        return met
+
+    def picture(self, dataset: Dataset, number: int, first: int = 0, code: np.ndarray | None = None) -> np.ndarray:
+        """The scene as a picture of the dataset shows it, its lens included, from column `first` on: (H, W - first, 3) float32.
+        `code`: (H,) of the appearance to show it in, None for the average."""
+        pictures = dataset.pictures
+        h, w = int(pictures.height[number]), int(pictures.width[number]) - first
+        row, column = np.divmod(np.arange(w * h), w)
+        origins, directions = rays(pictures, np.full(w * h, number), column + first, row, self.scene.mapping)
+        codes = None if code is None else np.tile(code, (w * h, 1))
+        return self.rgb(origins, directions, np.full(w * h, pictures.time[number], np.float32), codes).reshape(h, w, 3)
+
+    def code_of_left_half(self, dataset: Dataset, number: int) -> np.ndarray:
+        """The code that suits at most FIT_RAYS usable pixels of the left half of a picture best, `appearances.fitted_code`."""
+        pictures, rng = dataset.pictures, np.random.default_rng(number)
+        row, column = np.nonzero(dataset.usable(number)[:, : _middle(dataset, number)])
+        chosen = rng.permutation(len(row))[:FIT_RAYS]
+        row, column, n = row[chosen], column[chosen], len(chosen)
+        origins, directions = rays(pictures, np.full(n, number), column, row, self.scene.mapping)
+        batch = self.batch(origins, directions, np.full(n, pictures.time[number]))
+        return fitted_code(self.scene, self.field, batch, torch.from_numpy(true_picture(dataset, number)[row, column]))
+
+    def batch(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> Rays:
+        """Rays as pictures are made of them: samples in the middle of their steps, the scene's background."""
+        n = len(origins)
+        return Rays.of(origins, directions, times, np.full(n, 0.5), np.tile(self.scene.background, (n, 1)))
+
+
+def evenly_wide(scene: Scene) -> Scene:
+    """The same scene with as many channels at every scale as the widest has: the kernels know one number. What is added is 0 and
+    weighs nothing; the features of each scale stay in front of it."""
+    counts = [scale["xy"].shape[2] for scale in scene.scales]
+    most = max(counts)
+    if min(counts) == most:
+        return scene
+
+    def widened(weights: np.ndarray, axis: int) -> np.ndarray:
+        parts = np.split(weights, np.cumsum(counts)[:-1], axis=axis)
+        return np.concatenate([_filled_up(part, axis, most) for part in parts], axis=axis)
+
+    d = scene.decoder
+    decoder = replace(d, density_weight=widened(d.density_weight, 0), w2=widened(d.w2, 1), b2=widened(d.b2, 1))
+    scales = tuple({name: _filled_up(plane, 2, most) for name, plane in scale.items()} for scale in scene.scales)
+    return replace(scene, scales=scales, decoder=decoder)
+
+
+def as_wide_as(scene: Scene, decoder: AnyDecoder) -> AnyDecoder:
+    """The decoder of `evenly_wide(scene)` without what was added."""
+    if not isinstance(decoder, Decoder):
+        return decoder
+    counts = [scale["xy"].shape[2] for scale in scene.scales]
+    kept = np.concatenate([np.arange(max(counts)) < count for count in counts])
+    return replace(decoder, density_weight=decoder.density_weight[kept], w2=decoder.w2[:, kept], b2=decoder.b2[:, kept])
+
+
+def _filled_up(values: np.ndarray, axis: int, size: int) -> np.ndarray:
+    return np.pad(values, [(0, size - n if k == axis else 0) for k, n in enumerate(values.shape)])
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Means over the pictures that were compared."""
+
+    psnr: float
+    ssim: float
+    pictures: int
+
+
+def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None, field: Field | None = None) -> Quality | None:
+    """PSNR and SSIM over the held-out pictures, or over `most` of them evenly spaced; None where none are held out.
+
+    Pictures with alpha are composited on white, the background such scenes are stored with. What a mask ignores does not
+    count, and a picture not at all where its mask leaves no window of SSIM.
+
+    Where the scene has appearances, a picture that was not trained on has none yet: a code is fitted to its left half, and its
+    right half alone counts (K-Planes, section 4.3; the protocol is that of NeRF in the Wild, arXiv:2008.02268). `field` as in
+    `SceneRenderer`.
+    """
+    held_out = np.flatnonzero(dataset.pictures.is_test)
+    first = {int(number): _middle(dataset, int(number)) if scene.appearances else 0 for number in held_out}
+    if dataset.masks is not None:
+        held_out = held_out[[bool(_centres(dataset.usable(n)[:, start:]).any()) for n, start in first.items()]]
+    if len(held_out) == 0:
+        return None
+    if most is not None and len(held_out) > most:
+        held_out = held_out[np.linspace(0, len(held_out) - 1, most).round().astype(int)]
+    renderer = SceneRenderer(scene, field)
+    scores = []
+    for number in map(int, held_out):
+        start, code = first[number], renderer.code_of_left_half(dataset, number) if scene.appearances else None
+        picture = np.clip(renderer.picture(dataset, number, start, code), 0, 1)
+        truth = true_picture(dataset, number)[:, start:]
+        if dataset.masks is None:
+            scores.append((psnr(picture, truth), ssim(picture, truth)))
+        else:
+            usable = dataset.usable(number)[:, start:]
+            scores.append((psnr(picture[usable], truth[usable]), ssim(picture, truth, usable)))
+    mean_psnr, mean_ssim = np.mean(scores, axis=0)
+    return Quality(float(mean_psnr), float(mean_ssim), len(scores))
+
+
+def _middle(dataset: Dataset, number: int) -> int:
+    """The first column of a picture's right half."""
+    return int(dataset.pictures.width[number]) // 2
+
+
+def true_picture(dataset: Dataset, number: int) -> np.ndarray:
+    """A picture of the dataset as (H, W, 3) float32 in [0, 1], on white where it is transparent."""
+    picture = dataset.pixels.picture(number).astype(np.float32) / np.float32(255)
+    if dataset.has_alpha:
+        return picture[..., :3] * picture[..., 3:] + WHITE * (1 - picture[..., 3:])
+    return picture[..., :3]
+
+
+def ssim(a: np.ndarray, b: np.ndarray, usable: np.ndarray | None = None) -> float:
+    """Structural similarity of (H, W, 3) pictures in [0, 1], the mean over pixels and channels.
+
+    With (H, W) bool `usable`, the mean over windows whose central pixel is. They may reach over others.
+
+    Wang et al. 2004, eq. 13: Gaussian window of 11 x 11 with sigma 1.5, K1 = 0.01, K2 = 0.03; only windows that lie inside
+    the picture count (smaller pictures take a smaller window).
+    """
+    size = _window(*a.shape[:2])
+    x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
+    g = torch.exp(-x.square() / (2 * 1.5**2))
+    g = g / g.sum()
+
+    def blur(image: torch.Tensor) -> torch.Tensor:
+        return conv2d(conv2d(image, g.view(1, 1, 1, -1)), g.view(1, 1, -1, 1))
+
+    p, q = (torch.from_numpy(np.ascontiguousarray(i.transpose(2, 0, 1)[:, None], np.float64)) for i in (a, b))
+    mu_p, mu_q = blur(p), blur(q)
+    var_p, var_q, cov = blur(p * p) - mu_p**2, blur(q * q) - mu_q**2, blur(p * q) - mu_p * mu_q
+    c1, c2 = 0.01**2, 0.03**2
+    values = ((2 * mu_p * mu_q + c1) * (2 * cov + c2)) / ((mu_p**2 + mu_q**2 + c1) * (var_p + var_q + c2))
+    if usable is not None:
+        values = values[:, 0, torch.from_numpy(_centres(usable))]
+    return float(values.mean())
+
+
+def _window(height: int, width: int) -> int:
+    return min(11, height, width)
+
+
+def _centres(usable: np.ndarray) -> np.ndarray:
+    """The part of an (H, W) array that the central pixels of SSIM's windows lie in, row by row of windows."""
+    height, width = usable.shape
+    size = _window(height, width)
+    return usable[size // 2 : size // 2 + height - size + 1, size // 2 : size // 2 + width - size + 1]

@@ -1,0 +1,178 @@
+"""Where the time of a training step goes, and how near the kernels come to what the machine can do: `kpbench step`."""
+
+import copy
+import math
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from kpc.encoder.field.field import Layout
+from kpc.encoder.training.optimisers import PlainOptimiser
+from kpc.encoder.training.train import Trainer
+
+STEPS = 8
+"""Steps before the profile, in multiples of the first with an occupancy grid: the grid has formed, and been split in time."""
+ROUNDS = 3
+FUSED_STEPS = 50
+"""Each round takes so many steps as training does, then one in plain PyTorch on the same kind of batch."""
+
+
+def profile(trainer: Trainer) -> dict[str, Any]:
+    """Train for a while, then watch; what was found, in SI units and a step each, as a dictionary that JSON can hold.
+
+    Both optimisers work on the same field, grid and number of rays, by turns, with all cores. On a GPU there is one; of what it moves the
+    dictionary says how much, and how much the GPU could have moved.
+
+    Raises:
+        ValueError: the run has fewer steps than that takes. TrainingError: as `Trainer.run`.
+    """
+    config = trainer.config
+    if trainer.device.type != "cpu":
+        return _profile_on_gpu(trainer)
+    if config.steps < STEPS * config.occupancy_start + ROUNDS * FUSED_STEPS:
+        raise ValueError(f"{config.steps} steps are too few to profile one")
+    trainer.optimiser.config = replace(config, coarse_until=0.0)  # as in most of the run
+    trainer.run_to(STEPS * config.occupancy_start)
+    plain = PlainOptimiser(copy.deepcopy(trainer.field), config, trainer.grid.seen.shape, trainer.mapping)
+    fused_s, plain_s, parts, samples, rays = [], [], [], [], 0
+    for _ in range(ROUNDS):
+        before = dict(trainer.watch.seconds)
+        started = trainer.elapsed_s
+        trainer.run_to(trainer.step + FUSED_STEPS)
+        fused_s.append((trainer.elapsed_s - started) / FUSED_STEPS)
+        parts.append({name: (s - before.get(name, 0.0)) / FUSED_STEPS for name, s in trainer.watch.seconds.items()})
+        rays = trainer.rays_a_step
+        samples.append(trainer.samples_per_ray)
+        plain_s.append(_plain_step(trainer, plain, rays))
+    flops, bytes_ = work(trainer.field.layout, rays * statistics.median(samples))
+    kernel_s = statistics.median(part["kernel"] for part in parts)
+    return {
+        "device": "cpu",
+        "rays": rays, "samples_per_ray": statistics.median(samples), "parameters": trainer.field.theta.numel(),
+        "step_s": statistics.median(fused_s), "plain_step_s": statistics.median(plain_s),
+        "rays_per_s": rays / statistics.median(fused_s), "plain_rays_per_s": rays / statistics.median(plain_s),
+        "parts_s": {name: statistics.median(part[name] for part in parts) for name in parts[0]},
+        "kernel_gflops": flops / kernel_s / 1e9, "kernel_gb_s": bytes_ / kernel_s / 1e9,
+    }  # fmt: skip
+
+
+def _profile_on_gpu(trainer: Trainer) -> dict[str, Any]:
+    """As `profile`; `bytes`: what the operations of a step move, as `Traffic` counts them; `memory_gb_s`: what the device moves at most."""
+    config, optimiser = trainer.config, trainer.optimiser
+    assert isinstance(optimiser, PlainOptimiser)
+    if config.steps < STEPS * config.occupancy_start + (ROUNDS + 1) * FUSED_STEPS:
+        raise ValueError(f"{config.steps} steps are too few to profile one")
+    trainer.run_to(STEPS * config.occupancy_start)
+    steps_s, moved = [], []
+    for _ in range(ROUNDS):
+        torch.cuda.synchronize()
+        started = time.perf_counter()
+        trainer.run_to(trainer.step + FUSED_STEPS)
+        torch.cuda.synchronize()
+        steps_s.append((time.perf_counter() - started) / FUSED_STEPS)
+    rays = trainer.rays_a_step
+    for _ in range(config.regularise_every):
+        step = _drawn(trainer, optimiser, rays)
+        with Traffic() as traffic, optimiser.as_written():
+            step()
+        trainer.step += 1
+        moved.append(traffic.bytes)
+    step_s, bytes_ = statistics.median(steps_s), statistics.mean(moved)
+    _, least = work(trainer.field.layout, rays * trainer.samples_per_ray)
+    limit = _copy_rate()
+    return {
+        "device": torch.cuda.get_device_name(),
+        "rays": rays, "samples_per_ray": trainer.samples_per_ray, "parameters": trainer.field.theta.numel(),
+        "step_s": step_s, "rays_per_s": rays / step_s, "bytes": bytes_, "least_bytes": least,
+        "memory_gb_s": limit / 1e9, "share_of_memory": bytes_ / step_s / limit, "least_share_of_memory": least / step_s / limit,
+        "gpu_memory_bytes": torch.cuda.max_memory_allocated(),
+    }  # fmt: skip
+
+
+def _copy_rate() -> float:
+    """Bytes a second that the GPU reads and writes, in copying what fits no cache."""
+    one = torch.empty(1 << 28, device="cuda")
+    other, seconds = torch.empty_like(one), []
+    for _ in range(10):
+        torch.cuda.synchronize()
+        started = time.perf_counter()
+        other.copy_(one)
+        torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - started)
+    return 2 * one.nbytes / min(seconds)
+
+
+class Traffic(TorchDispatchMode):
+    """Counts what operations move, as if no cache kept anything from one to the next: what they read and what they write, once; of tables
+    only the rows that they look up.
+
+    Attributes:
+        bytes: so far.
+    """
+
+    LOOK_UPS = ("index", "index_select", "gather", "_embedding_bag", "_embedding_bag_forward_only")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bytes = 0.0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        out = func(*args, **(kwargs or {}))
+        name = func.overloadpacket.__name__
+        made = [a for a in tree_leaves(out) if isinstance(a, torch.Tensor)]
+        read = [a for a in tree_leaves((args, kwargs)) if isinstance(a, torch.Tensor)]
+        sparse = [a for a in read if a.layout == torch.sparse_csr]
+        if func.is_view or any(a.layout == torch.sparse_csr for a in made):
+            return out
+        if sparse:  # a row of what it is multiplied with for each entry, its number and its value; and what comes of it
+            self.bytes += sparse[0]._nnz() * (made[0].shape[1] + 2) * 4 + made[0].nbytes
+        elif name in self.LOOK_UPS:
+            a_row = read[1].numel() / len(made[0]) if name.startswith("_embedding_bag") else 1
+            self.bytes += sum(map(_bytes, read[1:])) + (1 + a_row) * _bytes(made[0])
+        else:
+            self.bytes += sum(map(_bytes, [*read, *made]))
+        return out
+
+
+def _bytes(tensor: torch.Tensor) -> int:
+    """Of the memory that a tensor reaches, what is repeated counted once."""
+    numbers = math.prod(size for size, stride in zip(tensor.shape, tensor.stride(), strict=True) if stride)
+    return numbers * tensor.element_size()
+
+
+def work(layout: Layout, samples: float) -> tuple[float, float]:
+    """What `kernels.backpropagate` has to do for so many samples at least: float operations, and bytes of texels read or written.
+
+    With P planes a scale and F = S M features, a sample takes 8 P F to interpolate and as many to give the gradient back, P F to
+    multiply, 14 F for the product's derivatives, 6 F for the density and 18 F for three colours, each with its gradient. It reads
+    four texels of 4 F bytes a plane, and reads and writes as much of the gradient.
+    """
+    planes, F = (6 if layout.is_dynamic else 3), layout.features
+    return samples * F * (17 * planes + 38), samples * 48 * planes * F
+
+
+def _plain_step(trainer: Trainer, plain: PlainOptimiser, count: int) -> float:
+    """Seconds of a step with `count` rays, the field's decoder included, by as many threads as the machine has cores."""
+    step, threads = _drawn(trainer, plain, count), torch.get_num_threads()
+    torch.set_num_threads(os.cpu_count() or 1)
+    try:
+        started = time.perf_counter()
+        step()
+        return time.perf_counter() - started
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _drawn(trainer: Trainer, optimiser: PlainOptimiser, count: int) -> Callable[[], object]:
+    """A step of `optimiser` with `count` rays, which are drawn at once."""
+    batch, targets = trainer.sampler.draw(trainer.rng, count, None if trainer.dataset.has_alpha else trainer.background)
+    return partial(optimiser.step, trainer.step, 1.0, 1e-3, batch, targets, trainer.aabb, trainer.grid.marched, trainer.step_length,
+                   trainer.extent)

@@ -1,0 +1,121 @@
+"""Proposal sampling: where on a ray to look, learnt by two small fields beside the one that is to be had.
+
+mip-NeRF 360 (arXiv:2111.12077, section 3.1), with K-Planes for the proposals (arXiv:2301.10241, section 3.4). For scenes in which
+an occupancy grid does not serve: where something is nearly everywhere, or far too fine for its cells. The proposals are of use in
+training alone: what is stored and played is marched through the grid that has formed meanwhile.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.field.field import Field, plan_layout
+from kpc.encoder.field.render import Rays, Samples, cells_of, fused_features, places, spans_of
+from kpc.format.scene.scene import Clip
+from kpc.format.scene.space import SpaceMapping
+
+PADDING = 0.01
+"""Added to each weight before samples are drawn by them, so that no part of a ray is given up for good."""
+
+ANNEALED = 500
+"""Steps over which the weights come into force, from all being equal; before, they are the weights of fields that know nothing."""
+
+Level = tuple[Tensor, Tensor]
+"""Of N rays cut into K intervals: edges (N, K + 1), s rising along each ray, and weights (N, K)."""
+
+
+class Proposals(nn.Module):
+    """Two fields with a density and no colour, one scale each.
+
+    Attributes:
+        fields: coarse, then fine.
+    """
+
+    def __init__(self, config: TrainConfig, aabb: np.ndarray, clip: Clip, is_dynamic: bool) -> None:
+        super().__init__()
+        fields = []
+        for level, texels in enumerate(config.proposal_resolutions):
+            shape = replace(config, resolutions=(texels,), channels=config.proposal_channels)
+            generator = torch.Generator().manual_seed(config.seed + 1 + level)
+            fields.append(Field(plan_layout(shape, aabb, clip, is_dynamic), 1, generator))
+        self.fields = nn.ModuleList(fields)
+        self.counts = config.proposal_samples
+
+    def sample(
+        self, rays: Rays, aabb: Tensor, mapping: SpaceMapping | None, cells: tuple[int, int, int], step: int, fused: bool,
+    ) -> tuple[Samples, Tensor, list[Level]]:
+        """Samples for the field that is to be had, as many on every ray; their edges (N, K + 1); what each proposal made of them.
+
+        Args:
+            cells: (Nz, Ny, Nx) of the occupancy grid. step: number of the training step. fused: whether the kernels look the
+                planes up.
+        """
+        near, far = spans_of(rays, aabb, mapping)
+        extent = (aabb[1] - aabb[0]).max()
+        force = min(1.0, 10 * step / (9 * step + ANNEALED))  # mip-NeRF 360's schedule: fast at first
+        edges = _evenly(near, far, self.counts[0], rays.jitters)
+        levels: list[Level] = []
+        for field, count in zip(self.fields, self.counts[1:], strict=True):
+            assert isinstance(field, Field)
+            samples = _between(rays, edges, aabb, mapping, cells)
+            look_up = fused_features(field) if fused else field.features
+            log_density, _ = field.decode(look_up(samples.points, rays.times[samples.ray]))
+            tau = (log_density.exp() * samples.length * samples.stretch / extent).view(len(near), -1)
+            trans = torch.exp(torch.cumsum(tau, 1).neg() + tau)
+            weights = trans * (1 - torch.exp(-tau))
+            levels.append((edges, weights))
+            edges = resampled(edges, weights.detach() ** force, count, rays.jitters)
+        return _between(rays, edges, aabb, mapping, cells), edges, levels
+
+
+def _evenly(near: Tensor, far: Tensor, count: int, jitters: Tensor) -> Tensor:
+    """Edges (N, count + 1) of equal intervals from near to far (N,), the inner ones moved by up to half an interval."""
+    at = torch.arange(count + 1, device=near.device, dtype=near.dtype) / count
+    moved = at + (jitters[:, None] - 0.5) / count * ((at > 0) & (at < 1))
+    return near[:, None] + moved * (far - near).clamp(min=0)[:, None]
+
+
+def _between(rays: Rays, edges: Tensor, aabb: Tensor, mapping: SpaceMapping | None, cells: tuple[int, int, int]) -> Samples:
+    """A sample in the middle of each interval."""
+    middle = (edges[:, 1:] + edges[:, :-1]) / 2
+    u, stretch = places(rays, middle, aabb, mapping)
+    u = u.clamp(0, 1)
+    ray = torch.arange(len(middle), device=middle.device)[:, None].expand_as(middle).flatten()
+    return Samples(ray, u.flatten(0, 1), middle.flatten(), (edges[:, 1:] - edges[:, :-1]).flatten(), stretch.flatten(),
+                   cells_of(u, cells).flatten(0, 1))
+
+
+def resampled(edges: Tensor, weights: Tensor, count: int, jitters: Tensor) -> Tensor:
+    """Edges (N, count + 1) of new intervals that all hold as much of the weights (N, K) between edges (N, K + 1).
+
+    The inverse of the cumulative weights, read at even steps moved by jitters (N,) in [0, 1); no gradient.
+    """
+    with torch.no_grad():
+        padded = weights + PADDING / weights.shape[1]
+        cumulative = torch.nn.functional.pad(torch.cumsum(padded / padded.sum(1, keepdim=True), 1), (1, 0)).clamp(max=1)
+        at = torch.arange(count + 1, device=edges.device, dtype=edges.dtype) / count
+        at = (at + (jitters[:, None] - 0.5) / count * ((at > 0) & (at < 1))).contiguous()
+        upper = torch.searchsorted(cumulative, at, right=True).clamp(1, edges.shape[1] - 1)
+        low, high = (torch.gather(cumulative, 1, i) for i in (upper - 1, upper))
+        share = ((at - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
+        start, end = (torch.gather(edges, 1, i) for i in (upper - 1, upper))
+        return start + share * (end - start)
+
+
+def histogram_loss(edges: Tensor, weights: Tensor, level: Level) -> Tensor:
+    """How far a proposal underrates what was found, arXiv:2111.12077, eq. 13; the gradient is for the proposal alone.
+
+    mean over rays of sum_i max(0, w_i - bound_i)^2 / w_i, where bound_i is the sum of the proposal's weights in all its intervals
+    that meet interval i of `edges` (N, K + 1), with `weights` (N, K).
+    """
+    proposed, estimate = level
+    edges, weights = edges.detach(), weights.detach()
+    cumulative = torch.nn.functional.pad(torch.cumsum(estimate, 1), (1, 0))
+    last = estimate.shape[1]
+    first = (torch.searchsorted(proposed.contiguous(), edges[:, :-1].contiguous(), right=True) - 1).clamp(0, last - 1)
+    beyond = torch.searchsorted(proposed.contiguous(), edges[:, 1:].contiguous()).clamp(1, last)
+    bound = torch.gather(cumulative, 1, torch.maximum(beyond, first + 1)) - torch.gather(cumulative, 1, first)
+    return ((weights - bound).clamp(min=0).square() / (weights + 1e-7)).sum(1).mean()

@@ -1,0 +1,91 @@
+"""Which rays a training step takes: pixels of the training pictures, drawn, and their rays."""
+
+import math
+
+import numpy as np
+import torch
+
+from kpc.encoder.datasets import Dataset, rays
+from kpc.encoder.training.importance import TileWeights
+from kpc.encoder.field.render import Rays
+from kpc.format.scene.space import SpaceMapping
+
+
+class RaySampler:
+    """Draws usable pixels of the training pictures, each as likely as any other unless told otherwise, and makes their rays.
+
+    Attributes:
+        frames: (P, 4) int64, columns from and to, rows from and to, of what is not transparent in each training picture;
+            None without alpha, and with masks, which need not agree with it.
+    """
+
+    MARGIN = 0.03
+    """Of a picture's longer side, about what is not transparent: the outline wants to be learnt from both sides."""
+
+    def __init__(
+        self, dataset: Dataset, mapping: SpaceMapping | None = None, appearances: np.ndarray | None = None
+    ) -> None:
+        """`appearances`: (P,) int64, of each picture, as `appearances.number_pictures` has them; None where there are none."""
+        self.dataset, self.mapping, self.appearances = dataset, mapping, appearances
+        self.train = np.flatnonzero(~dataset.pictures.is_test)
+        self.ends = np.cumsum(dataset.usable_counts[self.train])
+        self.frames: np.ndarray | None = None
+        if dataset.has_alpha and dataset.masks is None:
+            self.frames = np.array([self._frame(dataset.pixels.picture(int(p))[..., 3]) for p in self.train], np.int64)
+            sizes = (self.frames[:, 1] - self.frames[:, 0]) * (self.frames[:, 3] - self.frames[:, 2])
+            self.frame_ends = np.cumsum(sizes)
+
+    def draw(
+        self, rng: np.random.Generator, count: int, background: np.ndarray | None = None, object_rays: float = 0.0,
+        weights: TileWeights | None = None,
+    ) -> tuple[Rays, torch.Tensor]:
+        """`count` rays and the (count, 3) colours they should have, over one background or one drawn for each ray.
+
+        `object_rays` is the share of them that is drawn from `frames`, where there are any; the others go by `weights`.
+        """
+        pictures = self.dataset.pictures
+        within = 0 if self.frames is None or not self.frame_ends[-1] else round(object_rays * count)
+        if weights is not None:
+            picture, row, column = weights.draw(rng, count - within)
+        else:
+            which, rank = _pick(rng, self.ends, count - within)
+            picture = self.train[which]
+            row, column = np.divmod(self.dataset.nth_usable(picture, rank), pictures.width[picture])
+        if within:
+            which, rank = _pick(rng, self.frame_ends, within)
+            left, right, top, _ = self.frames[which].T
+            below, beside = np.divmod(rank, right - left)
+            picture = np.concatenate([self.train[which], picture])
+            row, column = np.concatenate([top + below, row]), np.concatenate([left + beside, column])
+        # Rays of one instant read the same rows of the space-time planes: side by side, they find them in the cache.
+        order = np.argsort(pictures.time[picture], kind="stable")
+        picture, row, column = picture[order], row[order], column[order]
+        inside = row * pictures.width[picture] + column
+        origins, directions = rays(pictures, picture, column, row, self.mapping)
+        colours = self.dataset.pixels.read(pictures.offset[picture] + inside).astype(np.float32) / np.float32(255)
+        if background is None:
+            backgrounds = rng.random((count, 3), dtype=np.float32)
+        else:
+            backgrounds = np.broadcast_to(background, (count, 3))
+        targets = colours[:, :3]
+        if self.dataset.has_alpha:
+            targets = targets * colours[:, 3:] + backgrounds * (1 - colours[:, 3:])
+        jitters = rng.random(count, dtype=np.float32)
+        numbers = None if self.appearances is None else self.appearances[picture]
+        batch = Rays.of(origins, directions, pictures.time[picture], jitters, backgrounds, appearances=numbers)
+        return batch, torch.from_numpy(targets)
+
+    def _frame(self, alpha: np.ndarray) -> tuple[int, int, int, int]:
+        rows, columns = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))
+        if not len(rows):
+            return 0, 0, 0, 0
+        (height, width), margin = alpha.shape, math.ceil(self.MARGIN * max(alpha.shape))
+        return (max(columns[0] - margin, 0), min(columns[-1] + 1 + margin, width),
+                max(rows[0] - margin, 0), min(rows[-1] + 1 + margin, height))
+
+
+def _pick(rng: np.random.Generator, ends: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """`count` of the ends[-1] pixels of several ranges laid end to end: which range each is in, and its number there."""
+    pixel = rng.integers(ends[-1], size=count)
+    which = np.searchsorted(ends, pixel, side="right")
+    return which, pixel - np.where(which > 0, ends[which - 1], 0)

@@ -1,0 +1,312 @@
+"""The training loop: draw rays, render them, step the planes, keep the occupancy grid current."""
+
+import hashlib
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from kpc.encoder.field.appearances import number_pictures
+from kpc.encoder.field.bounds import seen_cells
+from kpc.encoder.training.checkpoint import save_state
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.datasets import Dataset
+from kpc.encoder.field.field import Field, HybridField, SummedField, appearance_priors, motion_nodes, motion_priors, plan_layout, priors
+from kpc.encoder.training.importance import TileWeights, cameras_stand_still
+from kpc.encoder.field.occupancy_grid import OccupancyGrid, grid_shape
+from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser, log_densities
+from kpc.encoder.field.proposals import Proposals
+from kpc.encoder.training.sampler import RaySampler
+from kpc.format.common.errors import TrainingError
+from kpc.format.common.fidelity import psnr_of
+from kpc.format.scene.scene import Scene
+from kpc.format.scene.space import Contraction, SpaceMapping
+
+
+@dataclass(frozen=True)
+class Report:
+    """How training stands after a step."""
+
+    step: int
+    fraction: float
+    psnr: float
+    rays_per_second: float
+    samples_per_ray: float
+    occupied: float
+    elapsed_s: float
+
+
+class Trainer:
+    """One run: a dataset, a field, the optimiser's state. `run` trains to the end or until told to stop.
+
+    `elapsed_s` counts the seconds of training, those spent before, on a survey, included.
+    """
+
+    def __init__(
+        self, dataset: Dataset, config: TrainConfig, aabb: np.ndarray, device: str, elapsed_s: float = 0.0,
+        mapping: SpaceMapping | None = None,
+    ) -> None:
+        self.dataset, self.config, self.device, self.mapping = dataset, config, torch.device(device), mapping
+        self.aabb = np.asarray(aabb, np.float32)
+        self.extent = float(np.max(self.aabb[1] - self.aabb[0]))
+        steps_across = config.samples_across / (2 if isinstance(mapping, Contraction) else 1)  # a box is half of contracted space
+        self.step_length = self.extent / steps_across
+        self.rng = np.random.default_rng(config.seed)
+        layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
+        nodes = motion_nodes(config, self.aabb, layout)
+        appearances, self.names = number_pictures(dataset, config.appearance)
+        kind, hidden = (SummedField if config.summed else Field), config.hidden
+        if config.hybrid:
+            kind, hidden = HybridField, config.hybrid_width
+        generator = torch.Generator().manual_seed(config.seed)
+        self.field = kind(layout, hidden, generator, nodes, len(self.names)).to(self.device)
+        if not config.view_dependent:
+            torch.nn.init.zeros_(self.field.w1)
+        shape = grid_shape(self.aabb, config.cells_across)
+        threshold = math.log(-math.log(1 - config.occupancy_alpha) * steps_across)
+        self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape, mapping), threshold)
+        self.slots = min(config.occupancy_slots, dataset.clip.frame_count) if dataset.is_dynamic else 1
+        on_cpu = self.device.type == "cpu"
+        proposals = Proposals(config, self.aabb, dataset.clip, dataset.is_dynamic).to(self.device) if config.proposals else None
+        self.optimiser: FusedOptimiser | PlainOptimiser = (
+            FusedOptimiser(self.field, config, shape, mapping)
+            if on_cpu and proposals is None and not (config.hybrid or config.summed) else
+            PlainOptimiser(self.field, config, shape, mapping, fused=on_cpu, proposals=proposals)
+        )
+        self.watch = self.optimiser.watch
+        self.step = 0
+        self.elapsed_s = elapsed_s
+        self.samples_per_ray = float(config.samples_across)
+        self.sampler = RaySampler(dataset, mapping, appearances if self.names else None)
+        # Objects with alpha are shown on white. Elsewhere what the box leaves open is grey: the least wrong guess.
+        self.background = np.full(3, 1.0 if dataset.has_alpha else 0.5, np.float32)
+        self._weights: TileWeights | None = None
+        self._can_weigh = cameras_stand_still(dataset)
+        self._steady_rays, self._steady_s = 0, 0.0
+
+    def run(
+        self, report: Callable[[Report], None], checkpoint: Path | None = None, *,
+        time_budget_s: float | None = None, most_steps: int | None = None, checkpoint_every_s: float = 60.0,
+        interrupted: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Train until `config.steps`, or for `time_budget_s` seconds of training where given, and `most_steps` at most then.
+
+        A checkpoint that cannot be written on the way is said on stderr and tried again: it is no reason to stop.
+
+        Raises:
+            TrainingError: the loss is not finite.
+            KeyboardInterrupt: `interrupted()`, asked between steps, was true.
+        """
+        config = self.config
+        saved, error, drawn, since = time.monotonic(), 0.0, 0, time.monotonic()
+        while (fraction := self._fraction(time_budget_s, most_steps)) < 1:
+            if interrupted():
+                raise KeyboardInterrupt
+            started = time.monotonic()
+            with self.watch("occupancy"):
+                if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
+                    self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
+                if self.slots > 1 and self.step >= 4 * config.occupancy_start and self.step % config.occupancy_split_every == 0:
+                    self.grid.split(self.density_at, self.slots, self.rng)
+            count = self.rays_a_step
+            background = None if self.dataset.has_alpha else self.background
+            with self.watch("rays"):
+                weights = self._weights_at(fraction)
+                batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays, weights)
+            rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
+            squared_error, samples = self.optimiser.step(
+                self.step, fraction, rate, batch, targets, self.aabb, self.grid.marched,
+                self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1), self.extent,
+            )
+            if not math.isfinite(squared_error):
+                raise TrainingError(f"step {self.step}: {self._not_finite()}; try another --seed or --preset")
+            self.samples_per_ray += 0.1 * (samples - self.samples_per_ray)
+            self.step += 1
+            error, drawn = error + squared_error * count, drawn + count
+            now = time.monotonic()
+            self.elapsed_s += now - started
+            if self.step > 2 * config.occupancy_start:
+                self._steady_rays, self._steady_s = self._steady_rays + count, self._steady_s + now - started
+            if now - since > 0.5:
+                psnr = psnr_of(error / drawn)
+                report(Report(self.step, self._fraction(time_budget_s, most_steps), psnr, drawn / (now - since),
+                              self.samples_per_ray, float(self.grid.occupied.mean()), self.elapsed_s))
+                error, drawn, since = 0.0, 0, now
+            if checkpoint is not None and now - saved > checkpoint_every_s:
+                self._try_to_save(checkpoint)
+                saved = since = time.monotonic()
+        if checkpoint is not None:
+            self._try_to_save(checkpoint)
+
+    def run_to(self, step: int, watch: Callable[[], None] = lambda: None) -> None:
+        """Train as `run` does, without a report, but only to a step on the way; `watch` is called before each.
+
+        Raises:
+            As `run`.
+        """
+
+        def there() -> bool:
+            watch()
+            return self.step >= step
+
+        try:
+            self.run(lambda report: None, interrupted=there)
+        except KeyboardInterrupt:
+            if self.step < step:  # the user's
+                raise
+
+    @property
+    def rays_a_step(self) -> int:
+        """As many as keep a step's samples within bounds, now."""
+        return int(np.clip(self.config.samples / max(self.samples_per_ray, 1e-3), 256, self.config.rays))
+
+    @property
+    def rays_per_second(self) -> float:
+        """Rays trained in a second, all that a step takes included, once the occupancy grid has formed."""
+        return self._steady_rays / self._steady_s if self._steady_s else 0.0
+
+    def scene(self, occupancy: np.ndarray | None = None) -> Scene:
+        """The field as it stands, with an occupancy (slots, Nz, Ny, Nx), or with that of training; the planes are copied."""
+        if occupancy is None:
+            occupancy = self.grid.marched
+        return self.field.to_scene(
+            self.aabb, self.dataset.clip, occupancy, self.background, self.step_length, self.mapping, self.names)
+
+    def _weights_at(self, fraction: float) -> TileWeights | None:
+        """What decides which rays are drawn at this share of the run; it follows from the dataset, so no checkpoint holds it."""
+        if fraction < self.config.temporal_start or not self._can_weigh:
+            return None
+        if self._weights is None:
+            self._weights = TileWeights(self.dataset, self.config.temporal_floor)
+        return self._weights
+
+    def _fraction(self, time_budget_s: float | None, most_steps: int | None) -> float:
+        if time_budget_s is None:
+            return self.step / self.config.steps
+        return max(self.elapsed_s / time_budget_s, self.step / most_steps if most_steps else 0.0)
+
+    def _not_finite(self) -> str:
+        """Which terms of the loss hold NaN or infinity, the colours being one of them, and which parameters they come from."""
+        field, config = self.field, self.config
+        weighed = priors(field, config, config.variation(0.0)) | motion_priors(field, config) | appearance_priors(field, config)
+        terms = ["colour"] + [name for name, value in weighed.items() if not torch.isfinite(value)]
+        planes = [f"{name} at scale {s}" for s, name, *_ in self.field.layout.planes()
+                  if not torch.isfinite(self.field.plane(s, name)).all()]
+        decoder = [name for name, value in self.field.named_parameters() if name != "theta" and not torch.isfinite(value).all()]
+        found = ", ".join((planes + decoder)[:6])
+        return f"the loss is not finite ({', '.join(terms)})" + (f", nor are all values of {found}" if found else "")
+
+    def density_at(self, points: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Log densities at (N, 3) points in [0, 1]^3 and (N,) times."""
+        if isinstance(self.optimiser, FusedOptimiser):
+            return log_densities(self.field, points, times)
+        out = []
+        with torch.no_grad():
+            for p, t in zip(np.array_split(points, len(points) // 2**18 + 1), np.array_split(times, len(times) // 2**18 + 1)):
+                features = self.optimiser.features(*(torch.from_numpy(np.float32(a)).to(self.device) for a in (p, t)))
+                out.append(self.field.decode(features)[0].cpu().numpy())
+        return np.concatenate(out)
+
+    def save(self, path: Path) -> None:
+        """Write everything a later `resume` needs. The file is plain tensors and numbers; it is read without unpickling code.
+
+        Raises:
+            TrainingError: it cannot be written; an earlier checkpoint is left as it was.
+        """
+        state = {
+            "config": asdict(self.config), "aabb": torch.from_numpy(self.aabb), "step": self.step, "elapsed_s": self.elapsed_s,
+            "mapping": repr(self.mapping),
+            "samples_per_ray": self.samples_per_ray, "field": self.field.state_dict(), "optimiser": self.optimiser.state(),
+            "grid": self.grid.state(), "rng": _rng_to_plain(self.rng), "dataset": _fingerprint(self.dataset),
+        }
+        save_state(path, state, "give another folder with --work")
+
+    def _try_to_save(self, path: Path) -> None:
+        try:
+            self.save(path)
+        except TrainingError as error:
+            print(f"{error}; training goes on", file=sys.stderr, flush=True)
+
+    def resume(self, path: Path) -> None:
+        """Go on from a checkpoint of the same dataset and config, to bitwise the same end.
+
+        Raises:
+            TrainingError: it cannot be read, or belongs to another run.
+        """
+        try:
+            state = _load(path, self.device)
+            same = _comparable(state["config"]) == _comparable(asdict(self.config))
+            here = np.array_equal(state["aabb"].cpu().numpy(), self.aabb) and state.get("mapping") == repr(self.mapping)
+            if not same or not here:
+                raise TrainingError(f"{path}: belongs to a run with other settings; give the same ones or drop --resume")
+            if state["dataset"] != _fingerprint(self.dataset):
+                raise TrainingError(f"{path}: belongs to a run on other pictures; give the same dataset, --holdout and "
+                                    "--downscale, or drop --resume")
+            self.field.load_state_dict(state["field"])
+            self.optimiser.load(state["optimiser"])
+            self.grid.load(state["grid"])
+            self.rng.bit_generator.state = _rng_from_plain(state["rng"])
+            self.step, self.elapsed_s = state["step"], state["elapsed_s"]
+            self.samples_per_ray = state["samples_per_ray"]
+        except TrainingError:
+            raise
+        except Exception as error:  # what a damaged file holds may be of any kind
+            raise _unusable(path, error) from error
+
+
+def box_of_checkpoint(path: Path) -> np.ndarray:
+    """The (2, 3) box of the run that wrote a checkpoint.
+
+    Raises:
+        TrainingError: it cannot be read.
+    """
+    try:
+        aabb = _load(path, torch.device("cpu"))["aabb"].numpy()
+        if aabb.shape != (2, 3) or not np.isfinite(aabb).all() or not (aabb[0] < aabb[1]).all():
+            raise ValueError("aabb")
+    except Exception as error:
+        raise _unusable(path, error) from error
+    return aabb
+
+
+def _load(path: Path, device: torch.device) -> dict[str, Any]:
+    state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+    return state
+
+
+def _unusable(path: Path, error: Exception) -> TrainingError:
+    return TrainingError(f"{path}: not a usable checkpoint ({type(error).__name__}); delete it to start afresh")
+
+
+def _comparable(config: dict[str, Any]) -> dict[str, Any]:
+    """A config without what may differ between a run and its continuation."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in config.items()
+            if key not in ("steps", "prune_share", "tune_steps")}
+
+
+def _fingerprint(dataset: Dataset) -> str:
+    """Of what the rays of a training run depend on, the checksums of pixels and masks included."""
+    digest = hashlib.sha256(repr([(tile.offset, tile.crc32c) for tile in dataset.pixels.tiles]).encode())
+    p = dataset.pictures
+    for array in (p.time, p.is_test, p.width, p.height, p.intrinsics, p.distortion, p.camera_to_world):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    if dataset.masks is not None:
+        digest.update(repr(dataset.masks.crc32c).encode())
+    return digest.hexdigest()
+
+
+def _rng_to_plain(rng: np.random.Generator) -> dict[str, str]:
+    state = rng.bit_generator.state
+    return {"state": hex(state["state"]["state"]), "inc": hex(state["state"]["inc"]),
+            "has_uint32": str(state["has_uint32"]), "uinteger": str(state["uinteger"])}
+
+
+def _rng_from_plain(plain: dict[str, str]) -> dict[str, Any]:
+    return {"bit_generator": "PCG64", "state": {"state": int(plain["state"], 16), "inc": int(plain["inc"], 16)},
+            "has_uint32": int(plain["has_uint32"]), "uinteger": int(plain["uinteger"])}

@@ -1,0 +1,314 @@
+"""Planes as 8-bit symbols: what the file stores, and the one multiply-add that turns it back into numbers.
+
+    value = float32(float32(symbol * step) + offset)            spec/kpc-format.md, "Dequantisation"
+
+Both roundings are to nearest even and happen in this order: a decoder must not fuse them. An *uncoded* texel has
+symbol 0 in every channel, hence the value `offset`: exactly 1 on time planes (the multiplicative identity), a default
+of the channel on space planes (read only where nothing is seen).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from kpc.format.scene.cameras import Camera
+from kpc.format.common.errors import FormatError
+from kpc.format.scene.motion import QuantisedMotion, places_reached, quantise_motion
+from kpc.format.coding.poses import rigid, rounded
+from kpc.format.coding.rans import compiled
+from kpc.format.scene.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
+from kpc.format.scene.space import SpaceMapping
+from kpc.format.container.segments import PlaneGuide
+from kpc.format.coding.weights import FINEST
+
+SYMBOL_MIN, SYMBOL_MAX = -128, 127
+
+VALUE_LIMIT = 2048.0
+"""Magnitude of any plane value: float16 holds it, and with float16 weights no feature, density or colour overflows."""
+HALF_BITS = 11
+"""Significant bits of a float16."""
+COARSEST_STEP = 8.0
+"""A coarser step is taken for this one; 128 of it stay within the limit."""
+
+
+@dataclass(frozen=True)
+class QuantisedPlane:
+    """One plane as integers.
+
+    Attributes:
+        symbols: (H, W, M) int8; 0 wherever `coded` is False.
+        step: (M,) float32 > 0; offset: (M,) float32, exactly 1 on time planes.
+        coded: (H, W) bool, the texels whose symbols the file stores.
+        guide: by which symbols were chosen, if by any; one that they do not follow does no harm.
+        starts: the first rows of the segments that symbols were chosen for; none: those that are usual, `kpc.format.container.segments`.
+    """
+
+    symbols: np.ndarray
+    step: np.ndarray
+    offset: np.ndarray
+    coded: np.ndarray
+    guide: PlaneGuide | None = None
+    starts: tuple[int, ...] = ()
+
+    def dequantise(self) -> np.ndarray:
+        """(H, W, M) float32."""
+        return dequantised(self.symbols, self.step, self.offset)
+
+
+def dequantised(symbols: np.ndarray, step: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """(..., M) float32 of (..., M) int8: symbol * step + offset, rounded after the product and after the sum."""
+    values = symbols.astype(np.float32)
+    values *= step
+    values += offset
+    return values
+
+
+def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bool, needed: np.ndarray | None = None,
+                   name: str = "plane") -> QuantisedPlane:
+    """Round a plane to symbols: |dequantised - value| <= step / 2 (the plane's own step) at every needed texel.
+
+    Space planes (identity=False): the offset is the mean over the needed texels, to 8 significant bits, moved by as little as brings the
+    whole range into 8 bits; a step too small for the range is enlarged to range / 255. All needed texels are coded.
+    Time planes (identity=True): the offset is 1; a step too small is enlarged until [-128, 127] reaches both ends of
+    the range. Texels whose symbols all come out 0 are not coded.
+
+    Steps above COARSEST_STEP count as that.
+
+    Args:
+        values: (H, W, M) float32. step: (M,) or one number for all channels, > 0.
+        needed: (H, W) bool; False where no occupied point projects to. Those texels are not coded. None: all needed.
+        name: of the plane, for messages.
+
+    Raises:
+        FormatError: a needed value is NaN or beyond half of VALUE_LIMIT, or a step is not positive.
+    """
+    rows, columns, channels = values.shape
+    step = np.broadcast_to(np.asarray(step, np.float32), (channels,)).copy()
+    needed = np.ones((rows, columns), bool) if needed is None else needed.astype(bool)
+    wanted = values[needed].astype(np.float64)  # (needed texels, M)
+    if not (np.abs(wanted) <= VALUE_LIMIT / 2).all():
+        raise FormatError(f"{name}: holds NaN, infinity or a number beyond {VALUE_LIMIT / 2:g}, which no file can "
+                          "store; train with a lower learning rate")
+    if not (step > 0).all():
+        raise FormatError(f"{name}: a quantisation step is not a positive number")
+    step = np.minimum(step, np.float32(COARSEST_STEP))
+
+    low, high = (wanted.min(0), wanted.max(0)) if len(wanted) else (np.ones(channels), np.ones(channels))
+    if identity:
+        offset = np.ones(channels, np.float32)
+        step = _at_least(step, np.maximum((high - 1.0) / SYMBOL_MAX, (low - 1.0) / SYMBOL_MIN))
+    else:
+        step = _at_least(step, (high - low) / (SYMBOL_MAX - SYMBOL_MIN))
+        mean = wanted.mean(0).astype(np.float32) if len(wanted) else np.ones(channels, np.float32)
+        offset = np.clip(shortened(mean), high - SYMBOL_MAX * step.astype(np.float64), low - SYMBOL_MIN * step.astype(np.float64))
+        offset = offset.astype(np.float32)
+
+    symbols = np.zeros(values.shape, np.int8)
+    rounded = np.rint((wanted - offset) / step.astype(np.float64))
+    symbols[needed] = np.clip(rounded, SYMBOL_MIN, SYMBOL_MAX).astype(np.int8)
+    coded = np.asarray(symbols.any(axis=2)) if identity else needed
+    return QuantisedPlane(symbols, step, offset, coded)
+
+
+def _at_least(step: np.ndarray, bound: np.ndarray) -> np.ndarray:
+    """`step`, raised to `bound` where it falls short; rounded up, so that the bound still holds."""
+    single = bound.astype(np.float32)
+    single = np.where(single < bound, np.nextafter(single, np.float32(np.inf)), single)
+    return np.where(step < bound, short_above(single), step)
+
+
+def short_above(values: np.ndarray) -> np.ndarray:
+    """float32 numbers of 8 significant bits, at least as large as positive float32 ones and at most 1 / 128 larger: a file holds them in
+    little more than half the bytes."""
+    return shortened((values.view(np.uint32) + np.uint32(0xFFFF)).view(np.float32))
+
+
+def shortened(values: np.ndarray) -> np.ndarray:
+    """float32 numbers without all but their first 8 significant bits."""
+    return (values.view(np.uint32) & np.uint32(0xFFFF0000)).view(np.float32)
+
+
+CAMERA_BITS = 16
+"""Significant bits of focal lengths and principal points: a picture of a thousand pixels is shifted by a hundredth of one."""
+
+
+@dataclass(frozen=True)
+class QuantisedScene:
+    """A `Scene` as the file stores it: planes as symbols, decoder weights, codes and cameras rounded. Fields as in `Scene`."""
+
+    aabb: np.ndarray
+    clip: Clip
+    scales: tuple[Mapping[str, QuantisedPlane], ...]
+    decoder: AnyDecoder
+    occupancy: np.ndarray
+    background: np.ndarray
+    step: float
+    cameras: tuple[Camera, ...] = field(default=())
+    mapping: SpaceMapping | None = None
+    motion: QuantisedMotion | None = None
+    appearances: tuple[Appearance, ...] = field(default=())
+
+    def dequantise(self) -> Scene:
+        """The scene that every decoder sees."""
+        scales = tuple({name: plane.dequantise() for name, plane in scale.items()} for scale in self.scales)
+        return Scene(self.aabb, self.clip, scales, self.decoder, self.occupancy, self.background, self.step,
+                     self.cameras, self.mapping, None if self.motion is None else self.motion.dequantise(), self.appearances)
+
+    @property
+    def is_dynamic(self) -> bool:
+        return "xt" in self.scales[0]
+
+    @property
+    def parameter_count(self) -> int:
+        """Numbers in the model, coded or not; the same as the dequantised scene's."""
+        others = 0 if self.motion is None else self.motion.symbols.size
+        others += self.decoder.parameter_count + sum(appearance.code.size for appearance in self.appearances)
+        return sum(p.symbols.size for scale in self.scales for p in scale.values()) + others
+
+    @property
+    def identity_share(self) -> float:
+        """Share of the time planes' texels that are exactly 1 in every channel; 1 for a static scene."""
+        changed = [p.symbols.any(axis=2) for scale in self.scales for name, p in scale.items() if name in TIME_PLANES]
+        return 1.0 - sum(int(c.sum()) for c in changed) / sum(c.size for c in changed) if changed else 1.0
+
+
+def quantise_scene(scene: Scene, steps: Sequence[Mapping[str, np.ndarray | float]], *,
+                   skip_unseen: bool = True, reached: np.ndarray | None = None) -> QuantisedScene:
+    """Quantise every plane and round the rest to what the file stores.
+
+    Args:
+        steps: one mapping a scale, plane name -> step: (M,) or a number.
+        skip_unseen: leave texels that no occupied point projects to uncoded.
+        reached: `reached_by(scene)`, where it is at hand.
+
+    Raises:
+        FormatError: a value is NaN or infinite; the message names the scale and the plane.
+    """
+    if skip_unseen and reached is None:
+        reached = reached_by(scene)
+    scales = []
+    for number, (planes, plane_steps) in enumerate(zip(scene.scales, steps, strict=True)):
+        scales.append({
+            name: quantise_plane(
+                values, plane_steps[name], identity=name in TIME_PLANES, name=f"scale {number}, plane {name}",
+                needed=None if reached is None or not skip_unseen else needed_texels(reached, name, *values.shape[:2]))
+            for name, values in planes.items()
+        })
+    return QuantisedScene(
+        np.asarray(scene.aabb, np.float32), scene.clip, tuple(scales), round_decoder(scene.decoder),
+        np.asarray(scene.occupancy, bool), np.asarray(scene.background, np.float32), float(scene.step),
+        round_cameras(scene.cameras), scene.mapping,
+        None if scene.motion is None else quantise_motion(scene.motion),
+        tuple(Appearance(appearance.name, half(appearance.code, "appearances")) for appearance in scene.appearances),
+    )
+
+
+def reached_by(scene: Scene) -> np.ndarray:
+    """(slots, Nz, Ny, Nx) bool: the cells of the planes' [0, 1]^3 in which what is occupied is looked up."""
+    occupancy = np.asarray(scene.occupancy, bool)
+    return occupancy if scene.motion is None else places_reached(occupancy, scene.motion)
+
+
+def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) -> np.ndarray:
+    """(rows, columns) bool: the texels of a plane that a bilinear read from inside an occupied cell may touch.
+
+    Args:
+        occupancy: (slots, Nz, Ny, Nx) bool. plane: its name, such as "xy" or "zt".
+    """
+    return needed_rows(seen_along(occupancy, plane), rows, columns, range(rows))
+
+
+def seen_along(occupancy: np.ndarray, plane: str) -> np.ndarray:
+    """(cells down, cells across) bool: where any cell is occupied, seen along the axes that a plane does not have."""
+    axes = {"t": 0, "z": 1, "y": 2, "x": 3}
+    across, down = axes[plane[0]], axes[plane[1]]
+    others = tuple(axis for axis in range(4) if axis not in (across, down))
+    seen = np.asarray(occupancy.any(axis=others))  # the kept axes stay in the order t, z, y, x
+    return seen if down < across else np.ascontiguousarray(seen.T)
+
+
+def needed_rows(seen: np.ndarray, rows: int, columns: int, some: range) -> np.ndarray:
+    """Some rows of `needed_texels`, by `seen_along`. Takes no more memory than they do, and a row of cells."""
+    needed = np.empty((len(some), columns), bool)
+    _mark_met(seen, _reached_from(rows, seen.shape[0])[:, some.start : some.stop], _reached_from(columns, seen.shape[1]), needed)
+    return needed
+
+
+@compiled()
+def _mark_met(seen, down, across, needed):
+    """Fill `needed`: whether any cell is seen from down[0] to before down[1] and from across[0] to before across[1]."""
+    for row in range(needed.shape[0]):
+        met = np.zeros(seen.shape[1], np.bool_)
+        for cells in range(down[0, row], down[1, row]):
+            met |= seen[cells]
+        for column in range(needed.shape[1]):
+            needed[row, column] = False
+            for cell in range(across[0, column], across[1, column]):
+                needed[row, column] |= met[cell]
+
+
+def _reached_from(texels: int, cells: int) -> np.ndarray:
+    """(2, texels) int64: the first cell and the one after the last such that [c, c+1] / cells meets the closed support [i-1, i+1] / (texels-1)."""
+    i, apart = np.arange(texels), texels - 1
+    if apart == 0:
+        return np.array([[0], [cells]])
+    first, last = -(-(i - 1) * cells // apart) - 1, (i + 1) * cells // apart
+    return np.stack([np.maximum(first, 0), np.minimum(last + 1, cells)])
+
+
+def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) -> AnyDecoder:
+    """The decoder with its weights rounded to float16 (the density bias to float32), as float32 arrays.
+
+    Args:
+        bits: of some of its arrays, at most HALF_BITS: the weights of each are rounded to as many places as its largest has in so many.
+
+    Raises:
+        FormatError: a weight is NaN, infinite or beyond float16's 65504.
+    """
+    if not np.isfinite(decoder.density_bias):
+        raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
+    shorter = {name: half(_to_places(value, bits[name]) if bits and name in bits else value) for name, value in weights_of(decoder).items()}
+    return replace(decoder, **shorter, density_bias=float(np.float32(decoder.density_bias)))
+
+
+def weights_of(decoder: AnyDecoder) -> dict[str, np.ndarray]:
+    """Its arrays: all but the density bias."""
+    return {name: value for name, value in vars(decoder).items() if name != "density_bias"}
+
+
+def _to_bits(values: np.ndarray, bits: int) -> np.ndarray:
+    """Rounded to so many significant bits."""
+    mantissas, exponents = np.frexp(values)
+    return np.ldexp(np.rint(np.ldexp(mantissas, bits)), exponents - bits)
+
+
+def _to_places(values: np.ndarray, bits: int) -> np.ndarray:
+    """Rounded to multiples of a power of two, of which the largest takes so many bits."""
+    place = max(int(np.frexp(np.abs(values).max())[1]) - bits, FINEST)
+    return np.ldexp(np.rint(np.ldexp(values, -place)), place)
+
+
+def half(weights: np.ndarray, what: str = "decoder") -> np.ndarray:
+    """Numbers rounded to float16, as float32.
+
+    Raises:
+        FormatError: one is NaN, infinite or beyond float16's 65504.
+    """
+    if not (np.abs(weights) <= 65504.0).all():
+        raise FormatError(f"{what}: a weight is NaN or beyond 65504, which no file can store; lower the learning rate")
+    return np.asarray(weights).astype(np.float16).astype(np.float32)
+
+
+def round_cameras(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """Cameras with focal lengths and principal points rounded to CAMERA_BITS, and poses to turns and places, `kpc.format.coding.poses`; where they
+    are more than those, to float32."""
+    lenses = tuple(_with_short_lens(camera) for camera in cameras)
+    if lenses and rigid(lenses):
+        return rounded(lenses)
+    return tuple(replace(camera, camera_to_world=camera.camera_to_world.astype(np.float32).astype(np.float64)) for camera in lenses)
+
+
+def _with_short_lens(camera: Camera) -> Camera:
+    fl_x, fl_y, cx, cy = _to_bits(np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy]), CAMERA_BITS).tolist()
+    return replace(camera, fl_x=fl_x, fl_y=fl_y, cx=cx, cy=cy)

@@ -1,0 +1,347 @@
+"""Videos through ffmpeg, pictures through Pillow and OpenEXR.
+
+Colour. Whatever a file's tags say about matrix, range and chroma layout, `read_video` gives R'G'B' in [0, 255]. Where
+the tags are silent, players' custom is followed: limited range, BT.601 below 720 lines and BT.709 from there on. HDR
+transfer curves (PQ, HLG) are refused rather than shown wrong.
+"""
+
+import contextlib
+import functools
+import itertools
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import ffmpeg
+import imageio_ffmpeg
+import numpy as np
+import OpenEXR
+from PIL import Image, UnidentifiedImageError
+
+from kpc.format.common.cli import written_aside
+from kpc.format.common.errors import MediaError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
+
+_SCALE_FLAGS = "bicubic+accurate_rnd+full_chroma_int+full_chroma_inp"
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video's container and first frame say.
+
+    Attributes:
+        width, height: pixels, after the display rotation that phones write.
+        frame_count: coded frames.
+        fps: frames a second; 29.97 and its like stand for n * 1000/1001 exactly.
+        pix_fmt: ffmpeg's name, e.g. "yuv420p10le".
+        matrix: "bt601", "bt709", "bt2020" or "rgb"; full_range: False for 16..235.
+    """
+
+    width: int
+    height: int
+    frame_count: int
+    fps: float
+    pix_fmt: str
+    matrix: str
+    full_range: bool
+
+
+@functools.cache
+def ffmpeg_binary() -> str:
+    """The ffmpeg to run: PATH's own, else the one that imageio-ffmpeg brings."""
+    found = shutil.which("ffmpeg")
+    if found:
+        return found
+    try:
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    except RuntimeError as error:
+        raise MediaError(
+            "ffmpeg: no binary on PATH nor in imageio-ffmpeg; install ffmpeg (Debian: apt install ffmpeg)"
+        ) from error
+
+
+def probe(path: str | os.PathLike[str]) -> VideoInfo:
+    """Size, length and colour tags of a video. Its packets are counted, not decoded.
+
+    Raises:
+        MediaError: no such file, not a video, damaged, or HDR.
+    """
+    _require_file(path)
+    stream = ffmpeg.input(_url(path)).output("pipe:", format="null", codec="copy", map="0:V:0")
+    command = stream.global_args("-nostdin", "-hide_banner", "-nostats", "-progress", "pipe:1").compile(
+        cmd=ffmpeg_binary()
+    )
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    said = done.stderr.decode(errors="replace")
+    found = _STREAM.search(said)
+    counts = re.findall(r"^frame=\s*(\d+)", done.stdout.decode(errors="replace"), re.MULTILINE)
+    if done.returncode != 0 or found is None or not counts or int(counts[-1]) == 0:
+        raise MediaError(f"{path}: not a video ffmpeg can read ({_last_words(said)}); encode or copy it anew")
+    pix_fmt, tags, width, height = found["pix_fmt"], found["tags"] or "", int(found["width"]), int(found["height"])
+    if re.search(r"smpte2084|arib-std-b67", tags):
+        raise MediaError(f"{path}: HDR video ({tags}); tone-map it to BT.709 first")
+    turned = re.search(r"rotation of (-?\d+)", said[found.end() : _end_of_stream(said, found.end())])
+    if turned and int(turned[1]) % 180 == 90:
+        width, height = height, width
+    return VideoInfo(
+        width,
+        height,
+        int(counts[-1]),
+        _fps(found["rest"]),
+        pix_fmt,
+        _matrix(pix_fmt, tags, height),
+        "pc" in re.split(r"[,\s]+", tags) or pix_fmt.startswith("yuvj"),
+    )
+
+
+def read_video(
+    path: str | os.PathLike[str], info: VideoInfo | None = None, limit: int | None = None
+) -> Iterator[np.ndarray]:
+    """Decode a video: its first `limit` frames, uint8 (height, width, 3), each coded one once whatever its time stamp.
+
+    Raises:
+        MediaError: ffmpeg fails or complains, or the file ends inside a frame.
+    """
+    info = info or probe(path)
+    rgb = info.matrix == "rgb"
+    video = ffmpeg.input(_url(path))["V:0"].filter(
+        "scale",
+        info.width,
+        info.height,
+        flags=_SCALE_FLAGS,
+        out_range="full",
+        **({} if rgb else {"in_color_matrix": info.matrix, "in_range": "full" if info.full_range else "limited"}),
+    )
+    size = {} if limit is None else {"vframes": limit}
+    stream = video.output("pipe:", format="rawvideo", pix_fmt="rgb24", **_each_frame_once(), **size)
+    command = stream.global_args("-nostdin", "-v", "error").compile(cmd=ffmpeg_binary())
+    frame_bytes = info.width * info.height * 3
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log)
+        assert process.stdout is not None  # for the type checker: it is a pipe
+        try:
+            while data := process.stdout.read(frame_bytes):
+                if len(data) < frame_bytes:
+                    break
+                yield np.frombuffer(data, np.uint8).reshape(info.height, info.width, 3)
+            code = process.wait()
+        finally:
+            process.kill()
+            process.stdout.close()
+            process.wait()
+        said = _read_log(log)
+    if code != 0 or said or data:
+        raise MediaError(f"{path}: does not decode ({_last_words(said)}); encode or copy it anew")
+
+
+def write_video(
+    path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float, *, crf: int = 18, pix_fmt: str = "yuv420p"
+) -> int:
+    """Code uint8 (height, width, 3) frames as H.264, tagged BT.709 limited range; the number of frames written.
+
+    An odd size is made even by repeating the last row or column where `pix_fmt` needs it.
+
+    Raises:
+        MediaError: no frames, frames of different sizes, or ffmpeg fails.
+    """
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise MediaError(f"{path}: no frames to write")
+    height, width = first.shape[:2]
+    even = 1 if pix_fmt.startswith("yuv444") else 2
+    pad = ((0, -height % even), (0, -width % even), (0, 0))
+    raw = ffmpeg.input(
+        "pipe:", format="rawvideo", pix_fmt="rgb24", framerate=fps, video_size=(width + pad[1][1], height + pad[0][1])
+    )
+    scaled = raw.filter("scale", flags=_SCALE_FLAGS, out_color_matrix="bt709", out_range="limited")
+    tags = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
+    count = 0
+    with written_aside(path) as aside, tempfile.TemporaryFile() as log:
+        stream = scaled.output(_url(aside), vcodec="libx264", crf=crf, pix_fmt=pix_fmt, movflags="+faststart", **tags)
+        command = stream.global_args("-v", "error", "-y").compile(cmd=ffmpeg_binary())
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
+        assert process.stdin is not None
+        try:
+            for frame in itertools.chain([first], frames):
+                if frame.shape != first.shape or frame.dtype != np.uint8:
+                    raise MediaError(
+                        f"{path}: frame {count} is {frame.dtype} {frame.shape}, the first uint8 {first.shape}"
+                    )
+                process.stdin.write(np.pad(frame, pad, mode="edge").tobytes())
+                count += 1
+            process.stdin.close()
+            code = process.wait()
+        except BrokenPipeError:
+            code = process.wait() or 1
+        finally:
+            process.kill()
+            process.wait()
+            with contextlib.suppress(BrokenPipeError):
+                process.stdin.close()
+        if code != 0:
+            raise MediaError(
+                f"{path}: ffmpeg cannot write it ({_last_words(_read_log(log))}); it needs libx264 and free disk space"
+            )
+    return count
+
+
+def image_size(path: str | os.PathLike[str]) -> tuple[int, int, bool]:
+    """Width, height and whether there is an alpha channel, read from a picture's header."""
+    with _image_errors(path):
+        if _is_exr(path):
+            with OpenEXR.File(os.fspath(path), header_only=True) as exr:
+                header = exr.header()
+                low, high = header["dataWindow"]
+                names = {channel.name for channel in header["channels"]}
+            return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1), "A" in names
+        with Image.open(path) as image:
+            return image.width, image.height, image.has_transparency_data
+
+
+def read_image(path: str | os.PathLike[str]) -> np.ndarray:
+    """A PNG, JPEG or EXR as uint8 (height, width, 3), or 4 channels with straight alpha where the file has it.
+
+    An EXIF orientation is not applied: poses and intrinsics belong to the pixels as stored. An EXR holds linear light
+    with associated alpha: its colours are divided by alpha, clipped to [0, 1] and sent through the sRGB curve.
+
+    Raises:
+        MediaError: the file is missing, damaged or of another kind.
+    """
+    with _image_errors(path):
+        if _is_exr(path):
+            return _read_exr(path)
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+
+
+def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> None:
+    """Write uint8 (height, width, 3 or 4) as PNG or JPEG, by the suffix."""
+    with written_aside(path) as aside:
+        Image.fromarray(pixels).save(aside, quality=95)  # of JPEG; PNG knows no such thing
+
+
+def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
+    """The sRGB transfer curve (IEC 61966-2-1) on values clipped to [0, 1]; NaN counts as 0.
+
+    12.92 x up to 0.0031308, from there on 1.055 x^(1/2.4) - 0.055
+    """
+    clipped = np.clip(np.nan_to_num(linear), 0.0, 1.0)
+    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * np.power(clipped, 1 / 2.4) - 0.055)
+
+
+_STREAM = re.compile(
+    r"Stream #0:\d+[^\n]*?: Video: (?P<codec>[^\n]*?), (?P<pix_fmt>[a-z][a-z0-9_]*)(?:\((?P<tags>[^)\n]*)\))?"
+    r", (?P<width>\d+)x(?P<height>\d+)(?P<rest>(?:(?!attached pic)[^\n])*)$",
+    re.MULTILINE,
+)
+
+
+@functools.cache
+def _each_frame_once() -> dict[str, str]:
+    """The option that keeps ffmpeg from dropping or doubling frames to hold a rate; it was renamed in version 5.1."""
+    said = subprocess.run(
+        [ffmpeg_binary(), "-hide_banner", "-h", "long"], stdin=subprocess.DEVNULL, capture_output=True, check=False
+    )
+    return {"fps_mode" if b"-fps_mode" in said.stdout else "vsync": "passthrough"}
+
+
+def _end_of_stream(said: str, start: int) -> int:
+    end = said.find("Stream ", start)
+    return len(said) if end < 0 else end
+
+
+def _fps(rest: str) -> float:
+    found = re.search(r"([\d.]+)(k?) fps", rest) or re.search(r"([\d.]+)(k?) tbr", rest)
+    if found is None or float(found[1]) == 0:
+        return 25.0
+    fps = float(found[1]) * (1000 if found[2] else 1)
+    ntsc = round(fps * 1.001) * 1000 / 1001
+    return ntsc if abs(fps - ntsc) < 0.006 and abs(fps - round(fps)) > 0.006 else fps
+
+
+def _matrix(pix_fmt: str, tags: str, height: int) -> str:
+    """The first of "matrix/primaries/transfer" decides; ffmpeg prints one word where all three agree."""
+    if re.match(r"gbr|rgb|bgr|argb|abgr|pal8|0rgb|0bgr", pix_fmt):
+        return "rgb"
+    for word in re.split(r",\s*", tags):
+        name = word.split("/")[0]
+        if name in ("smpte170m", "bt470bg", "bt470m", "fcc"):
+            return "bt601"
+        if name in ("bt709", "gbr"):
+            return "bt709" if name == "bt709" else "rgb"
+        if name.startswith("bt2020"):
+            return "bt2020"
+    return "bt601" if height < 720 else "bt709"
+
+
+def _read_exr(path: str | os.PathLike[str]) -> np.ndarray:
+    with OpenEXR.File(os.fspath(path), separate_channels=True) as exr:
+        channels = exr.channels()
+        names = ["R", "G", "B"] if "R" in channels else ["Y", "Y", "Y"]
+        rgb = np.stack([np.asarray(channels[name].pixels, np.float32) for name in names], axis=-1)
+        alpha = np.asarray(channels["A"].pixels, np.float32)[..., None] if "A" in channels else None
+    if alpha is None:
+        return np.rint(srgb_from_linear(rgb) * 255).astype(np.uint8)
+    alpha = np.clip(np.nan_to_num(alpha), 0, 1)
+    straight = np.divide(rgb, alpha, out=np.zeros_like(rgb), where=alpha > 0)
+    return np.rint(np.concatenate([srgb_from_linear(straight), alpha], axis=-1) * 255).astype(np.uint8)
+
+
+@contextlib.contextmanager
+def _image_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what Pillow and OpenEXR raise about `path` into a MediaError."""
+    _require_file(path)
+    try:
+        with warnings.catch_warnings(action="ignore"):  # a large picture is not worth a warning
+            yield
+    except PermissionError as error:
+        raise MediaError(f"{path}: no permission to read it; chmod it or run as its owner") from error
+    except (
+        UnidentifiedImageError,
+        Image.DecompressionBombError,
+        OSError,
+        SyntaxError,
+        ValueError,
+        KeyError,
+        RuntimeError,
+        TypeError,
+    ) as error:
+        raise MediaError(f"{path}: not a picture that can be read ({error}); export or copy it anew") from error
+
+
+def _is_exr(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() == ".exr"
+
+
+def _require_file(path: str | os.PathLike[str]) -> None:
+    """A pipe or a device would make a reader wait for ever."""
+    if not Path(path).is_file():
+        raise MediaError(f"{path}: no such file" if not Path(path).exists() else f"{path}: not a regular file")
+
+
+def _url(path: str | os.PathLike[str]) -> str:
+    """A path that ffmpeg takes for nothing but a file, whatever characters it holds."""
+    return f"file:{Path(path).absolute()}"
+
+
+def _read_log(log: IO[bytes]) -> str:
+    log.seek(0)
+    return log.read().decode(errors="replace").strip()
+
+
+def _last_words(said: str) -> str:
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    errors = [
+        line for line in lines if re.search(r"error|invalid|denied|no such|not found|partial|corrupt|fail", line, re.I)
+    ]
+    return re.sub(r"^\[[^]]*\]\s*", "", (errors or lines or ["it ends early"])[0])[:160]

@@ -1,0 +1,114 @@
+"""What moves, and how much: the field at a place now, against the same place at other times of the clip.
+
+Time planes that differ from 1 say little about what is seen to move: fitted planes differ a little nearly everywhere, and one
+that is constant but not 1 moves nothing. So the field itself is compared. A place at time t looks as
+
+    q(t) = (alpha rgb, alpha)       alpha = 1 - exp(-sigma cell / extent), 0 where the occupancy grid is not set
+
+`cell` being the mean edge of a cell of the occupancy grid, and it changes at t by the mean over INSTANTS t' of max |q(t) - q(t')|.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.scene import Scene
+from kpc.format.scene.space import Contraction, DeviceCoordinates, contract
+from kpc.player.cpu import reference
+from kpc.player.orbit import Rig
+from kpc.player.cpu.reference import Moment, Rendering
+
+INSTANTS = (np.arange(8) + 0.5) / 8
+"""Of the clip."""
+STILL, LIVELY = 0.1, 0.3
+"""A change up to the one counts as none: some noise of fitting and rounding. From the other on a picture shows its full colour."""
+CELLS = 8192
+"""Looked at for a share; of more, as many, evenly spread."""
+CELLS_AT_ONCE = 1 << 20
+POINTS_AT_ONCE = 8192
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+"""Of BT.709."""
+MUTED = 0.6, 0.2
+"""Contrast and black of what stands still."""
+MOVING = np.array([1.0, 0.25, 0.05], np.float32)
+
+
+def dynamic_map(scene: Scene, camera: Camera, time: float, rendering: Rendering) -> Rendering:
+    """A rendering of `scene` with new colours: grey where what is seen at `time` is there all over the clip, from STILL to LIVELY
+    more and more of one colour where it is not. Looked at is the place at the mean depth of each ray."""
+    origins, directions = camera.rays()
+    seen = np.flatnonzero(rendering.opacity > 0)
+    change = np.zeros(rendering.opacity.size, np.float32)
+    for rays in np.split(seen, range(POINTS_AT_ONCE, len(seen), POINTS_AT_ONCE)):
+        o, d = origins[rays], directions[rays]
+        u = _place(scene, o + rendering.depth.reshape(-1)[rays, None] * d)
+        terms = _terms(scene, o, d)
+        others = np.stack([_looks(scene, u, terms, float(instant)) for instant in INSTANTS])
+        change[rays] = _change(_looks(scene, u, terms, time), others)
+    share = np.clip((change.reshape(rendering.opacity.shape) - STILL) / (LIVELY - STILL), 0, 1) * rendering.opacity
+    grey = (rendering.rgb @ LUMINANCE)[..., None]
+    muted, coloured = MUTED[0] * grey + MUTED[1], MOVING * (0.4 + 0.6 * grey)
+    return replace(rendering, rgb=(muted + share[..., None] * (coloured - muted)).astype(np.float32))
+
+
+def still_share(scene: Scene) -> float:
+    """Of the cells that are ever occupied, the share whose middle at no instant changes by more than STILL, seen as the opening
+    camera looks; 1 where none is occupied."""
+    ever = scene.occupancy.any(axis=0)
+    cells = _spread(ever.reshape(-1), CELLS)
+    if not len(cells):
+        return 1.0
+    middles = (np.stack(np.unravel_index(cells, ever.shape)[::-1], axis=1) + 0.5) / ever.shape[::-1]
+    pose = Rig.of(scene).cameras[0].camera_to_world.astype(np.float32)
+    terms = _terms(scene, pose[None, :3, 3], -pose[None, :3, 2])
+    looks = np.stack([_looks(scene, middles.astype(np.float32), terms, float(instant)) for instant in INSTANTS])
+    return float((np.max([_change(now, looks) for now in looks], axis=0) <= STILL).mean())
+
+
+def _spread(cells: np.ndarray, most: int) -> np.ndarray:
+    """Indices of set ones among (N,) bool, at most so many, evenly spread; in blocks, as those of all may not fit in memory."""
+    count = np.count_nonzero(cells)
+    wanted = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+    found, before = [np.empty(0, np.int64)], 0
+    for start in range(0, len(cells), CELLS_AT_ONCE):
+        here = start + np.flatnonzero(cells[start : start + CELLS_AT_ONCE])
+        low, high = np.searchsorted(wanted, (before, before + len(here)))
+        found.append(here[wanted[low:high] - before])
+        before += len(here)
+    return np.concatenate(found)
+
+
+def _change(now: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """The mean over (K, N, 4) others of max |now - other|: (N,)."""
+    return np.asarray(np.abs(others - now).max(axis=2).mean(axis=0))
+
+
+def _looks(scene: Scene, u: np.ndarray, terms: np.ndarray, time: float) -> np.ndarray:
+    """q of places (N, 3) in [0, 1]^3 at a time, given the `_terms` of as many rays or of one: (N, 4)."""
+    moment, decoder = Moment.of(scene, time), scene.decoder
+    cells = np.array(moment.occupied.shape[::-1])
+    x, y, z = np.clip((u * cells).astype(np.int32), 0, cells - 1).T
+    edges = (scene.aabb[1] - scene.aabb[0]) * (2 if isinstance(scene.mapping, Contraction) else 1)
+    f = reference.features(scene, moment, u)
+    alpha = 1 - np.exp(-reference.density(decoder, f) * np.float32((edges / cells).mean() / scene.extent))
+    alpha = np.where(moment.occupied[z, y, x], alpha, 0)[:, None]
+    rgb = reference.colour(decoder, f, terms)
+    return np.concatenate([alpha * rgb, alpha], axis=1)
+
+
+def _place(scene: Scene, points: np.ndarray) -> np.ndarray:
+    """Where in the planes' [0, 1]^3 points of the world (N, 3) are."""
+    if isinstance(scene.mapping, Contraction):
+        u = contract(points, scene.aabb)[0]
+    else:
+        inside = scene.mapping.place(points) if isinstance(scene.mapping, DeviceCoordinates) else points
+        u = (inside - scene.aabb[0]) / (scene.aabb[1] - scene.aabb[0])
+    return np.clip(u, 0, 1).astype(np.float32)
+
+
+def _terms(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """`kpc.player.cpu.reference.once_a_ray` of rays of the world, (N, 3) and (N, 3), in the average look."""
+    if isinstance(scene.mapping, DeviceCoordinates):
+        directions = scene.mapping.path(origins, directions).way
+    return reference.once_a_ray(scene.decoder, directions, reference.code_of(scene, None))

@@ -1,0 +1,216 @@
+"""Where the scene is: each way to find its box, each way that fails, and what the cameras see of it."""
+
+from dataclasses import replace
+
+import datasets as make
+import numpy as np
+import pytest
+
+from kpc.encoder.field.bounds import (
+    CLEAR, INNER, contraction_of, device_coordinates_of, find_box, find_inner_box, reaches_beyond, seen_cells,
+)
+from kpc.encoder.datasets import Pictures
+from kpc.format.scene.cameras import Camera
+from kpc.format.common.errors import DatasetError
+from kpc.format.scene.space import Contraction, expand
+
+
+def pictures_of(
+    cameras: list[Camera], near: float = np.nan, far: float = np.nan, tests: tuple[int, ...] = ()
+) -> Pictures:
+    n = len(cameras)
+    return Pictures(
+        file=tuple(f"{k}.png" for k in range(n)),
+        camera=np.arange(n, dtype=np.int32),
+        time=np.zeros(n, np.float32),
+        is_test=np.isin(np.arange(n), tests),
+        offset=np.zeros(n, np.int64),
+        width=np.array([c.width for c in cameras], np.int32),
+        height=np.array([c.height for c in cameras], np.int32),
+        intrinsics=np.array([[c.fl_x, c.fl_y, c.cx, c.cy] for c in cameras]),
+        distortion=np.zeros((n, 4)),
+        camera_to_world=np.stack([c.camera_to_world for c in cameras]),
+        near=np.full(n, near, np.float32),
+        far=np.full(n, far, np.float32),
+    )
+
+
+def straight(x: float = 0.0, turned: bool = False) -> Camera:
+    """A camera at (x, 0, 0) that looks along -z, or along +z: 90 degrees wide, 53 high."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    if turned:
+        pose[[0, 2], [0, 2]] = -1.0
+    return Camera(40, 20, 20.0, 20.0, 20.0, 10.0, pose)
+
+
+def test_near_and_far_give_the_bounds_of_the_frustums() -> None:
+    box = find_box(pictures_of([straight(), straight(1.0)], near=1.0, far=4.0), has_alpha=False)
+    assert box.dtype == np.float32
+    # 90 degrees wide and 53 high: at depth 4, 4 to each side and 2 up and down; the second camera one to the right.
+    np.testing.assert_allclose(box, [[-4, -2, -4], [5, 2, -1]], atol=1e-6)
+
+
+def test_pictures_held_out_do_not_count() -> None:
+    far_off = pictures_of([straight(), straight(1.0), straight(50.0)], near=1.0, far=4.0, tests=(2,))
+    np.testing.assert_allclose(find_box(far_off, has_alpha=False), [[-4, -2, -4], [5, 2, -1]], atol=1e-6)
+
+
+def test_an_object_on_its_own_fits_the_view() -> None:
+    rig = make.ring(5, width=20, height=20)
+    box = find_box(pictures_of(rig), has_alpha=True)
+    distance = np.linalg.norm(rig[0].camera_to_world[:3, 3])
+    half = distance * np.sin(np.arctan(0.5 / 1.2))  # the sphere that touches the sides of a view 1 / 1.2 wide
+    np.testing.assert_allclose(box, [[-half] * 3, [half] * 3], atol=1e-5)
+
+
+def test_a_subject_in_its_surroundings_reaches_behind_the_cameras() -> None:
+    rig = make.ring(5)
+    half = 2 * np.linalg.norm(rig[0].camera_to_world[:3, 3])
+    np.testing.assert_allclose(find_box(pictures_of(rig), has_alpha=False), [[-half] * 3, [half] * 3], atol=1e-5)
+
+
+@pytest.mark.parametrize("has_alpha", [True, False])
+def test_parallel_cameras_share_no_point(has_alpha: bool) -> None:
+    with pytest.raises(DatasetError, match="--box"):
+        find_box(pictures_of([straight(), straight(1.0)]), has_alpha)
+
+
+def test_cameras_that_look_away_from_each_other_share_no_point() -> None:
+    rig = [make.look_at((3 * np.sin(a), -3 * np.cos(a), 0.5)) for a in (0.0, 2.0, 4.0)]
+    flipped = [
+        Camera(c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy, c.camera_to_world @ np.diag([-1.0, 1, -1, 1]))
+        for c in rig
+    ]
+    find_box(pictures_of(rig), False)
+    with pytest.raises(DatasetError, match="no point they look at"):
+        find_box(pictures_of(flipped), False)
+
+
+def test_pictures_reach_beyond_a_box_where_nothing_bounds_them() -> None:
+    rig = make.ring(5)
+    assert reaches_beyond(pictures_of(rig), has_alpha=False)[0]
+    assert not reaches_beyond(pictures_of(rig), has_alpha=True)[0]
+    assert not reaches_beyond(pictures_of(rig, near=1.0, far=4.0), has_alpha=False)[0]
+    assert reaches_beyond(pictures_of(rig, near=1.0), has_alpha=False)[0]
+    words = {reaches_beyond(pictures_of(rig, near), alpha)[1] for near in (np.nan, 1.0) for alpha in (False, True)}
+    assert len(words) == 2 and all(words)
+
+
+def test_an_inner_box_is_about_what_the_cameras_look_at() -> None:
+    rig = make.ring(5)
+    half = INNER * np.linalg.norm(rig[0].camera_to_world[:3, 3])
+    np.testing.assert_allclose(find_inner_box(pictures_of(rig)), [[-half] * 3, [half] * 3], atol=1e-5)
+    # Parallel ones look at nothing in common: then it is about them.
+    apart = pictures_of([straight(), straight(1.0)])
+    np.testing.assert_allclose(find_inner_box(apart), [[-0.5, -1, -1], [1.5, 1, 1]], atol=1e-6)
+    with pytest.raises(DatasetError, match="--box"):
+        find_inner_box(pictures_of([straight()]))
+
+
+def test_even_steps_reach_the_far_corner_of_the_box() -> None:
+    rig = pictures_of(make.ring(5))
+    aabb = np.array([[-1, -2, -1], [1, 2, 3]], np.float32)
+    corners = np.stack(np.meshgrid(*aabb.T, indexing="ij"), -1).reshape(-1, 3)
+    farthest = np.linalg.norm(rig.camera_to_world[:, None, :3, 3] - corners, axis=2).max(1)
+    even = contraction_of(rig, aabb).even
+    assert farthest.min() <= even <= farthest.max() and even == pytest.approx(np.quantile(farthest, 0.9))
+
+
+def test_cells_of_contracted_space_are_seen_where_they_lie() -> None:
+    """A row of cells ahead of the cameras, out to infinity, and one behind them."""
+    aabb = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
+    cameras = pictures_of([straight(), straight(0.1)])
+    seen = seen_cells(cameras, aabb, (32, 32, 32), Contraction(2.0))
+    z, y, x = (np.argwhere(np.ones_like(seen)).T + 0.5) / 32
+    centres = expand(np.stack([x, y, z], axis=1), aabb)
+    assert np.abs(centres).max() == pytest.approx(16)
+    depth, clear = -centres[:, 2], 0.02 * 2  # the margin of a view 90 degrees wide and 53 high
+    in_view = (depth > 0) & (np.abs(centres[:, 1]) < (0.5 + clear) * depth)
+    for shift in (0.0, 0.1):
+        in_view &= np.abs(centres[:, 0] - shift) < (1 + clear) * depth
+    np.testing.assert_array_equal(seen.ravel(), in_view)
+    assert seen[0].any() and not seen[16:].any()
+
+
+def test_device_coordinates_of_a_row_of_cameras() -> None:
+    mapping, box = device_coordinates_of(pictures_of([straight(-0.5), straight(0.5)], near=1.0, far=4.0))
+    np.testing.assert_allclose(mapping.frame, np.eye(4)[:3], atol=1e-12)
+    assert mapping.near == pytest.approx(1) and mapping.baseline == pytest.approx(1)
+    # x / z from -0.5 - 1 at the near plane to 0.5 + 1, y / z half as wide as one camera sees, 1 / 1 - 1 / 4 deep.
+    np.testing.assert_allclose(box, [[-1.5, -0.5, 0], [1.5, 0.5, 0.75]], atol=1e-6)
+    shape = (3, 4, 6)
+    seen = seen_cells(pictures_of([straight(-0.5), straight(0.5)], near=1.0, far=4.0), box, shape, mapping)
+    assert seen[-1, :, 1:-1].all() and not seen[0, :, 0].any()  # at the far end both see nearly all, at the near end not the sides
+
+
+def test_device_coordinates_stand_as_far_forward_as_the_foremost_camera() -> None:
+    ahead = straight()
+    ahead.camera_to_world[2, 3] = -0.4
+    mapping, box = device_coordinates_of(pictures_of([straight(-0.5), straight(0.5), ahead], near=1.0, far=4.0))
+    assert mapping.frame[2, 3] == pytest.approx(-0.4) and mapping.near == pytest.approx(0.6)
+    assert box[1, 2] < mapping.baseline / mapping.near
+
+
+@pytest.mark.parametrize("rig", [[straight(), straight(turned=True)], [straight(), straight()]], ids=["apart", "one place"])
+def test_rigs_without_device_coordinates(rig: list[Camera]) -> None:
+    with pytest.raises(DatasetError, match="do not face one way"):
+        device_coordinates_of(pictures_of(rig, near=1.0, far=4.0))
+    with pytest.raises(DatasetError, match="near and far"):
+        device_coordinates_of(pictures_of([straight(), straight(1.0)]))
+
+
+def test_near_without_far_is_not_enough() -> None:
+    with pytest.raises(DatasetError, match="--box"):
+        find_box(pictures_of([straight(), straight(1.0)], near=1.0), False)
+
+
+def test_cells_count_as_seen_from_two_cameras() -> None:
+    box = np.array([[-2, -0.1, -2.2], [3, 0.1, -1.8]], np.float32)  # a bar 2 in front, in cells of 0.5
+    shape = (1, 1, 10)
+    x = -2 + 0.5 * (np.arange(10) + 0.5)
+    both = seen_cells(pictures_of([straight(), straight(1.0)]), box, shape)
+    assert both.shape == shape and both.dtype == bool
+    margin = 0.02 * 2 * 2  # of the picture's width, 2 away
+    np.testing.assert_array_equal(both[0, 0], (np.abs(x) < 2 + margin) & (np.abs(x - 1) < 2 + margin))
+    either = seen_cells(pictures_of([straight(), straight(1.0)]), box, shape, at_least=1)
+    assert either.all()
+    alone = seen_cells(pictures_of([straight(), straight(1.0)], tests=(1,)), box, shape)
+    np.testing.assert_array_equal(alone[0, 0], np.abs(x) < 2 + margin)
+
+
+def test_cells_behind_and_nearer_than_near_are_not_seen() -> None:
+    box = np.array([[-0.1, -0.1, -4], [0.1, 0.1, 4]], np.float32)
+    rig = pictures_of([straight(), straight(0.05)], near=2.0, far=9.0)
+    z = -4 + 0.5 * (np.arange(16) + 0.5)
+    np.testing.assert_array_equal(seen_cells(rig, box, (16, 1, 1))[:, 0, 0], -z > 1.8)
+
+
+def test_the_same_camera_twice_is_one() -> None:
+    box = np.array([[-0.1, -0.1, -4], [0.1, 0.1, -1]], np.float32)
+    twice_and_turned = pictures_of([straight(), straight(), straight(turned=True)])
+    assert not seen_cells(twice_and_turned, box, (2, 2, 2)).any()
+    assert seen_cells(pictures_of([straight(), straight()]), box, (2, 2, 2)).all()
+
+
+def test_nothing_is_right_before_a_camera() -> None:
+    rig = make.ring(6, width=20, height=20)
+    distance = np.linalg.norm(rig[0].camera_to_world[:3, 3])
+    aabb = np.array([[-distance] * 3, [distance] * 3], np.float32)
+    shape = (40, 40, 40)
+    seen = seen_cells(pictures_of(rig), aabb, shape)
+    z, y, x = (np.argwhere(seen).T + 0.5) / 40
+    centres = aabb[0] + np.stack([x, y, z], axis=1) * (aabb[1] - aabb[0])
+    nearest = min(np.linalg.norm(centres - c.camera_to_world[:3, 3], axis=1).min() for c in rig)
+    assert seen.any() and CLEAR * distance <= nearest < (CLEAR + 0.1) * distance
+
+
+def test_cameras_that_look_apart_have_no_clearance() -> None:
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
+    apart = [replace(c, camera_to_world=c.camera_to_world @ turned) for c in make.ring(6, width=20, height=20)]
+    distance = np.linalg.norm(apart[0].camera_to_world[:3, 3])
+    aabb = np.array([[-2 * distance] * 3, [2 * distance] * 3], np.float32)
+    seen = seen_cells(pictures_of(apart), aabb, (40, 40, 40), at_least=1)
+    z, y, x = (np.argwhere(seen).T + 0.5) / 40
+    centres = aabb[0] + np.stack([x, y, z], axis=1) * (aabb[1] - aabb[0])
+    assert np.linalg.norm(centres - apart[0].camera_to_world[:3, 3], axis=1).min() < CLEAR * distance / 2

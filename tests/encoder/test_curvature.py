@@ -1,0 +1,133 @@
+"""What errors in planes cost, against what they do to pictures."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import SPACES, tiny_scene, varied
+
+from kpc.encoder.rdo import curvature as module
+from kpc.encoder.rdo.curvature import curvature
+from kpc.encoder.evaluation.evaluate import SceneRenderer
+from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.format.scene.scene import Scene
+
+KINDS: dict[str, Callable[[Scene], Scene]] = SPACES | {
+    "still": lambda scene: tiny_scene(3, dynamic=False),
+    "varied": varied,
+    "no cameras": lambda scene: replace(scene, cameras=()),
+    "fewer channels": lambda scene: without_the_last_channels(scene),
+}
+
+
+def without_the_last_channels(scene: Scene) -> Scene:
+    """Of the coarsest scale, whose features come first."""
+    left = np.delete(np.arange(16), [6, 7])
+    d = scene.decoder
+    decoder = replace(d, density_weight=d.density_weight[left], w2=d.w2[:, left], b2=d.b2[:, left])
+    return replace(scene, decoder=decoder, scales=({n: p[..., :6] for n, p in scene.scales[0].items()}, scene.scales[1]))
+
+
+def probe_of(scene: Scene, count: int) -> Probe:
+    probe = Probe.of_surfaces(scene, count, seed=1)
+    return replace(probe, appearances=np.arange(count) % len(scene.appearances) if scene.appearances else None)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_foretells_what_small_errors_do_to_pictures(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Independent errors of variance s^2 move the three colours of a ray by s^2 sum(h) squared, in the mean: of each plane by
+    itself, since a large sum would hide a small one."""
+    scene = KINDS[kind](tiny_scene(3))
+    monkeypatch.setattr(module, "RAYS_AT_ONCE", 16)  # so few rays: hardly any cross terms, that they need not cancel
+    probe, rng = probe_of(scene, 2000), np.random.default_rng(0)
+    h = curvature(scene, probe, 2000).alone
+    renderer = SceneRenderer(scene)
+    codes = renderer.codes(probe.appearances)
+    before = renderer.rgb(*probe.rays, codes)
+    for s, scale in enumerate(scene.scales):
+        for name, plane in scale.items():
+            assert h[s][name].shape == plane.shape and h[s][name].dtype == np.float32 and (h[s][name] >= 0).all()
+            moved = []
+            for _ in range(12):
+                changed = dict(scale) | {name: plane + rng.normal(0, 1e-3, plane.shape).astype(np.float32)}
+                scales = (*scene.scales[:s], changed, *scene.scales[s + 1 :])
+                moved.append(np.square(SceneRenderer(replace(scene, scales=scales)).rgb(*probe.rays, codes) - before).sum(1).mean())
+            assert np.mean(moved) == pytest.approx(1e-6 * h[s][name].sum(), rel=0.3), (s, name)
+
+
+@pytest.mark.parametrize("kind", ["box", "fewer channels"])
+def test_it_foretells_what_errors_of_two_channels_do_together(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Squared moves of colours by the same errors in both channels, less those by errors of opposite signs, are four times what goes
+    together: of the two channels of each plane for which that is most."""
+    scene = KINDS[kind](tiny_scene(3))
+    monkeypatch.setattr(module, "RAYS_AT_ONCE", 16)
+    monkeypatch.setattr(module, "SIDE", 1)
+    probe, rng = probe_of(scene, 2000), np.random.default_rng(0)
+    found = curvature(scene, probe, 2000)
+    before = SceneRenderer(scene).rgb(*probe.rays)
+    for s, scale in enumerate(scene.scales):
+        for name, plane in scale.items():
+            roots, correlation = np.sqrt(found.alone[s][name]), found.together[s][name]
+            assert np.abs(correlation).max() < 1.001 and not np.einsum("abmm->abm", correlation).any()
+            np.testing.assert_array_equal(correlation, correlation.swapaxes(2, 3))
+            products = np.einsum("abmn,abm,abn->mn", correlation, roots, roots)
+            m, n = np.unravel_index(np.abs(products).argmax(), products.shape)
+            moved = []
+            for _ in range(12):
+                error = rng.normal(0, 1e-3, plane.shape[:2]).astype(np.float32)
+                for sign in (1, -1):
+                    changed = plane.copy()
+                    changed[..., m] += error
+                    changed[..., n] += sign * error
+                    scales = (*scene.scales[:s], dict(scale) | {name: changed}, *scene.scales[s + 1 :])
+                    colours = SceneRenderer(replace(scene, scales=scales)).rgb(*probe.rays)
+                    moved.append(sign * np.square(colours - before).sum(1).mean())
+            assert 2 * np.mean(moved) == pytest.approx(4e-6 * products[m, n], rel=0.35), (s, name)
+
+
+@pytest.mark.parametrize("rows, columns", [(4, 6), (5, 7), (1, 1)])
+def test_products_are_summed_over_blocks(rows: int, columns: int) -> None:
+    plane = np.random.default_rng(0).normal(size=(rows, columns, 3)).astype(np.float32)
+    sums = module._products(plane)
+    assert sums.shape == (-(-rows // 2), -(-columns // 2), 3, 3)
+    for y, x in np.ndindex(sums.shape[:2]):
+        block = plane[2 * y : 2 * y + 2, 2 * x : 2 * x + 2].reshape(-1, 3)
+        np.testing.assert_allclose(sums[y, x], block.T @ block, rtol=1e-4, atol=1e-6)
+
+
+def test_what_no_ray_meets_costs_nothing() -> None:
+    scene = tiny_scene(3)
+    h = curvature(replace(scene, occupancy=np.zeros_like(scene.occupancy)), probe_of(scene, 100), 100)
+    assert all(not plane.any() for part in (h.alone, h.together) for scale in part for plane in scale.values())
+
+
+def test_what_is_seen_more_costs_more() -> None:
+    """Half of the box is empty: texels of planes along x are met on one side alone, but for neighbours."""
+    scene = tiny_scene(3)
+    occupancy = scene.occupancy.copy()
+    occupancy[..., : occupancy.shape[3] // 2] = False
+    h = curvature(replace(scene, occupancy=occupancy), probe_of(scene, 500), 500).alone[1]
+    for name in ("xy", "xz", "xt"):
+        columns = h[name].sum((0, 2))
+        assert not columns[: len(columns) // 2 - 2].any() and columns[len(columns) // 2 + 2 : -4].all()
+
+
+def test_rays_beyond_those_of_the_probe_that_meet_something_are_drawn_from_the_cameras() -> None:
+    """All of a probe's rays miss: what is found comes from the others, the same ones each time."""
+    scene = tiny_scene(3)
+    blind = replace(probe_of(scene, 64), origins=np.full((64, 3), 50, np.float32))
+    once, again = (curvature(scene, blind, 1000).alone for _ in range(2))
+    assert once[0]["xy"].any()
+    for name in once[1]:
+        np.testing.assert_array_equal(once[1][name], again[1][name])
+
+
+def test_rays_that_pass_where_nothing_is_do_not_count() -> None:
+    scene = tiny_scene(3)
+    probe = probe_of(scene, 64)
+    astray = replace(probe, origins=np.concatenate([probe.origins, np.full((64, 3), 50, np.float32)]),
+                     directions=np.tile(probe.directions, (2, 1)), times=np.tile(probe.times, 2))
+    with_them, without = curvature(scene, astray, 64), curvature(scene, probe, 64)
+    for name, found in with_them.alone[1].items():
+        assert found.any() and found.tobytes() == without.alone[1][name].tobytes()

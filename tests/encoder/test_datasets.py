@@ -1,0 +1,620 @@
+"""Every layout is recognised by its content and read to the cameras and pixels it is of; every fault is one line."""
+
+import errno
+import json
+import os
+import shutil
+from pathlib import Path
+
+import datasets as make
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kpc.encoder.datasets import Dataset, PixelCache, load_dataset, pixel_cache, rays
+from kpc.encoder.datasets.capture import natural_key
+from kpc.encoder.datasets.dataset import shrunk, undistort
+from kpc.format.common.errors import DatasetError, KpcError, MediaError
+from kpc.format.common.media import write_image, write_video
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def load(folder: Path, **options: object) -> Dataset:
+    return load_dataset(folder, folder.parent / "cache", progress=False, **options)
+
+
+def fails(folder: Path, *words: str, **options: object) -> None:
+    """Loading raises one line with all these words in it."""
+    with pytest.raises(KpcError) as caught:
+        load(folder, **options)
+    message = str(caught.value)
+    assert isinstance(caught.value, (DatasetError, MediaError))
+    assert "\n" not in message and all(word in message for word in words), message
+
+
+def all_rays(dataset: Dataset, picture: int) -> tuple[np.ndarray, np.ndarray]:
+    camera = dataset.camera(picture)
+    row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
+    return rays(dataset.pictures, np.full(len(row), picture), column, row)
+
+
+# --- layouts
+
+
+def test_n3dv(tmp_path: Path) -> None:
+    rig = make.write_n3dv(tmp_path / "set")
+    dataset = load(tmp_path / "set")
+    p = dataset.pictures
+    assert (dataset.layout, dataset.is_dynamic, dataset.has_alpha, len(p)) == ("N3DV", True, False, 12)
+    assert (dataset.clip.frame_count, dataset.clip.fps) == (4, make.FPS)
+    assert dataset.camera_names == ("cam00", "cam01", "cam02")
+    np.testing.assert_allclose(p.time, np.tile([0, 1 / 3, 2 / 3, 1], 3), atol=1e-7)
+    np.testing.assert_array_equal(p.is_test, [True] * 4 + [False] * 8)
+    assert (p.near == 1).all() and (p.far == 6).all()
+    for n in range(len(p)):
+        camera, there = rig[p.camera[n]], dataset.camera(n)
+        np.testing.assert_allclose(there.camera_to_world, camera.camera_to_world, atol=1e-12)
+        assert (there.fl_x, there.fl_y, there.cx, there.cy) == (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
+        error = dataset.pixels.picture(n).astype(float) - make.picture(camera, float(p.time[n]))
+        assert np.abs(error).mean() < 2  # crf 1, and half a step of each of Y, Cb, Cr
+    said = dataset.describe()
+    assert all(
+        word in said for word in ("N3DV", "3 cameras", "12 pictures of 32x24", "cam00", "dynamic, 4 frames at 8 fps")
+    ), said
+
+
+def test_rays_are_those_of_the_pinhole_camera(tmp_path: Path) -> None:
+    make.write_n3dv(tmp_path / "set")
+    dataset = load(tmp_path / "set")
+    for n in (0, 5, 11):
+        origins, directions = all_rays(dataset, n)
+        expected_origins, expected_directions = dataset.camera(n).rays()
+        np.testing.assert_allclose(origins, expected_origins, atol=1e-6)
+        np.testing.assert_allclose(directions, expected_directions, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "holdout, tests", [(None, {"cam00"}), ("none", set()), ("cam02", {"cam02"}), ("cam01.mp4", {"cam01"})]
+)
+def test_holdout_of_videos(tmp_path: Path, holdout: str | None, tests: set[str]) -> None:
+    make.write_n3dv(tmp_path / "set")
+    dataset = load(tmp_path / "set", holdout=holdout)
+    p = dataset.pictures
+    assert {dataset.camera_names[c] for c in p.camera[p.is_test]} == tests
+    fails(tmp_path / "set", "cam07", "cam00, cam01", holdout="cam07")
+
+
+def test_one_frame_of_each_video_is_a_static_scene(tmp_path: Path) -> None:
+    make.write_n3dv(tmp_path / "set", frames=1)
+    dataset = load(tmp_path / "set")
+    assert not dataset.is_dynamic and dataset.clip.duration_s == 0 and (dataset.pictures.time == 0).all()
+    assert "static" in dataset.describe()
+
+
+def test_videos_in_natural_order(tmp_path: Path) -> None:
+    rig = make.write_n3dv(tmp_path / "set")
+    (tmp_path / "set" / "cam01.mp4").rename(tmp_path / "set" / "cam9.mp4")
+    (tmp_path / "set" / "cam02.mp4").rename(tmp_path / "set" / "cam10.mp4")
+    dataset = load(tmp_path / "set")
+    assert dataset.camera_names == ("cam00", "cam9", "cam10")
+    np.testing.assert_allclose(dataset.camera(8).camera_to_world, rig[2].camera_to_world)
+
+
+def test_natural_order() -> None:
+    names = ["", "2", "10", "a", "a0", "a1", "a01b", "a2", "a10", "a10b2", "a10b10", "a" + "9" * 5000, "b", "x\u00b21"]
+    assert sorted(reversed(names), key=natural_key) == names
+
+
+def test_llff_images(tmp_path: Path) -> None:
+    make.write_llff(tmp_path / "set")
+    dataset = load(tmp_path / "set")
+    assert (dataset.layout, dataset.is_dynamic) == ("LLFF", False)
+    np.testing.assert_array_equal(np.flatnonzero(dataset.pictures.is_test), [0, 8])
+    assert load(tmp_path / "set", holdout="view3").pictures.is_test.tolist() == [k == 3 for k in range(9)]
+
+
+def test_blender(tmp_path: Path) -> None:
+    make.write_blender(tmp_path / "set")
+    dataset = load(tmp_path / "set")
+    p = dataset.pictures
+    assert (dataset.layout, dataset.is_dynamic, dataset.has_alpha, len(p)) == ("Blender", True, True, 8)
+    assert dataset.clip.frame_count == 5
+    np.testing.assert_array_equal(p.is_test, [False] * 5 + [True] * 3)
+    np.testing.assert_allclose(p.time, [0, 0.25, 0.5, 0.75, 1, 0, 0.5, 1])
+    camera = make.ring(5, width=20, height=20)[1]
+    np.testing.assert_array_equal(dataset.pixels.picture(1), make.picture(camera, 0.25, alpha=True))
+    assert dataset.camera(1).fl_x == pytest.approx(camera.fl_x)
+    assert len(load(tmp_path / "set", holdout="none").pictures) == 10  # val is trained on too
+
+
+def test_blender_static_without_alpha(tmp_path: Path) -> None:
+    make.write_blender(tmp_path / "set", dynamic=False, alpha=False)
+    dataset = load(tmp_path / "set")
+    assert not dataset.is_dynamic and not dataset.has_alpha and dataset.pixels.picture(0).shape == (20, 20, 3)
+
+
+def test_alpha_that_is_opaque_everywhere_is_none(tmp_path: Path) -> None:
+    rig = make.write_nerfstudio(tmp_path / "set")
+    for k, camera in enumerate(rig):
+        opaque = np.concatenate([make.picture(camera), np.full((24, 32, 1), 255, np.uint8)], axis=2)
+        write_image(tmp_path / "set" / "images" / f"{k:04d}.png", opaque)
+    for _ in range(2):  # built, then opened
+        dataset = load(tmp_path / "set")
+        assert not dataset.has_alpha
+        np.testing.assert_array_equal(dataset.pixels.picture(3), make.picture(rig[3]))
+        assert dataset.pixels.read(np.array([5, 900])).shape == (2, 3)
+
+
+def test_nerfstudio_holds_out_every_eighth(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set")
+    dataset = load(tmp_path / "set")
+    assert (dataset.layout, dataset.is_dynamic) == ("nerfstudio", False)
+    np.testing.assert_array_equal(np.flatnonzero(dataset.pictures.is_test), [0, 8])
+
+
+def test_nerfstudio_split_time_and_depths(tmp_path: Path) -> None:
+    names = [f"images/{k:04d}.png" for k in range(10)]
+    make.write_nerfstudio(
+        tmp_path / "set",
+        times=[k / 9 for k in range(10)],
+        near=0.5,
+        far=4.5,
+        fps=12,
+        train_filenames=names[:7],
+        test_filenames=["./" + names[8]],
+    )
+    dataset = load(tmp_path / "set")
+    p = dataset.pictures
+    assert p.file == (*names[:7], names[8])  # 7 and 9 are in neither list
+    np.testing.assert_array_equal(p.is_test, [False] * 7 + [True])
+    assert (p.near == 0.5).all() and (p.far == 4.5).all() and dataset.clip.fps == 12
+    assert dataset.clip.frame_count == 8  # 10 at this step, but no more than there are pictures
+
+
+def test_frames_may_override_intrinsics(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set")
+    make.edit_json(tmp_path / "set" / "transforms.json", lambda d: d["frames"][4].update(fl_x=99.0, cx=15.0, k1=0.1))
+    dataset = load(tmp_path / "set")
+    assert dataset.pictures.intrinsics[4].tolist() == [99.0, 38.4, 15.0, 12.0]
+    assert dataset.pictures.distortion[4].tolist() == [0.1, 0, 0, 0]
+    assert len(dataset.camera_names) == 10 and dataset.pictures.camera.tolist() == list(range(10))
+
+
+def test_intrinsics_follow_the_images_size(tmp_path: Path) -> None:
+    """Calibrated on 64x48, the images are 32x24."""
+    make.write_nerfstudio(tmp_path / "set", w=64, h=48, fl_x=80.0, fl_y=82.0, cx=33.0, cy=23.0)
+    np.testing.assert_allclose(load(tmp_path / "set").pictures.intrinsics[0], [40.0, 41.0, 16.5, 11.5])
+
+
+def test_missing_images_are_named_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make.write_nerfstudio(tmp_path / "set")
+    for k in (2, 5):
+        (tmp_path / "set" / "images" / f"{k:04d}.png").unlink()
+    dataset = load(tmp_path / "set")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "2 of 10 frames" in line and "images/0002.png, images/0005.png" in line
+    np.testing.assert_array_equal(np.flatnonzero(dataset.pictures.is_test), [0])  # every eighth of those that exist
+
+
+def test_times_beyond_the_unit_are_scaled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    times = [12.0, 10.0, 11.0, 14.0, 13.0, 15.0, 19.0, 18.0, 17.0, 16.0]  # in no order, in frames
+    make.write_nerfstudio(tmp_path / "set", times=times)
+    dataset = load(tmp_path / "set", holdout="none")
+    np.testing.assert_allclose(dataset.pictures.time, (np.array(times) - 10) / 9, atol=1e-7)
+    assert dataset.clip.frame_count == 10
+    assert "10 to 19; scaled" in capsys.readouterr().err
+
+
+def test_equal_times_are_a_static_scene(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set", times=[0.5] * 10)
+    dataset = load(tmp_path / "set")
+    assert not dataset.is_dynamic and dataset.clip.frame_count == 1
+
+
+def test_fewer_frames_in_one_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = make.write_n3dv(tmp_path / "set")
+    write_video(
+        tmp_path / "set" / "cam01.mp4",
+        (make.picture(rig[1], t) for t in (0, 1 / 3)),
+        make.FPS,
+        crf=1,
+        pix_fmt="yuv444p",
+    )
+    dataset = load(tmp_path / "set")
+    assert dataset.clip.frame_count == 2 and len(dataset.pictures) == 6
+    assert dataset.pictures.time.tolist() == [0, 1] * 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "2 (cam01.mp4) to 4 frames" in line
+    error = dataset.pixels.picture(5).astype(float) - make.picture(rig[2], 1 / 3)
+    assert np.abs(error).mean() < 2
+
+
+# --- faults
+
+
+def test_folders_that_are_no_dataset(tmp_path: Path) -> None:
+    fails(tmp_path / "none", "no such directory")
+    (tmp_path / "file").write_text("x")
+    fails(tmp_path / "file", "not a directory")
+    (tmp_path / "empty").mkdir()
+    fails(tmp_path / "empty", "empty directory")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("x")
+    fails(tmp_path / "other", "poses_bounds.npy", "transforms_train.json", "transforms.json")
+
+
+def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make.write_llff(tmp_path / "set")
+
+    def refuse(path: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "iterdir", refuse)  # root may read everything, so the refusal is played
+    fails(tmp_path / "set", "no permission")
+
+
+def test_poses_that_do_not_match(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    make.write_n3dv(folder)
+    good = np.load(folder / "poses_bounds.npy")
+
+    def with_poses(rows: np.ndarray) -> Path:
+        np.save(folder / "poses_bounds.npy", rows)
+        return folder
+
+    def changed(row: int, column: int, value: float) -> Path:
+        rows = good.copy()
+        rows[row, column] = value
+        return with_poses(rows)
+
+    fails(with_poses(good[:2]), "poses_bounds.npy", "2 poses for 3 videos")
+    fails(with_poses(good[:, :15]), "poses_bounds.npy", "N x 17")
+    fails(with_poses(good.astype(complex)), "N x 17")
+    fails(changed(1, 3, np.nan), "row 1", "NaN")
+    fails(changed(2, 14, 0.0), "row 2", "focal length")
+    fails(changed(2, 14, np.nan), "row 2", "focal length")
+    fails(changed(0, 4, 0.0), "row 0", "empty")
+    fails(changed(0, 0, 9.0), "row 0", "not a rotation")
+    fails(changed(1, 15, -1.0), "row 1", "near")
+    fails(changed(1, 16, 0.5), "row 1", "far")
+    fails(changed(1, 9, 99.0), "another shape")
+    (folder / "poses_bounds.npy").write_bytes(b"not numpy")
+    fails(folder, "poses_bounds.npy", "not a numpy array")
+    np.save(folder / "poses_bounds.npy", np.array([{"a": 1}], object), allow_pickle=True)
+    fails(folder, "poses_bounds.npy", "not a numpy array")
+
+
+def test_poses_without_pictures(tmp_path: Path) -> None:
+    (tmp_path / "set").mkdir()
+    np.save(tmp_path / "set" / "poses_bounds.npy", make.poses_bounds(make.ring(3)))
+    fails(tmp_path / "set", "cam*.mp4")
+
+
+def test_a_video_that_is_none(tmp_path: Path) -> None:
+    make.write_n3dv(tmp_path / "set")
+    (tmp_path / "set" / "cam01.mp4").write_bytes(b"text")
+    fails(tmp_path / "set", "cam01.mp4")
+
+
+def test_a_video_that_is_cut_off(tmp_path: Path) -> None:
+    make.write_n3dv(tmp_path / "set")
+    video = tmp_path / "set" / "cam01.mp4"
+    video.write_bytes(video.read_bytes()[:-400])
+    fails(tmp_path / "set", "cam01.mp4")
+    assert not list((tmp_path / "cache").iterdir())
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_a_single_camera_that_does_not_move(tmp_path: Path, frames: int) -> None:
+    make.write_n3dv(tmp_path / "set", cameras=2, frames=frames)
+    fails(tmp_path / "set", "a single camera that does not move", "cam01.mp4")
+    make.write_n3dv(tmp_path / "one", cameras=1, frames=frames)
+    fails(tmp_path / "one", "every picture is held out")
+    fails(tmp_path / "one", "a single camera that does not move", holdout="none")
+
+
+def test_videos_at_different_rates(tmp_path: Path) -> None:
+    rig = make.write_n3dv(tmp_path / "set")
+    write_video(tmp_path / "set" / "cam01.mp4", [make.picture(rig[1])] * 4, 25, pix_fmt="yuv444p")
+    fails(tmp_path / "set", "8 to 25 fps")
+
+
+@pytest.mark.parametrize(
+    "key, value, words",
+    [
+        ("fl_x", 0.0, "focal length"),
+        ("fl_x", None, "fl_x"),
+        ("fl_x", "long", "fl_x"),
+        ("w", 0, "empty"),
+        ("h", 99, "another shape"),
+        ("frames", [], "no frames"),
+        ("frames", "none", "no frames"),
+        ("camera_model", "OPENCV_FISHEYE", "OPENCV_FISHEYE"),
+        ("k3", 0.5, "k3"),
+        ("train_filenames", 3, "train_filenames"),
+        ("test_filenames", [1], "test_filenames"),
+        ("fps", 0, "fps"),
+        ("frames", [{"file_path": "images/0000.png"}], "transform_matrix"),
+        ("frames", [7], "frame 0"),
+    ],
+)
+def test_malformed_transforms(tmp_path: Path, key: str, value: object, words: str) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3, **{key: value})
+    fails(tmp_path / "set", "transforms.json", *([words] if words != "k3" else ["beyond k1 k2 p1 p2"]))
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        [[1, 2], [3, 4]],
+        "text",
+        np.zeros((4, 4)).tolist(),
+        (np.eye(4) * np.nan).tolist(),
+        [[1], [2, 3]],
+        np.diag([-1.0, 1, 1, 1]).tolist(),
+    ],
+)
+def test_malformed_pose(tmp_path: Path, pose: object) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    make.edit_json(tmp_path / "set" / "transforms.json", lambda d: d["frames"][1].update(transform_matrix=pose))
+    fails(tmp_path / "set", "transforms.json frame 1")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", "null", "[" * 100000, '{"frames": 1}', "\x00"])
+def test_broken_json(tmp_path: Path, text: str) -> None:
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "transforms.json").write_text(text)
+    fails(tmp_path / "set", "transforms.json")
+
+
+@pytest.mark.parametrize(
+    "name", ["../secret.png", "/etc/secret.png", "images/../../secret.png", "..\\secret.png", "a\0b"]
+)
+def test_file_path_must_not_leave_the_folder(tmp_path: Path, name: str) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    write_image(tmp_path / "secret.png", make.picture(make.ring(1)[0]))
+    make.edit_json(tmp_path / "set" / "transforms.json", lambda d: d["frames"][1].update(file_path=name))
+    fails(tmp_path / "set", "transforms.json", "leads out of")
+
+
+def test_times_for_some_images_only(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set", times=[k / 9 for k in range(10)])
+    make.edit_json(tmp_path / "set" / "transforms.json", lambda d: d["frames"][3].pop("time"))
+    fails(tmp_path / "set", "0003.png", "time")
+    make.edit_json(tmp_path / "set" / "transforms.json", lambda d: d["frames"][3].update(time=float("nan")))
+    fails(tmp_path / "set", "0003.png", "time")
+
+
+def test_no_image_at_all(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    shutil.rmtree(tmp_path / "set" / "images")
+    fails(tmp_path / "set", "none of its 3 images")
+
+
+def test_damaged_image(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    image = tmp_path / "set" / "images" / "0001.png"
+    image.write_bytes(image.read_bytes()[:-300])
+    fails(tmp_path / "set", "0001.png")
+    assert not list((tmp_path / "cache").iterdir())
+
+
+def test_too_much_downscaling(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    fails(tmp_path / "set", "cannot be downscaled by 25", downscale=25)
+    fails(tmp_path / "set", "cannot be downscaled by 0", downscale=0)
+
+
+# --- the cache
+
+
+def cache_file(tmp_path: Path) -> Path:
+    (file,) = (tmp_path / "cache").glob("pixels-*.bin")
+    return file
+
+
+def test_cache_is_built_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make.write_n3dv(tmp_path / "set")
+    load(tmp_path / "set")
+    before = cache_file(tmp_path).stat().st_mtime_ns
+    load(tmp_path / "set", holdout="none")
+    assert cache_file(tmp_path).stat().st_mtime_ns == before
+    assert sorted(f.suffix for f in (tmp_path / "cache").iterdir()) == [".bin", ".json"]
+
+
+def test_stale_or_damaged_cache_is_rebuilt(tmp_path: Path) -> None:
+    rig = make.write_nerfstudio(tmp_path / "set")
+    load(tmp_path / "set")
+    file = cache_file(tmp_path)
+    good = file.read_bytes()
+    for damaged in (good[:-1], good + b"\0", bytes([good[0] ^ 1]) + good[1:], b""):
+        file.write_bytes(damaged)
+        load(tmp_path / "set")
+        assert file.read_bytes() == good
+    for text in ("", "{}", "[]", file.with_suffix(".json").read_text().replace("crc32c", "crc")):
+        file.with_suffix(".json").write_text(text)
+        load(tmp_path / "set")
+        assert json.loads(file.with_suffix(".json").read_text())["channels"] == 3
+    write_image(tmp_path / "set" / "images" / "0002.png", 255 - make.picture(rig[2]))
+    np.testing.assert_array_equal(load(tmp_path / "set").pixels.picture(2), 255 - make.picture(rig[2]))
+
+
+@pytest.mark.parametrize("mapped_bytes", [1 << 30, 0])
+def test_reading_pixels_mapped_and_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mapped_bytes: int) -> None:
+    monkeypatch.setattr(pixel_cache, "MAPPED_BYTES", mapped_bytes)
+    make.write_blender(tmp_path / "set")
+    dataset = load(tmp_path / "set")
+    p = dataset.pictures
+    rng = np.random.default_rng(0)
+    picture = rng.integers(len(p), size=500)
+    column, row = rng.integers(p.width[picture]), rng.integers(p.height[picture])
+    found = dataset.pixels.read(p.offset[picture] + row.astype(np.int64) * p.width[picture] + column)
+    expected = np.stack([dataset.pixels.picture(n)[j, i] for n, j, i in zip(picture, row, column)])
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_large_cache_stays_out_of_memory(tmp_path: Path) -> None:
+    """3 GB, sparse: reading all over it leaves none of it resident."""
+    file = tmp_path / "pixels.bin"
+    with open(file, "wb") as out:
+        out.truncate(3_000_000_000)
+    tiles = tuple(pixel_cache.Tile(n * 1_000_000, 1000, 1000, 0) for n in range(1000))
+    cache = PixelCache(file, tiles, 3, 3)
+    rng = np.random.default_rng(0)
+    before = resident_bytes()
+    for _ in range(20):
+        assert cache.read(rng.integers(10**9, size=8192)).shape == (8192, 3)
+    assert resident_bytes() - before < 50e6
+
+
+def resident_bytes() -> int:
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("the system does not tell resident memory in /proc")
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_cache_that_shrinks_while_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pixel_cache, "MAPPED_BYTES", 0)
+    make.write_blender(tmp_path / "set")
+    dataset = load(tmp_path / "set")
+    os.truncate(cache_file(tmp_path), 100)
+    with pytest.raises(DatasetError, match="shorter than it was"):
+        dataset.pixels.read(np.array([0, 3000]))
+    with pytest.raises(DatasetError, match="shorter than it was"):
+        dataset.pixels.picture(3)
+
+
+def test_disk_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    real, written = os.write, []
+
+    def write(fd: int, data: memoryview) -> int:
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written.append(fd)
+        return real(fd, data)
+
+    monkeypatch.setattr(pixel_cache.os, "write", write)
+    fails(tmp_path / "set", "disk is full", "--downscale")
+    assert not list((tmp_path / "cache").iterdir())
+    monkeypatch.setattr(pixel_cache.shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10, 10, 0))
+    written.clear()
+    fails(tmp_path / "set", "disk is full")
+
+
+def test_what_a_killed_build_left_is_swept(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    load(tmp_path / "set")
+    file = cache_file(tmp_path)
+    old, new = (file.with_name(f".{file.stem}.{name}.bin") for name in ("old", "new"))
+    for leftover in (old, new):
+        leftover.write_bytes(b"x")
+    os.utime(old, (0, 0))
+    file.unlink()
+    load(tmp_path / "set")
+    assert not old.exists() and new.exists()
+
+
+def test_cache_directory_that_cannot_be_made(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    (tmp_path / "cache").write_text("a file")
+    with pytest.raises(OSError) as caught:  # cli.run makes one line of it
+        load(tmp_path / "set")
+    assert caught.value.filename is not None
+
+
+# --- pixels and rays
+
+
+@pytest.mark.parametrize("factor", [2, 3, 5])
+def test_shrinking_averages_blocks(factor: int) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (16, 23, 3), dtype=np.uint8)
+    small = shrunk(picture, factor)
+    h, w = 16 // factor, 23 // factor
+    exact = picture[: h * factor, : w * factor].reshape(h, factor, w, factor, 3).mean((1, 3))
+    assert small.shape == (h, w, 3) and np.abs(small - exact).max() <= 0.5
+
+
+def test_shrinking_weighs_colours_by_alpha() -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (8, 8, 4), dtype=np.uint8)
+    picture[:2, :2, 3] = 0
+    blocks = picture.reshape(4, 2, 4, 2, 4).astype(float)
+    alpha = blocks[..., 3:].sum((1, 3))
+    with np.errstate(invalid="ignore"):
+        exact = np.where(
+            alpha > 0, (blocks[..., :3] * blocks[..., 3:]).sum((1, 3)) / alpha, blocks[..., :3].mean((1, 3))
+        )
+    small = shrunk(picture, 2)
+    assert np.abs(small[..., :3] - exact).max() <= 0.5
+    assert np.abs(small[..., 3:] - alpha / 4).max() <= 0.5
+
+
+def test_downscaled_intrinsics_keep_directions(tmp_path: Path) -> None:
+    """A pixel of the small picture looks where the middle of its block does."""
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    large, small = load(tmp_path / "set"), load(tmp_path / "set", downscale=4)
+    assert small.pixels.picture(0).shape == (6, 8, 3)
+    _, fine = all_rays(large, 1)
+    _, coarse = all_rays(small, 1)
+    corners = fine.reshape(6, 4, 8, 4, 3)[:, 1:3, :, 1:3]  # the middle four
+    middle = corners.mean((1, 3)).reshape(-1, 3)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    # the mean of four unit vectors half a pixel off the middle errs by less than (half a pixel)^2, 1 / 76.8 squared
+    assert np.abs(middle - coarse).max() < (0.5 / 38.4) ** 2 * 2
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_undistortion_inverts_distortion(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    coefficients = rng.uniform(-1, 1, (40, 4)) * [0.15, 0.08, 0.01, 0.01]
+    x, y = rng.uniform(-0.7, 0.7, (2, 40))  # at 0.8 the strongest of these lenses fold over
+    u, v = undistort(*distorted(x, y, coefficients), coefficients)
+    np.testing.assert_allclose(np.stack([u, v]), np.stack([x, y]), atol=1e-9)
+
+
+def distorted(x: np.ndarray, y: np.ndarray, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    k1, k2, p1, p2 = coefficients.T
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2
+    return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+
+
+def test_undistortion_beyond_the_fold_stays_finite() -> None:
+    coefficients = np.tile([-0.9, 0.0, 0.0, 0.0], (50, 1))
+    x = np.linspace(-3, 3, 50)
+    assert np.isfinite(undistort(x, x, coefficients)).all()
+
+
+def test_distorted_rays_pass_through_the_point_they_show(tmp_path: Path) -> None:
+    coefficients = np.array([[0.06, -0.08, -0.001, 0.0002]])  # of a real lens
+    make.write_nerfstudio(tmp_path / "set", images=3, **dict(zip(("k1", "k2", "p1", "p2"), coefficients[0].tolist())))
+    dataset = load(tmp_path / "set")
+    assert "distortion" in dataset.describe()
+    camera, p = dataset.camera(1), dataset.pictures
+    points = np.random.default_rng(0).uniform(-0.7, 0.7, (20, 3))
+    local = (points - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]
+    x, y = distorted(local[:, 0] / -local[:, 2], local[:, 1] / local[:, 2], coefficients)
+    column, row = camera.cx + camera.fl_x * x - 0.5, camera.cy + camera.fl_y * y - 0.5
+    origins, directions = rays(p, np.ones(20, int), column, row)
+    along = ((points - origins) * directions).sum(1, keepdims=True)
+    assert np.abs(origins + along * directions - points).max() < 1e-5  # float32 at 4 units
+
+
+# --- real sets
+
+
+@pytest.mark.skipif(not (DATA / "fox").is_dir(), reason="shared/data is not here")
+@pytest.mark.parametrize(
+    "name, words, pictures, tests",
+    [
+        ("soldier", "Blender: 120 cameras, 120 pictures of 200x200", 120, 20),
+        ("shelf_hand", "dynamic, 86 frames", 86, 11),
+        ("fox", "static, distortion", 50, 7),
+    ],
+)
+def test_real_sets(tmp_path: Path, name: str, words: str, pictures: int, tests: int) -> None:
+    dataset = load_dataset(DATA / name, tmp_path, downscale=8 if name == "fox" else 1, progress=False)
+    assert words in dataset.describe()
+    assert (len(dataset.pictures), int(dataset.pictures.is_test.sum())) == (pictures, tests)

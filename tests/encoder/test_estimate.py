@@ -1,0 +1,95 @@
+"""A dry run says what the run would take, takes nothing from it, and leaves nothing but decoded pixels."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import datasets as make
+import numpy as np
+import pytest
+
+from kpc.encoder.cli import estimate as module
+from kpc.encoder.cli import kpenc
+from kpc.encoder.field.config import PRESETS, TrainConfig
+from kpc.encoder.datasets import Dataset
+from kpc.encoder.training.train import Trainer
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+CONFIG = TrainConfig(
+    resolutions=(8, 16), samples_across=32, cells_across=12, steps=400, rays=256, samples=8192, warmup=5, occupancy_start=8,
+    occupancy_every=4, tune_steps=0,
+)
+BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
+
+
+def test_it_extrapolates_from_the_steps_it_watched(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that ticks once a step: the first half of the steps at 3 s, the others at 1 s."""
+    run = Trainer(moving, CONFIG, BOX, "cpu", elapsed_s=5.0)
+    watched = module.STEPS * CONFIG.occupancy_start
+    inner = run.run
+
+    def slow(*args: object, interrupted: Callable[[], bool]) -> None:
+        def ticking() -> bool:
+            run.elapsed_s = 5.0 + sum(3.0 if k < watched // 2 else 1.0 for k in range(run.step))
+            return interrupted()
+
+        inner(*args, interrupted=ticking)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(run, "run", slow)
+    found = module.estimate(run, probe_rays=100, tested=3, spent_s=2.0, time_budget_s=None)
+    assert run.step == watched
+    assert found.train_s == pytest.approx(5 + 3 * watched // 2 + 1.0 * (CONFIG.steps - watched // 2), abs=3)
+    assert 2 < found.rest_s < 60 and found.memory_bytes > 16 * run.field.theta.numel()
+
+
+def test_tuning_is_counted(moving: Dataset) -> None:
+    """By what a ray takes in training, and to be rendered."""
+    found = []
+    for tune_steps in (0, 100):
+        run = Trainer(moving, replace(CONFIG, steps=1250, tune_steps=tune_steps), BOX, "cpu")
+        found.append(module.estimate(run, probe_rays=100, tested=0, spent_s=0.0, time_budget_s=None).rest_s)
+    trained = module.TUNED * 2.5 * 100 * module.RAYS / run.rays_per_second
+    assert found[1] - found[0] == pytest.approx(trained, rel=0.5)
+
+
+def test_steps_with_the_coarsest_scale_alone_are_counted_apart(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the same clock: 1 s a step while it is alone, 4 s with all."""
+    run = Trainer(moving, replace(CONFIG, coarse_until=0.3), BOX, "cpu")
+    watched = module.STEPS * CONFIG.occupancy_start
+    inner = run.run
+
+    def slow(*args: object, interrupted: Callable[[], bool]) -> None:
+        def ticking() -> bool:
+            run.elapsed_s = sum(1.0 if k < watched else 4.0 for k in range(run.step))
+            return interrupted()
+
+        inner(*args, interrupted=ticking)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(run, "run", slow)
+    found = module.estimate(run, probe_rays=100, tested=0, spent_s=0.0, time_budget_s=None)
+    assert run.step > watched and found.train_s == pytest.approx(0.3 * 400 * 1.0 + 0.7 * 400 * 4.0, rel=0.03)
+
+
+def test_a_time_budget_is_the_time(moving: Dataset) -> None:
+    run = Trainer(moving, CONFIG, BOX, "cpu")
+    assert module.estimate(run, 100, 0, 0.0, 600.0).train_s == 600.0
+
+
+def test_a_dry_run_writes_no_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(PRESETS, "draft", CONFIG)
+    make.write_blender(tmp_path / "set")
+    words = [str(tmp_path / "set"), "-o", str(tmp_path / "out.kpc"), "--preset", "draft", "--steps", "30"]
+    assert kpenc.main([*words, "--dry-run"]) == 0
+    out, err = capsys.readouterr()
+    assert "would take" in out and "MB of memory" in out and "planes" in err
+    assert {p.name for p in tmp_path.iterdir()} == {"set", "out.kpc.work"}
+    assert {p.suffix for p in (tmp_path / "out.kpc.work").iterdir()} == {".bin", ".json"}
+    assert kpenc.main([*words, "--dry-run", "--json"]) == 0
+    assert set(json.loads(capsys.readouterr().out)) == {"train_s", "rest_s", "memory_bytes"}
+    with pytest.raises(SystemExit, match="2"):
+        kpenc.main([*words, "--dry-run", "--resume"])
+    assert kpenc.main(words) == 0
+    assert {p.name for p in tmp_path.iterdir()} == {"set", "out.kpc"}

@@ -1,0 +1,244 @@
+"""`kpenc --group`: which frames a group holds, how it begins, and that a run that ends goes on where it was."""
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import datasets as make
+import numpy as np
+import pytest
+import torch
+
+from kpc.encoder.cli import kpenc
+from kpc.encoder.rdo.rate_control import Trade
+from kpc.encoder.field.config import PRESETS, TrainConfig
+from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.cli.estimate import Estimate
+from kpc.encoder.field.field import Field, Layout
+from kpc.encoder.cli.grouped import LATER, OVERLAP, begin_with, share_of, spans_of
+from kpc.encoder.cli.options import Options
+from kpc.encoder.training.train import Trainer
+from kpc.format.container import scene_io
+from kpc.format.container.container import ENTRY, HEADER
+from kpc.format.common.errors import DatasetError, UsageError
+from kpc.format.container.groups import Groups, Span, Timeline
+from kpc.format.scene.scene import Clip
+from kpc.tools.bench import group_joins
+from kpc.tools.cli import kpjoin
+
+pytestmark = pytest.mark.usefixtures("one_thread", "few_rays", "tiny")
+FRAMES = 26
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    config = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
+                         occupancy_start=8, occupancy_every=4)  # fmt: skip
+    monkeypatch.setitem(PRESETS, "draft", config)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """26 frames at 8 fps: three groups of 1.2 s."""
+    folder = tmp_path_factory.mktemp("videos")
+    make.write_n3dv(folder, cameras=3, frames=FRAMES, width=16, height=12)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def clip(videos: Path, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return load_dataset(videos, tmp_path_factory.mktemp("cache"), progress=False)
+
+
+def encode(videos: Path, output: Path, *options: str) -> int:
+    return kpenc.main([str(videos), "-o", str(output), "--preset", "draft", "--group", "1.2s", *options])
+
+
+def test_groups_are_about_equally_long_and_share_frames():
+    spans = spans_of(Clip(100, 10.0), 2.5)
+    assert spans == (Span(0, 27), Span(23, 29), Span(48, 29), Span(73, 27))
+    timeline = Timeline(spans, 10.0)
+    assert [timeline.at(frame / 99)[0] for frame in range(100)] == [frame // 25 for frame in range(100)]
+    for frames in (26, 29, 300, 301):
+        cut = spans_of(Clip(frames, 10.0), 2.5)
+        shown = [Timeline(cut, 10.0).at(frame / (frames - 1))[0] for frame in range(frames)]
+        assert cut[0].start == 0 and cut[-1].last == frames - 1 and max(np.bincount(shown)) <= 25
+        assert np.ptp(np.bincount(shown)) <= 1
+    assert spans_of(Clip(20, 10.0), 2.5) == (Span(0, 20),)
+    with pytest.raises(UsageError, match="at least 0.8s"):
+        spans_of(Clip(100, 10.0), 0.3)
+
+
+def test_size_and_time_are_shared_out():
+    spans = spans_of(Clip(100, 10.0), 2.5)
+    options = Options(Path("a"), Path("b"), time_budget_s=100.0, trade=Trade(target_bytes=100_000))
+    shares = [share_of(options, number, spans) for number in range(4)]
+    assert sum(share.trade.target_bytes for share in shares) == pytest.approx(100_000 - HEADER.size - 4 * ENTRY.size, abs=4)
+    assert sum(share.time_budget_s for share in shares) == pytest.approx(100)
+    assert shares[1].time_budget_s / shares[0].time_budget_s == pytest.approx(LATER * 29 / 27)
+    plain = share_of(replace(options, trade=Trade(quality=50), time_budget_s=None), 1, spans)
+    assert plain.trade == Trade(quality=50) and plain.time_budget_s is None
+
+
+def test_a_field_begins_as_the_last_row_of_another():
+    def field(rows: int, seed: int) -> Field:
+        layout = Layout.of(np.array([[5, 4, 3, rows]]), 2)
+        made = Field(layout, 4, torch.Generator().manual_seed(seed), (rows, 2, 2, 2))
+        with torch.no_grad():
+            for value in made.parameters():
+                value += torch.rand(value.shape, generator=torch.Generator().manual_seed(seed + 9))
+        return made
+
+    earlier, later = field(6, 0), field(4, 1)
+    occupancy = np.ones((1, 2, 2, 2), bool)
+    scene = earlier.to_scene(np.array([[0, 0, 0], [1, 1, 1]], np.float32), Clip(12, 8.0), occupancy, np.ones(3), 0.1)
+    begin_with(later, scene)
+    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(3))
+    at_the_end = earlier.features(points, torch.ones(20))
+    for time in (0.0, 0.4, 1.0):
+        assert torch.allclose(later.features(points, torch.full((20,), time)), at_the_end, atol=1e-5)
+    assert torch.equal(later.density, earlier.density) and torch.equal(later.w2, earlier.w2)
+    assert later.theta.requires_grad and later.theta.is_leaf
+
+
+def test_what_goes_on_begins_with_all_scales(tmp_path):
+    make.write_blender(tmp_path / "set")
+    options = Options(tmp_path / "set", tmp_path / "out.kpc", preset="draft", box=((-1, -1, -1), (1, 1, 1)))
+    setting = kpenc._setting(options)
+    first = kpenc._trainer(options, setting)
+    later = kpenc._trainer(options, replace(setting, before=first.scene()))
+    assert first.config.coarse_until > 0 and later.config == replace(first.config, coarse_until=0.0)
+    assert torch.equal(later.field.density, first.field.density)
+
+
+def test_frames_of_a_clip_as_a_clip_of_their_own(clip):
+    some = clip.between(7, 19)
+    assert some.clip == Clip(13, clip.clip.fps) and len(some.pictures) == 3 * 13 and some.is_dynamic
+    assert np.allclose(np.unique(some.pictures.time), np.arange(13) / 12, atol=1e-6)
+    for picture in (0, 20, 38):
+        frame = 7 + round(float(some.pictures.time[picture]) * 12)
+        twin = int(some.pictures.camera[picture]) * FRAMES + frame
+        assert some.pictures.file[picture] == clip.pictures.file[twin]
+        assert np.array_equal(some.pixels.picture(picture), clip.pixels.picture(twin))
+        first = some.pictures.offset[picture : picture + 1]
+        assert np.array_equal(some.pixels.read(first), clip.pixels.read(clip.pictures.offset[twin : twin + 1]))
+    with pytest.raises(DatasetError, match="no picture to train on"):
+        clip.between(FRAMES + 3, FRAMES + 9)
+
+
+def test_a_clip_with_fewer_frames(clip):
+    thin = clip.thinned(5)
+    assert thin.clip.frame_count == 5 and len(thin.pictures) == 15
+    assert thin.clip.duration_s == pytest.approx(clip.clip.duration_s, rel=0.3)
+    assert np.allclose(np.unique(thin.pictures.time), np.rint(np.linspace(0, 25, 5)) / 25, atol=1e-6)
+    assert clip.thinned(FRAMES) is clip
+
+
+def test_masks_of_some_pictures(tmp_path):
+    make.write_colmap(tmp_path / "set", model="PINHOLE")
+    for k in range(10):
+        make.write_mask(tmp_path / f"set/masks/{k:04d}.png.png", np.arange(32) + np.zeros((24, 1)) > 3 * k)
+    masks = load_dataset(tmp_path / "set", tmp_path / "cache", progress=False).masks
+    numbers = np.array([7, 2, 5])
+    some = masks.some(numbers)
+    assert np.array_equal(some.counts, masks.counts[numbers])
+    for k, number in enumerate(numbers):
+        assert np.array_equal(some.usable(k), masks.usable(int(number)))
+        rank = np.arange(0, some.counts[k], 37)
+        assert np.array_equal(some.nth_usable(np.full(len(rank), k), rank), masks.nth_usable(np.full(len(rank), number), rank))
+
+
+def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
+    output = tmp_path / "long.kpc"
+    assert encode(videos, output, "--json") == 0
+    out, err = capsys.readouterr()
+    result, opened = json.loads(out), Groups(output)
+    assert opened.timeline.spans == spans_of(Clip(FRAMES, 8.0), 1.2) and len(opened) == 3
+    assert [group["frames"] for group in result["groups"]] == [[span.start, span.last] for span in opened.timeline.spans]
+    assert result["steps"] == 24 * (1 + 2 * LATER) and result["size_bytes"] == output.stat().st_size
+    assert 5 < result["test_psnr"] < 60 and result["test_pictures"] == FRAMES + 4 * OVERLAP
+    assert all(f"group {number} of 3" in err for number in range(3)) and err.count("begins where the one before ended") == 2
+    boxes = [opened.open(number).head.aabb for number in range(3)]
+    assert np.array_equal(boxes[0], boxes[1]) and np.array_equal(boxes[0], boxes[2])
+    assert list(tmp_path.iterdir()) == [output]
+    found = group_joins.measure(output, load_dataset(videos, tmp_path / "cache", progress=False))
+    assert [frame["frame"] for frame in found["frames"]] == list(range(FRAMES))
+    assert [join["frame"] for join in found["joins"]] == [8, 17] and all(5 < join["agreement_db"] < 100 for join in found["joins"])
+    assert np.mean([frame["psnr"] for frame in found["frames"]]) == pytest.approx(result["test_psnr"], abs=0.5)
+
+
+def test_an_interrupted_run_goes_on_at_its_group_to_the_same_file(videos, tmp_path, monkeypatch, capsys):
+    assert encode(videos, tmp_path / "whole.kpc") == 0
+    begun: list[Trainer] = []
+    make_trainer = Trainer.__init__
+
+    def init(self: Trainer, *args: object, **named: object) -> None:
+        make_trainer(self, *args, **named)  # type: ignore[arg-type]
+        begun.append(self)
+        step = self.optimiser.step
+
+        def stepping(count: int, *rest: object) -> tuple[float, float]:
+            if len(begun) == 2 and count == 3:
+                os.kill(os.getpid(), signal.SIGINT)
+            return step(count, *rest)  # type: ignore[arg-type]
+
+        self.optimiser.step = stepping  # type: ignore[method-assign]
+
+    output = tmp_path / "long.kpc"
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "__init__", init)
+        assert encode(videos, output) == 130
+    err = capsys.readouterr().err
+    assert "stopped at step 4" in err and "group-0001" in err and not output.exists()
+    assert encode(videos, output, "--resume", "--seed", "5") == 1 and "other settings" in capsys.readouterr().err
+    assert encode(videos, output, "--resume") == 0
+    err = capsys.readouterr().err
+    assert "group-0000.kpc: is there already" in err and "resumed at step 4" in err
+    assert output.read_bytes() == (tmp_path / "whole.kpc").read_bytes()
+
+
+def test_a_clip_in_groups_is_coded_again_group_by_group(videos, tmp_path, capsys):
+    assert encode(videos, tmp_path / "long.kpc", "--steps", "8") == 0
+    capsys.readouterr()
+    assert kpenc.main([str(tmp_path / "long.kpc"), "-o", str(tmp_path / "small.kpc"), "--quality", "20", "--tune-steps", "0", "--json"]) == 0
+    result, before, after = json.loads(capsys.readouterr().out), Groups(tmp_path / "long.kpc"), Groups(tmp_path / "small.kpc")
+    assert after.timeline == before.timeline and result["size_bytes"] == (tmp_path / "small.kpc").stat().st_size
+    assert all(new < old for new, old in zip(after.size_bytes, before.size_bytes, strict=True))
+    assert result["parameters"] == sum(scene_io.read(after.open(number)).parameter_count for number in range(3))
+
+
+def test_groups_that_are_coded_apart_are_joined(videos, tmp_path, capsys):
+    parts = [tmp_path / f"part{number}.kpc" for number in range(3)]
+    for number, part in enumerate(parts):
+        assert encode(videos, part, "--only", str(number), "--keep-checkpoint", str(part.with_suffix(".kpck"))) == 0
+        assert Groups(part).timeline.spans == spans_of(Clip(FRAMES, 8.0), 1.2)[number : number + 1]
+        assert part.with_suffix(".kpck").is_file()
+    assert kpjoin.main([*map(str, reversed(parts)), "-o", str(tmp_path / "long.kpc")]) == 0
+    joined = Groups(tmp_path / "long.kpc")
+    assert joined.timeline.spans == spans_of(Clip(FRAMES, 8.0), 1.2) and joined.clip == Clip(FRAMES, 8.0)
+    assert all(scene_io.read(joined.open(number)).is_dynamic for number in range(3))
+
+
+@pytest.mark.parametrize("options, complaint", [
+    (["--only", "3"], "has 3 groups"), (["--group", "0.2s"], "too few for a group"),
+    (["--keep-checkpoint", "x.kpck"], "single scene"),
+])  # fmt: skip
+def test_what_makes_no_sense_is_refused(videos, tmp_path, capsys, options, complaint):
+    try:
+        code = encode(videos, tmp_path / "long.kpc", *options)
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    assert code == 2 and complaint in capsys.readouterr().err and not (tmp_path / "long.kpc").exists()
+
+
+def test_a_dry_run_counts_all_groups(videos, tmp_path, monkeypatch):
+    monkeypatch.setattr(kpenc, "estimate", lambda trainer, *rest: Estimate(10.0, 4.0, trainer.dataset.clip.frame_count))
+    options = Options(videos, tmp_path / "long.kpc", preset="draft", group_s=1.2, device="cpu")
+    assert kpenc.dry_run(options) == Estimate(10 + 20 * LATER, 4 + 8 * LATER, 8 + OVERLAP)
+    assert kpenc.dry_run(replace(options, only=1)) == Estimate(10.0, 4.0, 9 + 2 * OVERLAP)

@@ -1,0 +1,247 @@
+"""The fused kernels meet their readable twins: `kpc.encoder.field.field` in float64, torch.optim.Adam, the numpy renderer.
+
+Tolerances. Float32 places a sample at 4 units from the eye to 2^-22 or so, 5e-7 of the box; planes of 24 texels that
+change by 1 a texel turn that into 1e-5 of a feature, and six factors, 16 features and a march of 60 samples into some
+1e-4 at worst.
+Colours must agree to 1e-4, a fortieth of an 8-bit level; a gradient to 1e-3 of the largest element of its array.
+"""
+
+import math
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gradients import KINDS, Calling, backpropagate, misty, rays_at, reference_gradients
+from numba.core.dispatcher import Dispatcher
+from scenes import displaced, tiny_scene
+
+from kpc.encoder.field import kernels
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.evaluation.evaluate import SceneRenderer
+from kpc.encoder.field.field import Field, Layout, priors
+from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_priors, log_densities, sample_capacity
+from kpc.encoder.field.render import Rays, render_reference
+from kpc.player.cpu import reference
+
+COLOUR = 1e-4
+GRADIENT = 1e-3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_backpropagate_is_autograd_through_the_reference(kind: tuple[bool, bool, bool]) -> None:
+    scene = misty(*kind)
+    rays = rays_at(scene, 403)
+    targets = torch.rand(403, 3, generator=torch.Generator().manual_seed(1))
+    ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
+    assert ours["counts"].sum() == theirs["samples"] > 403
+    np.testing.assert_allclose(ours["errors"], theirs["errors"], atol=6 * COLOUR)  # d e^2 = 2 e de, three channels
+    np.testing.assert_allclose(ours["peaks"], theirs["peaks"], atol=COLOUR)
+    for name in ("theta", "density", "basis", *(["motion"] if scene.motion is not None else [])):
+        largest = np.abs(theirs[name]).max()
+        assert largest > 0
+        np.testing.assert_allclose(ours[name], theirs[name], atol=GRADIENT * largest, err_msg=name)
+
+
+def test_backpropagate_gives_faint_samples_no_colour_and_hardly_errs() -> None:
+    """A sample of weight below 1e-4 gets no colour: off by less than that, `sample_capacity` times at most."""
+    scene = tiny_scene()
+    rays = rays_at(scene, 203)
+    targets = torch.rand(203, 3, generator=torch.Generator().manual_seed(1))
+    ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
+    colour = 1e-4 * sample_capacity(scene.aabb, scene.step)
+    np.testing.assert_allclose(ours["errors"], theirs["errors"], atol=6 * colour)
+    for name in ("theta", "density"):
+        difference = np.linalg.norm(ours[name] - theirs[name]) / np.linalg.norm(theirs[name])
+        assert difference < colour, (name, difference)
+
+
+def test_workers_share_the_rays_and_change_nothing_but_rounding() -> None:
+    scene = misty()
+    rays, targets = rays_at(scene, 103), torch.zeros(103, 3)
+    one, three = backpropagate(scene, rays, targets, workers=1), backpropagate(scene, rays, targets, workers=3)
+    np.testing.assert_array_equal(one["errors"], three["errors"])
+    np.testing.assert_array_equal(one["basis"], three["basis"])
+    np.testing.assert_array_equal(one["peaks"], three["peaks"])
+    # A sum of at most 103 * 60 float32 terms in another order.
+    np.testing.assert_allclose(one["theta"], three["theta"], atol=1e-5 * np.abs(one["theta"]).max())
+
+
+def test_a_machine_s_first_training_equals_its_second(tmp_path: Path) -> None:
+    """The first process compiles a kernel, the second finds it in numba's cache; sums in any order would differ between them.
+
+    The one that compiles fastest and sums stands for all: they have its flags.
+    """
+    functions = [f for f in vars(kernels).values() if isinstance(f, Dispatcher)]
+    assert len(functions) > 20 and all(f.targetoptions["fastmath"] == kernels._FASTMATH for f in functions)
+    field, rng = Field.from_scene(tiny_scene()), np.random.default_rng(0)
+    theta, density = field.theta.detach().numpy(), field.density.detach().numpy()
+    places = rng.random((500, 3), np.float32), rng.random(500, np.float32)
+    np.savez(tmp_path / "in.npz", theta, field.layout.table, field.layout.resolution, density, *places)
+    script = (
+        "import sys, numpy\nfrom kpc.encoder import kernels\n"
+        "theta, table, resolution, density, points, times = numpy.load(sys.argv[1]).values()\n"
+        f"logs = kernels.log_densities(theta, table, resolution, density, {field.layout.channels}, None, points, times, 2)\n"
+        "sys.stdout.buffer.write(logs.tobytes())"
+    )
+    command, env = [sys.executable, "-c", script, tmp_path / "in.npz"], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    compiled, cached = (subprocess.run(command, env=env, check=True, stdout=subprocess.PIPE).stdout for _ in range(2))
+    assert len(list(tmp_path.glob("cache/**/kernels.log_densities-*.nbc"))) == 1
+    assert len(compiled) == 2000 and compiled == cached
+
+
+def test_rays_that_miss_the_box_show_the_background() -> None:
+    scene = misty()
+    rays = rays_at(scene, 13)
+    away = replace(rays, origins=rays.origins + 100)
+    ours = backpropagate(scene, away, away.backgrounds)
+    assert not ours["counts"].any() and not ours["errors"].any() and not ours["theta"].any() and not ours["basis"].any()
+
+
+def test_the_reference_has_the_gradient_of_finite_differences() -> None:
+    generator = torch.Generator().manual_seed(3)
+    field = Field(Layout.of(np.array([[3, 3, 2, 2]]), 2), 2, generator).double()
+    aabb = torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]], dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(4, 3, generator=generator, dtype=torch.float64), dim=1)
+    rays = Rays(
+        -2 * directions,
+        directions,
+        *(torch.rand(4, generator=generator).double() for _ in range(2)),
+        torch.rand(4, 3, generator=generator).double(),
+    )
+    theta = (0.5 + torch.rand(field.layout.size, generator=generator, dtype=torch.float64)).requires_grad_()
+    density = torch.randn(3, generator=generator, dtype=torch.float64).requires_grad_()
+
+    def colours(theta: torch.Tensor, density: torch.Tensor) -> torch.Tensor:
+        def rendered(*_: object) -> torch.Tensor:
+            return render_reference(field, rays, aabb, torch.ones(1, 2, 2, 2), 0.3)[0]
+
+        return torch.func.functional_call(
+            Calling(field, rendered), {"field.theta": theta, "field.density": density}, ()
+        )
+
+    assert torch.autograd.gradcheck(colours, (theta, density))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_render_is_the_players_reference(kind: tuple[bool, bool, bool]) -> None:
+    scene = misty(*kind)
+    renderer = SceneRenderer(scene)
+    for time in (0.0, 0.3, 0.5, 1.0):
+        for camera in scene.cameras:
+            origins, directions = camera.rays()
+            theirs = reference.render_rays(scene, origins, directions, time)
+            ours = renderer.rgb(origins, directions, np.full(len(origins), time))
+            # A sample within rounding of a cell's face may count here and not there; few rays have one.
+            assert np.mean(np.abs(ours - theirs.rgb).max(1) > COLOUR) < 0.002
+            assert np.abs(ours - theirs.rgb).max() < 0.3
+
+
+def test_render_gives_opacity_depth_and_counts() -> None:
+    scene = misty()
+    field, camera = Field.from_scene(scene), scene.cameras[0]
+    origins, directions = camera.rays()
+    n = len(origins)
+    _, opacity, depth, counts = kernels.render(
+        field.theta.detach().numpy(),
+        field.layout.table,
+        field.layout.resolution,
+        field.density.detach().numpy(),
+        field.layout.channels,
+        None,
+        scene.aabb,
+        kernels.even_of(scene.mapping),
+        scene.occupancy.view(np.uint8),
+        np.float32(scene.step),
+        np.float32(scene.extent),
+        origins,
+        directions,
+        np.full(n, 0.4, np.float32),
+        field.basis(torch.from_numpy(directions)).detach().numpy(),
+        np.arange(n),
+        scene.background,
+        sample_capacity(scene.aabb, scene.step),
+        4,
+    )
+    theirs = reference.render_rays(scene, origins, directions, 0.4)
+    seen = theirs.opacity > 0.05
+    assert 0.1 < seen.mean() < 0.9
+    assert np.mean(np.abs(opacity - theirs.opacity) > COLOUR) < 0.002
+    assert np.mean(np.abs(depth - theirs.depth)[seen] > 4 * COLOUR) < 0.002  # depth reaches 4 units
+    assert np.mean(counts != theirs.samples) < 0.002
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_log_densities(moved: bool) -> None:
+    scene = displaced(tiny_scene()) if moved else tiny_scene()
+    field = Field.from_scene(scene)
+    rng = np.random.default_rng(0)
+    points, times = rng.random((500, 3), np.float32), rng.random(500, np.float32)
+    points[:4], times[:4] = [[0, 0, 0], [1, 1, 1], [0, 1, 0], [1, 0, 1]], [0, 1, 1, 0]
+    twin = field.double()
+    features = twin.features(torch.from_numpy(points).double(), torch.from_numpy(times).double())
+    expected = twin.decode(features)[0].detach().numpy()
+    np.testing.assert_allclose(log_densities(Field.from_scene(scene), points, times), expected, atol=COLOUR)
+
+
+def test_log_densities_are_clipped() -> None:
+    scene = tiny_scene()
+    for bias, limit in ((1e6, 20.0), (-1e6, -20.0)):
+        field = Field.from_scene(replace(scene, decoder=replace(scene.decoder, density_bias=bias)))
+        assert (log_densities(field, np.full((3, 3), 0.5), np.zeros(3)) == limit).all()
+
+
+WEIGHTS = dict(space_variation=0.3, transient_variation=0.4, time_smoothness=0.7, sparse_transients=0.2)
+
+
+@pytest.mark.parametrize("alone", [None, *WEIGHTS])
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("dynamic", [True, False])
+def test_priors_are_the_gradient_of_their_twin(dynamic: bool, late: bool, alone: str | None) -> None:
+    """All of them together, and each on its own."""
+    field = Field.from_scene(tiny_scene(dynamic=dynamic))
+    with torch.no_grad():
+        field.theta += 0.1 * torch.randn(field.layout.size, generator=torch.Generator().manual_seed(0))
+        field.theta[-50:] = 1.0  # the kink of |1 - P|, where the gradient is 0 by agreement
+    config = TrainConfig(**{name: weight if alone in (None, name) else 0.0 for name, weight in WEIGHTS.items()})
+    variation = replace(config, late_space_variation=config.space_variation).variation(float(late))
+    assert (variation.steep > 0) is late
+    grad = np.ones(field.layout.size, np.float32)
+    add_priors(field, field.theta.detach().numpy(), grad, config, variation, 4.0)
+    field = field.double()
+    (4 * sum(priors(field, config, variation).values())).backward()
+    expected = field.theta.grad.numpy()
+    # `grad` held 1 before: what is added is rounded to 2^-24 of that, a few times.
+    np.testing.assert_allclose(grad - 1, expected, atol=8 * 2.0**-24 + 1e-6 * np.abs(expected).max())
+
+
+def test_adam_is_pytorchs() -> None:
+    n, workers = 40_000, 3
+    rng = np.random.default_rng(0)
+    theta = rng.normal(size=n).astype(np.float32)
+    twin = torch.nn.Parameter(torch.from_numpy(theta.copy()).double())
+    optimiser = torch.optim.Adam([twin], lr=1.0, betas=(BETA1, BETA2), eps=EPSILON)
+    mean, square = np.zeros(n, np.float32), np.zeros(n, np.float32)
+    for number in range(1, 6):
+        rate = 0.05 / number
+        grad = rng.normal(size=(workers, n)).astype(np.float32)
+        grad[:, :100] = 0  # never reached: 0 / eps must not move them
+        twin.grad = torch.from_numpy(grad.sum(0, dtype=np.float64))
+        optimiser.param_groups[0]["lr"] = rate
+        optimiser.step()
+        kernels.adam(theta, grad, mean, square, rate, BETA1, BETA2, EPSILON, number)
+        assert not grad.any()
+    # Five steps of at most 0.05, each rounded to 1e-5 of itself or so; where gradients cancel, a little worse.
+    expected = twin.detach().numpy()
+    assert (theta[:100] == expected[:100].astype(np.float32)).all()
+    np.testing.assert_allclose(theta, expected, atol=1e-5)
+    np.testing.assert_allclose(square, optimiser.state[twin]["exp_avg_sq"].numpy(), rtol=1e-4, atol=1e-9)
+
+
+def test_sample_capacity_is_never_reached() -> None:
+    aabb = np.array([[0, 0, 0], [1, 2, 3]], np.float32)
+    assert sample_capacity(aabb, 0.1) >= math.sqrt(14) / 0.1 + 1

@@ -1,0 +1,186 @@
+"""The occupancy grid: what it keeps, what it empties, and what is stored of it."""
+
+import numpy as np
+
+from kpc.encoder.field.occupancy_grid import MORE_MARCHED, OccupancyGrid, grid_shape, in_fewest_slots
+from kpc.format.scene.grid import SPACE_AND_TIME, dilate
+
+SHAPE = (6, 5, 8)
+
+
+def ball(points: np.ndarray, times: np.ndarray, centre: float = 0.5) -> np.ndarray:
+    return np.where(np.linalg.norm(points - [centre, 0.5, 0.5], axis=1) < 0.3, 5.0, -5.0).astype(np.float32)
+
+
+def moving(points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """In the lower half of x during the first half of the clip, in the upper half during the second."""
+    return np.where((points[:, 0] < 0.5) == (times < 0.5), 5.0, -5.0).astype(np.float32)
+
+
+def grid(seen: np.ndarray | None = None) -> OccupancyGrid:
+    return OccupancyGrid(np.ones(SHAPE, bool) if seen is None else seen, threshold=0.0)
+
+
+def settled(g: OccupancyGrid, density: object, peaks: np.ndarray, updates: int = 200) -> OccupancyGrid:
+    rng = np.random.default_rng(0)
+    for _ in range(updates):
+        g.update(density, peaks, rng)  # type: ignore[arg-type]
+    return g
+
+
+def test_cells_are_cubes_as_nearly_as_may_be() -> None:
+    assert grid_shape(np.array([[0, 0, 0], [4, 2, 1]], np.float32), 96) == (24, 48, 96)
+    assert grid_shape(np.array([[0, 0, 0], [1, 1, 1e-9]], np.float32), 10) == (1, 10, 10)
+
+
+def test_dilation_reaches_all_26_neighbours_and_no_farther() -> None:
+    one = np.zeros((5, 5, 5), bool)
+    one[2, 2, 2] = True
+    wide = dilate(one)
+    assert wide.sum() == 27 and wide[1:4, 1:4, 1:4].all()
+    assert one.sum() == 1
+    corner = np.zeros((2, 3, 4, 5), bool)
+    corner[1, 0, 0, 0] = True
+    assert dilate(corner).sum() == 8 and not dilate(corner)[0].any()
+
+
+def test_dilation_along_time_too() -> None:
+    one = np.zeros((5, 3, 3, 3), bool)
+    one[2, 1, 1, 1] = True
+    np.testing.assert_array_equal(dilate(one, SPACE_AND_TIME).all((1, 2, 3)), [False, True, True, True, False])
+    assert dilate(one, SPACE_AND_TIME).sum() == 81
+
+
+def test_all_that_is_seen_is_occupied_at_first() -> None:
+    seen = np.random.default_rng(0).random(SHAPE) < 0.5
+    np.testing.assert_array_equal(grid(seen).occupied, seen)
+
+
+def test_it_settles_on_where_density_is() -> None:
+    g = settled(grid(), ball, np.ones(SHAPE, np.float32))
+    z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n for n in SHAPE), indexing="ij")
+    centre = ball(np.stack([x, y, z], -1).reshape(-1, 3), np.zeros(z.size)).reshape(SHAPE) > 0
+    half = np.linalg.norm([0.5 / n for n in SHAPE])  # from a cell's centre to its corner
+    far = np.linalg.norm(np.stack([x, y, z], -1) - 0.5, axis=-1) > 0.3 + half
+    assert g.occupied[centre].mean() > 0.95 and not g.occupied[far].any()
+
+
+def corner(points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    return np.where((points < 0.2).all(1), 5.0, -5.0).astype(np.float32)
+
+
+def test_density_that_vanishes_is_forgotten() -> None:
+    g = settled(grid(), lambda p, t: np.maximum(ball(p, t), corner(p, t)), np.ones(SHAPE, np.float32))
+    assert g.occupied[3, 2, 4] and g.occupied[0, 0, 0]
+    settled(g, corner, np.ones(SHAPE, np.float32), updates=201)  # 10 units of 0.05
+    assert g.occupied[0, 0, 0] and not g.occupied[3, 2, 4]
+
+
+def test_density_that_appears_is_found() -> None:
+    g = settled(grid(), corner, np.ones(SHAPE, np.float32), updates=5)
+    assert not g.occupied[3, 2, 4]
+    settled(g, ball, np.ones(SHAPE, np.float32))
+    assert g.occupied[3, 2, 4]
+
+
+def test_while_all_is_thin_the_thicker_half_stays() -> None:
+    """Everything below the threshold of 0: emptying it all would leave nothing to learn from."""
+    g = settled(grid(), lambda p, t: np.where(p[:, 0] < 0.5, -1.0, -3.0).astype(np.float32), np.ones(SHAPE, np.float32), 3)
+    assert g.occupied[:, :, :4].all() and not g.occupied[:, :, 4:].any()
+
+
+def test_what_gives_no_ray_colour_is_emptied() -> None:
+    """Density everywhere, weights in one cell only: that cell and its neighbours stay."""
+    peaks = np.zeros(SHAPE, np.float32)
+    peaks[3, 2, 4] = 0.5
+    g = settled(grid(), lambda p, t: np.full(len(p), 5.0, np.float32), peaks)
+    assert g.occupied.sum() == 27 and g.occupied[2:5, 1:4, 3:6].all()
+
+
+def test_cells_that_are_not_seen_stay_empty() -> None:
+    seen = np.ones(SHAPE, bool)
+    seen[:, :, :4] = False
+    g = settled(grid(seen), lambda p, t: np.full(len(p), 5.0, np.float32), np.ones(SHAPE, np.float32), updates=20)
+    np.testing.assert_array_equal(g.occupied, seen)
+    assert not g.over_time(ball, np.random.default_rng(0), 3)[:, ~seen].any()
+
+
+def test_over_time_follows_what_moves() -> None:
+    g = settled(grid(), moving, np.ones(SHAPE, np.float32))
+    assert g.occupied.all()
+    slots = g.over_time(moving, np.random.default_rng(0), 4)
+    assert slots.shape == (4, *SHAPE) and slots.dtype == bool
+    for slot, first_half in enumerate((True, True, False, False)):
+        assert (slots[slot, :, :, :4] == first_half).all() and (slots[slot, :, :, 4:] != first_half).all()
+
+
+def test_a_split_grid_is_marched_where_density_is_or_was_close_by() -> None:
+    """Of what moves at half time, the slots beside it hold both places; what no slot holds is not marched at all."""
+    g = settled(grid(), moving, np.ones(SHAPE, np.float32))
+    np.testing.assert_array_equal(g.marched, g.occupied[None])
+    g.split(moving, 6, np.random.default_rng(0))
+    lower, upper = g.marched[..., :3].all((1, 2, 3)), g.marched[..., 5:].all((1, 2, 3))  # 4 is a neighbour of both
+    np.testing.assert_array_equal(lower, [True, True, True, True, False, False])
+    np.testing.assert_array_equal(upper, [False, False, True, True, True, True])
+    assert not g.marched[4:, ..., :3].any() and not g.marched[:2, ..., 5:].any()
+
+
+def test_an_update_empties_cells_in_every_slot() -> None:
+    g = settled(grid(), lambda p, t: np.maximum(ball(p, t), corner(p, t)), np.ones(SHAPE, np.float32))
+    g.split(ball, 4, np.random.default_rng(0))
+    assert g.marched[:, 3, 2, 4].all()
+    settled(g, corner, np.ones(SHAPE, np.float32), updates=201)
+    assert not g.marched[:, 3, 2, 4].any()
+
+
+def test_while_all_is_thin_a_split_leaves_the_thicker_half() -> None:
+    def thin(points: np.ndarray, times: np.ndarray) -> np.ndarray:
+        return np.where(points[:, 0] < 0.5, -1.0, -3.0).astype(np.float32)
+
+    g = settled(grid(), thin, np.ones(SHAPE, np.float32), 3)
+    g.split(thin, 3, np.random.default_rng(0))
+    assert g.marched[..., :4].all() and not g.marched[..., 4:].any()
+    assert g.over_time(thin, np.random.default_rng(0), 2)[..., :4].all()
+
+
+def test_points_lie_in_their_cells_and_times_in_their_slot() -> None:
+    seen = np.zeros(SHAPE, bool)
+    seen[1, 4, 6] = True
+    asked: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def density(points: np.ndarray, times: np.ndarray) -> np.ndarray:
+        asked.append((points, times))
+        return np.full(len(points), 5.0, np.float32)
+
+    grid(seen).over_time(density, np.random.default_rng(0), 2, samples=8)
+    points = np.concatenate([p for p, _ in asked])
+    np.testing.assert_array_equal(np.floor(points * [8, 5, 6]), np.tile([6, 4, 1], (16, 1)))
+    times = np.concatenate([t for _, t in asked])
+    assert (times[:8] <= 0.5).all() and (times[8:] >= 0.5).all()
+
+
+def test_state_goes_into_another_grid() -> None:
+    one, two = settled(grid(), moving, np.ones(SHAPE, np.float32), updates=7), grid()
+    one.split(moving, 4, np.random.default_rng(0))
+    two.load(one.state())
+    settled(one, moving, np.ones(SHAPE, np.float32), updates=3)
+    settled(two, moving, np.ones(SHAPE, np.float32), updates=3)
+    for name in ("log_density", "peak", "occupied", "marched"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+def test_slots_are_as_few_as_what_moves_allows() -> None:
+    rng = np.random.default_rng(4)
+    still = np.broadcast_to(rng.random((1, 9, 8, 7)) < 0.3, (8, 9, 8, 7)).copy()
+    noisy = still & ((rng.random(still.shape) < 0.99) | (np.arange(8) == 3)[:, None, None, None])
+    halves = still.copy()
+    halves[:4, 5:] = halves[4:, :5] = False
+    turning = np.zeros_like(still)
+    for slot in range(8):
+        turning[slot, slot] = True
+    for before, slots in ((still, 1), (noisy, 1), (halves, 2), (turning, 8), (still[:5], 1), (turning[:5], 5), (still[:1], 1),
+                          (np.zeros_like(still), 1)):  # fmt: skip
+        after = in_fewest_slots(before)
+        assert len(after) == slots and after.dtype == bool and after.mean() <= (1 + MORE_MARCHED) * before.mean()
+        whole = np.repeat(after, len(before) // slots, axis=0)
+        assert (whole | before == whole).all() and (after.any(0) == before.any(0)).all()

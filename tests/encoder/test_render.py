@@ -1,0 +1,234 @@
+"""Rendering in PyTorch: the parts that the kernels stand in for, and the hybrid decoder, whose gradients only PyTorch has."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from gradients import KINDS, Calling, bilinear, misty, rays_at
+from scenes import hybrid, tiny_scene
+
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.evaluation.evaluate import SceneRenderer
+from kpc.encoder.field.field import Field, HybridField, Layout, SummedField
+from kpc.encoder.training.optimisers import Figures, PlainOptimiser, sample_capacity
+from kpc.encoder.training.cuda_graphs import Recorder
+from kpc.encoder.field.render import Rays, collected, fused_features, meet, reached, samples_of, shade
+from kpc.player.cpu import reference
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bool]) -> None:
+    scene = misty(*kind)
+    rays = rays_at(scene, 403)
+    ours = collected(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
+    theirs = samples_of(rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step, scene.mapping)
+    # A sample within rounding of a cell's face may count here and not there: rays of as many samples have the same ones.
+    counts = [np.bincount(samples.ray.numpy(), minlength=403) for samples in (ours, theirs)]
+    same = counts[0] == counts[1]
+    assert same.mean() > 0.98 and counts[0].sum() > 403
+    mine, other = same[ours.ray], same[theirs.ray]
+    np.testing.assert_array_equal(ours.ray[mine], theirs.ray[other])
+    for name, tolerance in (("points", 1e-5), ("s", 1e-4), ("length", 0), ("stretch", 1e-4)):
+        np.testing.assert_allclose(getattr(ours, name)[mine], getattr(theirs, name)[other], atol=tolerance, rtol=1e-4, err_msg=name)
+    assert (ours.cell[mine] == theirs.cell[other]).float().mean() > 0.999
+
+
+@pytest.mark.parametrize("short", [0, 300])
+def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(short: int) -> None:
+    scene = misty()
+    # So many rays that all samples fill vectors of 16: what is left over of one rounds otherwise, on one thread.
+    rays, field = rays_at(scene, 112), Field.from_scene(scene)
+    told = rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step
+    wanted = samples_of(*told)
+    n = len(wanted.ray) - short
+    assert len(wanted.ray) % 16 == 0
+    found = samples_of(*told, most=sample_capacity(scene.aabb, scene.step), capacity=n + (0 if short else 500))
+    for name in ("ray", "points", "s", "length", "stretch", "cell"):
+        assert torch.equal(getattr(found, name)[:n], getattr(wanted, name)[:n]), name
+    assert len(found.ray) == n + (0 if short else 500) and not found.length[n:].any() and short < n
+    if not short:
+        one, two = (meet(field, rays, s, field.features, scene.extent) for s in (wanted, found))
+        assert torch.equal(shade(field, rays, one), shade(field, rays, two)) and torch.equal(one.weights, two.weights[:n])
+        assert torch.isclose(one.distortion, two.distortion, rtol=1e-5)
+
+
+def test_mixed_precision_is_float32_within_its_bound() -> None:
+    """The layers' inputs and weights err by 2^-9 of themselves, bfloat16's half step, a number of them summed in float32: less than
+    1 % of a colour's range; so do gradients, against the largest of their kind.
+    """
+    scene = hybrid(misty())
+    rays = rays_at(scene, 203)
+    samples = samples_of(rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step)
+    rgb, gradients = {}, {}
+    for mixed in (False, True):
+        field = Field.from_scene(scene)
+        field.mixed = mixed
+        rgb[mixed] = shade(field, rays, meet(field, rays, samples, field.features, scene.extent))
+        rgb[mixed].square().mean().backward()
+        gradients[mixed] = {name: p.grad for name, p in field.named_parameters()}
+        assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in field.parameters())
+    assert not torch.equal(rgb[True], rgb[False])
+    assert (rgb[True] - rgb[False]).abs().max() < 0.01
+    for name, gradient in gradients[False].items():
+        assert (gradient - gradients[True][name]).abs().max() < 0.03 * gradient.abs().max(), name
+
+
+def test_gradients_are_added_up_in_float32() -> None:
+    """A thousand of 1/4096 after one of 1: a float16 sum would stay at 1."""
+    plane = torch.ones(2, 2, 1, requires_grad=True)
+    u = torch.zeros(1001)
+    g = torch.full((1001, 1), 1 / 4096)
+    g[0] = 1
+    (bilinear(plane, u, u) * g).sum().backward()
+    assert plane.grad is not None and plane.grad[0, 0, 0] == 1 + 1000 / 4096
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("hybrid_decoder", [False, True])
+def test_a_step_on_a_gpu_waits_for_nothing(hybrid_decoder: bool) -> None:
+    scene = hybrid(misty()) if hybrid_decoder else misty()
+    field = Field.from_scene(scene).cuda()
+    config = TrainConfig(hybrid=hybrid_decoder)
+    optimiser = PlainOptimiser(field, config, scene.occupancy.shape[1:])
+    rays, targets = rays_at(scene, 203), torch.rand(203, 3)
+    told = scene.aabb, scene.occupancy, scene.step, scene.extent
+    losses = [optimiser.step(k, 0.0, 0.1, rays, targets, *told)[0] for k in range(Figures.LATE + 2)]
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        losses += [optimiser.step(k, 0.0, 0.1, rays, targets, *told)[0] for k in range(20)]
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert losses[-1] < losses[0]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_recorded_step_on_a_gpu_is_the_step(moved: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = misty(True, False, moved)
+    rays, targets = rays_at(scene, 203), torch.rand(203, 3)
+    told = scene.aabb, scene.occupancy, scene.step, scene.extent
+    found = []
+    for records in (True, False):
+        if not records:
+            monkeypatch.setattr(Recorder, "run", lambda self, key, inputs, work: work(*inputs))
+        field = Field.from_scene(scene).cuda()
+        optimiser = PlainOptimiser(field, TrainConfig(learning_rate=1e-3), scene.occupancy.shape[1:])
+        losses = [optimiser.step(k, 0.0, 1.0, rays, targets, *told)[0] for k in range(60)]
+        assert bool(optimiser._recorder._recordings) == records
+        found.append((losses[-1], field.theta.detach().cpu(), optimiser.peaks()))
+    (loss, theta, peaks), (wanted_loss, wanted_theta, wanted_peaks) = found
+    assert loss == pytest.approx(wanted_loss, rel=1e-3)
+    torch.testing.assert_close(theta, wanted_theta, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(peaks, wanted_peaks, atol=1e-3)
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_samples_that_are_not_reached_take_no_part(moved: bool) -> None:
+    scene = misty(True, False, moved)
+    rays, field = rays_at(scene, 203), Field.from_scene(scene).double()
+    rays = rays.apply(torch.Tensor.double)
+    samples = samples_of(rays, torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy), scene.step)
+    whole = meet(field, rays, samples, field.features, scene.extent)
+    assert not whole.reached.all()
+    shown = shade(field, rays, whole)
+    shown.square().sum().backward()
+    wanted, field.theta.grad = field.theta.grad, None
+    count = int(whole.reached.sum())
+    for room in (count, count + 100):
+        some = reached(samples, whole.reached, room)
+        assert len(some.ray) == room and (some.ray.diff() >= 0).all()
+        met = meet(field, rays, some, field.features, scene.extent)
+        found = shade(field, rays, met)
+        torch.testing.assert_close(found, shown)
+        torch.testing.assert_close(met.distortion, whole.distortion)
+        found.square().sum().backward()
+        torch.testing.assert_close(field.theta.grad, wanted)
+        field.theta.grad = None
+
+
+def test_rays_that_meet_nothing_have_no_samples() -> None:
+    scene = misty()
+    rays = rays_at(scene, 13)
+    away = replace(rays, origins=rays.origins + 100)
+    samples = collected(away, scene.aabb, scene.occupancy, scene.step)
+    assert len(samples.ray) == 0
+    field = Field.from_scene(hybrid(scene))
+    met = meet(field, away, samples, fused_features(field), scene.extent)
+    assert torch.equal(shade(field, away, met), away.backgrounds) and not met.opacity.any() and float(met.distortion.detach()) == 0
+
+
+@pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_fused_features_are_plain_ones_with_their_gradient(dynamic: bool, moved: bool) -> None:
+    scene = misty(dynamic, False, moved and dynamic)
+    ours, theirs = Field.from_scene(scene), Field.from_scene(scene).double()
+    generator = torch.Generator().manual_seed(0)
+    points, times = torch.rand(500, 3, generator=generator), torch.rand(500, generator=generator)
+    g = torch.randn(500, ours.layout.features, generator=generator)
+    found, wanted = fused_features(ours)(points, times), theirs.features(points.double(), times.double())
+    np.testing.assert_allclose(found.detach(), wanted.detach(), rtol=1e-4, atol=1e-5)
+    (found * g).sum().backward()
+    (wanted * g.double()).sum().backward()
+    for name in ("theta", *(["motion"] if ours.motion is not None else [])):
+        mine, other = getattr(ours, name).grad, getattr(theirs, name).grad
+        np.testing.assert_allclose(mine, other, atol=1e-3 * float(other.abs().max()), err_msg=name)
+
+
+def test_the_hybrid_decoder_has_the_gradient_of_finite_differences() -> None:
+    generator = torch.Generator().manual_seed(3)
+    field = HybridField(Layout.of(np.array([[3, 3, 2, 2]]), 2), 3, generator).double()
+    aabb = torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]], dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(4, 3, generator=generator, dtype=torch.float64), dim=1)
+    chances = (torch.rand(4, generator=generator).double() for _ in range(2))
+    rays = Rays(-2 * directions, directions, *chances, torch.rand(4, 3, generator=generator).double())
+    samples = samples_of(rays, aabb, torch.ones(1, 2, 2, 2), 0.3)
+    parameters = dict(field.named_parameters())
+
+    def rendered() -> tuple[torch.Tensor, torch.Tensor]:
+        met = meet(field, rays, samples, field.features, 2.0)
+        return shade(field, rays, met), met.distortion
+
+    def met(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        changed = {f"field.{name}": value for name, value in zip(parameters, values)}
+        return torch.func.functional_call(Calling(field, rendered), changed, ())  # type: ignore[no-any-return]
+
+    values = tuple(p.detach().clone().requires_grad_() for p in parameters.values())
+    assert torch.autograd.gradcheck(met, values)
+    rgb, _ = met(*values)
+    for name, gradient in zip(parameters, torch.autograd.grad(rgb.square().sum(), values)):
+        assert gradient.abs().max() > 0, name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pictures_of_a_hybrid_scene_are_the_reference_s(kind: tuple[bool, bool, bool]) -> None:
+    scene = hybrid(misty(*kind))
+    renderer = SceneRenderer(scene)
+    for camera in scene.cameras:
+        origins, directions = camera.rays()
+        theirs = reference.render_rays(scene, origins, directions, 0.3)
+        rgb, opacity, depth = renderer.render(origins, directions, np.full(len(origins), 0.3))
+        # A sample within rounding of a cell's face may count here and not there; few rays have one.
+        assert np.mean(np.abs(rgb - theirs.rgb).max(1) > 1e-4) < 0.005
+        assert np.abs(rgb - theirs.rgb).max() < 0.3
+        assert np.mean(np.abs(opacity - theirs.opacity) > 1e-4) < 0.005
+        there = theirs.opacity > 0.01
+        assert np.mean(np.abs(depth[there] - theirs.depth[there]) > 0.01) < 0.01
+
+
+def test_a_hybrid_field_is_its_scene_again() -> None:
+    scene = hybrid(tiny_scene())
+    field = Field.from_scene(scene)
+    assert isinstance(field, HybridField)
+    for name, weights in vars(field.decoder_as_data()).items():
+        np.testing.assert_array_equal(weights, getattr(scene.decoder, name), err_msg=name)
+
+
+def test_added_planes_are_their_sum() -> None:
+    field = SummedField(Layout.of(np.array([[4, 3, 2, 3]]), 2), 2, torch.Generator().manual_seed(0))
+    assert not field.plane(0, "xt").any() and field.plane(0, "xy").all()
+    points, times = torch.rand(9, 3), torch.rand(9)
+    axis = {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2], "t": times}
+    wanted = sum(bilinear(field.plane(0, name), axis[name[0]], axis[name[1]]) for name in ("xy", "xz", "yz", "xt", "yt", "zt"))
+    torch.testing.assert_close(field.features(points, times), wanted)
+    assert fused_features(field)(points, times).equal(field.features(points, times))

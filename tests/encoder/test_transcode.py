@@ -1,0 +1,322 @@
+"""Finished checkpoints and files are coded anew: no pictures, no training, and nothing hostile gets through."""
+
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import datasets as make
+import numpy as np
+import pytest
+import torch
+from scenes import SPACES, tiny_scene, varied
+
+from kpc.encoder.cli import kpenc
+
+from kpc.encoder.rdo import codec_model, sequential_finetune
+from kpc.encoder.rdo.rate_control import Trade
+from kpc.encoder.field.config import PRESETS, TrainConfig
+from kpc.encoder.evaluation.evaluate import SceneRenderer
+from kpc.encoder.evaluation.validation_rays import ASSUMED_MSE, Probe, around
+from kpc.encoder.rdo.mode_decision import step_asked_for
+from kpc.format.container import scene_io
+from kpc.format.common.errors import TrainingError
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.scene.scene import Scene
+from kpc.player.cpu import reference
+
+pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
+TINY = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
+                   occupancy_start=8, occupancy_every=4)  # fmt: skip
+
+VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "valid"
+Kpenc = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture(autouse=True)
+def short_tuning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sequential_finetune, "RAYS", 256)
+
+
+@pytest.fixture
+def kpenc_says(capsys: pytest.CaptureFixture[str]) -> Kpenc:
+    """What kpenc --json says of a source and an output."""
+
+    def call(source: Path, output: Path, *options: str) -> dict[str, Any]:
+        capsys.readouterr()
+        assert kpenc.main([str(source), "-o", str(output), "--json", "--tune-steps", "0", *options]) == 0
+        found: dict[str, Any] = json.loads(capsys.readouterr().out)
+        return found
+
+    return call
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
+    """The one line that kpenc says of a source that it cannot use, after which nothing is left."""
+
+    def call(source: Path, *options: str, code: int = 1) -> str:
+        capsys.readouterr()
+        assert kpenc.main([str(source), "-o", str(tmp_path / "refused.kpc"), *options]) == code
+        out, err = capsys.readouterr()
+        assert out == "" and err.count("\n") == 1 and err.startswith("kpenc: ") and "Traceback" not in err
+        assert not list(tmp_path.glob("*refused*"))
+        return err
+
+    return call
+
+
+def saved(path: Path, scene: Scene) -> Path:
+    """A finished checkpoint of a scene."""
+    rays = Probe.of_cameras(scene)
+    truth = SceneRenderer(scene).rgb(*rays.rays)
+    numbers = np.arange(512) % len(scene.appearances) if scene.appearances else None
+    codec_model.save_checkpoint(path, scene, replace(rays, truth=truth, appearances=numbers))
+    return path
+
+
+# --- finished checkpoints
+
+
+@pytest.mark.parametrize("trade", [(), ("--max-loss", "1dB"), ("--quality", "60", "--tune-steps", "4"), ("--psnr", "9dB")])
+def test_a_checkpoint_gives_the_file_that_training_gave(
+    tmp_path: Path, kpenc_says: Kpenc, monkeypatch: pytest.MonkeyPatch, trade: tuple[str, ...]
+) -> None:
+    monkeypatch.setitem(PRESETS, "draft", TINY)
+    make.write_n3dv(tmp_path / "set", cameras=4)
+    keep = ("--keep-checkpoint", str(tmp_path / "model.kpck"))
+    trained = kpenc_says(tmp_path / "set", tmp_path / "out.kpc", "--preset", "draft", *keep, *trade)
+    again = kpenc_says(tmp_path / "model.kpck", tmp_path / "again.kpc", *trade)
+    assert (tmp_path / "out.kpc").read_bytes() == (tmp_path / "again.kpc").read_bytes()
+    said = ("trade", "asked", "judged_by", "probe_psnr", "probe_loss_db", "agreement_db", "size_bytes", "parameters", "identity_share")
+    assert {key: trained[key] for key in said} == {key: again[key] for key in said}
+    assert {p.name for p in tmp_path.iterdir()} == {"set", "out.kpc", "again.kpc", "model.kpck"}
+
+
+@pytest.mark.parametrize("kind", [*SPACES, "still", "varied", "no cameras"])
+def test_every_kind_of_scene_survives_a_checkpoint(tmp_path: Path, kind: str) -> None:
+    others = {"still": lambda scene: tiny_scene(2, dynamic=False), "varied": varied,
+              "no cameras": lambda scene: replace(scene, cameras=())}  # fmt: skip
+    scene = (SPACES | others)[kind](tiny_scene(2))
+    steps = [{name: 0.01 for name in scale} for scale in scene.scales]
+    back = codec_model.load(saved(tmp_path / "m.kpck", scene))
+    assert scene_io.encode(quantise_scene(back.scene, steps)) == scene_io.encode(quantise_scene(scene, steps))
+    assert back.coded is None and back.probe.measure(scene)(back.scene).error == 0
+
+
+def test_a_checkpoint_of_a_run_is_told_from_a_finished_one(
+    tmp_path: Path, kpenc_says: Kpenc, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(PRESETS, "draft", TINY)
+    make.write_n3dv(tmp_path / "set", cameras=4)
+    kpenc_says(tmp_path / "set", tmp_path / "out.kpc", "--preset", "draft", "--keep", "--steps", "2")
+    said = refused(tmp_path / "out.kpc.work" / kpenc.CHECKPOINT)
+    assert "no finished checkpoint" in said and "--keep-checkpoint" in said
+
+
+def test_damaged_checkpoints_are_refused_in_a_line(tmp_path: Path, refused: Callable[..., str]) -> None:
+    good, bad = saved(tmp_path / "good.kpck", tiny_scene(2)), tmp_path / "bad.kpck"
+    whole = good.read_bytes()
+    for content in (whole[:1000], whole[: len(whole) // 2], b"PK" + bytes(100), whole[:500] + bytes(3000) + whole[3500:]):
+        bad.write_bytes(content)
+        assert "not a usable checkpoint" in refused(bad) or "no finished" in refused(bad)
+    for content in (b"", b"nonsense", b"\x80\x04cos\nsystem\n"):
+        bad.write_bytes(content)
+        assert "neither a folder" in refused(bad, code=2)
+    with zipfile.ZipFile(good) as archive, zipfile.ZipFile(bad, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name in archive.namelist():
+            packed.writestr(name, archive.read(name))  # could unpack to any size
+    assert "not a usable checkpoint" in refused(bad)
+
+
+def changes() -> dict[str, Callable[[dict[str, Any]], object]]:
+    return {
+        "another version": lambda s: s.update(kpc=99),
+        "a part missing": lambda s: s.pop("decoder"),
+        "no plane": lambda s: s["scales"][0].pop("xy"),
+        "a plane of another size": lambda s: s["scales"][0].update(xz=torch.ones(3, 3, 3)),
+        "doubles": lambda s: s["scales"][0].update(xy=s["scales"][0]["xy"].double()),
+        "NaN in a plane": lambda s: s["scales"][0]["xy"].fill_(float("nan")),
+        "a tensor of nothing": lambda s: s.update(occupancy=torch.zeros(1, dtype=torch.bool).expand(1, 9999, 9999, 9999)),
+        "a box inside out": lambda s: s.update(aabb=s["aabb"].flip(0)),
+        "a step of 0": lambda s: s.update(step=0.0),
+        "endless rays": lambda s: s.update(step=1e-9),
+        "no frames": lambda s: s.update(frame_count=-1),
+        "a wide decoder": lambda s: s["decoder"].update(w1=torch.ones(9999, 9)),
+        "rays without length": lambda s: s["probe"]["directions"].zero_(),
+        "rays of NaN": lambda s: s["probe"]["origins"].fill_(float("nan")),
+        "times out of the clip": lambda s: s["probe"]["times"].fill_(2.0),
+        "fewer colours than rays": lambda s: s["probe"].update(truth=torch.ones(3, 3)),
+        "appearances of nobody": lambda s: s["probe"].update(appearances=torch.ones(512, dtype=torch.int64)),
+        "an unknown mapping": lambda s: s.update(mapping={"kind": "Path"}),
+        "a camera without focal length": lambda s: s["cameras"].zero_(),
+        "a string for a number": lambda s: s.update(step="long"),
+        "motion of NaN": lambda s: s.update(motion=torch.full((2, 2, 2, 2, 3), float("nan"))),
+    }
+
+
+@pytest.mark.parametrize("what", changes())
+def test_hostile_checkpoints_are_refused_in_a_line(tmp_path: Path, refused: Callable[..., str], what: str) -> None:
+    path = saved(tmp_path / "m.kpck", tiny_scene(2))
+    state = torch.load(path, weights_only=True)
+    changes()[what](state)
+    torch.save(state, path)
+    said = refused(path)
+    assert str(path) in said and ("not a usable checkpoint" in said or "no finished checkpoint" in said)
+
+
+def test_a_checkpoint_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise RuntimeError("unexpected pos 704 vs 598\nmore")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(TrainingError, match="m.kpck: the checkpoint cannot be written .*--keep-checkpoint"):
+        saved(tmp_path / "m.kpck", tiny_scene(2))
+    assert not any(tmp_path.iterdir())
+
+
+# --- files
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    scene = tiny_scene(3)
+    scene_io.write(quantise_scene(scene, [{name: 0.002 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
+    return tmp_path / "scene.kpc"
+
+
+def test_a_file_becomes_smaller(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
+    size = scene_file.stat().st_size
+    target = int(0.85 * size)
+    result = kpenc_says(scene_file, tmp_path / "smaller.kpc", "--target-size", str(target))
+    assert 0.9 * target < result["size_bytes"] == (tmp_path / "smaller.kpc").stat().st_size <= target
+    before, after = scene_io.read(scene_file).dequantise(), scene_io.read(tmp_path / "smaller.kpc").dequantise()
+    measured = Probe.of_cameras(before).measure(before)(after)
+    assert result["agreement_db"] == pytest.approx(measured.agreement_db) and measured.error > 0
+    lost = 10 * np.log10(1 + measured.error / 255**2 / ASSUMED_MSE)
+    assert result["probe_loss_db"] == pytest.approx(lost) and "30 dB" in result["judged_by"]
+
+
+def test_a_file_keeps_its_symbols_where_they_are_wanted(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
+    kpenc_says(scene_file, tmp_path / "same.kpc", "--target-size", "1MB")
+    assert (tmp_path / "same.kpc").read_bytes() == scene_file.read_bytes()
+
+
+def test_a_file_does_not_know_what_was_filmed(scene_file: Path, refused: Callable[..., str]) -> None:
+    assert "checkpoint" in refused(scene_file, "--psnr", "30dB", code=2)
+
+
+def test_the_ratio_of_steps_stays(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
+    kpenc_says(scene_file, tmp_path / "smaller.kpc", "--max-loss", "0.02dB")
+    steps = [[step_asked_for(plane) / step_asked_for(scene.scales[0]["xy"])[0] for scale in scene.scales for plane in scale.values()]
+             for scene in (scene_io.read(scene_file), scene_io.read(tmp_path / "smaller.kpc"))]  # fmt: skip
+    np.testing.assert_allclose(np.concatenate(steps[0]), np.concatenate(steps[1]), rtol=2**-6)  # each to 8 significant bits
+
+
+def test_damaged_files_are_refused_in_a_line(scene_file: Path, refused: Callable[..., str]) -> None:
+    whole = bytearray(scene_file.read_bytes())
+    whole[-3] ^= 1
+    scene_file.write_bytes(whole)
+    assert "damaged" in refused(scene_file)
+
+
+# --- the command line
+
+
+def test_options_of_training_mean_nothing_here(scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["--steps", "3"], ["--preset", "fast"], ["--resume"], ["--dry-run"], ["--keep-checkpoint", "m.kpck"]):
+        with pytest.raises(SystemExit, match="2"):
+            kpenc.main([str(scene_file), "-o", str(tmp_path / "x.kpc"), *words])
+        assert f"{words[0]}: {scene_file} is trained already" in capsys.readouterr().err
+
+
+def test_a_source_is_never_overwritten(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = scene_file.read_bytes()
+    assert kpenc.main([str(scene_file), "-o", str(scene_file), "--quality", "10"]) == 2
+    assert "is what is to be coded" in capsys.readouterr().err and scene_file.read_bytes() == before
+
+
+def test_what_is_printed(scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert kpenc.main([str(scene_file), "-o", str(tmp_path / "x.kpc"), "--lam", "3"]) == 0
+    out, _ = capsys.readouterr()
+    assert out.count("\n") == 1 and all(words in out for words in ("asked for lam 3; reached ", " bytes, ", "uncoded pictures"))
+
+
+@pytest.mark.parametrize("words", [["--quality", "0"], ["--quality", "101"], ["--quality", "nan"], ["--lam", "-1"], ["--lam", "x"],
+                                   ["--quality", "5", "--lam", "1"]])  # fmt: skip
+def test_a_trade_that_makes_no_sense(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        kpenc.main([str(tmp_path), "-o", str(tmp_path / "x.kpc"), *words])
+    assert words[0] in capsys.readouterr().err
+
+
+# --- what no training makes, but files may hold
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z", "t"])
+def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
+    """They hold the same all along the axis, and so do two."""
+    scene = tiny_scene()
+    thin = {name: plane[: 1 if axis == name[1] else None, : 1 if axis == name[0] else None] for name, plane in scene.scales[0].items()}
+    whole = quantise_scene(replace(scene, scales=(thin, scene.scales[1])), [{name: 0.01 for name in planes} for planes in scene.scales])
+    with pytest.raises(ValueError, match="one texel"):
+        SceneRenderer(whole.dequantise())
+    source = codec_model.model_of(whole)
+    camera = scene.cameras[0]
+    origins, directions = camera.rays()
+    times = np.full(len(origins), 0.4, np.float32)
+    shown = SceneRenderer(source.scene).rgb(origins, directions, times).reshape(camera.height, camera.width, 3)
+    np.testing.assert_allclose(shown, reference.render(whole.dequantise(), camera, 0.4).rgb, atol=2e-3)
+    coded = codec_model.code(source, Trade(), TrainConfig().prune_share, 1)
+    assert coded.loss_db <= 0.15 and scene_io.read(coded.data).scales[0].keys() == thin.keys()
+
+
+@pytest.mark.parametrize("name", ["appearances", "cells-one", "contracted", "device-coordinates", "dynamic", "hybrid-moved", "limits-large"])
+def test_files_of_all_kinds_are_coded_again(name: str) -> None:
+    source = codec_model.model_of(scene_io.read(VECTORS / f"{name}.kpc"))
+    coded = codec_model.code(source, Trade(), TrainConfig().prune_share, 1)
+    assert coded.loss_db <= 0.15 and len(scene_io.encode(scene_io.read(coded.data))) == coded.size_bytes
+    assert coded.size_bytes <= len(scene_io.encode(source.coded))  # type: ignore[arg-type]
+
+
+# --- probes
+
+
+def test_cameras_around_a_scene_without_any_see_it() -> None:
+    scene = replace(tiny_scene(4), cameras=())
+    corners = np.stack(np.meshgrid(*scene.bounds.T), -1).reshape(-1, 3)
+    for camera in around(scene):
+        local = (corners - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]
+        pixel = local[:, :2] / -local[:, 2:] * (camera.fl_x, -camera.fl_y) + (camera.cx, camera.cy)
+        assert (local[:, 2] < 0).all() and (pixel > 0).all() and (pixel < (camera.width, camera.height)).all()
+        np.testing.assert_allclose(camera.camera_to_world[:3, :3].T @ camera.camera_to_world[:3, :3], np.eye(3), atol=1e-12)
+
+
+def test_a_probe_of_surfaces_meets_them_from_all_cameras() -> None:
+    scene = tiny_scene(4)
+    rays, others = (Probe.of_surfaces(scene, 2000, seed) for seed in (1, 2))
+    assert len(rays.times) == 2000 and SceneRenderer(scene).meets(*rays.rays).all()
+    assert not SceneRenderer(scene).meets(*Probe.of_cameras(scene, 2000).rays).all()
+    eyes = [tuple(np.float32(camera.camera_to_world[:3, 3])) for camera in scene.cameras]
+    assert {tuple(origin) for origin in rays.origins[:200]} == set(eyes)
+    assert not np.array_equal(rays.times, others.times)
+
+
+def test_a_probe_of_surfaces_has_what_there_is() -> None:
+    scene = tiny_scene(4)
+    nothing = replace(scene, occupancy=np.zeros_like(scene.occupancy))
+    assert Probe.of_surfaces(nothing, 100, seed=1).origins.shape == (0, 3)
+    speck = np.zeros_like(scene.occupancy)
+    speck[:, 4, 5, 6] = True
+    few = Probe.of_surfaces(replace(scene, occupancy=speck), 100, seed=1)
+    assert 0 < len(few.times) < 100
+
+
+def test_a_probe_of_cameras_goes_through_their_pixels() -> None:
+    scene = tiny_scene(4)
+    rays = Probe.of_cameras(scene)
+    assert rays.truth is None and len(rays.times) == 512 and 0 <= rays.times.min() < rays.times.max() < 1
+    eyes = {tuple(np.float32(camera.camera_to_world[:3, 3])) for camera in scene.cameras}
+    assert {tuple(origin) for origin in rays.origins} == eyes

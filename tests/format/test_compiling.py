@@ -1,0 +1,87 @@
+"""That kernels are being compiled is said, once it takes a while."""
+
+import io
+import sys
+
+import pytest
+from numba import njit
+from numba.core import event
+
+from kpc.format.common import compiling
+from kpc.format.common.compiling import LEAST_S, NOTICE, WATCH, Watch
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    now = [100.0]
+    monkeypatch.setattr(compiling.time, "monotonic", lambda: now[0])
+    return now
+
+
+def started(watch: Watch, number: int = 1) -> None:
+    for _ in range(number):
+        watch.on_start(event.Event("numba:compile", event.EventStatus.START))
+
+
+def ended(watch: Watch, number: int = 1) -> None:
+    for _ in range(number):
+        watch.on_end(event.Event("numba:compile", event.EventStatus.END))
+
+
+def test_a_terminal_is_told_once_when_it_takes_a_while(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    watch, terminal = Watch(), Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    started(watch, 2)
+    assert not watch.is_under_way
+    clock[0] += 0.9 * LEAST_S
+    ended(watch, 2)
+    assert not watch.is_under_way and terminal.getvalue() == ""
+    clock[0] += 60.0  # in between nothing is compiled
+    started(watch)
+    assert not watch.is_under_way
+    clock[0] += 0.2 * LEAST_S
+    assert watch.is_under_way
+    started(watch, 2)  # another function that the first needs
+    started(watch)
+    assert terminal.getvalue() == f"{NOTICE}\n"
+    ended(watch, 4)
+    assert not watch.is_under_way
+
+
+def test_no_file_is_told(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    for stream in (io.StringIO(), None):
+        watch = Watch()
+        monkeypatch.setattr(sys, "stderr", stream)
+        started(watch)
+        clock[0] += 2 * LEAST_S
+        started(watch)
+        assert watch.is_under_way and (stream is None or stream.getvalue() == "")
+
+
+def test_numba_tells_what_it_compiles(clock: list[float]) -> None:
+    import kpc.format.coding.rans  # noqa: F401
+
+    seen, on_start = [], WATCH.on_start
+    WATCH.on_start = lambda event: (seen.append(event.kind), on_start(event))
+    try:
+        njit(lambda x: x + 1)(1)
+    finally:
+        del WATCH.on_start
+    assert "numba:compile" in seen and WATCH._depth == 0
+
+
+def test_a_player_that_waits_for_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    from kpc.player.streaming.stream import Stream
+
+    stream = Stream.__new__(Stream)
+    stream._failure = stream._trouble = None
+    monkeypatch.setattr(Stream, "rate", 2000.0)
+    for stalled, compiles, wanted in ((True, True, NOTICE), (True, False, "waiting for the scene, 2 KB/s"), (False, True, None)):
+        stream._stalled = stalled
+        monkeypatch.setattr(Watch, "is_under_way", compiles)
+        assert stream.message == wanted

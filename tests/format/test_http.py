@@ -1,0 +1,430 @@
+"""Files read from a real server on this machine: a good one, and every kind of bad one."""
+
+import gc
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, ClassVar
+
+import numpy as np
+import pytest
+from scenes import tiny_scene
+
+import kpc
+from kpc.format.container import http
+from kpc.format.container.container import RemoteSource, Source
+from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, NetworkError, UnreachableError
+from kpc.format.container.scene_io import SceneReader, write
+from kpc.format.container.http import FIRST_BYTES, HttpSource, is_url
+from kpc.format.coding.quantise import quantise_scene
+from kpc.tools.cli.serve import Handler, Line, serving
+
+DATA = np.random.default_rng(0).integers(0, 256, 400_000, np.uint8).tobytes()
+
+
+class Noting(Handler):
+    """Notes the ranges that are asked for."""
+
+    asked: ClassVar[list[str | None]] = []
+
+    def do_GET(self) -> None:
+        self.asked.append(self.headers.get("Range"))
+        super().do_GET()
+
+
+@pytest.fixture(autouse=True)
+def _fast_and_clean(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No long pauses; and no connection is left open behind anyone's back."""
+    monkeypatch.setattr(http, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(http, "CONNECT_S", 2.0)
+    monkeypatch.setattr(http, "SILENCE_S", 2.0)
+    Noting.asked.clear()
+    yield
+    gc.collect()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "data.bin").write_bytes(DATA)
+    (tmp_path / "short.bin").write_bytes(DATA[:100])
+    (tmp_path / "empty.bin").write_bytes(b"")
+    return tmp_path
+
+
+@pytest.fixture
+def url(folder: Path) -> Iterator[str]:
+    with serving(folder, handler=Noting) as address:
+        yield f"{address}/data.bin"
+
+
+def test_bytes_come_by_ranges_and_no_more_than_are_wanted(url: str) -> None:
+    source = HttpSource(url)
+    assert isinstance(source, Source) and isinstance(source, RemoteSource)
+    assert source.size == len(DATA) and source.name == url and source.has_ranges
+    assert source.read_at(0, 64) == DATA[:64] and source.read_at(64, 1000) == DATA[64:1064]
+    assert Noting.asked == [f"bytes=0-{FIRST_BYTES - 1}"]
+    assert source.read_at(300_000, 5000) == DATA[300_000:305_000]
+    assert source.read_at(len(DATA) - 10, 100) == DATA[-10:]
+    assert source.read_at(len(DATA), 5) == source.read_at(10**9, 5) == source.read_at(5, 0) == b""
+    assert Noting.asked[1:] == ["bytes=300000-304999", "bytes=399990-399999"]
+    assert source.received <= FIRST_BYTES + 5010
+    source.close()
+
+
+def test_what_is_held_costs_one_request(url: str) -> None:
+    source = HttpSource(url)
+    source.hold(100_000, 50_000)
+    for start in range(100_000, 150_000, 7000):
+        length = min(7000, 150_000 - start)
+        assert source.read_at(start, length) == DATA[start : start + length]
+    source.hold(150_000, 10_000)
+    assert source.read_at(155_000, 5000) == DATA[155_000:160_000]
+    assert Noting.asked == [f"bytes=0-{FIRST_BYTES - 1}", "bytes=100000-149999", "bytes=150000-159999"]
+    source.close()
+
+
+def test_all_of_a_file_takes_two_requests_and_nothing_twice(url: str) -> None:
+    source = HttpSource(url)
+    source.hold(0, source.size)
+    assert source.read_at(0, source.size) == DATA and source.received == len(DATA)
+    assert Noting.asked == [f"bytes=0-{FIRST_BYTES - 1}", f"bytes={FIRST_BYTES}-399999"]
+    source.close()
+
+
+def test_what_was_read_of_a_long_answer_is_let_go(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "KEPT_BYTES", 50_000)
+    source = HttpSource(url)
+    source.hold(0, source.size)
+    for start in range(0, len(DATA), 10_000):
+        assert source.read_at(start, 10_000) == DATA[start : start + 10_000]
+        assert len(source._answer.data) <= 50_000 + 10_000 + FIRST_BYTES
+    assert len(Noting.asked) == 2
+    source.close()
+
+
+def test_small_and_empty_files(url: str) -> None:
+    source = HttpSource(url.replace("data", "short"))
+    assert source.size == 100 and source.read_at(0, 1000) == DATA[:100]
+    source.close()
+    with pytest.raises(NetworkError, match="is empty"):
+        HttpSource(url.replace("data", "empty"))
+
+
+def test_a_server_without_ranges_sends_the_whole_file_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    class Whole(Noting):
+        def do_GET(self) -> None:
+            del self.headers["Range"]
+            super().do_GET()
+
+    with serving(folder, handler=Whole) as address:
+        source = HttpSource(f"{address}/data.bin")
+        assert not source.has_ranges and "no ranges, all of it" in capsys.readouterr().err
+        assert source.read_at(0, 64) == DATA[:64] and source.received < 200_000  # the rest is on its way
+        assert source.read_at(399_000, 1000) == DATA[399_000:] and source.read_at(10, 10) == DATA[10:20]
+        assert len(Noting.asked) == 1 and source.received == len(DATA)
+        source.close()
+        with pytest.raises(BudgetError, match="no ranges, and the whole of 400,000 bytes"):
+            HttpSource(f"{address}/data.bin", limit=399_999)
+
+
+def test_a_whole_file_without_its_length_is_read_to_its_end(folder: Path) -> None:
+    class Endless(Noting):
+        def answer(self, file: IO[bytes], stat: object) -> None:
+            self.wfile.write(b"HTTP/1.1 200 OK\r\nConnection: close\r\n\r\n")
+            self.close_connection = True
+            self.send(file, len(DATA))
+
+    with serving(folder, handler=Endless) as address:
+        source = HttpSource(f"{address}/data.bin")
+        assert source.size == len(DATA) and source.read_at(200_000, 10) == DATA[200_000:200_010]
+        source.close()
+        with pytest.raises(BudgetError, match="sends more than the budget of 100,000"):
+            HttpSource(f"{address}/data.bin", limit=100_000)
+
+
+def breaking(every: int, ranges: bool = True) -> type[Noting]:
+    """A server whose connections end after so many bytes of a body."""
+
+    class Breaking(Noting):
+        def send(self, file: IO[bytes], count: int) -> None:
+            super().send(file, min(count, every))
+            self.close_connection = True
+
+        def do_GET(self) -> None:
+            if not ranges:
+                del self.headers["Range"]
+            super().do_GET()
+
+    return Breaking
+
+
+def test_a_connection_that_breaks_off_is_taken_up_again_where_it_ended(folder: Path) -> None:
+    said: list[str | None] = []
+    with serving(folder, handler=breaking(30_000)) as address:
+        source = HttpSource(f"{address}/data.bin", say=said.append)
+        assert source.read_at(100_000, 100_000) == DATA[100_000:200_000]
+        assert Noting.asked[1:] == [f"bytes={start}-199999" for start in range(100_000, 200_000, 30_000)]
+        assert said.count(None) == 3 and sum("breaks off" in (words or "") or "fails" in (words or "") for words in said) == 3
+        source.close()
+
+
+def test_without_ranges_it_begins_again_and_gives_up_where_nothing_new_comes(folder: Path) -> None:
+    class Reviving(breaking(90_000, ranges=False)):  # type: ignore[misc]
+        def send(self, file: IO[bytes], count: int) -> None:
+            if len(self.asked) > 2:
+                Handler.send(self, file, count)
+            else:
+                super().send(file, count)
+
+    with serving(folder, handler=Reviving) as address:
+        source = HttpSource(f"{address}/data.bin", say=lambda message: None)
+        assert source.read_at(390_000, 10_000) == DATA[390_000:] and len(Noting.asked) == 3
+        source.close()
+    with serving(folder, handler=breaking(90_000, ranges=False)) as address:
+        source = HttpSource(f"{address}/data.bin", say=lambda message: None)
+        assert source.read_at(0, 90_000) == DATA[:90_000]
+        with pytest.raises(UnreachableError, match="breaks off|fails"):
+            source.read_at(390_000, 10_000)
+        source.close()
+
+
+def test_a_busy_server_is_asked_again(folder: Path) -> None:
+    class Busy(Noting):
+        def do_GET(self) -> None:
+            if len(self.asked) in (0, 1, 3):
+                self.asked.append(None)
+                self.send_error(503)
+            else:
+                super().do_GET()
+
+    with serving(folder, handler=Busy) as address:
+        source = HttpSource(f"{address}/data.bin", say=lambda message: None)
+        assert source.read_at(100_000, 10) == DATA[100_000:100_010] and len(Noting.asked) == 5
+        source.close()
+
+
+def test_nobody_there_is_told_after_a_few_attempts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with serving(folder) as address:
+        pass
+    with pytest.raises(UnreachableError, match=r"/data.bin: the connection fails \(Connection refused\)"):
+        HttpSource(f"{address}/data.bin")
+    assert capsys.readouterr().err.count("trying again in") == http.ATTEMPTS - 1
+
+
+def test_silence_is_not_waited_out(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "SILENCE_S", 0.1)
+    release = threading.Event()
+
+    class Silent(Noting):
+        def send(self, file: IO[bytes], count: int) -> None:
+            super().send(file, min(count, max(1000 - file.tell(), 0)))
+            release.wait(5)
+
+    with serving(folder, handler=Silent) as address:
+        source = HttpSource(f"{address}/data.bin", attempts=2, say=lambda message: None)
+        assert source.read_at(0, 1000) == DATA[:1000]
+        with pytest.raises(UnreachableError, match="in time"):
+            source.read_at(0, 5000)
+        release.set()
+        source.close()
+
+
+def test_a_trickle_is_not_waited_out(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(http, "LEAST_BYTES_S", 1e6)
+    with serving(folder, line=Line(rate=50_000)) as address:
+        source = HttpSource(f"{address}/data.bin", attempts=2, say=lambda message: None)
+        with pytest.raises(UnreachableError, match="too slow"):
+            source.read_at(0, 60_000)
+        source.close()
+
+
+def header_changed(name: str, change: Callable[[str, int], str | None]) -> type[Noting]:
+    """A server that says something else in one header; `change` gets its value and how many requests came before."""
+
+    class Changed(Noting):
+        def send_header(self, key: str, value: str) -> None:
+            said = change(value, len(self.asked) - 1) if key == name else value
+            if said is not None:
+                super().send_header(key, said)
+
+    return Changed
+
+
+@pytest.mark.parametrize(
+    ("handler", "words"),
+    [
+        (header_changed("ETag", lambda value, n: value if n == 0 else '"other"'), "changed on the server"),
+        (header_changed("Content-Range", lambda value, n: value if n == 0 else value.replace("/4", "/5")), "changed on the server"),
+        (header_changed("Content-Range", lambda value, n: value if n == 0 else "bytes 0-9/400000"), "not from 100000 on"),
+        (header_changed("Content-Range", lambda value, n: value if n == 0 else None), "does not say which bytes"),
+        (header_changed("Content-Range", lambda value, n: value if n == 0 else "bytes 100000-99/400000"), "sends bytes 100000-99"),
+    ],
+    ids=["etag", "size", "other bytes", "nothing said", "nonsense"],
+)
+def test_an_answer_that_does_not_fit_is_refused(folder: Path, handler: type[Noting], words: str) -> None:
+    with serving(folder, handler=handler) as address:
+        source = HttpSource(f"{address}/data.bin")
+        assert source.read_at(0, 1000) == DATA[:1000]
+        with pytest.raises(NetworkError, match=words):
+            source.read_at(100_000, 10)
+        source.close()
+
+
+@pytest.mark.parametrize("new", [DATA[::-1], DATA[:90_000]], ids=["other content", "shorter"])
+def test_a_file_that_changes_while_it_is_read_is_told(url: str, folder: Path, new: bytes) -> None:
+    source = HttpSource(url)
+    (folder / "data.bin").write_bytes(new)
+    with pytest.raises(NetworkError, match="changed on the server while it was read"):
+        source.read_at(100_000, 10)
+    source.close()
+
+
+def test_a_shorter_answer_than_asked_for_is_completed(folder: Path) -> None:
+    class Sparing(Noting):
+        def do_GET(self) -> None:
+            first, last = self.headers["Range"].removeprefix("bytes=").split("-")
+            self.headers.replace_header("Range", f"bytes={first}-{min(int(last), int(first) + 9999)}")
+            super().do_GET()
+
+    with serving(folder, handler=Sparing) as address:
+        source = HttpSource(f"{address}/data.bin", attempts=1)
+        assert source.read_at(0, 50_000) == DATA[:50_000] and source.read_at(395_000, 5000) == DATA[-5000:]
+        source.close()
+
+
+def test_a_compressed_answer_is_refused(folder: Path) -> None:
+    class Compressing(Noting):
+        def send_header(self, key: str, value: str) -> None:
+            super().send_header(key, value)
+            if key == "ETag":
+                super().send_header("Content-Encoding", "gzip")
+
+    with serving(folder, handler=Compressing) as address, pytest.raises(NetworkError, match=r"compressed \(gzip\)"):
+        HttpSource(f"{address}/data.bin")
+
+
+def leading(target: Callable[[str], str]) -> type[Noting]:
+    class Leading(Noting):
+        def do_GET(self) -> None:
+            if self.path.startswith("/to/"):
+                self.asked.append(None)
+                self.send_response(302)
+                self.send_header("Location", target(self.path))
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+            else:
+                super().do_GET()
+
+    return Leading
+
+
+def test_redirections_are_followed_once_and_not_for_ever(folder: Path) -> None:
+    with serving(folder, handler=leading(lambda path: path.removeprefix("/to"))) as address:
+        source = HttpSource(f"{address}/to/to/data.bin")
+        assert source.read_at(100_000, 10) == DATA[100_000:100_010] and len(Noting.asked) == 4
+        source.close()
+    with serving(folder, handler=leading(lambda path: path)) as address, pytest.raises(NetworkError, match="more than 5 redir"):
+        HttpSource(f"{address}/to/data.bin")
+    for target in ("file:///etc/passwd", "http://[", "https://", "ftp://127.0.0.1/data.bin"):
+        with serving(folder, handler=leading(lambda path, target=target: target)) as address, \
+                pytest.raises(NetworkError, match="no http or https address"):
+            HttpSource(f"{address}/to/data.bin")
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [("http://", "no http or https"), ("http://[::1", "no address"), ("http://a:b/c", "no address"),
+     ("http://a b/c", "connection|address")],
+)
+def test_addresses_that_make_no_sense(address: str, words: str) -> None:
+    with pytest.raises(NetworkError, match=words):
+        HttpSource(address, attempts=1)
+
+
+def test_what_is_secret_in_an_address_is_not_told(url: str) -> None:
+    with pytest.raises(NetworkError) as error:
+        HttpSource(url.replace("http://", "http://me:password@").replace("data.bin", "nothing.bin?key=token"))
+    assert "nothing.bin" in str(error.value) and not any(word in str(error.value) for word in ("password", "token", "me:"))
+
+
+def test_a_server_cannot_speak_to_the_terminal(folder: Path) -> None:
+    class Rude(Noting):
+        def do_GET(self) -> None:
+            self.wfile.write(b"HTTP/1.1 404 \x1b[31mgone\r\nContent-Length: 0\r\n\r\n")
+
+    with serving(folder, handler=Rude) as address, pytest.raises(NetworkError, match=r"404 \?\[31mgone"):
+        HttpSource(f"{address}/data.bin")
+
+
+def test_an_interrupted_read_goes_on_later_where_it_was(folder: Path) -> None:
+    with serving(folder, line=Line(rate=200_000), handler=Noting) as address:
+        source = HttpSource(f"{address}/data.bin")
+        source.interrupt()
+        with pytest.raises(InterruptedRead):
+            source.read_at(100_000, 100_000)
+        assert source.read_at(300_000, 10) == DATA[300_000:300_010]
+        assert source.read_at(100_000, 100_000) == DATA[100_000:200_000]
+        first, again = int(Noting.asked[1][6:].split("-")[0]), int(Noting.asked[3][6:].split("-")[0])  # type: ignore[index]
+        assert first == 100_000 < again < 200_000 and len(Noting.asked) == 4
+        source.close()
+
+
+def test_closing_ends_what_another_thread_waits_for(folder: Path) -> None:
+    with serving(folder, line=Line(rate=20_000)) as address:
+        source, errors = HttpSource(f"{address}/data.bin"), []
+
+        def read() -> None:
+            try:
+                source.read_at(0, 60_000)
+            except NetworkError as error:
+                errors.append(error)
+
+        thread = threading.Thread(target=read)
+        thread.start()
+        source.close()
+        thread.join(1.5)
+        assert not thread.is_alive() and "closed" in str(errors[0])
+
+
+def test_urls_are_told_from_paths() -> None:
+    assert is_url("http://a/b.kpc") and is_url("HTTPS://a") and not is_url("a/http://b") and not is_url("scene.kpc")
+    assert not is_url("ftp://a/b")
+
+
+@pytest.fixture
+def scene_url(folder: Path) -> Iterator[str]:
+    scene = tiny_scene(4)
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), folder / "scene.kpc", segment_rows=2)
+    (folder / "cut.kpc").write_bytes((folder / "scene.kpc").read_bytes()[:-1])
+    with serving(folder, handler=Noting) as address:
+        yield f"{address}/scene.kpc"
+
+
+def test_a_scene_behind_a_url_is_the_one_in_the_file(scene_url: str, folder: Path) -> None:
+    here, there = kpc.load(folder / "scene.kpc"), kpc.load(scene_url)
+    assert all(np.array_equal(a[name], b[name]) for a, b in zip(here.scales, there.scales, strict=True) for name in a)
+    with pytest.raises(FormatError, match="cut off"):
+        kpc.load(scene_url.replace("scene", "cut"))
+    with pytest.raises(FormatError, match="not a .kpc file"):
+        kpc.load(scene_url.replace("scene.kpc", "data.bin"))
+
+
+def test_header_and_index_take_one_request(scene_url: str) -> None:
+    reader = SceneReader(scene_url)
+    assert Noting.asked == [f"bytes=0-{FIRST_BYTES - 1}"] and len(reader.index) > 10
+    assert isinstance(reader.source, HttpSource)
+    reader.source.close()
+
+
+def test_kpinfo_and_kprender_read_urls(scene_url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from kpc.tools.cli import kpinfo, kprender
+
+    assert kpinfo.main([scene_url, "--verify"]) == 0
+    assert scene_url in capsys.readouterr().out
+    out = tmp_path / "still.png"
+    small = ["--backend", "reference", "--time", "0", "--size", "16x12", "-o", str(out)]
+    assert kprender.main([scene_url, *small]) == 0 and out.is_file()
+    assert kprender.main([scene_url.replace("scene", "nothing"), "-o", str(out)]) == 1
+    *_, said = capsys.readouterr().err.splitlines()
+    assert said.startswith("kprender: http://127.0.0.1") and "404" in said

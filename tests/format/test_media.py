@@ -1,0 +1,383 @@
+"""Videos with every combination of colour tags decode to the colours they were made from; damage is a MediaError."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from kpc.format.common import media
+from kpc.format.common.errors import MediaError
+from kpc.format.common.media import ffmpeg_binary, probe, read_image, read_video, srgb_from_linear, write_image, write_video
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+LUMA = {"bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722)}
+"""Kr, Kb (ITU-R BT.601 and BT.709)."""
+
+PATCH = 16
+
+
+def patches(rng: np.random.Generator) -> np.ndarray:
+    """8 x 4 patches of flat colour, uint8 (64, 128, 3): subsampled chroma keeps flat ones but for the seams."""
+    colours = rng.integers(0, 256, (4, 8, 3), dtype=np.uint8)
+    colours[0, :5] = [(0, 0, 0), (255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255)]
+    return colours.repeat(PATCH, 0).repeat(PATCH, 1)
+
+
+def middles(frame: np.ndarray) -> np.ndarray:
+    return frame[PATCH // 2 :: PATCH, PATCH // 2 :: PATCH].astype(float)
+
+
+def yuv(rgb: np.ndarray, matrix: str, full: bool, bits: int, subsampled: bool) -> bytes:
+    """The recommendations' own equations: planar Y'CbCr of one frame."""
+    kr, kb = LUMA[matrix]
+    r, g, b = np.moveaxis(rgb / 255.0, -1, 0)
+    y = kr * r + (1 - kr - kb) * g + kb * b
+    cb, cr = (b - y) / (2 * (1 - kb)), (r - y) / (2 * (1 - kr))
+    top, half = 2**bits - 1, 2 ** (bits - 1)
+    luma = y * top if full else (16 + 219 * y) * 2 ** (bits - 8)
+    chroma = [half + c * (top if full else 224 * 2 ** (bits - 8)) for c in (cb, cr)]
+    if subsampled:
+        chroma = [c[::2, ::2] for c in chroma]
+    kind = np.dtype("<u2") if bits > 8 else np.dtype("u1")
+    return b"".join(np.clip(np.rint(p), 0, top).astype(kind).tobytes() for p in (luma, *chroma))
+
+
+def encode(
+    path: Path, raw: bytes, pix_fmt: str, *, matrix: str | None, full: bool | None, codec: str = "ffv1", frames: int = 1
+) -> None:
+    """A lossless video of raw planes, tagged as told and not converted."""
+    tags = [f"colorspace={'smpte170m' if matrix == 'bt601' else matrix}"] if matrix else []
+    tags += [f"range={'pc' if full else 'tv'}"] if full is not None else []
+    command = [
+        ffmpeg_binary(),
+        "-v",
+        "error",
+        "-y",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        pix_fmt,
+        "-s",
+        "128x64",
+        "-r",
+        "10",
+        "-i",
+        "pipe:",
+    ]
+    command += ["-vf", "setparams=" + ":".join(tags)] if tags else []
+    command += ["-color_range", "pc" if full else "tv"] if full is not None else []
+    command += ["-c:v", codec, *(["-qp", "0"] if codec == "libx264" else []), str(path)]
+    subprocess.run(command, input=raw * frames, check=True, capture_output=True)
+
+
+def tolerance(matrix: str, full: bool, bits: int) -> float:
+    """Half a step of each of Y, Cb, Cr carried through the inverse matrix to the channel that feels it most, half a
+    level for rounding the result, and one for the fixed-point arithmetic of swscale."""
+    kr, kb = LUMA[matrix]
+    fine = 2 ** (bits - 8)
+    luma, chroma = (1.0, 1.0) if full else (255 / 219, 255 / 224)
+    green = 2 * (kb * (1 - kb) + kr * (1 - kr)) / (1 - kr - kb)
+    return 0.5 / fine * (luma + chroma * max(2 * (1 - kb), 2 * (1 - kr), green)) + 1.5
+
+
+@pytest.mark.parametrize("matrix", ["bt601", "bt709"])
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("pix_fmt", ["yuv420p", "yuv444p", "yuv420p10le", "yuv444p10le"])
+def test_tags_are_honoured(tmp_path: Path, matrix: str, full: bool, pix_fmt: str) -> None:
+    rgb = patches(np.random.default_rng(1))
+    bits = 10 if "10" in pix_fmt else 8
+    path = tmp_path / "tagged.mkv"
+    encode(path, yuv(rgb, matrix, full, bits, "420" in pix_fmt), pix_fmt, matrix=matrix, full=full)
+    info = probe(path)
+    assert (info.matrix, info.full_range, info.pix_fmt, info.width, info.height) == (matrix, full, pix_fmt, 128, 64)
+    (frame,) = read_video(path)
+    assert np.abs(middles(frame) - middles(rgb)).max() <= tolerance(matrix, full, bits)
+
+
+@pytest.mark.parametrize("matrix, full", [("bt601", True), ("bt709", False), ("bt601", False), ("bt709", True)])
+def test_tags_of_h264_are_honoured(tmp_path: Path, matrix: str, full: bool) -> None:
+    rgb = patches(np.random.default_rng(2))
+    encode(
+        tmp_path / "x.mp4",
+        yuv(rgb, matrix, full, 8, True),
+        "yuv420p",
+        matrix=matrix,
+        full=full,
+        codec="libx264",
+        frames=3,
+    )
+    frames = list(read_video(tmp_path / "x.mp4"))
+    assert len(frames) == 3
+    for frame in frames:
+        assert np.abs(middles(frame) - middles(rgb)).max() <= tolerance(matrix, full, 8)
+
+
+def test_untagged_small_video_is_limited_bt601(tmp_path: Path) -> None:
+    rgb = patches(np.random.default_rng(3))
+    encode(tmp_path / "x.mkv", yuv(rgb, "bt601", False, 8, False), "yuv444p", matrix=None, full=None)
+    info = probe(tmp_path / "x.mkv")
+    assert (info.matrix, info.full_range) == ("bt601", False)
+    (frame,) = read_video(tmp_path / "x.mkv")
+    assert np.abs(middles(frame) - middles(rgb)).max() <= tolerance("bt601", False, 8)
+
+
+@pytest.mark.parametrize(
+    "pix_fmt, tags, height, matrix",
+    [
+        ("yuv420p", "progressive", 719, "bt601"),
+        ("yuv420p", "progressive", 720, "bt709"),
+        ("yuv420p", "", 1080, "bt709"),
+        ("yuv420p", "tv, smpte170m/unknown/unknown, progressive", 1080, "bt601"),
+        ("yuv420p", "tv, bt709, progressive", 100, "bt709"),
+        ("yuvj420p", "pc, bt470bg/unknown/unknown", 1080, "bt601"),
+        ("yuv420p10le", "tv, bt2020nc/bt2020/bt709", 100, "bt2020"),
+        ("gbrp", "pc, gbr/unknown/unknown", 100, "rgb"),
+        ("rgb24", "", 100, "rgb"),
+    ],
+)
+def test_matrix_from_ffmpegs_words(pix_fmt: str, tags: str, height: int, matrix: str) -> None:
+    assert media._matrix(pix_fmt, tags, height) == matrix
+
+
+def test_hdr_is_refused(tmp_path: Path) -> None:
+    raw = yuv(patches(np.random.default_rng(3)), "bt709", False, 10, True)
+    command = [
+        ffmpeg_binary(),
+        "-v",
+        "error",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "yuv420p10le",
+        "-s",
+        "128x64",
+        "-i",
+        "pipe:",
+        "-vf",
+        "setparams=color_trc=smpte2084:colorspace=bt2020nc:color_primaries=bt2020",
+        "-c:v",
+        "ffv1",
+        str(tmp_path / "x.mkv"),
+    ]
+    subprocess.run(command, input=raw, check=True, capture_output=True)
+    with pytest.raises(MediaError, match="HDR"):
+        probe(tmp_path / "x.mkv")
+
+
+def test_display_rotation_is_applied(tmp_path: Path) -> None:
+    rgb = np.zeros((32, 64, 3), np.uint8)
+    rgb[:, :16] = 255
+    write_video(tmp_path / "x.mp4", [rgb] * 2, 10, crf=1)
+    turn = [
+        ffmpeg_binary(),
+        "-v",
+        "error",
+        "-display_rotation",
+        "90",
+        "-i",
+        str(tmp_path / "x.mp4"),
+        "-c",
+        "copy",
+        str(tmp_path / "y.mp4"),
+    ]
+    if subprocess.run(turn, check=False, capture_output=True).returncode != 0:
+        pytest.skip("this ffmpeg cannot write a rotation")
+    info = probe(tmp_path / "y.mp4")
+    assert (info.width, info.height) == (32, 64)
+    frame = next(read_video(tmp_path / "y.mp4"))
+    assert {frame[:12].mean() > 200, frame[-12:].mean() > 200} == {True, False}
+
+
+def test_rgb_video_is_exact(tmp_path: Path) -> None:
+    rgb = patches(np.random.default_rng(4))
+    encode(tmp_path / "x.mkv", rgb.tobytes(), "rgb24", matrix=None, full=None)
+    (frame,) = read_video(tmp_path / "x.mkv")
+    np.testing.assert_array_equal(frame, rgb)
+
+
+@pytest.mark.parametrize(
+    "rest, fps",
+    [
+        (", 29.97 fps, 30 tbr", 30000 / 1001),
+        (", 23.98 fps", 24000 / 1001),
+        (", 25 fps", 25),
+        (", 12.5 fps", 12.5),
+        (", 15 tbr", 15),
+    ],
+)
+def test_frame_rate(rest: str, fps: float) -> None:
+    assert media._fps(rest) == pytest.approx(fps, rel=1e-12)
+
+
+@pytest.mark.parametrize("fps", [7.0, 15.0, 29.97, 120.0])
+def test_written_video_comes_back_frame_by_frame(tmp_path: Path, fps: float) -> None:
+    """Each frame has its own grey; a frame dropped or doubled on the way would show."""
+    greys = np.arange(20, 240, 20)
+    frames = [np.full((32, 48, 3), g, np.uint8) for g in greys]
+    assert write_video(tmp_path / "x.mp4", frames, fps, crf=1) == len(frames)
+    info = probe(tmp_path / "x.mp4")
+    assert (info.frame_count, info.matrix, info.full_range, info.pix_fmt) == (len(frames), "bt709", False, "yuv420p")
+    assert info.fps == pytest.approx(fps, rel=1e-3)
+    means = [frame.mean() for frame in read_video(tmp_path / "x.mp4")]
+    assert np.abs(np.array(means) - greys).max() <= tolerance("bt709", False, 8)
+    assert len(list(read_video(tmp_path / "x.mp4", limit=4))) == 4
+
+
+def test_odd_sizes_are_padded_where_chroma_needs_it(tmp_path: Path) -> None:
+    frame = np.full((15, 21, 3), 90, np.uint8)
+    write_video(tmp_path / "even.mp4", [frame], 10)
+    write_video(tmp_path / "odd.mp4", [frame], 10, pix_fmt="yuv444p")
+    even, odd = probe(tmp_path / "even.mp4"), probe(tmp_path / "odd.mp4")
+    assert (even.width, even.height) == (22, 16)
+    assert (odd.width, odd.height) == (21, 15)
+
+
+def test_damaged_videos_are_media_errors(tmp_path: Path) -> None:
+    good = tmp_path / "good.mp4"
+    rng = np.random.default_rng(0)
+    write_video(good, [rng.integers(0, 256, (64, 64, 3), dtype=np.uint8) for _ in range(12)], 10)
+    data = good.read_bytes()
+    for name, damaged in {
+        "empty.mp4": b"",
+        "text.mp4": b"no video at all\n" * 50,
+        "head.mp4": data[:200],
+        "cut.mp4": data[: len(data) * 6 // 10],
+        "hole.mp4": data[: len(data) // 2] + bytes(8000) + data[len(data) // 2 + 8000 :],
+    }.items():
+        path = tmp_path / name
+        path.write_bytes(damaged)
+        with pytest.raises(MediaError, match=name) as caught:
+            list(read_video(path))
+        assert "\n" not in str(caught.value)
+
+
+def test_missing_video_and_pipe_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(MediaError, match="no such file"):
+        probe(tmp_path / "none.mp4")
+    os.mkfifo(tmp_path / "pipe.mp4")
+    with pytest.raises(MediaError, match="not a regular file"):
+        probe(tmp_path / "pipe.mp4")
+
+
+def test_names_that_look_like_options_or_urls(tmp_path: Path) -> None:
+    for name in ("-y.mp4", "a:b.mp4", "50%d done.mp4", "concat:x.mp4"):
+        write_video(tmp_path / name, [np.zeros((16, 16, 3), np.uint8)] * 2, 10)
+        assert probe(tmp_path / name).frame_count == 2
+
+
+def test_failed_writing_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(MediaError, match="no frames"):
+        write_video(tmp_path / "x.mp4", [], 10)
+    with pytest.raises(MediaError, match="frame 1"):
+        write_video(tmp_path / "x.mp4", [np.zeros((16, 16, 3), np.uint8), np.zeros((8, 16, 3), np.uint8)], 10)
+    with pytest.raises(MediaError, match="cannot write"):
+        write_video(tmp_path / "x.mp4", [np.zeros((16, 16, 3), np.uint8)] * 5, 10, pix_fmt="no_such_format")
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_ffmpeg_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> str:
+        raise RuntimeError("none")
+
+    monkeypatch.setattr(media.shutil, "which", lambda name: None)
+    monkeypatch.setattr(media.imageio_ffmpeg, "get_ffmpeg_exe", none)
+    ffmpeg_binary.cache_clear()
+    with pytest.raises(MediaError, match="install ffmpeg"):
+        ffmpeg_binary()
+    ffmpeg_binary.cache_clear()
+
+
+@pytest.mark.parametrize("mode, channels", [("RGB", 3), ("RGBA", 4), ("L", 3), ("LA", 4), ("P", 3)])
+def test_png_modes(tmp_path: Path, mode: str, channels: int) -> None:
+    Image.new(mode, (5, 4), 7).save(tmp_path / "x.png")
+    assert read_image(tmp_path / "x.png").shape == (4, 5, channels)
+    assert media.image_size(tmp_path / "x.png") == (5, 4, channels == 4)
+
+
+def test_images_round_trip(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 7, 4), dtype=np.uint8)
+    write_image(tmp_path / "x.png", pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / "x.png"), pixels)
+    flat = np.full((8, 8, 3), (200, 100, 50), np.uint8)
+    write_image(tmp_path / "x.jpg", flat)
+    assert np.abs(read_image(tmp_path / "x.jpg").astype(int) - flat).max() <= 2  # half a step of each of Y, Cb, Cr
+
+
+def test_exif_orientation_is_not_applied(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter turn
+    Image.new("RGB", (12, 8)).save(tmp_path / "x.jpg", exif=exif)
+    assert read_image(tmp_path / "x.jpg").shape == (8, 12, 3)
+
+
+def test_exr_goes_through_the_srgb_curve(tmp_path: Path) -> None:
+    linear = np.random.default_rng(0).uniform(-0.2, 1.4, (5, 6, 3)).astype(np.float32)
+    alpha = np.linspace(0, 1, 30, dtype=np.float32).reshape(5, 6)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"RGB": OpenEXR.Channel(linear.copy())}) as exr:
+        exr.write(str(tmp_path / "x.exr"))
+    with OpenEXR.File(
+        header, {"RGBA": OpenEXR.Channel(np.concatenate([linear * alpha[..., None], alpha[..., None]], axis=2))}
+    ) as exr:
+        exr.write(str(tmp_path / "a.exr"))
+    expected = np.rint(255 * srgb_from_linear(linear))
+    np.testing.assert_array_equal(read_image(tmp_path / "x.exr"), expected)
+    straight = read_image(tmp_path / "a.exr")
+    assert np.abs(straight[..., :3] - np.where(alpha[..., None] > 0, expected, 0)).max() <= 1  # float32 there and back
+    np.testing.assert_array_equal(straight[..., 3], np.rint(255 * alpha))
+    assert media.image_size(tmp_path / "x.exr") == (6, 5, False)
+    assert media.image_size(tmp_path / "a.exr") == (6, 5, True)
+
+
+def test_srgb_curve_at_known_points() -> None:
+    np.testing.assert_allclose(
+        srgb_from_linear(np.array([-1, 0, 0.0031308, 0.2140411, 1, 5, np.nan])),
+        [0, 0, 0.0404499, 0.5, 1, 1, 0],
+        atol=1e-6,
+    )
+
+
+@pytest.mark.parametrize("name", ["x.png", "x.jpg", "x.exr"])
+def test_damaged_images_are_media_errors(tmp_path: Path, name: str) -> None:
+    with pytest.raises(MediaError, match="no such file"):
+        read_image(tmp_path / name)
+    if name == "x.exr":
+        with OpenEXR.File(
+            {"type": OpenEXR.scanlineimage}, {"RGB": OpenEXR.Channel(np.ones((40, 40, 3), np.float32))}
+        ) as exr:
+            exr.write(str(tmp_path / name))
+    else:
+        write_image(tmp_path / name, np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8))
+    data = (tmp_path / name).read_bytes()
+    for damaged in (b"", b"nonsense", data[: len(data) // 2]):
+        (tmp_path / name).write_bytes(damaged)
+        with pytest.raises(MediaError, match=name):
+            read_image(tmp_path / name)
+
+
+def test_image_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_image(tmp_path / "x.png", np.zeros((4, 4, 3), np.uint8))
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied", "x.png")
+
+    monkeypatch.setattr(media.Image, "open", refuse)  # root may read everything, so the refusal is played
+    with pytest.raises(MediaError, match="no permission"):
+        read_image(tmp_path / "x.png")
+
+
+@pytest.mark.skipif(not (DATA / "room").is_dir(), reason="shared/data is not here")
+@pytest.mark.parametrize("name, psnr_db", [("room", 39.28), ("liam", 42.39)])
+def test_real_videos_decode_as_their_readme_says(name: str, psnr_db: float) -> None:
+    errors = []
+    for k, frame in enumerate(read_video(DATA / name / "cam00.mp4")):
+        truth = DATA / name / "gt" / f"cam00_f{k:03d}.png"
+        if truth.exists():
+            errors.append(np.mean((frame.astype(float) - read_image(truth)[..., :3]) ** 2))
+    assert len(errors) >= 5
+    assert 10 * np.log10(255**2 / np.mean(errors)) == pytest.approx(psnr_db, abs=0.01)

@@ -1,0 +1,112 @@
+"""Displacements: the formula point by point, in numpy and PyTorch; rounding; what is reached through them."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kpc.encoder.field import field
+from kpc.format.common.errors import FormatError
+from kpc.format.scene.grid import linear
+from kpc.format.scene.motion import DISPLACEMENT_LIMIT, STEP, QuantisedMotion, _fill, moved, places_reached, quantise_motion
+
+RNG = np.random.default_rng(0)
+
+
+def by_hand(u: np.ndarray, time: float, offsets: np.ndarray) -> np.ndarray:
+    """u + sum over nodes of the product of hat functions, clamped; float64."""
+    rows, nz, ny, nx, _ = offsets.shape
+
+    def hats(x: float, size: int) -> np.ndarray:
+        return np.maximum(0, 1 - np.abs(x * (size - 1) - np.arange(size)))
+
+    weights = (hats(time, rows), hats(u[2], nz), hats(u[1], ny), hats(u[0], nx))
+    return np.clip(u + np.einsum("t,z,y,x,tzyxc->c", *weights, offsets.astype(np.float64)), 0, 1)
+
+
+@pytest.mark.parametrize("most", [0.05, 2.0])
+def test_moved_is_the_formula_in_numpy_and_pytorch(most: float) -> None:
+    offsets = RNG.uniform(-most, most, (5, 3, 2, 4, 3)).astype(np.float32)
+    u = RNG.random((300, 3), np.float32)
+    u[:8] = list(np.ndindex(2, 2, 2))
+    times = RNG.random(300, np.float32)
+    times[:3] = 0, 1, 0.25  # on rows, too
+    wanted = np.array([by_hand(*a, offsets) for a in zip(u.astype(np.float64), times, strict=True)])
+    ours = np.array([moved(p, linear(offsets, float(t))) for p, t in zip(u, times, strict=True)])
+    np.testing.assert_allclose(ours, wanted, atol=1e-6 * (1 + most))
+    theirs = field.moved(*map(torch.from_numpy, (u, times, offsets))).numpy()
+    np.testing.assert_allclose(theirs, wanted, atol=1e-6 * (1 + most))
+    assert (np.mean((wanted == 0) | (wanted == 1)) > 0.2) == (most > 1)  # what leaves the planes is kept at their border
+
+
+def test_pytorch_has_the_gradient_of_finite_differences() -> None:
+    points, times = torch.rand(20, 3, dtype=torch.float64) * 0.6 + 0.2, torch.rand(20, dtype=torch.float64)
+    motion = (0.1 * torch.randn(3, 2, 3, 2, 3, dtype=torch.float64)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda motion: field.moved(points, times, motion), (motion,))
+
+
+@pytest.mark.parametrize("most", [1e-9, 0.1, 3.0, DISPLACEMENT_LIMIT / 2])
+def test_rounding(most: float) -> None:
+    offsets = RNG.uniform(-most, most, (3, 2, 2, 2, 3)).astype(np.float32)
+    offsets[0, 0, 0, 0] = most, -most, 0
+    rounded = quantise_motion(offsets)
+    assert rounded.step == STEP or most > 32767 * STEP
+    # Half a step, and the rounding of the product to float32.
+    assert np.abs(rounded.dequantise() - offsets).max() <= rounded.step / 2 + most * 2.0**-23
+
+
+@pytest.mark.parametrize("multiple", [1, 3, 16])
+def test_multiples_of_several_steps_are_stored_as_such(multiple: int) -> None:
+    offsets = np.random.default_rng(0).integers(-30, 30, (2, 3, 2, 2, 3)).astype(np.float32) * np.float32(multiple * STEP)
+    rounded = quantise_motion(offsets)
+    assert rounded.step == multiple * STEP and np.abs(rounded.symbols).max() <= 30
+    np.testing.assert_array_equal(rounded.dequantise(), offsets)
+
+
+def test_all_that_a_file_can_hold_can_be_stored_anew() -> None:
+    widest = QuantisedMotion(np.resize(np.int16([-32768, 32767, 0]), (2, 2, 2, 2, 3)), DISPLACEMENT_LIMIT / 32768)
+    again = quantise_motion(widest.dequantise())
+    assert again.step == widest.step
+    np.testing.assert_array_equal(again.symbols, widest.symbols)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, np.nextafter(np.float32(-DISPLACEMENT_LIMIT), np.float32(-np.inf))])
+def test_what_no_file_can_store(value: float) -> None:
+    offsets = np.zeros((2, 2, 2, 2, 3), np.float32)
+    offsets[1, 1, 0, 1, 2] = value
+    with pytest.raises(FormatError, match="motion"):
+        quantise_motion(offsets)
+
+
+@given(seed=st.integers(0, 2**32 - 1), stretch=st.floats(0, 0.9))
+@settings(max_examples=30, deadline=None)
+def test_no_place_that_is_reached_is_missed(seed: int, stretch: float) -> None:
+    """As long as neighbouring points part by no more than their distance."""
+    rng = np.random.default_rng(seed)
+    nodes = rng.integers(2, 5, 4)
+    offsets = rng.uniform(-1, 1, (*nodes, 3)).astype(np.float32)
+    offsets *= np.float32(stretch / (6 * max(nodes[1:])))  # no slope beyond `stretch`, summed over three axes
+    offsets += rng.uniform(-0.3, 0.3, (nodes[0], 1, 1, 1, 3)).astype(np.float32)  # all of it moves, as fast as it likes
+    occupancy = rng.random(rng.integers(1, 9, 4)) < 0.1
+    reached = places_reached(occupancy, offsets)
+    slots, shape = len(occupancy), np.array(occupancy.shape[1:])
+    for slot, *cell in np.argwhere(occupancy):
+        for _ in range(5):
+            u, time = ((cell + rng.random(3)) / shape)[::-1], (slot + rng.random()) / slots
+            place = moved(u.astype(np.float32), linear(offsets, time))
+            assert reached[slot][tuple(np.minimum((place[::-1] * shape).astype(int), shape - 1))]
+
+
+def test_nothing_occupied_reaches_nothing_and_no_motion_stays_close() -> None:
+    still = np.zeros((2, 2, 2, 2, 3), np.float32)
+    assert not places_reached(np.zeros((2, 4, 5, 6), bool), still).any()
+    occupancy = np.zeros((1, 8, 8, 8), bool)
+    occupancy[0, 3, 4, 5] = True
+    assert places_reached(occupancy, still).sum() == 27
+
+
+def test_boxes_are_filled() -> None:
+    grid = np.zeros((3, 4, 5), bool)
+    _fill(grid, np.array([[0, 1, 2], [2, 3, 4]]), np.array([[1, 1, 4], [2, 3, 4]]))
+    assert grid.sum() == 7 and grid[:2, 1, 2:].all() and grid[2, 3, 4]

@@ -1,0 +1,293 @@
+import time
+from types import FunctionType
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba import njit
+from plain import assert_plain_python_prints_the_same
+
+from kpc.format.common.errors import FormatError
+from kpc.format.coding.raw_planes import encode_segment
+from kpc.format.coding import predictive as module
+from kpc.format.coding.predictive import (
+    ACTIVITIES, ANY, AROUND, LATTICE_BIT, SET_COUNTS, TRELLIS, WEIGHTS, Guide, decode_symbols, encode_symbols, encode_with, fitted,
+    follows_trellis, guide_of, neighbourhoods, next_state,
+)
+from kpc.tools.vectors.specvectors import walked
+
+shapes = st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 5))
+
+PAINTS = {
+    "noise": lambda rng, shape: rng.integers(-128, 128, shape),
+    "extremes": lambda rng, shape: rng.choice([-128, 127], shape),
+    "ramps": lambda rng, shape: rng.integers(-3, 4, shape).cumsum(0).cumsum(1),  # wraps in the corner
+    "nearly flat": lambda rng, shape: rng.random(shape) < 0.05,
+    "constant": lambda rng, shape: np.full(shape, rng.choice([-128, -1, 0, 127])),
+}
+
+
+def painted(paint: str, shape: tuple[int, int, int], seed: int, share: float) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    symbols = PAINTS[paint](rng, shape).astype(np.int8)
+    coded = rng.random(shape[:2]) < share
+    symbols[~coded] = 0
+    return symbols, coded
+
+
+def assert_decodes(body: bytes, symbols: np.ndarray, coded: np.ndarray) -> None:
+    decoded, where = decode_symbols(body, *symbols.shape)
+    assert decoded.dtype == np.int8 and np.array_equal(decoded, symbols)
+    assert where.dtype == bool and np.array_equal(where, coded)
+
+
+@given(paint=st.sampled_from(sorted(PAINTS)), shape=shapes, seed=st.integers(0, 2**32 - 1),
+       share=st.sampled_from([0.0, 0.3, 0.8, 1.0]))
+@settings(deadline=None)
+def test_symbols_come_back(paint, shape, seed, share):
+    symbols, coded = painted(paint, shape, seed, share)
+    assert_decodes(encode_symbols(symbols, coded), symbols, coded)
+
+
+@given(shape=shapes, seed=st.integers(0, 2**32 - 1), count=st.sampled_from(SET_COUNTS), extreme=st.booleans())
+@settings(deadline=None)
+def test_any_weights_will_do(shape, seed, count, extreme):
+    symbols, coded = painted("noise", shape, seed, 0.8)
+    rng = np.random.default_rng(seed)
+    weights = rng.choice([-128, 127], (count, WEIGHTS)) if extreme else rng.integers(-128, 128, (count, WEIGHTS))
+    assert_decodes(encode_with(weights.astype(np.int8), symbols, coded, ANY), symbols, coded)
+
+
+def textured(rows: int = 60, columns: int = 70, channels: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    """Smooth waves and noise, stronger on one side, within an ellipse."""
+    rng = np.random.default_rng(0)
+    y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij")
+    waves = sum(np.multiply.outer(np.sin(a * x + b * y + c), 25 * rng.normal(0, 1, channels))
+                for a, b, c in rng.normal(0, 3, (4, 3)))
+    symbols = np.clip(np.rint(waves + (1.5 + x)[..., None] * rng.normal(0, 1, waves.shape)), -128, 127).astype(np.int8)
+    coded = x * x + y * y < 0.9
+    symbols[~coded] = 0
+    return symbols, coded
+
+
+@given(paint=st.sampled_from(sorted(PAINTS)), shape=shapes, seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.3, 0.8, 1.0]))
+@settings(deadline=None)
+def test_symbols_on_the_trellis_come_back(paint, shape, seed, share):
+    symbols, coded = painted(paint, shape, seed, share)
+    symbols = on_trellis(symbols, coded)
+    assert follows_trellis(symbols, coded)
+    body = encode_symbols(symbols, coded)
+    assert body[1] >> LATTICE_BIT == TRELLIS and guide_of(body) is None
+    assert_decodes(body, symbols, coded)
+
+
+def on_trellis(symbols: np.ndarray, coded: np.ndarray) -> np.ndarray:
+    """The symbols, the last bit of each changed where it has to be."""
+    symbols = symbols.copy()
+    for y, m in np.ndindex(len(symbols), symbols.shape[2]):
+        state = 0
+        for x in np.flatnonzero(coded[y]):
+            symbols[y, x, m] = symbols[y, x, m] & ~1 | state & 1
+            state = next_state(state, int(symbols[y, x, m]))
+    return symbols
+
+
+def test_the_trellis_saves_a_bit_a_symbol():
+    rng = np.random.default_rng(0)
+    symbols, coded = rng.integers(-40, 40, (60, 60, 4)).astype(np.int8), np.ones((60, 60), bool)
+    steered = on_trellis(symbols, coded)
+    assert not follows_trellis(symbols, coded)
+    assert len(encode_symbols(steered, coded)) < len(encode_symbols(symbols, coded)) - 0.95 * symbols.size / 8
+
+
+@given(paint=st.sampled_from(sorted(PAINTS)), shape=shapes, seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.3, 0.8, 1.0]),
+       count=st.sampled_from(SET_COUNTS))
+@settings(deadline=None)
+def test_symbols_around_predictions_come_back(paint, shape, seed, share, count):
+    symbols, coded = painted(paint, shape, seed, share)
+    guide = Guide(np.random.default_rng(seed).integers(-128, 128, (count, WEIGHTS)).astype(np.int8))
+    symbols = followed(symbols, coded, guide)
+    body = encode_symbols(symbols, coded, guide)
+    assert_decodes(body, symbols, coded)
+    assert guide_of(body) == guide and body == encode_with(guide.weights, symbols, coded, AROUND)
+
+
+def followed(symbols: np.ndarray, coded: np.ndarray, guide: Guide) -> np.ndarray:
+    """Symbols near to these, none at the ends of 8 bits, that follow a guide."""
+    symbols = np.clip(symbols, -126, 126)
+    walked(symbols, coded, guide.weights, AROUND)
+    return symbols
+
+
+@pytest.mark.parametrize("flat", [0, ACTIVITIES])
+def test_around_predictions_errors_of_odd_places_are_odd_or_none(monkeypatch, flat):
+    """By the definition, told here once more: of segments whose weights are 0, so that what is foreseen is the mean of left and above; were
+    all flat, or nothing."""
+    monkeypatch.setattr(module, "FLAT", flat)
+    for name in ("walk_map", "walk"):
+        monkeypatch.setattr(module, name, njit(FunctionType(vars(module)[name].py_func.__code__, vars(module), name)))
+    v = np.random.default_rng(5).integers(-40, 40, (9, 30, 2)).astype(np.int8)
+    trace = np.empty(v.size * module.MOST_DECISIONS, np.int16)
+    module.walk(v, np.ones((9, 30), bool), AROUND, np.zeros((1, WEIGHTS), np.int8), 0, 0, None, trace, None)
+    assert follows_trellis(v, np.ones((9, 30), bool)) == (flat == 0)
+    odd_ones, v = 0, v.astype(int)
+    for y, m in np.ndindex(9, 2) if flat else ():
+        place = 0
+        for x in range(30):
+            left = v[y, x - 1, m] if x else v[y - 1, 0, m] if y else 0
+            above = v[y - 1, x, m] if y else left
+            away = v[y, x, m] - (left + above + 1 >> 1)
+            size, rest = divmod(abs(away) + (place & 1), 2)
+            assert rest == 0 or away == 0
+            odd_ones += away != 0 and place & 1
+            place = next_state(place, 2 * size)
+    assert odd_ones > 100 or not flat
+
+
+def test_what_leaves_its_guide_is_told_without():
+    symbols, coded = textured(40, 50, 3)
+    symbols //= 16
+    guide = Guide(fitted(neighbourhoods(symbols, coded), 1))
+    assert encode_with(guide.weights, symbols, coded, AROUND) is None
+    assert encode_symbols(symbols, coded, guide) == encode_symbols(symbols, coded)
+    follows = followed(symbols, coded, guide)
+    assert len(encode_symbols(follows, coded, guide)) < 0.95 * len(encode_symbols(follows, coded))
+
+
+def test_one_symbol_off_the_trellis_is_enough_to_leave_it():
+    symbols, coded = textured(9, 11, 3)
+    steered = on_trellis(symbols, coded)
+    y, x = np.argwhere(coded)[20]
+    steered[y, x, 1] ^= 1
+    assert not follows_trellis(steered, coded)
+    assert_decodes(encode_symbols(steered, coded), steered, coded)
+
+
+def test_smooth_planes_take_far_less_than_with_zstd():
+    symbols, coded = textured()
+    body = encode_symbols(symbols, coded)
+    assert_decodes(body, symbols, coded)
+    frame = zstandard.ZstdCompressor(level=19).compress(b"".join(encode_segment(symbols, coded)))
+    assert len(body) < 0.85 * len(frame)
+
+
+def test_arrays_may_have_any_layout_and_are_left_as_they_are():
+    symbols, coded = textured(9, 11, 3)
+    body = encode_symbols(symbols, coded)
+    across = np.asfortranarray(symbols)[:, :, :]
+    for array in (symbols, across, coded):
+        array.flags.writeable = False
+    assert encode_symbols(symbols, coded) == encode_symbols(across, np.asfortranarray(coded)) == body
+
+
+def test_noise_takes_hardly_more_than_it_holds():
+    symbols, coded = painted("noise", (40, 40, 4), 0, 1.0)
+    assert len(encode_symbols(symbols, coded)) < 1.15 * symbols.size
+
+
+def test_what_is_not_coded_costs_its_map_and_a_map_without_surprises_little():
+    still, nowhere = np.zeros((100, 200, 8), np.int8), np.zeros((100, 200), bool)
+    assert len(encode_symbols(still, nowhere)) < 40
+    assert len(encode_symbols(still, ~nowhere)) < 120
+    half = nowhere | (np.arange(200) < 90)
+    assert len(encode_symbols(still, half)) < 200
+
+
+# The same lines, not compiled: what numba makes of integers must be what Python makes of them.
+PLAIN = """
+import hashlib
+import numpy as np
+from test_symbols import followed, on_trellis, painted, textured
+from kpc.format.coding.predictive import ANY, AROUND, TRELLIS, Guide, decode_symbols, encode_with
+
+smooth, coded = textured(14, 12, 3)
+weights = np.random.default_rng(3).integers(-128, 128, (4, 9)).astype(np.int8)
+for symbols, coded, lattice in (
+        (smooth, coded, ANY), (on_trellis(smooth, coded), coded, TRELLIS), (*painted("noise", (7, 9, 3), 1, 0.7), ANY),
+        (*painted("extremes", (9, 5, 2), 2, 1.0), ANY), (followed(smooth, coded, Guide(weights)), coded, AROUND),
+        (followed(smooth // 30, coded, Guide(weights // 8)), coded, AROUND)):
+    body = encode_with(weights // 8 if symbols.max() < 8 else weights, symbols, coded, lattice)
+    assert np.array_equal(decode_symbols(body, *symbols.shape)[0], symbols)
+    print(hashlib.sha256(body).hexdigest())
+"""
+
+
+def test_compiled_code_and_plain_python_give_the_same_bytes():
+    assert_plain_python_prints_the_same(PLAIN, "kpc.format.coding.rans:adapt")
+
+
+# --- damage and hostility
+
+
+def decodes_or_is_refused(body: bytes, shape: tuple[int, int, int]) -> bool:
+    try:
+        symbols, coded = decode_symbols(body, *shape)
+    except FormatError:
+        return False
+    assert symbols.shape == shape and coded.shape == shape[:2] and not symbols[~coded].any()
+    return True
+
+
+@pytest.fixture(scope="module")
+def small() -> tuple[bytes, tuple[int, int, int]]:
+    symbols, coded = textured(9, 11, 3)
+    return encode_symbols(symbols, coded), symbols.shape
+
+
+def test_every_truncation_is_refused(small):
+    body, shape = small
+    assert decodes_or_is_refused(body, shape)
+    assert not any(decodes_or_is_refused(body[:length], shape) for length in range(len(body)))
+
+
+def test_flipped_bits_are_refused_or_mean_something_else(small):
+    """Nearly all are refused, since the last state must come out right; none leads outside of the arrays."""
+    body, shape = small
+    accepted = 0
+    for position in range(len(body)):
+        for bit in range(8):
+            damaged = bytearray(body)
+            damaged[position] ^= 1 << bit
+            accepted += decodes_or_is_refused(bytes(damaged), shape)
+    assert accepted <= len(body) // 100
+
+
+@given(body=st.binary(max_size=80), shape=shapes, count=st.sampled_from([0, 1, 2, 3, 4, 8, 255]), flag=st.integers(0, 6))
+@settings(deadline=None)
+def test_any_bytes_decode_or_are_refused(body, shape, count, flag):
+    decodes_or_is_refused(body, shape)
+    decodes_or_is_refused(bytes([count, flag]) + body, shape)
+
+
+def test_a_body_of_another_shape_is_refused(small):
+    body, (rows, columns, channels) = small
+    for other in ((rows, columns, channels + 1), (rows + 1, columns, channels), (columns, rows, channels), (1, 1, 1)):
+        assert not decodes_or_is_refused(body, other)
+
+
+def test_a_stream_that_ends_early_is_given_up_at_once():
+    """Within a row of its end: the hundreds of millions of symbols after it would take ten seconds and more."""
+    symbols, coded = painted("noise", (8, 8, 1), 0, 1.0)
+    body = encode_symbols(symbols, coded)
+    start = time.perf_counter()
+    with pytest.raises(FormatError, match="plane segment"):
+        decode_symbols(body, 4, 16, 1 << 22)
+    assert time.perf_counter() - start < 2.0
+
+
+@pytest.mark.parametrize("change, complaint", [
+    (lambda body: b"", "number of sets"),
+    (lambda body: b"\3" + body[1:], "number of sets"),
+    (lambda body: b"\0" + body[1:], "number of sets"),
+    (lambda body: body[:1] + b"\x06" + body[2:], "or flag"),
+    (lambda body: body[:2 + WEIGHTS + 3], "cut off"),
+    (lambda body: body + b"\0", "cut off"),
+    (lambda body: body + b"\0\0", "do not end"),
+    (lambda body: body[:2 + WEIGHTS] + b"\xff\xff\0\0" + body[2 + WEIGHTS + 4:], "first state"),
+])
+def test_what_is_wrong_is_said(change, complaint):
+    body = encode_with(np.zeros((1, WEIGHTS), np.int8), np.arange(8, dtype=np.int8).reshape(2, 2, 2), np.ones((2, 2), bool), ANY)
+    with pytest.raises(FormatError, match=complaint):
+        decode_symbols(change(body), 2, 2, 2)

@@ -1,0 +1,78 @@
+"""A bar on a terminal, a line every ten seconds elsewhere, nothing when told so."""
+
+import io
+import sys
+
+import pytest
+
+from kpc.format.common import progress as module
+from kpc.format.common.progress import Progress, progress
+
+
+class Clock:
+    now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(module, "time", clock)
+    return clock
+
+
+def test_lines_every_ten_seconds(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress("decode", 100, "frame") as bar:
+        for _ in range(50):
+            clock.now += 0.5
+            bar.note("fine")
+            bar.advance()
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines() == ["decode: 20/100 frame, 40 s left, fine", "decode: 40/100 frame, 30 s left, fine"]
+
+
+def test_what_comes_before_the_first_unit_does_not_count(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress("train", 1000) as bar:
+        clock.now = 30.0
+        bar.advance()
+        for _ in range(100):
+            clock.now += 0.1
+            bar.advance()
+    assert capsys.readouterr().err.splitlines() == ["train: 1/1000", "train: 101/1000, 90 s left"]
+
+
+def test_without_a_total(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress("count") as bar:
+        clock.now = 11
+        bar.advance(7)
+    assert capsys.readouterr().err == "count: 7\n"
+
+
+def test_hidden(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress("decode", 10, shown=False) as bar:
+        clock.now = 60
+        bar.advance()
+    assert capsys.readouterr().err == ""
+
+
+def test_iterable_is_passed_on() -> None:
+    assert list(progress([1, 2, 3], "count")) == [1, 2, 3]
+    assert list(progress((k for k in "ab"), "letters", total=2)) == ["a", "b"]
+
+
+@pytest.mark.parametrize("total", [3, None])
+def test_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, total: int | None) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with Progress("decode", total, "frame") as bar:
+        bar.note("psnr 30")
+        bar.advance(2)
+        bar.bar.refresh()
+    assert "decode" in terminal.getvalue() and "psnr 30" in terminal.getvalue() and "2" in terminal.getvalue()

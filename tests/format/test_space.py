@@ -1,0 +1,244 @@
+"""Contracted space and device coordinates against float64 and against themselves, in each language; at the extremes."""
+
+from dataclasses import replace
+
+import gl
+import numpy as np
+import pytest
+import torch
+from scenes import faced, look_at, surrounded, tiny_scene
+
+from kpc.encoder.field import kernels
+from kpc.encoder.field import render as in_pytorch
+from kpc.format.scene.scene import Scene
+from kpc.format.scene.space import FAR, LEAST_DISPARITY, Contraction, DeviceCoordinates, contract, expand
+from kpc.player.cpu.reference import places, render
+
+AABB = np.array([[-1.0, -0.5, 2.0], [3.0, 1.5, 2.5]])
+RNG = np.random.default_rng(0)
+
+
+def points(count: int, most: float) -> np.ndarray:
+    """World points at all scales, from the middle of the box to `most` half edges from it."""
+    directions = RNG.normal(size=(count, 3))
+    y = directions / np.abs(directions).max(1, keepdims=True) * most ** RNG.uniform(-1, 1, (count, 1))
+    return AABB.mean(0) + y * (AABB[1] - AABB[0]) / 2
+
+
+def by_hand(p: np.ndarray) -> np.ndarray:
+    y = (p - AABB.mean(0)) / ((AABB[1] - AABB[0]) / 2)
+    r = np.abs(y).max()
+    return (y if r <= 1 else (2 - 1 / r) * y / r) / 4 + 0.5
+
+
+def test_contract_is_the_formula_point_by_point() -> None:
+    p = points(500, 1e6)
+    u, radius = contract(p, AABB)
+    np.testing.assert_allclose(u, [by_hand(q) for q in p], atol=1e-12)
+    assert (u > 0).all() and (u < 1).all() and radius.max() > 1e5 and radius.min() < 1e-5
+
+
+def test_the_box_takes_the_inner_half_undistorted() -> None:
+    p = AABB[0] + RNG.random((100, 3)) * (AABB[1] - AABB[0])
+    np.testing.assert_allclose(contract(p, AABB)[0], 0.25 + (p - AABB[0]) / (AABB[1] - AABB[0]) / 2, atol=1e-12)
+
+
+def test_expand_is_the_inverse() -> None:
+    p = points(500, 1e6)
+    u, radius = contract(p, AABB)
+    # Near the border the place is 1/2 - 1/(4 r): rounded to 2^-53, r is known to 4 r 2^-53 of itself.
+    np.testing.assert_array_less(np.abs(expand(u, AABB) - p).max(1), 1e-14 * (1 + radius) ** 2)
+
+
+def test_contraction_has_no_step_at_the_faces_of_the_box() -> None:
+    p = points(200, 1.0)
+    y = (p - AABB.mean(0)) / (AABB[1] - AABB[0]) * 2
+    on_a_face = y / np.abs(y).max(1, keepdims=True)
+    inside, outside = (AABB.mean(0) + k * on_a_face * (AABB[1] - AABB[0]) / 2 for k in (1 - 1e-9, 1 + 1e-9))
+    np.testing.assert_allclose(contract(inside, AABB)[0], contract(outside, AABB)[0], atol=2e-9)
+
+
+@pytest.mark.parametrize("even", [1e-3, 1.0, 1e6])
+def test_s_and_distance_both_ways(even: float) -> None:
+    mapping = Contraction(even)
+    t = even * np.logspace(-6, np.log10(FAR), 1000)
+    s = mapping.progress(t)
+    np.testing.assert_allclose(s, [d if d <= even else even * (2 - even / d) for d in t], rtol=1e-12)
+    np.testing.assert_allclose(mapping.distance(s), t, rtol=1e-12)
+    assert (np.diff(s) > 0).all() and s[-1] == pytest.approx(mapping.end)
+    single = mapping.distance(s.astype(np.float32))
+    # s / even is known to 2^-23; what is left up to 2 is as small as 1 / FAR.
+    np.testing.assert_allclose(single, t, rtol=2 * FAR * 2.0**-23)
+    assert single.dtype == np.float32
+    assert mapping.progress(np.array([1e6 * even, np.inf])) == pytest.approx([(2 - 1e-6) * even, 2 * even])
+    assert mapping.distance(np.array([3 * even])) == pytest.approx(FAR * even)
+
+
+@pytest.mark.parametrize("even", [0.7, 40.0])
+def test_every_language_puts_samples_in_the_same_place(even: float) -> None:
+    """numpy, PyTorch and the kernels, in float32 against float64; GLSL is held by pictures in test_renderer."""
+    scene = replace(surrounded(tiny_scene(0)), mapping=Contraction(even))
+    origins, directions = (a[::60] for a in scene.cameras[0].rays())
+    s = np.linspace(0, scene.mapping.end, 50, dtype=np.float32)[None].repeat(len(origins), 0)
+    exact = places(scene, *(a.astype(np.float64) for a in (origins, directions, s)))
+    assert exact[0].max() == pytest.approx(FAR * even) and exact[0].min() == 0
+    for name, got in {"numpy": places(scene, origins, directions, s), "torch": _torch(scene, origins, directions, s),
+                      "kernels": _kernels(scene, origins, directions, s)}.items():
+        for found, expected, tolerance in zip(got, exact, (2 * FAR * 2.0**-23, 0, 1e-3), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=tolerance, atol=2e-5 if not tolerance else 0, err_msg=name)
+
+
+def _torch(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
+    o, d, *rest = map(torch.from_numpy, (origins, directions, s, scene.aabb))
+    nothing = torch.zeros(len(o))
+    u, stretch = in_pytorch.places(in_pytorch.Rays(o, d, nothing, nothing, nothing), *rest, scene.mapping)
+    return scene.mapping.distance(s), u.numpy(), stretch.numpy()
+
+
+def _kernels(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
+    even, inverse = kernels.even_of(scene.mapping), 1 / (scene.aabb[1] - scene.aabb[0])
+    t, u, stretch = np.empty_like(s), np.empty((*s.shape, 3), np.float32), np.empty_like(s)
+    for ray, k in np.ndindex(s.shape):
+        t[ray, k] = kernels._distance(s[ray, k], even)
+        *u[ray, k], stretch[ray, k] = kernels._place(origins[ray], directions[ray], t[ray, k], scene.aabb, inverse, even)
+    return t, u, stretch
+
+
+def test_a_step_counts_for_the_density_as_the_derivatives_say() -> None:
+    """sigma is per unit of contracted length outwards: the sum over steps is its integral along the ray."""
+    aabb = np.array([[-1, -1, -1], [1, 1, 1]], np.float64)
+    scene = replace(surrounded(tiny_scene(0)), aabb=aabb, mapping=Contraction(2.0))
+    step = 1e-4
+    s = (np.arange(int(scene.mapping.end / step))[None] + 0.5) * step
+    _, _, stretch = places(scene, np.zeros((1, 3)), np.array([[1.0, 0, 0]]), s)
+    # From the middle to 1, then 2 - 1/t up to t = FAR even.
+    assert (stretch * step).sum() == pytest.approx(2 - 1 / (2 * FAR), rel=1e-4)
+
+
+def test_the_bounds_that_skipping_empty_cells_rests_on() -> None:
+    """player/glsl/occupancy.glsl: |d contract / dt| <= 4/3 v, and <= (v + 2 w) / r^2 outside the box."""
+    n, m = 200, 4000
+    aabb = np.array([[-1, -1, -1], [1, 1, 1]], np.float64)
+    start = RNG.normal(size=(n, 3)) * 10 ** RNG.uniform(-1, 1.5, (n, 1))
+    rate = RNG.normal(size=(n, 3)) * 10 ** RNG.uniform(-1, 1, (n, 1))
+    rate[:3], start[3] = np.eye(3), 0
+    t = np.concatenate([np.linspace(0, 20, m // 2), np.logspace(1.4, 4, m // 2)])
+    u, radius = contract(start[:, None] + t[:, None] * rate[:, None], aabb)
+    pace = np.abs(np.diff(4 * u, axis=1)).max(-1) / np.diff(t)
+    speed = np.abs(rate).max(1)[:, None]
+    turn = np.abs(np.cross(start, rate)).max(1)[:, None]
+    least = np.minimum(radius[:, 1:], radius[:, :-1])
+    assert (pace <= 4 / 3 * speed * (1 + 1e-9)).all() and (pace > 1.2 * speed).any()
+    # The radius is convex along a ray: but about its minimum, it is least at an end of an interval.
+    turning = np.abs(np.arange(m - 1) + 0.5 - radius.argmin(1)[:, None]) < 1
+    outside = (least > 1) & ~turning
+    bound = (speed + 2 * turn) / np.maximum(least, 1) ** 2
+    assert (pace <= bound * (1 + 1e-9))[outside].all() and (pace > 0.5 * bound)[outside].any()
+
+
+def test_glsl_skips_empty_space_but_never_a_sample() -> None:
+    """Few cells are set, near and far: all samples in them must be found, from inside and outside, near and very far."""
+    from scenes import look_at
+
+    from kpc.player.gl.renderer import Renderer
+
+    scene = surrounded(tiny_scene(3))
+    occupancy = RNG.random((1, 40, 50, 60)) < 0.002
+    scene = replace(scene, occupancy=occupancy, step=0.01)
+    renderer = Renderer(gl.context(), scene)
+    for eye in ((2.4, 1.0, 2.2), (0.1, 0.2, 0.3), (-9.0, 2.0, 4.0), (60.0, 20.0, -80.0)):
+        camera = look_at(eye, (0.1, 0.05, 0.05), 48, 36, 30.0)
+        got, wanted = renderer.render(camera, 0.3), render(scene, camera, 0.3)
+        assert wanted.samples.max() > 3
+        assert np.mean(got.samples == wanted.samples) > 0.99  # a sample on the face of a cell may round to either side
+        assert abs(int(got.samples.sum()) - int(wanted.samples.sum())) < 2e-3 * wanted.samples.sum() + 2
+
+
+def coordinates(near: float = 0.5, baseline: float = 1.5) -> DeviceCoordinates:
+    return DeviceCoordinates(look_at((0.5, -1.0, 2.0), (0.0, 0.2, -1.0), 1, 1, 1.0).camera_to_world[:3], near, baseline)
+
+
+def before(ndc: DeviceCoordinates, count: int) -> np.ndarray:
+    """World points at all depths, from `near` to 1e4 times that."""
+    depth = ndc.near * 10 ** RNG.uniform(0, 4, count)
+    local = np.stack([*(depth * RNG.uniform(-1, 1, (2, count))), -depth], axis=1)
+    return local @ ndc.frame[:, :3].T + ndc.frame[:, 3]
+
+
+def test_device_coordinates_are_what_a_pinhole_and_a_pair_of_them_see() -> None:
+    ndc = coordinates()
+    points = before(ndc, 300)
+    right, up, back, eye = ndc.frame.T
+    for point, place in zip(points, ndc.place(points), strict=True):
+        depth = -(point - eye) @ back
+        assert place[:2] == pytest.approx([(point - eye) @ right / depth, (point - eye) @ up / depth])
+        # A pinhole a baseline to the right sees it moved by baseline / depth.
+        moved = (point - eye - ndc.baseline * right) @ right / depth
+        assert place[2] == pytest.approx(ndc.baseline / ndc.near - (place[0] - moved), abs=1e-9)
+    np.testing.assert_allclose(ndc.expand(ndc.place(points)), points, rtol=1e-9, atol=1e-9)
+
+
+def test_rays_stay_straight_and_distances_come_back() -> None:
+    ndc = coordinates()
+    eyes = ndc.frame[:, 3] + RNG.uniform(-0.7, 0.7, (200, 3))  # before, on and behind the near plane
+    directions = before(ndc, 200) - eyes
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = directions[(forward := -(directions @ ndc.frame[:, 2]) > 0.05)]
+    eyes = eyes[forward]
+    path = ndc.path(eyes, directions)
+    np.testing.assert_allclose(np.linalg.norm(path.way, axis=1), 1)
+    s = path.length[:, None] * np.array([0.0, 0.1, 0.5, 0.9, 0.999])
+    t = path.distance(s)
+    world = eyes[:, None] + t[..., None] * directions[:, None]
+    np.testing.assert_allclose(ndc.place(world), path.begin[:, None] + s[..., None] * path.way[:, None], atol=1e-9)
+    depths = (ndc.frame[:, 3] - world) @ ndc.frame[:, 2]
+    own = (ndc.frame[:, 3] - eyes) @ ndc.frame[:, 2]
+    np.testing.assert_allclose(depths[:, 0], np.maximum(own, ndc.near))
+    assert (own > ndc.near).any() and (own < 0).any()
+    assert (path.distance(path.length[:, None] * 2) < np.inf).all()  # capped
+    assert np.allclose(path.distance(path.length[:, None]), path.start[:, None] + path.pace[:, None] * (1 / LEAST_DISPARITY - 1))
+
+
+def test_rays_in_single_precision() -> None:
+    ndc = coordinates()
+    eyes = ndc.frame[:, 3] + RNG.uniform(-0.4, 0.4, (500, 3))
+    directions = before(ndc, 500) - eyes
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    exact, single = ndc.path(eyes, directions), ndc.path(eyes.astype(np.float32), directions.astype(np.float32))
+    far = -(directions @ ndc.frame[:, 2]) > 0.1
+    np.testing.assert_allclose(single.begin[far], exact.begin[far], atol=2e-5)
+    np.testing.assert_allclose(single.way[far], exact.way[far], atol=2e-4)
+    assert single.begin.dtype == single.way.dtype == np.float32
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rays_that_do_not_go_forward_see_the_background(dtype: type) -> None:
+    scene = faced(tiny_scene(0))
+    assert isinstance(scene.mapping, DeviceCoordinates)
+    right, _, back, eye = scene.mapping.frame.T
+    directions = np.array([back, right, right - 1e-5 * back]).astype(dtype)
+    path = scene.mapping.path(np.tile(eye, (3, 1)).astype(dtype), directions)
+    assert np.isfinite(path.begin).all() and np.isfinite(path.way).all() and np.isfinite(path.distance(np.ones((3, 1), dtype))).all()
+    behind = look_at(tuple(eye), tuple(eye + back), 8, 6, 5.0)
+    seen = render(scene, behind, 0.5)
+    assert not seen.opacity.any() and not seen.samples.any() and np.isinf(seen.depth).all()
+
+
+def test_depth_is_in_the_world() -> None:
+    scene = faced(tiny_scene(4))
+    camera = scene.cameras[0]
+    seen = render(scene, camera, 0.5)
+    origins, directions = camera.rays()
+    solid = (seen.opacity > 0.99).ravel()
+    ends = (origins + seen.depth.ravel()[:, None] * directions)[solid]
+    places_of_ends = scene.mapping.place(ends.astype(np.float64))
+    assert solid.sum() > 20
+    assert (places_of_ends >= scene.aabb[0] - 0.1).all() and (places_of_ends <= scene.aabb[1] + 0.1).all()
+
+
+def test_bounds_hold_the_box() -> None:
+    scene = faced(tiny_scene(4))
+    inside = scene.aabb[0] + RNG.random((500, 3)) * (scene.aabb[1] - scene.aabb[0])
+    world, bounds = scene.mapping.expand(inside), scene.bounds
+    assert (world >= bounds[0]).all() and (world <= bounds[1]).all()
+    assert np.array_equal(tiny_scene(4).bounds, tiny_scene(4).aabb)

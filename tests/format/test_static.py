@@ -1,0 +1,156 @@
+"""What of a scene is static: the cells, their share, and the picture that shows it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import SPACES, tiny_scene
+
+from kpc.format.container.scene_io import write
+from kpc.format.coding.quantise import needed_texels, quantise_scene
+from kpc.format.scene.scene import TIME_PLANES, Scene
+from kpc.format.scene.static import cells_touched, static_cells, static_share, unchanging_cells, unchanging_share
+from kpc.player.cpu import motion_map, reference
+from kpc.player.cpu.motion_map import dynamic_map, still_share
+from kpc.player.cpu.reference import Moment
+from kpc.tools.cli import kpinfo
+
+
+def still(scene: Scene) -> Scene:
+    """The same with time planes that are 1, and an occupancy that stays as it is in its first slot."""
+    scales = tuple({name: np.ones_like(p) if name in TIME_PLANES else p for name, p in scale.items()} for scale in scene.scales)
+    return replace(scene, scales=scales, occupancy=np.repeat(scene.occupancy[:1], len(scene.occupancy), axis=0))
+
+
+def wavering(scene: Scene, plane: str, rows: slice, columns: slice, factor: float = 0.5) -> Scene:
+    """The same with some texels of the finest time plane of that name multiplied."""
+    values = scene.scales[-1][plane].copy()
+    values[rows, columns] *= factor
+    return replace(scene, scales=(*scene.scales[:-1], {**scene.scales[-1], plane: values}))
+
+
+def box_of_cells(time: int = 9) -> Scene:
+    """Nine texels along every axis, all cells occupied: 8 x 8 x 8 in four slots."""
+    return replace(still(tiny_scene(resolution=(9, 9, 9), time=time)), occupancy=np.ones((4, 8, 8, 8), bool))
+
+
+@pytest.mark.parametrize("plane, axis", [("xt", 2), ("yt", 1), ("zt", 0)])
+def test_a_texel_moves_the_slab_of_cells_that_read_it(plane: str, axis: int) -> None:
+    scene = wavering(box_of_cells(), plane, slice(4, 5), slice(6, 7))  # at 1/2 over the clip, reads from 3/8 to 5/8 touch it
+    moving = np.zeros((4, 8, 8, 8), bool)
+    np.moveaxis(moving, axis + 1, 1)[1:3, 4:8] = True  # between 5/8 and 7/8, closed: cells 4 and 7 touch it at their edges
+    assert np.array_equal(static_cells(scene), ~moving)
+    assert static_share(scene) == 0.75 and unchanging_share(scene) == 0.5
+    assert np.array_equal(unchanging_cells(scene), ~moving.any(axis=0))
+
+
+def test_kpinfo_tells_the_shares(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = wavering(box_of_cells(), "xt", slice(4, 5), slice(6, 7))
+    write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
+    assert kpinfo.main([str(tmp_path / "scene.kpc"), "--json"]) == 0
+    shares = json.loads(capsys.readouterr().out)["static"]
+    assert shares["identity_share"] == 0.75 and shares["unchanging_share"] == 0.5 <= shares["still_share"] <= 1
+    assert kpinfo.main([str(tmp_path / "scene.kpc")]) == 0
+    page = capsys.readouterr().out
+    assert "75.0% of the occupied space-time is identity; 50.0% of the occupied space never changes" in page
+
+
+def test_what_is_constant_but_not_one_never_changes_and_yet_is_not_static() -> None:
+    scene = wavering(box_of_cells(), "yt", slice(None), slice(None))
+    assert static_share(scene) == 0 and unchanging_share(scene) == 1
+
+
+def test_only_occupied_cells_count_and_one_that_comes_and_goes_changes() -> None:
+    scene = wavering(box_of_cells(), "xt", slice(None), slice(6, 7))
+    occupancy = np.zeros((4, 8, 8, 8), bool)
+    occupancy[:, 0, 0, :4] = True
+    assert static_share(replace(scene, occupancy=occupancy)) == 1 == unchanging_share(replace(scene, occupancy=occupancy))
+    occupancy[2, 0, 0, 0] = False
+    assert unchanging_share(replace(scene, occupancy=occupancy)) == 0.75
+    assert static_share(replace(scene, occupancy=np.zeros_like(occupancy))) == 1
+
+
+def test_scenes_without_time_planes_are_static() -> None:
+    scene = tiny_scene(dynamic=False)
+    assert static_cells(scene).shape == scene.occupancy.shape
+    assert static_share(scene) == unchanging_share(scene) == still_share(scene) == 1
+
+
+def test_in_static_cells_features_are_those_of_the_static_scene() -> None:
+    """By definition, at random places and times in them."""
+    scene, rng = tiny_scene(), np.random.default_rng(1)
+    motion = np.zeros((3, 2, 2, 4, 3), np.float32)
+    motion[:, :, :, 3] = rng.uniform(-0.2, 0.2, (3, 2, 2, 3))  # displaces what is farther than 2/3 along x
+    scene = replace(scene, motion=motion)
+    cells = np.argwhere(static_cells(scene))
+    slots, *shape = scene.occupancy.shape
+    assert 0.01 < len(cells) / scene.occupancy.size < 0.9
+    for slot in range(slots):
+        inside = cells[cells[:, 0] == slot][:, 1:]
+        u = ((inside + rng.uniform(size=inside.shape)) / shape)[:, ::-1].astype(np.float32)
+        for time in (slot + rng.uniform(size=4)) / slots:
+            full, static = Moment.of(scene, time), Moment.of(scene, time, with_motion=False)
+            assert np.array_equal(reference.features(scene, full, u), reference.features(scene, static, u))
+
+
+def test_cells_and_texels_touch_as_the_encoder_has_it() -> None:
+    """`needed_texels` tells which texels a cell needs, `cells_touched` which cells a texel serves."""
+    for texels, cells in [(1, 5), (2, 3), (5, 8), (8, 5), (9, 8), (17, 17), (30, 4)]:
+        for cell in range(cells):
+            occupancy = np.zeros((1, 1, 1, cells), bool)
+            occupancy[..., cell] = True
+            needed = needed_texels(occupancy, "xt", 1, texels)[0]
+            assert [bool(cells_touched(texel, 0, cells)[cell]) for texel in np.eye(texels, dtype=bool)] == needed.tolist()
+
+
+def test_displaced_cells_are_not_static() -> None:
+    scene = box_of_cells()
+    motion = np.zeros((3, 3, 3, 5, 3), np.float32)
+    motion[1, 0, 0, 0] = 0.01  # the node in the corner; its support reaches to 1/4 along x, 1/2 along y and z
+    moving = np.zeros((8, 8, 8), bool)
+    moving[:5, :5, :3] = True
+    assert np.array_equal(unchanging_cells(replace(scene, motion=motion)), ~moving)
+    assert np.array_equal(static_cells(replace(scene, motion=motion)), np.repeat(~moving[None], 4, axis=0))
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_the_map_is_grey_where_nothing_moves(space: str) -> None:
+    scene = SPACES[space](tiny_scene())
+    still_scene = replace(still(scene), motion=None if scene.motion is None else np.zeros_like(scene.motion))
+    camera = scene.cameras[0]
+    for shown, colourful in ((still_scene, False), (scene, True)):
+        rendering = reference.render(shown, camera, 0.4)
+        picture = dynamic_map(shown, camera, 0.4, rendering)
+        assert picture.depth is rendering.depth and picture.rgb.shape == rendering.rgb.shape
+        assert (np.ptp(picture.rgb, axis=2).max() > 0.2) == colourful
+    assert still_share(still_scene) == 1 > still_share(scene)
+
+
+def test_a_share_is_that_of_cells_evenly_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(motion_map, "CELLS_AT_ONCE", 7)
+    cells = np.random.default_rng(0).uniform(size=100) < 0.4
+    indices = np.flatnonzero(cells)
+    assert np.array_equal(motion_map._spread(cells, 1000), indices)
+    some = motion_map._spread(cells, 10)
+    assert len(some) == 10 and some[0] == indices[0] and some[-1] == indices[-1] and cells[some].all()
+    assert len(motion_map._spread(np.zeros(20, bool), 10)) == 0
+
+
+def test_the_map_colours_what_moves_while_it_is_there() -> None:
+    """A scene whose right half goes out in the second half of the clip: red at the start, and nowhere to be seen at the end."""
+    scene = still(tiny_scene(time=9))
+    occupancy = scene.occupancy[:1].repeat(2, axis=0)
+    occupancy[1, :, :, 6:] = False
+    scene, camera = replace(scene, occupancy=occupancy), scene.cameras[0]
+    rendering = reference.render(scene, camera, 0.2)
+    red = np.ptp(dynamic_map(scene, camera, 0.2, rendering).rgb, axis=2) > 0.1
+    origins, directions = camera.rays()
+    sure = (rendering.opacity > 0.99).reshape(-1)
+    x = (origins + np.where(sure, rendering.depth.reshape(-1), 0)[:, None] * directions)[sure, 0]
+    right = x > scene.aabb[:, 0].mean()
+    assert right.any() and not right.all()
+    assert red.reshape(-1)[sure][right].mean() > 0.8 and not red.reshape(-1)[sure][~right].any()
+    late = dynamic_map(scene, camera, 0.8, reference.render(scene, camera, 0.8))
+    assert np.ptp(late.rgb, axis=2).max() < 0.1

@@ -1,0 +1,102 @@
+"""Weights of decoders under codec 2 (spec, section 7): the same comes back, in fewer bytes than float16 or zstd takes, and damage is refused."""
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plain import assert_plain_python_prints_the_same
+from scenes import tiny_scene
+
+from kpc.format.common.errors import FormatError
+from kpc.format.coding.quantise import round_decoder, weights_of
+from kpc.format.coding.weights import COARSEST, FINEST, LARGEST, decode_weights, encode_weights
+
+SHAPES = [(5,), (3, 4), (1,), (2, 3, 7)]
+
+
+def some(seed: int, largest: int = 60, power: int = -5, shapes: list[tuple[int, ...]] = SHAPES) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [(np.rint(rng.normal(0, largest / 3, shape)).clip(-largest, largest) * 2.0 ** (power - number)).astype(np.float32)
+            for number, shape in enumerate(shapes)]  # fmt: skip
+
+
+def encoded(arrays: list[np.ndarray]) -> bytes:
+    body = encode_weights(arrays)
+    assert body is not None
+    return body
+
+
+def assert_decodes(body: bytes, arrays: list[np.ndarray]) -> None:
+    found = decode_weights(body, [array.shape for array in arrays])
+    for one, other in zip(found, arrays, strict=True):
+        assert one.dtype == np.float32 and np.array_equal(one, other)
+
+
+def decodes_or_is_refused(body: bytes, shapes: list[tuple[int, ...]] = SHAPES) -> bool:
+    try:
+        decode_weights(body, shapes)
+    except FormatError:
+        return False
+    return True
+
+
+@given(seed=st.integers(0, 2**32 - 1), largest=st.integers(1, LARGEST), power=st.integers(FINEST + 3, 4))
+@settings(deadline=None)
+def test_weights_come_back(seed: int, largest: int, power: int) -> None:
+    arrays = some(seed, largest, power)
+    assert_decodes(encoded(arrays), arrays)
+
+
+def test_the_ends_of_float16_come_back() -> None:
+    least = np.float32(0.5**24)
+    arrays = [np.float32([65504, -65504, 32]), least * np.float32([1, -2048, 3]), np.zeros(4, np.float32), np.float32([2.0**15])]
+    body = encoded(arrays)
+    assert_decodes(body, arrays)
+    assert np.frombuffer(body[:4], np.int8).tolist() == [5, FINEST, 0, COARSEST]
+
+
+def test_what_has_too_many_digits_is_left_to_other_codecs() -> None:
+    assert encode_weights([np.float32([1, 0.5**12])]) is None
+    assert encode_weights([np.float32([1, 0.5**11])]) is not None
+
+
+def test_weights_of_a_decoder_take_fewer_bytes_than_zstd_makes_of_them() -> None:
+    """At the errors that rounding each to so many significant bits makes, which is best for zstd."""
+    decoder = tiny_scene(6, channels=24).decoder
+    arrays = list(weights_of(round_decoder(decoder, dict.fromkeys(weights_of(decoder), 6))).values())
+    halves = b"".join(values.astype("<f2").tobytes() for values in arrays)
+    assert len(encoded(arrays)) < 0.8 * len(zstandard.ZstdCompressor(level=19).compress(halves)) < 0.9 * len(halves)
+
+
+def test_plain_python_codes_the_same() -> None:
+    assert_plain_python_prints_the_same(
+        "from test_weights import encoded, some\n"
+        "for seed in range(3):\n"
+        "    print(encoded(some(seed, 60 * 6 ** seed)).hex())",
+        "kpc.format.coding.weights:walk",
+    )
+
+
+def test_every_truncation_is_refused_and_every_flipped_bit_decodes_or_is() -> None:
+    body = encoded(some(1))
+    assert decodes_or_is_refused(body)
+    assert not any(decodes_or_is_refused(body[:length]) for length in range(len(body)))
+    assert not any(decodes_or_is_refused(body + more) for more in (b"\0", b"\0\0", b"\xff\xff"))
+    for bit in range(8 * len(body)):
+        flipped = bytearray(body)
+        flipped[bit // 8] ^= 1 << bit % 8
+        decodes_or_is_refused(bytes(flipped))
+
+
+@given(body=st.binary(max_size=80))
+@settings(deadline=None)
+def test_any_bytes_decode_or_are_refused(body: bytes) -> None:
+    decodes_or_is_refused(body)
+
+
+def test_what_is_no_number_of_float16_is_refused() -> None:
+    body = encoded([np.float32([2047, 1])])
+    for power, message in ((FINEST - 1, "power of two"), (COARSEST + 1, "power of two"), (COARSEST, "no number of float16")):
+        with pytest.raises(FormatError, match=message):
+            decode_weights(np.int8([power]).tobytes() + body[1:], [(2,)])

@@ -1,0 +1,187 @@
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scenes import look_at
+
+from kpc.format.scene.cameras import Camera, Shot, load_shots, save_shots
+from kpc.format.common.errors import DatasetError
+from kpc.format.scene.rotations import quaternion_of, rotation_of
+from kpc.player.app.camera_paths import GAP_S, CameraPath
+
+VIEWS = tuple(
+    look_at((3 * math.cos(a), 0.7 + 0.2 * a, 3 * math.sin(a)), (0.1, 0.05, 0.05), 48, 36, 50.0 + 10 * a) for a in (0.0, 0.9, 2.1, 4.0)
+)
+
+
+def path_of(times: tuple[float, ...] = (0.0, 0.2, 0.2, 0.9), ats: tuple[float | None, ...] = (0.0, 1.0, 4.0, 5.0)) -> CameraPath:
+    return CameraPath(tuple(Shot(view, time, f"{n}.png", at) for n, (view, time, at) in enumerate(zip(VIEWS, times, ats))))
+
+
+@settings(max_examples=50, deadline=None)
+@given(hnp.arrays(float, 4, elements=st.floats(-1, 1)).filter(lambda q: np.linalg.norm(q) > 1e-3))
+def test_quaternions_and_rotations_are_each_others_inverse(q: np.ndarray) -> None:
+    rotation = rotation_of(q)
+    assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12) and np.linalg.det(rotation) == pytest.approx(1)
+    assert rotation_of(quaternion_of(rotation)) == pytest.approx(rotation, abs=1e-9)
+
+
+def test_half_a_turn_has_a_quaternion_too() -> None:
+    for axis in range(3):
+        turn = -np.eye(3)
+        turn[axis, axis] = 1
+        assert rotation_of(quaternion_of(turn)) == pytest.approx(turn, abs=1e-12)
+
+
+def test_passes_every_keyframe_exactly() -> None:
+    path = path_of()
+    for shot in path.keyframes:
+        camera, time = path.at(shot.at_s)
+        assert camera.camera_to_world == pytest.approx(shot.camera.camera_to_world, abs=1e-9)
+        assert (camera.fl_x, camera.fl_y, camera.cx, camera.cy, time) == pytest.approx(
+            (shot.camera.fl_x, shot.camera.fl_y, shot.camera.cx, shot.camera.cy, shot.time)
+        )
+    assert path.at(-1.0)[1] == 0.0 and path.at(99.0)[1] == pytest.approx(0.9)
+
+
+def test_goes_smoothly_and_turns_no_way_round() -> None:
+    path, step = path_of(), 1e-3
+    cameras = [path.at(s)[0] for s in np.arange(0, 5, step)]
+    eyes = np.stack([camera.camera_to_world[:3, 3] for camera in cameras])
+    axes = np.stack([camera.camera_to_world[:3, :3] for camera in cameras])
+    for values in (eyes, axes.reshape(-1, 9)):
+        speeds = np.diff(values, axis=0) / step
+        assert np.abs(np.diff(speeds, axis=0)).max() < 0.05 * np.abs(speeds).max()  # no kink at a keyframe
+    turned = np.arccos(np.clip((np.einsum("nij,nij->n", axes[1:], axes[:-1]) - 1) / 2, -1, 1)).sum()
+    direct = [np.arccos((np.trace(a.camera_to_world[:3, :3].T @ b.camera_to_world[:3, :3]) - 1) / 2) for a, b in zip(VIEWS, VIEWS[1:])]
+    assert turned < 1.15 * sum(direct)
+
+
+def test_the_clip_stands_still_between_equal_times_and_never_runs_back() -> None:
+    times = [path_of().at(s)[1] for s in np.arange(0, 5, 0.01)]
+    assert np.diff(times).min() >= -1e-12 and set(np.round(times[100:400], 9)) == {0.2}
+
+
+def test_an_earlier_time_is_reached_through_the_end_of_the_clip() -> None:
+    times = np.array([path_of((0.5, 0.9, 0.3, 0.4)).at(s)[1] for s in np.arange(0, 5, 0.01)])
+    drops = np.flatnonzero(np.diff(times) < 0)
+    assert len(drops) == 1 and times[drops[0]] > 0.98 and times[drops[0] + 1] < 0.02
+    assert ((times >= 0) & (times <= 1)).all()
+
+
+def test_one_keyframe_is_a_still() -> None:
+    path = CameraPath().with_keyframe(VIEWS[1], 0.3)
+    assert path.at(7.0) == (VIEWS[1], 0.3) and len(path.shots(30)) == 1 and path.start_s == path.end_s == 0.0
+
+
+def test_keyframes_come_and_go() -> None:
+    path = CameraPath()
+    for view in VIEWS:
+        path = path.with_keyframe(view, 0.5)
+    assert [shot.at_s for shot in path.keyframes] == [0, GAP_S, 2 * GAP_S, 3 * GAP_S]
+    assert [shot.at_s for shot in path.without(1).keyframes] == [0, 2 * GAP_S, 3 * GAP_S]
+    assert [shot.at_s for shot in path.spaced(2, 0.5).keyframes] == [0, GAP_S, GAP_S + 0.5, 2 * GAP_S + 0.5]
+    assert path.without(0).at(0.0)[0].camera_to_world == pytest.approx(VIEWS[1].camera_to_world)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(hnp.arrays(float, 4, elements=st.floats(-1, 1)).filter(lambda q: np.linalg.norm(q) > 1e-2),
+                       st.floats(0, 1), st.floats(1e-3, 1e3)), min_size=2, max_size=6),
+    st.lists(st.floats(0, 1), min_size=1, max_size=8),
+)
+def test_whatever_the_keyframes_every_camera_is_one(keys: list[tuple[np.ndarray, float, float]], shares: list[float]) -> None:
+    path = CameraPath()
+    for quaternion, time, gap in keys:
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_of(quaternion)
+        path = path.with_keyframe(replace(VIEWS[0], camera_to_world=pose), time, gap)
+    for share in shares:
+        camera, time = path.at(share * path.end_s)
+        axes = camera.camera_to_world[:3, :3]
+        assert axes.T @ axes == pytest.approx(np.eye(3), abs=1e-6) and np.linalg.det(axes) > 0 and 0 <= time <= 1
+
+
+def test_frames_of_a_video_are_evenly_spaced_and_include_both_ends() -> None:
+    shots = path_of().shots(10)
+    assert len(shots) == 51 and shots[10].time == pytest.approx(0.2) and shots[-1].time == pytest.approx(0.9)
+    assert shots[0].camera.camera_to_world == pytest.approx(VIEWS[0].camera_to_world, abs=1e-9)
+
+
+def test_a_path_is_kept_in_a_camera_file(tmp_path: Path) -> None:
+    path = path_of()
+    path.save(tmp_path / "path.json")
+    got = CameraPath.load(tmp_path / "path.json")
+    assert len(load_shots(tmp_path / "path.json")) == 4
+    for one, other in zip(got.keyframes, path.keyframes, strict=True):
+        assert (one.time, one.at_s, one.file, one.camera.fl_x, one.camera.width) == (
+            other.time, other.at_s, other.file, other.camera.fl_x, other.camera.width
+        )  # fmt: skip
+        assert np.array_equal(one.camera.camera_to_world, other.camera.camera_to_world)
+
+
+def test_views_without_seconds_are_evenly_apart(tmp_path: Path) -> None:
+    save_shots(tmp_path / "c.json", [Shot(view, 0.1, "a.png") for view in VIEWS])
+    assert "at" not in json.loads((tmp_path / "c.json").read_text())["frames"][0]
+    assert CameraPath.load(tmp_path / "c.json").end_s == 3 * GAP_S
+
+
+def test_keyframes_of_another_size_see_the_same() -> None:
+    path = CameraPath((Shot(VIEWS[0], 0, "a", 0.0), Shot(VIEWS[1].resized(96, 72), 0, "b", 1.0)))
+    assert path.at(1.0)[0].fl_x == pytest.approx(VIEWS[1].fl_x) and path.at(1.0)[0].width == 48
+
+
+MIRRORED = np.diag([-1.0, 1, 1, 1])
+
+
+@pytest.mark.parametrize(("poses", "ats", "words"), [
+    ([np.eye(4), np.eye(4)], [1.0, 1.0], "keyframe 2"),
+    ([np.eye(4), np.eye(4)], [2.0, 1.0], "does not follow"),
+    ([np.eye(4)], [-1.0], "keyframe 1"),
+    ([np.eye(4)], [math.nan], "keyframe 1"),
+    ([np.eye(4), np.eye(4)], [0.0, 1e9], "keyframe 2"),
+    ([np.eye(4), MIRRORED], [0.0, 1.0], "mirrored"),
+    ([2 * np.eye(4)], [0.0], "scaled"),
+    ([np.full((4, 4), np.nan)], [0.0], "NaN"),
+    ([np.eye(4)], ["soon"], "frame 0"),
+])  # fmt: skip
+def test_a_path_that_leads_nowhere_is_refused(tmp_path: Path, poses: list[np.ndarray], ats: list[float], words: str) -> None:
+    frames = [{"transform_matrix": pose.tolist(), "at": at} for pose, at in zip(poses, ats)]
+    (tmp_path / "bad.json").write_text(json.dumps({"w": 4, "h": 4, "fl_x": 4, "frames": frames}))
+    with pytest.raises(DatasetError, match=words) as caught:
+        CameraPath.load(tmp_path / "bad.json")
+    assert "bad.json" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("[" * 100_000, "not JSON"),
+    ('{"w": Infinity, "h": 1, "fl_x": 1, "frames": [{}]}', "frame 0"),
+    ('{"w": 1e9, "h": 1, "fl_x": 1, "frames": [{"transform_matrix": 0}]}', "too large"),
+    ('{"frames": {"a": 1}}', "frame 0"),
+    ("[]", "frame 0"),
+    ("\udcff", "not JSON"),
+])  # fmt: skip
+def test_a_camera_file_of_another_kind_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "bad.json").write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(DatasetError, match=words):
+        load_shots(tmp_path / "bad.json")
+
+
+def test_a_camera_file_without_end_is_not_read_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kpc.format.scene.cameras.LARGEST_FILE", 1 << 10)
+    (tmp_path / "big.json").write_text(" " * 2000)
+    with pytest.raises(DatasetError, match="larger"):
+        load_shots(tmp_path / "big.json")
+
+
+def test_a_camera_with_nan_is_none() -> None:
+    pose = np.eye(4)
+    pose[1, 3] = np.nan
+    with pytest.raises(DatasetError, match="NaN"):
+        Camera(4, 4, 4.0, 4.0, 2.0, 2.0, pose)

@@ -1,0 +1,129 @@
+"""What planes come to at the corners of their texels, and pictures that a processor marches itself, against the reference."""
+
+from dataclasses import replace
+
+import gl
+import numpy as np
+import pytest
+from scenes import SPACES, bring, displaced, flat, look_at, of_first_degree, one_sided, tiny_scene, uneven, without_planes
+
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
+from kpc.player.cpu.corner_grid import MOST_CORNERS, Baking, corners_of
+from kpc.player.cpu.raymarch import BAKED as CORNER_BAKED
+from kpc.player.quality import LADDER, Quality
+from kpc.player.cpu.reference import Moment, Part, features, render
+from kpc.player.gl.renderer import Renderer
+from kpc.player.cpu.simd import LARGEST
+
+CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
+FOLDED, BAKED = Quality(folded=True), Quality(folded=True, baked=TERMINATION)
+
+
+def baking_of(scene: Scene, camera: Camera = CAMERA, time: float = 0.0) -> Baking:
+    """As it is after a picture."""
+    renderer = Renderer(gl.context(), scene, BAKED)
+    if not renderer.casts:
+        pytest.skip("a graphics card, which bakes nothing")
+    renderer.march(camera, time)
+    return renderer._kept(Baking)
+
+
+SCENES = {"even": lambda: one_sided(tiny_scene(4, channels=16)), "uneven": uneven, "flat": flat, "displaced": lambda: displaced(one_sided(tiny_scene(4, channels=16)))}
+
+
+@pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
+def test_corners_hold_what_a_sample_there_finds(make) -> None:
+    scene = make()
+    shape = corners_of(scene)
+    at = np.argwhere(np.ones(shape, bool))[:, ::-1] / np.maximum(np.array(shape[::-1]) - 1, 1)
+    still, decoder = replace(scene, motion=None), scene.decoder
+    weights = np.concatenate([decoder.b2, decoder.density_weight[None]]).astype(np.float64)
+    for time in (0.0, 0.37, 1.0):
+        baking = baking_of(scene, time=time)
+        wanted = features(still, Moment.of(still, time), at.astype(np.float32)) @ weights.T
+        wanted[:, 3] += decoder.density_bias
+        known = (baking._known & CORNER_BAKED).any(0).reshape(-1)
+        # Each of a plane's numbers is off by half a step at most, of 32767 to the largest.
+        largest = np.prod([max(np.abs(scale[name]).max() for scale in scene.scales) for name in SPACE_PLANES])
+        off = 3 * largest * np.abs(weights).sum(1) * 0.5 / 32767 * max(np.abs(scale["xt"]).max() for scale in scene.scales) ** 3
+        assert np.all(np.abs(baking.grid.reshape(-1, 4)[known] - wanted[known]) < off + 1e-4) and off.max() < 0.05
+        assert known.mean() > 0.05
+
+
+def test_what_overflows_is_finite() -> None:
+    scene = one_sided(tiny_scene(4, channels=16))
+    for value in (3e38, -3e38, 1e-38):
+        for name in SPACE_PLANES:
+            scene.scales[1][name][:] = value
+        baking = baking_of(scene, time=0.3)
+        assert np.isfinite(baking.grid).all() and np.abs(baking.grid).max() <= LARGEST
+
+
+@pytest.mark.parametrize("change", [{"step": 2.0}, {"termination": 1 / 16}, {"across": 4}, {"resolution": 0.5}])
+def test_qualities_mean_what_they_mean_for_planes(change: dict[str, float]) -> None:
+    scene = displaced(of_first_degree(one_sided(tiny_scene(4, scales=1, channels=32, resolution=(90, 80, 70)))))
+    camera = look_at((4.8, 2.0, 4.4), (0.1, 0.05, 0.05), 61, 45, 60.0) if "across" in change else CAMERA
+    assert Baking.serves(scene)
+    renderers = [Renderer(gl.context(), scene, replace(quality, **change)) for quality in (BAKED, FOLDED)]
+    renderers[1].casts = False
+    if "termination" in change:
+        renderers[0].quality = replace(BAKED, baked=change["termination"])
+    assert renderers[0].rays_across(camera) > 1 or "across" not in change
+    got, wanted = (renderer.render(camera, 0.6) for renderer in renderers)
+    np.testing.assert_allclose(got.rgb, wanted.rgb, atol=2e-3)
+    assert np.mean(got.samples == wanted.samples) > 0.99 and wanted.samples.sum() > 100
+
+
+@pytest.mark.parametrize("space", ["box", "displaced"])
+def test_pictures_are_near_those_of_the_reference(space: str) -> None:
+    """Of a scene of 24 texels, smooth over six. What is exact, or static, looks up planes."""
+    scene = SPACES[space](one_sided(tiny_scene(4, channels=16)))
+    renderer = Renderer(gl.context(), scene, BAKED)
+    assert renderer._marching_kind(moving=True) is (Baking if renderer.casts else None)
+    for time in (0.1, 0.5, 0.9):
+        got, wanted = renderer.render(CAMERA, time), render(scene, CAMERA, time)
+        assert -10 * np.log10(np.mean((got.rgb - wanted.rgb) ** 2)) > 40
+        assert np.mean(np.abs(got.samples - wanted.samples) <= 1) > 0.95
+    still = renderer.render(CAMERA, 0.9, part=Part.STATIC)
+    np.testing.assert_array_equal(still.rgb, Renderer(gl.context(), scene, FOLDED).render(CAMERA, 0.9, part=Part.STATIC).rgb)
+    renderer.quality = LADDER["reference"]
+    assert renderer.marched_by == "fragment shaders"
+    exact = renderer.render(CAMERA, 0.9)
+    np.testing.assert_array_equal(exact.rgb, Renderer(gl.context(), scene, LADDER["reference"]).render(CAMERA, 0.9).rgb)
+
+
+def test_what_it_takes_is_counted() -> None:
+    baking = baking_of(one_sided(tiny_scene(4, channels=16)))
+    taken = baking.grid.nbytes + baking._known.nbytes + sum(plane.nbytes for plane in baking._planes)
+    assert taken == Baking.bytes_for(baking._scene) and taken + baking._room.nbytes == baking.memory_bytes
+
+
+def test_a_picture_hangs_on_none_before_it() -> None:
+    scene = displaced(one_sided(tiny_scene(4, channels=16)))
+    renderer = Renderer(gl.context(), scene, LADDER["balanced"])
+    for time in (0.1, 0.11, 0.7, 0.12):
+        got = renderer.render(CAMERA, time)
+    if not renderer.casts:
+        pytest.skip("a graphics card, which bakes nothing")
+    np.testing.assert_array_equal(got.rgb, Renderer(gl.context(), scene, LADDER["balanced"]).render(CAMERA, 0.12).rgb)
+
+
+def test_planes_that_arrive_later_count() -> None:
+    scene = one_sided(tiny_scene(4, channels=16))
+    early = without_planes(scene)
+    renderer, whole = Renderer(gl.context(), early, BAKED), Renderer(gl.context(), scene, BAKED)
+    renderer.render(CAMERA, 0.5)
+    bring(renderer, early, scene)
+    np.testing.assert_array_equal(renderer.render(CAMERA, 0.5).rgb, whole.render(CAMERA, 0.5).rgb)
+
+
+def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
+    assert Baking.serves(one_sided(tiny_scene(channels=16)))
+    fine = one_sided(tiny_scene(scales=1, channels=30, resolution=(200, 180, 120)))
+    assert np.prod(corners_of(fine)) > MOST_CORNERS
+    mapped = [SPACES[space](one_sided(tiny_scene(channels=16))) for space in ("ndc", "contracted")]
+    for scene in (*mapped, tiny_scene(channels=16), one_sided(tiny_scene(channels=16, dynamic=False)), one_sided(tiny_scene()), fine, SPACES["hybrid"](tiny_scene(channels=16))):
+        assert not Baking.serves(scene)
+        got, wanted = (Renderer(gl.context(), scene, quality).render(CAMERA, 0.5) for quality in (BAKED, FOLDED))
+        np.testing.assert_array_equal(got.rgb, wanted.rgb)

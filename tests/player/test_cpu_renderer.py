@@ -1,0 +1,193 @@
+"""Pictures that a processor marches itself, through a grid or by planes, against the reference."""
+
+from dataclasses import replace
+
+import gl
+import numpy as np
+import pytest
+from numba import njit
+from scenes import SPACES, bring, displaced, flat, look_at, of_first_degree, one_sided, tiny_scene, uneven, varied, without_planes
+
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
+from kpc.player.cpu.corner_grid import Baking
+from kpc.player.cpu.raymarch import _FAST, _within, cast
+from kpc.player.cpu.plane_sampler import Lookup
+from kpc.player.cpu.cpu_renderer import in_steps, rehearse
+from kpc.player.quality import LADDER, Quality
+from kpc.player.cpu.reference import Part, render
+from kpc.player.gl.renderer import Renderer
+
+CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
+FOLDED, BAKED = Quality(folded=True), Quality(folded=True, baked=TERMINATION)
+QUALITY = {Lookup: FOLDED, Baking: BAKED}
+
+
+def renderer_of(scene: Scene, kind: type = Lookup, quality: Quality | None = None) -> Renderer:
+    renderer = Renderer(gl.context(), scene, quality or QUALITY[kind])
+    if not renderer.casts:
+        pytest.skip("a graphics card, which marches everything")
+    assert renderer._marching_kind(scene.is_dynamic) is kind and renderer.marched_by == "the processor itself"
+    return renderer
+
+
+@njit(**_FAST)
+def clamped(places, most):
+    out = np.empty_like(places)
+    for i in range(len(places)):
+        out[i] = _within(places[i], most)
+    return out
+
+
+VIEWS = {
+    "from outside": CAMERA,
+    "within": look_at((0.5, 0.3, 0.2), (-0.4, -0.2, -0.1), 48, 36, 40.0),
+    "amid what is opaque": look_at((0.1, 0.05, 0.05), (1.0, 0.4, 0.3), 33, 21, 30.0),
+    "from far away": look_at((240.0, 100.0, 220.0), (0.1, 0.05, 0.05), 47, 39, 7000.0),
+    "along an axis": look_at((0.1, 0.05, 4.0), (0.1, 0.05, 0.0), 40, 30, 60.0),
+    "of one pixel": look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 1, 1, 1.0),
+    "a long line": look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 4096, 1, 4000.0),
+    "beside it": look_at((2.4, 1.0, 2.2), (9.0, 9.0, 2.0), 40, 30, 60.0),
+}
+
+
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+@pytest.mark.parametrize("kind, where", [(kind, where) for kind in (Lookup, Baking) for where in ("box", "displaced", "opaque", "fog")] + [(Lookup, "contracted")])
+def test_pictures_are_those_of_the_reference(kind: type, where: str, view: Camera) -> None:
+    """Through a grid, where that holds all there is."""
+    scene = tiny_scene(4, scales=1, channels=32)
+    scene = of_first_degree(one_sided(scene)) if kind is Baking else scene
+    if where in ("displaced", "contracted"):
+        scene = SPACES[where](scene)
+    elif where == "opaque":
+        scene = replace(scene, decoder=replace(scene.decoder, density_bias=60.0))
+    elif where == "fog":
+        weight = 0.02 * scene.decoder.density_weight
+        scene = replace(scene, step=0.002, decoder=replace(scene.decoder, density_bias=0.0, density_weight=weight))
+    renderer = renderer_of(scene, kind)
+    for time in (0.0, 0.6, 1.0):
+        got, wanted = renderer.render(view, time), render(scene, view, time)
+        off = np.abs(got.rgb - wanted.rgb).max(axis=2)
+        assert np.mean(off <= 1 / 255) > 0.998 and np.mean(np.abs(got.opacity - wanted.opacity) <= 1 / 255) > 0.998
+        apart = np.abs(got.samples - wanted.samples)  # one more or less where a sample lies on a cell's face
+        assert np.mean(apart <= 1) > 0.99 and np.mean(apart == 0) > 0.95
+        both = (got.opacity > 0.1) & (wanted.opacity > 0.1)
+        assert np.mean(np.abs(got.depth[both] - wanted.depth[both]) < 2 * scene.step) > 0.99 if both.any() else True
+    if view.width > 1 and where != "contracted":  # there something is everywhere
+        assert (wanted.opacity.max() > 0.1) == (view is not VIEWS["beside it"])
+
+
+SCENES = {
+    "two scales": lambda: tiny_scene(4, channels=16),
+    "five channels": lambda: tiny_scene(4, channels=5, scales=3),
+    "uneven": uneven,
+    "one texel along z": flat,
+    "one-sided": lambda: one_sided(tiny_scene(4)),
+    "static": lambda: tiny_scene(4, dynamic=False),
+    "appearances": lambda: varied(tiny_scene(4)),
+    "contracted": lambda: SPACES["contracted"](tiny_scene(4)),
+    "contracted and static": lambda: SPACES["contracted"](tiny_scene(4, dynamic=False)),
+}
+
+
+@pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
+def test_planes_of_all_sizes_are_looked_up(make) -> None:
+    scene = make()
+    renderer = renderer_of(scene)
+    code = scene.appearances[1].code if scene.appearances else None
+    for time in (0.0, 0.37, 1.0):
+        for part in (Part.FULL, Part.STATIC):
+            got, wanted = renderer.render(CAMERA, time, part=part, appearance=code), render(scene, CAMERA, time, part=part, appearance=code)
+            assert np.mean(np.abs(got.rgb - wanted.rgb).max(axis=2) <= 1 / 255) > 0.998
+            assert np.mean(got.samples == wanted.samples) > 0.95 and wanted.samples.sum() > 500
+    if code is not None:
+        assert np.abs(renderer.render(CAMERA, 1.0).rgb - got.rgb).max() > 0.05
+
+
+def test_what_is_no_number_is_no_place_in_an_array() -> None:
+    places = np.array([np.nan, -np.inf, -1.0, 0.0, 2.5, 7.0, np.inf] * 5, np.float32)  # more than vectors hold
+    np.testing.assert_array_equal(clamped(places, np.float32(5)), np.float32([0, 0, 0, 0, 2.5, 5, 5] * 5))
+
+
+@pytest.mark.parametrize("value", [3e38, -3e38, 1e-38])
+def test_what_overflows_is_no_crash(value: float) -> None:
+    scene = tiny_scene(4)
+    for name in SPACE_PLANES:
+        scene.scales[1][name][:] = value
+    assert np.isfinite(renderer_of(scene).render(CAMERA, 0.3).rgb).all()
+
+
+@pytest.mark.parametrize("kind", [Lookup, Baking])
+@pytest.mark.parametrize("edges", [(0.0, 1.0, 1.0), (1.0, 1.0, 1e-6)])
+def test_boxes_without_a_volume_show_the_background(edges: tuple[float, float, float], kind: type) -> None:
+    scene = displaced(tiny_scene(4, channels=16))
+    scene = replace(one_sided(scene) if kind is Baking else scene, aabb=np.array([[0, 0, 0], edges], np.float32))
+    for camera in (CAMERA, look_at((0.0, 0.0, 0.0), (1.0, 0.4, 0.3), 33, 21, 30.0)):
+        got = renderer_of(scene, kind).render(camera, 1.0)
+        assert np.isfinite(got.rgb).all() and np.abs(got.rgb - scene.background).max() < 0.02
+
+
+def test_planes_are_as_near_as_their_steps() -> None:
+    plane = np.random.default_rng(0).normal(size=(7, 9, 5)).astype(np.float32) * np.float32([1e-30, 1, 0, 1e30, 5])
+    whole, step = in_steps(plane)
+    assert whole.dtype == np.int16 and step[2] == 0 and not whole[..., 2].any()
+    assert (np.abs(whole * step - plane) <= 0.51 * step).all() and (np.abs(whole).max((0, 1)) == [32767, 32767, 0, 32767, 32767]).all()
+
+
+@pytest.mark.parametrize("rung", ["quick", "balanced", "fine", "finer"])
+@pytest.mark.parametrize("space", ["box", "displaced", "contracted"])
+def test_rungs_are_as_near_as_by_shaders(rung: str, space: str) -> None:
+    """While the clip plays, too."""
+    scene, camera = SPACES[space](tiny_scene(4, channels=16)), CAMERA.resized(160, 120)
+    by_shaders, itself = Renderer(gl.context(), scene, LADDER[rung]), renderer_of(scene, quality=LADDER[rung])
+    by_shaders.casts = False
+    for time in (0.4, 0.41, 0.42, 0.43):
+        wanted = render(scene, camera, time).rgb
+        off = [np.mean((renderer.render(camera, time).rgb - wanted) ** 2) for renderer in (by_shaders, itself)]
+        assert off[1] < 1.3 * off[0] + 1e-6
+
+
+def test_scenes_that_it_would_not_serve_are_marched_by_shaders() -> None:
+    assert Lookup.serves(tiny_scene()) and Lookup.serves(tiny_scene(dynamic=False))
+    for space in ("ndc", "hybrid"):
+        scene = SPACES[space](tiny_scene(4))
+        renderer = Renderer(gl.context(), scene, FOLDED)
+        assert not Lookup.serves(scene) and renderer.marched_by.endswith("shaders")
+        assert np.isfinite(renderer.render(CAMERA, 0.5).rgb).all()
+    scene = tiny_scene(4)
+    for quality in (LADDER["reference"], Quality(folded=True, scales=1)):
+        renderer = Renderer(gl.context(), scene, quality)
+        assert renderer.marched_by == "fragment shaders"
+        renderer.render(CAMERA, 0.5)
+        assert not renderer._in_memory
+
+
+def test_planes_that_arrive_later_count() -> None:
+    scene = displaced(tiny_scene(4))
+    early = without_planes(scene)
+    renderer, whole = renderer_of(early), renderer_of(scene)
+    renderer.render(CAMERA, 0.5)
+    bring(renderer, early, scene)
+    np.testing.assert_array_equal(renderer.render(CAMERA, 0.5).rgb, whole.render(CAMERA, 0.5).rgb)
+
+
+def test_what_it_takes_is_counted() -> None:
+    for make in SCENES.values():
+        renderer = renderer_of(scene := make())
+        before = renderer.memory_bytes
+        renderer.render(CAMERA, 0.5)
+        lookup = renderer._kept(Lookup)
+        taken = lookup._planes.nbytes + lookup._rows.nbytes + lookup._seen_from.nbytes
+        assert taken == Lookup.bytes_for(scene) or not scene.decoder.w2.any() and taken < Lookup.bytes_for(scene)
+        assert renderer.memory_bytes >= before + lookup.memory_bytes >= Lookup.bytes_for(scene) + lookup._room.nbytes
+
+
+@pytest.mark.parametrize("kind", [Lookup, Baking])
+def test_what_is_rehearsed_is_what_pictures_need(kind: type) -> None:
+    """Whether or not anything is displaced, colours have sides or something moves."""
+    for scene in [make() for make in SCENES.values()] if kind is Lookup else [uneven(), flat()]:
+        rehearse(kind, scene)
+        before = list(cast.signatures)
+        for shown in (scene, displaced(scene)) if scene.is_dynamic else (scene,):
+            renderer_of(shown, kind).render(CAMERA, 0.3)
+        assert cast.signatures == before

@@ -1,0 +1,40 @@
+"""Which library windows are made with, and that all take it from one place."""
+
+import ast
+from pathlib import Path
+
+import glfw
+import pytest
+from test_floors import ROOT, imports
+
+from kpc.player.app.desktop import wayland_library
+
+LIBRARY = Path(glfw.__file__).with_name("wayland") / "libglfw.so"
+
+
+@pytest.mark.parametrize(
+    ("environment", "is_wanted"),
+    [
+        ({}, False),
+        ({"DISPLAY": ":0"}, False),
+        ({"WAYLAND_DISPLAY": "wayland-0"}, True),
+        ({"WAYLAND_DISPLAY": "wayland-0", "DISPLAY": ""}, True),
+        ({"WAYLAND_DISPLAY": "wayland-0", "DISPLAY": ":0", "XDG_SESSION_TYPE": "wayland"}, False),
+        ({"WAYLAND_DISPLAY": "wayland-0", "DISPLAY": ":0", "PYGLFW_LIBRARY_VARIANT": "Wayland"}, True),
+        ({"WAYLAND_DISPLAY": "wayland-0", "PYGLFW_LIBRARY_VARIANT": "x11"}, False),
+    ],
+)
+def test_wayland_is_for_where_there_is_no_x_server_or_who_asks(environment: dict[str, str], is_wanted: bool) -> None:
+    assert wayland_library("linux", environment) == (LIBRARY if is_wanted and LIBRARY.is_file() else None)
+    assert wayland_library("darwin", environment) is None and wayland_library("win32", environment) is None
+
+
+def test_windows_are_made_from_one_place() -> None:
+    """Whoever imports glfw before imgui-bundle takes the wrong library, or none that loads."""
+    for folder in ("player", "tools"):
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            found = {module.split(".")[0] for module in imports(file)} & {"glfw", "imgui_bundle"}
+            assert not found or file.name == "desktop.py", f"{file.relative_to(ROOT)} imports {found}"
+    lines = [node for node in ast.walk(ast.parse((ROOT / "player/desktop.py").read_text())) if isinstance(node, ast.Import | ast.ImportFrom)]
+    order = {(node.module if isinstance(node, ast.ImportFrom) else node.names[0].name): node.lineno for node in lines}
+    assert order["imgui_bundle"] < order["glfw"]

@@ -1,0 +1,199 @@
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+from scenes import tiny_scene, varied
+
+from kpc.format.container.scene_io import write
+from kpc.format.common.media import read_image
+from kpc.format.coding.quantise import quantise_scene
+from kpc.tools.cli.serve import Handler, serving
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "tiny.kpc"
+    scene = varied(tiny_scene(4))
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def display() -> Iterator[str]:
+    """The display there is, else one of Xvfb's."""
+    if os.environ.get("DISPLAY"):
+        yield os.environ["DISPLAY"]
+        return
+    if shutil.which("Xvfb") is None:
+        pytest.skip("no display and no Xvfb (Debian: apt install xvfb)")
+    reader, writer = os.pipe()
+    server = subprocess.Popen(  # without -noreset it starts over when its last client leaves, and refuses the next meanwhile
+        ["Xvfb", "-noreset", "-displayfd", str(writer), "-screen", "0", "1024x768x24"],
+        pass_fds=[writer],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(writer)
+    with os.fdopen(reader) as said:
+        number = said.readline().strip()
+    try:
+        if not number:
+            pytest.skip("Xvfb does not start")
+        yield f":{number}"
+    finally:
+        server.terminate()
+        server.wait()
+
+
+@pytest.fixture(scope="module")
+def wayland(display: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """The environment of a compositor that offers no X server, two pixels to each of its units. It has a window of one, for its keys and pointer:
+    without any, glfw stumbles."""
+    if shutil.which("weston") is None:
+        pytest.skip("no weston (Debian: apt install weston)")
+    folder = tmp_path_factory.mktemp("wayland")
+    folder.chmod(0o700)
+    told = {"XDG_RUNTIME_DIR": str(folder), "WAYLAND_DISPLAY": "kpc"}
+    command = ["weston", "--backend=x11-backend.so", "--socket=kpc", "--width=400", "--height=300", "--scale=2", "--idle-time=0"]
+    server = subprocess.Popen(command, env={**os.environ, **told, "DISPLAY": display}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        for _ in range(100):
+            if (folder / "kpc").exists() or server.poll() is not None:
+                break
+            time.sleep(0.1)
+        if not (folder / "kpc").exists():
+            pytest.skip("weston does not start")
+        yield told
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def kpplay(*arguments: object, display: str | None = None, told: Mapping[str, str] = MappingProxyType({})) -> subprocess.CompletedProcess[str]:
+    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "PYGLFW_LIBRARY")} | (
+        {"DISPLAY": display} if display else {}
+    ) | dict(told)  # fmt: skip
+    command = [sys.executable, "-W", "error", "-m", "kpc.player.app.kpplay", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=env, timeout=60, check=False)
+
+
+def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> None:
+    shot = tmp_path / "shot.png"
+    done = kpplay(scene_file, "--size", "400x300", "--frames", 5, "--screenshot", shot, display=display)
+    assert done.returncode == 0 and done.stdout == "" and "Traceback" not in done.stderr, done.stderr
+    picture = read_image(shot).astype(int)
+    assert picture.shape == (300, 400, 3)
+    background = np.rint(tiny_scene(4).background * 255)
+    assert np.abs(picture[:20, -20:] - background).max() <= 1  # the corner is empty
+    assert np.abs(picture[150:170, 260:280] - background).max() > 20  # the scene
+    assert picture[12:100, 12:100].mean() < 180  # the HUD
+
+
+@pytest.mark.parametrize("session", [{}, {"XDG_SESSION_TYPE": "wayland"}], ids=["untold", "told"])
+def test_plays_where_there_is_no_x_server(scene_file: Path, wayland: dict[str, str], session: dict[str, str], tmp_path: Path) -> None:
+    shot = tmp_path / "shot.png"
+    done = kpplay(scene_file, "--size", "300x200", "--frames", 20, "--screenshot", shot, told={**wayland, **session})
+    assert done.returncode == 0 and done.stdout == "" and "Traceback" not in done.stderr, done.stderr
+    picture = read_image(shot).astype(int)
+    assert picture.shape == (400, 600, 3)  # what the compositor counts
+    assert picture[24:200, 24:200].mean() < 180  # the HUD
+
+
+def test_plays_from_a_server(scene_file: Path, display: str, tmp_path: Path) -> None:
+    shot = tmp_path / "shot.png"
+    with serving(scene_file.parent) as url:
+        options = ["--size", "400x300", "--memory", "50MB", "--frames", 3, "--screenshot", shot]
+        done = kpplay(f"{url}/tiny.kpc", *options, display=display)
+    assert done.returncode == 0 and done.stdout == done.stderr == "", done.stderr
+    background = np.rint(tiny_scene(4).background * 255)
+    assert np.abs(read_image(shot).astype(int)[150:170, 260:280] - background).max() > 20
+
+
+def test_a_server_that_fails_is_told_in_the_window(scene_file: Path, display: str, tmp_path: Path) -> None:
+    class Failing(Handler):
+        """Gives a little at a time, and after the first picture nothing."""
+
+        def do_GET(self) -> None:
+            first, last = map(int, self.headers["Range"].removeprefix("bytes=").split("-"))
+            if first >= 6000:
+                self.send_error(404)
+                return
+            self.headers.replace_header("Range", f"bytes={first}-{min(last, first + 1999)}")
+            super().do_GET()
+
+    shots = [tmp_path / "whole.png", tmp_path / "told.png"]
+    for handler, shot in zip((Handler, Failing), shots):
+        with serving(scene_file.parent, handler=handler) as url:
+            done = kpplay(f"{url}/tiny.kpc", "--size", "400x300", "--frames", 2, "--screenshot", shot, display=display)
+        assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+    whole, told = (read_image(shot).astype(int)[22:38, 250:390] for shot in shots)  # where the message is, right of the HUD
+    assert told.max() > 200 > 100 > told.min() and np.abs(whole - told).max() > 100
+
+
+def test_long_playback_makes_nothing_anew(scene_file: Path, display: str) -> None:
+    command = [sys.executable, "-m", "kpc.tools.bench.kpbench", "steady", str(scene_file), "--size", "200x150", "--frames", "40"]
+    env = {**os.environ, "DISPLAY": display}
+    done = subprocess.run(command, capture_output=True, text=True, env=env, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    (record,) = json.loads(done.stdout)
+    (run,) = record["repeats"]
+    assert run["made_on_card"] == 0 and run["most_bytes"] - run["first_bytes"] < 1 << 24 < run["first_bytes"]
+    assert "made on the card" in done.stderr and record["renderer"]
+
+
+def test_a_window_that_is_left_to_itself_is_measured(scene_file: Path, display: str) -> None:
+    command = [sys.executable, "-m", "kpc.tools.bench.kpbench", "window", str(scene_file), "--size", "320x240", "--seconds", "1", "--turn", "20"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "DISPLAY": display}, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    (record,) = json.loads(done.stdout)
+    (run,) = record["repeats"]
+    assert run["raster"] == "320x240" and run["raster_share"] == 1 and run["psnr"] >= run["psnr_least"] > 30, run  # so small a scene needs no less
+    assert 5 < run["fps"] and "degrees a second" in done.stderr
+
+
+def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
+    done = kpplay(scene_file)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("kpplay: no window to be had") and "kprender" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["nowhere.kpc"], 1, "nowhere.kpc"),
+        (["http://127.0.0.1:9/nowhere.kpc"], 1, "http://127.0.0.1:9/nowhere.kpc"),
+        (["{scene}", "--memory", "1MB"], 1, "--memory"),
+        (["{scene}", "--size", "7x7"], 2, "--size"),
+        (["{scene}", "--frames", "0"], 2, "--frames"),
+        (["{scene}", "--screenshot", "x.bmp"], 2, "x.bmp"),
+        (["{scene}", "--folder", "nowhere"], 1, "nowhere"),
+        (["{scene}", "--path", "nowhere.json"], 1, "nowhere.json"),
+        (["{scene}", "--path", "{scene}"], 1, "tiny.kpc"),
+        (["{scene}", "--quality", "perfect"], 2, "fastest"),
+        (["{scene}", "--target-fps", "0"], 2, "--target-fps"),
+    ],
+)
+def test_bad_input_is_told_before_a_window_opens(scene_file: Path, arguments: list[str], code: int, words: str) -> None:
+    done = kpplay(*[a.format(scene=scene_file) for a in arguments])
+    assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr
+
+
+def test_every_key_and_drag(scene_file: Path, display: str, tmp_path: Path) -> None:
+    """In a process of its own: Mesa lets none hold both a GLX and an EGL context, and other tests do the latter."""
+    command = [sys.executable, "-W", "error", str(Path(__file__).parents[1] / "press_every_key.py"), str(scene_file)]
+    env = {**os.environ, "DISPLAY": display, "XDG_CONFIG_HOME": str(tmp_path / "settings")}
+    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    reset, unwritten = done.stderr.splitlines()
+    assert reset == "kpplay: the graphics card was reset; start kpplay anew, or update the graphics driver"
+    assert unwritten.startswith("kpplay: settings are not remembered")
+    saved = list(tmp_path.glob("tiny-*.png"))
+    assert len(saved) == 1 and read_image(saved[0]).shape == (330, 420, 3)

@@ -1,0 +1,74 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from kpc.player.app.preferences import _IS_RIGHT, LARGEST, Preferences, load, place, save
+
+MINE = Preferences((800, 600), "fine", 30.0, 0.5, False, False, True, True, 1.5)
+
+
+def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "player.json"
+    for preferences in (Preferences(), MINE):
+        save(preferences, path)
+        assert load(path) == preferences and [p.name for p in path.parent.iterdir()] == ["player.json"]
+
+
+def test_every_field_is_checked() -> None:
+    assert set(_IS_RIGHT) == set(Preferences.__dataclass_fields__)
+
+
+@pytest.mark.parametrize(("name", "values"), {
+    "size": [[1, 1], [1e9, 5], "big", [800], [800.5, 600], [True, True], None],
+    "quality": ["perfect", 3, [], None],
+    "target_fps": [0, -1, 1e9, "fast", True, float("nan"), float("inf"), [30]],
+    "speed": [3, -1, "1", [], float("nan"), 10**400],
+    "loop": [1, "yes", None],
+    "text_size": [0, 99, float("nan"), "x"],
+}.items())  # fmt: skip
+def test_a_wrong_value_counts_as_not_there(tmp_path: Path, name: str, values: list[object]) -> None:
+    path = tmp_path / "player.json"
+    save(MINE, path)
+    for value in values:
+        path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
+        got = load(path)
+        assert getattr(got, name) == getattr(Preferences(), name)
+        assert got.graphs  # the others stay
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[]", b"null", b"[" * 60_000, b'{"a": 1}', b" " * (2 * LARGEST)])
+def test_another_file_is_none(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "player.json").write_bytes(content)
+    assert load(tmp_path / "player.json") == Preferences()
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.dictionaries(st.sampled_from(sorted(_IS_RIGHT)), st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=8), lambda inner: st.lists(inner, max_size=3))))
+def test_whatever_it_says_the_player_starts(tmp_path: Path, said: dict[str, object]) -> None:
+    (tmp_path / "player.json").write_text(json.dumps(said))
+    got = load(tmp_path / "player.json")
+    assert {name: getattr(got, name) for name in _IS_RIGHT if name not in said} == {
+        name: getattr(Preferences(), name) for name in _IS_RIGHT if name not in said
+    }
+
+
+def test_no_file_a_folder_and_a_pipe_are_no_preferences(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "none.json", tmp_path, tmp_path / "pipe"):
+        assert load(path) == Preferences()
+
+
+def test_lies_in_the_folder_the_platform_has_for_it(tmp_path: Path) -> None:
+    """In a process of its own: the platform is asked once."""
+    program = "from kpc.player.app.preferences import place; print(place())"
+    env = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path), "APPDATA": str(tmp_path), "HOME": str(tmp_path)}
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=env, check=True).stdout
+    assert said.startswith(str(tmp_path)) and said.strip().endswith(os.path.join("kpc", "player.json"))
+    assert place().is_absolute()

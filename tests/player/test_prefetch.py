@@ -1,0 +1,73 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scenes import tiny_scene
+from test_partial import opened
+
+from kpc.format.container.partial import PartialScene
+from kpc.player.streaming.prefetch import Playhead, distances_ahead, fetching_order, least_room, worth_holding
+
+
+@pytest.fixture(scope="module")
+def scene() -> PartialScene:
+    """Two scales, 20 rows in segments of 2."""
+    return opened(tiny_scene(4, time=20), 2)[0]
+
+
+def listed(scene: PartialScene, order: np.ndarray) -> list[tuple[int, bool, int]]:
+    return [(int(scene.scales[i]), bool(scene.moves[i]), scene.entry(int(scene.numbers[i])).row_start) for i in order]
+
+
+def test_the_first_coarse_picture_comes_first_then_finer_ones_then_what_is_ahead(scene: PartialScene) -> None:
+    order = listed(scene, fetching_order(scene, Playhead(0.5)))
+    now = [(False, 0)] * 3 + [(True, 8)] * 3 + [(True, 10)] * 3  # row 9.5 lies between two segments
+    coarse, fine, rest = order[:9], order[9:18], order[18:]
+    assert coarse == [(0, *place) for place in now] and fine == [(1, *place) for place in now]
+    ahead = [(row - 9.5) % 20 for _, _, row in rest]
+    assert all(a <= b for a, b in pairwise(ahead)) and all(moves for _, moves, _ in rest)
+
+
+def test_while_it_plays_what_comes_soon_precedes_a_finer_scale(scene: PartialScene) -> None:
+    paused, playing = (fetching_order(scene, Playhead(0.5, pace)) for pace in (0.0, 0.3))
+    finer = [next(k for k, (scale, moves, _) in enumerate(listed(scene, order)) if scale == 1) for order in (paused, playing)]
+    assert finer[0] < finer[1]
+    soon = {row for scale, moves, row in listed(scene, playing)[: finer[1]] if moves}
+    assert max(soon) >= 14 and min(soon) >= 8
+
+
+def test_what_the_picture_shown_needs_precedes_all_else(scene: PartialScene) -> None:
+    order = listed(scene, fetching_order(scene, Playhead(0.5, 0.3), shown=2))
+    moving = [place for place in order if place[1]]
+    assert moving[:12] == [(scale, True, row) for scale in (0, 1) for row in (8, 8, 8, 10, 10, 10)]
+
+
+def test_behind_the_playhead_comes_around_again_or_last(scene: PartialScene) -> None:
+    first = [k for k in range(len(scene.numbers)) if scene.moves[k] and scene.entry(int(scene.numbers[k])).row_start == 0]
+    loop, once = (distances_ahead(scene, Playhead(0.9, 0.1, loop)) for loop in (True, False))
+    assert np.allclose(loop[first], 0.1) and (once[first] > 2).all()
+    before = [k for k in range(len(scene.numbers)) if scene.moves[k] and scene.entry(int(scene.numbers[k])).row_start == 12]
+    assert (loop[before] > loop[first].max()).all() and (once[before] < once[first].min()).all()
+
+
+def test_the_least_room_is_what_some_time_needs(scene: PartialScene) -> None:
+    needs = [int(scene.sizes[scene.moves & scene.is_needed(t, t)].sum()) for t in np.linspace(0, 1, 2000)]
+    assert least_room(scene) == max(needs)
+
+
+@pytest.mark.parametrize("time", [0.0, 0.33, 0.5, 0.98, 1.0])
+def test_what_fits_is_what_comes_next_and_what_is_needed_always_fits(scene: PartialScene, time: float) -> None:
+    least, every = least_room(scene), int(scene.sizes[scene.moves].sum())
+    assert 0 < least < every
+    for room in (least, 2 * least, every):
+        held = worth_holding(scene, Playhead(time, 0.1), room)
+        assert held[~scene.moves].all() and held[scene.is_needed(time, time)].all()
+        assert scene.sizes[held & scene.moves].sum() <= room
+        distance = distances_ahead(scene, Playhead(time, 0.1))
+        assert held.all() if room == every else distance[held].max() <= distance[~held].min() + 1e-9
+
+
+def test_nothing_moves_in_a_static_scene() -> None:
+    still = opened(tiny_scene(4, dynamic=False))[0]
+    assert least_room(still) == 0 and worth_holding(still, Playhead(), 0).all()
+    assert sorted(fetching_order(still, Playhead())) == list(range(6))

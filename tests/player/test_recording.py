@@ -1,0 +1,83 @@
+"""Videos in the making: what is put in comes out, and nobody waits."""
+
+import time as clock
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kpc.format.common.media import read_video
+from kpc.player.app import recording
+from kpc.player.app.recording import Recording, frames_due
+
+
+def wait_for(video: Recording, seconds: float = 20.0) -> None:
+    until = clock.monotonic() + seconds
+    while not video.is_over and clock.monotonic() < until:
+        clock.sleep(0.01)
+    assert video.is_over
+
+
+def frame(level: int, height: int = 30) -> np.ndarray:
+    return np.full((height, 40, 3), level, np.uint8)
+
+
+def test_frames_come_out_in_order(tmp_path: Path) -> None:
+    video = Recording(tmp_path / "a.mp4", 10, (40, 30))
+    for level in (20, 120, 220):
+        assert video.take(frame(level))
+    video.end()
+    assert not video.take(frame(0)) and video.taken == 3 and video.duration_s == pytest.approx(0.3)
+    wait_for(video)
+    assert video.failure is None
+    assert [round(float(f.mean()), -1) for f in read_video(tmp_path / "a.mp4")] == [20, 120, 220]
+
+
+def test_a_full_queue_refuses_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "WAITING_BYTES", 1)
+
+    def slow(path: Path, frames: object, fps: float) -> None:
+        for _ in frames:
+            clock.sleep(0.2)
+
+    monkeypatch.setattr(recording, "write_video", slow)
+    video = Recording(tmp_path / "a.mp4", 10, (40, 30))
+    started = clock.monotonic()
+    taken = [video.take(frame(n)) for n in range(20)]
+    assert clock.monotonic() - started < 0.1 and taken[:2] == [True, True] and sum(taken) <= 3
+    assert not video.has_room and video.taken == sum(taken)
+    video.close(5.0)
+    assert video.is_over
+
+
+def test_what_is_given_up_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    video = Recording(tmp_path / "a.mp4", 10, (40, 30))
+    video.take(frame(9))
+    monkeypatch.setattr(video, "end", lambda: None)  # as if frames waited still
+    video.close(0.2)
+    assert video.is_over and "given up" in str(video.failure) and list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+    video = Recording(tmp_path / "nowhere" / "a.mp4", 10, (40, 30))
+    video.take(frame(9))
+    video.end()
+    wait_for(video)
+    assert "nowhere" in str(video.failure)
+
+
+def test_a_video_without_frames_is_told(tmp_path: Path) -> None:
+    video = Recording(tmp_path / "a.mp4", 10, (40, 30))
+    video.end()
+    wait_for(video)
+    assert "no frames" in str(video.failure)
+
+
+@pytest.mark.parametrize("turn_s", [1 / 200, 1 / 60, 1 / 30, 1 / 7])
+def test_a_recording_lasts_as_long_as_what_it_shows(turn_s: float) -> None:
+    taken = 0
+    for elapsed in np.arange(0, 4, turn_s):
+        due = frames_due(float(elapsed), 30, taken)
+        assert due <= 30 * turn_s + 2
+        taken += due
+        assert abs(taken / 30 - elapsed) <= 1 / 30 + 1e-9

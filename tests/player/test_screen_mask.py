@@ -1,0 +1,88 @@
+"""Blocks of a picture that can show anything."""
+
+import gl
+import numpy as np
+import pytest
+from scenes import displaced, hybrid, look_at, tiny_scene
+
+from kpc.format.scene.scene import Scene
+from kpc.player.gl import renderer as renderer_module
+from kpc.player.cpu.screen_mask import MOST_CELLS, Cover
+from kpc.player.quality import LADDER
+from kpc.player.cpu.reference import render, slot_at
+from kpc.player.gl.renderer import Renderer
+
+CAMERAS = {
+    "near": look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 61, 43, 60.0),
+    "far": look_at((20.0, 9.0, -30.0), (0.1, 0.05, 0.05), 64, 48, 160.0),
+    "beside": look_at((2.4, 1.0, 2.2), (2.0, 3.0, 0.05), 50, 50, 30.0),
+    "away": look_at((2.4, 1.0, 2.2), (4.8, 2.0, 4.4), 32, 32, 30.0),
+    "wide": look_at((1.4, 0.1, 1.9), (0.1, 1.4, 0.05), 90, 30, 14.0),
+}
+
+
+def sparse(scene: Scene, share: float, seed: int = 0) -> Scene:
+    """A few cells of each slot, no two slots alike."""
+    scene.occupancy[:] = np.random.default_rng(seed).random(scene.occupancy.shape) < share
+    return scene
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("share", [0.003, 0.05, 1.0])
+def test_no_ray_of_the_other_blocks_has_a_sample(camera: str, share: float) -> None:
+    scene, view, side = sparse(tiny_scene(3), share), CAMERAS[camera], 4
+    blocks = Cover.of(scene.occupancy[slot_at(scene, 0.4)], scene.aabb).blocks(view, side)
+    assert blocks is not None and blocks.shape == (-(-view.height // side), -(-view.width // side))
+    pixels = blocks.repeat(side, 0).repeat(side, 1)[: view.height, : view.width][::-1]
+    assert not render(scene, view, 0.4).samples[~pixels].any()
+    if camera == "away":
+        assert not blocks.any()
+    if camera == "far":
+        assert blocks.any() and blocks.mean() < 0.5
+
+
+def test_many_cells_are_covered_by_fewer_cubes() -> None:
+    occupied = np.random.default_rng(1).random((70, 61, 83)) < 0.3
+    aabb = np.array([[-1.0, -2.0, 0.0], [3.0, 1.0, 2.5]])
+    cover = Cover.of(occupied, aabb)
+    assert len(cover.centres) <= MOST_CELLS
+    cell = (aabb[1] - aabb[0]) / occupied.shape[::-1]
+    z, y, x = np.nonzero(occupied)
+    view = look_at((9.0, 7.0, 8.0), (1.0, -0.5, 1.0), 320, 240, 700.0)
+    blocks = cover.blocks(view, 4)
+    assert blocks is not None
+    local = (aabb[0] + cell * (np.stack([x, y, z], -1) + 0.5) - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
+    column, row = view.cx - view.fl_x * local[:, 0] / local[:, 2], view.height - view.cy - view.fl_y * local[:, 1] / local[:, 2]
+    seen = (column >= 0) & (column < 320) & (row >= 0) & (row < 240)
+    assert seen.sum() > 1000 and blocks[row[seen].astype(int) // 4, column[seen].astype(int) // 4].all()
+
+
+def test_nothing_occupied_covers_nothing() -> None:
+    blocks = Cover.of(np.zeros((5, 6, 7), bool), np.array([[0.0, 0, 0], [1, 1, 1]])).blocks(CAMERAS["near"], 4)
+    assert blocks is not None and not blocks.any()
+
+
+def test_from_among_what_is_occupied_all_is_drawn() -> None:
+    scene = tiny_scene(3)
+    inside = look_at((0.1, 0.05, 0.05), (1.0, 0.0, 0.0), 32, 24, 30.0)
+    assert Cover.of(np.ones((8, 8, 8), bool), scene.aabb).blocks(look_at(tuple(scene.aabb[0]), (0.0, 0.0, 0.0), 8, 8, 9.0), 4) is None
+    filled = np.zeros((8, 8, 8), bool)
+    filled[3:5, 3:5, 3:5] = True
+    assert Cover.of(filled, scene.aabb).blocks(inside, 4) is None
+
+
+@pytest.mark.parametrize("kind", ["plain", "hybrid", "displaced"])
+@pytest.mark.parametrize("camera", ["near", "far", "beside", "away"])
+def test_pictures_are_the_same(monkeypatch: pytest.MonkeyPatch, kind: str, camera: str) -> None:
+    make = {"plain": lambda s: s, "hybrid": hybrid, "displaced": displaced}[kind]
+    scene, view = sparse(make(tiny_scene(3)), 0.02), CAMERAS[camera]
+    for name in ("reference", "balanced"):
+        pictures = []
+        for most_covered in (renderer_module.MOST_COVERED, -1.0):
+            monkeypatch.setattr(renderer_module, "MOST_COVERED", most_covered)
+            renderer = Renderer(gl.context(), scene, LADDER[name])
+            renderer._is_software = True
+            pictures.append([renderer.render(view, time) for time in (0.3, 0.31, 0.32, 0.7, 0.7)])
+        for one, other in zip(*pictures, strict=True):
+            for field in ("rgb", "opacity", "samples", "depth"):
+                np.testing.assert_array_equal(getattr(one, field), getattr(other, field), f"{name} {field}")

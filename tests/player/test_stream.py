@@ -1,0 +1,470 @@
+"""Scenes played while they arrive: from memory, and over good and bad lines from a real server on this machine."""
+
+import gc
+import threading
+import time as clock
+import tracemalloc
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, ClassVar
+
+import gl
+import moderngl
+import numpy as np
+import pytest
+from scenes import SPACES, tiny_scene
+from test_partial import coded
+
+import kpc
+from kpc.format.container import http
+from kpc.format.container.container import Reader, open_source
+from kpc.format.common.errors import BudgetError
+from kpc.format.scene.scene import Scene
+from kpc.player.streaming import stream as module
+from kpc.player.streaming.prefetch import Playhead
+from kpc.player.cpu.corner_grid import Baking
+from kpc.player.quality import Quality
+from kpc.player.gl.renderer import Renderer
+from kpc.player.streaming.stream import Stream
+from kpc.tools.cli.serve import Handler, Line, serving
+
+PATIENCE_S = 20.0
+SIZE = (48, 36)
+
+
+@pytest.fixture(autouse=True)
+def _fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(http, "FIRST_BYTES", 4096)
+
+
+@pytest.fixture
+def watched() -> Iterator[Callable[..., Stream]]:
+    """Opens streams, and closes them in the end."""
+    opened: list[Stream] = []
+
+    def open_stream(source: object, **options: object) -> Stream:
+        opened.append(Stream(open_source(source), **options))  # type: ignore[arg-type]
+        return opened[-1]
+
+    yield open_stream
+    for stream in opened:
+        stream.close()
+        stream._thread.join(PATIENCE_S)
+        assert not stream._thread.is_alive()
+
+
+def until(condition: Callable[[], object], stream: Stream, renderer: Renderer) -> None:
+    """Frames without pictures, until something has come about."""
+    end = clock.monotonic() + PATIENCE_S
+    while not condition():
+        assert clock.monotonic() < end, stream.message
+        stream.upload(renderer)
+        clock.sleep(0.001)
+
+
+def picture(renderer: Renderer, scene: Scene, time: float) -> np.ndarray:
+    return renderer.render(scene.cameras[0].resized(*SIZE), time).rgb
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
+
+
+@pytest.mark.parametrize("folded", [False, True])
+@pytest.mark.parametrize("space", [*SPACES, "baked"])
+def test_once_all_is_there_it_is_the_same_picture(space: str, folded: bool, watched: Callable[..., Stream], tmp_path: Path) -> None:
+    scene, quality = SPACES["displaced" if space == "baked" else space](tiny_scene(4, channels=16, time=10)), Quality(folded=folded)
+    if space == "baked":
+        scene = replace(scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2))
+        quality = Quality(folded=folded, baked=1 / 16)
+        assert Baking.serves(scene)
+    data = coded(scene)
+    (tmp_path / "scene.kpc").write_bytes(data)
+    whole = kpc.load(data)
+    wanted = Renderer(gl.context(), whole, quality)
+    with serving(tmp_path) as url:
+        for source in (str(tmp_path / "scene.kpc"), f"{url}/scene.kpc"):
+            stream = watched(source)
+            renderer = Renderer(gl.context(), stream.scene, quality)
+            picture(renderer, whole, 0.3)  # whatever is there
+            until(lambda stream=stream: stream.is_settled, stream, renderer)
+            assert stream.share_here == 1 and stream.can_show(0.3) and stream.message is None
+            pictures = sum(24 * target.seen.width * target.seen.height for target in renderer._targets.values())
+            assert stream.fixed_bytes > renderer.memory_bytes - pictures - 24 * SIZE[0] * SIZE[1]
+            for time in (0.0, 0.3, 1.0):
+                assert np.array_equal(picture(renderer, whole, time), picture(wanted, whole, time))
+
+
+def test_a_static_scene_streams_too(watched: Callable[..., Stream]) -> None:
+    data = coded(tiny_scene(6, dynamic=False))
+    stream, whole = watched(data), kpc.load(data)
+    renderer = Renderer(gl.context(), stream.scene)
+    until(lambda: stream.is_settled, stream, renderer)
+    assert np.array_equal(picture(renderer, whole, 0.0), picture(Renderer(gl.context(), whole), whole, 0.0))
+
+
+def test_the_coarse_picture_is_there_long_before_the_rest_and_gets_finer(watched: Callable[..., Stream], tmp_path: Path) -> None:
+    data = coded(tiny_scene(4, time=10, scales=3, resolution=(96, 80, 64)))
+    (tmp_path / "scene.kpc").write_bytes(data)
+    whole, found = kpc.load(data), []
+    with serving(tmp_path, line=Line(rate=20_000)) as url:
+        stream = watched(f"{url}/scene.kpc")
+        renderer = Renderer(gl.context(), stream.scene)
+        for scales in (1, 2, 3):
+            until(lambda scales=scales: stream.scales_here >= scales and stream.can_show(0.0), stream, renderer)
+            found.append((stream.scales_here, stream.source.received, picture(renderer, whole, 0.0)))  # type: ignore[attr-defined]
+        until(lambda: stream.is_settled, stream, renderer)
+    wanted = picture(Renderer(gl.context(), whole), whole, 0.0)
+    quality = [psnr(rgb, wanted) for *_, rgb in found]
+    assert [scales for scales, *_ in found] == [1, 2, 3]
+    assert found[0][1] < 0.4 * len(data) and quality[0] < quality[-1] == psnr(wanted, wanted)
+
+
+def long_scene() -> bytes:
+    return coded(tiny_scene(4, time=120), 4)
+
+
+def test_a_long_clip_plays_in_little_memory(watched: Callable[..., Stream], tmp_path: Path) -> None:
+    """What is behind the playhead goes, what is ahead is fetched, and every picture is the right one."""
+    data = long_scene()
+    (tmp_path / "scene.kpc").write_bytes(data)
+    whole = kpc.load(data)
+    wanted = Renderer(gl.context(), whole)
+    with serving(tmp_path) as url:
+        probe = watched(f"{url}/scene.kpc")
+        fixed, all_of_it = probe.fixed_bytes, int(probe.parts.sizes[probe.parts.moves].sum())
+        room = all_of_it // 5
+        stream = watched(f"{url}/scene.kpc", memory=fixed + room)
+        renderer, most = Renderer(gl.context(), stream.scene), 0
+        until(lambda: stream.scales_here == 2, stream, renderer)
+        for turn in range(2):
+            for time in np.linspace(0, 1, 60):
+                stream.steer(Playhead(float(time), 0.1))
+                until(lambda time=time: stream.can_show(float(time)), stream, renderer)
+                most = max(most, stream.memory_bytes)
+                segments = sum(p.nbytes for s in stream.scene.scales for n in ("xt", "yt", "zt") for p in s[n]._segments.values())
+                assert segments <= stream.memory_bytes <= room
+                if int(60 * time) % 7 == turn:
+                    assert np.array_equal(picture(renderer, whole, float(time)), picture(wanted, whole, float(time)))
+        assert most > room / 3 and not stream._here.all()
+        assert stream.source.received > 1.2 * len(data)  # type: ignore[attr-defined]  # evicted, and fetched again the second time
+
+
+def test_too_little_memory_is_told_before_any_plane_is_fetched() -> None:
+    data = long_scene()
+    with pytest.raises(BudgetError, match=r"takes [\d,]+ bytes to play, more than the 3,000,000 of --memory"):
+        Stream(open_source(data), memory=3_000_000)
+    assert "fetching" not in [thread.name for thread in threading.enumerate()]
+
+
+class Noting(Handler):
+    """Notes the first byte of every range that is asked for."""
+
+    asked: ClassVar[list[int]] = []
+
+    def do_GET(self) -> None:
+        self.asked.append(int(self.headers["Range"].removeprefix("bytes=").split("-")[0]))
+        super().do_GET()
+
+
+def test_a_jump_is_served_before_all_that_lies_between(watched: Callable[..., Stream], tmp_path: Path,
+                                                       monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "RUN_BYTES", 2048)
+    data = long_scene()
+    (tmp_path / "scene.kpc").write_bytes(data)
+    Noting.asked.clear()
+    with serving(tmp_path, line=Line(rate=40_000, delay_s=0.002), handler=Noting) as url:
+        stream = watched(f"{url}/scene.kpc")
+        renderer = Renderer(gl.context(), stream.scene)
+        until(lambda: stream.scales_here == 2 and stream.can_show(0.0), stream, renderer)
+        before = len(Noting.asked)
+        stream.steer(Playhead(0.9))
+        assert not stream.can_show(0.9)
+        until(lambda: stream.can_show(0.9), stream, renderer)
+        assert stream.share_here < 0.9
+        late = [e.offset for e in Reader(data).index if e.kind == "PLNE" and 104 <= e.row_start <= 108]
+        since = Noting.asked[before:]
+        assert any(offset in late for offset in since[:3])  # what was under way may end first
+
+
+def test_a_jump_does_not_wait_for_the_end_of_a_large_chunk(watched: Callable[..., Stream], tmp_path: Path) -> None:
+    scene = tiny_scene(4, time=120, resolution=(160, 160, 160), scales=3)
+    rng = np.random.default_rng(0)
+    noise = {name: rng.normal(0, 0.2, plane.shape).astype(np.float32) for name, plane in scene.scales[2].items()}
+    finest = {name: plane + (noise[name] if name in ("xy", "xz", "yz") else 0) for name, plane in scene.scales[2].items()}
+    data = coded(replace(scene, scales=(*scene.scales[:2], finest)), 4)
+    (tmp_path / "scene.kpc").write_bytes(data)
+    largest = max(e.stored_length for e in Reader(data).index)
+    assert largest > 100_000
+    with serving(tmp_path, line=Line(rate=100_000)) as url:
+        stream = watched(f"{url}/scene.kpc")
+        renderer = Renderer(gl.context(), stream.scene)
+        until(lambda: stream.scales_here == 2 and stream.can_show(0.0) and stream._under_way is not None, stream, renderer)
+        received = stream.received
+        stream.steer(Playhead(0.7))
+        until(lambda: stream.can_show(0.7), stream, renderer)
+        assert stream.scales_here == 2 and stream.received - received < largest / 2
+        until(lambda: stream.is_settled, stream, renderer)
+        whole = kpc.load(data)
+        assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
+        assert stream.received < 1.05 * len(data)  # what came before the jump was not for nothing
+
+
+def test_a_player_that_stalls_goes_on_by_itself(watched: Callable[..., Stream], tmp_path: Path) -> None:
+    (tmp_path / "scene.kpc").write_bytes(long_scene())
+    release = threading.Event()
+
+    class Halting(Handler):
+        """Sends what makes up the first picture, then nothing, until it is let go on."""
+
+        def send(self, file: IO[bytes], count: int) -> None:
+            if file.tell() > 30_000:
+                release.wait(PATIENCE_S)
+            super().send(file, count)
+
+    with serving(tmp_path, handler=Halting) as url:
+        stream = watched(f"{url}/scene.kpc")
+        renderer = Renderer(gl.context(), stream.scene)
+        assert (stream.message or "").startswith("waiting for the scene, ")
+        until(lambda: stream.can_show(0.0), stream, renderer)
+        assert stream.message is None
+        time = 0.0
+        while stream.can_show(time):
+            stream.steer(Playhead(time, 0.1))
+            time += 0.01
+            assert time < 1
+        assert (stream.message or "").startswith("waiting for the scene, ")
+        release.set()
+        until(lambda: stream.can_show(time, 0.1), stream, renderer)
+        assert stream.message is None
+
+
+def test_the_window_waits_for_nothing_while_the_line_is_dead(watched: Callable[..., Stream], tmp_path: Path,
+                                                             monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "SILENCE_S", 0.3)
+    (tmp_path / "scene.kpc").write_bytes(long_scene())
+    release, silent = threading.Event(), threading.Event()
+
+    class Dying(Handler):
+        def send(self, file: IO[bytes], count: int) -> None:
+            if file.tell() >= 4096 and not release.is_set():
+                silent.set()
+                release.wait(PATIENCE_S)
+                self.close_connection = True
+            else:
+                super().send(file, count)
+
+    with serving(tmp_path, handler=Dying) as url:
+        opened: list[Stream] = []
+        thread = threading.Thread(target=lambda: opened.append(watched(f"{url}/scene.kpc")))
+        thread.start()  # what there can be no picture without is waited for
+        silent.wait(PATIENCE_S)
+        release.set()
+        thread.join(PATIENCE_S)
+        stream = opened[0]
+        renderer = Renderer(gl.context(), stream.scene)
+        until(lambda: stream.can_show(0.0), stream, renderer)
+        release.clear()
+        slowest = 0.0
+        for frame in range(200):
+            started = clock.monotonic()
+            stream.steer(Playhead(frame / 200, 0.1))
+            stream.upload(renderer)
+            stream.can_show(frame / 200)
+            stream.message, stream.share_here, stream.rate
+            slowest = max(slowest, clock.monotonic() - started)
+        release.set()
+    assert slowest < 0.25  # a request would have waited for longer
+
+
+def test_a_line_that_breaks_in_mid_chunk_is_told_and_taken_up_again(watched: Callable[..., Stream], tmp_path: Path) -> None:
+    data = long_scene()
+    (tmp_path / "scene.kpc").write_bytes(data)
+    whole = kpc.load(data)
+
+    class Breaking(Handler):
+        def send(self, file: IO[bytes], count: int) -> None:
+            super().send(file, min(count, 3000))
+            self.close_connection = self.close_connection or count > 3000
+
+    with serving(tmp_path, handler=Breaking) as url:
+        stream, said = watched(f"{url}/scene.kpc"), []
+        renderer = Renderer(gl.context(), stream.scene)
+
+        def settled() -> bool:
+            said.append(stream.message)
+            return stream.is_settled
+
+        until(settled, stream, renderer)
+        assert any("trying again" in (message or "") for message in said)
+        stream.can_show(0.5)
+        assert stream.message is None
+        assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
+
+
+def test_a_server_without_ranges_plays_from_the_beginning_on(watched: Callable[..., Stream], tmp_path: Path,
+                                                             capsys: pytest.CaptureFixture[str]) -> None:
+    data = coded(tiny_scene(4, time=10, scales=3, resolution=(96, 80, 64)))
+    (tmp_path / "scene.kpc").write_bytes(data)
+    whole = kpc.load(data)
+
+    class Whole(Handler):
+        def do_GET(self) -> None:
+            del self.headers["Range"]
+            super().do_GET()
+
+    with serving(tmp_path, handler=Whole, line=Line(rate=100_000)) as url:
+        stream = watched(f"{url}/scene.kpc")
+        renderer = Renderer(gl.context(), stream.scene)
+        until(lambda: stream.scales_here >= 1 and stream.can_show(0.0), stream, renderer)
+        assert stream.source.received < 0.7 * len(data)  # type: ignore[attr-defined]
+        until(lambda: stream.is_settled, stream, renderer)
+        assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
+        assert stream.source.received == len(data)  # type: ignore[attr-defined]
+    assert "no ranges" in capsys.readouterr().err
+
+
+def test_a_file_that_changes_is_told_and_what_is_there_still_plays(watched: Callable[..., Stream], tmp_path: Path,
+                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "RUN_BYTES", 4096)
+    data = long_scene()
+    path = tmp_path / "scene.kpc"
+    path.write_bytes(data)
+
+    class Swapping(Handler):
+        def do_GET(self) -> None:
+            if int(self.headers["Range"].removeprefix("bytes=").split("-")[0]) > 10_000:
+                path.write_bytes(data[::-1])
+            super().do_GET()
+
+    with serving(tmp_path, handler=Swapping) as url:
+        stream = watched(f"{url}/scene.kpc")
+        renderer = Renderer(gl.context(), stream.scene)
+        until(lambda: stream.failure is not None, stream, renderer)
+        until(lambda: not stream._finished, stream, renderer)
+        assert "changed on the server" in (stream.failure or "") and stream.is_settled
+        assert (stream.message or "").startswith("no more of the scene will come: ")
+        stream.upload(renderer)
+        assert picture(renderer, stream.scene, 0.0).std() > 0.01 or stream.scales_here == 0
+
+
+def flipping(times: int, at: int) -> type[Handler]:
+    class Flipping(Handler):
+        """Damages one byte, so many times."""
+
+        left = times
+
+        def send(self, file: IO[bytes], count: int) -> None:
+            start = file.tell()
+            body = bytearray(file.read(count))
+            if start <= at < start + count and type(self).left:
+                type(self).left -= 1
+                body[at - start] ^= 1
+            self.wfile.write(body)
+
+    return Flipping
+
+
+def test_a_damaged_chunk_is_fetched_a_second_time_and_not_a_third(watched: Callable[..., Stream], tmp_path: Path) -> None:
+    (tmp_path / "scene.kpc").write_bytes(long_scene())
+    of_a_plane = Reader(long_scene()).index[-1].offset
+    for times, words in ((1, None), (2, "is damaged")):
+        with serving(tmp_path, handler=flipping(times, of_a_plane)) as url:
+            stream = watched(f"{url}/scene.kpc")
+            renderer = Renderer(gl.context(), stream.scene)
+            until(lambda stream=stream: stream.is_settled, stream, renderer)
+            assert (stream.failure is None) if words is None else words in (stream.failure or "")
+
+
+def test_a_damaged_file_on_a_disk_is_told(watched: Callable[..., Stream]) -> None:
+    data = bytearray(long_scene())
+    data[-10] ^= 1
+    stream = watched(bytes(data))
+    renderer = Renderer(gl.context(), stream.scene)
+    until(lambda: stream.is_settled, stream, renderer)
+    assert "is damaged" in (stream.failure or "")
+
+
+def test_a_bug_in_the_thread_is_no_silence(watched: Callable[..., Stream], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "dequantised", lambda *arguments: 1 / 0)
+    stream = watched(long_scene())
+    renderer = Renderer(gl.context(), stream.scene)
+    with pytest.raises(ZeroDivisionError):
+        until(lambda: False, stream, renderer)
+
+
+def test_closing_does_not_wait_for_a_slow_line(tmp_path: Path) -> None:
+    (tmp_path / "scene.kpc").write_bytes(long_scene())
+    with serving(tmp_path, line=Line(rate=20_000)) as url:
+        stream = Stream(open_source(f"{url}/scene.kpc"))
+        started = clock.monotonic()
+        stream.close()
+        assert clock.monotonic() - started < 1.5
+        stream._thread.join(PATIENCE_S)
+        assert not stream._thread.is_alive()
+
+
+def test_a_large_plane_goes_up_over_several_frames(watched: Callable[..., Stream]) -> None:
+    data = coded(tiny_scene(4, time=10, scales=2, resolution=(96, 80, 64)))
+    stream, whole = watched(data), kpc.load(data)
+    renderer, written = Renderer(gl.context(), stream.scene), []
+    put = renderer.put
+
+    def noted(scale: int, plane: str, texels: np.ndarray, first: int = 0) -> None:
+        written.append(texels.nbytes)
+        put(scale, plane, texels, first)
+
+    renderer.put = noted  # type: ignore[method-assign]
+    end = clock.monotonic() + PATIENCE_S
+    while not stream.is_settled and clock.monotonic() < end:
+        written.clear()
+        stream.upload(renderer, most_bytes=20_000)
+        assert sum(written) <= 20_000 + 96 * 2 * 16
+    assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
+
+
+MAKERS = ("texture", "texture3d", "texture_array", "buffer", "framebuffer", "simple_framebuffer", "renderbuffer", "vertex_array",
+          "simple_vertex_array", "program", "sampler", "query")
+
+
+@pytest.mark.parametrize("folded", [False, True])
+def test_steady_playback_makes_nothing_on_the_card_and_keeps_memory_flat(
+    folded: bool, watched: Callable[..., Stream], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even while segments come and go."""
+    data = long_scene()
+    probe = watched(data)
+    room = int(probe.parts.sizes[probe.parts.moves].sum()) // 4
+    stream = watched(data, memory=probe.fixed_bytes + room)
+    ctx = gl.context()
+    renderer, screen = Renderer(ctx, stream.scene, Quality(folded=folded)), ctx.simple_framebuffer(SIZE, 4)
+    camera = stream.scene.cameras[0].resized(*SIZE)
+    until(lambda: stream.scales_here == 2, stream, renderer)
+    made: list[str] = []
+
+    def play(turns: int) -> None:
+        for time in np.tile(np.linspace(0, 1, 40), turns):
+            stream.steer(Playhead(float(time), 0.1))
+            until(lambda time=time: stream.can_show(float(time)), stream, renderer)
+            renderer.show(screen, camera, float(time))
+
+    play(2)
+    for name in MAKERS:
+        monkeypatch.setattr(moderngl.Context, name, lambda *a, name=name, **k: made.append(name))
+    tracemalloc.start()
+    try:
+        play(1)
+        gc.collect()
+        before = tracemalloc.get_traced_memory()[0]
+        play(4)
+        gc.collect()
+        grown = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        for each in (probe, stream):  # no kernel may allocate meanwhile: CPython's issue 128679, a crash before 3.14
+            each.close()
+            each._thread.join(PATIENCE_S)
+        tracemalloc.stop()
+    assert not made
+    assert grown < room + 100_000  # segments that happen to be there; a row of texels kept a frame would be 1.6 MB

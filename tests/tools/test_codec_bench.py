@@ -1,0 +1,225 @@
+"""Rate against distortion beside other tools: the figures, the curves, and the whole command."""
+
+import csv
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from datasets import write_n3dv
+from scenes import tiny_scene
+
+from kpc.format.container import scene_io
+from kpc.format.coding.quantise import quantise_scene
+from kpc.tools.bench import codec_bench, kpbench, plot, results
+from kpc.tools.bench.codec_bench import headline
+from kpc.tools.bench.rd_curves import Point, bd_rate, size_at
+from kpc.tools.bench.baselines import Bytes, Half, Planes, Video
+
+
+def points(scale: float, psnrs: tuple[float, ...] = (27.0, 28.0, 29.0, 29.7, 29.9)) -> list[Point]:
+    """A curve whose sizes double with every decibel, times a factor; the uncoded scene has 30 dB."""
+    return [{"psnr": p, "loss_db": 30 - p, "size_bytes": scale * 1000 * 2 ** (p - 27)} for p in psnrs]
+
+
+def test_the_same_curve_at_half_the_rate_is_half_as_large() -> None:
+    assert bd_rate(points(0.5), points(1.0)) == pytest.approx(-0.5, abs=1e-9)
+    assert bd_rate(points(1.3), points(1.0)) == pytest.approx(0.3, abs=1e-9)
+    other = points(1.0, (26.0, 27.5, 28.5, 29.2, 29.8, 29.95))
+    assert bd_rate(points(0.6), other) == pytest.approx(-0.4, abs=1e-9)
+
+
+def test_curves_of_planes_leave_out_what_else_there_is() -> None:
+    ours, others = ([point | {"size_bytes": 1e4 + point["size_bytes"], "planes_bytes": point["size_bytes"]} for point in points(scale)] for scale in (0.5, 1.0))
+    assert bd_rate(ours, others, "planes_bytes") == pytest.approx(-0.5, abs=1e-9)
+    assert -0.2 < (bd_rate(ours, others) or 0) < 0
+
+
+def test_curves_are_compared_where_both_are_and_not_below_the_worst_loss() -> None:
+    far = [{"psnr": p, "loss_db": 30 - p, "size_bytes": 10.0 * (p + 1)} for p in (1.0, 5.0, 10.0, 20.0)]
+    assert bd_rate(points(0.5) + far, points(1.0) + far) == pytest.approx(-0.5, abs=0.02)
+    assert bd_rate(points(1), [p | {"psnr": p["psnr"] - 20} for p in points(1)]) is None
+    assert bd_rate(points(1)[:3], points(1)) is None and bd_rate([], points(1)) is None
+
+
+def test_points_that_a_smaller_one_beats_count_for_nothing() -> None:
+    worse = {"psnr": 27.5, "loss_db": 2.5, "size_bytes": 9e9}
+    assert bd_rate([*points(0.5), worse], points(1.0)) == pytest.approx(-0.5, abs=1e-9)
+
+
+def test_what_a_table_shows() -> None:
+    assert size_at(points(1.0), 0.15) == pytest.approx(1000 * 2**2.85)
+    assert size_at(points(1.0), 9.0) is None and size_at([], 1.0) is None
+    shown = headline(points(1.0))
+    assert shown["loss_db"] == pytest.approx(0.1) and shown["size_at_default_loss"] == size_at(points(1.0), 0.15)
+    assert headline([]) == {}
+
+
+def test_sizes_at_equal_loss_beside_the_smallest_at_hand() -> None:
+    curves = {"kpc": points(0.6), "kpc without tuning": points(0.1), "PNG": points(2.0), "AV1": points(1.0), "HEVC": []}
+    records = [{"name": "scene", "coder": coder, "points": curve} for coder, curve in curves.items()]
+    head, row = results._loss_table(records)
+    assert head == ["scene", "0.05 dB", "0.1 dB", "0.2 dB", "0.5 dB", "1 dB", "2 dB"]
+    assert row == ["scene", "-", *(f"{0.6 * 2 ** (3 - loss):.0f} KB, 40% (AV1)" for loss in (0.1, 0.2, 0.5, 1.0, 2.0))]
+    assert results._loss_table(records[:1])[1][2:] == [f"{0.6 * 2 ** (3 - loss):.0f} KB" for loss in (0.1, 0.2, 0.5, 1.0, 2.0)]
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    scene = tiny_scene(3, channels=4)
+    scene_io.write(quantise_scene(scene, [{name: 0.002 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
+    return tmp_path / "scene.kpc"
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch, few_rays: None) -> None:
+    """Here, and with little to do; what it does in processes of its own one test says."""
+    def here(jobs: list[codec_bench.Job], views: object, processes: int) -> list[Point | None]:
+        codec_bench._source.cache_clear()
+        codec_bench._judge_by(views)  # type: ignore[arg-type]
+        try:
+            return [codec_bench.point(job) for job in jobs]
+        finally:
+            codec_bench._judge_by(None)
+
+    monkeypatch.setattr(codec_bench, "in_parallel", here)
+    monkeypatch.setattr("kpc.encoder.rdo.codec_model.TOLERANCE", 0.2)
+    monkeypatch.setattr(codec_bench, "TUNE_STEPS", 0)
+    monkeypatch.setattr(codec_bench, "RATES", (1e-3, 3.0, 4.0))
+    monkeypatch.setattr(codec_bench, "QUALITIES", (60, 70, 80, 90))
+    others = Half("zstd -19"), Bytes(), Video("X", "libnothing", (1,), ())
+    monkeypatch.setattr(codec_bench, "RIVALS", {rival.name: rival for rival in others})
+    monkeypatch.setattr(codec_bench, "TUNED", {"X, tuned": "X", "Y, tuned": "Y"})  # the one cannot be used here, of the other nobody knows
+
+
+def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "codec.json"
+    assert kpbench.main(["codec", str(scene_file), "--ablate", "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    records = results.load([out])
+    assert [record["coder"] for record in records] == ["kpc", *codec_bench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19", "X", "X, tuned"]
+    ours, *without, halves, levels, missing, missing_too = records
+    for one in (missing, missing_too):
+        assert one["missing"] == "this ffmpeg has no libnothing" and one["points"] == [] and one["bd_rate"] is None
+    assert len(halves["points"]) == 6 and halves["bd_rate"] is not None
+    whole = scene_file.stat().st_size
+    assert len(ours["points"]) == 6  # no file has a thousandth of a bit
+    for found in ours["points"]:
+        assert found["size_bytes"] <= whole and sum(found["shares"].values()) == pytest.approx(1)
+        assert found["bits_per_parameter"] == pytest.approx(8 * found["size_bytes"] / tiny_scene(3, channels=4).parameter_count)
+    rates = [p["size_bytes"] for p in ours["points"][:2]]
+    assert rates[0] <= 3 * tiny_scene(3, channels=4).parameter_count / 8 and rates[0] < rates[1]
+    for found, quality in zip(ours["points"][2:], (60, 70, 80, 90), strict=True):
+        assert found["setting"] == f"quality {quality}"
+        # A file's own rounding is not much finer; and errors leap where a plane of so few texels leaves the trellis for predictions.
+        assert 0 <= found["agreement_db"] - (20 + quality / 3) < 1.5
+    assert "| scene | 60 | 70 | 80 | 90 |" in results.markdown(records)
+    others = codec_bench.others_bytes(scene_file)
+    assert min(p["size_bytes"] for p in halves["points"]) > others > 100
+    assert all(found["size_bytes"] - found["planes_bytes"] == others for found in halves["points"])
+    for found in ours["points"]:
+        of_planes = found["shares"].get("PLNE", 0) + found["shares"]["index"]
+        assert found["planes_bytes"] == pytest.approx(of_planes * found["size_bytes"])
+    assert halves["bd_rate_planes"] < halves["bd_rate"] < 0
+    assert all("its own probe" == record["settings"]["judged_by"] for record in records)
+    assert "kpc is smaller by" in said.err and "Coding, beside what is at hand" in results.markdown(records)
+    with (tmp_path / "codec.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    assert len(rows) == 6 + 7 * 4 + 6 + 5 and [len(one["points"]) for one in without] == [4] * 7
+    assert {row["coder"] for row in rows} == {"kpc", *codec_bench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19"}
+    assert float(rows[0]["size_bytes"]) == ours["points"][0]["size_bytes"]
+    svg = (tmp_path / "codec.svg").read_text()
+    assert "uint8 + zstd -19" in svg and "bits per parameter" in svg
+    assert plot.main([str(out), "-o", str(tmp_path / "again.svg")]) == 0
+    assert (tmp_path / "again.svg").read_text() == svg
+
+
+def test_what_was_measured_before_an_end_is_not_measured_again(
+    few: None, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, real, asked = tmp_path / "codec.json", codec_bench.point, []
+
+    def ends_at_the_eighth(job: codec_bench.Job) -> Point | None:
+        asked.append(job.key)
+        if len(asked) == 8:
+            raise KeyboardInterrupt
+        return real(job)
+
+    def one_by_one(jobs: list[codec_bench.Job], views: object, processes: int) -> Iterator[Point | None]:
+        return map(codec_bench.point, jobs)
+
+    monkeypatch.setattr(codec_bench, "in_parallel", one_by_one)
+    monkeypatch.setattr(codec_bench, "point", ends_at_the_eighth)
+    assert kpbench.main(["codec", str(scene_file), "--out", str(out)]) != 0 and not out.exists()
+    (notes,) = tmp_path.glob("codec.*.points")
+    with notes.open("a") as scene_io:
+        scene_io.write('["a line that was cut')
+    assert kpbench.main(["codec", str(scene_file), "--out", str(out)]) == 0
+    assert sorted(asked) == sorted([*set(asked), asked[7]])  # that which it ended at, and no other, twice
+    assert not notes.exists() and len(results.load([out])[0]["points"]) == 6
+    # Of another state of the code nothing is taken over.
+    notes.write_text(json.dumps({"commit": "another"}) + "\n" + json.dumps([asked[0], None]) + "\n")
+    assert codec_bench.Notes(notes, {"commit": "this"}).read() == {}
+
+
+def test_a_rival_that_is_tuned_comes_nearer_and_codes_every_plane_once(
+    few: None, scene_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(codec_bench, "TUNED", {"levels, tuned": Bytes().name})
+    monkeypatch.setattr(codec_bench, "TUNE_STEPS", 40)
+    monkeypatch.setattr("kpc.encoder.rdo.sequential_finetune.RAYS", 512)
+    shapes: list[tuple[int, ...]] = []
+    real = Bytes.encode
+
+    def encode(self: Bytes, planes: Planes, setting: int) -> list[bytes]:
+        shapes.extend(plane.shape for scale in planes for plane in scale.values())
+        return real(self, planes, setting)
+
+    monkeypatch.setattr(Bytes, "encode", encode)
+    plain = codec_bench.point(codec_bench.Job(scene_file, Bytes().name, 4, 100))
+    once, shapes[:] = sorted(shapes), ()
+    tuned = codec_bench.point(codec_bench.Job(scene_file, "levels, tuned", 4, 100))
+    assert sorted(shapes) == once == sorted(plane.shape for scale in tiny_scene(3, channels=4).scales for plane in scale.values())
+    assert plain is not None and tuned is not None and tuned["agreement_db"] > plain["agreement_db"] + 0.2
+    assert 0.8 * plain["size_bytes"] < tuned["size_bytes"] < 1.3 * plain["size_bytes"] and tuned["search_s"] > tuned["encode_s"]
+
+
+def test_held_out_views_judge(few: None, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_n3dv(tmp_path / "set", cameras=3)
+    monkeypatch.setattr(codec_bench, "VIEW_PIXELS", 256)
+    out = tmp_path / "codec.json"
+    assert kpbench.main(["codec", str(scene_file), "--dataset", str(tmp_path / "set"), "--out", str(out)]) == 0
+    records = results.load([out])
+    assert records[0]["settings"]["judged_by"] == "held-out views of set"
+    psnrs = {round(p["psnr"] + p["loss_db"], 6) for record in records for p in record["points"]}
+    assert len(psnrs) == 1 and 3 < psnrs.pop() < 25  # one uncoded scene, and not what these pictures show
+
+
+def test_processes_of_their_own(scene_file: Path) -> None:
+    jobs = [codec_bench.Job(scene_file, "kpc without tuning", "quality 5", codec_bench.Trade(quality=5.0)), codec_bench.Job(scene_file, Bytes().name, 4)]
+    ours, levels = codec_bench.in_parallel(jobs, None, 2)
+    assert ours is not None and levels is not None and ours["psnr"] < 30 and levels["size_bytes"] > 100
+    assert math.isfinite(levels["psnr"])
+
+
+def test_errors_are_one_line(few: None, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "bad").write_bytes(b"nonsense")
+    for words in (["codec", str(tmp_path / "bad")], ["codec", str(tmp_path / "none.kpc")],
+                  ["codec", str(scene_file), "--dataset", str(tmp_path / "no")],
+                  ["codec", str(scene_file), "--dataset", ".", "--dataset", "."]):  # fmt: skip
+        assert kpbench.main(words) in (1, 2)
+        said = capsys.readouterr()
+        assert said.out == "" and said.err.splitlines()[-1].startswith("kpbench: ") and "Traceback" not in said.err
+
+
+def test_records_survive_json(
+    few: None, scene_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(codec_bench, "RATES", (3.0,))
+    monkeypatch.setattr(codec_bench, "QUALITIES", (60,))
+    monkeypatch.setattr(codec_bench, "TUNE_STEPS", 2)
+    monkeypatch.setattr(codec_bench, "RIVALS", {Bytes().name: Bytes()})
+    monkeypatch.setattr(codec_bench, "TUNED", {"levels, tuned": Bytes().name})
+    assert kpbench.main(["codec", str(scene_file)]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["kind"] == "codec"

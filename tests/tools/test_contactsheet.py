@@ -1,0 +1,48 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from kpc.format.common.media import read_image, write_image
+from kpc.tools.cli import contactsheet
+
+
+def fill(folder: Path, names: list[str], level: int, size: tuple[int, int] = (40, 60)) -> Path:
+    folder.mkdir()
+    for name in names:
+        write_image(folder / f"{name}.png", np.full((*size, 3), level, np.uint8))
+    return folder
+
+
+def test_truth_rendered_and_depth_stand_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth, drawn = fill(tmp_path / "gt", ["a", "b", "c", "d"], 100), fill(tmp_path / "out", ["a", "b", "c", "z"], 110)
+    for name in "abc":
+        depth = np.linspace(1000, 2000, 40 * 60).reshape(40, 60).astype(np.uint16)
+        depth[0] = contactsheet.NOTHING
+        Image.fromarray(depth).save(drawn / f"{name}_depth.png")
+    out = tmp_path / "sheet.png"
+    assert contactsheet.main([str(truth), str(drawn), "-o", str(out), "--rows", "2"]) == 0
+    assert capsys.readouterr().out == f"{out}: mean PSNR 28.13 dB over 3 pictures\n"  # 20 log10(255 / 10)
+    page, gap, step = read_image(out), contactsheet.GAP, 40 + contactsheet.CAPTION
+    assert page.shape == (2 * step + gap, gap + 3 * (60 + gap), 3)
+    for row in (gap, gap + step):
+        assert (page[row : row + 40, gap : gap + 60] == 100).all()
+        assert (page[row : row + 40, 2 * gap + 60 : 2 * gap + 120] == 110).all()
+        grey = page[row : row + 40, 3 * gap + 120 : 3 * gap + 180, 0].astype(int)
+        assert (grey[0] == 0).all() and (np.diff(grey[1:].ravel()) <= 0).all() and grey[1, 0] > 4 * grey[-1, -1] > 0
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda root: fill(root / "out", ["other"], 0),
+        lambda root: fill(root / "out", ["a"], 0, (20, 30)),
+        lambda root: root / "out",
+    ],
+)
+def test_what_does_not_match_is_one_line(make, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth, drawn = fill(tmp_path / "gt", ["a"], 0), make(tmp_path)
+    assert contactsheet.main([str(truth), str(drawn), "-o", str(tmp_path / "sheet.png")]) in (1, 2)
+    said = capsys.readouterr().err
+    assert said.startswith(f"contactsheet: {drawn}") and said.count("\n") == 1 and not (tmp_path / "sheet.png").exists()

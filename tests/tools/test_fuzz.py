@@ -1,0 +1,137 @@
+"""Damaged files: whatever is done to one, a reader reads it or refuses it."""
+
+import json
+import os
+import random
+import time
+
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from kpc.format.common.errors import FormatError
+from kpc.format.container.scene_io import read
+from kpc.tools.vectors import fuzz, specvectors
+
+FEW = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+
+
+@pytest.fixture(scope="module")
+def starts() -> list[fuzz.Taken]:
+    return fuzz.seeds()
+
+
+@pytest.fixture(scope="module")
+def minimal() -> bytes:
+    return specvectors.encode(specvectors.minimal_scene(), compress=False)
+
+
+def test_a_file_taken_apart_and_put_together_is_the_same(starts, minimal):
+    assert fuzz.Taken.of(minimal).together() == minimal
+    assert all(fuzz.examined(taken.together()) in ("read", "FormatError") for taken in starts)
+    assert sum(fuzz.examined(taken.together()) == "read" for taken in starts) > 30
+
+
+@pytest.mark.parametrize("name", fuzz.MUTATIONS)
+@given(rng=st.randoms(use_true_random=False))
+@FEW
+def test_damage_of_every_kind_is_read_or_refused(starts, name, rng):
+    fuzz.examined(fuzz.MUTATIONS[name](rng, rng.choice(starts), starts))
+
+
+def test_damage_gets_past_the_checksums(starts):
+    """Of content changed, a part is read and a part is refused by what decodes it, none by a checksum."""
+    said = []
+    for number in range(150):
+        rng = random.Random(number)
+        data = fuzz.in_content(rng, starts[0], starts)
+        try:
+            read(data)
+            said.append("read")
+        except FormatError as error:
+            said.append(str(error))
+    assert said.count("read") > 10 and len(set(said)) > 15
+    assert not any("CRC32C" in message for message in said)
+
+
+def test_every_truncation_of_a_small_file_is_refused(minimal):
+    for length in range(len(minimal)):
+        with pytest.raises(FormatError):
+            read(minimal[:length])
+        fuzz.examined(minimal[:length])
+
+
+def test_every_bit_flip_of_a_small_file_is_refused(minimal):
+    for bit in range(8 * len(minimal)):
+        damaged = bytearray(minimal)
+        damaged[bit >> 3] ^= 1 << (bit & 7)
+        with pytest.raises(FormatError):
+            read(bytes(damaged))
+
+
+def test_the_command_counts_and_keeps_what_it_finds(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(fuzz, "run", lambda *args, **more: {"count": 3, "findings": [(2, "ValueError: no")]})
+    assert fuzz.main(["--count", "3", "--seed", "5", "-o", str(tmp_path / "found")]) == 1
+    said = capsys.readouterr()
+    assert json.loads(said.out)["count"] == 3 and "1 of 3 files" in said.err
+    assert (tmp_path / "found" / "5-2.kpc").read_bytes() == fuzz.file_number(5, 2, fuzz.seeds())
+
+
+def test_vectors_by_name():
+    assert 0 < len(fuzz.seeds("borders,implied")) < len(fuzz.seeds()) / 4
+    assert fuzz.main(["--count", "1", "--only", "nothing-is-called-so"]) != 0
+
+
+def breaks(data: bytes, budget: int = 0) -> str:
+    raise ValueError("as it should not")
+
+
+def test_other_errors_are_found_and_work_goes_on(monkeypatch):
+    sent: list = []
+    monkeypatch.setattr(fuzz, "_limit_memory", lambda more: monkeypatch.setattr(fuzz, "examined", breaks))
+    pipe = type("Pipe", (), {"send": staticmethod(sent.append)})
+    fuzz._work(pipe, [0.0, 0.0, 0.0], 1, range(0, 3), frozenset({1}), fuzz.BUDGET, "")
+    (following, tally, findings), = sent
+    assert following == 3 and tally == {"finding": 2}
+    assert findings == [(0, "ValueError: as it should not"), (2, "ValueError: as it should not")]
+
+
+def test_processes_of_their_own():
+    found = fuzz.run(4, seed=3, processes=1)
+    assert found["count"] == 4 and not found["findings"]
+
+
+def test_a_run_in_parts(monkeypatch):
+    """Two parts examine what the whole does; each process takes every other of them."""
+    asked: list[range] = []
+
+    class Process:
+        pid, exitcode = 0, 0
+
+        def __init__(self, target, args, daemon):
+            self.pipe, _, _, self.numbers, *_ = args
+
+        def start(self):
+            asked.append(self.numbers)
+            self.pipe.send((self.numbers.stop, fuzz.Counter(read=len(self.numbers)), []))
+
+        def join(self):
+            pass
+
+    context = fuzz.multiprocessing.get_context("spawn")
+    monkeypatch.setattr(type(context), "Process", Process)
+    parts = [fuzz.run(count, seed=1, processes=2, first=first) for first, count in ((0, 5), (5, 4), (9, 1))]
+    assert [part["count"] for part in parts] == [5, 4, 1]
+    assert sorted(number for numbers in asked for number in numbers) == list(range(10))
+
+
+def test_computing_is_told_of_other_processes():
+    assert fuzz._computed_s(os.getpid()) == pytest.approx(time.process_time(), abs=0.2)
+    assert fuzz._computed_s(-1) == 0
+
+
+def test_a_frame_that_says_it_is_vast_is_not_taken_at_its_word() -> None:
+    small, vast = zstandard.compress(b"a" * 100), b"\x28\xb5\x2f\xfd\xe0" + (1 << 50).to_bytes(8, "little") + b"\x01\x00\x00"
+    assert fuzz._decompressed(small) == b"a" * 100
+    assert fuzz._decompressed(vast) is None and fuzz._decompressed(b"no frame") is None

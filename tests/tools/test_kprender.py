@@ -1,0 +1,343 @@
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import gl
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+from scenes import surrounded, tiny_scene, varied
+
+import kpc
+from kpc.format.scene.cameras import load_shots
+from kpc.format.common.errors import DisplayError
+from kpc.format.container.scene_io import write
+from kpc.format.common.media import read_image, read_video
+from kpc.format.coding.quantise import quantise_scene
+from kpc.player.cpu import reference
+from kpc.player.gl import offscreen
+from kpc.player.app.camera_paths import CameraPath
+from kpc.tools.cli import kprender
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "tiny.kpc"
+    scene = tiny_scene(4)
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    return path
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Iterator[object]:
+    def call(*arguments: object) -> tuple[int, str, str]:
+        try:
+            code = kprender.main([str(a) for a in arguments])
+        except SystemExit as error:  # argparse
+            code = int(error.code or 0)
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    yield call
+
+
+def cameras_json(path: Path, files: list[str]) -> Path:
+    scene = tiny_scene(4)
+    frames = [
+        {
+            "file": name,
+            "time": n / max(len(files) - 1, 1),
+            "transform_matrix": scene.cameras[n % 2].camera_to_world.tolist(),
+        }
+        for n, name in enumerate(files)
+    ]
+    path.write_text(json.dumps({"w": 48, "h": 36, "fl_x": 55, "fl_y": 55, "cx": 24, "cy": 18, "frames": frames}))
+    return path
+
+
+@pytest.mark.parametrize("backend", ["gl", "reference"])
+def test_pictures_from_a_camera_file(run, scene_file: Path, tmp_path: Path, backend: str) -> None:
+    if backend == "gl":
+        gl.context()
+    listed = cameras_json(tmp_path / "cameras.json", ["a/one.png", "two.jpg"])
+    out = tmp_path / "new" / "out"
+    code, said, _ = run(scene_file, "--cameras", listed, "-o", out, "--backend", backend)
+    assert code == 0 and said.startswith(f"{out}: 2 pictures, 48x36")
+    assert sorted(p.name for p in out.iterdir()) == ["one.png", "two.png"]
+    scene = kpc.load(scene_file)
+    for n, name in enumerate(("one.png", "two.png")):
+        wanted = reference.render(scene, tiny_scene(4).cameras[n], float(n)).rgb
+        assert np.mean(np.abs(read_image(out / name) / 255 - wanted).max(axis=2) < 1.5 / 255) > 0.999
+
+
+def test_names_from_a_camera_file_stay_in_the_directory(run, scene_file: Path, tmp_path: Path) -> None:
+    names = [
+        "../../escape.png",
+        "/etc/passwd",
+        "..\\..\\win.png",
+        "",
+        "..",
+        ".hidden",
+        "x.png",
+        "y/x.png",
+        "nul\0l\n.png",
+        "n" * 400,
+    ]
+    listed = cameras_json(tmp_path / "cameras.json", names)
+    out = tmp_path / "out"
+    code, _, _ = run(scene_file, "--cameras", listed, "-o", out, "--backend", "reference", "--size", "8x6")
+    assert code == 0
+    found = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()} - {"cameras.json"}
+    assert len(found) == len(names) and all(name.startswith("out/") and name.count("/") == 1 for name in found)
+    assert {"out/escape.png", "out/passwd.png", "out/win.png", "out/x.png"} <= found
+
+
+def test_exr_holds_linear_colour_and_depth(run, scene_file: Path, tmp_path: Path) -> None:
+    code, _, _ = run(scene_file, "--time", 0.4, "--backend", "reference", "-o", tmp_path / "x.exr")
+    assert code == 0
+    scene = kpc.load(scene_file)
+    wanted = reference.render(scene, scene.cameras[0], 0.4)
+    with OpenEXR.File(str(tmp_path / "x.exr"), separate_channels=True) as exr:
+        depth = np.array(exr.channels()["Z"].pixels)
+    assert np.array_equal(depth, wanted.depth) and depth.dtype == np.float32
+    assert np.abs(read_image(tmp_path / "x.exr") / 255 - wanted.rgb).max() < 1 / 255
+
+
+def test_depth_beside_a_png(run, scene_file: Path, tmp_path: Path) -> None:
+    code, _, _ = run(scene_file, "--time", 0.4, "--backend", "reference", "--depth", "-o", tmp_path / "x.png")
+    assert code == 0
+    scene = kpc.load(scene_file)
+    wanted = reference.render(scene, scene.cameras[0], 0.4).depth
+    with Image.open(tmp_path / "x_depth.png") as image:
+        unit, levels = float(image.text["depth_unit"]), np.asarray(image)
+    assert np.array_equal(levels == kprender.NOTHING, np.isinf(wanted))
+    seen = np.isfinite(wanted)
+    assert np.abs(levels[seen] * unit - wanted[seen]).max() <= unit / 2 * 1.01
+
+
+def test_depth_in_contracted_space_reaches_far_and_says_where_it_stops(run, tmp_path: Path) -> None:
+    path, camera = tmp_path / "around.kpc", tmp_path / "c.json"
+    scene = surrounded(tiny_scene(4))
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales], skip_unseen=False), path)
+    pose = scene.cameras[0].camera_to_world.copy()
+    pose[:3, 3] = [0.1, 0.05, 1.4]  # in the open, the wall behind it all
+    camera.write_text(json.dumps({"w": 40, "h": 30, "fl_x": 12, "fl_y": 12, "cx": 20, "cy": 15, "frames": [
+        {"file": "a.png", "time": 0.4, "transform_matrix": pose.tolist()}]}))
+    assert run(path, "--cameras", camera, "--backend", "reference", "--depth", "-o", tmp_path)[0] == 0
+    scene = kpc.load(path)
+    wanted = reference.render(scene, load_shots(camera)[0].camera, 0.4).depth
+    with Image.open(tmp_path / "a_depth.png") as image:
+        unit, levels = float(image.text["depth_unit"]), np.asarray(image)
+    there = np.isfinite(wanted)
+    limit = kprender.FARTHEST_EVEN * scene.mapping.even
+    assert wanted[there].max() > 2 * scene.mapping.even and unit == pytest.approx(limit / 65534)
+    np.testing.assert_allclose(levels[there] * unit, np.minimum(wanted, limit)[there], atol=0.51 * unit)
+    assert (levels[~there] == kprender.NOTHING).all()
+    assert run(path, "--cameras", camera, "--backend", "reference", "--depth", "-o", tmp_path / "a.mp4")[0] == 0
+    (frame,) = read_video(tmp_path / "a.mp4")
+    grey = 255 * (1 - scene.mapping.progress(wanted) / (2 * scene.mapping.even))
+    assert np.abs(frame[..., 1].astype(float) - grey).mean() < 6 and grey.std() > 10
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_an_orbit_becomes_a_video(run, scene_file: Path, tmp_path: Path, depth: bool) -> None:
+    out = tmp_path / "orbit.mp4"
+    code, said, _ = run(
+        scene_file, "--orbit", 7, "--size", "64x48", "--backend", "reference", "-o", out, *["--depth"] * depth
+    )
+    assert code == 0 and "7 frames at 10 fps" in said
+    frames = list(read_video(out))
+    assert len(frames) == 7 and frames[0].shape == (48, 64, 3)
+    assert np.abs(frames[0].astype(int) - frames[3]).mean() > 1  # it moves
+
+
+def test_a_path_becomes_a_video_and_its_keyframes_pictures(run, scene_file: Path, tmp_path: Path) -> None:
+    path = CameraPath()
+    for time, camera in zip((0.0, 0.4, 0.9), (*tiny_scene(4).cameras, tiny_scene(4).cameras[0])):
+        path = path.with_keyframe(camera, time, 0.5)
+    path.save(tmp_path / "path.json")
+    code, said, _ = run(scene_file, "--path", tmp_path / "path.json", "--backend", "reference", "-o", tmp_path / "a.mp4", "--fps", 6)
+    assert code == 0 and "7 frames at 6 fps, 48x36" in said
+    frames = list(read_video(tmp_path / "a.mp4"))
+    code, said, _ = run(scene_file, "--cameras", tmp_path / "path.json", "--backend", "reference", "-o", tmp_path / "keys")
+    assert code == 0 and "3 pictures" in said
+    for number, frame in enumerate((frames[0], frames[3], frames[6])):
+        key = read_image(tmp_path / "keys" / f"{number:04d}.png")
+        assert np.abs(frame.astype(float) - key).mean() < 6  # but for H.264's losses
+    assert np.abs(frames[0].astype(int) - frames[3]).mean() > 6
+
+
+def test_the_clip_from_the_first_camera(run, scene_file: Path, tmp_path: Path) -> None:
+    code, said, _ = run(scene_file, "--backend", "reference", "-o", tmp_path / "clip.mp4", "--fps", 5)
+    assert code == 0 and "11 frames at 5 fps" in said
+
+
+def test_quality_is_a_rung_of_the_ladder(run, scene_file: Path, tmp_path: Path) -> None:
+    gl.context()
+    pictures = {}
+    for name in ("reference", "finer", "fastest"):
+        path = tmp_path / f"{name}.png"
+        assert run(scene_file, "--time", 0.4, "-o", path, "--quality", name)[0] == 0
+        pictures[name] = read_image(path).astype(int)
+    off = [np.abs(pictures[name] - pictures["reference"]).mean() for name in ("finer", "fastest")]
+    assert off[0] < 0.5 < off[1]
+    assert run(scene_file, "--time", 0.4, "-o", tmp_path / "x.png", "--quality", "best")[0] == 2
+
+
+def test_static_and_dynamic_only(run, scene_file: Path, tmp_path: Path) -> None:
+    pictures = {}
+    for flag in ("", "--static-only", "--dynamic-only"):
+        path = tmp_path / f"x{flag}.png"
+        assert run(scene_file, "--time", 0.4, "--backend", "reference", "-o", path, *[flag] * bool(flag))[0] == 0
+        pictures[flag] = read_image(path).astype(int)
+    difference = np.abs(pictures[""] - pictures["--static-only"])
+    assert difference.max() > 5
+    assert np.abs(difference - pictures["--dynamic-only"]).max() <= 1
+
+
+def test_the_dynamic_map_is_grey_and_of_one_colour_by_either_backend(run, scene_file: Path, tmp_path: Path) -> None:
+    gl.context()
+    pictures = []
+    for backend in ("gl", "reference"):
+        path = tmp_path / f"{backend}.png"
+        assert run(scene_file, "--time", 0.4, "--dynamic-map", "--backend", backend, "-o", path)[0] == 0
+        pictures.append(read_image(path).astype(int))
+    assert np.abs(pictures[0] - pictures[1]).mean() < 2
+    red, green, blue = np.moveaxis(pictures[1], -1, 0)
+    assert (red - blue).max() > 60 and (red >= green - 1).all() and (green >= blue - 1).all()
+    assert ((red == green) & (green == blue)).mean() > 0.2
+    assert run(scene_file, "--time", 0, "--dynamic-map", "--static-only", "-o", path)[0] == 2
+
+
+@pytest.fixture(scope="module")
+def varied_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("varied") / "varied.kpc"
+    scene = varied(tiny_scene(4), ("dawn.jpg", "5:00 pm", "a/b.jpg", "x:y:0.5"))
+    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    return path
+
+
+@pytest.mark.parametrize("backend", ["gl", "reference"])
+@pytest.mark.parametrize("text, one, other, share", [
+    ("dawn.jpg", 0, 0, 0), ("x:y:0.5", 3, 3, 0), ("dawn.jpg:5:00 pm:0.3", 0, 1, 0.3), ("5:00 pm:a/b.jpg:1", 1, 2, 1.0),
+    ("x:y:0.5:dawn.jpg:0.75", 3, 0, 0.75),
+])
+def test_appearances_by_name_and_between_two(
+    run, varied_file: Path, tmp_path: Path, backend: str, text: str, one: int, other: int, share: float
+) -> None:
+    if backend == "gl":
+        gl.context()
+    code, _, _ = run(varied_file, "--time", 0.4, "--appearance", text, "--backend", backend, "-o", tmp_path / "x.png")
+    assert code == 0
+    scene = kpc.load(varied_file)
+    codes = [appearance.code for appearance in scene.appearances]
+    wanted, average = (
+        kpc.render(scene, scene.cameras[0], 0.4, appearance).rgb
+        for appearance in ((1 - share) * codes[one] + share * codes[other], None)
+    )
+    assert np.abs(read_image(tmp_path / "x.png") / 255 - wanted).max() < 1.5 / 255
+    assert np.abs(wanted - average).max() > 5 / 255
+
+
+@pytest.mark.parametrize("text, words", [
+    ("dusk.jpg", "'dusk.jpg'"), ("", "''"), ("dawn.jpg:dusk.jpg", "'dawn.jpg:dusk.jpg'"), ("dawn.jpg:dusk.jpg:0.5", "'dusk.jpg'"),
+    ("dawn.jpg:a/b.jpg:1.5", "not a share"), ("dawn.jpg:a/b.jpg:x", "not a share"),
+])
+def test_appearances_that_are_not_there(run, varied_file: Path, scene_file: Path, tmp_path: Path, text: str, words: str) -> None:
+    arguments = ("--appearance", text, "--time", 0, "--backend", "reference", "-o", tmp_path / "x.png")
+    code, _, complaint = run(varied_file, *arguments)
+    assert code == 2 and words in complaint and complaint.count("\n") == 1
+    code, _, complaint = run(scene_file, *arguments)
+    assert code == 2 and ("none" in complaint or words == "not a share") and not (tmp_path / "x.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["{missing}", "-o", "{dir}"], 1, "missing.kpc"),
+        (["{text}", "-o", "{dir}"], 1, "text.kpc"),
+        (["{scene}", "--cameras", "{missing}", "-o", "{dir}"], 1, "missing.kpc"),
+        (["{scene}", "--cameras", "{text}", "-o", "{dir}"], 1, "not JSON"),
+        (["{scene}", "--cameras", "{empty}", "-o", "{dir}"], 1, "frames"),
+        (["{scene}", "--cameras", "{nan}", "-o", "{dir}"], 1, "NaN"),
+        (["{scene}", "--path", "{missing}", "-o", "{dir}"], 1, "missing.kpc"),
+        (["{scene}", "--path", "{nan}", "-o", "{dir}"], 1, "NaN"),
+        (["{scene}", "--path", "{long}", "-o", "{dir}"], 2, "more than 100000 pictures"),
+        (["{scene}", "--path", "x", "--orbit", "2", "-o", "{dir}"], 2, "not allowed"),
+        (["{scene}", "--orbit", "2", "-o", "{text}/inside"], 1, "text.kpc"),
+        (["{scene}", "--orbit", "2", "-o", "{dir}/no/such/a.mp4"], 1, "no/such"),
+        (["{scene}", "--orbit", "2", "-o", "{dir}/a.png"], 2, "2 pictures do not go into one"),
+        (["{scene}", "--orbit", "0", "-o", "{dir}"], 2, "--orbit"),
+        (["{scene}", "--orbit", "x", "-o", "{dir}"], 2, "--orbit"),
+        (["{scene}", "--time", "1.5", "-o", "{dir}"], 2, "--time"),
+        (["{scene}", "--size", "0x5", "-o", "{dir}"], 2, "--size"),
+        (["{scene}", "--size", "640", "-o", "{dir}"], 2, "--size"),
+        (["{scene}", "--fps", "-1", "-o", "{dir}"], 2, "--fps"),
+        (["{scene}", "--orbit", "2", "--cameras", "x", "-o", "{dir}"], 2, "not allowed"),
+        (["{scene}"], 2, "--output"),
+    ],
+)
+def test_bad_input_is_one_line(
+    run, scene_file: Path, tmp_path: Path, arguments: list[str], code: int, words: str
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (tmp_path / "text.kpc").write_text("not a scene")
+    (tmp_path / "empty.json").write_text("{}")
+    pose = np.eye(4).tolist()
+    pose[0][3] = float("nan")
+    (tmp_path / "nan.json").write_text(json.dumps({"w": 4, "h": 4, "fl_x": 4, "frames": [{"transform_matrix": pose}]}))
+    frames = [{"transform_matrix": np.eye(4).tolist(), "at": at} for at in (0, 80_000)]
+    (tmp_path / "long.json").write_text(json.dumps({"w": 4, "h": 4, "fl_x": 4, "frames": frames}))
+    names = {
+        "long": tmp_path / "long.json",
+        "scene": scene_file,
+        "missing": tmp_path / "missing.kpc",
+        "text": tmp_path / "text.kpc",
+        "dir": out,
+        "empty": tmp_path / "empty.json",
+        "nan": tmp_path / "nan.json",
+    }
+    got, said, complaint = run(*[a.format(**names) for a in arguments], "--backend", "reference")
+    assert got == code and said == "" and words in complaint
+    assert "Traceback" not in complaint
+    last = [line for line in complaint.splitlines() if line.startswith("kprender:")]
+    assert len(last) >= 1 and words in last[-1]
+    assert list(out.iterdir()) == []
+
+
+def test_a_directory_that_cannot_be_written(
+    run, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", str(tmp_path / "x.png"))
+
+    monkeypatch.setattr("kpc.format.common.cli.tempfile.mkstemp", refuse)
+    code, _, complaint = run(scene_file, "--time", 0, "-o", tmp_path / "x.png", "--backend", "reference")
+    assert code == 1 and complaint.splitlines()[-1] == f"kprender: {tmp_path / 'x.png'}: Permission denied"
+
+
+def test_without_opengl_the_reference_backend_is_offered(run, scene_file: Path, tmp_path: Path, monkeypatch) -> None:
+    def refuse() -> None:
+        raise DisplayError(f"no OpenGL 3.3 to be had: {offscreen.REMEDY}")
+
+    monkeypatch.setattr(offscreen, "open_context", refuse)
+    code, _, complaint = run(scene_file, "--time", 0, "-o", tmp_path / "x.png")
+    assert code == 1 and "--backend reference" in complaint and "libegl1" in complaint and complaint.count("\n") == 1
+
+
+def test_the_reference_backend_needs_no_opengl_module(scene_file: Path, tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.modules.update(moderngl=None, glfw=None, imgui_bundle=None, torch=None); "
+        "from kpc.tools.cli.kprender import main; sys.exit(main())"
+    )
+    arguments = [str(scene_file), "--time", "0", "-o", str(tmp_path / "x.png"), "--backend", "reference"]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, env=dict(os.environ), check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert read_image(tmp_path / "x.png").shape == (36, 48, 3)

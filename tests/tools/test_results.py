@@ -1,0 +1,112 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from kpc.format.common.errors import FormatError
+from kpc.tools.bench import results
+
+MACHINE = {"cpu": "Test CPU", "cores": 2, "memory_bytes": 8 << 30, "os": "Linux", "python": "3.11"}
+
+
+def encode_record(name: str, psnrs: list[float | None], **changes: object) -> results.Record:
+    run: results.Record = dict(
+        test_ssim=0.9, size_bytes=345678, bits_per_parameter=1.25, identity_share=None, coding_loss_db=0.1
+    )
+    run |= dict(train_s=100.0, encode_s=120.0, rays_per_s=23456.0, peak_memory_bytes=9e8)
+    record: results.Record = dict(
+        kind="encode", name=name, commit="0123456789abcdef", command=f"kpbench encode {name}", renderer="cpu"
+    )
+    record |= dict(machine=MACHINE, settings={"preset": "fast"}, repeats=[run | {"test_psnr": psnr} for psnr in psnrs])
+    return record | changes
+
+
+def test_a_cell_is_the_median_of_the_repeats_that_have_it() -> None:
+    record = encode_record("room", [30.0, None, 32.0, 33.0])
+    assert results.median(record, "test_psnr") == 32.0
+    assert results.median(record, "identity_share") is None
+    head, row = results.cells("encode", [record])
+    assert dict(zip(head, row))["PSNR dB"] == "32.00" and dict(zip(head, row))["identity"] == "-"
+    assert dict(zip(head, row))["file KB"] == "346" and dict(zip(head, row))["rays/s"] == "23,456"
+
+
+def test_tables_are_split_by_machine_and_say_where_they_come_from() -> None:
+    other = encode_record("liam", [28.0], machine=MACHINE | {"cores": 64}, commit="f" * 40 + "+dirty")
+    text = results.markdown([encode_record("room", [30.0, 31.0]), other, encode_record("fox", [20.0, 21.0])])
+    first, second = text.split("**Encoding**")[1:]
+    assert "Test CPU, 2 cores, 8 GiB" in first and "| room | fast | 30.50 |" in first and "| fox |" in first
+    assert "Commit 012345678; median of 2 runs; `kpbench encode room`; `kpbench encode fox`." in first
+    assert "64 cores" in second and "Commit fffffffff+dirty; median of 1 run;" in second
+
+
+def player_records(name: str, size: str = "320x240", renderer: str = "llvmpipe") -> list[results.Record]:
+    accuracy = dict.fromkeys(("samples_per_ray", "psnr_least", "psnr_turning", "within_one_level"), 0.5) | {"psnr": 41.6}
+    return [
+        encode_record(name, [30.0], kind="player", accuracy=accuracy, renderer=renderer, repeats=[{"fps": 31.4}],
+                      settings={"quality": quality, "default": "balanced", "size": size})
+        for quality in ("fast", "balanced", "fine", "reference")
+    ]  # fmt: skip
+
+
+def test_documents_show_only_the_default_quality_and_the_reference() -> None:
+    each = [*player_records("room"), encode_record("liam", [1.0])]
+    document = "".join(f"<!-- {kind}: begin -->\n<!-- {kind}: end -->\n" for kind in ("player", "encode"))
+    every, few = results.markdown(each), results.written(document, each)
+    assert every.count("| room |") == 4 and few.count("| room |") == 2 and few.count("| liam |") == 1
+    assert "| balanced (default) |" in few and "| reference |" in few
+
+
+def test_at_a_glance_each_scene_that_a_processor_plays_is_beside_its_encoding() -> None:
+    scene, asked = encode_record("room", [30.0]), encode_record("room", [20.0], settings={"preset": "fast", "psnr_db": 20.0})
+    played = [player_records("room-fast", "640x480"), player_records("room-fast"), player_records("room-fast", "640x480", "NVIDIA"),
+              player_records("fox-fast", "640x480")]  # fmt: skip
+    head, _, *rows = results.glance([scene, asked, *(record for records in played for record in records)]).splitlines()
+    assert rows == ["| room | fast | 30.00 | 0.900 | 346 | 2 | 2 | 31 | 42 |"] and head.count("|") == rows[0].count("|")
+
+
+def test_what_is_between_a_documents_markers_is_rewritten_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    readme, tables, records = tmp_path / "README.md", tmp_path / "tables.md", tmp_path / "a.json"
+    before, after = "before\n\n<!-- glance: begin; a word -->", "<!-- glance: end -->\n\nafter\n"
+    readme.write_text(f"{before}\nold\n{after}")
+    tables.write_text("<!-- step: begin -->\nold <!-- step: end -->\n<!-- encode: begin --><!-- encode: end -->")
+    records.write_text(json.dumps([encode_record("room", [30.0])]))
+    for _ in range(2):
+        assert results.main([str(records), "--into", str(readme), str(tables)]) == 0
+        assert capsys.readouterr().out == f"{readme}\n{tables}\n"
+    text = readme.read_text()
+    assert text.startswith(f"{before}\n\n| dataset |") and text.endswith(f"\n\n{after}") and "old" not in text
+    text = tables.read_text()
+    assert text.startswith("<!-- step: begin -->\n\n\n\n<!-- step: end -->\n<!-- encode: begin -->\n\n**Encoding**") and text.count("| room |") == 1
+
+
+def test_records_without_a_place_are_named_and_nothing_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document, records = tmp_path / "a.md", tmp_path / "a.json"
+    document.write_text("<!-- step: begin --><!-- step: end -->")
+    records.write_text(json.dumps([encode_record("room", [30.0])]))
+    assert results.main([str(records), "--into", str(document)]) == 1
+    assert "no place for tables of encode" in capsys.readouterr().err
+    assert document.read_text() == "<!-- step: begin --><!-- step: end -->"
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[1]", '[{"kind": "other"}]', '[{"kind": "encode"}]'])
+def test_other_files_are_refused_by_name(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=r"a\.json: not records of kpbench"):
+        results.load([path])
+
+
+@pytest.mark.parametrize("text", ["nothing", "<!-- encode: end --><!-- encode: begin -->", "<!-- encode: begin -->",
+                                  "<!-- encode: begin --><!-- encode: end -->" * 2, "<!-- other: begin --><!-- other: end -->"])  # fmt: skip
+def test_documents_without_a_pair_of_markers_a_name_are_refused(tmp_path: Path, text: str) -> None:
+    document = tmp_path / "a.md"
+    document.write_text(text)
+    with pytest.raises(FormatError, match="needs lines such as"):
+        results.names_in(document)
+
+
+@pytest.mark.parametrize("document", ["README.md", "docs/measured.md"])
+def test_committed_records_make_the_tables_of_the_documents(document: str) -> None:
+    root = Path(__file__).parents[2]
+    text = (root / document).read_text()
+    assert results.written(text, results.load(sorted((root / "docs" / "bench").glob("*.json")))) == text

@@ -1,0 +1,87 @@
+import http.client
+import subprocess
+import sys
+import time as clock
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from kpc.tools.cli import serve
+from kpc.tools.cli.serve import Line, serving
+
+DATA = bytes(range(256)) * 40
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "served").mkdir()
+    (tmp_path / "secret").write_bytes(b"secret")
+    (tmp_path / "served" / "scene.kpc").write_bytes(DATA)
+    return tmp_path / "served"
+
+
+def get(url: str, path: str, **headers: str) -> tuple[http.client.HTTPResponse, bytes]:
+    connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=10)
+    try:
+        connection.request("GET", path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+        response = connection.getresponse()
+        return response, response.read()
+    finally:
+        connection.close()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "status", "span"),
+    [("bytes=0-99", 206, (0, 100)), ("bytes=100-", 206, (100, 10240)), ("bytes=10000-99999", 206, (10000, 10240)),
+     ("bytes=10240-", 416, (0, 0)), ("bytes=5-4", 416, (0, 0)), ("bytes=-5", 200, (0, 10240)), ("bytes=0-1,3-4", 200, (0, 10240)),
+     ("lines=0-1", 200, (0, 10240))],
+)  # fmt: skip
+def test_ranges(folder: Path, wanted: str, status: int, span: tuple[int, int]) -> None:
+    with serving(folder) as url:
+        response, body = get(url, "/scene.kpc", Range=wanted)
+        assert response.status == status and body == DATA[slice(*span)]
+        if status == 206:
+            assert response.headers["Content-Range"] == f"bytes {span[0]}-{span[1] - 1}/10240"
+
+
+def test_a_range_of_another_file_is_the_whole(folder: Path) -> None:
+    with serving(folder) as url:
+        response, _ = get(url, "/scene.kpc", Range="bytes=0-9")
+        etag = response.headers["ETag"]
+        assert get(url, "/scene.kpc", Range="bytes=0-9", If_Range=etag)[1] == DATA[:10]
+        (folder / "scene.kpc").write_bytes(DATA[::-1])
+        response, body = get(url, "/scene.kpc", Range="bytes=0-9", If_Range=etag)
+        assert response.status == 200 and body == DATA[::-1]
+
+
+def test_nothing_outside_the_folder_is_served(folder: Path) -> None:
+    with serving(folder) as url:
+        for path in ("/../secret", "/%2e%2e/secret", "/nothing.kpc"):
+            response, body = get(url, path)
+            assert response.status == 404 and b"secret" not in body.replace(b"/secret", b"")
+
+
+def test_a_slow_line_is_slow(folder: Path) -> None:
+    with serving(folder, line=Line(rate=50_000, delay_s=0.05)) as url:
+        started = clock.monotonic()
+        assert get(url, "/scene.kpc")[1] == DATA
+        assert 0.2 < clock.monotonic() - started
+
+
+def test_the_command_says_the_addresses(folder: Path) -> None:
+    command = [sys.executable, "-m", "kpc.tools.cli.serve", str(folder), "--port", "0", "--rate", "8Mbit", "--delay", "1ms"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        url = server.stdout.readline().strip()
+        assert url.endswith("/scene.kpc") and get(url, "/scene.kpc")[1] == DATA
+        server.terminate()
+
+
+@pytest.mark.parametrize("arguments", [["nowhere"], [".", "--port", "70000"], [".", "--rate", "fast"], [".", "--delay", "1s"]])
+def test_wrong_options_are_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        code = serve.main(arguments)
+    except SystemExit as error:
+        code = error.code  # type: ignore[assignment]
+    assert code == 2 and arguments[-1] in capsys.readouterr().err

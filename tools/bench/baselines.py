@@ -1,0 +1,336 @@
+"""What a user has at hand to code planes with, to compare with: numbers through general compressors, planes as pictures, planes as
+video. Each has several settings, from the finest to the coarsest.
+
+A rival gets planes as float32 arrays and returns what comes back from its bytes. What nobody reads of them has been evened out, so
+that it costs a rival next to nothing; everything needed to undo its coding is part of its bytes.
+"""
+
+import functools
+import io
+import lzma
+import math
+import subprocess
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import zstandard
+from PIL import Image, features
+
+from kpc.format.common.errors import MediaError
+from kpc.format.common.media import ffmpeg_binary
+from kpc.format.coding.quantise import needed_texels, reached_by
+from kpc.format.scene.scene import TIME_PLANES, Scene
+
+Planes = Sequence[Mapping[str, np.ndarray]]
+"""As `Scene.scales`."""
+
+TEN_BITS = 1023
+TIMEOUT_S = 600
+
+
+@dataclass(frozen=True)
+class Coding:
+    """Bytes, seconds to make and to undo them, and the planes that come back."""
+
+    size_bytes: int
+    encode_s: float
+    decode_s: float
+    planes: list[dict[str, np.ndarray]]
+
+
+class Rival(ABC):
+    """A way to code planes.
+
+    Attributes:
+        name: in tables. settings: of its knob, the finest first.
+    """
+
+    name: str
+    settings: tuple[int, ...]
+
+    def missing(self) -> str | None:
+        """Why it cannot be used here; None where it can."""
+        return None
+
+    def code(self, planes: Planes, setting: int) -> Coding:
+        started = time.perf_counter()
+        blobs = self.encode(planes, setting)
+        encoded = time.perf_counter()
+        shapes = [{name: plane.shape for name, plane in scale.items()} for scale in planes]
+        back = self.decode(blobs, shapes, setting)
+        return Coding(sum(map(len, blobs)), encoded - started, time.perf_counter() - encoded, back)
+
+    @abstractmethod
+    def encode(self, planes: Planes, setting: int) -> list[bytes]: ...
+
+    @abstractmethod
+    def decode(
+        self, blobs: list[bytes], shapes: Sequence[Mapping[str, tuple[int, ...]]], setting: int
+    ) -> list[dict[str, np.ndarray]]: ...
+
+
+def tidied(scene: Scene) -> Planes:
+    """The planes of a scene; texels that nobody reads hold the mean of the others, on time planes 1."""
+    reached, scales = reached_by(scene), []
+    for scale in scene.scales:
+        tidy = {}
+        for name, plane in scale.items():
+            needed = needed_texels(reached, name, *plane.shape[:2])
+            filling = 1.0 if name in TIME_PLANES or not needed.any() else plane[needed].mean(0)
+            tidy[name] = np.where(needed[..., None], plane, np.float32(filling))
+        scales.append(tidy)
+    return scales
+
+
+# --- numbers through general compressors
+
+
+def _zstd(data: bytes) -> bytes:
+    return zstandard.ZstdCompressor(level=19).compress(data)
+
+
+def _zstd_back(data: bytes) -> bytes:
+    return zstandard.ZstdDecompressor().decompress(data)
+
+
+def _xz(data: bytes) -> bytes:
+    return lzma.compress(data, preset=9)
+
+
+class Half(Rival):
+    """float16, low bits of the mantissa rounded off, channel after channel, through zstd -19 or xz -9. Setting: bits kept."""
+
+    settings = (10, 8, 6, 5, 4, 3)
+
+    def __init__(self, tool: str) -> None:
+        self.name = f"fp16 + {tool}"
+        self.pack, self.unpack = {"zstd -19": (_zstd, _zstd_back), "xz -9": (_xz, lzma.decompress)}[tool]
+
+    def encode(self, planes: Planes, setting: int) -> list[bytes]:
+        drop = 10 - setting
+        parts = []
+        for plane in _each(planes):
+            bits = plane.transpose(2, 0, 1).astype("<f2").view("<u2").astype(np.uint32)
+            rounded = (bits + (1 << drop >> 1)) >> drop << drop
+            parts.append(np.minimum(rounded, 0xFFFF).astype("<u2").tobytes())
+        return [self.pack(b"".join(parts))]
+
+    def decode(
+        self, blobs: list[bytes], shapes: Sequence[Mapping[str, tuple[int, ...]]], setting: int
+    ) -> list[dict[str, np.ndarray]]:
+        values = np.frombuffer(self.unpack(blobs[0]), "<f2").astype(np.float32)
+        return _cut(values, shapes)
+
+
+class Bytes(Rival):
+    """Channels from their least to their largest number in uint8, through zstd -19. Setting: bits, the number of levels."""
+
+    name = "uint8 + zstd -19"
+    settings = (8, 7, 6, 5, 4)
+
+    def encode(self, planes: Planes, setting: int) -> list[bytes]:
+        levels, side = _levels(planes, 2**setting - 1)
+        return [_zstd(b"".join(plane.transpose(2, 0, 1).astype(np.uint8).tobytes() for plane in _each(levels))), side]
+
+    def decode(
+        self, blobs: list[bytes], shapes: Sequence[Mapping[str, tuple[int, ...]]], setting: int
+    ) -> list[dict[str, np.ndarray]]:
+        return _unlevelled(_cut(np.frombuffer(_zstd_back(blobs[0]), np.uint8), shapes), blobs[1])
+
+
+# --- planes as pictures
+
+
+class Pictures(Rival):
+    """The same levels as grey pictures without loss, one a plane, its channels side by side. Setting: bits."""
+
+    settings = Bytes.settings
+
+    def __init__(self, kind: str) -> None:
+        self.kind, self.name = kind, {"png": "PNG", "webp": "WebP lossless"}[kind]
+
+    def missing(self) -> str | None:
+        return "this Pillow has no WebP" if self.kind == "webp" and not features.check("webp") else None
+
+    def encode(self, planes: Planes, setting: int) -> list[bytes]:
+        levels, side = _levels(planes, 2**setting - 1)
+        blobs = []
+        for plane in _each(levels):
+            picture, file = Image.fromarray(_canvas(plane.astype(np.uint8))), io.BytesIO()
+            if self.kind == "png":
+                picture.save(file, "png", optimize=True)
+            else:
+                picture.convert("RGB").save(file, "webp", lossless=True, quality=100, method=6)
+            blobs.append(file.getvalue())
+        return [*blobs, side]
+
+    def decode(
+        self, blobs: list[bytes], shapes: Sequence[Mapping[str, tuple[int, ...]]], setting: int
+    ) -> list[dict[str, np.ndarray]]:
+        pictures = (np.asarray(Image.open(io.BytesIO(blob)).convert("L")) for blob in blobs[:-1])
+        planes = [{name: _uncanvassed(next(pictures), shape) for name, shape in scale.items()} for scale in shapes]
+        return _unlevelled(planes, blobs[-1])
+
+
+def _canvas(plane: np.ndarray) -> np.ndarray:
+    """Channels in a grid nearly square."""
+    rows, columns, channels = plane.shape
+    across = math.ceil(math.sqrt(channels))
+    down = -(-channels // across)
+    filled = np.zeros((rows, columns, down * across), plane.dtype)
+    filled[..., :channels] = plane
+    return filled.reshape(rows, columns, down, across).transpose(2, 0, 3, 1).reshape(down * rows, across * columns)
+
+
+def _uncanvassed(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    rows, columns, channels = shape
+    across = picture.shape[1] // columns
+    tiles = picture.reshape(-1, rows, across, columns).transpose(1, 3, 0, 2)
+    return tiles.reshape(rows, columns, -1)[..., :channels]
+
+
+# --- planes as video
+
+
+class Video(Rival):
+    """Ten-bit grey video through ffmpeg: one a scale, its planes packed into a canvas, a frame for each channel. Each frame stands
+    alone: predicting channels from one another made files larger. Setting: the encoder's quantiser."""
+
+    PIX_FMT = "gray10le"
+
+    def __init__(self, name: str, encoder: str, settings: tuple[int, ...], options: tuple[str, ...]) -> None:
+        self.name, self.encoder, self.settings, self.options = name, encoder, settings, options
+
+    def missing(self) -> str | None:
+        return None if self.encoder in _encoders() else f"this ffmpeg has no {self.encoder}"
+
+    def encode(self, planes: Planes, setting: int) -> list[bytes]:
+        levels, side = _levels(planes, TEN_BITS)
+        return [*(self._video(_packed(scale), setting) for scale in levels), side]
+
+    def decode(
+        self, blobs: list[bytes], shapes: Sequence[Mapping[str, tuple[int, ...]]], setting: int
+    ) -> list[dict[str, np.ndarray]]:
+        planes = []
+        for blob, scale in zip(blobs, shapes):
+            height, width = _canvas_size(scale)
+            raw = np.frombuffer(_ffmpeg(["-i", "-", "-f", "rawvideo", "-pix_fmt", self.PIX_FMT, "-"], blob), "<u2")
+            planes.append(_unpacked(raw.reshape(-1, height, width), scale))
+        return _unlevelled(planes, blobs[-1])
+
+    def _video(self, frames: np.ndarray, setting: int) -> bytes:
+        _, height, width = frames.shape
+        kind = "hevc" if "265" in self.encoder else "obu"
+        options = [option.format(setting) for option in self.options]
+        source = ["-f", "rawvideo", "-pix_fmt", self.PIX_FMT, "-s", f"{width}x{height}", "-r", "25", "-i", "-"]
+        return _ffmpeg([*source, "-c:v", self.encoder, *options, "-f", kind, "-"], frames.astype("<u2").tobytes())
+
+
+def _canvas_size(shapes: Mapping[str, tuple[int, ...]]) -> tuple[int, int]:
+    """Of the planes of a scale one below the other, in whole blocks of 8."""
+    height = sum(_whole(rows) for rows, _, _ in shapes.values())
+    return max(height, 64), max(64, *(_whole(columns) for _, columns, _ in shapes.values()))
+
+
+def _whole(size: int) -> int:
+    return -(-size // 8) * 8
+
+
+def _packed(planes: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(M, height, width) uint16; around planes their edges go on."""
+    height, width = _canvas_size({name: plane.shape for name, plane in planes.items()})
+    frames = np.zeros((next(iter(planes.values())).shape[2], height, width), np.uint16)
+    row = 0
+    for plane in planes.values():
+        rows, columns, _ = plane.shape
+        margin = ((0, _whole(rows) - rows), (0, width - columns), (0, 0))
+        frames[:, row : row + _whole(rows)] = np.pad(plane.astype(np.uint16), margin, mode="edge").transpose(2, 0, 1)
+        row += _whole(rows)
+    return frames
+
+
+def _unpacked(frames: np.ndarray, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+    planes, row = {}, 0
+    for name, (rows, columns, channels) in shapes.items():
+        planes[name] = frames[:channels, row : row + rows, :columns].transpose(1, 2, 0)
+        row += _whole(rows)
+    return planes
+
+
+@functools.cache
+def _encoders() -> frozenset[str]:
+    try:
+        listed = _ffmpeg(["-encoders"], b"").decode(errors="replace")
+    except MediaError:
+        return frozenset()
+    return frozenset(line.split()[1] for line in listed.splitlines() if len(line.split()) > 1)
+
+
+def _ffmpeg(words: Sequence[str], data: bytes) -> bytes:
+    command = [ffmpeg_binary(), "-hide_banner", "-v", "error", *words]
+    try:
+        done = subprocess.run(command, input=data, capture_output=True, check=False, timeout=TIMEOUT_S)
+    except subprocess.TimeoutExpired as error:
+        raise MediaError(f"ffmpeg: takes longer than {TIMEOUT_S} s") from error
+    if done.returncode != 0:
+        said = done.stderr.decode(errors="replace").strip().splitlines() or ["it says nothing"]
+        raise MediaError(f"ffmpeg: {said[-1]}")
+    return done.stdout
+
+
+# --- levels of channels
+
+
+def _each(planes: Planes) -> list[np.ndarray]:
+    return [plane for scale in planes for plane in scale.values()]
+
+
+def _levels(planes: Planes, most: int) -> tuple[Planes, bytes]:
+    """Channels in whole numbers from 0 to `most`, and float32 least and width of each."""
+    scales, side = [], []
+    for scale in planes:
+        levels = {}
+        for name, plane in scale.items():
+            low = plane.min((0, 1))
+            width = np.maximum(plane.max((0, 1)) - low, np.float32(1e-9)) / np.float32(most)
+            levels[name] = np.clip(np.rint((plane - low) / width), 0, most)
+            side.append(np.stack([low, width]).astype("<f4").tobytes())
+        scales.append(levels)
+    return scales, b"".join(side)
+
+
+def _unlevelled(planes: Planes, side: bytes) -> list[dict[str, np.ndarray]]:
+    numbers, start, scales = np.frombuffer(side, "<f4"), 0, []
+    for scale in planes:
+        values = {}
+        for name, plane in scale.items():
+            channels = plane.shape[2]
+            low, width = numbers[start : start + 2 * channels].reshape(2, channels)
+            values[name] = np.float32(plane) * width + low
+            start += 2 * channels
+        scales.append(values)
+    return scales
+
+
+def _cut(values: np.ndarray, shapes: Sequence[Mapping[str, tuple[int, ...]]]) -> list[dict[str, np.ndarray]]:
+    """Planes (rows, columns, M) of numbers laid out plane by plane, channel by channel."""
+    start, scales = 0, []
+    for scale in shapes:
+        planes = {}
+        for name, (rows, columns, channels) in scale.items():
+            size = rows * columns * channels
+            planes[name] = values[start : start + size].reshape(channels, rows, columns).transpose(1, 2, 0)
+            start += size
+        scales.append(planes)
+    return scales
+
+
+RIVALS: tuple[Rival, ...] = (
+    Half("zstd -19"), Half("xz -9"), Bytes(), Pictures("png"), Pictures("webp"),
+    Video("HEVC", "libx265", (10, 14, 18, 22, 27, 33, 39, 45),
+          ("-preset", "slow", "-tune", "psnr", "-x265-params", "qp={}:keyint=1:info=0")),
+    Video("AV1", "libaom-av1", (4, 8, 12, 18, 26, 36, 46, 56), ("-usage", "allintra", "-cpu-used", "4", "-crf", "{}", "-b:v", "0")),
+)  # fmt: skip
