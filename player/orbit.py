@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 
@@ -97,7 +96,13 @@ def presets(scene: Scene) -> dict[str, Camera]:
     azimuth, elevation, distance = rig.angles()
     far, level = float(np.median(distance)), float(elevation.mean())
     if is_ring(azimuth):
-        around = {"front": (0.0, level), "right": (0.5, level), "back": (1.0, level), "left": (-0.5, level), "above": (0.0, 1.4)}
+        around = {
+            "front": (0.0, level),
+            "right": (0.5, level),
+            "back": (1.0, level),
+            "left": (-0.5, level),
+            "above": (0.0, 1.4),
+        }
         places = {name: (math.pi * turn, height, far) for name, (turn, height) in around.items()}
     else:
         middle, sway_a, sway_e = _sways(azimuth, elevation)

@@ -69,7 +69,17 @@ class Quality:
     scales: int | None = None
 
     def __post_init__(self) -> None:
-        marchable = self.step >= 1 and self.share > 0 and 0 < self.termination < 1 and 0 < self.resolution <= 1 and self.tolerance >= 0 and self.blur >= 0 and 0 <= self.thin < 1 and 0 <= self.baked < 1 and self.across >= 1
+        marchable = (
+            self.step >= 1
+            and self.share > 0
+            and 0 < self.termination < 1
+            and 0 < self.resolution <= 1
+            and self.tolerance >= 0
+            and self.blur >= 0
+            and 0 <= self.thin < 1
+            and 0 <= self.baked < 1
+            and self.across >= 1
+        )
         if not marchable or self.scales is not None and self.scales < 1:
             raise ValueError(f"no picture can be drawn with {self}")
 
@@ -80,11 +90,43 @@ soldier 0.53, 45.5 (54.4); liam 0.75, 40.2 (42.9); room, full of fine patterns, 
 0.90, 42.0; 0.95, 43.8."""
 
 LADDER: dict[str, Quality] = {
-    "fastest": Quality(folded=True, step=2.0, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, resolution=0.5),
-    "faster": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, resolution=0.5),
-    "fast": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, resolution=0.75),
-    "quick": Quality(folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, across=4),
-    "balanced": Quality(folded=True, termination=1 / 32, share=3.5, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 16, across=4),
+    "fastest": Quality(
+        folded=True,
+        step=2.0,
+        termination=1 / 16,
+        share=2.0,
+        tolerance=5 / 255,
+        blur=BLUR,
+        thin=1 / 32,
+        baked=1 / 8,
+        resolution=0.5,
+    ),
+    "faster": Quality(
+        folded=True,
+        termination=1 / 16,
+        share=2.0,
+        tolerance=5 / 255,
+        blur=BLUR,
+        thin=1 / 32,
+        baked=1 / 8,
+        resolution=0.5,
+    ),
+    "fast": Quality(
+        folded=True,
+        termination=1 / 16,
+        share=2.0,
+        tolerance=5 / 255,
+        blur=BLUR,
+        thin=1 / 32,
+        baked=1 / 8,
+        resolution=0.75,
+    ),
+    "quick": Quality(
+        folded=True, termination=1 / 16, share=2.0, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 8, across=4
+    ),
+    "balanced": Quality(
+        folded=True, termination=1 / 32, share=3.5, tolerance=5 / 255, blur=BLUR, thin=1 / 32, baked=1 / 16, across=4
+    ),
     "fine": Quality(folded=True, termination=1 / 64, share=3.5, blur=BLUR / 4, thin=1 / 256, across=4),
     "finer": Quality(folded=True, across=4),
     "reference": Quality(),

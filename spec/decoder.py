@@ -56,7 +56,7 @@ class Bytes:
     def take(self, length):
         require(self.at + length <= len(self.data), "chunk too short")
         self.at += length
-        return self.data[self.at - length:self.at]
+        return self.data[self.at - length : self.at]
 
     def unpack(self, layout):
         return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
@@ -71,30 +71,47 @@ class Bytes:
 def entries(data, partial):  # sections 3, 4 and 10
     """Yield the entries of the index, each with value_count, and the stored bytes, None where a prefix lacks them."""
     require(len(data) >= 64 and data[:8] == b"\x89KPC\r\n\x1a\n", "not a .kpc file")
-    (version, flags, header_length, index_offset, index_length, count, file_length, value_count, largest_raw, reserved,
-     index_crc, header_crc) = struct.unpack("<HHIQIIQQIIII", data[8:64])
+    (
+        version,
+        flags,
+        header_length,
+        index_offset,
+        index_length,
+        count,
+        file_length,
+        value_count,
+        largest_raw,
+        reserved,
+        index_crc,
+        header_crc,
+    ) = struct.unpack("<HHIQIIQQIIII", data[8:64])
     require(version in (0, 1, 2), "unknown version")
     require(crc32c(data[:60]) == header_crc, "header damaged")
     require(flags == reserved == 0 and header_length == index_offset == 64, "reserved field")
-    require(1 <= count <= 65536 and (index_length < 40 * count if version == 2 else index_length == 40 * count), "chunk count")
+    require(
+        1 <= count <= 65536 and (index_length < 40 * count if version == 2 else index_length == 40 * count),
+        "chunk count",
+    )
     require(version != 2 or file_length >= 64 + 8 * count, "chunk count")
     require(len(data) <= file_length if partial else len(data) == file_length, "file length")
     require(max(value_count, largest_raw) <= file_length * 32768, "limits")
-    index = data[64:64 + index_length]
+    index = data[64 : 64 + index_length]
     require(len(index) == index_length and crc32c(index) == index_crc, "index damaged")
     if version == 2:
         columns = decoded(index, 1, 32 * count)
         listed = [columns[k::count] for k in range(count)]
     else:
-        listed = [index[40 * k:40 * k + 40] for k in range(count)]
+        listed = [index[40 * k : 40 * k + 40] for k in range(count)]
     expected = 64 + index_length
     for entry in listed:
-        kind, group, scale, plane, start, rows, codec, reserved, stored, raw, crc = struct.unpack("<4sHBBIIHHIII", entry[:32])
+        kind, group, scale, plane, start, rows, codec, reserved, stored, raw, crc = struct.unpack(
+            "<4sHBBIIHHIII", entry[:32]
+        )
         require(kind.isalpha() and reserved == 0 and raw <= largest_raw, "index entry")
         offset = expected
         require(version == 2 or struct.unpack("<Q", entry[32:]) == (offset,), "offset")
         expected += stored
-        body = data[offset:offset + stored]
+        body = data[offset : offset + stored]
         if len(body) < stored:
             require(partial, "chunk cut off")
             body = None if kind != b"GRUP" else body
@@ -112,7 +129,12 @@ def chunks(data, partial):  # section 4
         require(known or not kind[:1].isupper(), "unknown critical chunk")
         require(not known or (kind == b"PLNE" and group == 0) or group == scale == plane == start == rows == 0, "place")
         if known:
-            if kind in (b"PLNE", b"OCCU", b"MOVE", b"DECO", b"HYBR", b"came") and codec == 2 or kind in (b"MOVE", b"PLNE") and codec == 3:
+            if (
+                kind in (b"PLNE", b"OCCU", b"MOVE", b"DECO", b"HYBR", b"came")
+                and codec == 2
+                or kind in (b"MOVE", b"PLNE")
+                and codec == 3
+            ):
                 require(raw <= 32768 * stored, "so much in too few bytes")
                 content = None if body is None else (raw, body, codec)
             else:
@@ -200,15 +222,26 @@ def decode(data, partial=False):
     scene["motion"] = motion_chunk(parts["MOVE"], scene["scales"]) if "MOVE" in parts else None
     expected = sum(s["channels"] for s in scene["scales"])
     scene |= hybrid_chunk(parts["HYBR"], expected) if "HYBR" in parts else decoder_chunk(parts["DECO"], expected)
-    scene |= coded_occupancy_chunk(*parts["OCCU"][:2]) if isinstance(parts["OCCU"], tuple) else occupancy_chunk(Bytes(parts["OCCU"]))
+    scene |= (
+        coded_occupancy_chunk(*parts["OCCU"][:2])
+        if isinstance(parts["OCCU"], tuple)
+        else occupancy_chunk(Bytes(parts["OCCU"]))
+    )
     scene["cameras"] = cameras_chunk(parts["came"]) if parts.get("came") is not None else []
-    scene["appearances"] = appearances_chunk(Bytes(parts["appe"]), scene["hidden"]) if parts.get("appe") is not None else {}
+    scene["appearances"] = (
+        appearances_chunk(Bytes(parts["appe"]), scene["hidden"]) if parts.get("appe") is not None else {}
+    )
 
     for scale in scene["scales"]:
         for plane in scale["planes"].values():  # uncoded until a segment says otherwise
             texels = plane["rows"] * plane["columns"]
-            plane["coded"], plane["symbols"], plane["next_row"], plane["segments"], plane["held"] = [0] * texels, \
-                [0] * (texels * scale["channels"]), 0, 0, False
+            plane["coded"], plane["symbols"], plane["next_row"], plane["segments"], plane["held"] = (
+                [0] * texels,
+                [0] * (texels * scale["channels"]),
+                0,
+                0,
+                False,
+            )
     for scale, number, start, rows, raw in sorted(segments, key=lambda s: s[:3]):
         require(scale < len(scene["scales"]) and number < 6, "place")
         planes, name = scene["scales"][scale]["planes"], PLANES[number]
@@ -225,8 +258,8 @@ def decode(data, partial=False):
             else:
                 coded, symbols = segment(Bytes(raw), rows, plane["columns"], channels)
             first = start * plane["columns"]
-            plane["coded"][first:first + len(coded)] = coded
-            plane["symbols"][first * channels:first * channels + len(symbols)] = symbols
+            plane["coded"][first : first + len(coded)] = coded
+            plane["symbols"][first * channels : first * channels + len(symbols)] = symbols
     for scale in scene["scales"]:
         channels = scale["channels"]
         for name, plane in scale["planes"].items():
@@ -234,8 +267,10 @@ def decode(data, partial=False):
             require(name in PLANES[3:] or plane["segments"] == 1, "a space plane in pieces")
             if name in PLANES[:3] and not plane["held"]:  # section 10
                 plane["offset"] = [0.0] * channels
-            plane["values"] = [f32(f32(s * plane["step"][i % channels]) + plane["offset"][i % channels])
-                               for i, s in enumerate(plane["symbols"])]
+            plane["values"] = [
+                f32(f32(s * plane["step"][i % channels]) + plane["offset"][i % channels])
+                for i, s in enumerate(plane["symbols"])
+            ]
     return scene
 
 
@@ -253,28 +288,37 @@ def scene_chunk(chunk):  # section 5
         require(1 <= channels <= 256 and all(1 <= size[a] <= 16384 for a in "xyz") and size["t"] <= 16384, "size")
         require((size["t"] > 0) == bool(dynamic), "rows in time")
         planes = {}
-        for name in PLANES[:6 if dynamic else 3]:
+        for name in PLANES[: 6 if dynamic else 3]:
             step_of = chunk.unpack(f"{channels}f")
             offset_of = chunk.unpack(f"{channels}f") if "t" not in name else (1.0,) * channels
             require(all(s > 0 and 128 * s + abs(o) <= 2048 for s, o in zip(step_of, offset_of)), "step or offset")
             planes[name] = {"columns": size[name[0]], "rows": size[name[1]], "step": step_of, "offset": offset_of}
         scales.append({"channels": channels, "planes": planes})
     chunk.end()
-    return {"aabb": [low, high], "frame_count": frame_count, "fps": fps, "step": step, "background": [r, g, b],
-            "scales": scales}
+    return {
+        "aabb": [low, high],
+        "frame_count": frame_count,
+        "fps": fps,
+        "step": step,
+        "background": [r, g, b],
+        "scales": scales,
+    }
 
 
 def warp_chunk(chunk, scene):  # section 5
-    mapping, = chunk.unpack("I")
+    (mapping,) = chunk.unpack("I")
     require(mapping in (1, 2), "mapping")
     if mapping == 1:
-        even, = chunk.unpack("d")
+        (even,) = chunk.unpack("d")
         require(2**-30 <= even <= 2**30 and 2 * even / scene["step"] <= 65536, "even")
         chunk.end()
         return {"even": even}
     *frame, near, baseline = chunk.unpack("12ddd")
     chunk.end()
-    require(all(2**-30 <= x <= 2**30 for x in (near, baseline)) and all(abs(x) <= 2**30 for x in frame), "device coordinates")
+    require(
+        all(2**-30 <= x <= 2**30 for x in (near, baseline)) and all(abs(x) <= 2**30 for x in frame),
+        "device coordinates",
+    )
     axes = [frame[column::4] for column in range(4)]  # right, up, backward, eye
     for i in range(3):
         for j in range(3):
@@ -315,9 +359,14 @@ def coded_motion(chunk, rows, nz, ny, nx):  # section 5, codec 2
             for y in range(ny):
                 for x in range(nx):
                     for component in range(3):
-                        places = {i: (t - (i >> 3), z - (i >> 2 & 1), y - (i >> 1 & 1), x - (i & 1), component) for i in range(16)}
+                        places = {
+                            i: (t - (i >> 3), z - (i >> 2 & 1), y - (i >> 1 & 1), x - (i & 1), component)
+                            for i in range(16)
+                        }
                         there = [i for i in range(1, 16) if places[i] in v]
-                        weights = k if len(there) == 15 else [1024 if i.bit_count() % 2 else -1024 for i in range(1, 16)]
+                        weights = (
+                            k if len(there) == 15 else [1024 if i.bit_count() % 2 else -1024 for i in range(1, 16)]
+                        )
                         predicted = sum(weights[i - 1] * v[places[i]] for i in there) + 512 >> 10
                         predicted = min(max(predicted, -32768), 32767)
                         around = [r[places[i]] for i in (8, 4, 2, 1) if i in there]
@@ -339,7 +388,11 @@ def halved_motion(chunk, *sizes):  # section 5, codec 3
         others = [there[a] for a in range(4) if a != axis]
         for place in itertools.product(*others):
             node = (*place[:axis], new, *place[axis:])
-            back = [(*place[:a], others[a][others[a].index(place[a]) - 1], *place[a + 1:]) for a in range(3) if place[a] > 0]
+            back = [
+                (*place[:a], others[a][others[a].index(place[a]) - 1], *place[a + 1 :])
+                for a in range(3)
+                if place[a] > 0
+            ]
             before = [(*one[:axis], new, *one[axis:]) for one in back]
             for c in range(3):
                 used = [(k, (*place[:axis], sides[k], *place[axis:], c)) for k in range(4) if weights[k]]
@@ -378,7 +431,7 @@ def halved_motion(chunk, *sizes):  # section 5, codec 3
 
 def segment(chunk, rows, columns, channels):  # section 6
     """(coded, symbols): a flat list of 0 or 1 for each texel, and of symbols by row, column, channel."""
-    flag, = chunk.unpack("B")
+    (flag,) = chunk.unpack("B")
     require(flag <= 1, "map flag")
     texels = rows * columns
     coded = bits(chunk.take(-(-texels // 8)), texels) if flag else [1] * texels
@@ -403,7 +456,7 @@ def segment(chunk, rows, columns, channels):  # section 6
 class Decisions:  # section 6, codec 2
     def __init__(self, chunk):
         """From state and words, which are the rest of the chunk."""
-        self.state, = chunk.unpack("I")
+        (self.state,) = chunk.unpack("I")
         require(self.state >= 1 << 16, "first state")
         words = chunk.rest()
         require(len(words) % 2 == 0, "half a word")
@@ -467,8 +520,12 @@ def implied_map(scene, name, rows, columns, start):
     seen = set()
     for place, occupied in enumerate(scene["occupancy"]):
         if occupied:
-            cell = {"t": place % scene["slots"], "x": place // scene["slots"] % nx, "y": place // scene["slots"] // nx % ny,
-                    "z": place // scene["slots"] // nx // ny}
+            cell = {
+                "t": place % scene["slots"],
+                "x": place // scene["slots"] % nx,
+                "y": place // scene["slots"] // nx % ny,
+                "z": place // scene["slots"] // nx // ny,
+            }
             seen.add((cell[name[1]], cell[name[0]]))
 
     def reaches(cell, cells, texel, texels):
@@ -538,7 +595,9 @@ def context_coded(chunk, codec, H, W, channels, place=None):  # section 6, codec
                 else:
                     whole = predicted + 64 >> 7
                 fraction = predicted - 128 * whole
-                error = decisions.error(3 * active + (odd if around else min(3 * abs(fraction) >> (7 if lattice else 6), 2)))
+                error = decisions.error(
+                    3 * active + (odd if around else min(3 * abs(fraction) >> (7 if lattice else 6), 2))
+                )
                 if fraction < 0:
                     error = -error
                 if around:
@@ -553,20 +612,31 @@ def context_coded(chunk, codec, H, W, channels, place=None):  # section 6, codec
                 symbols[(y * W + x) * channels + c] = v
         for y in range(H):
             for x in range(W):
-                smooth = sum((2 - abs(i)) * (2 - abs(j)) * at(min(max(y + i, 0), H - 1), x + j, 0)[1]
-                             for i in (-1, 0, 1) for j in (-1, 0, 1)) >> 1
+                smooth = (
+                    sum(
+                        (2 - abs(i)) * (2 - abs(j)) * at(min(max(y + i, 0), H - 1), x + j, 0)[1]
+                        for i in (-1, 0, 1)
+                        for j in (-1, 0, 1)
+                    )
+                    >> 1
+                )
                 cross[y, x] = cross[y, x] + (smooth - cross[y, x] >> 3) if c else smooth
     decisions.end()
     return [coded[y, x] for y in range(H) for x in range(W)], symbols
 
 
 COSINES = [181, 180, 178, 173, 167, 160, 151, 140, 128, 115, 101, 85, 69, 53, 35, 18, 0]
-COARSER = {4: [52, 55, 64, 80], 8: [52, 53, 55, 59, 64, 71, 80, 87],
-           16: [52, 52, 53, 54, 55, 57, 59, 61, 64, 67, 71, 75, 80, 84, 87, 90]}
+COARSER = {
+    4: [52, 55, 64, 80],
+    8: [52, 53, 55, 59, 64, 71, 80, 87],
+    16: [52, 52, 53, 54, 55, 57, 59, 61, 64, 67, 71, 75, 80, 84, 87, 90],
+}
 FINER = [181, 128, 91, 64, 45, 32, 23, 16]
-LIKELY = [[27, 66, 61, 86, 79, 96, 118, 143, 168, 190, 206, 220, 230, 238, 243, 248],
-          [19, 26, 24, 37, 37, 48, 67, 90, 120, 151, 179, 201, 217, 229, 235, 244],
-          [110, 100, 90, 86, 82, 80, 87, 98, 117, 135, 160, 184, 204, 220, 230, 243]]
+LIKELY = [
+    [27, 66, 61, 86, 79, 96, 118, 143, 168, 190, 206, 220, 230, 238, 243, 248],
+    [19, 26, 24, 37, 37, 48, 67, 90, 120, 151, 179, 201, 217, 229, 235, 244],
+    [110, 100, 90, 86, 82, 80, 87, 98, 117, 135, 160, 184, 204, 220, 230, 243],
+]
 LIKELY_MEANS = [243, 210, 220]
 AGREES = [134, 135, 138, 141, 152, 159, 164, 170, 178, 184, 190, 197, 205, 212, 218, 224, 229, 234, 239, 244]
 LOG2 = {4: 2, 8: 3, 16: 4}
@@ -580,13 +650,16 @@ def doublings(k):
 
 def in_blocks(chunk, N, flags, H, W, channels, place):  # section 6, blocks
     """As `segment`."""
-    Q, = chunk.unpack("B")
+    (Q,) = chunk.unpack("B")
     require(N in (4, 8, 16) and (N == 4 or N <= 2 * min(H, W)) and Q > 0, "side of blocks or quantiser")
     decisions, borders = Decisions(chunk), flags & 8
     coded = decisions.map(H, W) if flags & 1 else untold_map(flags, H, W, place)
     BY, BX = -(-H // N), -(-W // N)
-    told = {(b, d): any(coded.get((y, x)) for y in range(b * N, b * N + N) for x in range(d * N, d * N + N))
-            for b in range(BY) for d in range(BX)}
+    told = {
+        (b, d): any(coded.get((y, x)) for y in range(b * N, b * N + N) for x in range(d * N, d * N + N))
+        for b in range(BY)
+        for d in range(BX)
+    }
     fine = {}
     for b, d in told:
         left = fine[b, d - 1] if d else fine[b - 1, d] if b else 3
@@ -635,7 +708,11 @@ def in_blocks(chunk, N, flags, H, W, channels, place):  # section 6, blocks
             return cosine(across, 0) * (sum(min(max(border[k], -4095), 4095) * cosine(along, k) for k in range(N)) >> 7)
 
         follow(0, 0, min(max(levels[0, 0] * q[0, 0], -32768), 32767))
-        for i, j in [(i, diagonal - i) for diagonal in range(1, end) for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1)]:
+        for i, j in [
+            (i, diagonal - i)
+            for diagonal in range(1, end)
+            for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1)
+        ]:
             if levels[i, j]:
                 c = min(levels[i, j] * q[i, j], 32767)
                 s = (pull(left, i, j) if beside else 0) + (pull(above, j, i) if over else 0)
@@ -652,7 +729,11 @@ def in_blocks(chunk, N, flags, H, W, channels, place):  # section 6, blocks
     for c in range(channels):
         mean, right, bottom = {}, {}, {}
         for b, d in told:
-            q = {(i, j): max(Q * FINER[fine[b, d]] * COARSER[N][i] * COARSER[N][j] + 131072 >> 18, 1) for i in range(N) for j in range(N)}
+            q = {
+                (i, j): max(Q * FINER[fine[b, d]] * COARSER[N][i] * COARSER[N][j] + 131072 >> 18, 1)
+                for i in range(N)
+                for j in range(N)
+            }
             if b == 0 or d == 0:
                 mean[b, d] = mean[b, d - 1] if d else mean[b - 1, d] if b else 0
             else:
@@ -667,7 +748,9 @@ def in_blocks(chunk, N, flags, H, W, channels, place):  # section 6, blocks
                 if beside or over:
                     expected = sum(beside or over) * 4 + sum(over or beside) * 4 + expected >> 1
                 context = min(doublings(sum(ends)), 9)
-                end[c, b, d] = min(decisions.magnitude(lambda k: decisions.by_counter(("end", context, k)), 2, 4) - 1, 2 * N - 1)  # noqa: B023
+                end[c, b, d] = min(
+                    decisions.magnitude(lambda k: decisions.by_counter(("end", context, k)), 2, 4) - 1, 2 * N - 1
+                )  # noqa: B023
             else:
                 usual = ends[0] + ends[1] + 2 * ends[2] + 2 >> 2
                 context = 0 if usual == 0 else 1 + (usual - 1) * 7 // (2 * N - 1)
@@ -683,10 +766,18 @@ def in_blocks(chunk, N, flags, H, W, channels, place):  # section 6, blocks
                 tell_signs(levels, q, end[c, b, d], beside, over)
             factors = {at: min(max(value * q[at], -32768), 32767) for at, value in levels.items()}
             mean[b, d] = factors[0, 0]
-            down = [[sum(cosine(i, y) * factors.get((i, j), 0) for i in range(N)) + 64 >> 7 for j in range(N)] for y in range(N)]
+            down = [
+                [sum(cosine(i, y) * factors.get((i, j), 0) for i in range(N)) + 64 >> 7 for j in range(N)]
+                for y in range(N)
+            ]
             shift = 10 + LOG2[N]
-            v = [[min(max(sum(cosine(j, x) * down[y][j] for j in range(N)) + (1 << shift - 1) >> shift, -128), 127) for x in range(N)]
-                 for y in range(N)]
+            v = [
+                [
+                    min(max(sum(cosine(j, x) * down[y][j] for j in range(N)) + (1 << shift - 1) >> shift, -128), 127)
+                    for x in range(N)
+                ]
+                for y in range(N)
+            ]
             right[b, d], bottom[b, d] = [row[-1] for row in v], v[-1]
             for y in range(min(N, H - b * N)):
                 for x in range(min(N, W - d * N)):
@@ -701,8 +792,13 @@ def decoder_chunk(content, expected):  # section 7
     chunk = opened(content)
     features, hidden, bias = chunk.unpack("HHf")
     require(features == expected and 1 <= hidden <= 256 and math.isfinite(bias), "decoder sizes")
-    weights = {"density_weight": features, "w1": hidden * 9, "b1": hidden, "w2": 3 * features * hidden,
-               "b2": 3 * features}
+    weights = {
+        "density_weight": features,
+        "w1": hidden * 9,
+        "b1": hidden,
+        "w2": 3 * features * hidden,
+        "b2": 3 * features,
+    }
     return weights_of(content, chunk, weights) | {"density_bias": bias, "hidden": hidden, "width": None}
 
 
@@ -710,8 +806,16 @@ def hybrid_chunk(content, expected):  # section 7
     chunk = opened(content)
     features, width, hidden, bias = chunk.unpack("HHHf")
     require(features == expected and 1 <= width <= 256 and 1 <= hidden <= 256 and math.isfinite(bias), "decoder sizes")
-    weights = {"v": width * features, "v_bias": width, "density_weight": width, "w1": hidden * 9, "b1": hidden,
-               "u": hidden * width, "w2": 3 * hidden, "b2": 3}
+    weights = {
+        "v": width * features,
+        "v_bias": width,
+        "density_weight": width,
+        "w1": hidden * 9,
+        "b1": hidden,
+        "u": hidden * width,
+        "w2": 3 * hidden,
+        "b2": 3,
+    }
     return weights_of(content, chunk, weights) | {"density_bias": bias, "hidden": hidden, "width": width}
 
 
@@ -753,8 +857,19 @@ def coded_occupancy_chunk(raw_length, body):  # section 8, codec 2
     require(all(1 <= n <= 16384 for n in (slots, nz, ny, nx)), "grid")
     require(raw_length == 8 + -(-slots * nz * ny * nx // 8), "raw length")
     decisions, occupied = Decisions(chunk), {}
-    around = [(0, 0, 0, -1), (0, 0, -1, 0), (0, -1, 0, 0), (0, -1, 1, 0), (0, 0, -1, 1), (0, -1, 0, 1),
-              (-1, 0, 0, 0), (-1, 0, 0, -1), (-1, 1, 0, 0), (-1, 0, -1, 0), (-1, -1, 0, 0)]
+    around = [
+        (0, 0, 0, -1),
+        (0, 0, -1, 0),
+        (0, -1, 0, 0),
+        (0, -1, 1, 0),
+        (0, 0, -1, 1),
+        (0, -1, 0, 1),
+        (-1, 0, 0, 0),
+        (-1, 0, 0, -1),
+        (-1, 1, 0, 0),
+        (-1, 0, -1, 0),
+        (-1, -1, 0, 0),
+    ]
     for s in range(slots):
         for z in range(nz):
             for y in range(ny):
@@ -762,8 +877,13 @@ def coded_occupancy_chunk(raw_length, body):  # section 8, codec 2
                     near = [occupied.get((s + h, z + k, y + j, x + i), 0) for h, k, j, i in around]
                     occupied[s, z, y, x] = decisions.by_counter(tuple(near))
     decisions.end()
-    return {"cells": (nx, ny, nz), "slots": slots, "occupancy": [
-        occupied[s, z, y, x] for z in range(nz) for y in range(ny) for x in range(nx) for s in range(slots)]}
+    return {
+        "cells": (nx, ny, nz),
+        "slots": slots,
+        "occupancy": [
+            occupied[s, z, y, x] for z in range(nz) for y in range(ny) for x in range(nx) for s in range(slots)
+        ],
+    }
 
 
 def cameras_chunk(content):  # section 9
@@ -773,7 +893,7 @@ def cameras_chunk(content):  # section 9
         require(content[0] == 2 + 68 * len(cameras), "raw length")
     else:
         chunk = Bytes(content)
-        count, = chunk.unpack("H")
+        (count,) = chunk.unpack("H")
         cameras = [chunk.unpack("HH16f") for _ in range(count)]
         chunk.end()
     require(1 <= len(cameras) <= 4096, "number of cameras")
@@ -798,8 +918,11 @@ def posed_cameras(chunk):  # section 9, codec 2
         q.insert(turn >> 54, math.sqrt(rest))
         squares.insert(turn >> 54, rest)
         (w, x, y, z), (_, xx, yy, zz) = q, squares
-        rows = [[131071**2 - (yy + zz), x * y - w * z, x * z + w * y], [x * y + w * z, 131071**2 - (xx + zz), y * z - w * x],
-                [x * z - w * y, y * z + w * x, 131071**2 - (xx + yy)]]
+        rows = [
+            [131071**2 - (yy + zz), x * y - w * z, x * z + w * y],
+            [x * y + w * z, 131071**2 - (xx + zz), y * z - w * x],
+            [x * z - w * y, y * z + w * x, 131071**2 - (xx + yy)],
+        ]
         pose = []
         for row in range(3):
             at = corner[row] + (place >> 18 * row & 0x3FFFF)
@@ -817,7 +940,7 @@ def appearances_chunk(chunk, expected):  # section 9
     require(all(math.isfinite(a) for code in codes for a in code), "codes")
     appearances = {}
     for code in codes:
-        length, = chunk.unpack("B")
+        (length,) = chunk.unpack("B")
         try:
             name = chunk.take(length).decode("utf-8")
         except UnicodeDecodeError as error:
@@ -950,7 +1073,7 @@ def dot(a, b):
 
 def layer(weights, biases, values):
     n = len(values)
-    return [dot(weights[n * row:n * row + n], values) + bias for row, bias in enumerate(biases)]
+    return [dot(weights[n * row : n * row + n], values) + bias for row, bias in enumerate(biases)]
 
 
 def clipped(values):
@@ -966,7 +1089,7 @@ def looking(scene, direction, code):
         return hidden
     F = len(scene["density_weight"])
     basis = layer(scene["w2"], scene["b2"], [max(x, 0.0) for x in hidden])
-    return [basis[c * F:(c + 1) * F] for c in range(3)]
+    return [basis[c * F : (c + 1) * F] for c in range(3)]
 
 
 def logits(scene, f, towards):
@@ -978,10 +1101,16 @@ def logits(scene, f, towards):
 def hashes(scene):  # section 16
     """{(scale, plane): (symbols, coded, values)}, each a SHA-256 in hexadecimal."""
     return {
-        (number, name): tuple(hashlib.sha256(data).hexdigest() for data in (
-            struct.pack(f"{len(plane['symbols'])}b", *plane["symbols"]), bytes(plane["coded"]),
-            struct.pack(f"<{len(plane['values'])}f", *plane["values"])))
-        for number, scale in enumerate(scene["scales"]) for name, plane in scale["planes"].items()
+        (number, name): tuple(
+            hashlib.sha256(data).hexdigest()
+            for data in (
+                struct.pack(f"{len(plane['symbols'])}b", *plane["symbols"]),
+                bytes(plane["coded"]),
+                struct.pack(f"<{len(plane['values'])}f", *plane["values"]),
+            )
+        )
+        for number, scale in enumerate(scene["scales"])
+        for name, plane in scale["planes"].items()
     }
 
 

@@ -33,7 +33,6 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
 def moving(tmp_path_factory: pytest.TempPathFactory) -> "Dataset":
     """A moving object with alpha, seen once an instant."""
     import datasets as make
-
     from kpc.encoder.datasets import load_dataset
 
     folder = tmp_path_factory.mktemp("moving")

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from kpc.format.scene.cameras import Camera
 from kpc.format.common.media import write_image, write_video
+from kpc.format.scene.cameras import Camera
 
 FPS = 8.0
 
@@ -143,8 +142,12 @@ def write_unequal(folder: Path, images: int = 32, own_lens: bool = True, unequal
         pattern = 150 + 100 * np.sin(5 * met @ np.array([[1, 0.3, 0], [0, 1, 0.5], [0.6, -0.8, 1]]))
         pixels = np.concatenate([gain * pattern, 255.0 * (beside < 0.7)[:, None]], axis=1)
         write_image(folder / "images" / f"{k:04d}.png", np.rint(pixels).astype(np.uint8).reshape(32, 32, 4))
-        frames.append({"file_path": f"images/{k:04d}.png", "transform_matrix": camera.camera_to_world.tolist(), "fl_x": focal})
-    (folder / "transforms.json").write_text(json.dumps({"w": 32, "h": 32, "cx": 16, "cy": 16, "fl_x": 1, "frames": frames}))
+        frames.append(
+            {"file_path": f"images/{k:04d}.png", "transform_matrix": camera.camera_to_world.tolist(), "fl_x": focal}
+        )
+    (folder / "transforms.json").write_text(
+        json.dumps({"w": 32, "h": 32, "cx": 16, "cy": 16, "fl_x": 1, "frames": frames})
+    )
     return rig
 
 

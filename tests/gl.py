@@ -5,7 +5,6 @@ import functools
 import moderngl
 import numpy as np
 import pytest
-
 from kpc.format.common.errors import DisplayError
 from kpc.player.gl import shader
 from kpc.player.gl.offscreen import open_context
@@ -28,7 +27,9 @@ def context() -> moderngl.Context:
     return found
 
 
-def evaluate(glsl: str, expression: str, *inputs: np.ndarray, grid: np.ndarray | None = None, **defines: int) -> np.ndarray:
+def evaluate(
+    glsl: str, expression: str, *inputs: np.ndarray, grid: np.ndarray | None = None, **defines: int
+) -> np.ndarray:
     """(N, 4) float32: `expression`, a vec4, at each of N places, N a multiple of 256; inputs (N, 4) are called a, b, c, d there.
 
     `glsl`: what comes before main, `#include`s for the most part. `grid`: (Nz, Ny, Nx, 4), a filtered sampler3D of that name.
@@ -36,7 +37,11 @@ def evaluate(glsl: str, expression: str, *inputs: np.ndarray, grid: np.ndarray |
     ctx, names = context(), "abcd"[: len(inputs)]
     size = (256, len(inputs[0]) // 256)
     fetch = "".join(f"vec4 {n} = texelFetch(from_{n}, ivec2(gl_FragCoord.xy), 0); " for n in names)
-    text = "".join(f"uniform sampler2D from_{n};\n" for n in names) + "uniform sampler3D grid;\n" * (grid is not None) + glsl
+    text = (
+        "".join(f"uniform sampler2D from_{n};\n" for n in names)
+        + "uniform sampler3D grid;\n" * (grid is not None)
+        + glsl
+    )
     program = shader.build(ctx, "main", {"CONTRACTED": 0, "NDC": 0, **defines},
                            {"main": f"{text}\nout vec4 o;\nvoid main() {{ {fetch} o = {expression}; }}\n"})  # fmt: skip
     textures = [ctx.texture(size, 4, np.ascontiguousarray(array, np.float32), dtype="f4") for array in inputs]

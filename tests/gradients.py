@@ -4,18 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from kpc.encoder.field import kernels
+from kpc.encoder.field.field import Blend, Field, corners_of
+from kpc.encoder.field.render import Rays, render_reference
+from kpc.encoder.training.optimisers import motion_of, sample_capacity
+from kpc.format.scene.scene import Scene
 from scenes import displaced, surrounded, tiny_scene
 from torch import Tensor
 
-from kpc.encoder.field import kernels
-from kpc.encoder.field.field import Blend, Field, corners_of
-from kpc.encoder.training.optimisers import motion_of, sample_capacity
-from kpc.encoder.field.render import Rays, render_reference
-from kpc.format.scene.scene import Scene
-
-
-KINDS = [(True, False, False), (True, False, True), (False, False, False), (True, True, False), (True, True, True),
-         (False, True, False)]
+KINDS = [
+    (True, False, False),
+    (True, False, True),
+    (False, False, False),
+    (True, True, False),
+    (True, True, True),
+    (False, True, False),
+]
 """Whether it moves, lies in contracted space, has a motion grid."""
 
 
@@ -133,5 +137,5 @@ def bilinear(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """A plane (rows, columns, M) as `Field.features` reads it, u (N,) along its columns, v along its rows: (N, M)."""
     rows, columns, M = plane.shape
     corners, shares = corners_of(u, v, torch.tensor(columns), torch.tensor(rows))
-    values, = Blend.apply(plane.reshape(-1, M), corners[None], shares[None])
+    (values,) = Blend.apply(plane.reshape(-1, M), corners[None], shares[None])
     return values

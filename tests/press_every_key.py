@@ -7,23 +7,22 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from pytest import approx, raises
-
-from kpc.format.container import groups
-from kpc.format.container.container import open_source
 from kpc.format.common.errors import DisplayError
 from kpc.format.common.media import read_image, read_video
+from kpc.format.container import groups
+from kpc.format.container.container import open_source
 from kpc.player.app import kpplay, panels
 from kpc.player.app import window as window_module
-from kpc.player.app.desktop import glfw, imgui
-from kpc.player.app.quality_controller import RUNGS
 from kpc.player.app.camera_paths import CameraPath
+from kpc.player.app.desktop import glfw, imgui
 from kpc.player.app.preferences import Preferences, place
-from kpc.player.quality import DEFAULT, climbed
-from kpc.player.streaming.group_playback import Reel
+from kpc.player.app.quality_controller import RUNGS
+from kpc.player.app.window import Player, Window
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.renderer import Look
-from kpc.player.app.window import Player, Window
+from kpc.player.quality import DEFAULT, climbed
+from kpc.player.streaming.group_playback import Reel
+from pytest import approx, raises
 
 
 def main(scene_file: str) -> None:
@@ -191,7 +190,11 @@ def follow_a_path(player: Player, press: Callable[..., None]) -> None:
     player.playback.seek(0.6)
     press(glfw.KEY_N, glfw.KEY_K, glfw.KEY_K, glfw.KEY_BACKSPACE)
     second = player.view.eye
-    assert [shot.time for shot in player.path.keyframes] == approx([0.2, 0.6]) and player.path.end_s == 2.0 and player.show_path
+    assert (
+        [shot.time for shot in player.path.keyframes] == approx([0.2, 0.6])
+        and player.path.end_s == 2.0
+        and player.show_path
+    )
     player.path = player.path.spaced(1, 0.2)
 
     press(glfw.KEY_J)
@@ -251,8 +254,13 @@ def reach_into_corners(player: Player) -> None:
     panels.show(player)
     player._finish()
     width, height = player.canvas.size
-    screen = np.frombuffer(player.ctx.screen.read(viewport=(0, 0, width, height), alignment=1), np.uint8).reshape(height, width, 3)[::-1]
-    assert player.ctx.error in ("GL_NO_ERROR", "GL_INVALID_OPERATION")  # moderngl reads from an attachment that no window's own has
+    screen = np.frombuffer(player.ctx.screen.read(viewport=(0, 0, width, height), alignment=1), np.uint8).reshape(
+        height, width, 3
+    )[::-1]
+    assert player.ctx.error in (
+        "GL_NO_ERROR",
+        "GL_INVALID_OPERATION",
+    )  # moderngl reads from an attachment that no window's own has
     over = np.any(screen != player._pixels(), axis=2)
     top, left = over.any(1).argmax(), over.any(0).argmax()
     bottom, right = height - over.any(1)[::-1].argmax(), width - over.any(0)[::-1].argmax()
@@ -266,8 +274,12 @@ def see_the_same_however_coarsely(player: Player) -> None:
         player._picture(scale, "fast")
     player._show = show  # type: ignore[method-assign]
     for camera in seen:
-        assert len(seen) == 4 and (camera.fl_x / camera.width, camera.cx / camera.width) == approx((whole.fl_x / whole.width, whole.cx / whole.width))
-        assert (camera.fl_y / camera.height, camera.cy / camera.height) == approx((whole.fl_y / whole.height, whole.cy / whole.height))
+        assert len(seen) == 4 and (camera.fl_x / camera.width, camera.cx / camera.width) == approx(
+            (whole.fl_x / whole.width, whole.cx / whole.width)
+        )
+        assert (camera.fl_y / camera.height, camera.cy / camera.height) == approx(
+            (whole.fl_y / whole.height, whole.cy / whole.height)
+        )
 
 
 def see_every_pixel_once(window: Window, player: Player) -> None:
@@ -280,14 +292,21 @@ def see_every_pixel_once(window: Window, player: Player) -> None:
         heights.append(imgui.get_font_size() * player.overlay.io.display_framebuffer_scale.x)
         show(player)
 
-    for units, count, text in (((320, 240), (320, 240), 1.0), ((160, 120), (320, 240), 2.0), ((320, 240), (320, 240), 2.0)):
+    for units, count, text in (
+        ((320, 240), (320, 240), 1.0),
+        ((160, 120), (320, 240), 2.0),
+        ((320, 240), (320, 240), 2.0),
+    ):
         Window.size, Window.pixels, Window.text_scale = units, count, text  # type: ignore[assignment, method-assign]
         panels.show = measure
         player.frame()
         panels.show = show
         assert player.canvas.size == count
         io = player.overlay.io
-        assert (io.display_size.x * io.display_framebuffer_scale.x, io.display_size.y * io.display_framebuffer_scale.y) == count
+        assert (
+            io.display_size.x * io.display_framebuffer_scale.x,
+            io.display_size.y * io.display_framebuffer_scale.y,
+        ) == count
         before = player.view
         window._moved(None, 0.9 * units[0], 0.3 * units[1])
         player.show_hud = False
@@ -355,7 +374,12 @@ def drop_files(window: Window, player: Player, scene_file: Path) -> None:
     keyframes = player.path.keyframes
     player.path = CameraPath()
     Path("text.kpc").write_text("no scene")
-    for file, words in (("text.kpc", "text.kpc"), ("none.kpc", "none.kpc"), ("none.json", "none.json"), ("text.kpc.JSON", "JSON")):
+    for file, words in (
+        ("text.kpc", "text.kpc"),
+        ("none.kpc", "none.kpc"),
+        ("none.json", "none.json"),
+        ("text.kpc.JSON", "JSON"),
+    ):
         window._drop(None, [file])
         player.frame()
         assert player.notice_is_error and words in player.notice and player.successor is None, player.notice
@@ -410,8 +434,10 @@ def stand_where_groups_are_mixed(window: Window, scene_file: str) -> None:
         player.frame()
     other, time_in_it, share = reel.beside(0.5)
     camera = player.view.camera(*player.canvas.size)
-    alone, beside = (renderer.render(camera, at).rgb.clip(0, 1)
-                     for renderer, at in ((reel.renderer, reel.time_in(0.5)), (other, time_in_it)))
+    alone, beside = (
+        renderer.render(camera, at).rgb.clip(0, 1)
+        for renderer, at in ((reel.renderer, reel.time_in(0.5)), (other, time_in_it))
+    )
     assert share == 0.5 and np.abs(alone - beside).max() > 0.1
     assert np.abs(player._pixels() / 255 - (alone + beside) / 2).max() < 2 / 255
     player.close()
@@ -474,7 +500,12 @@ def remember(scene_file: str) -> None:
     place().parent.write_text("no folder")
     assert kpplay.main([scene_file]) == 0
     Player.run = run  # type: ignore[method-assign]
-    assert [one.size for one in seen[:3]] == 3 * [(300, 200)] and [one.graphs for one in seen] == [False, True, False, False]
+    assert [one.size for one in seen[:3]] == 3 * [(300, 200)] and [one.graphs for one in seen] == [
+        False,
+        True,
+        False,
+        False,
+    ]
     assert [one.quality for one in seen] == [DEFAULT, climbed(DEFAULT, -1), "fine", DEFAULT]
     assert [one.target_fps for one in seen] == [None, 25.0, None, None]
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates
@@ -12,8 +11,14 @@ from kpc.player.gl.renderer import Renderer
 from kpc.player.gl.textures import Layout
 
 
-def tiny_scene(seed: int = 0, dynamic: bool = True, scales: int = 2, channels: int = 8,
-               resolution: tuple[int, int, int] = (24, 20, 16), time: int = 6) -> Scene:
+def tiny_scene(
+    seed: int = 0,
+    dynamic: bool = True,
+    scales: int = 2,
+    channels: int = 8,
+    resolution: tuple[int, int, int] = (24, 20, 16),
+    time: int = 6,
+) -> Scene:
     """A scene of smooth random planes in a box of unequal edges, seen by two cameras.
 
     Args:
@@ -86,7 +91,9 @@ def hybrid(scene: Scene, seed: int = 6, width: int = 6, hidden: int = 7) -> Scen
     rng = np.random.default_rng(seed)
     F = scene.decoder.w2.shape[1]
     shapes = HybridDecoder.shapes(F, width, hidden)
-    weights = {name: rng.normal(0.0, 2.0 / np.sqrt(shape[-1]), shape).astype(np.float32) for name, shape in shapes.items()}
+    weights = {
+        name: rng.normal(0.0, 2.0 / np.sqrt(shape[-1]), shape).astype(np.float32) for name, shape in shapes.items()
+    }
     return replace(scene, decoder=HybridDecoder(density_bias=3.5, **weights))
 
 
@@ -104,7 +111,10 @@ def one_sided(scene: Scene) -> Scene:
 
 def uneven() -> Scene:
     """Scales of other channels, rows of time and sizes; the first is the finer one along y."""
-    coarse, fine = tiny_scene(1, channels=13, resolution=(12, 44, 10), time=4), tiny_scene(2, channels=19, resolution=(23, 20, 15), time=7)
+    coarse, fine = (
+        tiny_scene(1, channels=13, resolution=(12, 44, 10), time=4),
+        tiny_scene(2, channels=19, resolution=(23, 20, 15), time=7),
+    )
     scales = coarse.scales[-1], fine.scales[-1]
     rng, features = np.random.default_rng(3), 32
     decoder = replace(fine.decoder, density_weight=rng.normal(0, 0.8, features).astype(np.float32),
@@ -115,7 +125,10 @@ def uneven() -> Scene:
 def flat() -> Scene:
     """Of one texel along z."""
     scene = tiny_scene(5, scales=1, channels=30, resolution=(9, 20, 2))
-    planes = {name: plane[:1] if name in ("xz", "yz") else plane[:, :1] if name == "zt" else plane for name, plane in scene.scales[0].items()}
+    planes = {
+        name: plane[:1] if name in ("xz", "yz") else plane[:, :1] if name == "zt" else plane
+        for name, plane in scene.scales[0].items()
+    }
     return one_sided(replace(scene, scales=(planes,)))
 
 
@@ -129,7 +142,10 @@ def of_first_degree(scene: Scene) -> Scene:
 
 
 SPACES: dict[str, Callable[[Scene], Scene]] = {
-    "box": lambda scene: scene, "contracted": surrounded, "displaced": displaced, "ndc": faced,
+    "box": lambda scene: scene,
+    "contracted": surrounded,
+    "displaced": displaced,
+    "ndc": faced,
     "hybrid": hybrid,
 }
 """What there is besides a plain box and the explicit decoder."""
@@ -137,7 +153,9 @@ SPACES: dict[str, Callable[[Scene], Scene]] = {
 
 def without_planes(scene: Scene) -> Scene:
     """A scene of whose planes nothing is there yet: all are 1."""
-    return replace(scene, scales=tuple({name: np.ones_like(plane) for name, plane in scale.items()} for scale in scene.scales))
+    return replace(
+        scene, scales=tuple({name: np.ones_like(plane) for name, plane in scale.items()} for scale in scene.scales)
+    )
 
 
 def bring(renderer: Renderer, early: Scene, scene: Scene) -> None:
@@ -151,8 +169,9 @@ def bring(renderer: Renderer, early: Scene, scene: Scene) -> None:
     renderer.refresh()
 
 
-def look_at(eye: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int,
-            focal: float) -> Camera:
+def look_at(
+    eye: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int, focal: float
+) -> Camera:
     """A camera at `eye` that looks at `target`, +y up."""
     back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
     right = np.cross([0.0, 1.0, 0.0], back)

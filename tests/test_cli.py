@@ -4,7 +4,6 @@ import errno
 from collections.abc import Callable
 
 import pytest
-
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, UsageError
 

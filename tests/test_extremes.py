@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 import torch
 from gradients import backpropagate, misty, rays_at, reference_gradients
-
+from kpc.encoder.cli.kpenc import to_scene
+from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate
 from kpc.encoder.field import kernels
 from kpc.encoder.field.bounds import find_box
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate
 from kpc.encoder.field.field import Field, Layout, priors
-from kpc.encoder.cli.kpenc import to_scene
-from kpc.encoder.training.optimisers import add_priors
 from kpc.encoder.field.render import Rays
+from kpc.encoder.training.optimisers import add_priors
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import write_image
@@ -29,8 +28,15 @@ from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION, Scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = TrainConfig(
-    resolutions=(8, 16), samples_across=48, cells_across=16, steps=40, rays=256, samples=12288, warmup=5,
-    occupancy_start=16, occupancy_every=8,
+    resolutions=(8, 16),
+    samples_across=48,
+    cells_across=16,
+    steps=40,
+    rays=256,
+    samples=12288,
+    warmup=5,
+    occupancy_start=16,
+    occupancy_every=8,
 )
 BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
 
@@ -63,7 +69,9 @@ def test_log_densities_far_beyond_the_limit_have_finite_gradients(bias: float) -
     ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
     for name in ("theta", "density", "basis", "errors"):
         assert np.isfinite(ours[name]).all() and np.isfinite(theirs[name]).all(), name
-        np.testing.assert_allclose(ours[name], theirs[name], atol=1e-3 * max(np.abs(theirs[name]).max(), 1e-6), err_msg=name)
+        np.testing.assert_allclose(
+            ours[name], theirs[name], atol=1e-3 * max(np.abs(theirs[name]).max(), 1e-6), err_msg=name
+        )
     if abs(bias) == 1e4:
         assert not ours["density"].any()
 
@@ -97,12 +105,20 @@ def fog(steps: int, optical_depth: float) -> tuple[Scene, Rays]:
     """A box of even fog and a ray along x that crosses it in so many steps."""
     scene = misty(dynamic=False)
     scene = replace(
-        scene, aabb=BOX, occupancy=np.ones_like(scene.occupancy), step=2.0 / steps,
-        decoder=replace(scene.decoder, density_weight=np.zeros_like(scene.decoder.density_weight),
-                        density_bias=math.log(optical_depth)),
+        scene,
+        aabb=BOX,
+        occupancy=np.ones_like(scene.occupancy),
+        step=2.0 / steps,
+        decoder=replace(
+            scene.decoder,
+            density_weight=np.zeros_like(scene.decoder.density_weight),
+            density_bias=math.log(optical_depth),
+        ),
     )
     one = torch.ones(1)
-    return scene, Rays(torch.tensor([[-2.0, 0.1, 0.2]]), torch.tensor([[1.0, 0, 0]]), 0 * one, 0.5 * one, torch.ones(1, 3))
+    return scene, Rays(
+        torch.tensor([[-2.0, 0.1, 0.2]]), torch.tensor([[1.0, 0, 0]]), 0 * one, 0.5 * one, torch.ones(1, 3)
+    )
 
 
 @pytest.mark.parametrize("optical_depth", [1e-3, 1.0, 9.0])
@@ -117,7 +133,9 @@ def test_transmittance_over_4096_samples(optical_depth: float) -> None:
             break
         left *= math.exp(-tau)
     assert 1 - float(opacity[0]) == pytest.approx(left, rel=3e-4)
-    black = replace(scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2, b2=np.full_like(scene.decoder.b2, -40.0)))
+    black = replace(
+        scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2, b2=np.full_like(scene.decoder.b2, -40.0))
+    )
     ours, theirs = (f(black, ray, torch.zeros(1, 3)) for f in (backpropagate, reference_gradients))
     assert ours["counts"][0] == theirs["samples"] >= min(4096, math.floor(-math.log(TERMINATION) / tau))
     assert ours["density"][-1] == pytest.approx(theirs["density"][-1], rel=5e-3)
@@ -225,5 +243,3 @@ def test_identical_cameras_are_refused(tmp_path: Path) -> None:
     make.edit_json(tmp_path / "set" / "transforms.json", stack)
     with pytest.raises(DatasetError, match="does not move"):
         load_dataset(tmp_path / "set", tmp_path / "cache", progress=False)
-
-

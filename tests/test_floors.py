@@ -52,6 +52,4 @@ def test_floors_hold(floor: str) -> None:
 
 
 def test_the_package_itself_needs_no_torch() -> None:
-    assert not any(
-        is_within(m, p) for m in imports(ROOT / "src/kpc/__init__.py") for p in ("torch", "kpc.encoder")
-    )
+    assert not any(is_within(m, p) for m in imports(ROOT / "src/kpc/__init__.py") for p in ("torch", "kpc.encoder"))

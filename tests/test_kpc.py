@@ -2,11 +2,11 @@ import subprocess
 import sys
 
 import numpy as np
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.container.scene_io import write
 from scenes import tiny_scene
 
 import kpc
-from kpc.format.container.scene_io import write
-from kpc.format.coding.quantise import quantise_scene
 
 
 def test_the_example_of_the_docstring(tmp_path):
@@ -21,7 +21,9 @@ def test_the_example_of_the_docstring(tmp_path):
 
 
 def test_playing_needs_no_torch_and_reading_no_opengl():
-    program = ("import sys, kpc, kpc.format.container.scene_io; "
-               "print([m for m in ('torch', 'moderngl', 'glfw') if m in sys.modules])")
+    program = (
+        "import sys, kpc, kpc.format.container.scene_io; "
+        "print([m for m in ('torch', 'moderngl', 'glfw') if m in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

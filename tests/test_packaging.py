@@ -72,7 +72,14 @@ WITHOUT_TORCH = without("torch")
 
 VIEWERS = (
     *("player.gl.renderer", "player.app.kpplay", "player.app.window"),
-    *("tools.cli.kprender", "tools.cli.kpinfo", "tools.bench.kpbench", "tools.dev.scenegen", "tools.bench.results", "tools.cli.contactsheet"),
+    *(
+        "tools.cli.kprender",
+        "tools.cli.kpinfo",
+        "tools.bench.kpbench",
+        "tools.dev.scenegen",
+        "tools.bench.results",
+        "tools.cli.contactsheet",
+    ),
 )
 
 
@@ -81,7 +88,17 @@ def test_viewers_need_no_torch(module: str) -> None:
     subprocess.run([sys.executable, "-c", f"{WITHOUT_TORCH}\nimport kpc.{module}"], check=True)
 
 
-@pytest.mark.parametrize("module", ["encoder.cli.kpenc", "player.app.kpplay", "tools.cli.kprender", "tools.cli.kpinfo", "tools.cli.kpjoin", "tools.cli.contactsheet"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "encoder.cli.kpenc",
+        "player.app.kpplay",
+        "tools.cli.kprender",
+        "tools.cli.kpinfo",
+        "tools.cli.kpjoin",
+        "tools.cli.contactsheet",
+    ],
+)
 def test_nobody_needs_what_tests_and_benches_do(module: str) -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = {re.split(r"[<>=]", requirement)[0] for extra in ("bench", "test") for requirement in extras[extra]}

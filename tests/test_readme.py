@@ -8,12 +8,11 @@ from pathlib import Path
 
 import gl
 import pytest
-from scenes import tiny_scene
-
-from kpc.format.scene.cameras import load_shots
-from kpc.format.container.scene_io import write
-from kpc.format.common.media import read_image
 from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common.media import read_image
+from kpc.format.container.scene_io import write
+from kpc.format.scene.cameras import load_shots
+from scenes import tiny_scene
 
 ROOT = Path(__file__).parent.parent
 README, MEASURED = ((ROOT / name).read_text() for name in ("README.md", "docs/measured.md"))
@@ -69,7 +68,15 @@ def test_links_lead_somewhere_and_pictures_are_small(text: str, folder: Path) ->
         if not target.startswith("https://"):
             path, _, section = target.partition("#")
             assert (folder / path).exists(), target
-            titles = [line.lstrip("# ").lower().replace(" ", "-") for line in (folder / path).read_text().splitlines() if line.startswith("#")] if section else []
+            titles = (
+                [
+                    line.lstrip("# ").lower().replace(" ", "-")
+                    for line in (folder / path).read_text().splitlines()
+                    if line.startswith("#")
+                ]
+                if section
+                else []
+            )
             assert not section or section in titles, target
     for target in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):
         assert (folder / target).stat().st_size < PICTURE_LIMIT

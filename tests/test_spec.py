@@ -1,7 +1,7 @@
 """The page, the decoder written from it, the vectors and the package must all say the same."""
 
-import importlib.util
 import hashlib
+import importlib.util
 import json
 import re
 import struct
@@ -10,17 +10,14 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from scenes import SPACES, tiny_scene
-
 from kpc.format.coding import poses, raw_planes
-
 from kpc.format.common import errors
-
 from kpc.format.container import container, groups, scene_io
 from kpc.format.scene.scene import ALL_PLANES, LOG_DENSITY_LIMIT, TERMINATION
 from kpc.format.scene.space import FAR, FORWARD, LEAST_DISPARITY
 from kpc.player.cpu import reference
 from kpc.tools.vectors import specvectors
+from scenes import SPACES, tiny_scene
 
 SPEC = Path(__file__).parent.parent / "spec"
 PAGE = (SPEC / "kpc-format.md").read_text()
@@ -63,16 +60,33 @@ def layouts(text: str) -> list[str]:
 
 def same(layout: str, expected: struct.Struct) -> bool:
     """Equal but for how repeats are written: "ff" and "2f"."""
+
     def spelled(text: str) -> str:
         return re.sub(r"(\d+)([a-rt-zA-Z])", lambda m: m[2] * int(m[1]), text)
 
     return spelled(layout) == spelled(expected.format)
 
 
-@pytest.mark.parametrize("number, structures", [
-    (3, [container.HEADER]), (4, [container.ENTRY]), (5, [scene_io.SCENE_STRUCT, scene_io.SCALE_STRUCT, scene_io.WARP_STRUCT, scene_io.NDC_STRUCT, scene_io.MOTION_STRUCT]),
-    (7, [scene_io.DECODER_STRUCT, scene_io.HYBRID_STRUCT]), (8, [scene_io.OCCUPANCY_STRUCT]), (9, [scene_io.CAMERA_STRUCT, poses.HEAD, scene_io.APPEARANCE_STRUCT]),
-])
+@pytest.mark.parametrize(
+    "number, structures",
+    [
+        (3, [container.HEADER]),
+        (4, [container.ENTRY]),
+        (
+            5,
+            [
+                scene_io.SCENE_STRUCT,
+                scene_io.SCALE_STRUCT,
+                scene_io.WARP_STRUCT,
+                scene_io.NDC_STRUCT,
+                scene_io.MOTION_STRUCT,
+            ],
+        ),
+        (7, [scene_io.DECODER_STRUCT, scene_io.HYBRID_STRUCT]),
+        (8, [scene_io.OCCUPANCY_STRUCT]),
+        (9, [scene_io.CAMERA_STRUCT, poses.HEAD, scene_io.APPEARANCE_STRUCT]),
+    ],
+)
 def test_byte_tables_are_the_code_s_structures(number, structures):
     tables = layouts(section(number))
     assert len(tables) == len(structures)
@@ -88,13 +102,19 @@ def test_sizes_in_the_text():
     assert f"the part that\nkeeps its shape. {scene_io.WARP_STRUCT.size} bytes" in section(5)
     assert f"from these {scene_io.NDC_STRUCT.size} bytes" in section(5)
     assert f"may have one. It begins with {scene_io.MOTION_STRUCT.size} bytes" in section(5)
-    assert f"each camera {scene_io.CAMERA_STRUCT.size} bytes" in section(9) and f"first {poses.LENS.size} of the" in section(9)
+    assert f"each camera {scene_io.CAMERA_STRUCT.size} bytes" in section(
+        9
+    ) and f"first {poses.LENS.size} of the" in section(9)
 
 
 def test_limits_are_the_code_s():
     rows = dict(re.findall(r"^\| ([A-Z_]+) \| (\d+) \|", section(12), re.M))
-    code = {name: int(value) for module in (container, scene_io) for name, value in vars(module).items()
-            if name.endswith("_LIMIT") and name != "HEAD_LIMIT"}
+    code = {
+        name: int(value)
+        for module in (container, scene_io)
+        for name, value in vars(module).items()
+        if name.endswith("_LIMIT") and name != "HEAD_LIMIT"
+    }
     assert {name: int(value) for name, value in rows.items()} == code
 
 
@@ -105,7 +125,9 @@ def test_names_and_numbers_are_the_code_s():
     assert container.READABLE_VERSIONS == (0, container.PLAIN_VERSION, container.VERSION)
     assert f"content size, {container.TOLD} x chunk_count" in section(4)
     assert f"at least {container.HEADER.size} + {container.LEAST_CHUNK} chunk_count" in section(3)
-    assert set(re.findall(r"^\| ([A-Za-z]{4}) \| [01]", section(4), re.M)) == scene_io.KNOWN_KINDS | {scene_io.GROUP_KIND}
+    assert set(re.findall(r"^\| ([A-Za-z]{4}) \| [01]", section(4), re.M)) == scene_io.KNOWN_KINDS | {
+        scene_io.GROUP_KIND
+    }
     numbered = ", ".join(f"{number} `{name}`" for number, name in enumerate(ALL_PLANES))
     assert numbered in section(4)
     filters = re.findall(r"^\| (\d) \| r\[y, x\]", section(6), re.M)
@@ -144,7 +166,10 @@ def test_the_decoder_written_from_the_page_agrees(path, twin):
     scene = twin.decode(path.read_bytes(), expected["partial"])
     for plane in expected["planes"]:
         assert twin.hashes(scene)[plane["scale"], plane["plane"]] == (
-            plane["symbols_sha256"], plane["coded_sha256"], plane["values_sha256"])
+            plane["symbols_sha256"],
+            plane["coded_sha256"],
+            plane["values_sha256"],
+        )
     occupied = np.array(scene["occupancy"], np.uint8).reshape(*scene["cells"][::-1], scene["slots"])
     occupied = np.ascontiguousarray(np.moveaxis(occupied, -1, 0))
     assert list(occupied.shape) == expected["occupancy"]["shape"]
@@ -159,13 +184,18 @@ def test_the_decoder_written_from_the_page_agrees(path, twin):
     assert {"count": len(cameras), "sha256": hashlib.sha256(cameras.tobytes()).hexdigest()} == expected["cameras"]
     if "appearances" in expected:
         codes = np.array(list(scene["appearances"].values()), "<f4")
-        assert hashlib.sha256("".join(scene["appearances"]).encode()).hexdigest() == expected["appearances"]["names_sha256"]
+        assert (
+            hashlib.sha256("".join(scene["appearances"]).encode()).hexdigest()
+            == expected["appearances"]["names_sha256"]
+        )
         assert hashlib.sha256(codes.tobytes()).hexdigest() == expected["appearances"]["sha256"]
         assert len(codes) == expected["appearances"]["count"]
     else:
         assert scene["appearances"] == {}
     for ray in expected["rays"]:
-        rgb, opacity, depth = twin.render_ray(scene, ray["origin"], ray["direction"], ray["time"], ray.get("appearance"))
+        rgb, opacity, depth = twin.render_ray(
+            scene, ray["origin"], ray["direction"], ray["time"], ray.get("appearance")
+        )
         assert rgb == pytest.approx(ray["rgb"], abs=RAY_TOLERANCE)
         assert opacity == pytest.approx(ray["opacity"], abs=RAY_TOLERANCE)
         if ray["depth"] is None:
@@ -198,8 +228,11 @@ def test_vectors_of_groups_hold_the_vectors_that_they_say(path, twin):
     expected, data = json.loads(path.with_suffix(".json").read_text()), path.read_bytes()
     opened = groups.Groups(path, allow_partial=expected["partial"])
     theirs, scenes = twin.groups(data, expected["partial"])
-    assert [(span.start, span.count) for span in opened.timeline.spans] == [place[:2] for place in theirs] \
+    assert (
+        [(span.start, span.count) for span in opened.timeline.spans]
+        == [place[:2] for place in theirs]
         == [(group["row_start"], group["row_count"]) for group in expected["groups"]]
+    )
     for number, (group, (*_, content)) in enumerate(zip(expected["groups"], theirs, strict=True)):
         if group["scene"] is not None:
             assert content == path.with_name(f"{group['scene']}.kpc").read_bytes()
@@ -211,7 +244,11 @@ def test_vectors_of_groups_hold_the_vectors_that_they_say(path, twin):
         assert time_in_it == pytest.approx(moment["time_in_it"], abs=1e-6)
         shares = {str(part): share for part, _, share in opened.timeline.mixed(moment["time"])}
         theirs_mixed = twin.mix([place[:2] for place in theirs], moment["time"])
-        assert shares == pytest.approx(moment["mix"], abs=1e-6) == {str(part): share for part, share in theirs_mixed.items()}
+        assert (
+            shares
+            == pytest.approx(moment["mix"], abs=1e-6)
+            == {str(part): share for part, share in theirs_mixed.items()}
+        )
         assert twin.shown([place[:2] for place in theirs], moment["time"])[1] == pytest.approx(time_in_it, abs=1e-9)
 
 
@@ -228,9 +265,14 @@ def test_vectors_are_what_their_maker_makes():
     assert sum(len(content) for content in made.values()) < 750_000
 
 
-@pytest.mark.parametrize("name, digest", {
-    "version-0": "332b031a5b8c07bb5451f6db534829b7548d34a87e6125edd11a70c80040cb42", "version-0-symbols": "2836f74ea5ad19d75e12237690d2e54db6430c45b179f6d22bc2c01d78163ecd", "version-0-groups": "fd15878b0953fd13abe5fe47c2137bfb160260d5ee51b422a15d62a407021845",
-}.items())
+@pytest.mark.parametrize(
+    "name, digest",
+    {
+        "version-0": "332b031a5b8c07bb5451f6db534829b7548d34a87e6125edd11a70c80040cb42",
+        "version-0-symbols": "2836f74ea5ad19d75e12237690d2e54db6430c45b179f6d22bc2c01d78163ecd",
+        "version-0-groups": "fd15878b0953fd13abe5fe47c2137bfb160260d5ee51b422a15d62a407021845",
+    }.items(),
+)
 def test_files_of_the_draft_are_kept_as_they_were_made(name, digest):
     data = (SPEC / "vectors" / "valid" / f"{name}.kpc").read_bytes()
     assert hashlib.sha256(data).hexdigest() == digest
@@ -241,7 +283,10 @@ def test_a_file_may_have_so_many_chunks_and_no_more(twin, monkeypatch):
     """No vector, for its index takes 2.6 MB: the least file, and after it chunks of nothing that nobody knows."""
     path = SPEC / "vectors" / "valid" / "minimal.kpc"
     reader = container.Reader(path.read_bytes())
-    known = [container.Chunk(e.kind, [reader.chunk(k)], e.scale, e.plane, e.row_start, e.row_count) for k, e in enumerate(reader.index)]
+    known = [
+        container.Chunk(e.kind, [reader.chunk(k)], e.scale, e.plane, e.row_start, e.row_count)
+        for k, e in enumerate(reader.index)
+    ]
     empty = [container.Chunk("note", [b""])] * (container.CHUNK_LIMIT - len(known))
     data = container.pack([*known, *empty], reader.header.value_count, compress=False)
     assert len(container.Reader(data).index) == 65536
@@ -252,7 +297,11 @@ def test_a_file_may_have_so_many_chunks_and_no_more(twin, monkeypatch):
         container.pack([*known, *empty, *empty[:1]], reader.header.value_count, compress=False)
     full = [container.Chunk("note", [bytes(8)])] * len(empty)  # as many in a file of version 2 are no smaller than this
     data = container.pack([*known, *full], reader.header.value_count)
-    assert container.Reader(data).header.version == 2 and len(data) < 9 * 65536 and len(container.Reader(data).index) == 65536
+    assert (
+        container.Reader(data).header.version == 2
+        and len(data) < 9 * 65536
+        and len(container.Reader(data).index) == 65536
+    )
     assert twin.hashes(twin.decode(data)) == plain
     assert container.Reader(container.pack([*known, *empty], reader.header.value_count)).header.version == 1
     with monkeypatch.context() as patch:
@@ -265,9 +314,14 @@ def test_a_file_may_have_so_many_chunks_and_no_more(twin, monkeypatch):
 
 
 def test_valid_vectors_cover_every_kind_under_every_codec():
-    found = {(entry.kind, entry.codec) for path in VALID + GROUPED
-             for entry in container.Reader(path.read_bytes(), allow_partial=True).index}
-    codecs = {kind: {0, 1, 2} if kind in ("PLNE", "OCCU", "MOVE", "DECO", "HYBR") else {0, 1} for kind in scene_io.KNOWN_KINDS}
+    found = {
+        (entry.kind, entry.codec)
+        for path in VALID + GROUPED
+        for entry in container.Reader(path.read_bytes(), allow_partial=True).index
+    }
+    codecs = {
+        kind: {0, 1, 2} if kind in ("PLNE", "OCCU", "MOVE", "DECO", "HYBR") else {0, 1} for kind in scene_io.KNOWN_KINDS
+    }
     assert found >= {(kind, codec) for kind, known in codecs.items() for codec in known} | {(scene_io.GROUP_KIND, 0)}
 
 

@@ -4,17 +4,16 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
-
-from kpc.encoder.rdo.occupancy_rdo import errors_of_flips
-from kpc.encoder.rdo.mode_decision import quantise_by_cost
-from kpc.encoder.rdo.rate_control import PROBES
-from kpc.encoder.rdo.curvature import RAYS as CURVATURE_RAYS
-from kpc.encoder.rdo.curvature import curvature
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.rdo.curvature import RAYS as CURVATURE_RAYS
+from kpc.encoder.rdo.curvature import curvature
+from kpc.encoder.rdo.mode_decision import quantise_by_cost
+from kpc.encoder.rdo.occupancy_rdo import errors_of_flips
 from kpc.encoder.rdo.prune import renderings
-from kpc.encoder.training.train import Trainer
+from kpc.encoder.rdo.rate_control import PROBES
 from kpc.encoder.rdo.sequential_finetune import RAYS, steps_after, steps_in_all
+from kpc.encoder.training.train import Trainer
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.scene.scene import Scene
 
@@ -38,7 +37,12 @@ class Estimate:
 
 
 def estimate(
-    trainer: Trainer, probe_rays: int, tested: int, spent_s: float, time_budget_s: float | None, tune_steps: int | None = None
+    trainer: Trainer,
+    probe_rays: int,
+    tested: int,
+    spent_s: float,
+    time_budget_s: float | None,
+    tune_steps: int | None = None,
 ) -> Estimate:
     """Take the first steps of a run, the same that it will take, and go on in thought.
 
@@ -60,7 +64,9 @@ def estimate(
         coarse_s = coarse_steps * a_step
         trainer.optimiser.config = replace(config, coarse_until=0.0)
         a_step = _seconds_a_step(trainer, min(config.steps, 2 * watched))
-    train_s = time_budget_s or trainer.elapsed_s + coarse_s + a_step * max(0.0, config.steps - trainer.step - coarse_steps)
+    train_s = time_budget_s or trainer.elapsed_s + coarse_s + a_step * max(
+        0.0, config.steps - trainer.step - coarse_steps
+    )
 
     pixels = trainer.dataset.pictures.width.astype(np.int64) * trainer.dataset.pictures.height
     probes = PROBES + (renderings(trainer.field.layout.features) if config.prunes else 0)
@@ -71,7 +77,11 @@ def estimate(
     a_coding, a_ray = _seconds_a_coding(scene), _seconds_a_ray(trainer)
     coding_s = PROBES * a_coding + _seconds_of_errors(scene)
     if tune_steps is None:
-        trained = config.steps if time_budget_s is None else trainer.step + max(0.0, time_budget_s - trainer.elapsed_s) / max(a_step, 1e-6)
+        trained = (
+            config.steps
+            if time_budget_s is None
+            else trainer.step + max(0.0, time_budget_s - trainer.elapsed_s) / max(a_step, 1e-6)
+        )
         tune_steps = steps_after(int(trained), scene, config.tune_steps)
     if steps := steps_in_all(scene, tune_steps):
         a_trained_ray = 1 / trainer.rays_per_second if trainer.rays_per_second else 3 * a_ray

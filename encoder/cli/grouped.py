@@ -9,12 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-
-from kpc.encoder.rdo.rate_control import Trade
-from kpc.encoder.field.field import Field
 from kpc.encoder.cli.options import Options
-from kpc.format.container.container import ENTRY, HEADER
+from kpc.encoder.field.field import Field
+from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.common.errors import UsageError
+from kpc.format.container.container import ENTRY, HEADER
 from kpc.format.container.groups import Span
 from kpc.format.scene.scene import TIME_PLANES, Clip, Scene
 
@@ -41,8 +40,10 @@ def spans_of(clip: Clip, group_s: float) -> tuple[Span, ...]:
     """
     frames = int(group_s * clip.fps + 1e-6)
     if frames < LEAST_FRAMES:
-        raise UsageError(f"--group {group_s:g}s: {frames} frames at {clip.fps:g} fps are too few for a group; give at least "
-                         f"{LEAST_FRAMES / clip.fps:.2g}s")
+        raise UsageError(
+            f"--group {group_s:g}s: {frames} frames at {clip.fps:g} fps are too few for a group; give at least "
+            f"{LEAST_FRAMES / clip.fps:.2g}s"
+        )
     count = -(-clip.frame_count // frames)
     ends = [number * clip.frame_count // count for number in range(count + 1)]
     spans = []
@@ -81,5 +82,7 @@ def begin_with(field: Field, before: Scene) -> None:
             field.motion[:] = earlier.motion[-1:]
         for name, value in earlier.named_parameters():
             mine = getattr(field, name)
-            if name not in ("theta", "motion") and mine.shape == value.shape:  # codes of other pictures may be more or fewer
+            if (
+                name not in ("theta", "motion") and mine.shape == value.shape
+            ):  # codes of other pictures may be more or fewer
                 mine[:] = value

@@ -14,31 +14,37 @@ from typing import Any
 
 import numpy as np
 import torch
-
-from kpc.encoder.evaluation.ablations import changed_by
-from kpc.encoder.field.bounds import contraction_of, device_coordinates_of, find_box, find_inner_box, reaches_beyond, seen_cells
-from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.cli.estimate import Estimate, estimate
-from kpc.encoder.evaluation.evaluate import evaluate
-from kpc.encoder.field.field import time_rows
 from kpc.encoder.cli.grouped import LATER, begin_with, share_of, spans_of
-from kpc.encoder.rdo.codec_model import Model, code, load_checkpoint, save_checkpoint
-from kpc.encoder.field.occupancy_grid import grid_shape, in_fewest_slots
 from kpc.encoder.cli.options import Options, parse
+from kpc.encoder.cli.transcode import check_outputs, figures, reached, recode, together
+from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.evaluation.ablations import changed_by
+from kpc.encoder.evaluation.evaluate import evaluate
 from kpc.encoder.evaluation.profile import profile
 from kpc.encoder.evaluation.validation_rays import PROBE_RAYS, Probe
+from kpc.encoder.field.bounds import (
+    contraction_of,
+    device_coordinates_of,
+    find_box,
+    find_inner_box,
+    reaches_beyond,
+    seen_cells,
+)
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.field.field import time_rows
+from kpc.encoder.field.occupancy_grid import grid_shape, in_fewest_slots
+from kpc.encoder.rdo.codec_model import Model, code, load_checkpoint, save_checkpoint
 from kpc.encoder.rdo.prune import Pruned
-from kpc.encoder.cli.transcode import check_outputs, figures, reached, recode, together
-from kpc.encoder.training.temporal_resolution import TimeResolution, fitted_in_time
-from kpc.encoder.training.train import Report, Trainer, box_of_checkpoint
-from kpc.encoder.training.tight_bounds import trim_box
 from kpc.encoder.rdo.sequential_finetune import steps_after
+from kpc.encoder.training.temporal_resolution import TimeResolution, fitted_in_time
+from kpc.encoder.training.tight_bounds import trim_box
+from kpc.encoder.training.train import Report, Trainer, box_of_checkpoint
 from kpc.format.common import cli
-from kpc.format.container import groups, scene_io
 from kpc.format.common.errors import DatasetError, TrainingError, UsageError
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.common.progress import Progress
+from kpc.format.container import groups, scene_io
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import FAR, Contraction, DeviceCoordinates, SpaceMapping
 
@@ -81,19 +87,26 @@ def _command(argv: list[str]) -> None:
 def _print_result(result: dict[str, Any], options: Options) -> None:
     quality = "no view held out"
     if result["test_psnr"] is not None:
-        quality = (f"held-out PSNR {result['test_psnr']:.2f} dB, SSIM {result['test_ssim']:.4f} "
-                   f"over {result['test_pictures']} pictures")
+        quality = (
+            f"held-out PSNR {result['test_psnr']:.2f} dB, SSIM {result['test_ssim']:.4f} "
+            f"over {result['test_pictures']} pictures"
+        )
         if result["appearances"]:
             quality += ", right halves, each in an appearance fitted to its left half"
     print(f"{options.output}: {quality} (rendered from the decoded file)")
-    print(f"{result['size_bytes']:,} bytes, {result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}; "
-          f"coding loss {result['coding_loss_db']:.3f} dB" + (" on held-out views" if result["test_psnr"] is not None else ""))
+    print(
+        f"{result['size_bytes']:,} bytes, {result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}; "
+        f"coding loss {result['coding_loss_db']:.3f} dB"
+        + (" on held-out views" if result["test_psnr"] is not None else "")
+    )
     print(reached(result))
     if result["identity_share"] is not None:
         print(f"time-plane texels exactly at identity: {result['identity_share']:.1%}")
     if len(result.get("groups", [])) > 1:
         print(f"{len(result['groups'])} groups: " + ", ".join(_of_group(group) for group in result["groups"]))
-    print(f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps)")
+    print(
+        f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps)"
+    )
 
 
 def _of_group(group: dict[str, Any]) -> str:
@@ -106,8 +119,10 @@ def _print_estimate(expected: Estimate, options: Options, as_json: bool) -> None
         print(json.dumps(asdict(expected), indent=1))
         return
     total = expected.train_s + expected.rest_s
-    print(f"{options.output} would take {total:.0f} s, of which training {expected.train_s:.0f} s, and "
-          f"{expected.memory_bytes / 1e6:.0f} MB of memory; decoded pixels wait in {options.work_dir}")
+    print(
+        f"{options.output} would take {total:.0f} s, of which training {expected.train_s:.0f} s, and "
+        f"{expected.memory_bytes / 1e6:.0f} MB of memory; decoded pixels wait in {options.work_dir}"
+    )
 
 
 def encode(options: Options) -> dict[str, Any]:
@@ -168,19 +183,33 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         _say(_left_out(scene, coded.pruned, coded.spare_db))
     size = _write(coded.data, options.output, work)
     decoded = scene_io.read(options.output).dequantise()
-    test, before = evaluate(decoded, dataset, most=options.most_tests), evaluate(scene, dataset, most=options.most_tests)
+    test, before = (
+        evaluate(decoded, dataset, most=options.most_tests),
+        evaluate(scene, dataset, most=options.most_tests),
+    )
     if not options.keep:
         _clear(work)
     return {
-        "file": str(options.output), "layout": dataset.layout, "dynamic": dataset.is_dynamic, "preset": options.preset,
-        "seed": options.seed, "device": str(trainer.device), "box": trainer.aabb.tolist(),
+        "file": str(options.output),
+        "layout": dataset.layout,
+        "dynamic": dataset.is_dynamic,
+        "preset": options.preset,
+        "seed": options.seed,
+        "device": str(trainer.device),
+        "box": trainer.aabb.tolist(),
         "space": SPACES[type(trainer.mapping)][0],
-        "appearance": trainer.config.appearance, "appearances": len(trainer.names),
-        "test_psnr": test and test.psnr, "test_ssim": test and test.ssim, "test_pictures": test.pictures if test else 0,
+        "appearance": trainer.config.appearance,
+        "appearances": len(trainer.names),
+        "test_psnr": test and test.psnr,
+        "test_ssim": test and test.ssim,
+        "test_pictures": test.pictures if test else 0,
         "coding_loss_db": before.psnr - test.psnr if test and before else coded.loss_db,
         **figures(coded, size, options.trade, "training views"),
-        "steps": trainer.step, "train_s": trainer.elapsed_s, "encode_s": time.monotonic() - started,
-        "rays_per_s": trainer.rays_per_second, "peak_memory_bytes": peak_memory_bytes(),
+        "steps": trainer.step,
+        "train_s": trainer.elapsed_s,
+        "encode_s": time.monotonic() - started,
+        "rays_per_s": trainer.rays_per_second,
+        "peak_memory_bytes": peak_memory_bytes(),
     }
 
 
@@ -201,8 +230,12 @@ def _encode_groups(options: Options) -> dict[str, Any]:
     for number in numbers:
         span, part = spans[number], _part(work, number)
         _say(f"group {number} of {len(spans)}: frames {span.start} to {span.last}")
-        told = replace(share_of(options, number, spans), output=part, work=part.with_suffix(""),
-                       keep_checkpoint=options.keep_checkpoint or part.with_suffix(".kpck"))
+        told = replace(
+            share_of(options, number, spans),
+            output=part,
+            work=part.with_suffix(""),
+            keep_checkpoint=options.keep_checkpoint or part.with_suffix(".kpck"),
+        )
         if options.resume and part.with_suffix(".json").exists():
             found.append(_finished(part, told))
         else:
@@ -211,7 +244,9 @@ def _encode_groups(options: Options) -> dict[str, Any]:
     size = _joined([groups.Part.of(_part(work, number), spans[number].start) for number in numbers], options)
     if not options.keep:
         _clear(work)
-    return _of_all(found, [spans[number] for number in numbers], size, options) | {"encode_s": time.monotonic() - started}
+    return _of_all(found, [spans[number] for number in numbers], size, options) | {
+        "encode_s": time.monotonic() - started
+    }
 
 
 def _part(work: Path, number: int) -> Path:
@@ -260,7 +295,9 @@ def _finished(part: Path, told: Options) -> dict[str, Any]:
             raise TrainingError(f"{part}: belongs to a run with other settings; give the same ones or drop --resume")
         found: dict[str, Any] = kept["found"]
     except (OSError, ValueError, KeyError) as error:
-        raise TrainingError(f"{part}: what was measured of it is gone; delete it to have the group encoded anew") from error
+        raise TrainingError(
+            f"{part}: what was measured of it is gone; delete it to have the group encoded anew"
+        ) from error
     _say(f"{part}: is there already")
     return found
 
@@ -278,7 +315,9 @@ def _joined(parts: Sequence[groups.Part], options: Options) -> int:
         raise TrainingError(f"{options.output}: {error.strerror}; make room there, {kept}") from error
 
 
-def _of_all(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size: int, options: Options) -> dict[str, Any]:
+def _of_all(
+    found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size: int, options: Options
+) -> dict[str, Any]:
     """Of all groups together: sums, means over frames or pictures, and those of each group."""
 
     def mean(name: str, weights: Sequence[float]) -> float | None:
@@ -303,9 +342,15 @@ def _not_written(trainer: Trainer, options: Options, started: float) -> dict[str
     if not options.keep:
         _clear(options.work_dir)
     return {
-        "file": str(options.output), "device": str(trainer.device), "seed": options.seed, "steps": trainer.step,
-        "test_psnr": test and test.psnr, "test_ssim": test and test.ssim, "test_pictures": test.pictures if test else 0,
-        "train_s": trainer.elapsed_s, "encode_s": time.monotonic() - started,
+        "file": str(options.output),
+        "device": str(trainer.device),
+        "seed": options.seed,
+        "steps": trainer.step,
+        "test_psnr": test and test.psnr,
+        "test_ssim": test and test.ssim,
+        "test_pictures": test.pictures if test else 0,
+        "train_s": trainer.elapsed_s,
+        "encode_s": time.monotonic() - started,
     }
 
 
@@ -326,8 +371,12 @@ def dry_run(options: Options) -> Estimate:
     trainer = _trainer(options, setting)
     tested = int(trainer.dataset.pictures.is_test.sum())
     found = estimate(
-        trainer, PROBE_RAYS, min(tested, options.most_tests or tested), time.monotonic() - started - trainer.elapsed_s,
-        options.time_budget_s, options.tune_steps,
+        trainer,
+        PROBE_RAYS,
+        min(tested, options.most_tests or tested),
+        time.monotonic() - started - trainer.elapsed_s,
+        options.time_budget_s,
+        options.tune_steps,
     )
     return replace(found, train_s=groups_count * found.train_s, rest_s=groups_count * found.rest_s)
 
@@ -401,29 +450,41 @@ def to_scene(trainer: Trainer) -> Scene:
     """The trained field with its final occupancy and a few of the cameras, the most central first."""
     dataset = trainer.dataset
     slots = min(8, dataset.clip.frame_count) if dataset.is_dynamic else 1
-    occupancy = in_fewest_slots(trainer.grid.over_time(trainer.density_at, np.random.default_rng(trainer.config.seed), slots))
+    occupancy = in_fewest_slots(
+        trainer.grid.over_time(trainer.density_at, np.random.default_rng(trainer.config.seed), slots)
+    )
     return replace(trainer.scene(occupancy), cameras=tuple(dataset.camera(p) for p in _spread_of_cameras(dataset)))
 
 
 def _trimmed(
-    dataset: Dataset, config: TrainConfig, aabb: np.ndarray, time_budget_s: float | None, mapping: DeviceCoordinates | None
+    dataset: Dataset,
+    config: TrainConfig,
+    aabb: np.ndarray,
+    time_budget_s: float | None,
+    mapping: DeviceCoordinates | None,
 ) -> tuple[np.ndarray, float]:
     """The box cut down to where something is, and the seconds that took."""
     with Progress("survey", total=1000, unit="‰") as progress:
-        return trim_box(dataset, config, aabb, lambda r: _show(progress, r), time_budget_s=time_budget_s, mapping=mapping)
+        return trim_box(
+            dataset, config, aabb, lambda r: _show(progress, r), time_budget_s=time_budget_s, mapping=mapping
+        )
 
 
 def _train(trainer: Trainer, checkpoint: Path, time_budget_s: float | None) -> None:
     """Train to the end, or until Ctrl-C, which waits for the step to be done."""
     requests: list[int] = []
     with Progress("train", total=1000, unit="‰") as progress, _on_signals(lambda number, _: requests.append(number)):
-        trainer.run(lambda r: _show(progress, r), checkpoint, time_budget_s=time_budget_s, interrupted=lambda: bool(requests))
+        trainer.run(
+            lambda r: _show(progress, r), checkpoint, time_budget_s=time_budget_s, interrupted=lambda: bool(requests)
+        )
 
 
 def _show(progress: Progress, r: Report) -> None:
     """Step, train PSNR, rays/s and samples/ray; the bar runs in per mille of the work."""
-    progress.note(f"step {r.step}, psnr {r.psnr:.2f}, {r.rays_per_second:,.0f} rays/s, "
-                  f"{r.samples_per_ray:.1f} samples/ray, {r.occupied:.1%} occupied")
+    progress.note(
+        f"step {r.step}, psnr {r.psnr:.2f}, {r.rays_per_second:,.0f} rays/s, "
+        f"{r.samples_per_ray:.1f} samples/ray, {r.occupied:.1%} occupied"
+    )
     progress.advance(1000 * min(r.fraction, 1.0) - progress.done)
 
 
@@ -468,11 +529,18 @@ def _plan(trainer: Trainer) -> str:
         beyond = f" and all around it, even steps up to {mapping.even:.4g}, rays to {FAR * mapping.even:.4g}"
     elif mapping is not None:
         beyond = f" of device coordinates, near {mapping.near:.4g}, baseline {mapping.baseline:.4g}"
-    nodes = "" if trainer.field.motion is None else (
-        f", read where a motion grid of {'x'.join(str(n) for n in trainer.field.motion.shape[3:0:-1])} nodes leads")
+    nodes = (
+        ""
+        if trainer.field.motion is None
+        else (
+            f", read where a motion grid of {'x'.join(str(n) for n in trainer.field.motion.shape[3:0:-1])} nodes leads"
+        )
+    )
     decoder = "hybrid" if trainer.config.hybrid else "explicit"
-    return (f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
-            f"{layout.size / 1e6:.2f} M parameters{nodes}; {decoder} decoder; on {trainer.device}")
+    return (
+        f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels, "
+        f"{layout.size / 1e6:.2f} M parameters{nodes}; {decoder} decoder; on {trainer.device}"
+    )
 
 
 def _rows_in_time(config: TrainConfig, dataset: Dataset, found: TimeResolution | None) -> str:
@@ -482,8 +550,10 @@ def _rows_in_time(config: TrainConfig, dataset: Dataset, found: TimeResolution |
     if found is None:
         return f"{said} (the preset's; it is measured where cameras stand still)"
     wider = "" if math.isnan(found.next_error) else f", wider apart {found.next_error:.3f}"
-    return (f"{said} (lines between them miss {found.changing:.1%} of the pixels, those that change, by {found.error:.3f} of the "
-            f"full range{wider}; {config.time_tolerance:g} allowed; noise {found.noise:.3f})")
+    return (
+        f"{said} (lines between them miss {found.changing:.1%} of the pixels, those that change, by {found.error:.3f} of the "
+        f"full range{wider}; {config.time_tolerance:g} allowed; noise {found.noise:.3f})"
+    )
 
 
 def _occupied(scene: Scene) -> str:
@@ -499,8 +569,11 @@ def _left_out(scene: Scene, pruned: Pruned, spare_db: float) -> str:
     worth, counts = pruned.view_worth_db, [scale["xy"].shape[2] for scale in scene.scales]
     said = "colour: the same from all sides, as trained"
     if worth is not None:
-        said = f"colour: by direction, worth {worth:.3f} dB" if worth > spare_db else (
-            f"colour: the same from all sides, direction is worth {worth:.3f} dB")
+        said = (
+            f"colour: by direction, worth {worth:.3f} dB"
+            if worth > spare_db
+            else (f"colour: the same from all sides, direction is worth {worth:.3f} dB")
+        )
     left = " + ".join(f"{len(kept)} of {count}" for kept, count in zip(pruned.kept, counts))
     more = "" if math.isinf(pruned.next_db) else f", {pruned.next_db:.3f} dB with fewer"
     return f"{said}; channels: {left} a scale; costs {pruned.loss_db:.3f} dB{more} ({spare_db:.3f} allowed)"
@@ -522,7 +595,9 @@ def _space_of(dataset: Dataset, options: Options) -> tuple[np.ndarray, SpaceMapp
     beyond, why = reaches_beyond(dataset.pictures, dataset.has_alpha)
     space = options.space if options.space != "auto" else "contracted" if beyond else "box"
     if space == "ndc" and options.box is not None:
-        raise UsageError("--box is in world units, device coordinates have a box of their own: drop --box or --space ndc")
+        raise UsageError(
+            "--box is in world units, device coordinates have a box of their own: drop --box or --space ndc"
+        )
     mapping: SpaceMapping | None = None
     try:
         if space == "ndc":
@@ -538,15 +613,20 @@ def _space_of(dataset: Dataset, options: Options) -> tuple[np.ndarray, SpaceMapp
     if space == "contracted":
         mapping = contraction_of(dataset.pictures, aabb)
     if not (np.abs(aabb) <= scene_io.BOX_LIMIT).all() or not (aabb[1] - aabb[0] >= 1 / scene_io.BOX_LIMIT).all():
-        raise DatasetError(f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; "
-                           "give another with --box x0,y0,z0,x1,y1,z1")
+        raise DatasetError(
+            f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; "
+            "give another with --box x0,y0,z0,x1,y1,z1"
+        )
     across = options.config(dataset).samples_across / (aabb[1] - aabb[0]).max()
     if isinstance(mapping, Contraction) and mapping.even * across > scene_io.SAMPLE_LIMIT:
-        raise DatasetError(f"{options.source}: the box is too small for cameras that lie {mapping.even:.4g} from its far side; "
-                           "give a larger one with --box x0,y0,z0,x1,y1,z1, or --space box")
+        raise DatasetError(
+            f"{options.source}: the box is too small for cameras that lie {mapping.even:.4g} from its far side; "
+            "give a larger one with --box x0,y0,z0,x1,y1,z1, or --space box"
+        )
     if not seen_cells(dataset.pictures, aabb, grid_shape(aabb, 64), mapping).any():
-        raise DatasetError(f"{options.source}: the box lies outside every camera's view; give another with "
-                           "--box x0,y0,z0,x1,y1,z1")
+        raise DatasetError(
+            f"{options.source}: the box lies outside every camera's view; give another with --box x0,y0,z0,x1,y1,z1"
+        )
     return aabb, mapping, f"{why}; --space overrides" if options.space == "auto" else "as told"
 
 
@@ -575,7 +655,9 @@ def _device(name: str) -> str:
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and not torch.cuda.is_available():
-        raise UsageError("--device cuda: this PyTorch sees no CUDA device; use --device cpu, or install a CUDA build of PyTorch")
+        raise UsageError(
+            "--device cuda: this PyTorch sees no CUDA device; use --device cpu, or install a CUDA build of PyTorch"
+        )
     return name
 
 

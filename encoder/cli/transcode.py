@@ -7,14 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from kpc.encoder.rdo import codec_model
-from kpc.encoder.rdo.rate_control import Trade
-from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.cli.grouped import share_of
 from kpc.encoder.cli.options import Options
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.rdo import codec_model
+from kpc.encoder.rdo.rate_control import Trade
+from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.container import groups, scene_io
 from kpc.format.container.container import MAGIC
-from kpc.format.common.errors import TrainingError, UsageError
 
 JUDGED_BY = ("training views", "views of its own, taken to be right to 30 dB")
 """What losses are measured on: those of a checkpoint, and those of a file."""
@@ -54,7 +54,9 @@ def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
         trade = share_of(options, number, spans).trade
         reader = source.open(number)
         scene = replace(scene_io.read(reader), cameras=reader.cameras() or source.cameras())
-        coded = codec_model.code(codec_model.model_of(scene), trade, TrainConfig().prune_share, _tune_steps(options), shown=True)
+        coded = codec_model.code(
+            codec_model.model_of(scene), trade, TrainConfig().prune_share, _tune_steps(options), shown=True
+        )
         parts.append(groups.Part.of(coded.data, span.start))
         found.append(figures(coded, coded.size_bytes, trade, JUDGED_BY[1]))
     size = groups.write(parts, options.output)
@@ -79,9 +81,14 @@ def figures(coded: codec_model.Coded, size: int, trade: Trade, judged_by: str) -
     """What is said of every file that is written."""
     name, value = trade.bound
     return {
-        "trade": name, "asked": value, "judged_by": judged_by,
-        "probe_psnr": coded.psnr, "probe_loss_db": coded.loss_db, "agreement_db": coded.agreement_db,
-        "size_bytes": size, "parameters": coded.scene.parameter_count,
+        "trade": name,
+        "asked": value,
+        "judged_by": judged_by,
+        "probe_psnr": coded.psnr,
+        "probe_loss_db": coded.loss_db,
+        "agreement_db": coded.agreement_db,
+        "size_bytes": size,
+        "parameters": coded.scene.parameter_count,
         "bits_per_parameter": 8 * size / coded.scene.parameter_count,
         "identity_share": coded.scene.identity_share if coded.scene.is_dynamic else None,
     }
@@ -94,8 +101,10 @@ def reached(result: dict[str, Any]) -> str:
             "quality": f"quality {asked:g}", "lam": f"lam {asked:g}", "psnr_db": f"at least {asked:g} dB"}[name]  # fmt: skip
     lost = f"{result['probe_loss_db']:.3f} dB of loss on {result['judged_by']}"
     at = f"{result['probe_psnr']:.2f} dB, " if name == "psnr_db" else ""
-    return (f"asked for {said}; reached {result['size_bytes']:,} bytes, {at}{lost}, "
-            f"{result['agreement_db']:.1f} dB against the uncoded pictures")
+    return (
+        f"asked for {said}; reached {result['size_bytes']:,} bytes, {at}{lost}, "
+        f"{result['agreement_db']:.1f} dB against the uncoded pictures"
+    )
 
 
 def check_outputs(options: Options) -> None:

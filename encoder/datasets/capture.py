@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import IMAGE_SUFFIXES, VideoInfo, image_size
 
@@ -183,7 +182,9 @@ def say_missing(file: Path, missing: list[str], total: int) -> None:
     if len(missing) == total:
         raise DatasetError(f"{file}: none of its {total} images exists ({plain(missing[0])} ...); copy them beside it")
     if missing:
-        print(f"{file}: {len(missing)} of {total} frames have no image and are skipped: {some(missing)}", file=sys.stderr)
+        print(
+            f"{file}: {len(missing)} of {total} frames have no image and are skipped: {some(missing)}", file=sys.stderr
+        )
 
 
 def some(names: Sequence[str]) -> str:

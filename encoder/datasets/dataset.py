@@ -9,15 +9,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-
-from kpc.encoder.datasets.layouts import blender, colmap, llff, nerfstudio
 from kpc.encoder.datasets.capture import Capture, View
+from kpc.encoder.datasets.layouts import blender, colmap, llff, nerfstudio
 from kpc.encoder.datasets.masks import FOLDER, Masks, find_masks, load_masks
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
-from kpc.format.scene.cameras import Camera
 from kpc.format.common.errors import DatasetError, MediaError
 from kpc.format.common.media import read_image, read_video
 from kpc.format.common.progress import Progress
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import DeviceCoordinates, SpaceMapping
 
@@ -108,7 +107,9 @@ class Dataset:
         times = (frame[numbers] - first) / max(last - first, 1)
         chosen = self._some(numbers, np.clip(times, 0, 1), Clip(last - first + 1, self.clip.fps))
         if chosen.pictures.is_test.all():
-            raise DatasetError(f"{self.path}: frames {first} to {last} hold no picture to train on; give a longer --group")
+            raise DatasetError(
+                f"{self.path}: frames {first} to {last} hold no picture to train on; give a longer --group"
+            )
         return chosen
 
     def thinned(self, frame_count: int) -> "Dataset":
@@ -119,12 +120,18 @@ class Dataset:
         kept = np.linspace(0, clip.frame_count - 1, frame_count).round()
         frame = self.pictures.time.astype(np.float64) * (clip.frame_count - 1)
         numbers = np.flatnonzero(np.isin(np.rint(frame), kept))
-        return self._some(numbers, self.pictures.time[numbers], Clip(frame_count, clip.fps * frame_count / clip.frame_count))
+        return self._some(
+            numbers, self.pictures.time[numbers], Clip(frame_count, clip.fps * frame_count / clip.frame_count)
+        )
 
     def _some(self, numbers: np.ndarray, times: np.ndarray, clip: Clip) -> "Dataset":
         return replace(
-            self, pictures=replace(self.pictures.some(numbers), time=times.astype(np.float32)), pixels=self.pixels.some(numbers),
-            clip=clip, is_dynamic=clip.frame_count > 1, masks=None if self.masks is None else self.masks.some(numbers),
+            self,
+            pictures=replace(self.pictures.some(numbers), time=times.astype(np.float32)),
+            pixels=self.pixels.some(numbers),
+            clip=clip,
+            is_dynamic=clip.frame_count > 1,
+            masks=None if self.masks is None else self.masks.some(numbers),
         )
 
     def describe(self) -> str:
@@ -241,7 +248,9 @@ def rays(
     return _through(x, y, pictures.camera_to_world[picture], mapping)
 
 
-def rays_of_camera(camera: Camera, places: np.ndarray, mapping: SpaceMapping | None = None) -> tuple[np.ndarray, np.ndarray]:
+def rays_of_camera(
+    camera: Camera, places: np.ndarray, mapping: SpaceMapping | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """As `rays`, through (N, 2) places on the raster of a pinhole camera, pixels from the left and top edges."""
     x, y = ((places - (camera.cx, camera.cy)) / (camera.fl_x, camera.fl_y)).T
     return _through(x, y, camera.camera_to_world[None], mapping)

@@ -15,7 +15,6 @@ from typing import Any
 
 import google_crc32c
 import numpy as np
-
 from kpc.format.common.cli import written_aside
 from kpc.format.common.errors import DatasetError
 

@@ -5,17 +5,16 @@ from dataclasses import dataclass, replace
 import numba
 import numpy as np
 import torch
-from torch.nn.functional import conv2d
-
+from kpc.encoder.datasets import Dataset, rays
 from kpc.encoder.field import kernels
 from kpc.encoder.field.appearances import FIT_RAYS, fitted_code
-from kpc.encoder.datasets import Dataset, rays
 from kpc.encoder.field.field import Field
-from kpc.encoder.training.optimisers import sample_capacity
 from kpc.encoder.field.render import Rays, marched, sample_counts, shade
+from kpc.encoder.training.optimisers import sample_capacity
 from kpc.format.common.fidelity import psnr
 from kpc.format.scene.scene import AnyDecoder, Decoder, Scene
 from kpc.format.scene.space import Contraction
+from torch.nn.functional import conv2d
 
 WHITE = np.ones(3, np.float32)
 
@@ -60,10 +59,25 @@ class SceneRenderer:
         scene, field, layout = self.scene, self.field, self.field.layout
         basis = field.basis(torch.from_numpy(d), codes).numpy()
         colours, opacities, depths, _ = kernels.render(
-            field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
-            layout.channels, scene.motion, scene.aabb, kernels.even_of(scene.mapping), scene.occupancy.view(np.uint8),
-            np.float32(scene.step), np.float32(scene.extent), o, d, t, basis, np.arange(len(o)), scene.background,
-            sample_capacity(scene.aabb, scene.step, scene.mapping), 8 * numba.get_num_threads(),
+            field.theta.detach().numpy(),
+            layout.table,
+            layout.resolution,
+            field.density.detach().numpy(),
+            layout.channels,
+            scene.motion,
+            scene.aabb,
+            kernels.even_of(scene.mapping),
+            scene.occupancy.view(np.uint8),
+            np.float32(scene.step),
+            np.float32(scene.extent),
+            o,
+            d,
+            t,
+            basis,
+            np.arange(len(o)),
+            scene.background,
+            sample_capacity(scene.aabb, scene.step, scene.mapping),
+            8 * numba.get_num_threads(),
         )
         return colours, opacities, depths
 
@@ -73,7 +87,11 @@ class SceneRenderer:
         scene = self.scene
         batch = self.batch(o, d, t)
         samples, met = marched(self.field, batch, scene)
-        along = samples.s.numpy() if not isinstance(scene.mapping, Contraction) else scene.mapping.distance(samples.s.numpy())
+        along = (
+            samples.s.numpy()
+            if not isinstance(scene.mapping, Contraction)
+            else scene.mapping.distance(samples.s.numpy())
+        )
         depths = np.bincount(samples.ray.numpy(), met.weights.numpy() * along, len(o)).astype(np.float32)
         opacities = met.opacity.numpy()
         return shade(self.field, batch, met, codes).numpy(), opacities, depths / np.maximum(opacities, np.float32(1e-6))
@@ -81,7 +99,12 @@ class SceneRenderer:
     def meets(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
         """(N,) bool: whether rays pass where anything may be. The others show the background, whatever planes hold."""
         scene = self.scene
-        met: np.ndarray = sample_counts(self.batch(origins, directions, times), scene.aabb, scene.occupancy, scene.step, scene.mapping) > 0
+        met: np.ndarray = (
+            sample_counts(
+                self.batch(origins, directions, times), scene.aabb, scene.occupancy, scene.step, scene.mapping
+            )
+            > 0
+        )
         return met
 
     def picture(self, dataset: Dataset, number: int, first: int = 0, code: np.ndarray | None = None) -> np.ndarray:

@@ -11,12 +11,11 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
-
 from kpc.encoder.field.field import Layout
 from kpc.encoder.training.optimisers import PlainOptimiser
 from kpc.encoder.training.train import Trainer
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 STEPS = 8
 """Steps before the profile, in multiples of the first with an occupancy grid: the grid has formed, and been split in time."""
@@ -174,5 +173,15 @@ def _plain_step(trainer: Trainer, plain: PlainOptimiser, count: int) -> float:
 def _drawn(trainer: Trainer, optimiser: PlainOptimiser, count: int) -> Callable[[], object]:
     """A step of `optimiser` with `count` rays, which are drawn at once."""
     batch, targets = trainer.sampler.draw(trainer.rng, count, None if trainer.dataset.has_alpha else trainer.background)
-    return partial(optimiser.step, trainer.step, 1.0, 1e-3, batch, targets, trainer.aabb, trainer.grid.marched, trainer.step_length,
-                   trainer.extent)
+    return partial(
+        optimiser.step,
+        trainer.step,
+        1.0,
+        1e-3,
+        batch,
+        targets,
+        trainer.aabb,
+        trainer.grid.marched,
+        trainer.step_length,
+        trainer.extent,
+    )

@@ -5,12 +5,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-
 from kpc.encoder.datasets import rays_of_camera
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.training.sampler import RaySampler
-from kpc.format.scene.cameras import Camera
 from kpc.format.common.fidelity import psnr, psnr_of
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 
 PROBE_RAYS = 1 << 15
@@ -142,7 +141,9 @@ def around(scene: Scene, count: int = 12) -> tuple[Camera, ...]:
     cameras = []
     for k in range(count):
         azimuth, height = 2 * math.pi * k / count, 0.35 * (-1) ** k
-        backward = np.array([math.cos(azimuth) * math.cos(height), math.sin(azimuth) * math.cos(height), math.sin(height)])
+        backward = np.array(
+            [math.cos(azimuth) * math.cos(height), math.sin(azimuth) * math.cos(height), math.sin(height)]
+        )
         right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
         pose = np.eye(4)
         pose[:3] = np.stack([right, np.cross(backward, right), backward, middle + 1.5 * reach * backward], axis=1)

@@ -10,14 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
-
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.render import Rays, marched, shade
 from kpc.format.common.errors import UsageError
 from kpc.format.container.scene_io import APPEARANCE_LIMIT, is_name
 from kpc.format.scene.scene import Scene
+from torch import Tensor
 
 FIT_RAYS = 1024
 """Of a picture, that tell its code."""
@@ -38,7 +37,9 @@ def choose_kind(dataset: Dataset) -> tuple[str, str]:
     if dataset.is_dynamic:
         return "none", "a clip, filmed as one"
     train = ~pictures.is_test
-    lenses = np.concatenate([pictures.intrinsics[train], pictures.width[train, None], pictures.height[train, None]], axis=1)
+    lenses = np.concatenate(
+        [pictures.intrinsics[train], pictures.width[train, None], pictures.height[train, None]], axis=1
+    )
     _, counts = np.unique(lenses, axis=0, return_counts=True)
     alone, total = int((counts == 1).sum()), len(lenses)
     if 2 * alone <= total or total > APPEARANCE_LIMIT:
@@ -67,7 +68,9 @@ def number_pictures(dataset: Dataset, kind: str) -> tuple[np.ndarray, tuple[str,
         names = [[Path(file).name for file in files], files, _counted(files)]
     if len(files) > APPEARANCE_LIMIT:
         remedy = "give --appearance camera" if kind == "image" else "give --appearance none"
-        raise UsageError(f"--appearance {kind}: would be {len(files):,} appearances, a file holds {APPEARANCE_LIMIT:,}; {remedy}")
+        raise UsageError(
+            f"--appearance {kind}: would be {len(files):,} appearances, a file holds {APPEARANCE_LIMIT:,}; {remedy}"
+        )
     return numbers, _storable(next((some for some in names if len(set(some)) == len(some)), names[-1]))
 
 

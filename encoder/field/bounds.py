@@ -1,11 +1,10 @@
 """Where the scene is: its axis-aligned box, and which parts of it the cameras see."""
 
 import numpy as np
-from numba import njit, prange
-
 from kpc.encoder.datasets.dataset import Pictures
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping, expand
+from numba import njit, prange
 
 CLEAR = 0.3
 """Share of a camera's distance to the scene's middle, around it, where nothing is."""
@@ -31,11 +30,15 @@ def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
         return np.stack([corners.min(0), corners.max(0)]).astype(np.float32)
     focus = _focus(pictures, cameras)
     if focus is None:
-        raise DatasetError("the cameras share no point they look at and have no near and far; give --box x0,y0,z0,x1,y1,z1")
+        raise DatasetError(
+            "the cameras share no point they look at and have no near and far; give --box x0,y0,z0,x1,y1,z1"
+        )
     distance = np.linalg.norm(focus - pictures.camera_to_world[cameras, :3, 3], axis=1)
     if has_alpha:
-        size = np.maximum(pictures.width[cameras] / pictures.intrinsics[cameras, 0],
-                          pictures.height[cameras] / pictures.intrinsics[cameras, 1])
+        size = np.maximum(
+            pictures.width[cameras] / pictures.intrinsics[cameras, 0],
+            pictures.height[cameras] / pictures.intrinsics[cameras, 1],
+        )
         half = np.max(distance * np.sin(np.arctan(size / 2)))
     else:
         half = 2 * np.median(distance)
@@ -117,7 +120,11 @@ def device_coordinates_of(pictures: Pictures) -> tuple[DeviceCoordinates, np.nda
 
 
 def seen_cells(
-    pictures: Pictures, aabb: np.ndarray, shape: tuple[int, int, int], mapping: SpaceMapping | None = None, at_least: int = 2
+    pictures: Pictures,
+    aabb: np.ndarray,
+    shape: tuple[int, int, int],
+    mapping: SpaceMapping | None = None,
+    at_least: int = 2,
 ) -> np.ndarray:
     """Cells of an (Nz, Ny, Nx) grid over what the planes cover whose centre at least so many distinct cameras see: bool.
 
@@ -184,10 +191,14 @@ def _frustum(pictures: Pictures, p: int) -> np.ndarray:
     """The eight corners of a picture's view between near and far, world coordinates."""
     fx, fy, cx, cy = pictures.intrinsics[p]
     w, h = pictures.width[p], pictures.height[p]
-    local = np.array([
-        [(i - cx) / fx * d, -(j - cy) / fy * d, -d]
-        for d in (pictures.near[p], pictures.far[p]) for i in (0, w) for j in (0, h)
-    ])
+    local = np.array(
+        [
+            [(i - cx) / fx * d, -(j - cy) / fy * d, -d]
+            for d in (pictures.near[p], pictures.far[p])
+            for i in (0, w)
+            for j in (0, h)
+        ]
+    )
     pose = pictures.camera_to_world[p]
     return local @ pose[:3, :3].T + pose[:3, 3]
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 from kpc.format.common.errors import UsageError
 
-
 APPEARANCES = ("none", "camera", "image")
 
 
@@ -182,8 +181,22 @@ class TrainConfig:
     100 files are 2 % smaller at equal error."""
 
     def __post_init__(self) -> None:
-        positive = ("channels", "steps", "rays", "samples", "hidden", "hybrid_width", "samples_across", "cells_across", "warmup",
-                    "regularise_every", "motion_every", "occupancy_every", "occupancy_slots", "occupancy_split_every")
+        positive = (
+            "channels",
+            "steps",
+            "rays",
+            "samples",
+            "hidden",
+            "hybrid_width",
+            "samples_across",
+            "cells_across",
+            "warmup",
+            "regularise_every",
+            "motion_every",
+            "occupancy_every",
+            "occupancy_slots",
+            "occupancy_split_every",
+        )
         for name in positive:
             if getattr(self, name) < 1:
                 raise UsageError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -194,8 +207,15 @@ class TrainConfig:
         for name in ("object_rays", "channel_dropout", "scale_dropout"):
             if not 0 <= getattr(self, name) < 1:
                 raise UsageError(f"{name} must be at least 0 and less than 1, not {getattr(self, name)}")
-        for name in ("temporal_start", "temporal_floor", "time_tolerance", "prune_share", "dropout_until", "coarse_until",
-                     "edges_from"):
+        for name in (
+            "temporal_start",
+            "temporal_floor",
+            "time_tolerance",
+            "prune_share",
+            "dropout_until",
+            "coarse_until",
+            "edges_from",
+        ):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"{name} must be from 0 to 1, not {getattr(self, name)}")
         if self.appearance not in APPEARANCES:
@@ -233,26 +253,59 @@ class TrainConfig:
         without the direction.
         """
         finest = max(self.resolutions)
-        return replace(self, resolutions=(min(max(16, finest // 4), 32), max(16, finest // 2)),
-                       channels=32 if finest <= 256 else 64,
-                       frames_per_row=2 * self.frames_per_row, motion_cells=10, channel_dropout=0.4, coarse_until=0.3, view_dependent=False,
-                       edges_from=1.0, samples_across=max(32, self.samples_across // 2), steps=3 * self.steps)
+        return replace(
+            self,
+            resolutions=(min(max(16, finest // 4), 32), max(16, finest // 2)),
+            channels=32 if finest <= 256 else 64,
+            frames_per_row=2 * self.frames_per_row,
+            motion_cells=10,
+            channel_dropout=0.4,
+            coarse_until=0.3,
+            view_dependent=False,
+            edges_from=1.0,
+            samples_across=max(32, self.samples_across // 2),
+            steps=3 * self.steps,
+        )
 
 
 PROGRESSIVE = 0.1
 """`scale_dropout` of scenes that are to be seen while they arrive."""
 
 PRESETS = {
-    "draft": TrainConfig(resolutions=(48, 96), channels=8, samples_across=160, cells_across=64, steps=1500,
-                         occupancy_start=64, tune_steps=0),
+    "draft": TrainConfig(
+        resolutions=(48, 96),
+        channels=8,
+        samples_across=160,
+        cells_across=64,
+        steps=1500,
+        occupancy_start=64,
+        tune_steps=0,
+    ),
     "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
     # Room, held-out views of 3,000 steps and the file of quality 70: with (64, 128, 256) and 8 channels 27.98 dB and 156 KB, with (96, 256) and 12
     # channels 28.44 dB and 183 KB, in as many texels looked up a sample and no more time; with 16 channels 28.95 dB and 213 KB, in 1.2 times the time
     # that a frame takes to play; with (64, 128, 256) and 12 channels 28.87 dB and 196 KB, in as much.
     "balanced": TrainConfig(resolutions=(96, 256), channels=16, steps=10000, temporal_start=0.75, temporal_floor=0.3),
-    "best": TrainConfig(resolutions=(64, 128, 256, 448), channels=16, samples_across=512, cells_across=128, steps=40000,
-                        late_space_variation=5e-3),
+    "best": TrainConfig(
+        resolutions=(64, 128, 256, 448),
+        channels=16,
+        samples_across=512,
+        cells_across=128,
+        steps=40000,
+        late_space_variation=5e-3,
+    ),
     # K-Planes' own settings (section 3.1 and its appendix), but for the march through occupied cells. It wants a GPU.
-    "paper": TrainConfig(resolutions=(64, 128, 256, 512), channels=32, samples_across=640, cells_across=128, steps=30000,
-                         samples=131072, occupancy_every=32, learning_rate=1e-2, space_variation=1e-3, edges_from=1.0, adapts=False),
+    "paper": TrainConfig(
+        resolutions=(64, 128, 256, 512),
+        channels=32,
+        samples_across=640,
+        cells_across=128,
+        steps=30000,
+        samples=131072,
+        occupancy_every=32,
+        learning_rate=1e-2,
+        space_variation=1e-3,
+        edges_from=1.0,
+        adapts=False,
+    ),
 }

@@ -21,10 +21,9 @@ Naming, throughout this module
 import math
 
 import numpy as np
-from numba import njit, prange
-
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
 from kpc.format.scene.space import FAR, Contraction, SpaceMapping
+from numba import njit, prange
 
 _LIMIT = np.float32(LOG_DENSITY_LIMIT)
 _TERMINATION = np.float32(TERMINATION)
@@ -285,8 +284,17 @@ def _scatter_planes(grad, table, resolution, M, corners, fractions, values, g, s
                     low, high = theta[corner : corner + 2 * M], theta[corner + columns * M : corner + (columns + 2) * M]
                     along, per_column = slopes[across * M : (across + 1) * M], np.float32(columns - 1)
                     if c < 3:
-                        _slopes(low, high, fc, fr, per_column, np.float32(resolution[s, down] - 1),
-                                scratch[c * M : (c + 1) * M], along, slopes[down * M : (down + 1) * M])
+                        _slopes(
+                            low,
+                            high,
+                            fc,
+                            fr,
+                            per_column,
+                            np.float32(resolution[s, down] - 1),
+                            scratch[c * M : (c + 1) * M],
+                            along,
+                            slopes[down * M : (down + 1) * M],
+                        )
                     else:
                         _slope(low, high, fr, per_column, scratch[c * M : (c + 1) * M], along)
 
@@ -341,8 +349,29 @@ def _cell(grid, u, v, w):
 
 @_bare
 def _march(
-    theta, table, resolution, density, M, motion, aabb, even, occupancy, origin, direction, time, jitter, step, extent,
-    values, features, points, corners, fractions, weights, logs, places,
+    theta,
+    table,
+    resolution,
+    density,
+    M,
+    motion,
+    aabb,
+    even,
+    occupancy,
+    origin,
+    direction,
+    time,
+    jitter,
+    step,
+    extent,
+    values,
+    features,
+    points,
+    corners,
+    fractions,
+    weights,
+    logs,
+    places,
 ):
     """March one ray; fill the scratch for each occupied sample.
 
@@ -400,8 +429,25 @@ def _scratch(table, M, capacity):
 
 @_parallel
 def render(
-    theta, table, resolution, density, M, motion, aabb, even, occupancy, step, extent,
-    origins, directions, times, basis, basis_index, background, capacity, workers,
+    theta,
+    table,
+    resolution,
+    density,
+    M,
+    motion,
+    aabb,
+    even,
+    occupancy,
+    step,
+    extent,
+    origins,
+    directions,
+    times,
+    basis,
+    basis_index,
+    background,
+    capacity,
+    workers,
 ):
     """Colour, opacity and depth of rays: (N, 3), (N,), (N,) float32, and the samples each of them took.
 
@@ -418,9 +464,29 @@ def render(
         values, features, points, corners, fractions, weights, logs, places = _scratch(table, M, capacity)
         for ray in range(worker, N, workers):
             count, trans = _march(
-                theta, table, resolution, density, M, motion, aabb, even, occupancy, origins[ray], directions[ray],
-                times[ray], np.float32(0.5), step, extent,
-                values, features, points, corners, fractions, weights, logs, places,
+                theta,
+                table,
+                resolution,
+                density,
+                M,
+                motion,
+                aabb,
+                even,
+                occupancy,
+                origins[ray],
+                directions[ray],
+                times[ray],
+                np.float32(0.5),
+                step,
+                extent,
+                values,
+                features,
+                points,
+                corners,
+                fractions,
+                weights,
+                logs,
+                places,
             )
             b = basis[basis_index[ray]]
             red, green, blue, depth = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
@@ -457,8 +523,32 @@ def _distortion_gradient(weights, places, count, step, extent, factor, out):
 
 @_parallel
 def backpropagate(
-    theta, grad, table, resolution, density, grad_density, M, motion, grad_motion, moving, aabb, even, occupancy, step, extent,
-    origins, directions, times, jitters, basis, grad_basis, targets, backgrounds, peaks, distortion, capacity,
+    theta,
+    grad,
+    table,
+    resolution,
+    density,
+    grad_density,
+    M,
+    motion,
+    grad_motion,
+    moving,
+    aabb,
+    even,
+    occupancy,
+    step,
+    extent,
+    origins,
+    directions,
+    times,
+    jitters,
+    basis,
+    grad_basis,
+    targets,
+    backgrounds,
+    peaks,
+    distortion,
+    capacity,
 ):
     """Render a batch, and add the gradient of its loss to grad, grad_density, grad_motion and grad_basis.
 
@@ -498,9 +588,29 @@ def backpropagate(
         g_density = grad_density[worker]
         for ray in range(worker, N, workers):
             count, trans = _march(
-                theta, table, resolution, density, M, motion, aabb, even, occupancy, origins[ray], directions[ray],
-                times[ray], jitters[ray], step, extent,
-                values, features, points, corners, fractions, weights, logs, places,
+                theta,
+                table,
+                resolution,
+                density,
+                M,
+                motion,
+                aabb,
+                even,
+                occupancy,
+                origins[ray],
+                directions[ray],
+                times[ray],
+                jitters[ray],
+                step,
+                extent,
+                values,
+                features,
+                points,
+                corners,
+                fractions,
+                weights,
+                logs,
+                places,
             )
             b = basis[0] if shared else basis[ray]
             g_b = grad_basis[worker] if shared else grad_basis[ray]
@@ -551,7 +661,18 @@ def backpropagate(
                 if motion is not None:
                     slopes[:] = np.float32(0.0)
                 _scatter_planes(
-                    g_theta, table, resolution, M, corners[k], fractions[k], values[k], g_features, plane_scratch, theta, slopes, moving
+                    g_theta,
+                    table,
+                    resolution,
+                    M,
+                    corners[k],
+                    fractions[k],
+                    values[k],
+                    g_features,
+                    plane_scratch,
+                    theta,
+                    slopes,
+                    moving,
                 )
                 if motion is not None and moving:
                     for axis in range(3):
@@ -614,7 +735,18 @@ def scatter(theta, grad, table, resolution, M, motion, grad_motion, points, time
             if motion is not None:
                 slopes[:] = np.float32(0.0)
             _scatter_planes(
-                grad[worker], table, resolution, M, corners[0], fractions[0], values[0], g[i], plane_scratch, theta, slopes, True
+                grad[worker],
+                table,
+                resolution,
+                M,
+                corners[0],
+                fractions[0],
+                values[0],
+                g[i],
+                plane_scratch,
+                theta,
+                slopes,
+                True,
             )
             if motion is not None:
                 for axis in range(3):
@@ -624,7 +756,9 @@ def scatter(theta, grad, table, resolution, M, motion, grad_motion, points, time
 
 
 @_parallel
-def collect(aabb, even, occupancy, step, origins, directions, times, jitters, starts, points, places, stretches, cells, workers):
+def collect(
+    aabb, even, occupancy, step, origins, directions, times, jitters, starts, points, places, stretches, cells, workers
+):
     """The occupied samples of rays, none of them ended early: (N,) int64, how many each ray has.
 
     Unless `points` is None, those of ray i are written from starts[i] on: points (n, 3) in [0, 1]^3, places (n,) their s,

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-
 from kpc.format.scene.grid import SPACE_AND_TIME, dilate
 
 MORE_MARCHED = 0.1
@@ -32,7 +31,9 @@ def in_fewest_slots(occupancy: np.ndarray, more: float = MORE_MARCHED) -> np.nda
     in place of 6.8, with 0.4 % more.
     """
     slots, *cells = occupancy.shape
-    merged = (occupancy.reshape(count, slots // count, *cells).any(1) for count in range(1, slots + 1) if slots % count == 0)
+    merged = (
+        occupancy.reshape(count, slots // count, *cells).any(1) for count in range(1, slots + 1) if slots % count == 0
+    )
     return next(grid for grid in merged if grid.mean() <= (1 + more) * occupancy.mean())
 
 
@@ -86,7 +87,9 @@ class OccupancyGrid:
         self.log_density -= self.DENSITY_DECAY
         cells = np.argwhere(chosen)
         for _ in range(self.LOOKS):
-            self.log_density[chosen] = np.maximum(self.log_density[chosen], self._look(density_at, cells, rng, 0.0, 1.0))
+            self.log_density[chosen] = np.maximum(
+                self.log_density[chosen], self._look(density_at, cells, rng, 0.0, 1.0)
+            )
         self.occupied = matters & (self.log_density > self._least())
         self.marched = self._dense & self.occupied
 
@@ -100,8 +103,13 @@ class OccupancyGrid:
         self.marched = self._dense & self.occupied
 
     def state(self) -> dict[str, Any]:
-        return {"log_density": torch.from_numpy(self.log_density), "peak": torch.from_numpy(self.peak),
-                "occupied": torch.from_numpy(self.occupied), "dense": torch.from_numpy(self._dense), "known": self._known}
+        return {
+            "log_density": torch.from_numpy(self.log_density),
+            "peak": torch.from_numpy(self.peak),
+            "occupied": torch.from_numpy(self.occupied),
+            "dense": torch.from_numpy(self._dense),
+            "known": self._known,
+        }
 
     def load(self, state: dict[str, Any]) -> None:
         names = ("log_density", "peak", "occupied", "dense")
@@ -114,7 +122,9 @@ class OccupancyGrid:
         known = self.log_density[self.seen]
         return min(self.threshold, math.log(max(float(np.exp(known.astype(np.float64)).mean()), 1e-30)))
 
-    def _look(self, density_at: DensityAt, cells: np.ndarray, rng: np.random.Generator, start: float, end: float) -> np.ndarray:
+    def _look(
+        self, density_at: DensityAt, cells: np.ndarray, rng: np.random.Generator, start: float, end: float
+    ) -> np.ndarray:
         """Log density at a random point of each cell and a random time in [start, end]."""
         points = (cells + rng.random(cells.shape, dtype=np.float32)) / np.array(self.seen.shape, np.float32)
         times = start + (end - start) * rng.random(len(cells), dtype=np.float32)

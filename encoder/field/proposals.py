@@ -9,13 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, plan_layout
 from kpc.encoder.field.render import Rays, Samples, cells_of, fused_features, places, spans_of
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import SpaceMapping
+from torch import Tensor, nn
 
 PADDING = 0.01
 """Added to each weight before samples are drawn by them, so that no part of a ray is given up for good."""
@@ -45,7 +44,13 @@ class Proposals(nn.Module):
         self.counts = config.proposal_samples
 
     def sample(
-        self, rays: Rays, aabb: Tensor, mapping: SpaceMapping | None, cells: tuple[int, int, int], step: int, fused: bool,
+        self,
+        rays: Rays,
+        aabb: Tensor,
+        mapping: SpaceMapping | None,
+        cells: tuple[int, int, int],
+        step: int,
+        fused: bool,
     ) -> tuple[Samples, Tensor, list[Level]]:
         """Samples for the field that is to be had, as many on every ray; their edges (N, K + 1); what each proposal made of them.
 
@@ -78,14 +83,22 @@ def _evenly(near: Tensor, far: Tensor, count: int, jitters: Tensor) -> Tensor:
     return near[:, None] + moved * (far - near).clamp(min=0)[:, None]
 
 
-def _between(rays: Rays, edges: Tensor, aabb: Tensor, mapping: SpaceMapping | None, cells: tuple[int, int, int]) -> Samples:
+def _between(
+    rays: Rays, edges: Tensor, aabb: Tensor, mapping: SpaceMapping | None, cells: tuple[int, int, int]
+) -> Samples:
     """A sample in the middle of each interval."""
     middle = (edges[:, 1:] + edges[:, :-1]) / 2
     u, stretch = places(rays, middle, aabb, mapping)
     u = u.clamp(0, 1)
     ray = torch.arange(len(middle), device=middle.device)[:, None].expand_as(middle).flatten()
-    return Samples(ray, u.flatten(0, 1), middle.flatten(), (edges[:, 1:] - edges[:, :-1]).flatten(), stretch.flatten(),
-                   cells_of(u, cells).flatten(0, 1))
+    return Samples(
+        ray,
+        u.flatten(0, 1),
+        middle.flatten(),
+        (edges[:, 1:] - edges[:, :-1]).flatten(),
+        stretch.flatten(),
+        cells_of(u, cells).flatten(0, 1),
+    )
 
 
 def resampled(edges: Tensor, weights: Tensor, count: int, jitters: Tensor) -> Tensor:

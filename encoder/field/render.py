@@ -13,12 +13,11 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from torch import Tensor
-
 from kpc.encoder.field import kernels
 from kpc.encoder.field.field import Field, Layout, SummedField
 from kpc.format.scene.scene import TERMINATION, Scene
 from kpc.format.scene.space import Contraction, SpaceMapping
+from torch import Tensor
 
 OPAQUE = 50.0
 """Optical thickness of a sample beyond which more makes no difference to what lies behind it."""
@@ -86,7 +85,12 @@ class Met:
 
 
 def render_reference(
-    field: Field, rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, kept: Tensor | None = None,
+    field: Field,
+    rays: Rays,
+    aabb: Tensor,
+    occupancy: Tensor,
+    step: float,
+    kept: Tensor | None = None,
     mapping: SpaceMapping | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Colours of a batch of rays, in plain PyTorch: the reference of `kernels.backpropagate`.
@@ -102,8 +106,14 @@ def render_reference(
 
 
 def samples_of(
-    rays: Rays, aabb: Tensor, occupancy: Tensor, step: float, mapping: SpaceMapping | None = None, *,
-    most: int | None = None, capacity: int | None = None,
+    rays: Rays,
+    aabb: Tensor,
+    occupancy: Tensor,
+    step: float,
+    mapping: SpaceMapping | None = None,
+    *,
+    most: int | None = None,
+    capacity: int | None = None,
 ) -> Samples:
     """The samples of rays where the occupancy grid (slots, Nz, Ny, Nx) is set.
 
@@ -126,8 +136,14 @@ def samples_of(
         index = taken.nonzero(as_tuple=True)
         return Samples(index[0], u[index], s[index], torch.full_like(s[index], step), stretch[index], cell[index])
     chosen, there = _places_of(taken.flatten(), capacity)
-    return Samples(chosen // most, u.flatten(0, 1)[chosen], s.flatten()[chosen], step * there, stretch.flatten()[chosen],
-                   cell.flatten(0, 1)[chosen])
+    return Samples(
+        chosen // most,
+        u.flatten(0, 1)[chosen],
+        s.flatten()[chosen],
+        step * there,
+        stretch.flatten()[chosen],
+        cell.flatten(0, 1)[chosen],
+    )
 
 
 def reached(samples: Samples, is_reached: Tensor, capacity: int) -> Samples:
@@ -178,7 +194,11 @@ def cells_of(u: Tensor, cells: tuple[int, ...]) -> Tensor:
 
 
 def meet(
-    field: Field, rays: Rays, samples: Samples, features: Callable[[Tensor, Tensor], Tensor], extent: float,
+    field: Field,
+    rays: Rays,
+    samples: Samples,
+    features: Callable[[Tensor, Tensor], Tensor],
+    extent: float,
     kept: Tensor | None = None,
 ) -> Met:
     """Spend the light of N rays on their samples, front to back.
@@ -234,7 +254,7 @@ class _SumBefore(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, g):  # type: ignore[no-untyped-def]
-        last, = ctx.saved_tensors
+        (last,) = ctx.saved_tensors
         total = torch.cumsum(g.double(), 0)
         return (total[last] - total).to(g.dtype), None, None
 
@@ -248,8 +268,9 @@ def sample_counts(
     rays: Rays, aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None = None
 ) -> np.ndarray:
     """(N,) int64: how many of `samples_of` each ray takes, on the CPU, by the kernel."""
-    counts: np.ndarray = kernels.collect(*_as_collected(rays, aabb, occupancy, step, mapping), None, None, None, None, None,
-                                         8 * numba.get_num_threads())
+    counts: np.ndarray = kernels.collect(
+        *_as_collected(rays, aabb, occupancy, step, mapping), None, None, None, None, None, 8 * numba.get_num_threads()
+    )
     return counts
 
 
@@ -262,13 +283,22 @@ def collected(
     n = int(ends[-1]) if len(ends) else 0
     points, s, stretch = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     cell = np.empty((n, 3), np.int64)
-    kernels.collect(*_as_collected(rays, aabb, occupancy, step, mapping), ends - counts, points, s, stretch, cell,
-                    8 * numba.get_num_threads())
+    kernels.collect(
+        *_as_collected(rays, aabb, occupancy, step, mapping),
+        ends - counts,
+        points,
+        s,
+        stretch,
+        cell,
+        8 * numba.get_num_threads(),
+    )
     ray = np.repeat(np.arange(len(counts)), counts)
     return Samples(*(torch.from_numpy(a) for a in (ray, points, s, np.full_like(s, step), stretch, cell)))
 
 
-def _as_collected(rays: Rays, aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None) -> tuple[Any, ...]:
+def _as_collected(
+    rays: Rays, aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None
+) -> tuple[Any, ...]:
     """As `kernels.collect` is told of rays and of where they go."""
     where = (a.numpy() for a in (rays.origins, rays.directions, rays.times, rays.jitters))
     return aabb, kernels.even_of(mapping), occupancy.view(np.uint8), np.float32(step), *where
@@ -288,8 +318,11 @@ class FusedFeatures(torch.autograd.Function):
     def forward(ctx, theta, motion, layout, points, times):  # type: ignore[no-untyped-def]
         arrays = [None if a is None else a.detach().numpy() for a in (theta, motion, points, times)]
         ctx.layout, ctx.arrays = layout, arrays
-        return torch.from_numpy(kernels.features(arrays[0], layout.table, layout.resolution, layout.channels, *arrays[1:],
-                                                 8 * numba.get_num_threads()))
+        return torch.from_numpy(
+            kernels.features(
+                arrays[0], layout.table, layout.resolution, layout.channels, *arrays[1:], 8 * numba.get_num_threads()
+            )
+        )
 
     @staticmethod
     def backward(ctx, g):  # type: ignore[no-untyped-def]
@@ -298,10 +331,25 @@ class FusedFeatures(torch.autograd.Function):
         workers = numba.get_num_threads()
         grad = np.zeros((workers, theta.size), np.float32)
         grad_motion = None if motion is None else np.zeros((workers, *motion.shape), np.float32)
-        kernels.scatter(theta, grad, layout.table, layout.resolution, layout.channels, motion, grad_motion, points, times,
-                        g.contiguous().numpy())
-        return (torch.from_numpy(grad.sum(0)), None if grad_motion is None else torch.from_numpy(grad_motion.sum(0)),
-                None, None, None)
+        kernels.scatter(
+            theta,
+            grad,
+            layout.table,
+            layout.resolution,
+            layout.channels,
+            motion,
+            grad_motion,
+            points,
+            times,
+            g.contiguous().numpy(),
+        )
+        return (
+            torch.from_numpy(grad.sum(0)),
+            None if grad_motion is None else torch.from_numpy(grad_motion.sum(0)),
+            None,
+            None,
+            None,
+        )
 
 
 def fused_features(field: Field) -> Callable[[Tensor, Tensor], Tensor]:
@@ -309,4 +357,5 @@ def fused_features(field: Field) -> Callable[[Tensor, Tensor], Tensor]:
     if isinstance(field, SummedField):
         return field.features
     return lambda points, times: FusedFeatures.apply(  # type: ignore[no-any-return,no-untyped-call]
-        field.theta, field.motion, field.layout, points, times)
+        field.theta, field.motion, field.layout, points, times
+    )

@@ -14,27 +14,38 @@ from typing import Any
 
 import numpy as np
 import torch
-
-from kpc.encoder.rdo.occupancy_rdo import errors_of_flips, told_cheaply
-from kpc.encoder.training.checkpoint import save_state
-from kpc.encoder.rdo.mode_decision import quantise_by_cost, step_asked_for
-from kpc.encoder.rdo.rate_control import (
-    DECODER_SHARE, ERRORS_LEFT, ROUGHLY, SLOTS_SHARE, Attempt, Quantise, Trade, compress, decoder_bits, error_at, loss_at, relative_steps,
-    significance, with_fewer_slots,
-)
-from kpc.encoder.rdo.curvature import Curvature, PerPlane, curvature
-from kpc.encoder.rdo.motion_rdo import with_coarser_motion
 from kpc.encoder.evaluation.validation_rays import Measure, Measured, Probe
+from kpc.encoder.rdo.curvature import Curvature, PerPlane, curvature
+from kpc.encoder.rdo.distortion import Name
+from kpc.encoder.rdo.mode_decision import quantise_by_cost, step_asked_for
+from kpc.encoder.rdo.motion_rdo import with_coarser_motion
+from kpc.encoder.rdo.occupancy_rdo import errors_of_flips, told_cheaply
 from kpc.encoder.rdo.prune import Pruned, prune
+from kpc.encoder.rdo.rate_control import (
+    DECODER_SHARE,
+    ERRORS_LEFT,
+    ROUGHLY,
+    SLOTS_SHARE,
+    Attempt,
+    Quantise,
+    Trade,
+    compress,
+    decoder_bits,
+    error_at,
+    loss_at,
+    relative_steps,
+    significance,
+    with_fewer_slots,
+)
 from kpc.encoder.rdo.rate_search import TOLERANCE
 from kpc.encoder.rdo.sequential_finetune import spread, tuned
-from kpc.encoder.rdo.distortion import Name
-from kpc.format.container import scene_io
-from kpc.format.scene.cameras import Camera
-from kpc.format.container.container import MAGIC
-from kpc.format.common.errors import FormatError, TrainingError, UsageError
-from kpc.format.scene.motion import STEP
+from kpc.encoder.training.checkpoint import save_state
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, quantise_scene, round_decoder, short_above
+from kpc.format.common.errors import FormatError, TrainingError, UsageError
+from kpc.format.container import scene_io
+from kpc.format.container.container import MAGIC
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.motion import STEP
 from kpc.format.scene.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
 
@@ -121,8 +132,11 @@ class Kept:
     @staticmethod
     def all_of(model: Model) -> "Kept":
         significant = significance(model.curvature.alone)
-        steps: PerPlane = relative_steps(significant) if model.coded is None else [
-            {name: step_asked_for(plane) for name, plane in scale.items()} for scale in model.coded.scales]
+        steps: PerPlane = (
+            relative_steps(significant)
+            if model.coded is None
+            else [{name: step_asked_for(plane) for name, plane in scale.items()} for scale in model.coded.scales]
+        )
         return Kept(model.scene, model.coded, steps, significant, model.curvature.together)
 
     def needed(self, model: Model, measure: Measure, loss_db: float, prune_share: float, grids: bool) -> "Kept":
@@ -148,7 +162,13 @@ class Kept:
 
 
 def code(
-    model: Model, trade: Trade, prune_share: float, tune_steps: int, quantise: Quantise | None = None, shown: bool = False, grids: bool = True
+    model: Model,
+    trade: Trade,
+    prune_share: float,
+    tune_steps: int,
+    quantise: Quantise | None = None,
+    shown: bool = False,
+    grids: bool = True,
 ) -> Coded:
     """What of a model is needed, `kpc.encoder.rdo.prune`, in symbols as coarse or as fine as a trade asks for.
 
@@ -166,7 +186,13 @@ def code(
     whole = measure(model.scene).psnr
 
     def met(kept: Kept, tune_steps: int, tolerance: float) -> Attempt:
-        def chosen(scene: Scene, steps: PerPlane, reached: np.ndarray, significant: PerPlane, only: Collection[Name] | None = None) -> QuantisedScene:
+        def chosen(
+            scene: Scene,
+            steps: PerPlane,
+            reached: np.ndarray,
+            significant: PerPlane,
+            only: Collection[Name] | None = None,
+        ) -> QuantisedScene:
             if quantise is not None:
                 quantised = quantise(scene, steps, reached, significant)
             else:
@@ -176,15 +202,29 @@ def code(
         def tune(steps: PerPlane, reached: np.ndarray) -> QuantisedScene:
             if model.coded is None:  # steps of a file were spread when it was made
                 factors = spread(kept.scene)
-                steps = [{name: short_above(step * np.float32(factors[s, name])) for name, step in scale.items()} for s, scale in enumerate(steps)]
+                steps = [
+                    {name: short_above(step * np.float32(factors[s, name])) for name, step in scale.items()}
+                    for s, scale in enumerate(steps)
+                ]
 
             def choose(candidate: Scene, group: Sequence[Name]) -> QuantisedScene:
                 return chosen(candidate, steps, reached, kept.significant, group)
 
             return tuned(kept.scene, model.scene, choose, tune_steps, shown)
 
-        return compress(kept.scene, kept.steps, kept.significant, measure, whole, trade, kept.coded, chosen,
-                        tune if tune_steps else None, own_steps=model.coded is not None, tolerance=tolerance)
+        return compress(
+            kept.scene,
+            kept.steps,
+            kept.significant,
+            measure,
+            whole,
+            trade,
+            kept.coded,
+            chosen,
+            tune if tune_steps else None,
+            own_steps=model.coded is not None,
+            tolerance=tolerance,
+        )
 
     def needed(loss_db: float) -> Kept:
         return every.needed(model, measure, loss_db, prune_share, grids)
@@ -202,12 +242,16 @@ def code(
             kept = needed(loss_db)
     found, pruned = met(kept, tune_steps, TOLERANCE), kept.pruned
     if trade.target_bytes is not None and found.size_bytes > trade.target_bytes:
-        raise TrainingError(f"{found.size_bytes:,} bytes is the least that this model takes, not {trade.target_bytes:,}; give "
-                            "another --target-size, or train anew with a smaller --preset")
+        raise TrainingError(
+            f"{found.size_bytes:,} bytes is the least that this model takes, not {trade.target_bytes:,}; give "
+            "another --target-size, or train anew with a smaller --preset"
+        )
     if model.coded is not None and (as_it_was := Attempt(model.coded, measure, 0.0)).size_bytes <= found.size_bytes:
         found, pruned = as_it_was, None
     measured: Measured = found.measured
-    return Coded(found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, kept.spare_db)
+    return Coded(
+        found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, kept.spare_db
+    )
 
 
 def load(path: Path) -> Model:
@@ -238,12 +282,15 @@ def model_of(coded: QuantisedScene) -> Model:
 
 def with_two_texels(coded: QuantisedScene) -> QuantisedScene:
     """The same pictures of planes with at least two texels along either axis, as training wants them: files may hold one, all along the axis."""
+
     def widened(plane: QuantisedPlane) -> QuantisedPlane:
         twice = [2 if size == 1 else 1 for size in plane.coded.shape]
         symbols, known = (a.repeat(twice[0], axis=0).repeat(twice[1], axis=1) for a in (plane.symbols, plane.coded))
         return replace(plane, symbols=symbols, coded=known)
 
-    return replace(coded, scales=tuple({name: widened(plane) for name, plane in scale.items()} for scale in coded.scales))
+    return replace(
+        coded, scales=tuple({name: widened(plane) for name, plane in scale.items()} for scale in coded.scales)
+    )
 
 
 # --- finished checkpoints
@@ -257,13 +304,22 @@ def save_checkpoint(path: Path, scene: Scene, probe: Probe) -> None:
     """
     kind = "hybrid" if isinstance(scene.decoder, HybridDecoder) else "explicit"
     state = {
-        "kpc": VERSION, "aabb": scene.aabb, "frame_count": scene.clip.frame_count, "fps": float(scene.clip.fps),
-        "scales": scene.scales, "kind": kind, "decoder": vars(scene.decoder),
-        "occupancy": scene.occupancy, "background": scene.background, "step": float(scene.step),
+        "kpc": VERSION,
+        "aabb": scene.aabb,
+        "frame_count": scene.clip.frame_count,
+        "fps": float(scene.clip.fps),
+        "scales": scene.scales,
+        "kind": kind,
+        "decoder": vars(scene.decoder),
+        "occupancy": scene.occupancy,
+        "background": scene.background,
+        "step": float(scene.step),
         "cameras": np.array([_camera_as_numbers(camera) for camera in scene.cameras]).reshape(-1, 22),
-        "mapping": _mapping_as_numbers(scene.mapping), "motion": scene.motion,
+        "mapping": _mapping_as_numbers(scene.mapping),
+        "motion": scene.motion,
         "names": [appearance.name for appearance in scene.appearances],
-        "codes": [appearance.code for appearance in scene.appearances], "probe": vars(probe),
+        "codes": [appearance.code for appearance in scene.appearances],
+        "probe": vars(probe),
     }
     state = _changed(state, np.ndarray, lambda a: torch.from_numpy(np.ascontiguousarray(a)))
     save_state(path, state, "name another --keep-checkpoint")
@@ -282,14 +338,18 @@ def load_checkpoint(path: Path) -> Model:
                 raise ValueError("compressed")
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(state, dict) or state.get("kpc") != VERSION:
-            raise TrainingError(f"{path}: no finished checkpoint; kpenc DATASET --keep-checkpoint writes one, --resume goes on "
-                                "from one of a run")
+            raise TrainingError(
+                f"{path}: no finished checkpoint; kpenc DATASET --keep-checkpoint writes one, --resume goes on "
+                "from one of a run"
+            )
         state = _changed(state, torch.Tensor, _as_array)
         scene = _scene_of(state)
         probe = Probe(**state["probe"])
         _check(scene, probe)
         # What no file could hold is found here, by the rules of every reader, before anything is rendered.
-        scene_io.scene_chunks(quantise_scene(scene, [{name: 8.0 for name in scale} for scale in scene.scales], skip_unseen=False))
+        scene_io.scene_chunks(
+            quantise_scene(scene, [{name: 8.0 for name in scale} for scale in scene.scales], skip_unseen=False)
+        )
     except (TrainingError, OSError):
         raise
     except FormatError as error:
@@ -302,9 +362,16 @@ def load_checkpoint(path: Path) -> Model:
 def _scene_of(state: Mapping[str, Any]) -> Scene:
     kind = {"explicit": Decoder, "hybrid": HybridDecoder}[state["kind"]]
     return Scene(
-        state["aabb"], Clip(int(state["frame_count"]), float(state["fps"])), tuple(state["scales"]), kind(**state["decoder"]),
-        state["occupancy"], state["background"], float(state["step"]),
-        tuple(_camera_of(numbers) for numbers in state["cameras"]), _mapping_of(state["mapping"]), state["motion"],
+        state["aabb"],
+        Clip(int(state["frame_count"]), float(state["fps"])),
+        tuple(state["scales"]),
+        kind(**state["decoder"]),
+        state["occupancy"],
+        state["background"],
+        float(state["step"]),
+        tuple(_camera_of(numbers) for numbers in state["cameras"]),
+        _mapping_of(state["mapping"]),
+        state["motion"],
         tuple(Appearance(name, code) for name, code in zip(state["names"], state["codes"], strict=True)),
     )
 

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-
 from kpc.encoder.evaluation.evaluate import SceneRenderer
-from kpc.encoder.field.field import Layout
 from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.field.field import Layout
 from kpc.encoder.field.render import marched, shade
 from kpc.format.scene.scene import Scene
 
@@ -78,8 +77,10 @@ def curvature(scene: Scene, probe: Probe, rays: int | None = None) -> Curvature:
             for total, gradient in zip(squares, gradients, strict=True):
                 total += gradient.square_()
     of_planes, *of_motion = (total.numpy() / max(1, len(probe.times) + len(more.times)) for total in squares)
-    alone = [{name: _smoothed(_smoothed(plane, 0), 1) for name, plane in scale.items()}
-             for scale in _by_plane(field.layout, scene, of_planes)]
+    alone = [
+        {name: _smoothed(_smoothed(plane, 0), 1) for name, plane in scale.items()}
+        for scale in _by_plane(field.layout, scene, of_planes)
+    ]
     together = [{name: _correlation(sums) for name, sums in scale.items()} for scale in products]
     return Curvature(alone, together, *of_motion)
 
@@ -97,7 +98,9 @@ def _products(plane: np.ndarray) -> np.ndarray:
     """(blocks down, blocks along, M, M): of a (rows, columns, M) plane, products of channels, summed over the texels of each block."""
     rows, columns, M = plane.shape
     whole = np.pad(plane, ((0, -rows % SIDE), (0, -columns % SIDE), (0, 0)))
-    blocks = whole.reshape(-(-rows // SIDE), SIDE, -1, SIDE, M).swapaxes(1, 2).reshape(-(-rows // SIDE), -1, SIDE * SIDE, M)
+    blocks = (
+        whole.reshape(-(-rows // SIDE), SIDE, -1, SIDE, M).swapaxes(1, 2).reshape(-(-rows // SIDE), -1, SIDE * SIDE, M)
+    )
     return blocks.swapaxes(2, 3) @ blocks
 
 

@@ -19,16 +19,34 @@ import math
 from dataclasses import replace
 
 import numpy as np
-
 from kpc.encoder.rdo.curvature import SIDE
-from kpc.encoder.rdo.texel_map_rdo import told_texels
 from kpc.encoder.rdo.distortion import LAM, bits_of_magnitudes, others, worths
-from kpc.format.coding.transform import (
-    ENDS, FINENESSES, FREQUENCIES, LARGEST, PARTS, SIZES, USUAL, Blocks, around, blocks_of, coarser, cosines, decode_blocks, encode_blocks,
-    end_context, foreseen_mean, largest_side, last_diagonal, level_context, quantisers, sum_across,
-)
+from kpc.encoder.rdo.texel_map_rdo import told_texels
 from kpc.format.coding.quantise import QuantisedPlane, quantise_plane, short_above
 from kpc.format.coding.rans import compiled, inlined
+from kpc.format.coding.transform import (
+    ENDS,
+    FINENESSES,
+    FREQUENCIES,
+    LARGEST,
+    PARTS,
+    SIZES,
+    USUAL,
+    Blocks,
+    around,
+    blocks_of,
+    coarser,
+    cosines,
+    decode_blocks,
+    encode_blocks,
+    end_context,
+    foreseen_mean,
+    largest_side,
+    last_diagonal,
+    level_context,
+    quantisers,
+    sum_across,
+)
 from kpc.format.container.segments import Told, rows_of_segments
 
 PRICE = 0.03
@@ -52,8 +70,15 @@ TOLD_APART = 20
 
 
 def in_blocks(
-    plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool, together: np.ndarray, side: int,
-    implied: np.ndarray | None = None, needed: np.ndarray | None = None,
+    plane: QuantisedPlane,
+    values: np.ndarray,
+    step: np.ndarray,
+    significant: np.ndarray,
+    identity: bool,
+    together: np.ndarray,
+    side: int,
+    implied: np.ndarray | None = None,
+    needed: np.ndarray | None = None,
 ) -> tuple[QuantisedPlane, int] | None:
     """A plane told in blocks of a side, or of smaller ones where a segment is small; and the bytes that takes. None where 8 bits are too few.
 
@@ -84,11 +109,20 @@ def in_blocks(
     for start in range(0, len(values), rows):
         own = slice(start, start + rows)
         there = np.ascontiguousarray(known[own])
-        blocks = searched(wanted[own], worth[own], there, _own_blocks(together, start, rows), min(side, largest_side(*there.shape)), quantiser)
+        blocks = searched(
+            wanted[own],
+            worth[own],
+            there,
+            _own_blocks(together, start, rows),
+            min(side, largest_side(*there.shape)),
+            quantiser,
+        )
         of_occupancy = None if implied is None else implied[own]
         told[start] = encode_blocks(blocks, there, of_occupancy)
         symbols[own], _ = decode_blocks(told[start], *symbols[own].shape, implied=of_occupancy)
-    return replace(finer, symbols=symbols, coded=known, guide=Told(told), starts=tuple(told)), sum(map(len, told.values()))
+    return replace(finer, symbols=symbols, coded=known, guide=Told(told), starts=tuple(told)), sum(
+        map(len, told.values())
+    )
 
 
 def step_in_blocks(plane: QuantisedPlane) -> np.ndarray:
@@ -103,7 +137,9 @@ def _own_blocks(together: np.ndarray, start: int, rows: int) -> np.ndarray:
     return np.ascontiguousarray(together[start // SIDE : -(-(start + rows) // SIDE)])
 
 
-def searched(wanted: np.ndarray, worth: np.ndarray, known: np.ndarray, together: np.ndarray, side: int, quantiser: int) -> Blocks:
+def searched(
+    wanted: np.ndarray, worth: np.ndarray, known: np.ndarray, together: np.ndarray, side: int, quantiser: int
+) -> Blocks:
     """Blocks of a segment.
 
     Args:
@@ -128,6 +164,7 @@ def searched(wanted: np.ndarray, worth: np.ndarray, known: np.ndarray, together:
 def _fineness(worth: np.ndarray, known: np.ndarray, busy: np.ndarray, side: int) -> np.ndarray:
     """(blocks down, blocks across) int64: quantisers of a block go with the fourth root of what errors in it are worth, in the
     mean. With the square root, as it would be if levels were not rounded but by rate and distortion, files are about the same."""
+
     def summed(values: np.ndarray) -> np.ndarray:
         rows, columns = values.shape
         padded = np.pad(values, ((0, -rows % side), (0, -columns % side)))
@@ -165,7 +202,9 @@ def _blurred(values: np.ndarray) -> np.ndarray:
 def _bits(counts: np.ndarray) -> np.ndarray:
     """(contexts, TOLD_APART + 1) bits of levels by their magnitude, that came so often in each context. What is expected is the mean of the levels
     that the context stands for."""
-    total = 0.75 * 2.0 ** (np.arange(SIZES) / 2 + 1) * (np.arange(SIZES) > 0)  # of 36 levels, as `level_context` sums them
+    total = (
+        0.75 * 2.0 ** (np.arange(SIZES) / 2 + 1) * (np.arange(SIZES) > 0)
+    )  # of 36 levels, as `level_context` sums them
     mean = np.repeat(total / 36 + 0.02, FREQUENCIES)
     mean[FREQUENCIES - 1 :: FREQUENCIES] *= 3
     return bits_of_magnitudes(counts, mean)
@@ -179,7 +218,9 @@ def _end_bits(counts: np.ndarray) -> np.ndarray:
 
 
 @compiled()
-def _search(wanted, worth, known, busy, levels, fineness, finer, basis, seen, filled, price, end_price, errors, together):
+def _search(
+    wanted, worth, known, busy, levels, fineness, finer, basis, seen, filled, price, end_price, errors, together
+):
     """Find `levels` anew, of which the search before is known, or `filled`; counts of levels and ends in their contexts, as `_bits` and
     `_end_bits` take them.
 
@@ -235,8 +276,23 @@ def _search(wanted, worth, known, busy, levels, fineness, finer, basis, seen, fi
                         here[i, j] = abs(found - usual)
                 told[:] = here[:N, :N]
                 place = end_context(end[Y, X - 1], end[Y - 1, X], end_before[Y, X])
-                last = _trimmed(block, here, told, left, above, past, last_diagonal(told), quantiser, basis, seen, curve, error, weight, price,
-                                end_price[place])
+                last = _trimmed(
+                    block,
+                    here,
+                    told,
+                    left,
+                    above,
+                    past,
+                    last_diagonal(told),
+                    quantiser,
+                    basis,
+                    seen,
+                    curve,
+                    error,
+                    weight,
+                    price,
+                    end_price[place],
+                )
                 end[Y, X], mean[Y, X] = last, block[0, 0] * quantiser[0, 0]
                 _edges(block, quantiser, basis, right, bottom[bx])
                 end_counts[place, last] += 1
@@ -342,7 +398,9 @@ def _cheapest(best, usual, worth, bits):
 
 
 @compiled()
-def _trimmed(block, here, told, left, above, past, last, quantiser, basis, seen, curve, error, weight, price, end_price):
+def _trimmed(
+    block, here, told, left, above, past, last, quantiser, basis, seen, curve, error, weight, price, end_price
+):
     """The end of a block after the quickest diagonals are left out, one after the other, as long as that costs less than it saves."""
     N = len(basis)
     while last > 1:

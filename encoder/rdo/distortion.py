@@ -11,7 +11,6 @@ and a bit is worth LAM of that.
 """
 
 import numpy as np
-
 from kpc.encoder.rdo.curvature import SIDE
 from kpc.format.coding.rans import compiled
 
@@ -77,6 +76,9 @@ def others(errors: np.ndarray, together: np.ndarray, m: int) -> np.ndarray:
             c[y + 1, x + 1] = TOGETHER * (together[y // SIDE, x // SIDE, m] * errors[y + 1, x + 1]).sum()
     for y in range(H):
         for x in range(W):
-            out[y, x] = c[y + 1, x + 1] + BESIDE * (c[y, x + 1] + c[y + 2, x + 1] + c[y + 1, x] + c[y + 1, x + 2]) + ACROSS * (
-                c[y, x] + c[y, x + 2] + c[y + 2, x] + c[y + 2, x + 2])
+            out[y, x] = (
+                c[y + 1, x + 1]
+                + BESIDE * (c[y, x + 1] + c[y + 2, x + 1] + c[y + 1, x] + c[y + 1, x + 2])
+                + ACROSS * (c[y, x] + c[y, x + 2] + c[y + 2, x] + c[y + 2, x + 2])
+            )
     return out

@@ -15,14 +15,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-
-from kpc.encoder.rdo.dct_rdo import in_blocks, step_in_blocks
 from kpc.encoder.rdo.curvature import PerPlane
-from kpc.encoder.rdo.trellis import THIN, on_trellis, step_on_trellis
+from kpc.encoder.rdo.dct_rdo import in_blocks, step_in_blocks
 from kpc.encoder.rdo.distortion import ALONE, Name, cost, worths
+from kpc.encoder.rdo.trellis import THIN, on_trellis, step_on_trellis
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels, quantise_scene, reached_by
-from kpc.format.scene.scene import TIME_PLANES, Scene
 from kpc.format.container.segments import Told, encode_coded, guide_at, rows_of_segments
+from kpc.format.scene.scene import TIME_PLANES, Scene
 
 SIDES = 8, 16
 """Of blocks that are tried. Those of 4 never cost least (room, soldier)."""
@@ -37,8 +36,13 @@ FEW_BITS, MANY_BITS = 0.25, 1.5
 
 
 def quantise_by_cost(
-    scene: Scene, steps: PerPlane, reached: np.ndarray | None = None,
-    significant: PerPlane | None = None, only: Collection[Name] | None = None, together: PerPlane | None = None, thin: float = THIN,
+    scene: Scene,
+    steps: PerPlane,
+    reached: np.ndarray | None = None,
+    significant: PerPlane | None = None,
+    only: Collection[Name] | None = None,
+    together: PerPlane | None = None,
+    thin: float = THIN,
     blocks: bool = True,
 ) -> QuantisedScene:
     """As `quantise_scene`, with symbols that cost least.
@@ -51,7 +55,9 @@ def quantise_by_cost(
     """
     reached = reached_by(scene) if reached is None else reached
     quantised = quantise_scene(scene, steps, reached=reached)
-    matters = significant or [{name: np.ones(plane.shape, np.float32) for name, plane in scale.items()} for scale in scene.scales]
+    matters = significant or [
+        {name: np.ones(plane.shape, np.float32) for name, plane in scale.items()} for scale in scene.scales
+    ]
     chosen = [(s, name) for s, scale in enumerate(scene.scales) for name in scale if only is None or (s, name) in only]
 
     def found(plane: Name) -> QuantisedPlane:
@@ -66,7 +72,10 @@ def quantise_by_cost(
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the searches hold no lock
         searched = dict(zip(chosen, pool.map(found, chosen), strict=True))
-    scales = tuple({name: searched.get((s, name), plane) for name, plane in scale.items()} for s, scale in enumerate(quantised.scales))
+    scales = tuple(
+        {name: searched.get((s, name), plane) for name, plane in scale.items()}
+        for s, scale in enumerate(quantised.scales)
+    )
     return replace(quantised, scales=scales)
 
 
@@ -76,8 +85,15 @@ def step_asked_for(plane: QuantisedPlane) -> np.ndarray:
 
 
 def _cheapest(
-    plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool, together: np.ndarray, thin: float,
-    implied: np.ndarray, needed: np.ndarray,
+    plane: QuantisedPlane,
+    values: np.ndarray,
+    step: np.ndarray,
+    significant: np.ndarray,
+    identity: bool,
+    together: np.ndarray,
+    thin: float,
+    implied: np.ndarray,
+    needed: np.ndarray,
 ) -> QuantisedPlane:
     """The plane that is quantised to the nearest, with the symbols that cost least. `needed`: texels that anything occupied looks up; `implied`:
     those of which a file need not say so. Others as of `on_trellis`."""
@@ -89,8 +105,12 @@ def _cheapest(
 
     tried = []
     for side in SIDES:
-        found = [told for which in ((None, needed) if identity else (None,))
-                 if (told := in_blocks(plane, values, step, significant, identity, together, side, implied, which)) is not None]
+        found = [
+            told
+            for which in ((None, needed) if identity else (None,))
+            if (told := in_blocks(plane, values, step, significant, identity, together, side, implied, which))
+            is not None
+        ]
         if not found:
             break
         tried += [(in_all(*told), told[0]) for told in found]
@@ -108,5 +128,7 @@ def _cheapest(
 def _size(plane: QuantisedPlane, identity: bool, implied: np.ndarray) -> int:
     """Bytes of its segments."""
     rows = rows_of_segments(len(plane.symbols), identity)
-    segments = [(slice(start, start + rows), guide_at(plane.guide, start)) for start in range(0, len(plane.symbols), rows)]
+    segments = [
+        (slice(start, start + rows), guide_at(plane.guide, start)) for start in range(0, len(plane.symbols), rows)
+    ]
     return sum(len(encode_coded(plane.symbols[own], plane.coded[own], guide, implied[own])) for own, guide in segments)

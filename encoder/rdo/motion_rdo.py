@@ -13,12 +13,11 @@ import math
 from dataclasses import replace
 
 import numpy as np
-
 from kpc.encoder.evaluation.validation_rays import Measure
 from kpc.encoder.rdo.distortion import BESIDE, bits_of_magnitudes
 from kpc.format.coding.motion_hierarchical import CONTEXTS, context_of, foreseen, passes, told_beside
-from kpc.format.scene.motion import STEP
 from kpc.format.coding.rans import compiled, inlined
+from kpc.format.scene.motion import STEP
 from kpc.format.scene.scene import Scene
 
 SHARE, MOST_STEPS = 0.1, 64
@@ -57,7 +56,9 @@ def with_coarser_motion(scene: Scene, worth: np.ndarray | None, measure: Measure
         found = measure(candidate).error - known
         if found <= error:
             return candidate
-        multiple = min(multiple - 1, int(multiple * math.sqrt(error / found))) if found > error else 0  # errors grow with a step's square
+        multiple = (
+            min(multiple - 1, int(multiple * math.sqrt(error / found))) if found > error else 0
+        )  # errors grow with a step's square
     return scene
 
 
@@ -71,7 +72,20 @@ def told_cheaply(wanted: np.ndarray, worth: np.ndarray) -> np.ndarray:
         counts = np.zeros_like(counts)
         for one in order:
             values, r, aim, weight, err = (np.moveaxis(a, one.axis, 0) for a in (symbols, missed, wanted, root, errors))
-            _search(values, r, aim, weight, err, one.new, one.sides, one.weights, *one.there, PRICE * FINER ** (one.level - 1), bits, counts)
+            _search(
+                values,
+                r,
+                aim,
+                weight,
+                err,
+                one.new,
+                one.sides,
+                one.weights,
+                *one.there,
+                PRICE * FINER ** (one.level - 1),
+                bits,
+                counts,
+            )
     return symbols
 
 
@@ -119,7 +133,9 @@ def _cheapest(best, usual, worth, price, bits):
     for which in range(3):
         value = nearest if which == 0 else usual if which == 2 else nearest - 1 if nearest > usual else nearest + 1
         away = abs(value - usual)
-        cost = worth * (value - best) ** 2 + price * (bits[min(away, TOLD_APART)] + 2 * math.log2(max(away, TOLD_APART) / TOLD_APART))
+        cost = worth * (value - best) ** 2 + price * (
+            bits[min(away, TOLD_APART)] + 2 * math.log2(max(away, TOLD_APART) / TOLD_APART)
+        )
         if cost < least:
             found, least = min(max(value, -32768), 32767), cost
     return found

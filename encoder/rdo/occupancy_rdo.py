@@ -14,13 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import Measure, Probe
 from kpc.encoder.field.render import marched
 from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS
-from kpc.format.scene.grid import dilate
 from kpc.format.coding.rans import compiled, inlined
+from kpc.format.scene.grid import dilate
 from kpc.format.scene.scene import Scene
 
 MARCHED = 0.5
@@ -68,7 +67,9 @@ def errors_of_flips(scene: Scene, probe: Probe, share: int = 1) -> np.ndarray:
     neither occupied nor next to one. By one in `share` of the rays that it takes."""
     wide = replace(scene, occupancy=dilate(scene.occupancy))
     rays = RAYS_A_CELL * int(np.count_nonzero(scene.occupancy))
-    own, next_to_it = (contributions(one, probe, min(rays, most) // share) for one, most in ((scene, RAYS), (wide, FEWER_RAYS)))
+    own, next_to_it = (
+        contributions(one, probe, min(rays, most) // share) for one, most in ((scene, RAYS), (wide, FEWER_RAYS))
+    )
     return np.where(scene.occupancy, own, next_to_it)
 
 
@@ -88,9 +89,13 @@ def contributions(scene: Scene, probe: Probe, rays: int) -> np.ndarray:
             ray, weights = samples.ray.numpy(), met.weights.numpy().astype(np.float64)
             slot = np.minimum((some.times * slots).astype(np.int64), slots - 1)[ray]
             cell = np.ravel_multi_index((slot, *samples.cell.numpy().T), scene.occupancy.shape)
-            first = np.flatnonzero(np.diff(cell, prepend=-1) | np.diff(ray, prepend=-1))  # of a ray's samples in one cell
+            first = np.flatnonzero(
+                np.diff(cell, prepend=-1) | np.diff(ray, prepend=-1)
+            )  # of a ray's samples in one cell
             sums += np.bincount(cell[first], np.add.reduceat(weights, first) ** 2 if len(first) else None, sums.size)
-    error: np.ndarray = 255**2 * CONTRAST * sums.reshape(scene.occupancy.shape) / max(1, len(probe.times) + len(more.times))
+    error: np.ndarray = (
+        255**2 * CONTRAST * sums.reshape(scene.occupancy.shape) / max(1, len(probe.times) + len(more.times))
+    )
     return error
 
 
@@ -133,11 +138,20 @@ def _flip(cells, bits, occupied, neighbours):
                 for x in range(X):
                     is_set = int(cells[s, z, y, x])
                     context = context_at(cells, s, z, y, x, neighbours)
-                    more = bits[context, 1 - is_set] - bits[context, is_set] + (-occupied[s, z, y, x] if is_set else occupied[s, z, y, x])
+                    more = (
+                        bits[context, 1 - is_set]
+                        - bits[context, is_set]
+                        + (-occupied[s, z, y, x] if is_set else occupied[s, z, y, x])
+                    )
                     if not more < SURE:
                         continue
                     for k in range(len(neighbours)):  # those in whose contexts it is
-                        i, j, v, u = s - neighbours[k, 0], z - neighbours[k, 1], y - neighbours[k, 2], x - neighbours[k, 3]
+                        i, j, v, u = (
+                            s - neighbours[k, 0],
+                            z - neighbours[k, 1],
+                            y - neighbours[k, 2],
+                            x - neighbours[k, 3],
+                        )
                         if 0 <= i < S and 0 <= j < Z and 0 <= v < Y and 0 <= u < X:
                             theirs, told = context_at(cells, i, j, v, u, neighbours), int(cells[i, j, v, u])
                             more += bits[theirs ^ 1 << len(neighbours) - 1 - k, told] - bits[theirs, told]

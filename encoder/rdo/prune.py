@@ -11,11 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-
-from kpc.encoder.field import render
-from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.evaluation.evaluate import SceneRenderer
+from kpc.encoder.field import render
 from kpc.encoder.field.field import Field, Layout
+from kpc.encoder.rdo.curvature import PerPlane
 from kpc.format.scene.scene import Decoder, Scene
 from kpc.format.scene.space import Contraction
 
@@ -56,8 +55,11 @@ class Pruned:
 
     def of_each_plane(self, numbers: PerPlane, in_pairs: bool = False) -> list[dict[str, np.ndarray]]:
         """The part of (..., M) numbers of each plane, or of (..., M, M) `in_pairs`, that belongs to what is left."""
-        left = [((..., kept[:, None], kept) if in_pairs else (..., kept), scale)
-                for kept, scale in zip(self.kept, numbers, strict=True) if len(kept)]
+        left = [
+            ((..., kept[:, None], kept) if in_pairs else (..., kept), scale)
+            for kept, scale in zip(self.kept, numbers, strict=True)
+            if len(kept)
+        ]
         return [{name: some[part] for name, some in scale.items()} for part, scale in left]
 
 
@@ -105,7 +107,9 @@ def one_colour(scene: Scene, directions: np.ndarray) -> Scene:
     b2 = decoder.b2 if not decoder.w2.any() else _basis(scene, directions).mean(0)
     F = len(decoder.density_weight)
     nothing = [np.zeros(shape, np.float32) for shape in ((1, 9), (1,), (3, F, 1))]
-    return replace(scene, decoder=Decoder(decoder.density_weight, decoder.density_bias, *nothing, b2.astype(np.float32)))
+    return replace(
+        scene, decoder=Decoder(decoder.density_weight, decoder.density_bias, *nothing, b2.astype(np.float32))
+    )
 
 
 @dataclass(frozen=True)
@@ -132,15 +136,23 @@ class Seen:
         slots, *cells = scene.occupancy.shape
         rng = np.random.default_rng(0)
         occupied = np.argwhere(scene.occupancy)
-        chosen = occupied[rng.integers(len(occupied), size=len(ends))] if len(occupied) else np.zeros((len(ends), 4), np.int64)
+        chosen = (
+            occupied[rng.integers(len(occupied), size=len(ends))]
+            if len(occupied)
+            else np.zeros((len(ends), 4), np.int64)
+        )
         inside = (chosen + rng.random(chosen.shape)) / (slots, *cells)
-        counts = [scale["xy"].shape[2] for scale in scene.scales]  # the renderer's field has as many as the widest at each
+        counts = [
+            scale["xy"].shape[2] for scale in scene.scales
+        ]  # the renderer's field has as many as the widest at each
         own = np.concatenate([max(counts) * s + np.arange(count) for s, count in enumerate(counts)])
         with torch.no_grad():
             features, elsewhere = (
                 renderer.field.features(p.float(), t.float()).numpy()[:, own].astype(np.float64)
-                for p, t in ((u[:, 0].clamp(0, 1), torch.from_numpy(times[ends])),
-                             (torch.from_numpy(inside[:, :0:-1].copy()), torch.from_numpy(inside[:, 0].copy())))
+                for p, t in (
+                    (u[:, 0].clamp(0, 1), torch.from_numpy(times[ends])),
+                    (torch.from_numpy(inside[:, :0:-1].copy()), torch.from_numpy(inside[:, 0].copy())),
+                )
             )
         return Seen(features, _basis(scene, directions[ends]), np.concatenate([features, elsewhere]))
 
@@ -167,7 +179,9 @@ def dispensable(decoder: Decoder, seen: Seen) -> np.ndarray:
         share[left] = np.linalg.solve(moments[np.ix_(left, left)], moments[left, m])
         passed = np.outer(listened[:, m], share)
         listened += passed + passed.T + listened[m, m] * np.outer(share, share)
-        weight[left] += weight[m] * np.linalg.solve(all_moments[np.ix_([*left, -1], [*left, -1])], all_moments[[*left, -1], m])[:-1]
+        weight[left] += (
+            weight[m] * np.linalg.solve(all_moments[np.ix_([*left, -1], [*left, -1])], all_moments[[*left, -1], m])[:-1]
+        )
         order.append(m)
     return np.array(order, np.int64)
 
@@ -180,7 +194,9 @@ def passed_on(decoder: Decoder, seen: Seen, gone: np.ndarray) -> Decoder:
     moments, all_moments = _moments(seen.features), _moments(seen.all_features, constant=True)
     share = np.linalg.solve(moments[np.ix_(left, left)], moments[np.ix_(left, gone)])
     with_constant = np.append(left, F)
-    density_share = np.linalg.solve(all_moments[np.ix_(with_constant, with_constant)], all_moments[np.ix_(with_constant, gone)])
+    density_share = np.linalg.solve(
+        all_moments[np.ix_(with_constant, with_constant)], all_moments[np.ix_(with_constant, gone)]
+    )
     weight, w2, b2 = (np.array(a, np.float64) for a in (decoder.density_weight, decoder.w2, decoder.b2))
     taken = density_share @ weight[gone]
     weight[left] += taken[:-1]
@@ -188,14 +204,22 @@ def passed_on(decoder: Decoder, seen: Seen, gone: np.ndarray) -> Decoder:
     b2[:, left] += b2[:, gone] @ share.T
     for a in (weight, w2.swapaxes(0, 1), b2.T):
         a[gone] = 0
-    return replace(decoder, density_weight=weight.astype(np.float32), density_bias=float(decoder.density_bias + taken[-1]),
-                   w2=w2.astype(np.float32), b2=b2.astype(np.float32))
+    return replace(
+        decoder,
+        density_weight=weight.astype(np.float32),
+        density_bias=float(decoder.density_bias + taken[-1]),
+        w2=w2.astype(np.float32),
+        b2=b2.astype(np.float32),
+    )
 
 
 def without(scene: Scene, kept: Sequence[np.ndarray]) -> Scene:
     """The scene with some channels of each scale alone, (M',) numbers; scales without any are left out."""
-    scales = tuple({name: np.ascontiguousarray(plane[..., channels]) for name, plane in scale.items()}
-                   for channels, scale in zip(kept, scene.scales, strict=True) if len(channels))
+    scales = tuple(
+        {name: np.ascontiguousarray(plane[..., channels]) for name, plane in scale.items()}
+        for channels, scale in zip(kept, scene.scales, strict=True)
+        if len(channels)
+    )
     starts = np.cumsum([0] + [scale["xy"].shape[2] for scale in scene.scales[:-1]])
     features = np.concatenate([start + channels for start, channels in zip(starts, kept)])
     d = scene.decoder
@@ -220,6 +244,8 @@ def _moments(features: np.ndarray, constant: bool = False) -> np.ndarray:
 def _basis(scene: Scene, directions: np.ndarray) -> np.ndarray:
     """The colour basis of (N, 3) directions: (N, 3, F) float64."""
     with torch.no_grad():
-        field = Field(Layout.of(np.array([[2, 2, 2, 0]]), 1), len(scene.decoder.b1))  # whose planes, evenly wide, are of no matter
+        field = Field(
+            Layout.of(np.array([[2, 2, 2, 0]]), 1), len(scene.decoder.b1)
+        )  # whose planes, evenly wide, are of no matter
         field.load_decoder(scene.decoder)
         return field.basis(torch.from_numpy(directions)).numpy().astype(np.float64)  # type: ignore[no-any-return]

@@ -10,14 +10,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-
-from kpc.encoder.rdo.mode_decision import quantise_by_cost
-from kpc.encoder.rdo.curvature import PerPlane
-from kpc.encoder.field.occupancy_grid import in_fewest_slots
 from kpc.encoder.evaluation.validation_rays import Measure, Measured, squares_of
+from kpc.encoder.field.occupancy_grid import in_fewest_slots
+from kpc.encoder.rdo.curvature import PerPlane
+from kpc.encoder.rdo.mode_decision import quantise_by_cost
 from kpc.encoder.rdo.rate_search import TOLERANCE, cheapest, farthest, farthest_tuned
-from kpc.format.container import scene_io
 from kpc.format.coding.quantise import HALF_BITS, QuantisedScene, reached_by, round_decoder, short_above, weights_of
+from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 
 FINEST, COARSEST = -13.0, 2.0
@@ -189,7 +188,9 @@ def relative_steps(significant: PerPlane) -> Steps:
     with each doubling of d. At equal slopes the mean of w d^2 is the same everywhere: d = 1 / sqrt(mean w), over texels that matter
     at all. Channels without any get the coarsest step of all.
     """
-    return [{name: np.maximum(_means(w), LEAST_SIGNIFICANCE) ** -0.5 for name, w in scale.items()} for scale in significant]
+    return [
+        {name: np.maximum(_means(w), LEAST_SIGNIFICANCE) ** -0.5 for name, w in scale.items()} for scale in significant
+    ]
 
 
 def _means(values: np.ndarray) -> np.ndarray:
@@ -204,9 +205,17 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
 
 
 def compress(
-    scene: Scene, steps: Steps, significant: PerPlane, measure: Measure, uncoded_psnr: float, trade: Trade,
-    as_it_is: QuantisedScene | None = None, quantise: Quantise = quantise_by_cost, tune: Tune | None = None,
-    own_steps: bool = False, tolerance: float = TOLERANCE,
+    scene: Scene,
+    steps: Steps,
+    significant: PerPlane,
+    measure: Measure,
+    uncoded_psnr: float,
+    trade: Trade,
+    as_it_is: QuantisedScene | None = None,
+    quantise: Quantise = quantise_by_cost,
+    tune: Tune | None = None,
+    own_steps: bool = False,
+    tolerance: float = TOLERANCE,
 ) -> Attempt:
     """The quantisation that a trade asks for; of a size that no file has, the smallest.
 
@@ -226,7 +235,9 @@ def compress(
         if as_it_is is not None and exponent == 0:
             return Attempt(as_it_is, measure, exponent)
         if exponent not in tried:
-            tried[exponent] = Attempt(quantise(scene, scaled(steps, 2.0**exponent), reached, significant), measure, exponent)
+            tried[exponent] = Attempt(
+                quantise(scene, scaled(steps, 2.0**exponent), reached, significant), measure, exponent
+            )
         return tried[exponent]
 
     def tuned(exponent: float) -> Attempt:
@@ -243,7 +254,13 @@ def compress(
             return whole
         start, end, most, slope, value = coarsest, finest, bound, BYTES_GROW, lambda found: found.size_bytes
     elif name == "quality":
-        start, end, most, slope, value = finest, coarsest, error_of(bound), ERRORS_GROW, lambda found: found.measured.error
+        start, end, most, slope, value = (
+            finest,
+            coarsest,
+            error_of(bound),
+            ERRORS_GROW,
+            lambda found: found.measured.error,
+        )
     else:
         start, end, most, slope = finest, coarsest, trade.loss_db(uncoded_psnr), ERRORS_GROW
         value = lambda found: uncoded_psnr - found.measured.psnr

@@ -36,8 +36,15 @@ Made = TypeVar("Made", bound=Tried)
 
 
 def farthest(
-    start: float, end: float, guess: float, attempt: Callable[[float], Made], value: Callable[[Made], float], most: float, slope: float,
-    tolerance: float = TOLERANCE, tried: Iterable[Made] = (),
+    start: float,
+    end: float,
+    guess: float,
+    attempt: Callable[[float], Made],
+    value: Callable[[Made], float],
+    most: float,
+    slope: float,
+    tolerance: float = TOLERANCE,
+    tried: Iterable[Made] = (),
 ) -> Made:
     """What `attempt` makes of the exponent farthest from `start` towards `end`, along which `value` rises, where that is `most` or less; of
     `start` where nowhere.
@@ -52,10 +59,14 @@ def farthest(
     wanted = math.log(most * (1 - tolerance / 2)) if most > 0 else -math.inf
     leap, grains = LEAP, 0
     for number in range(ATTEMPTS + 1):  # and a last look
-        within = max((one for one in known if value(one) <= most), key=lambda one: way * one.exponent, default=None)  # not so with NaN
+        within = max(
+            (one for one in known if value(one) <= most), key=lambda one: way * one.exponent, default=None
+        )  # not so with NaN
         beyond = min((one for one in known if not value(one) <= most and (within is None or way * (one.exponent - within.exponent) > 0)),
                      key=lambda one: way * one.exponent, default=None)  # fmt: skip
-        if within is not None and (value(within) >= (1 - tolerance) * most or within.exponent == end or number == ATTEMPTS):
+        if within is not None and (
+            value(within) >= (1 - tolerance) * most or within.exponent == end or number == ATTEMPTS
+        ):
             return within
         if within is None and (number == ATTEMPTS or beyond is not None and beyond.exponent == start):
             break
@@ -92,8 +103,16 @@ def _share(low: float, high: float, wanted: float) -> float:
 
 
 def farthest_tuned(
-    start: float, end: float, found: Made, tried: Iterable[Made], tuned: Callable[[float], Made],
-    value: Callable[[Made], float], most: float, enough: float, made: float, slope: float,
+    start: float,
+    end: float,
+    found: Made,
+    tried: Iterable[Made],
+    tuned: Callable[[float], Made],
+    value: Callable[[Made], float],
+    most: float,
+    enough: float,
+    made: float,
+    slope: float,
 ) -> Made | None:
     """A coding that is tuned, whose value is `most` or less, by the share `enough` where a few tunings come so near; None where none has it.
 
@@ -132,8 +151,11 @@ def _where(known: Sequence[tuple[float, float]], wanted: float, slope: float) ->
     the line through the two nearest to it; where there is but one, or that line is steeper or flatter than the slope by more than a factor
     of three, on one through the latest with that slope."""
     below = max((point for point in known if point[1] <= wanted), key=lambda point: slope * point[0], default=None)
-    above = min((point for point in known if point[1] > wanted and below is not None and slope * (point[0] - below[0]) > 0),
-                key=lambda point: slope * point[0], default=None)
+    above = min(
+        (point for point in known if point[1] > wanted and below is not None and slope * (point[0] - below[0]) > 0),
+        key=lambda point: slope * point[0],
+        default=None,
+    )
     if below is not None and above is not None:
         return below[0] + (wanted - below[1]) / (above[1] - below[1]) * (above[0] - below[0])
     nearest = sorted(known, key=lambda point: abs(point[1] - wanted))[:2]

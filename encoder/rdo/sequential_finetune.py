@@ -16,15 +16,14 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-
-from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.evaluation.evaluate import SceneRenderer, as_wide_as, evenly_wide
-from kpc.encoder.field.field import Field
-from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser
 from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.field.field import Field
 from kpc.encoder.rdo.distortion import Name
-from kpc.format.common.progress import Progress
+from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.common.progress import Progress
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 
 RAYS = 1 << 12
@@ -50,7 +49,11 @@ def spread(scene: Scene) -> dict[Name, float]:
     """By how much coarser than others each plane may be, as planes coded after it make up for some of its errors: 2^SPREAD for the first,
     2^-SPREAD for the last."""
     groups = order(scene)
-    return {plane: 2.0 ** (SPREAD * (1 - 2 * number / (len(groups) - 1))) for number, group in enumerate(groups) for plane in group}
+    return {
+        plane: 2.0 ** (SPREAD * (1 - 2 * number / (len(groups) - 1)))
+        for number, group in enumerate(groups)
+        for plane in group
+    }
 
 
 def steps_in_all(scene: Scene, steps: int) -> int:
@@ -64,7 +67,11 @@ def steps_after(trained: int, scene: Scene, most: int) -> int:
 
 
 def tuned(
-    scene: Scene, whole: Scene, quantise: Callable[[Scene, Sequence[Name]], QuantisedScene], steps: int, shown: bool = False
+    scene: Scene,
+    whole: Scene,
+    quantise: Callable[[Scene, Sequence[Name]], QuantisedScene],
+    steps: int,
+    shown: bool = False,
 ) -> QuantisedScene:
     """A scene quantised group by group.
 
@@ -80,11 +87,17 @@ def tuned(
         return {key: plane.dequantise() for key, plane in found.items()}
 
     rest = quantise(coded_in_groups(scene, whole, coded, steps, shown), ())
-    return replace(rest, scales=tuple({name: settled[s, name] for name in scale} for s, scale in enumerate(scene.scales)))
+    return replace(
+        rest, scales=tuple({name: settled[s, name] for name in scale} for s, scale in enumerate(scene.scales))
+    )
 
 
 def coded_in_groups(
-    scene: Scene, whole: Scene, coded: Callable[[Scene, Sequence[Name]], Mapping[Name, np.ndarray]], steps: int, shown: bool = False
+    scene: Scene,
+    whole: Scene,
+    coded: Callable[[Scene, Sequence[Name]], Mapping[Name, np.ndarray]],
+    steps: int,
+    shown: bool = False,
 ) -> Scene:
     """A scene whose planes are what comes back from their coding, whatever codes them, group by group.
 
@@ -99,32 +112,64 @@ def coded_in_groups(
         for number, group in enumerate(groups):
             back = coded(scene, group)
             settled |= back.keys()
-            scales = tuple({name: back.get((s, name), plane) for name, plane in scale.items()} for s, scale in enumerate(scene.scales))
+            scales = tuple(
+                {name: back.get((s, name), plane) for name, plane in scale.items()}
+                for s, scale in enumerate(scene.scales)
+            )
             scene = replace(scene, scales=scales)
-            scene = _taught(scene, teacher, settled, steps if number < len(groups) - 1 else steps // 2, number, progress)
+            scene = _taught(
+                scene, teacher, settled, steps if number < len(groups) - 1 else steps // 2, number, progress
+            )
     return scene
 
 
-def _taught(scene: Scene, teacher: SceneRenderer, settled: Collection[Name], steps: int, seed: int, progress: Progress) -> Scene:
+def _taught(
+    scene: Scene, teacher: SceneRenderer, settled: Collection[Name], steps: int, seed: int, progress: Progress
+) -> Scene:
     """With planes that are not settled, and the decoder, nearer to what the teacher shows."""
     field = Field.from_scene(evenly_wide(scene))
     explicit = isinstance(scene.decoder, Decoder)
     config = replace(
-        TrainConfig(), learning_rate=LEARNING_RATE, decoder_learning_rate=DECODER_LEARNING_RATE, appearance_learning_rate=0.0,
-        view_dependent=not explicit or bool(scene.decoder.w2.any()), distortion=0.0, channel_dropout=0.0, scale_dropout=0.0,
-        coarse_until=0.0, regularise_every=steps + 1, motion_every=steps + 1)
+        TrainConfig(),
+        learning_rate=LEARNING_RATE,
+        decoder_learning_rate=DECODER_LEARNING_RATE,
+        appearance_learning_rate=0.0,
+        view_dependent=not explicit or bool(scene.decoder.w2.any()),
+        distortion=0.0,
+        channel_dropout=0.0,
+        scale_dropout=0.0,
+        coarse_until=0.0,
+        regularise_every=steps + 1,
+        motion_every=steps + 1,
+    )
     cells = scene.occupancy.shape[1:]
-    optimiser = FusedOptimiser(field, config, cells, scene.mapping) if explicit else PlainOptimiser(
-        field, config, cells, scene.mapping, fused=True)
+    optimiser = (
+        FusedOptimiser(field, config, cells, scene.mapping)
+        if explicit
+        else PlainOptimiser(field, config, cells, scene.mapping, fused=True)
+    )
     theta, M = field.theta.detach().numpy(), field.layout.channels
-    kept = [slice(start, start + rows * columns * M) for s, name, start, rows, columns in field.layout.planes() if (s, name) in settled]
+    kept = [
+        slice(start, start + rows * columns * M)
+        for s, name, start, rows, columns in field.layout.planes()
+        if (s, name) in settled
+    ]
     before = [theta[some].copy() for some in kept]
     probe = Probe.of_surfaces(scene, RAYS * steps, seed=100 + seed)
     for number in range(steps if len(probe.times) >= steps else 0):
         rays = [a[number::steps] for a in probe.rays]
         colours = torch.from_numpy(teacher.rgb(*rays))
-        optimiser.step(number + 1, 1.0, 1 - number / steps, teacher.batch(*rays), colours,
-                       scene.aabb, scene.occupancy, scene.step, scene.extent)
+        optimiser.step(
+            number + 1,
+            1.0,
+            1 - number / steps,
+            teacher.batch(*rays),
+            colours,
+            scene.aabb,
+            scene.occupancy,
+            scene.step,
+            scene.extent,
+        )
         for some, values in zip(kept, before, strict=True):
             theta[some] = values
         progress.advance()

@@ -11,9 +11,8 @@ map before had them.
 """
 
 import numpy as np
-
-from kpc.format.coding.rans import compiled, inlined
 from kpc.format.coding.predictive import MAP_CONTEXTS
+from kpc.format.coding.rans import compiled, inlined
 
 UNCHANGED = 0.6
 """Squared steps, as much as they are worth, in the mean over channels: a texel of a time plane that is nearer to 1 is taken for it. Room and
@@ -24,7 +23,9 @@ MAP_LAM = 1.5
 than where each texel is judged alone; 1.1 % with 4."""
 PASSES = 4
 """Over all texels."""
-LIKELY = 0.05 + 0.9 * np.array([context.bit_count() for context in range(MAP_CONTEXTS)]) / (MAP_CONTEXTS - 1).bit_count()
+LIKELY = (
+    0.05 + 0.9 * np.array([context.bit_count() for context in range(MAP_CONTEXTS)]) / (MAP_CONTEXTS - 1).bit_count()
+)
 """How likely texels are told, by context, before any is known: most are as those around them."""
 BEFORE = 1.0
 """Texels that this counts for."""

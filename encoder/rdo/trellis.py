@@ -24,16 +24,32 @@ import math
 from dataclasses import replace
 
 import numpy as np
-
-from kpc.encoder.rdo.texel_map_rdo import told_texels
 from kpc.encoder.rdo.distortion import ACROSS, ALONE, BESIDE, LAM, bits_of_magnitudes, others, worths
+from kpc.encoder.rdo.texel_map_rdo import told_texels
+from kpc.format.coding.predictive import (
+    ACTIVITIES,
+    ANY,
+    AROUND,
+    FLAT,
+    SLOPES,
+    TRELLIS,
+    UNKNOWN,
+    Guide,
+    activity,
+    begin_row,
+    factors,
+    fitted,
+    foreseen,
+    look_above,
+    meant,
+    neighbourhoods,
+    next_place,
+    predict,
+    remember,
+)
 from kpc.format.coding.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, quantise_plane, short_above
 from kpc.format.coding.rans import compiled
 from kpc.format.container.segments import rows_of_segments
-from kpc.format.coding.predictive import (
-    ACTIVITIES, ANY, AROUND, FLAT, SLOPES, TRELLIS, UNKNOWN, Guide, activity, begin_row, factors, fitted, foreseen, look_above,
-    meant, neighbourhoods, next_place, predict, remember,
-)
 
 THIN = 1.3
 """Bits of a symbol below which the trellis goes around predictions. Liam and soldier, large planes alone, at equal slopes: squared errors
@@ -54,8 +70,13 @@ TOLD_APART = 40
 
 
 def on_trellis(
-    plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool,
-    together: np.ndarray = ALONE, thin: float = THIN,
+    plane: QuantisedPlane,
+    values: np.ndarray,
+    step: np.ndarray,
+    significant: np.ndarray,
+    identity: bool,
+    together: np.ndarray = ALONE,
+    thin: float = THIN,
 ) -> QuantisedPlane:
     """A plane that is quantised to the nearest, with other symbols, and around predictions with other steps. What was left out stays so, and
     holds 0; and so does what is so near the identity that it is not worth telling.
@@ -92,8 +113,16 @@ class _Search:
     Args: as of `on_trellis`; `lattice`: as of `kpc.format.coding.predictive`.
     """
 
-    def __init__(self, plane: QuantisedPlane, values: np.ndarray, step: np.ndarray, significant: np.ndarray, identity: bool,
-                 together: np.ndarray, lattice: int) -> None:
+    def __init__(
+        self,
+        plane: QuantisedPlane,
+        values: np.ndarray,
+        step: np.ndarray,
+        significant: np.ndarray,
+        identity: bool,
+        together: np.ndarray,
+        lattice: int,
+    ) -> None:
         self.plane, self.identity, self.together, self.lattice = plane, identity, together, lattice
         self._finer = FINER if lattice == AROUND else 1.0
         self.rows = rows_of_segments(len(values), identity)
@@ -115,8 +144,16 @@ class _Search:
             neighbours = neighbourhoods(self.symbols, self.known)
             self.weights = fitted(neighbours, SETS if self.lattice != AROUND or len(neighbours) >= MANY else 1)
             self.symbols, self.counts = _search(
-                self.wanted, self.worth, self.known, self.rows, self.lattice, self.weights, LAM * self._finer**2 * _bits(self.counts),
-                self.errors, self.together)
+                self.wanted,
+                self.worth,
+                self.known,
+                self.rows,
+                self.lattice,
+                self.weights,
+                LAM * self._finer**2 * _bits(self.counts),
+                self.errors,
+                self.together,
+            )
 
     @property
     def bits_of_a_symbol(self) -> float:
@@ -125,7 +162,9 @@ class _Search:
     def found(self) -> QuantisedPlane:
         if self.lattice == AROUND:  # what is coded tells what is foreseen
             return replace(self.plane, symbols=self.symbols, coded=self.known, guide=Guide(self.weights))
-        return replace(self.plane, symbols=self.symbols, coded=self.symbols.any(axis=2) if self.identity else self.known)
+        return replace(
+            self.plane, symbols=self.symbols, coded=self.symbols.any(axis=2) if self.identity else self.known
+        )
 
 
 def _bits(counts: np.ndarray) -> np.ndarray:
@@ -136,7 +175,14 @@ def _bits(counts: np.ndarray) -> np.ndarray:
 
 @compiled()
 def _search(
-    wanted: np.ndarray, worth: np.ndarray, known: np.ndarray, rows: int, lattice: int, weights: np.ndarray, price: np.ndarray, errors: np.ndarray,
+    wanted: np.ndarray,
+    worth: np.ndarray,
+    known: np.ndarray,
+    rows: int,
+    lattice: int,
+    weights: np.ndarray,
+    price: np.ndarray,
+    errors: np.ndarray,
     together: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, M) int8 symbols of (H, W, M) numbers in steps, whose errors are worth as much as that; 0 where nothing is `known`; and how often
@@ -157,7 +203,11 @@ def _search(
     V, R = np.zeros((W + 4, STATES), np.int64), np.zeros((W + 4, STATES), np.int64)  # of the survivor that ends there
     U = np.zeros((W + 2, STATES), np.float32)
     cost, before = np.zeros(STATES), np.zeros(STATES)
-    came, context, missed = np.zeros((W, STATES), np.int64), np.zeros((W, STATES), np.int64), np.zeros((W, STATES), np.int64)
+    came, context, missed = (
+        np.zeros((W, STATES), np.int64),
+        np.zeros((W, STATES), np.int64),
+        np.zeros((W, STATES), np.int64),
+    )
     for m in range(M):
         outside_others = others(errors, together, m)
         for y in range(H):
@@ -177,8 +227,11 @@ def _search(
                 before, cost = cost, before
                 cost[:] = np.inf
                 root, here = math.sqrt(worth[y, x, m]), errors[y + 1, x + 1, m]
-                outside = outside_others[y, x] + BESIDE * (errors[y, x + 1, m] + errors[y + 2, x + 1, m]) + ACROSS * (
-                    errors[y, x, m] + errors[y, x + 2, m] + errors[y + 2, x, m] + errors[y + 2, x + 2, m])
+                outside = (
+                    outside_others[y, x]
+                    + BESIDE * (errors[y, x + 1, m] + errors[y + 2, x + 1, m])
+                    + ACROSS * (errors[y, x, m] + errors[y, x + 2, m] + errors[y + 2, x, m] + errors[y + 2, x + 2, m])
+                )
                 for s in range(STATES):
                     if before[s] == np.inf:
                         continue
@@ -192,8 +245,19 @@ def _search(
                         cost[s], came[x, s], U[x + 1, s] = before[s] + 2 * here * BESIDE * U[x, s], s, here
                         continue
                     if own == 0:  # nothing is above but what is to the left
-                        v1[x:x + 5], v2[x:x + 5], r1[x:x + 5], r2[x:x + 5] = w, w, rw, rw
-                        look_above(sets, v1[x:], v2[x:], r1[x:], r2[x:], past[x:], m, leaning[:, x:x + 1], steep[x:x + 1], restless[x:x + 1])
+                        v1[x : x + 5], v2[x : x + 5], r1[x : x + 5], r2[x : x + 5] = w, w, rw, rw
+                        look_above(
+                            sets,
+                            v1[x:],
+                            v2[x:],
+                            r1[x:],
+                            r2[x:],
+                            past[x:],
+                            m,
+                            leaning[:, x : x + 1],
+                            steep[x : x + 1],
+                            restless[x : x + 1],
+                        )
                     predicted, gradient = predict(sets, classes, w, ww, int(v1[X - 1]), x, leaning, steep)
                     active, odd = activity(restless[x], rw, rww, gradient, m), s & 1 if lattice != ANY else 0
                     kind = TRELLIS if lattice == AROUND and active >= FLAT else lattice
@@ -205,7 +269,12 @@ def _search(
                     away = best - whole
                     size = int((abs(away) + (1 if odd and kind == AROUND else 0)) / apart)
                     inside = size if away > 0 else -size
-                    for error in (inside - 1, inside, inside + 1, 0):  # those around it, the next that costs less, what is foreseen
+                    for error in (
+                        inside - 1,
+                        inside,
+                        inside + 1,
+                        0,
+                    ):  # those around it, the next that costs less, what is foreseen
                         value = whole + meant(error, kind, odd)
                         if not SYMBOL_MIN <= value <= SYMBOL_MAX:
                             continue
@@ -224,7 +293,7 @@ def _search(
                     errors[y + 1, x + 1, m] = U[x + 1, s]
                     counts[context[x, s], missed[x, s]] += 1
                 s = came[x, s]
-            v0[W + 2:], r0[W + 2:] = v0[W + 1], r0[W + 1]
+            v0[W + 2 :], r0[W + 2 :] = v0[W + 1], r0[W + 1]
             if own > 0:
                 remember(cross[y - 1], r2, r1, r0, m)
             if own == rows - 1 or y == H - 1:

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-
 from kpc.format.common.cli import written_aside
 from kpc.format.common.errors import TrainingError
 
@@ -20,4 +19,6 @@ def save_state(path: Path, state: dict[str, Any], remedy: str) -> None:
             torch.save(state, aside)
     except (OSError, RuntimeError) as error:  # PyTorch reports a full disk as RuntimeError
         reason = error.strerror if isinstance(error, OSError) else str(error).partition("\n")[0]
-        raise TrainingError(f"{path}: the checkpoint cannot be written ({reason}); free space there, or {remedy}") from error
+        raise TrainingError(
+            f"{path}: the checkpoint cannot be written ({reason}); free space there, or {remedy}"
+        ) from error

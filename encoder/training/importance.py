@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from functools import reduce
 
 import numpy as np
-
 from kpc.encoder.datasets import Dataset
 
 SMALLEST_TILE = 8
@@ -44,7 +43,9 @@ class TileWeights:
         pictures = dataset.pictures
         self.train = np.flatnonzero(~pictures.is_test)
         self.tile = SMALLEST_TILE
-        while (tiles := self._tiles()).sum() > MOST_TILES and self.tile < max(pictures.width.max(), pictures.height.max()):
+        while (tiles := self._tiles()).sum() > MOST_TILES and self.tile < max(
+            pictures.width.max(), pictures.height.max()
+        ):
             self.tile *= 2
         self.across = -(-pictures.width[self.train] // self.tile)
         self.ends = np.cumsum(tiles)
@@ -140,7 +141,9 @@ def largest_change(pictures: np.ndarray, radius: int) -> np.ndarray:
     """
     above = _running(np.maximum, pictures, radius) - pictures
     below = pictures - _running(np.minimum, pictures, radius)
-    return reduce(np.maximum, np.moveaxis(np.maximum(above, below), 3, 0))  # max(axis=3) takes four times as long in all
+    return reduce(
+        np.maximum, np.moveaxis(np.maximum(above, below), 3, 0)
+    )  # max(axis=3) takes four times as long in all
 
 
 def _running(extreme: np.ufunc, values: np.ndarray, radius: int) -> np.ndarray:

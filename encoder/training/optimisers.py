@@ -11,13 +11,12 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-
 from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig, Variation
 from kpc.encoder.field.field import Field, appearance_priors, motion_priors, priors
 from kpc.encoder.field.proposals import Level, Proposals, histogram_loss
-from kpc.encoder.training.cuda_graphs import Recorder
 from kpc.encoder.field.render import Rays, Samples, collected, fused_features, meet, reached, samples_of, shade
+from kpc.encoder.training.cuda_graphs import Recorder
 from kpc.format.scene.scene import SPACE_PLANES
 from kpc.format.scene.space import Contraction, SpaceMapping
 
@@ -56,7 +55,7 @@ def kept_channels(field: Field, config: TrainConfig, step: int, fraction: float)
     factors = np.full((scales, M), M / (M - dropped), np.float32)
     factors[:, rng.permutation(M)[:dropped]] = 0
     if scales > 1 and rng.random() < config.scale_dropout:
-        factors[rng.integers(1, scales):] = 0
+        factors[rng.integers(1, scales) :] = 0
     if fraction < config.coarse_until:
         factors[1:] = 0
     return torch.from_numpy(factors.ravel())
@@ -71,7 +70,9 @@ class FusedOptimiser:
         self.field, self.config, self.mapping = field, config, mapping
         self.watch = Stopwatch()
         self.workers = numba.get_num_threads()  # starts numba's threads, which would undo the next line
-        torch.set_num_threads(1)  # the decoder is so small that sharing it out costs more, a hundredfold on a busy machine
+        torch.set_num_threads(
+            1
+        )  # the decoder is so small that sharing it out costs more, a hundredfold on a busy machine
         self.theta = field.theta.detach().numpy()
         self.grad = np.zeros((self.workers, self.theta.size), np.float32)
         self.mean, self.square = np.zeros_like(self.theta), np.zeros_like(self.theta)
@@ -85,8 +86,16 @@ class FusedOptimiser:
         return peaks
 
     def step(
-        self, number: int, fraction: float, rate: float, batch: Rays, targets: torch.Tensor,
-        aabb: np.ndarray, occupancy: np.ndarray, step_length: float, extent: float,
+        self,
+        number: int,
+        fraction: float,
+        rate: float,
+        batch: Rays,
+        targets: torch.Tensor,
+        aabb: np.ndarray,
+        occupancy: np.ndarray,
+        step_length: float,
+        extent: float,
     ) -> tuple[float, float]:
         """Mean squared error a colour channel, and samples a ray, of step `number` at a fraction of the run, with learning rates times
         `rate`."""
@@ -108,15 +117,38 @@ class FusedOptimiser:
             moving = motion is not None and number % config.motion_every == 0
         with self.watch("kernel"):
             errors, counts = kernels.backpropagate(
-                self.theta, self.grad, layout.table[:scales], layout.resolution[:scales], density.numpy(), grad_density,
-                layout.channels, motion, grad_motion, moving, aabb, kernels.even_of(self.mapping), occupancy.view(np.uint8),
-                np.float32(step_length), np.float32(extent), batch.origins.numpy(), batch.directions.numpy(), batch.times.numpy(),
-                batch.jitters.numpy(), basis.detach().numpy(), grad_basis, targets.numpy(), batch.backgrounds.numpy(),
-                self._peaks, np.float32(config.distortion), sample_capacity(aabb, step_length, self.mapping),
+                self.theta,
+                self.grad,
+                layout.table[:scales],
+                layout.resolution[:scales],
+                density.numpy(),
+                grad_density,
+                layout.channels,
+                motion,
+                grad_motion,
+                moving,
+                aabb,
+                kernels.even_of(self.mapping),
+                occupancy.view(np.uint8),
+                np.float32(step_length),
+                np.float32(extent),
+                batch.origins.numpy(),
+                batch.directions.numpy(),
+                batch.times.numpy(),
+                batch.jitters.numpy(),
+                basis.detach().numpy(),
+                grad_basis,
+                targets.numpy(),
+                batch.backgrounds.numpy(),
+                self._peaks,
+                np.float32(config.distortion),
+                sample_capacity(aabb, step_length, self.mapping),
             )
         with self.watch("priors"):
             if number % config.regularise_every == 0:
-                add_priors(self.field, self.theta, self.grad[0], config, config.variation(fraction), config.regularise_every)
+                add_priors(
+                    self.field, self.theta, self.grad[0], config, config.variation(fraction), config.regularise_every
+                )
         with self.watch("decoder"):
             self.decoder.zero_grad()
             basis.backward(torch.from_numpy(grad_basis if config.view_dependent else grad_basis.sum(0, keepdims=True)))
@@ -132,13 +164,26 @@ class FusedOptimiser:
             _set_rate(self.decoder, rate)
             self.decoder.step()
         with self.watch("adam"):
-            kernels.adam(self.theta, self.grad, self.mean, self.square, config.learning_rate * rate, BETA1, BETA2, EPSILON,
-                         number + 1)
+            kernels.adam(
+                self.theta,
+                self.grad,
+                self.mean,
+                self.square,
+                config.learning_rate * rate,
+                BETA1,
+                BETA2,
+                EPSILON,
+                number + 1,
+            )
         return float(errors.mean(dtype=np.float64)) / 3, float(counts.mean())
 
     def state(self) -> dict[str, Any]:
-        return {"mean": torch.from_numpy(self.mean), "square": torch.from_numpy(self.square),
-                "peaks": torch.from_numpy(self._peaks.max(0)), "decoder": self.decoder.state_dict()}
+        return {
+            "mean": torch.from_numpy(self.mean),
+            "square": torch.from_numpy(self.square),
+            "peaks": torch.from_numpy(self._peaks.max(0)),
+            "decoder": self.decoder.state_dict(),
+        }
 
     def load(self, state: dict[str, Any]) -> None:
         self.mean[:], self.square[:] = state["mean"].numpy(), state["square"].numpy()
@@ -196,8 +241,14 @@ class PlainOptimiser:
     """
 
     def __init__(
-        self, field: Field, config: TrainConfig, cells: tuple[int, int, int], mapping: SpaceMapping | None = None, *,
-        fused: bool = False, proposals: Proposals | None = None,
+        self,
+        field: Field,
+        config: TrainConfig,
+        cells: tuple[int, int, int],
+        mapping: SpaceMapping | None = None,
+        *,
+        fused: bool = False,
+        proposals: Proposals | None = None,
     ) -> None:
         self.field, self.config, self.mapping, self.proposals = field, config, mapping, proposals
         self.watch = Stopwatch()
@@ -220,7 +271,14 @@ class PlainOptimiser:
             each.mixed = config.mixed_precision and self._on_gpu
         self.planes = _adam([([each.theta for each in self.fields], config.learning_rate)])
         self.decoder = _decoder_optimiser(field, config, [each.density for each in self.fields[1:]])
-        self._recorder = Recorder([p for optimiser in (self.planes, self.decoder) for group in optimiser.param_groups for p in group["params"]])
+        self._recorder = Recorder(
+            [
+                p
+                for optimiser in (self.planes, self.decoder)
+                for group in optimiser.param_groups
+                for p in group["params"]
+            ]
+        )
 
     @contextlib.contextmanager
     def as_written(self) -> Iterator[None]:
@@ -238,16 +296,29 @@ class PlainOptimiser:
         return peaks
 
     def step(
-        self, number: int, fraction: float, rate: float, batch: Rays, targets: torch.Tensor,
-        aabb: np.ndarray, occupancy: np.ndarray, step_length: float, extent: float,
+        self,
+        number: int,
+        fraction: float,
+        rate: float,
+        batch: Rays,
+        targets: torch.Tensor,
+        aabb: np.ndarray,
+        occupancy: np.ndarray,
+        step_length: float,
+        extent: float,
     ) -> tuple[float, float]:
         """As `FusedOptimiser.step`."""
         config, rays = self.config, len(targets)
         variation = config.variation(fraction) if number % config.regularise_every == 0 else None
         most = sample_capacity(aabb, step_length, self.mapping)
         plan = Plan(
-            number if self.proposals is not None else 0, step_length, extent,
-            self.field.motion is not None and number % config.motion_every == 0, variation, most, self._rooms_for(rays, most) if self._on_gpu else None,
+            number if self.proposals is not None else 0,
+            step_length,
+            extent,
+            self.field.motion is not None and number % config.motion_every == 0,
+            variation,
+            most,
+            self._rooms_for(rays, most) if self._on_gpu else None,
         )
         with self.watch("moves"):
             if self._aabb is None:
@@ -280,7 +351,12 @@ class PlainOptimiser:
         return squared_error, self._reached_a_ray
 
     def _backpropagate(
-        self, plan: Plan, packed: torch.Tensor, kept: torch.Tensor, occupancy: torch.Tensor, appearances: torch.Tensor | None = None
+        self,
+        plan: Plan,
+        packed: torch.Tensor,
+        kept: torch.Tensor,
+        occupancy: torch.Tensor,
+        appearances: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Give every parameter its gradient, and cells their peaks. Returns the mean squared error, and samples a ray, taken and reached."""
         field, config = self.field, self.config
@@ -291,7 +367,8 @@ class PlainOptimiser:
             samples = self._samples(plan, batch, occupancy)
         else:
             samples, edges, levels = self.proposals.sample(
-                batch, self._aabb, self.mapping, tuple(self._peaks.shape), plan.number, self.fused)
+                batch, self._aabb, self.mapping, tuple(self._peaks.shape), plan.number, self.fused
+            )
         taken = (samples.length > 0).sum()
         if plan.rooms is not None and self.proposals is None:
             # What lies behind the end of its ray takes no part: half of the samples, of which the gradient is spared.
@@ -324,7 +401,9 @@ class PlainOptimiser:
             return collected(batch, self._aabb.numpy(), occupancy.numpy(), plan.step_length, self.mapping)
         if plan.rooms is None:
             return samples_of(batch, self._aabb, occupancy, plan.step_length, self.mapping)
-        return samples_of(batch, self._aabb, occupancy, plan.step_length, self.mapping, most=plan.most, capacity=plan.rooms[0])
+        return samples_of(
+            batch, self._aabb, occupancy, plan.step_length, self.mapping, most=plan.most, capacity=plan.rooms[0]
+        )
 
     def _rooms_for(self, rays: int, most: int) -> tuple[int, int]:
         """For how many samples that are taken, and that are reached, there is room, given how many there lately were: as before as long as
@@ -343,8 +422,12 @@ class PlainOptimiser:
         return values.pin_memory().to(self.device, non_blocking=True) if self._on_gpu else values
 
     def state(self) -> dict[str, Any]:
-        return {"planes": self.planes.state_dict(), "decoder": self.decoder.state_dict(), "peaks": self._peaks,
-                "proposals": self.proposals and self.proposals.state_dict()}
+        return {
+            "planes": self.planes.state_dict(),
+            "decoder": self.decoder.state_dict(),
+            "peaks": self._peaks,
+            "proposals": self.proposals and self.proposals.state_dict(),
+        }
 
     def load(self, state: dict[str, Any]) -> None:
         self._peaks.copy_(state["peaks"])
@@ -356,13 +439,21 @@ class PlainOptimiser:
 
 def _packed(batch: Rays, targets: torch.Tensor) -> torch.Tensor:
     """Rays and their targets in one tensor (N, 14): each move to a device takes its time, however little it moves."""
-    columns = (batch.origins, batch.directions, batch.backgrounds, targets, batch.times[:, None], batch.jitters[:, None])
+    columns = (
+        batch.origins,
+        batch.directions,
+        batch.backgrounds,
+        targets,
+        batch.times[:, None],
+        batch.jitters[:, None],
+    )
     return torch.cat(columns, dim=1)
 
 
 def _unpacked(packed: torch.Tensor, appearances: torch.Tensor | None) -> tuple[Rays, torch.Tensor]:
     origins, directions, backgrounds, targets, times, jitters = (
-        part.contiguous() for part in packed.split([3, 3, 3, 3, 1, 1], dim=1))
+        part.contiguous() for part in packed.split([3, 3, 3, 3, 1, 1], dim=1)
+    )
     return Rays(origins, directions, times[:, 0], jitters[:, 0], backgrounds, appearances), targets
 
 
@@ -370,7 +461,9 @@ def _total(weighed: dict[str, torch.Tensor]) -> torch.Tensor:
     return torch.stack(list(weighed.values())).sum()
 
 
-def add_priors(field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, variation: Variation, times: float) -> None:
+def add_priors(
+    field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, variation: Variation, times: float
+) -> None:
     """Add `times` the gradient of `kpc.encoder.field.field.priors` to grad."""
     M = field.layout.channels
     space, transient, steep = times * variation.space, times * variation.transient, variation.steep
@@ -388,8 +481,14 @@ def log_densities(field: Field, points: np.ndarray, times: np.ndarray) -> np.nda
     """Log densities at (N, 3) points in [0, 1]^3 and (N,) times, on the CPU."""
     layout = field.layout
     return kernels.log_densities(
-        field.theta.detach().numpy(), layout.table, layout.resolution, field.density.detach().numpy(),
-        layout.channels, motion_of(field), np.asarray(points, np.float32), np.asarray(times, np.float32),
+        field.theta.detach().numpy(),
+        layout.table,
+        layout.resolution,
+        field.density.detach().numpy(),
+        layout.channels,
+        motion_of(field),
+        np.asarray(points, np.float32),
+        np.asarray(times, np.float32),
         8 * numba.get_num_threads(),
     )
 
@@ -401,7 +500,11 @@ def motion_of(field: Field) -> np.ndarray | None:
 
 def sample_capacity(aabb: np.ndarray, step_length: float, mapping: SpaceMapping | None = None) -> int:
     """Samples a ray can take at most: the box's diagonal in steps, or all of a ray through contracted space."""
-    longest = np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64)) if not isinstance(mapping, Contraction) else mapping.end
+    longest = (
+        np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64))
+        if not isinstance(mapping, Contraction)
+        else mapping.end
+    )
     return int(longest / step_length) + 2
 
 
@@ -418,8 +521,12 @@ def _decoder_optimiser(
 def _adam(groups: list[tuple[list[torch.nn.Parameter], float]]) -> torch.optim.Adam:
     """For groups of parameters and the peak of the learning rate of each."""
     on_gpu = groups[0][0][0].is_cuda
-    return torch.optim.Adam([{"params": parameters, "peak": peak, "lr": peak} for parameters, peak in groups],
-                            betas=(BETA1, BETA2), eps=EPSILON, fused=on_gpu)
+    return torch.optim.Adam(
+        [{"params": parameters, "peak": peak, "lr": peak} for parameters, peak in groups],
+        betas=(BETA1, BETA2),
+        eps=EPSILON,
+        fused=on_gpu,
+    )
 
 
 def _set_rate(optimiser: torch.optim.Adam, rate: float) -> None:

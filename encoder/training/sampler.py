@@ -4,10 +4,9 @@ import math
 
 import numpy as np
 import torch
-
 from kpc.encoder.datasets import Dataset, rays
-from kpc.encoder.training.importance import TileWeights
 from kpc.encoder.field.render import Rays
+from kpc.encoder.training.importance import TileWeights
 from kpc.format.scene.space import SpaceMapping
 
 
@@ -36,7 +35,11 @@ class RaySampler:
             self.frame_ends = np.cumsum(sizes)
 
     def draw(
-        self, rng: np.random.Generator, count: int, background: np.ndarray | None = None, object_rays: float = 0.0,
+        self,
+        rng: np.random.Generator,
+        count: int,
+        background: np.ndarray | None = None,
+        object_rays: float = 0.0,
         weights: TileWeights | None = None,
     ) -> tuple[Rays, torch.Tensor]:
         """`count` rays and the (count, 3) colours they should have, over one background or one drawn for each ray.
@@ -80,8 +83,12 @@ class RaySampler:
         if not len(rows):
             return 0, 0, 0, 0
         (height, width), margin = alpha.shape, math.ceil(self.MARGIN * max(alpha.shape))
-        return (max(columns[0] - margin, 0), min(columns[-1] + 1 + margin, width),
-                max(rows[0] - margin, 0), min(rows[-1] + 1 + margin, height))
+        return (
+            max(columns[0] - margin, 0),
+            min(columns[-1] + 1 + margin, width),
+            max(rows[0] - margin, 0),
+            min(rows[-1] + 1 + margin, height),
+        )
 
 
 def _pick(rng: np.random.Generator, ends: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

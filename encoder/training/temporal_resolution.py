@@ -9,9 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-
-from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.datasets import Dataset
+from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows
 from kpc.encoder.training.importance import cameras_stand_still, faded, of_each_camera
 
@@ -102,8 +101,9 @@ def measure(dataset: Dataset, tolerance: float) -> TimeResolution | None:
     # A row for every frame leaves nothing, whatever rounding says.
     within = next((k for k, error in enumerate(errors) if k and error > tolerance), len(spacings)) - 1
     beyond = float(errors[within + 1]) if within + 1 < len(spacings) else float("nan")
-    return TimeResolution(spacings[within], float(errors[within]), beyond, float(np.sqrt(np.mean(noises))),
-                          changing / max(pixels, 1))
+    return TimeResolution(
+        spacings[within], float(errors[within]), beyond, float(np.sqrt(np.mean(noises))), changing / max(pixels, 1)
+    )
 
 
 def _spacings(frame_count: int) -> list[int]:

@@ -4,10 +4,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-
-from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer
+from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.scene.space import DeviceCoordinates
 
@@ -26,8 +25,13 @@ MARGIN = 0.04
 
 
 def trim_box(
-    dataset: Dataset, config: TrainConfig, aabb: np.ndarray, report: Callable[[Report], None], *,
-    time_budget_s: float | None = None, mapping: DeviceCoordinates | None = None,
+    dataset: Dataset,
+    config: TrainConfig,
+    aabb: np.ndarray,
+    report: Callable[[Report], None],
+    *,
+    time_budget_s: float | None = None,
+    mapping: DeviceCoordinates | None = None,
 ) -> tuple[np.ndarray, float]:
     """The part of a (2, 3) box that holds what the pictures show, and the seconds it took to find out.
 
@@ -41,8 +45,20 @@ def trim_box(
     steps = min(MOST_STEPS, config.steps // 10)
     if time_budget_s is None and steps < LEAST_STEPS:
         return aabb, 0.0
-    coarse = replace(config, hybrid=False, summed=False, resolutions=(32, 64), channels=8, motion_cells=0, channel_dropout=0.0,
-                     temporal_start=1.0, samples_across=160, cells_across=64, steps=steps, occupancy_start=64)
+    coarse = replace(
+        config,
+        hybrid=False,
+        summed=False,
+        resolutions=(32, 64),
+        channels=8,
+        motion_cells=0,
+        channel_dropout=0.0,
+        temporal_start=1.0,
+        samples_across=160,
+        cells_across=64,
+        steps=steps,
+        occupancy_start=64,
+    )
     trainer = Trainer(dataset, coarse, aabb, "cpu", mapping=mapping)
     trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10, most_steps=MOST_STEPS)
     if trainer.step < LEAST_STEPS:

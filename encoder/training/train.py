@@ -11,17 +11,25 @@ from typing import Any
 
 import numpy as np
 import torch
-
+from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.appearances import number_pictures
 from kpc.encoder.field.bounds import seen_cells
-from kpc.encoder.training.checkpoint import save_state
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.datasets import Dataset
-from kpc.encoder.field.field import Field, HybridField, SummedField, appearance_priors, motion_nodes, motion_priors, plan_layout, priors
-from kpc.encoder.training.importance import TileWeights, cameras_stand_still
+from kpc.encoder.field.field import (
+    Field,
+    HybridField,
+    SummedField,
+    appearance_priors,
+    motion_nodes,
+    motion_priors,
+    plan_layout,
+    priors,
+)
 from kpc.encoder.field.occupancy_grid import OccupancyGrid, grid_shape
-from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser, log_densities
 from kpc.encoder.field.proposals import Proposals
+from kpc.encoder.training.checkpoint import save_state
+from kpc.encoder.training.importance import TileWeights, cameras_stand_still
+from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser, log_densities
 from kpc.encoder.training.sampler import RaySampler
 from kpc.format.common.errors import TrainingError
 from kpc.format.common.fidelity import psnr_of
@@ -49,13 +57,20 @@ class Trainer:
     """
 
     def __init__(
-        self, dataset: Dataset, config: TrainConfig, aabb: np.ndarray, device: str, elapsed_s: float = 0.0,
+        self,
+        dataset: Dataset,
+        config: TrainConfig,
+        aabb: np.ndarray,
+        device: str,
+        elapsed_s: float = 0.0,
         mapping: SpaceMapping | None = None,
     ) -> None:
         self.dataset, self.config, self.device, self.mapping = dataset, config, torch.device(device), mapping
         self.aabb = np.asarray(aabb, np.float32)
         self.extent = float(np.max(self.aabb[1] - self.aabb[0]))
-        steps_across = config.samples_across / (2 if isinstance(mapping, Contraction) else 1)  # a box is half of contracted space
+        steps_across = config.samples_across / (
+            2 if isinstance(mapping, Contraction) else 1
+        )  # a box is half of contracted space
         self.step_length = self.extent / steps_across
         self.rng = np.random.default_rng(config.seed)
         layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
@@ -73,11 +88,13 @@ class Trainer:
         self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape, mapping), threshold)
         self.slots = min(config.occupancy_slots, dataset.clip.frame_count) if dataset.is_dynamic else 1
         on_cpu = self.device.type == "cpu"
-        proposals = Proposals(config, self.aabb, dataset.clip, dataset.is_dynamic).to(self.device) if config.proposals else None
+        proposals = (
+            Proposals(config, self.aabb, dataset.clip, dataset.is_dynamic).to(self.device) if config.proposals else None
+        )
         self.optimiser: FusedOptimiser | PlainOptimiser = (
             FusedOptimiser(self.field, config, shape, mapping)
-            if on_cpu and proposals is None and not (config.hybrid or config.summed) else
-            PlainOptimiser(self.field, config, shape, mapping, fused=on_cpu, proposals=proposals)
+            if on_cpu and proposals is None and not (config.hybrid or config.summed)
+            else PlainOptimiser(self.field, config, shape, mapping, fused=on_cpu, proposals=proposals)
         )
         self.watch = self.optimiser.watch
         self.step = 0
@@ -91,8 +108,13 @@ class Trainer:
         self._steady_rays, self._steady_s = 0, 0.0
 
     def run(
-        self, report: Callable[[Report], None], checkpoint: Path | None = None, *,
-        time_budget_s: float | None = None, most_steps: int | None = None, checkpoint_every_s: float = 60.0,
+        self,
+        report: Callable[[Report], None],
+        checkpoint: Path | None = None,
+        *,
+        time_budget_s: float | None = None,
+        most_steps: int | None = None,
+        checkpoint_every_s: float = 60.0,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
         """Train until `config.steps`, or for `time_budget_s` seconds of training where given, and `most_steps` at most then.
@@ -112,7 +134,11 @@ class Trainer:
             with self.watch("occupancy"):
                 if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
                     self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
-                if self.slots > 1 and self.step >= 4 * config.occupancy_start and self.step % config.occupancy_split_every == 0:
+                if (
+                    self.slots > 1
+                    and self.step >= 4 * config.occupancy_start
+                    and self.step % config.occupancy_split_every == 0
+                ):
                     self.grid.split(self.density_at, self.slots, self.rng)
             count = self.rays_a_step
             background = None if self.dataset.has_alpha else self.background
@@ -121,8 +147,15 @@ class Trainer:
                 batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays, weights)
             rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
             squared_error, samples = self.optimiser.step(
-                self.step, fraction, rate, batch, targets, self.aabb, self.grid.marched,
-                self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1), self.extent,
+                self.step,
+                fraction,
+                rate,
+                batch,
+                targets,
+                self.aabb,
+                self.grid.marched,
+                self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1),
+                self.extent,
             )
             if not math.isfinite(squared_error):
                 raise TrainingError(f"step {self.step}: {self._not_finite()}; try another --seed or --preset")
@@ -135,8 +168,17 @@ class Trainer:
                 self._steady_rays, self._steady_s = self._steady_rays + count, self._steady_s + now - started
             if now - since > 0.5:
                 psnr = psnr_of(error / drawn)
-                report(Report(self.step, self._fraction(time_budget_s, most_steps), psnr, drawn / (now - since),
-                              self.samples_per_ray, float(self.grid.occupied.mean()), self.elapsed_s))
+                report(
+                    Report(
+                        self.step,
+                        self._fraction(time_budget_s, most_steps),
+                        psnr,
+                        drawn / (now - since),
+                        self.samples_per_ray,
+                        float(self.grid.occupied.mean()),
+                        self.elapsed_s,
+                    )
+                )
                 error, drawn, since = 0.0, 0, now
             if checkpoint is not None and now - saved > checkpoint_every_s:
                 self._try_to_save(checkpoint)
@@ -176,7 +218,8 @@ class Trainer:
         if occupancy is None:
             occupancy = self.grid.marched
         return self.field.to_scene(
-            self.aabb, self.dataset.clip, occupancy, self.background, self.step_length, self.mapping, self.names)
+            self.aabb, self.dataset.clip, occupancy, self.background, self.step_length, self.mapping, self.names
+        )
 
     def _weights_at(self, fraction: float) -> TileWeights | None:
         """What decides which rays are drawn at this share of the run; it follows from the dataset, so no checkpoint holds it."""
@@ -194,11 +237,20 @@ class Trainer:
     def _not_finite(self) -> str:
         """Which terms of the loss hold NaN or infinity, the colours being one of them, and which parameters they come from."""
         field, config = self.field, self.config
-        weighed = priors(field, config, config.variation(0.0)) | motion_priors(field, config) | appearance_priors(field, config)
+        weighed = (
+            priors(field, config, config.variation(0.0))
+            | motion_priors(field, config)
+            | appearance_priors(field, config)
+        )
         terms = ["colour"] + [name for name, value in weighed.items() if not torch.isfinite(value)]
-        planes = [f"{name} at scale {s}" for s, name, *_ in self.field.layout.planes()
-                  if not torch.isfinite(self.field.plane(s, name)).all()]
-        decoder = [name for name, value in self.field.named_parameters() if name != "theta" and not torch.isfinite(value).all()]
+        planes = [
+            f"{name} at scale {s}"
+            for s, name, *_ in self.field.layout.planes()
+            if not torch.isfinite(self.field.plane(s, name)).all()
+        ]
+        decoder = [
+            name for name, value in self.field.named_parameters() if name != "theta" and not torch.isfinite(value).all()
+        ]
         found = ", ".join((planes + decoder)[:6])
         return f"the loss is not finite ({', '.join(terms)})" + (f", nor are all values of {found}" if found else "")
 
@@ -208,7 +260,9 @@ class Trainer:
             return log_densities(self.field, points, times)
         out = []
         with torch.no_grad():
-            for p, t in zip(np.array_split(points, len(points) // 2**18 + 1), np.array_split(times, len(times) // 2**18 + 1)):
+            for p, t in zip(
+                np.array_split(points, len(points) // 2**18 + 1), np.array_split(times, len(times) // 2**18 + 1)
+            ):
                 features = self.optimiser.features(*(torch.from_numpy(np.float32(a)).to(self.device) for a in (p, t)))
                 out.append(self.field.decode(features)[0].cpu().numpy())
         return np.concatenate(out)
@@ -220,10 +274,17 @@ class Trainer:
             TrainingError: it cannot be written; an earlier checkpoint is left as it was.
         """
         state = {
-            "config": asdict(self.config), "aabb": torch.from_numpy(self.aabb), "step": self.step, "elapsed_s": self.elapsed_s,
+            "config": asdict(self.config),
+            "aabb": torch.from_numpy(self.aabb),
+            "step": self.step,
+            "elapsed_s": self.elapsed_s,
             "mapping": repr(self.mapping),
-            "samples_per_ray": self.samples_per_ray, "field": self.field.state_dict(), "optimiser": self.optimiser.state(),
-            "grid": self.grid.state(), "rng": _rng_to_plain(self.rng), "dataset": _fingerprint(self.dataset),
+            "samples_per_ray": self.samples_per_ray,
+            "field": self.field.state_dict(),
+            "optimiser": self.optimiser.state(),
+            "grid": self.grid.state(),
+            "rng": _rng_to_plain(self.rng),
+            "dataset": _fingerprint(self.dataset),
         }
         save_state(path, state, "give another folder with --work")
 
@@ -244,10 +305,14 @@ class Trainer:
             same = _comparable(state["config"]) == _comparable(asdict(self.config))
             here = np.array_equal(state["aabb"].cpu().numpy(), self.aabb) and state.get("mapping") == repr(self.mapping)
             if not same or not here:
-                raise TrainingError(f"{path}: belongs to a run with other settings; give the same ones or drop --resume")
+                raise TrainingError(
+                    f"{path}: belongs to a run with other settings; give the same ones or drop --resume"
+                )
             if state["dataset"] != _fingerprint(self.dataset):
-                raise TrainingError(f"{path}: belongs to a run on other pictures; give the same dataset, --holdout and "
-                                    "--downscale, or drop --resume")
+                raise TrainingError(
+                    f"{path}: belongs to a run on other pictures; give the same dataset, --holdout and "
+                    "--downscale, or drop --resume"
+                )
             self.field.load_state_dict(state["field"])
             self.optimiser.load(state["optimiser"])
             self.grid.load(state["grid"])
@@ -286,8 +351,11 @@ def _unusable(path: Path, error: Exception) -> TrainingError:
 
 def _comparable(config: dict[str, Any]) -> dict[str, Any]:
     """A config without what may differ between a run and its continuation."""
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in config.items()
-            if key not in ("steps", "prune_share", "tune_steps")}
+    return {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in config.items()
+        if key not in ("steps", "prune_share", "tune_steps")
+    }
 
 
 def _fingerprint(dataset: Dataset) -> str:
@@ -303,10 +371,18 @@ def _fingerprint(dataset: Dataset) -> str:
 
 def _rng_to_plain(rng: np.random.Generator) -> dict[str, str]:
     state = rng.bit_generator.state
-    return {"state": hex(state["state"]["state"]), "inc": hex(state["state"]["inc"]),
-            "has_uint32": str(state["has_uint32"]), "uinteger": str(state["uinteger"])}
+    return {
+        "state": hex(state["state"]["state"]),
+        "inc": hex(state["state"]["inc"]),
+        "has_uint32": str(state["has_uint32"]),
+        "uinteger": str(state["uinteger"]),
+    }
 
 
 def _rng_from_plain(plain: dict[str, str]) -> dict[str, Any]:
-    return {"bit_generator": "PCG64", "state": {"state": int(plain["state"], 16), "inc": int(plain["inc"], 16)},
-            "has_uint32": int(plain["has_uint32"]), "uinteger": int(plain["uinteger"])}
+    return {
+        "bit_generator": "PCG64",
+        "state": {"state": int(plain["state"], 16), "inc": int(plain["inc"], 16)},
+        "has_uint32": int(plain["has_uint32"]),
+        "uinteger": int(plain["uinteger"]),
+    }

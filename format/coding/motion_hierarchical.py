@@ -11,10 +11,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-
-from kpc.format.common.errors import FormatError
 from kpc.format.coding.motion_raster import CONTEXTS, DECISIONS, ESCAPES, MOST_DECISIONS, UNARY
 from kpc.format.coding.rans import compiled, counters, doublings, ended, inlined, integer, opened, stream
+from kpc.format.common.errors import FormatError
 
 WEIGHT_BITS = 6
 """Weights are multiples of 2^-WEIGHT_BITS."""
@@ -62,8 +61,13 @@ def passes(sizes: tuple[int, ...]) -> Iterator[Pass]:
                 gaps = [k for k in range(1, len(places)) if places[k] - places[k - 1] > 1]
                 new = [places[k - 1] + places[k] >> 1 for k in gaps]
                 around = [[places[i] if 0 <= i < len(places) else None for i in range(k - 2, k + 2)] for k in gaps]
-                yield told(axis, new, [[0 if place is None else place for place in four] for four in around],
-                           [cubic(middle, four) for middle, four in zip(new, around, strict=True)], level)
+                yield told(
+                    axis,
+                    new,
+                    [[0 if place is None else place for place in four] for four in around],
+                    [cubic(middle, four) for middle, four in zip(new, around, strict=True)],
+                    level,
+                )
 
 
 def cubic(middle: int, places: list[int | None]) -> list[int]:
@@ -74,7 +78,9 @@ def cubic(middle: int, places: list[int | None]) -> list[int]:
         for other in places:
             if own is not None and other is not None and other != own:
                 over, under = over * (middle - other), under * (own - other)
-        weights.append(0 if own is None else (2 * over + under) // (2 * under))  # rounded; signs of both may be negative
+        weights.append(
+            0 if own is None else (2 * over + under) // (2 * under)
+        )  # rounded; signs of both may be negative
     weights[1] += (1 << WEIGHT_BITS) - sum(weights)
     return weights
 
@@ -125,7 +131,9 @@ def walk(values, r, new, sides, weights, first, second, third, table, state, at,
                         predicted = foreseen(values, sides[n], weights[n], a, b, c, m)
                         context = context_of(r, new[n], sides[n], weights[n], beside, a, b, c, m)
                         error = values[new[n], a, b, c, m] - predicted
-                        error, state, at = integer(error, table, context * DECISIONS, UNARY, ESCAPES, state, at, words, trace)
+                        error, state, at = integer(
+                            error, table, context * DECISIONS, UNARY, ESCAPES, state, at, words, trace
+                        )
                         value = predicted + error
                         if not -32768 <= value <= 32767:
                             return state, at, False

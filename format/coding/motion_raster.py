@@ -10,10 +10,9 @@ Naming as in `kpc.format.coding.predictive`: r is by how much predictions missed
 """
 
 import numpy as np
-
-from kpc.format.common.errors import FormatError
-from kpc.format.coding.rans import compiled, counters, doublings, ended, inlined, integer, opened, stream
 from kpc.format.coding.predictive import FIT_VALUES, least_absolute
+from kpc.format.coding.rans import compiled, counters, doublings, ended, inlined, integer, opened, stream
+from kpc.format.common.errors import FormatError
 
 NEIGHBOURS = 15
 """Number k is one step back along time if its bit 3 is set, along z if bit 2, y bit 1, x bit 0; weight k - 1 is its own."""
@@ -54,7 +53,7 @@ def decode_nodes(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
     if len(body) < 2 * NEIGHBOURS:
         raise FormatError("motion: cut off within its weights")
     weights = np.stack([LORENZO, np.frombuffer(body, "<i2", NEIGHBOURS)]).astype(np.int64)
-    state, words = opened(body[2 * NEIGHBOURS:], "motion")
+    state, words = opened(body[2 * NEIGHBOURS :], "motion")
     symbols = np.zeros(shape, np.int16)
     state, at, fit = walk(symbols, weights, state, 0, words, None)
     if not fit:
@@ -95,7 +94,9 @@ def walk(symbols, weights, state, at, words, trace):
                         predicted = _predicted(symbols, inner, t, z, y, x, m)
                         context = _context(r, t, z, y, x, m)
                         error = int(symbols[t, z, y, x, m]) - predicted
-                        error, state, at = integer(error, table, context * DECISIONS, UNARY, ESCAPES, state, at, words, trace)
+                        error, state, at = integer(
+                            error, table, context * DECISIONS, UNARY, ESCAPES, state, at, words, trace
+                        )
                         value = predicted + error
                         if not -32768 <= value <= 32767:
                             return state, at, False

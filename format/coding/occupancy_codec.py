@@ -4,13 +4,23 @@ A cell is most often as its neighbours are, and as it was. Which of these agree 
 """
 
 import numpy as np
-
 from kpc.format.coding.rans import adapt, compiled, counters, ended, opened, stream
 
-NEIGHBOURS = np.array([
-    (0, 0, 0, -1), (0, 0, -1, 0), (0, -1, 0, 0), (0, -1, 1, 0), (0, 0, -1, 1), (0, -1, 0, 1),
-    (-1, 0, 0, 0), (-1, 0, 0, -1), (-1, 1, 0, 0), (-1, 0, -1, 0), (-1, -1, 0, 0),
-])
+NEIGHBOURS = np.array(
+    [
+        (0, 0, 0, -1),
+        (0, 0, -1, 0),
+        (0, -1, 0, 0),
+        (0, -1, 1, 0),
+        (0, 0, -1, 1),
+        (0, -1, 0, 1),
+        (-1, 0, 0, 0),
+        (-1, 0, 0, -1),
+        (-1, 1, 0, 0),
+        (-1, 0, -1, 0),
+        (-1, -1, 0, 0),
+    ]
+)
 """(slot, z, y, x) from a cell to those that make its context, the most significant bit first. `walk` has them row by row."""
 CONTEXTS = 1 << len(NEIGHBOURS)
 
@@ -56,8 +66,18 @@ def walk(cells, state, at, words, trace):
                 for x in range(X):
                     corners = 2 * int(north[x + 1]) + int(back[x + 1]) if x + 1 < X else 0
                     now = int(before[x])
-                    context = left << 10 | int(north[x]) << 9 | int(back[x]) << 8 | int(below[x]) << 7 | corners << 5 \
-                        | now << 4 | past << 3 | int(front[x]) << 2 | int(above[x]) << 1 | int(behind[x])
+                    context = (
+                        left << 10
+                        | int(north[x]) << 9
+                        | int(back[x]) << 8
+                        | int(below[x]) << 7
+                        | corners << 5
+                        | now << 4
+                        | past << 3
+                        | int(front[x]) << 2
+                        | int(above[x]) << 1
+                        | int(behind[x])
+                    )
                     left, state, at = adapt(int(here[x]), table, context, state, at, words, trace)
                     here[x] = left
                     past = now

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-
-from kpc.format.scene.cameras import Camera
 from kpc.format.common.errors import FormatError
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rotations import quaternion_of
 
 HEAD = struct.Struct("<HHb3i")
@@ -46,8 +45,10 @@ def rigid(cameras: Sequence[Camera]) -> bool:
 def rounded(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
     """`rigid` cameras with poses as they come back from a file."""
     exponent, corner, words = _as_words(_poses(cameras))
-    return tuple(replace(camera, camera_to_world=np.vstack([pose, [0, 0, 0, 1]]))
-                 for camera, pose in zip(cameras, _from_words(exponent, corner, words), strict=True))
+    return tuple(
+        replace(camera, camera_to_world=np.vstack([pose, [0, 0, 0, 1]]))
+        for camera, pose in zip(cameras, _from_words(exponent, corner, words), strict=True)
+    )
 
 
 def encode_poses(cameras: Sequence[Camera]) -> bytes | None:
@@ -83,11 +84,13 @@ def decode_poses(body: bytes, most: int) -> list[tuple[float, ...]]:
     if not 0 < count <= most:
         raise FormatError(f"came: {count} cameras (1 to {most} allowed)")
     if lens_count not in (1, count) or not FINEST <= exponent <= COARSEST:
-        raise FormatError(f"came: {lens_count} lenses of {count} cameras, or places in multiples of 2^{exponent}, make no sense")
+        raise FormatError(
+            f"came: {lens_count} lenses of {count} cameras, or places in multiples of 2^{exponent}, make no sense"
+        )
     start = HEAD.size + lens_count * LENS.size
     if len(body) != start + 2 * WORD * count:
         raise FormatError(f"came: {len(body):,} bytes are not those of {count} cameras and {lens_count} lenses")
-    lenses = list(LENS.iter_unpack(body[HEAD.size:start])) * (count // lens_count)
+    lenses = list(LENS.iter_unpack(body[HEAD.size : start])) * (count // lens_count)
     told = np.frombuffer(body, np.uint8, offset=start).reshape(-1, WORD)
     words = np.pad(told, ((0, 0), (0, 8 - WORD))).view("<u8").reshape(count, 2)
     poses = _from_words(exponent, np.array(corner, np.int64), words)
@@ -116,7 +119,9 @@ def _as_words(poses: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
     quaternions *= np.sign(quaternions[np.arange(len(poses)), largest])[:, None]
     others = quaternions[np.arange(4) != largest[:, None]].reshape(-1, 3)
     turns = np.rint(others * (np.sqrt(2) * ROOT)).astype(np.int64) + NOTHING
-    words = np.stack([_joined(turns) | largest.astype(np.uint64) << np.uint64(3 * BITS), _joined(multiples - corner)], axis=1)
+    words = np.stack(
+        [_joined(turns) | largest.astype(np.uint64) << np.uint64(3 * BITS), _joined(multiples - corner)], axis=1
+    )
     return exponent, corner, words
 
 
@@ -128,7 +133,9 @@ def _joined(numbers: np.ndarray) -> np.ndarray:
 
 def _parted(words: np.ndarray) -> np.ndarray:
     """What `_joined` undoes, (N, 3) int64."""
-    return (words[:, None] >> np.arange(0, 3 * BITS, BITS, dtype=np.uint64) & np.uint64((1 << BITS) - 1)).astype(np.int64)
+    return (words[:, None] >> np.arange(0, 3 * BITS, BITS, dtype=np.uint64) & np.uint64((1 << BITS) - 1)).astype(
+        np.int64
+    )
 
 
 def _from_words(exponent: int, corner: np.ndarray, words: np.ndarray) -> np.ndarray:
@@ -147,8 +154,13 @@ def _from_words(exponent: int, corner: np.ndarray, words: np.ndarray) -> np.ndar
     quaternions[is_largest], squares[is_largest] = np.sqrt(rest), rest
     quaternions[~is_largest], squares[~is_largest] = others.reshape(-1), (others**2).reshape(-1)
     (w, x, y, z), (_, xx, yy, zz) = quaternions.T, squares.T
-    axes = np.array([[ROOT**2 - (yy + zz), x * y - w * z, x * z + w * y], [x * y + w * z, ROOT**2 - (xx + zz), y * z - w * x],
-                     [x * z - w * y, y * z + w * x, ROOT**2 - (xx + yy)]])
+    axes = np.array(
+        [
+            [ROOT**2 - (yy + zz), x * y - w * z, x * z + w * y],
+            [x * y + w * z, ROOT**2 - (xx + zz), y * z - w * x],
+            [x * z - w * y, y * z + w * x, ROOT**2 - (xx + yy)],
+        ]
+    )
     places = np.ldexp((corner + _parted(words[:, 1])).astype(np.float64), exponent)
     poses = np.concatenate([np.moveaxis(axes, -1, 0) / ROOT**2, places[:, :, None]], axis=2)
     single: np.ndarray = poses.astype(np.float32).astype(np.float64) + 0.0  # no 0 has a sign

@@ -33,9 +33,8 @@ Naming, throughout this module
 from dataclasses import dataclass
 
 import numpy as np
-
-from kpc.format.common.errors import FormatError
 from kpc.format.coding.rans import adapt, compiled, counters, ended, inlined, integer, opened, stream
+from kpc.format.common.errors import FormatError
 
 SET_COUNTS = (1, 2, 4, 8)
 """How many sets of weights a segment may store."""
@@ -67,7 +66,9 @@ UNKNOWN = 16
 
 SLOPES = np.array([min(k.bit_length(), 7) for k in range(5 * 255 + 1)])
 """Of a gradient: one of 8 classes, of which each set of weights has as many."""
-_LOGARITHMS = np.array([0, 0] + [2 * (k.bit_length() - 2) + (k >> k.bit_length() - 2 & 1) for k in range(2, 2443)], np.int8)
+_LOGARITHMS = np.array(
+    [0, 0] + [2 * (k.bit_length() - 2) + (k >> k.bit_length() - 2 & 1) for k in range(2, 2443)], np.int8
+)
 """Of k >= 2: 2 log2(k / 2), rounded down after linear interpolation between powers of two."""
 
 
@@ -85,12 +86,17 @@ class Guide:
         return isinstance(other, Guide) and np.array_equal(self.weights, other.weights)
 
 
-def encode_symbols(symbols: np.ndarray, coded: np.ndarray, guide: Guide | None = None, implied: np.ndarray | None = None) -> bytes:
+def encode_symbols(
+    symbols: np.ndarray, coded: np.ndarray, guide: Guide | None = None, implied: np.ndarray | None = None
+) -> bytes:
     """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: by their guide, if they have one that they follow, else with as many
     sets of weights as make it shortest. `implied`: the map that needs not be told."""
     if guide is not None and (body := encode_with(guide.weights, symbols, coded, AROUND, implied)) is not None:
         return body
-    symbols, coded = np.array(symbols, order="C"), np.array(coded, order="C")  # compiled for this layout; and `walk` writes
+    symbols, coded = (
+        np.array(symbols, order="C"),
+        np.array(coded, order="C"),
+    )  # compiled for this layout; and `walk` writes
     neighbours, lattice = neighbourhoods(symbols, coded), TRELLIS if follows_trellis(symbols, coded) else ANY
     bodies = (encode_with(fitted(neighbours, count), symbols, coded, lattice, implied) for count in SET_COUNTS)
     return min((body for body in bodies if body is not None), key=len)
@@ -120,7 +126,7 @@ def decode_symbols(
         FormatError: the body is cut, too long, or says what only a damaged one would.
     """
     weights, lattice = _head(body)
-    state, words = opened(body[2 + weights.size:], "plane segment")
+    state, words = opened(body[2 + weights.size :], "plane segment")
 
     symbols, coded = np.zeros((rows, columns, channels), np.int8), untold_map(body[1], rows, columns, implied)
     at, fit = 0, True
@@ -337,9 +343,20 @@ def walk(symbols, coded, lattice, weights, state, at, words, trace, neighbours):
                     v0[X], r0[X] = w, rw
                     continue
                 if y == 0:  # nothing is above but what is to the left
-                    v1[x:x + 5], v2[x:x + 5] = w, w
-                    r1[x:x + 5], r2[x:x + 5] = rw, rw
-                    look_above(sets, v1[x:], v2[x:], r1[x:], r2[x:], past[x:], m, leaning[:, x:x + 1], steep[x:x + 1], restless[x:x + 1])
+                    v1[x : x + 5], v2[x : x + 5] = w, w
+                    r1[x : x + 5], r2[x : x + 5] = rw, rw
+                    look_above(
+                        sets,
+                        v1[x:],
+                        v2[x:],
+                        r1[x:],
+                        r2[x:],
+                        past[x:],
+                        m,
+                        leaning[:, x : x + 1],
+                        steep[x : x + 1],
+                        restless[x : x + 1],
+                    )
                 predicted, gradient = predict(sets, classes, w, ww, v1[X - 1], x, leaning, steep)
                 active, odd = activity(restless[x], rw, rww, gradient, m), place & 1
                 kind = TRELLIS if lattice == AROUND and active >= FLAT else lattice
@@ -359,14 +376,19 @@ def walk(symbols, coded, lattice, weights, state, at, words, trace, neighbours):
                     row, n, nw = neighbours[noted], v1[X], v1[X - 1]
                     both = w + n
                     row[0], row[1], row[2] = SLOPES[gradient], 2 * value - both, w - n
-                    row[3], row[4], row[5], row[6] = 2 * nw - both, 2 * v1[X + 1] - both, 2 * ww - both, 2 * v2[X] - both
+                    row[3], row[4], row[5], row[6] = (
+                        2 * nw - both,
+                        2 * v1[X + 1] - both,
+                        2 * ww - both,
+                        2 * v2[X] - both,
+                    )
                     row[7], row[8] = 2 * v1[X - 2] - both, 2 * v2[X - 1] - both
                     row[9], row[10] = 2 * v2[X + 1] - both, 2 * v1[X + 2] - both
                     noted += 1
                 ww, rww = w, rw
                 w, rw = value, abs((value << 7) - predicted) >> 3
                 v0[X], r0[X] = w, rw
-            v0[W + 2:], r0[W + 2:] = v0[W + 1], r0[W + 1]
+            v0[W + 2 :], r0[W + 2 :] = v0[W + 1], r0[W + 1]
             if words is not None and at > words.size:
                 return state, at, True
             if y > 0:
@@ -402,11 +424,27 @@ def look_above(sets, v1, v2, r1, r2, past, m, leaning, steep, restless):
     W = steep.size
     for c in range(len(sets)):
         n, nw, ne, nn, nww, nnw, nne, nee = (
-            sets[c, 1], sets[c, 2], sets[c, 3], sets[c, 5], sets[c, 6], sets[c, 7], sets[c, 8], sets[c, 9])
+            sets[c, 1],
+            sets[c, 2],
+            sets[c, 3],
+            sets[c, 5],
+            sets[c, 6],
+            sets[c, 7],
+            sets[c, 8],
+            sets[c, 9],
+        )
         for x in range(W):
             X = x + 2
-            leaning[c, x] = nww * v1[X - 2] + nw * v1[X - 1] + n * v1[X] + ne * v1[X + 1] + nee * v1[X + 2] \
-                + nnw * v2[X - 1] + nn * v2[X] + nne * v2[X + 1]
+            leaning[c, x] = (
+                nww * v1[X - 2]
+                + nw * v1[X - 1]
+                + n * v1[X]
+                + ne * v1[X + 1]
+                + nee * v1[X + 2]
+                + nnw * v2[X - 1]
+                + nn * v2[X]
+                + nne * v2[X + 1]
+            )
     now, before = shares(m)
     for x in range(W):
         X = x + 2
@@ -449,7 +487,14 @@ def remember(cross, above, here, below, m):
     """Let `cross`, of one row, take in r of this channel: smoothed by (1 2 1) x (1 2 1) / 2, an eighth of the way."""
     for x in range(cross.size):
         X = x + 2
-        smooth = (above[X - 1] + 2 * above[X] + above[X + 1] + 2 * (here[X - 1] + 2 * here[X] + here[X + 1])
-                  + below[X - 1] + 2 * below[X] + below[X + 1]) >> 1
+        smooth = (
+            above[X - 1]
+            + 2 * above[X]
+            + above[X + 1]
+            + 2 * (here[X - 1] + 2 * here[X] + here[X + 1])
+            + below[X - 1]
+            + 2 * below[X]
+            + below[X + 1]
+        ) >> 1
         past = int(cross[x])
         cross[x] = smooth if m == 0 else past + (smooth - past >> 3)

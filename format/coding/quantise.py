@@ -11,16 +11,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-
-from kpc.format.scene.cameras import Camera
-from kpc.format.common.errors import FormatError
-from kpc.format.scene.motion import QuantisedMotion, places_reached, quantise_motion
 from kpc.format.coding.poses import rigid, rounded
 from kpc.format.coding.rans import compiled
+from kpc.format.coding.weights import FINEST
+from kpc.format.common.errors import FormatError
+from kpc.format.container.segments import PlaneGuide
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.motion import QuantisedMotion, places_reached, quantise_motion
 from kpc.format.scene.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
 from kpc.format.scene.space import SpaceMapping
-from kpc.format.container.segments import PlaneGuide
-from kpc.format.coding.weights import FINEST
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
 
@@ -64,8 +63,14 @@ def dequantised(symbols: np.ndarray, step: np.ndarray, offset: np.ndarray) -> np
     return values
 
 
-def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bool, needed: np.ndarray | None = None,
-                   name: str = "plane") -> QuantisedPlane:
+def quantise_plane(
+    values: np.ndarray,
+    step: np.ndarray | float,
+    *,
+    identity: bool,
+    needed: np.ndarray | None = None,
+    name: str = "plane",
+) -> QuantisedPlane:
     """Round a plane to symbols: |dequantised - value| <= step / 2 (the plane's own step) at every needed texel.
 
     Space planes (identity=False): the offset is the mean over the needed texels, to 8 significant bits, moved by as little as brings the
@@ -88,8 +93,10 @@ def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bo
     needed = np.ones((rows, columns), bool) if needed is None else needed.astype(bool)
     wanted = values[needed].astype(np.float64)  # (needed texels, M)
     if not (np.abs(wanted) <= VALUE_LIMIT / 2).all():
-        raise FormatError(f"{name}: holds NaN, infinity or a number beyond {VALUE_LIMIT / 2:g}, which no file can "
-                          "store; train with a lower learning rate")
+        raise FormatError(
+            f"{name}: holds NaN, infinity or a number beyond {VALUE_LIMIT / 2:g}, which no file can "
+            "store; train with a lower learning rate"
+        )
     if not (step > 0).all():
         raise FormatError(f"{name}: a quantisation step is not a positive number")
     step = np.minimum(step, np.float32(COARSEST_STEP))
@@ -101,7 +108,9 @@ def quantise_plane(values: np.ndarray, step: np.ndarray | float, *, identity: bo
     else:
         step = _at_least(step, (high - low) / (SYMBOL_MAX - SYMBOL_MIN))
         mean = wanted.mean(0).astype(np.float32) if len(wanted) else np.ones(channels, np.float32)
-        offset = np.clip(shortened(mean), high - SYMBOL_MAX * step.astype(np.float64), low - SYMBOL_MIN * step.astype(np.float64))
+        offset = np.clip(
+            shortened(mean), high - SYMBOL_MAX * step.astype(np.float64), low - SYMBOL_MIN * step.astype(np.float64)
+        )
         offset = offset.astype(np.float32)
 
     symbols = np.zeros(values.shape, np.int8)
@@ -152,8 +161,19 @@ class QuantisedScene:
     def dequantise(self) -> Scene:
         """The scene that every decoder sees."""
         scales = tuple({name: plane.dequantise() for name, plane in scale.items()} for scale in self.scales)
-        return Scene(self.aabb, self.clip, scales, self.decoder, self.occupancy, self.background, self.step,
-                     self.cameras, self.mapping, None if self.motion is None else self.motion.dequantise(), self.appearances)
+        return Scene(
+            self.aabb,
+            self.clip,
+            scales,
+            self.decoder,
+            self.occupancy,
+            self.background,
+            self.step,
+            self.cameras,
+            self.mapping,
+            None if self.motion is None else self.motion.dequantise(),
+            self.appearances,
+        )
 
     @property
     def is_dynamic(self) -> bool:
@@ -173,8 +193,13 @@ class QuantisedScene:
         return 1.0 - sum(int(c.sum()) for c in changed) / sum(c.size for c in changed) if changed else 1.0
 
 
-def quantise_scene(scene: Scene, steps: Sequence[Mapping[str, np.ndarray | float]], *,
-                   skip_unseen: bool = True, reached: np.ndarray | None = None) -> QuantisedScene:
+def quantise_scene(
+    scene: Scene,
+    steps: Sequence[Mapping[str, np.ndarray | float]],
+    *,
+    skip_unseen: bool = True,
+    reached: np.ndarray | None = None,
+) -> QuantisedScene:
     """Quantise every plane and round the rest to what the file stores.
 
     Args:
@@ -189,16 +214,30 @@ def quantise_scene(scene: Scene, steps: Sequence[Mapping[str, np.ndarray | float
         reached = reached_by(scene)
     scales = []
     for number, (planes, plane_steps) in enumerate(zip(scene.scales, steps, strict=True)):
-        scales.append({
-            name: quantise_plane(
-                values, plane_steps[name], identity=name in TIME_PLANES, name=f"scale {number}, plane {name}",
-                needed=None if reached is None or not skip_unseen else needed_texels(reached, name, *values.shape[:2]))
-            for name, values in planes.items()
-        })
+        scales.append(
+            {
+                name: quantise_plane(
+                    values,
+                    plane_steps[name],
+                    identity=name in TIME_PLANES,
+                    name=f"scale {number}, plane {name}",
+                    needed=None
+                    if reached is None or not skip_unseen
+                    else needed_texels(reached, name, *values.shape[:2]),
+                )
+                for name, values in planes.items()
+            }
+        )
     return QuantisedScene(
-        np.asarray(scene.aabb, np.float32), scene.clip, tuple(scales), round_decoder(scene.decoder),
-        np.asarray(scene.occupancy, bool), np.asarray(scene.background, np.float32), float(scene.step),
-        round_cameras(scene.cameras), scene.mapping,
+        np.asarray(scene.aabb, np.float32),
+        scene.clip,
+        tuple(scales),
+        round_decoder(scene.decoder),
+        np.asarray(scene.occupancy, bool),
+        np.asarray(scene.background, np.float32),
+        float(scene.step),
+        round_cameras(scene.cameras),
+        scene.mapping,
         None if scene.motion is None else quantise_motion(scene.motion),
         tuple(Appearance(appearance.name, half(appearance.code, "appearances")) for appearance in scene.appearances),
     )
@@ -231,7 +270,12 @@ def seen_along(occupancy: np.ndarray, plane: str) -> np.ndarray:
 def needed_rows(seen: np.ndarray, rows: int, columns: int, some: range) -> np.ndarray:
     """Some rows of `needed_texels`, by `seen_along`. Takes no more memory than they do, and a row of cells."""
     needed = np.empty((len(some), columns), bool)
-    _mark_met(seen, _reached_from(rows, seen.shape[0])[:, some.start : some.stop], _reached_from(columns, seen.shape[1]), needed)
+    _mark_met(
+        seen,
+        _reached_from(rows, seen.shape[0])[:, some.start : some.stop],
+        _reached_from(columns, seen.shape[1]),
+        needed,
+    )
     return needed
 
 
@@ -268,7 +312,10 @@ def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) ->
     """
     if not np.isfinite(decoder.density_bias):
         raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
-    shorter = {name: half(_to_places(value, bits[name]) if bits and name in bits else value) for name, value in weights_of(decoder).items()}
+    shorter = {
+        name: half(_to_places(value, bits[name]) if bits and name in bits else value)
+        for name, value in weights_of(decoder).items()
+    }
     return replace(decoder, **shorter, density_bias=float(np.float32(decoder.density_bias)))
 
 
@@ -306,7 +353,10 @@ def round_cameras(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
     lenses = tuple(_with_short_lens(camera) for camera in cameras)
     if lenses and rigid(lenses):
         return rounded(lenses)
-    return tuple(replace(camera, camera_to_world=camera.camera_to_world.astype(np.float32).astype(np.float64)) for camera in lenses)
+    return tuple(
+        replace(camera, camera_to_world=camera.camera_to_world.astype(np.float32).astype(np.float64))
+        for camera in lenses
+    )
 
 
 def _with_short_lens(camera: Camera) -> Camera:

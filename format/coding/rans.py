@@ -11,10 +11,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
-
 from kpc.format.common import compiling
 from kpc.format.common.errors import FormatError
+from numba import njit
 
 compiling.watch()
 
@@ -34,6 +33,7 @@ RATES = np.array([327680 // (5 * n + 8) for n in range(PATIENCE + 1)])
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """numba's njit, cached on disk where numba finds a folder to write to (the package's, else the user's), without a GIL."""
+
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return njit(cache=True, nogil=True, **options)(function)
@@ -130,7 +130,9 @@ def natural(value, table, first, unary, escapes, state, at, words, trace):
     if found == unary:  # Exp-Golomb: as many ones as bits follow, a zero, the bits
         rest, bits = beyond - unary + 1, 0
         while bits < escapes:
-            bit, state, at = adapt(1 if rest >> bits + 1 != 0 else 0, table, first + unary + bits, state, at, words, trace)
+            bit, state, at = adapt(
+                1 if rest >> bits + 1 != 0 else 0, table, first + unary + bits, state, at, words, trace
+            )
             if not bit:
                 break
             bits += 1

@@ -8,7 +8,6 @@ texels cost nothing but their bit in the map.
 """
 
 import numpy as np
-
 from kpc.format.common.errors import FormatError
 
 FILTER_NONE, FILTER_LEFT, FILTER_UP, FILTER_PLANE = range(4)
@@ -42,7 +41,7 @@ def decode_segment(payload: bytes, rows: int, columns: int, channels: int) -> tu
     texels = rows * columns
     flag, start = payload[:1], 1
     if flag == bytes([MAP_PRESENT]):
-        packed = np.frombuffer(payload[start:start + -(-texels // 8)], np.uint8)
+        packed = np.frombuffer(payload[start : start + -(-texels // 8)], np.uint8)
         if packed.size * 8 < texels:
             raise FormatError("plane segment: too short for its map")
         if np.unpackbits(packed, bitorder="little")[texels:].any():
@@ -55,8 +54,9 @@ def decode_segment(payload: bytes, rows: int, columns: int, channels: int) -> tu
         raise FormatError("plane segment: unknown map flag")
     count = int(coded.sum())
     if len(payload) != start + channels + channels * count:
-        raise FormatError(f"plane segment: holds {len(payload)} bytes where its map implies "
-                          f"{start + channels + channels * count}")
+        raise FormatError(
+            f"plane segment: holds {len(payload)} bytes where its map implies {start + channels + channels * count}"
+        )
     filters = np.frombuffer(payload, np.uint8, channels, start)
     if (filters >= FILTER_COUNT).any():
         raise FormatError(f"plane segment: unknown filter {filters.max()}")

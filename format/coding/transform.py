@@ -27,10 +27,22 @@ Naming, throughout this module
 from dataclasses import dataclass
 
 import numpy as np
-
-from kpc.format.common.errors import FormatError
-from kpc.format.coding.rans import SCALE, adapt, compiled, counters, decide, doublings, ended, inlined, integer, natural, opened, stream
 from kpc.format.coding.predictive import LATTICE_BIT, MAP, THIRD, known_flags, map_flags, untold_map, walk_map
+from kpc.format.coding.rans import (
+    SCALE,
+    adapt,
+    compiled,
+    counters,
+    decide,
+    doublings,
+    ended,
+    inlined,
+    integer,
+    natural,
+    opened,
+    stream,
+)
+from kpc.format.common.errors import FormatError
 
 SIDES = (4, 8, 16)
 BLOCKS = 3
@@ -58,11 +70,13 @@ UNARY, ESCAPES = 5, 12
 DECISIONS = 1 + UNARY + ESCAPES
 LARGEST = UNARY + (2 << ESCAPES) - 1
 """Magnitude that can be told."""
-LIKELY = np.array([
-    [27, 66, 61, 86, 79, 96, 118, 143, 168, 190, 206, 220, 230, 238, 243, 248],
-    [19, 26, 24, 37, 37, 48, 67, 90, 120, 151, 179, 201, 217, 229, 235, 244],
-    [110, 100, 90, 86, 82, 80, 87, 98, 117, 135, 160, 184, 204, 220, 230, 243],
-])
+LIKELY = np.array(
+    [
+        [27, 66, 61, 86, 79, 96, 118, 143, 168, 190, 206, 220, 230, 238, 243, 248],
+        [19, 26, 24, 37, 37, 48, 67, 90, 120, 151, 179, 201, 217, 229, 235, 244],
+        [110, 100, 90, 86, 82, 80, 87, 98, 117, 135, 160, 184, 204, 220, 230, 243],
+    ]
+)
 """What counters begin with, of 256, by how large levels are around: that there is one, that it is more than 1, than any more up to UNARY."""
 KNOWN = 8
 """Decisions that this counts for."""
@@ -138,7 +152,12 @@ def encode_blocks(blocks: Blocks, coded: np.ndarray, implied: np.ndarray | None 
     them; codec 2 has neither."""
     levels, coded = np.ascontiguousarray(blocks.levels), np.array(coded, order="C")
     side, busy = levels.shape[-1], blocks_of(coded, levels.shape[-1])
-    trace, at = np.empty(coded.size + busy.size * (3 + MOST_END_DECISIONS * len(levels)) + levels.size * MOST_DECISIONS, np.int16), 0
+    trace, at = (
+        np.empty(
+            coded.size + busy.size * (3 + MOST_END_DECISIONS * len(levels)) + levels.size * MOST_DECISIONS, np.int16
+        ),
+        0,
+    )
     flags = map_flags(coded, implied)
     if flags & MAP:
         _, at = walk_map(coded, 0, at, None, trace)
@@ -192,7 +211,9 @@ def _decoded(
         state, at = walk_fineness(fineness, busy, state, at, words, None)
     if at <= len(words):
         borders, finer = body[1] & THIRD != 0, quantisers(side, body[2])
-        state, at = walk_levels(levels, fineness, busy, finer, borders, state, at, words, None, symbols, cosines(side), coded)
+        state, at = walk_levels(
+            levels, fineness, busy, finer, borders, state, at, words, None, symbols, cosines(side), coded
+        )
     ended(state, at, words, "plane segment")
     return symbols, coded, fineness
 
@@ -213,7 +234,15 @@ def walk_fineness(fineness, busy, state, at, words, trace):
             node, place = 1, FINENESSES >> 1
             if busy[by, bx]:
                 while place:
-                    bit, state, at = adapt(1 if fineness[by, bx] & place else 0, table, foreseen * FINENESSES + node, state, at, words, trace)
+                    bit, state, at = adapt(
+                        1 if fineness[by, bx] & place else 0,
+                        table,
+                        foreseen * FINENESSES + node,
+                        state,
+                        at,
+                        words,
+                        trace,
+                    )
                     node = node << 1 | bit
                     place >>= 1
                 fineness[by, bx] = node - FINENESSES
@@ -263,12 +292,24 @@ def walk_levels(levels, fineness, busy, quantisers, borders, state, at, words, t
                 ends = end[Y, X - 1], end[Y - 1, X], end_before[Y, X]
                 if borders:
                     first = end_context(*ends) * END_DECISIONS
-                    last, state, at = natural(last_diagonal(block) + 1, end_table, first, END_UNARY, END_ESCAPES, state, at, words, trace)
+                    last, state, at = natural(
+                        last_diagonal(block) + 1, end_table, first, END_UNARY, END_ESCAPES, state, at, words, trace
+                    )
                     end[Y, X] = min(last - 1, 2 * N - 1)
                 else:
                     usual = usual_end(*ends)
                     first = plain_end_context(usual, N) * PLAIN_END_DECISIONS
-                    last, state, at = integer(last_diagonal(block) - usual, end_table, first, PLAIN_END_UNARY, END_ESCAPES, state, at, words, trace)
+                    last, state, at = integer(
+                        last_diagonal(block) - usual,
+                        end_table,
+                        first,
+                        PLAIN_END_UNARY,
+                        END_ESCAPES,
+                        state,
+                        at,
+                        words,
+                        trace,
+                    )
                     end[Y, X] = min(max(last + usual, 0), 2 * N - 1)
                 for diagonal in range(end[Y, X] - 1, -1, -1):
                     signed = not borders or diagonal == 0
@@ -278,14 +319,18 @@ def walk_levels(levels, fineness, busy, quantisers, borders, state, at, words, t
                         here[i, j], state, at = walk_size(abs(block[i, j]), table, first, state, at, words, trace)
                         positive = 1
                         if signed and here[i, j]:
-                            positive, state, at = decide(1 if block[i, j] > 0 else 0, SCALE >> 1, state, at, words, trace)
+                            positive, state, at = decide(
+                                1 if block[i, j] > 0 else 0, SCALE >> 1, state, at, words, trace
+                            )
                         if words is not None:
                             block[i, j] = here[i, j] if positive else -here[i, j]
                 block[0, 0] += foreseen
                 mean[Y, X] = coefficient(block[0, 0], quantiser[0, 0])
                 if borders:
                     begin_rest(rest, right, bottom[bx], beside, over)
-                    state, at = walk_signs(block, end[Y, X], quantiser, cosines, rest, beside, over, sign_table, state, at, words, trace)
+                    state, at = walk_signs(
+                        block, end[Y, X], quantiser, cosines, rest, beside, over, sign_table, state, at, words, trace
+                    )
                 if levels is not None and words is not None:
                     levels[m, by, bx] = block
                 if borders or symbols is not None:

@@ -9,9 +9,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-
-from kpc.format.common.errors import FormatError
 from kpc.format.coding.rans import compiled, counters, ended, integer, opened, stream
+from kpc.format.common.errors import FormatError
 
 UNARY, ESCAPES = 4, 10
 DECISIONS = 2 + 2 * (UNARY + ESCAPES)
@@ -47,20 +46,24 @@ def decode_weights(body: bytes, shapes: Sequence[tuple[int, ...]]) -> list[np.nd
     Raises:
         FormatError: the body is cut, too long, or says what only a damaged one would.
     """
-    powers = np.frombuffer(body[:len(shapes)], np.int8).tolist()
+    powers = np.frombuffer(body[: len(shapes)], np.int8).tolist()
     if any(not FINEST <= power <= COARSEST for power in powers):
         raise FormatError("weights: a power of two is not one of float16's")
-    state, words = opened(body[len(shapes):], "weights")
+    state, words = opened(body[len(shapes) :], "weights")
     multiples = [np.zeros(math.prod(shape), np.int64) for shape in shapes]
     state, at = _walk(multiples, state, words, None)
     ended(state, at, words, "weights")
     arrays = [np.ldexp(wholes.astype(np.float64), power) for wholes, power in zip(multiples, powers, strict=True)]
-    if any((abs(wholes) > LARGEST).any() for wholes in multiples) or any((abs(values) > HALF_LIMIT).any() for values in arrays):
+    if any((abs(wholes) > LARGEST).any() for wholes in multiples) or any(
+        (abs(values) > HALF_LIMIT).any() for values in arrays
+    ):
         raise FormatError("weights: one is no number of float16")
     return [values.astype(np.float32).reshape(shape) for values, shape in zip(arrays, shapes, strict=True)]
 
 
-def _walk(multiples: Sequence[np.ndarray], state: int, words: np.ndarray | None, trace: np.ndarray | None) -> tuple[int, int]:
+def _walk(
+    multiples: Sequence[np.ndarray], state: int, words: np.ndarray | None, trace: np.ndarray | None
+) -> tuple[int, int]:
     """Code int64 `multiples`, or decode into them: (state, at)."""
     at = 0
     for values in multiples:

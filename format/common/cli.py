@@ -25,7 +25,10 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         return _fail(name, str(error), 2)
     except KpcError as error:
         return _fail(name, str(error), 1)
-    except (KeyboardInterrupt, SystemError) as error:  # the latter is what compiled functions make of one that reaches them
+    except (
+        KeyboardInterrupt,
+        SystemError,
+    ) as error:  # the latter is what compiled functions make of one that reaches them
         if not any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):
             raise
         return _fail(name, "interrupted", 130)
@@ -88,6 +91,7 @@ def duration_s(text: str) -> float:
 
 def frame_rate(low: float, high: float) -> Callable[[str], float]:
     """A parser of pictures a second, from `low` to `high`."""
+
     def parse(text: str) -> float:
         try:
             value = float(text)
@@ -130,6 +134,10 @@ def box_corners(text: str) -> tuple[float, ...]:
         numbers = tuple(float(n) for n in text.split(","))
     except ValueError:
         numbers = ()
-    if len(numbers) != 6 or not all(map(math.isfinite, numbers)) or not all(a < b for a, b in zip(numbers[:3], numbers[3:])):
+    if (
+        len(numbers) != 6
+        or not all(map(math.isfinite, numbers))
+        or not all(a < b for a, b in zip(numbers[:3], numbers[3:]))
+    ):
         raise argparse.ArgumentTypeError(f"{text!r} is not x0,y0,z0,x1,y1,z1 with each lower bound below the upper")
     return numbers

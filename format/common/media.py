@@ -23,10 +23,9 @@ import ffmpeg
 import imageio_ffmpeg
 import numpy as np
 import OpenEXR
-from PIL import Image, UnidentifiedImageError
-
 from kpc.format.common.cli import written_aside
 from kpc.format.common.errors import MediaError
+from PIL import Image, UnidentifiedImageError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")

@@ -19,7 +19,6 @@ from typing import BinaryIO, Protocol, runtime_checkable
 import google_crc32c
 import numpy as np
 import zstandard
-
 from kpc.format.common.errors import FormatError
 
 MAGIC = b"\x89KPC\r\n\x1a\n"
@@ -172,7 +171,9 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True, ve
         FormatError: the result would break a limit that every reader checks.
     """
     if len(chunks) > CHUNK_LIMIT:
-        raise FormatError(f"{len(chunks)} chunks are more than the {CHUNK_LIMIT} that a file may have; use fewer and longer segments")
+        raise FormatError(
+            f"{len(chunks)} chunks are more than the {CHUNK_LIMIT} that a file may have; use fewer and longer segments"
+        )
     entries, bodies = [], []
     for chunk in chunks:
         raw = b"".join(chunk.parts)
@@ -181,16 +182,32 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True, ve
             body = make()
             if chunk.symbol_count <= len(body) * EXPANSION_LIMIT:
                 forms.append((body, codec, chunk.symbol_count))
-        if compress and (chunk.kind != "PLNE" or len(forms) == 1):  # zstd would double the time, and never beats symbols of planes
+        if compress and (
+            chunk.kind != "PLNE" or len(forms) == 1
+        ):  # zstd would double the time, and never beats symbols of planes
             forms += [(frame, CODEC_ZSTD, len(raw)) for frame in _zstd_frames(chunk.parts)]
         body, codec, length = min(forms, key=lambda form: len(form[0]))
-        entries.append(Entry(chunk.kind, 0, chunk.scale, chunk.plane, chunk.row_start, chunk.row_count, codec, len(body), length,
-                             google_crc32c.value(body)))
+        entries.append(
+            Entry(
+                chunk.kind,
+                0,
+                chunk.scale,
+                chunk.plane,
+                chunk.row_start,
+                chunk.row_count,
+                codec,
+                len(body),
+                length,
+                google_crc32c.value(body),
+            )
+        )
         bodies.append(body)
     data = b"".join([header_and_index(entries, value_count, version if compress else PLAIN_VERSION), *bodies])
     if max(value_count, *(entry.raw_length for entry in entries)) > len(data) * EXPANSION_LIMIT:
-        raise FormatError(f"the scene is too empty for its size: {value_count:,} values in {len(data):,} bytes; "
-                          "choose a lower resolution")
+        raise FormatError(
+            f"the scene is too empty for its size: {value_count:,} values in {len(data):,} bytes; "
+            "choose a lower resolution"
+        )
     return data
 
 
@@ -205,8 +222,21 @@ def header_and_index(entries: Sequence[Entry], value_count: int, version: int = 
         else:
             version = PLAIN_VERSION
     file_length = HEADER.size + len(index) + stored
-    header = HEADER.pack(MAGIC, version, 0, HEADER.size, HEADER.size, len(index), len(entries), file_length, value_count,
-                         max((entry.raw_length for entry in entries), default=0), 0, google_crc32c.value(index), 0)
+    header = HEADER.pack(
+        MAGIC,
+        version,
+        0,
+        HEADER.size,
+        HEADER.size,
+        len(index),
+        len(entries),
+        file_length,
+        value_count,
+        max((entry.raw_length for entry in entries), default=0),
+        0,
+        google_crc32c.value(index),
+        0,
+    )
     return b"".join([header[:-4], struct.pack("<I", google_crc32c.value(header[:-4])), index])
 
 
@@ -214,8 +244,22 @@ def _plain_index(entries: Sequence[Entry]) -> bytes:
     """As files of version 1 hold it."""
     offset, parts = HEADER.size + ENTRY.size * len(entries), []
     for e in entries:
-        parts.append(ENTRY.pack(e.kind.encode("ascii"), e.group, e.scale, e.plane, e.row_start, e.row_count, e.codec, 0, e.stored_length,
-                                e.raw_length, e.crc, offset))
+        parts.append(
+            ENTRY.pack(
+                e.kind.encode("ascii"),
+                e.group,
+                e.scale,
+                e.plane,
+                e.row_start,
+                e.row_count,
+                e.codec,
+                0,
+                e.stored_length,
+                e.raw_length,
+                e.crc,
+                offset,
+            )
+        )
         offset += e.stored_length
     return b"".join(parts)
 
@@ -272,12 +316,25 @@ class Reader:
 
     def _read_header(self, allow_partial: bool) -> Header:
         head = self.source.read_at(0, HEADER.size)
-        if head[:len(MAGIC)] != MAGIC[:len(head)] or not head:
+        if head[: len(MAGIC)] != MAGIC[: len(head)] or not head:
             raise FormatError(f"{self.name}: not a .kpc file")
         if len(head) < HEADER.size:
             raise FormatError(f"{self.name}: cut off within the header; fetch the file again")
-        (_, version, flags, header_length, index_offset, index_length, chunk_count, file_length, value_count,
-         largest_raw, reserved, index_crc, header_crc) = HEADER.unpack(head)
+        (
+            _,
+            version,
+            flags,
+            header_length,
+            index_offset,
+            index_length,
+            chunk_count,
+            file_length,
+            value_count,
+            largest_raw,
+            reserved,
+            index_crc,
+            header_crc,
+        ) = HEADER.unpack(head)
         if version not in READABLE_VERSIONS:
             raise FormatError(f"{self.name}: format version {version}, this reader knows up to {VERSION}; update kpc")
         if google_crc32c.value(head[:-4]) != header_crc:
@@ -285,7 +342,9 @@ class Reader:
         if flags or reserved or header_length != HEADER.size or index_offset != HEADER.size:
             raise FormatError(f"{self.name}: the header uses reserved fields; update kpc")
         plain = chunk_count * ENTRY.size
-        if not 0 < chunk_count <= CHUNK_LIMIT or not (index_length < plain if version == VERSION else index_length == plain):
+        if not 0 < chunk_count <= CHUNK_LIMIT or not (
+            index_length < plain if version == VERSION else index_length == plain
+        ):
             raise FormatError(f"{self.name}: the header claims {chunk_count} chunks in {index_length} bytes of index")
         if file_length < HEADER.size + LEAST_CHUNK * chunk_count:
             raise FormatError(f"{self.name}: the header claims {chunk_count} chunks in a file of {file_length} bytes")
@@ -294,11 +353,14 @@ class Reader:
         if self.source.size > file_length:
             raise FormatError(f"{self.name}: {self.source.size - file_length} bytes follow the end of the file")
         if self.source.size < file_length and not allow_partial:
-            raise FormatError(f"{self.name}: cut off at {self.source.size} of {file_length} bytes; "
-                              "fetch the file again")
+            raise FormatError(
+                f"{self.name}: cut off at {self.source.size} of {file_length} bytes; fetch the file again"
+            )
         if max(value_count, largest_raw) > file_length * EXPANSION_LIMIT:
-            raise FormatError(f"{self.name}: claims {value_count:,} values and chunks of {largest_raw:,} bytes, "
-                              f"more than {file_length:,} bytes can hold")
+            raise FormatError(
+                f"{self.name}: claims {value_count:,} values and chunks of {largest_raw:,} bytes, "
+                f"more than {file_length:,} bytes can hold"
+            )
         return Header(version, index_length, chunk_count, file_length, value_count, largest_raw, index_crc)
 
     def _read_index(self) -> tuple[Entry, ...]:
@@ -318,8 +380,11 @@ class Reader:
                 raise FormatError(f"{self.name}: chunk {number} starts at byte {offset}, not at {expected}")
             if raw > self.header.largest_raw:
                 raise FormatError(f"{self.name}: chunk {number} claims {raw:,} bytes, more than the header's limit")
-            entries.append(Entry(kind.decode("ascii"), group, scale, plane, row_start, row_count, codec, stored, raw,
-                                 crc, expected))
+            entries.append(
+                Entry(
+                    kind.decode("ascii"), group, scale, plane, row_start, row_count, codec, stored, raw, crc, expected
+                )
+            )
             expected += stored
         if expected != self.header.file_length:
             raise FormatError(f"{self.name}: the chunks end at byte {expected} of {self.header.file_length}")
@@ -345,8 +410,9 @@ class Reader:
         if len(body) != entry.stored_length:
             raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is not there; fetch the file again")
         if google_crc32c.value(body) != entry.crc:
-            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is damaged (its CRC32C differs); "
-                              "fetch the file again")
+            raise FormatError(
+                f"{self.name}: chunk {number} ({entry.kind}) is damaged (its CRC32C differs); fetch the file again"
+            )
         return body
 
     def chunk(self, number: int, limit: int | None = None) -> bytes:
@@ -357,19 +423,25 @@ class Reader:
         """
         entry = self.index[number]
         if limit is not None and entry.raw_length > limit:
-            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) claims {entry.raw_length:,} bytes where at "
-                              f"most {limit:,} make sense")
+            raise FormatError(
+                f"{self.name}: chunk {number} ({entry.kind}) claims {entry.raw_length:,} bytes where at "
+                f"most {limit:,} make sense"
+            )
         body = self.stored(number)
         if entry.codec == CODEC_RAW:
             raw = body
         elif entry.codec == CODEC_ZSTD:
             raw = self._unframed(body, entry.raw_length, f"chunk {number} ({entry.kind})")
         else:
-            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) uses codec {entry.codec}, "
-                              "unknown to this reader; update kpc")
+            raise FormatError(
+                f"{self.name}: chunk {number} ({entry.kind}) uses codec {entry.codec}, "
+                "unknown to this reader; update kpc"
+            )
         if len(raw) != entry.raw_length:
-            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) holds {len(raw)} bytes, "
-                              f"not the {entry.raw_length} it claims")
+            raise FormatError(
+                f"{self.name}: chunk {number} ({entry.kind}) holds {len(raw)} bytes, "
+                f"not the {entry.raw_length} it claims"
+            )
         return raw
 
     def _unframed(self, body: bytes, length: int, what: str) -> bytes:
@@ -388,7 +460,7 @@ class _BytesSource:
         self.data, self.name, self.size = memoryview(data), name, len(data)
 
     def read_at(self, offset: int, length: int) -> bytes:
-        return bytes(self.data[offset:offset + length])
+        return bytes(self.data[offset : offset + length])
 
     def hold(self, offset: int, length: int) -> None:
         """All bytes are at hand."""
@@ -429,7 +501,10 @@ def open_source(source: AnySource, *, limit: int = DEFAULT_BUDGET) -> Source:
         limit: bytes of memory that a file may take whose server sends it as a whole only.
     """
     if isinstance(source, str) and "://" in source:
-        from kpc.format.container.http import HttpSource, is_url  # only now: what it takes to speak to servers is slow to load
+        from kpc.format.container.http import (
+            HttpSource,
+            is_url,
+        )  # only now: what it takes to speak to servers is slow to load
 
         if is_url(source):
             return HttpSource(source, limit=limit)

@@ -18,16 +18,25 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import google_crc32c
-
-from kpc.format.scene.cameras import Camera
 from kpc.format.common.cli import written_aside
-from kpc.format.container.container import (
-    CODEC_RAW, DEFAULT_BUDGET, ENTRY, HEADER, AnySource, Entry, Reader, RemoteSource, Source, header_and_index, open_source,
-)
 from kpc.format.common.errors import FormatError, UsageError
+from kpc.format.container.container import (
+    CODEC_RAW,
+    DEFAULT_BUDGET,
+    ENTRY,
+    HEADER,
+    AnySource,
+    Entry,
+    Reader,
+    RemoteSource,
+    Source,
+    header_and_index,
+    open_source,
+)
 from kpc.format.container.scene_io import FRAME_LIMIT, GROUP_KIND, SceneReader, read
-from kpc.format.scene.scene import Clip, Scene
 from kpc.format.container.slices import sliced
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.scene import Clip, Scene
 
 
 @dataclass(frozen=True)
@@ -76,7 +85,10 @@ class Timeline:
             first, last = self.spans[later].start, self.spans[later - 1].last
             if first < frame < last:
                 share = (frame - first) / (last - first)
-                return [(later - 1, self.time_in(later - 1, time), 1 - share), (later, self.time_in(later, time), share)]
+                return [
+                    (later - 1, self.time_in(later - 1, time), 1 - share),
+                    (later, self.time_in(later, time), share),
+                ]
         return [(number, time_in_it, 1.0)]
 
     def time_in(self, number: int, time: float) -> float:
@@ -121,15 +133,23 @@ class Groups:
         FormatError, BudgetError: as `SceneReader`, or the groups do not make a clip.
     """
 
-    def __init__(self, source: AnySource, *, memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False,
-                 in_parts: bool = False) -> None:
+    def __init__(
+        self,
+        source: AnySource,
+        *,
+        memory_budget: int = DEFAULT_BUDGET,
+        allow_partial: bool = False,
+        in_parts: bool = False,
+    ) -> None:
         source = open_source(source, limit=memory_budget)
         self.reader = Reader(source, allow_partial=allow_partial)
         self.name, self._budget, self._in_parts = self.reader.name, memory_budget, in_parts
         self._chunks = [number for number, entry in enumerate(self.reader.index) if entry.kind == GROUP_KIND]
         self.is_single = not self._chunks
         if self.is_single:
-            self._first = SceneReader(self.reader, memory_budget=memory_budget, allow_partial=allow_partial, in_parts=in_parts)
+            self._first = SceneReader(
+                self.reader, memory_budget=memory_budget, allow_partial=allow_partial, in_parts=in_parts
+            )
             spans: tuple[Span, ...] = (Span(0, self._first.head.clip.frame_count),)
         else:
             if isinstance(source, RemoteSource) and not source.has_ranges:  # groups are read at the same time
@@ -185,11 +205,19 @@ class Groups:
         entries = self.reader.index
         for number, entry in enumerate(entries):
             if entry.is_critical and entry.kind != GROUP_KIND:
-                raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) lies beside groups, not in one; update kpc")
-            if entry.kind == GROUP_KIND and (entry.codec != CODEC_RAW or entry.raw_length != entry.stored_length
-                                             or entry.scale or entry.plane or not entry.row_count):
-                raise FormatError(f"{self.name}: chunk {number} ({GROUP_KIND}) claims a codec, a place among the planes, or no "
-                                  "frame")
+                raise FormatError(
+                    f"{self.name}: chunk {number} ({entry.kind}) lies beside groups, not in one; update kpc"
+                )
+            if entry.kind == GROUP_KIND and (
+                entry.codec != CODEC_RAW
+                or entry.raw_length != entry.stored_length
+                or entry.scale
+                or entry.plane
+                or not entry.row_count
+            ):
+                raise FormatError(
+                    f"{self.name}: chunk {number} ({GROUP_KIND}) claims a codec, a place among the planes, or no frame"
+                )
         self._chunks.sort(key=lambda chunk: entries[chunk].group)
         if [entries[chunk].group for chunk in self._chunks] != list(range(len(self._chunks))):
             raise FormatError(f"{self.name}: its groups are not numbered from 0 on, each once")
@@ -202,17 +230,22 @@ class Groups:
         return sliced(source, entry.offset, entry.stored_length, f"{self.name}, group {number}")
 
     def _opened(self, number: int, source: Source) -> SceneReader:
-        return SceneReader(source, memory_budget=self._budget,
-                           allow_partial=not self.available(number), in_parts=self._in_parts)
+        return SceneReader(
+            source, memory_budget=self._budget, allow_partial=not self.available(number), in_parts=self._in_parts
+        )
 
     def _check(self, number: int, scene: SceneReader) -> None:
         clip, span = scene.head.clip, self.timeline.spans[number]
         if clip != Clip(span.count, self.timeline.fps):
-            raise FormatError(f"{scene.name}: holds {clip.frame_count} frames at {clip.fps:g} fps, not {span.count} at "
-                              f"{self.timeline.fps:g} as the file says")
+            raise FormatError(
+                f"{scene.name}: holds {clip.frame_count} frames at {clip.fps:g} fps, not {span.count} at "
+                f"{self.timeline.fps:g} as the file says"
+            )
         if scene.head.value_count > self.reader.header.value_count:
-            raise FormatError(f"{scene.name}: holds {scene.head.value_count:,} values, more than the header's "
-                              f"{self.reader.header.value_count:,}")
+            raise FormatError(
+                f"{scene.name}: holds {scene.head.value_count:,} values, more than the header's "
+                f"{self.reader.header.value_count:,}"
+            )
 
 
 class LongScene:
@@ -244,10 +277,15 @@ class LongScene:
             As `at`.
         """
         parts = self.timeline.mixed(time)
-        return [(self._scene(number, {number for number, *_ in parts}), time_in_it, share) for number, time_in_it, share in parts]
+        return [
+            (self._scene(number, {number for number, *_ in parts}), time_in_it, share)
+            for number, time_in_it, share in parts
+        ]
 
     def _scene(self, number: int, wanted: set[int]) -> Scene:
-        self._held = {held: scene for held, scene in self._held.items() if held in wanted}  # let go before there is another
+        self._held = {
+            held: scene for held, scene in self._held.items() if held in wanted
+        }  # let go before there is another
         if number not in self._held:
             scene = read(self._groups.open(number)).dequantise()
             self._held[number] = replace(scene, cameras=scene.cameras or self.cameras)
@@ -291,7 +329,9 @@ def parts_of(files: Sequence[AnySource]) -> list[Part]:
         if groups.is_single:
             parts.append(Part.of(groups.reader.source, parts[-1].span.last + 1 if parts else 0))
         else:
-            parts += [Part.of(groups.source_of(number), span.start) for number, span in enumerate(groups.timeline.spans)]
+            parts += [
+                Part.of(groups.source_of(number), span.start) for number, span in enumerate(groups.timeline.spans)
+            ]
     return parts
 
 
@@ -307,15 +347,31 @@ def write(parts: Sequence[Part], path: str | os.PathLike[str]) -> int:
         raise UsageError(str(error)) from error
     odd = next((part for part in parts if part.fps != parts[0].fps), None)
     if odd is not None:
-        raise UsageError(f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; encode them "
-                         "alike")
+        raise UsageError(
+            f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; encode them alike"
+        )
     entries: list[Entry] = []
     with written_aside(path) as aside, aside.open("wb") as opened:
-        opened.seek(HEADER.size + ENTRY.size * len(parts))  # the index, which comes first, holds checksums of what follows
+        opened.seek(
+            HEADER.size + ENTRY.size * len(parts)
+        )  # the index, which comes first, holds checksums of what follows
         for number, part in enumerate(parts):
             body, span = part.source.read_at(0, part.source.size), part.span
             opened.write(body)
-            entries.append(Entry(GROUP_KIND, number, 0, 0, span.start, span.count, CODEC_RAW, len(body), len(body), google_crc32c.value(body)))
+            entries.append(
+                Entry(
+                    GROUP_KIND,
+                    number,
+                    0,
+                    0,
+                    span.start,
+                    span.count,
+                    CODEC_RAW,
+                    len(body),
+                    len(body),
+                    google_crc32c.value(body),
+                )
+            )
         size = opened.tell()
         opened.seek(0)
         opened.write(header_and_index(entries, max(part.value_count for part in parts)))
@@ -332,11 +388,15 @@ def check_spans(spans: Sequence[Span], names: str | Sequence[str]) -> None:
     for number, (before, after) in enumerate(zip(spans, spans[1:])):
         if not before.start < after.start <= before.last + 1 or not before.last < after.last:
             one, other = called[number : number + 2]
-            raise FormatError(f"{one} holds frames {before.start} to {before.last}, {other} frames {after.start} to {after.last}: "
-                              "each must begin and end later than the one before, and leave no frame out")
+            raise FormatError(
+                f"{one} holds frames {before.start} to {before.last}, {other} frames {after.start} to {after.last}: "
+                "each must begin and end later than the one before, and leave no frame out"
+            )
     for number, (before, after) in enumerate(zip(spans, spans[2:])):
         if after.start <= before.last:
-            raise FormatError(f"{called[number + 2]} begins with frame {after.start}, which two groups before it hold: a frame may be in "
-                              "two groups, not in three")
+            raise FormatError(
+                f"{called[number + 2]} begins with frame {after.start}, which two groups before it hold: a frame may be in "
+                "two groups, not in three"
+            )
     if (frames := spans[-1].last - spans[0].start + 1) > FRAME_LIMIT:
         raise FormatError(f"{called[-1]}: {frames:,} frames are more than {FRAME_LIMIT:,}")

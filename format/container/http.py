@@ -24,9 +24,8 @@ from dataclasses import dataclass, field
 from urllib.parse import urljoin, urlsplit, urlunsplit
 
 import urllib3
-
-from kpc.format.container.container import DEFAULT_BUDGET
 from kpc.format.common.errors import BudgetError, InterruptedRead, NetworkError, UnreachableError
+from kpc.format.container.container import DEFAULT_BUDGET
 
 SCHEMES = ("http", "https")
 FIRST_BYTES = 1 << 16
@@ -122,8 +121,14 @@ class HttpSource:
         BudgetError: a server without ranges holds more than `limit`.
     """
 
-    def __init__(self, url: str, *, limit: int = DEFAULT_BUDGET, attempts: float = ATTEMPTS,
-                 say: Callable[[str | None], None] = say_on_stderr) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        limit: int = DEFAULT_BUDGET,
+        attempts: float = ATTEMPTS,
+        say: Callable[[str | None], None] = say_on_stderr,
+    ) -> None:
         self.name, self.attempts, self.received, self.has_ranges = _without_secrets(url), attempts, 0, True
         self._url = self._address = url
         self._limit, self.say, self._closed = limit, say, threading.Event()
@@ -170,7 +175,12 @@ class HttpSource:
         """The same file through connections of its own, for another thread; nothing is asked for before it reads. Without ranges it
         would be fetched as a whole once more."""
         other = copy.copy(self)
-        other._pools, other._reading, other._closed, other._interruption = {}, threading.Lock(), threading.Event(), threading.Event()
+        other._pools, other._reading, other._closed, other._interruption = (
+            {},
+            threading.Lock(),
+            threading.Event(),
+            threading.Event(),
+        )
         other._answer, other._parked, other._troubled, other.received = _Answer(0, 0), None, False, 0
         return other
 
@@ -270,10 +280,14 @@ class HttpSource:
         response = self._request(headers)
         answer.response, answer.waited_s, answer.came = response, 0.0, 0
         if response.status in TEMPORARY:
-            raise _Interrupted(f"the server answers {response.status} {response.reason}", pause_s=_retry_after(response))
+            raise _Interrupted(
+                f"the server answers {response.status} {response.reason}", pause_s=_retry_after(response)
+            )
         encoding = response.headers.get("Content-Encoding", "identity")
         if response.status in (200, 206) and encoding != "identity":
-            raise self._refused(answer, f"the server sends it compressed ({encoding[:40]}), which ranges of a file must not be")
+            raise self._refused(
+                answer, f"the server sends it compressed ({encoding[:40]}), which ranges of a file must not be"
+            )
         if response.status == 206 and self.has_ranges:
             self._accept_range(answer, response)
         elif response.status == 200:
@@ -310,8 +324,10 @@ class HttpSource:
         if first_time:
             if (size or 0) > self._limit:
                 answer.drop_connection()
-                raise BudgetError(f"{self.name}: the server has no ranges, and the whole of {size:,} bytes is more than the budget "
-                                  f"of {self._limit:,}")
+                raise BudgetError(
+                    f"{self.name}: the server has no ranges, and the whole of {size:,} bytes is more than the budget "
+                    f"of {self._limit:,}"
+                )
             if self.has_ranges:
                 self.say(f"{self.name}: the server has no ranges, all of it has to be downloaded")
                 self.say(None)
@@ -337,7 +353,9 @@ class HttpSource:
             answer.check_pace()
             if len(answer.data) > self._limit:
                 answer.drop_connection()
-                raise BudgetError(f"{self.name}: the server has no ranges and sends more than the budget of {self._limit:,} bytes")
+                raise BudgetError(
+                    f"{self.name}: the server has no ranges and sends more than the budget of {self._limit:,} bytes"
+                )
         self.received += len(answer.data)
         answer.drop_connection()
         return len(answer.data)
@@ -347,8 +365,15 @@ class HttpSource:
         address = self._address
         for _ in range(REDIRECTS + 1):
             try:
-                response = self._pool(address).request("GET", address, headers=headers, preload_content=False, decode_content=False,
-                                                       redirect=False, retries=False)
+                response = self._pool(address).request(
+                    "GET",
+                    address,
+                    headers=headers,
+                    preload_content=False,
+                    decode_content=False,
+                    redirect=False,
+                    retries=False,
+                )
             except (urllib3.exceptions.LocationValueError, UnicodeError) as error:
                 raise NetworkError(f"{self.name}: no address that can be asked ({error})") from error
             except urllib3.exceptions.SSLError as error:
@@ -375,12 +400,17 @@ class HttpSource:
         if proxy not in self._pools:
             timeout = urllib3.Timeout(connect=CONNECT_S, read=SILENCE_S)
             direct = proxy is None
-            self._pools[proxy] = urllib3.PoolManager(timeout=timeout) if direct else urllib3.ProxyManager(proxy, timeout=timeout)
+            self._pools[proxy] = (
+                urllib3.PoolManager(timeout=timeout) if direct else urllib3.ProxyManager(proxy, timeout=timeout)
+            )
         return self._pools[proxy]
 
     def _is_same(self, response: urllib3.BaseHTTPResponse) -> bool:
         """Whether an answer is of the file that was opened, as far as the server says."""
-        return self._validator is None or response.headers.get(self._validator[0], self._validator[1]) == self._validator[1]
+        return (
+            self._validator is None
+            or response.headers.get(self._validator[0], self._validator[1]) == self._validator[1]
+        )
 
     def _refused(self, answer: _Answer, message: str) -> NetworkError:
         answer.drop_connection()
@@ -436,12 +466,16 @@ def _reason(error: Exception) -> str:
     """Why a connection failed, in a few words."""
     if isinstance(error, urllib3.exceptions.NameResolutionError):
         return "no such server is known"
-    if isinstance(error, urllib3.exceptions.TimeoutError) and not isinstance(error, urllib3.exceptions.NewConnectionError):
+    if isinstance(error, urllib3.exceptions.TimeoutError) and not isinstance(
+        error, urllib3.exceptions.NewConnectionError
+    ):
         return "the server does not answer in time"
     if any(isinstance(e, urllib3.exceptions.IncompleteRead) for e in (error, *error.args)):
         return "the connection breaks off"
     cause: BaseException = error
-    while (below := cause.__cause__ or next((a for a in reversed(cause.args) if isinstance(a, Exception)), None)) is not None:
+    while (
+        below := cause.__cause__ or next((a for a in reversed(cause.args) if isinstance(a, Exception)), None)
+    ) is not None:
         cause = below
     words = getattr(cause, "strerror", None) or str(cause) or type(cause).__name__
     return f"the connection fails ({words[:120]})"

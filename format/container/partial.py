@@ -13,10 +13,9 @@ from collections.abc import Iterable, Sequence
 from typing import cast
 
 import numpy as np
-
+from kpc.format.coding.quantise import dequantised
 from kpc.format.container.container import Entry, Reader
 from kpc.format.container.scene_io import KNOWN_KINDS, PlaneHead, SceneReader
-from kpc.format.coding.quantise import dequantised
 from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, Scene
 
 HAIR = 1e-6
@@ -46,7 +45,11 @@ class SegmentedPlane:
     def __getitem__(self, row: int) -> np.ndarray:
         start = self._starts[bisect_right(self._starts, int(row)) - 1]
         symbols = self._segments.get(start)
-        return self._missing if symbols is None else dequantised(symbols[int(row) - start], self._head.step, self._head.offset)
+        return (
+            self._missing
+            if symbols is None
+            else dequantised(symbols[int(row) - start], self._head.step, self._head.offset)
+        )
 
     def put(self, start: int, symbols: np.ndarray) -> None:
         """The segment that begins at row `start`: (row_count, columns, M) int8."""
@@ -82,7 +85,9 @@ class PartialScene:
         self.since = np.where(self.moves, (first - 1) / last, -1.0) - HAIR
         self.until = np.where(self.moves, (first + count) / last, 2.0) + HAIR
         self.sizes = count * np.array([plane.columns * plane.channels for plane in map(self.head_of, self.numbers)])
-        first_picture = {number for number, entry in enumerate(reader.index) if entry.kind in KNOWN_KINDS and entry.kind != "PLNE"}
+        first_picture = {
+            number for number, entry in enumerate(reader.index) if entry.kind in KNOWN_KINDS and entry.kind != "PLNE"
+        }
         hold(reader, runs(reader.index, sorted(first_picture.union(self.needed(1, 0.0, 0.0))))[0])
         motion = reader.motion()
         self._planes: list[dict[str, np.ndarray]] = []

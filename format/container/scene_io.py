@@ -22,26 +22,59 @@ from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
-
-from kpc.format.scene.cameras import Camera
-from kpc.format.coding.occupancy_codec import decode_cells, encode_cells
-from kpc.format.common.cli import written_aside
-from kpc.format.container.container import (
-    CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_THIRD, DEFAULT_BUDGET, EXPANSION_LIMIT, AnySource, Chunk, Entry, Reader, open_source, pack,
-)
-from kpc.format.common.errors import BudgetError, DatasetError, FormatError
 from kpc.format.coding.motion_hierarchical import decode_midpoints, encode_midpoints
-from kpc.format.scene.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.coding.motion_raster import decode_nodes, encode_nodes
-from kpc.format.coding.raw_planes import decode_segment, encode_segment
+from kpc.format.coding.occupancy_codec import decode_cells, encode_cells
 from kpc.format.coding.poses import decode_poses, encode_poses
-from kpc.format.coding.quantise import VALUE_LIMIT, QuantisedPlane, QuantisedScene, needed_rows, needed_texels, seen_along
-from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, AnyDecoder, Appearance, Clip, Decoder, HybridDecoder
+from kpc.format.coding.quantise import (
+    VALUE_LIMIT,
+    QuantisedPlane,
+    QuantisedScene,
+    needed_rows,
+    needed_texels,
+    seen_along,
+)
+from kpc.format.coding.raw_planes import decode_segment, encode_segment
+from kpc.format.coding.weights import decode_weights, encode_weights
+from kpc.format.common.cli import written_aside
+from kpc.format.common.errors import BudgetError, DatasetError, FormatError
+from kpc.format.container.container import (
+    CODEC_MIDPOINTS,
+    CODEC_SYMBOLS,
+    CODEC_THIRD,
+    DEFAULT_BUDGET,
+    EXPANSION_LIMIT,
+    AnySource,
+    Chunk,
+    Entry,
+    Reader,
+    open_source,
+    pack,
+)
 from kpc.format.container.segments import (
-    SegmentGuide, codec_of, decode_coded, form_of, guide_at, guide_together, rows_of_segments, segment_guide, wants_occupancy,
+    SegmentGuide,
+    codec_of,
+    decode_coded,
+    form_of,
+    guide_at,
+    guide_together,
+    rows_of_segments,
+    segment_guide,
+    wants_occupancy,
+)
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.motion import DISPLACEMENT_LIMIT, QuantisedMotion
+from kpc.format.scene.scene import (
+    ALL_PLANES,
+    SPACE_PLANES,
+    TIME_PLANES,
+    AnyDecoder,
+    Appearance,
+    Clip,
+    Decoder,
+    HybridDecoder,
 )
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
-from kpc.format.coding.weights import decode_weights, encode_weights
 
 Parsed = TypeVar("Parsed")
 Weights = Callable[["_Cursor", Mapping[str, tuple[int, ...]]], dict[str, np.ndarray]]
@@ -191,15 +224,32 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> l
             chunks.append(Chunk("appe", [appe]))
     except (struct.error, OverflowError) as error:
         raise FormatError(f"scene: a number does not fit its field ({error})") from error
-    segments = [(start / len(plane.symbols), number, ALL_PLANES.index(name), start, stop) for number, scale in enumerate(scene.scales)
-                for name, plane in scale.items() for start, stop in _segments_of(plane, name in TIME_PLANES, segment_rows)]
-    implied = [{name: needed_texels(scene.occupancy, name, *plane.coded.shape) for name, plane in scale.items()} for scale in scene.scales]
+    segments = [
+        (start / len(plane.symbols), number, ALL_PLANES.index(name), start, stop)
+        for number, scale in enumerate(scene.scales)
+        for name, plane in scale.items()
+        for start, stop in _segments_of(plane, name in TIME_PLANES, segment_rows)
+    ]
+    implied = [
+        {name: needed_texels(scene.occupancy, name, *plane.coded.shape) for name, plane in scale.items()}
+        for scale in scene.scales
+    ]
     for _, number, of_plane, start, stop in sorted(segments):
         plane = scene.scales[number][ALL_PLANES[of_plane]]
         segment, coded = plane.symbols[start:stop], plane.coded[start:stop]
         form = form_of(segment, coded, guide_at(plane.guide, start), implied[number][ALL_PLANES[of_plane]][start:stop])
-        chunks.append(Chunk("PLNE", encode_segment(segment, coded), number, of_plane, start, stop - start,
-                            dict([form]), segment.size))
+        chunks.append(
+            Chunk(
+                "PLNE",
+                encode_segment(segment, coded),
+                number,
+                of_plane,
+                start,
+                stop - start,
+                dict([form]),
+                segment.size,
+            )
+        )
     return chunks
 
 
@@ -214,8 +264,17 @@ def _segments_of(plane: QuantisedPlane, over_time: bool, segment_rows: int | Non
 def _pack_head(scene: QuantisedScene) -> bytes:
     if np.shape(scene.aabb) != (2, 3) or np.shape(scene.background) != (3,) or not 0 < len(scene.scales) < 256:
         raise FormatError("scene: the box must be (2, 3), the background (3,), and there must be 1 to 255 scales")
-    parts = [SCENE_STRUCT.pack(*np.ravel(scene.aabb), scene.clip.frame_count, scene.clip.fps, scene.step,
-                               *scene.background, len(scene.scales), scene.is_dynamic)]
+    parts = [
+        SCENE_STRUCT.pack(
+            *np.ravel(scene.aabb),
+            scene.clip.frame_count,
+            scene.clip.fps,
+            scene.step,
+            *scene.background,
+            len(scene.scales),
+            scene.is_dynamic,
+        )
+    ]
     names = ALL_PLANES if scene.is_dynamic else SPACE_PLANES
     for number, scale in enumerate(scene.scales):
         if set(scale) != set(names):
@@ -276,8 +335,15 @@ def _motion_chunk(motion: QuantisedMotion) -> Chunk:
     low_bytes_first = np.ascontiguousarray(differences.reshape(-1, 1).view(np.uint8).T)
     head = MOTION_STRUCT.pack(*symbols.shape[:4], motion.step)
     raw = head + low_bytes_first.tobytes()
-    return Chunk("MOVE", [raw], symbol_count=len(raw), coded={
-        CODEC_SYMBOLS: lambda: head + encode_nodes(symbols), CODEC_MIDPOINTS: lambda: head + encode_midpoints(symbols)})
+    return Chunk(
+        "MOVE",
+        [raw],
+        symbol_count=len(raw),
+        coded={
+            CODEC_SYMBOLS: lambda: head + encode_nodes(symbols),
+            CODEC_MIDPOINTS: lambda: head + encode_midpoints(symbols),
+        },
+    )
 
 
 def _occupancy_chunk(occupancy: np.ndarray) -> Chunk:
@@ -292,7 +358,8 @@ def _occupancy_chunk(occupancy: np.ndarray) -> Chunk:
 def _cameras_chunk(cameras: tuple[Camera, ...]) -> Chunk:
     raw = struct.pack("<H", len(cameras)) + b"".join(
         CAMERA_STRUCT.pack(c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy, *np.ravel(c.camera_to_world[:3]))
-        for c in cameras)
+        for c in cameras
+    )
     _parse_cameras(raw)
     told = encode_poses(cameras)
     return Chunk("came", [raw], coded={} if told is None else {CODEC_SYMBOLS: lambda: told}, symbol_count=len(raw))
@@ -304,16 +371,24 @@ def _pack_appearances(appearances: tuple[Appearance, ...], hidden: int) -> bytes
         raise FormatError(f"appearances: codes of shapes {sorted({np.shape(code) for code in codes})}, not {(hidden,)}")
     if any(not np.array_equal(code, code.astype(np.float16)) for code in codes):
         raise FormatError("appearances: the codes are not rounded to float16 (kpc.format.coding.quantise.half)")
-    names = [appearance.name.encode(errors="surrogatepass") for appearance in appearances]  # the parser refuses surrogates
-    return b"".join([APPEARANCE_STRUCT.pack(len(codes), hidden), np.stack(codes).astype("<f2").tobytes(),
-                     *(struct.pack("<B", len(name)) + name for name in names)])
+    names = [
+        appearance.name.encode(errors="surrogatepass") for appearance in appearances
+    ]  # the parser refuses surrogates
+    return b"".join(
+        [
+            APPEARANCE_STRUCT.pack(len(codes), hidden),
+            np.stack(codes).astype("<f2").tobytes(),
+            *(struct.pack("<B", len(name)) + name for name in names),
+        ]
+    )
 
 
 # --- reading
 
 
-def read(source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET,
-         allow_partial: bool = False) -> QuantisedScene:
+def read(
+    source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False
+) -> QuantisedScene:
     """Read a whole scene; every byte of the file is verified.
 
     Args:
@@ -327,14 +402,22 @@ def read(source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET,
     """
     reader = SceneReader(source, memory_budget=memory_budget, allow_partial=allow_partial)
     reader.source.hold(0, reader.source.size)
-    segments = [number for number, entry in enumerate(reader.index) if entry.kind == "PLNE" and reader.available(number)]
+    segments = [
+        number for number, entry in enumerate(reader.index) if entry.kind == "PLNE" and reader.available(number)
+    ]
     held = {(reader.index[number].scale, ALL_PLANES[reader.index[number].plane]) for number in segments}
-    scales = tuple({
-        name: QuantisedPlane(np.zeros((p.rows, p.columns, p.channels), np.int8), p.step,
-                             p.offset if name in TIME_PLANES or (s, name) in held else np.zeros_like(p.offset),
-                             np.zeros((p.rows, p.columns), bool))
-        for name, p in scale.items()
-    } for s, scale in enumerate(reader.head.scales))
+    scales = tuple(
+        {
+            name: QuantisedPlane(
+                np.zeros((p.rows, p.columns, p.channels), np.int8),
+                p.step,
+                p.offset if name in TIME_PLANES or (s, name) in held else np.zeros_like(p.offset),
+                np.zeros((p.rows, p.columns), bool),
+            )
+            for name, p in scale.items()
+        }
+        for s, scale in enumerate(reader.head.scales)
+    )
     starts: dict[tuple[int, str], list[int]] = {}
     for entry in reader.index:
         if entry.kind == "PLNE":
@@ -351,13 +434,25 @@ def read(source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET,
                 plane.symbols[rows], plane.coded[rows] = decoded, coded
             guides.setdefault((entry.scale, name), {})[entry.row_start] = guide
     for (s, name), of_segments in guides.items():
-        scales[s][name] = replace(scales[s][name], guide=guide_together(of_segments), starts=tuple(sorted(starts[s, name])))
+        scales[s][name] = replace(
+            scales[s][name], guide=guide_together(of_segments), starts=tuple(sorted(starts[s, name]))
+        )
     for number, entry in enumerate(reader.index):
         if entry.kind not in KNOWN_KINDS and reader.available(number):
             reader.stored(number)  # ignored, but never damaged
-    return QuantisedScene(reader.head.aabb, reader.head.clip, scales, reader.decoder(), reader.occupancy(),
-                          reader.head.background, reader.head.step, reader.cameras(), reader.mapping(), reader.motion(),
-                          reader.appearances())
+    return QuantisedScene(
+        reader.head.aabb,
+        reader.head.clip,
+        scales,
+        reader.decoder(),
+        reader.occupancy(),
+        reader.head.background,
+        reader.head.step,
+        reader.cameras(),
+        reader.mapping(),
+        reader.motion(),
+        reader.appearances(),
+    )
 
 
 class SceneReader(Reader):
@@ -375,8 +470,14 @@ class SceneReader(Reader):
         FormatError, BudgetError: as `read`.
     """
 
-    def __init__(self, source: AnySource | Reader, *, memory_budget: int = DEFAULT_BUDGET, allow_partial: bool = False,
-                 in_parts: bool = False):
+    def __init__(
+        self,
+        source: AnySource | Reader,
+        *,
+        memory_budget: int = DEFAULT_BUDGET,
+        allow_partial: bool = False,
+        in_parts: bool = False,
+    ):
         opened = source if isinstance(source, Reader) else open_source(source, limit=memory_budget)
         super().__init__(opened, allow_partial=allow_partial)
         self.memory_budget = memory_budget
@@ -384,18 +485,23 @@ class SceneReader(Reader):
             raise FormatError(f"{self.name}: a clip in groups, where a single scene is wanted")
         for number, entry in enumerate(self.index):
             if entry.is_critical and entry.kind not in KNOWN_KINDS:
-                raise FormatError(f"{self.name}: chunk {number} is of the critical kind {entry.kind}, unknown to this "
-                                  "reader; update kpc")
+                raise FormatError(
+                    f"{self.name}: chunk {number} is of the critical kind {entry.kind}, unknown to this "
+                    "reader; update kpc"
+                )
         self.head = self._parsed(_parse_head, self.chunk(self._only("SCNE"), HEAD_LIMIT))
         if self.head.value_count != self.header.value_count:
-            raise FormatError(f"{self.name}: the header claims {self.header.value_count:,} values, "
-                              f"the scene {self.head.value_count:,}")
+            raise FormatError(
+                f"{self.name}: the header claims {self.header.value_count:,} values, "
+                f"the scene {self.head.value_count:,}"
+            )
         self._beside: dict[str, int] = {}
         self._seen: dict[str, np.ndarray] = {}
         self.planes_bytes = 0 if in_parts else 5 * self.head.value_count  # one int8 symbol and one float32 each
         if self.planes_bytes > memory_budget:
-            raise BudgetError(f"{self.name}: needs {self.planes_bytes:,} bytes of memory, more than the budget of "
-                              f"{memory_budget:,}")
+            raise BudgetError(
+                f"{self.name}: needs {self.planes_bytes:,} bytes of memory, more than the budget of {memory_budget:,}"
+            )
         self._check_segments()
         self._decoder_number()
         self._only("OCCU")
@@ -414,11 +520,15 @@ class SceneReader(Reader):
             payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * (1 + texels))
             return *self._parsed(lambda raw: decode_segment(raw, *shape), payload), None
         if entry.raw_length != texels * plane.channels:
-            raise FormatError(f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
-                              f"{texels * plane.channels:,} of its rows")
+            raise FormatError(
+                f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
+                f"{texels * plane.channels:,} of its rows"
+            )
         body = self._context_coded(number)
         if codec_of(body) != entry.codec:
-            raise FormatError(f"{self.name}: chunk {number} (PLNE): codec {entry.codec} has no such number of sets of weights or flag")
+            raise FormatError(
+                f"{self.name}: chunk {number} (PLNE): codec {entry.codec} has no such number of sets of weights or flag"
+            )
 
         implied = None
         if wants_occupancy(body):
@@ -443,7 +553,10 @@ class SceneReader(Reader):
         if decode is None:
             return self._parsed(lambda raw: _parse_motion(raw, self.head.is_dynamic), self.chunk(number))
         raw_length = self.index[number].raw_length
-        return self._parsed(lambda body: _parse_coded_motion(body, raw_length, self.head.is_dynamic, decode), self._context_coded(number))
+        return self._parsed(
+            lambda body: _parse_coded_motion(body, raw_length, self.head.is_dynamic, decode),
+            self._context_coded(number),
+        )
 
     def decoder(self) -> AnyDecoder:
         """The DECO or HYBR chunk."""
@@ -455,7 +568,11 @@ class SceneReader(Reader):
         parse: Callable[[_Cursor, int, Weights], AnyDecoder]
         kind, raw_length = self.index[number].kind, self.index[number].raw_length
         if kind == "HYBR":
-            head, parse, shapes = HYBRID_STRUCT, _parse_hybrid, HybridDecoder.shapes(features, HIDDEN_LIMIT, HIDDEN_LIMIT)
+            head, parse, shapes = (
+                HYBRID_STRUCT,
+                _parse_hybrid,
+                HybridDecoder.shapes(features, HIDDEN_LIMIT, HIDDEN_LIMIT),
+            )
         else:
             head, parse, shapes = DECODER_STRUCT, _parse_decoder, Decoder.shapes(features, HIDDEN_LIMIT)
         if self.index[number].codec == CODEC_SYMBOLS:
@@ -509,8 +626,10 @@ class SceneReader(Reader):
         """A chunk of codec 2 or 3 as it is stored, if it may stand for as much as it claims."""
         entry = self.index[number]
         if entry.raw_length > entry.stored_length * EXPANSION_LIMIT:
-            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) claims a length of {entry.raw_length:,}, more than "
-                              f"{entry.stored_length:,} bytes can hold")
+            raise FormatError(
+                f"{self.name}: chunk {number} ({entry.kind}) claims a length of {entry.raw_length:,}, more than "
+                f"{entry.stored_length:,} bytes can hold"
+            )
         return self.stored(number)
 
     def _only(self, kind: str) -> int:
@@ -533,8 +652,10 @@ class SceneReader(Reader):
         self._beside[what] = more_bytes
         needed = self.planes_bytes + sum(self._beside.values())
         if needed > self.memory_budget:
-            raise BudgetError(f"{self.name}: needs {needed:,} bytes of memory with {what}, more than the budget of "
-                              f"{self.memory_budget:,}")
+            raise BudgetError(
+                f"{self.name}: needs {needed:,} bytes of memory with {what}, more than the budget of "
+                f"{self.memory_budget:,}"
+            )
 
     def _parsed(self, parse: Callable[[bytes], Parsed], raw: bytes) -> Parsed:
         try:
@@ -546,16 +667,20 @@ class SceneReader(Reader):
         """Every plane is listed whole: its segments, in order of their rows, neither overlap nor leave a gap."""
         names = ALL_PLANES if self.head.is_dynamic else SPACE_PLANES
         runs: dict[tuple[int, int], list[Entry]] = {
-            (scale, plane): [] for scale in range(len(self.head.scales)) for plane in range(len(names))}
+            (scale, plane): [] for scale in range(len(self.head.scales)) for plane in range(len(names))
+        }
         for number, entry in enumerate(self.index):
             if entry.kind != "PLNE":
                 if entry.kind in KNOWN_KINDS and any(
-                        (entry.group, entry.scale, entry.plane, entry.row_start, entry.row_count)):
+                    (entry.group, entry.scale, entry.plane, entry.row_start, entry.row_count)
+                ):
                     raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) claims a place among the planes")
                 continue
             if entry.group != 0 or (entry.scale, entry.plane) not in runs:
-                raise FormatError(f"{self.name}: chunk {number} belongs to group {entry.group}, scale {entry.scale}, "
-                                  f"plane {entry.plane}, which the scene does not have")
+                raise FormatError(
+                    f"{self.name}: chunk {number} belongs to group {entry.group}, scale {entry.scale}, "
+                    f"plane {entry.plane}, which the scene does not have"
+                )
             runs[entry.scale, entry.plane].append(entry)
         for (scale, plane), entries in runs.items():
             where, head, row = f"scale {scale}, plane {names[plane]}", self.head.scales[scale][names[plane]], 0
@@ -607,12 +732,20 @@ def _parse_mapping(raw: bytes, head: SceneHead) -> SpaceMapping:
         _, *frame, near, baseline = cursor.unpack(NDC_STRUCT)
         cursor.finish()
         mapping = DeviceCoordinates(np.reshape(frame, (3, 4)), near, baseline)
-        within = all(1 / BOX_LIMIT <= x <= BOX_LIMIT for x in (near, baseline)) and (np.abs(mapping.frame) <= BOX_LIMIT).all()
+        within = (
+            all(1 / BOX_LIMIT <= x <= BOX_LIMIT for x in (near, baseline))
+            and (np.abs(mapping.frame) <= BOX_LIMIT).all()
+        )
         # False for NaN, too; only what is within has products that are none of them infinite
-        if not within or not (np.abs(mapping.frame[:, :3].T @ mapping.frame[:, :3] - np.eye(3)) < FRAME_TOLERANCE).all() \
-                or not head.aabb[1, 2] < baseline / near:
-            raise FormatError(f"WARP: device coordinates of near {near} and baseline {baseline}, their frame or the box in them "
-                              "make no sense")
+        if (
+            not within
+            or not (np.abs(mapping.frame[:, :3].T @ mapping.frame[:, :3] - np.eye(3)) < FRAME_TOLERANCE).all()
+            or not head.aabb[1, 2] < baseline / near
+        ):
+            raise FormatError(
+                f"WARP: device coordinates of near {near} and baseline {baseline}, their frame or the box in them "
+                "make no sense"
+            )
         return mapping
     if kind != CONTRACTED:
         raise FormatError(f"WARP: mapping {kind} of space, unknown to this reader; update kpc")
@@ -647,8 +780,10 @@ def _motion_head(cursor: "_Cursor", dynamic: bool) -> tuple[list[int], float]:
     *sizes, step = cursor.unpack(MOTION_STRUCT)
     rows, *nodes = sizes
     if not dynamic or not 2 <= rows <= AXIS_LIMIT or not all(2 <= n <= MOTION_LIMIT for n in nodes):
-        raise FormatError(f"MOVE: a motion grid of {rows} rows of {nodes} nodes in a {'moving' if dynamic else 'static'} scene "
-                          "makes no sense")
+        raise FormatError(
+            f"MOVE: a motion grid of {rows} rows of {nodes} nodes in a {'moving' if dynamic else 'static'} scene "
+            "makes no sense"
+        )
     if not (step > 0 and 32768 * step <= DISPLACEMENT_LIMIT):  # False for NaN, too
         raise FormatError(f"MOVE: a step of {step} lies outside its range")
     return sizes, step
@@ -657,15 +792,21 @@ def _motion_head(cursor: "_Cursor", dynamic: bool) -> tuple[list[int], float]:
 def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, PlaneHead]:
     channels, nx, ny, nz, nt = cursor.unpack(SCALE_STRUCT)
     size = {"x": nx, "y": ny, "z": nz, "t": nt}
-    if not 0 < channels <= CHANNEL_LIMIT or not all(0 < n <= AXIS_LIMIT for n in (nx, ny, nz)) \
-            or dynamic != (nt > 0) or nt > AXIS_LIMIT:
-        raise FormatError(f"SCNE: scale {number} claims {channels} channels on a grid of {nx}x{ny}x{nz}, "
-                          f"{nt} rows in time")
+    if (
+        not 0 < channels <= CHANNEL_LIMIT
+        or not all(0 < n <= AXIS_LIMIT for n in (nx, ny, nz))
+        or dynamic != (nt > 0)
+        or nt > AXIS_LIMIT
+    ):
+        raise FormatError(
+            f"SCNE: scale {number} claims {channels} channels on a grid of {nx}x{ny}x{nz}, {nt} rows in time"
+        )
     planes = {}
     for name in ALL_PLANES if dynamic else SPACE_PLANES:
         step = cursor.array("<f4", channels).astype(np.float32)
-        offset = cursor.array("<f4", channels).astype(np.float32) if name in SPACE_PLANES \
-            else np.ones(channels, np.float32)
+        offset = (
+            cursor.array("<f4", channels).astype(np.float32) if name in SPACE_PLANES else np.ones(channels, np.float32)
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             in_range = (step > 0) & (step * np.float32(128) + np.abs(offset) <= VALUE_LIMIT)
         if not in_range.all():
@@ -677,23 +818,33 @@ def _parse_scale(cursor: "_Cursor", number: int, dynamic: bool) -> dict[str, Pla
 def _parse_decoder(cursor: "_Cursor", expected_features: int, weights: Weights) -> Decoder:
     features, hidden, bias = cursor.unpack(DECODER_STRUCT)
     if features != expected_features or not 0 < hidden <= HIDDEN_LIMIT or not math.isfinite(bias):
-        raise FormatError(f"DECO: {features} features (the planes give {expected_features}), {hidden} hidden units "
-                          f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}")
+        raise FormatError(
+            f"DECO: {features} features (the planes give {expected_features}), {hidden} hidden units "
+            f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}"
+        )
     return Decoder(density_bias=bias, **weights(cursor, Decoder.shapes(features, hidden)))
 
 
 def _parse_hybrid(cursor: "_Cursor", expected_features: int, weights: Weights) -> HybridDecoder:
     features, width, hidden, bias = cursor.unpack(HYBRID_STRUCT)
-    if features != expected_features or not 0 < min(width, hidden) <= max(width, hidden) <= HIDDEN_LIMIT \
-            or not math.isfinite(bias):
-        raise FormatError(f"HYBR: {features} features (the planes give {expected_features}), {width} and {hidden} hidden units "
-                          f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}")
+    if (
+        features != expected_features
+        or not 0 < min(width, hidden) <= max(width, hidden) <= HIDDEN_LIMIT
+        or not math.isfinite(bias)
+    ):
+        raise FormatError(
+            f"HYBR: {features} features (the planes give {expected_features}), {width} and {hidden} hidden units "
+            f"(1 to {HIDDEN_LIMIT} allowed), density bias {bias}"
+        )
     return HybridDecoder(density_bias=bias, **weights(cursor, HybridDecoder.shapes(features, width, hidden)))
 
 
 def _half_weights(cursor: "_Cursor", shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     with np.errstate(invalid="ignore"):  # a signalling NaN says so when it is cast
-        weights = {name: cursor.array("<f2", math.prod(shape)).astype(np.float32).reshape(shape) for name, shape in shapes.items()}
+        weights = {
+            name: cursor.array("<f2", math.prod(shape)).astype(np.float32).reshape(shape)
+            for name, shape in shapes.items()
+        }
     cursor.finish()
     if not all(np.isfinite(w).all() for w in weights.values()):
         raise FormatError(f"{cursor.kind}: a weight is NaN or infinite")
@@ -735,7 +886,7 @@ def _occupancy_shape(cursor: "_Cursor") -> tuple[int, ...]:
 
 def _parse_cameras(raw: bytes) -> tuple[Camera, ...]:
     cursor = _Cursor(raw, "came")
-    count, = cursor.unpack(struct.Struct("<H"))
+    (count,) = cursor.unpack(struct.Struct("<H"))
     if not 0 < count <= CAMERA_LIMIT:
         raise FormatError(f"came: {count} cameras (1 to {CAMERA_LIMIT} allowed)")
     cameras = tuple(_camera(number, cursor.unpack(CAMERA_STRUCT)) for number in range(count))
@@ -767,21 +918,25 @@ def _parse_appearances(raw: bytes, expected_hidden: int) -> tuple[Appearance, ..
     cursor = _Cursor(raw, "appe")
     count, hidden = cursor.unpack(APPEARANCE_STRUCT)
     if not 0 < count <= APPEARANCE_LIMIT or hidden != expected_hidden:
-        raise FormatError(f"appe: {count} appearances (1 to {APPEARANCE_LIMIT} allowed) of {hidden} numbers (the decoder has "
-                          f"{expected_hidden} hidden units)")
+        raise FormatError(
+            f"appe: {count} appearances (1 to {APPEARANCE_LIMIT} allowed) of {hidden} numbers (the decoder has "
+            f"{expected_hidden} hidden units)"
+        )
     with np.errstate(invalid="ignore"):  # a signalling NaN says so when it is cast
         codes = cursor.array("<f2", count * hidden).astype(np.float32).reshape(count, hidden)
     if not np.isfinite(codes).all():
         raise FormatError("appe: a code is NaN or infinite")
     appearances, known = [], set()
     for number, code in enumerate(codes):
-        length, = cursor.unpack(struct.Struct("<B"))
+        (length,) = cursor.unpack(struct.Struct("<B"))
         try:
             name = cursor.take(length).decode()
         except UnicodeDecodeError as error:
             raise FormatError(f"appe: the name of appearance {number} is not UTF-8") from error
         if not is_name(name) or name in known:
-            raise FormatError(f"appe: the name of appearance {number} is empty, holds a control character, or is there twice")
+            raise FormatError(
+                f"appe: the name of appearance {number} is empty, holds a control character, or is there twice"
+            )
         known.add(name)
         appearances.append(Appearance(name, code))
     cursor.finish()
@@ -803,7 +958,7 @@ class _Cursor:
         self.raw, self.kind, self.position = raw, kind, 0
 
     def take(self, length: int) -> bytes:
-        taken = self.raw[self.position:self.position + length]
+        taken = self.raw[self.position : self.position + length]
         if len(taken) != length:
             raise FormatError(f"{self.kind}: ends after {len(self.raw)} bytes, {self.position + length} needed")
         self.position += length

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-
-from kpc.format.coding.transform import decode_blocks, holds_blocks
-from kpc.format.container.container import CODEC_SYMBOLS, CODEC_THIRD
-from kpc.format.common.errors import FormatError
 from kpc.format.coding.predictive import IMPLIED, THIRD, Guide, decode_symbols, encode_symbols, guide_of, map_flags
-
+from kpc.format.coding.transform import decode_blocks, holds_blocks
+from kpc.format.common.errors import FormatError
+from kpc.format.container.container import CODEC_SYMBOLS, CODEC_THIRD
 
 SEGMENT_ROWS, WHOLE = 32, 16
 """Of a time plane, the fewest that are decoded together, but for what is left at its end: each segment begins without neighbours and with
@@ -55,7 +53,9 @@ def guide_together(guides: Mapping[int, SegmentGuide | None]) -> PlaneGuide | No
     return known[0] if known and all(guide == known[0] for guide in known) else None
 
 
-def encode_coded(symbols: np.ndarray, coded: np.ndarray, guide: SegmentGuide | None = None, implied: np.ndarray | None = None) -> bytes:
+def encode_coded(
+    symbols: np.ndarray, coded: np.ndarray, guide: SegmentGuide | None = None, implied: np.ndarray | None = None
+) -> bytes:
     """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: as their guide has it, if it does, else symbol by symbol. `implied`:
     `kpc.format.coding.quantise.needed_texels`, if a reader knows them."""
     return form_of(symbols, coded, guide, implied)[1]()

@@ -7,7 +7,11 @@ from kpc.format.container.container import RemoteSource, Source
 
 def sliced(source: Source, offset: int, length: int, name: str) -> Source:
     """`length` bytes of a source from `offset` on, fewer where it ends sooner; on a network if that is."""
-    return RemoteSlice(source, offset, length, name) if isinstance(source, RemoteSource) else Slice(source, offset, length, name)
+    return (
+        RemoteSlice(source, offset, length, name)
+        if isinstance(source, RemoteSource)
+        else Slice(source, offset, length, name)
+    )
 
 
 class Slice:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
 from kpc.format.common.cli import written_aside
 from kpc.format.common.errors import DatasetError
 
@@ -142,4 +141,11 @@ def save_shots(path: str | os.PathLike[str], shots: Sequence[Shot]) -> None:
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
-    return {"w": camera.width, "h": camera.height, "fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.cy}
+    return {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fl_x,
+        "fl_y": camera.fl_y,
+        "cx": camera.cx,
+        "cy": camera.cy,
+    }

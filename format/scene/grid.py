@@ -2,7 +2,6 @@
 
 import numpy as np
 
-
 SPACE = (-3, -2, -1)
 SPACE_AND_TIME = (-4, *SPACE)
 

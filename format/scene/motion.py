@@ -13,7 +13,6 @@ network, here so few numbers that a player keeps D at one instant as a small tex
 from dataclasses import dataclass
 
 import numpy as np
-
 from kpc.format.common.errors import FormatError
 from kpc.format.scene.grid import linear, tap
 
@@ -51,8 +50,10 @@ def quantise_motion(offsets: np.ndarray) -> QuantisedMotion:
     """
     largest = float(np.abs(offsets).max())
     if not largest <= DISPLACEMENT_LIMIT:  # False for NaN, too
-        raise FormatError(f"motion: holds NaN or a displacement of more than {DISPLACEMENT_LIMIT:g} boxes, which no file can store; train with a "
-                          "lower learning rate")
+        raise FormatError(
+            f"motion: holds NaN or a displacement of more than {DISPLACEMENT_LIMIT:g} boxes, which no file can store; train with a "
+            "lower learning rate"
+        )
     wide_enough = np.nextafter(np.float32(largest / 32767), np.float32(np.inf))
     step = np.float32(np.clip(wide_enough, STEP, DISPLACEMENT_LIMIT / 32768))
     symbols = np.rint(offsets.astype(np.float64) / step).clip(-32768, 32767).astype(np.int16)

@@ -20,9 +20,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-
-from kpc.format.scene.cameras import Camera
 from kpc.format.common.errors import UsageError
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.space import DeviceCoordinates, SpaceMapping
 
 SPACE_PLANES = ("xy", "xz", "yz")
@@ -71,7 +70,13 @@ class Decoder:
     @staticmethod
     def shapes(features: int, hidden: int) -> dict[str, tuple[int, ...]]:
         """Of the arrays, in their order."""
-        return {"density_weight": (features,), "w1": (hidden, 9), "b1": (hidden,), "w2": (3, features, hidden), "b2": (3, features)}
+        return {
+            "density_weight": (features,),
+            "w1": (hidden, 9),
+            "b1": (hidden,),
+            "w2": (3, features, hidden),
+            "b2": (3, features),
+        }
 
     @property
     def parameter_count(self) -> int:
@@ -106,8 +111,16 @@ class HybridDecoder:
     @staticmethod
     def shapes(features: int, width: int, hidden: int) -> dict[str, tuple[int, ...]]:
         """Of the arrays, in their order."""
-        return {"v": (width, features), "v_bias": (width,), "density_weight": (width,), "w1": (hidden, 9), "b1": (hidden,),
-                "u": (hidden, width), "w2": (3, hidden), "b2": (3,)}
+        return {
+            "v": (width, features),
+            "v_bias": (width,),
+            "density_weight": (width,),
+            "w1": (hidden, 9),
+            "b1": (hidden,),
+            "u": (hidden, width),
+            "w2": (3, hidden),
+            "b2": (3,),
+        }
 
     @property
     def parameter_count(self) -> int:
@@ -193,7 +206,9 @@ class Scene:
         """Numbers in the model: every texel of every channel of every plane, the decoder's weights, displacements, codes."""
         motion = 0 if self.motion is None else self.motion.size
         codes = sum(appearance.code.size for appearance in self.appearances)
-        return sum(p.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count + motion + codes
+        return (
+            sum(p.size for scale in self.scales for p in scale.values()) + self.decoder.parameter_count + motion + codes
+        )
 
     def appearance(self, name: str) -> np.ndarray:
         """The code of an appearance, (H,) float32.

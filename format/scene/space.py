@@ -90,7 +90,9 @@ class DeviceCoordinates:
         """Coordinates (..., 3) of world points (..., 3) of positive depth."""
         local = (points - self.frame[:, 3]) @ self.frame[:, :3]
         depth = -local[..., 2]
-        return np.stack([local[..., 0] / depth, local[..., 1] / depth, self.baseline * (1 / self.near - 1 / depth)], axis=-1)
+        return np.stack(
+            [local[..., 0] / depth, local[..., 1] / depth, self.baseline * (1 / self.near - 1 / depth)], axis=-1
+        )
 
     def expand(self, places: np.ndarray) -> np.ndarray:
         """World points (..., 3) at coordinates (..., 3), the third below baseline / near: the inverse of `place`."""

@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-
-from kpc.format.scene.cameras import Camera, Shot, load_shots, save_shots
 from kpc.format.common.errors import DatasetError
+from kpc.format.scene.cameras import Camera, Shot, load_shots, save_shots
 from kpc.format.scene.rotations import quaternion_of, rotation_of
 
 GAP_S = 2.0
@@ -51,7 +50,9 @@ class CameraPath:
         for number, shot in enumerate(shots, 1):
             axes = shot.camera.camera_to_world[:3, :3]
             if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3 or np.linalg.det(axes) < 0:
-                raise DatasetError(f"keyframe {number} of the camera path: its pose is scaled, skewed or mirrored; turn and shift only")
+                raise DatasetError(
+                    f"keyframe {number} of the camera path: its pose is scaled, skewed or mirrored; turn and shift only"
+                )
         object.__setattr__(self, "keyframes", tuple(shots))
 
     @staticmethod
@@ -104,8 +105,11 @@ class CameraPath:
         seconds = float(np.clip(seconds, ats[0], ats[-1]))
         before = min(int(np.searchsorted(ats, seconds, side="right")) - 1, len(ats) - 2)
         length = ats[before + 1] - ats[before]
-        values = _hermite(self._values[before : before + 2], length * self._speeds[before : before + 2],
-                          (seconds - ats[before]) / length)
+        values = _hermite(
+            self._values[before : before + 2],
+            length * self._speeds[before : before + 2],
+            (seconds - ats[before]) / length,
+        )
         pose = np.eye(4)
         pose[:3, 3], pose[:3, :3] = values[:3], rotation_of(values[3:7])
         fl_x, fl_y = np.exp(values[7:9])
@@ -130,7 +134,10 @@ class CameraPath:
         for before, turn in itertools.pairwise(turns):
             turn *= 1.0 if before @ turn >= 0 else -1.0  # q and -q are the same turn: take the short way
         lenses = np.array([[np.log(c.fl_x), np.log(c.fl_y), c.cx, c.cy] for c in cameras])
-        eyes, times = np.stack([c.camera_to_world[:3, 3] for c in cameras]), np.array([shot.time for shot in self.keyframes])
+        eyes, times = (
+            np.stack([c.camera_to_world[:3, 3] for c in cameras]),
+            np.array([shot.time for shot in self.keyframes]),
+        )
         rounds = np.concatenate([[0], np.cumsum(np.diff(times) < 0)])
         return np.concatenate([eyes, turns, lenses, (times + rounds)[:, None]], axis=1)
 

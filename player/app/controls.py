@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.orbit import Rig, fitted

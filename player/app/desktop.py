@@ -24,8 +24,7 @@ def wayland_library(platform: str, environment: Mapping[str, str]) -> Path | Non
 if library := wayland_library(sys.platform, os.environ):
     os.environ.setdefault("PYGLFW_LIBRARY", str(library))
 
-from imgui_bundle import hello_imgui, imgui  # noqa: E402
-
 import glfw  # noqa: E402, I001
+from imgui_bundle import hello_imgui, imgui  # noqa: E402
 
 __all__ = ["glfw", "hello_imgui", "imgui"]

@@ -4,9 +4,8 @@ import ctypes
 
 import moderngl
 import numpy as np
-
-from kpc.player.gl import shader
 from kpc.player.app.desktop import imgui
+from kpc.player.gl import shader
 
 _VERTEX = f"""{shader.GL33}
 uniform vec2 display;

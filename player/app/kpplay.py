@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kpc.format.common import cli
-from kpc.format.container.container import DEFAULT_BUDGET, open_source
 from kpc.format.common.errors import ContextLostError, UsageError
+from kpc.format.container.container import DEFAULT_BUDGET, open_source
 from kpc.player.app import preferences
-from kpc.player.app.controls import CARD_FPS
-from kpc.player.orbit import Rig
 from kpc.player.app.camera_paths import CameraPath
+from kpc.player.app.controls import CARD_FPS
 from kpc.player.app.preferences import TARGET_FPS, WINDOW_SIDES, Preferences
+from kpc.player.orbit import Rig
 from kpc.player.quality import LADDER
 
 if TYPE_CHECKING:
@@ -49,9 +49,13 @@ def _command(argv: list[str]) -> None:
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), options.folder)
     path = None if options.path is None else CameraPath.load(options.path)
 
-    from kpc.player.streaming.group_playback import Reel  # only now: what is wrong with the options is told without OpenGL's libraries
+    from kpc.player.streaming.group_playback import (
+        Reel,
+    )  # only now: what is wrong with the options is told without OpenGL's libraries
 
-    lasting = preferences.place() if options.frames is None else None  # counted frames are a test, which leaves no trace
+    lasting = (
+        preferences.place() if options.frames is None else None
+    )  # counted frames are a test, which leaves no trace
     stream = Reel(open_source(options.scene, limit=options.memory), memory=options.memory)
     wanted = _over(preferences.load(lasting) if lasting else Preferences(), options)
     last = _play(stream, wanted, options, path)
@@ -66,7 +70,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="kpplay", description="Fly through a .kpc scene. Press H for the keys.")
     parser.add_argument("scene", help="a .kpc file, or its http address")
     parser.add_argument(
-        "--size", type=_size, metavar="WxH", help=f"of the window (default: as it was; {HEIGHT} high, as wide as the camera)"
+        "--size",
+        type=_size,
+        metavar="WxH",
+        help=f"of the window (default: as it was; {HEIGHT} high, as wide as the camera)",
     )
     parser.add_argument(
         "--memory",
@@ -79,15 +86,22 @@ def _parser() -> argparse.ArgumentParser:
         "--quality", choices=list(LADDER), help="how finely to draw (default: as it was; else what the device is up to)"
     )
     parser.add_argument(
-        "--target-fps", type=cli.frame_rate(*TARGET_FPS), metavar="F",
+        "--target-fps",
+        type=cli.frame_rate(*TARGET_FPS),
+        metavar="F",
         help="hold so many frames a second by moving the quality "
         f"(default: as it was; else a graphics card holds {CARD_FPS:.0f})",
     )
     parser.add_argument("--path", metavar="JSON", help="a camera path, as saved before, for J to follow")
     parser.add_argument(
-        "--folder", default=".", metavar="DIR", help="for screenshots, videos and camera paths (default: the working directory)"
+        "--folder",
+        default=".",
+        metavar="DIR",
+        help="for screenshots, videos and camera paths (default: the working directory)",
     )
-    parser.add_argument("--frames", type=int, metavar="N", help="leave after N frames, and neither take nor leave settings")
+    parser.add_argument(
+        "--frames", type=int, metavar="N", help="leave after N frames, and neither take nor leave settings"
+    )
     parser.add_argument("--screenshot", metavar="PNG", help="save the window when leaving")
     return parser
 
@@ -96,14 +110,17 @@ def _over(remembered: Preferences, options: argparse.Namespace) -> Preferences:
     """What is asked for goes before what is remembered; a quality that is asked for is not moved by itself."""
     target_fps = options.target_fps or (None if options.quality else remembered.target_fps)
     return replace(
-        remembered, size=options.size or remembered.size, quality=options.quality or remembered.quality, target_fps=target_fps
+        remembered,
+        size=options.size or remembered.size,
+        quality=options.quality or remembered.quality,
+        target_fps=target_fps,
     )
 
 
 def _play(stream: "Reel", wanted: Preferences, options: argparse.Namespace, path: CameraPath | None) -> Preferences:
     """From the first scene to the last that is dragged in, and over a graphics card that is reset; what to remember."""
-    from kpc.player.streaming.group_playback import Reel
     from kpc.player.app.window import Player, Window  # only now: a scene that cannot be read is told without a display
+    from kpc.player.streaming.group_playback import Reel
 
     window = Window("kpplay", wanted.size or _opening_size(stream))
     before, resets = None, 0

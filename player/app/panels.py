@@ -7,17 +7,16 @@ from typing import TYPE_CHECKING, TypeVar
 
 import moderngl
 import numpy as np
-
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.scene import HybridDecoder, Scene
 from kpc.player.app.controls import SPEEDS
 from kpc.player.app.desktop import imgui
-from kpc.player.app.quality_controller import RUNGS
 from kpc.player.app.preferences import TARGET_FPS
-from kpc.player.quality import LADDER
+from kpc.player.app.quality_controller import RUNGS
+from kpc.player.app.time_plane_pictures import moving_part, time_plane_picture, time_planes
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.renderer import Look
-from kpc.player.app.time_plane_pictures import moving_part, time_plane_picture, time_planes
+from kpc.player.quality import LADDER
 
 if TYPE_CHECKING:
     from kpc.player.app.window import Player
@@ -265,7 +264,10 @@ def _time_planes(player: "Player", bottom: float) -> float:
             player.scrub(player.stream.time_of((imgui.get_mouse_pos().x - corner.x) / max(size.x, 1.0)))
         at = corner.x + player.stream.time_in(player.playback.time) * size.x
         imgui.get_window_draw_list().add_line(
-            imgui.ImVec2(at, corner.y), imgui.ImVec2(at, corner.y + size.y), imgui.get_color_u32(ACCENT), max(0.12 * em, 1.0)
+            imgui.ImVec2(at, corner.y),
+            imgui.ImVec2(at, corner.y + size.y),
+            imgui.get_color_u32(ACCENT),
+            max(0.12 * em, 1.0),
         )
         return bottom - imgui.get_window_height()
 
@@ -312,7 +314,9 @@ def _camera_path(player: "Player", top: float, bottom: float) -> None:
             player.save_path()
         imgui.end_disabled()
         if not path.keyframes:
-            imgui.text_disabled("No keyframes yet. Fly somewhere,\npress K, and again elsewhere;\nor drag a saved path in.")
+            imgui.text_disabled(
+                "No keyframes yet. Fly somewhere,\npress K, and again elsewhere;\nor drag a saved path in."
+            )
             return
         imgui.set_next_item_width(-1)
         ride_s = min(max(player.ride_s, path.start_s), path.end_s)
@@ -366,7 +370,14 @@ def _filming(player: "Player") -> None:
     name = film.path if len(str(film.path)) < 60 else f".../{film.path.name}"
     what = "finishing" if film.is_ending else "filming the path" if player.is_filming_path else "filming"
     share = f" of {player.path.end_s - player.path.start_s:.1f}" if player.is_filming_path else ""
-    _say("film", f"{what}: {film.duration_s:.1f}{share} s, {name}", (0.0, float(width)), 0.06 * player.window.size[1], 0.0, ACCENT)
+    _say(
+        "film",
+        f"{what}: {film.duration_s:.1f}{share} s, {name}",
+        (0.0, float(width)),
+        0.06 * player.window.size[1],
+        0.0,
+        ACCENT,
+    )
 
 
 def _key_list(player: "Player") -> None:
@@ -421,14 +432,21 @@ def _toggle(label: str, on: bool) -> bool:
 
 
 def _place(
-    x: float, y: float, pivot_x: float = 0.0, pivot_y: float = 0.0, most_height: float | None = None, least_width: float = 0.0
+    x: float,
+    y: float,
+    pivot_x: float = 0.0,
+    pivot_y: float = 0.0,
+    most_height: float | None = None,
+    least_width: float = 0.0,
 ) -> None:
     imgui.set_next_window_pos(imgui.ImVec2(x, y), imgui.Cond_.always, imgui.ImVec2(pivot_x, pivot_y))
     if most_height is not None:
         imgui.set_next_window_size_constraints(imgui.ImVec2(least_width, 0), imgui.ImVec2(1e5, max(most_height, 1.0)))
 
 
-def _say(name: str, text: str, across: tuple[float, float], y: float, pivot: float, colour: imgui.ImVec4 | None = None) -> None:
+def _say(
+    name: str, text: str, across: tuple[float, float], y: float, pivot: float, colour: imgui.ImVec4 | None = None
+) -> None:
     """A message in the middle of what is between two places across the window, wrapped; `pivot` of its height lies at `y`."""
     _place(sum(across) / 2, y, 0.5, pivot)
     with _panel(name, imgui.WindowFlags_.no_inputs):

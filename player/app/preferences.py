@@ -73,7 +73,9 @@ def place() -> Path:
     """The file: under $XDG_CONFIG_HOME or ~/.config, ~/Library/Application Support, or %APPDATA%."""
     from kpc.player.app.desktop import hello_imgui
 
-    return Path(hello_imgui.ini_folder_location(hello_imgui.IniFolderType.app_user_config_folder)) / "kpc" / "player.json"
+    return (
+        Path(hello_imgui.ini_folder_location(hello_imgui.IniFolderType.app_user_config_folder)) / "kpc" / "player.json"
+    )
 
 
 def load(path: Path) -> Preferences:
@@ -101,4 +103,6 @@ def save(preferences: Preferences, path: Path) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_aside(path) as aside:
-        aside.write_text(json.dumps({name: value for name, value in asdict(preferences).items() if value is not None}, indent=1))
+        aside.write_text(
+            json.dumps({name: value for name, value in asdict(preferences).items() if value is not None}, indent=1)
+        )

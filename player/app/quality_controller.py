@@ -122,7 +122,9 @@ class Dial:
     def _learn(self, seconds: float) -> None:
         """How the rung it is on compares with the one it came from, if that is the next."""
         if self._left is not None:
-            (lower, fast), (upper, slow) = sorted((self._left, (self.rung, seconds)), key=lambda pair: RUNGS.index(pair[0]))
+            (lower, fast), (upper, slow) = sorted(
+                (self._left, (self.rung, seconds)), key=lambda pair: RUNGS.index(pair[0])
+            )
             if upper == climbed(lower, 1, self.passed_over):
                 self._growth[lower] = max(slow / max(fast, 1e-6), 1.0)
             self._left = None

@@ -1,7 +1,6 @@
 """Time planes as pictures: what moves shows as waves along the time axis, what stands still as even grey."""
 
 import numpy as np
-
 from kpc.format.scene.scene import TIME_PLANES, Scene
 
 MOST_ROWS = 1024
@@ -33,7 +32,11 @@ def time_plane_picture(scene: Scene, plane: str, scale: int) -> np.ndarray:
     main = main * np.where(main[np.abs(main).argmax(0), np.arange(main.shape[1])] < 0, -1.0, 1.0)
     seen = np.zeros((*deviations.shape[:2], 3))
     seen[..., : main.shape[1]] = deviations @ main
-    most = np.percentile(np.abs(seen[np.abs(deviations).max(axis=2) > 0]), SPREAD, axis=0) if deviations.any() else np.ones(3)
+    most = (
+        np.percentile(np.abs(seen[np.abs(deviations).max(axis=2) > 0]), SPREAD, axis=0)
+        if deviations.any()
+        else np.ones(3)
+    )
     shown = 0.5 + 0.5 * np.clip(seen / np.maximum(most, 1e-6), -1.0, 1.0)
     return np.ascontiguousarray(np.rint(255 * shown).astype(np.uint8).swapaxes(0, 1)[::-1])
 

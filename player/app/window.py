@@ -12,27 +12,26 @@ from typing import Any
 
 import moderngl
 import numpy as np
-
-from kpc.format.scene.cameras import Camera
-from kpc.format.container.container import open_source
 from kpc.format.common.errors import ContextLostError, DisplayError, KpcError
 from kpc.format.common.media import write_image
+from kpc.format.container.container import open_source
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.app import panels
+from kpc.player.app.camera_paths import GAP_S, CameraPath
 from kpc.player.app.controls import Playback, View, Wardrobe
 from kpc.player.app.desktop import glfw, imgui
-from kpc.player.app.quality_controller import RUNGS, dial_for
-from kpc.player.orbit import Rig, presets
 from kpc.player.app.imgui_renderer import Overlay
 from kpc.player.app.panels import LOOKS, PARTS
-from kpc.player.app.camera_paths import GAP_S, CameraPath
 from kpc.player.app.preferences import TEXT_SIZES, Preferences
-from kpc.player.streaming.prefetch import Playhead
-from kpc.player.quality import LADDER, climbed
+from kpc.player.app.quality_controller import RUNGS, dial_for
 from kpc.player.app.recording import Recording, frames_due
-from kpc.player.streaming.group_playback import Reel
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.renderer import Look, Renderer, is_software
+from kpc.player.orbit import Rig, presets
+from kpc.player.quality import LADDER, climbed
+from kpc.player.streaming.group_playback import Reel
+from kpc.player.streaming.prefetch import Playhead
 
 REMEDY = "render pictures or a video with kprender instead"
 
@@ -226,7 +225,9 @@ class Player:
         self.rig, self.presets = Rig.of(scene), presets(scene)
         self.camera_number, self.preset_number = 0, -1
         self.view = View.of(self.rig, self.rig.cameras[0])
-        self.playback = Playback(stream.clip, playing=stream.clip.duration_s > 0, speed=preferences.speed, loop=preferences.loop)
+        self.playback = Playback(
+            stream.clip, playing=stream.clip.duration_s > 0, speed=preferences.speed, loop=preferences.loop
+        )
         self.wardrobe = Wardrobe(scene)
         self.part, self.look, self.exact = Part.FULL, Look.COLOUR, False
         self.path, self.ride_s, self.riding = CameraPath(), 0.0, False
@@ -234,7 +235,11 @@ class Player:
         self.film: Recording | None = None
         self._filming_path, self._filming_since = False, 0.0
         self.show_hud, self.show_keys, self.show_path = preferences.controls, False, False
-        self.show_graphs, self.show_planes, self.text_size = preferences.graphs, preferences.planes, preferences.text_size
+        self.show_graphs, self.show_planes, self.text_size = (
+            preferences.graphs,
+            preferences.planes,
+            preferences.text_size,
+        )
         self.history = np.zeros((2, HISTORY), np.float32)
         """Milliseconds from one frame to the next, and that a picture took; the column of the next is `frames % HISTORY`."""
         self.frames = 0
@@ -287,7 +292,11 @@ class Player:
         """Until the window is closed, another scene is opened, or for a number of frames once all of the scene is there that is
         to come."""
         shown = 0
-        while not glfw.window_should_close(self.window.handle) and (frames is None or shown < frames) and self.successor is None:
+        while (
+            not glfw.window_should_close(self.window.handle)
+            and (frames is None or shown < frames)
+            and self.successor is None
+        ):
             if (frames is None or not self.stream.is_settled) and self._is_sharp and self.film is None:
                 glfw.wait_events_timeout(0.05)  # nothing moves: spend next to nothing
             else:
@@ -553,8 +562,16 @@ class Player:
         """Draw the scene if anything has changed, finely once nothing does any more."""
         worn = (self.wardrobe.number, self.wardrobe.progress)
         dial = self.dial
-        wanted = (self.view, self.playback.time, self.part, self.look, dial.chosen, self.exact, worn,
-                  self.stream.version_at(self.playback.time))
+        wanted = (
+            self.view,
+            self.playback.time,
+            self.part,
+            self.look,
+            dial.chosen,
+            self.exact,
+            worn,
+            self.stream.version_at(self.playback.time),
+        )
         if self.stream.scales_here == 0:
             self._is_sharp = True  # as sharp as nothing can be
         elif self.is_filming_path:
@@ -564,7 +581,11 @@ class Player:
             self._picture(dial.pace.scale, dial.rung)
             self._is_paced = True
             drawn, resting = self.renderer.quality, LADDER[dial.resting]
-            is_whole = self.raster == self.canvas.size and not (drawn.tolerance or drawn.blur) and drawn.across == resting.across
+            is_whole = (
+                self.raster == self.canvas.size
+                and not (drawn.tolerance or drawn.blur)
+                and drawn.across == resting.across
+            )
             self._is_sharp = is_whole and dial.rung == dial.resting
         elif not self._is_sharp and now - self._moved > SHARPEN_AFTER_S:
             self._sharpen()
@@ -580,7 +601,9 @@ class Player:
             self._measure()
         width, height = (max(1, round(side * scale)) for side in self.canvas.size)
         self.raster = (width, height)
-        self._show(self.canvas, self.view.camera(*self.canvas.size).resized(width, height))  # the same view, however sides are rounded
+        self._show(
+            self.canvas, self.view.camera(*self.canvas.size).resized(width, height)
+        )  # the same view, however sides are rounded
 
     def _sharpen(self) -> None:
         """Draw the next rows of the picture as finely as it is to be, from above, so many as do not keep the controls waiting."""

@@ -14,13 +14,12 @@ import math
 from typing import Any
 
 import numpy as np
-
 from kpc.format.scene.grid import linear, tap
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
-from kpc.player.cpu.threads import WORKERS
 from kpc.player.cpu.cpu_renderer import Marching, in_steps
-from kpc.player.gl.textures import Layout, filled
 from kpc.player.cpu.simd import LARGEST, WIDE
+from kpc.player.cpu.threads import WORKERS
+from kpc.player.gl.textures import Layout, filled
 
 MOST_CORNERS = 1 << 22
 """Of a grid, 64 MB. With soldier's planes twice as fine, 3,900,000 corners, a picture of 320x240 takes 0.4 of the time that it takes by planes, one
@@ -97,11 +96,22 @@ class Baking(Marching):
 
     def _looked_at(self, worker: int) -> tuple[Any, Any]:
         bias, corners = np.float32(self._scene.decoder.density_bias), self.grid.shape[2::-1]
-        return (self._planes, self._rows, self._weights_in_steps, bias, self.grid.reshape(-1, 4), self._known[worker].reshape(-1), corners), None
+        return (
+            self._planes,
+            self._rows,
+            self._weights_in_steps,
+            bias,
+            self.grid.reshape(-1, 4),
+            self._known[worker].reshape(-1),
+            corners,
+        ), None
 
     @staticmethod
     def rehearsed(scene: Scene) -> tuple[Any, Any]:
-        planes, rows = (np.zeros((1, WIDE), np.int16),) * len(SPACE_PLANES), (np.zeros((1, WIDE), np.float32),) * len(TIME_PLANES)
+        planes, rows = (
+            (np.zeros((1, WIDE), np.int16),) * len(SPACE_PLANES),
+            (np.zeros((1, WIDE), np.float32),) * len(TIME_PLANES),
+        )
         weights, grid, known = np.zeros((4, WIDE), np.float32), np.zeros((1, 4), np.float32), np.zeros(1, np.uint8)
         return (planes, rows, weights, np.float32(0), grid, known, (1, 1, 1)), None
 
@@ -119,7 +129,9 @@ class Baking(Marching):
                 before, share = taps[len(plane)]
                 for instant, weight in ((int(before), 1 - share), (min(int(before) + 1, len(plane) - 1), share)):
                     key = name, number, instant
-                    self._cut[key] = kept[key] if key in kept else self._at_corners(np.asarray(plane[instant], np.float32), name[0])
+                    self._cut[key] = (
+                        kept[key] if key in kept else self._at_corners(np.asarray(plane[instant], np.float32), name[0])
+                    )
                     row[:, first : first + channels] += weight * self._cut[key]
                 first += channels
             rows.append(row)
@@ -133,4 +145,6 @@ class Baking(Marching):
 
 def corners_of(scene: Scene) -> tuple[int, int, int]:
     """(Nz, Ny, Nx) of the grid: those of the finest scale's texels."""
-    return tuple(max(scale[plane].shape[axis] for scale in scene.scales) for plane, axis in (("xz", 0), ("xy", 0), ("xy", 1)))
+    return tuple(
+        max(scale[plane].shape[axis] for scale in scene.scales) for plane, axis in (("xz", 0), ("xy", 0), ("xy", 1))
+    )

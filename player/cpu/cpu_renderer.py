@@ -5,7 +5,6 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.grid import linear
 from kpc.format.scene.scene import Scene
@@ -103,8 +102,12 @@ class Marching(ABC):
         low, box = scene.aabb[0], scene.aabb[1] - scene.aabb[0]
         pose = camera.camera_to_world
         even = _even(scene)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a box without a volume, a camera at the end of the world: no ray meets a thing
-            start = (pose[:3, 3] - low) / box if even is None else (pose[:3, 3] - scene.aabb.mean(0)) / (box := 0.5 * box)
+        with np.errstate(
+            divide="ignore", invalid="ignore", over="ignore"
+        ):  # a box without a volume, a camera at the end of the world: no ray meets a thing
+            start = (
+                (pose[:3, 3] - low) / box if even is None else (pose[:3, 3] - scene.aabb.mean(0)) / (box := 0.5 * box)
+            )
         lens, axes, begin, edges, background = (
             np.ascontiguousarray(array, np.float32)
             for array in ((camera.fl_x, camera.fl_y, camera.cx, camera.cy), pose[:3, :3], start, box, scene.background)

@@ -11,13 +11,12 @@ that is constant but not 1 moves nothing. So the field itself is compared. A pla
 from dataclasses import replace
 
 import numpy as np
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, contract
 from kpc.player.cpu import reference
-from kpc.player.orbit import Rig
 from kpc.player.cpu.reference import Moment, Rendering
+from kpc.player.orbit import Rig
 
 INSTANTS = (np.arange(8) + 0.5) / 8
 """Of the clip."""

@@ -10,9 +10,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-
-from kpc.format.scene.grid import linear
 from kpc.format.coding.rans import compiled
+from kpc.format.scene.grid import linear
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, SPACE_PLANES, Decoder, Scene
 from kpc.format.scene.space import Contraction
 from kpc.player.cpu.threads import share_out
@@ -109,7 +108,12 @@ class Thinning:
             if offsets is not None:
                 _displace(places[part], offsets)
             for scale, weights in enumerate(self._weights):
-                _add_scale(places[part], *self._folded[len(SPACE_PLANES) * scale : len(SPACE_PLANES) * (scale + 1)], weights, out[part])
+                _add_scale(
+                    places[part],
+                    *self._folded[len(SPACE_PLANES) * scale : len(SPACE_PLANES) * (scale + 1)],
+                    weights,
+                    out[part],
+                )
 
         share_out(add, len(places))
         return out
@@ -121,7 +125,11 @@ def _displace(places, offsets):
     nz, ny, nx = offsets.shape[:3]
     one = np.float32(1)
     for n in range(len(places)):
-        x, y, z = places[n, 0] * np.float32(nx - 1), places[n, 1] * np.float32(ny - 1), places[n, 2] * np.float32(nz - 1)
+        x, y, z = (
+            places[n, 0] * np.float32(nx - 1),
+            places[n, 1] * np.float32(ny - 1),
+            places[n, 2] * np.float32(nz - 1),
+        )
         i, j, k = min(int(x), max(nx - 2, 0)), min(int(y), max(ny - 2, 0)), min(int(z), max(nz - 2, 0))
         f, g, h = np.float32(x - i), np.float32(y - j), np.float32(z - k)
         for axis in range(3):
@@ -141,19 +149,46 @@ def _add_scale(places, xy, xz, yz, weights, out):
     of_xy, of_xz, of_yz = xy.ravel(), xz.ravel(), yz.ravel()
     # Unsigned, so that no place counts from an array's end: that would keep the loop over channels from being one of vectors.
     along_x, along_y = np.uint64(channels if nx > 1 else 0), np.uint64(channels if ny > 1 else 0)
-    up_y, up_z, up_z_of_y = along_y * np.uint64(nx), np.uint64(channels * nx if nz > 1 else 0), np.uint64(channels * ny if nz > 1 else 0)
+    up_y, up_z, up_z_of_y = (
+        along_y * np.uint64(nx),
+        np.uint64(channels * nx if nz > 1 else 0),
+        np.uint64(channels * ny if nz > 1 else 0),
+    )
     for n in range(len(places)):
-        x, y, z = places[n, 0] * np.float32(nx - 1), places[n, 1] * np.float32(ny - 1), places[n, 2] * np.float32(nz - 1)
+        x, y, z = (
+            places[n, 0] * np.float32(nx - 1),
+            places[n, 1] * np.float32(ny - 1),
+            places[n, 2] * np.float32(nz - 1),
+        )
         i, j, k = min(int(x), max(nx - 2, 0)), min(int(y), max(ny - 2, 0)), min(int(z), max(nz - 2, 0))
         f, g, h = np.float32(x - i), np.float32(y - j), np.float32(z - k)
-        a, b, c = np.uint64(channels * (j * nx + i)), np.uint64(channels * (k * nx + i)), np.uint64(channels * (k * ny + j))
+        a, b, c = (
+            np.uint64(channels * (j * nx + i)),
+            np.uint64(channels * (k * nx + i)),
+            np.uint64(channels * (k * ny + j)),
+        )
         a0, a1, a2, a3 = (one - f) * (one - g), f * (one - g), (one - f) * g, f * g
         b0, b1, b2, b3 = (one - f) * (one - h), f * (one - h), (one - f) * h, f * h
         c0, c1, c2, c3 = (one - g) * (one - h), g * (one - h), (one - g) * h, g * h
         log_density = np.float32(0)
         for m in range(np.uint64(channels)):
-            in_xy = a0 * of_xy[a + m] + a1 * of_xy[a + m + along_x] + a2 * of_xy[a + m + up_y] + a3 * of_xy[a + m + along_x + up_y]
-            in_xz = b0 * of_xz[b + m] + b1 * of_xz[b + m + along_x] + b2 * of_xz[b + m + up_z] + b3 * of_xz[b + m + along_x + up_z]
-            in_yz = c0 * of_yz[c + m] + c1 * of_yz[c + m + along_y] + c2 * of_yz[c + m + up_z_of_y] + c3 * of_yz[c + m + along_y + up_z_of_y]
+            in_xy = (
+                a0 * of_xy[a + m]
+                + a1 * of_xy[a + m + along_x]
+                + a2 * of_xy[a + m + up_y]
+                + a3 * of_xy[a + m + along_x + up_y]
+            )
+            in_xz = (
+                b0 * of_xz[b + m]
+                + b1 * of_xz[b + m + along_x]
+                + b2 * of_xz[b + m + up_z]
+                + b3 * of_xz[b + m + along_x + up_z]
+            )
+            in_yz = (
+                c0 * of_yz[c + m]
+                + c1 * of_yz[c + m + along_y]
+                + c2 * of_yz[c + m + up_z_of_y]
+                + c3 * of_yz[c + m + along_y + up_z_of_y]
+            )
             log_density += in_xy * in_xz * in_yz * weights[m]
         out[n] += log_density

@@ -4,15 +4,14 @@ import math
 from typing import Any
 
 import numpy as np
-
 from kpc.format.scene.grid import linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.format.scene.space import DeviceCoordinates
-from kpc.player.cpu.raymarch import LANES
-from kpc.player.cpu.threads import WORKERS
 from kpc.player.cpu.cpu_renderer import Marching, in_steps
-from kpc.player.gl.textures import Layout, filled
+from kpc.player.cpu.raymarch import LANES
 from kpc.player.cpu.simd import CHANNELS, LARGEST, NARROW, WIDE
+from kpc.player.cpu.threads import WORKERS
+from kpc.player.gl.textures import Layout, filled
 
 
 class Lookup(Marching):
@@ -34,10 +33,15 @@ class Lookup(Marching):
         self._firsts = np.concatenate([_starts(planes), _starts(rows)], axis=1)
         self._planes, self._rows = np.zeros(int(planes.sum()), np.int16), np.ones(int(rows.sum()), np.float32)
         hidden = len(decoder.b1) if decoder.w2.any() else 0
-        self._w1, self._b1 = np.ascontiguousarray(decoder.w1[:hidden], np.float32), np.asarray(decoder.b1[:hidden], np.float32)
+        self._w1, self._b1 = (
+            np.ascontiguousarray(decoder.w1[:hidden], np.float32),
+            np.asarray(decoder.b1[:hidden], np.float32),
+        )
         w2 = np.moveaxis(decoder.w2, 2, 0)[:hidden]
         self._w2 = self._w2_in_steps = self._as_it_lies(np.concatenate([w2, np.zeros_like(w2[:, :1])], axis=1))
-        self._weights = self._weights_in_steps = self._as_it_lies(np.concatenate([decoder.b2, decoder.density_weight[None]]))
+        self._weights = self._weights_in_steps = self._as_it_lies(
+            np.concatenate([decoder.b2, decoder.density_weight[None]])
+        )
         self._seen_from = np.zeros((WORKERS, LANES if hidden else 0, len(self._weights)), np.float32)
         """Each worker's room for weights as its rays see them."""
 
@@ -52,7 +56,9 @@ class Lookup(Marching):
         for scale in scene.scales:
             nx, ny, nz = _texels(scale)
             channels = scale["xy"].shape[2]
-            taken += (channels + -channels % _wide(scene)) * (2 * (nx * ny + nx * nz + ny * nz) + 4 * (nx + ny + nz) + 4 * CHANNELS * WORKERS * LANES)
+            taken += (channels + -channels % _wide(scene)) * (
+                2 * (nx * ny + nx * nz + ny * nz) + 4 * (nx + ny + nz) + 4 * CHANNELS * WORKERS * LANES
+            )
         return taken
 
     def keep(self, atlas: np.ndarray) -> None:
@@ -63,7 +69,10 @@ class Lookup(Marching):
                 whole = _twice(whole, axis)
             self._put(self._planes, block.scale, SPACE_PLANES.index(block.plane), whole)
             steps.append(step)
-        product = [np.prod(steps[first : first + len(SPACE_PLANES)], axis=0) for first in range(0, len(steps), len(SPACE_PLANES))]
+        product = [
+            np.prod(steps[first : first + len(SPACE_PLANES)], axis=0)
+            for first in range(0, len(steps), len(SPACE_PLANES))
+        ]
         in_all = self._as_it_lies(np.tile(np.concatenate(product), (CHANNELS, 1)))
         self._w2_in_steps, self._weights_in_steps = (
             np.clip(weights * in_all, -LARGEST, LARGEST).astype(np.float32) for weights in (self._w2, self._weights)
@@ -89,9 +98,25 @@ class Lookup(Marching):
 
     @staticmethod
     def rehearsed(scene: Scene) -> tuple[Any, Any]:
-        halves, flat, of_two = tuple(range(0, _wide(scene), NARROW)), np.zeros(1, np.float32), np.zeros((1, 1), np.float32)
+        halves, flat, of_two = (
+            tuple(range(0, _wide(scene), NARROW)),
+            np.zeros(1, np.float32),
+            np.zeros((1, 1), np.float32),
+        )
         places = np.zeros((1, 1), np.int64)
-        return None, (halves, np.zeros(1, np.int16), flat, places, places, of_two, flat, of_two, flat, np.float32(0), of_two)
+        return None, (
+            halves,
+            np.zeros(1, np.int16),
+            flat,
+            places,
+            places,
+            of_two,
+            flat,
+            of_two,
+            flat,
+            np.float32(0),
+            of_two,
+        )
 
     def _put(self, into: np.ndarray, scale: int, which: int, texels: np.ndarray) -> None:
         """(..., channels) where it lies."""
@@ -102,7 +127,10 @@ class Lookup(Marching):
 
     def _as_it_lies(self, weights: np.ndarray) -> np.ndarray:
         """(..., CHANNELS, F) float64 as (..., CHANNELS F): each group's features of each of the channels."""
-        parts = [filled(part, part.ndim - 1, self._wide) for part in np.split(weights, np.cumsum(self._channels)[:-1], axis=-1)]
+        parts = [
+            filled(part, part.ndim - 1, self._wide)
+            for part in np.split(weights, np.cumsum(self._channels)[:-1], axis=-1)
+        ]
         whole = np.concatenate(parts, axis=-1).astype(np.float64)
         grouped = whole.reshape(*whole.shape[:-1], whole.shape[-1] // self._wide, self._wide).swapaxes(-3, -2)
         return np.ascontiguousarray(grouped).reshape(*whole.shape[:-2], math.prod(whole.shape[-2:]))

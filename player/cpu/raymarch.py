@@ -13,9 +13,8 @@ may look at 290,000.
 import math
 
 import numpy as np
-
-from kpc.format.scene import space
 from kpc.format.coding.rans import compiled
+from kpc.format.scene import space
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
 from kpc.player.cpu.reference import PARALLEL
 from kpc.player.cpu.simd import CHANNELS, NARROW, WIDE, combine, interpolate, weigh
@@ -51,7 +50,29 @@ _part = compiled(forceinline=True, _nrt=False, **_FAST)
 
 
 @compiled(**_FAST)
-def cast(blocks, side, origin, size, lens, axes, start, box, even, stride, tau, termination, background, free, cells, motion, nodes, baked, looked_up, seen, met):
+def cast(
+    blocks,
+    side,
+    origin,
+    size,
+    lens,
+    axes,
+    start,
+    box,
+    even,
+    stride,
+    tau,
+    termination,
+    background,
+    free,
+    cells,
+    motion,
+    nodes,
+    baked,
+    looked_up,
+    seen,
+    met,
+):
     """March the pixels of blocks.
 
     `blocks`: (N, 2) int64 of row and column, each of `side` x `side` pixels, rows from below. `origin`: column and row of the pixel that comes
@@ -72,7 +93,12 @@ def cast(blocks, side, origin, size, lens, axes, start, box, even, stride, tau, 
     (1, 4 F), those of all.
     """
     rays, samples = np.zeros((STRETCH + 1, LANES), np.float32), np.zeros((LOG_DENSITY + 1, LANES), np.float32)
-    pixel, cell, around, of_ray = np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.zeros(LANES, np.int32), np.empty(LANES, np.int32)
+    pixel, cell, around, of_ray = (
+        np.empty(LANES, np.int32),
+        np.empty(LANES, np.int32),
+        np.zeros(LANES, np.int32),
+        np.empty(LANES, np.int32),
+    )
     wanted = np.empty(AROUND * LANES + 1, np.int32)
     texels, kept = np.zeros((6, LANES), np.int32), np.zeros(LANES, np.int32)
     if baked is not None:
@@ -81,7 +107,10 @@ def cast(blocks, side, origin, size, lens, axes, start, box, even, stride, tau, 
         halves, planes, rows, firsts, sizes, w1, b1, w2, of_all, bias, weights = looked_up
         if len(b1) > 0:
             kept[:] = np.arange(LANES)  # each ray's own weights
-    taken, count = np.int64(0), np.int64(0)  # a plain 0 would be a type of its own, for which parts are compiled once more
+    taken, count = (
+        np.int64(0),
+        np.int64(0),
+    )  # a plain 0 would be a type of its own, for which parts are compiled once more
     while taken < len(blocks) or count > 0:
         while taken < len(blocks) and count + side * side <= LANES:
             count = _begin(blocks[taken], side, size, lens, axes, start, box, even, count, rays, pixel)
@@ -250,9 +279,17 @@ def _pass_by_contracted(count, start, even, stride, cells, rays, around):
         x_low, x_high = _sides(rays[X, i], reach, F(nx))
         y_low, y_high = _sides(rays[Y, i], reach, F(ny))
         z_low, z_high = _sides(rays[Z, i], reach, F(nz))
-        straight = min(_straight(x, vx, x_low, x_high), min(_straight(y, vy, y_low, y_high), _straight(z, vz, z_low, z_high)))
+        straight = min(
+            _straight(x, vx, x_low, x_high), min(_straight(y, vy, y_low, y_high), _straight(z, vz, z_low, z_high))
+        )
         at_x, at_y, at_z = FOUR * rays[X, i] - TWO, FOUR * rays[Y, i] - TWO, FOUR * rays[Z, i] - TWO
-        margin = max(min(min(min(at_x - x_low, x_high - at_x), min(at_y - y_low, y_high - at_y)), min(at_z - z_low, z_high - at_z)), ZERO)
+        margin = max(
+            min(
+                min(min(at_x - x_low, x_high - at_x), min(at_y - y_low, y_high - at_y)),
+                min(at_z - z_low, z_high - at_z),
+            ),
+            ZERO,
+        )
         speed = _largest(vx, vy, vz)
         turn = _largest(start[1] * vz - start[2] * vy, start[2] * vx - start[0] * vz, start[0] * vy - start[1] * vx)
         nearest = _largest(at_x, at_y, at_z) - margin
@@ -329,7 +366,9 @@ def _wanted(found, known, corners, cell, wanted):
         if known[first] & WHOLE:
             continue
         for number in range(AROUND):
-            corner = first + (right if number & 1 else U(0)) + (up if number & 2 else U(0)) + (back if number & 4 else U(0))
+            corner = (
+                first + (right if number & 1 else U(0)) + (up if number & 2 else U(0)) + (back if number & 4 else U(0))
+            )
             wanted[count] = corner
             count += U(known[corner] == 0)
             known[corner] |= BAKED
@@ -362,7 +401,14 @@ def _face(found, box, of_ray, rays, kept, w1, b1, w2, of_all, weights):
             weights[row, m] = of_all[m]
         for h in range(U(len(b1))):
             sum_ = b1[h] + w1[h, 0] * x + w1[h, 1] * y + w1[h, 2] * z
-            sum_ += w1[h, 3] * x * x + w1[h, 4] * y * y + w1[h, 5] * z * z + w1[h, 6] * x * y + w1[h, 7] * y * z + w1[h, 8] * z * x
+            sum_ += (
+                w1[h, 3] * x * x
+                + w1[h, 4] * y * y
+                + w1[h, 5] * z * z
+                + w1[h, 6] * x * y
+                + w1[h, 7] * y * z
+                + w1[h, 8] * z * x
+            )
             if sum_ > ZERO:
                 for m in range(U(len(of_all))):
                     weights[row, m] += sum_ * w2[h, m]
@@ -373,8 +419,17 @@ def _weigh(found, halves, planes, rows, firsts, sizes, weights, bias, of_ray, ke
     """Logits and log densities from planes and rows."""
     flat, each, wide = weights.reshape(-1), U(weights.shape[1]), U(NARROW * len(halves))
     for j in range(_whole(found)):
-        samples[AT_X, j], samples[AT_Y, j], samples[AT_Z, j] = _within(samples[AT_X, j], ONE), _within(samples[AT_Y, j], ONE), _within(samples[AT_Z, j], ONE)
-        samples[LOGIT_RED, j], samples[LOGIT_GREEN, j], samples[LOGIT_BLUE, j], samples[LOG_DENSITY, j] = ZERO, ZERO, ZERO, bias
+        samples[AT_X, j], samples[AT_Y, j], samples[AT_Z, j] = (
+            _within(samples[AT_X, j], ONE),
+            _within(samples[AT_Y, j], ONE),
+            _within(samples[AT_Z, j], ONE),
+        )
+        samples[LOGIT_RED, j], samples[LOGIT_GREEN, j], samples[LOGIT_BLUE, j], samples[LOG_DENSITY, j] = (
+            ZERO,
+            ZERO,
+            ZERO,
+            bias,
+        )
     for group in range(U(len(sizes))):
         nx, ny, nz = sizes[group, 0], sizes[group, 1], sizes[group, 2]
         for j in range(_whole(found)):
@@ -383,7 +438,14 @@ def _weigh(found, halves, planes, rows, firsts, sizes, weights, bias, of_ray, ke
             samples[PART_X, j], samples[PART_Y, j], samples[PART_Z, j] = x - F(column), y - F(row), z - F(layer)
             texels[0, j], texels[1, j], texels[2, j] = row * I(nx) + column, layer * I(nx) + column, layer * I(ny) + row
             texels[3, j], texels[4, j], texels[5, j] = column, row, layer
-        xy, xz, yz, of_x, of_y, of_z = firsts[group, 0], firsts[group, 1], firsts[group, 2], firsts[group, 3], firsts[group, 4], firsts[group, 5]
+        xy, xz, yz, of_x, of_y, of_z = (
+            firsts[group, 0],
+            firsts[group, 1],
+            firsts[group, 2],
+            firsts[group, 3],
+            firsts[group, 4],
+            firsts[group, 5],
+        )
         up, up_yz = wide * U(nx), wide * U(ny)
         for j in range(U(found)):
             weigh(

@@ -19,12 +19,19 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.grid import linear, tap
 from kpc.format.scene.motion import moved
 from kpc.format.scene.scene import (
-    ACTIVATION_LIMIT, LOG_DENSITY_LIMIT, SPACE_PLANES, TERMINATION, TIME_PLANES, AnyDecoder, Decoder, HybridDecoder, Scene,
+    ACTIVATION_LIMIT,
+    LOG_DENSITY_LIMIT,
+    SPACE_PLANES,
+    TERMINATION,
+    TIME_PLANES,
+    AnyDecoder,
+    Decoder,
+    HybridDecoder,
+    Scene,
 )
 from kpc.format.scene.space import Contraction, DeviceCoordinates, contract
 
@@ -64,7 +71,9 @@ class Rendering:
 def mixed(parts: Sequence[tuple[Rendering, float]]) -> Rendering:
     """Pictures of one camera and their shares as one: colours and opacity in these shares, depth of the one whose share is largest, samples
     of all."""
-    rgb, opacity = (sum(np.float32(share) * getattr(part, name) for part, share in parts) for name in ("rgb", "opacity"))
+    rgb, opacity = (
+        sum(np.float32(share) * getattr(part, name) for part, share in parts) for name in ("rgb", "opacity")
+    )
     largest, _ = max(parts, key=lambda part: part[1])
     return Rendering(rgb, largest.depth, opacity, sum(part.samples for part, _ in parts))
 
@@ -80,7 +89,12 @@ def render(
 
 
 def render_rays(
-    scene: Scene, origins: np.ndarray, directions: np.ndarray, time: float, *, part: Part = Part.FULL,
+    scene: Scene,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    time: float,
+    *,
+    part: Part = Part.FULL,
     appearance: np.ndarray | None = None,
 ) -> Rendering:
     """Render rays, (N, 3) float32 origins and unit directions in world coordinates. Memory does not grow with N but for
@@ -112,7 +126,9 @@ def code_of(scene: Scene, appearance: np.ndarray | None) -> np.ndarray:
     if appearance is None:
         return np.zeros(hidden, np.float32)
     if np.shape(appearance) != (hidden,) or not scene.appearances:
-        raise ValueError(f"a code of shape {np.shape(appearance)} for {len(scene.appearances)} appearances of {hidden} numbers")
+        raise ValueError(
+            f"a code of shape {np.shape(appearance)} for {len(scene.appearances)} appearances of {hidden} numbers"
+        )
     return np.asarray(appearance, np.float32)
 
 
@@ -206,7 +222,9 @@ def features(scene: Scene, moment: Moment, u: np.ndarray) -> np.ndarray:
 def density(decoder: AnyDecoder, f: np.ndarray) -> np.ndarray:
     """sigma per longest edge of the box of features (N, F): (N,). `kpc.format.scene.scene`."""
     values = activations(decoder, f) if isinstance(decoder, HybridDecoder) else f
-    return np.exp(np.clip(values @ decoder.density_weight + decoder.density_bias, -LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT))
+    return np.exp(
+        np.clip(values @ decoder.density_weight + decoder.density_bias, -LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)
+    )
 
 
 def activations(decoder: HybridDecoder, f: np.ndarray) -> np.ndarray:

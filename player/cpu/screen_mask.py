@@ -7,7 +7,6 @@ pixels run as one, and what one of them need not do is done all the same.
 from dataclasses import dataclass
 
 import numpy as np
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.grid import dilate
 
@@ -48,7 +47,10 @@ class Cover:
             return None
         columns, rows = -(-camera.width // side), -(-camera.height // side)
         edges = []
-        for offset, focal, centre, count in ((x, camera.fl_x, camera.cx, columns), (y, camera.fl_y, camera.height - camera.cy, rows)):
+        for offset, focal, centre, count in (
+            (x, camera.fl_x, camera.cx, columns),
+            (y, camera.fl_y, camera.height - camera.cy, rows),
+        ):
             low, high = offset - self.reach, offset + self.reach
             first = np.floor((centre + focal * np.minimum(low / nearest, low / farthest)) / side)
             last = np.floor((centre + focal * np.maximum(high / nearest, high / farthest)) / side)

@@ -27,7 +27,20 @@ _CONTRACT = ["contract"]
 
 
 @intrinsic
-def interpolate(_: Any, grid: Any, first: Any, right: Any, up: Any, back: Any, x: Any, y: Any, z: Any, into: Any, line: Any, column: Any) -> Any:
+def interpolate(
+    _: Any,
+    grid: Any,
+    first: Any,
+    right: Any,
+    up: Any,
+    back: Any,
+    x: Any,
+    y: Any,
+    z: Any,
+    into: Any,
+    line: Any,
+    column: Any,
+) -> Any:
     """into[line + c, column] = the sum over the eight nodes around of their weights times grid[node, c], c = 0 to 3.
 
     `grid`, (N, 4) float32; `first`, the node before along all axes, `right`, `up`, `back` from it to the next along x, y, z, uint64; x, y, z,
@@ -36,7 +49,10 @@ def interpolate(_: Any, grid: Any, first: Any, right: Any, up: Any, back: Any, x
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
         grid, first, right, up, back, x, y, z, into, line, column = arguments
-        nodes, out = _array(context, builder, signature, arguments, 0), _array(context, builder, signature, arguments, 8)
+        nodes, out = (
+            _array(context, builder, signature, arguments, 0),
+            _array(context, builder, signature, arguments, 8),
+        )
         one = ir.Constant(_FLOAT, 1.0)
         ways = [(step, builder.fsub(one, share), share) for step, share in ((right, x), (up, y), (back, z))]
         terms = []
@@ -83,13 +99,23 @@ def combine(_: Any, wholes: Any, factors: Any, weights: Any, bias: Any, into: An
             feature = reduce(builder.fmul, [*of_wholes, *(_load(builder, array.data, m, WIDE) for array in factors)])
             for channel, sum_ in enumerate(sums):
                 weight = _load(builder, weights.data, builder.add(builder.mul(count, _INDEX(channel)), m), WIDE)
-                builder.store(builder.fadd(builder.load(sum_), builder.fmul(feature, weight, flags=_CONTRACT), flags=_CONTRACT), sum_)
+                builder.store(
+                    builder.fadd(builder.load(sum_), builder.fmul(feature, weight, flags=_CONTRACT), flags=_CONTRACT),
+                    sum_,
+                )
         total = _sums(builder, [builder.load(sum_) for sum_ in sums], WIDE)
         total = builder.fadd(total, builder.insert_element(_constant(0.0, CHANNELS), bias, _LANE(CHANNELS - 1)))
         is_number = builder.fcmp_ordered("ord", total, total)
         for limit, keeps in ((LARGEST, "<"), (-LARGEST, ">")):
-            total = builder.select(builder.fcmp_ordered(keeps, total, _constant(limit, CHANNELS)), total, _constant(limit, CHANNELS))
-        _store(builder, builder.select(is_number, total, _constant(0.0, CHANNELS)), out.data, builder.mul(row, _INDEX(CHANNELS)))
+            total = builder.select(
+                builder.fcmp_ordered(keeps, total, _constant(limit, CHANNELS)), total, _constant(limit, CHANNELS)
+            )
+        _store(
+            builder,
+            builder.select(is_number, total, _constant(0.0, CHANNELS)),
+            out.data,
+            builder.mul(row, _INDEX(CHANNELS)),
+        )
         return context.get_dummy_value()
 
     return types.void(wholes, factors, weights, bias, into, row), generate
@@ -128,10 +154,23 @@ def weigh(
             for plane in corners:
                 wholes = [_load(builder, planes.data, builder.add(place, m), NARROW, _SHORT) for place, _ in plane]
                 floats = [builder.sitofp(whole, _vector(NARROW)) for whole in wholes]
-                factors.append(_sum(builder, [builder.fmul(x, factor, flags=_CONTRACT) for x, (_, factor) in zip(floats, plane, strict=True)]))
+                factors.append(
+                    _sum(
+                        builder,
+                        [
+                            builder.fmul(x, factor, flags=_CONTRACT)
+                            for x, (_, factor) in zip(floats, plane, strict=True)
+                        ],
+                    )
+                )
             for start, way in zip(starts, ways, strict=True):
-                before, behind = (_load(builder, rows.data, builder.add(start, _INDEX(half + further)), NARROW) for further in (0, wide))
-                factors.append(_sum(builder, [before, builder.fmul(way, builder.fsub(behind, before), flags=_CONTRACT)]))
+                before, behind = (
+                    _load(builder, rows.data, builder.add(start, _INDEX(half + further)), NARROW)
+                    for further in (0, wide)
+                )
+                factors.append(
+                    _sum(builder, [before, builder.fmul(way, builder.fsub(behind, before), flags=_CONTRACT)])
+                )
             feature = reduce(builder.fmul, factors)
             for c in range(CHANNELS):
                 weight = _load(builder, weights.data, builder.add(first, _INDEX(wide * c + half)), NARROW)
@@ -157,7 +196,10 @@ def _sums(builder: Any, vectors: Sequence[Any], wide: int) -> Any:
         halves = range(wide), range(wide, 2 * wide)
         vectors = [builder.fadd(*(_picked(builder, vector, vector, lanes) for lanes in halves)) for vector in vectors]
     a, b, c, d = vectors
-    one, other = (builder.fadd(_picked(builder, x, y, (0, 4, 1, 5)), _picked(builder, x, y, (2, 6, 3, 7))) for x, y in ((a, b), (c, d)))
+    one, other = (
+        builder.fadd(_picked(builder, x, y, (0, 4, 1, 5)), _picked(builder, x, y, (2, 6, 3, 7)))
+        for x, y in ((a, b), (c, d))
+    )
     return builder.fadd(_picked(builder, one, other, (0, 1, 4, 5)), _picked(builder, one, other, (2, 3, 6, 7)))
 
 

@@ -10,24 +10,32 @@ from typing import Any
 
 import moderngl
 import numpy as np
-
-from kpc.format.scene.cameras import Camera
 from kpc.format.common.errors import DisplayError
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.grid import linear
 from kpc.format.scene.scene import SPACE_PLANES, HybridDecoder, Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
-from kpc.player.gl import shader
 from kpc.player.cpu.corner_grid import Baking
-from kpc.player.cpu.screen_mask import Cover
-from kpc.player.cpu.plane_sampler import Lookup
 from kpc.player.cpu.cpu_renderer import BLOCK, Marching, probes_of, rehearse
-from kpc.player.quality import LADDER, Quality
+from kpc.player.cpu.occupancy_culling import Thinning
+from kpc.player.cpu.plane_sampler import Lookup
 from kpc.player.cpu.reference import Part, Rendering, code_of, places, sample_range, slot_at
+from kpc.player.cpu.screen_mask import Cover
+from kpc.player.gl import shader
 from kpc.player.gl.targets import EVERYWHERE, Bounds, Canvas, Target, first_channel, read, read_into, room_on, write
 from kpc.player.gl.textures import (
-    LARGEST_FLOAT, Layout, Rows, block_arrays, decoder_arrays, decoder_shape, distances, filled, multiplied, planes_shape,
+    LARGEST_FLOAT,
+    Layout,
+    Rows,
+    block_arrays,
+    decoder_arrays,
+    decoder_shape,
+    distances,
+    filled,
+    multiplied,
+    planes_shape,
 )
-from kpc.player.cpu.occupancy_culling import Thinning
+from kpc.player.quality import LADDER, Quality
 
 REFINED = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
@@ -322,7 +330,9 @@ class Renderer:
         for block in self.layout.blocks:
             self.put(block.scale, block.plane, self.layout.texels(scene.scales[block.scale][block.plane]))
         self._slot: int | None = None
-        self._programs: dict[tuple[object, ...], tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]] = {}
+        self._programs: dict[
+            tuple[object, ...], tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]
+        ] = {}
         self._targets: dict[tuple[Part, tuple[int, int], int], Target] = {}
         self._canvas: Canvas | None = None
         self.check()
@@ -338,7 +348,17 @@ class Renderer:
     def release(self) -> None:
         """Give back all that the scene takes of the card."""
         self.ctx.detect_framebuffer(0).use()  # moderngl would bind again what it knows as bound, though it is gone
-        things: list[Target | Canvas | Folded | FoldedInMemory | moderngl.Texture | moderngl.Texture3D | moderngl.Framebuffer | moderngl.Program | moderngl.VertexArray]
+        things: list[
+            Target
+            | Canvas
+            | Folded
+            | FoldedInMemory
+            | moderngl.Texture
+            | moderngl.Texture3D
+            | moderngl.Framebuffer
+            | moderngl.Program
+            | moderngl.VertexArray
+        ]
         things = [self._planes, self._row_texture, self._cells, *self._targets.values()]
         things += [thing for pair in self._programs.values() for thing in reversed(pair)]
         things += [] if self._folded is None else [self._folded]
@@ -469,7 +489,9 @@ class Renderer:
             canvas.shown.use(SEEN_UNIT)
             self._show_on(screen, vertices, bounds, over=share < 1)
 
-    def _show_on(self, screen: moderngl.Framebuffer, vertices: moderngl.VertexArray, bounds: Bounds, over: bool) -> None:
+    def _show_on(
+        self, screen: moderngl.Framebuffer, vertices: moderngl.VertexArray, bounds: Bounds, over: bool
+    ) -> None:
         """Draw what touches `bounds`, and what rays see that meet nothing around it."""
         if bounds != EVERYWHERE:
             screen.scissor = None
@@ -485,8 +507,14 @@ class Renderer:
         return self._canvas
 
     def march(
-        self, camera: Camera, time: float, *, part: Part = Part.FULL, program: str = "march.glsl",
-        appearance: np.ndarray | None = None, small: bool = False,
+        self,
+        camera: Camera,
+        time: float,
+        *,
+        part: Part = Part.FULL,
+        program: str = "march.glsl",
+        appearance: np.ndarray | None = None,
+        small: bool = False,
     ) -> Target:
         """Draw into a target of the camera's size, which stays valid until the next march of the same part and size.
 
@@ -515,7 +543,13 @@ class Renderer:
         return self._resampled(target, self._target(part, size), across)
 
     def _march_planes(
-        self, part: Part, camera: Camera, time: float, program: str, appearance: np.ndarray | None, marching: type[Marching] | None
+        self,
+        part: Part,
+        camera: Camera,
+        time: float,
+        program: str,
+        appearance: np.ndarray | None,
+        marching: type[Marching] | None,
     ) -> Target:
         """A picture for which samples look up planes; it may follow the one before."""
         quality, scene, moving = self.quality, self.scene, part is Part.FULL and self._rows is not None
@@ -541,7 +575,9 @@ class Renderer:
             draw(target, camera)
         return target
 
-    def _by_shaders(self, program: str, time: float, moving: bool, free: np.ndarray, code: np.ndarray) -> Callable[..., None]:
+    def _by_shaders(
+        self, program: str, time: float, moving: bool, free: np.ndarray, code: np.ndarray
+    ) -> Callable[..., None]:
         """What draws all, probes, or doubted blocks of a picture into a target."""
         quality, scene = self.quality, self.scene
         folded, displaced = moving and quality.folded, moving and self._motion_texture is not None
@@ -600,12 +636,18 @@ class Renderer:
 
         return draw
 
-    def _by_processor(self, marching: Marching, time: float | None, free: np.ndarray, code: np.ndarray, termination: float) -> Callable[..., None]:
+    def _by_processor(
+        self, marching: Marching, time: float | None, free: np.ndarray, code: np.ndarray, termination: float
+    ) -> Callable[..., None]:
         """As `_by_shaders`."""
         marching.go_to(time, code)
 
-        def march(camera: Camera, blocks: np.ndarray, side: int, first: tuple[int, int], seen: np.ndarray, met: np.ndarray) -> None:
-            marching.march(camera, free, blocks, side, self.scene.step * self.quality.step, termination, first, seen, met)
+        def march(
+            camera: Camera, blocks: np.ndarray, side: int, first: tuple[int, int], seen: np.ndarray, met: np.ndarray
+        ) -> None:
+            marching.march(
+                camera, free, blocks, side, self.scene.step * self.quality.step, termination, first, seen, met
+            )
 
         def draw(
             target: Target, camera: Camera, pixels: int = ALL, points: int = 0, doubts: Target | None = None, bearable: float = 0.0,
@@ -681,7 +723,15 @@ class Renderer:
             return 1.0, EVERYWHERE
         self._empty(target)
         target.drawn = _shares(_bounds(blocks), blocks.shape[::-1])
-        draw(target, camera, ONLY_COVERED, blocks.size, self._target(part, blocks.shape[::-1], DOUBTS), 0.5, covered=blocks)
+        draw(
+            target,
+            camera,
+            ONLY_COVERED,
+            blocks.size,
+            self._target(part, blocks.shape[::-1], DOUBTS),
+            0.5,
+            covered=blocks,
+        )
         return float(blocks.mean()), target.drawn
 
     def _draw_alone(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> float:
@@ -768,7 +818,9 @@ class Renderer:
         self._draw(doubts.framebuffer, vertices, within=bounds)
         if self._share_of(doubts) > MOST_DOUBTED * before.marched:
             marched = self._draw_alone(draw, part, picture, camera)
-            self._shots[part, size] = replace(shot, marched=marched, alone=0 if self._since_s(shot, before) > JUMP_S else ALONE_FOR)
+            self._shots[part, size] = replace(
+                shot, marched=marched, alone=0 if self._since_s(shot, before) > JUMP_S else ALONE_FOR
+            )
             return picture
         settle, vertices = self._program("settle.glsl", self.layout)
         _set(settle, size=tuple(map(float, size)), **common)
@@ -784,7 +836,10 @@ class Renderer:
 
     def _follows(self, shot: Shot, before: Shot) -> bool:
         """Whether a picture shows the same as the one before, at another time: while the clip stands still, pictures are whole."""
-        return self._since_s(shot, before) > 0 and (shot.appearance, shot.quality) == (before.appearance, before.quality)
+        return self._since_s(shot, before) > 0 and (shot.appearance, shot.quality) == (
+            before.appearance,
+            before.quality,
+        )
 
     def _since_s(self, shot: Shot, before: Shot) -> float:
         return abs(shot.time - before.time) * self.scene.clip.duration_s
@@ -878,11 +933,18 @@ class Renderer:
         self.ctx.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         if over:
             self.ctx.enable(moderngl.BLEND)
-            self.ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
+            self.ctx.blend_func = (
+                moderngl.SRC_ALPHA,
+                moderngl.ONE_MINUS_SRC_ALPHA,
+                moderngl.ONE,
+                moderngl.ONE_MINUS_SRC_ALPHA,
+            )
         framebuffer.use()
         framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
         left, bottom, right, top = (int(side * share) for side, share in zip(2 * framebuffer.size, within))
-        framebuffer.scissor = None if within == EVERYWHERE else (left - 1, bottom - 1, right - left + 3, top - bottom + 3)
+        framebuffer.scissor = (
+            None if within == EVERYWHERE else (left - 1, bottom - 1, right - left + 3, top - bottom + 3)
+        )
         self.ctx.enable(moderngl.PROGRAM_POINT_SIZE)
         vertices.render(moderngl.POINTS if points else moderngl.TRIANGLES, vertices=points or 3)
         framebuffer.scissor = None  # or what is cleared next would be no more than this
@@ -899,8 +961,18 @@ class Renderer:
         return target
 
     def _program(
-        self, name: str, layout: Layout, *, rows: bool = False, displaced: bool = False, drawn: int = 0,
-        shared: int = 0, pixels: int = ALL, moved: bool = False, cubic: bool = False, view: int = 0,
+        self,
+        name: str,
+        layout: Layout,
+        *,
+        rows: bool = False,
+        displaced: bool = False,
+        drawn: int = 0,
+        shared: int = 0,
+        pixels: int = ALL,
+        moved: bool = False,
+        cubic: bool = False,
+        view: int = 0,
         compute: bool = False,
     ) -> tuple[moderngl.Program | moderngl.ComputeShader, moderngl.VertexArray]:
         """Compiled when first needed, with everything set that does not change. `layout`: of the planes it reads."""
@@ -928,7 +1000,9 @@ class Renderer:
             "SQUARE": tiles.square if tiles else MORE_THAN_A_RASTER,
         }
         written = {"decoder_weights": self._decoder, "plane_blocks": shader.constants(block_arrays(scene, layout))}
-        where = "places.glsl" if name == "settle.glsl" else "blocks.glsl" if pixels == ONLY_DOUBTED else "fullscreen.glsl"
+        where = (
+            "places.glsl" if name == "settle.glsl" else "blocks.glsl" if pixels == ONLY_DOUBTED else "fullscreen.glsl"
+        )
         if pixels == ONLY_PROBES and tiles:
             where = "squares.glsl"
         program: moderngl.Program | moderngl.ComputeShader
@@ -983,7 +1057,9 @@ class Renderer:
     def _displace(self, time: float) -> None:
         if time != self._motion_time and self._motion_texture is not None and self.scene.motion is not None:
             offsets = linear(self.scene.motion, time)
-            self._motion_texture.write(np.concatenate([offsets, offsets[..., :1]], axis=-1))  # RGBA: RGB is seldom native
+            self._motion_texture.write(
+                np.concatenate([offsets, offsets[..., :1]], axis=-1)
+            )  # RGBA: RGB is seldom native
             self._motion_time = time
 
     def _refined(self) -> Folded | FoldedInMemory:
@@ -1010,7 +1086,9 @@ class Renderer:
             folded.rows.write(rows)
             folded.refined.use(PLANES_UNIT)
             folded.rows.use(ROWS_UNIT)
-            self._draw_planes("fold.glsl", folded.fold_into, folded_rows_texel=tuple(1 / side for side in folded.rows.size))
+            self._draw_planes(
+                "fold.glsl", folded.fold_into, folded_rows_texel=tuple(1 / side for side in folded.rows.size)
+            )
         self._folded_time = time
         return folded.planes
 
@@ -1043,7 +1121,10 @@ def _refuse_too_large(scene: Scene, layout: Layout, card: Mapping[str, Any]) -> 
     """Raise a DisplayError that names what of the scene is larger than the card's textures may be."""
     flat, deep = card["GL_MAX_TEXTURE_SIZE"], card["GL_MAX_3D_TEXTURE_SIZE"]
     planes = {
-        f"plane {name} of scale {number + 1}": (-(-scale[name].shape[2] // 4) * scale[name].shape[1], scale[name].shape[0])
+        f"plane {name} of scale {number + 1}": (
+            -(-scale[name].shape[2] // 4) * scale[name].shape[1],
+            scale[name].shape[0],
+        )
         for number, scale in enumerate(scene.scales)
         for name in scale
         if name in SPACE_PLANES

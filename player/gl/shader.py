@@ -11,7 +11,6 @@ from importlib import resources
 
 import moderngl
 import numpy as np
-
 from kpc.format.common.errors import DisplayError
 
 GL33 = "#version 330 core"
@@ -152,7 +151,10 @@ def constants(arrays: Mapping[str, np.ndarray]) -> str:
     lines = []
     for name, array in arrays.items():
         if array.ndim == 2:
-            kind, values = "vec4", ["vec4(" + ", ".join(f"{x:.9e}" for x in row) + ")" for row in np.asarray(array, np.float32)]
+            kind, values = (
+                "vec4",
+                ["vec4(" + ", ".join(f"{x:.9e}" for x in row) + ")" for row in np.asarray(array, np.float32)],
+            )
         elif array.dtype.kind == "i":
             kind, values = "int", [str(n) for n in array]
         else:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import moderngl
 import numpy as np
-
 from kpc.format.common.errors import DisplayError
 
 Bounds = tuple[float, float, float, float]
@@ -77,7 +76,9 @@ def read_into(target: Target, first: tuple[int, int], seen: np.ndarray, met: np.
     """A part of a target from column and row `first` on."""
     for number, array in enumerate((seen, met)):
         place = (*first, *array.shape[1::-1])
-        target.framebuffer.read_into(array, place, components=array.shape[2], attachment=number, alignment=4, dtype="f4")
+        target.framebuffer.read_into(
+            array, place, components=array.shape[2], attachment=number, alignment=4, dtype="f4"
+        )
 
 
 def write(target: Target, first: tuple[int, int], seen: np.ndarray, met: np.ndarray) -> None:

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-
-from kpc.format.scene.grid import dilate, linear
 from kpc.format.coding.rans import compiled
+from kpc.format.scene.grid import dilate, linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder, Scene
 from kpc.player.cpu.threads import share_out
 
@@ -227,7 +226,10 @@ def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[st
     """
     features = layout.features * 4
     place = np.concatenate(
-        [4 * first + np.arange(scale["xy"].shape[2]) for first, scale in zip(layout.first_layers, scene.scales, strict=True)]
+        [
+            4 * first + np.arange(scale["xy"].shape[2])
+            for first, scale in zip(layout.first_layers, scene.scales, strict=True)
+        ]
     )
 
     def spread(weights: np.ndarray) -> np.ndarray:

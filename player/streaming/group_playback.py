@@ -12,13 +12,13 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from kpc.format.container.container import DEFAULT_BUDGET, RemoteSource, Source
 from kpc.format.common.errors import KpcError
+from kpc.format.container.container import DEFAULT_BUDGET, RemoteSource, Source
 from kpc.format.container.groups import Groups
 from kpc.format.scene.scene import Scene
+from kpc.player.gl.renderer import Renderer
 from kpc.player.orbit import Rig
 from kpc.player.streaming.prefetch import Playhead
-from kpc.player.gl.renderer import Renderer
 from kpc.player.streaming.stream import Stream
 
 AHEAD_S = 5.0
@@ -54,7 +54,9 @@ class Reel:
         KpcError: as `Groups` and `Stream`.
     """
 
-    def __init__(self, source: Source, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, source: Source, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None
+    ) -> None:
         self.source, self.memory, self._arrived = source, memory, arrived
         self.groups = Groups(source, memory_budget=memory, in_parts=True)
         self.timeline, self.clip = self.groups.timeline, self.groups.clip
@@ -132,8 +134,11 @@ class Reel:
     @property
     def is_settled(self) -> bool:
         """Whether all of the group that shows is there that fits the memory, or nothing more will come."""
-        return self.stream.is_settled and (self._failure is not None or not self._is_short and (
-            self._beside is None or self._next is not None and self._next.stream.is_settled))
+        return self.stream.is_settled and (
+            self._failure is not None
+            or not self._is_short
+            and (self._beside is None or self._next is not None and self._next.stream.is_settled)
+        )
 
     @property
     def message(self) -> str | None:
@@ -154,7 +159,13 @@ class Reel:
         the picture. None where nothing is, or where it is not there."""
         parts = {number: (time_in_it, share) for number, time_in_it, share in self.timeline.mixed(time)}
         other = self._next
-        if self.number not in parts or other is None or other.number not in parts or other.renderer is None or not other.is_warm:
+        if (
+            self.number not in parts
+            or other is None
+            or other.number not in parts
+            or other.renderer is None
+            or not other.is_warm
+        ):
             return None
         time_in_it, share = parts[other.number]
         return (other.renderer, time_in_it, share) if other.stream.can_show(time_in_it) else None
@@ -200,7 +211,9 @@ class Reel:
         if coming is not None and self._make is not None:
             if coming.renderer is None:
                 coming.renderer = self._make(coming.stream.scene)
-            elif not coming.is_warm:  # a turn later: compiling takes the longest of all that the window's thread does here
+            elif (
+                not coming.is_warm
+            ):  # a turn later: compiling takes the longest of all that the window's thread does here
                 coming.renderer.quality = self.renderer.quality
                 coming.renderer.render(Rig.of(coming.stream.scene).cameras[0].resized(*WARM_UP), 0.0)
                 coming.is_warm = True

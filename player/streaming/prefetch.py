@@ -12,7 +12,6 @@ Held is what the playhead comes to first, as far as memory goes; what lies behin
 from dataclasses import dataclass
 
 import numpy as np
-
 from kpc.format.container.partial import PartialScene
 
 URGENT_S = 1.0

@@ -15,20 +15,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-
-from kpc.format.common.compiling import NOTICE, WATCH
-from kpc.format.container.container import DEFAULT_BUDGET, Reader, RemoteSource, Source
-from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, KpcError
-from kpc.format.container.scene_io import SceneReader
-from kpc.format.container.partial import PartialScene, hold, runs
 from kpc.format.coding.quantise import dequantised
+from kpc.format.common.compiling import NOTICE, WATCH
+from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, KpcError
+from kpc.format.container.container import DEFAULT_BUDGET, Reader, RemoteSource, Source
+from kpc.format.container.partial import PartialScene, hold, runs
+from kpc.format.container.scene_io import SceneReader
 from kpc.format.scene.scene import ALL_PLANES, Scene
 from kpc.player.cpu.corner_grid import Baking
+from kpc.player.cpu.occupancy_culling import Thinning
 from kpc.player.cpu.plane_sampler import Lookup
-from kpc.player.streaming.prefetch import Playhead, fetching_order, least_room, worth_holding
 from kpc.player.gl.renderer import REFINED, Renderer
 from kpc.player.gl.textures import Layout, Rows
-from kpc.player.cpu.occupancy_culling import Thinning
+from kpc.player.streaming.prefetch import Playhead, fetching_order, least_room, worth_holding
 
 RUN_BYTES, RUN_CHUNKS = 1 << 18, 256
 """Fetched with one request at most, so that a playhead that jumps does not wait long."""
@@ -80,7 +79,9 @@ class Stream:
         self._layout = Layout.of(self.scene)
         fixed, least = self.fixed_bytes, least_room(self.parts)
         if fixed + least > memory:
-            raise BudgetError(f"{source.name}: takes {fixed + least:,} bytes to play, more than the {memory:,} of --memory")
+            raise BudgetError(
+                f"{source.name}: takes {fixed + least:,} bytes to play, more than the {memory:,} of --memory"
+            )
         self._room = memory - fixed
         self._stored = np.array([self.parts.entry(number).stored_length for number in self.parts.numbers])
         self._taken = np.zeros(len(self._stored), bool)
@@ -214,7 +215,9 @@ class Stream:
         motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
         decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw
         whole = isinstance(self.source, RemoteSource) and not self.source.has_ranges
-        source = self.source.size if whole else 2 * (RUN_BYTES + max(entry.stored_length for entry in self._reader.index))
+        source = (
+            self.source.size if whole else 2 * (RUN_BYTES + max(entry.stored_length for entry in self._reader.index))
+        )
         return 16 * texels + marching + 2 * scene.occupancy.nbytes + motion + decoding + source
 
     @property
@@ -248,8 +251,12 @@ class Stream:
     def _hurry(self, time: float) -> None:
         """Under the lock: what the picture needs now does not wait for the end of something else, far as that is on a slow line."""
         now = self.parts.is_needed(time, time) & (self.parts.scales < max(self.scales_here, 1))
-        if self._under_way is not None and not now[self._under_way] and (now & self._keep & ~self._taken).any() \
-                and isinstance(self.source, RemoteSource):
+        if (
+            self._under_way is not None
+            and not now[self._under_way]
+            and (now & self._keep & ~self._taken).any()
+            and isinstance(self.source, RemoteSource)
+        ):
             self.source.interrupt()
 
     def _drop(self, which: np.ndarray) -> None:

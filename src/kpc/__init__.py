@@ -1,16 +1,16 @@
 """KPC: 4D video you can fly through.
 
-    import kpc
+import kpc
 
-    scene = kpc.load("scene.kpc")
-    picture = kpc.render(scene, scene.cameras[0], time=0.5).rgb     # (H, W, 3) float32
+scene = kpc.load("scene.kpc")
+picture = kpc.render(scene, scene.cameras[0], time=0.5).rgb     # (H, W, 3) float32
 """
 
 import os
 from typing import TYPE_CHECKING, BinaryIO
 
-from kpc.format.scene.cameras import Camera
 from kpc.format.common.errors import KpcError
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -41,7 +41,9 @@ def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int =
     return groups.load(path, memory_budget)
 
 
-def render(scene: "Scene | LongScene", camera: Camera, time: float, appearance: "np.ndarray | None" = None) -> "Rendering":
+def render(
+    scene: "Scene | LongScene", camera: Camera, time: float, appearance: "np.ndarray | None" = None
+) -> "Rendering":
     """Render one picture with the readable reference renderer; no graphics card is needed.
 
     Args:
@@ -55,4 +57,6 @@ def render(scene: "Scene | LongScene", camera: Camera, time: float, appearance: 
     from kpc.player.cpu import reference
 
     parts = scene.mixed(time) if appearance is None else [(*scene.at(time), 1.0)]
-    return reference.mixed([(reference.render(shown, camera, t, appearance=appearance), share) for shown, t, share in parts])
+    return reference.mixed(
+        [(reference.render(shown, camera, t, appearance=appearance), share) for shown, t, share in parts]
+    )

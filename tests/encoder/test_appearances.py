@@ -9,30 +9,35 @@ import numpy as np
 import pytest
 import torch
 from gradients import misty, rays_at
-from scenes import hybrid, tiny_scene, varied
-
 from kpc.encoder.cli import kpenc
-
+from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim, true_picture
+from kpc.encoder.evaluation.validation_rays import Probe
 from kpc.encoder.field import appearances
 from kpc.encoder.field.appearances import choose_kind, fitted_code, number_pictures
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim, true_picture
 from kpc.encoder.field.field import Field, appearance_priors
-from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser
-from kpc.encoder.evaluation.validation_rays import Probe
 from kpc.encoder.field.render import render_reference
+from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser
 from kpc.encoder.training.train import Trainer
+from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import UsageError
 from kpc.format.common.fidelity import psnr
 from kpc.format.container.scene_io import encode, read
-from kpc.format.coding.quantise import quantise_scene
 from kpc.player.cpu import reference
+from scenes import hybrid, tiny_scene, varied
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = TrainConfig(
-    resolutions=(12, 32), samples_across=48, cells_across=16, steps=200, rays=512, samples=24576, warmup=10,
-    occupancy_start=32, occupancy_every=8,
+    resolutions=(12, 32),
+    samples_across=48,
+    cells_across=16,
+    steps=200,
+    rays=512,
+    samples=24576,
+    warmup=10,
+    occupancy_start=32,
+    occupancy_every=8,
 )
 BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
 
@@ -65,7 +70,9 @@ def with_codes(unequal: Dataset) -> Trainer:
 # --- who has one
 
 
-def test_photographs_by_many_lenses_have_appearances_and_nothing_else_has(unequal: Dataset, rig: Dataset, tmp_path: Path) -> None:
+def test_photographs_by_many_lenses_have_appearances_and_nothing_else_has(
+    unequal: Dataset, rig: Dataset, tmp_path: Path
+) -> None:
     assert choose_kind(unequal) == ("image", "photographs: 28 of 28 pictures have a lens or size of their own")
     assert choose_kind(rig) == ("none", "a clip, filmed as one")
     make.write_unequal(tmp_path / "set", images=9, own_lens=False)
@@ -84,7 +91,9 @@ def test_each_image_or_each_camera_has_its_own(rig: Dataset, unequal: Dataset) -
     numbers, names = number_pictures(rig, "camera")
     assert names == ("cam01", "cam02") and numbers.tolist() == [-1] * 3 + [0] * 3 + [1] * 3
     numbers, names = number_pictures(rig, "image")
-    assert names == tuple(f"cam0{c}.mp4#{f}" for c in (1, 2) for f in range(3)) and numbers.tolist() == [-1] * 3 + list(range(6))
+    assert names == tuple(f"cam0{c}.mp4#{f}" for c in (1, 2) for f in range(3)) and numbers.tolist() == [-1] * 3 + list(
+        range(6)
+    )
     numbers, names = number_pictures(rig, "none")
     assert names == () and (numbers == -1).all()
     numbers, names = number_pictures(unequal, "image")
@@ -135,15 +144,20 @@ def test_gradients_are_those_of_autograd_in_double_precision(way: str) -> None:
     twin = copy.deepcopy(field).double()
     optimiser.step(1, 0.0, 0.0, rays, targets, scene.aabb, scene.occupancy, scene.step, scene.extent)  # at a rate of 0
 
-    floats = type(rays)(*(value.double() for name, value in vars(rays).items() if name != "appearances"), rays.appearances)
+    floats = type(rays)(
+        *(value.double() for name, value in vars(rays).items() if name != "appearances"), rays.appearances
+    )
     rgb, distortion, *_ = render_reference(
-        twin, floats, torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy), scene.step)
+        twin, floats, torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy), scene.step
+    )
     prior = appearance_priors(twin, config)["appearance_size"]
     ((rgb - targets.double()).square().mean() + config.distortion * distortion + prior).backward()
     assert twin.codes is not None and twin.codes.grad.abs().max() > 1e-4
     for name in ("codes", "w1", "b1", "w2", "b2"):
         ours, theirs = getattr(field, name).grad.double(), getattr(twin, name).grad
-        assert float((ours - theirs).abs().max()) < 2e-3 * float(theirs.abs().max()), name  # samples below 1e-4 have no colour
+        assert float((ours - theirs).abs().max()) < 2e-3 * float(theirs.abs().max()), (
+            name
+        )  # samples below 1e-4 have no colour
 
 
 def test_the_prior_is_the_mean_square_and_pulls_each_code_to_0() -> None:
@@ -196,11 +210,15 @@ def test_the_average_look_is_the_mean_of_the_codes(with_codes: Trainer) -> None:
 
 def test_codes_come_back_from_the_file(with_codes: Trainer) -> None:
     scene = with_codes.scene()
-    decoded = read(encode(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]))).dequantise()
+    decoded = read(
+        encode(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]))
+    ).dequantise()
     assert [a.name for a in decoded.appearances] == [a.name for a in scene.appearances] == [*with_codes.names]
     back = Field.from_scene(decoded)
     assert back.codes is not None
-    np.testing.assert_allclose(back.codes.detach().numpy(), np.stack([a.code for a in scene.appearances]), atol=2e-7, rtol=2.0**-11)
+    np.testing.assert_allclose(
+        back.codes.detach().numpy(), np.stack([a.code for a in scene.appearances]), atol=2e-7, rtol=2.0**-11
+    )
     camera = with_codes.dataset.camera(1)
     ours = SceneRenderer(decoded).picture(with_codes.dataset, 1, 0, decoded.appearances[0].code)
     theirs = reference.render(decoded, camera, 0.0, appearance=decoded.appearances[0].code).rgb
@@ -215,7 +233,9 @@ def test_held_out_right_halves_gain(unequal: Dataset, with_codes: Trainer) -> No
     """Measured: 18.5 dB without, 24.8 dB with; and 18.9 and 24.7 dB with another seed."""
     without, quality = SceneRenderer(kpenc.to_scene(trained(unequal))), evaluate(kpenc.to_scene(with_codes), unequal)
     numbers = np.flatnonzero(unequal.pictures.is_test)
-    plain = np.mean([psnr(np.clip(without.picture(unequal, n, 16), 0, 1), true_picture(unequal, n)[:, 16:]) for n in numbers])
+    plain = np.mean(
+        [psnr(np.clip(without.picture(unequal, n, 16), 0, 1), true_picture(unequal, n)[:, 16:]) for n in numbers]
+    )
     assert quality is not None and quality.pictures == 4 and quality.psnr > plain + 4, (quality, plain)
 
 
@@ -237,7 +257,9 @@ def test_the_left_half_tells_the_code_and_the_right_half_is_scored(unequal: Data
     half, truth = np.clip(renderer.picture(unequal, number, 16, code), 0, 1), true_picture(unequal, number)[:, 16:]
     assert half.shape == (32, 16, 3) and quality is not None
     assert quality.psnr == pytest.approx(psnr(half, truth)) and quality.ssim == pytest.approx(ssim(half, truth))
-    np.testing.assert_array_equal(renderer.picture(unequal, number, 0, code)[:, 16:], renderer.picture(unequal, number, 16, code))
+    np.testing.assert_array_equal(
+        renderer.picture(unequal, number, 0, code)[:, 16:], renderer.picture(unequal, number, 16, code)
+    )
 
 
 def test_masks_count_in_halves(tmp_path: Path, with_codes: Trainer) -> None:
@@ -272,6 +294,8 @@ def test_a_fitted_code_shows_what_it_was_fitted_to(contracted: bool, decoder: st
 def test_codings_are_judged_with_the_codes_of_the_rays(with_codes: Trainer) -> None:
     scene = kpenc.to_scene(with_codes)
     measure = Probe.of_training(with_codes.sampler, with_codes.background).measure(scene)
-    turned = tuple(replace(a, code=b.code) for a, b in zip(scene.appearances, scene.appearances[1:] + scene.appearances[:1]))
+    turned = tuple(
+        replace(a, code=b.code) for a, b in zip(scene.appearances, scene.appearances[1:] + scene.appearances[:1])
+    )
     judged = measure(replace(scene, appearances=turned))
     assert measure(scene).psnr > 25 > judged.psnr + 3 and measure(scene).error == 0 < judged.error

@@ -5,13 +5,19 @@ from dataclasses import replace
 import datasets as make
 import numpy as np
 import pytest
-
-from kpc.encoder.field.bounds import (
-    CLEAR, INNER, contraction_of, device_coordinates_of, find_box, find_inner_box, reaches_beyond, seen_cells,
-)
 from kpc.encoder.datasets import Pictures
-from kpc.format.scene.cameras import Camera
+from kpc.encoder.field.bounds import (
+    CLEAR,
+    INNER,
+    contraction_of,
+    device_coordinates_of,
+    find_box,
+    find_inner_box,
+    reaches_beyond,
+    seen_cells,
+)
 from kpc.format.common.errors import DatasetError
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.space import Contraction, expand
 
 
@@ -141,7 +147,9 @@ def test_device_coordinates_of_a_row_of_cameras() -> None:
     np.testing.assert_allclose(box, [[-1.5, -0.5, 0], [1.5, 0.5, 0.75]], atol=1e-6)
     shape = (3, 4, 6)
     seen = seen_cells(pictures_of([straight(-0.5), straight(0.5)], near=1.0, far=4.0), box, shape, mapping)
-    assert seen[-1, :, 1:-1].all() and not seen[0, :, 0].any()  # at the far end both see nearly all, at the near end not the sides
+    assert (
+        seen[-1, :, 1:-1].all() and not seen[0, :, 0].any()
+    )  # at the far end both see nearly all, at the near end not the sides
 
 
 def test_device_coordinates_stand_as_far_forward_as_the_foremost_camera() -> None:
@@ -152,7 +160,9 @@ def test_device_coordinates_stand_as_far_forward_as_the_foremost_camera() -> Non
     assert box[1, 2] < mapping.baseline / mapping.near
 
 
-@pytest.mark.parametrize("rig", [[straight(), straight(turned=True)], [straight(), straight()]], ids=["apart", "one place"])
+@pytest.mark.parametrize(
+    "rig", [[straight(), straight(turned=True)], [straight(), straight()]], ids=["apart", "one place"]
+)
 def test_rigs_without_device_coordinates(rig: list[Camera]) -> None:
     with pytest.raises(DatasetError, match="do not face one way"):
         device_coordinates_of(pictures_of(rig, near=1.0, far=4.0))

@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_datasets import all_rays, distorted, fails, load
-
 from kpc.encoder.datasets import rays
-
 from kpc.encoder.datasets.layouts import colmap
 from kpc.format.common.errors import KpcError
 from kpc.format.common.media import write_image
+from test_datasets import all_rays, distorted, fails, load
 
 POSE = (1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 3.0)
 PINHOLE = (40.0, 41.0, 16.5, 11.5)
@@ -34,7 +32,9 @@ def model_of(
 
 
 def three(*names: str, pose: tuple[float, ...] = POSE) -> list[make.ColmapImage]:
-    return [(k, (*pose[:4], pose[4] + k, *pose[5:]), 1, name, 0) for k, name in enumerate(names or ("0000", "0001", "0002"))]
+    return [
+        (k, (*pose[:4], pose[4] + k, *pose[5:]), 1, name, 0) for k, name in enumerate(names or ("0000", "0001", "0002"))
+    ]
 
 
 # --- what it reads
@@ -66,7 +66,9 @@ def test_cameras_come_back(
         assert (there.fl_x, there.fl_y, there.cx, there.cy) == (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
         np.testing.assert_array_equal(dataset.pixels.picture(n), make.picture(camera))
     np.testing.assert_array_equal(p.distortion, np.tile(distortion, (10, 1)))
-    assert ("distortion" in dataset.describe()) == any(distortion) and dataset.describe().startswith("COLMAP: 10 cameras")
+    assert ("distortion" in dataset.describe()) == any(distortion) and dataset.describe().startswith(
+        "COLMAP: 10 cameras"
+    )
 
 
 def test_rays_pass_through_what_the_model_projects(tmp_path: Path) -> None:
@@ -190,7 +192,13 @@ def test_impossible_cameras(tmp_path: Path, binary: bool, camera: make.ColmapCam
 @pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize(
     "pose",
-    [(0.0,) * 7, (np.nan, *POSE[1:]), (*POSE[:6], np.inf), (1e308,) * 7, (0.9, 0.1, 0.3, 0.2, 1.7e308, 1.7e308, 1.7e308)],
+    [
+        (0.0,) * 7,
+        (np.nan, *POSE[1:]),
+        (*POSE[:6], np.inf),
+        (1e308,) * 7,
+        (0.9, 0.1, 0.3, 0.2, 1.7e308, 1.7e308, 1.7e308),
+    ],
 )
 def test_impossible_poses(tmp_path: Path, binary: bool, pose: tuple[float, ...]) -> None:
     images = [*three()[:2], (5, pose, 1, "0002.png", 0)]

@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import SPACES, tiny_scene, varied
-
-from kpc.encoder.rdo import curvature as module
-from kpc.encoder.rdo.curvature import curvature
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.rdo import curvature as module
+from kpc.encoder.rdo.curvature import curvature
 from kpc.format.scene.scene import Scene
+from scenes import SPACES, tiny_scene, varied
 
 KINDS: dict[str, Callable[[Scene], Scene]] = SPACES | {
     "still": lambda scene: tiny_scene(3, dynamic=False),
@@ -26,7 +25,9 @@ def without_the_last_channels(scene: Scene) -> Scene:
     left = np.delete(np.arange(16), [6, 7])
     d = scene.decoder
     decoder = replace(d, density_weight=d.density_weight[left], w2=d.w2[:, left], b2=d.b2[:, left])
-    return replace(scene, decoder=decoder, scales=({n: p[..., :6] for n, p in scene.scales[0].items()}, scene.scales[1]))
+    return replace(
+        scene, decoder=decoder, scales=({n: p[..., :6] for n, p in scene.scales[0].items()}, scene.scales[1])
+    )
 
 
 def probe_of(scene: Scene, count: int) -> Probe:
@@ -52,7 +53,11 @@ def test_it_foretells_what_small_errors_do_to_pictures(kind: str, monkeypatch: p
             for _ in range(12):
                 changed = dict(scale) | {name: plane + rng.normal(0, 1e-3, plane.shape).astype(np.float32)}
                 scales = (*scene.scales[:s], changed, *scene.scales[s + 1 :])
-                moved.append(np.square(SceneRenderer(replace(scene, scales=scales)).rgb(*probe.rays, codes) - before).sum(1).mean())
+                moved.append(
+                    np.square(SceneRenderer(replace(scene, scales=scales)).rgb(*probe.rays, codes) - before)
+                    .sum(1)
+                    .mean()
+                )
             assert np.mean(moved) == pytest.approx(1e-6 * h[s][name].sum(), rel=0.3), (s, name)
 
 
@@ -126,8 +131,12 @@ def test_rays_beyond_those_of_the_probe_that_meet_something_are_drawn_from_the_c
 def test_rays_that_pass_where_nothing_is_do_not_count() -> None:
     scene = tiny_scene(3)
     probe = probe_of(scene, 64)
-    astray = replace(probe, origins=np.concatenate([probe.origins, np.full((64, 3), 50, np.float32)]),
-                     directions=np.tile(probe.directions, (2, 1)), times=np.tile(probe.times, 2))
+    astray = replace(
+        probe,
+        origins=np.concatenate([probe.origins, np.full((64, 3), 50, np.float32)]),
+        directions=np.tile(probe.directions, (2, 1)),
+        times=np.tile(probe.times, 2),
+    )
     with_them, without = curvature(scene, astray, 64), curvature(scene, probe, 64)
     for name, found in with_them.alone[1].items():
         assert found.any() and found.tobytes() == without.alone[1][name].tobytes()

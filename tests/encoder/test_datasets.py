@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from kpc.encoder.datasets import Dataset, PixelCache, load_dataset, pixel_cache, rays
 from kpc.encoder.datasets.capture import natural_key
 from kpc.encoder.datasets.dataset import shrunk, undistort

@@ -8,17 +8,24 @@ from pathlib import Path
 import datasets as make
 import numpy as np
 import pytest
-
 from kpc.encoder.cli import estimate as module
 from kpc.encoder.cli import kpenc
-from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import Dataset
+from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.training.train import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = TrainConfig(
-    resolutions=(8, 16), samples_across=32, cells_across=12, steps=400, rays=256, samples=8192, warmup=5, occupancy_start=8,
-    occupancy_every=4, tune_steps=0,
+    resolutions=(8, 16),
+    samples_across=32,
+    cells_across=12,
+    steps=400,
+    rays=256,
+    samples=8192,
+    warmup=5,
+    occupancy_start=8,
+    occupancy_every=4,
+    tune_steps=0,
 )
 BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
 
@@ -53,7 +60,9 @@ def test_tuning_is_counted(moving: Dataset) -> None:
     assert found[1] - found[0] == pytest.approx(trained, rel=0.5)
 
 
-def test_steps_with_the_coarsest_scale_alone_are_counted_apart(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_with_the_coarsest_scale_alone_are_counted_apart(
+    moving: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """By the same clock: 1 s a step while it is alone, 4 s with all."""
     run = Trainer(moving, replace(CONFIG, coarse_until=0.3), BOX, "cpu")
     watched = module.STEPS * CONFIG.occupancy_start

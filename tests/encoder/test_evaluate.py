@@ -7,13 +7,12 @@ from pathlib import Path
 import datasets as make
 import numpy as np
 import pytest
-from scenes import tiny_scene
-
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim, true_picture
 from kpc.format.common.fidelity import psnr
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
+from scenes import tiny_scene
 
 
 def plain_ssim(a: np.ndarray, b: np.ndarray) -> float:

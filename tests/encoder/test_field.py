@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import torch
 from gradients import bilinear
-from scenes import displaced, tiny_scene
-
 from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.field.field import Field, Layout, gathered_by_row, motion_nodes, motion_priors, plan_layout, scattered
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip
 from kpc.player.cpu import reference
+from scenes import displaced, tiny_scene
 
 BOX = np.array([[0, 0, 0], [4, 2, 1]], np.float32)
 
@@ -78,7 +77,11 @@ def test_scene_to_field_and_back(kind: str) -> None:
 
 
 def test_the_motion_grid_starts_at_rest_with_cells_as_near_to_cubes_as_may_be() -> None:
-    box, clip, config = np.array([[0, 0, 0], [1.2, 0.5, 2.4]]), Clip(30, 30.0), replace(PRESETS["draft"], motion_cells=6)
+    box, clip, config = (
+        np.array([[0, 0, 0], [1.2, 0.5, 2.4]]),
+        Clip(30, 30.0),
+        replace(PRESETS["draft"], motion_cells=6),
+    )
     layout = plan_layout(config, box, clip, is_dynamic=True)
     assert motion_nodes(config, box, layout) == (15, 7, 2, 4)
     field = Field(layout, 4, motion_nodes=(15, 7, 2, 4))
@@ -152,10 +155,20 @@ def test_features_multiply_planes_and_concatenate_scales() -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"channels": 0}, {"steps": 0}, {"rays": -1}, {"resolutions": ()}, {"resolutions": (64, 1)}, {"object_rays": 1.0},
-        {"temporal_start": -0.1}, {"temporal_floor": 1.1},
-        {"channel_dropout": -0.1}, {"channel_dropout": 1.0}, {"scale_dropout": -0.1}, {"scale_dropout": 1.0},
-        {"appearance": "sometimes"}, {"appearance": "image", "view_dependent": False},
+        {"channels": 0},
+        {"steps": 0},
+        {"rays": -1},
+        {"resolutions": ()},
+        {"resolutions": (64, 1)},
+        {"object_rays": 1.0},
+        {"temporal_start": -0.1},
+        {"temporal_floor": 1.1},
+        {"channel_dropout": -0.1},
+        {"channel_dropout": 1.0},
+        {"scale_dropout": -0.1},
+        {"scale_dropout": 1.0},
+        {"appearance": "sometimes"},
+        {"appearance": "image", "view_dependent": False},
     ],
 )
 def test_a_config_that_makes_no_sense_is_refused(change: dict[str, object]) -> None:

@@ -11,19 +11,18 @@ import datasets as make
 import numpy as np
 import pytest
 import torch
-
 from kpc.encoder.cli import kpenc
-from kpc.encoder.rdo.rate_control import Trade
-from kpc.encoder.field.config import PRESETS, TrainConfig
-from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.cli.estimate import Estimate
-from kpc.encoder.field.field import Field, Layout
 from kpc.encoder.cli.grouped import LATER, OVERLAP, begin_with, share_of, spans_of
 from kpc.encoder.cli.options import Options
+from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.field.config import PRESETS, TrainConfig
+from kpc.encoder.field.field import Field, Layout
+from kpc.encoder.rdo.rate_control import Trade
 from kpc.encoder.training.train import Trainer
+from kpc.format.common.errors import DatasetError, UsageError
 from kpc.format.container import scene_io
 from kpc.format.container.container import ENTRY, HEADER
-from kpc.format.common.errors import DatasetError, UsageError
 from kpc.format.container.groups import Groups, Span, Timeline
 from kpc.format.scene.scene import Clip
 from kpc.tools.bench import group_joins
@@ -79,7 +78,9 @@ def test_size_and_time_are_shared_out():
     spans = spans_of(Clip(100, 10.0), 2.5)
     options = Options(Path("a"), Path("b"), time_budget_s=100.0, trade=Trade(target_bytes=100_000))
     shares = [share_of(options, number, spans) for number in range(4)]
-    assert sum(share.trade.target_bytes for share in shares) == pytest.approx(100_000 - HEADER.size - 4 * ENTRY.size, abs=4)
+    assert sum(share.trade.target_bytes for share in shares) == pytest.approx(
+        100_000 - HEADER.size - 4 * ENTRY.size, abs=4
+    )
     assert sum(share.time_budget_s for share in shares) == pytest.approx(100)
     assert shares[1].time_budget_s / shares[0].time_budget_s == pytest.approx(LATER * 29 / 27)
     plain = share_of(replace(options, trade=Trade(quality=50), time_budget_s=None), 1, spans)
@@ -151,7 +152,9 @@ def test_masks_of_some_pictures(tmp_path):
     for k, number in enumerate(numbers):
         assert np.array_equal(some.usable(k), masks.usable(int(number)))
         rank = np.arange(0, some.counts[k], 37)
-        assert np.array_equal(some.nth_usable(np.full(len(rank), k), rank), masks.nth_usable(np.full(len(rank), number), rank))
+        assert np.array_equal(
+            some.nth_usable(np.full(len(rank), k), rank), masks.nth_usable(np.full(len(rank), number), rank)
+        )
 
 
 def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
@@ -160,16 +163,23 @@ def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
     out, err = capsys.readouterr()
     result, opened = json.loads(out), Groups(output)
     assert opened.timeline.spans == spans_of(Clip(FRAMES, 8.0), 1.2) and len(opened) == 3
-    assert [group["frames"] for group in result["groups"]] == [[span.start, span.last] for span in opened.timeline.spans]
+    assert [group["frames"] for group in result["groups"]] == [
+        [span.start, span.last] for span in opened.timeline.spans
+    ]
     assert result["steps"] == 24 * (1 + 2 * LATER) and result["size_bytes"] == output.stat().st_size
     assert 5 < result["test_psnr"] < 60 and result["test_pictures"] == FRAMES + 4 * OVERLAP
-    assert all(f"group {number} of 3" in err for number in range(3)) and err.count("begins where the one before ended") == 2
+    assert (
+        all(f"group {number} of 3" in err for number in range(3))
+        and err.count("begins where the one before ended") == 2
+    )
     boxes = [opened.open(number).head.aabb for number in range(3)]
     assert np.array_equal(boxes[0], boxes[1]) and np.array_equal(boxes[0], boxes[2])
     assert list(tmp_path.iterdir()) == [output]
     found = group_joins.measure(output, load_dataset(videos, tmp_path / "cache", progress=False))
     assert [frame["frame"] for frame in found["frames"]] == list(range(FRAMES))
-    assert [join["frame"] for join in found["joins"]] == [8, 17] and all(5 < join["agreement_db"] < 100 for join in found["joins"])
+    assert [join["frame"] for join in found["joins"]] == [8, 17] and all(
+        5 < join["agreement_db"] < 100 for join in found["joins"]
+    )
     assert np.mean([frame["psnr"] for frame in found["frames"]]) == pytest.approx(result["test_psnr"], abs=0.5)
 
 
@@ -206,8 +216,26 @@ def test_an_interrupted_run_goes_on_at_its_group_to_the_same_file(videos, tmp_pa
 def test_a_clip_in_groups_is_coded_again_group_by_group(videos, tmp_path, capsys):
     assert encode(videos, tmp_path / "long.kpc", "--steps", "8") == 0
     capsys.readouterr()
-    assert kpenc.main([str(tmp_path / "long.kpc"), "-o", str(tmp_path / "small.kpc"), "--quality", "20", "--tune-steps", "0", "--json"]) == 0
-    result, before, after = json.loads(capsys.readouterr().out), Groups(tmp_path / "long.kpc"), Groups(tmp_path / "small.kpc")
+    assert (
+        kpenc.main(
+            [
+                str(tmp_path / "long.kpc"),
+                "-o",
+                str(tmp_path / "small.kpc"),
+                "--quality",
+                "20",
+                "--tune-steps",
+                "0",
+                "--json",
+            ]
+        )
+        == 0
+    )
+    result, before, after = (
+        json.loads(capsys.readouterr().out),
+        Groups(tmp_path / "long.kpc"),
+        Groups(tmp_path / "small.kpc"),
+    )
     assert after.timeline == before.timeline and result["size_bytes"] == (tmp_path / "small.kpc").stat().st_size
     assert all(new < old for new, old in zip(after.size_bytes, before.size_bytes, strict=True))
     assert result["parameters"] == sum(scene_io.read(after.open(number)).parameter_count for number in range(3))

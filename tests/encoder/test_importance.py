@@ -6,9 +6,8 @@ from pathlib import Path
 import datasets as make
 import numpy as np
 import pytest
-
-from kpc.encoder.training import importance
 from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.training import importance
 from kpc.encoder.training.importance import SMALLEST_TILE, TileWeights, cameras_stand_still, largest_change
 from kpc.format.common.media import write_image
 

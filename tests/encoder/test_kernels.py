@@ -17,16 +17,15 @@ import numpy as np
 import pytest
 import torch
 from gradients import KINDS, Calling, backpropagate, misty, rays_at, reference_gradients
-from numba.core.dispatcher import Dispatcher
-from scenes import displaced, tiny_scene
-
+from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field.field import Field, Layout, priors
-from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_priors, log_densities, sample_capacity
 from kpc.encoder.field.render import Rays, render_reference
+from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_priors, log_densities, sample_capacity
 from kpc.player.cpu import reference
+from numba.core.dispatcher import Dispatcher
+from scenes import displaced, tiny_scene
 
 COLOUR = 1e-4
 GRADIENT = 1e-3
@@ -88,7 +87,10 @@ def test_a_machine_s_first_training_equals_its_second(tmp_path: Path) -> None:
         f"logs = kernels.log_densities(theta, table, resolution, density, {field.layout.channels}, None, points, times, 2)\n"
         "sys.stdout.buffer.write(logs.tobytes())"
     )
-    command, env = [sys.executable, "-c", script, tmp_path / "in.npz"], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command, env = (
+        [sys.executable, "-c", script, tmp_path / "in.npz"],
+        os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+    )
     compiled, cached = (subprocess.run(command, env=env, check=True, stdout=subprocess.PIPE).stdout for _ in range(2))
     assert len(list(tmp_path.glob("cache/**/kernels.log_densities-*.nbc"))) == 1
     assert len(compiled) == 2000 and compiled == cached

@@ -17,10 +17,9 @@ import datasets as make
 import numpy as np
 import pytest
 import torch
-
 from kpc.encoder.cli import kpenc
-from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.datasets import pixel_cache
+from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.training.train import Trainer
 from kpc.format.common import cli
 from kpc.format.container import scene_io
@@ -129,7 +128,12 @@ def test_a_folder_becomes_a_file(
     code, out, err = run(sets / name, "--json")
     assert code == 0
     result, output = json.loads(out), tmp_path / "out.kpc"
-    assert (result["layout"], result["dynamic"], result["steps"], result["file"]) == (layout, dynamic, steps, str(output))
+    assert (result["layout"], result["dynamic"], result["steps"], result["file"]) == (
+        layout,
+        dynamic,
+        steps,
+        str(output),
+    )
     assert result["size_bytes"] == output.stat().st_size
     assert 5 < result["test_psnr"] < 60 and -1 < result["test_ssim"] <= 1 and result["test_pictures"] > 0
     assert (result["identity_share"] is not None) == dynamic
@@ -171,7 +175,9 @@ def test_what_is_printed(run: Kpenc, sets: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("tolerance, rows, why", [(1.0, 2, "1 allowed"), (1e-4, 4, "0.0001 allowed"), (0.0, 3, "the preset's")])
+@pytest.mark.parametrize(
+    "tolerance, rows, why", [(1.0, 2, "1 allowed"), (1e-4, 4, "0.0001 allowed"), (0.0, 3, "the preset's")]
+)
 def test_rows_of_time_are_as_far_apart_as_the_motion_allows(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tolerance: float, rows: int, why: str
 ) -> None:
@@ -181,7 +187,11 @@ def test_rows_of_time_are_as_far_apart_as_the_motion_allows(
     for options in (("--keep",), ("--resume",)):
         code, _, err = run(sets / "n3dv", "--steps", "2", *options)
         (said,) = [line for line in err.splitlines() if line.startswith("time: ")]
-        assert code == 0 and f"time: {rows} rows, one for {4 / rows if rows != 3 else 1.5:g} of 4 frames" in said and why in said
+        assert (
+            code == 0
+            and f"time: {rows} rows, one for {4 / rows if rows != 3 else 1.5:g} of 4 frames" in said
+            and why in said
+        )
         assert len(scene_io.read(tmp_path / "out.kpc").scales[0]["xt"].symbols) == rows
     assert "resumed at step 2" in err
 
@@ -246,7 +256,11 @@ def test_what_is_left_out_is_said_and_missing_from_the_file(
     scene = scene_io.read(tmp_path / "out.kpc")
     counts = [scale["xy"].symbols.shape[2] for scale in scene.scales]
     assert code == 0 and json.loads(out)["coding_loss_db"] <= 1
-    assert ("colour: the same from all sides, direction is worth" in err) == (share > 0) == (scene.decoder.w1.shape == (1, 9))
+    assert (
+        ("colour: the same from all sides, direction is worth" in err)
+        == (share > 0)
+        == (scene.decoder.w1.shape == (1, 9))
+    )
     assert sum(counts) < 16 if share else counts == [8, 8]
     assert all(f"{count} of 8" in err for count in counts) == (share > 0)
 
@@ -482,8 +496,12 @@ def test_space_is_a_box_where_something_bounds_it(run: Kpenc, sets: Path, name: 
     assert code == 0 and json.loads(out)["space"] == "box" and why in err
 
 
-@pytest.mark.parametrize("asked, names", [("auto", "image"), ("image", "image"), ("camera", "camera"), ("none", "none")])
-def test_appearances_are_chosen_said_and_overridden(run: Kpenc, sets: Path, tmp_path: Path, asked: str, names: str) -> None:
+@pytest.mark.parametrize(
+    "asked, names", [("auto", "image"), ("image", "image"), ("camera", "camera"), ("none", "none")]
+)
+def test_appearances_are_chosen_said_and_overridden(
+    run: Kpenc, sets: Path, tmp_path: Path, asked: str, names: str
+) -> None:
     code, out, err = run(sets / "unequal", "--appearance", asked, "--steps", "60", "--test-views", "1")
     assert code == 0 and ("28 of 28 pictures have a lens" if asked == "auto" else "as told") in err
     assert ("appearance: none" if names == "none" else f"appearance: a code for each {names} (") in err
@@ -508,7 +526,9 @@ def test_appearances_in_numbers_and_in_the_plan(run: Kpenc, sets: Path) -> None:
     assert code == 0 and (json.loads(out)["appearances"], json.loads(out)["test_psnr"]) == (4, None)
 
 
-def test_a_lone_object_gets_colour_by_direction_where_appearances_are_asked_for(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+def test_a_lone_object_gets_colour_by_direction_where_appearances_are_asked_for(
+    run: Kpenc, sets: Path, tmp_path: Path
+) -> None:
     for options, directed in (((), False), (("--appearance", "image"), True)):
         assert run(sets / "blender", "--test-views", "1", *options)[0] == 0
         scene = scene_io.read(tmp_path / "out.kpc")
@@ -778,6 +798,8 @@ def test_a_trade_that_makes_no_sense(
     assert named in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text, count", [("300000", 300_000), ("300KB", 300_000), ("2mb", 2_000_000), ("1.5M", 1_500_000)])
+@pytest.mark.parametrize(
+    "text, count", [("300000", 300_000), ("300KB", 300_000), ("2mb", 2_000_000), ("1.5M", 1_500_000)]
+)
 def test_sizes(text: str, count: int) -> None:
     assert cli.byte_count(text) == count

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import tiny_scene
-from test_datasets import fails, load
-
 from kpc.encoder.datasets import Dataset, pixel_cache
 from kpc.encoder.datasets.masks import BLOCK
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim, true_picture
 from kpc.encoder.training.sampler import RaySampler
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.media import write_image
+from scenes import tiny_scene
+from test_datasets import fails, load
 
 SIZE = (24, 32)
 
@@ -206,7 +205,8 @@ def test_without_masks_the_same_rays_are_drawn_as_ever(tmp_path: Path) -> None:
     whole = load(folder)
     assert whole.masks is not None
     (rays, targets), (same_rays, same_targets) = (
-        RaySampler(d, appearances=np.arange(10)).draw(np.random.default_rng(5), 500) for d in (plain, whole))
+        RaySampler(d, appearances=np.arange(10)).draw(np.random.default_rng(5), 500) for d in (plain, whole)
+    )
     for a, b in zip((*vars(rays).values(), targets), (*vars(same_rays).values(), same_targets), strict=True):
         np.testing.assert_array_equal(a.numpy(), b.numpy())
 

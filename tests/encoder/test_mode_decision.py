@@ -4,23 +4,28 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from kpc.encoder.rdo import dct_rdo as search
+from kpc.encoder.rdo import mode_decision
+from kpc.encoder.rdo.distortion import ALONE, cost
+from kpc.encoder.rdo.mode_decision import quantise_by_cost, step_asked_for
+from kpc.encoder.rdo.trellis import THIN, on_trellis
+from kpc.format.coding.predictive import Guide
+from kpc.format.coding.quantise import QuantisedPlane, quantise_plane
+from kpc.format.coding.transform import FINENESSES, USUAL
+from kpc.format.container import scene_io
+from kpc.format.container.segments import Told
 from scenes import tiny_scene
 from test_trellis import waves
 
-from kpc.encoder.rdo import dct_rdo as search
-from kpc.encoder.rdo import mode_decision
-from kpc.encoder.rdo.mode_decision import quantise_by_cost, step_asked_for
-from kpc.encoder.rdo.trellis import THIN, on_trellis
-from kpc.encoder.rdo.distortion import ALONE, cost
-from kpc.format.container import scene_io
-from kpc.format.coding.transform import FINENESSES, USUAL
-from kpc.format.coding.quantise import QuantisedPlane, quantise_plane
-from kpc.format.container.segments import Told
-from kpc.format.coding.predictive import Guide
 
-
-def in_blocks(values: np.ndarray, step: float, significant: np.ndarray | None = None, needed: np.ndarray | None = None,
-              identity: bool = False, side: int = 8) -> tuple[QuantisedPlane, int]:
+def in_blocks(
+    values: np.ndarray,
+    step: float,
+    significant: np.ndarray | None = None,
+    needed: np.ndarray | None = None,
+    identity: bool = False,
+    side: int = 8,
+) -> tuple[QuantisedPlane, int]:
     steps = np.full(values.shape[2], step)
     rounded = quantise_plane(values, steps, identity=identity, needed=needed)
     significant = np.ones_like(values) if significant is None else significant
@@ -48,11 +53,16 @@ def test_a_time_plane_that_is_nearly_1_is_told_without_a_map_and_is_1_where_noth
     swell = np.exp(-((u - 24) ** 2 + (v - 20) ** 2) / 120)[..., None] * np.array([4.0, -3.0, 2.0])
     values, steps, everywhere = (1 + swell).astype(np.float32), np.full(3, 1.0), np.ones((48, 96), bool)
     rounded = quantise_plane(values, steps, identity=True)
-    found = mode_decision._cheapest(rounded, values, steps, np.ones_like(values), True, ALONE, THIN, everywhere, everywhere)
+    found = mode_decision._cheapest(
+        rounded, values, steps, np.ones_like(values), True, ALONE, THIN, everywhere, everywhere
+    )
     assert isinstance(found.guide, Told) and found.coded.all()
     assert (found.dequantise()[:, 64:] == 1).all()
     mapped = in_blocks(values, 1.0, identity=True, side=16)[0]
-    assert not mapped.coded.all() and np.square(found.dequantise() - values).sum() < 0.7 * np.square(mapped.dequantise() - values).sum()
+    assert (
+        not mapped.coded.all()
+        and np.square(found.dequantise() - values).sum() < 0.7 * np.square(mapped.dequantise() - values).sum()
+    )
     assert mode_decision._size(found, True, everywhere) < mode_decision._size(mapped, True, everywhere)
 
 
@@ -76,10 +86,15 @@ def test_errors_are_smaller_where_they_are_worth_more() -> None:
     def error(plane: QuantisedPlane, half: slice) -> float:
         return float(np.square(plane.dequantise() - values)[:, half].mean())
 
-    assert error(plane, slice(32, None)) < 1.05 * error(alike, slice(32, None)) < 0.7 * error(plane, slice(0, 32)) and size < 0.9 * as_ever
+    assert (
+        error(plane, slice(32, None)) < 1.05 * error(alike, slice(32, None)) < 0.7 * error(plane, slice(0, 32))
+        and size < 0.9 * as_ever
+    )
     told = search._fineness(significant, np.ones((64, 64), bool), np.ones((8, 8), bool), 8)
     assert (told[:, 4:] > told[:, :4]).all() and told.min() >= 0 and told.max() < FINENESSES
-    assert (search._fineness(np.ones_like(significant), np.ones((64, 64), bool), np.ones((8, 8), bool), 8) == USUAL).all()
+    assert (
+        search._fineness(np.ones_like(significant), np.ones((64, 64), bool), np.ones((8, 8), bool), 8) == USUAL
+    ).all()
 
 
 def test_time_planes_are_told_by_segments_and_the_identity_stays() -> None:
@@ -87,8 +102,12 @@ def test_time_planes_are_told_by_segments_and_the_identity_stays() -> None:
     values[:64, 20:] += waves(6, 64, 20) / 10
     plane, size = in_blocks(values, 0.5, identity=True)
     assert isinstance(plane.guide, Told) and sorted(plane.guide.segments) == [0, 32, 64]
-    assert size == sum(map(len, plane.guide.segments.values())) and len(plane.guide.segments[64]) < 20  # nothing to tell
-    assert (plane.dequantise()[:, :20] == 1).all() and not plane.coded[:, :20].any() and plane.coded[:64, 20:].mean() > 0.5
+    assert (
+        size == sum(map(len, plane.guide.segments.values())) and len(plane.guide.segments[64]) < 20
+    )  # nothing to tell
+    assert (
+        (plane.dequantise()[:, :20] == 1).all() and not plane.coded[:, :20].any() and plane.coded[:64, 20:].mean() > 0.5
+    )
 
 
 def test_levels_are_near_to_the_best_ones() -> None:
@@ -102,14 +121,26 @@ def test_levels_are_near_to_the_best_ones() -> None:
 
 def test_where_eight_bits_are_too_few_there_are_no_blocks() -> None:
     values, steps = waves(8), np.full(3, 0.01)
-    assert search.in_blocks(quantise_plane(values, steps, identity=False), values, steps, np.ones_like(values), False, ALONE, 8) is None
+    assert (
+        search.in_blocks(
+            quantise_plane(values, steps, identity=False), values, steps, np.ones_like(values), False, ALONE, 8
+        )
+        is None
+    )
     nothing = np.ones((9, 9, 2), np.float32)
-    assert search.in_blocks(quantise_plane(nothing, np.full(2, 0.1), identity=True), nothing, np.full(2, 0.1), nothing, True, ALONE, 8) is None
+    assert (
+        search.in_blocks(
+            quantise_plane(nothing, np.full(2, 0.1), identity=True), nothing, np.full(2, 0.1), nothing, True, ALONE, 8
+        )
+        is None
+    )
 
 
 def test_files_keep_what_is_told_and_say_for_which_steps() -> None:
     scene = tiny_scene(3, resolution=(40, 36, 32), time=34)
-    steps = [{name: np.full(plane.shape[2], 0.4, np.float32) for name, plane in scale.items()} for scale in scene.scales]
+    steps = [
+        {name: np.full(plane.shape[2], 0.4, np.float32) for name, plane in scale.items()} for scale in scene.scales
+    ]
     quantised = quantise_by_cost(scene, steps)
     kinds = {type(plane.guide) for scale in quantised.scales for plane in scale.values()}
     assert Told in kinds
@@ -122,8 +153,13 @@ def test_files_keep_what_is_told_and_say_for_which_steps() -> None:
             np.testing.assert_array_equal(ours[name].coded, theirs[name].coded)
             if isinstance(ours[name].guide, Told):
                 np.testing.assert_allclose(step_asked_for(ours[name]), 0.4, rtol=2**-7)
-    forgotten = replace(back, scales=tuple({name: replace(plane, guide=None) for name, plane in scale.items()} for scale in back.scales))
+    forgotten = replace(
+        back, scales=tuple({name: replace(plane, guide=None) for name, plane in scale.items()} for scale in back.scales)
+    )
     assert len(scene_io.encode(forgotten)) > len(data)
-    assert scene_io.read(scene_io.encode(forgotten)).scales[0]["xy"].symbols.tobytes() == back.scales[0]["xy"].symbols.tobytes()
+    assert (
+        scene_io.read(scene_io.encode(forgotten)).scales[0]["xy"].symbols.tobytes()
+        == back.scales[0]["xy"].symbols.tobytes()
+    )
     without = quantise_by_cost(scene, steps, blocks=False)
     assert {type(plane.guide) for scale in without.scales for plane in scale.values()} <= {Guide, type(None)}

@@ -4,14 +4,13 @@ import math
 
 import numpy as np
 import pytest
-from scenes import displaced, tiny_scene
-from test_nodes import swaying
-
-from kpc.encoder.rdo.motion_rdo import MOST_STEPS, SHARE, told_cheaply, with_coarser_motion
 from kpc.encoder.evaluation.validation_rays import Measured
+from kpc.encoder.rdo.motion_rdo import MOST_STEPS, SHARE, told_cheaply, with_coarser_motion
 from kpc.format.coding.motion_hierarchical import encode_midpoints
 from kpc.format.scene.motion import STEP
 from kpc.format.scene.scene import Scene
+from scenes import displaced, tiny_scene
+from test_nodes import swaying
 
 
 def errs(scene: Scene, left_out: float = 1e-3):

@@ -1,7 +1,6 @@
 """The occupancy grid: what it keeps, what it empties, and what is stored of it."""
 
 import numpy as np
-
 from kpc.encoder.field.occupancy_grid import MORE_MARCHED, OccupancyGrid, grid_shape, in_fewest_slots
 from kpc.format.scene.grid import SPACE_AND_TIME, dilate
 
@@ -85,7 +84,9 @@ def test_density_that_appears_is_found() -> None:
 
 def test_while_all_is_thin_the_thicker_half_stays() -> None:
     """Everything below the threshold of 0: emptying it all would leave nothing to learn from."""
-    g = settled(grid(), lambda p, t: np.where(p[:, 0] < 0.5, -1.0, -3.0).astype(np.float32), np.ones(SHAPE, np.float32), 3)
+    g = settled(
+        grid(), lambda p, t: np.where(p[:, 0] < 0.5, -1.0, -3.0).astype(np.float32), np.ones(SHAPE, np.float32), 3
+    )
     assert g.occupied[:, :, :4].all() and not g.occupied[:, :, 4:].any()
 
 

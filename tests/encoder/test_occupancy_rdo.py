@@ -5,15 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import tiny_scene
-from test_cells import rolling
-
+from kpc.encoder.evaluation.validation_rays import Measured, Probe
 from kpc.encoder.rdo import occupancy_rdo
 from kpc.encoder.rdo.occupancy_rdo import CONTRAST, contributions, counted, flipped, told_cheaply
-from kpc.encoder.evaluation.validation_rays import Measured, Probe
 from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS, encode_cells
-from kpc.format.scene.grid import dilate
 from kpc.format.coding.rans import adapt, counters, stream
+from kpc.format.scene.grid import dilate
+from scenes import tiny_scene
+from test_cells import rolling
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -25,7 +24,9 @@ def test_contexts_are_those_of_the_coder():
     occupancy = rolling(3, 6, 7, 8)
     told, table, trace, at = occupancy.astype(np.uint8), counters(CONTEXTS), np.empty(occupancy.size, np.int16), 0
     for place in np.ndindex(told.shape):
-        _, _, at = adapt(int(told[place]), table, occupancy_rdo.context_at(told, *place, NEIGHBOURS), 0, at, None, trace)
+        _, _, at = adapt(
+            int(told[place]), table, occupancy_rdo.context_at(told, *place, NEIGHBOURS), 0, at, None, trace
+        )
     assert stream(trace) == encode_cells(occupancy)
     assert counted(told, NEIGHBOURS).sum() == told.size
 
@@ -64,7 +65,9 @@ def judged(found: list, error: float):
     return measure
 
 
-@pytest.mark.parametrize("error, tries", [(0.0, 1), (0.04, 1), (0.06, occupancy_rdo.TRIES), (math.nan, occupancy_rdo.TRIES)])
+@pytest.mark.parametrize(
+    "error, tries", [(0.0, 1), (0.04, 1), (0.06, occupancy_rdo.TRIES), (math.nan, occupancy_rdo.TRIES)]
+)
 def test_a_grid_is_taken_where_pictures_hardly_lose_by_it(error, tries):
     seen: list = []
     found = told_cheaply(SCENE, np.zeros(SCENE.occupancy.shape), judged(seen, error), 1.0)

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_train import BOX, CONFIG
-
-from kpc.encoder.evaluation import profile
 from kpc.encoder.datasets import Dataset
+from kpc.encoder.evaluation import profile
 from kpc.encoder.field.field import Layout
 from kpc.encoder.training.train import Trainer
 from kpc.tools.bench import machine_limits
+from test_train import BOX, CONFIG
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -76,4 +75,6 @@ def test_traffic_is_what_operations_read_and_write() -> None:
     x = torch.rand(100, 50, requires_grad=True)
     with profile.Traffic() as traffic:
         x.exp().sum().backward()
-    assert traffic.bytes == pytest.approx(4 * (2 * 5000 + 5000 + 2 * 5000), rel=0.01)  # the gradient of the sum is one number
+    assert traffic.bytes == pytest.approx(
+        4 * (2 * 5000 + 5000 + 2 * 5000), rel=0.01
+    )  # the gradient of the sum is one number

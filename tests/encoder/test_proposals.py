@@ -4,20 +4,30 @@ import datasets as make
 import numpy as np
 import pytest
 import torch
-
 from kpc.encoder.cli import kpenc
-from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import evaluate
+from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.proposals import PADDING, histogram_loss, resampled
 from kpc.encoder.training.train import Trainer
 from kpc.format.scene.space import Contraction
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
-CONFIG = TrainConfig(resolutions=(12, 24), samples_across=48, cells_across=16, steps=200, rays=256, samples=12288, warmup=5,
-                     occupancy_start=16, occupancy_every=8, proposals=True, proposal_resolutions=(8, 16),
-                     proposal_samples=(48, 24, 16))
+CONFIG = TrainConfig(
+    resolutions=(12, 24),
+    samples_across=48,
+    cells_across=16,
+    steps=200,
+    rays=256,
+    samples=12288,
+    warmup=5,
+    occupancy_start=16,
+    occupancy_every=8,
+    proposals=True,
+    proposal_resolutions=(8, 16),
+    proposal_samples=(48, 24, 16),
+)
 
 
 def intervals(rays: int, count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -93,7 +103,9 @@ def test_training_learns_a_scene_and_where_to_look(surrounded: Dataset) -> None:
         """Share of the light that the field's samples on those rays have met."""
         optimiser = run.optimiser
         with torch.no_grad():
-            samples, *_ = optimiser.proposals.sample(batch, torch.from_numpy(BOX), mapping, (16, 16, 16), run.step, True)
+            samples, *_ = optimiser.proposals.sample(
+                batch, torch.from_numpy(BOX), mapping, (16, 16, 16), run.step, True
+            )
             s = samples.s.view(512, -1)
             return float((s[:, 1:] - s[:, :-1]).median(1).values.mean())
 

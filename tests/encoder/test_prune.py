@@ -5,17 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import SPACES, tiny_scene, varied
-
-from kpc.encoder.rdo.rate_control import Trade
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evenly_wide
-from kpc.encoder.rdo.codec_model import Model, code, model_of
 from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.rdo.codec_model import Model, code, model_of
 from kpc.encoder.rdo.prune import Seen, dispensable, one_colour, passed_on, prune, renderings, without
-from kpc.format.container import scene_io
+from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.coding.quantise import quantise_scene
+from kpc.format.container import scene_io
 from kpc.format.scene.scene import Decoder, Scene
 from kpc.player.cpu import reference
+from scenes import SPACES, tiny_scene, varied
 
 pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
 SPARE = 0.05
@@ -80,7 +79,12 @@ def test_a_channel_that_says_nothing_new_goes_at_no_cost(kind: str) -> None:
 def test_what_is_needed_stays_bit_for_bit() -> None:
     scene = tiny_scene()
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), 1e-4)
-    assert pruned.loss_db == 0 and pruned.next_db > 1e-4 and pruned.view_worth_db is not None and pruned.view_worth_db > 1e-4
+    assert (
+        pruned.loss_db == 0
+        and pruned.next_db > 1e-4
+        and pruned.view_worth_db is not None
+        and pruned.view_worth_db > 1e-4
+    )
     for ours, theirs in zip(pruned.scene.scales, scene.scales, strict=True):
         assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
     assert all(np.array_equal(a, b) for a, b in zip(vars(pruned.scene.decoder).values(), vars(scene.decoder).values()))
@@ -190,7 +194,9 @@ def test_passing_on_is_least_squares() -> None:
     target = seen.all_features[:, gone] @ scene.decoder.density_weight[gone]
     least = np.square(with_constant @ np.linalg.lstsq(with_constant, target, rcond=None)[0] - target).mean()
     before = scene.decoder
-    change = seen.all_features @ (after.density_weight - before.density_weight) + after.density_bias - before.density_bias
+    change = (
+        seen.all_features @ (after.density_weight - before.density_weight) + after.density_bias - before.density_bias
+    )
     assert np.square(change).mean() == pytest.approx(least, rel=1e-2)
     assert not after.density_weight[gone].any() and not after.b2[:, gone].any() and not after.w2[:, gone].any()
 
@@ -228,11 +234,15 @@ def test_the_direction_stays_where_appearances_act_through_it() -> None:
     probes = rays_of(scene)
     pruned = prune(scene, probes, lambda candidate: 30.0, 1.0)  # whatever goes costs nothing
     assert pruned.view_worth_db is None and pruned.scene.decoder.w2.any()
-    assert pruned.scene.appearances == scene.appearances and len(pruned.scene.decoder.b1) == len(scene.appearances[0].code)
+    assert pruned.scene.appearances == scene.appearances and len(pruned.scene.decoder.b1) == len(
+        scene.appearances[0].code
+    )
 
 
 @pytest.mark.parametrize("quality", [10, 20, 99])
-def test_a_file_that_something_is_left_out_of_is_coded_between_its_own_steps_and_much_coarser_ones(quality: float) -> None:
+def test_a_file_that_something_is_left_out_of_is_coded_between_its_own_steps_and_much_coarser_ones(
+    quality: float,
+) -> None:
     scene = redundant(tiny_scene(scales=3, resolution=(48, 40, 32)))
     own = quantise_scene(scene, [{name: 0.004 for name in planes} for planes in scene.scales])
     coded = code(model_of(own), Trade(quality=quality), 0.25, 0)

@@ -5,18 +5,30 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from kpc.encoder.evaluation.validation_rays import Measured
+from kpc.encoder.rdo.mode_decision import quantise_by_cost
+from kpc.encoder.rdo.rate_control import (
+    FINEST,
+    LEAST_SIGNIFICANCE,
+    TRUST,
+    Attempt,
+    Steps,
+    Trade,
+    agreement_of,
+    compress,
+    decoder_bits,
+    error_of,
+    relative_steps,
+    scaled,
+    significance,
+    with_fewer_slots,
+)
+from kpc.encoder.rdo.rate_search import TUNINGS
+from kpc.format.coding.quantise import QuantisedScene, quantise_scene, round_decoder
+from kpc.format.container import scene_io
+from kpc.format.scene.scene import Scene
 from scenes import tiny_scene
 
-from kpc.encoder.rdo.rate_control import (
-    FINEST, LEAST_SIGNIFICANCE, TRUST, Attempt, Steps, Trade, agreement_of, compress, decoder_bits, error_of, relative_steps, scaled,
-    significance, with_fewer_slots,
-)
-from kpc.encoder.evaluation.validation_rays import Measured
-from kpc.encoder.rdo.rate_search import TUNINGS
-from kpc.encoder.rdo.mode_decision import quantise_by_cost
-from kpc.format.container import scene_io
-from kpc.format.coding.quantise import QuantisedScene, quantise_scene, round_decoder
-from kpc.format.scene.scene import Scene
 
 def needed(scene: Scene) -> Scene:
     """With every texel."""
@@ -167,6 +179,7 @@ def test_what_errors_cost_is_trusted_so_far() -> None:
 
 def test_steps_follow_the_significance() -> None:
     """At each step errors that rounding makes cost the same, of all that are not nothing."""
+
     def of(k: int, plane: np.ndarray) -> np.ndarray:
         w = 0.5**k * np.arange(1.0, plane.shape[2] + 1) * np.linspace(0, 2, plane.shape[0])[:, None, None]
         return np.broadcast_to(w, plane.shape).astype(np.float32)
@@ -211,7 +224,9 @@ def test_weights_of_the_decoder_have_as_few_bits_as_their_error_allows(error: fl
 
     def measure(candidate: Scene) -> Measured:
         exact, rounded = (one.decoder.w1 for one in (scene, candidate))
-        return Measured(30.0, 0.25 + float(np.max(np.abs(rounded - exact)) / 2.0 ** np.frexp(np.abs(exact).max())[1]) ** 2)
+        return Measured(
+            30.0, 0.25 + float(np.max(np.abs(rounded - exact)) / 2.0 ** np.frexp(np.abs(exact).max())[1]) ** 2
+        )
 
     found = decoder_bits(scene, measure, error)
     assert found == ({} if bits is None else {"density_weight": 3, "w1": bits, "b1": 3, "w2": 3, "b2": 3})
@@ -232,8 +247,11 @@ def test_scaled() -> None:
 
 def tuned_to(factor: float, seen: list[Attempt] | None = None, power: float = 1.0, **trade: float) -> Attempt:
     """With a stand-in for tuning: steps to some power, times a factor, at the bytes that those take."""
+
     def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
-        made = quantise_by_cost(SCENE, [{name: factor * step**power for name, step in scale.items()} for scale in steps], reached)
+        made = quantise_by_cost(
+            SCENE, [{name: factor * step**power for name, step in scale.items()} for scale in steps], reached
+        )
         if seen is not None:
             seen.append(Attempt(made, measure, 0.0))
         return made

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-
 from kpc.encoder.rdo.rate_search import ATTEMPTS, NEAR, TUNINGS, cheapest, farthest, farthest_tuned
 
 
@@ -30,7 +29,9 @@ def rough(noise: list[float]) -> tuple[Told | None, list[Told]]:
     return farthest_tuned(-13, 2, tried[0], tried, tuned, lambda one: one.error, 1.0, 0.1, 0.7, 1.2), seen
 
 
-@pytest.mark.parametrize("noise, tunings", [((1.0,), 1), ((1.5, 1.5), 2), ((1.6, 1.2, 1.4), 3), ((1.5, 1.3, 1.45, 1.4), 4)])
+@pytest.mark.parametrize(
+    "noise, tunings", [((1.0,), 1), ((1.5, 1.5), 2), ((1.6, 1.2, 1.4), 3), ((1.5, 1.3, 1.45, 1.4), 4)]
+)
 def test_rough_tunings_come_near_enough(noise: tuple[float, ...], tunings: int) -> None:
     found, seen = rough([*noise])
     assert found is not None and 0.9 <= found.error <= 1 and len(seen) == tunings
@@ -54,8 +55,15 @@ def test_no_tuning_is_found_where_all_err_too_much() -> None:
     assert found is None and len(seen) == TUNINGS
 
 
-def sought(error: Callable[[float], float], most: float, start: float = -13, end: float = 2, guess: float = -9.5,
-           tried: tuple[float, ...] = (), tolerance: float = 0.02) -> tuple[Told, list[float]]:
+def sought(
+    error: Callable[[float], float],
+    most: float,
+    start: float = -13,
+    end: float = 2,
+    guess: float = -9.5,
+    tried: tuple[float, ...] = (),
+    tolerance: float = 0.02,
+) -> tuple[Told, list[float]]:
     """What is found, and at which exponents something was made for that."""
     seen: list[float] = []
 
@@ -115,8 +123,11 @@ def test_not_a_number_is_not_good_enough() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_rough_values_end_a_search(seed: int) -> None:
     """Which leap by a fifth from one grain to the next."""
+
     def leaping(exponent: float) -> float:
-        return grown(exponent) * float(np.exp(np.random.default_rng([seed, round(1e3 * exponent) % 9973]).normal(0, 0.1)))
+        return grown(exponent) * float(
+            np.exp(np.random.default_rng([seed, round(1e3 * exponent) % 9973]).normal(0, 0.1))
+        )
 
     found, seen = sought(leaping, 0.15)
     assert 0.7 * 0.15 <= found.error <= 0.15 and len(seen) <= ATTEMPTS

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import torch
 from gradients import KINDS, Calling, bilinear, misty, rays_at
-from scenes import hybrid, tiny_scene
-
-from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.evaluation.evaluate import SceneRenderer
+from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, HybridField, Layout, SummedField
-from kpc.encoder.training.optimisers import Figures, PlainOptimiser, sample_capacity
-from kpc.encoder.training.cuda_graphs import Recorder
 from kpc.encoder.field.render import Rays, collected, fused_features, meet, reached, samples_of, shade
+from kpc.encoder.training.cuda_graphs import Recorder
+from kpc.encoder.training.optimisers import Figures, PlainOptimiser, sample_capacity
 from kpc.player.cpu import reference
+from scenes import hybrid, tiny_scene
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -22,7 +21,9 @@ def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bo
     scene = misty(*kind)
     rays = rays_at(scene, 403)
     ours = collected(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
-    theirs = samples_of(rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step, scene.mapping)
+    theirs = samples_of(
+        rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step, scene.mapping
+    )
     # A sample within rounding of a cell's face may count here and not there: rays of as many samples have the same ones.
     counts = [np.bincount(samples.ray.numpy(), minlength=403) for samples in (ours, theirs)]
     same = counts[0] == counts[1]
@@ -30,7 +31,9 @@ def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bo
     mine, other = same[ours.ray], same[theirs.ray]
     np.testing.assert_array_equal(ours.ray[mine], theirs.ray[other])
     for name, tolerance in (("points", 1e-5), ("s", 1e-4), ("length", 0), ("stretch", 1e-4)):
-        np.testing.assert_allclose(getattr(ours, name)[mine], getattr(theirs, name)[other], atol=tolerance, rtol=1e-4, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(ours, name)[mine], getattr(theirs, name)[other], atol=tolerance, rtol=1e-4, err_msg=name
+        )
     assert (ours.cell[mine] == theirs.cell[other]).float().mean() > 0.999
 
 
@@ -49,7 +52,9 @@ def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(sh
     assert len(found.ray) == n + (0 if short else 500) and not found.length[n:].any() and short < n
     if not short:
         one, two = (meet(field, rays, s, field.features, scene.extent) for s in (wanted, found))
-        assert torch.equal(shade(field, rays, one), shade(field, rays, two)) and torch.equal(one.weights, two.weights[:n])
+        assert torch.equal(shade(field, rays, one), shade(field, rays, two)) and torch.equal(
+            one.weights, two.weights[:n]
+        )
         assert torch.isclose(one.distortion, two.distortion, rtol=1e-5)
 
 
@@ -155,7 +160,11 @@ def test_rays_that_meet_nothing_have_no_samples() -> None:
     assert len(samples.ray) == 0
     field = Field.from_scene(hybrid(scene))
     met = meet(field, away, samples, fused_features(field), scene.extent)
-    assert torch.equal(shade(field, away, met), away.backgrounds) and not met.opacity.any() and float(met.distortion.detach()) == 0
+    assert (
+        torch.equal(shade(field, away, met), away.backgrounds)
+        and not met.opacity.any()
+        and float(met.distortion.detach()) == 0
+    )
 
 
 @pytest.mark.parametrize("moved", [False, True])
@@ -229,6 +238,8 @@ def test_added_planes_are_their_sum() -> None:
     assert not field.plane(0, "xt").any() and field.plane(0, "xy").all()
     points, times = torch.rand(9, 3), torch.rand(9)
     axis = {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2], "t": times}
-    wanted = sum(bilinear(field.plane(0, name), axis[name[0]], axis[name[1]]) for name in ("xy", "xz", "yz", "xt", "yt", "zt"))
+    wanted = sum(
+        bilinear(field.plane(0, name), axis[name[0]], axis[name[1]]) for name in ("xy", "xz", "yz", "xt", "yt", "zt")
+    )
     torch.testing.assert_close(field.features(points, times), wanted)
     assert fused_features(field)(points, times).equal(field.features(points, times))

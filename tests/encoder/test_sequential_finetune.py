@@ -6,17 +6,16 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scenes import displaced, hybrid, tiny_scene, varied
-
-from kpc.encoder.rdo import sequential_finetune
 from kpc.encoder.evaluation.evaluate import as_wide_as, evenly_wide
 from kpc.encoder.evaluation.validation_rays import Probe
-from kpc.encoder.rdo.mode_decision import quantise_by_cost
+from kpc.encoder.rdo import sequential_finetune
 from kpc.encoder.rdo.distortion import Name
+from kpc.encoder.rdo.mode_decision import quantise_by_cost
 from kpc.encoder.rdo.sequential_finetune import SPREAD, coded_in_groups, order, spread, steps_after, steps_in_all, tuned
-from kpc.format.container import scene_io
 from kpc.format.coding.quantise import QuantisedScene
+from kpc.format.container import scene_io
 from kpc.format.scene.scene import Decoder, Scene
+from scenes import displaced, hybrid, tiny_scene, varied
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STEP = 0.2
@@ -40,7 +39,9 @@ def test_every_plane_has_its_turn_the_finest_first() -> None:
     scene = tiny_scene(scales=3)
     groups = order(scene)
     assert [{s for s, _ in group} for group in groups] == [{s} for s in (2, 2, 2, 1, 1, 1, 0, 0, 0, 2, 1, 0)]
-    assert sorted(plane for group in groups for plane in group) == sorted((s, name) for s in range(3) for name in scene.scales[s])
+    assert sorted(plane for group in groups for plane in group) == sorted(
+        (s, name) for s in range(3) for name in scene.scales[s]
+    )
     assert order(tiny_scene(dynamic=False, scales=1)) == [[(0, "xy")], [(0, "xz")], [(0, "yz")]]
 
 
@@ -65,7 +66,11 @@ def test_what_is_coded_first_is_coded_as_it_was_and_nothing_but_planes_and_decod
     plain, better = choose(scene), tuned(scene, scene, choose, 20)
     assert np.array_equal(better.scales[-1]["xy"].symbols, plain.scales[-1]["xy"].symbols)
     assert not np.array_equal(better.scales[0]["xy"].symbols, plain.scales[0]["xy"].symbols)
-    assert better.motion is not None and plain.motion is not None and np.array_equal(better.motion.symbols, plain.motion.symbols)
+    assert (
+        better.motion is not None
+        and plain.motion is not None
+        and np.array_equal(better.motion.symbols, plain.motion.symbols)
+    )
     assert np.array_equal(better.occupancy, plain.occupancy) and isinstance(better.decoder, Decoder)
     assert not np.array_equal(better.decoder.w2, plain.decoder.w2)  # type: ignore[union-attr]
 
@@ -80,7 +85,9 @@ def test_after_short_training_steps_are_few() -> None:
 @pytest.mark.parametrize("steps", [0, 1])
 def test_few_steps_or_none_are_no_mishap(steps: int) -> None:
     scene = tiny_scene()
-    planes = coded_in_groups(scene, scene, lambda candidate, group: {(s, name): candidate.scales[s][name] for s, name in group}, steps)
+    planes = coded_in_groups(
+        scene, scene, lambda candidate, group: {(s, name): candidate.scales[s][name] for s, name in group}, steps
+    )
     assert planes.scales[-1]["xy"].tobytes() == scene.scales[-1]["xy"].tobytes()
     assert (planes.scales[0]["xt"].tobytes() == scene.scales[0]["xt"].tobytes()) == (steps == 0)
 
@@ -93,7 +100,9 @@ def test_where_nothing_is_nothing_is_learnt() -> None:
         assert all(np.array_equal(plane.symbols, same.scales[s][name].symbols) for name, plane in scale.items())
 
 
-def test_progress_is_shown_where_it_is_wanted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_is_shown_where_it_is_wanted(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("kpc.format.common.progress.LINE_EVERY_S", 0.0)
     scene = tiny_scene(scales=1, dynamic=False)
     tuned(scene, scene, choose, 4)

@@ -8,11 +8,10 @@ from pathlib import Path
 import datasets as make
 import numpy as np
 import pytest
-
-from kpc.encoder.training import temporal_resolution
-from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows
+from kpc.encoder.training import temporal_resolution
 from kpc.encoder.training.temporal_resolution import fitted_in_time, measure
 from kpc.format.common.media import write_image
 
@@ -83,7 +82,9 @@ def test_errors_are_those_of_least_squares(clips: Callable[[float], Dataset]) ->
         found = measure(clips(period), 0.05)
         assert found is not None and found.error <= 0.05 < found.next_error
         assert found.error == pytest.approx(by_definition(clips(period), found.frames_per_row), rel=1e-3, abs=1e-5)
-        wider = temporal_resolution._spacings(FRAMES)[temporal_resolution._spacings(FRAMES).index(found.frames_per_row) + 1]
+        wider = temporal_resolution._spacings(FRAMES)[
+            temporal_resolution._spacings(FRAMES).index(found.frames_per_row) + 1
+        ]
         assert found.next_error == pytest.approx(by_definition(clips(period), wider), rel=1e-3)
         assert found.changing == pytest.approx(0.5) and found.noise < 1e-3
 

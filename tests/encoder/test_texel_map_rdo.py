@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-
 from kpc.encoder.rdo.texel_map_rdo import MAP_LAM, UNCHANGED, map_context, told_texels
-from kpc.format.coding.rans import SCALE, adapt, counters
 from kpc.format.coding.predictive import MAP_CONTEXTS, walk_map
+from kpc.format.coding.rans import SCALE, adapt, counters
 
 
 def bits_of(told):

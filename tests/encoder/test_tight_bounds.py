@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from kpc.encoder.field.config import PRESETS, TrainConfig
-from kpc.encoder.datasets import Dataset
 from kpc.encoder.cli.options import Options
+from kpc.encoder.datasets import Dataset
+from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.training.tight_bounds import MOST_STEPS, trim_box
 
 CONFIG = TrainConfig(steps=1500, rays=256, samples=12288, warmup=5)
@@ -47,4 +46,7 @@ def test_a_lone_object_seen_once_gets_a_model_of_its_own(moving: Dataset, tmp_pa
     assert replace(options, progressive=True).config(moving).scale_dropout > lone.scale_dropout == 0
     twice = replace(moving.pictures, time=np.zeros(len(moving.pictures), np.float32))
     assert options.config(replace(moving, pictures=twice)).view_dependent
-    assert replace(options, steps=None).config(moving).steps == 3 * plain.steps and lone.motion_cells > plain.motion_cells == 0
+    assert (
+        replace(options, steps=None).config(moving).steps == 3 * plain.steps
+        and lone.motion_cells > plain.motion_cells == 0
+    )

@@ -9,15 +9,14 @@ import numba
 import numpy as np
 import pytest
 import torch
-
-from kpc.encoder.field.bounds import contraction_of, find_box
-from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.cli.kpenc import to_scene
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import evaluate
+from kpc.encoder.field.bounds import contraction_of, find_box
+from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
-from kpc.encoder.cli.kpenc import to_scene
-from kpc.encoder.training.optimisers import PlainOptimiser, kept_channels
 from kpc.encoder.field.render import Rays
+from kpc.encoder.training.optimisers import PlainOptimiser, kept_channels
 from kpc.encoder.training.sampler import RaySampler
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.errors import TrainingError
@@ -120,7 +119,13 @@ def test_a_seed_repeats_bitwise(moving: Dataset, hybrid: bool) -> None:
 def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(
     moving: Dataset, tmp_path: Path, stop_at: int, other: dict[str, object]
 ) -> None:
-    changes = other | {"steps": 80, "channel_dropout": 0.25, "occupancy_split_every": 64, "motion_cells": 3, "appearance": "image"}
+    changes = other | {
+        "steps": 80,
+        "channel_dropout": 0.25,
+        "occupancy_split_every": 64,
+        "motion_cells": 3,
+        "appearance": "image",
+    }
     whole = trained(moving, **changes)
     assert whole.field.codes is not None and whole.field.codes.any(1).all()
     assert len(whole.grid.marched) == whole.slots > 1
@@ -451,11 +456,14 @@ def test_finer_scales_are_left_out_now_and_then(moving: Dataset) -> None:
 
 def test_coarse_scales_make_a_picture_alone(moving: Dataset) -> None:
     """What is left when the finer scale counts as 0 is nearer to the pictures if training has left it out at times."""
+
     def coarse(scale_dropout: float) -> float:
         run = trainer(moving, steps=150, scale_dropout=scale_dropout)
         run.run(lambda report: None)
         scene = to_scene(run)
-        finer = {name: np.zeros_like(plane) if name in SPACE_PLANES else plane for name, plane in scene.scales[1].items()}
+        finer = {
+            name: np.zeros_like(plane) if name in SPACE_PLANES else plane for name, plane in scene.scales[1].items()
+        }
         quality = evaluate(replace(scene, scales=(scene.scales[0], finer)), moving, most=4)
         assert quality is not None
         return quality.psnr
@@ -466,7 +474,13 @@ def test_coarse_scales_make_a_picture_alone(moving: Dataset) -> None:
 def test_the_coarsest_scale_begins_alone_and_dropout_ends(moving: Dataset) -> None:
     run = trainer(moving, resolutions=(8, 12, 16), channel_dropout=0.25, dropout_until=0.5, coarse_until=0.3)
     M = run.field.layout.channels
-    for fraction, scales, channels in ((0.0, 1, M - M // 4), (0.29, 1, M - M // 4), (0.3, 3, M - M // 4), (0.5, 3, M), (1.0, 3, M)):
+    for fraction, scales, channels in (
+        (0.0, 1, M - M // 4),
+        (0.29, 1, M - M // 4),
+        (0.3, 3, M - M // 4),
+        (0.5, 3, M),
+        (1.0, 3, M),
+    ):
         kept = kept_channels(run.field, run.config, 7, fraction).view(3, M)
         assert kept.any(1).sum() == scales and kept[:scales].bool().sum() == scales * channels
     before = run.field.theta.detach().clone()
@@ -512,16 +526,34 @@ def plain_twin(fused: Trainer) -> PlainOptimiser:
 @pytest.mark.parametrize("mapping", [None, Contraction(4.0)])
 @pytest.mark.parametrize(
     ("channel_dropout", "view_dependent", "motion_cells", "appearance"),
-    [(0.0, True, 0, "none"), (0.5, True, 0, "none"), (0.5, False, 0, "none"), (0.0, True, 3, "none"), (0.5, True, 0, "image")],
+    [
+        (0.0, True, 0, "none"),
+        (0.5, True, 0, "none"),
+        (0.5, False, 0, "none"),
+        (0.0, True, 3, "none"),
+        (0.5, True, 0, "image"),
+    ],
 )
 @pytest.mark.parametrize("coarse_until", [0.0, 0.5])
 def test_plain_pytorch_takes_the_same_steps(
-    moving: Dataset, channel_dropout: float, view_dependent: bool, motion_cells: int, appearance: str, mapping: Contraction | None,
+    moving: Dataset,
+    channel_dropout: float,
+    view_dependent: bool,
+    motion_cells: int,
+    appearance: str,
+    mapping: Contraction | None,
     coarse_until: float,
 ) -> None:
     """Adam moves by the sign of a gradient at first; where that is all rounding, either way."""
-    run = trainer(moving, mapping, channel_dropout=channel_dropout, view_dependent=view_dependent, motion_cells=motion_cells,
-                  appearance=appearance, coarse_until=coarse_until)
+    run = trainer(
+        moving,
+        mapping,
+        channel_dropout=channel_dropout,
+        view_dependent=view_dependent,
+        motion_cells=motion_cells,
+        appearance=appearance,
+        coarse_until=coarse_until,
+    )
     plain = plain_twin(run)
     for number in range(3):
         batch, targets = run.sampler.draw(run.rng, 256)

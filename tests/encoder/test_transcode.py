@@ -11,21 +11,19 @@ import datasets as make
 import numpy as np
 import pytest
 import torch
-from scenes import SPACES, tiny_scene, varied
-
 from kpc.encoder.cli import kpenc
-
-from kpc.encoder.rdo import codec_model, sequential_finetune
-from kpc.encoder.rdo.rate_control import Trade
-from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import ASSUMED_MSE, Probe, around
+from kpc.encoder.field.config import PRESETS, TrainConfig
+from kpc.encoder.rdo import codec_model, sequential_finetune
 from kpc.encoder.rdo.mode_decision import step_asked_for
-from kpc.format.container import scene_io
-from kpc.format.common.errors import TrainingError
+from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common.errors import TrainingError
+from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
+from scenes import SPACES, tiny_scene, varied
 
 pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
 TINY = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
@@ -80,7 +78,9 @@ def saved(path: Path, scene: Scene) -> Path:
 # --- finished checkpoints
 
 
-@pytest.mark.parametrize("trade", [(), ("--max-loss", "1dB"), ("--quality", "60", "--tune-steps", "4"), ("--psnr", "9dB")])
+@pytest.mark.parametrize(
+    "trade", [(), ("--max-loss", "1dB"), ("--quality", "60", "--tune-steps", "4"), ("--psnr", "9dB")]
+)
 def test_a_checkpoint_gives_the_file_that_training_gave(
     tmp_path: Path, kpenc_says: Kpenc, monkeypatch: pytest.MonkeyPatch, trade: tuple[str, ...]
 ) -> None:
@@ -90,7 +90,17 @@ def test_a_checkpoint_gives_the_file_that_training_gave(
     trained = kpenc_says(tmp_path / "set", tmp_path / "out.kpc", "--preset", "draft", *keep, *trade)
     again = kpenc_says(tmp_path / "model.kpck", tmp_path / "again.kpc", *trade)
     assert (tmp_path / "out.kpc").read_bytes() == (tmp_path / "again.kpc").read_bytes()
-    said = ("trade", "asked", "judged_by", "probe_psnr", "probe_loss_db", "agreement_db", "size_bytes", "parameters", "identity_share")
+    said = (
+        "trade",
+        "asked",
+        "judged_by",
+        "probe_psnr",
+        "probe_loss_db",
+        "agreement_db",
+        "size_bytes",
+        "parameters",
+        "identity_share",
+    )
     assert {key: trained[key] for key in said} == {key: again[key] for key in said}
     assert {p.name for p in tmp_path.iterdir()} == {"set", "out.kpc", "again.kpc", "model.kpck"}
 
@@ -119,7 +129,12 @@ def test_a_checkpoint_of_a_run_is_told_from_a_finished_one(
 def test_damaged_checkpoints_are_refused_in_a_line(tmp_path: Path, refused: Callable[..., str]) -> None:
     good, bad = saved(tmp_path / "good.kpck", tiny_scene(2)), tmp_path / "bad.kpck"
     whole = good.read_bytes()
-    for content in (whole[:1000], whole[: len(whole) // 2], b"PK" + bytes(100), whole[:500] + bytes(3000) + whole[3500:]):
+    for content in (
+        whole[:1000],
+        whole[: len(whole) // 2],
+        b"PK" + bytes(100),
+        whole[:500] + bytes(3000) + whole[3500:],
+    ):
         bad.write_bytes(content)
         assert "not a usable checkpoint" in refused(bad) or "no finished" in refused(bad)
     for content in (b"", b"nonsense", b"\x80\x04cos\nsystem\n"):
@@ -139,7 +154,9 @@ def changes() -> dict[str, Callable[[dict[str, Any]], object]]:
         "a plane of another size": lambda s: s["scales"][0].update(xz=torch.ones(3, 3, 3)),
         "doubles": lambda s: s["scales"][0].update(xy=s["scales"][0]["xy"].double()),
         "NaN in a plane": lambda s: s["scales"][0]["xy"].fill_(float("nan")),
-        "a tensor of nothing": lambda s: s.update(occupancy=torch.zeros(1, dtype=torch.bool).expand(1, 9999, 9999, 9999)),
+        "a tensor of nothing": lambda s: s.update(
+            occupancy=torch.zeros(1, dtype=torch.bool).expand(1, 9999, 9999, 9999)
+        ),
         "a box inside out": lambda s: s.update(aabb=s["aabb"].flip(0)),
         "a step of 0": lambda s: s.update(step=0.0),
         "endless rays": lambda s: s.update(step=1e-9),
@@ -183,7 +200,9 @@ def test_a_checkpoint_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest
 @pytest.fixture
 def scene_file(tmp_path: Path) -> Path:
     scene = tiny_scene(3)
-    scene_io.write(quantise_scene(scene, [{name: 0.002 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
+    scene_io.write(
+        quantise_scene(scene, [{name: 0.002 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc"
+    )
     return tmp_path / "scene.kpc"
 
 
@@ -212,7 +231,9 @@ def test_the_ratio_of_steps_stays(scene_file: Path, tmp_path: Path, kpenc_says: 
     kpenc_says(scene_file, tmp_path / "smaller.kpc", "--max-loss", "0.02dB")
     steps = [[step_asked_for(plane) / step_asked_for(scene.scales[0]["xy"])[0] for scale in scene.scales for plane in scale.values()]
              for scene in (scene_io.read(scene_file), scene_io.read(tmp_path / "smaller.kpc"))]  # fmt: skip
-    np.testing.assert_allclose(np.concatenate(steps[0]), np.concatenate(steps[1]), rtol=2**-6)  # each to 8 significant bits
+    np.testing.assert_allclose(
+        np.concatenate(steps[0]), np.concatenate(steps[1]), rtol=2**-6
+    )  # each to 8 significant bits
 
 
 def test_damaged_files_are_refused_in_a_line(scene_file: Path, refused: Callable[..., str]) -> None:
@@ -225,7 +246,9 @@ def test_damaged_files_are_refused_in_a_line(scene_file: Path, refused: Callable
 # --- the command line
 
 
-def test_options_of_training_mean_nothing_here(scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_of_training_mean_nothing_here(
+    scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for words in (["--steps", "3"], ["--preset", "fast"], ["--resume"], ["--dry-run"], ["--keep-checkpoint", "m.kpck"]):
         with pytest.raises(SystemExit, match="2"):
             kpenc.main([str(scene_file), "-o", str(tmp_path / "x.kpc"), *words])
@@ -241,7 +264,9 @@ def test_a_source_is_never_overwritten(scene_file: Path, capsys: pytest.CaptureF
 def test_what_is_printed(scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert kpenc.main([str(scene_file), "-o", str(tmp_path / "x.kpc"), "--lam", "3"]) == 0
     out, _ = capsys.readouterr()
-    assert out.count("\n") == 1 and all(words in out for words in ("asked for lam 3; reached ", " bytes, ", "uncoded pictures"))
+    assert out.count("\n") == 1 and all(
+        words in out for words in ("asked for lam 3; reached ", " bytes, ", "uncoded pictures")
+    )
 
 
 @pytest.mark.parametrize("words", [["--quality", "0"], ["--quality", "101"], ["--quality", "nan"], ["--lam", "-1"], ["--lam", "x"],
@@ -259,8 +284,13 @@ def test_a_trade_that_makes_no_sense(words: list[str], tmp_path: Path, capsys: p
 def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
     """They hold the same all along the axis, and so do two."""
     scene = tiny_scene()
-    thin = {name: plane[: 1 if axis == name[1] else None, : 1 if axis == name[0] else None] for name, plane in scene.scales[0].items()}
-    whole = quantise_scene(replace(scene, scales=(thin, scene.scales[1])), [{name: 0.01 for name in planes} for planes in scene.scales])
+    thin = {
+        name: plane[: 1 if axis == name[1] else None, : 1 if axis == name[0] else None]
+        for name, plane in scene.scales[0].items()
+    }
+    whole = quantise_scene(
+        replace(scene, scales=(thin, scene.scales[1])), [{name: 0.01 for name in planes} for planes in scene.scales]
+    )
     with pytest.raises(ValueError, match="one texel"):
         SceneRenderer(whole.dequantise())
     source = codec_model.model_of(whole)
@@ -273,7 +303,9 @@ def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
     assert coded.loss_db <= 0.15 and scene_io.read(coded.data).scales[0].keys() == thin.keys()
 
 
-@pytest.mark.parametrize("name", ["appearances", "cells-one", "contracted", "device-coordinates", "dynamic", "hybrid-moved", "limits-large"])
+@pytest.mark.parametrize(
+    "name", ["appearances", "cells-one", "contracted", "device-coordinates", "dynamic", "hybrid-moved", "limits-large"]
+)
 def test_files_of_all_kinds_are_coded_again(name: str) -> None:
     source = codec_model.model_of(scene_io.read(VECTORS / f"{name}.kpc"))
     coded = codec_model.code(source, Trade(), TrainConfig().prune_share, 1)
@@ -291,7 +323,9 @@ def test_cameras_around_a_scene_without_any_see_it() -> None:
         local = (corners - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]
         pixel = local[:, :2] / -local[:, 2:] * (camera.fl_x, -camera.fl_y) + (camera.cx, camera.cy)
         assert (local[:, 2] < 0).all() and (pixel > 0).all() and (pixel < (camera.width, camera.height)).all()
-        np.testing.assert_allclose(camera.camera_to_world[:3, :3].T @ camera.camera_to_world[:3, :3], np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(
+            camera.camera_to_world[:3, :3].T @ camera.camera_to_world[:3, :3], np.eye(3), atol=1e-12
+        )
 
 
 def test_a_probe_of_surfaces_meets_them_from_all_cameras() -> None:

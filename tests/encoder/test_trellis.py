@@ -4,17 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import tiny_scene
-
 from kpc.encoder.rdo import distortion, trellis
+from kpc.encoder.rdo.distortion import ALONE
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
 from kpc.encoder.rdo.trellis import STATES, TOLD_APART
-from kpc.encoder.rdo.distortion import ALONE
-from kpc.format.container import scene_io
+from kpc.format.coding.predictive import (
+    ACTIVITIES,
+    TRELLIS,
+    WEIGHTS,
+    encode_symbols,
+    follows_trellis,
+    guide_of,
+    next_state,
+)
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
-from kpc.format.scene.scene import TIME_PLANES, Scene
+from kpc.format.container import scene_io
 from kpc.format.container.segments import rows_of_segments
-from kpc.format.coding.predictive import ACTIVITIES, TRELLIS, WEIGHTS, encode_symbols, follows_trellis, guide_of, next_state
+from kpc.format.scene.scene import TIME_PLANES, Scene
+from scenes import tiny_scene
 
 
 def noisy(seed: int = 1) -> Scene:
@@ -38,12 +45,21 @@ FREE = np.zeros((2 * ACTIVITIES, TOLD_APART))
 """Every error costs nothing."""
 
 
-def searched(wanted: np.ndarray, known: np.ndarray, bits: np.ndarray = FREE, distortion: np.ndarray | None = None,
-             together: np.ndarray = ALONE) -> np.ndarray:
+def searched(
+    wanted: np.ndarray,
+    known: np.ndarray,
+    bits: np.ndarray = FREE,
+    distortion: np.ndarray | None = None,
+    together: np.ndarray = ALONE,
+) -> np.ndarray:
     distortion = np.ones(wanted.shape, np.float32) if distortion is None else distortion
     errors = np.zeros((wanted.shape[0] + 2, wanted.shape[1] + 2, wanted.shape[2]), np.float32)
-    symbols, counts = trellis._search(wanted, distortion, known, len(wanted), TRELLIS, NO_WEIGHTS, bits, errors, together)
-    assert np.allclose(errors[1:-1, 1:-1], np.where(known[..., None], np.sqrt(distortion) * (symbols - wanted), 0), atol=1e-4)
+    symbols, counts = trellis._search(
+        wanted, distortion, known, len(wanted), TRELLIS, NO_WEIGHTS, bits, errors, together
+    )
+    assert np.allclose(
+        errors[1:-1, 1:-1], np.where(known[..., None], np.sqrt(distortion) * (symbols - wanted), 0), atol=1e-4
+    )
     assert counts.sum() == known.sum() * wanted.shape[2]
     assert follows_trellis(symbols, known) and not symbols[~known].any()
     return symbols
@@ -128,7 +144,9 @@ def test_seen_is_what_bilinear_look_ups_see() -> None:
     errors, (u, v) = rng.normal(size=(60, 80, 1)).cumsum(1), rng.random((2, 200_000))
     errors -= errors.mean()
     row, column = rng.integers(0, 59, u.size), rng.integers(0, 79, u.size)
-    corners = [errors[row + i, column + j, 0] * (v if i else 1 - v) * (u if j else 1 - u) for i in (0, 1) for j in (0, 1)]
+    corners = [
+        errors[row + i, column + j, 0] * (v if i else 1 - v) * (u if j else 1 - u) for i in (0, 1) for j in (0, 1)
+    ]
     assert seen(errors) == pytest.approx(np.mean(np.square(sum(corners))) * 9 / 4, rel=0.05)
 
 
@@ -188,9 +206,14 @@ def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float)
     def size(plane: QuantisedPlane) -> int:
         return len(encode_symbols(plane.symbols, plane.coded, plane.guide))
 
-    economical = trellis.on_trellis(quantise_plane(values, step, identity=False), values, np.full(3, step), np.ones_like(values), False)
-    as_bad = next(plane for k in np.arange(1, 4, 0.01)
-                  if error(plane := quantise_plane(values, k * step, identity=False)) >= error(economical))
+    economical = trellis.on_trellis(
+        quantise_plane(values, step, identity=False), values, np.full(3, step), np.ones_like(values), False
+    )
+    as_bad = next(
+        plane
+        for k in np.arange(1, 4, 0.01)
+        if error(plane := quantise_plane(values, k * step, identity=False)) >= error(economical)
+    )
     assert size(economical) < size(as_bad) - 0.12 * values.size / 8  # 1.09 dB are 0.18 bits
 
 
@@ -204,7 +227,9 @@ def test_where_eight_bits_are_too_few_any_symbol_may_follow(monkeypatch: pytest.
     significant[:, 20:] = 1e-9
     free = trellis.on_trellis(nearest, values, step, np.ones_like(values), False)
     told = trellis.on_trellis(nearest, values, step, significant, False)
-    assert not follows_trellis(free.symbols, free.coded) and np.abs(free.symbols - nearest.symbols.astype(int)).max() <= 1
+    assert (
+        not follows_trellis(free.symbols, free.coded) and np.abs(free.symbols - nearest.symbols.astype(int)).max() <= 1
+    )
     errors = [seen((plane.dequantise() - values)[:, :20]) for plane in (nearest, free, told)]
     assert errors[1] < errors[0] and errors[2] < 1.1 * errors[0]
     assert len(encode_symbols(told.symbols, told.coded)) < 0.95 * len(encode_symbols(nearest.symbols, nearest.coded))
@@ -221,7 +246,9 @@ def test_what_was_left_out_stays_so_and_steps_stay(step: float) -> None:
     for ours, theirs in zip(after.scales, before.scales):
         for name in ours:
             np.testing.assert_allclose(trellis.step_on_trellis(ours[name]), theirs[name].step, rtol=2**-7)
-            assert not ours[name].symbols[~ours[name].coded].any() and not (ours[name].coded & ~theirs[name].coded).any()
+            assert (
+                not ours[name].symbols[~ours[name].coded].any() and not (ours[name].coded & ~theirs[name].coded).any()
+            )
             if name not in TIME_PLANES:
                 np.testing.assert_array_equal(ours[name].coded, theirs[name].coded)
             elif ours[name].guide is None:
@@ -251,7 +278,9 @@ def test_what_is_hardly_told_goes_around_predictions(identity: bool) -> None:
         bodies = [encode_symbols(plane.symbols[rows], plane.coded[rows], plane.guide) for rows in parts]
         assert all(guide_of(body) == plane.guide for body in bodies)
         errors = plane.dequantise() - values
-        return float((errors / 2.0).ravel() @ (errors / 2.0).ravel() * seen(errors) / np.mean(np.square(errors))) + distortion.LAM * 8 * sum(map(len, bodies))
+        return float(
+            (errors / 2.0).ravel() @ (errors / 2.0).ravel() * seen(errors) / np.mean(np.square(errors))
+        ) + distortion.LAM * 8 * sum(map(len, bodies))
 
     around = trellis.on_trellis(rounded, values, step, alike, identity)
     assert around.guide is not None
@@ -267,7 +296,9 @@ def test_files_keep_what_symbols_were_chosen_by() -> None:
     assert scene_io.encode(back) == data
     for ours, theirs in zip(back.scales, scene.scales):
         assert all(ours[name].guide == theirs[name].guide for name in ours)
-    forgotten = replace(back, scales=tuple({name: replace(plane, guide=None) for name, plane in scale.items()} for scale in back.scales))
+    forgotten = replace(
+        back, scales=tuple({name: replace(plane, guide=None) for name, plane in scale.items()} for scale in back.scales)
+    )
     assert len(scene_io.encode(forgotten)) > len(data)
 
 

@@ -4,11 +4,10 @@ import io
 import sys
 
 import pytest
-from numba import njit
-from numba.core import event
-
 from kpc.format.common import compiling
 from kpc.format.common.compiling import LEAST_S, NOTICE, WATCH, Watch
+from numba import njit
+from numba.core import event
 
 
 class Terminal(io.StringIO):
@@ -81,7 +80,11 @@ def test_a_player_that_waits_for_that_says_so(monkeypatch: pytest.MonkeyPatch) -
     stream = Stream.__new__(Stream)
     stream._failure = stream._trouble = None
     monkeypatch.setattr(Stream, "rate", 2000.0)
-    for stalled, compiles, wanted in ((True, True, NOTICE), (True, False, "waiting for the scene, 2 KB/s"), (False, True, None)):
+    for stalled, compiles, wanted in (
+        (True, True, NOTICE),
+        (True, False, "waiting for the scene, 2 KB/s"),
+        (False, True, None),
+    ):
         stream._stalled = stalled
         monkeypatch.setattr(Watch, "is_under_way", compiles)
         assert stream.message == wanted

@@ -5,13 +5,26 @@ from dataclasses import replace
 import google_crc32c
 import numpy as np
 import pytest
-
-from kpc.format.container.container import CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, ENTRY, EXPANSION_LIMIT, HEADER, Chunk, Reader, pack
 from kpc.format.common.errors import FormatError
+from kpc.format.container.container import (
+    CODEC_RAW,
+    CODEC_SYMBOLS,
+    CODEC_ZSTD,
+    ENTRY,
+    EXPANSION_LIMIT,
+    HEADER,
+    Chunk,
+    Reader,
+    pack,
+)
 
 NOISE = np.random.default_rng(0).integers(0, 256, 300).astype(np.uint8).tobytes()
-CHUNKS = [Chunk("ABCD", [b"head"]), Chunk("PLNE", [b"x" * 500, NOISE], 1, 3, 16, 8), Chunk("none", [b""]),
-          Chunk("long", [bytes(100_000)])]
+CHUNKS = [
+    Chunk("ABCD", [b"head"]),
+    Chunk("PLNE", [b"x" * 500, NOISE], 1, 3, 16, 8),
+    Chunk("none", [b""]),
+    Chunk("long", [bytes(100_000)]),
+]
 
 
 def test_chunks_come_back_with_their_places():
@@ -26,12 +39,24 @@ def test_chunks_come_back_with_their_places():
     assert all(reader.available(n) for n in range(4))
 
 
-@pytest.mark.parametrize("kind, body, count, codec", [
-    *((kind, b"s" * 9, count, codec) for kind in ("PLNE", "OCCU") for count, codec in (
-        (300, CODEC_SYMBOLS), (9 * EXPANSION_LIMIT, CODEC_SYMBOLS), (9 * EXPANSION_LIMIT + 1, CODEC_ZSTD))),
-    ("PLNE", b"s" * 500, 300, CODEC_RAW), ("OCCU", b"s" * 500, 300, CODEC_ZSTD), ("OCCU", b"s" * 100, 300, CODEC_ZSTD),
-    ("PLNE", None, 0, CODEC_ZSTD),
-])
+@pytest.mark.parametrize(
+    "kind, body, count, codec",
+    [
+        *(
+            (kind, b"s" * 9, count, codec)
+            for kind in ("PLNE", "OCCU")
+            for count, codec in (
+                (300, CODEC_SYMBOLS),
+                (9 * EXPANSION_LIMIT, CODEC_SYMBOLS),
+                (9 * EXPANSION_LIMIT + 1, CODEC_ZSTD),
+            )
+        ),
+        ("PLNE", b"s" * 500, 300, CODEC_RAW),
+        ("OCCU", b"s" * 500, 300, CODEC_ZSTD),
+        ("OCCU", b"s" * 100, 300, CODEC_ZSTD),
+        ("PLNE", None, 0, CODEC_ZSTD),
+    ],
+)
 def test_symbols_are_taken_where_they_are_shorter_and_may_stand_for_so_many(kind, body, count, codec):
     data = pack([Chunk(kind, [b"x" * 500], coded={CODEC_SYMBOLS: lambda: body} if body else {}, symbol_count=count)], 1)
     entry = Reader(data).index[0]
@@ -77,14 +102,14 @@ class Recorded:
 
     def read_at(self, offset: int, length: int) -> bytes:
         self.asked.append((offset, length))
-        return self.data[offset:offset + length]
+        return self.data[offset : offset + length]
 
     def hold(self, offset: int, length: int) -> None:
         pass
 
 
 def test_an_index_is_stored_in_columns_where_that_is_smaller():
-    many = [*CHUNKS, *[Chunk("note", [NOISE[:20 + k]], row_start=k) for k in range(30)]]
+    many = [*CHUNKS, *[Chunk("note", [NOISE[: 20 + k]], row_start=k) for k in range(30)]]
     plain, told = pack(many, 7, version=1), pack(many, 7)
     before, now = Reader(plain), Reader(told)
     assert (before.header.version, now.header.version) == (1, 2) and len(plain) - len(told) > 15 * len(many)
@@ -97,7 +122,10 @@ def test_an_index_is_stored_in_columns_where_that_is_smaller():
 def test_opening_takes_two_requests_and_a_chunk_one(version: int):
     source = Recorded(pack(CHUNKS, 7, version=version))
     reader = Reader(source)
-    assert source.asked == [(0, HEADER.size), (HEADER.size, reader.header.index_length)] and reader.header.version == version
+    assert (
+        source.asked == [(0, HEADER.size), (HEADER.size, reader.header.index_length)]
+        and reader.header.version == version
+    )
     source.asked.clear()
     assert reader.chunk(1) == b"x" * 500 + NOISE
     assert source.asked == [(reader.index[1].offset, reader.index[1].stored_length)]

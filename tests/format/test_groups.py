@@ -6,21 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import tiny_scene, varied
-
-import kpc
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common.errors import BudgetError, FormatError, UsageError
+from kpc.format.common.media import read_image
 from kpc.format.container import groups, scene_io
 from kpc.format.container.container import Reader
-from kpc.format.common.errors import BudgetError, FormatError, UsageError
 from kpc.format.container.groups import Groups, LongScene, Part, Span, Timeline
-from kpc.format.common.media import read_image
-from kpc.format.coding.quantise import quantise_scene
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.cpu import reference
 from kpc.player.cpu.motion_map import dynamic_map
 from kpc.player.orbit import fitted
 from kpc.tools.cli import kpinfo, kpjoin, kprender
 from kpc.tools.cli.serve import Handler, serving
+from scenes import tiny_scene, varied
+
+import kpc
 
 
 def coded(scene: Scene) -> bytes:
@@ -74,7 +74,9 @@ def test_a_clip_goes_over_from_one_group_to_the_next_without_a_jump(clip):
     (first, t, _), (second, u, share) = long.mixed(9.0 / 29)
     one, other = reference.render(first, camera, t), reference.render(second, camera, u)
     assert share == pytest.approx(0.5) and np.abs(one.rgb - other.rgb).max() > 0.1
-    assert np.abs(middle.rgb - (one.rgb + other.rgb) / 2).max() < 1e-6 and np.array_equal(middle.samples, one.samples + other.samples)
+    assert np.abs(middle.rgb - (one.rgb + other.rgb) / 2).max() < 1e-6 and np.array_equal(
+        middle.samples, one.samples + other.samples
+    )
     assert np.abs(middle.opacity - (one.opacity + other.opacity) / 2).max() < 1e-6
     assert np.abs(before.rgb - after.rgb).max() < 0.02
 
@@ -93,8 +95,23 @@ def test_a_clip_shows_its_groups(clip, scenes):
 
 def test_what_moves_is_told_and_shown_of_the_group_that_shows(clip, scenes, tmp_path, capsys):
     for number, time, own in ((1, 13 / 29, 0.5), (2, 1.0, 1.0)):
-        assert kprender.main([str(clip), "--dynamic-map", "--time", str(time), "--size", "24x18", "--backend", "reference",
-                              "-o", str(tmp_path / "map.png")]) == 0
+        assert (
+            kprender.main(
+                [
+                    str(clip),
+                    "--dynamic-map",
+                    "--time",
+                    str(time),
+                    "--size",
+                    "24x18",
+                    "--backend",
+                    "reference",
+                    "-o",
+                    str(tmp_path / "map.png"),
+                ]
+            )
+            == 0
+        )
         capsys.readouterr()
         assert kpinfo.main([str(clip), "--group", str(number), "--json"]) == 0
         shares = json.loads(capsys.readouterr().out)["static"]
@@ -154,7 +171,10 @@ def test_groups_are_read_from_a_server_one_by_one(clip):
     with serving(clip.parent) as url:
         remote = Groups(f"{url}/long.kpc")
         for number in (2, 0, 1):
-            assert scene_io.read(remote.open(number)).parameter_count == scene_io.read(Groups(clip).open(number)).parameter_count
+            assert (
+                scene_io.read(remote.open(number)).parameter_count
+                == scene_io.read(Groups(clip).open(number)).parameter_count
+            )
         source = remote.source_of(1)
         assert source.read_at(0, 4) == b"\x89KPC" and source.received < clip.stat().st_size
         source.close()
@@ -182,7 +202,9 @@ def test_a_server_without_ranges_sends_it_once(clip, capfd):
 def test_parts_of_a_clip_are_put_in_order(scenes, tmp_path, capsys):
     for number, start in enumerate((40, 48, 59)):
         groups.write([Part.of(scenes[number], start)], tmp_path / f"{number}.kpc")
-    assert kpjoin.main([*(str(tmp_path / f"{number}.kpc") for number in (2, 0, 1)), "-o", str(tmp_path / "long.kpc")]) == 0
+    assert (
+        kpjoin.main([*(str(tmp_path / f"{number}.kpc") for number in (2, 0, 1)), "-o", str(tmp_path / "long.kpc")]) == 0
+    )
     assert "3 groups, 30 frames at 10 fps" in capsys.readouterr().out
     joined = Groups(tmp_path / "long.kpc")
     assert joined.timeline.spans == (Span(40, 11), Span(48, 11), Span(59, 11))
@@ -202,8 +224,11 @@ def test_what_does_not_make_a_clip_is_refused(clip, scenes, tmp_path, capsys):
     slower.write_bytes(coded(replace(tiny_scene(3, scales=1), clip=Clip(11, 12.5))))
     output = tmp_path / "out.kpc"
     for names, complaint in (
-        (["early", "late"], "leave no frame out"), (["early", "early"], "leave no frame out"), (["early"], "name two or more"),
-        (["early", "slower"], "runs at 12.5 fps"), (["early", "none"], "No such file"),
+        (["early", "late"], "leave no frame out"),
+        (["early", "early"], "leave no frame out"),
+        (["early"], "name two or more"),
+        (["early", "slower"], "runs at 12.5 fps"),
+        (["early", "none"], "No such file"),
     ):
         assert kpjoin.main([*(str(tmp_path / f"{name}.kpc") for name in names), "-o", str(output)]) in (1, 2)
         assert complaint in capsys.readouterr().err and not output.exists()

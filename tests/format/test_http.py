@@ -8,16 +8,16 @@ from typing import IO, ClassVar
 
 import numpy as np
 import pytest
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, NetworkError, UnreachableError
+from kpc.format.container import http
+from kpc.format.container.container import RemoteSource, Source
+from kpc.format.container.http import FIRST_BYTES, HttpSource, is_url
+from kpc.format.container.scene_io import SceneReader, write
+from kpc.tools.cli.serve import Handler, Line, serving
 from scenes import tiny_scene
 
 import kpc
-from kpc.format.container import http
-from kpc.format.container.container import RemoteSource, Source
-from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, NetworkError, UnreachableError
-from kpc.format.container.scene_io import SceneReader, write
-from kpc.format.container.http import FIRST_BYTES, HttpSource, is_url
-from kpc.format.coding.quantise import quantise_scene
-from kpc.tools.cli.serve import Handler, Line, serving
 
 DATA = np.random.default_rng(0).integers(0, 256, 400_000, np.uint8).tobytes()
 
@@ -164,7 +164,10 @@ def test_a_connection_that_breaks_off_is_taken_up_again_where_it_ended(folder: P
         source = HttpSource(f"{address}/data.bin", say=said.append)
         assert source.read_at(100_000, 100_000) == DATA[100_000:200_000]
         assert Noting.asked[1:] == [f"bytes={start}-199999" for start in range(100_000, 200_000, 30_000)]
-        assert said.count(None) == 3 and sum("breaks off" in (words or "") or "fails" in (words or "") for words in said) == 3
+        assert (
+            said.count(None) == 3
+            and sum("breaks off" in (words or "") or "fails" in (words or "") for words in said) == 3
+        )
         source.close()
 
 
@@ -255,10 +258,19 @@ def header_changed(name: str, change: Callable[[str, int], str | None]) -> type[
     ("handler", "words"),
     [
         (header_changed("ETag", lambda value, n: value if n == 0 else '"other"'), "changed on the server"),
-        (header_changed("Content-Range", lambda value, n: value if n == 0 else value.replace("/4", "/5")), "changed on the server"),
-        (header_changed("Content-Range", lambda value, n: value if n == 0 else "bytes 0-9/400000"), "not from 100000 on"),
+        (
+            header_changed("Content-Range", lambda value, n: value if n == 0 else value.replace("/4", "/5")),
+            "changed on the server",
+        ),
+        (
+            header_changed("Content-Range", lambda value, n: value if n == 0 else "bytes 0-9/400000"),
+            "not from 100000 on",
+        ),
         (header_changed("Content-Range", lambda value, n: value if n == 0 else None), "does not say which bytes"),
-        (header_changed("Content-Range", lambda value, n: value if n == 0 else "bytes 100000-99/400000"), "sends bytes 100000-99"),
+        (
+            header_changed("Content-Range", lambda value, n: value if n == 0 else "bytes 100000-99/400000"),
+            "sends bytes 100000-99",
+        ),
     ],
     ids=["etag", "size", "other bytes", "nothing said", "nonsense"],
 )
@@ -324,18 +336,27 @@ def test_redirections_are_followed_once_and_not_for_ever(folder: Path) -> None:
         source = HttpSource(f"{address}/to/to/data.bin")
         assert source.read_at(100_000, 10) == DATA[100_000:100_010] and len(Noting.asked) == 4
         source.close()
-    with serving(folder, handler=leading(lambda path: path)) as address, pytest.raises(NetworkError, match="more than 5 redir"):
+    with (
+        serving(folder, handler=leading(lambda path: path)) as address,
+        pytest.raises(NetworkError, match="more than 5 redir"),
+    ):
         HttpSource(f"{address}/to/data.bin")
     for target in ("file:///etc/passwd", "http://[", "https://", "ftp://127.0.0.1/data.bin"):
-        with serving(folder, handler=leading(lambda path, target=target: target)) as address, \
-                pytest.raises(NetworkError, match="no http or https address"):
+        with (
+            serving(folder, handler=leading(lambda path, target=target: target)) as address,
+            pytest.raises(NetworkError, match="no http or https address"),
+        ):
             HttpSource(f"{address}/to/data.bin")
 
 
 @pytest.mark.parametrize(
     ("address", "words"),
-    [("http://", "no http or https"), ("http://[::1", "no address"), ("http://a:b/c", "no address"),
-     ("http://a b/c", "connection|address")],
+    [
+        ("http://", "no http or https"),
+        ("http://[::1", "no address"),
+        ("http://a:b/c", "no address"),
+        ("http://a b/c", "connection|address"),
+    ],
 )
 def test_addresses_that_make_no_sense(address: str, words: str) -> None:
     with pytest.raises(NetworkError, match=words):
@@ -345,7 +366,9 @@ def test_addresses_that_make_no_sense(address: str, words: str) -> None:
 def test_what_is_secret_in_an_address_is_not_told(url: str) -> None:
     with pytest.raises(NetworkError) as error:
         HttpSource(url.replace("http://", "http://me:password@").replace("data.bin", "nothing.bin?key=token"))
-    assert "nothing.bin" in str(error.value) and not any(word in str(error.value) for word in ("password", "token", "me:"))
+    assert "nothing.bin" in str(error.value) and not any(
+        word in str(error.value) for word in ("password", "token", "me:")
+    )
 
 
 def test_a_server_cannot_speak_to_the_terminal(folder: Path) -> None:
@@ -395,7 +418,11 @@ def test_urls_are_told_from_paths() -> None:
 @pytest.fixture
 def scene_url(folder: Path) -> Iterator[str]:
     scene = tiny_scene(4)
-    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), folder / "scene.kpc", segment_rows=2)
+    write(
+        quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]),
+        folder / "scene.kpc",
+        segment_rows=2,
+    )
     (folder / "cut.kpc").write_bytes((folder / "scene.kpc").read_bytes()[:-1])
     with serving(folder, handler=Noting) as address:
         yield f"{address}/scene.kpc"

@@ -7,11 +7,18 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from PIL import Image
-
 from kpc.format.common import media
 from kpc.format.common.errors import MediaError
-from kpc.format.common.media import ffmpeg_binary, probe, read_image, read_video, srgb_from_linear, write_image, write_video
+from kpc.format.common.media import (
+    ffmpeg_binary,
+    probe,
+    read_image,
+    read_video,
+    srgb_from_linear,
+    write_image,
+    write_video,
+)
+from PIL import Image
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -5,11 +5,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from kpc.encoder.field import field
 from kpc.format.common.errors import FormatError
 from kpc.format.scene.grid import linear
-from kpc.format.scene.motion import DISPLACEMENT_LIMIT, STEP, QuantisedMotion, _fill, moved, places_reached, quantise_motion
+from kpc.format.scene.motion import (
+    DISPLACEMENT_LIMIT,
+    STEP,
+    QuantisedMotion,
+    _fill,
+    moved,
+    places_reached,
+    quantise_motion,
+)
 
 RNG = np.random.default_rng(0)
 
@@ -37,7 +44,9 @@ def test_moved_is_the_formula_in_numpy_and_pytorch(most: float) -> None:
     np.testing.assert_allclose(ours, wanted, atol=1e-6 * (1 + most))
     theirs = field.moved(*map(torch.from_numpy, (u, times, offsets))).numpy()
     np.testing.assert_allclose(theirs, wanted, atol=1e-6 * (1 + most))
-    assert (np.mean((wanted == 0) | (wanted == 1)) > 0.2) == (most > 1)  # what leaves the planes is kept at their border
+    assert (np.mean((wanted == 0) | (wanted == 1)) > 0.2) == (
+        most > 1
+    )  # what leaves the planes is kept at their border
 
 
 def test_pytorch_has_the_gradient_of_finite_differences() -> None:
@@ -58,7 +67,9 @@ def test_rounding(most: float) -> None:
 
 @pytest.mark.parametrize("multiple", [1, 3, 16])
 def test_multiples_of_several_steps_are_stored_as_such(multiple: int) -> None:
-    offsets = np.random.default_rng(0).integers(-30, 30, (2, 3, 2, 2, 3)).astype(np.float32) * np.float32(multiple * STEP)
+    offsets = np.random.default_rng(0).integers(-30, 30, (2, 3, 2, 2, 3)).astype(np.float32) * np.float32(
+        multiple * STEP
+    )
     rounded = quantise_motion(offsets)
     assert rounded.step == multiple * STEP and np.abs(rounded.symbols).max() <= 30
     np.testing.assert_array_equal(rounded.dequantise(), offsets)

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plain import assert_plain_python_prints_the_same
-from test_nodes import PAINTS, painted, swaying
-
-from kpc.format.common.errors import FormatError
 from kpc.format.coding.motion_hierarchical import WEIGHT_BITS, cubic, decode_midpoints, encode_midpoints, passes
 from kpc.format.coding.motion_raster import encode_nodes
+from kpc.format.common.errors import FormatError
+from plain import assert_plain_python_prints_the_same
+from test_nodes import PAINTS, painted, swaying
 
 sizes = st.tuples(*4 * [st.integers(2, 6)])
 
@@ -63,9 +62,15 @@ def test_weights_are_those_of_the_polynomial_through_all_that_are_there(places):
     there = [place for place in places if place is not None]
     middle = (places[1] + places[2]) // 2
     weights = cubic(middle, places)
-    assert sum(weights) == 1 << WEIGHT_BITS and all(weight == 0 for weight, place in zip(weights, places, strict=True) if place is None)
+    assert sum(weights) == 1 << WEIGHT_BITS and all(
+        weight == 0 for weight, place in zip(weights, places, strict=True) if place is None
+    )
     for power in range(len(there)):
-        exact = sum(Fraction(weight, 1 << WEIGHT_BITS) * place**power for weight, place in zip(weights, places, strict=True) if place is not None)
+        exact = sum(
+            Fraction(weight, 1 << WEIGHT_BITS) * place**power
+            for weight, place in zip(weights, places, strict=True)
+            if place is not None
+        )
         assert abs(exact - middle**power) <= Fraction(2, 1 << WEIGHT_BITS) * sum(abs(place) ** power for place in there)
 
 
@@ -134,7 +139,10 @@ def test_any_bytes_decode_or_are_refused(body, shape):
 
 def test_a_body_of_another_shape_is_refused():
     body = encode_midpoints(swaying(*SHAPE[:4]))
-    assert not any(decodes_or_is_refused(body, other) for other in ((5, *SHAPE[1:]), (3, *SHAPE[1:]), (4, 4, 4, 3, 3), (2, 2, 2, 2, 3)))
+    assert not any(
+        decodes_or_is_refused(body, other)
+        for other in ((5, *SHAPE[1:]), (3, *SHAPE[1:]), (4, 4, 4, 3, 3), (2, 2, 2, 2, 3))
+    )
 
 
 def test_a_symbol_that_leaves_its_16_bits_is_refused():

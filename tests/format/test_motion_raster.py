@@ -7,10 +7,9 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plain import assert_plain_python_prints_the_same
-
-from kpc.format.common.errors import FormatError
 from kpc.format.coding.motion_raster import LORENZO, NEIGHBOURS, decode_nodes, encode_nodes, encode_with
+from kpc.format.common.errors import FormatError
+from plain import assert_plain_python_prints_the_same
 
 shapes = st.tuples(*4 * [st.integers(1, 5)], st.just(3))
 
@@ -31,7 +30,10 @@ def swaying(rows: int = 20, nz: int = 8, ny: int = 6, nx: int = 6) -> np.ndarray
     """(rows, nz, ny, nx, 3) int16: waves that travel, and a little noise."""
     rng = np.random.default_rng(0)
     places = np.indices((rows, nz, ny, nx))
-    waves = [300 * np.sin(sum(np.tensordot(k, places, 1) for k in rng.normal(0, 0.3, (1, 4))) + 9 * rng.random()) for _ in range(9)]
+    waves = [
+        300 * np.sin(sum(np.tensordot(k, places, 1) for k in rng.normal(0, 0.3, (1, 4))) + 9 * rng.random())
+        for _ in range(9)
+    ]
     field = np.stack([sum(waves[c::3]) for c in range(3)], -1)
     return np.rint(field + rng.normal(0, 0.5, field.shape)).astype(np.int16)
 

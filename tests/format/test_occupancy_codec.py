@@ -7,10 +7,9 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plain import assert_plain_python_prints_the_same
-
 from kpc.format.coding.occupancy_codec import decode_cells, encode_cells
 from kpc.format.common.errors import FormatError
+from plain import assert_plain_python_prints_the_same
 
 shapes = st.tuples(*4 * [st.integers(1, 7)])
 
@@ -19,7 +18,9 @@ def rolling(slots: int = 5, nz: int = 32, ny: int = 36, nx: int = 40) -> np.ndar
     """(slots, nz, ny, nx) bool: where waves that travel are high, with borders that fray."""
     rng = np.random.default_rng(0)
     places = np.indices((slots, nz, ny, nx))
-    height = sum(np.sin(np.tensordot(rng.normal(0, (0.1, 0.3, 0.3, 0.3)), places, 1) + 9 * rng.random()) for _ in range(6))
+    height = sum(
+        np.sin(np.tensordot(rng.normal(0, (0.1, 0.3, 0.3, 0.3)), places, 1) + 9 * rng.random()) for _ in range(6)
+    )
     return height + rng.normal(0, 0.2, (nz, ny, nx)) > 1.5
 
 
@@ -113,7 +114,9 @@ def test_any_bytes_decode_or_are_refused(body, shape):
 
 def test_a_body_of_another_shape_is_refused():
     body = encode_cells(rolling(*SHAPE))
-    assert not any(decodes_or_is_refused(body, other) for other in ((4, 8, 9, 10), (2, 8, 9, 10), (3, 8, 9, 11), (1, 1, 1, 1)))
+    assert not any(
+        decodes_or_is_refused(body, other) for other in ((4, 8, 9, 10), (2, 8, 9, 10), (3, 8, 9, 11), (1, 1, 1, 1))
+    )
 
 
 def test_a_stream_that_ends_early_is_given_up_at_once():

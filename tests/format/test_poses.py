@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from kpc.format.scene.cameras import Camera
 from kpc.format.coding.poses import decode_poses, encode_poses, rigid, rounded
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rotations import rotation_of
 
 
@@ -29,7 +28,11 @@ def numbers_of(cameras):
 @st.composite
 def captures(draw):
     """Cameras anywhere, turned in any way, most often a right angle or nearly so."""
-    count, span, away = draw(st.integers(1, 9)), draw(st.sampled_from([0.0, 1e-30, 1e-3, 1.0, 3e4])), draw(st.sampled_from([0.0, 1.0, 2e4]))
+    count, span, away = (
+        draw(st.integers(1, 9)),
+        draw(st.sampled_from([0.0, 1e-30, 1e-3, 1.0, 3e4])),
+        draw(st.sampled_from([0.0, 1.0, 2e4])),
+    )
     part = st.one_of(st.sampled_from([-1.0, 0.0, 1.0, 1e-9, -1e-5]), st.floats(-1, 1))
     rng = np.random.default_rng(draw(st.integers(0, 1000)))
     turns = [draw(st.tuples(part, part, part, part).filter(lambda q: np.linalg.norm(q) > 0.1)) for _ in range(count)]
@@ -56,7 +59,9 @@ def test_most_cameras_take_fourteen_bytes_each():
     assert decode_poses(encode_poses(near), 500) == numbers_of(near)
 
 
-@pytest.mark.parametrize("quaternion", [(1, 0, 0, 0), (1, 1, 0, 0), (1, -1, 0, 0), (0, 0, 1, 1), (0, 1, 0, 0), (-1, 0, 0, 1)])
+@pytest.mark.parametrize(
+    "quaternion", [(1, 0, 0, 0), (1, 1, 0, 0), (1, -1, 0, 0), (0, 0, 1, 1), (0, 1, 0, 0), (-1, 0, 0, 1)]
+)
 def test_right_angles_are_exact(quaternion):
     near = rounded([camera(quaternion, (1.0, 2.0, 3.0))])
     assert np.array_equal(near[0].camera_to_world, np.rint(near[0].camera_to_world))

@@ -6,17 +6,30 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import njit
-from plain import assert_plain_python_prints_the_same
-
-from kpc.format.common.errors import FormatError
-from kpc.format.coding.raw_planes import encode_segment
 from kpc.format.coding import predictive as module
 from kpc.format.coding.predictive import (
-    ACTIVITIES, ANY, AROUND, LATTICE_BIT, SET_COUNTS, TRELLIS, WEIGHTS, Guide, decode_symbols, encode_symbols, encode_with, fitted,
-    follows_trellis, guide_of, neighbourhoods, next_state,
+    ACTIVITIES,
+    ANY,
+    AROUND,
+    LATTICE_BIT,
+    SET_COUNTS,
+    TRELLIS,
+    WEIGHTS,
+    Guide,
+    decode_symbols,
+    encode_symbols,
+    encode_with,
+    fitted,
+    follows_trellis,
+    guide_of,
+    neighbourhoods,
+    next_state,
 )
+from kpc.format.coding.raw_planes import encode_segment
+from kpc.format.common.errors import FormatError
 from kpc.tools.vectors.specvectors import walked
+from numba import njit
+from plain import assert_plain_python_prints_the_same
 
 shapes = st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 5))
 
@@ -43,8 +56,12 @@ def assert_decodes(body: bytes, symbols: np.ndarray, coded: np.ndarray) -> None:
     assert where.dtype == bool and np.array_equal(where, coded)
 
 
-@given(paint=st.sampled_from(sorted(PAINTS)), shape=shapes, seed=st.integers(0, 2**32 - 1),
-       share=st.sampled_from([0.0, 0.3, 0.8, 1.0]))
+@given(
+    paint=st.sampled_from(sorted(PAINTS)),
+    shape=shapes,
+    seed=st.integers(0, 2**32 - 1),
+    share=st.sampled_from([0.0, 0.3, 0.8, 1.0]),
+)
 @settings(deadline=None)
 def test_symbols_come_back(paint, shape, seed, share):
     symbols, coded = painted(paint, shape, seed, share)
@@ -64,15 +81,22 @@ def textured(rows: int = 60, columns: int = 70, channels: int = 6) -> tuple[np.n
     """Smooth waves and noise, stronger on one side, within an ellipse."""
     rng = np.random.default_rng(0)
     y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij")
-    waves = sum(np.multiply.outer(np.sin(a * x + b * y + c), 25 * rng.normal(0, 1, channels))
-                for a, b, c in rng.normal(0, 3, (4, 3)))
+    waves = sum(
+        np.multiply.outer(np.sin(a * x + b * y + c), 25 * rng.normal(0, 1, channels))
+        for a, b, c in rng.normal(0, 3, (4, 3))
+    )
     symbols = np.clip(np.rint(waves + (1.5 + x)[..., None] * rng.normal(0, 1, waves.shape)), -128, 127).astype(np.int8)
     coded = x * x + y * y < 0.9
     symbols[~coded] = 0
     return symbols, coded
 
 
-@given(paint=st.sampled_from(sorted(PAINTS)), shape=shapes, seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.3, 0.8, 1.0]))
+@given(
+    paint=st.sampled_from(sorted(PAINTS)),
+    shape=shapes,
+    seed=st.integers(0, 2**32 - 1),
+    share=st.sampled_from([0.3, 0.8, 1.0]),
+)
 @settings(deadline=None)
 def test_symbols_on_the_trellis_come_back(paint, shape, seed, share):
     symbols, coded = painted(paint, shape, seed, share)
@@ -102,8 +126,13 @@ def test_the_trellis_saves_a_bit_a_symbol():
     assert len(encode_symbols(steered, coded)) < len(encode_symbols(symbols, coded)) - 0.95 * symbols.size / 8
 
 
-@given(paint=st.sampled_from(sorted(PAINTS)), shape=shapes, seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.3, 0.8, 1.0]),
-       count=st.sampled_from(SET_COUNTS))
+@given(
+    paint=st.sampled_from(sorted(PAINTS)),
+    shape=shapes,
+    seed=st.integers(0, 2**32 - 1),
+    share=st.sampled_from([0.3, 0.8, 1.0]),
+    count=st.sampled_from(SET_COUNTS),
+)
 @settings(deadline=None)
 def test_symbols_around_predictions_come_back(paint, shape, seed, share, count):
     symbols, coded = painted(paint, shape, seed, share)
@@ -254,7 +283,9 @@ def test_flipped_bits_are_refused_or_mean_something_else(small):
     assert accepted <= len(body) // 100
 
 
-@given(body=st.binary(max_size=80), shape=shapes, count=st.sampled_from([0, 1, 2, 3, 4, 8, 255]), flag=st.integers(0, 6))
+@given(
+    body=st.binary(max_size=80), shape=shapes, count=st.sampled_from([0, 1, 2, 3, 4, 8, 255]), flag=st.integers(0, 6)
+)
 @settings(deadline=None)
 def test_any_bytes_decode_or_are_refused(body, shape, count, flag):
     decodes_or_is_refused(body, shape)
@@ -277,17 +308,22 @@ def test_a_stream_that_ends_early_is_given_up_at_once():
     assert time.perf_counter() - start < 2.0
 
 
-@pytest.mark.parametrize("change, complaint", [
-    (lambda body: b"", "number of sets"),
-    (lambda body: b"\3" + body[1:], "number of sets"),
-    (lambda body: b"\0" + body[1:], "number of sets"),
-    (lambda body: body[:1] + b"\x06" + body[2:], "or flag"),
-    (lambda body: body[:2 + WEIGHTS + 3], "cut off"),
-    (lambda body: body + b"\0", "cut off"),
-    (lambda body: body + b"\0\0", "do not end"),
-    (lambda body: body[:2 + WEIGHTS] + b"\xff\xff\0\0" + body[2 + WEIGHTS + 4:], "first state"),
-])
+@pytest.mark.parametrize(
+    "change, complaint",
+    [
+        (lambda body: b"", "number of sets"),
+        (lambda body: b"\3" + body[1:], "number of sets"),
+        (lambda body: b"\0" + body[1:], "number of sets"),
+        (lambda body: body[:1] + b"\x06" + body[2:], "or flag"),
+        (lambda body: body[: 2 + WEIGHTS + 3], "cut off"),
+        (lambda body: body + b"\0", "cut off"),
+        (lambda body: body + b"\0\0", "do not end"),
+        (lambda body: body[: 2 + WEIGHTS] + b"\xff\xff\0\0" + body[2 + WEIGHTS + 4 :], "first state"),
+    ],
+)
 def test_what_is_wrong_is_said(change, complaint):
-    body = encode_with(np.zeros((1, WEIGHTS), np.int8), np.arange(8, dtype=np.int8).reshape(2, 2, 2), np.ones((2, 2), bool), ANY)
+    body = encode_with(
+        np.zeros((1, WEIGHTS), np.int8), np.arange(8, dtype=np.int8).reshape(2, 2, 2), np.ones((2, 2), bool), ANY
+    )
     with pytest.raises(FormatError, match=complaint):
         decode_symbols(change(body), 2, 2, 2)

@@ -4,7 +4,6 @@ import io
 import sys
 
 import pytest
-
 from kpc.format.common import progress as module
 from kpc.format.common.progress import Progress, progress
 

@@ -2,13 +2,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import tiny_scene
-
-from kpc.format.scene.cameras import Camera
+from kpc.format.coding.quantise import (
+    VALUE_LIMIT,
+    QuantisedPlane,
+    needed_texels,
+    quantise_plane,
+    quantise_scene,
+    round_cameras,
+    round_decoder,
+)
 from kpc.format.common.errors import FormatError
-from kpc.format.coding.quantise import (VALUE_LIMIT, QuantisedPlane, needed_texels, quantise_plane, quantise_scene,
-                                 round_cameras, round_decoder)
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import TIME_PLANES, Decoder
+from scenes import tiny_scene
 
 
 def tolerance(values: np.ndarray, plane: QuantisedPlane) -> np.ndarray:
@@ -17,8 +23,13 @@ def tolerance(values: np.ndarray, plane: QuantisedPlane) -> np.ndarray:
     return plane.step * 0.5 + 4 * largest * 2.0**-24
 
 
-@given(seed=st.integers(0, 2**32 - 1), step=st.floats(1e-4, 2.0), spread=st.floats(1e-3, 50.0),
-       centre=st.floats(-20.0, 20.0), identity=st.booleans())
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    step=st.floats(1e-4, 2.0),
+    spread=st.floats(1e-3, 50.0),
+    centre=st.floats(-20.0, 20.0),
+    identity=st.booleans(),
+)
 def test_every_needed_value_is_within_half_a_step(seed, step, spread, centre, identity):
     rng = np.random.default_rng(seed)
     values = (centre + spread * rng.uniform(-1, 1, (5, 7, 3))).astype(np.float32)
@@ -120,16 +131,21 @@ def test_scene_keeps_what_is_not_a_plane_and_counts_the_same_parameters(dynamic)
     assert decoded.is_dynamic == quantised.is_dynamic == dynamic
     assert np.array_equal(decoded.occupancy, scene.occupancy) and decoded.clip == scene.clip
     if dynamic:
-        ones = [(plane == 1).all(axis=2) for scale in decoded.scales for name, plane in scale.items()
-                if name in TIME_PLANES]
+        ones = [
+            (plane == 1).all(axis=2) for scale in decoded.scales for name, plane in scale.items() if name in TIME_PLANES
+        ]
         assert quantised.identity_share == pytest.approx(sum(o.sum() for o in ones) / sum(o.size for o in ones))
         assert quantised.identity_share >= 0.5  # the bump covers a third of the columns
     else:
         assert quantised.identity_share == 1.0
 
 
-@given(seed=st.integers(0, 2**32 - 1), plane=st.sampled_from(["xy", "xz", "yz", "xt", "yt", "zt"]),
-       rows=st.integers(1, 12), columns=st.integers(1, 12))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    plane=st.sampled_from(["xy", "xz", "yz", "xt", "yt", "zt"]),
+    rows=st.integers(1, 12),
+    columns=st.integers(1, 12),
+)
 def test_needed_texels_cover_every_read_from_an_occupied_cell(seed, plane, rows, columns):
     rng = np.random.default_rng(seed)
     shape = tuple(rng.integers(1, 6, 4))
@@ -140,7 +156,7 @@ def test_needed_texels_cover_every_read_from_an_occupied_cell(seed, plane, rows,
         for _ in range(4):
             u = (cell + rng.random(4)) / shape
             x, y = u[axis[plane[0]]] * (columns - 1), u[axis[plane[1]]] * (rows - 1)
-            assert needed[int(y):int(np.ceil(y)) + 1, int(x):int(np.ceil(x)) + 1].all()
+            assert needed[int(y) : int(np.ceil(y)) + 1, int(x) : int(np.ceil(x)) + 1].all()
     if not occupancy.any():
         assert not needed.any()
     # As the spec has it.
@@ -148,8 +164,12 @@ def test_needed_texels_cover_every_read_from_an_occupied_cell(seed, plane, rows,
     cells = {(cell[axis[plane[1]]], cell[axis[plane[0]]]) for cell in np.argwhere(occupancy)}
     for i, j in np.ndindex(rows, columns):
         assert needed[i, j] == any(
-            (i + 1) * n >= c * (rows - 1) and (i - 1) * n <= (c + 1) * (rows - 1)
-            and (j + 1) * m >= d * (columns - 1) and (j - 1) * m <= (d + 1) * (columns - 1) for c, d in cells)
+            (i + 1) * n >= c * (rows - 1)
+            and (i - 1) * n <= (c + 1) * (rows - 1)
+            and (j + 1) * m >= d * (columns - 1)
+            and (j - 1) * m <= (d + 1) * (columns - 1)
+            for c, d in cells
+        )
 
 
 def test_decoder_weights_become_float16_and_refuse_what_it_cannot_hold():
@@ -170,19 +190,19 @@ def test_cameras_are_rounded_by_no_more_than_pictures_show():
     pose = tiny_scene().cameras[0].camera_to_world.copy()
     pose[:3, 3] += 5e5  # a survey's origin may be far away
     camera = Camera(4000, 48, 3001.07, 50.2, 1999.9, -24.3, pose)
-    rounded, = round_cameras([camera])
+    (rounded,) = round_cameras([camera])
     assert rounded.width == 4000 and rounded.fl_x == np.float32(rounded.fl_x)
     for name in ("fl_x", "fl_y", "cx", "cy"):
         assert abs(getattr(rounded, name) / getattr(camera, name) - 1) <= 2.0**-16
     assert np.abs(rounded.camera_to_world - pose)[:3, :3].max() <= 1e-5
     assert np.abs(rounded.camera_to_world - pose)[:3, 3].max() <= 2.0**-5  # as float32
-    again, = round_cameras([rounded])
+    (again,) = round_cameras([rounded])
     assert np.array_equal(again.camera_to_world, rounded.camera_to_world) and again.fl_x == rounded.fl_x
 
 
 def test_poses_that_are_more_than_turns_and_places_are_rounded_to_float32():
     pose = np.diag([1.1, 0.9, -1.0, 1.0])
     pose[:3, 3] = 0.1
-    rounded, = round_cameras([Camera(4, 3, 5.0, 5.0, 2.0, 1.5, pose)])
+    (rounded,) = round_cameras([Camera(4, 3, 5.0, 5.0, 2.0, 1.5, pose)])
     assert np.array_equal(rounded.camera_to_world, pose.astype(np.float32))
     assert round_cameras(()) == ()

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-
 from kpc.format.coding.rans import EVEN, LOWEST_STATE, PATIENCE, SCALE, adapt, compiled, counters, decide, words_of
 
 

@@ -2,9 +2,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
+from kpc.format.coding.raw_planes import (
+    FILTER_LEFT,
+    FILTER_NONE,
+    FILTER_PLANE,
+    FILTER_UP,
+    decode_segment,
+    encode_segment,
+)
 from kpc.format.common.errors import FormatError
-from kpc.format.coding.raw_planes import FILTER_LEFT, FILTER_NONE, FILTER_PLANE, FILTER_UP, decode_segment, encode_segment
 
 shapes = st.tuples(st.integers(1, 9), st.integers(1, 9), st.integers(1, 4))
 
@@ -13,8 +19,7 @@ def packed(symbols: np.ndarray, coded: np.ndarray) -> bytes:
     return b"".join(encode_segment(symbols, coded))
 
 
-@given(shape=shapes, seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.3, 0.8, 1.0]),
-       smooth=st.booleans())
+@given(shape=shapes, seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.3, 0.8, 1.0]), smooth=st.booleans())
 def test_symbols_come_back(shape, seed, share, smooth):
     rng = np.random.default_rng(seed)
     symbols = rng.integers(-128, 128, shape)
@@ -74,16 +79,19 @@ def test_any_bytes_decode_or_are_refused(payload, shape):
     assert symbols.shape == shape and not symbols[~coded].any()
 
 
-@pytest.mark.parametrize("payload, complaint", [
-    (b"", "map flag"),
-    (b"\2" + bytes(9), "map flag"),
-    (b"\1", "too short for its map"),
-    (b"\1\xf0" + bytes(9), "unused bits"),
-    (b"\1\x0f", "its map implies"),
-    (b"\0\4\0\0\0\0", "filter 4"),
-    (b"\0\0\0\0\0", "its map implies"),
-    (b"\0\0\0\0\0\0\0", "its map implies"),
-])
+@pytest.mark.parametrize(
+    "payload, complaint",
+    [
+        (b"", "map flag"),
+        (b"\2" + bytes(9), "map flag"),
+        (b"\1", "too short for its map"),
+        (b"\1\xf0" + bytes(9), "unused bits"),
+        (b"\1\x0f", "its map implies"),
+        (b"\0\4\0\0\0\0", "filter 4"),
+        (b"\0\0\0\0\0", "its map implies"),
+        (b"\0\0\0\0\0\0\0", "its map implies"),
+    ],
+)
 def test_what_is_wrong_is_said(payload, complaint):
     with pytest.raises(FormatError, match=complaint):
         decode_segment(payload, 2, 2, 1)

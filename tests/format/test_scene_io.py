@@ -8,21 +8,30 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kpc.format.coding.quantise import QuantisedScene, quantise_scene
+from kpc.format.common.errors import BudgetError, FormatError
+from kpc.format.container.container import (
+    CODEC_MIDPOINTS,
+    CODEC_RAW,
+    CODEC_SYMBOLS,
+    CODEC_THIRD,
+    CODEC_ZSTD,
+    HEADER,
+    Reader,
+    pack,
+)
+from kpc.format.container.scene_io import APPEARANCE_LIMIT, NAME_LIMIT, SceneReader, encode, read, scene_chunks, write
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.motion import STEP, QuantisedMotion
+from kpc.format.scene.scene import TIME_PLANES, Appearance
+from kpc.format.scene.space import Contraction, DeviceCoordinates
+from kpc.tools.vectors.specvectors import seen_through
 from scenes import displaced, faced, tiny_scene, varied
 from test_cells import rolling
 from test_midpoints import drifting
 from test_nodes import swaying
 
 import kpc
-from kpc.format.scene.cameras import Camera
-from kpc.format.container.container import CODEC_MIDPOINTS, CODEC_RAW, CODEC_SYMBOLS, CODEC_THIRD, CODEC_ZSTD, HEADER, Reader, pack
-from kpc.format.common.errors import BudgetError, FormatError
-from kpc.format.container.scene_io import APPEARANCE_LIMIT, NAME_LIMIT, SceneReader, encode, read, scene_chunks, write
-from kpc.format.scene.motion import STEP, QuantisedMotion
-from kpc.format.coding.quantise import QuantisedScene, quantise_scene
-from kpc.format.scene.scene import TIME_PLANES, Appearance
-from kpc.format.scene.space import Contraction, DeviceCoordinates
-from kpc.tools.vectors.specvectors import seen_through
 
 
 def quantised(step: float = 0.02, **options) -> QuantisedScene:
@@ -42,8 +51,9 @@ def assert_same(a: QuantisedScene, b: QuantisedScene) -> None:
     assert len(a.cameras) == len(b.cameras)
     for one, other in zip(a.cameras, b.cameras, strict=True):
         assert np.array_equal(one.camera_to_world, other.camera_to_world)
-        assert [getattr(one, k) for k in ("width", "height", "fl_x", "fl_y", "cx", "cy")] == \
-            [getattr(other, k) for k in ("width", "height", "fl_x", "fl_y", "cx", "cy")]
+        assert [getattr(one, k) for k in ("width", "height", "fl_x", "fl_y", "cx", "cy")] == [
+            getattr(other, k) for k in ("width", "height", "fl_x", "fl_y", "cx", "cy")
+        ]
     assert [one.name for one in a.appearances] == [other.name for other in b.appearances]
     for one, other in zip(a.appearances, b.appearances, strict=True):
         assert one.code.dtype == other.code.dtype and np.array_equal(one.code, other.code)
@@ -55,13 +65,21 @@ def assert_same(a: QuantisedScene, b: QuantisedScene) -> None:
                 assert x.dtype == y.dtype and np.array_equal(x, y), (name, field)
 
 
-@given(seed=st.integers(0, 1000), dynamic=st.booleans(), scales=st.integers(1, 3), channels=st.integers(1, 9),
-       resolution=st.tuples(*[st.integers(1, 12)] * 3), time=st.integers(1, 7), segment_rows=st.integers(1, 9),
-       step=st.sampled_from([0.001, 0.05, 1.0]))
+@given(
+    seed=st.integers(0, 1000),
+    dynamic=st.booleans(),
+    scales=st.integers(1, 3),
+    channels=st.integers(1, 9),
+    resolution=st.tuples(*[st.integers(1, 12)] * 3),
+    time=st.integers(1, 7),
+    segment_rows=st.integers(1, 9),
+    step=st.sampled_from([0.001, 0.05, 1.0]),
+)
 @settings(max_examples=25, deadline=None)
 def test_a_scene_comes_back(seed, dynamic, scales, channels, resolution, time, segment_rows, step):
-    scene = quantised(step, seed=seed, dynamic=dynamic, scales=scales, channels=channels, resolution=resolution,
-                      time=time)
+    scene = quantised(
+        step, seed=seed, dynamic=dynamic, scales=scales, channels=channels, resolution=resolution, time=time
+    )
     data = encode(scene, segment_rows=segment_rows)
     assert_same(read(data), scene)
     assert encode(read(data)) == data  # in the segments that it had
@@ -86,10 +104,19 @@ def test_device_coordinates_come_back():
     assert (back.near, back.baseline) == (scene.mapping.near, scene.mapping.baseline)
 
 
-@pytest.mark.parametrize("change", [
-    {"near": 0.0}, {"near": float("nan")}, {"baseline": -1.0}, {"baseline": 1e12}, {"near": 5.0}, {"frame": np.eye(4)[:3] * 1.01},
-    {"frame": np.full((3, 4), np.nan)}, {"frame": np.eye(3, 4, 3) * 2.0**31 + np.eye(3, 4)},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"near": 0.0},
+        {"near": float("nan")},
+        {"baseline": -1.0},
+        {"baseline": 1e12},
+        {"near": 5.0},
+        {"frame": np.eye(4)[:3] * 1.01},
+        {"frame": np.full((3, 4), np.nan)},
+        {"frame": np.eye(3, 4, 3) * 2.0**31 + np.eye(3, 4)},
+    ],
+)
 def test_device_coordinates_that_make_no_sense_are_not_written(change):
     scene = faced(tiny_scene())
     broken = replace(scene, mapping=replace(scene.mapping, **change))
@@ -100,7 +127,7 @@ def test_device_coordinates_that_make_no_sense_are_not_written(change):
 def test_a_prefix_without_the_mapping_shows_nothing():
     data = encode(replace(quantised(), mapping=Contraction(2.0)))
     index = Reader(data).index
-    assert read(data[:index[4].offset], allow_partial=True).mapping == Contraction(2.0)
+    assert read(data[: index[4].offset], allow_partial=True).mapping == Contraction(2.0)
     # A writer may put it last; then what came before it is of no use.
     from kpc.format.container.container import Chunk, pack
     from kpc.format.container.scene_io import WARP_STRUCT, scene_chunks
@@ -121,7 +148,7 @@ def test_a_motion_grid_comes_back_and_says_so_in_a_chunk_of_its_own():
     back = read(data).dequantise().motion
     assert back is not None and np.abs(back - scene.motion).max() <= STEP / 2 + 1e-7
     index = Reader(data).index
-    assert np.array_equal(read(data[:index[4].offset], allow_partial=True).dequantise().motion, back)
+    assert np.array_equal(read(data[: index[4].offset], allow_partial=True).dequantise().motion, back)
 
 
 def test_a_motion_grid_counts_against_the_budget():
@@ -152,8 +179,8 @@ def test_appearances_come_back_and_say_so_in_a_chunk_of_their_own():
 def test_a_prefix_without_the_appearances_plays_the_average():
     data = encode(quantised_varied())
     index = Reader(data).index
-    assert read(data[:index[4].offset], allow_partial=True).appearances == ()
-    assert len(read(data[:index[5].offset], allow_partial=True).appearances) == 3
+    assert read(data[: index[4].offset], allow_partial=True).appearances == ()
+    assert len(read(data[: index[5].offset], allow_partial=True).appearances) == 3
 
 
 def test_appearances_count_against_the_budget():
@@ -292,10 +319,10 @@ def test_every_prefix_that_ends_at_a_chunk_plays():
     ends = [e.offset + e.stored_length for e in index]
     for number in (0, 1):
         with pytest.raises(FormatError, match="is not there"):
-            read(data[:ends[number]], allow_partial=True)
+            read(data[: ends[number]], allow_partial=True)
     for number in range(2, len(index)):
-        partial = read(data[:ends[number]], allow_partial=True)
-        there = {(e.scale, e.plane, e.row_start) for e in index[:number + 1] if e.kind == "PLNE"}
+        partial = read(data[: ends[number]], allow_partial=True)
+        there = {(e.scale, e.plane, e.row_start) for e in index[: number + 1] if e.kind == "PLNE"}
         for scale, (planes, whole) in enumerate(zip(partial.scales, scene.scales, strict=True)):
             for p, (name, plane) in enumerate(planes.items()):
                 for start in (0, 4) if name in TIME_PLANES else (0,):
@@ -413,46 +440,70 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
     assert caught.value.filename == str(tmp_path / "none" / "scene.kpc")
 
 
-@pytest.mark.parametrize("change, complaint", [
-    (lambda s: {"aabb": s.aabb[::-1]}, "box"),
-    (lambda s: {"mapping": Contraction(0.0)}, "WARP"),
-    (lambda s: {"mapping": Contraction(-1.0)}, "WARP"),
-    (lambda s: {"mapping": Contraction(float("nan"))}, "WARP"),
-    (lambda s: {"mapping": Contraction(float("inf"))}, "WARP"),
-    (lambda s: {"mapping": Contraction(40000 * s.step)}, "WARP"),
-    (lambda s: {"motion": QuantisedMotion(np.zeros((1, 2, 2, 2, 3), np.int16), STEP)}, "MOVE"),
-    (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 1, 3), np.int16), STEP)}, "MOVE"),
-    (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int16), 0.0)}, "MOVE"),
-    (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int16), 1.0)}, "MOVE"),
-    (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int32), STEP)}, "motion"),
-    (lambda s: {"aabb": np.full((2, 3), np.nan, np.float32)}, "box"),
-    (lambda s: {"step": 0.0}, "ray step"),
-    (lambda s: {"step": 1e-9}, "ray step"),
-    (lambda s: {"background": np.float32([0, 0, 2])}, "background"),
-    (lambda s: {"clip": replace(s.clip, frame_count=0)}, "0 frames"),
-    (lambda s: {"clip": replace(s.clip, frame_count=-1)}, "does not fit"),
-    (lambda s: {"occupancy": np.zeros((3, 3, 3), bool)}, "occupancy"),
-    (lambda s: {"occupancy": s.occupancy.astype(np.uint8)}, "occupancy"),
-    (lambda s: {"scales": s.scales[:1]}, "decoder"),
-    (lambda s: {"scales": ({k: v for k, v in s.scales[0].items() if k != "yt"},)}, "scale 0 holds planes"),
-    (lambda s: {"decoder": replace(s.decoder, w1=s.decoder.w1 + np.float32(1e-5))}, "float16"),
-    (lambda s: {"appearances": (Appearance("a", np.zeros(15, np.float32)),)}, "shapes"),
-    (lambda s: {"appearances": (Appearance("a", np.full(16, 0.1, np.float32)),)}, "float16"),
-    (lambda s: {"appearances": (Appearance("a", np.full(16, np.inf, np.float32)),)}, "infinite"),
-    (lambda s: {"appearances": 2 * (Appearance("a", np.zeros(16, np.float32)),)}, "there twice"),
-    (lambda s: {"appearances": (Appearance("", np.zeros(16, np.float32)),)}, "empty"),
-    (lambda s: {"appearances": (Appearance("a\nb", np.zeros(16, np.float32)),)}, "control character"),
-    (lambda s: {"appearances": (Appearance("\ud800", np.zeros(16, np.float32)),)}, "UTF-8"),
-    (lambda s: {"appearances": (Appearance("x" * 256, np.zeros(16, np.float32)),)}, "does not fit"),
-    (lambda s: {"cameras": (Camera(70000, 4, 5.0, 5.0, 1.0, 1.0, np.eye(4)),)}, "does not fit"),
-    (lambda s: {"scales": (s.scales[0], {**s.scales[1], "xt": replace(
-        s.scales[1]["xt"], offset=np.zeros(8, np.float32))})}, "offset of a time plane"),
-    (lambda s: {"scales": (s.scales[0], {**s.scales[1], "xt": replace(
-        s.scales[1]["xt"], coded=np.zeros_like(s.scales[1]["xt"].coded))})}, "uncoded texel"),
-    (lambda s: {"scales": (s.scales[0], {**s.scales[1], "yz": s.scales[1]["xy"]})}, "plane yz"),
-    (lambda s: {"scales": (s.scales[0], {**s.scales[1], "xy": replace(
-        s.scales[1]["xy"], step=np.full(8, 1e3, np.float32))})}, "plane xy: a step"),
-])
+@pytest.mark.parametrize(
+    "change, complaint",
+    [
+        (lambda s: {"aabb": s.aabb[::-1]}, "box"),
+        (lambda s: {"mapping": Contraction(0.0)}, "WARP"),
+        (lambda s: {"mapping": Contraction(-1.0)}, "WARP"),
+        (lambda s: {"mapping": Contraction(float("nan"))}, "WARP"),
+        (lambda s: {"mapping": Contraction(float("inf"))}, "WARP"),
+        (lambda s: {"mapping": Contraction(40000 * s.step)}, "WARP"),
+        (lambda s: {"motion": QuantisedMotion(np.zeros((1, 2, 2, 2, 3), np.int16), STEP)}, "MOVE"),
+        (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 1, 3), np.int16), STEP)}, "MOVE"),
+        (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int16), 0.0)}, "MOVE"),
+        (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int16), 1.0)}, "MOVE"),
+        (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int32), STEP)}, "motion"),
+        (lambda s: {"aabb": np.full((2, 3), np.nan, np.float32)}, "box"),
+        (lambda s: {"step": 0.0}, "ray step"),
+        (lambda s: {"step": 1e-9}, "ray step"),
+        (lambda s: {"background": np.float32([0, 0, 2])}, "background"),
+        (lambda s: {"clip": replace(s.clip, frame_count=0)}, "0 frames"),
+        (lambda s: {"clip": replace(s.clip, frame_count=-1)}, "does not fit"),
+        (lambda s: {"occupancy": np.zeros((3, 3, 3), bool)}, "occupancy"),
+        (lambda s: {"occupancy": s.occupancy.astype(np.uint8)}, "occupancy"),
+        (lambda s: {"scales": s.scales[:1]}, "decoder"),
+        (lambda s: {"scales": ({k: v for k, v in s.scales[0].items() if k != "yt"},)}, "scale 0 holds planes"),
+        (lambda s: {"decoder": replace(s.decoder, w1=s.decoder.w1 + np.float32(1e-5))}, "float16"),
+        (lambda s: {"appearances": (Appearance("a", np.zeros(15, np.float32)),)}, "shapes"),
+        (lambda s: {"appearances": (Appearance("a", np.full(16, 0.1, np.float32)),)}, "float16"),
+        (lambda s: {"appearances": (Appearance("a", np.full(16, np.inf, np.float32)),)}, "infinite"),
+        (lambda s: {"appearances": 2 * (Appearance("a", np.zeros(16, np.float32)),)}, "there twice"),
+        (lambda s: {"appearances": (Appearance("", np.zeros(16, np.float32)),)}, "empty"),
+        (lambda s: {"appearances": (Appearance("a\nb", np.zeros(16, np.float32)),)}, "control character"),
+        (lambda s: {"appearances": (Appearance("\ud800", np.zeros(16, np.float32)),)}, "UTF-8"),
+        (lambda s: {"appearances": (Appearance("x" * 256, np.zeros(16, np.float32)),)}, "does not fit"),
+        (lambda s: {"cameras": (Camera(70000, 4, 5.0, 5.0, 1.0, 1.0, np.eye(4)),)}, "does not fit"),
+        (
+            lambda s: {
+                "scales": (
+                    s.scales[0],
+                    {**s.scales[1], "xt": replace(s.scales[1]["xt"], offset=np.zeros(8, np.float32))},
+                )
+            },
+            "offset of a time plane",
+        ),
+        (
+            lambda s: {
+                "scales": (
+                    s.scales[0],
+                    {**s.scales[1], "xt": replace(s.scales[1]["xt"], coded=np.zeros_like(s.scales[1]["xt"].coded))},
+                )
+            },
+            "uncoded texel",
+        ),
+        (lambda s: {"scales": (s.scales[0], {**s.scales[1], "yz": s.scales[1]["xy"]})}, "plane yz"),
+        (
+            lambda s: {
+                "scales": (
+                    s.scales[0],
+                    {**s.scales[1], "xy": replace(s.scales[1]["xy"], step=np.full(8, 1e3, np.float32))},
+                )
+            },
+            "plane xy: a step",
+        ),
+    ],
+)
 def test_the_writer_refuses_what_readers_would(change, complaint):
     scene = quantised()
     with pytest.raises(FormatError, match=complaint):

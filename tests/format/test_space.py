@@ -6,13 +6,12 @@ import gl
 import numpy as np
 import pytest
 import torch
-from scenes import faced, look_at, surrounded, tiny_scene
-
 from kpc.encoder.field import kernels
 from kpc.encoder.field import render as in_pytorch
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import FAR, LEAST_DISPARITY, Contraction, DeviceCoordinates, contract, expand
 from kpc.player.cpu.reference import places, render
+from scenes import faced, look_at, surrounded, tiny_scene
 
 AABB = np.array([[-1.0, -0.5, 2.0], [3.0, 1.5, 2.5]])
 RNG = np.random.default_rng(0)
@@ -82,8 +81,11 @@ def test_every_language_puts_samples_in_the_same_place(even: float) -> None:
     s = np.linspace(0, scene.mapping.end, 50, dtype=np.float32)[None].repeat(len(origins), 0)
     exact = places(scene, *(a.astype(np.float64) for a in (origins, directions, s)))
     assert exact[0].max() == pytest.approx(FAR * even) and exact[0].min() == 0
-    for name, got in {"numpy": places(scene, origins, directions, s), "torch": _torch(scene, origins, directions, s),
-                      "kernels": _kernels(scene, origins, directions, s)}.items():
+    for name, got in {
+        "numpy": places(scene, origins, directions, s),
+        "torch": _torch(scene, origins, directions, s),
+        "kernels": _kernels(scene, origins, directions, s),
+    }.items():
         for found, expected, tolerance in zip(got, exact, (2 * FAR * 2.0**-23, 0, 1e-3), strict=True):
             np.testing.assert_allclose(found, expected, rtol=tolerance, atol=2e-5 if not tolerance else 0, err_msg=name)
 
@@ -100,7 +102,9 @@ def _kernels(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.nd
     t, u, stretch = np.empty_like(s), np.empty((*s.shape, 3), np.float32), np.empty_like(s)
     for ray, k in np.ndindex(s.shape):
         t[ray, k] = kernels._distance(s[ray, k], even)
-        *u[ray, k], stretch[ray, k] = kernels._place(origins[ray], directions[ray], t[ray, k], scene.aabb, inverse, even)
+        *u[ray, k], stretch[ray, k] = kernels._place(
+            origins[ray], directions[ray], t[ray, k], scene.aabb, inverse, even
+        )
     return t, u, stretch
 
 
@@ -138,9 +142,8 @@ def test_the_bounds_that_skipping_empty_cells_rests_on() -> None:
 
 def test_glsl_skips_empty_space_but_never_a_sample() -> None:
     """Few cells are set, near and far: all samples in them must be found, from inside and outside, near and very far."""
-    from scenes import look_at
-
     from kpc.player.gl.renderer import Renderer
+    from scenes import look_at
 
     scene = surrounded(tiny_scene(3))
     occupancy = RNG.random((1, 40, 50, 60)) < 0.002
@@ -196,7 +199,9 @@ def test_rays_stay_straight_and_distances_come_back() -> None:
     np.testing.assert_allclose(depths[:, 0], np.maximum(own, ndc.near))
     assert (own > ndc.near).any() and (own < 0).any()
     assert (path.distance(path.length[:, None] * 2) < np.inf).all()  # capped
-    assert np.allclose(path.distance(path.length[:, None]), path.start[:, None] + path.pace[:, None] * (1 / LEAST_DISPARITY - 1))
+    assert np.allclose(
+        path.distance(path.length[:, None]), path.start[:, None] + path.pace[:, None] * (1 / LEAST_DISPARITY - 1)
+    )
 
 
 def test_rays_in_single_precision() -> None:
@@ -218,7 +223,11 @@ def test_rays_that_do_not_go_forward_see_the_background(dtype: type) -> None:
     right, _, back, eye = scene.mapping.frame.T
     directions = np.array([back, right, right - 1e-5 * back]).astype(dtype)
     path = scene.mapping.path(np.tile(eye, (3, 1)).astype(dtype), directions)
-    assert np.isfinite(path.begin).all() and np.isfinite(path.way).all() and np.isfinite(path.distance(np.ones((3, 1), dtype))).all()
+    assert (
+        np.isfinite(path.begin).all()
+        and np.isfinite(path.way).all()
+        and np.isfinite(path.distance(np.ones((3, 1), dtype))).all()
+    )
     behind = look_at(tuple(eye), tuple(eye + back), 8, 6, 5.0)
     seen = render(scene, behind, 0.5)
     assert not seen.opacity.any() and not seen.samples.any() and np.isinf(seen.depth).all()

@@ -6,21 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import SPACES, tiny_scene
-
-from kpc.format.container.scene_io import write
 from kpc.format.coding.quantise import needed_texels, quantise_scene
+from kpc.format.container.scene_io import write
 from kpc.format.scene.scene import TIME_PLANES, Scene
 from kpc.format.scene.static import cells_touched, static_cells, static_share, unchanging_cells, unchanging_share
 from kpc.player.cpu import motion_map, reference
 from kpc.player.cpu.motion_map import dynamic_map, still_share
 from kpc.player.cpu.reference import Moment
 from kpc.tools.cli import kpinfo
+from scenes import SPACES, tiny_scene
 
 
 def still(scene: Scene) -> Scene:
     """The same with time planes that are 1, and an occupancy that stays as it is in its first slot."""
-    scales = tuple({name: np.ones_like(p) if name in TIME_PLANES else p for name, p in scale.items()} for scale in scene.scales)
+    scales = tuple(
+        {name: np.ones_like(p) if name in TIME_PLANES else p for name, p in scale.items()} for scale in scene.scales
+    )
     return replace(scene, scales=scales, occupancy=np.repeat(scene.occupancy[:1], len(scene.occupancy), axis=0))
 
 
@@ -38,9 +39,13 @@ def box_of_cells(time: int = 9) -> Scene:
 
 @pytest.mark.parametrize("plane, axis", [("xt", 2), ("yt", 1), ("zt", 0)])
 def test_a_texel_moves_the_slab_of_cells_that_read_it(plane: str, axis: int) -> None:
-    scene = wavering(box_of_cells(), plane, slice(4, 5), slice(6, 7))  # at 1/2 over the clip, reads from 3/8 to 5/8 touch it
+    scene = wavering(
+        box_of_cells(), plane, slice(4, 5), slice(6, 7)
+    )  # at 1/2 over the clip, reads from 3/8 to 5/8 touch it
     moving = np.zeros((4, 8, 8, 8), bool)
-    np.moveaxis(moving, axis + 1, 1)[1:3, 4:8] = True  # between 5/8 and 7/8, closed: cells 4 and 7 touch it at their edges
+    np.moveaxis(moving, axis + 1, 1)[1:3, 4:8] = (
+        True  # between 5/8 and 7/8, closed: cells 4 and 7 touch it at their edges
+    )
     assert np.array_equal(static_cells(scene), ~moving)
     assert static_share(scene) == 0.75 and unchanging_share(scene) == 0.5
     assert np.array_equal(unchanging_cells(scene), ~moving.any(axis=0))
@@ -66,7 +71,9 @@ def test_only_occupied_cells_count_and_one_that_comes_and_goes_changes() -> None
     scene = wavering(box_of_cells(), "xt", slice(None), slice(6, 7))
     occupancy = np.zeros((4, 8, 8, 8), bool)
     occupancy[:, 0, 0, :4] = True
-    assert static_share(replace(scene, occupancy=occupancy)) == 1 == unchanging_share(replace(scene, occupancy=occupancy))
+    assert (
+        static_share(replace(scene, occupancy=occupancy)) == 1 == unchanging_share(replace(scene, occupancy=occupancy))
+    )
     occupancy[2, 0, 0, 0] = False
     assert unchanging_share(replace(scene, occupancy=occupancy)) == 0.75
     assert static_share(replace(scene, occupancy=np.zeros_like(occupancy))) == 1
@@ -102,7 +109,9 @@ def test_cells_and_texels_touch_as_the_encoder_has_it() -> None:
             occupancy = np.zeros((1, 1, 1, cells), bool)
             occupancy[..., cell] = True
             needed = needed_texels(occupancy, "xt", 1, texels)[0]
-            assert [bool(cells_touched(texel, 0, cells)[cell]) for texel in np.eye(texels, dtype=bool)] == needed.tolist()
+            assert [
+                bool(cells_touched(texel, 0, cells)[cell]) for texel in np.eye(texels, dtype=bool)
+            ] == needed.tolist()
 
 
 def test_displaced_cells_are_not_static() -> None:

@@ -6,17 +6,28 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-
 from kpc.format.coding import transform
-
-from kpc.format.container import segments
+from kpc.format.coding.predictive import WEIGHTS, Guide, encode_symbols
 from kpc.format.coding.transform import (
-    FINENESSES, HEAD, LARGEST, PARTS, SIDES, USUAL, Blocks, blocks_in, blocks_of, coarser, cosines, decode_blocks, encode_blocks, largest_side,
+    FINENESSES,
+    HEAD,
+    LARGEST,
+    PARTS,
+    SIDES,
+    USUAL,
+    Blocks,
+    blocks_in,
+    blocks_of,
+    coarser,
+    cosines,
+    decode_blocks,
+    encode_blocks,
+    largest_side,
     quantisers,
 )
-from kpc.format.container.container import CODEC_SYMBOLS, CODEC_THIRD
 from kpc.format.common.errors import FormatError
-from kpc.format.coding.predictive import WEIGHTS, Guide, encode_symbols
+from kpc.format.container import segments
+from kpc.format.container.container import CODEC_SYMBOLS, CODEC_THIRD
 
 SPEC = Path(__file__).parents[2] / "spec"
 SIZES = ((4, 1, 1), (4, 9, 30), (8, 4, 5), (8, 37, 50), (16, 20, 35), (16, 8, 8))
@@ -63,18 +74,24 @@ def test_cosines_are_nearly_orthogonal(side: int) -> None:
 
 @pytest.mark.parametrize(("side", "rows", "columns"), SIZES)
 @pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
-def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(side: int, rows: int, columns: int, share: float) -> None:
+def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(
+    side: int, rows: int, columns: int, share: float
+) -> None:
     for seed in range(4):
         told, coded = some(side, rows, columns, share, seed)
         symbols, where = decode_blocks(encode_blocks(told, coded), rows, columns, 3)
-        np.testing.assert_array_equal(symbols, decode_blocks(encode_blocks(told, coded, borders=False), rows, columns, 3)[0])
+        np.testing.assert_array_equal(
+            symbols, decode_blocks(encode_blocks(told, coded, borders=False), rows, columns, 3)[0]
+        )
         np.testing.assert_array_equal(where, coded)
         for borders in (True, False):
             body = encode_blocks(told, coded, borders=borders)
             assert encode_blocks(blocks_in(body, rows, columns, 3), coded, borders=borders) == body
         exact = float_symbols(told, coded)
         # A rounded cosine errs by 1 / 256 of 1 at most, in each of two sums over levels; then half a symbol, and a 1 / 16 after the first sum.
-        side_sum = np.abs(told.levels * quantisers(side, told.quantiser)[told.fineness] / PARTS).sum((3, 4)).max(initial=0)
+        side_sum = (
+            np.abs(told.levels * quantisers(side, told.quantiser)[told.fineness] / PARTS).sum((3, 4)).max(initial=0)
+        )
         bound = 0.5 + 1 / 16 + 2 * side_sum * 2 / side * np.sqrt(2) / 256
         assert np.abs(np.clip(exact, -128, 127) - symbols).max(initial=0) <= bound
         assert not symbols[~coded].any()
@@ -83,10 +100,15 @@ def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(side: int, rows:
 @pytest.mark.parametrize(("side", "rows", "columns"), SIZES)
 @pytest.mark.parametrize("share", [0.6, 1.0])
 @pytest.mark.parametrize("codec", [CODEC_SYMBOLS, CODEC_THIRD])
-def test_the_spec_s_own_decoder_agrees(twin: ModuleType, codec: int, side: int, rows: int, columns: int, share: float) -> None:
+def test_the_spec_s_own_decoder_agrees(
+    twin: ModuleType, codec: int, side: int, rows: int, columns: int, share: float
+) -> None:
     for seed in range(3):
         told, coded = some(side, rows, columns, share, seed + 10)
-        told.levels[0, 0, 0, -1, -1], told.levels[-1, -1, -1, 0, -1] = -1, LARGEST  # the quickest alone, and the largest there is
+        told.levels[0, 0, 0, -1, -1], told.levels[-1, -1, -1, 0, -1] = (
+            -1,
+            LARGEST,
+        )  # the quickest alone, and the largest there is
         body = encode_blocks(told, coded, borders=codec == CODEC_THIRD)
         assert segments.codec_of(body) == codec
         symbols, _ = decode_blocks(body, rows, columns, 3)
@@ -96,7 +118,15 @@ def test_the_spec_s_own_decoder_agrees(twin: ModuleType, codec: int, side: int, 
 
 
 def test_the_largest_side_never_makes_much_more_of_a_segment_than_it_is() -> None:
-    assert [largest_side(*size) for size in ((1, 900), (2, 2), (3, 9), (4, 4), (7, 50), (8, 8), (500, 500))] == [4, 4, 4, 8, 8, 16, 16]
+    assert [largest_side(*size) for size in ((1, 900), (2, 2), (3, 9), (4, 4), (7, 50), (8, 8), (500, 500))] == [
+        4,
+        4,
+        4,
+        8,
+        8,
+        16,
+        16,
+    ]
     for rows in range(1, 40):
         for columns in range(1, 40):
             side = largest_side(rows, columns)
@@ -185,9 +215,20 @@ def test_guides_of_segments_are_one_of_the_plane() -> None:
     told, coded = some(8, 20, 20, 0.8, 6)
     body = encode_blocks(told, coded)
     plane = segments.guide_together({0: body, 20: body})
-    assert isinstance(plane, segments.Told) and segments.guide_at(plane, 20) == body and segments.guide_at(plane, 3) is None
+    assert (
+        isinstance(plane, segments.Told)
+        and segments.guide_at(plane, 20) == body
+        and segments.guide_at(plane, 3) is None
+    )
     part = segments.guide_together({0: body, 20: None})  # of which one was smaller without
-    assert isinstance(part, segments.Told) and segments.guide_at(part, 20) is None and segments.guide_together({0: None}) is None
+    assert (
+        isinstance(part, segments.Told)
+        and segments.guide_at(part, 20) is None
+        and segments.guide_together({0: None}) is None
+    )
     one, other = Guide(np.ones((1, WEIGHTS), np.int8)), Guide(np.zeros((1, WEIGHTS), np.int8))
-    assert segments.guide_together({0: one, 20: None, 30: one}) == one and segments.guide_together({0: one, 20: other}) is None
+    assert (
+        segments.guide_together({0: one, 20: None, 30: one}) == one
+        and segments.guide_together({0: one, 20: other}) is None
+    )
     assert HEAD == 3

@@ -5,12 +5,11 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plain import assert_plain_python_prints_the_same
-from scenes import tiny_scene
-
-from kpc.format.common.errors import FormatError
 from kpc.format.coding.quantise import round_decoder, weights_of
 from kpc.format.coding.weights import COARSEST, FINEST, LARGEST, decode_weights, encode_weights
+from kpc.format.common.errors import FormatError
+from plain import assert_plain_python_prints_the_same
+from scenes import tiny_scene
 
 SHAPES = [(5,), (3, 4), (1,), (2, 3, 7)]
 
@@ -50,7 +49,12 @@ def test_weights_come_back(seed: int, largest: int, power: int) -> None:
 
 def test_the_ends_of_float16_come_back() -> None:
     least = np.float32(0.5**24)
-    arrays = [np.float32([65504, -65504, 32]), least * np.float32([1, -2048, 3]), np.zeros(4, np.float32), np.float32([2.0**15])]
+    arrays = [
+        np.float32([65504, -65504, 32]),
+        least * np.float32([1, -2048, 3]),
+        np.zeros(4, np.float32),
+        np.float32([2.0**15]),
+    ]
     body = encoded(arrays)
     assert_decodes(body, arrays)
     assert np.frombuffer(body[:4], np.int8).tolist() == [5, FINEST, 0, COARSEST]
@@ -97,6 +101,10 @@ def test_any_bytes_decode_or_are_refused(body: bytes) -> None:
 
 def test_what_is_no_number_of_float16_is_refused() -> None:
     body = encoded([np.float32([2047, 1])])
-    for power, message in ((FINEST - 1, "power of two"), (COARSEST + 1, "power of two"), (COARSEST, "no number of float16")):
+    for power, message in (
+        (FINEST - 1, "power of two"),
+        (COARSEST + 1, "power of two"),
+        (COARSEST, "no number of float16"),
+    ):
         with pytest.raises(FormatError, match=message):
             decode_weights(np.int8([power]).tobytes() + body[1:], [(2,)])

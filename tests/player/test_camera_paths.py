@@ -8,20 +8,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from scenes import look_at
-
-from kpc.format.scene.cameras import Camera, Shot, load_shots, save_shots
 from kpc.format.common.errors import DatasetError
+from kpc.format.scene.cameras import Camera, Shot, load_shots, save_shots
 from kpc.format.scene.rotations import quaternion_of, rotation_of
 from kpc.player.app.camera_paths import GAP_S, CameraPath
+from scenes import look_at
 
 VIEWS = tuple(
-    look_at((3 * math.cos(a), 0.7 + 0.2 * a, 3 * math.sin(a)), (0.1, 0.05, 0.05), 48, 36, 50.0 + 10 * a) for a in (0.0, 0.9, 2.1, 4.0)
+    look_at((3 * math.cos(a), 0.7 + 0.2 * a, 3 * math.sin(a)), (0.1, 0.05, 0.05), 48, 36, 50.0 + 10 * a)
+    for a in (0.0, 0.9, 2.1, 4.0)
 )
 
 
-def path_of(times: tuple[float, ...] = (0.0, 0.2, 0.2, 0.9), ats: tuple[float | None, ...] = (0.0, 1.0, 4.0, 5.0)) -> CameraPath:
-    return CameraPath(tuple(Shot(view, time, f"{n}.png", at) for n, (view, time, at) in enumerate(zip(VIEWS, times, ats))))
+def path_of(
+    times: tuple[float, ...] = (0.0, 0.2, 0.2, 0.9), ats: tuple[float | None, ...] = (0.0, 1.0, 4.0, 5.0)
+) -> CameraPath:
+    return CameraPath(
+        tuple(Shot(view, time, f"{n}.png", at) for n, (view, time, at) in enumerate(zip(VIEWS, times, ats)))
+    )
 
 
 @settings(max_examples=50, deadline=None)
@@ -59,7 +63,10 @@ def test_goes_smoothly_and_turns_no_way_round() -> None:
         speeds = np.diff(values, axis=0) / step
         assert np.abs(np.diff(speeds, axis=0)).max() < 0.05 * np.abs(speeds).max()  # no kink at a keyframe
     turned = np.arccos(np.clip((np.einsum("nij,nij->n", axes[1:], axes[:-1]) - 1) / 2, -1, 1)).sum()
-    direct = [np.arccos((np.trace(a.camera_to_world[:3, :3].T @ b.camera_to_world[:3, :3]) - 1) / 2) for a, b in zip(VIEWS, VIEWS[1:])]
+    direct = [
+        np.arccos((np.trace(a.camera_to_world[:3, :3].T @ b.camera_to_world[:3, :3]) - 1) / 2)
+        for a, b in zip(VIEWS, VIEWS[1:])
+    ]
     assert turned < 1.15 * sum(direct)
 
 
@@ -92,11 +99,20 @@ def test_keyframes_come_and_go() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.lists(st.tuples(hnp.arrays(float, 4, elements=st.floats(-1, 1)).filter(lambda q: np.linalg.norm(q) > 1e-2),
-                       st.floats(0, 1), st.floats(1e-3, 1e3)), min_size=2, max_size=6),
+    st.lists(
+        st.tuples(
+            hnp.arrays(float, 4, elements=st.floats(-1, 1)).filter(lambda q: np.linalg.norm(q) > 1e-2),
+            st.floats(0, 1),
+            st.floats(1e-3, 1e3),
+        ),
+        min_size=2,
+        max_size=6,
+    ),
     st.lists(st.floats(0, 1), min_size=1, max_size=8),
 )
-def test_whatever_the_keyframes_every_camera_is_one(keys: list[tuple[np.ndarray, float, float]], shares: list[float]) -> None:
+def test_whatever_the_keyframes_every_camera_is_one(
+    keys: list[tuple[np.ndarray, float, float]], shares: list[float]
+) -> None:
     path = CameraPath()
     for quaternion, time, gap in keys:
         pose = np.eye(4)
@@ -151,7 +167,9 @@ MIRRORED = np.diag([-1.0, 1, 1, 1])
     ([np.full((4, 4), np.nan)], [0.0], "NaN"),
     ([np.eye(4)], ["soon"], "frame 0"),
 ])  # fmt: skip
-def test_a_path_that_leads_nowhere_is_refused(tmp_path: Path, poses: list[np.ndarray], ats: list[float], words: str) -> None:
+def test_a_path_that_leads_nowhere_is_refused(
+    tmp_path: Path, poses: list[np.ndarray], ats: list[float], words: str
+) -> None:
     frames = [{"transform_matrix": pose.tolist(), "at": at} for pose, at in zip(poses, ats)]
     (tmp_path / "bad.json").write_text(json.dumps({"w": 4, "h": 4, "fl_x": 4, "frames": frames}))
     with pytest.raises(DatasetError, match=words) as caught:

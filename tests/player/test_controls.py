@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import tiny_scene, varied
-
 from kpc.format.scene.scene import Clip
 from kpc.player.app.controls import FADE_S, SPEEDS, Pace, Playback, View, Wardrobe
 from kpc.player.orbit import Rig
+from scenes import tiny_scene, varied
 
 SCENE = tiny_scene(0)
 RIG = Rig.of(SCENE)
@@ -151,7 +150,9 @@ def test_a_scene_of_one_appearance_knows_no_other() -> None:
 def test_where_a_clip_will_be_is_where_it_comes_to() -> None:
     playback = Playback(Clip(31, 10.0), time=0.25, speed=2.0)
     later = playback.after(0.5)
-    assert playback.time == 0.25 and later.time == pytest.approx(0.25 + 1 / 3) == pytest.approx(0.25 + 0.5 * playback.pace)
+    assert playback.time == 0.25 and later.time == pytest.approx(0.25 + 1 / 3) == pytest.approx(
+        0.25 + 0.5 * playback.pace
+    )
     assert Playback(Clip(31, 10.0), playing=False).pace == 0.0 == Playback(Clip(1, 10.0)).pace
 
 

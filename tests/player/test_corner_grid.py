@@ -5,16 +5,26 @@ from dataclasses import replace
 import gl
 import numpy as np
 import pytest
-from scenes import SPACES, bring, displaced, flat, look_at, of_first_degree, one_sided, tiny_scene, uneven, without_planes
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
 from kpc.player.cpu.corner_grid import MOST_CORNERS, Baking, corners_of
 from kpc.player.cpu.raymarch import BAKED as CORNER_BAKED
-from kpc.player.quality import LADDER, Quality
 from kpc.player.cpu.reference import Moment, Part, features, render
-from kpc.player.gl.renderer import Renderer
 from kpc.player.cpu.simd import LARGEST
+from kpc.player.gl.renderer import Renderer
+from kpc.player.quality import LADDER, Quality
+from scenes import (
+    SPACES,
+    bring,
+    displaced,
+    flat,
+    look_at,
+    of_first_degree,
+    one_sided,
+    tiny_scene,
+    uneven,
+    without_planes,
+)
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
 FOLDED, BAKED = Quality(folded=True), Quality(folded=True, baked=TERMINATION)
@@ -29,7 +39,12 @@ def baking_of(scene: Scene, camera: Camera = CAMERA, time: float = 0.0) -> Bakin
     return renderer._kept(Baking)
 
 
-SCENES = {"even": lambda: one_sided(tiny_scene(4, channels=16)), "uneven": uneven, "flat": flat, "displaced": lambda: displaced(one_sided(tiny_scene(4, channels=16)))}
+SCENES = {
+    "even": lambda: one_sided(tiny_scene(4, channels=16)),
+    "uneven": uneven,
+    "flat": flat,
+    "displaced": lambda: displaced(one_sided(tiny_scene(4, channels=16))),
+}
 
 
 @pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
@@ -46,7 +61,14 @@ def test_corners_hold_what_a_sample_there_finds(make) -> None:
         known = (baking._known & CORNER_BAKED).any(0).reshape(-1)
         # Each of a plane's numbers is off by half a step at most, of 32767 to the largest.
         largest = np.prod([max(np.abs(scale[name]).max() for scale in scene.scales) for name in SPACE_PLANES])
-        off = 3 * largest * np.abs(weights).sum(1) * 0.5 / 32767 * max(np.abs(scale["xt"]).max() for scale in scene.scales) ** 3
+        off = (
+            3
+            * largest
+            * np.abs(weights).sum(1)
+            * 0.5
+            / 32767
+            * max(np.abs(scale["xt"]).max() for scale in scene.scales) ** 3
+        )
         assert np.all(np.abs(baking.grid.reshape(-1, 4)[known] - wanted[known]) < off + 1e-4) and off.max() < 0.05
         assert known.mean() > 0.05
 
@@ -86,7 +108,9 @@ def test_pictures_are_near_those_of_the_reference(space: str) -> None:
         assert -10 * np.log10(np.mean((got.rgb - wanted.rgb) ** 2)) > 40
         assert np.mean(np.abs(got.samples - wanted.samples) <= 1) > 0.95
     still = renderer.render(CAMERA, 0.9, part=Part.STATIC)
-    np.testing.assert_array_equal(still.rgb, Renderer(gl.context(), scene, FOLDED).render(CAMERA, 0.9, part=Part.STATIC).rgb)
+    np.testing.assert_array_equal(
+        still.rgb, Renderer(gl.context(), scene, FOLDED).render(CAMERA, 0.9, part=Part.STATIC).rgb
+    )
     renderer.quality = LADDER["reference"]
     assert renderer.marched_by == "fragment shaders"
     exact = renderer.render(CAMERA, 0.9)
@@ -123,7 +147,14 @@ def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
     fine = one_sided(tiny_scene(scales=1, channels=30, resolution=(200, 180, 120)))
     assert np.prod(corners_of(fine)) > MOST_CORNERS
     mapped = [SPACES[space](one_sided(tiny_scene(channels=16))) for space in ("ndc", "contracted")]
-    for scene in (*mapped, tiny_scene(channels=16), one_sided(tiny_scene(channels=16, dynamic=False)), one_sided(tiny_scene()), fine, SPACES["hybrid"](tiny_scene(channels=16))):
+    for scene in (
+        *mapped,
+        tiny_scene(channels=16),
+        one_sided(tiny_scene(channels=16, dynamic=False)),
+        one_sided(tiny_scene()),
+        fine,
+        SPACES["hybrid"](tiny_scene(channels=16)),
+    ):
         assert not Baking.serves(scene)
         got, wanted = (Renderer(gl.context(), scene, quality).render(CAMERA, 0.5) for quality in (BAKED, FOLDED))
         np.testing.assert_array_equal(got.rgb, wanted.rgb)

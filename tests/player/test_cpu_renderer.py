@@ -5,18 +5,29 @@ from dataclasses import replace
 import gl
 import numpy as np
 import pytest
-from numba import njit
-from scenes import SPACES, bring, displaced, flat, look_at, of_first_degree, one_sided, tiny_scene, uneven, varied, without_planes
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
 from kpc.player.cpu.corner_grid import Baking
-from kpc.player.cpu.raymarch import _FAST, _within, cast
-from kpc.player.cpu.plane_sampler import Lookup
 from kpc.player.cpu.cpu_renderer import in_steps, rehearse
-from kpc.player.quality import LADDER, Quality
+from kpc.player.cpu.plane_sampler import Lookup
+from kpc.player.cpu.raymarch import _FAST, _within, cast
 from kpc.player.cpu.reference import Part, render
 from kpc.player.gl.renderer import Renderer
+from kpc.player.quality import LADDER, Quality
+from numba import njit
+from scenes import (
+    SPACES,
+    bring,
+    displaced,
+    flat,
+    look_at,
+    of_first_degree,
+    one_sided,
+    tiny_scene,
+    uneven,
+    varied,
+    without_planes,
+)
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
 FOLDED, BAKED = Quality(folded=True), Quality(folded=True, baked=TERMINATION)
@@ -52,7 +63,11 @@ VIEWS = {
 
 
 @pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
-@pytest.mark.parametrize("kind, where", [(kind, where) for kind in (Lookup, Baking) for where in ("box", "displaced", "opaque", "fog")] + [(Lookup, "contracted")])
+@pytest.mark.parametrize(
+    "kind, where",
+    [(kind, where) for kind in (Lookup, Baking) for where in ("box", "displaced", "opaque", "fog")]
+    + [(Lookup, "contracted")],
+)
 def test_pictures_are_those_of_the_reference(kind: type, where: str, view: Camera) -> None:
     """Through a grid, where that holds all there is."""
     scene = tiny_scene(4, scales=1, channels=32)
@@ -97,7 +112,10 @@ def test_planes_of_all_sizes_are_looked_up(make) -> None:
     code = scene.appearances[1].code if scene.appearances else None
     for time in (0.0, 0.37, 1.0):
         for part in (Part.FULL, Part.STATIC):
-            got, wanted = renderer.render(CAMERA, time, part=part, appearance=code), render(scene, CAMERA, time, part=part, appearance=code)
+            got, wanted = (
+                renderer.render(CAMERA, time, part=part, appearance=code),
+                render(scene, CAMERA, time, part=part, appearance=code),
+            )
             assert np.mean(np.abs(got.rgb - wanted.rgb).max(axis=2) <= 1 / 255) > 0.998
             assert np.mean(got.samples == wanted.samples) > 0.95 and wanted.samples.sum() > 500
     if code is not None:
@@ -131,7 +149,9 @@ def test_planes_are_as_near_as_their_steps() -> None:
     plane = np.random.default_rng(0).normal(size=(7, 9, 5)).astype(np.float32) * np.float32([1e-30, 1, 0, 1e30, 5])
     whole, step = in_steps(plane)
     assert whole.dtype == np.int16 and step[2] == 0 and not whole[..., 2].any()
-    assert (np.abs(whole * step - plane) <= 0.51 * step).all() and (np.abs(whole).max((0, 1)) == [32767, 32767, 0, 32767, 32767]).all()
+    assert (np.abs(whole * step - plane) <= 0.51 * step).all() and (
+        np.abs(whole).max((0, 1)) == [32767, 32767, 0, 32767, 32767]
+    ).all()
 
 
 @pytest.mark.parametrize("rung", ["quick", "balanced", "fine", "finer"])

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import glfw
 import pytest
-from test_floors import ROOT, imports
-
 from kpc.player.app.desktop import wayland_library
+from test_floors import ROOT, imports
 
 LIBRARY = Path(glfw.__file__).with_name("wayland") / "libglfw.so"
 
@@ -35,6 +34,10 @@ def test_windows_are_made_from_one_place() -> None:
         for file in sorted((ROOT / folder).rglob("*.py")):
             found = {module.split(".")[0] for module in imports(file)} & {"glfw", "imgui_bundle"}
             assert not found or file.name == "desktop.py", f"{file.relative_to(ROOT)} imports {found}"
-    lines = [node for node in ast.walk(ast.parse((ROOT / "player/desktop.py").read_text())) if isinstance(node, ast.Import | ast.ImportFrom)]
+    lines = [
+        node
+        for node in ast.walk(ast.parse((ROOT / "player/desktop.py").read_text()))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    ]
     order = {(node.module if isinstance(node, ast.ImportFrom) else node.names[0].name): node.lineno for node in lines}
     assert order["imgui_bundle"] < order["glfw"]

@@ -3,12 +3,11 @@
 import gl
 import numpy as np
 import pytest
-from scenes import look_at
-
 from kpc.format.scene.motion import moved
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT
 from kpc.format.scene.space import Contraction, contract
 from kpc.player.cpu.reference import sigmoid
+from scenes import look_at
 
 N = 1 << 16
 RNG = np.random.default_rng(0)
@@ -41,7 +40,9 @@ def test_a_place_is_seen_where_its_ray_leaves_the_raster() -> None:
     error = 2.0**-22 * np.maximum(np.abs(places).max(1), 3) / away * CAMERA.fl_x + 1e-4
     assert (np.abs(on - np.stack([i, 48 - j], axis=1)).max(1) < error + 2e-5 * 64).all()
     behind = CAMERA.camera_to_world[:3, 3] - away[:, None] * directions
-    assert (gl.evaluate(glsl, "vec4(on_raster(a.xyz, 48.0, lens, axes, eye), 0.0, 0.0)", columns(*behind.T))[:, :2] < -1e8).all()
+    assert (
+        gl.evaluate(glsl, "vec4(on_raster(a.xyz, 48.0, lens, axes, eye), 0.0, 0.0)", columns(*behind.T))[:, :2] < -1e8
+    ).all()
 
 
 def test_distances_in_contracted_space() -> None:
@@ -84,7 +85,8 @@ def test_walking_finds_the_cells_that_the_reference_finds() -> None:
     u = RNG.uniform(-0.1, 1.1, (N, 3))
     glsl = '#include "ray.glsl"\n#include "space.glsl"\n#include "occupancy.glsl"\n' + (
         "const vec3 many = vec3(12.0, 10.0, 8.0);\n"
-        "Walk walk = Walk(vec3(0.0), vec3(1.0), vec3(1.0), many, 1.0 / many, 0.0, 1.0, 0.1, 1.0, 0.0);\n")
+        "Walk walk = Walk(vec3(0.0), vec3(1.0), vec3(1.0), many, 1.0 / many, 0.0, 1.0, 0.1, 1.0, 0.0);\n"
+    )
     cells = gl.evaluate(glsl, "vec4(cell_of(walk, a.xyz), 0.0)", columns(*u.T))[:, :3]
     wanted = np.clip(np.floor(u * count), 0, count - 1)
     assert (np.abs(u * count - np.rint(u * count))[cells != wanted] < 1e-5).all() and np.mean(cells != wanted) < 1e-4
@@ -102,11 +104,19 @@ def cubic(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     (i, across), (j, up) = taps
     weights = up[:, :, None] * across[:, None, :]
     weights[:, [0, 0, 3, 3], [0, 3, 0, 3]] = 0
-    return np.einsum("nji,njic->nc", weights / weights.sum((1, 2), keepdims=True), picture[j[:, :, None], i[:, None, :]].astype(np.float64))
+    return np.einsum(
+        "nji,njic->nc",
+        weights / weights.sum((1, 2), keepdims=True),
+        picture[j[:, :, None], i[:, None, :]].astype(np.float64),
+    )
 
 
 def test_colours_between_pixels() -> None:
-    x, y, picture = RNG.uniform(-0.01, 1.01, N).astype(np.float32), RNG.random(N, np.float32), RNG.random((N, 4), np.float32)
+    x, y, picture = (
+        RNG.uniform(-0.01, 1.01, N).astype(np.float32),
+        RNG.random(N, np.float32),
+        RNG.random((N, 4), np.float32),
+    )
     x[:2], y[:2] = (0.5 / 256, 1.0), (0.5 / 256, 0.0)
     got = gl.evaluate('#include "cubic.glsl"\n', "vec4(cubic(from_b, a.xy), 0.0)", columns(x, y), picture)
     wanted = cubic(picture.reshape(256, 256, 4)[..., :3], x.astype(np.float64), y.astype(np.float64))
@@ -121,5 +131,7 @@ def test_places_are_moved(nodes: tuple[int, int, int]) -> None:
     u, offsets = rng.random((N, 3), np.float32), rng.uniform(-0.3, 0.3, (*nodes, 3)).astype(np.float32)
     grid = np.concatenate([offsets, np.zeros((*nodes, 1))], axis=-1)
     counts = "vec3({}.0, {}.0, {}.0)".format(*nodes[::-1])
-    got = gl.evaluate('#include "motion.glsl"\n', f"vec4(moved(grid, {counts}, a.xyz), 0.0)", columns(*u.T), grid=grid)[:, :3]
+    got = gl.evaluate('#include "motion.glsl"\n', f"vec4(moved(grid, {counts}, a.xyz), 0.0)", columns(*u.T), grid=grid)[
+        :, :3
+    ]
     np.testing.assert_allclose(got, moved(u, offsets), atol=2e-6)

@@ -9,19 +9,19 @@ from pathlib import Path
 import gl
 import numpy as np
 import pytest
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common.errors import BudgetError
+from kpc.format.container import groups, scene_io
+from kpc.format.container.container import Reader, open_source
+from kpc.format.container.groups import Groups, Part
+from kpc.format.scene.scene import Clip, Scene
+from kpc.player.gl.renderer import Renderer
+from kpc.player.streaming.group_playback import Reel
+from kpc.player.streaming.prefetch import Playhead
+from kpc.tools.cli.serve import serving
 from scenes import tiny_scene
 
 import kpc
-from kpc.format.container import groups, scene_io
-from kpc.format.container.container import Reader, open_source
-from kpc.format.common.errors import BudgetError
-from kpc.format.container.groups import Groups, Part
-from kpc.format.coding.quantise import quantise_scene
-from kpc.format.scene.scene import Clip, Scene
-from kpc.player.streaming.prefetch import Playhead
-from kpc.player.streaming.group_playback import Reel
-from kpc.player.gl.renderer import Renderer
-from kpc.tools.cli.serve import serving
 
 SOON_S = 10.0
 PACE = 0.2
@@ -37,7 +37,9 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Frames 0 to 10, 8 to 18 and 19 to 29 at 2 fps; the groups differ in scales and in what they move."""
     path = tmp_path_factory.mktemp("reel") / "long.kpc"
     scenes = [tiny_scene(0, scales=1), tiny_scene(1), tiny_scene(2, dynamic=False, scales=1)]
-    scenes = [replace(scene, clip=Clip(11, 2.0), cameras=scene.cameras if k == 0 else ()) for k, scene in enumerate(scenes)]
+    scenes = [
+        replace(scene, clip=Clip(11, 2.0), cameras=scene.cameras if k == 0 else ()) for k, scene in enumerate(scenes)
+    ]
     groups.write([Part.of(coded(scene), start) for scene, start in zip(scenes, (0, 8, 19), strict=True)], path)
     return path
 
@@ -116,14 +118,19 @@ def test_two_groups_are_mixed_amid_the_frames_that_they_share(clip, opened):
         settled(reel, time, number)
         assert (reel.beside(time) is not None) == (8 < frame < 10)
         if reel.beside(time) is not None:
-            assert reel._next.number == 1 - number and reel.version_at(time) == (reel.version, reel._next.stream.version)
+            assert reel._next.number == 1 - number and reel.version_at(time) == (
+                reel.version,
+                reel._next.stream.version,
+            )
         assert_shows(reel, clip, time)
 
 
 def held_up(reel: Reel, monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Let no further group be opened until this is set."""
     gate, open_group = threading.Event(), reel.groups.open
-    monkeypatch.setattr(reel.groups, "open", lambda *args, **options: gate.wait(SOON_S) and open_group(*args, **options))
+    monkeypatch.setattr(
+        reel.groups, "open", lambda *args, **options: gate.wait(SOON_S) and open_group(*args, **options)
+    )
     return gate
 
 

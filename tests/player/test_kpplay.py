@@ -10,12 +10,11 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
-from scenes import tiny_scene, varied
-
-from kpc.format.container.scene_io import write
-from kpc.format.common.media import read_image
 from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common.media import read_image
+from kpc.format.container.scene_io import write
 from kpc.tools.cli.serve import Handler, serving
+from scenes import tiny_scene, varied
 
 
 @pytest.fixture(scope="module")
@@ -35,11 +34,13 @@ def display() -> Iterator[str]:
     if shutil.which("Xvfb") is None:
         pytest.skip("no display and no Xvfb (Debian: apt install xvfb)")
     reader, writer = os.pipe()
-    server = subprocess.Popen(  # without -noreset it starts over when its last client leaves, and refuses the next meanwhile
-        ["Xvfb", "-noreset", "-displayfd", str(writer), "-screen", "0", "1024x768x24"],
-        pass_fds=[writer],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+    server = (
+        subprocess.Popen(  # without -noreset it starts over when its last client leaves, and refuses the next meanwhile
+            ["Xvfb", "-noreset", "-displayfd", str(writer), "-screen", "0", "1024x768x24"],
+            pass_fds=[writer],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
     )
     os.close(writer)
     with os.fdopen(reader) as said:
@@ -62,8 +63,18 @@ def wayland(display: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     folder = tmp_path_factory.mktemp("wayland")
     folder.chmod(0o700)
     told = {"XDG_RUNTIME_DIR": str(folder), "WAYLAND_DISPLAY": "kpc"}
-    command = ["weston", "--backend=x11-backend.so", "--socket=kpc", "--width=400", "--height=300", "--scale=2", "--idle-time=0"]
-    server = subprocess.Popen(command, env={**os.environ, **told, "DISPLAY": display}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    command = [
+        "weston",
+        "--backend=x11-backend.so",
+        "--socket=kpc",
+        "--width=400",
+        "--height=300",
+        "--scale=2",
+        "--idle-time=0",
+    ]
+    server = subprocess.Popen(
+        command, env={**os.environ, **told, "DISPLAY": display}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     try:
         for _ in range(100):
             if (folder / "kpc").exists() or server.poll() is not None:
@@ -77,7 +88,9 @@ def wayland(display: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         server.wait()
 
 
-def kpplay(*arguments: object, display: str | None = None, told: Mapping[str, str] = MappingProxyType({})) -> subprocess.CompletedProcess[str]:
+def kpplay(
+    *arguments: object, display: str | None = None, told: Mapping[str, str] = MappingProxyType({})
+) -> subprocess.CompletedProcess[str]:
     env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "PYGLFW_LIBRARY")} | (
         {"DISPLAY": display} if display else {}
     ) | dict(told)  # fmt: skip
@@ -98,7 +111,9 @@ def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("session", [{}, {"XDG_SESSION_TYPE": "wayland"}], ids=["untold", "told"])
-def test_plays_where_there_is_no_x_server(scene_file: Path, wayland: dict[str, str], session: dict[str, str], tmp_path: Path) -> None:
+def test_plays_where_there_is_no_x_server(
+    scene_file: Path, wayland: dict[str, str], session: dict[str, str], tmp_path: Path
+) -> None:
     shot = tmp_path / "shot.png"
     done = kpplay(scene_file, "--size", "300x200", "--frames", 20, "--screenshot", shot, told={**wayland, **session})
     assert done.returncode == 0 and done.stdout == "" and "Traceback" not in done.stderr, done.stderr
@@ -134,12 +149,24 @@ def test_a_server_that_fails_is_told_in_the_window(scene_file: Path, display: st
         with serving(scene_file.parent, handler=handler) as url:
             done = kpplay(f"{url}/tiny.kpc", "--size", "400x300", "--frames", 2, "--screenshot", shot, display=display)
         assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
-    whole, told = (read_image(shot).astype(int)[22:38, 250:390] for shot in shots)  # where the message is, right of the HUD
+    whole, told = (
+        read_image(shot).astype(int)[22:38, 250:390] for shot in shots
+    )  # where the message is, right of the HUD
     assert told.max() > 200 > 100 > told.min() and np.abs(whole - told).max() > 100
 
 
 def test_long_playback_makes_nothing_anew(scene_file: Path, display: str) -> None:
-    command = [sys.executable, "-m", "kpc.tools.bench.kpbench", "steady", str(scene_file), "--size", "200x150", "--frames", "40"]
+    command = [
+        sys.executable,
+        "-m",
+        "kpc.tools.bench.kpbench",
+        "steady",
+        str(scene_file),
+        "--size",
+        "200x150",
+        "--frames",
+        "40",
+    ]
     env = {**os.environ, "DISPLAY": display}
     done = subprocess.run(command, capture_output=True, text=True, env=env, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
@@ -150,12 +177,28 @@ def test_long_playback_makes_nothing_anew(scene_file: Path, display: str) -> Non
 
 
 def test_a_window_that_is_left_to_itself_is_measured(scene_file: Path, display: str) -> None:
-    command = [sys.executable, "-m", "kpc.tools.bench.kpbench", "window", str(scene_file), "--size", "320x240", "--seconds", "1", "--turn", "20"]
-    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "DISPLAY": display}, timeout=60, check=False)
+    command = [
+        sys.executable,
+        "-m",
+        "kpc.tools.bench.kpbench",
+        "window",
+        str(scene_file),
+        "--size",
+        "320x240",
+        "--seconds",
+        "1",
+        "--turn",
+        "20",
+    ]
+    done = subprocess.run(
+        command, capture_output=True, text=True, env={**os.environ, "DISPLAY": display}, timeout=60, check=False
+    )
     assert done.returncode == 0, done.stderr
     (record,) = json.loads(done.stdout)
     (run,) = record["repeats"]
-    assert run["raster"] == "320x240" and run["raster_share"] == 1 and run["psnr"] >= run["psnr_least"] > 30, run  # so small a scene needs no less
+    assert run["raster"] == "320x240" and run["raster_share"] == 1 and run["psnr"] >= run["psnr_least"] > 30, (
+        run
+    )  # so small a scene needs no less
     assert 5 < run["fps"] and "degrees a second" in done.stderr
 
 

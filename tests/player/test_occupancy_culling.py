@@ -5,15 +5,14 @@ from dataclasses import replace
 import gl
 import numpy as np
 import pytest
-from scenes import SPACES, bring, displaced, look_at, tiny_scene, without_planes
-
 from kpc.format.scene.scene import Scene
-from kpc.player.gl import renderer as module
-from kpc.player.quality import LADDER, Quality
+from kpc.player.cpu.occupancy_culling import Thinning
 from kpc.player.cpu.reference import Moment, Part, features, render, slot_at
+from kpc.player.gl import renderer as module
 from kpc.player.gl.renderer import Renderer
 from kpc.player.gl.textures import Layout, Rows
-from kpc.player.cpu.occupancy_culling import Thinning
+from kpc.player.quality import LADDER, Quality
+from scenes import SPACES, bring, displaced, look_at, tiny_scene, without_planes
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
 FOLDED = Quality(folded=True)
@@ -22,7 +21,9 @@ FOLDED = Quality(folded=True)
 def moving(channels: int = 8, resolution: tuple[int, int, int] = (24, 20, 16)) -> Scene:
     """A scene much of which is empty some of the time."""
     scene = tiny_scene(4, channels=channels, resolution=resolution)
-    return replace(scene, decoder=replace(scene.decoder, density_weight=3 * scene.decoder.density_weight, density_bias=-13.0))
+    return replace(
+        scene, decoder=replace(scene.decoder, density_weight=3 * scene.decoder.density_weight, density_bias=-13.0)
+    )
 
 
 def thinning_of(scene: Scene) -> Thinning:
@@ -43,15 +44,22 @@ def densities_of_folded(scene: Scene, places: np.ndarray, time: float) -> np.nda
         for scale, rows in zip(scene.scales, moment.rows, strict=True)
     )
     folded = replace(moment, rows=tuple({} for _ in scales))
-    return features(replace(scene, scales=scales), folded, places) @ scene.decoder.density_weight + scene.decoder.density_bias
+    return (
+        features(replace(scene, scales=scales), folded, places) @ scene.decoder.density_weight
+        + scene.decoder.density_bias
+    )
 
 
-@pytest.mark.parametrize("scene", [moving(), moving(5, (9, 20, 1)), displaced(moving())], ids=["even", "odd", "displaced"])
+@pytest.mark.parametrize(
+    "scene", [moving(), moving(5, (9, 20, 1)), displaced(moving())], ids=["even", "odd", "displaced"]
+)
 def test_densities_are_those_of_folded_planes(scene: Scene) -> None:
     rng, thinning = np.random.default_rng(3), thinning_of(scene)
     rows = Rows(scene, Layout.of(scene))
     for time in (0.0, 0.37, 1.0):
-        places = np.concatenate([rng.random((1 << 16, 3), np.float32), np.eye(3, dtype=np.float32), np.ones((1, 3), np.float32)])
+        places = np.concatenate(
+            [rng.random((1 << 16, 3), np.float32), np.eye(3, dtype=np.float32), np.ones((1, 3), np.float32)]
+        )
         got, wanted = thinning.log_densities(places, rows.at(time), time), densities_of_folded(scene, places, time)
         np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-4 * np.abs(wanted).max())
 
@@ -62,7 +70,9 @@ def test_a_cell_is_empty_whose_corners_are() -> None:
     for time in (0.1, 0.2, 0.9):
         slot = slot_at(scene, time)
         occupied = scene.occupancy[slot]
-        corners = np.argwhere(np.ones([side + 1 for side in occupied.shape], bool))[:, ::-1] / np.array(occupied.shape[::-1])
+        corners = np.argwhere(np.ones([side + 1 for side in occupied.shape], bool))[:, ::-1] / np.array(
+            occupied.shape[::-1]
+        )
         sigma = np.exp(np.float64(densities_of_folded(scene, corners.astype(np.float32), time)))
         alpha = (1 - np.exp(-sigma * scene.step / scene.extent)).reshape([side + 1 for side in occupied.shape])
         most = np.max([alpha[z : z + 8, y : y + 10, x : x + 12] for z, y, x in np.ndindex(2, 2, 2)], axis=0)
@@ -89,7 +99,9 @@ def test_rays_pass_by_what_is_empty_and_pictures_stay(space: str) -> None:
         assert got.samples.sum() < 0.9 * wanted.samples.sum()
         assert -10 * np.log10(np.mean((got.rgb - wanted.rgb) ** 2)) > 40
     # What is exact, or static, sees all of the slot again.
-    np.testing.assert_array_equal(thin.render(CAMERA, 0.9, part=Part.STATIC).samples, whole.render(CAMERA, 0.9, part=Part.STATIC).samples)
+    np.testing.assert_array_equal(
+        thin.render(CAMERA, 0.9, part=Part.STATIC).samples, whole.render(CAMERA, 0.9, part=Part.STATIC).samples
+    )
     thin.render(CAMERA, 0.9)
     thin.quality = LADDER["reference"]
     assert np.mean(thin.render(CAMERA, 0.9).samples == render(scene, CAMERA, 0.9).samples) > 0.99

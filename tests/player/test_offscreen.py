@@ -1,7 +1,6 @@
 import gl
 import moderngl
 import pytest
-
 from kpc.format.common.errors import DisplayError
 from kpc.player.gl import offscreen
 

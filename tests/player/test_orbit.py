@@ -3,11 +3,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import tiny_scene
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.orbit import Rig, fitted, is_ring, look_at, orbit, presets
+from scenes import tiny_scene
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -90,7 +89,9 @@ def test_presets_stay_where_something_was_seen() -> None:
     around, ahead = presets(scene_of(RING)), presets(scene_of(WALL))
     assert list(around) == ["front", "right", "back", "left", "above", "near", "far"]
     eyes = {name: camera.camera_to_world[:3, 3] for name, camera in around.items()}
-    assert eyes["front"][:2] == pytest.approx(-eyes["back"][:2], abs=1e-6) and eyes["left"][:2] == pytest.approx(-eyes["right"][:2], abs=1e-6)
+    assert eyes["front"][:2] == pytest.approx(-eyes["back"][:2], abs=1e-6) and eyes["left"][:2] == pytest.approx(
+        -eyes["right"][:2], abs=1e-6
+    )
     assert eyes["above"][2] > 0.95 * np.linalg.norm(eyes["above"])
     assert np.linalg.norm(eyes["near"]) < np.linalg.norm(eyes["front"]) < np.linalg.norm(eyes["far"])
     xs = {name: camera.camera_to_world[0, 3] for name, camera in ahead.items()}

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-
 from kpc.player.app.preferences import _IS_RIGHT, LARGEST, Preferences, load, place, save
 
 MINE = Preferences((800, 600), "fine", 30.0, 0.5, False, False, True, True, 1.5)
@@ -42,15 +41,24 @@ def test_a_wrong_value_counts_as_not_there(tmp_path: Path, name: str, values: li
         assert got.graphs  # the others stay
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[]", b"null", b"[" * 60_000, b'{"a": 1}', b" " * (2 * LARGEST)])
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\xfe", b"[]", b"null", b"[" * 60_000, b'{"a": 1}', b" " * (2 * LARGEST)]
+)
 def test_another_file_is_none(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "player.json").write_bytes(content)
     assert load(tmp_path / "player.json") == Preferences()
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.dictionaries(st.sampled_from(sorted(_IS_RIGHT)), st.recursive(
-    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=8), lambda inner: st.lists(inner, max_size=3))))
+@given(
+    st.dictionaries(
+        st.sampled_from(sorted(_IS_RIGHT)),
+        st.recursive(
+            st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=8),
+            lambda inner: st.lists(inner, max_size=3),
+        ),
+    )
+)
 def test_whatever_it_says_the_player_starts(tmp_path: Path, said: dict[str, object]) -> None:
     (tmp_path / "player.json").write_text(json.dumps(said))
     got = load(tmp_path / "player.json")

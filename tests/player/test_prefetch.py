@@ -2,11 +2,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scenes import tiny_scene
-from test_partial import opened
-
 from kpc.format.container.partial import PartialScene
 from kpc.player.streaming.prefetch import Playhead, distances_ahead, fetching_order, least_room, worth_holding
+from scenes import tiny_scene
+from test_partial import opened
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +29,9 @@ def test_the_first_coarse_picture_comes_first_then_finer_ones_then_what_is_ahead
 
 def test_while_it_plays_what_comes_soon_precedes_a_finer_scale(scene: PartialScene) -> None:
     paused, playing = (fetching_order(scene, Playhead(0.5, pace)) for pace in (0.0, 0.3))
-    finer = [next(k for k, (scale, moves, _) in enumerate(listed(scene, order)) if scale == 1) for order in (paused, playing)]
+    finer = [
+        next(k for k, (scale, moves, _) in enumerate(listed(scene, order)) if scale == 1) for order in (paused, playing)
+    ]
     assert finer[0] < finer[1]
     soon = {row for scale, moves, row in listed(scene, playing)[: finer[1]] if moves}
     assert max(soon) >= 14 and min(soon) >= 8
@@ -43,10 +44,14 @@ def test_what_the_picture_shown_needs_precedes_all_else(scene: PartialScene) -> 
 
 
 def test_behind_the_playhead_comes_around_again_or_last(scene: PartialScene) -> None:
-    first = [k for k in range(len(scene.numbers)) if scene.moves[k] and scene.entry(int(scene.numbers[k])).row_start == 0]
+    first = [
+        k for k in range(len(scene.numbers)) if scene.moves[k] and scene.entry(int(scene.numbers[k])).row_start == 0
+    ]
     loop, once = (distances_ahead(scene, Playhead(0.9, 0.1, loop)) for loop in (True, False))
     assert np.allclose(loop[first], 0.1) and (once[first] > 2).all()
-    before = [k for k in range(len(scene.numbers)) if scene.moves[k] and scene.entry(int(scene.numbers[k])).row_start == 12]
+    before = [
+        k for k in range(len(scene.numbers)) if scene.moves[k] and scene.entry(int(scene.numbers[k])).row_start == 12
+    ]
     assert (loop[before] > loop[first].max()).all() and (once[before] < once[first].min()).all()
 
 

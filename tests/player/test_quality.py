@@ -5,15 +5,14 @@ from dataclasses import replace
 import gl
 import numpy as np
 import pytest
-from scenes import SPACES, look_at, tiny_scene, varied
-
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, TIME_PLANES, Scene
-from kpc.player.gl import renderer as module
 from kpc.player.cpu.cpu_renderer import probes_of
-from kpc.player.quality import DEFAULT, LADDER, Quality, climbed
 from kpc.player.cpu.reference import Part, box_range, render
+from kpc.player.gl import renderer as module
 from kpc.player.gl.renderer import COMPUTE_VERSION, TRIAL_AFTER, Renderer
+from kpc.player.quality import DEFAULT, LADDER, Quality, climbed
+from scenes import SPACES, look_at, tiny_scene, varied
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
 
@@ -60,15 +59,24 @@ def test_compute_shaders_draw_the_same(space: str) -> None:
     camera = CAMERA.resized(61, 43)  # no whole number of work groups
     renderer, pictures = Renderer(ctx, scene), {}
     bent = LADDER["balanced"]
-    qualities = {"reference": LADDER["reference"], "fine": replace(LADDER["fine"], blur=0.0), "balanced": replace(bent, blur=0.0), "bent": bent}
+    qualities = {
+        "reference": LADDER["reference"],
+        "fine": replace(LADDER["fine"], blur=0.0),
+        "balanced": replace(bent, blur=0.0),
+        "bent": bent,
+    }
     for renderer.compute in (False, True):
         for name, renderer.quality in qualities.items():
             pictures[name, renderer.compute] = renderer.render(camera, 0.3)
     renderer.check()
-    assert psnr(pictures["bent", False].rgb, pictures["bent", True].rgb) > 50  # a block that bends by just so much may go either way
+    assert (
+        psnr(pictures["bent", False].rgb, pictures["bent", True].rgb) > 50
+    )  # a block that bends by just so much may go either way
     for name in ("reference", "balanced", "fine"):
         one, other = pictures[name, False], pictures[name, True]
-        assert np.mean(np.abs(one.rgb - other.rgb).max(axis=2) < 1 / 255) > 0.999 and psnr(one.rgb, other.rgb) > 55, name
+        assert np.mean(np.abs(one.rgb - other.rgb).max(axis=2) < 1 / 255) > 0.999 and psnr(one.rgb, other.rgb) > 55, (
+            name
+        )
         assert np.mean(one.samples == other.samples) > 0.99
 
 
@@ -114,7 +122,8 @@ def around(angles: np.ndarray) -> list[Camera]:
 
 
 @pytest.mark.parametrize(
-    ("space", "size"), [*((space, (64, 48)) for space in SPACES), *(("box", size) for size in ((33, 17), (1, 1), (4096, 1), (3, 64)))]
+    ("space", "size"),
+    [*((space, (64, 48)) for space in SPACES), *(("box", size) for size in ((33, 17), (1, 1), (4096, 1), (3, 64)))],
 )
 def test_while_a_clip_plays_only_what_has_changed_is_marched_again(space: str, size: tuple[int, int]) -> None:
     scene, camera, times = SPACES[space](tiny_scene(4)), CAMERA.resized(*size), np.linspace(0.4, 0.5, 9)
@@ -137,7 +146,10 @@ def test_what_was_seen_from_far_away_is_whole_from_near(rung: str) -> None:
     """Of a picture's targets, as much is shown as was drawn into them."""
     ctx, scene = gl.context(), tiny_scene(4)
     renderer, shown = Renderer(ctx, scene, LADDER[rung]), []
-    far, near = look_at((24.0, 10.0, 22.0), (0.1, 0.05, 0.05), 64, 48, 70.0), look_at((0.9, 0.5, 0.8), (0.1, 0.05, 0.05), 64, 48, 40.0)
+    far, near = (
+        look_at((24.0, 10.0, 22.0), (0.1, 0.05, 0.05), 64, 48, 70.0),
+        look_at((0.9, 0.5, 0.8), (0.1, 0.05, 0.05), 64, 48, 40.0),
+    )
     for drawer, cameras in ((renderer, (far, near)), (Renderer(ctx, scene, LADDER[rung]), (near,))):
         screen = ctx.simple_framebuffer((64, 48), 4)
         for camera in cameras:
@@ -158,7 +170,9 @@ def test_every_pixel_is_a_probe_by_turns() -> None:
     seen = np.zeros((62, 63), int)
     for turn in range(16):
         numbers = np.stack([x, y, x, y], 1).astype(np.float32)
-        places = gl.evaluate('#include "probes.glsl"\n', f"vec4(probe_of(a.xy, {turn}, vec2(63.0, 62.0)), 0.0, 0.0)", numbers)
+        places = gl.evaluate(
+            '#include "probes.glsl"\n', f"vec4(probe_of(a.xy, {turn}, vec2(63.0, 62.0)), 0.0, 0.0)", numbers
+        )
         column, row = places[:, :2].astype(int).T
         assert (column // 4 == x).all() and (row // 4 == y).all()
         np.add.at(seen, (row, column), 1)
@@ -172,7 +186,9 @@ def test_every_probe_has_a_texel_of_its_own(tiles: module.Tiles | None) -> None:
     x, y = np.mgrid[:128, :64].reshape(2, -1)
     blocks = np.stack([x, y, x, y], 1).astype(np.float32)
     tile, square = (tiles.tile, tiles.square) if tiles else (module.MORE_THAN_A_RASTER,) * 2
-    places = gl.evaluate('#include "tiles.glsl"\n', "vec4(texel_of(a.xy), block_of(texel_of(a.xy)))", blocks, TILE=tile, SQUARE=square)
+    places = gl.evaluate(
+        '#include "tiles.glsl"\n', "vec4(texel_of(a.xy), block_of(texel_of(a.xy)))", blocks, TILE=tile, SQUARE=square
+    )
     assert np.array_equal(places[:, 2:], blocks[:, :2]) and len(np.unique(places[:, :2], axis=0)) == 128 * 64
     across, up = tiles.raster((128, 64)) if tiles else (128, 64)
     assert (places[:, :2] < (across, up)).all() and places[:, 0].max() >= across - square
@@ -180,7 +196,9 @@ def test_every_probe_has_a_texel_of_its_own(tiles: module.Tiles | None) -> None:
 
 @pytest.mark.parametrize("size", [(64, 48), (170, 90), (321, 1)])
 @pytest.mark.parametrize("covered", [False, True])
-def test_probes_see_the_same_wherever_they_lie(monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], covered: bool) -> None:
+def test_probes_see_the_same_wherever_they_lie(
+    monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], covered: bool
+) -> None:
     """Spread over tiles, all of them or those in sight of what is occupied; or side by side."""
     monkeypatch.setattr(module, "MOST_COVERED", float(covered))
     scene, camera, pictures = tiny_scene(4), CAMERA.resized(*size), []
@@ -200,7 +218,9 @@ def test_nothing_is_left_behind_by_what_moves() -> None:
     camera, changed = CAMERA.resized(128, 96), 0.0
     first = whole.render(camera, 0.0).rgb
     for time in (*np.linspace(0, 1, 60), *np.linspace(0, 0.2, 12)):
-        error = np.abs(renderer.render(camera, float(time)).rgb - (wanted := whole.render(camera, float(time)).rgb)).max(axis=2)
+        error = np.abs(
+            renderer.render(camera, float(time)).rgb - (wanted := whole.render(camera, float(time)).rgb)
+        ).max(axis=2)
         changed = max(changed, float(np.mean(np.abs(wanted - first).max(axis=2) > 8 * TOLERANCE)))
         assert np.mean(error > 2 * TOLERANCE) < 0.02 and np.mean(error > 8 * TOLERANCE) < 0.001, time
     assert changed > 0.05
@@ -265,7 +285,9 @@ def test_what_arrives_is_folded_anew() -> None:
     for s, scale in enumerate(finer.scales):
         for plane in SPACE_PLANES:
             renderer.put(s, plane, renderer.layout.texels(scale[plane]))
-    same_times = [{**new, **{p: old[p] for p in TIME_PLANES}} for new, old in zip(finer.scales, scene.scales, strict=True)]
+    same_times = [
+        {**new, **{p: old[p] for p in TIME_PLANES}} for new, old in zip(finer.scales, scene.scales, strict=True)
+    ]
     wanted = Renderer(gl.context(), replace(scene, scales=tuple(same_times)), Quality(folded=True)).render(CAMERA, 0.4)
     assert np.array_equal(renderer.render(CAMERA, 0.4).rgb, wanted.rgb)
 
@@ -369,7 +391,9 @@ def test_interpolated_pixels_are_off_by_no_more_than_may_be(size: tuple[int, int
     off = {blur: np.sqrt(np.mean((each.rgb - whole.rgb) ** 2)) for blur, each in pictures.items()}
     # Cells end this scene abruptly: of edges so sharp bends tell less than half, and slivers are met by no coarser ray at all.
     assert all(off[blur] < 4 * blur + 1.5e-3 for blur in blurs)
-    assert list(off.values()) == sorted(off.values()) and all(shares[more] <= shares[less] for less, more in zip(blurs[1:], blurs[2:]))
+    assert list(off.values()) == sorted(off.values()) and all(
+        shares[more] <= shares[less] for less, more in zip(blurs[1:], blurs[2:])
+    )
     assert off[1.0] > 4 * off[0.002] and (not software or shares[1e-6] > 2 * shares[1.0])
     assert np.abs(pictures[0.01].opacity - whole.opacity).mean() < 0.01
 
@@ -389,8 +413,12 @@ def test_how_far_blocks_are_off_is_told_by_bends(size: tuple[int, int]) -> None:
 
     padded = np.pad(colours[..., :3].astype(float), ((1, 1), (1, 1), (0, 0)), "edge")
     here = padded[1:-1, 1:-1]
-    bends = np.abs(padded[1:-1, :-2] + padded[1:-1, 2:] - 2 * here) + np.abs(padded[:-2, 1:-1] + padded[2:, 1:-1] - 2 * here)
-    columns, rows = (np.minimum((2 * np.arange(2 * n) + 1) * fewer // side, fewer - 1) for n, fewer, side in zip(blocks, few, size))
+    bends = np.abs(padded[1:-1, :-2] + padded[1:-1, 2:] - 2 * here) + np.abs(
+        padded[:-2, 1:-1] + padded[2:, 1:-1] - 2 * here
+    )
+    columns, rows = (
+        np.minimum((2 * np.arange(2 * n) + 1) * fewer // side, fewer - 1) for n, fewer, side in zip(blocks, few, size)
+    )
     squares = np.mean((bends / 8) ** 2, axis=2)[rows[:, None], columns]
     wanted = squares.reshape(blocks[1], 2, blocks[0], 2).mean((1, 3))
     np.testing.assert_allclose(got, np.repeat(wanted[..., None], 4, axis=2), rtol=1e-4)
@@ -407,11 +435,16 @@ def test_what_was_drawn_before_is_gone() -> None:
             for time in (0.3, 0.31):
                 alone = Renderer(gl.context(), scene, replace(quality, tolerance=0.0))
                 alone._covered = lambda camera: None  # all of the picture
-                assert psnr(renderer.render(camera, time).rgb, alone.render(camera, time).rgb) > (60 if quality is blurred else 40)
+                assert psnr(renderer.render(camera, time).rgb, alone.render(camera, time).rgb) > (
+                    60 if quality is blurred else 40
+                )
 
     shown = []
     for screen in (gl.context().simple_framebuffer((201, 97)), gl.context().simple_framebuffer((201, 97))):
-        renderer, cameras = Renderer(gl.context(), scene, blurred), [look_at((x, 1.0, 3.0), (0.3, 0.2, 0.0), 96, 64, 70.0) for x in (9.0, -2.0, 2.0)]
+        renderer, cameras = (
+            Renderer(gl.context(), scene, blurred),
+            [look_at((x, 1.0, 3.0), (0.3, 0.2, 0.0), 96, 64, 70.0) for x in (9.0, -2.0, 2.0)],
+        )
         if shown:  # all of it, and nothing before
             renderer._covered, cameras = lambda camera: None, cameras[-1:]
         for camera in cameras:
@@ -502,7 +535,9 @@ def test_fewer_scales_are_a_coarser_picture() -> None:
 def fog(density: float, step: float = 0.04) -> Scene:
     """Everywhere of the same density, per longest edge of the box; with surroundings, in them too."""
     scene = tiny_scene(4, dynamic=False)
-    even = replace(scene.decoder, density_weight=np.zeros_like(scene.decoder.density_weight), density_bias=float(np.log(density)))
+    even = replace(
+        scene.decoder, density_weight=np.zeros_like(scene.decoder.density_weight), density_bias=float(np.log(density))
+    )
     return replace(scene, decoder=even, step=step, occupancy=np.ones_like(scene.occupancy))
 
 
@@ -513,7 +548,11 @@ def test_fog_of_any_density_against_float64(density: float, step: float) -> None
     n 2^-24; rays end with their transmittance at the termination."""
     scene = fog(density, step)
     size = (scene.aabb[1] - scene.aabb[0]).astype(np.float64)
-    for eye, target in (((0.1, 0.05, 3.0), (0.1, 0.05, 0.0)), ((0.1, 0.05, 0.05), (5.0, 0.05, 0.05)), ((800.0, 0.05, 0.05), (0, 0.05, 0.05))):
+    for eye, target in (
+        ((0.1, 0.05, 3.0), (0.1, 0.05, 0.0)),
+        ((0.1, 0.05, 0.05), (5.0, 0.05, 0.05)),
+        ((800.0, 0.05, 0.05), (0, 0.05, 0.05)),
+    ):
         camera = look_at(eye, target, 1, 1, 50.0)
         origins, directions = camera.rays()
         near, far = box_range(scene.aabb, origins, directions)
@@ -549,5 +588,7 @@ def test_folded_planes_in_half_floats_are_near_those_in_floats(monkeypatch: pyte
     assert half.memory_bytes < exact.memory_bytes and not np.array_equal(found, wanted)
     assert np.abs(found - wanted).max() < 0.01
     # What float16 cannot hold is cut off, not infinite.
-    bright = replace(scene, scales=tuple({name: 1e4 * plane for name, plane in scale.items()} for scale in scene.scales))
+    bright = replace(
+        scene, scales=tuple({name: 1e4 * plane for name, plane in scale.items()} for scale in scene.scales)
+    )
     assert np.isfinite(Renderer(ctx, bright, LADDER["finer"], compute=False).render(CAMERA, 0.4).rgb).all()

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from kpc.player.app.controls import Pace
 from kpc.player.app.quality_controller import NOT_FOR_CARDS, RUNGS, TOO_SLOW, Dial, dial_for
 from kpc.player.quality import DEFAULT
@@ -16,7 +15,9 @@ def rate_for(rung: str, share: float = 0.8) -> float:
     return share * 1e3 / COSTS_MS[rung]
 
 
-def turns(dial: Dial, frames: int, load: float = 1.0, noise: float = 0.0, seed: int = 0, spikes: float = 0.0) -> list[str]:
+def turns(
+    dial: Dial, frames: int, load: float = 1.0, noise: float = 0.0, seed: int = 0, spikes: float = 0.0
+) -> list[str]:
     """Draw so many pictures on a device whose rungs take COSTS_MS times `load`, in proportion to pixels; the rung of each."""
     rng, rungs = np.random.default_rng(seed), []
     for _ in range(frames):
@@ -125,7 +126,9 @@ def test_a_rung_that_was_left_out_on_the_way_down_is_tried_again() -> None:
 
 
 @pytest.mark.parametrize("rung", sorted(NOT_FOR_CARDS))
-def test_a_card_is_not_moved_to_what_takes_it_longer_than_the_next_finer_rung(rung: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_card_is_not_moved_to_what_takes_it_longer_than_the_next_finer_rung(
+    rung: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     below, above = (RUNGS[RUNGS.index(rung) + way] for way in (-1, 1))
     monkeypatch.setitem(COSTS_MS, rung, 1.9 * COSTS_MS[below])
     monkeypatch.setitem(COSTS_MS, above, 1.1 * COSTS_MS[below])

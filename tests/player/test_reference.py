@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import look_at, tiny_scene, varied
-
-from kpc.format.scene.cameras import Camera
 from kpc.format.common.errors import UsageError
+from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TERMINATION, Scene
 from kpc.player.cpu import reference
 from kpc.player.cpu.reference import Part, render, render_rays
+from scenes import look_at, tiny_scene, varied
 
 
 def plain_bilinear(plane: np.ndarray, u: float, v: float) -> np.ndarray:
@@ -185,7 +184,9 @@ def test_appearances_by_name_and_between_two() -> None:
     assert scene.appearance("noon.jpg") is noon
     np.testing.assert_array_equal(scene.appearance_between("dawn.jpg", "noon.jpg", 0), dawn)
     np.testing.assert_array_equal(scene.appearance_between("dawn.jpg", "noon.jpg", 1), noon)
-    np.testing.assert_allclose(scene.appearance_between("dawn.jpg", "noon.jpg", 0.25), 0.75 * dawn + 0.25 * noon, atol=1e-6)
+    np.testing.assert_allclose(
+        scene.appearance_between("dawn.jpg", "noon.jpg", 0.25), 0.75 * dawn + 0.25 * noon, atol=1e-6
+    )
     with pytest.raises(UsageError, match="'night.jpg'.*dawn.jpg, noon.jpg, dusk.jpg$"):
         scene.appearance("night.jpg")
     with pytest.raises(UsageError, match="none.*leave it out"):

@@ -8,19 +8,18 @@ import gl
 import moderngl
 import numpy as np
 import pytest
+from kpc.encoder.rdo.prune import without
+from kpc.format.common.errors import DisplayError
+from kpc.format.container import scene_io
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.scene import Scene
+from kpc.player.cpu.reference import Part, Rendering, render
+from kpc.player.gl.renderer import Look, Renderer
+from kpc.player.orbit import Rig, fitted
+from kpc.player.quality import LADDER, Quality
 from PIL import Image
 from scenes import SPACES, displaced, hybrid, look_at, surrounded, tiny_scene, varied
 from test_glsl import cubic
-
-from kpc.encoder.rdo.prune import without
-from kpc.format.container import scene_io
-from kpc.format.scene.cameras import Camera
-from kpc.format.common.errors import DisplayError
-from kpc.format.scene.scene import Scene
-from kpc.player.orbit import Rig, fitted
-from kpc.player.quality import LADDER, Quality
-from kpc.player.cpu.reference import Part, Rendering, render
-from kpc.player.gl.renderer import Look, Renderer
 
 CENTRE = (0.1, 0.05, 0.05)
 CAMERAS = {
@@ -81,8 +80,18 @@ def test_gives_the_reference_picture(view: str, part: Part, space: str) -> None:
         undirected(tiny_scene(6)),
         without(tiny_scene(4, scales=3), (np.array([1, 4, 6]), np.array([0]), np.arange(8))),
     ],
-    ids=["static", "uneven", "few texels", "one cell", "nothing", "contracted", "nothing anywhere", "thrown about", "one colour",
-         "pruned"],
+    ids=[
+        "static",
+        "uneven",
+        "few texels",
+        "one cell",
+        "nothing",
+        "contracted",
+        "nothing anywhere",
+        "thrown about",
+        "one colour",
+        "pruned",
+    ],
 )
 def test_scenes_of_all_shapes(scene: Scene) -> None:
     renderer = Renderer(gl.context(), scene)
@@ -100,8 +109,10 @@ def test_appearances_are_those_of_the_reference(part: Part, hidden: int) -> None
     renderer, pictures = Renderer(gl.context(), scene), []
     between = scene.appearance_between("dawn.jpg", "dusk.jpg", 0.5)
     for code in (None, *(appearance.code for appearance in scene.appearances), between):
-        got, wanted = (render_it(CAMERAS["outside"], 0.62, part=part, appearance=code)
-                       for render_it in (renderer.render, lambda *a, **k: render(scene, *a, **k)))
+        got, wanted = (
+            render_it(CAMERAS["outside"], 0.62, part=part, appearance=code)
+            for render_it in (renderer.render, lambda *a, **k: render(scene, *a, **k))
+        )
         check(got, wanted)
         pictures.append(got.rgb)
     average, _, noon, dusk, _ = pictures
@@ -151,14 +162,20 @@ def test_a_share_of_a_picture_goes_over_what_is_there(share: float) -> None:
 
 
 def test_scenes_without_appearances_have_no_code_in_the_shader() -> None:
-    for scene, held in ((tiny_scene(4), False), (varied(tiny_scene(4)), True), (varied(undirected(tiny_scene(4))), False)):
+    for scene, held in (
+        (tiny_scene(4), False),
+        (varied(tiny_scene(4)), True),
+        (varied(undirected(tiny_scene(4))), False),
+    ):
         renderer = Renderer(gl.context(), scene)
         renderer.render(CAMERAS["outside"], 0.62)
         (program,) = (program for (name, *_), (program, _) in renderer._programs.items() if name == "march.glsl")
         assert (program.get("appearance", None) is not None) == held
         if not held and scene.appearances:  # colour is the same from all sides, whatever the code
-            check(renderer.render(CAMERAS["outside"], 0.62, appearance=scene.appearance("dawn.jpg")),
-                  render(scene, CAMERAS["outside"], 0.62, appearance=scene.appearance("dawn.jpg")))
+            check(
+                renderer.render(CAMERAS["outside"], 0.62, appearance=scene.appearance("dawn.jpg")),
+                render(scene, CAMERAS["outside"], 0.62, appearance=scene.appearance("dawn.jpg")),
+            )
 
 
 def test_sparse_occupancy_loses_no_sample() -> None:
@@ -278,7 +295,9 @@ def test_a_processor_folds_as_shaders_do(factor: float) -> None:
         renderer = Renderer(gl.context(), replace(scene, scales=tuple(larger)), FOLDED)
         renderer._folds_in_memory, renderer._folds_in_half, renderer.casts = in_memory, False, False
         renderer.march(CAMERAS["outside"], 0.3)
-        planes.append(np.frombuffer(renderer.march(CAMERAS["outside"], 0.7) and renderer._folded.planes.read(), np.float32))
+        planes.append(
+            np.frombuffer(renderer.march(CAMERAS["outside"], 0.7) and renderer._folded.planes.read(), np.float32)
+        )
     assert np.array_equal(*planes) and np.abs(planes[0]).max() > min(factor / 10, 3e38)
 
 
@@ -348,10 +367,17 @@ def test_a_small_picture_is_enlarged_by_more_than_straight_lines() -> None:
     wanted = cubic(small, *places.T).reshape(large.shape).clip(0, 1)
     assert np.abs(large - wanted).max() < 1.01 / 255
 
-    straight = np.asarray(Image.fromarray((255 * small).round().astype(np.uint8)).resize(screens[2].size, Image.Resampling.BILINEAR)) / 255
+    straight = (
+        np.asarray(
+            Image.fromarray((255 * small).round().astype(np.uint8)).resize(screens[2].size, Image.Resampling.BILINEAR)
+        )
+        / 255
+    )
     assert np.abs(straight - wanted).max() > 4 / 255
 
     for share in (0.25, 1.0):  # and over what is there
         screens[2].clear(0.2, 0.4, 0.6, 1.0)
         renderer.show(screens[2], camera, 0.62, share=share)
-        np.testing.assert_allclose(shown_on(screens[2]), share * large + (1 - share) * np.array([0.2, 0.4, 0.6]), atol=1.5 / 255)
+        np.testing.assert_allclose(
+            shown_on(screens[2]), share * large + (1 - share) * np.array([0.2, 0.4, 0.6]), atol=1.5 / 255
+        )

@@ -3,14 +3,13 @@
 import gl
 import numpy as np
 import pytest
-from scenes import displaced, hybrid, look_at, tiny_scene
-
 from kpc.format.scene.scene import Scene
-from kpc.player.gl import renderer as renderer_module
-from kpc.player.cpu.screen_mask import MOST_CELLS, Cover
-from kpc.player.quality import LADDER
 from kpc.player.cpu.reference import render, slot_at
+from kpc.player.cpu.screen_mask import MOST_CELLS, Cover
+from kpc.player.gl import renderer as renderer_module
 from kpc.player.gl.renderer import Renderer
+from kpc.player.quality import LADDER
+from scenes import displaced, hybrid, look_at, tiny_scene
 
 CAMERAS = {
     "near": look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 61, 43, 60.0),
@@ -51,8 +50,13 @@ def test_many_cells_are_covered_by_fewer_cubes() -> None:
     view = look_at((9.0, 7.0, 8.0), (1.0, -0.5, 1.0), 320, 240, 700.0)
     blocks = cover.blocks(view, 4)
     assert blocks is not None
-    local = (aabb[0] + cell * (np.stack([x, y, z], -1) + 0.5) - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
-    column, row = view.cx - view.fl_x * local[:, 0] / local[:, 2], view.height - view.cy - view.fl_y * local[:, 1] / local[:, 2]
+    local = (aabb[0] + cell * (np.stack([x, y, z], -1) + 0.5) - view.camera_to_world[:3, 3]) @ view.camera_to_world[
+        :3, :3
+    ]
+    column, row = (
+        view.cx - view.fl_x * local[:, 0] / local[:, 2],
+        view.height - view.cy - view.fl_y * local[:, 1] / local[:, 2],
+    )
     seen = (column >= 0) & (column < 320) & (row >= 0) & (row < 240)
     assert seen.sum() > 1000 and blocks[row[seen].astype(int) // 4, column[seen].astype(int) // 4].all()
 
@@ -65,7 +69,12 @@ def test_nothing_occupied_covers_nothing() -> None:
 def test_from_among_what_is_occupied_all_is_drawn() -> None:
     scene = tiny_scene(3)
     inside = look_at((0.1, 0.05, 0.05), (1.0, 0.0, 0.0), 32, 24, 30.0)
-    assert Cover.of(np.ones((8, 8, 8), bool), scene.aabb).blocks(look_at(tuple(scene.aabb[0]), (0.0, 0.0, 0.0), 8, 8, 9.0), 4) is None
+    assert (
+        Cover.of(np.ones((8, 8, 8), bool), scene.aabb).blocks(
+            look_at(tuple(scene.aabb[0]), (0.0, 0.0, 0.0), 8, 8, 9.0), 4
+        )
+        is None
+    )
     filled = np.zeros((8, 8, 8), bool)
     filled[3:5, 3:5, 3:5] = True
     assert Cover.of(filled, scene.aabb).blocks(inside, 4) is None

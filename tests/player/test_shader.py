@@ -4,11 +4,10 @@ from itertools import chain
 import gl
 import numpy as np
 import pytest
-from scenes import hybrid, tiny_scene
-
 from kpc.format.common.errors import DisplayError
 from kpc.player.gl import shader
 from kpc.player.gl.textures import Layout, block_arrays, decoder_arrays, decoder_shape, planes_shape
+from scenes import hybrid, tiny_scene
 
 VERTICES = {"settle.glsl": ["places.glsl"], "march.glsl": ["blocks.glsl", "squares.glsl"]}
 """Those of fragment shaders that are not drawn all over the viewport, or not always."""
@@ -36,13 +35,17 @@ def test_includes_come_once_and_lines_keep_their_numbers() -> None:
 
 
 def test_loops_are_written_out() -> None:
-    written = {"a": "#unroll i TWO\nint x_##i = i;\n#unroll j N_##i  // nested\nint y_##i##j = idle + j;\n#end\n#end\nint bad;\n"}
+    written = {
+        "a": "#unroll i TWO\nint x_##i = i;\n#unroll j N_##i  // nested\nint y_##i##j = idle + j;\n#end\n#end\nint bad;\n"
+    }
     text, _ = shader.compose("a", {"TWO": 2, "N_0": 1, "N_1": 2}, written=written)
     lines = text.splitlines()
     assert [line for line in lines if line.startswith("int")] == [
         "int x_0 = 0;", "int y_00 = idle + 0;", "int x_1 = 1;", "int y_10 = idle + 0;", "int y_11 = idle + 1;", "int bad;",
     ]  # fmt: skip
-    assert lines[lines.index("int bad;") - 1] == "#line 7" and lines[lines.index("int y_11 = idle + 1;") - 1] == "#line 4"
+    assert (
+        lines[lines.index("int bad;") - 1] == "#line 7" and lines[lines.index("int y_11 = idle + 1;") - 1] == "#line 4"
+    )
     with pytest.raises(ValueError, match="#unroll i has no #end"):
         shader.compose("a", written={"a": "#unroll i 3\n"})
     with pytest.raises(ValueError, match="MANY: that count is not known"):
@@ -59,7 +62,9 @@ def test_a_missing_file_is_named() -> None:
 def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
     scene = tiny_scene(0)
     defines = {**planes_shape(Layout.of(scene)), **decoder_shape(scene.decoder), "SHARED": 1}
-    text, files = shader.compose(name, defines, written={"decoder_weights": "", "plane_blocks": ""}, preamble=shader.ES30)
+    text, files = shader.compose(
+        name, defines, written={"decoder_weights": "", "plane_blocks": ""}, preamble=shader.ES30
+    )
     assert text.startswith("#version 300 es\n") and text.count("#version") == 1
     assert len(set(files)) == len(files)
 
@@ -99,7 +104,23 @@ def test_constants_are_exact() -> None:
 @pytest.mark.parametrize("space", ["box", "contracted", "ndc", "hybrid"])
 @pytest.mark.parametrize("rows", [0, 1])
 @pytest.mark.parametrize("motion", [0, 1])
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "refine.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "enlarge.glsl", "average.glsl", "nothing.glsl", "predict.glsl", "doubt.glsl", "settle.glsl"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "march.glsl",
+        "cells.glsl",
+        "refine.glsl",
+        "fold.glsl",
+        "present.glsl",
+        "upscale.glsl",
+        "enlarge.glsl",
+        "average.glsl",
+        "nothing.glsl",
+        "predict.glsl",
+        "doubt.glsl",
+        "settle.glsl",
+    ],
+)
 def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, rows: int, space: str) -> None:
     ctx = gl.context()
     if "GL_ARB_ES3_compatibility" not in ctx.extensions:

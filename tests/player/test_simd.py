@@ -2,15 +2,26 @@
 
 import numpy as np
 import pytest
-from numba import njit
-
 from kpc.player.cpu.simd import LARGEST, NARROW, WIDE, combine, interpolate, weigh
+from numba import njit
 
 
 @njit
 def interpolated(grid, first, steps, shares, into):
     for n in range(len(first)):
-        interpolate(grid, first[n], steps[0], steps[1], steps[2], shares[n, 0], shares[n, 1], shares[n, 2], into, np.uint64(1), np.uint64(n))
+        interpolate(
+            grid,
+            first[n],
+            steps[0],
+            steps[1],
+            steps[2],
+            shares[n, 0],
+            shares[n, 1],
+            shares[n, 2],
+            into,
+            np.uint64(1),
+            np.uint64(n),
+        )
 
 
 @njit
@@ -38,8 +49,17 @@ def test_neighbours_are_weighted_as_they_should(shape: tuple[int, int, int]) -> 
     at = rng.random((count, 3)).astype(np.float32) * (np.array([nx, ny, nz]) - 1)
     first = np.minimum(at.astype(int), np.maximum(np.array([nx, ny, nz]) - 2, 0))
     into = np.full((6, count), np.nan, np.float32)
-    interpolated(values.reshape(-1, 4), (first @ [1, nx, nx * ny]).astype(np.uint64), steps, (at - first).astype(np.float32), into)
-    hats = [np.maximum(1 - np.abs(at[:, [axis]].astype(np.float64) - np.arange(n)), 0) for axis, n in enumerate((nx, ny, nz))]
+    interpolated(
+        values.reshape(-1, 4),
+        (first @ [1, nx, nx * ny]).astype(np.uint64),
+        steps,
+        (at - first).astype(np.float32),
+        into,
+    )
+    hats = [
+        np.maximum(1 - np.abs(at[:, [axis]].astype(np.float64) - np.arange(n)), 0)
+        for axis, n in enumerate((nx, ny, nz))
+    ]
     wanted = np.einsum("zyxc,nx,ny,nz->cn", values.astype(np.float64), *hats)
     np.testing.assert_allclose(into[1:5], wanted, atol=1e-5)
     assert np.isnan(into[[0, 5]]).all()
@@ -73,10 +93,19 @@ def test_samples_of_planes_are_products_of_what_is_between_texels(halves: tuple[
     texels = firsts[0] + wide * np.stack([y * nx + x, z * nx + x, z * ny + y], 1)
     starts = firsts[1] + wide * first
     into = np.full((6, count), 0.5, np.float32)
-    flat, ups = [np.concatenate([part.reshape(-1) for part in parts]) for parts in (planes, rows)], np.uint64([wide * nx, wide * nx, wide * ny])
+    flat, ups = (
+        [np.concatenate([part.reshape(-1) for part in parts]) for parts in (planes, rows)],
+        np.uint64([wide * nx, wide * nx, wide * ny]),
+    )
     weighed(flat[0], texels.astype(np.uint64), ups, flat[1], starts.astype(np.uint64), shares, weights, halves, into)
-    hats = [np.maximum(1 - np.abs(at[:, [axis]].astype(np.float64) - np.arange(n)), 0) for axis, n in enumerate((nx, ny, nz))]
-    parts = [np.einsum("yxc,ny,nx->nc", plane.astype(np.float64), hats[b], hats[a]) for plane, (a, b) in zip(planes, ((0, 1), (0, 2), (1, 2)), strict=True)]
+    hats = [
+        np.maximum(1 - np.abs(at[:, [axis]].astype(np.float64) - np.arange(n)), 0)
+        for axis, n in enumerate((nx, ny, nz))
+    ]
+    parts = [
+        np.einsum("yxc,ny,nx->nc", plane.astype(np.float64), hats[b], hats[a])
+        for plane, (a, b) in zip(planes, ((0, 1), (0, 2), (1, 2)), strict=True)
+    ]
     parts += [np.einsum("xc,nx->nc", row.astype(np.float64), hat) for row, hat in zip(rows, hats, strict=True)]
     wanted = 0.5 + weights[3:].reshape(4, wide).astype(np.float64) @ np.prod(parts, axis=0).T
     np.testing.assert_allclose(into[1:5], wanted, rtol=1e-3, atol=1e-3)
@@ -88,5 +117,11 @@ def test_sums_are_finite(value: float, wanted: float) -> None:
     ones, into = np.ones(WIDE, np.int16), np.zeros((3, 4), np.float32)
     weights = np.zeros((4, WIDE), np.float32)
     weights[:, 0] = 1.0
-    combined((ones,), (np.full(WIDE, value, np.float32),), np.where(weights > 0, weights, 0 if np.isfinite(value) else 1).astype(np.float32), np.float32(0), into)
+    combined(
+        (ones,),
+        (np.full(WIDE, value, np.float32),),
+        np.where(weights > 0, weights, 0 if np.isfinite(value) else 1).astype(np.float32),
+        np.float32(0),
+        into,
+    )
     assert (into[1] == np.float32(wanted)).all()

@@ -13,21 +13,21 @@ import gl
 import moderngl
 import numpy as np
 import pytest
+from kpc.format.common.errors import BudgetError
+from kpc.format.container import http
+from kpc.format.container.container import Reader, open_source
+from kpc.format.scene.scene import Scene
+from kpc.player.cpu.corner_grid import Baking
+from kpc.player.gl.renderer import Renderer
+from kpc.player.quality import Quality
+from kpc.player.streaming import stream as module
+from kpc.player.streaming.prefetch import Playhead
+from kpc.player.streaming.stream import Stream
+from kpc.tools.cli.serve import Handler, Line, serving
 from scenes import SPACES, tiny_scene
 from test_partial import coded
 
 import kpc
-from kpc.format.container import http
-from kpc.format.container.container import Reader, open_source
-from kpc.format.common.errors import BudgetError
-from kpc.format.scene.scene import Scene
-from kpc.player.streaming import stream as module
-from kpc.player.streaming.prefetch import Playhead
-from kpc.player.cpu.corner_grid import Baking
-from kpc.player.quality import Quality
-from kpc.player.gl.renderer import Renderer
-from kpc.player.streaming.stream import Stream
-from kpc.tools.cli.serve import Handler, Line, serving
 
 PATIENCE_S = 20.0
 SIZE = (48, 36)
@@ -74,8 +74,13 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("folded", [False, True])
 @pytest.mark.parametrize("space", [*SPACES, "baked"])
-def test_once_all_is_there_it_is_the_same_picture(space: str, folded: bool, watched: Callable[..., Stream], tmp_path: Path) -> None:
-    scene, quality = SPACES["displaced" if space == "baked" else space](tiny_scene(4, channels=16, time=10)), Quality(folded=folded)
+def test_once_all_is_there_it_is_the_same_picture(
+    space: str, folded: bool, watched: Callable[..., Stream], tmp_path: Path
+) -> None:
+    scene, quality = (
+        SPACES["displaced" if space == "baked" else space](tiny_scene(4, channels=16, time=10)),
+        Quality(folded=folded),
+    )
     if space == "baked":
         scene = replace(scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2))
         quality = Quality(folded=folded, baked=1 / 16)
@@ -105,7 +110,9 @@ def test_a_static_scene_streams_too(watched: Callable[..., Stream]) -> None:
     assert np.array_equal(picture(renderer, whole, 0.0), picture(Renderer(gl.context(), whole), whole, 0.0))
 
 
-def test_the_coarse_picture_is_there_long_before_the_rest_and_gets_finer(watched: Callable[..., Stream], tmp_path: Path) -> None:
+def test_the_coarse_picture_is_there_long_before_the_rest_and_gets_finer(
+    watched: Callable[..., Stream], tmp_path: Path
+) -> None:
     data = coded(tiny_scene(4, time=10, scales=3, resolution=(96, 80, 64)))
     (tmp_path / "scene.kpc").write_bytes(data)
     whole, found = kpc.load(data), []
@@ -144,7 +151,9 @@ def test_a_long_clip_plays_in_little_memory(watched: Callable[..., Stream], tmp_
                 stream.steer(Playhead(float(time), 0.1))
                 until(lambda time=time: stream.can_show(float(time)), stream, renderer)
                 most = max(most, stream.memory_bytes)
-                segments = sum(p.nbytes for s in stream.scene.scales for n in ("xt", "yt", "zt") for p in s[n]._segments.values())
+                segments = sum(
+                    p.nbytes for s in stream.scene.scales for n in ("xt", "yt", "zt") for p in s[n]._segments.values()
+                )
                 assert segments <= stream.memory_bytes <= room
                 if int(60 * time) % 7 == turn:
                     assert np.array_equal(picture(renderer, whole, float(time)), picture(wanted, whole, float(time)))
@@ -169,8 +178,9 @@ class Noting(Handler):
         super().do_GET()
 
 
-def test_a_jump_is_served_before_all_that_lies_between(watched: Callable[..., Stream], tmp_path: Path,
-                                                       monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_jump_is_served_before_all_that_lies_between(
+    watched: Callable[..., Stream], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "RUN_BYTES", 2048)
     data = long_scene()
     (tmp_path / "scene.kpc").write_bytes(data)
@@ -193,7 +203,9 @@ def test_a_jump_does_not_wait_for_the_end_of_a_large_chunk(watched: Callable[...
     scene = tiny_scene(4, time=120, resolution=(160, 160, 160), scales=3)
     rng = np.random.default_rng(0)
     noise = {name: rng.normal(0, 0.2, plane.shape).astype(np.float32) for name, plane in scene.scales[2].items()}
-    finest = {name: plane + (noise[name] if name in ("xy", "xz", "yz") else 0) for name, plane in scene.scales[2].items()}
+    finest = {
+        name: plane + (noise[name] if name in ("xy", "xz", "yz") else 0) for name, plane in scene.scales[2].items()
+    }
     data = coded(replace(scene, scales=(*scene.scales[:2], finest)), 4)
     (tmp_path / "scene.kpc").write_bytes(data)
     largest = max(e.stored_length for e in Reader(data).index)
@@ -201,7 +213,9 @@ def test_a_jump_does_not_wait_for_the_end_of_a_large_chunk(watched: Callable[...
     with serving(tmp_path, line=Line(rate=100_000)) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
-        until(lambda: stream.scales_here == 2 and stream.can_show(0.0) and stream._under_way is not None, stream, renderer)
+        until(
+            lambda: stream.scales_here == 2 and stream.can_show(0.0) and stream._under_way is not None, stream, renderer
+        )
         received = stream.received
         stream.steer(Playhead(0.7))
         until(lambda: stream.can_show(0.7), stream, renderer)
@@ -241,8 +255,9 @@ def test_a_player_that_stalls_goes_on_by_itself(watched: Callable[..., Stream], 
         assert stream.message is None
 
 
-def test_the_window_waits_for_nothing_while_the_line_is_dead(watched: Callable[..., Stream], tmp_path: Path,
-                                                             monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_window_waits_for_nothing_while_the_line_is_dead(
+    watched: Callable[..., Stream], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(http, "SILENCE_S", 0.3)
     (tmp_path / "scene.kpc").write_bytes(long_scene())
     release, silent = threading.Event(), threading.Event()
@@ -279,7 +294,9 @@ def test_the_window_waits_for_nothing_while_the_line_is_dead(watched: Callable[.
     assert slowest < 0.25  # a request would have waited for longer
 
 
-def test_a_line_that_breaks_in_mid_chunk_is_told_and_taken_up_again(watched: Callable[..., Stream], tmp_path: Path) -> None:
+def test_a_line_that_breaks_in_mid_chunk_is_told_and_taken_up_again(
+    watched: Callable[..., Stream], tmp_path: Path
+) -> None:
     data = long_scene()
     (tmp_path / "scene.kpc").write_bytes(data)
     whole = kpc.load(data)
@@ -304,8 +321,9 @@ def test_a_line_that_breaks_in_mid_chunk_is_told_and_taken_up_again(watched: Cal
         assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
 
 
-def test_a_server_without_ranges_plays_from_the_beginning_on(watched: Callable[..., Stream], tmp_path: Path,
-                                                             capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_server_without_ranges_plays_from_the_beginning_on(
+    watched: Callable[..., Stream], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     data = coded(tiny_scene(4, time=10, scales=3, resolution=(96, 80, 64)))
     (tmp_path / "scene.kpc").write_bytes(data)
     whole = kpc.load(data)
@@ -326,8 +344,9 @@ def test_a_server_without_ranges_plays_from_the_beginning_on(watched: Callable[.
     assert "no ranges" in capsys.readouterr().err
 
 
-def test_a_file_that_changes_is_told_and_what_is_there_still_plays(watched: Callable[..., Stream], tmp_path: Path,
-                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_changes_is_told_and_what_is_there_still_plays(
+    watched: Callable[..., Stream], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "RUN_BYTES", 4096)
     data = long_scene()
     path = tmp_path / "scene.kpc"
@@ -367,7 +386,9 @@ def flipping(times: int, at: int) -> type[Handler]:
     return Flipping
 
 
-def test_a_damaged_chunk_is_fetched_a_second_time_and_not_a_third(watched: Callable[..., Stream], tmp_path: Path) -> None:
+def test_a_damaged_chunk_is_fetched_a_second_time_and_not_a_third(
+    watched: Callable[..., Stream], tmp_path: Path
+) -> None:
     (tmp_path / "scene.kpc").write_bytes(long_scene())
     of_a_plane = Reader(long_scene()).index[-1].offset
     for times, words in ((1, None), (2, "is damaged")):
@@ -425,8 +446,20 @@ def test_a_large_plane_goes_up_over_several_frames(watched: Callable[..., Stream
     assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
 
 
-MAKERS = ("texture", "texture3d", "texture_array", "buffer", "framebuffer", "simple_framebuffer", "renderbuffer", "vertex_array",
-          "simple_vertex_array", "program", "sampler", "query")
+MAKERS = (
+    "texture",
+    "texture3d",
+    "texture_array",
+    "buffer",
+    "framebuffer",
+    "simple_framebuffer",
+    "renderbuffer",
+    "vertex_array",
+    "simple_vertex_array",
+    "program",
+    "sampler",
+    "query",
+)
 
 
 @pytest.mark.parametrize("folded", [False, True])

@@ -5,11 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from scenes import tiny_scene
-
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES
 from kpc.player.cpu import reference
 from kpc.player.gl.textures import FARTHEST, Layout, Rows, decoder_arrays, distances
+from scenes import tiny_scene
 
 
 @pytest.mark.parametrize(("channels", "scales"), [(8, 2), (5, 3), (1, 1)])
@@ -20,7 +19,9 @@ def test_the_atlas_holds_every_plane(channels: int, scales: int) -> None:
     for block in layout.blocks:
         assert layout.block(block.scale, block.plane) is block
         wide = layout.layers[block.scale] * block.width
-        atlas[block.y : block.y + block.height, block.x : block.x + wide] = layout.texels(scene.scales[block.scale][block.plane])
+        atlas[block.y : block.y + block.height, block.x : block.x + wide] = layout.texels(
+            scene.scales[block.scale][block.plane]
+        )
     assert layout.layers == (-(-channels // 4),) * scales and atlas.shape == (layout.size[1], layout.size[0], 4)
     claimed = np.zeros(atlas.shape[:2], int)
     for block, (s, name) in zip(

@@ -3,7 +3,6 @@
 import threading
 
 import pytest
-
 from kpc.player.cpu import threads
 from kpc.player.cpu.threads import from_both_ends, share_out
 
@@ -26,6 +25,7 @@ def test_all_is_done_once(count: int, among: int, monkeypatch: pytest.MonkeyPatc
 def test_what_goes_wrong_in_any_part_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "CORES", 2)
     for wrong in (0, 5):
+
         def work(part: slice) -> None:
             if part.start == wrong:
                 raise ValueError(threading.current_thread().name)
@@ -36,7 +36,9 @@ def test_what_goes_wrong_in_any_part_is_raised(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 1000])
 @pytest.mark.parametrize("among", [1, 2, 3, 8])
-def test_from_both_ends_all_is_done_once_in_parts_of_some_size(count: int, among: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_from_both_ends_all_is_done_once_in_parts_of_some_size(
+    count: int, among: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(threads, "WORKERS", among)
     done, parts = [0] * count, []
 
@@ -62,6 +64,7 @@ def test_workers_meet_in_the_middle(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_goes_wrong_at_either_end_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "WORKERS", 2)
     for wrong in (0, 310):
+
         def work(worker: int, part: slice) -> None:
             if part.start <= wrong < part.stop:
                 raise ValueError(worker)

@@ -1,12 +1,11 @@
 import numpy as np
 import pytest
-from scenes import tiny_scene
-
-from kpc.format.container.scene_io import SceneReader, encode
-from kpc.format.container.partial import PartialScene
 from kpc.format.coding.quantise import quantise_scene
+from kpc.format.container.partial import PartialScene
+from kpc.format.container.scene_io import SceneReader, encode
 from kpc.player.app import time_plane_pictures
 from kpc.player.app.time_plane_pictures import moving_part, time_plane_picture, time_planes
+from scenes import tiny_scene
 
 
 @pytest.mark.parametrize("channels", [1, 2, 8])

@@ -4,19 +4,19 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from scenes import tiny_scene
-
-from kpc.format.common.errors import MediaError
 from kpc.format.coding.quantise import needed_texels, reached_by
+from kpc.format.common.errors import MediaError
 from kpc.format.scene.scene import TIME_PLANES
 from kpc.tools.bench import baselines
 from kpc.tools.bench.baselines import RIVALS, Bytes, Half, Pictures, Rival, Video, tidied
+from scenes import tiny_scene
 
 SCENE = tiny_scene(1, channels=5)
 
 
 def worst(ours: list[dict[str, np.ndarray]], theirs: baselines.Planes, levels: bool) -> float:
     """The largest error, of numbers or in widths of the channels' ranges."""
+
     def one(a: np.ndarray, b: np.ndarray) -> float:
         width = np.ptp(b, axis=(0, 1)) if levels else 1.0
         return float((np.abs(a - b) / np.maximum(width, 1e-6)).max())
@@ -31,12 +31,17 @@ def test_coarser_settings_take_less_and_err_more(rival: Rival) -> None:
     planes = tidied(SCENE)
     fine, coarse = (rival.code(planes, setting) for setting in (rival.settings[0], rival.settings[-1]))
     assert 0 < coarse.size_bytes < fine.size_bytes and min(fine.encode_s, fine.decode_s) > 0
-    errors = [np.mean([np.square(a[n] - b[n]).mean() for a, b in zip(c.planes, planes) for n in b]) for c in (fine, coarse)]
+    errors = [
+        np.mean([np.square(a[n] - b[n]).mean() for a, b in zip(c.planes, planes) for n in b]) for c in (fine, coarse)
+    ]
     assert errors[0] < errors[1]
     for scale, original in zip(fine.planes, planes, strict=True):
         assert {n: p.shape for n, p in scale.items()} == {n: p.shape for n, p in original.items()}
         assert all(plane.dtype == np.float32 for plane in scale.values())
-    assert list(rival.settings) in (sorted(rival.settings), sorted(rival.settings, reverse=True)) and len(rival.settings) >= 4
+    assert (
+        list(rival.settings) in (sorted(rival.settings), sorted(rival.settings, reverse=True))
+        and len(rival.settings) >= 4
+    )
 
 
 @pytest.mark.parametrize("rival", [Bytes(), Pictures("png"), Pictures("webp")], ids=lambda rival: rival.name)
@@ -73,7 +78,9 @@ def test_what_nobody_reads_is_evened_out_and_the_rest_is_as_it_was() -> None:
             needed = needed_texels(reached, name, *plane.shape[:2])
             np.testing.assert_array_equal(tidy[name][needed], plane[needed])
             expected = 1.0 if name in TIME_PLANES else plane[needed].mean(0)
-            np.testing.assert_allclose(tidy[name][~needed], np.broadcast_to(expected, tidy[name][~needed].shape), rtol=1e-5)
+            np.testing.assert_allclose(
+                tidy[name][~needed], np.broadcast_to(expected, tidy[name][~needed].shape), rtol=1e-5
+            )
 
 
 @pytest.mark.parametrize("shape", [(5, 7, 1), (5, 7, 5), (3, 2, 64)])

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 from datasets import write_n3dv
-from scenes import tiny_scene
-
-from kpc.format.container import scene_io
 from kpc.format.coding.quantise import quantise_scene
+from kpc.format.container import scene_io
 from kpc.tools.bench import codec_bench, kpbench, plot, results
+from kpc.tools.bench.baselines import Bytes, Half, Planes, Video
 from kpc.tools.bench.codec_bench import headline
 from kpc.tools.bench.rd_curves import Point, bd_rate, size_at
-from kpc.tools.bench.baselines import Bytes, Half, Planes, Video
+from scenes import tiny_scene
 
 
 def points(scale: float, psnrs: tuple[float, ...] = (27.0, 28.0, 29.0, 29.7, 29.9)) -> list[Point]:
@@ -31,7 +30,13 @@ def test_the_same_curve_at_half_the_rate_is_half_as_large() -> None:
 
 
 def test_curves_of_planes_leave_out_what_else_there_is() -> None:
-    ours, others = ([point | {"size_bytes": 1e4 + point["size_bytes"], "planes_bytes": point["size_bytes"]} for point in points(scale)] for scale in (0.5, 1.0))
+    ours, others = (
+        [
+            point | {"size_bytes": 1e4 + point["size_bytes"], "planes_bytes": point["size_bytes"]}
+            for point in points(scale)
+        ]
+        for scale in (0.5, 1.0)
+    )
     assert bd_rate(ours, others, "planes_bytes") == pytest.approx(-0.5, abs=1e-9)
     assert -0.2 < (bd_rate(ours, others) or 0) < 0
 
@@ -62,19 +67,24 @@ def test_sizes_at_equal_loss_beside_the_smallest_at_hand() -> None:
     head, row = results._loss_table(records)
     assert head == ["scene", "0.05 dB", "0.1 dB", "0.2 dB", "0.5 dB", "1 dB", "2 dB"]
     assert row == ["scene", "-", *(f"{0.6 * 2 ** (3 - loss):.0f} KB, 40% (AV1)" for loss in (0.1, 0.2, 0.5, 1.0, 2.0))]
-    assert results._loss_table(records[:1])[1][2:] == [f"{0.6 * 2 ** (3 - loss):.0f} KB" for loss in (0.1, 0.2, 0.5, 1.0, 2.0)]
+    assert results._loss_table(records[:1])[1][2:] == [
+        f"{0.6 * 2 ** (3 - loss):.0f} KB" for loss in (0.1, 0.2, 0.5, 1.0, 2.0)
+    ]
 
 
 @pytest.fixture
 def scene_file(tmp_path: Path) -> Path:
     scene = tiny_scene(3, channels=4)
-    scene_io.write(quantise_scene(scene, [{name: 0.002 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
+    scene_io.write(
+        quantise_scene(scene, [{name: 0.002 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc"
+    )
     return tmp_path / "scene.kpc"
 
 
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch, few_rays: None) -> None:
     """Here, and with little to do; what it does in processes of its own one test says."""
+
     def here(jobs: list[codec_bench.Job], views: object, processes: int) -> list[Point | None]:
         codec_bench._source.cache_clear()
         codec_bench._judge_by(views)  # type: ignore[arg-type]
@@ -90,7 +100,9 @@ def few(monkeypatch: pytest.MonkeyPatch, few_rays: None) -> None:
     monkeypatch.setattr(codec_bench, "QUALITIES", (60, 70, 80, 90))
     others = Half("zstd -19"), Bytes(), Video("X", "libnothing", (1,), ())
     monkeypatch.setattr(codec_bench, "RIVALS", {rival.name: rival for rival in others})
-    monkeypatch.setattr(codec_bench, "TUNED", {"X, tuned": "X", "Y, tuned": "Y"})  # the one cannot be used here, of the other nobody knows
+    monkeypatch.setattr(
+        codec_bench, "TUNED", {"X, tuned": "X", "Y, tuned": "Y"}
+    )  # the one cannot be used here, of the other nobody knows
 
 
 def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -98,7 +110,14 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert kpbench.main(["codec", str(scene_file), "--ablate", "--out", str(out)]) == 0
     said = capsys.readouterr()
     records = results.load([out])
-    assert [record["coder"] for record in records] == ["kpc", *codec_bench.WITHOUT, "fp16 + zstd -19", "uint8 + zstd -19", "X", "X, tuned"]
+    assert [record["coder"] for record in records] == [
+        "kpc",
+        *codec_bench.WITHOUT,
+        "fp16 + zstd -19",
+        "uint8 + zstd -19",
+        "X",
+        "X, tuned",
+    ]
     ours, *without, halves, levels, missing, missing_too = records
     for one in (missing, missing_too):
         assert one["missing"] == "this ffmpeg has no libnothing" and one["points"] == [] and one["bd_rate"] is None
@@ -107,7 +126,9 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
     assert len(ours["points"]) == 6  # no file has a thousandth of a bit
     for found in ours["points"]:
         assert found["size_bytes"] <= whole and sum(found["shares"].values()) == pytest.approx(1)
-        assert found["bits_per_parameter"] == pytest.approx(8 * found["size_bytes"] / tiny_scene(3, channels=4).parameter_count)
+        assert found["bits_per_parameter"] == pytest.approx(
+            8 * found["size_bytes"] / tiny_scene(3, channels=4).parameter_count
+        )
     rates = [p["size_bytes"] for p in ours["points"][:2]]
     assert rates[0] <= 3 * tiny_scene(3, channels=4).parameter_count / 8 and rates[0] < rates[1]
     for found, quality in zip(ours["points"][2:], (60, 70, 80, 90), strict=True):
@@ -180,9 +201,16 @@ def test_a_rival_that_is_tuned_comes_nearer_and_codes_every_plane_once(
     plain = codec_bench.point(codec_bench.Job(scene_file, Bytes().name, 4, 100))
     once, shapes[:] = sorted(shapes), ()
     tuned = codec_bench.point(codec_bench.Job(scene_file, "levels, tuned", 4, 100))
-    assert sorted(shapes) == once == sorted(plane.shape for scale in tiny_scene(3, channels=4).scales for plane in scale.values())
+    assert (
+        sorted(shapes)
+        == once
+        == sorted(plane.shape for scale in tiny_scene(3, channels=4).scales for plane in scale.values())
+    )
     assert plain is not None and tuned is not None and tuned["agreement_db"] > plain["agreement_db"] + 0.2
-    assert 0.8 * plain["size_bytes"] < tuned["size_bytes"] < 1.3 * plain["size_bytes"] and tuned["search_s"] > tuned["encode_s"]
+    assert (
+        0.8 * plain["size_bytes"] < tuned["size_bytes"] < 1.3 * plain["size_bytes"]
+        and tuned["search_s"] > tuned["encode_s"]
+    )
 
 
 def test_held_out_views_judge(few: None, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +225,10 @@ def test_held_out_views_judge(few: None, scene_file: Path, tmp_path: Path, monke
 
 
 def test_processes_of_their_own(scene_file: Path) -> None:
-    jobs = [codec_bench.Job(scene_file, "kpc without tuning", "quality 5", codec_bench.Trade(quality=5.0)), codec_bench.Job(scene_file, Bytes().name, 4)]
+    jobs = [
+        codec_bench.Job(scene_file, "kpc without tuning", "quality 5", codec_bench.Trade(quality=5.0)),
+        codec_bench.Job(scene_file, Bytes().name, 4),
+    ]
     ours, levels = codec_bench.in_parallel(jobs, None, 2)
     assert ours is not None and levels is not None and ours["psnr"] < 30 and levels["size_bytes"] > 100
     assert math.isfinite(levels["psnr"])

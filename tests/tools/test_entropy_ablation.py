@@ -2,16 +2,15 @@ import json
 
 import numpy as np
 import pytest
+from kpc.format.coding import predictive, transform
+from kpc.format.coding.predictive import SET_COUNTS, Guide, encode_symbols
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.container.scene_io import write
+from kpc.format.container.segments import encode_coded
+from kpc.tools.bench import entropy_ablation, kpbench, results
 from scenes import tiny_scene
 from test_blocks import some
 from test_symbols import followed, textured
-
-from kpc.format.coding import predictive, transform
-from kpc.format.container.scene_io import write
-from kpc.format.coding.quantise import quantise_scene
-from kpc.format.container.segments import encode_coded
-from kpc.format.coding.predictive import SET_COUNTS, Guide, encode_symbols
-from kpc.tools.bench import entropy_ablation, kpbench, results
 
 
 def in_blocks(side=8, rows=60, columns=92, share=0.7, by_occupancy=False):
@@ -38,10 +37,19 @@ def test_with_nothing_changed_blocks_are_as_they_were(by_occupancy):
     segment, walks = in_blocks(by_occupancy=by_occupancy), entropy_ablation._compiled(transform, {})
     assert entropy_ablation._bytes_in_blocks(segment, walks, borders=True) == len(segment.body)
     told = transform.blocks_in(segment.body, *segment.symbols.shape, segment.implied)
-    assert entropy_ablation._bytes_in_blocks(segment, walks, borders=False) == len(transform.encode_blocks(told, segment.coded, borders=False))
+    assert entropy_ablation._bytes_in_blocks(segment, walks, borders=False) == len(
+        transform.encode_blocks(told, segment.coded, borders=False)
+    )
 
 
-@pytest.mark.parametrize("idea", [name for name, idea in entropy_ablation.LEFT_OUT.items() if isinstance(idea, entropy_ablation.OfBlocks) and idea.changes])
+@pytest.mark.parametrize(
+    "idea",
+    [
+        name
+        for name, idea in entropy_ablation.LEFT_OUT.items()
+        if isinstance(idea, entropy_ablation.OfBlocks) and idea.changes
+    ],
+)
 def test_what_is_left_out_of_blocks_changes_something(idea, monkeypatch):
     monkeypatch.setattr(entropy_ablation, "njit", lambda function: function)  # as plain Python: compiling takes longer
     segment = in_blocks(rows=60, columns=64, share=1.0)
@@ -59,8 +67,13 @@ def test_a_map_is_told_where_occupancy_does_not():
 
 
 def test_what_tables_would_take():
-    asked = np.repeat(np.int16([-10000, -10001, -10002, -10003, -20000]), [50, 50, 0, 64, 1])  # 0 and 1 as often, 1 always, 0 once
-    assert entropy_ablation._tables(np.append(asked, np.int16([2048, -2048]))) * 8 == 100 + 3 * entropy_ablation.TABLE_BITS + 2
+    asked = np.repeat(
+        np.int16([-10000, -10001, -10002, -10003, -20000]), [50, 50, 0, 64, 1]
+    )  # 0 and 1 as often, 1 always, 0 once
+    assert (
+        entropy_ablation._tables(np.append(asked, np.int16([2048, -2048]))) * 8
+        == 100 + 3 * entropy_ablation.TABLE_BITS + 2
+    )
 
 
 def test_records(tmp_path, monkeypatch):
@@ -74,5 +87,7 @@ def test_records(tmp_path, monkeypatch):
     assert list(records) == ["nothing", "all of them: zstd", idea]
     assert records["nothing"]["plane_bytes"] < records["all of them: zstd"]["plane_bytes"]
     assert records["nothing"]["decode_ms"] > 0
-    assert records["nothing"]["file_bytes"] == (tmp_path / "tiny.kpc").stat().st_size and records["nothing"]["read_ms"] > 0
+    assert (
+        records["nothing"]["file_bytes"] == (tmp_path / "tiny.kpc").stat().st_size and records["nothing"]["read_ms"] > 0
+    )
     assert "whole file KB" in results.markdown(json.loads(out.read_text()))

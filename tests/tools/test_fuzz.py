@@ -9,7 +9,6 @@ import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-
 from kpc.format.common.errors import FormatError
 from kpc.format.container.scene_io import read
 from kpc.tools.vectors import fuzz, specvectors
@@ -92,7 +91,7 @@ def test_other_errors_are_found_and_work_goes_on(monkeypatch):
     monkeypatch.setattr(fuzz, "_limit_memory", lambda more: monkeypatch.setattr(fuzz, "examined", breaks))
     pipe = type("Pipe", (), {"send": staticmethod(sent.append)})
     fuzz._work(pipe, [0.0, 0.0, 0.0], 1, range(0, 3), frozenset({1}), fuzz.BUDGET, "")
-    (following, tally, findings), = sent
+    ((following, tally, findings),) = sent
     assert following == 3 and tally == {"finding": 2}
     assert findings == [(0, "ValueError: as it should not"), (2, "ValueError: as it should not")]
 
@@ -132,6 +131,9 @@ def test_computing_is_told_of_other_processes():
 
 
 def test_a_frame_that_says_it_is_vast_is_not_taken_at_its_word() -> None:
-    small, vast = zstandard.compress(b"a" * 100), b"\x28\xb5\x2f\xfd\xe0" + (1 << 50).to_bytes(8, "little") + b"\x01\x00\x00"
+    small, vast = (
+        zstandard.compress(b"a" * 100),
+        b"\x28\xb5\x2f\xfd\xe0" + (1 << 50).to_bytes(8, "little") + b"\x01\x00\x00",
+    )
     assert fuzz._decompressed(small) == b"a" * 100
     assert fuzz._decompressed(vast) is None and fuzz._decompressed(b"no frame") is None

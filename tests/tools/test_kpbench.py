@@ -9,18 +9,17 @@ from typing import Any
 import gl
 import pytest
 from datasets import write_n3dv
-from scenes import tiny_scene
-
-import kpc
 from kpc.encoder.evaluation import profile
 from kpc.encoder.evaluation.ablations import ABLATIONS, changed_by
 from kpc.encoder.field.config import PRESETS
-from kpc.format.container.scene_io import write
 from kpc.format.coding.quantise import quantise_scene
+from kpc.format.container.scene_io import write
 from kpc.player.quality import DEFAULT, LADDER
 from kpc.tools.bench import kpbench, machine_limits, plot, results
 from kpc.tools.bench.provenance import data_hash
+from scenes import tiny_scene
 
+import kpc
 
 SMALL = replace(PRESETS["draft"], resolutions=(8, 16), samples_across=32, cells_across=12, rays=256, samples=8192, warmup=5,
                 occupancy_start=8, occupancy_every=4)  # fmt: skip
@@ -77,7 +76,15 @@ def test_step_sets_training_beside_plain_pytorch_and_the_machine(
     monkeypatch.setattr(profile, "FUSED_STEPS", 5)
     monkeypatch.setattr(machine_limits, "MEMORY_BYTES", 1 << 24)
     write_n3dv(tmp_path / "tiny", frames=2)
-    command = ["step", str(tmp_path / "tiny"), "--preset", "draft", "--box=-1,-1,-1,1,1,1", "--out", str(tmp_path / "step.json")]
+    command = [
+        "step",
+        str(tmp_path / "tiny"),
+        "--preset",
+        "draft",
+        "--box=-1,-1,-1,1,1,1",
+        "--out",
+        str(tmp_path / "step.json"),
+    ]
     assert kpbench.main(command) == 0
     (record,) = results.load([tmp_path / "step.json"])
     (run,) = record["repeats"]
@@ -117,10 +124,24 @@ def test_ablate_changes_one_thing_at_a_time(
         monkeypatch.delitem(ABLATIONS, name)
     write_n3dv(tmp_path / "tiny", frames=2)
     out = tmp_path / "ablate.json"
-    command = ["ablate", str(tmp_path / "tiny"), "--preset", "draft", "--steps", "3", "--box=-1,-1,-1,1,1,1", "--out", str(out)]
+    command = [
+        "ablate",
+        str(tmp_path / "tiny"),
+        "--preset",
+        "draft",
+        "--steps",
+        "3",
+        "--box=-1,-1,-1,1,1,1",
+        "--out",
+        str(out),
+    ]
     assert kpbench.main(command) == 0
     records = results.load([out])  # there is no motion grid to leave out
-    assert [record["settings"]["ablation"] for record in records] == ["as it is", "half the channels", "planes added up"]
+    assert [record["settings"]["ablation"] for record in records] == [
+        "as it is",
+        "half the channels",
+        "planes added up",
+    ]
     whole, half, added = (record["repeats"][0] for record in records)
     assert added["test_psnr"] > 5 and "size_bytes" not in added  # no file can hold it
     assert whole["parameters"] > 1.8 * half["parameters"] and whole["steps"] == half["steps"] == 3
@@ -160,7 +181,11 @@ def test_player_measures_every_quality(tmp_path: Path, capsys: pytest.CaptureFix
             assert record["accuracy"]["psnr_turning"] > 50 and run["times_reference"] == 1
             assert record["accuracy"]["psnr_least"] == record["accuracy"]["psnr_least_turning"] == 100
             most, folding = record["accuracy"]["folding_most"], record["accuracy"]["folding_psnr"]
-            assert (most < 1e-5 and folding == 100) if record["name"] == "still" else 1 / 255 < most < 0.5 and 30 < folding < 90
+            assert (
+                (most < 1e-5 and folding == 100)
+                if record["name"] == "still"
+                else 1 / 255 < most < 0.5 and 30 < folding < 90
+            )
         else:
             assert "folding_psnr" not in record["accuracy"]
         if record["settings"]["quality"] == DEFAULT:
@@ -210,8 +235,15 @@ def test_senseless_minutes_are_refused(minutes: str, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(
-    "command", [["encode", "missing"], ["curve", "missing"], ["ablate", "missing"], ["player", "missing.kpc"], ["player", "x.kpc", "--out", "no/x"],
-                ["player", GROUPS]]
+    "command",
+    [
+        ["encode", "missing"],
+        ["curve", "missing"],
+        ["ablate", "missing"],
+        ["player", "missing.kpc"],
+        ["player", "x.kpc", "--out", "no/x"],
+        ["player", GROUPS],
+    ],
 )
 def test_errors_are_one_line(command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                              capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip

@@ -2,13 +2,12 @@ import json
 
 import numpy as np
 import pytest
-from scenes import displaced, faced, surrounded, tiny_scene, varied
-
+from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.container import Reader
 from kpc.format.container.scene_io import write
 from kpc.format.scene.motion import STEP
-from kpc.format.coding.quantise import quantise_scene
 from kpc.tools.cli import kpinfo
+from scenes import displaced, faced, surrounded, tiny_scene, varied
 
 
 @pytest.fixture
@@ -22,9 +21,18 @@ def scene_file(tmp_path):
 def test_the_page(scene_file, capsys):
     assert kpinfo.main([str(scene_file)]) == 0
     page = capsys.readouterr().out
-    for part in ("11 frames at 10 fps, 1.00 s, dynamic", "(-1, -0.8, -0.6) to (1.2, 0.9, 0.7)", "3 x 12x10x8 cells",
-                 "scale 1     8 channels; xy 24x20, xz 24x16, yz 20x16, xt 24x6", "bits each", "identity", "SCNE",
-                 "came", "zstd", "rANS"):
+    for part in (
+        "11 frames at 10 fps, 1.00 s, dynamic",
+        "(-1, -0.8, -0.6) to (1.2, 0.9, 0.7)",
+        "3 x 12x10x8 cells",
+        "scale 1     8 channels; xy 24x20, xz 24x16, yz 20x16, xt 24x6",
+        "bits each",
+        "identity",
+        "SCNE",
+        "came",
+        "zstd",
+        "rANS",
+    ):
         assert part in page, page
     assert "cut off" not in page and "verified" not in page
 
@@ -38,8 +46,10 @@ def test_json_adds_up(scene_file, capsys):
     assert info["verified"] and info["missing_chunks"] == 0 and info["space"] == {"mapping": "box"}
     assert info["scales"][0]["planes"]["xt"]["rows"] == 6
     assert 0 < info["dont_care_share"] < 1 and 0.5 < info["identity_share"] < 1
-    assert info["cameras"] == 2 and info["camera_box"] == [pytest.approx([-1.8, 1.0, 2.2], abs=2e-5),
-                                                           pytest.approx([2.4, 1.4, 2.6], abs=2e-5)]
+    assert info["cameras"] == 2 and info["camera_box"] == [
+        pytest.approx([-1.8, 1.0, 2.2], abs=2e-5),
+        pytest.approx([2.4, 1.4, 2.6], abs=2e-5),
+    ]
     assert sum(c["share"] for c in info["chunks"]) < 1
     assert {c["plane"] for c in info["chunks"]} == {None, "xy", "xz", "yz", "xt", "yt", "zt"}
 
@@ -50,7 +60,9 @@ def test_a_static_scene(tmp_path, capsys):
     write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), path)
     assert kpinfo.main([str(path), "--verify"]) == 0
     page = capsys.readouterr().out
-    assert "100.0% of the occupied space-time is identity" in page and "100.0% of the occupied space never changes" in page
+    assert (
+        "100.0% of the occupied space-time is identity" in page and "100.0% of the occupied space never changes" in page
+    )
     assert "static" in page and "verified" in page and "xt" not in page
 
 
@@ -97,7 +109,9 @@ def test_a_scene_with_appearances(tmp_path, capsys):
     write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), path)
     assert kpinfo.main([str(path), "--verify"]) == 0
     page = capsys.readouterr().out
-    assert "appearances 11: 00.jpg, 01.jpg" in page and "07.jpg, ..." in page and "08.jpg" not in page and "appe" in page
+    assert (
+        "appearances 11: 00.jpg, 01.jpg" in page and "07.jpg, ..." in page and "08.jpg" not in page and "appe" in page
+    )
     assert kpinfo.main([str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["appearances"] == [*names]
     data = bytearray(path.read_bytes())
@@ -121,7 +135,7 @@ def test_verify_lists_every_damaged_chunk(scene_file, capsys):
 
 def test_a_file_whose_end_is_missing_is_described_but_not_verified(scene_file, capsys):
     data = scene_file.read_bytes()
-    scene_file.write_bytes(data[:Reader(data).index[-2].offset])
+    scene_file.write_bytes(data[: Reader(data).index[-2].offset])
     assert kpinfo.main([str(scene_file)]) == 0
     page = capsys.readouterr().out
     assert "2 of 22 chunks are missing" in page and page.count("  missing") == 2
@@ -129,8 +143,10 @@ def test_a_file_whose_end_is_missing_is_described_but_not_verified(scene_file, c
     assert "cut off at" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("content, complaint", [(b"", "not a .kpc file"), (b"RIFF" * 40, "not a .kpc file"),
-                                                (b"\x89KPC\r\n\x1a\n", "cut off within the header")])
+@pytest.mark.parametrize(
+    "content, complaint",
+    [(b"", "not a .kpc file"), (b"RIFF" * 40, "not a .kpc file"), (b"\x89KPC\r\n\x1a\n", "cut off within the header")],
+)
 def test_other_files(tmp_path, capsys, content, complaint):
     path = tmp_path / "other.kpc"
     path.write_bytes(content)

@@ -9,19 +9,19 @@ import gl
 import numpy as np
 import OpenEXR
 import pytest
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common.errors import DisplayError
+from kpc.format.common.media import read_image, read_video
+from kpc.format.container.scene_io import write
+from kpc.format.scene.cameras import load_shots
+from kpc.player.app.camera_paths import CameraPath
+from kpc.player.cpu import reference
+from kpc.player.gl import offscreen
+from kpc.tools.cli import kprender
 from PIL import Image
 from scenes import surrounded, tiny_scene, varied
 
 import kpc
-from kpc.format.scene.cameras import load_shots
-from kpc.format.common.errors import DisplayError
-from kpc.format.container.scene_io import write
-from kpc.format.common.media import read_image, read_video
-from kpc.format.coding.quantise import quantise_scene
-from kpc.player.cpu import reference
-from kpc.player.gl import offscreen
-from kpc.player.app.camera_paths import CameraPath
-from kpc.tools.cli import kprender
 
 
 @pytest.fixture(scope="module")
@@ -125,8 +125,19 @@ def test_depth_in_contracted_space_reaches_far_and_says_where_it_stops(run, tmp_
     write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales], skip_unseen=False), path)
     pose = scene.cameras[0].camera_to_world.copy()
     pose[:3, 3] = [0.1, 0.05, 1.4]  # in the open, the wall behind it all
-    camera.write_text(json.dumps({"w": 40, "h": 30, "fl_x": 12, "fl_y": 12, "cx": 20, "cy": 15, "frames": [
-        {"file": "a.png", "time": 0.4, "transform_matrix": pose.tolist()}]}))
+    camera.write_text(
+        json.dumps(
+            {
+                "w": 40,
+                "h": 30,
+                "fl_x": 12,
+                "fl_y": 12,
+                "cx": 20,
+                "cy": 15,
+                "frames": [{"file": "a.png", "time": 0.4, "transform_matrix": pose.tolist()}],
+            }
+        )
+    )
     assert run(path, "--cameras", camera, "--backend", "reference", "--depth", "-o", tmp_path)[0] == 0
     scene = kpc.load(path)
     wanted = reference.render(scene, load_shots(camera)[0].camera, 0.4).depth
@@ -160,10 +171,14 @@ def test_a_path_becomes_a_video_and_its_keyframes_pictures(run, scene_file: Path
     for time, camera in zip((0.0, 0.4, 0.9), (*tiny_scene(4).cameras, tiny_scene(4).cameras[0])):
         path = path.with_keyframe(camera, time, 0.5)
     path.save(tmp_path / "path.json")
-    code, said, _ = run(scene_file, "--path", tmp_path / "path.json", "--backend", "reference", "-o", tmp_path / "a.mp4", "--fps", 6)
+    code, said, _ = run(
+        scene_file, "--path", tmp_path / "path.json", "--backend", "reference", "-o", tmp_path / "a.mp4", "--fps", 6
+    )
     assert code == 0 and "7 frames at 6 fps, 48x36" in said
     frames = list(read_video(tmp_path / "a.mp4"))
-    code, said, _ = run(scene_file, "--cameras", tmp_path / "path.json", "--backend", "reference", "-o", tmp_path / "keys")
+    code, said, _ = run(
+        scene_file, "--cameras", tmp_path / "path.json", "--backend", "reference", "-o", tmp_path / "keys"
+    )
     assert code == 0 and "3 pictures" in said
     for number, frame in enumerate((frames[0], frames[3], frames[6])):
         key = read_image(tmp_path / "keys" / f"{number:04d}.png")
@@ -222,10 +237,16 @@ def varied_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("backend", ["gl", "reference"])
-@pytest.mark.parametrize("text, one, other, share", [
-    ("dawn.jpg", 0, 0, 0), ("x:y:0.5", 3, 3, 0), ("dawn.jpg:5:00 pm:0.3", 0, 1, 0.3), ("5:00 pm:a/b.jpg:1", 1, 2, 1.0),
-    ("x:y:0.5:dawn.jpg:0.75", 3, 0, 0.75),
-])
+@pytest.mark.parametrize(
+    "text, one, other, share",
+    [
+        ("dawn.jpg", 0, 0, 0),
+        ("x:y:0.5", 3, 3, 0),
+        ("dawn.jpg:5:00 pm:0.3", 0, 1, 0.3),
+        ("5:00 pm:a/b.jpg:1", 1, 2, 1.0),
+        ("x:y:0.5:dawn.jpg:0.75", 3, 0, 0.75),
+    ],
+)
 def test_appearances_by_name_and_between_two(
     run, varied_file: Path, tmp_path: Path, backend: str, text: str, one: int, other: int, share: float
 ) -> None:
@@ -243,11 +264,20 @@ def test_appearances_by_name_and_between_two(
     assert np.abs(wanted - average).max() > 5 / 255
 
 
-@pytest.mark.parametrize("text, words", [
-    ("dusk.jpg", "'dusk.jpg'"), ("", "''"), ("dawn.jpg:dusk.jpg", "'dawn.jpg:dusk.jpg'"), ("dawn.jpg:dusk.jpg:0.5", "'dusk.jpg'"),
-    ("dawn.jpg:a/b.jpg:1.5", "not a share"), ("dawn.jpg:a/b.jpg:x", "not a share"),
-])
-def test_appearances_that_are_not_there(run, varied_file: Path, scene_file: Path, tmp_path: Path, text: str, words: str) -> None:
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("dusk.jpg", "'dusk.jpg'"),
+        ("", "''"),
+        ("dawn.jpg:dusk.jpg", "'dawn.jpg:dusk.jpg'"),
+        ("dawn.jpg:dusk.jpg:0.5", "'dusk.jpg'"),
+        ("dawn.jpg:a/b.jpg:1.5", "not a share"),
+        ("dawn.jpg:a/b.jpg:x", "not a share"),
+    ],
+)
+def test_appearances_that_are_not_there(
+    run, varied_file: Path, scene_file: Path, tmp_path: Path, text: str, words: str
+) -> None:
     arguments = ("--appearance", text, "--time", 0, "--backend", "reference", "-o", tmp_path / "x.png")
     code, _, complaint = run(varied_file, *arguments)
     assert code == 2 and words in complaint and complaint.count("\n") == 1

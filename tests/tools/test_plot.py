@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-
 from kpc.format.common.errors import FormatError
 from kpc.tools.bench import plot, results
 
@@ -30,7 +29,12 @@ def test_a_line_a_dataset_through_medians_in_the_order_of_time_and_a_dot_a_repea
     assert (line.get_label(), other.get_label()) == ("a, fast", "b, fast")
     assert line.get_color() == dots.get_color() != other.get_color()
     assert line.get_xydata().tolist() == [[61 / 60, 21.0], [10.0, 30.0]]
-    assert sorted(map(tuple, dots.get_xydata().tolist())) == [(1.0, 20.0), (61 / 60, 28.0), (62 / 60, 21.0), (10.0, 30.0)]
+    assert sorted(map(tuple, dots.get_xydata().tolist())) == [
+        (1.0, 20.0),
+        (61 / 60, 28.0),
+        (62 / 60, 21.0),
+        (10.0, 30.0),
+    ]
     assert size.lines[2].get_xydata().tolist() == [[1.0, 60.0]]
     assert psnr.get_xscale() == "log"
 

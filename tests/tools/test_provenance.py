@@ -4,10 +4,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
-
-import kpc
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.tools.bench import provenance
+
+import kpc
 
 
 def test_the_hash_of_a_folder_is_of_names_and_contents(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@ import json
 from pathlib import Path
 
 import pytest
-
 from kpc.format.common.errors import FormatError
 from kpc.tools.bench import results
 
@@ -40,7 +39,9 @@ def test_tables_are_split_by_machine_and_say_where_they_come_from() -> None:
 
 
 def player_records(name: str, size: str = "320x240", renderer: str = "llvmpipe") -> list[results.Record]:
-    accuracy = dict.fromkeys(("samples_per_ray", "psnr_least", "psnr_turning", "within_one_level"), 0.5) | {"psnr": 41.6}
+    accuracy = dict.fromkeys(("samples_per_ray", "psnr_least", "psnr_turning", "within_one_level"), 0.5) | {
+        "psnr": 41.6
+    }
     return [
         encode_record(name, [30.0], kind="player", accuracy=accuracy, renderer=renderer, repeats=[{"fps": 31.4}],
                       settings={"quality": quality, "default": "balanced", "size": size})
@@ -57,14 +58,19 @@ def test_documents_show_only_the_default_quality_and_the_reference() -> None:
 
 
 def test_at_a_glance_each_scene_that_a_processor_plays_is_beside_its_encoding() -> None:
-    scene, asked = encode_record("room", [30.0]), encode_record("room", [20.0], settings={"preset": "fast", "psnr_db": 20.0})
+    scene, asked = (
+        encode_record("room", [30.0]),
+        encode_record("room", [20.0], settings={"preset": "fast", "psnr_db": 20.0}),
+    )
     played = [player_records("room-fast", "640x480"), player_records("room-fast"), player_records("room-fast", "640x480", "NVIDIA"),
               player_records("fox-fast", "640x480")]  # fmt: skip
     head, _, *rows = results.glance([scene, asked, *(record for records in played for record in records)]).splitlines()
     assert rows == ["| room | fast | 30.00 | 0.900 | 346 | 2 | 2 | 31 | 42 |"] and head.count("|") == rows[0].count("|")
 
 
-def test_what_is_between_a_documents_markers_is_rewritten_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_between_a_documents_markers_is_rewritten_and_nothing_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     readme, tables, records = tmp_path / "README.md", tmp_path / "tables.md", tmp_path / "a.json"
     before, after = "before\n\n<!-- glance: begin; a word -->", "<!-- glance: end -->\n\nafter\n"
     readme.write_text(f"{before}\nold\n{after}")
@@ -76,10 +82,15 @@ def test_what_is_between_a_documents_markers_is_rewritten_and_nothing_else(tmp_p
     text = readme.read_text()
     assert text.startswith(f"{before}\n\n| dataset |") and text.endswith(f"\n\n{after}") and "old" not in text
     text = tables.read_text()
-    assert text.startswith("<!-- step: begin -->\n\n\n\n<!-- step: end -->\n<!-- encode: begin -->\n\n**Encoding**") and text.count("| room |") == 1
+    assert (
+        text.startswith("<!-- step: begin -->\n\n\n\n<!-- step: end -->\n<!-- encode: begin -->\n\n**Encoding**")
+        and text.count("| room |") == 1
+    )
 
 
-def test_records_without_a_place_are_named_and_nothing_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_records_without_a_place_are_named_and_nothing_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     document, records = tmp_path / "a.md", tmp_path / "a.json"
     document.write_text("<!-- step: begin --><!-- step: end -->")
     records.write_text(json.dumps([encode_record("room", [30.0])]))

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from kpc.encoder.datasets import load_dataset, rays
-from kpc.format.scene.cameras import Camera, load_shots
 from kpc.format.common.media import read_image
+from kpc.format.scene.cameras import Camera, load_shots
 from kpc.tools.dev import scenegen
 from kpc.tools.dev.scenegen import GRADES, Film, Options, movers, rig, unseen
 
@@ -103,7 +102,9 @@ def test_shortcuts_change_nothing(monkeypatch: pytest.MonkeyPatch, time: float) 
     quick = Film(rig(TINY)[0], TINY).picture(time)
     small = movers
     monkeypatch.setattr(
-        scenegen, "movers", lambda t, *c: tuple(scenegen.Mover(m.centre, 6.0, m.distance, m.materials) for m in small(t, *c))
+        scenegen,
+        "movers",
+        lambda t, *c: tuple(scenegen.Mover(m.centre, 6.0, m.distance, m.materials) for m in small(t, *c)),
     )
     slow = Film(rig(TINY)[0], TINY).picture(time)
     difference = np.abs(quick.astype(int) - slow)

@@ -6,7 +6,6 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-
 from kpc.tools.cli import serve
 from kpc.tools.cli.serve import Line, serving
 
@@ -70,7 +69,18 @@ def test_a_slow_line_is_slow(folder: Path) -> None:
 
 
 def test_the_command_says_the_addresses(folder: Path) -> None:
-    command = [sys.executable, "-m", "kpc.tools.cli.serve", str(folder), "--port", "0", "--rate", "8Mbit", "--delay", "1ms"]
+    command = [
+        sys.executable,
+        "-m",
+        "kpc.tools.cli.serve",
+        str(folder),
+        "--port",
+        "0",
+        "--rate",
+        "8Mbit",
+        "--delay",
+        "1ms",
+    ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         url = server.stdout.readline().strip()
@@ -78,7 +88,9 @@ def test_the_command_says_the_addresses(folder: Path) -> None:
         server.terminate()
 
 
-@pytest.mark.parametrize("arguments", [["nowhere"], [".", "--port", "70000"], [".", "--rate", "fast"], [".", "--delay", "1s"]])
+@pytest.mark.parametrize(
+    "arguments", [["nowhere"], [".", "--port", "70000"], [".", "--rate", "fast"], [".", "--delay", "1s"]]
+)
 def test_wrong_options_are_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     try:
         code = serve.main(arguments)

@@ -17,12 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import zstandard
-from PIL import Image, features
-
+from kpc.format.coding.quantise import needed_texels, reached_by
 from kpc.format.common.errors import MediaError
 from kpc.format.common.media import ffmpeg_binary
-from kpc.format.coding.quantise import needed_texels, reached_by
 from kpc.format.scene.scene import TIME_PLANES, Scene
+from PIL import Image, features
 
 Planes = Sequence[Mapping[str, np.ndarray]]
 """As `Scene.scales`."""

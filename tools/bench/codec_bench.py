@@ -24,25 +24,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
+from kpc.encoder.datasets import Dataset, load_dataset, rays
+from kpc.encoder.evaluation.validation_rays import Measure, Measured, Probe
+from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.rdo import codec_model
+from kpc.encoder.rdo.codec_model import Model
+from kpc.encoder.rdo.distortion import Name
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
 from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, Quantise, Trade
-from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.datasets import Dataset, load_dataset, rays
-from kpc.encoder.rdo.codec_model import Model
-from kpc.encoder.evaluation.validation_rays import Measure, Measured, Probe
 from kpc.encoder.rdo.sequential_finetune import coded_in_groups
-from kpc.encoder.rdo.distortion import Name
-from kpc.format.container import scene_io
-from kpc.format.common.errors import KpcError, TrainingError
 from kpc.format.coding.quantise import quantise_scene, round_decoder
+from kpc.format.common.errors import KpcError, TrainingError
+from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 from kpc.tools.bench import baselines
-from kpc.tools.dev.processes import end_with_parent
-from kpc.tools.bench.rd_curves import Point, bd_rate, size_at
-from kpc.tools.bench.provenance import machine
 from kpc.tools.bench.baselines import Coding, Rival
+from kpc.tools.bench.provenance import machine
+from kpc.tools.bench.rd_curves import Point, bd_rate, size_at
+from kpc.tools.dev.processes import end_with_parent
 
 RATES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Bits per parameter that our coder is asked for, of the file and all that is in it."""
@@ -58,9 +57,12 @@ WITHOUT: dict[str, Quantise | None] = {
     "kpc without tuning": None,
     GRIDS_AS_THEY_ARE: None,
     "kpc, channels apart": quantise_by_cost,
-    "kpc, never in blocks": lambda scene, steps, reached, significant: quantise_by_cost(scene, steps, reached, significant, blocks=False),
+    "kpc, never in blocks": lambda scene, steps, reached, significant: quantise_by_cost(
+        scene, steps, reached, significant, blocks=False
+    ),
     "kpc, never around predictions": lambda scene, steps, reached, significant: quantise_by_cost(
-        scene, steps, reached, significant, thin=0.0, blocks=False),
+        scene, steps, reached, significant, thin=0.0, blocks=False
+    ),
     "kpc without the trellis": lambda scene, steps, reached, significant: quantise_scene(scene, steps, reached=reached),
     "kpc, every texel alike": lambda scene, steps, reached, significant: quantise_by_cost(scene, steps, reached),
 }
@@ -115,7 +117,9 @@ class Notes:
             scene_io.write(json.dumps([key, point]) + "\n")
 
 
-def measure(scene: Path, dataset: Path | None, processes: int, ablate: bool, notes: Notes | None = None) -> list[dict[str, Any]]:
+def measure(
+    scene: Path, dataset: Path | None, processes: int, ablate: bool, notes: Notes | None = None
+) -> list[dict[str, Any]]:
     """The coders, ours first, then, to `ablate`, WITHOUT: each its name, its points (or why it has none) and by how much ours is smaller.
     What `notes` hold is not measured again.
 
@@ -128,7 +132,11 @@ def measure(scene: Path, dataset: Path | None, processes: int, ablate: bool, not
     rates = {f"{rate:g} bits": Trade(target_bytes=int(rate * count / 8)) for rate in RATES}
     qualities = {f"quality {q:g}": Trade(quality=q) for q in QUALITIES}
     ours = [OURS, *(WITHOUT if ablate else ())]
-    jobs = [Job(scene, name, said, trade) for name in ours for said, trade in ((rates if name == OURS else {}) | qualities).items()]
+    jobs = [
+        Job(scene, name, said, trade)
+        for name in ours
+        for said, trade in ((rates if name == OURS else {}) | qualities).items()
+    ]
     others_at_hand = RIVALS | {name: RIVALS[rival] for name, rival in TUNED.items() if rival in RIVALS}
     missing = {name: why for name, rival in others_at_hand.items() if (why := rival.missing())}
     jobs += [Job(scene, name, setting) for name, rival in others_at_hand.items() if name not in missing
@@ -177,7 +185,15 @@ def point(job: Job) -> Point | None:
     if job.coder in RIVALS:
         coding = RIVALS[job.coder].code(_tidied(job.scene), int(job.setting))
         judged = measured(replace(source.scene, scales=tuple(coding.planes)))
-        return _point(job, source, coding.size_bytes, others_bytes(job.scene), (coding.encode_s, coding.decode_s), uncoded.psnr, judged)
+        return _point(
+            job,
+            source,
+            coding.size_bytes,
+            others_bytes(job.scene),
+            (coding.encode_s, coding.decode_s),
+            uncoded.psnr,
+            judged,
+        )
     started = time.perf_counter()
     if job.coder in TUNED:
         scene, codings = tuned_through(RIVALS[TUNED[job.coder]], int(job.setting), source.scene)
@@ -188,8 +204,14 @@ def point(job: Job) -> Point | None:
         return found | {"search_s": searched - started}
     try:
         tune_steps = TUNE_STEPS if job.coder == OURS else 0
-        coded = codec_model.code(source, job.trade, TrainConfig().prune_share, tune_steps, WITHOUT.get(job.coder),
-                           grids=job.coder != GRIDS_AS_THEY_ARE)
+        coded = codec_model.code(
+            source,
+            job.trade,
+            TrainConfig().prune_share,
+            tune_steps,
+            WITHOUT.get(job.coder),
+            grids=job.coder != GRIDS_AS_THEY_ARE,
+        )
     except TrainingError:
         return None
     searched = time.perf_counter()
@@ -200,7 +222,10 @@ def point(job: Job) -> Point | None:
     stored = stored_bytes(data)
     others = _of_others(stored)
     found = _point(job, source, len(data) - others, others, took, uncoded.psnr, measured(scene))
-    return found | {"search_s": searched - started, "shares": {kind: count / len(data) for kind, count in stored.items()}}
+    return found | {
+        "search_s": searched - started,
+        "shares": {kind: count / len(data) for kind, count in stored.items()},
+    }
 
 
 def tuned_through(rival: Rival, setting: int, scene: Scene) -> tuple[Scene, list[Coding]]:
@@ -211,15 +236,27 @@ def tuned_through(rival: Rival, setting: int, scene: Scene) -> tuple[Scene, list
     def coded(candidate: Scene, group: Sequence[Name]) -> dict[Name, np.ndarray]:
         planes = baselines.tidied(candidate)
         scales = sorted({s for s, _ in group})
-        codings.append(rival.code([{name: plane for name, plane in planes[s].items() if (s, name) in group} for s in scales], setting))
-        return {(s, name): plane for s, back in zip(scales, codings[-1].planes, strict=True) for name, plane in back.items()}
+        codings.append(
+            rival.code(
+                [{name: plane for name, plane in planes[s].items() if (s, name) in group} for s in scales], setting
+            )
+        )
+        return {
+            (s, name): plane for s, back in zip(scales, codings[-1].planes, strict=True) for name, plane in back.items()
+        }
 
     back = coded_in_groups(scene, scene, coded, TUNE_STEPS)
     return replace(back, decoder=round_decoder(back.decoder)), codings
 
 
 def _point(
-    job: Job, source: Model, planes_size: int, others_size: int, took: tuple[float, float], uncoded_psnr: float, judged: Measured
+    job: Job,
+    source: Model,
+    planes_size: int,
+    others_size: int,
+    took: tuple[float, float],
+    uncoded_psnr: float,
+    judged: Measured,
 ) -> Point:
     size = planes_size + others_size
     return {
@@ -321,5 +358,7 @@ def as_csv(records: Sequence[dict[str, Any]]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, CSV_COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    writer.writerows({"name": record["name"], "coder": record["coder"]} | point for record in records for point in record["points"])
+    writer.writerows(
+        {"name": record["name"], "coder": record["coder"]} | point for record in records for point in record["points"]
+    )
     return text.getvalue()

@@ -13,18 +13,17 @@ from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
-from numba import njit
-
 from kpc.format.coding import predictive, rans, transform
+from kpc.format.coding.predictive import ANY, AROUND, MOST_DECISIONS, SET_COUNTS, TRELLIS, WEIGHTS, fitted
+from kpc.format.coding.quantise import needed_texels
+from kpc.format.coding.rans import words_of
 from kpc.format.coding.transform import DECISIONS as LEVEL_DECISIONS
 from kpc.format.coding.transform import FREQUENCIES, blocks_in
 from kpc.format.container.container import pack
 from kpc.format.container.scene_io import SceneReader, read, scene_chunks
-from kpc.format.coding.quantise import needed_texels
-from kpc.format.coding.rans import words_of
-from kpc.format.scene.scene import ALL_PLANES
 from kpc.format.container.segments import SegmentGuide, encode_coded, guide_at
-from kpc.format.coding.predictive import ANY, AROUND, MOST_DECISIONS, SET_COUNTS, TRELLIS, WEIGHTS, fitted
+from kpc.format.scene.scene import ALL_PLANES
+from numba import njit
 
 DECODINGS = 5
 TABLE_BITS = 12
@@ -63,14 +62,23 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
         if chunk.kind == "PLNE":
             name = ALL_PLANES[chunk.plane]
             plane = quantised.scales[chunk.scale][name]
-            rows, guide = slice(chunk.row_start, chunk.row_start + chunk.row_count), guide_at(plane.guide, chunk.row_start)
-            told = plane.symbols[rows], plane.coded[rows], needed_texels(quantised.occupancy, name, *plane.coded.shape)[rows]
+            rows, guide = (
+                slice(chunk.row_start, chunk.row_start + chunk.row_count),
+                guide_at(plane.guide, chunk.row_start),
+            )
+            told = (
+                plane.symbols[rows],
+                plane.coded[rows],
+                needed_texels(quantised.occupancy, name, *plane.coded.shape)[rows],
+            )
             segments.append(Segment(*told, guide, encode_coded(*told[:2], guide, told[2])))
     values = sum(plane.symbols.size for planes in quantised.scales for plane in planes.values())
     found = {
         "nothing": _decoded(pack(chunks, values))
         | {"file_bytes": scene.stat().st_size, "read_ms": _median_ms(partial(read, scene.read_bytes()))},
-        "all of them: zstd": _decoded(pack([replace(chunk, coded={}) if chunk.kind == "PLNE" else chunk for chunk in chunks], values)),
+        "all of them: zstd": _decoded(
+            pack([replace(chunk, coded={}) if chunk.kind == "PLNE" else chunk for chunk in chunks], values)
+        ),
     }
     for name, idea in LEFT_OUT.items():
         if any(map(idea.has, segments)):
@@ -161,8 +169,22 @@ def _even_signs():
 
 
 CALLERS = {
-    predictive: ("begin_row", "remember", "next_state", "next_place", "predict", "nearest", "foreseen", "meant", "told", "activity", "natural",
-              "integer", "walk_map", "walk"),
+    predictive: (
+        "begin_row",
+        "remember",
+        "next_state",
+        "next_place",
+        "predict",
+        "nearest",
+        "foreseen",
+        "meant",
+        "told",
+        "activity",
+        "natural",
+        "integer",
+        "walk_map",
+        "walk",
+    ),
     transform: ("walk_signs", "walk_levels"),
 }
 """What calls what may be changed, and that itself, each before those that call it."""
@@ -178,7 +200,9 @@ def _compiled(module: ModuleType, changes: dict[str, Any]) -> Walks:
     return names
 
 
-def _bytes(segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callable[[np.ndarray], float] | None = None) -> int:
+def _bytes(
+    segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callable[[np.ndarray], float] | None = None
+) -> int:
     """What a segment takes that is told symbol by symbol, with the best number of sets of weights, or with none; with those of its guide, if it has
     one. `size` is of a trace, else of its words."""
     told, coded = np.array(segment.symbols, order="C"), np.ascontiguousarray(segment.coded)  # `walk` writes
@@ -196,7 +220,9 @@ def _bytes(segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callab
             _, at = walks["walk_map"](coded, 0, at, None, trace)
             trace[:at] -= 8192 * (size is not None)  # counters of the map are others
         _, at, _ = walks["walk"](told, coded, lattice, weights, 0, at, None, trace, None)
-        sizes.append(2 + (weights.size if counts or guide else 0) + (size(trace[:at]) if size else 2 * len(words_of(trace[:at]))))
+        sizes.append(
+            2 + (weights.size if counts or guide else 0) + (size(trace[:at]) if size else 2 * len(words_of(trace[:at])))
+        )
     return round(min(sizes))
 
 
@@ -283,6 +309,8 @@ LEFT_OUT: dict[str, OfSymbols | OfBlocks | OfMaps] = {
     "blocks: no levels around": OfBlocks({"level_context": _frequency_alone}),
     "blocks: no frequency": OfBlocks({"level_context": _without_frequency}),
     "blocks: no channel before": OfBlocks({"level_context": _without_before}),
-    "blocks: counters that know nothing at first": OfBlocks({"level_counters": _even_levels, "sign_counters": _even_signs}),
+    "blocks: counters that know nothing at first": OfBlocks(
+        {"level_counters": _even_levels, "sign_counters": _even_signs}
+    ),
 }
 """By what the tables call them."""

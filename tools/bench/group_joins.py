@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, true_picture
 from kpc.encoder.rdo.codec_model import with_two_texels
-from kpc.format.container import scene_io
 from kpc.format.common.fidelity import psnr
+from kpc.format.container import scene_io
 from kpc.format.container.groups import Groups
 
 AROUND = 5
@@ -62,7 +61,9 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
     """
     groups = Groups(scene)
     timeline, first = groups.timeline, groups.timeline.spans[0].start
-    begun: dict[tuple[int, int], np.ndarray] = {}  # what a group makes of frames that are mixed of it and the next; by camera
+    begun: dict[
+        tuple[int, int], np.ndarray
+    ] = {}  # what a group makes of frames that are mixed of it and the next; by camera
     last_of: dict[int, np.ndarray] = {}
     found: list[Frame] = []
     agreements: list[list[float]] = [[] for _ in timeline.spans]
@@ -88,7 +89,10 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
             last_of[camera] = error
             shown, _ = timeline.at(_time(groups, frame))
             found.append(Frame(some.camera_names[camera], frame, shown, psnr(error, 0), change))
-    return {"frames": [asdict(frame) for frame in found], "joins": [asdict(join) for join in _joins(groups, found, agreements)]}
+    return {
+        "frames": [asdict(frame) for frame in found],
+        "joins": [asdict(join) for join in _joins(groups, found, agreements)],
+    }
 
 
 def _time(groups: Groups, frame: int) -> float:
@@ -98,8 +102,10 @@ def _time(groups: Groups, frame: int) -> float:
 def _joins(groups: Groups, frames: list[Frame], agreements: list[list[float]]) -> list[Join]:
     spans, first = groups.timeline.spans, groups.timeline.spans[0].start
     starts = [min(frame.frame for frame in frames if frame.group == number) for number in range(1, len(spans))]
-    shared = [{start, *range(after.start - first + 1, before.last - first + 1)}
-              for start, before, after in zip(starts, spans, spans[1:], strict=False)]
+    shared = [
+        {start, *range(after.start - first + 1, before.last - first + 1)}
+        for start, before, after in zip(starts, spans, spans[1:], strict=False)
+    ]
     others = [f.change for f in frames if f.change is not None and not any(f.frame in some for some in shared)] or [0.0]
     found = []
     for start, some, agreement in zip(starts, shared, agreements[1:], strict=True):

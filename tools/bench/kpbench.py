@@ -34,18 +34,16 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
-
 from kpc.format.common import cli
-
-from kpc.format.container import scene_io
 from kpc.format.common.errors import KpcError, UsageError
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.memory import peak_memory_bytes
+from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 from kpc.player.quality import DEFAULT, LADDER
 from kpc.tools.bench import results
-from kpc.tools.dev.processes import end_with_parent
 from kpc.tools.bench.provenance import commit, data_hash, machine, versions
+from kpc.tools.dev.processes import end_with_parent
 
 T = TypeVar("T")
 
@@ -139,7 +137,9 @@ def _ablate(options: argparse.Namespace, origin: results.Record) -> Iterator[res
     runs: list[Run] = []
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         for source in options.datasets:
-            job = _job(options, _folder(source), options.seed, Path(scratch) / "none.kpc", Path(scratch) / f"{len(runs)}.work")
+            job = _job(
+                options, _folder(source), options.seed, Path(scratch) / "none.kpc", Path(scratch) / f"{len(runs)}.work"
+            )
             runs += [(source, {"ablation": name}) for name in _alone(_ablations, job)]
     yield from _encodes("ablate", options, origin, runs)
 
@@ -164,7 +164,9 @@ def _encodes(
                 "test_views": options.test_views,
             }
             record = _record(kind, _folder(source), origin, settings) | {"seed": options.seed, "repeats": []}
-            told = "" if kind == "encode" else "-" + "-".join(str(value) for value in changes.values()).replace(" ", "-")
+            told = (
+                "" if kind == "encode" else "-" + "-".join(str(value) for value in changes.values()).replace(" ", "-")
+            )
             label = f"{record['name']}-{options.preset}{told}"
             for seed in range(options.seed, options.seed + options.repeats):
                 suffix = f"-{seed}" if options.repeats > 1 else ""
@@ -177,7 +179,10 @@ def _encodes(
                     **changes,
                 )
                 said = ", ".join(f"{key} {value}" for key, value in changes.items() if value is not None)
-                print(f"kpbench: {record['name']}, {options.preset}, {said + ', ' if said else ''}seed {seed}", file=sys.stderr)
+                print(
+                    f"kpbench: {record['name']}, {options.preset}, {said + ', ' if said else ''}seed {seed}",
+                    file=sys.stderr,
+                )
                 device, outcome = _alone(_encode_once, job)
                 record["repeats"].append(outcome)
             yield record | {"renderer": device}
@@ -188,7 +193,12 @@ def _step(options: argparse.Namespace, origin: results.Record) -> Iterator[resul
     _encoder()  # what is missing is said before anything is read
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         for source in options.datasets:
-            settings = {"preset": options.preset, "downscale": options.downscale, "space": options.space, "box": options.box}
+            settings = {
+                "preset": options.preset,
+                "downscale": options.downscale,
+                "space": options.space,
+                "box": options.box,
+            }
             record = _record("step", _folder(source), origin, settings) | {"seed": options.seed, "repeats": []}
             work = Path(scratch) / f"{record['name']}.work"
             job = _job(options, source, options.seed, Path(scratch) / "none.kpc", work)
@@ -299,7 +309,12 @@ def _player(options: argparse.Namespace, origin: results.Record) -> Iterator[res
     whatever else the machine does slows them all alike."""
     for source in options.scenes:
         scene_io.read(source)  # what is wrong with it is told before anything is measured
-        common = {"size": "{}x{}".format(*options.size), "frames": options.frames, "warm_up": WARM_UP, "default": DEFAULT}
+        common = {
+            "size": "{}x{}".format(*options.size),
+            "frames": options.frames,
+            "warm_up": WARM_UP,
+            "default": DEFAULT,
+        }
         record = _record("player", source, origin, common)
         job = Play(source, options.size, options.frames)
         print(f"kpbench: {record['name']}", file=sys.stderr)
@@ -321,8 +336,8 @@ def _play_once(job: Play) -> dict[str, results.Record]:
     """Of each quality: open the file, draw the first frame, then `job.frames` more, the clip's own one after the other; by fragment and by
     compute shaders where there is a choice, of which the faster counts."""
     from kpc.player.gl import offscreen
-    from kpc.player.orbit import Rig, fitted
     from kpc.player.gl.renderer import Renderer, tries_compute
+    from kpc.player.orbit import Rig, fitted
     from kpc.tools.bench.machine_limits import texel_rate
 
     begun = clock.perf_counter()
@@ -352,7 +367,12 @@ def _play_once(job: Play) -> dict[str, results.Record]:
             shown = clock.perf_counter()
             parts = {"load_ms": 1e3 * (loaded - opened), "upload_ms": 1e3 * (uploaded - started),
                      "first_render_ms": 1e3 * (shown - uploaded)}  # fmt: skip
-            found[name, way] = {"way": way, "context_ms": 1e3 * (opened - begun), **parts, "first_frame_ms": sum(parts.values())}
+            found[name, way] = {
+                "way": way,
+                "context_ms": 1e3 * (opened - begun),
+                **parts,
+                "first_frame_ms": sum(parts.values()),
+            }
     took: dict[tuple[str, str], list[tuple[float, float]]] = {key: [] for key in renderers}
     times = _frame_times(scene, WARM_UP + job.frames, 1.0)
     for first in range(0, len(times), TURN):
@@ -375,7 +395,9 @@ def _play_once(job: Play) -> dict[str, results.Record]:
             "gpu_memory_bytes": renderer.memory_bytes,
             "peak_memory_bytes": peak_memory_bytes(),
         }
-        if renderer.quality.tolerance == 0 and renderer.rays_across(camera) == 1 and renderer.texels_a_sample:  # all it shows has been marched for it
+        if (
+            renderer.quality.tolerance == 0 and renderer.rays_across(camera) == 1 and renderer.texels_a_sample
+        ):  # all it shows has been marched for it
             texels = renderer.texels_a_sample * float(renderer.render(camera, 1.0).samples.sum())
             peak = texel_rate(ctx, key[1] == "compute", "f2" if renderer.in_half else "f4")
             best[name] |= {"texels_a_frame": texels, "share_of_texel_rate": texels / (1e-3 * median[key]) / peak}
@@ -402,7 +424,12 @@ def _steady(options: argparse.Namespace, origin: results.Record) -> Iterator[res
 
     for source in options.scenes:
         record = _record("steady", source, origin, {"size": "{}x{}".format(*options.size), "frames": options.frames})
-        yield _in_window(record, options.repeats, playback_stability.measure, playback_stability.Steady(source, options.size, options.frames))
+        yield _in_window(
+            record,
+            options.repeats,
+            playback_stability.measure,
+            playback_stability.Steady(source, options.size, options.frames),
+        )
 
 
 def _window(options: argparse.Namespace, origin: results.Record) -> Iterator[results.Record]:
@@ -415,7 +442,9 @@ def _window(options: argparse.Namespace, origin: results.Record) -> Iterator[res
         yield _in_window(_record("window", source, origin, settings), options.repeats, pacing.measure, job)
 
 
-def _in_window(record: results.Record, repeats: int, measure: Callable[[Any], results.Record], job: object) -> results.Record:
+def _in_window(
+    record: results.Record, repeats: int, measure: Callable[[Any], results.Record], job: object
+) -> results.Record:
     """A record with what was measured, each time in a process of its own."""
     print(f"kpbench: {record['name']}", file=sys.stderr)
     found = [_alone(measure, job) for _ in range(repeats)]
@@ -437,9 +466,9 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
     """
     from kpc.player.cpu import reference
     from kpc.player.gl import offscreen
+    from kpc.player.gl.renderer import Renderer
     from kpc.player.orbit import Rig, fitted, orbit
     from kpc.player.quality import Quality
-    from kpc.player.gl.renderer import Renderer
 
     ctx = offscreen.open_context()
     scene = scene_io.read(job.scene).dequantise()
@@ -486,7 +515,9 @@ def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[resu
 
     folders: list[Path | None] = options.dataset or [None] * len(options.scenes)
     if len(folders) != len(options.scenes):
-        raise UsageError(f"--dataset is given {len(folders)} times for {len(options.scenes)} scenes; name one for each, or none")
+        raise UsageError(
+            f"--dataset is given {len(folders)} times for {len(options.scenes)} scenes; name one for each, or none"
+        )
     if options.out is not None:
         from kpc.tools.bench import plot  # needs matplotlib
     records: list[results.Record] = []
@@ -495,8 +526,10 @@ def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[resu
         judged_by = "its own probe" if folder is None else f"held-out views of {_folder(folder).resolve().name}"
         record = _record("codec", source, origin, {"judged_by": judged_by, "processes": options.processes})
         print(f"kpbench: {record['name']}, judged by {judged_by}", file=sys.stderr)
-        notes = options.out and codec_bench.Notes(options.out.with_suffix(f".{record['name']}.points"), {
-            key: record[key] for key in ("commit", "data_sha256", "machine", "versions", "settings")})
+        notes = options.out and codec_bench.Notes(
+            options.out.with_suffix(f".{record['name']}.points"),
+            {key: record[key] for key in ("commit", "data_sha256", "machine", "versions", "settings")},
+        )
         coders = codec_bench.measure(source, folder, options.processes, options.ablate, notes)
         for coder in coders:
             repeats = [codec_bench.headline(coder["points"])]
@@ -537,14 +570,18 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="encode|curve|ablate|step|groups|player|stream|window|steady|codec|entropy")
+    kinds = parser.add_subparsers(
+        dest="kind", required=True, metavar="encode|curve|ablate|step|groups|player|stream|window|steady|codec|entropy"
+    )
 
     encode = kinds.add_parser("encode", help="kpenc on each dataset", description="Run kpenc on each dataset.")
     encode.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
     encode.add_argument("--time-budget", type=cli.duration_s, metavar="10m", help="of training, instead of steps")
     encode.set_defaults(measure=_encode)
 
-    curve = kinds.add_parser("curve", help="quality against time", description="Run kpenc on each dataset for each time.")
+    curve = kinds.add_parser(
+        "curve", help="quality against time", description="Run kpenc on each dataset for each time."
+    )
     curve.add_argument("--minutes", type=_minutes, default=(1.0, 2.0, 5.0, 10.0, 20.0), metavar="1,2,5,10,20",
                        help="of training, a run of its own for each (default: 1,2,5,10,20)")  # fmt: skip
     curve.set_defaults(measure=_curve, steps=None)
@@ -554,28 +591,40 @@ def _parser() -> argparse.ArgumentParser:
     ablate.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
     ablate.set_defaults(measure=_ablate)
 
-    step = kinds.add_parser("step", help="where the time of training goes", description="Profile a training step, on the CPU.")
+    step = kinds.add_parser(
+        "step", help="where the time of training goes", description="Profile a training step, on the CPU."
+    )
     step.set_defaults(measure=_step, device="cpu")
 
     groups = kinds.add_parser("groups", help="a long clip in groups", description="Run kpenc --group on each dataset: memory of "
                               "one group and of all, and how steady held-out views are where groups join.")  # fmt: skip
-    groups.add_argument("--group", type=cli.duration_s, default=10.0, metavar="10s", help="that each shows (default: 10s)")
+    groups.add_argument(
+        "--group", type=cli.duration_s, default=10.0, metavar="10s", help="that each shows (default: 10s)"
+    )
     groups.add_argument("--steps", type=_positive, help="optimiser steps of the first group instead of the preset's")
     groups.set_defaults(measure=_groups)
 
     for kind in (encode, curve, ablate, step, groups):
         kind.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="folders, as for kpenc")
         kind.add_argument("--preset", choices=("draft", "fast", "balanced", "best", "paper"), default="balanced")
-        kind.add_argument("--seed", type=int, default=0, help="of the first repeat; each next one takes the next number")
+        kind.add_argument(
+            "--seed", type=int, default=0, help="of the first repeat; each next one takes the next number"
+        )
         kind.add_argument("--downscale", type=_positive, default=1, help="average blocks of N x N pixels first")
-        kind.add_argument("--space", choices=("auto", "box", "contracted", "ndc"), default="auto", help="of every dataset")
+        kind.add_argument(
+            "--space", choices=("auto", "box", "contracted", "ndc"), default="auto", help="of every dataset"
+        )
         kind.add_argument("--box", type=cli.box_corners, metavar="x0,y0,z0,x1,y1,z1", help="of every dataset")
         kind.set_defaults(psnr=None)
-    encode.add_argument("--psnr", type=cli.decibels, metavar="30dB", help="the smallest files of at least this PSNR on training views")
+    encode.add_argument(
+        "--psnr", type=cli.decibels, metavar="30dB", help="the smallest files of at least this PSNR on training views"
+    )
     for kind in (encode, curve, ablate, groups):
         kind.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
         kind.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
-        kind.add_argument("--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there, and what `codec` takes, .kpck")
+        kind.add_argument(
+            "--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files there, and what `codec` takes, .kpck"
+        )
 
     player = kinds.add_parser("player", help="draw each scene, headless", description="Draw each scene, headless.")
     player.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
@@ -592,16 +641,22 @@ def _parser() -> argparse.ArgumentParser:
     playback_stability = kinds.add_parser("steady", help="long playback in a window", description="Whether memory stays as it is, and nothing "
                               "is made anew on the graphics card, while scenes play in a window. Wants a display.")  # fmt: skip
     playback_stability.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
-    playback_stability.add_argument("--size", type=_size, default=(320, 240), metavar="WxH", help="of the window (default: 320x240)")
+    playback_stability.add_argument(
+        "--size", type=_size, default=(320, 240), metavar="WxH", help="of the window (default: 320x240)"
+    )
     playback_stability.add_argument("--frames", type=_positive, default=10_000, help="to draw (default: 10000)")
     playback_stability.set_defaults(measure=_steady)
 
     window = kinds.add_parser("window", help="playback in a window that is left to itself", description="On how fine a raster, and how "
                               "often, a window draws scenes as they play, and how near that is to exact pictures. Wants a display.")  # fmt: skip
     window.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help=".kpc files")
-    window.add_argument("--size", type=_size, default=(800, 600), metavar="WxH", help="of the window (default: 800x600)")
+    window.add_argument(
+        "--size", type=_size, default=(800, 600), metavar="WxH", help="of the window (default: 800x600)"
+    )
     window.add_argument("--seconds", type=_positive, default=20, metavar="S", help="to look at (default: 20)")
-    window.add_argument("--turn", type=float, default=0.0, metavar="DEGREES", help="a second, around the scene meanwhile (default: 0)")
+    window.add_argument(
+        "--turn", type=float, default=0.0, metavar="DEGREES", help="a second, around the scene meanwhile (default: 0)"
+    )
     window.set_defaults(measure=_window)
 
     codec = kinds.add_parser("codec", help="rate against distortion, beside general tools",
@@ -612,7 +667,11 @@ def _parser() -> argparse.ArgumentParser:
     codec.add_argument("--dataset", type=Path, action="append", metavar="DIR",
                        help="judge by its held-out views; once for each scene, in their order (default: training pixels of a "
                             "checkpoint, a file's own pictures)")  # fmt: skip
-    codec.add_argument("--ablate", action="store_true", help="measure our own coder with one of its ideas left out, too: for each of them")
+    codec.add_argument(
+        "--ablate",
+        action="store_true",
+        help="measure our own coder with one of its ideas left out, too: for each of them",
+    )
     codec.add_argument("--processes", type=_positive, default=int(machine()["cores"]), metavar="N",
                        help="at a time (default: one a core)")  # fmt: skip
     codec.set_defaults(measure=_codec)

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import moderngl
 import numba
 import numpy as np
-from numba import njit, prange
-
 from kpc.player.gl.shader import build, build_compute
+from numba import njit, prange
 
 CACHED_BYTES = 1 << 20
 """Of three arrays together for each thread: what fits a second-level cache."""
@@ -64,7 +63,11 @@ SHORTEST_S = 0.05
 def texel_rate(ctx: moderngl.Context, compute: bool, dtype: str) -> float:
     """Look-ups a second, at most: filtered, of four channels of `dtype` ("f4" or "f2"), by neighbours that read side by side, in a compute
     or else a fragment shader. (A card need not let all its units draw: of an H100's, few do.)"""
-    texels = np.random.default_rng(0).random(4 * TEXTURE_SIDE**2, np.float32).astype({"f4": np.float32, "f2": np.float16}[dtype])
+    texels = (
+        np.random.default_rng(0)
+        .random(4 * TEXTURE_SIDE**2, np.float32)
+        .astype({"f4": np.float32, "f2": np.float16}[dtype])
+    )
     texture = ctx.texture((TEXTURE_SIDE, TEXTURE_SIDE), 4, texels.tobytes(), dtype=dtype)
     texture.filter = moderngl.LINEAR, moderngl.LINEAR
     seen = ctx.texture((PICTURE_SIDE, PICTURE_SIDE), 4, dtype="f4")

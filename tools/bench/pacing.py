@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from kpc.format.common.fidelity import psnr
-from kpc.player.gl import offscreen
 from kpc.player.app.desktop import glfw
 from kpc.player.app.preferences import Preferences
+from kpc.player.gl import offscreen
 from kpc.tools.bench.playback_stability import in_window
 
 LEAD_IN_S = 5.0

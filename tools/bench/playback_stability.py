@@ -11,15 +11,14 @@ from typing import Any
 
 import moderngl
 import numpy as np
-
-from kpc.format.container.container import open_source
 from kpc.format.common.memory import peak_memory_bytes
-from kpc.player.gl import offscreen
+from kpc.format.container.container import open_source
 from kpc.player.app.controls import Pace
 from kpc.player.app.desktop import glfw
 from kpc.player.app.preferences import Preferences
-from kpc.player.streaming.group_playback import Reel
 from kpc.player.app.window import Player, Window
+from kpc.player.gl import offscreen
+from kpc.player.streaming.group_playback import Reel
 
 MAKERS = ("texture", "texture3d", "texture_array", "texture_cube", "depth_texture", "buffer", "framebuffer", "simple_framebuffer",
           "renderbuffer", "vertex_array", "simple_vertex_array", "program", "sampler", "compute_shader", "query")  # fmt: skip
@@ -89,7 +88,10 @@ def in_window(scene: Path, size: tuple[int, int], preferences: Preferences) -> I
     Raises:
         DisplayError: there is no display.
     """
-    with contextlib.closing(Window("kpbench", size)) as window, contextlib.closing(Reel(open_source(str(scene)))) as stream:
+    with (
+        contextlib.closing(Window("kpbench", size)) as window,
+        contextlib.closing(Reel(open_source(str(scene)))) as stream,
+    ):
         glfw.swap_interval(0)
         with contextlib.closing(Player(window, stream, preferences)) as player:
             yield player

@@ -15,14 +15,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from kpc.format.common import cli
+from kpc.format.common.errors import FormatError, UsageError
+from kpc.tools.bench import results
 from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-from kpc.format.common import cli
-from kpc.format.common.errors import FormatError, UsageError
-from kpc.tools.bench import results
 
 PANELS = (("test_psnr", "held-out PSNR, dB", 1.0), ("test_ssim", "held-out SSIM", 1.0), ("size_bytes", "file, KB", 1e3))
 """Keys of a repeat, what they are, and their units."""
@@ -140,14 +139,25 @@ def qualities(records: Sequence[results.Record]) -> Figure:
         if record["kind"] == "player" and record["settings"]["quality"] != "reference":
             settings = record["settings"]
             lines.setdefault(f"{record['name']}, {settings['size']}", []).append(
-                (results.median(record, "frame_ms_median") or 0.0, record["accuracy"]["psnr"], settings["quality"] == settings["default"])
+                (
+                    results.median(record, "frame_ms_median") or 0.0,
+                    record["accuracy"]["psnr"],
+                    settings["quality"] == settings["default"],
+                )
             )
     if not lines:
         raise FormatError("no records of kpbench player to draw; write some with kpbench player --out")
     figure = Figure(figsize=RATE_PANEL_INCHES, layout="constrained")
     axes = figure.subplots()
     for number, (name, points) in enumerate(lines.items()):
-        axes.plot([ms for ms, *_ in points], [psnr for _, psnr, _ in points], marker="o", markersize=3, color=f"C{number}", label=name)
+        axes.plot(
+            [ms for ms, *_ in points],
+            [psnr for _, psnr, _ in points],
+            marker="o",
+            markersize=3,
+            color=f"C{number}",
+            label=name,
+        )
         axes.plot(*zip(*[(ms, psnr) for ms, psnr, default in points if default]), "o", markersize=9, markerfacecolor="none",
                   color=f"C{number}")  # fmt: skip
     axes.set(xlabel="milliseconds a frame", ylabel="PSNR to the reference, dB")
@@ -189,12 +199,18 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser("plot", description="Quality and size against training, rate against distortion, or time against truth.")
-    parser.add_argument("records", type=Path, nargs="+", help="files that kpbench curve, codec, groups or player --out wrote")
+    parser = argparse.ArgumentParser(
+        "plot", description="Quality and size against training, rate against distortion, or time against truth."
+    )
+    parser.add_argument(
+        "records", type=Path, nargs="+", help="files that kpbench curve, codec, groups or player --out wrote"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .svg, .png or .pdf file to write")
     options = parser.parse_args(argv)
     records = results.load(options.records)
-    draw = {"codec": rate_distortion, "groups": per_frame, "player": qualities}.get(records[0]["kind"] if records else "", curves)
+    draw = {"codec": rate_distortion, "groups": per_frame, "player": qualities}.get(
+        records[0]["kind"] if records else "", curves
+    )
     save(draw(records), options.output)
     print(options.output)
 

@@ -84,7 +84,9 @@ def _prefixes(record: Record) -> str:
 
 def _at_joins(record: Record) -> str:
     """Of each join; changes are in 8-bit levels."""
-    return "; ".join(f"{join['before']:.1f}, {join['after']:.1f}; {255 * join['change']:.1f}" for join in record["joins"])
+    return "; ".join(
+        f"{join['before']:.1f}, {join['after']:.1f}; {255 * join['change']:.1f}" for join in record["joins"]
+    )
 
 
 def _usual_change(record: Record) -> str:
@@ -124,14 +126,18 @@ def _quality_table(records: Iterable[Record]) -> list[list[str]]:
     for record in records:
         if record["coder"] == "kpc":
             labelled = ((str(point["setting"]), point) for point in record["points"])
-            points = {label.removeprefix("quality "): point for label, point in labelled if label.startswith("quality ")}
+            points = {
+                label.removeprefix("quality "): point for label, point in labelled if label.startswith("quality ")
+            }
             rows.append((record["name"], points))
     qualities = sorted({quality for _, points in rows for quality in points}, key=float)
 
     def cell(point: Record | None) -> str:
         return "-" if point is None else f"{point['size_bytes'] / 1e3:.0f} KB, {point['loss_db']:.2f} dB"
 
-    return [["scene", *qualities]] + [[name, *(cell(points.get(quality)) for quality in qualities)] for name, points in rows]
+    return [["scene", *qualities]] + [
+        [name, *(cell(points.get(quality)) for quality in qualities)] for name, points in rows
+    ]
 
 
 def _loss_table(records: Sequence[Record]) -> list[list[str]]:
@@ -146,7 +152,11 @@ def _loss_table(records: Sequence[Record]) -> list[list[str]]:
             ours = size_at(points.get("kpc", []), loss)
             sizes = {coder: size for coder in points if not is_ours(coder) and (size := size_at(points[coder], loss))}
             best = min(sizes, key=lambda coder: sizes[coder], default=None)
-            row.append("-" if ours is None else f"{ours / 1e3:.0f} KB" + (f", {1 - ours / sizes[best]:.0%} ({best})" if best else ""))
+            row.append(
+                "-"
+                if ours is None
+                else f"{ours / 1e3:.0f} KB" + (f", {1 - ours / sizes[best]:.0%} ({best})" if best else "")
+            )
         rows.append(row)
     return [["scene", *(f"{loss:g} dB" for loss in LOSSES_DB)], *rows]
 
@@ -218,7 +228,10 @@ COLUMNS: dict[str, list[Column]] = {
     ],
     "player": [
         ("scene", lambda r: r["name"]),
-        ("quality", lambda r: r["settings"]["quality"] + " (default)" * (r["settings"]["quality"] == r["settings"]["default"])),
+        (
+            "quality",
+            lambda r: r["settings"]["quality"] + " (default)" * (r["settings"]["quality"] == r["settings"]["default"]),
+        ),
         ("size", lambda r: r["settings"]["size"]),
         ("first frame ms", _number("first_frame_ms", "{:.0f}")),
         ("median ms", _number("frame_ms_median", "{:.1f}")),
@@ -308,12 +321,20 @@ COLUMNS: dict[str, list[Column]] = {
     ],
 }
 
-TITLES = {"encode": "Encoding", "curve": "Encoding, quality against time", "ablate": "Encoding, one thing changed",
-          "step": "A step of training", "gpu": "A step of training", "player": "Playing", "stream": "Playing while it arrives",
-          "groups": "A clip in groups",
-          "window": "Playing in a window that is left to itself",
-          "steady": "Playing for long, all controls shown",
-          "codec": "Coding, beside what is at hand", "entropy": "Entropy coding of planes, one idea left out; one core"}
+TITLES = {
+    "encode": "Encoding",
+    "curve": "Encoding, quality against time",
+    "ablate": "Encoding, one thing changed",
+    "step": "A step of training",
+    "gpu": "A step of training",
+    "player": "Playing",
+    "stream": "Playing while it arrives",
+    "groups": "A clip in groups",
+    "window": "Playing in a window that is left to itself",
+    "steady": "Playing for long, all controls shown",
+    "codec": "Coding, beside what is at hand",
+    "entropy": "Entropy coding of planes, one idea left out; one core",
+}
 
 
 def cells(kind: str, records: Iterable[Record]) -> list[list[str]]:
@@ -375,7 +396,13 @@ def glance(records: Sequence[Record]) -> str:
          str(encoded[name]["machine"]["cores"]), *(cell(played[name]) for cell in (_number("fps", "{:.0f}"), _accuracy("psnr", "{:.0f}")))]
         for name in played if name in encoded
     ]  # fmt: skip
-    head = [*(name for name, _ in _ENCODED), "encoded in minutes", "on cores", f"fps at {GLANCED_AT}", "dB to exact ones"]
+    head = [
+        *(name for name, _ in _ENCODED),
+        "encoded in minutes",
+        "on cores",
+        f"fps at {GLANCED_AT}",
+        "dB to exact ones",
+    ]
     return _lines(head, rows)
 
 
@@ -428,8 +455,15 @@ def names_in(document: Path) -> set[str]:
     """
     text, known = document.read_text(), {*TITLES, "glance"}
     names = [name for _, name, _, _ in MARKED.findall(text)]
-    if not names or len(MARKER.findall(text)) != 2 * len(names) or len({*names}) < len(names) or not known.issuperset(names):
-        raise FormatError(f"{document}: needs lines such as <!-- encode: begin --> and <!-- encode: end -->, a pair a name of {sorted(known)}")
+    if (
+        not names
+        or len(MARKER.findall(text)) != 2 * len(names)
+        or len({*names}) < len(names)
+        or not known.issuperset(names)
+    ):
+        raise FormatError(
+            f"{document}: needs lines such as <!-- encode: begin --> and <!-- encode: end -->, a pair a name of {sorted(known)}"
+        )
     return {*names}
 
 
@@ -451,7 +485,13 @@ def main(argv: list[str] | None = None) -> int:
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser("results", description="Tables of benchmark records, as Markdown.")
     parser.add_argument("records", type=Path, nargs="+", help="files that kpbench --out wrote")
-    parser.add_argument("--into", type=Path, nargs="+", default=[], help="rewrite those between these files' markers instead of printing")
+    parser.add_argument(
+        "--into",
+        type=Path,
+        nargs="+",
+        default=[],
+        help="rewrite those between these files' markers instead of printing",
+    )
     options = parser.parse_args(argv)
     records = load(options.records)
     if not options.into:

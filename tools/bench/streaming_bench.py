@@ -15,19 +15,18 @@ from typing import Any
 
 import moderngl
 import numpy as np
-
-from kpc.format.container.container import open_source
 from kpc.format.common.errors import KpcError
 from kpc.format.common.fidelity import psnr_of
-from kpc.format.container.scene_io import SceneReader, encode, read
+from kpc.format.container.container import open_source
 from kpc.format.container.partial import PartialScene
+from kpc.format.container.scene_io import SceneReader, encode, read
 from kpc.format.scene.scene import TIME_PLANES, Clip
-from kpc.player.gl import offscreen
 from kpc.player.app.controls import Pace
-from kpc.player.orbit import Rig, fitted
-from kpc.player.streaming.prefetch import Playhead, least_room
-from kpc.player.quality import Quality
+from kpc.player.gl import offscreen
 from kpc.player.gl.renderer import Renderer, is_software
+from kpc.player.orbit import Rig, fitted
+from kpc.player.quality import Quality
+from kpc.player.streaming.prefetch import Playhead, least_room
 from kpc.player.streaming.stream import Stream
 
 RATE, DELAY = "10Mbit", "20ms"
@@ -82,8 +81,13 @@ def _arrival(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, 
         sharp = clock.perf_counter()
         _until(stream, renderer, lambda: stream.is_settled)
         ended = clock.perf_counter()
-    return {"open_ms": 1e3 * (opened - begun), "first_picture_ms": 1e3 * (first - begun), "first_picture_bytes": received,
-            "finest_picture_ms": 1e3 * (sharp - begun), "all_ms": 1e3 * (ended - begun)}
+    return {
+        "open_ms": 1e3 * (opened - begun),
+        "first_picture_ms": 1e3 * (first - begun),
+        "first_picture_bytes": received,
+        "finest_picture_ms": 1e3 * (sharp - begun),
+        "all_ms": 1e3 * (ended - begun),
+    }
 
 
 def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, url: str) -> dict[str, Any]:
@@ -108,8 +112,13 @@ def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, ur
             waits.append(1e3 * (there - started))
             draws.append(1e3 * (clock.perf_counter() - there))
     together = [wait + drawn for wait, drawn in zip(waits, draws)]
-    return {"jumps": SEEKS, "jumps_that_waited": missed, "jump_wait_ms": float(np.median(waits)),
-            "jump_ms": float(np.median(together)), "jump_ms_p95": float(np.percentile(together, 95))}
+    return {
+        "jumps": SEEKS,
+        "jumps_that_waited": missed,
+        "jump_wait_ms": float(np.median(waits)),
+        "jump_ms": float(np.median(together)),
+        "jump_ms_p95": float(np.percentile(together, 95)),
+    }
 
 
 def prefixes(job: Arrival) -> list[dict[str, Any]]:
@@ -127,9 +136,17 @@ def prefixes(job: Arrival) -> list[dict[str, Any]]:
         if after is not None and (after.scale, after.row_start) == (entry.scale, entry.row_start):
             continue
         renderer = Renderer(ctx, scene.scene)
-        errors = [np.mean((renderer.render(camera, time).rgb.clip(0, 1) - rgb) ** 2) for time, rgb in zip(TIMES, wanted)]
-        found.append({"bytes": entry.offset + entry.stored_length, "scale": entry.scale, "row_start": entry.row_start,
-                      "psnr": psnr_of(float(np.mean(errors)))})
+        errors = [
+            np.mean((renderer.render(camera, time).rgb.clip(0, 1) - rgb) ** 2) for time, rgb in zip(TIMES, wanted)
+        ]
+        found.append(
+            {
+                "bytes": entry.offset + entry.stored_length,
+                "scale": entry.scale,
+                "row_start": entry.row_start,
+                "psnr": psnr_of(float(np.mean(errors))),
+            }
+        )
     return found
 
 
@@ -139,7 +156,11 @@ def _lengthened(scene: Path, folder: Path) -> Path:
     scales = tuple({name: replace(plane, symbols=np.tile(plane.symbols, (LONGER, 1, 1)), coded=np.tile(plane.coded, (LONGER, 1)),
                                   guide=None, starts=())
                     if name in TIME_PLANES else plane for name, plane in scale.items()} for scale in short.scales)  # fmt: skip
-    motion = None if short.motion is None else replace(short.motion, symbols=np.tile(short.motion.symbols, (LONGER, 1, 1, 1, 1)))
+    motion = (
+        None
+        if short.motion is None
+        else replace(short.motion, symbols=np.tile(short.motion.symbols, (LONGER, 1, 1, 1, 1)))
+    )
     long = replace(short, clip=Clip(short.clip.frame_count * LONGER, short.clip.fps), scales=scales, motion=motion,
                    occupancy=np.tile(short.occupancy, (LONGER, 1, 1, 1)))  # fmt: skip
     path = folder / scene.name

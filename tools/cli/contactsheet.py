@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
-
 from kpc.format.common import cli
 from kpc.format.common.errors import MediaError, UsageError
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.media import IMAGE_SUFFIXES, read_image, write_image
+from PIL import Image, ImageDraw, ImageFont
 
 GAP = 6
 CAPTION = 22

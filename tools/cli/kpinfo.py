@@ -16,13 +16,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-
-from kpc.format.common import cli
-from kpc.format.container.container import CODEC_MIDPOINTS, CODEC_RAW, CODEC_SYMBOLS, CODEC_ZSTD, DEFAULT_BUDGET, Entry, open_source
-from kpc.format.common.errors import FormatError, UsageError
-from kpc.format.container.scene_io import SceneReader, read
-from kpc.format.container.groups import Groups
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.common import cli
+from kpc.format.common.errors import FormatError, UsageError
+from kpc.format.container.container import (
+    CODEC_MIDPOINTS,
+    CODEC_RAW,
+    CODEC_SYMBOLS,
+    CODEC_ZSTD,
+    DEFAULT_BUDGET,
+    Entry,
+    open_source,
+)
+from kpc.format.container.groups import Groups
+from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, HybridDecoder
 from kpc.format.scene.space import FAR, Contraction, SpaceMapping
 from kpc.format.scene.static import static_share, unchanging_share
@@ -42,8 +49,13 @@ def _command(argv: list[str]) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--group", type=int, metavar="N", help="of a clip in groups, describe this one, from 0 on")
     parser.add_argument("--verify", action="store_true", help="check every CRC32C and decode everything")
-    parser.add_argument("--memory-budget", type=int, default=DEFAULT_BUDGET, metavar="BYTES",
-                        help="memory the scene may take (default: %(default)s)")
+    parser.add_argument(
+        "--memory-budget",
+        type=int,
+        default=DEFAULT_BUDGET,
+        metavar="BYTES",
+        help="memory the scene may take (default: %(default)s)",
+    )
     options = parser.parse_args(argv)
     if options.memory_budget < 1:
         raise UsageError(f"--memory-budget {options.memory_budget} is not positive")
@@ -80,8 +92,9 @@ def verify(reader: SceneReader) -> None:
             damaged.append((number, entry.kind, error))
     if len(damaged) > 1:
         listed = ", ".join(f"{number} ({kind})" for number, kind, _ in damaged)
-        raise FormatError(f"{reader.name}: {len(damaged)} of {len(reader.index)} chunks are damaged: {listed}; "
-                          "fetch the file again")
+        raise FormatError(
+            f"{reader.name}: {len(damaged)} of {len(reader.index)} chunks are damaged: {listed}; fetch the file again"
+        )
     if damaged:
         raise damaged[0][2]
     reader.mapping(), reader.motion(), reader.decoder(), reader.occupancy(), reader.cameras(), reader.appearances()
@@ -94,15 +107,24 @@ def describe_groups(groups: Groups) -> dict[str, Any]:
         if whole := groups.available(number):
             head = groups.open(number).head
         since, until = (round(time * clip.duration_s, 6) for time in groups.timeline.shown(number))
-        described.append({
-            "frames": [span.start, span.last], "shown_s": [since, until], "size_bytes": size, "missing": not whole,
-            "values": head.value_count if whole else None, "scales": len(head.scales) if whole else None,
-            "is_dynamic": head.is_dynamic if whole else None,
-        })
+        described.append(
+            {
+                "frames": [span.start, span.last],
+                "shown_s": [since, until],
+                "size_bytes": size,
+                "missing": not whole,
+                "values": head.value_count if whole else None,
+                "scales": len(head.scales) if whole else None,
+                "is_dynamic": head.is_dynamic if whole else None,
+            }
+        )
     return {
-        "file": groups.name, "version": groups.reader.header.version, "size_bytes": groups.reader.header.file_length,
+        "file": groups.name,
+        "version": groups.reader.header.version,
+        "size_bytes": groups.reader.header.file_length,
         "clip": {"frame_count": clip.frame_count, "fps": clip.fps, "duration_s": clip.duration_s},
-        "cameras": len(groups.cameras()), "groups": described,
+        "cameras": len(groups.cameras()),
+        "groups": described,
     }
 
 
@@ -113,13 +135,16 @@ def _page_of_groups(info: dict[str, Any]) -> str:
         + (", verified" if info["verified"] else ""),
         f"  clip        {clip['frame_count']} frames at {clip['fps']:g} fps, {clip['duration_s']:.2f} s, in "
         f"{len(info['groups'])} groups",
-        f"  cameras     {info['cameras']}", "",
+        f"  cameras     {info['cameras']}",
+        "",
         "  group       frames          shown, s       stored   scales       values",
     ]
     for number, group in enumerate(info["groups"]):
         (first, last), (since, until) = group["frames"], group["shown_s"]
         model = "missing" if group["missing"] else f"{group['scales']:>7}  {group['values']:>11,}"
-        lines.append(f"  {number:>5}  {first:>6}-{last:<6}  {since:>8.2f}-{until:<8.2f}  {group['size_bytes']:>9,}  {model}")
+        lines.append(
+            f"  {number:>5}  {first:>6}-{last:<6}  {since:>8.2f}-{until:<8.2f}  {group['size_bytes']:>9,}  {model}"
+        )
     return "\n".join(lines)
 
 
@@ -132,20 +157,34 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
         "version": reader.header.version,
         "size_bytes": size,
         "missing_chunks": sum(missing),
-        "clip": {"frame_count": scene.clip.frame_count, "fps": scene.clip.fps, "duration_s": scene.clip.duration_s,
-                 "is_dynamic": scene.is_dynamic},
+        "clip": {
+            "frame_count": scene.clip.frame_count,
+            "fps": scene.clip.fps,
+            "duration_s": scene.clip.duration_s,
+            "is_dynamic": scene.is_dynamic,
+        },
         "aabb": scene.aabb.tolist(),
         "step": scene.step,
         "space": _describe_space(scene.mapping),
-        "motion": None if scene.motion is None else
-                  {"rows": scene.motion.symbols.shape[0], "nodes_zyx": list(scene.motion.symbols.shape[1:4]),
-                   "largest": float(np.abs(scene.motion.dequantise()).max())},
+        "motion": None
+        if scene.motion is None
+        else {
+            "rows": scene.motion.symbols.shape[0],
+            "nodes_zyx": list(scene.motion.symbols.shape[1:4]),
+            "largest": float(np.abs(scene.motion.dequantise()).max()),
+        },
         "background": scene.background.tolist(),
         "scales": [_describe_scale(scale) for scale in scene.scales],
-        "decoder": {"kind": "hybrid" if isinstance(scene.decoder, HybridDecoder) else "explicit", "hidden": len(scene.decoder.b1),
-                    "features": sum(scale["xy"].symbols.shape[2] for scale in scene.scales)},
-        "occupancy": {"slots": scene.occupancy.shape[0], "cells_zyx": list(scene.occupancy.shape[1:]),
-                      "share": float(scene.occupancy.mean())},
+        "decoder": {
+            "kind": "hybrid" if isinstance(scene.decoder, HybridDecoder) else "explicit",
+            "hidden": len(scene.decoder.b1),
+            "features": sum(scale["xy"].symbols.shape[2] for scale in scene.scales),
+        },
+        "occupancy": {
+            "slots": scene.occupancy.shape[0],
+            "cells_zyx": list(scene.occupancy.shape[1:]),
+            "share": float(scene.occupancy.mean()),
+        },
         "cameras": len(scene.cameras),
         "camera_box": _camera_box(scene),
         "appearances": [appearance.name for appearance in scene.appearances],
@@ -162,8 +201,11 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
 def _describe_static(scene: QuantisedScene) -> dict[str, float]:
     """How much of what is occupied stands still: where time planes are 1, where nothing changes, and where little does."""
     decoded = scene.dequantise()
-    return {"identity_share": static_share(decoded), "unchanging_share": unchanging_share(decoded),
-            "still_share": still_share(decoded)}
+    return {
+        "identity_share": static_share(decoded),
+        "unchanging_share": unchanging_share(decoded),
+        "still_share": still_share(decoded),
+    }
 
 
 def _describe_space(mapping: SpaceMapping | None) -> dict[str, Any]:
@@ -178,8 +220,12 @@ def _describe_scale(scale: Mapping[str, QuantisedPlane]) -> dict[str, Any]:
     return {
         "channels": scale["xy"].symbols.shape[2],
         "planes": {
-            name: {"rows": plane.symbols.shape[0], "columns": plane.symbols.shape[1],
-                   "coded_share": float(plane.coded.mean()), "mean_step": float(plane.step.mean())}
+            name: {
+                "rows": plane.symbols.shape[0],
+                "columns": plane.symbols.shape[1],
+                "coded_share": float(plane.coded.mean()),
+                "mean_step": float(plane.step.mean()),
+            }
             for name, plane in scale.items()
         },
     }
@@ -193,7 +239,9 @@ def _describe_chunk(entry: Entry, missing: bool, size: int) -> dict[str, Any]:
         "scale": entry.scale if is_plane else None,
         "plane": ALL_PLANES[entry.plane] if is_plane else None,
         "rows": [entry.row_start, entry.row_start + entry.row_count] if is_plane else None,
-        "codec": "packed" if entry.kind == "came" and entry.codec == CODEC_SYMBOLS else CODEC_NAMES.get(entry.codec, str(entry.codec)),
+        "codec": "packed"
+        if entry.kind == "came" and entry.codec == CODEC_SYMBOLS
+        else CODEC_NAMES.get(entry.codec, str(entry.codec)),
         "offset": entry.offset,
         "stored_bytes": entry.stored_length,
         "raw_bytes": entry.raw_length,
@@ -242,14 +290,21 @@ def _page(info: dict[str, Any]) -> str:
         f"  don't care  {info['dont_care_share']:.1%} of the space-plane texels are not stored",
     ]
     if info["missing_chunks"]:
-        lines.append(f"  cut off     {info['missing_chunks']} of {len(info['chunks'])} chunks are missing and count as "
-                     "not stored")
+        lines.append(
+            f"  cut off     {info['missing_chunks']} of {len(info['chunks'])} chunks are missing and count as "
+            "not stored"
+        )
     lines += ["", "  chunk  kind  scale  plane  rows        codec      stored         raw   share"]
     for number, chunk in enumerate(info["chunks"]):
-        place = f"{'-':>5}  {'-':<5}  {'-':<10}" if chunk["plane"] is None else \
-            f"{chunk['scale']:>5}  {chunk['plane']:<5}  {chunk['rows'][0]:>4}-{chunk['rows'][1]:<5}"
-        lines.append(f"  {number:>5}  {chunk['kind']}  {place}  {chunk['codec']:<5}  {chunk['stored_bytes']:>10,}  "
-                     f"{chunk['raw_bytes']:>10,}  {chunk['share']:>6.1%}" + ("  missing" if chunk["missing"] else ""))
+        place = (
+            f"{'-':>5}  {'-':<5}  {'-':<10}"
+            if chunk["plane"] is None
+            else f"{chunk['scale']:>5}  {chunk['plane']:<5}  {chunk['rows'][0]:>4}-{chunk['rows'][1]:<5}"
+        )
+        lines.append(
+            f"  {number:>5}  {chunk['kind']}  {place}  {chunk['codec']:<5}  {chunk['stored_bytes']:>10,}  "
+            f"{chunk['raw_bytes']:>10,}  {chunk['share']:>6.1%}" + ("  missing" if chunk["missing"] else "")
+        )
     overhead = info["overhead_bytes"]
     lines.append(f"  header and index {overhead:>37,} {'':>12} {overhead / info['size_bytes']:>6.1%}")
     return "\n".join(lines)
@@ -260,8 +315,12 @@ def _space(space: Mapping[str, Any]) -> list[str]:
     if space["mapping"] == "box":
         return []
     if space["mapping"] == "ndc":
-        return [f"  space       device coordinates, the box being in those; near {space['near']:.4g}, baseline {space['baseline']:.4g}"]
-    return [f"  space       contracted beyond the box; even steps up to {space['even']:.4g}, rays end at {space['far']:.4g}"]
+        return [
+            f"  space       device coordinates, the box being in those; near {space['near']:.4g}, baseline {space['baseline']:.4g}"
+        ]
+    return [
+        f"  space       contracted beyond the box; even steps up to {space['even']:.4g}, rays end at {space['far']:.4g}"
+    ]
 
 
 def _motion(motion: Mapping[str, Any] | None) -> list[str]:

@@ -11,9 +11,8 @@ import sys
 from pathlib import Path
 
 from kpc.format.common import cli
-
-from kpc.format.container import groups
 from kpc.format.common.errors import UsageError
+from kpc.format.container import groups
 
 
 def main(argv: list[str] | None = None) -> int:

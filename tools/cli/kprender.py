@@ -22,23 +22,23 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
+from kpc.format.common import cli
+from kpc.format.common.errors import UsageError
+from kpc.format.common.media import write_image, write_video
+from kpc.format.common.progress import progress
+from kpc.format.container.groups import LongScene
+from kpc.format.scene.cameras import Camera, Shot, load_shots
+from kpc.format.scene.scene import Clip, Scene
+from kpc.format.scene.space import Contraction
+from kpc.player.app.camera_paths import CameraPath
+from kpc.player.cpu import reference
+from kpc.player.cpu.motion_map import dynamic_map
+from kpc.player.cpu.reference import Part, Rendering
+from kpc.player.orbit import Rig, fitted, orbit
+from kpc.player.quality import LADDER
 from PIL import Image, PngImagePlugin
 
 import kpc
-from kpc.format.common import cli
-from kpc.format.scene.cameras import Camera, Shot, load_shots
-from kpc.format.common.errors import UsageError
-from kpc.format.container.groups import LongScene
-from kpc.format.common.media import write_image, write_video
-from kpc.format.common.progress import progress
-from kpc.format.scene.scene import Clip, Scene
-from kpc.format.scene.space import Contraction
-from kpc.player.cpu import reference
-from kpc.player.cpu.motion_map import dynamic_map
-from kpc.player.orbit import Rig, fitted, orbit
-from kpc.player.app.camera_paths import CameraPath
-from kpc.player.quality import LADDER
-from kpc.player.cpu.reference import Part, Rendering
 
 Render = Callable[[Camera, float], Rendering]
 
@@ -102,7 +102,9 @@ def _parser() -> argparse.ArgumentParser:
         "--cameras", metavar="JSON", help="cameras and times: w h fl_x fl_y cx cy frames[file time transform_matrix]"
     )
     views.add_argument(
-        "--path", metavar="JSON", help="a smooth way through such cameras, that passes each `at` so many seconds (else 2 s apart)"
+        "--path",
+        metavar="JSON",
+        help="a smooth way through such cameras, that passes each `at` so many seconds (else 2 s apart)",
     )
     views.add_argument("--orbit", type=_count, metavar="N", help="N pictures along a path around the scene")
     parser.add_argument(
@@ -147,7 +149,12 @@ def _parser() -> argparse.ArgumentParser:
         default="png",
         help="of pictures in a directory: 8-bit, or linear float colour and depth (default: %(default)s)",
     )
-    parser.add_argument("--fps", type=cli.frame_rate(SLOWEST, FASTEST), metavar="F", help="of an mp4, and of --path (default: the clip's)")
+    parser.add_argument(
+        "--fps",
+        type=cli.frame_rate(SLOWEST, FASTEST),
+        metavar="F",
+        help="of an mp4, and of --path (default: the clip's)",
+    )
     parser.add_argument(
         "--backend",
         choices=("gl", "reference"),
@@ -180,7 +187,9 @@ def _appearance(scene: Scene, text: str | None) -> np.ndarray | None:
     try:
         so_far = _moment(share)
     except argparse.ArgumentTypeError as error:
-        raise UsageError(f"--appearance {text}: {share!r} is not a share in [0, 1]; give NAME or NAME:NAME:SHARE") from error
+        raise UsageError(
+            f"--appearance {text}: {share!r} is not a share in [0, 1]; give NAME or NAME:NAME:SHARE"
+        ) from error
     cuts = [k for k, letter in enumerate(pair) if letter == ":"]
     cut = next((k for k in cuts if names.issuperset({pair[:k], pair[k + 1 :]})), cuts[0])
     return scene.appearance_between(pair[:cut], pair[cut + 1 :], so_far)
@@ -216,7 +225,9 @@ def _fps(clip: Clip, options: argparse.Namespace) -> float:
 def _path_shots(clip: Clip, options: argparse.Namespace) -> list[Shot]:
     path, fps = CameraPath.load(options.path), _fps(clip, options)
     if (path.end_s - path.start_s) * fps >= MOST:
-        raise UsageError(f"--path {options.path}: {path.end_s - path.start_s:g} s at {fps:g} fps are more than {MOST} pictures")
+        raise UsageError(
+            f"--path {options.path}: {path.end_s - path.start_s:g} s at {fps:g} fps are more than {MOST} pictures"
+        )
     return path.shots(fps)
 
 
@@ -251,10 +262,26 @@ def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Re
     if options.backend == "reference":
 
         def by_reference(camera: Camera, time: float) -> Rendering:
-            return reference.mixed([
-                (shown(scene, camera, time, reference.render(scene, camera, time, part=options.part,
-                                                             appearance=_appearance(scene, options.appearance))), share)
-                for scene, time, share in loaded.mixed(time)])
+            return reference.mixed(
+                [
+                    (
+                        shown(
+                            scene,
+                            camera,
+                            time,
+                            reference.render(
+                                scene,
+                                camera,
+                                time,
+                                part=options.part,
+                                appearance=_appearance(scene, options.appearance),
+                            ),
+                        ),
+                        share,
+                    )
+                    for scene, time, share in loaded.mixed(time)
+                ]
+            )
 
         return by_reference, "reference renderer (numpy)"
     from kpc.player.gl import offscreen

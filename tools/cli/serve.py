@@ -131,7 +131,9 @@ class _Server(http.server.ThreadingHTTPServer):
 
 
 @contextmanager
-def serving(folder: Path, *, port: int = 0, line: Line | None = None, handler: type[Handler] = Handler) -> Iterator[str]:
+def serving(
+    folder: Path, *, port: int = 0, line: Line | None = None, handler: type[Handler] = Handler
+) -> Iterator[str]:
     """Serve a folder to this machine while the context lasts; gives the URL of the folder, without a slash at its end."""
     server = _Server(("127.0.0.1", port), partial(handler, directory=str(folder), line=line))
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
@@ -152,7 +154,9 @@ def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser("serve", description="Serve a folder to this machine by HTTP, with byte ranges.")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--port", type=int, default=8000, help="default: %(default)s")
-    parser.add_argument("--rate", type=_rate, default=float("inf"), metavar="10Mbit", help="bits a second, all requests together")
+    parser.add_argument(
+        "--rate", type=_rate, default=float("inf"), metavar="10Mbit", help="bits a second, all requests together"
+    )
     parser.add_argument("--delay", type=_delay, default=0.0, metavar="40ms", help="before every answer")
     options = parser.parse_args(argv)
     if not options.folder.is_dir():

@@ -25,12 +25,11 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-
 from kpc.format.common import cli
-from kpc.format.scene.cameras import Camera
 from kpc.format.common.errors import UsageError
 from kpc.format.common.media import srgb_from_linear, write_image, write_video
 from kpc.format.common.progress import progress
+from kpc.format.scene.cameras import Camera
 from kpc.tools.dev.processes import end_with_parent
 
 Distance = Callable[[np.ndarray], np.ndarray]
@@ -247,7 +246,11 @@ class Paint:
         return _plain(colour, p)
 
     def _floor(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        wood = self._planks(x, y) if "planks" in self.content.patterns else _plain((0.43, 0.24, 0.115), np.stack([x, x, x]))
+        wood = (
+            self._planks(x, y)
+            if "planks" in self.content.patterns
+            else _plain((0.43, 0.24, 0.115), np.stack([x, x, x]))
+        )
         if "rug" not in self.content.patterns:
             return wood
         r = np.hypot(x - 0.1, (y + 0.25) * 1.15)
@@ -686,7 +689,9 @@ def generate(target: str | os.PathLike[str], options: Options) -> None:
         (camera, options, folder, f"cam{k:02d}", times, stills if k == 0 else []) for k, camera in enumerate(filmed)
     ]
     jobs += [(camera, options, folder, f"novel{k:02d}", [], stills[1:-1] or stills) for k, camera in enumerate(extra)]
-    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(jobs)), multiprocessing.get_context("spawn"), end_with_parent) as pool:
+    with ProcessPoolExecutor(
+        min(os.cpu_count() or 1, len(jobs)), multiprocessing.get_context("spawn"), end_with_parent
+    ) as pool:
         depths = list(progress(pool.map(_film, jobs), "filming", len(jobs), "camera"))
     rows = [_poses_bounds(camera, *bounds) for camera, bounds in zip(filmed, depths)]
     with cli.written_aside(folder / "poses_bounds.npy") as aside:

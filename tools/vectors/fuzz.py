@@ -26,13 +26,12 @@ from typing import Any
 import google_crc32c
 import numpy as np
 import zstandard
-
 from kpc.format.common import cli
-from kpc.format.container.container import CODEC_RAW, CODEC_ZSTD, ENTRY, HEADER, Entry, Reader, header_and_index
 from kpc.format.common.errors import FormatError, KpcError, UsageError
-from kpc.format.container.scene_io import GROUP_KIND, SceneReader, read
+from kpc.format.container.container import CODEC_RAW, CODEC_ZSTD, ENTRY, HEADER, Entry, Reader, header_and_index
 from kpc.format.container.groups import Groups
 from kpc.format.container.partial import PartialScene
+from kpc.format.container.scene_io import GROUP_KIND, SceneReader, read
 from kpc.format.scene.scene import ALL_PLANES
 from kpc.tools.vectors import specvectors
 
@@ -52,9 +51,42 @@ LONG = ("limits-cameras", "limits-appearances")
 """Vectors of so many equal things that reading them takes 0.23 and 0.1 s, of the others 4 ms on average."""
 
 BITS = {1: "<B", 2: "<H", 4: "<I", 8: "<Q"}
-WHOLES = (0, 1, 2, 3, 7, 127, 128, 255, 256, 0x7FFF, 0x8000, 0xFFFF, 0x10000, 1 << 24, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 50)
+WHOLES = (
+    0,
+    1,
+    2,
+    3,
+    7,
+    127,
+    128,
+    255,
+    256,
+    0x7FFF,
+    0x8000,
+    0xFFFF,
+    0x10000,
+    1 << 24,
+    0x7FFFFFFF,
+    0x80000000,
+    0xFFFFFFFF,
+    1 << 50,
+)
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-30, 1e30, 3e38, float("nan"), float("inf"), -float("inf"), 5e-324, 1e300)
-HEADER_FIELDS = ((0, 8), (8, 2), (10, 2), (12, 4), (16, 8), (24, 4), (28, 4), (32, 8), (40, 8), (48, 4), (52, 4), (56, 4), (60, 4))
+HEADER_FIELDS = (
+    (0, 8),
+    (8, 2),
+    (10, 2),
+    (12, 4),
+    (16, 8),
+    (24, 4),
+    (28, 4),
+    (32, 8),
+    (40, 8),
+    (48, 4),
+    (52, 4),
+    (56, 4),
+    (60, 4),
+)
 ENTRY_FIELDS = ((0, 4), (4, 2), (6, 1), (7, 1), (8, 4), (12, 4), (16, 2), (18, 2), (20, 4), (24, 4), (28, 4), (32, 8))
 KINDS = ("SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "PLNE", "GRUP", "note", "Note")
 
@@ -77,14 +109,26 @@ class Taken:
     @staticmethod
     def of(data: bytes) -> "Taken":
         reader = Reader(data, allow_partial=True)
-        return Taken(reader.header.value_count, tuple(
-            Piece(entry, reader.stored(number)) for number, entry in enumerate(reader.index) if reader.available(number)))
+        return Taken(
+            reader.header.value_count,
+            tuple(
+                Piece(entry, reader.stored(number))
+                for number, entry in enumerate(reader.index)
+                if reader.available(number)
+            ),
+        )
 
     def together(self) -> bytes:
         """A file again, right in all but what the pieces say."""
-        entries = [replace(e, stored_length=len(body), crc=google_crc32c.value(body),
-                           raw_length=len(body) if e.codec == CODEC_RAW else min(e.raw_length, 0xFFFFFFFF))
-                   for e, body in ((piece.entry, piece.body) for piece in self.pieces)]
+        entries = [
+            replace(
+                e,
+                stored_length=len(body),
+                crc=google_crc32c.value(body),
+                raw_length=len(body) if e.codec == CODEC_RAW else min(e.raw_length, 0xFFFFFFFF),
+            )
+            for e, body in ((piece.entry, piece.body) for piece in self.pieces)
+        ]
         return header_and_index(entries, self.value_count) + b"".join(piece.body for piece in self.pieces)
 
 
@@ -104,7 +148,7 @@ def scrambled(rng: random.Random, body: bytes) -> bytes:
                 out[at] = rng.randrange(256)
             case 2 | 3:
                 put = _number(rng, rng.choice((1, 2, 4, 8)))
-                out[at:at + len(put)] = put
+                out[at : at + len(put)] = put
             case 4:
                 del out[at:until]
             case 5:
@@ -127,7 +171,7 @@ def in_header(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> byte
     """A field of the header changed, its checksum right."""
     out = bytearray(taken.together())
     at, size = rng.choice(HEADER_FIELDS)
-    out[at:at + size] = _number(rng, size) if rng.random() < 0.7 else rng.randbytes(size)
+    out[at : at + size] = _number(rng, size) if rng.random() < 0.7 else rng.randbytes(size)
     struct.pack_into("<I", out, 60, google_crc32c.value(bytes(out[:60])))
     return bytes(out)
 
@@ -139,11 +183,11 @@ def in_index(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes
         (field, size), number = rng.choice(ENTRY_FIELDS), rng.randrange(len(taken.pieces))
         at = HEADER.size + ENTRY.size * number + field
         if field == 0:
-            out[at:at + 4] = rng.choice(KINDS).encode()
+            out[at : at + 4] = rng.choice(KINDS).encode()
         else:
-            before = int.from_bytes(out[at:at + size], "little")
+            before = int.from_bytes(out[at : at + size], "little")
             nearby = (before + rng.choice((-2, -1, 1, 2)) & (1 << 8 * size) - 1).to_bytes(size, "little")
-            out[at:at + size] = nearby if rng.random() < 0.5 else _number(rng, size)
+            out[at : at + size] = nearby if rng.random() < 0.5 else _number(rng, size)
     if rng.random() < 0.3:  # else what is too long is all that is ever seen
         struct.pack_into("<I", out, 48, min(len(out) << 15, 0xFFFFFFFF))
     return specvectors.resealed(bytes(out))
@@ -151,6 +195,7 @@ def in_index(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes
 
 def in_columns(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
     """As `in_index`, of a file of version 2: one or two bytes of entries, the frame around them, or their number."""
+
     def edited(told: bytes) -> bytes:
         out = bytearray(told)
         for _ in range(rng.choice((1, 1, 2)) if out else 0):
@@ -209,7 +254,7 @@ def of_chunks(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> byte
 def of_bytes(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
     """Any bytes changed, checksums left as they were; or the file cut."""
     data = taken.together()
-    return data[:rng.randrange(len(data))] if rng.random() < 0.5 else scrambled(rng, data)
+    return data[: rng.randrange(len(data))] if rng.random() < 0.5 else scrambled(rng, data)
 
 
 MUTATIONS: dict[str, Mutation] = {
@@ -250,8 +295,14 @@ def _decompressed(body: bytes) -> bytes | None:
 def seeds(only: str = "") -> list[Taken]:
     """The valid conformance vectors whose names begin with one of `only`, separated by commas, taken apart, but for those that would take more time than all others together."""
     begins = tuple(only.split(","))
-    return [Taken.of(data) for path, data in specvectors.vectors().items()
-            if path.startswith("valid/") and path.endswith(".kpc") and Path(path).stem.startswith(begins) and Path(path).stem not in LONG]
+    return [
+        Taken.of(data)
+        for path, data in specvectors.vectors().items()
+        if path.startswith("valid/")
+        and path.endswith(".kpc")
+        and Path(path).stem.startswith(begins)
+        and Path(path).stem not in LONG
+    ]
 
 
 def examined(data: bytes, budget: int = BUDGET) -> str:
@@ -300,7 +351,9 @@ def file_number(seed: int, number: int, starts: Sequence[Taken]) -> bytes:
     return mutated(rng, rng.choice(starts), starts)
 
 
-def _work(pipe: Connection, now: Any, seed: int, numbers: range, skipped: frozenset[int], budget: int, only: str) -> None:
+def _work(
+    pipe: Connection, now: Any, seed: int, numbers: range, skipped: frozenset[int], budget: int, only: str
+) -> None:
     """Examine files; tell (next number, outcomes, findings) every so often. `now`: the number at hand, and since when, in
     seconds of computing and on the clock."""
     warnings.simplefilter("error")
@@ -347,8 +400,15 @@ def _computed_s(pid: int) -> float:
         return 0.0
 
 
-def run(count: int, seed: int, processes: int, budget: int = BUDGET, say: Callable[[str], None] = lambda text: None,
-        first: int = 0, only: str = "") -> dict[str, Any]:
+def run(
+    count: int,
+    seed: int,
+    processes: int,
+    budget: int = BUDGET,
+    say: Callable[[str], None] = lambda text: None,
+    first: int = 0,
+    only: str = "",
+) -> dict[str, Any]:
     """Examine `count` files from number `first` on, made of some `seeds`; how many were read, how many refused, and what was found, as
     [number, what]."""
     context, started, said = multiprocessing.get_context("spawn"), time.monotonic(), time.monotonic()
@@ -390,7 +450,9 @@ def run(count: int, seed: int, processes: int, budget: int = BUDGET, say: Callab
                 process.kill()
         if time.monotonic() - said > 30:
             said = time.monotonic()
-            say(f"{sum(tally.values()):,} files, {len(findings)} findings, {sum(tally.values()) / (said - started):,.0f} files/s")
+            say(
+                f"{sum(tally.values()):,} files, {len(findings)} findings, {sum(tally.values()) / (said - started):,.0f} files/s"
+            )
     return {"first": first, "count": sum(tally.values()), "seed": seed, "processes": processes, "budget_bytes": budget,
             "seconds": time.monotonic() - started, "outcomes": dict(tally), "findings": sorted(findings)}  # fmt: skip
 

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import google_crc32c
-
 from kpc.format.container.container import ENTRY, HEADER, Entry, Reader, header_and_index
 from kpc.format.container.groups import Groups
 
@@ -24,12 +23,18 @@ Group = tuple[int, int, bytes]
 """First frame, number of frames, and file of a group."""
 
 
-def packed(groups: Sequence[Group], *, beside: Sequence[tuple[str, bytes]] = (), value_count: int | None = None) -> bytes:
+def packed(
+    groups: Sequence[Group], *, beside: Sequence[tuple[str, bytes]] = (), value_count: int | None = None
+) -> bytes:
     """A clip in groups, whether they make one or not; with chunks of other kinds after them."""
     bodies = [body for *_, body in groups] + [body for _, body in beside]
-    places = [("GRUP", number, start, count) for number, (start, count, _) in enumerate(groups)] + [(kind, 0, 0, 0) for kind, _ in beside]
-    entries = [Entry(kind, number, 0, 0, start, count, 0, len(body), len(body), google_crc32c.value(body))
-               for (kind, number, start, count), body in zip(places, bodies, strict=True)]
+    places = [("GRUP", number, start, count) for number, (start, count, _) in enumerate(groups)] + [
+        (kind, 0, 0, 0) for kind, _ in beside
+    ]
+    entries = [
+        Entry(kind, number, 0, 0, start, count, 0, len(body), len(body), google_crc32c.value(body))
+        for (kind, number, start, count), body in zip(places, bodies, strict=True)
+    ]
     most = max(struct.unpack_from("<Q", body, 40)[0] for *_, body in groups) if value_count is None else value_count
     return header_and_index(entries, most) + b"".join(bodies)
 
@@ -50,7 +55,7 @@ def valid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, bool]]:
         "groups-one": (packed([(40, 12, third)]), False),
         "groups-versions": (packed([(0, 12, scenes[DRAFT]), (12, 12, other)]), False),
         "version-0-groups": (of_the_draft(packed([(40, 12, scenes[DRAFT])])), False),
-        "groups-prefix": (joined[:Reader(joined).index[1].offset + len(other) // 2], True),
+        "groups-prefix": (joined[: Reader(joined).index[1].offset + len(other) // 2], True),
     }
 
 
@@ -63,7 +68,7 @@ def invalid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, str, str]]:
     def changed(at: int, layout: str, number: int) -> bytes:
         out = bytearray(good)
         struct.pack_into(layout, out, at, number)
-        struct.pack_into("<I", out, 56, google_crc32c.value(bytes(out[HEADER.size:HEADER.size + 2 * ENTRY.size])))
+        struct.pack_into("<I", out, 56, google_crc32c.value(bytes(out[HEADER.size : HEADER.size + 2 * ENTRY.size])))
         struct.pack_into("<I", out, 60, google_crc32c.value(bytes(out[:60])))
         return bytes(out)
 
@@ -85,10 +90,18 @@ def invalid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, str, str]]:
         "groups-values": (packed([(0, 12, third), (9, 12, other)], value_count=7), broken, "more than the header's 7"),
         "groups-beside": (packed([(0, 12, third)], beside=[("SCNE", b"")]), broken, "lies beside groups"),
         "groups-in-groups": (packed([(0, 21, good)]), broken, "a clip in groups"),
-        "groups-no-file": (packed([(0, 12, third), (9, 12, other)])[: -len(other)] + bytes(len(other)), broken, "not a .kpc file"),
+        "groups-no-file": (
+            packed([(0, 12, third), (9, 12, other)])[: -len(other)] + bytes(len(other)),
+            broken,
+            "not a .kpc file",
+        ),
         "groups-cut": (packed([(0, 12, third), (9, 12, other[:-1])]), broken, "cut off"),
         "groups-trailing": (packed([(0, 12, third), (9, 12, other + b"\0")]), broken, "follow the end"),
-        "groups-damaged": (packed([(0, 12, third), (9, 12, other[:-1] + bytes([other[-1] ^ 1]))]), broken, "is damaged"),
+        "groups-damaged": (
+            packed([(0, 12, third), (9, 12, other[:-1] + bytes([other[-1] ^ 1]))]),
+            broken,
+            "is damaged",
+        ),
     }
 
 
@@ -100,9 +113,21 @@ def described(data: bytes, partial: bool, names: dict[bytes, str]) -> dict[str, 
     return {
         "partial": partial,
         "zstd": None,
-        "groups": [{"row_start": entry.row_start, "row_count": entry.row_count,
-                    "scene": names.get(data[entry.offset : entry.offset + entry.stored_length])} for entry in entries],
-        "times": [{"time": time, "group": number, "time_in_it": round(time_in_it, 9),
-                   "mix": {str(part): round(share, 9) for part, _, share in groups.timeline.mixed(time)}}
-                  for time, number, time_in_it in shown],
+        "groups": [
+            {
+                "row_start": entry.row_start,
+                "row_count": entry.row_count,
+                "scene": names.get(data[entry.offset : entry.offset + entry.stored_length]),
+            }
+            for entry in entries
+        ],
+        "times": [
+            {
+                "time": time,
+                "group": number,
+                "time_in_it": round(time_in_it, 9),
+                "mix": {str(part): round(share, 9) for part, _, share in groups.timeline.mixed(time)},
+            }
+            for time, number, time_in_it in shown
+        ],
     }

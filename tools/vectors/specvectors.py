@@ -22,35 +22,66 @@ from typing import Any
 import google_crc32c
 import numpy as np
 import zstandard
-
-from kpc.format.common import cli
-
-from kpc.format.container import container
-from kpc.format.coding.transform import FINENESSES, HEAD, Blocks, blocks_of, encode_blocks, largest_side
-from kpc.format.scene.cameras import Camera
-from kpc.format.coding.occupancy_codec import encode_cells
-from kpc.format.container.container import (
-    CODEC_MIDPOINTS, CODEC_SYMBOLS, CODEC_THIRD, CODEC_ZSTD, ENTRY, HEADER, PLAIN_VERSION, VERSION, Chunk, Reader,
-)
-from kpc.format.common.errors import UsageError
-from kpc.format.container.scene_io import (
-    APPEARANCE_LIMIT, AXIS_LIMIT, BOX_LIMIT, CAMERA_LIMIT, CAMERA_STRUCT, CHANNEL_LIMIT, DECODER_STRUCT, FRAME_LIMIT, HIDDEN_LIMIT, MOTION_LIMIT, MOTION_STRUCT,
-    NAME_LIMIT, SAMPLE_LIMIT, SCALE_LIMIT, read, scene_chunks,
-)
 from kpc.format.coding.motion_hierarchical import encode_midpoints
-from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.coding.motion_raster import LORENZO, NEIGHBOURS
 from kpc.format.coding.motion_raster import encode_with as encode_nodes_with
+from kpc.format.coding.occupancy_codec import encode_cells
 from kpc.format.coding.poses import BITS, LENS, NOTHING, ROOT, WORD
 from kpc.format.coding.poses import HEAD as POSES_HEAD
+from kpc.format.coding.predictive import (
+    ANY,
+    AROUND,
+    LATTICE_BIT,
+    MOST_DECISIONS,
+    TRELLIS,
+    WEIGHTS,
+    Guide,
+    encode_with,
+    follows_trellis,
+    next_state,
+    walk,
+)
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels
 from kpc.format.coding.rans import stream
+from kpc.format.coding.transform import FINENESSES, HEAD, Blocks, blocks_of, encode_blocks, largest_side
+from kpc.format.common import cli
+from kpc.format.common.errors import UsageError
+from kpc.format.container import container
+from kpc.format.container.container import (
+    CODEC_MIDPOINTS,
+    CODEC_SYMBOLS,
+    CODEC_THIRD,
+    CODEC_ZSTD,
+    ENTRY,
+    HEADER,
+    PLAIN_VERSION,
+    VERSION,
+    Chunk,
+    Reader,
+)
+from kpc.format.container.scene_io import (
+    APPEARANCE_LIMIT,
+    AXIS_LIMIT,
+    BOX_LIMIT,
+    CAMERA_LIMIT,
+    CAMERA_STRUCT,
+    CHANNEL_LIMIT,
+    DECODER_STRUCT,
+    FRAME_LIMIT,
+    HIDDEN_LIMIT,
+    MOTION_LIMIT,
+    MOTION_STRUCT,
+    NAME_LIMIT,
+    SAMPLE_LIMIT,
+    SCALE_LIMIT,
+    read,
+    scene_chunks,
+)
+from kpc.format.container.segments import codec_of
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.scene.space import Contraction, DeviceCoordinates
-from kpc.format.container.segments import codec_of
-from kpc.format.coding.predictive import (
-    ANY, AROUND, LATTICE_BIT, MOST_DECISIONS, TRELLIS, WEIGHTS, Guide, encode_with, follows_trellis, next_state, walk,
-)
 from kpc.player.cpu import reference
 from kpc.tools.vectors import groupvectors
 from kpc.tools.vectors.groupvectors import of_the_draft
@@ -85,7 +116,9 @@ def vectors() -> dict[str, bytes]:
     whole = {name: data for name, (data, partial) in scenes.items() if not partial}
     for name, (data, partial) in groupvectors.valid(whole).items():
         files[f"valid/{name}.kpc"] = data
-        files[f"valid/{name}.json"] = _json(groupvectors.described(data, partial, {data: name for name, data in whole.items()}))
+        files[f"valid/{name}.json"] = _json(
+            groupvectors.described(data, partial, {data: name for name, data in whole.items()})
+        )
     for name, (data, error, message) in (_invalid() | groupvectors.invalid(whole)).items():
         files[f"invalid/{name}.kpc"] = data
         files[f"invalid/{name}.json"] = _json({"error": error, "message": message})
@@ -98,31 +131,62 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
     decoder = scene.decoder
     return {
         "partial": partial,
-        "zstd": ZSTD_VERSION if any(entry.codec == CODEC_ZSTD for entry in Reader(data, allow_partial=partial).index) else None,
+        "zstd": ZSTD_VERSION
+        if any(entry.codec == CODEC_ZSTD for entry in Reader(data, allow_partial=partial).index)
+        else None,
         "frame_count": scene.clip.frame_count,
         "fps": scene.clip.fps,
         "step": scene.step,
         **({"even": scene.mapping.even} if isinstance(scene.mapping, Contraction) else {}),
-        **({"frame": scene.mapping.frame.tolist(), "near": scene.mapping.near, "baseline": scene.mapping.baseline}
-           if isinstance(scene.mapping, DeviceCoordinates) else {}),
-        **({"motion": {"shape": list(scene.motion.symbols.shape), "sha256": _sha256(scene.motion.dequantise().astype("<f4"))}}
-           if scene.motion else {}),
-        **({"appearances": {"count": len(scene.appearances),
-                            "names_sha256": _sha256(*(np.frombuffer(look.name.encode(), np.uint8) for look in scene.appearances)),
-                            "sha256": _sha256(*(look.code.astype("<f4") for look in scene.appearances))}}
-           if scene.appearances else {}),
+        **(
+            {"frame": scene.mapping.frame.tolist(), "near": scene.mapping.near, "baseline": scene.mapping.baseline}
+            if isinstance(scene.mapping, DeviceCoordinates)
+            else {}
+        ),
+        **(
+            {
+                "motion": {
+                    "shape": list(scene.motion.symbols.shape),
+                    "sha256": _sha256(scene.motion.dequantise().astype("<f4")),
+                }
+            }
+            if scene.motion
+            else {}
+        ),
+        **(
+            {
+                "appearances": {
+                    "count": len(scene.appearances),
+                    "names_sha256": _sha256(
+                        *(np.frombuffer(look.name.encode(), np.uint8) for look in scene.appearances)
+                    ),
+                    "sha256": _sha256(*(look.code.astype("<f4") for look in scene.appearances)),
+                }
+            }
+            if scene.appearances
+            else {}
+        ),
         "aabb": scene.aabb.tolist(),
         "background": scene.background.tolist(),
         "cameras": {"count": len(scene.cameras), "sha256": _sha256(*map(_camera, scene.cameras))},
         "occupancy": {"shape": list(scene.occupancy.shape), "sha256": _sha256(scene.occupancy.astype(np.uint8))},
-        "decoder": {"features": sum(scale["xy"].symbols.shape[2] for scale in scene.scales),
-                    **({"width": len(decoder.v_bias)} if isinstance(decoder, HybridDecoder) else {}), "hidden": len(decoder.b1),
-                    "sha256": _sha256(*(np.asarray(w, "<f4") for w in vars(decoder).values()))},
+        "decoder": {
+            "features": sum(scale["xy"].symbols.shape[2] for scale in scene.scales),
+            **({"width": len(decoder.v_bias)} if isinstance(decoder, HybridDecoder) else {}),
+            "hidden": len(decoder.b1),
+            "sha256": _sha256(*(np.asarray(w, "<f4") for w in vars(decoder).values())),
+        },
         "planes": [
-            {"scale": number, "plane": name, "shape": list(plane.symbols.shape),
-             "symbols_sha256": _sha256(plane.symbols), "coded_sha256": _sha256(plane.coded.astype(np.uint8)),
-             "values_sha256": _sha256(plane.dequantise().astype("<f4"))}
-            for number, scale in enumerate(scene.scales) for name, plane in scale.items()
+            {
+                "scale": number,
+                "plane": name,
+                "shape": list(plane.symbols.shape),
+                "symbols_sha256": _sha256(plane.symbols),
+                "coded_sha256": _sha256(plane.coded.astype(np.uint8)),
+                "values_sha256": _sha256(plane.dequantise().astype("<f4")),
+            }
+            for number, scale in enumerate(scene.scales)
+            for name, plane in scale.items()
         ],
         "rays": _rays(scene),
     }
@@ -134,8 +198,8 @@ def resealed(data: bytes) -> bytes:
     count = struct.unpack_from("<I", out, 28)[0]
     for start in range(HEADER.size, HEADER.size + ENTRY.size * count, ENTRY.size):
         stored, offset = struct.unpack_from("<I", out, start + 20)[0], struct.unpack_from("<Q", out, start + 32)[0]
-        struct.pack_into("<I", out, start + 28, google_crc32c.value(bytes(out[offset:offset + stored])))
-    struct.pack_into("<I", out, 56, google_crc32c.value(bytes(out[HEADER.size:HEADER.size + ENTRY.size * count])))
+        struct.pack_into("<I", out, start + 28, google_crc32c.value(bytes(out[offset : offset + stored])))
+    struct.pack_into("<I", out, 56, google_crc32c.value(bytes(out[HEADER.size : HEADER.size + ENTRY.size * count])))
     struct.pack_into("<I", out, 60, google_crc32c.value(bytes(out[:60])))
     return bytes(out)
 
@@ -153,8 +217,15 @@ def encode(scene: QuantisedScene, *, segment_rows: int = 16, compress: bool = Tr
     return pack(chunks, _value_count(scene), compress=compress)
 
 
-def context_coded(scene: QuantisedScene, sets: int = 1, *, segment_rows: int = 16, weights: np.ndarray | None = None,
-                  flat: bool = False, implied: bool = False) -> bytes:
+def context_coded(
+    scene: QuantisedScene,
+    sets: int = 1,
+    *,
+    segment_rows: int = 16,
+    weights: np.ndarray | None = None,
+    flat: bool = False,
+    implied: bool = False,
+) -> bytes:
     """A file all of whose planes are context-coded, also where raw ones would be smaller, with so many sets of weights.
 
     The weights, if none are given, are no good ones but such as need no floating-point fit, and the largest and the smallest among
@@ -183,17 +254,35 @@ def around(scene: QuantisedScene, guide: Guide, segment_rows: int) -> QuantisedS
     """The scene with near symbols, none at the ends of 8 bits, that follow a guide in each segment."""
 
     def moved(plane: QuantisedPlane, rows: int) -> QuantisedPlane:
-        segments = [np.clip(plane.symbols[start : start + rows], -126, 126) for start in range(0, len(plane.symbols), rows)]
+        segments = [
+            np.clip(plane.symbols[start : start + rows], -126, 126) for start in range(0, len(plane.symbols), rows)
+        ]
         for number, symbols in enumerate(segments):
             walked(symbols, plane.coded[rows * number : rows * (number + 1)], guide.weights, AROUND)
         return replace(plane, symbols=np.concatenate(segments), guide=guide)
 
-    return replace(scene, scales=tuple({name: moved(plane, segment_rows if name in TIME_PLANES else len(plane.symbols))
-                                        for name, plane in scale.items()} for scale in scene.scales))
+    return replace(
+        scene,
+        scales=tuple(
+            {
+                name: moved(plane, segment_rows if name in TIME_PLANES else len(plane.symbols))
+                for name, plane in scale.items()
+            }
+            for scale in scene.scales
+        ),
+    )
 
 
-def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *, segment_rows: int = 16,
-              codec: int = CODEC_SYMBOLS, implied: bool = False) -> bytes:
+def in_blocks(
+    scene: QuantisedScene,
+    side: int,
+    quantiser: int,
+    spread: float,
+    *,
+    segment_rows: int = 16,
+    codec: int = CODEC_SYMBOLS,
+    implied: bool = False,
+) -> bytes:
     """A file all of whose planes are told in blocks of a side, or of smaller ones where a segment is small, with levels from noise, those of
     means as large as may be, quick ones small; levels grow and fall with `spread`. `implied`: maps follow from occupancy."""
 
@@ -205,11 +294,17 @@ def in_blocks(scene: QuantisedScene, side: int, quantiser: int, spread: float, *
         levels = _noise((plane.symbols.shape[2], *grid, N, N), seed) / 128 * spread
         levels *= np.float32(1) / (1 + np.add.outer(np.arange(N), np.arange(N), dtype=np.float32)) ** 2
         fineness = np.abs(_noise(grid, seed + 1)).astype(np.int64) % FINENESSES
-        return encode_blocks(Blocks(np.trunc(levels).astype(np.int64), fineness, quantiser), coded, _needed(scene, chunk) if implied else None,
-                             borders=codec == CODEC_THIRD)
+        return encode_blocks(
+            Blocks(np.trunc(levels).astype(np.int64), fineness, quantiser),
+            coded,
+            _needed(scene, chunk) if implied else None,
+            borders=codec == CODEC_THIRD,
+        )
 
-    chunks = [_forced(chunk, body(chunk), codec) if chunk.kind == "PLNE" else replace(chunk, coded={})
-              for chunk in scene_chunks(scene, segment_rows=segment_rows)]
+    chunks = [
+        _forced(chunk, body(chunk), codec) if chunk.kind == "PLNE" else replace(chunk, coded={})
+        for chunk in scene_chunks(scene, segment_rows=segment_rows)
+    ]
     return pack(chunks, _value_count(scene))
 
 
@@ -218,6 +313,7 @@ on_from_borders = partial(in_blocks, codec=CODEC_THIRD)
 
 def seen_through(scene: QuantisedScene, occupancy: np.ndarray) -> QuantisedScene:
     """The scene so occupied, of whose planes those texels are coded that this needs."""
+
     def cut(name: str, plane: QuantisedPlane) -> QuantisedPlane:
         coded = needed_texels(occupancy, name, *plane.coded.shape)
         return replace(plane, symbols=plane.symbols * coded[..., None], coded=coded)
@@ -234,7 +330,9 @@ def seen_through_slits(scene: QuantisedScene) -> QuantisedScene:
 def _needed(scene: QuantisedScene, chunk: Chunk) -> np.ndarray:
     """Those texels of a segment."""
     name = ALL_PLANES[chunk.plane]
-    return needed_texels(scene.occupancy, name, *scene.scales[chunk.scale][name].coded.shape)[chunk.row_start : chunk.row_start + chunk.row_count]
+    return needed_texels(scene.occupancy, name, *scene.scales[chunk.scale][name].coded.shape)[
+        chunk.row_start : chunk.row_start + chunk.row_count
+    ]
 
 
 def walked(symbols: np.ndarray, coded: np.ndarray, weights: np.ndarray, lattice: int) -> bytes:
@@ -252,22 +350,28 @@ def coded_grids(scene: QuantisedScene) -> bytes:
         if chunk.kind == "MOVE":  # weights that need no floating-point fit, and the largest and the smallest among them
             weights = LORENZO - _noise((NEIGHBOURS,), 67).astype(np.int16)
             weights[-2:] = -32768, 32767
-            body = chunk.parts[0][:MOTION_STRUCT.size] + encode_nodes_with(weights, scene.motion.symbols)
+            body = chunk.parts[0][: MOTION_STRUCT.size] + encode_nodes_with(weights, scene.motion.symbols)
         chunks.append(_forced(chunk, body) if body else replace(chunk, coded={}))
     return pack(chunks, _value_count(scene))
 
 
 def halved(scene: QuantisedScene) -> bytes:
     """A file whose motion grid is told by midpoints, also where a raw one would be smaller, and all else as it ever was."""
-    chunks = [_forced(chunk, chunk.coded[CODEC_MIDPOINTS](), CODEC_MIDPOINTS) if chunk.kind == "MOVE" else replace(chunk, coded={})
-              for chunk in scene_chunks(scene)]
+    chunks = [
+        _forced(chunk, chunk.coded[CODEC_MIDPOINTS](), CODEC_MIDPOINTS)
+        if chunk.kind == "MOVE"
+        else replace(chunk, coded={})
+        for chunk in scene_chunks(scene)
+    ]
     return pack(chunks, _value_count(scene))
 
 
 def coded_weights(scene: QuantisedScene) -> bytes:
     """A file whose decoder's weights are context-coded, also where raw ones would be smaller, and all else as it ever was."""
-    chunks = [_forced(chunk, chunk.coded[CODEC_SYMBOLS]()) if chunk.kind in ("DECO", "HYBR") else replace(chunk, coded={})
-              for chunk in scene_chunks(scene)]
+    chunks = [
+        _forced(chunk, chunk.coded[CODEC_SYMBOLS]()) if chunk.kind in ("DECO", "HYBR") else replace(chunk, coded={})
+        for chunk in scene_chunks(scene)
+    ]
     return pack(chunks, _value_count(scene))
 
 
@@ -278,13 +382,18 @@ def posed(scene: QuantisedScene, body: bytes) -> bytes:
     return claiming(chunks, came, _value_count(scene), 2 + struct.unpack_from("<H", body)[0] * CAMERA_STRUCT.size)
 
 
-def told_poses(exponent: int, corner: tuple[int, ...], turns: list[tuple[int, ...]], places: list[tuple[int, ...]], lenses: int = 1) -> bytes:
+def told_poses(
+    exponent: int, corner: tuple[int, ...], turns: list[tuple[int, ...]], places: list[tuple[int, ...]], lenses: int = 1
+) -> bytes:
     """The `came` chunk of such cameras under codec 2. `turns`: which number of a quaternion is left out, and the others."""
+
     def word(numbers: tuple[int, ...], above: int = 0) -> bytes:
         return sum(number << BITS * k for k, number in enumerate((*numbers, above))).to_bytes(WORD, "little")
 
-    told = (word(tuple(number + NOTHING for number in others), largest) + word(place)
-            for (largest, *others), place in zip(turns, places, strict=True))
+    told = (
+        word(tuple(number + NOTHING for number in others), largest) + word(place)
+        for (largest, *others), place in zip(turns, places, strict=True)
+    )
     kinds = (LENS.pack(64 + k, 48, 80.0, 80.5 + k, 32.0, 24.0) for k in range(lenses))
     return POSES_HEAD.pack(len(turns), lenses, exponent, *corner) + b"".join(kinds) + b"".join(told)
 
@@ -294,8 +403,11 @@ def all_zstd(scene: QuantisedScene) -> bytes:
     chunks = scene_chunks(scene)
     raws = [b"".join(chunk.parts) for chunk in chunks]
     bodies = [zstandard.ZstdCompressor(level=19).compress(raw) for raw in raws]
-    data = pack([replace(chunk, parts=[body], coded={}) for chunk, body in zip(chunks, bodies, strict=True)],
-                _value_count(scene), compress=False)
+    data = pack(
+        [replace(chunk, parts=[body], coded={}) for chunk, body in zip(chunks, bodies, strict=True)],
+        _value_count(scene),
+        compress=False,
+    )
     for number, raw in enumerate(raws):
         entry = HEADER.size + ENTRY.size * number
         data = patched(patched(data, entry + 16, "<H", CODEC_ZSTD), entry + 24, "<I", len(raw))
@@ -307,17 +419,29 @@ def _forced(chunk: Chunk, body: bytes, codec: int = CODEC_SYMBOLS) -> Chunk:
     return replace(chunk, parts=[body, b"\0"], coded={codec: lambda: body})
 
 
-def in_columns(data: bytes, change: Callable[[bytes], bytes] = bytes, count: int | None = None, *,
-               frame: Callable[[bytes], bytes] = bytes) -> bytes:
+def in_columns(
+    data: bytes,
+    change: Callable[[bytes], bytes] = bytes,
+    count: int | None = None,
+    *,
+    frame: Callable[[bytes], bytes] = bytes,
+) -> bytes:
     """A file of version 1 as one of version 2, its index in a frame of a raw block, which no library has to make.
 
     The index may be changed before it comes into the frame, the frame itself, and the number of chunks in the header; checksums are right.
     """
     reader = Reader(data)
-    columns = change(container.in_columns(data[HEADER.size:HEADER.size + reader.header.index_length]))
-    index = frame(b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", len(columns)) + struct.pack("<I", 1 | len(columns) << 3)[:3] + columns)
-    body = data[HEADER.size + reader.header.index_length:]
-    head = patched(data[:HEADER.size], 24, "<IIQ", len(index), count or len(reader.index), HEADER.size + len(index) + len(body))
+    columns = change(container.in_columns(data[HEADER.size : HEADER.size + reader.header.index_length]))
+    index = frame(
+        b"\x28\xb5\x2f\xfd\xa0"
+        + struct.pack("<I", len(columns))
+        + struct.pack("<I", 1 | len(columns) << 3)[:3]
+        + columns
+    )
+    body = data[HEADER.size + reader.header.index_length :]
+    head = patched(
+        data[: HEADER.size], 24, "<IIQ", len(index), count or len(reader.index), HEADER.size + len(index) + len(body)
+    )
     head = patched(patched(head, 8, "<H", VERSION), 56, "<I", google_crc32c.value(index))
     return patched(head, 60, "<I", google_crc32c.value(head[:60])) + index + body
 
@@ -357,7 +481,7 @@ def _motion_grids(
     return {
         name: (coded(replace(dense, motion=_swaying(6, 4, 3, 5))), False),
         f"{name}-noise": (coded(moved), False),
-        f"{name}-prefix": (coded(moved)[:Reader(coded(moved)).index[5].offset], True),
+        f"{name}-prefix": (coded(moved)[: Reader(coded(moved)).index[5].offset], True),
         f"{name}-extremes": (coded(replace(dense, motion=extremes)), False),
         f"{name}-smallest": (coded(replace(dense, motion=_motion(2, 2, 2, 2))), False),
     }
@@ -370,12 +494,17 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
     dense = replace(_scene(dynamic=True, sizes=[(2, 9, 8, 7, 3)], cameras=1), occupancy=_noise((2, 3, 3, 5), 98) > -64)
     contracted, moved = replace(dense, mapping=Contraction(3.5)), replace(dense, motion=_motion(4, 3, 2, 5))
     frame = np.array([[0.96, 0, 0.28, 0.5], [0, 1, 0, -0.25], [-0.28, 0, 0.96, 3]])
-    faced = replace(dense, mapping=DeviceCoordinates(frame, 1.5, 2.0),
-                    aabb=np.array([[-0.5, -0.5, 0.125], [0.5, 0.5, 1.25]], np.float32))
+    faced = replace(
+        dense,
+        mapping=DeviceCoordinates(frame, 1.5, 2.0),
+        aabb=np.array([[-0.5, -0.5, 0.125], [0.5, 0.5, 1.25]], np.float32),
+    )
     hybrid = replace(dense, decoder=_hybrid(2, 5, 3))
     varied = replace(dense, appearances=_appearances("north.mp4", "süd.mp4", "東/0003.jpg"))
     y, x = np.indices((6, 9))
-    rolling = np.stack([np.stack([(x - s - 4) ** 2 + (y - 2) ** 2 + (z - 3) ** 2 < 8 for z in range(5)]) for s in range(3)])
+    rolling = np.stack(
+        [np.stack([(x - s - 4) ** 2 + (y - 2) ** 2 + (z - 3) ** 2 < 8 for z in range(5)]) for s in range(3)]
+    )
     note = Chunk("note", [b"readers skip what they need not know"])
     chunks = scene_chunks(minimal)
     index = Reader(packed).index
@@ -383,9 +512,17 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
     columns = in_columns(context_coded(dynamic, 8, segment_rows=4))
     plain = _scene(dynamic=False, sizes=[(1, 2, 2, 2, 0)], cameras=1)
     some = _noise((5, 6), 83).astype(int) * 500
-    poses = told_poses(-17, (-131072, 3, 99999), [(k % 4, *some[k, :3].tolist()) for k in range(5)],
-                       [tuple((some[k, 3:] + NOTHING).tolist()) for k in range(5)])
-    turns = [(largest, *others) for largest in range(4) for others in ((-ROOT, -ROOT, 0), (ROOT, 0, ROOT - 1), (0, 0, -NOTHING), (0, 0, 0))]
+    poses = told_poses(
+        -17,
+        (-131072, 3, 99999),
+        [(k % 4, *some[k, :3].tolist()) for k in range(5)],
+        [tuple((some[k, 3:] + NOTHING).tolist()) for k in range(5)],
+    )
+    turns = [
+        (largest, *others)
+        for largest in range(4)
+        for others in ((-ROOT, -ROOT, 0), (ROOT, 0, ROOT - 1), (0, 0, -NOTHING), (0, 0, 0))
+    ]
     return {
         "minimal": (encode(minimal, compress=False), False),
         "static": (encode(_scene(dynamic=False, sizes=[(3, 17, 13, 11, 0)])), False),
@@ -395,42 +532,74 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "one-texel": (encode(_scene(dynamic=True, sizes=[(1, 1, 1, 1, 1)]), compress=False), False),
         "wrap": (encode(_scene(dynamic=False, sizes=[(8, 12, 10, 6, 0)], amplitude=400), compress=False), False),
         "contracted": (encode(contracted), False),
-        "contracted-prefix": (encode(contracted)[:Reader(encode(contracted)).index[4].offset], True),
+        "contracted-prefix": (encode(contracted)[: Reader(encode(contracted)).index[4].offset], True),
         "moved": (encode(moved), False),
-        "moved-prefix": (encode(moved)[:Reader(encode(moved)).index[4].offset], True),
+        "moved-prefix": (encode(moved)[: Reader(encode(moved)).index[4].offset], True),
         "moved-contracted": (encode(replace(contracted, motion=_motion(2, 2, 2, 2, 32.0)), compress=False), False),
         "device-coordinates": (encode(faced), False),
         "hybrid": (encode(hybrid), False),
         "hybrid-moved": (encode(replace(hybrid, motion=moved.motion, decoder=_hybrid(2, 1, 1)), compress=False), False),
         "appearances": (encode(varied), False),
-        "appearances-prefix": (encode(varied)[:Reader(encode(varied)).index[4].offset], True),
+        "appearances-prefix": (encode(varied)[: Reader(encode(varied)).index[4].offset], True),
         "symbols": (context_coded(dynamic, 8, segment_rows=4), False),
-        "symbols-prefix": (context_coded(dynamic, 2)[:Reader(context_coded(dynamic, 2)).index[9].offset], True),
-        "symbols-extremes": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4), False),
+        "symbols-prefix": (context_coded(dynamic, 2)[: Reader(context_coded(dynamic, 2)).index[9].offset], True),
+        "symbols-extremes": (
+            context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4),
+            False,
+        ),
         "symbols-noise": (context_coded(_painted(_noise), 2), False),
         "symbols-contexts": (_in_all_contexts(), False),
-        "symbols-constant": (context_coded(_painted(lambda shape, seed: np.full(shape, (127, -128, 1)[seed % 3]))), False),
+        "symbols-constant": (
+            context_coded(_painted(lambda shape, seed: np.full(shape, (127, -128, 1)[seed % 3]))),
+            False,
+        ),
         "symbols-empty": (context_coded(_painted(lambda shape, seed: np.zeros(shape), coded=False)), False),
         "trellis": (context_coded(_on_trellis(dynamic), 8, segment_rows=4), False),
-        "trellis-extremes": (context_coded(_on_trellis(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127))), 4),
-                             False),
+        "trellis-extremes": (
+            context_coded(_on_trellis(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127))), 4),
+            False,
+        ),
         "around": (context_coded(dynamic, 8, segment_rows=4, flat=True), False),
-        "around-extremes": (context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4, flat=True), False),
+        "around-extremes": (
+            context_coded(_painted(lambda shape, seed: np.where(_noise(shape, seed) < 0, -128, 127)), 4, flat=True),
+            False,
+        ),
         "around-flat": (context_coded(_painted(lambda shape, seed: _noise(shape, seed) // 50), 2, flat=True), False),
         "blocks": (in_blocks(dynamic, 16, 12, 60, segment_rows=4), False),
-        "blocks-prefix": (in_blocks(dynamic, 8, 64, 8)[:Reader(in_blocks(dynamic, 8, 64, 8)).index[9].offset], True),
+        "blocks-prefix": (in_blocks(dynamic, 8, 64, 8)[: Reader(in_blocks(dynamic, 8, 64, 8)).index[9].offset], True),
         "blocks-extremes": (in_blocks(_scene(dynamic=True, sizes=[(2, 9, 6, 5, 4)]), 4, 255, 8196), False),
         "blocks-fine": (in_blocks(_scene(dynamic=False, sizes=[(2, 20, 17, 9, 0)]), 16, 1, 8196), False),
         "blocks-empty": (in_blocks(_painted(lambda shape, seed: np.zeros(shape), coded=False), 8, 64, 0), False),
         "blocks-one-texel": (in_blocks(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)]), 4, 64, 20), False),
         "borders": (on_from_borders(dynamic, 16, 12, 60, segment_rows=4), False),
-        "implied": (context_coded(seen_through_slits(_scene(dynamic=True, sizes=[(2, 11, 8, 9, 6), (3, 20, 13, 17, 6)])), 2, segment_rows=4,
-                                  implied=True), False),
-        "implied-borders": (on_from_borders(seen_through_slits(_scene(dynamic=True, sizes=[(2, 29, 21, 16, 5)])), 8, 20, 100, implied=True), False),
+        "implied": (
+            context_coded(
+                seen_through_slits(_scene(dynamic=True, sizes=[(2, 11, 8, 9, 6), (3, 20, 13, 17, 6)])),
+                2,
+                segment_rows=4,
+                implied=True,
+            ),
+            False,
+        ),
+        "implied-borders": (
+            on_from_borders(
+                seen_through_slits(_scene(dynamic=True, sizes=[(2, 29, 21, 16, 5)])), 8, 20, 100, implied=True
+            ),
+            False,
+        ),
         "borders-eight": (on_from_borders(_scene(dynamic=True, sizes=[(2, 20, 17, 9, 4)]), 8, 20, 100), False),
-        "borders-sparse": (on_from_borders(seen_through_slits(_scene(dynamic=False, sizes=[(3, 41, 38, 35, 0)])), 4, 24, 24), False),
-        "blocks-sparse": (in_blocks(seen_through_slits(_scene(dynamic=False, sizes=[(3, 41, 38, 35, 0)])), 4, 24, 24), False),
-        "borders-prefix": (on_from_borders(dynamic, 8, 64, 8)[:Reader(on_from_borders(dynamic, 8, 64, 8)).index[9].offset], True),
+        "borders-sparse": (
+            on_from_borders(seen_through_slits(_scene(dynamic=False, sizes=[(3, 41, 38, 35, 0)])), 4, 24, 24),
+            False,
+        ),
+        "blocks-sparse": (
+            in_blocks(seen_through_slits(_scene(dynamic=False, sizes=[(3, 41, 38, 35, 0)])), 4, 24, 24),
+            False,
+        ),
+        "borders-prefix": (
+            on_from_borders(dynamic, 8, 64, 8)[: Reader(on_from_borders(dynamic, 8, 64, 8)).index[9].offset],
+            True,
+        ),
         "borders-extremes": (on_from_borders(_scene(dynamic=True, sizes=[(2, 9, 6, 5, 4)]), 4, 255, 8196), False),
         "borders-large": (on_from_borders(_scene(dynamic=False, sizes=[(2, 33, 20, 17, 0)]), 16, 255, 8196), False),
         "borders-fine": (on_from_borders(_scene(dynamic=False, sizes=[(2, 20, 17, 9, 0)]), 16, 1, 8196), False),
@@ -439,7 +608,7 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "symbols-one-texel": (context_coded(_scene(dynamic=True, sizes=[(3, 1, 1, 1, 1)])), False),
         "cells": (coded_grids(replace(dense, occupancy=rolling)), False),
         "cells-noise": (coded_grids(dense), False),
-        "cells-prefix": (coded_grids(dense)[:Reader(coded_grids(dense)).index[4].offset], True),
+        "cells-prefix": (coded_grids(dense)[: Reader(coded_grids(dense)).index[4].offset], True),
         "cells-thin": (coded_grids(replace(minimal, occupancy=_noise((1, 1, 1, 70), 97) > 0)), False),
         "cells-one": (coded_grids(minimal), False),
         "cells-long-times": (coded_grids(replace(dense, occupancy=_noise((40, 1, 2, 1), 96) > 0)), False),
@@ -451,15 +620,27 @@ def _valid() -> dict[str, tuple[bytes, bool]]:
         "version-0-symbols": (of_the_draft(context_coded(dynamic, 8, segment_rows=4)), False),
         "weights": (coded_weights(dense), False),
         "weights-hybrid": (coded_weights(hybrid), False),
-        "weights-prefix": (coded_weights(dense)[:Reader(coded_weights(dense)).index[4].offset], True),
+        "weights-prefix": (coded_weights(dense)[: Reader(coded_weights(dense)).index[4].offset], True),
         "poses": (posed(plain, poses), False),
-        "poses-prefix": (posed(plain, poses)[:Reader(posed(plain, poses)).index[4].offset], True),
-        "poses-lenses": (posed(plain, told_poses(-24, (-5, 1 << 24, -7), 3 * [(0, 3, 4, 5)], [(1, 0, 2), (0, 9, 0), (4, 4, 0)], lenses=3)), False),
-        "poses-extremes": (posed(plain, told_poses(30, (-1, 0, -1), turns, [(k & 1, k >> 1 & 1, 0) for k in range(len(turns))])), False),
-        "poses-small": (posed(plain, told_poses(-126, (-(1 << 31), 0, (1 << 31) - 1), [(3, 0, 0, 0)], [((1 << BITS) - 1, 1, 0)])), False),
+        "poses-prefix": (posed(plain, poses)[: Reader(posed(plain, poses)).index[4].offset], True),
+        "poses-lenses": (
+            posed(
+                plain,
+                told_poses(-24, (-5, 1 << 24, -7), 3 * [(0, 3, 4, 5)], [(1, 0, 2), (0, 9, 0), (4, 4, 0)], lenses=3),
+            ),
+            False,
+        ),
+        "poses-extremes": (
+            posed(plain, told_poses(30, (-1, 0, -1), turns, [(k & 1, k >> 1 & 1, 0) for k in range(len(turns))])),
+            False,
+        ),
+        "poses-small": (
+            posed(plain, told_poses(-126, (-(1 << 31), 0, (1 << 31) - 1), [(3, 0, 0, 0)], [((1 << BITS) - 1, 1, 0)])),
+            False,
+        ),
         "weights-extremes": (coded_weights(replace(dense, decoder=_extreme(dense.decoder))), False),
         "columns": (columns, False),
-        "columns-prefix": (columns[:Reader(columns).index[9].offset], True),
+        "columns-prefix": (columns[: Reader(columns).index[9].offset], True),
         "zstd": (all_zstd(replace(varied, mapping=contracted.mapping, motion=moved.motion)), False),
         "zstd-hybrid": (all_zstd(hybrid), False),
         "time-empty": (encode(_at_rest(dynamic), segment_rows=4, compress=False), False),
@@ -478,36 +659,92 @@ def _limits() -> dict[str, bytes]:
     rows = _scene(dynamic=True, sizes=[(1, 1, 2, 1, AXIS_LIMIT)])
     pose = np.diag([1.0, 1, 1, 1])
     names = [chr(0x4E00 + k) for k in range(APPEARANCE_LIMIT)]
-    steps = np.float32([16, 8, 0.5**20, 0.5**149, 0.5**126])  # the last two: the least number above 0, the least that is normal
-    wide = {name: QuantisedPlane(np.tile(np.int8([[[-128], [127], [1]]]), (1, 1, 5)), steps, np.float32([0, -1024, 1, 0, 0.5**126]),
-                                 np.ones((1, 3), bool)) for name in SPACE_PLANES[:2]}
+    steps = np.float32(
+        [16, 8, 0.5**20, 0.5**149, 0.5**126]
+    )  # the last two: the least number above 0, the least that is normal
+    wide = {
+        name: QuantisedPlane(
+            np.tile(np.int8([[[-128], [127], [1]]]), (1, 1, 5)),
+            steps,
+            np.float32([0, -1024, 1, 0, 0.5**126]),
+            np.ones((1, 3), bool),
+        )
+        for name in SPACE_PLANES[:2]
+    }
     wide["yz"] = replace(wide["xy"], symbols=wide["xy"].symbols[:, :1], coded=np.ones((1, 1), bool))
     decoder = _scene(dynamic=False, sizes=[(5, 1, 1, 1, 0)]).decoder
-    far = replace(plain, aabb=np.float32([[-BOX_LIMIT] * 3, [BOX_LIMIT] * 3]), clip=Clip(FRAME_LIMIT, 5e-324), scales=(wide,),
-                  decoder=decoder, step=2.0**32 / SAMPLE_LIMIT, occupancy=np.zeros((1, 1, 1, 1), bool), background=np.float32([0, 1, 1]),
-                  cameras=(Camera(65535, 65535, BOX_LIMIT, BOX_LIMIT, -BOX_LIMIT, BOX_LIMIT, pose + np.pad([[BOX_LIMIT]], ((0, 3), (3, 0)))),),
-                  appearances=_appearances("n" * NAME_LIMIT, "é" * (NAME_LIMIT // 2)))
-    near = replace(plain, aabb=np.float32([[0, 0, 0], [1 / BOX_LIMIT] * 3]), step=2.0**-33, clip=Clip(1, 1.7e308), occupancy=far.occupancy,
-                   mapping=Contraction(1 / BOX_LIMIT))
+    far = replace(
+        plain,
+        aabb=np.float32([[-BOX_LIMIT] * 3, [BOX_LIMIT] * 3]),
+        clip=Clip(FRAME_LIMIT, 5e-324),
+        scales=(wide,),
+        decoder=decoder,
+        step=2.0**32 / SAMPLE_LIMIT,
+        occupancy=np.zeros((1, 1, 1, 1), bool),
+        background=np.float32([0, 1, 1]),
+        cameras=(
+            Camera(
+                65535,
+                65535,
+                BOX_LIMIT,
+                BOX_LIMIT,
+                -BOX_LIMIT,
+                BOX_LIMIT,
+                pose + np.pad([[BOX_LIMIT]], ((0, 3), (3, 0))),
+            ),
+        ),
+        appearances=_appearances("n" * NAME_LIMIT, "é" * (NAME_LIMIT // 2)),
+    )
+    near = replace(
+        plain,
+        aabb=np.float32([[0, 0, 0], [1 / BOX_LIMIT] * 3]),
+        step=2.0**-33,
+        clip=Clip(1, 1.7e308),
+        occupancy=far.occupancy,
+        mapping=Contraction(1 / BOX_LIMIT),
+    )
     periodic = _noise((97,), 71) / np.float32(64)
 
     def repeated(shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
         return {name: np.resize(periodic, shape) for name, shape in shapes.items()}
 
     return {
-        "limits-scales": encode(replace(deep, decoder=replace(deep.decoder, density_weight=np.zeros(SCALE_LIMIT, np.float32)))),
+        "limits-scales": encode(
+            replace(deep, decoder=replace(deep.decoder, density_weight=np.zeros(SCALE_LIMIT, np.float32)))
+        ),
         "limits-channels": encode(many),
-        "limits-axes": encode(_smooth(replace(axes, occupancy=np.ones((1, 1, 1, AXIS_LIMIT), bool))), segment_rows=AXIS_LIMIT),
-        "limits-rows": encode(_smooth(replace(rows, occupancy=np.ones((AXIS_LIMIT, 1, 1, 1), bool))), segment_rows=AXIS_LIMIT),
-        "limits-motion": encode(replace(moving, motion=QuantisedMotion(
-            np.resize(np.int16([-32768, 32767, 0]), (AXIS_LIMIT, 2, 2, 2, 3)), 1 / 32))),
+        "limits-axes": encode(
+            _smooth(replace(axes, occupancy=np.ones((1, 1, 1, AXIS_LIMIT), bool))), segment_rows=AXIS_LIMIT
+        ),
+        "limits-rows": encode(
+            _smooth(replace(rows, occupancy=np.ones((AXIS_LIMIT, 1, 1, 1), bool))), segment_rows=AXIS_LIMIT
+        ),
+        "limits-motion": encode(
+            replace(
+                moving,
+                motion=QuantisedMotion(np.resize(np.int16([-32768, 32767, 0]), (AXIS_LIMIT, 2, 2, 2, 3)), 1 / 32),
+            )
+        ),
         "limits-nodes": coded_grids(replace(moving, motion=_swaying(2, 2, 2, MOTION_LIMIT))),
-        "limits-hidden": encode(replace(plain, decoder=Decoder(density_bias=0.5, **repeated(Decoder.shapes(1, HIDDEN_LIMIT))))),
-        "limits-hybrid": encode(replace(plain, decoder=HybridDecoder(
-            density_bias=0.5, **repeated(HybridDecoder.shapes(1, HIDDEN_LIMIT, HIDDEN_LIMIT))))),
-        "limits-cameras": encode(replace(plain, cameras=tuple(
-            Camera(64 + k % 7, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(CAMERA_LIMIT)))),
-        "limits-appearances": encode(replace(plain, appearances=tuple(Appearance(name, np.zeros(3, np.float32)) for name in names))),
+        "limits-hidden": encode(
+            replace(plain, decoder=Decoder(density_bias=0.5, **repeated(Decoder.shapes(1, HIDDEN_LIMIT))))
+        ),
+        "limits-hybrid": encode(
+            replace(
+                plain,
+                decoder=HybridDecoder(
+                    density_bias=0.5, **repeated(HybridDecoder.shapes(1, HIDDEN_LIMIT, HIDDEN_LIMIT))
+                ),
+            )
+        ),
+        "limits-cameras": encode(
+            replace(
+                plain, cameras=tuple(Camera(64 + k % 7, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(CAMERA_LIMIT))
+            )
+        ),
+        "limits-appearances": encode(
+            replace(plain, appearances=tuple(Appearance(name, np.zeros(3, np.float32)) for name in names))
+        ),
         "limits-large": encode(far),
         "limits-small": encode(near),
     }
@@ -515,13 +752,23 @@ def _limits() -> dict[str, bytes]:
 
 def _at_rest(scene: QuantisedScene) -> QuantisedScene:
     """The scene with time planes none of whose texels is coded."""
-    return replace(scene, scales=tuple({
-        name: replace(plane, symbols=0 * plane.symbols, coded=plane.coded & False) if name in TIME_PLANES else plane
-        for name, plane in scale.items()} for scale in scene.scales))
+    return replace(
+        scene,
+        scales=tuple(
+            {
+                name: replace(plane, symbols=0 * plane.symbols, coded=plane.coded & False)
+                if name in TIME_PLANES
+                else plane
+                for name, plane in scale.items()
+            }
+            for scale in scene.scales
+        ),
+    )
 
 
 def _smooth(scene: QuantisedScene) -> QuantisedScene:
     """The scene with planes that take few bytes however large they are: they rise and fall slowly, from end to end of 8 bits."""
+
     def slow(plane: QuantisedPlane) -> QuantisedPlane:
         index = np.arange(plane.symbols.size).reshape(plane.symbols.shape) // 32 % 512
         return replace(plane, symbols=(np.minimum(index, 511 - index) - 128).astype(np.int8), coded=plane.coded | True)
@@ -544,7 +791,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         raw = b"".join(chunks[number].parts)
         old = chunks[number]
         new = Chunk(old.kind, [change(raw)], old.scale, old.plane, old.row_start, old.row_count)
-        return pack([*chunks[:number], new, *chunks[number + 1:]], values, compress=False)
+        return pack([*chunks[:number], new, *chunks[number + 1 :]], values, compress=False)
 
     def set_at(offset: int, layout: str, *numbers: int | float) -> Callable[[bytes], bytes]:
         return lambda raw: patched(raw, offset, layout, *numbers)
@@ -572,21 +819,28 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
 
     def decoded_by(*parts: bytes) -> bytes:
         """The file with hybrid decoders in place of its own."""
-        return pack([*chunks[:deco], *(Chunk("HYBR", [part]) for part in parts), *chunks[occu:]], values, compress=False)
+        return pack(
+            [*chunks[:deco], *(Chunk("HYBR", [part]) for part in parts), *chunks[occu:]], values, compress=False
+        )
 
     def varied(*parts: bytes) -> bytes:
         return with_chunks("appe", *parts)
 
     def appe(*names: bytes, count: int = 2, hidden: int = 3, codes: bytes = bytes(2 * 2 * 3)) -> bytes:
-        return struct.pack("<HH", count, hidden) + codes + b"".join(struct.pack("<B", len(name)) + name for name in names)
+        return (
+            struct.pack("<HH", count, hidden) + codes + b"".join(struct.pack("<B", len(name)) + name for name in names)
+        )
 
     def without(number: int) -> bytes:
-        return pack(chunks[:number] + chunks[number + 1:], values, compress=False)
+        return pack(chunks[:number] + chunks[number + 1 :], values, compress=False)
 
     run = 1 << 17  # RFC 8878: a frame of one segment that claims 1 MiB, then eight blocks of 128 KiB of zeros each
-    bomb = b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", 8 * run) + b"".join(
-        struct.pack("<I", (block == 7) | 1 << 1 | run << 3)[:3] + b"\0" for block in range(8))
-    bomb_file = pack([*chunks[:xy], Chunk("PLNE", [bomb], 0, 0, 0, 4), *chunks[xy + 1:]], values, compress=False)
+    bomb = (
+        b"\x28\xb5\x2f\xfd\xa0"
+        + struct.pack("<I", 8 * run)
+        + b"".join(struct.pack("<I", (block == 7) | 1 << 1 | run << 3)[:3] + b"\0" for block in range(8))
+    )
+    bomb_file = pack([*chunks[:xy], Chunk("PLNE", [bomb], 0, 0, 0, 4), *chunks[xy + 1 :]], values, compress=False)
     nan = float("nan")
     broken = "FormatError"
 
@@ -600,8 +854,10 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
 
     def context(body: bytes, codec: int = CODEC_SYMBOLS) -> bytes:
         """A file whose first plane is so coded."""
-        told = [*small_chunks[:small_xy], _forced(small_chunks[small_xy], body, codec), *small_chunks[small_xy + 1:]]
-        return pack([chunk if number == small_xy else replace(chunk, coded={}) for number, chunk in enumerate(told)], 24)
+        told = [*small_chunks[:small_xy], _forced(small_chunks[small_xy], body, codec), *small_chunks[small_xy + 1 :]]
+        return pack(
+            [chunk if number == small_xy else replace(chunk, coded={}) for number, chunk in enumerate(told)], 24
+        )
 
     told = context(coarse)
     four = Blocks(np.trunc(_noise((2, 1, 1, 4, 4), 71) / 8).astype(np.int64), np.full((1, 1), 2), 40)
@@ -646,11 +902,13 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         """A file with such cameras, which claim to stand for so many bytes."""
         return claiming([*small_chunks[:3], Chunk("came", [body]), *small_chunks[3:]], 3, 24, length)
 
-    def damaged_words(name: str, made: Callable[[bytes], bytes], body: bytes, state_at: int) -> dict[str, tuple[bytes, str, str]]:
+    def damaged_words(
+        name: str, made: Callable[[bytes], bytes], body: bytes, state_at: int
+    ) -> dict[str, tuple[bytes, str, str]]:
         """Files, `made` of a body with state and words from `state_at` to its end, in which these are damaged."""
         last = len(body) - 1
         return {
-            f"{name}-short": (made(body[:state_at + 3]), broken, "cut off within its words"),
+            f"{name}-short": (made(body[: state_at + 3]), broken, "cut off within its words"),
             f"{name}-half-word": (made(body[:-1]), broken, "cut off within its words"),
             f"{name}-cut": (made(body[:-2]), broken, "do not end where they should"),
             f"{name}-long": (made(body + bytes(2)), broken, "do not end where they should"),
@@ -660,11 +918,20 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
 
     # A plane of nothing, told in fewer bytes than its number of symbols allows; the writer itself would take the zstd frame.
     vast = _scene(dynamic=False, sizes=[(256, 64, 64, 1, 0)])
-    vast = replace(vast, scales=({name: replace(plane, symbols=0 * plane.symbols, coded=plane.coded & False)
-                                  for name, plane in vast.scales[0].items()},))
+    vast = replace(
+        vast,
+        scales=(
+            {
+                name: replace(plane, symbols=0 * plane.symbols, coded=plane.coded & False)
+                for name, plane in vast.scales[0].items()
+            },
+        ),
+    )
     nothing = encode_with(weights, vast.scales[0]["xy"].symbols, vast.scales[0]["xy"].coded, TRELLIS)
-    hollow = [replace(chunk, coded={}, parts=[nothing] if number == small_xy else chunk.parts)
-              for number, chunk in enumerate(scene_chunks(vast))]
+    hollow = [
+        replace(chunk, coded={}, parts=[nothing] if number == small_xy else chunk.parts)
+        for number, chunk in enumerate(scene_chunks(vast))
+    ]
     bomb_symbols = patched(pack(hollow, _value_count(vast)), small_entry + 16, "<H", 2)
     for place in (48, small_entry + 24):
         bomb_symbols = patched(bomb_symbols, place, "<I", 64 * 64 * 256)
@@ -673,19 +940,39 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "magic": (patched(good, 1, "4s", b"JPEG"), broken, "not a .kpc file"),
         "version": (resealed(patched(good, 8, "<H", 2)), broken, "bytes of index"),  # its index is that of version 1
         "version-3": (resealed(patched(good, 8, "<H", 3)), broken, "format version 3"),
-        "columns-garbage": (in_columns(good, frame=lambda frame: patched(frame, 0, "<B", 0)), broken, "chunk index is no valid zstd frame"),
-        "columns-long": (in_columns(good, frame=lambda frame: frame + b"\0"), broken, "chunk index is no valid zstd frame"),
+        "columns-garbage": (
+            in_columns(good, frame=lambda frame: patched(frame, 0, "<B", 0)),
+            broken,
+            "chunk index is no valid zstd frame",
+        ),
+        "columns-long": (
+            in_columns(good, frame=lambda frame: frame + b"\0"),
+            broken,
+            "chunk index is no valid zstd frame",
+        ),
         "columns-fewer": (in_columns(good, count=len(chunks) + 1), broken, "claims another length"),
         "columns-many": (in_columns(good, count=1000), broken, "1000 chunks in a file of"),
-        "columns-reserved": (in_columns(good, lambda told: patched(told, 18 * len(chunks), "<B", 1)), broken, "reserved"),
+        "columns-reserved": (
+            in_columns(good, lambda told: patched(told, 18 * len(chunks), "<B", 1)),
+            broken,
+            "reserved",
+        ),
         "columns-kind": (in_columns(good, lambda told: patched(told, 0, "<B", 0)), broken, "four letters"),
-        "columns-end": (in_columns(good, lambda told: patched(told, 21 * len(chunks), "<B", 1)), broken, "the chunks end at"),
-        "columns-raw-length": (in_columns(good, lambda told: patched(told, 26 * len(chunks), "<B", 255)), broken, "more than the header's"),
+        "columns-end": (
+            in_columns(good, lambda told: patched(told, 21 * len(chunks), "<B", 1)),
+            broken,
+            "the chunks end at",
+        ),
+        "columns-raw-length": (
+            in_columns(good, lambda told: patched(told, 26 * len(chunks), "<B", 255)),
+            broken,
+            "more than the header's",
+        ),
         "header-crc": (patched(good, 40, "<Q", values + 1), broken, "header is damaged"),
         "header-flags": (resealed(patched(good, 10, "<H", 1)), broken, "reserved"),
         "header-reserved": (resealed(patched(good, 52, "<I", 1)), broken, "reserved"),
         "header-cut": (good[:63], broken, "cut off within the header"),
-        "index-cut": (good[:HEADER.size + 1], broken, "cut off"),
+        "index-cut": (good[: HEADER.size + 1], broken, "cut off"),
         "chunk-cut": (good[:-1], broken, "cut off"),
         "trailing-byte": (good + b"\0", broken, "follow the end"),
         "no-chunks": (resealed(patched(good, 24, "<II", 0, 0)), broken, "0 chunks"),
@@ -703,8 +990,11 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "place": (resealed(patched(good, entry[deco] + 6, "<B", 1)), broken, "among the planes"),
         "chunk-crc": (patched(good, body[xy] + 9, "<B", good[body[xy] + 9] ^ 1), broken, "is damaged"),
         "raw-length": (resealed(patched(good, entry[deco] + 24, "<I", 1)), broken, "not the 1 it claims"),
-        "zstd-length": (resealed(patched(patched(bomb_file, entry[xy] + 16, "<H", 1), entry[xy] + 24, "<I", 40)),
-                        broken, "claims another length"),
+        "zstd-length": (
+            resealed(patched(patched(bomb_file, entry[xy] + 16, "<H", 1), entry[xy] + 24, "<I", 40)),
+            broken,
+            "claims another length",
+        ),
         "zstd-garbage": (resealed(patched(good, entry[xy] + 16, "<H", 1)), broken, "zstd frame"),
         "symbols-sets": (context(patched(coarse, 0, "<B", 3)), broken, "number of sets"),
         "symbols-flags": (context(patched(coarse, 1, "<B", 6)), broken, "unknown side of blocks"),
@@ -729,35 +1019,55 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "symbols-range": (context(walked(symbols + 200, whole, weights, ANY)), broken, "leaves its 8 bits"),
         "around-range": (context(walked(0 * symbols + 200, whole, weights, AROUND)), broken, "leaves its 8 bits"),
         "symbols-count": (resealed(patched(told, small_entry + 24, "<I", 7)), broken, "claims 7 symbols"),
-        "symbols-elsewhere": (resealed(patched(good, entry[deco] + 16, "<H", 2)), broken, "weights"),  # DECO had no codec 2 once
+        "symbols-elsewhere": (
+            resealed(patched(good, entry[deco] + 16, "<H", 2)),
+            broken,
+            "weights",
+        ),  # DECO had no codec 2 once
         "symbols-in-head": (resealed(patched(good, entry[scne] + 16, "<H", 2)), broken, "codec 2"),
         **damaged_words("cells", occupied, cells, 8),
         "cells-none": (occupied(patched(cells, 4, "<H", 0)), broken, "makes no sense"),
         "cells-more": (occupied(patched(cells, 0, "<H", 2), 8 + 12), broken, "do not end where they should"),
         "cells-length": (occupied(cells, 15), broken, "claims 15 bytes"),
-        "cells-bomb": (occupied(struct.pack("<4HI", 8, 50, 80, 100, 1 << 16), 8 + 400_000), broken, "more than 12 bytes can hold"),
-        "nodes-weights": (moving(nodes[:nodes_at - 1]), broken, "cut off within its weights"),
+        "cells-bomb": (
+            occupied(struct.pack("<4HI", 8, 50, 80, 100, 1 << 16), 8 + 400_000),
+            broken,
+            "more than 12 bytes can hold",
+        ),
+        "nodes-weights": (moving(nodes[: nodes_at - 1]), broken, "cut off within its weights"),
         **damaged_words("nodes", moving, nodes, nodes_at),
-        "nodes-range": (moving(struct.pack("<4Hf", 2, 2, 2, 2, grid.step) + encode_nodes_with(LORENZO, leaving), 12 + 6 * 16),
-                        broken, "leaves its 16 bits"),
+        "nodes-range": (
+            moving(struct.pack("<4Hf", 2, 2, 2, 2, grid.step) + encode_nodes_with(LORENZO, leaving), 12 + 6 * 16),
+            broken,
+            "leaves its 16 bits",
+        ),
         "nodes-rows": (moving(patched(nodes, 0, "<H", 1)), broken, "makes no sense"),
         "nodes-step": (moving(patched(nodes, 8, "<f", nan)), broken, "outside its range"),
         "nodes-length": (moving(nodes, 12 + 6 * 24 + 1), broken, "claims 157 bytes"),
-        "nodes-bomb": (moving(struct.pack("<4Hf15hI", 50, 60, 60, 20, grid.step, *15 * [0], 1 << 16), 12 + 6 * 50 * 60 * 60 * 20),
-                       broken, "more than 46 bytes can hold"),
+        "nodes-bomb": (
+            moving(struct.pack("<4Hf15hI", 50, 60, 60, 20, grid.step, *15 * [0], 1 << 16), 12 + 6 * 50 * 60 * 60 * 20),
+            broken,
+            "more than 46 bytes can hold",
+        ),
         **damaged_words("midpoints", moving_halves, halves, 12),
-        "midpoints-range": (moving_halves(struct.pack("<4Hf", 2, 2, 2, 2, grid.step) + encode_midpoints(leaving), 12 + 6 * 16),
-                            broken, "leaves its 16 bits"),
+        "midpoints-range": (
+            moving_halves(struct.pack("<4Hf", 2, 2, 2, 2, grid.step) + encode_midpoints(leaving), 12 + 6 * 16),
+            broken,
+            "leaves its 16 bits",
+        ),
         "midpoints-rows": (moving_halves(patched(halves, 0, "<H", 1)), broken, "makes no sense"),
         "midpoints-length": (moving_halves(halves, 12 + 6 * 24 + 1), broken, "claims 157 bytes"),
-        "midpoints-bomb": (moving_halves(struct.pack("<4HfI", 50, 60, 60, 20, grid.step, 1 << 16), 12 + 6 * 50 * 60 * 60 * 20),
-                           broken, "more than 16 bytes can hold"),
+        "midpoints-bomb": (
+            moving_halves(struct.pack("<4HfI", 50, 60, 60, 20, grid.step, 1 << 16), 12 + 6 * 50 * 60 * 60 * 20),
+            broken,
+            "more than 16 bytes can hold",
+        ),
         **damaged_words("weights", weighing, small_weights, powers_at + 5),
         "weights-power": (weighing(patched(small_weights, powers_at, "<b", 16)), broken, "not one of float16's"),
         "weights-range": (weighing(patched(small_weights, powers_at, "<b", 15)), broken, "no number of float16"),
-        "weights-none": (weighing(small_weights[:powers_at + 3]), broken, "cut off within its words"),
+        "weights-none": (weighing(small_weights[: powers_at + 3]), broken, "cut off within its words"),
         "weights-length": (weighing(small_weights, small_raw + 2), broken, "bytes of weights, not those"),
-        "poses-head": (turned(told_turn[:POSES_HEAD.size - 1]), broken, "cut off within its head"),
+        "poses-head": (turned(told_turn[: POSES_HEAD.size - 1]), broken, "cut off within its head"),
         "poses-none": (turned(patched(told_turn, 0, "<H", 0)), broken, "0 cameras"),
         "poses-many": (turned(patched(told_turn, 0, "<H", 4097)), broken, "4097 cameras"),
         "poses-lenses": (turned(patched(told_turn, 2, "<H", 3)), broken, "3 lenses of 2 cameras"),
@@ -765,8 +1075,16 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "poses-fine": (turned(patched(told_turn, 4, "<b", -127)), broken, "multiples of 2^-127"),
         "poses-short": (turned(told_turn[:-1]), broken, "are not those of 2 cameras"),
         "poses-long": (turned(told_turn + bytes(1)), broken, "are not those of 2 cameras"),
-        "poses-turn": (turned(told_poses(0, (0, 0, 0), 2 * [(0, -ROOT, ROOT, 1)], 2 * [(0, 0, 0)])), broken, "a turn or a place is none"),
-        "poses-place-bits": (turned(patched(told_turn, len(told_turn) - 1, "<B", 64)), broken, "a turn or a place is none"),
+        "poses-turn": (
+            turned(told_poses(0, (0, 0, 0), 2 * [(0, -ROOT, ROOT, 1)], 2 * [(0, 0, 0)])),
+            broken,
+            "a turn or a place is none",
+        ),
+        "poses-place-bits": (
+            turned(patched(told_turn, len(told_turn) - 1, "<B", 64)),
+            broken,
+            "a turn or a place is none",
+        ),
         "poses-far": (turned(told_poses(30, (2, 0, 0), 2 * [(0, 0, 0, 0)], 2 * [(0, 0, 0)])), broken, "absurdly far"),
         "poses-focal": (turned(patched(told_turn, POSES_HEAD.size + 4, "<f", 0.0)), broken, "focal length"),
         "poses-length": (turned(told_turn, 2 + 68), broken, "claims 70 bytes"),
@@ -818,8 +1136,11 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         "move-short": (displaced(move(2, 2, 2, 2, 0.5**13)[:-1]), broken, "ends after"),
         "move-long": (displaced(move(2, 2, 2, 2, 0.5**13) + bytes(1)), broken, "1 bytes too long"),
         "move-twice": (displaced(*2 * [move(2, 2, 2, 2, 0.5**13)]), broken, "2 MOVE chunks"),
-        "move-static": (pack([*scene_chunks(still), Chunk("MOVE", [move(2, 2, 2, 2, 0.5**13)])], still_values, compress=False),
-                        broken, "static scene"),
+        "move-static": (
+            pack([*scene_chunks(still), Chunk("MOVE", [move(2, 2, 2, 2, 0.5**13)])], still_values, compress=False),
+            broken,
+            "static scene",
+        ),
         "decoder-features": (repacked(deco, set_at(0, "<H", 3)), broken, "3 features"),
         "decoder-nan": (repacked(deco, set_at(8, "<H", 0x7E00)), broken, "NaN or infinite"),
         "hybrid-features": (decoded_by(patched(mlps, 0, "<H", 3)), broken, "3 features"),
@@ -854,43 +1175,82 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
 
 def minimal_scene() -> QuantisedScene:
     """The smallest scene worth a look: one channel, two texels an axis, a fog that is denser towards +x."""
-    planes = {name: QuantisedPlane(np.array([[[0], [4]], [[0], [4]]], np.int8), np.array([0.25], np.float32),
-                                   np.array([1.0], np.float32), np.ones((2, 2), bool))
-              for name in SPACE_PLANES}
-    decoder = Decoder(np.array([1.0], np.float32), 0.0, np.zeros((1, 9), np.float32), np.zeros(1, np.float32),
-                      np.zeros((3, 1, 1), np.float32), np.array([[1.0], [0.5], [0.0]], np.float32))
-    return QuantisedScene(np.array([[0, 0, 0], [1, 1, 1]], np.float32), Clip(1, 1.0), (planes,), decoder,
-                          np.ones((1, 1, 1, 1), bool), np.zeros(3, np.float32), 0.125)
+    planes = {
+        name: QuantisedPlane(
+            np.array([[[0], [4]], [[0], [4]]], np.int8),
+            np.array([0.25], np.float32),
+            np.array([1.0], np.float32),
+            np.ones((2, 2), bool),
+        )
+        for name in SPACE_PLANES
+    }
+    decoder = Decoder(
+        np.array([1.0], np.float32),
+        0.0,
+        np.zeros((1, 9), np.float32),
+        np.zeros(1, np.float32),
+        np.zeros((3, 1, 1), np.float32),
+        np.array([[1.0], [0.5], [0.0]], np.float32),
+    )
+    return QuantisedScene(
+        np.array([[0, 0, 0], [1, 1, 1]], np.float32),
+        Clip(1, 1.0),
+        (planes,),
+        decoder,
+        np.ones((1, 1, 1, 1), bool),
+        np.zeros(3, np.float32),
+        0.125,
+    )
 
 
-def _scene(dynamic: bool, sizes: list[tuple[int, int, int, int, int]], amplitude: int = 60,
-           cameras: int = 0) -> QuantisedScene:
+def _scene(
+    dynamic: bool, sizes: list[tuple[int, int, int, int, int]], amplitude: int = 60, cameras: int = 0
+) -> QuantisedScene:
     """A scene made of integers alone. `sizes`: channels, Nx, Ny, Nz, T of each scale."""
     scales = []
     for number, (channels, nx, ny, nz, nt) in enumerate(sizes):
         size = {"x": nx, "y": ny, "z": nz, "t": nt}
-        scales.append({
-            name: _plane(size[name[1]], size[name[0]], channels, amplitude, ALL_PLANES.index(name) + 7 * number,
-                         name in TIME_PLANES)
-            for name in (ALL_PLANES if dynamic else SPACE_PLANES)
-        })
+        scales.append(
+            {
+                name: _plane(
+                    size[name[1]],
+                    size[name[0]],
+                    channels,
+                    amplitude,
+                    ALL_PLANES.index(name) + 7 * number,
+                    name in TIME_PLANES,
+                )
+                for name in (ALL_PLANES if dynamic else SPACE_PLANES)
+            }
+        )
     features, hidden = sum(size[0] for size in sizes), 3
-    weights = {name: _noise(shape, 17 + k) / np.float32(64)
-               for k, (name, shape) in enumerate(Decoder.shapes(features, hidden).items())}
+    weights = {
+        name: _noise(shape, 17 + k) / np.float32(64)
+        for k, (name, shape) in enumerate(Decoder.shapes(features, hidden).items())
+    }
     occupancy = _noise((2 if dynamic else 1, 3, 3, 5), 99) > 0
     pose = np.array([[1, 0, 0, 0.5], [0, 1, 0, -0.25], [0, 0, 1, 3], [0, 0, 0, 1]], np.float64)
     return QuantisedScene(
-        np.array([[-1, -0.75, -0.5], [1, 0.75, 0.5]], np.float32), Clip(12, 24.0) if dynamic else Clip(1, 24.0),
-        tuple(scales), Decoder(density_bias=0.5, **weights), occupancy, np.array([0.25, 0.5, 1], np.float32), 0.0625,
-        tuple(Camera(64 + k, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(cameras)))
+        np.array([[-1, -0.75, -0.5], [1, 0.75, 0.5]], np.float32),
+        Clip(12, 24.0) if dynamic else Clip(1, 24.0),
+        tuple(scales),
+        Decoder(density_bias=0.5, **weights),
+        occupancy,
+        np.array([0.25, 0.5, 1], np.float32),
+        0.0625,
+        tuple(Camera(64 + k, 48, 80.0, 80.5, 32.0, 24.0, pose) for k in range(cameras)),
+    )
 
 
-def _painted(paint: Callable[[tuple[int, int, int], int], np.ndarray], coded: bool = True,
-             size: tuple[int, int, int] = (9, 6, 5)) -> QuantisedScene:
+def _painted(
+    paint: Callable[[tuple[int, int, int], int], np.ndarray], coded: bool = True, size: tuple[int, int, int] = (9, 6, 5)
+) -> QuantisedScene:
     """A static scene of `paint(shape, number)` on every plane, all of whose texels are coded, or none."""
     scene = _scene(dynamic=False, sizes=[(3, *size, 0)])
     planes = {
-        name: replace(plane, symbols=paint(plane.symbols.shape, number).astype(np.int8), coded=np.full(plane.coded.shape, coded))
+        name: replace(
+            plane, symbols=paint(plane.symbols.shape, number).astype(np.int8), coded=np.full(plane.coded.shape, coded)
+        )
         for number, (name, plane) in enumerate(scene.scales[0].items())
     }
     return replace(scene, scales=(planes,))
@@ -911,15 +1271,22 @@ def _in_all_contexts() -> bytes:
 
 def _hybrid(features: int, width: int, hidden: int) -> HybridDecoder:
     shapes = HybridDecoder.shapes(features, width, hidden)
-    return HybridDecoder(density_bias=0.5, **{
-        name: _noise(shape, 17 + k) / np.float32(64) for k, (name, shape) in enumerate(shapes.items())})
+    return HybridDecoder(
+        density_bias=0.5,
+        **{name: _noise(shape, 17 + k) / np.float32(64) for k, (name, shape) in enumerate(shapes.items())},
+    )
 
 
 def _extreme(decoder: Decoder) -> Decoder:
     """With the largest and the smallest numbers that codec 2 has, and an array of zeros."""
-    return replace(decoder, density_weight=np.float32([-65504, 65504, 32][:len(decoder.density_weight)]), w1=0 * decoder.w1,
-                   b1=np.float32([1, -2, 2048]) * np.float32(0.5**24),
-                   w2=_noise(decoder.w2.shape, 83) * np.float32(16), b2=_noise(decoder.b2.shape, 84) * np.float32(0.5**20))
+    return replace(
+        decoder,
+        density_weight=np.float32([-65504, 65504, 32][: len(decoder.density_weight)]),
+        w1=0 * decoder.w1,
+        b1=np.float32([1, -2, 2048]) * np.float32(0.5**24),
+        w2=_noise(decoder.w2.shape, 83) * np.float32(16),
+        b2=_noise(decoder.b2.shape, 84) * np.float32(0.5**20),
+    )
 
 
 def _motion(rows: int, nz: int, ny: int, nx: int, step: float = 8.0) -> QuantisedMotion:
@@ -978,14 +1345,21 @@ def _rays(scene: QuantisedScene) -> list[dict[str, Any]]:
     rays, appearances = [], itertools.islice(itertools.chain(scene.appearances, itertools.repeat(None)), 4)
     for origin, direction, time, look in zip(origins, directions, (0.0, 0.375, 0.8125, 1.0), appearances, strict=True):
         with np.errstate(over="ignore"):  # a vector may saturate colours
-            seen = reference.render_rays(scene.dequantise(), origin[None], direction[None], time, appearance=look and look.code)
+            seen = reference.render_rays(
+                scene.dequantise(), origin[None], direction[None], time, appearance=look and look.code
+            )
         depth = float(seen.depth[0])
-        rays.append({
-            "origin": origin.tolist(), "direction": direction.tolist(), "time": time,
-            "rgb": [round(float(c), 6) for c in seen.rgb[0]], "opacity": round(float(seen.opacity[0]), 6),
-            "depth": round(depth, 6) if np.isfinite(depth) else None,
-            **({"appearance": look and look.name} if scene.appearances else {}),
-        })
+        rays.append(
+            {
+                "origin": origin.tolist(),
+                "direction": direction.tolist(),
+                "time": time,
+                "rgb": [round(float(c), 6) for c in seen.rgb[0]],
+                "opacity": round(float(seen.opacity[0]), 6),
+                "depth": round(depth, 6) if np.isfinite(depth) else None,
+                **({"appearance": look and look.name} if scene.appearances else {}),
+            }
+        )
     return rays
 
 
@@ -1002,6 +1376,7 @@ def _sha256(*arrays: np.ndarray) -> str:
 
 def _json(document: dict[str, Any]) -> bytes:
     """A line for each member, and for each element of one that is a list of objects."""
+
     def lines(value: Any) -> str:
         if isinstance(value, list) and value and isinstance(value[0], dict):
             return "[\n  " + ",\n  ".join(json.dumps(element, separators=(",", ":")) for element in value) + "]"

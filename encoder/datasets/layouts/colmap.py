@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import BinaryIO, TextIO
 
 import numpy as np
-
 from kpc.encoder.datasets.capture import (
     HOLD_OUT_EVERY,
     Capture,
@@ -173,7 +172,9 @@ def _camera_to_world(where: str, pose: tuple[float, ...]) -> np.ndarray:
     rotation = rotation_of(np.array(pose[:4]) / length)  # which would overflow with some of them
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = rotation.T * [1, -1, -1]
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused with the other poses that are not finite
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # what overflows is refused with the other poses that are not finite
         camera_to_world[:3, 3] = -rotation.T @ np.array(pose[4:])
     return camera_to_world
 

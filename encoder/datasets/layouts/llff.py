@@ -7,7 +7,6 @@ Row n of `poses_bounds.npy` belongs to the n-th file in natural order: 15 number
 from pathlib import Path
 
 import numpy as np
-
 from kpc.encoder.datasets.capture import (
     HOLD_OUT_EVERY,
     Capture,

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from kpc.encoder.datasets.capture import View, image_view
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import image_size
