@@ -1,4 +1,4 @@
-"""What README.md and docs/measured.md show must work."""
+"""What README.md and docs/benchmarks.md show must work."""
 
 import importlib
 import re
@@ -15,7 +15,7 @@ from kpc.format.scene.cameras import load_shots
 from scenes import tiny_scene
 
 ROOT = Path(__file__).parent.parent
-README, MEASURED = ((ROOT / name).read_text() for name in ("README.md", "docs/measured.md"))
+README, MEASURED = ((ROOT / name).read_text() for name in ("README.md", "docs/benchmarks.md"))
 PICTURE_LIMIT = 200_000
 
 

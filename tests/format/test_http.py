@@ -14,7 +14,7 @@ from kpc.format.container import http
 from kpc.format.container.container import RemoteSource, Source
 from kpc.format.container.http import FIRST_BYTES, HttpSource, is_url
 from kpc.format.container.scene_io import SceneReader, write
-from kpc.tools.cli.serve import Handler, Line, serving
+from kpc.tools.cli.serve import Handler, Link, serving
 from scenes import tiny_scene
 
 import kpc
@@ -235,7 +235,7 @@ def test_silence_is_not_waited_out(folder: Path, monkeypatch: pytest.MonkeyPatch
 def test_a_trickle_is_not_waited_out(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "PATIENCE_S", 0.3)
     monkeypatch.setattr(http, "LEAST_BYTES_S", 1e6)
-    with serving(folder, line=Line(rate=50_000)) as address:
+    with serving(folder, link=Link(rate=50_000)) as address:
         source = HttpSource(f"{address}/data.bin", attempts=2, say=lambda message: None)
         with pytest.raises(UnreachableError, match="too slow"):
             source.read_at(0, 60_000)
@@ -381,7 +381,7 @@ def test_a_server_cannot_speak_to_the_terminal(folder: Path) -> None:
 
 
 def test_an_interrupted_read_goes_on_later_where_it_was(folder: Path) -> None:
-    with serving(folder, line=Line(rate=200_000), handler=Noting) as address:
+    with serving(folder, link=Link(rate=200_000), handler=Noting) as address:
         source = HttpSource(f"{address}/data.bin")
         source.interrupt()
         with pytest.raises(InterruptedRead):
@@ -394,7 +394,7 @@ def test_an_interrupted_read_goes_on_later_where_it_was(folder: Path) -> None:
 
 
 def test_closing_ends_what_another_thread_waits_for(folder: Path) -> None:
-    with serving(folder, line=Line(rate=20_000)) as address:
+    with serving(folder, link=Link(rate=20_000)) as address:
         source, errors = HttpSource(f"{address}/data.bin"), []
 
         def read() -> None:

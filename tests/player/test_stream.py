@@ -23,7 +23,7 @@ from kpc.player.quality import Quality
 from kpc.player.streaming import stream as module
 from kpc.player.streaming.prefetch import Playhead
 from kpc.player.streaming.stream import Stream
-from kpc.tools.cli.serve import Handler, Line, serving
+from kpc.tools.cli.serve import Handler, Link, serving
 from scenes import SPACES, tiny_scene
 from test_partial import coded
 
@@ -116,7 +116,7 @@ def test_the_coarse_picture_is_there_long_before_the_rest_and_gets_finer(
     data = coded(tiny_scene(4, time=10, scales=3, resolution=(96, 80, 64)))
     (tmp_path / "scene.kpc").write_bytes(data)
     whole, found = kpc.load(data), []
-    with serving(tmp_path, line=Line(rate=20_000)) as url:
+    with serving(tmp_path, link=Link(rate=20_000)) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         for scales in (1, 2, 3):
@@ -185,7 +185,7 @@ def test_a_jump_is_served_before_all_that_lies_between(
     data = long_scene()
     (tmp_path / "scene.kpc").write_bytes(data)
     Noting.asked.clear()
-    with serving(tmp_path, line=Line(rate=40_000, delay_s=0.002), handler=Noting) as url:
+    with serving(tmp_path, link=Link(rate=40_000, delay_s=0.002), handler=Noting) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         until(lambda: stream.scales_here == 2 and stream.can_show(0.0), stream, renderer)
@@ -210,7 +210,7 @@ def test_a_jump_does_not_wait_for_the_end_of_a_large_chunk(watched: Callable[...
     (tmp_path / "scene.kpc").write_bytes(data)
     largest = max(e.stored_length for e in Reader(data).index)
     assert largest > 100_000
-    with serving(tmp_path, line=Line(rate=100_000)) as url:
+    with serving(tmp_path, link=Link(rate=100_000)) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         until(
@@ -333,7 +333,7 @@ def test_a_server_without_ranges_plays_from_the_beginning_on(
             del self.headers["Range"]
             super().do_GET()
 
-    with serving(tmp_path, handler=Whole, line=Line(rate=100_000)) as url:
+    with serving(tmp_path, handler=Whole, link=Link(rate=100_000)) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         until(lambda: stream.scales_here >= 1 and stream.can_show(0.0), stream, renderer)
@@ -418,7 +418,7 @@ def test_a_bug_in_the_thread_is_no_silence(watched: Callable[..., Stream], monke
 
 def test_closing_does_not_wait_for_a_slow_line(tmp_path: Path) -> None:
     (tmp_path / "scene.kpc").write_bytes(long_scene())
-    with serving(tmp_path, line=Line(rate=20_000)) as url:
+    with serving(tmp_path, link=Link(rate=20_000)) as url:
         stream = Stream(open_source(f"{url}/scene.kpc"))
         started = clock.monotonic()
         stream.close()

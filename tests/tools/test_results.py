@@ -116,7 +116,7 @@ def test_documents_without_a_pair_of_markers_a_name_are_refused(tmp_path: Path, 
         results.names_in(document)
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/measured.md"])
+@pytest.mark.parametrize("document", ["README.md", "docs/benchmarks.md"])
 def test_committed_records_make_the_tables_of_the_documents(document: str) -> None:
     root = Path(__file__).parents[2]
     text = (root / document).read_text()

@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from kpc.tools.cli import serve
-from kpc.tools.cli.serve import Line, serving
+from kpc.tools.cli.serve import Link, serving
 
 DATA = bytes(range(256)) * 40
 
@@ -62,7 +62,7 @@ def test_nothing_outside_the_folder_is_served(folder: Path) -> None:
 
 
 def test_a_slow_line_is_slow(folder: Path) -> None:
-    with serving(folder, line=Line(rate=50_000, delay_s=0.05)) as url:
+    with serving(folder, link=Link(rate=50_000, delay_s=0.05)) as url:
         started = clock.monotonic()
         assert get(url, "/scene.kpc")[1] == DATA
         assert 0.2 < clock.monotonic() - started

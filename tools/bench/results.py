@@ -1,7 +1,7 @@
 """Tables of benchmark records, and the documents that hold them.
 
 python -m kpc.tools.bench.results docs/bench/*.json                                        print the tables as Markdown
-python -m kpc.tools.bench.results docs/bench/*.json --into README.md docs/measured.md      rewrite those between the documents' markers
+python -m kpc.tools.bench.results docs/bench/*.json --into README.md docs/benchmarks.md      rewrite those between the documents' markers
 
 Tables in documents come from here, never from a keyboard. A cell is the median over the repeats of a run.
 """

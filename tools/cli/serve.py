@@ -28,7 +28,7 @@ PIECE_BYTES = 4096
 """Sent at a time where the rate is limited."""
 
 
-class Line:
+class Link:
     """A connection to the world that all requests share: so many bytes a second, each answer so much later.
 
     Attributes:
@@ -51,12 +51,12 @@ class Handler(http.server.SimpleHTTPRequestHandler):
     """Python's own, and byte ranges: one a request, and If-Range."""
 
     protocol_version = "HTTP/1.1"
-    line: ClassVar[Line] = Line()
+    link: ClassVar[Link] = Link()
     timeout = 60
     disable_nagle_algorithm = True  # else a short body waits for the answer to its header
 
-    def __init__(self, *args: object, line: Line | None = None, **kwargs: object) -> None:
-        self.shared = line or self.line
+    def __init__(self, *args: object, link: Link | None = None, **kwargs: object) -> None:
+        self.shared = link or self.link
         super().__init__(*args, **kwargs)  # type: ignore[arg-type]
 
     def do_GET(self) -> None:
@@ -132,10 +132,10 @@ class _Server(http.server.ThreadingHTTPServer):
 
 @contextmanager
 def serving(
-    folder: Path, *, port: int = 0, line: Line | None = None, handler: type[Handler] = Handler
+    folder: Path, *, port: int = 0, link: Link | None = None, handler: type[Handler] = Handler
 ) -> Iterator[str]:
     """Serve a folder to this machine while the context lasts; gives the URL of the folder, without a slash at its end."""
-    server = _Server(("127.0.0.1", port), partial(handler, directory=str(folder), line=line))
+    server = _Server(("127.0.0.1", port), partial(handler, directory=str(folder), link=link))
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
     thread.start()
     try:
@@ -163,7 +163,7 @@ def _command(argv: list[str]) -> None:
         raise UsageError(f"{options.folder}: no such folder")
     if not 0 <= options.port < 65536:
         raise UsageError(f"--port {options.port} is none")
-    with serving(options.folder, port=options.port, line=Line(options.rate, options.delay)) as url:
+    with serving(options.folder, port=options.port, link=Link(options.rate, options.delay)) as url:
         for path in sorted(options.folder.glob("*.kpc")):
             print(f"{url}/{path.name}", flush=True)
         print(f"serve: {options.folder} at {url}; Ctrl-C ends it", file=sys.stderr)
