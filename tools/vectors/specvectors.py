@@ -110,14 +110,14 @@ def vectors() -> dict[str, bytes]:
     """All files of the vector set: path -> content."""
     files = {}
     scenes = _valid()
-    for name, (data, partial) in scenes.items():
+    for name, (data, is_partial) in scenes.items():
         files[f"valid/{name}.kpc"] = data
-        files[f"valid/{name}.json"] = _json(described(data, partial))
-    whole = {name: data for name, (data, partial) in scenes.items() if not partial}
-    for name, (data, partial) in groupvectors.valid(whole).items():
+        files[f"valid/{name}.json"] = _json(described(data, is_partial))
+    whole = {name: data for name, (data, is_partial) in scenes.items() if not is_partial}
+    for name, (data, is_partial) in groupvectors.valid(whole).items():
         files[f"valid/{name}.kpc"] = data
         files[f"valid/{name}.json"] = _json(
-            groupvectors.described(data, partial, {data: name for name, data in whole.items()})
+            groupvectors.described(data, is_partial, {data: name for name, data in whole.items()})
         )
     for name, (data, error, message) in (_invalid() | groupvectors.invalid(whole)).items():
         files[f"invalid/{name}.kpc"] = data
