@@ -1,4 +1,4 @@
-"""Processes that work for another one."""
+"""Worker processes."""
 
 import os
 import signal
@@ -25,19 +25,19 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
-def test_they_end_when_it_is_killed(tmp_path: Path) -> None:
+@pytest.mark.skipif(os.name != "posix", reason="uses POSIX signals")
+def test_workers_exit_when_their_parent_is_killed(tmp_path: Path) -> None:
     (tmp_path / "parent.py").write_text(PARENT)
     parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py"), str(tmp_path / "pid")])
     child = int(_awaited(lambda: (tmp_path / "pid").read_text() if (tmp_path / "pid").exists() else ""))
-    os.kill(child, 0)  # it is there
+    os.kill(child, 0)  # raises unless the process exists
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     assert _awaited(lambda: "gone" if _is_gone(child) else "") == "gone"
 
 
 def _awaited(found) -> str:  # type: ignore[no-untyped-def]
-    """What is found, within half a minute, or an empty text."""
+    """Return the first non-empty text that `found` returns within half a minute."""
     until = time.monotonic() + 30
     while not (text := found()) and time.monotonic() < until:
         time.sleep(0.05)
@@ -50,4 +50,4 @@ def _is_gone(pid: int) -> bool:
     except ProcessLookupError:
         return True
     stat = Path(f"/proc/{pid}/stat")
-    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] == "Z"  # dead, and nobody there to be told
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] == "Z"  # a zombie that nobody reaps

@@ -1,4 +1,4 @@
-"""Processes that work for another one."""
+"""Worker processes."""
 
 import multiprocessing
 import os
@@ -6,7 +6,10 @@ import threading
 
 
 def end_with_parent() -> None:
-    """The initialiser of a pool's processes: end when the one that started them is gone, killed, say, however deep in work."""
+    """Make this worker process exit as soon as its parent does, even if the parent was killed.
+
+    It is the initialiser of a process pool; a thread waits for the parent, so a long computation does not delay it.
+    """
     parent = multiprocessing.parent_process()
     assert parent is not None
 
