@@ -15,20 +15,20 @@ from kpc.player.app import kpplay, panels
 from kpc.player.app import window as window_module
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.desktop import glfw, imgui
-from kpc.player.app.preferences import Preferences, place
-from kpc.player.app.quality_controller import RUNGS
+from kpc.player.app.preferences import Preferences, preferences_path
+from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.window import Player, Window
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.renderer import Look
 from kpc.player.quality import DEFAULT, climbed
-from kpc.player.streaming.group_playback import Reel
+from kpc.player.streaming.group_playback import GroupPlayback
 from pytest import approx, raises
 
 
 def main(scene_file: str) -> None:
     ask_for_less()
     window = Window("test", (320, 240))
-    stream = Reel(open_source(scene_file))
+    stream = GroupPlayback(open_source(scene_file))
     player = Player(window, stream, Preferences(text_size=0.9, speed=1.0))
     while not stream.is_settled:
         player.frame()
@@ -87,11 +87,11 @@ def main(scene_file: str) -> None:
     average = canvas()
     for number, name in enumerate(("dawn.jpg", "noon.jpg", "dusk.jpg"), 1):
         press(glfw.KEY_V)
-        assert player.wardrobe.number == number and player.wardrobe.names[number] == name
-    player.wardrobe.advance(1.0)
+        assert player.appearance.number == number and player.appearance.names[number] == name
+    player.appearance.advance(1.0)
     assert np.abs(canvas() - average).max() > 10
     press(glfw.KEY_V)
-    player.wardrobe.advance(1.0)
+    player.appearance.advance(1.0)
     assert np.abs(canvas() - average).max() <= 1  # where a value lies between two levels, it may round to either
 
     before = player.view
@@ -111,16 +111,16 @@ def main(scene_file: str) -> None:
     press(glfw.KEY_B)
     assert player.preset_number == 0 and player.view.eye != approx(before.eye)
 
-    rung = player.dial.rung
+    rung = player.quality.level
     press(glfw.KEY_MINUS)
-    assert player.dial.rung == climbed(rung, -1) and rung == DEFAULT
+    assert player.quality.level == climbed(rung, -1) and rung == DEFAULT
     press(glfw.KEY_EQUAL)
-    assert player.dial.rung == rung
+    assert player.quality.level == rung
     press(glfw.KEY_U)
-    assert player.dial.target_s == approx(1 / 30)
+    assert player.quality.target_s == approx(1 / 30)
     press(glfw.KEY_U, glfw.KEY_T, glfw.KEY_G)
-    assert player.dial.target_s is None and player.show_planes and player.show_graphs
-    player.dial.choose(rung)  # where it stood is the machine's business
+    assert player.quality.target_s is None and player.show_planes and player.show_graphs
+    player.quality.choose(rung)  # where it stood is the machine's business
     before_size = player.text_size
     press(glfw.KEY_EQUAL, mods=glfw.MOD_CONTROL)
     assert player.text_size > before_size
@@ -289,7 +289,7 @@ def see_every_pixel_once(window: Window, player: Player) -> None:
     show = panels.show
 
     def measure(player: Player) -> None:
-        heights.append(imgui.get_font_size() * player.overlay.io.display_framebuffer_scale.x)
+        heights.append(imgui.get_font_size() * player.imgui.io.display_framebuffer_scale.x)
         show(player)
 
     for units, count, text in (
@@ -302,7 +302,7 @@ def see_every_pixel_once(window: Window, player: Player) -> None:
         player.frame()
         panels.show = show
         assert player.canvas.size == count
-        io = player.overlay.io
+        io = player.imgui.io
         assert (
             io.display_size.x * io.display_framebuffer_scale.x,
             io.display_size.y * io.display_framebuffer_scale.y,
@@ -332,7 +332,7 @@ def come_to_rest(player: Player) -> None:
     player.show_hud = False
     band_s, window_module.BAND_S = window_module.BAND_S, 1e-6
     player.look_from(player.view.orbit(0.1, 0.0))
-    player.dial.pace.scale = 0.25
+    player.quality.resolution.scale = 0.25
     player.frame()
     coarse = player._pixels().astype(int)
     time.sleep(0.3)
@@ -348,7 +348,7 @@ def come_to_rest(player: Player) -> None:
 
 def run_out_of_room(player: Player) -> None:
     """What the card refuses is told, and drawn more coarsely; what it refuses again and again ends the player."""
-    show, rung = player.renderer.show, player.dial.rung
+    show, rung = player.renderer.show, player.quality.level
 
     def refuse(*_: object, **__: object) -> None:
         raise DisplayError("no room for a picture")
@@ -358,13 +358,13 @@ def run_out_of_room(player: Player) -> None:
         player.look_from(player.view.orbit(0.1, 0.0))
         player.frame()
         assert player.notice_is_error and "no room" in player.notice
-    assert RUNGS.index(player.dial.rung) < RUNGS.index(rung)
+    assert LEVEL_NAMES.index(player.quality.level) < LEVEL_NAMES.index(rung)
     player.look_from(player.view.orbit(0.1, 0.0))
     with raises(DisplayError, match="no room"):
         player.frame()
     imgui.end_frame()
     player.renderer.show, player._mishaps = show, 0  # type: ignore[method-assign]
-    player.dial.choose(rung)
+    player.quality.choose(rung)
     player.frame()
 
 
@@ -396,20 +396,20 @@ def drop_files(window: Window, player: Player, scene_file: Path) -> None:
 def go_through_groups(window: Window, scene_file: str) -> None:
     """The scene twice as one clip: each half shows in its time, in the quality and the appearance that were chosen."""
     groups.write(groups.parts_of([scene_file, scene_file]), "twice.kpc")
-    reel = Reel(open_source("twice.kpc"))
+    reel = GroupPlayback(open_source("twice.kpc"))
     player = Player(window, reel, Preferences())
     player.type(glfw.KEY_SPACE, 0)
-    player.wardrobe.wear(2)
+    player.appearance.select(2)
     player.type(glfw.KEY_MINUS, 0)
-    chosen, times = player.dial.rung, []
+    chosen, times = player.quality.level, []
     for key, number in ((glfw.KEY_END, 1), (glfw.KEY_LEFT, 1), (glfw.KEY_HOME, 0)):
         player.type(key, 0)
         until = time.monotonic() + 20
         while not (reel.number == number and reel.is_settled and player._is_sharp):
             assert time.monotonic() < until
             player.frame()
-        assert player.scene is reel.scene and player.wardrobe.scene is reel.scene and player.wardrobe.number == 2
-        assert player.dial.rung == chosen
+        assert player.scene is reel.scene and player.appearance.scene is reel.scene and player.appearance.number == 2
+        assert player.quality.level == chosen
         times.append((player.playback.time, reel.time_in(player.playback.time)))
     assert np.allclose(times, [(1.0, 1.0), (20 / 21, 0.9), (0.0, 0.0)], atol=1e-6)
     player.type(glfw.KEY_SPACE, 0)  # from here it plays over the join
@@ -425,7 +425,7 @@ def go_through_groups(window: Window, scene_file: str) -> None:
 def stand_where_groups_are_mixed(window: Window, scene_file: str) -> None:
     """Amid the frames that two groups share the picture is made of both, also once it is sharp."""
     groups.write([groups.Part.of(scene_file, 0), groups.Part.of(scene_file, 6)], "mixed.kpc")
-    reel = Reel(open_source("mixed.kpc"))
+    reel = GroupPlayback(open_source("mixed.kpc"))
     player = Player(window, reel, Preferences())
     player.scrub(0.5)
     until = time.monotonic() + 20
@@ -469,11 +469,11 @@ def lose_the_card(scene_file: str) -> None:
 def begin_on_a_card(window: Window, scene_file: str) -> None:
     """A graphics card holds a rate from the reference on, as long as nothing else is asked for; the control shows it, and it is remembered."""
     real, window_module.is_software = window_module.is_software, lambda ctx: False
-    for asked, quality, fps in ((Preferences(), RUNGS[-1], 50.0), (Preferences(quality="fine"), "fine", None)):
-        reel = Reel(open_source(scene_file))
+    for asked, quality, fps in ((Preferences(), LEVEL_NAMES[-1], 50.0), (Preferences(quality="fine"), "fine", None)):
+        reel = GroupPlayback(open_source(scene_file))
         player = Player(window, reel, asked)
-        assert player.preferences().quality == player.dial.rung == quality
-        assert player.preferences().target_fps == approx(fps) if fps else player.dial.target_s is None
+        assert player.preferences().quality == player.quality.level == quality
+        assert player.preferences().target_fps == approx(fps) if fps else player.quality.target_s is None
         assert player.target_fps == approx(fps or window_module.FILM_FPS)
         player.target_fps = 42.0
         assert Player(window, reel, asked, before=player).target_fps == 42.0
@@ -496,8 +496,8 @@ def remember(scene_file: str) -> None:
     assert kpplay.main([scene_file, "--size", "300x200"]) == 0
     assert kpplay.main([scene_file, "--target-fps", "25"]) == 0
     assert kpplay.main([scene_file, "--quality", "fine"]) == 0
-    shutil.rmtree(place().parent)
-    place().parent.write_text("no folder")
+    shutil.rmtree(preferences_path().parent)
+    preferences_path().parent.write_text("no folder")
     assert kpplay.main([scene_file]) == 0
     Player.run = run  # type: ignore[method-assign]
     assert [one.size for one in seen[:3]] == 3 * [(300, 200)] and [one.graphs for one in seen] == [

@@ -29,7 +29,7 @@ void main() {{ shown = tint * texture(sheet, at); }}
 """
 
 
-class Overlay:
+class ImGuiRenderer:
     """The ImGui context of one window. Feed `io` with events, build widgets after `begin`, then `draw`."""
 
     def __init__(self, ctx: moderngl.Context) -> None:

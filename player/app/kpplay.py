@@ -22,13 +22,13 @@ from kpc.format.common.errors import ContextLostError, UsageError
 from kpc.format.container.container import DEFAULT_BUDGET, open_source
 from kpc.player.app import preferences
 from kpc.player.app.camera_paths import CameraPath
-from kpc.player.app.controls import CARD_FPS
 from kpc.player.app.preferences import TARGET_FPS, WINDOW_SIDES, Preferences
-from kpc.player.orbit import Rig
+from kpc.player.app.resolution_controller import GPU_FPS
 from kpc.player.quality import LADDER
+from kpc.player.viewpoints import Rig
 
 if TYPE_CHECKING:
-    from kpc.player.streaming.group_playback import Reel
+    from kpc.player.streaming.group_playback import GroupPlayback
 
 HEIGHT = 720
 MOST_RESETS = 3
@@ -50,13 +50,13 @@ def _command(argv: list[str]) -> None:
     path = None if options.path is None else CameraPath.load(options.path)
 
     from kpc.player.streaming.group_playback import (
-        Reel,
+        GroupPlayback,
     )  # only now: what is wrong with the options is told without OpenGL's libraries
 
     lasting = (
-        preferences.place() if options.frames is None else None
+        preferences.preferences_path() if options.frames is None else None
     )  # counted frames are a test, which leaves no trace
-    stream = Reel(open_source(options.scene, limit=options.memory), memory=options.memory)
+    stream = GroupPlayback(open_source(options.scene, limit=options.memory), memory=options.memory)
     wanted = _over(preferences.load(lasting) if lasting else Preferences(), options)
     last = _play(stream, wanted, options, path)
     if lasting is not None:
@@ -90,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
         type=cli.frame_rate(*TARGET_FPS),
         metavar="F",
         help="hold so many frames a second by moving the quality "
-        f"(default: as it was; else a graphics card holds {CARD_FPS:.0f})",
+        f"(default: as it was; else a graphics card holds {GPU_FPS:.0f})",
     )
     parser.add_argument("--path", metavar="JSON", help="a camera path, as saved before, for J to follow")
     parser.add_argument(
@@ -117,10 +117,12 @@ def _over(remembered: Preferences, options: argparse.Namespace) -> Preferences:
     )
 
 
-def _play(stream: "Reel", wanted: Preferences, options: argparse.Namespace, path: CameraPath | None) -> Preferences:
+def _play(
+    stream: "GroupPlayback", wanted: Preferences, options: argparse.Namespace, path: CameraPath | None
+) -> Preferences:
     """From the first scene to the last that is dragged in, and over a graphics card that is reset; what to remember."""
     from kpc.player.app.window import Player, Window  # only now: a scene that cannot be read is told without a display
-    from kpc.player.streaming.group_playback import Reel
+    from kpc.player.streaming.group_playback import GroupPlayback
 
     window = Window("kpplay", wanted.size or _opening_size(stream))
     before, resets = None, 0
@@ -146,7 +148,7 @@ def _play(stream: "Reel", wanted: Preferences, options: argparse.Namespace, path
                 window.close()
                 stream.close()
                 window = Window("kpplay", wanted.size or _opening_size(stream))
-                stream = Reel(open_source(stream.source.name, limit=options.memory), memory=options.memory)
+                stream = GroupPlayback(open_source(stream.source.name, limit=options.memory), memory=options.memory)
             elif player.successor is not None:
                 stream.close()
                 stream = player.successor
@@ -157,7 +159,7 @@ def _play(stream: "Reel", wanted: Preferences, options: argparse.Namespace, path
         window.close()
 
 
-def _opening_size(stream: "Reel") -> tuple[int, int]:
+def _opening_size(stream: "GroupPlayback") -> tuple[int, int]:
     camera = Rig.of(stream.scene).cameras[0]
     return min(max(round(HEIGHT * camera.width / camera.height), 480), 1600), HEIGHT
 

@@ -12,7 +12,7 @@ from kpc.format.scene.scene import HybridDecoder, Scene
 from kpc.player.app.controls import SPEEDS
 from kpc.player.app.desktop import imgui
 from kpc.player.app.preferences import TARGET_FPS
-from kpc.player.app.quality_controller import RUNGS
+from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.time_plane_pictures import moving_part, time_plane_picture, time_planes
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.renderer import Look
@@ -54,8 +54,8 @@ KEYS = (
     ("H", "these keys"),
     ("Esc", "quit"),
 )
-LOOKS = {Look.COLOUR: "colour", Look.DEPTH: "depth", Look.SAMPLES: "samples", Look.OCCUPANCY: "occupancy"}
-PARTS = {Part.FULL: "all", Part.STATIC: "static only", Part.DYNAMIC: "dynamic only"}
+DISPLAY_MODE_NAMES = {Look.COLOUR: "colour", Look.DEPTH: "depth", Look.SAMPLES: "samples", Look.OCCUPANCY: "occupancy"}
+PART_NAMES = {Part.FULL: "all", Part.STATIC: "static only", Part.DYNAMIC: "dynamic only"}
 
 LABEL_EM = 5.2
 """Width of the labels before controls, in heights of the text."""
@@ -112,17 +112,17 @@ def _status(player: "Player", bottom: float) -> float:
         if isinstance(player.scene.decoder, HybridDecoder):
             imgui.text_disabled("hybrid decoder: plays slower")
         if not stream.is_settled:
-            imgui.text_disabled(f"{stream.share_here:.0%} here, {stream.rate / 1e3:,.0f} KB/s")
+            imgui.text_disabled(f"{stream.loaded_fraction:.0%} here, {stream.rate / 1e3:,.0f} KB/s")
         imgui.separator()
         _quality(player)
         imgui.separator()
-        player.look = _choice("view", player.look, LOOKS)
+        player.look = _choice("view", player.look, DISPLAY_MODE_NAMES)
         if player.scene.is_dynamic:
-            player.part = _choice("part", player.part, PARTS)
+            player.part = _choice("part", player.part, PART_NAMES)
         if player.scene.appearances:
-            worn = _choice("colours", player.wardrobe.number, dict(enumerate(player.wardrobe.names)))
-            if worn != player.wardrobe.number:
-                player.wardrobe.wear(worn)
+            selected = _choice("colours", player.appearance.number, dict(enumerate(player.appearance.names)))
+            if selected != player.appearance.number:
+                player.appearance.select(selected)
         _places(player)
         imgui.separator()
         player.show_graphs = _toggle("graphs", player.show_graphs)
@@ -138,12 +138,14 @@ def _status(player: "Player", bottom: float) -> float:
 
 def _quality(player: "Player") -> None:
     """The dial, and whether it moves by itself."""
-    dial = player.dial
+    dial = player.quality
     _label("quality")
-    number = RUNGS.index(dial.rung)
-    changed, wanted = imgui.slider_int("##quality", number, 0, len(RUNGS) - 1, dial.rung, imgui.SliderFlags_.no_input)
+    number = LEVEL_NAMES.index(dial.level)
+    changed, wanted = imgui.slider_int(
+        "##quality", number, 0, len(LEVEL_NAMES) - 1, dial.level, imgui.SliderFlags_.no_input
+    )
     if changed and wanted != number:
-        dial.choose(RUNGS[wanted])
+        dial.choose(LEVEL_NAMES[wanted])
     imgui.set_item_tooltip("From fastest to what the format says. - and = move it.")
     _label("hold")
     held = dial.target_s is not None
@@ -158,7 +160,7 @@ def _quality(player: "Player") -> None:
         player.target_fps = min(max(fps, TARGET_FPS[0]), TARGET_FPS[1])
     if changed or (moved and held):
         dial.hold(player.target_fps if held else None)
-    if player.scene.is_dynamic and LADDER[dial.rung].folded:
+    if player.scene.is_dynamic and LADDER[dial.level].folded:
         _label("exact")
         _, player.exact = imgui.checkbox("##exact", player.exact)
         imgui.set_item_tooltip("Samples time planes beside the space planes, and does not multiply them in: slower.")
@@ -230,8 +232,8 @@ class PlaneView:
             size = picture.shape[1], picture.shape[0]
             if self._texture is None or self._texture.size != size:
                 if self._texture is not None:
-                    player.overlay.forget(self._texture)
-                self._texture = player.overlay.adopt(player.ctx.texture(size, 3, alignment=1))
+                    player.imgui.forget(self._texture)
+                self._texture = player.imgui.adopt(player.ctx.texture(size, 3, alignment=1))
             self._texture.write(picture.tobytes(), alignment=1)
             self.low, self.high = moving_part(picture)
             self._shown, self._made = wanted, clock.monotonic()
@@ -279,7 +281,7 @@ def _graphs(player: "Player", top: float) -> float:
     _place(width - 0.8 * em, top, 1.0, 0.0)
     imgui.set_next_window_size(imgui.ImVec2(PANEL_EM * em, 0))
     with _panel("graphs", fitted=False):
-        for (label, target_s), values in zip((("frame", None), ("picture", player.dial.target_s)), player.history):
+        for (label, target_s), values in zip((("frame", None), ("picture", player.quality.target_s)), player.history):
             seen = values[:count] if count else np.zeros(1, np.float32)
             median, slow = np.percentile(seen, (50, 95))
             imgui.text_disabled(f"{label} {median:.1f} ms, 95% {slow:.1f}")

@@ -69,7 +69,7 @@ _IS_RIGHT: dict[str, Callable[[Any], bool]] = {
 }
 
 
-def place() -> Path:
+def preferences_path() -> Path:
     """The file: under $XDG_CONFIG_HOME or ~/.config, ~/Library/Application Support, or %APPDATA%."""
     from kpc.player.app.desktop import hello_imgui
 

@@ -19,19 +19,19 @@ from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.app import panels
 from kpc.player.app.camera_paths import GAP_S, CameraPath
-from kpc.player.app.controls import Playback, View, Wardrobe
+from kpc.player.app.controls import AppearanceSelection, Playback, View
 from kpc.player.app.desktop import glfw, imgui
-from kpc.player.app.imgui_renderer import Overlay
-from kpc.player.app.panels import LOOKS, PARTS
+from kpc.player.app.imgui_renderer import ImGuiRenderer
+from kpc.player.app.panels import DISPLAY_MODE_NAMES, PART_NAMES
 from kpc.player.app.preferences import TEXT_SIZES, Preferences
-from kpc.player.app.quality_controller import RUNGS, dial_for
+from kpc.player.app.quality_controller import LEVEL_NAMES, quality_controller_for
 from kpc.player.app.recording import Recording, frames_due
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.renderer import Look, Renderer, is_software
-from kpc.player.orbit import Rig, presets
 from kpc.player.quality import LADDER, climbed
-from kpc.player.streaming.group_playback import Reel
+from kpc.player.streaming.group_playback import GroupPlayback
 from kpc.player.streaming.prefetch import Playhead
+from kpc.player.viewpoints import Rig, presets
 
 REMEDY = "render pictures or a video with kprender instead"
 
@@ -205,7 +205,7 @@ class Player:
     def __init__(
         self,
         window: Window,
-        stream: Reel,
+        stream: GroupPlayback,
         preferences: Preferences = Preferences(),
         *,
         before: "Player | None" = None,
@@ -216,19 +216,19 @@ class Player:
         stream.arrived = glfw.post_empty_event
         self.ctx = window.ctx
         self.device = self.ctx.info["GL_RENDERER"]
-        self.dial = dial_for(is_software(self.ctx), preferences.quality, preferences.target_fps)
-        self.target_fps = preferences.target_fps or (1 / self.dial.target_s if self.dial.target_s else FILM_FPS)
+        self.quality = quality_controller_for(is_software(self.ctx), preferences.quality, preferences.target_fps)
+        self.target_fps = preferences.target_fps or (1 / self.quality.target_s if self.quality.target_s else FILM_FPS)
         if not stream.is_drawn:
             stream.draw_with(self._make_renderer)
-        self.overlay = Overlay(self.ctx)
-        window.io = self.overlay.io
+        self.imgui = ImGuiRenderer(self.ctx)
+        window.io = self.imgui.io
         self.rig, self.presets = Rig.of(scene), presets(scene)
         self.camera_number, self.preset_number = 0, -1
         self.view = View.of(self.rig, self.rig.cameras[0])
         self.playback = Playback(
             stream.clip, playing=stream.clip.duration_s > 0, speed=preferences.speed, loop=preferences.loop
         )
-        self.wardrobe = Wardrobe(scene)
+        self.appearance = AppearanceSelection(scene)
         self.part, self.look, self.exact = Part.FULL, Look.COLOUR, False
         self.path, self.ride_s, self.riding = CameraPath(), 0.0, False
         self._keyed_at: float | None = None
@@ -246,7 +246,7 @@ class Player:
         self.frame_s = self.draw_s = 0.0
         self.samples, self.most_samples, self.depths = 0.0, 16.0, (0.0, 1.0)
         self.planes = panels.PlaneView(scene)
-        self.successor: Reel | None = None
+        self.successor: GroupPlayback | None = None
         self._mishaps = 0
         self.say("H: keys")
         self._measured = -STATS_EVERY_S
@@ -269,22 +269,22 @@ class Player:
         return self.stream.renderer
 
     def _make_renderer(self, scene: Scene) -> Renderer:
-        return Renderer(self.ctx, scene, LADDER[self.dial.rung])
+        return Renderer(self.ctx, scene, LADDER[self.quality.level])
 
     def _go_on_from(self, before: "Player") -> None:
         self.view, self.playback, self.path, self.part, self.look = (
             before.view, before.playback, before.path, before.part, before.look
         )  # fmt: skip
-        self.dial, self.target_fps, self.exact = before.dial, before.target_fps, before.exact
-        self.wardrobe.wear(before.wardrobe.number)
+        self.quality, self.target_fps, self.exact = before.quality, before.target_fps, before.exact
+        self.appearance.select(before.appearance.number)
         self.show_hud, self.show_path = before.show_hud, before.show_path
         self.complain("the graphics card was reset; the scene is there again")
 
     def preferences(self) -> Preferences:
         """What to remember of it."""
-        holds = self.dial.target_s is not None
+        holds = self.quality.target_s is not None
         return Preferences(
-            self.window.plain_size, self.dial.chosen, self.target_fps if holds else None, self.playback.speed, self.playback.loop,
+            self.window.plain_size, self.quality.chosen_level, self.target_fps if holds else None, self.playback.speed, self.playback.loop,
             self.show_hud, self.show_graphs, self.show_planes, self.text_size,
         )  # fmt: skip
 
@@ -328,7 +328,7 @@ class Player:
         self.window.dropped.clear()
         try:
             self._advance(seconds)
-            self.wardrobe.advance(seconds)
+            self.appearance.advance(seconds)
             self._draw(now)
             self.renderer.check()
         except ContextLostError:
@@ -341,7 +341,7 @@ class Player:
         panels.show(self)
         self._finish()
         if self._is_paced:  # all but waiting for the screen counts, and but for looking at statistics
-            self.dial.saw(clock.monotonic() - now - self._aside_s)
+            self.quality.record(clock.monotonic() - now - self._aside_s)
         glfw.swap_buffers(self.window.handle)
         self.window.sweep()
 
@@ -351,7 +351,7 @@ class Player:
         if self._mishaps > MOST_MISHAPS:
             raise error
         self.complain(str(error))
-        self.dial.choose(climbed(self.dial.rung, -1))
+        self.quality.choose(climbed(self.quality.level, -1))
 
     def _advance(self, seconds: float) -> None:
         """Let the clip, or the camera path, go on, unless what comes next is not there yet."""
@@ -364,11 +364,11 @@ class Player:
                 ride_s, self.riding = (self.path.start_s, True) if self.playback.loop else (self.path.end_s, False)
             camera, time = self.path.at(ride_s)
             later, view = replace(later, time=time), View.of(self.rig, camera)
-        self.stream.steer(Playhead(later.time, self.playback.pace, self.playback.loop))
+        self.stream.set_playhead(Playhead(later.time, self.playback.rate, self.playback.loop))
         self.stream.upload()
-        if self.wardrobe.scene is not self.scene:
-            self.wardrobe = Wardrobe(self.scene, self.wardrobe.names[self.wardrobe.number])
-        if self.stream.can_show(later.time, self.playback.pace):
+        if self.appearance.scene is not self.scene:
+            self.appearance = AppearanceSelection(self.scene, self.appearance.names[self.appearance.number])
+        if self.stream.can_show(later.time, self.playback.rate):
             self.playback, self.ride_s, self.view = later, ride_s, view
 
     # --- files
@@ -408,7 +408,7 @@ class Player:
                 self.path, self.ride_s, self.show_path = CameraPath.load(file), 0.0, True
                 self.say(f"{len(self.path.keyframes)} keyframes from {file}; J follows them")
                 return
-            stream = Reel(open_source(file, limit=self.stream.memory), memory=self.stream.memory)
+            stream = GroupPlayback(open_source(file, limit=self.stream.memory), memory=self.stream.memory)
             try:
                 stream.draw_with(self._make_renderer)
                 self.successor = stream
@@ -421,7 +421,7 @@ class Player:
         self._begin(1 / 60)
         self._still()
         panels.show(self)
-        self.overlay.draw(self.canvas)
+        self.imgui.draw(self.canvas)
         write_image(path, self._pixels())
         self._drawn = ()
 
@@ -560,39 +560,39 @@ class Player:
 
     def _draw(self, now: float) -> None:
         """Draw the scene if anything has changed, finely once nothing does any more."""
-        worn = (self.wardrobe.number, self.wardrobe.progress)
-        dial = self.dial
+        selected = (self.appearance.number, self.appearance.progress)
+        dial = self.quality
         wanted = (
             self.view,
             self.playback.time,
             self.part,
             self.look,
-            dial.chosen,
+            dial.chosen_level,
             self.exact,
-            worn,
+            selected,
             self.stream.version_at(self.playback.time),
         )
-        if self.stream.scales_here == 0:
+        if self.stream.complete_scales == 0:
             self._is_sharp = True  # as sharp as nothing can be
         elif self.is_filming_path:
             self._is_sharp = False  # `_film_path` draws
         elif wanted != self._drawn:
             self._drawn, self._moved, self._is_sharp, self._sharp_rows = wanted, now, False, 0
-            self._picture(dial.pace.scale, dial.rung)
+            self._picture(dial.resolution.scale, dial.level)
             self._is_paced = True
-            drawn, resting = self.renderer.quality, LADDER[dial.resting]
+            drawn, resting = self.renderer.quality, LADDER[dial.still_level]
             is_whole = (
                 self.raster == self.canvas.size
                 and not (drawn.tolerance or drawn.blur)
                 and drawn.across == resting.across
             )
-            self._is_sharp = is_whole and dial.rung == dial.resting
+            self._is_sharp = is_whole and dial.level == dial.still_level
         elif not self._is_sharp and now - self._moved > SHARPEN_AFTER_S:
             self._sharpen()
 
     def _still(self) -> None:
         """Draw the scene on the canvas as finely as a picture that stands still, at once."""
-        self._picture(1.0, self.dial.resting, still=True)
+        self._picture(1.0, self.quality.still_level, still=True)
 
     def _picture(self, scale: float, rung: str, still: bool = False) -> None:
         """Draw the scene on the canvas, at a share of its resolution."""
@@ -607,7 +607,7 @@ class Player:
 
     def _sharpen(self) -> None:
         """Draw the next rows of the picture as finely as it is to be, from above, so many as do not keep the controls waiting."""
-        self._set_quality(self.dial.resting, still=True)
+        self._set_quality(self.quality.still_level, still=True)
         width, height = self.canvas.size
         if self._sharp_rows == 0:
             whole_s = self.draw_s * width * height / (self.raster[0] * self.raster[1])
@@ -637,10 +637,10 @@ class Player:
 
     def _show(self, target: moderngl.Framebuffer, camera: Camera) -> None:
         started = clock.monotonic()
-        parts = [(self.renderer, self.stream.time_in(self.playback.time), 1.0, self.wardrobe.code)]
+        parts = [(self.renderer, self.stream.time_in(self.playback.time), 1.0, self.appearance.code)]
         if (beside := self.stream.beside(self.playback.time)) is not None:
-            worn = self.wardrobe.names[self.wardrobe.number]
-            parts.append((*beside, Wardrobe(beside[0].scene, worn).code))
+            selected = self.appearance.names[self.appearance.number]
+            parts.append((*beside, AppearanceSelection(beside[0].scene, selected).code))
         for renderer, time, share, code in parts:
             renderer.quality = self.renderer.quality
             renderer.show(
@@ -675,18 +675,18 @@ class Player:
         self._aside_s += self._measured - started
 
     def _begin(self, seconds: float) -> None:
-        self.overlay.begin(self.window.size, self.canvas.size, self.text_size * self.window.text_scale, seconds)
+        self.imgui.begin(self.window.size, self.canvas.size, self.text_size * self.window.text_scale, seconds)
 
     def _finish(self) -> None:
         """The canvas, and the controls over it, on the screen."""
         self.ctx.copy_framebuffer(self.ctx.screen, self.canvas)
-        self.overlay.draw(self.ctx.screen)
+        self.imgui.draw(self.ctx.screen)
 
     # --- events
 
     def _point(self) -> None:
         """Drags and the wheel, where no control takes them."""
-        io = self.overlay.io
+        io = self.imgui.io
         if io.want_capture_mouse:
             return
         width, height = self.window.size
@@ -742,17 +742,19 @@ class Player:
         elif key == glfw.KEY_B:
             self.to_preset((self.preset_number + 1) % len(self.presets))
         elif key == glfw.KEY_V:
-            self.wardrobe.next()
-        elif glfw.KEY_1 <= key < glfw.KEY_1 + len(LOOKS):
-            self.look = list(LOOKS)[key - glfw.KEY_1]
+            self.appearance.next()
+        elif glfw.KEY_1 <= key < glfw.KEY_1 + len(DISPLAY_MODE_NAMES):
+            self.look = list(DISPLAY_MODE_NAMES)[key - glfw.KEY_1]
         elif key == glfw.KEY_C and self.scene.is_dynamic:
-            parts = list(PARTS)
+            parts = list(PART_NAMES)
             self.part = parts[(parts.index(self.part) + 1) % len(parts)]
         elif key in (glfw.KEY_MINUS, glfw.KEY_EQUAL):
-            self.dial.choose(climbed(self.dial.rung, 1 if key == glfw.KEY_EQUAL else -1))
-            self.say(f"quality: {self.dial.rung}, {RUNGS.index(self.dial.rung) + 1} of {len(RUNGS)}")
+            self.quality.choose(climbed(self.quality.level, 1 if key == glfw.KEY_EQUAL else -1))
+            self.say(
+                f"quality: {self.quality.level}, {LEVEL_NAMES.index(self.quality.level) + 1} of {len(LEVEL_NAMES)}"
+            )
         elif key == glfw.KEY_U:
-            self.dial.hold(self.target_fps if self.dial.target_s is None else None)
+            self.quality.hold(self.target_fps if self.quality.target_s is None else None)
         elif key == glfw.KEY_F and self.scene.is_dynamic:
             self.exact = not self.exact
         elif key == glfw.KEY_K:
@@ -795,5 +797,5 @@ class Player:
             self.film.close(FINISHING_S)
             told = self.film.failure or f"saved {self.film.path}, {self.film.duration_s:.1f} s"
         self.window.io = None
-        self.overlay.close()
+        self.imgui.close()
         return told

@@ -16,7 +16,7 @@ from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, contract
 from kpc.player.cpu import reference
 from kpc.player.cpu.reference import Moment, Rendering
-from kpc.player.orbit import Rig
+from kpc.player.viewpoints import Rig
 
 INSTANTS = (np.arange(8) + 0.5) / 8
 """Of the clip."""

@@ -17,9 +17,9 @@ from kpc.format.container.container import DEFAULT_BUDGET, RemoteSource, Source
 from kpc.format.container.groups import Groups
 from kpc.format.scene.scene import Scene
 from kpc.player.gl.renderer import Renderer
-from kpc.player.orbit import Rig
 from kpc.player.streaming.prefetch import Playhead
 from kpc.player.streaming.stream import Stream
+from kpc.player.viewpoints import Rig
 
 AHEAD_S = 5.0
 """The next group is opened so long before it shows, even if the one that shows is still arriving."""
@@ -28,7 +28,7 @@ WARM_UP = (8, 6)
 
 
 @dataclass
-class Held:
+class LoadedGroup:
     """A group that is there, or on its way."""
 
     number: int
@@ -38,7 +38,7 @@ class Held:
     """Whether the renderer's shaders are compiled."""
 
 
-class Reel:
+class GroupPlayback:
     """See the module.
 
     Args:
@@ -61,9 +61,9 @@ class Reel:
         self.groups = Groups(source, memory_budget=memory, in_parts=True)
         self.timeline, self.clip = self.groups.timeline, self.groups.clip
         self._a_group = memory if self.groups.is_single else memory // 2
-        self._shown = Held(0, Stream(self.groups.open(0), memory=self._a_group, arrived=arrived))
+        self._shown = LoadedGroup(0, Stream(self.groups.open(0), memory=self._a_group, arrived=arrived))
         self.cameras = self._shown.stream.scene.cameras
-        self._next: Held | None = None
+        self._next: LoadedGroup | None = None
         self._make: Callable[[Scene], Renderer] | None = None
         self._before = 0
         """Versions of what has shown before."""
@@ -73,7 +73,7 @@ class Reel:
         self._closed = False
         self._opening: int | None = None
         """What a thread opens; what came of it lies in one of the next."""
-        self._opened: Held | None = None
+        self._opened: LoadedGroup | None = None
         self._failure: KpcError | OSError | None = None
         self._bug: BaseException | None = None
 
@@ -117,14 +117,14 @@ class Reel:
         return self.timeline.time_of(self.number, time_in_it)
 
     @property
-    def scales_here(self) -> int:
+    def complete_scales(self) -> int:
         """As of `Stream`."""
-        return self.stream.scales_here
+        return self.stream.complete_scales
 
     @property
-    def share_here(self) -> float:
+    def loaded_fraction(self) -> float:
         """As of `Stream`, of the group that shows."""
-        return self.stream.share_here
+        return self.stream.loaded_fraction
 
     @property
     def version(self) -> int:
@@ -176,7 +176,7 @@ class Reel:
 
     # --- the window's thread
 
-    def steer(self, head: Playhead) -> None:
+    def set_playhead(self, head: Playhead) -> None:
         """Say where the clip is.
 
         Raises:
@@ -198,7 +198,7 @@ class Reel:
         if ahead is not None and self._next is None and (wanted_now or self.stream.is_settled):
             self._open(ahead)
         for held in filter(None, (self._shown, self._next)):
-            held.stream.steer(self._head_in(held.number, head))
+            held.stream.set_playhead(self._head_in(held.number, head))
 
     def upload(self) -> bool:
         """Take over what has arrived; whether the picture may have changed.
@@ -221,10 +221,10 @@ class Reel:
                 changed |= coming.stream.upload(coming.renderer) and self._beside is not None
         return changed
 
-    def can_show(self, time: float, pace: float = 0.0) -> bool:
+    def can_show(self, time: float, rate: float = 0.0) -> bool:
         """As `Stream.can_show`; not while the group is missing, or one that is mixed with it is on its way."""
         number, time_in_it = self.timeline.at(time)
-        if number != self.number or not self.stream.can_show(time_in_it, self._pace_in(number, pace)):
+        if number != self.number or not self.stream.can_show(time_in_it, self._rate_in(number, rate)):
             return False
         return len(self.timeline.mixed(time)) == 1 or self._failure is not None or self.beside(time) is not None
 
@@ -254,9 +254,9 @@ class Reel:
         _, until = self.timeline.shown(self.number)
         return (until - head.time) * self.clip.duration_s < AHEAD_S
 
-    def _is_ready(self, held: Held, head: Playhead) -> bool:
+    def _is_ready(self, held: LoadedGroup, head: Playhead) -> bool:
         there = self._head_in(held.number, head)
-        return held.is_warm and held.stream.can_show(there.time, there.pace)
+        return held.is_warm and held.stream.can_show(there.time, there.rate)
 
     def _turn(self) -> None:
         """The next group shows; the one that did is held as long as it is mixed with it."""
@@ -266,18 +266,18 @@ class Reel:
         self._shown.is_warm = True
         self._shown, self._next = self._next, self._shown
 
-    def _let_go(self, held: Held) -> None:
+    def _let_go(self, held: LoadedGroup) -> None:
         held.stream.close()
         if held.renderer is not None:
             held.renderer.release()
 
     def _head_in(self, number: int, head: Playhead) -> Playhead:
         loops = head.loop and self.groups.is_single
-        return Playhead(self.timeline.time_in(number, head.time), self._pace_in(number, head.pace), loops)
+        return Playhead(self.timeline.time_in(number, head.time), self._rate_in(number, head.rate), loops)
 
-    def _pace_in(self, number: int, pace: float) -> float:
-        """Of a group in a second, where it is `pace` of the clip."""
-        return pace * max(self.clip.frame_count - 1, 1) / max(self.timeline.spans[number].count - 1, 1)
+    def _rate_in(self, number: int, rate: float) -> float:
+        """Of a group in a second, where it is `rate` of the clip."""
+        return rate * max(self.clip.frame_count - 1, 1) / max(self.timeline.spans[number].count - 1, 1)
 
     def _open(self, number: int) -> None:
         """Have a group opened by a thread, unless that has something to do, or has failed."""
@@ -297,7 +297,7 @@ class Reel:
             stream = Stream(self.groups.open(number, apart=True), memory=self._a_group, arrived=self._wake)
             if not stream.scene.cameras:
                 stream.scene = replace(stream.scene, cameras=self.cameras)
-            self._opened = Held(number, stream)
+            self._opened = LoadedGroup(number, stream)
             if self._closed:
                 stream.close()
         except (KpcError, OSError) as error:

@@ -24,12 +24,12 @@ class Playhead:
 
     Attributes:
         time: [0, 1] over the clip.
-        pace: of the clip in a second; 0 while it does not play.
+        rate: of the clip in a second; 0 while it does not play.
         loop: after the end comes the beginning.
     """
 
     time: float = 0.0
-    pace: float = 0.0
+    rate: float = 0.0
     loop: bool = True
 
 
@@ -43,16 +43,16 @@ def distances_ahead(scene: PartialScene, head: Playhead) -> np.ndarray:
     return np.where(scene.is_needed(head.time, head.time), 0.0, ahead)
 
 
-def fetching_order(scene: PartialScene, head: Playhead, shown: int = 0) -> np.ndarray:
+def fetch_order(scene: PartialScene, head: Playhead, shown: int = 0) -> np.ndarray:
     """(N,) positions in the scene's arrays, what to fetch first first; of `shown` scales the space planes are all there."""
     distance = distances_ahead(scene, head)
-    soon = (distance > 0) & (distance < head.pace * URGENT_S)
+    soon = (distance > 0) & (distance < head.rate * URGENT_S)
     stage = np.where(distance == 0, 2 * scene.scales, np.where(soon, 2 * scene.scales + 1, 2 * scene.scales.max() + 2))
     stage[(distance == 0) & (scene.scales < shown)] = -1
     return np.lexsort((scene.numbers, scene.scales, distance, stage))
 
 
-def worth_holding(scene: PartialScene, head: Playhead, room_bytes: int) -> np.ndarray:
+def segments_to_keep(scene: PartialScene, head: Playhead, room_bytes: int) -> np.ndarray:
     """(N,) bool: segments of time planes that fit, nearest first. Space planes always do: they lie elsewhere."""
     order = np.lexsort((scene.numbers, scene.scales, distances_ahead(scene, head)))
     held = np.zeros(len(order), bool)
@@ -60,7 +60,7 @@ def worth_holding(scene: PartialScene, head: Playhead, room_bytes: int) -> np.nd
     return np.asarray(held | ~scene.moves)
 
 
-def least_room(scene: PartialScene) -> int:
+def min_segment_bytes(scene: PartialScene) -> int:
     """Bytes of the segments that are needed at once, at the time that needs most."""
     sizes = scene.sizes[scene.moves]
     times = np.concatenate([scene.since[scene.moves], scene.until[scene.moves]])

@@ -1,7 +1,7 @@
 """A scene that plays while it arrives: a thread fetches and decodes, the window's thread takes over what is finished.
 
     fetching thread      what to fetch next (`kpc.player.streaming.prefetch`) -> source -> CRC32C, decoding -> finished pieces
-    window's thread      `steer` says where the playhead is; `upload` takes finished pieces, so many bytes a frame
+    window's thread      `set_playhead` says where the playhead is; `upload` takes finished pieces, so many bytes a frame
 
 The window's thread waits for nothing but a lock that is never held for long. Segments of time planes lie in memory as symbols
 and are dropped when the playhead has passed and the room is needed; space planes go to the graphics card and are gone from here.
@@ -27,7 +27,7 @@ from kpc.player.cpu.occupancy_culling import Thinning
 from kpc.player.cpu.plane_sampler import Lookup
 from kpc.player.gl.renderer import REFINED, Renderer
 from kpc.player.gl.textures import Layout, Rows
-from kpc.player.streaming.prefetch import Playhead, fetching_order, least_room, worth_holding
+from kpc.player.streaming.prefetch import Playhead, fetch_order, min_segment_bytes, segments_to_keep
 
 RUN_BYTES, RUN_CHUNKS = 1 << 18, 256
 """Fetched with one request at most, so that a playhead that jumps does not wait long."""
@@ -77,7 +77,7 @@ class Stream:
         self.parts = PartialScene(self._reader)
         self.scene: Scene = self.parts.scene
         self._layout = Layout.of(self.scene)
-        fixed, least = self.fixed_bytes, least_room(self.parts)
+        fixed, least = self.fixed_bytes, min_segment_bytes(self.parts)
         if fixed + least > memory:
             raise BudgetError(
                 f"{source.name}: takes {fixed + least:,} bytes to play, more than the {memory:,} of --memory"
@@ -88,7 +88,7 @@ class Stream:
         """Fetched or being fetched, and not dropped since."""
         self._here = np.zeros(len(self._stored), bool)
         """Uploaded, or put into the scene."""
-        self._head, self._keep = Playhead(), worth_holding(self.parts, Playhead(), self._room)
+        self._head, self._keep = Playhead(), segments_to_keep(self.parts, Playhead(), self._room)
         self._is_long = not self._keep.all()
         self._finished: deque[Piece] = deque()
         self._change = threading.Condition()
@@ -107,12 +107,12 @@ class Stream:
 
     # --- the window's thread
 
-    def steer(self, head: Playhead) -> None:
+    def set_playhead(self, head: Playhead) -> None:
         """Say where the clip is. What it has left far behind is dropped if the room is needed."""
         with self._change:
             self._head = head
             if self._is_long:
-                self._keep = worth_holding(self.parts, head, self._room)
+                self._keep = segments_to_keep(self.parts, head, self._room)
                 self._drop(self._here & ~self._keep)
             if (self._keep & ~self._taken).any():
                 self._change.notify_all()
@@ -150,18 +150,18 @@ class Stream:
         self.version += changed
         return changed
 
-    def can_show(self, time: float, pace: float = 0.0) -> bool:
+    def can_show(self, time: float, rate: float = 0.0) -> bool:
         """Whether a clip that plays may go on to `time`. After a pause, only once RESUME_S from there on are there, too.
 
         All that the scales need whose space planes are there must be, and at least scale 0: a picture once fine stays fine.
         """
-        end = min(time + pace * RESUME_S, 1.0) if self._stalled else time
-        needed = self.parts.is_needed(time, end) & (self.parts.scales < max(self.scales_here, 1)) & self._keep
+        end = min(time + rate * RESUME_S, 1.0) if self._stalled else time
+        needed = self.parts.is_needed(time, end) & (self.parts.scales < max(self.complete_scales, 1)) & self._keep
         self._stalled = bool((needed & ~self._here).any())
         return not self._stalled
 
     @property
-    def scales_here(self) -> int:
+    def complete_scales(self) -> int:
         """Scales from the coarsest on whose space planes are all there."""
         missing = self.parts.scales[~self.parts.moves & ~self._here]
         return int(missing.min()) if len(missing) else int(self.parts.scales.max()) + 1
@@ -175,7 +175,7 @@ class Stream:
             return not (self._keep & ~self._here).any()
 
     @property
-    def share_here(self) -> float:
+    def loaded_fraction(self) -> float:
         """Of the bytes of all planes."""
         return float(self._stored[self._here].sum() / max(self._stored.sum(), 1))
 
@@ -250,7 +250,7 @@ class Stream:
 
     def _hurry(self, time: float) -> None:
         """Under the lock: what the picture needs now does not wait for the end of something else, far as that is on a slow line."""
-        now = self.parts.is_needed(time, time) & (self.parts.scales < max(self.scales_here, 1))
+        now = self.parts.is_needed(time, time) & (self.parts.scales < max(self.complete_scales, 1))
         if (
             self._under_way is not None
             and not now[self._under_way]
@@ -294,7 +294,7 @@ class Stream:
         """Wait until something is to be fetched; its position, and the chunks held by the source. None once closed."""
         with self._change:
             while not self._closed:
-                order = fetching_order(self.parts, self._head, self.scales_here)
+                order = fetch_order(self.parts, self._head, self.complete_scales)
                 wanted = order[(self._keep & ~self._taken)[order]]
                 if len(wanted) and not self._is_full(int(wanted[0])):
                     break

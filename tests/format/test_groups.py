@@ -15,7 +15,7 @@ from kpc.format.container.groups import Groups, LongScene, Part, Span, Timeline
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.cpu import reference
 from kpc.player.cpu.motion_map import dynamic_map
-from kpc.player.orbit import fitted
+from kpc.player.viewpoints import fit_camera
 from kpc.tools.cli import kpinfo, kpjoin, kprender
 from kpc.tools.cli.serve import Handler, serving
 from scenes import tiny_scene, varied
@@ -115,7 +115,7 @@ def test_what_moves_is_told_and_shown_of_the_group_that_shows(clip, scenes, tmp_
         capsys.readouterr()
         assert kpinfo.main([str(clip), "--group", str(number), "--json"]) == 0
         shares = json.loads(capsys.readouterr().out)["static"]
-        alone, camera = kpc.load(scenes[number]), fitted(kpc.load(clip).cameras[0], 24, 18)
+        alone, camera = kpc.load(scenes[number]), fit_camera(kpc.load(clip).cameras[0], 24, 18)
         expected = dynamic_map(alone, camera, own, reference.render(alone, camera, own)).rgb
         assert np.abs(read_image(tmp_path / "map.png") - 255 * np.clip(expected, 0, 1)).max() <= 1
         assert (shares == {"identity_share": 1, "unchanging_share": 1, "still_share": 1}) == (number == 2)
@@ -271,10 +271,10 @@ def test_kprender_goes_from_group_to_group(clip, backend, tmp_path):
     options = [str(clip), "--orbit", "4", "--size", "16x12", "--backend", backend, "-o", str(tmp_path / "pictures")]
     assert kprender.main(options) == 0
     long = kpc.load(clip)
-    from kpc.player.orbit import fitted, orbit
+    from kpc.player.viewpoints import fit_camera, orbit
 
     for number, camera in enumerate(orbit(long.at(0.0)[0], 4)):
-        seen = np.rint(np.clip(kpc.render(long, fitted(camera, 16, 12), number / 3).rgb, 0, 1) * 255)
+        seen = np.rint(np.clip(kpc.render(long, fit_camera(camera, 16, 12), number / 3).rgb, 0, 1) * 255)
         picture = np.asarray(Image.open(tmp_path / "pictures" / f"{number:04d}.png"), float)
         assert np.abs(picture - seen).max() <= 1, number
 

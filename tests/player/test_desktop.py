@@ -36,7 +36,7 @@ def test_windows_are_made_from_one_place() -> None:
             assert not found or file.name == "desktop.py", f"{file.relative_to(ROOT)} imports {found}"
     lines = [
         node
-        for node in ast.walk(ast.parse((ROOT / "player/desktop.py").read_text()))
+        for node in ast.walk(ast.parse((ROOT / "player/app/desktop.py").read_text()))
         if isinstance(node, ast.Import | ast.ImportFrom)
     ]
     order = {(node.module if isinstance(node, ast.ImportFrom) else node.names[0].name): node.lineno for node in lines}

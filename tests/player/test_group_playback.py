@@ -16,7 +16,7 @@ from kpc.format.container.container import Reader, open_source
 from kpc.format.container.groups import Groups, Part
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.gl.renderer import Renderer
-from kpc.player.streaming.group_playback import Reel
+from kpc.player.streaming.group_playback import GroupPlayback
 from kpc.player.streaming.prefetch import Playhead
 from kpc.tools.cli.serve import serving
 from scenes import tiny_scene
@@ -24,7 +24,7 @@ from scenes import tiny_scene
 import kpc
 
 SOON_S = 10.0
-PACE = 0.2
+RATE = 0.2
 """Of the clip in a second."""
 
 
@@ -45,12 +45,12 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def opened() -> Iterator[Callable[..., Reel]]:
+def opened() -> Iterator[Callable[..., GroupPlayback]]:
     """Opens reels that draw on the shared context, and closes them in the end."""
-    reels: list[Reel] = []
+    reels: list[GroupPlayback] = []
 
-    def open_reel(source: object, **options: int) -> Reel:
-        reel = Reel(open_source(source), **options)  # type: ignore[arg-type]
+    def open_reel(source: object, **options: int) -> GroupPlayback:
+        reel = GroupPlayback(open_source(source), **options)  # type: ignore[arg-type]
         reel.draw_with(lambda scene: Renderer(gl.context(), scene))
         reels.append(reel)
         return reel
@@ -60,24 +60,24 @@ def opened() -> Iterator[Callable[..., Reel]]:
         reel.close()
 
 
-def wait_for(reel: Reel, head: Playhead, done: Callable[[], bool]) -> float:
+def wait_for(reel: GroupPlayback, head: Playhead, done: Callable[[], bool]) -> float:
     """Turn after turn of a window until something is so; the longest that one took, seconds."""
     longest, until = 0.0, clock.monotonic() + SOON_S
     while not done():
         assert clock.monotonic() < until, "never"
         started = clock.monotonic()
-        reel.steer(head)
+        reel.set_playhead(head)
         reel.upload()
         longest = max(longest, clock.monotonic() - started)
         clock.sleep(0.002)
     return longest
 
 
-def settled(reel: Reel, time: float, number: int) -> None:
+def settled(reel: GroupPlayback, time: float, number: int) -> None:
     wait_for(reel, Playhead(time), lambda: reel.number == number and reel.can_show(time) and reel.is_settled)
 
 
-def assert_shows(reel: Reel, path: object, time: float) -> None:
+def assert_shows(reel: GroupPlayback, path: object, time: float) -> None:
     """The picture at a time of the clip is that of the whole."""
     whole = kpc.load(path)  # type: ignore[arg-type]
     camera = kpc.load(path).cameras[0].resized(16, 12)  # type: ignore[arg-type]
@@ -98,15 +98,15 @@ def test_each_group_shows_in_its_time(clip, opened):
 
 
 def test_the_next_group_is_there_before_it_shows(clip, opened):
-    reel, head = opened(clip), Playhead(0.1, PACE)
+    reel, head = opened(clip), Playhead(0.1, RATE)
     wait_for(reel, head, lambda: reel._next is not None and reel._next.is_warm and reel._next.stream.is_settled)
     assert reel.number == 0 and reel._next.number == 1
-    assert reel.can_show(8 / 29, PACE)
-    reel.steer(Playhead(9.1 / 29, PACE))
-    assert reel.number == 1 and reel.can_show(9.1 / 29, PACE)  # in the same turn
+    assert reel.can_show(8 / 29, RATE)
+    reel.set_playhead(Playhead(9.1 / 29, RATE))
+    assert reel.number == 1 and reel.can_show(9.1 / 29, RATE)  # in the same turn
     assert_shows(reel, clip, 9.1 / 29)
     version = reel.version
-    wait_for(reel, Playhead(0.6, PACE), lambda: reel._next is not None and reel._next.number == 2)
+    wait_for(reel, Playhead(0.6, RATE), lambda: reel._next is not None and reel._next.number == 2)
     assert reel.version >= version
 
 
@@ -125,7 +125,7 @@ def test_two_groups_are_mixed_amid_the_frames_that_they_share(clip, opened):
         assert_shows(reel, clip, time)
 
 
-def held_up(reel: Reel, monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+def held_up(reel: GroupPlayback, monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Let no further group be opened until this is set."""
     gate, open_group = threading.Event(), reel.groups.open
     monkeypatch.setattr(
@@ -138,7 +138,7 @@ def test_a_clip_does_not_go_on_into_frames_of_a_group_that_is_not_there(clip, op
     reel = opened(clip)
     gate = held_up(reel, monkeypatch)
     settled(reel, 0.0, 0)
-    reel.steer(Playhead(8.5 / 29))
+    reel.set_playhead(Playhead(8.5 / 29))
     assert reel.number == 0 and reel.beside(8.5 / 29) is None
     assert not reel.can_show(8.5 / 29) and reel.can_show(8 / 29) and not reel.is_settled and "waiting" in reel.message
     gate.set()
@@ -148,8 +148,8 @@ def test_a_clip_does_not_go_on_into_frames_of_a_group_that_is_not_there(clip, op
 def test_after_the_last_comes_the_first_where_it_loops(clip, opened):
     reel = opened(clip)
     settled(reel, 0.99, 2)
-    wait_for(reel, Playhead(0.99, PACE, loop=True), lambda: reel._next is not None and reel._next.number == 0)
-    reel.steer(Playhead(0.99, PACE, loop=False))
+    wait_for(reel, Playhead(0.99, RATE, loop=True), lambda: reel._next is not None and reel._next.number == 0)
+    reel.set_playhead(Playhead(0.99, RATE, loop=False))
     assert reel._next is None
 
 
@@ -170,7 +170,7 @@ def test_what_is_not_there_is_waited_for_without_blocking(clip, opened, monkeypa
     reel = opened(clip)
     gate = held_up(reel, monkeypatch)
     settled(reel, 0.0, 0)
-    reel.steer(Playhead(0.99))
+    reel.set_playhead(Playhead(0.99))
     assert not reel.can_show(0.99) and not reel.is_settled and reel.number == 0
     assert reel.time_in(0.99) == 1.0  # the group before stays, with its last picture
     gate.set()
@@ -179,7 +179,7 @@ def test_what_is_not_there_is_waited_for_without_blocking(clip, opened, monkeypa
 
 def test_the_memory_is_halved_between_two_groups(clip, opened):
     single = Groups(clip).source_of(1)
-    needed = Reel(open_source(single.read_at(0, single.size)))
+    needed = GroupPlayback(open_source(single.read_at(0, single.size)))
     most = needed.stream.fixed_bytes
     needed.close()
     with pytest.raises(BudgetError):

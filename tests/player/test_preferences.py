@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from kpc.player.app.preferences import _IS_RIGHT, LARGEST, Preferences, load, place, save
+from kpc.player.app.preferences import _IS_RIGHT, LARGEST, Preferences, load, preferences_path, save
 
 MINE = Preferences((800, 600), "fine", 30.0, 0.5, False, False, True, True, 1.5)
 
@@ -79,4 +79,4 @@ def test_lies_in_the_folder_the_platform_has_for_it(tmp_path: Path) -> None:
     env = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path), "APPDATA": str(tmp_path), "HOME": str(tmp_path)}
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=env, check=True).stdout
     assert said.startswith(str(tmp_path)) and said.strip().endswith(os.path.join("kpc", "player.json"))
-    assert place().is_absolute()
+    assert preferences_path().is_absolute()

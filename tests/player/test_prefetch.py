@@ -3,7 +3,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from kpc.format.container.partial import PartialScene
-from kpc.player.streaming.prefetch import Playhead, distances_ahead, fetching_order, least_room, worth_holding
+from kpc.player.streaming.prefetch import Playhead, distances_ahead, fetch_order, min_segment_bytes, segments_to_keep
 from scenes import tiny_scene
 from test_partial import opened
 
@@ -19,7 +19,7 @@ def listed(scene: PartialScene, order: np.ndarray) -> list[tuple[int, bool, int]
 
 
 def test_the_first_coarse_picture_comes_first_then_finer_ones_then_what_is_ahead(scene: PartialScene) -> None:
-    order = listed(scene, fetching_order(scene, Playhead(0.5)))
+    order = listed(scene, fetch_order(scene, Playhead(0.5)))
     now = [(False, 0)] * 3 + [(True, 8)] * 3 + [(True, 10)] * 3  # row 9.5 lies between two segments
     coarse, fine, rest = order[:9], order[9:18], order[18:]
     assert coarse == [(0, *place) for place in now] and fine == [(1, *place) for place in now]
@@ -28,7 +28,7 @@ def test_the_first_coarse_picture_comes_first_then_finer_ones_then_what_is_ahead
 
 
 def test_while_it_plays_what_comes_soon_precedes_a_finer_scale(scene: PartialScene) -> None:
-    paused, playing = (fetching_order(scene, Playhead(0.5, pace)) for pace in (0.0, 0.3))
+    paused, playing = (fetch_order(scene, Playhead(0.5, rate)) for rate in (0.0, 0.3))
     finer = [
         next(k for k, (scale, moves, _) in enumerate(listed(scene, order)) if scale == 1) for order in (paused, playing)
     ]
@@ -38,7 +38,7 @@ def test_while_it_plays_what_comes_soon_precedes_a_finer_scale(scene: PartialSce
 
 
 def test_what_the_picture_shown_needs_precedes_all_else(scene: PartialScene) -> None:
-    order = listed(scene, fetching_order(scene, Playhead(0.5, 0.3), shown=2))
+    order = listed(scene, fetch_order(scene, Playhead(0.5, 0.3), shown=2))
     moving = [place for place in order if place[1]]
     assert moving[:12] == [(scale, True, row) for scale in (0, 1) for row in (8, 8, 8, 10, 10, 10)]
 
@@ -57,15 +57,15 @@ def test_behind_the_playhead_comes_around_again_or_last(scene: PartialScene) -> 
 
 def test_the_least_room_is_what_some_time_needs(scene: PartialScene) -> None:
     needs = [int(scene.sizes[scene.moves & scene.is_needed(t, t)].sum()) for t in np.linspace(0, 1, 2000)]
-    assert least_room(scene) == max(needs)
+    assert min_segment_bytes(scene) == max(needs)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.33, 0.5, 0.98, 1.0])
 def test_what_fits_is_what_comes_next_and_what_is_needed_always_fits(scene: PartialScene, time: float) -> None:
-    least, every = least_room(scene), int(scene.sizes[scene.moves].sum())
+    least, every = min_segment_bytes(scene), int(scene.sizes[scene.moves].sum())
     assert 0 < least < every
     for room in (least, 2 * least, every):
-        held = worth_holding(scene, Playhead(time, 0.1), room)
+        held = segments_to_keep(scene, Playhead(time, 0.1), room)
         assert held[~scene.moves].all() and held[scene.is_needed(time, time)].all()
         assert scene.sizes[held & scene.moves].sum() <= room
         distance = distances_ahead(scene, Playhead(time, 0.1))
@@ -74,5 +74,5 @@ def test_what_fits_is_what_comes_next_and_what_is_needed_always_fits(scene: Part
 
 def test_nothing_moves_in_a_static_scene() -> None:
     still = opened(tiny_scene(4, dynamic=False))[0]
-    assert least_room(still) == 0 and worth_holding(still, Playhead(), 0).all()
-    assert sorted(fetching_order(still, Playhead())) == list(range(6))
+    assert min_segment_bytes(still) == 0 and segments_to_keep(still, Playhead(), 0).all()
+    assert sorted(fetch_order(still, Playhead())) == list(range(6))

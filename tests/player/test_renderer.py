@@ -15,8 +15,8 @@ from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part, Rendering, render
 from kpc.player.gl.renderer import Look, Renderer
-from kpc.player.orbit import Rig, fitted
 from kpc.player.quality import LADDER, Quality
+from kpc.player.viewpoints import Rig, fit_camera
 from PIL import Image
 from scenes import SPACES, displaced, hybrid, look_at, surrounded, tiny_scene, varied
 from test_glsl import cubic
@@ -344,7 +344,7 @@ def test_conformance_files_are_drawn_at_every_quality(name: str) -> None:
         with pytest.raises(DisplayError, match=TOO_LARGE[name]):
             Renderer(gl.context(), scene)
         return
-    camera = fitted(Rig.of(scene).cameras[0], 32, 24)
+    camera = fit_camera(Rig.of(scene).cameras[0], 32, 24)
     renderer = Renderer(gl.context(), scene)
     for quality in LADDER.values():
         renderer.quality = quality

@@ -95,7 +95,7 @@ def test_once_all_is_there_it_is_the_same_picture(
             renderer = Renderer(gl.context(), stream.scene, quality)
             picture(renderer, whole, 0.3)  # whatever is there
             until(lambda stream=stream: stream.is_settled, stream, renderer)
-            assert stream.share_here == 1 and stream.can_show(0.3) and stream.message is None
+            assert stream.loaded_fraction == 1 and stream.can_show(0.3) and stream.message is None
             pictures = sum(24 * target.seen.width * target.seen.height for target in renderer._targets.values())
             assert stream.fixed_bytes > renderer.memory_bytes - pictures - 24 * SIZE[0] * SIZE[1]
             for time in (0.0, 0.3, 1.0):
@@ -120,8 +120,8 @@ def test_the_coarse_picture_is_there_long_before_the_rest_and_gets_finer(
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         for scales in (1, 2, 3):
-            until(lambda scales=scales: stream.scales_here >= scales and stream.can_show(0.0), stream, renderer)
-            found.append((stream.scales_here, stream.source.received, picture(renderer, whole, 0.0)))  # type: ignore[attr-defined]
+            until(lambda scales=scales: stream.complete_scales >= scales and stream.can_show(0.0), stream, renderer)
+            found.append((stream.complete_scales, stream.source.received, picture(renderer, whole, 0.0)))  # type: ignore[attr-defined]
         until(lambda: stream.is_settled, stream, renderer)
     wanted = picture(Renderer(gl.context(), whole), whole, 0.0)
     quality = [psnr(rgb, wanted) for *_, rgb in found]
@@ -145,10 +145,10 @@ def test_a_long_clip_plays_in_little_memory(watched: Callable[..., Stream], tmp_
         room = all_of_it // 5
         stream = watched(f"{url}/scene.kpc", memory=fixed + room)
         renderer, most = Renderer(gl.context(), stream.scene), 0
-        until(lambda: stream.scales_here == 2, stream, renderer)
+        until(lambda: stream.complete_scales == 2, stream, renderer)
         for turn in range(2):
             for time in np.linspace(0, 1, 60):
-                stream.steer(Playhead(float(time), 0.1))
+                stream.set_playhead(Playhead(float(time), 0.1))
                 until(lambda time=time: stream.can_show(float(time)), stream, renderer)
                 most = max(most, stream.memory_bytes)
                 segments = sum(
@@ -188,12 +188,12 @@ def test_a_jump_is_served_before_all_that_lies_between(
     with serving(tmp_path, link=Link(rate=40_000, delay_s=0.002), handler=Noting) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
-        until(lambda: stream.scales_here == 2 and stream.can_show(0.0), stream, renderer)
+        until(lambda: stream.complete_scales == 2 and stream.can_show(0.0), stream, renderer)
         before = len(Noting.asked)
-        stream.steer(Playhead(0.9))
+        stream.set_playhead(Playhead(0.9))
         assert not stream.can_show(0.9)
         until(lambda: stream.can_show(0.9), stream, renderer)
-        assert stream.share_here < 0.9
+        assert stream.loaded_fraction < 0.9
         late = [e.offset for e in Reader(data).index if e.kind == "PLNE" and 104 <= e.row_start <= 108]
         since = Noting.asked[before:]
         assert any(offset in late for offset in since[:3])  # what was under way may end first
@@ -214,12 +214,14 @@ def test_a_jump_does_not_wait_for_the_end_of_a_large_chunk(watched: Callable[...
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         until(
-            lambda: stream.scales_here == 2 and stream.can_show(0.0) and stream._under_way is not None, stream, renderer
+            lambda: stream.complete_scales == 2 and stream.can_show(0.0) and stream._under_way is not None,
+            stream,
+            renderer,
         )
         received = stream.received
-        stream.steer(Playhead(0.7))
+        stream.set_playhead(Playhead(0.7))
         until(lambda: stream.can_show(0.7), stream, renderer)
-        assert stream.scales_here == 2 and stream.received - received < largest / 2
+        assert stream.complete_scales == 2 and stream.received - received < largest / 2
         until(lambda: stream.is_settled, stream, renderer)
         whole = kpc.load(data)
         assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
@@ -246,7 +248,7 @@ def test_a_player_that_stalls_goes_on_by_itself(watched: Callable[..., Stream], 
         assert stream.message is None
         time = 0.0
         while stream.can_show(time):
-            stream.steer(Playhead(time, 0.1))
+            stream.set_playhead(Playhead(time, 0.1))
             time += 0.01
             assert time < 1
         assert (stream.message or "").startswith("waiting for the scene, ")
@@ -285,10 +287,10 @@ def test_the_window_waits_for_nothing_while_the_line_is_dead(
         slowest = 0.0
         for frame in range(200):
             started = clock.monotonic()
-            stream.steer(Playhead(frame / 200, 0.1))
+            stream.set_playhead(Playhead(frame / 200, 0.1))
             stream.upload(renderer)
             stream.can_show(frame / 200)
-            stream.message, stream.share_here, stream.rate
+            stream.message, stream.loaded_fraction, stream.rate
             slowest = max(slowest, clock.monotonic() - started)
         release.set()
     assert slowest < 0.25  # a request would have waited for longer
@@ -336,7 +338,7 @@ def test_a_server_without_ranges_plays_from_the_beginning_on(
     with serving(tmp_path, handler=Whole, link=Link(rate=100_000)) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
-        until(lambda: stream.scales_here >= 1 and stream.can_show(0.0), stream, renderer)
+        until(lambda: stream.complete_scales >= 1 and stream.can_show(0.0), stream, renderer)
         assert stream.source.received < 0.7 * len(data)  # type: ignore[attr-defined]
         until(lambda: stream.is_settled, stream, renderer)
         assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
@@ -366,7 +368,7 @@ def test_a_file_that_changes_is_told_and_what_is_there_still_plays(
         assert "changed on the server" in (stream.failure or "") and stream.is_settled
         assert (stream.message or "").startswith("no more of the scene will come: ")
         stream.upload(renderer)
-        assert picture(renderer, stream.scene, 0.0).std() > 0.01 or stream.scales_here == 0
+        assert picture(renderer, stream.scene, 0.0).std() > 0.01 or stream.complete_scales == 0
 
 
 def flipping(times: int, at: int) -> type[Handler]:
@@ -474,12 +476,12 @@ def test_steady_playback_makes_nothing_on_the_card_and_keeps_memory_flat(
     ctx = gl.context()
     renderer, screen = Renderer(ctx, stream.scene, Quality(folded=folded)), ctx.simple_framebuffer(SIZE, 4)
     camera = stream.scene.cameras[0].resized(*SIZE)
-    until(lambda: stream.scales_here == 2, stream, renderer)
+    until(lambda: stream.complete_scales == 2, stream, renderer)
     made: list[str] = []
 
     def play(turns: int) -> None:
         for time in np.tile(np.linspace(0, 1, 40), turns):
-            stream.steer(Playhead(float(time), 0.1))
+            stream.set_playhead(Playhead(float(time), 0.1))
             until(lambda time=time: stream.can_show(float(time)), stream, renderer)
             renderer.show(screen, camera, float(time))
 

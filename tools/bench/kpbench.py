@@ -337,7 +337,7 @@ def _play_once(job: Play) -> dict[str, results.Record]:
     compute shaders where there is a choice, of which the faster counts."""
     from kpc.player.gl import offscreen
     from kpc.player.gl.renderer import Renderer, tries_compute
-    from kpc.player.orbit import Rig, fitted
+    from kpc.player.viewpoints import Rig, fit_camera
     from kpc.tools.bench.machine_limits import texel_rate
 
     begun = clock.perf_counter()
@@ -346,7 +346,7 @@ def _play_once(job: Play) -> dict[str, results.Record]:
     opened = clock.perf_counter()
     scene = scene_io.read(job.scene).dequantise()
     loaded = clock.perf_counter()
-    camera = fitted(Rig.of(scene).cameras[0], *job.size)
+    camera = fit_camera(Rig.of(scene).cameras[0], *job.size)
 
     def draw(renderer: Renderer, time: float) -> tuple[float, float]:
         """Milliseconds until the picture is there, and those that the processors spent on it."""
@@ -467,8 +467,8 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
     from kpc.player.cpu import reference
     from kpc.player.gl import offscreen
     from kpc.player.gl.renderer import Renderer
-    from kpc.player.orbit import Rig, fitted, orbit
     from kpc.player.quality import Quality
+    from kpc.player.viewpoints import Rig, fit_camera, orbit
 
     ctx = offscreen.open_context()
     scene = scene_io.read(job.scene).dequantise()
@@ -483,7 +483,7 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
         renderers = {name: Renderer(ctx, scene, quality) for name, quality in LADDER.items()}
         each: dict[str, list[float]] = {name: [] for name in LADDER}
         for view, time in zip(cameras, times, strict=True):
-            camera = fitted(view, *size)
+            camera = fit_camera(view, *size)
             exact = np.clip(renderers["reference"].render(camera, float(time)).rgb, 0, 1)
             drawn = {name: renderer.render(camera, float(time)) for name, renderer in renderers.items()}
             for name, picture in drawn.items():

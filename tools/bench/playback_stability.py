@@ -13,12 +13,12 @@ import moderngl
 import numpy as np
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.container.container import open_source
-from kpc.player.app.controls import Pace
 from kpc.player.app.desktop import glfw
 from kpc.player.app.preferences import Preferences
+from kpc.player.app.resolution_controller import ResolutionController
 from kpc.player.app.window import Player, Window
 from kpc.player.gl import offscreen
-from kpc.player.streaming.group_playback import Reel
+from kpc.player.streaming.group_playback import GroupPlayback
 
 MAKERS = ("texture", "texture3d", "texture_array", "texture_cube", "depth_texture", "buffer", "framebuffer", "simple_framebuffer",
           "renderbuffer", "vertex_array", "simple_vertex_array", "program", "sampler", "compute_shader", "query")  # fmt: skip
@@ -47,7 +47,9 @@ def measure(job: Steady) -> dict[str, Any]:
     with in_window(job.scene, job.size, Preferences(graphs=True, planes=True)) as player:
         window, stream = player.window, player.stream
         player.show_path = True
-        player.dial.pace = Pace(budget_s=3600.0)  # the raster stays as it is, however busy the machine
+        player.quality.resolution = ResolutionController(
+            budget_s=3600.0
+        )  # the raster stays as it is, however busy the machine
         for _ in range(2):
             player.add_keyframe()
         while not stream.is_settled:
@@ -90,7 +92,7 @@ def in_window(scene: Path, size: tuple[int, int], preferences: Preferences) -> I
     """
     with (
         contextlib.closing(Window("kpbench", size)) as window,
-        contextlib.closing(Reel(open_source(str(scene)))) as stream,
+        contextlib.closing(GroupPlayback(open_source(str(scene)))) as stream,
     ):
         glfw.swap_interval(0)
         with contextlib.closing(Player(window, stream, preferences)) as player:

@@ -21,13 +21,13 @@ from kpc.format.container.container import open_source
 from kpc.format.container.partial import PartialScene
 from kpc.format.container.scene_io import SceneReader, encode, read
 from kpc.format.scene.scene import TIME_PLANES, Clip
-from kpc.player.app.controls import Pace
+from kpc.player.app.resolution_controller import ResolutionController
 from kpc.player.gl import offscreen
 from kpc.player.gl.renderer import Renderer, is_software
-from kpc.player.orbit import Rig, fitted
 from kpc.player.quality import Quality
-from kpc.player.streaming.prefetch import Playhead, least_room
+from kpc.player.streaming.prefetch import Playhead, min_segment_bytes
 from kpc.player.streaming.stream import Stream
+from kpc.player.viewpoints import Rig, fit_camera
 
 RATE, DELAY = "10Mbit", "20ms"
 SEEKS = 12
@@ -72,11 +72,11 @@ def _arrival(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, 
         opened = clock.perf_counter()
         renderer = Renderer(ctx, stream.scene, job.quality)
         draw = _drawing(screen, renderer, job)
-        _until(stream, renderer, lambda: stream.scales_here > 0 and stream.can_show(0.0))
+        _until(stream, renderer, lambda: stream.complete_scales > 0 and stream.can_show(0.0))
         received = stream.received
-        draw(0.0, Pace.of(is_software(ctx)).scale)
+        draw(0.0, ResolutionController.of(is_software(ctx)).scale)
         first = clock.perf_counter()
-        _until(stream, renderer, lambda: stream.scales_here == len(stream.scene.scales) and stream.can_show(0.0))
+        _until(stream, renderer, lambda: stream.complete_scales == len(stream.scene.scales) and stream.can_show(0.0))
         draw(0.0)
         sharp = clock.perf_counter()
         _until(stream, renderer, lambda: stream.is_settled)
@@ -95,7 +95,7 @@ def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, ur
     with ExitStack() as stack:
         probe = Stream(open_source(url))
         stack.callback(probe.close)
-        stream = Stream(open_source(url), memory=probe.fixed_bytes + least_room(probe.parts))
+        stream = Stream(open_source(url), memory=probe.fixed_bytes + min_segment_bytes(probe.parts))
         stack.callback(stream.close)
         renderer = Renderer(ctx, stream.scene, job.quality)
         draw = _drawing(screen, renderer, job)
@@ -104,11 +104,11 @@ def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, ur
         waits, draws, missed = [], [], 0
         for time in np.random.default_rng(0).permutation(np.linspace(0.0, 1.0, SEEKS)):
             started = clock.perf_counter()
-            stream.steer(Playhead(float(time)))
+            stream.set_playhead(Playhead(float(time)))
             missed += not stream.can_show(float(time))
             _until(stream, renderer, lambda time=float(time): stream.can_show(time))  # type: ignore[misc]
             there = clock.perf_counter()
-            draw(float(time), Pace.of(is_software(ctx)).scale)
+            draw(float(time), ResolutionController.of(is_software(ctx)).scale)
             waits.append(1e3 * (there - started))
             draws.append(1e3 * (clock.perf_counter() - there))
     together = [wait + drawn for wait, drawn in zip(waits, draws)]
@@ -124,7 +124,7 @@ def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, ur
 def prefixes(job: Arrival) -> list[dict[str, Any]]:
     """How near the picture of each prefix is to that of the whole file, where a scale, or a segment over all scales, ends."""
     ctx, whole = offscreen.open_context(), read(job.scene).dequantise()
-    camera = fitted(Rig.of(whole).cameras[0], *job.size)
+    camera = fit_camera(Rig.of(whole).cameras[0], *job.size)
     scene = PartialScene(SceneReader(str(job.scene), in_parts=True))
     reference = Renderer(ctx, whole)
     wanted = [reference.render(camera, time).rgb.clip(0, 1) for time in TIMES]
@@ -173,7 +173,7 @@ def _drawing(screen: moderngl.Framebuffer, renderer: Renderer, job: Arrival) -> 
 
     def draw(time: float, scale: float = 1.0) -> None:
         width, height = (max(1, round(side * scale)) for side in job.size)
-        renderer.show(screen, fitted(camera, width, height), time)
+        renderer.show(screen, fit_camera(camera, width, height), time)
         renderer.ctx.finish()
 
     return draw

@@ -34,8 +34,8 @@ from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
 from kpc.player.cpu.motion_map import dynamic_map
 from kpc.player.cpu.reference import Part, Rendering
-from kpc.player.orbit import Rig, fitted, orbit
 from kpc.player.quality import LADDER
+from kpc.player.viewpoints import Rig, fit_camera, orbit
 from PIL import Image, PngImagePlugin
 
 import kpc
@@ -248,10 +248,10 @@ def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[Shot]:
     if options.time is not None:
         shots = [replace(shot, time=options.time) for shot in shots]
     if options.size is not None:
-        shots = [replace(shot, camera=fitted(shot.camera, *options.size)) for shot in shots]
+        shots = [replace(shot, camera=fit_camera(shot.camera, *options.size)) for shot in shots]
     elif options.cameras is not None and Path(options.output).suffix.lower() == ".mp4":
         first = shots[0].camera
-        shots = [replace(shot, camera=fitted(shot.camera, first.width, first.height)) for shot in shots]
+        shots = [replace(shot, camera=fit_camera(shot.camera, first.width, first.height)) for shot in shots]
     return shots
 
 

@@ -71,7 +71,7 @@ def orbit(scene: Scene, count: int) -> list[Camera]:
     rig = Rig.of(scene)
     azimuth, elevation, distance = rig.angles()
     turns = 2 * math.pi * np.arange(count) / count
-    if is_ring(azimuth):
+    if surround_focus(azimuth):
         return [rig.camera(turn, float(elevation.mean()), float(distance.mean())) for turn in turns]
     (middle_a, middle_e), sway_a, sway_e = _sways(azimuth, elevation)
     far = float(np.median(distance))
@@ -95,7 +95,7 @@ def presets(scene: Scene) -> dict[str, Camera]:
     rig = Rig.of(scene)
     azimuth, elevation, distance = rig.angles()
     far, level = float(np.median(distance)), float(elevation.mean())
-    if is_ring(azimuth):
+    if surround_focus(azimuth):
         around = {
             "front": (0.0, level),
             "right": (0.5, level),
@@ -113,7 +113,7 @@ def presets(scene: Scene) -> dict[str, Camera]:
     return {name: rig.camera(*place) for name, place in places.items()}
 
 
-def is_ring(azimuth: np.ndarray) -> bool:
+def surround_focus(azimuth: np.ndarray) -> bool:
     """Whether directions, radians, leave no wide gap on the circle."""
     around = np.sort(azimuth)
     gaps = np.diff(np.append(around, around[0] + 2 * math.pi))
@@ -132,7 +132,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     return pose
 
 
-def fitted(camera: Camera, width: int, height: int) -> Camera:
+def fit_camera(camera: Camera, width: int, height: int) -> Camera:
     """The same view on a raster of another shape: the vertical field of view stays, square pixels stay square."""
     scale = height / camera.height
     return Camera(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
-from kpc.player.orbit import Rig, fitted, is_ring, look_at, orbit, presets
+from kpc.player.viewpoints import Rig, fit_camera, look_at, orbit, presets, surround_focus
 from scenes import tiny_scene
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -71,18 +71,18 @@ def test_parallel_cameras_look_at_the_middle_of_the_box() -> None:
 
 
 def test_rings_are_told_from_arcs() -> None:
-    assert is_ring(np.radians([0.0, 100.0, -110.0]))
-    assert not is_ring(np.radians([0.0, 60.0, -60.0]))
-    assert not is_ring(np.array([0.0]))
+    assert surround_focus(np.radians([0.0, 100.0, -110.0]))
+    assert not surround_focus(np.radians([0.0, 60.0, -60.0]))
+    assert not surround_focus(np.array([0.0]))
 
 
 def test_fitting_keeps_the_vertical_field_of_view() -> None:
     camera = Camera(64, 48, 60, 62, 30, 25, np.eye(4))
-    wide = fitted(camera, 128, 72)
+    wide = fit_camera(camera, 128, 72)
     assert (wide.fl_y / wide.height, wide.cy / wide.height) == pytest.approx((62 / 48, 25 / 48))
     assert wide.fl_x / wide.fl_y == pytest.approx(60 / 62)
     assert (wide.cx - 64) / wide.fl_x == pytest.approx((30 - 32) / 60)
-    assert fitted(camera, 64, 48) == camera
+    assert fit_camera(camera, 64, 48) == camera
 
 
 def test_presets_stay_where_something_was_seen() -> None:
