@@ -3,29 +3,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import BudgetError
 from kpc.format.container.container import Reader
 from kpc.format.container.partial import PartialScene, SegmentedPlane, runs
-from kpc.format.container.scene_io import SceneReader, encode, read
+from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.scene.grid import linear
 from kpc.format.scene.scene import TIME_PLANES, Scene
 from kpc.player.cpu import reference
 from kpc.tools.cli.serve import serving
+from partial_scenes import coded, opened
 from scenes import SPACES, tiny_scene, varied
-
-import kpc
-
-
-def coded(scene: Scene, segment_rows: int = 3) -> bytes:
-    return encode(
-        quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), segment_rows=segment_rows
-    )
-
-
-def opened(scene: Scene, segment_rows: int = 3) -> tuple[PartialScene, Scene]:
-    data = coded(scene, segment_rows)
-    return PartialScene(SceneReader(data, in_parts=True)), kpc.load(data)
 
 
 def picture(scene: Scene, time: float) -> np.ndarray:

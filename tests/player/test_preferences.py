@@ -75,7 +75,7 @@ def test_no_file_a_folder_and_a_pipe_are_no_preferences(tmp_path: Path) -> None:
 
 def test_lies_in_the_folder_the_platform_has_for_it(tmp_path: Path) -> None:
     """In a process of its own: the platform is asked once."""
-    program = "from kpc.player.app.preferences import place; print(place())"
+    program = "from kpc.player.app.preferences import preferences_path; print(preferences_path())"
     env = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path), "APPDATA": str(tmp_path), "HOME": str(tmp_path)}
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=env, check=True).stdout
     assert said.startswith(str(tmp_path)) and said.strip().endswith(os.path.join("kpc", "player.json"))

@@ -24,8 +24,8 @@ from kpc.player.streaming import stream as module
 from kpc.player.streaming.prefetch import Playhead
 from kpc.player.streaming.stream import Stream
 from kpc.tools.cli.serve import Handler, Link, serving
+from partial_scenes import coded
 from scenes import SPACES, tiny_scene
-from test_partial import coded
 
 import kpc
 
