@@ -1,0 +1,136 @@
+"""Section 4: header, index, chunks and groups."""
+
+import struct
+from dataclasses import dataclass
+
+import zstandard
+
+from .common import Refused, crc32c, require
+
+RAW, ZSTD, PREDICTIVE, TRANSFORM, MOTION, OCCUPANCY, WEIGHTS, POSES = range(8)
+CODECS = {  # beside RAW and ZSTD
+    b"PLNE": (PREDICTIVE, TRANSFORM),
+    b"MOVE": (MOTION,),
+    b"OCCU": (OCCUPANCY,),
+    b"DECO": (WEIGHTS,),
+    b"HYBR": (WEIGHTS,),
+    b"came": (POSES,),
+    b"SCNE": (),
+    b"WARP": (),
+    b"appe": (),
+}
+HEADER, ENTRY = struct.Struct("<8sHHIIIQQII"), struct.Struct("<4sHBBIIHIII")
+EXPANSION_LIMIT = 32768
+
+
+@dataclass
+class Content:
+    """What a chunk holds: its raw bytes or, under codecs 2 to 7, the stored bytes and the raw length."""
+
+    codec: int
+    raw_length: int
+    data: bytes
+
+    @property
+    def is_coded(self):
+        return self.codec > ZSTD
+
+
+@dataclass
+class Chunk:
+    """An index entry with the stored bytes of its chunk; of a prefix, those that are there."""
+
+    kind: bytes
+    group: int
+    scale: int
+    plane: int
+    row_start: int
+    row_count: int
+    codec: int
+    stored_length: int
+    raw_length: int
+    crc: int
+    stored: bytes = b""
+
+    @property
+    def is_whole(self):
+        return len(self.stored) == self.stored_length
+
+    @property
+    def is_critical(self):
+        return self.kind[:1].isupper()
+
+
+def read_chunks(data, is_prefix):  # sections 4.1 and 4.2
+    """Return (chunks, value_count) of a file."""
+    require(len(data) >= HEADER.size and data[:8] == b"\x89KPC\r\n\x1a\n", "not a .kpc file")
+    _, version, header_length, chunk_count, index_length, index_crc, *fields = HEADER.unpack(data[: HEADER.size])
+    file_length, value_count, largest_raw, header_crc = fields
+    require(header_length != 0, "a draft of the format; encode it again")
+    require(version == 1, "unknown version")
+    require(crc32c(data[:44]) == header_crc, "damaged header")
+    require(header_length == HEADER.size, "header length")
+    require(1 <= chunk_count <= 65536 and 1 <= index_length <= 64 + 40 * chunk_count, "number of chunks")
+    require(file_length >= HEADER.size + max(index_length, 8 * chunk_count), "file length")
+    require(len(data) <= file_length if is_prefix else len(data) == file_length, "file length")
+    require(max(value_count, largest_raw) <= file_length * EXPANSION_LIMIT, "claims of the header")
+    index = data[HEADER.size : HEADER.size + index_length]
+    require(len(index) == index_length and crc32c(index) == index_crc, "damaged index")
+    table = decompress(index, ENTRY.size * chunk_count)
+    chunks, start = [], HEADER.size + index_length
+    for number in range(chunk_count):
+        chunk = Chunk(*ENTRY.unpack(table[number::chunk_count]))
+        require(chunk.kind.isalpha() and chunk.raw_length <= largest_raw, "index entry")
+        chunk.stored = data[start : start + chunk.stored_length]
+        require(is_prefix or chunk.is_whole, "a chunk is cut off")
+        start += chunk.stored_length
+        chunks.append(chunk)
+    require(start == file_length, "chunks and the end of the file")
+    return chunks, value_count
+
+
+def decompress(frame, length):  # section 4.5
+    try:
+        require(zstandard.get_frame_parameters(frame).content_size == length, "content size of a Zstandard frame")
+        return zstandard.ZstdDecompressor().decompress(frame, max_output_size=length, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise Refused("Zstandard") from error
+
+
+def scene_contents(data, is_prefix):  # sections 4.3 and 4.4
+    """Return (list of (chunk, content), value_count) of a scene; the content is None where a prefix lacks it."""
+    chunks, value_count = read_chunks(data, is_prefix)
+    contents = []
+    for chunk in chunks:
+        require(chunk.kind in CODECS or not chunk.is_critical, "unknown critical chunk")
+        if chunk.kind not in CODECS:
+            continue
+        position = chunk.scale, chunk.plane, chunk.row_start, chunk.row_count
+        require(chunk.group == 0 and (chunk.kind == b"PLNE" or not any(position)), "fields of an index entry")
+        require(chunk.codec in (RAW, ZSTD, *CODECS[chunk.kind]), "unknown codec")
+        require(chunk.codec != RAW or chunk.raw_length == chunk.stored_length, "raw length")
+        require(chunk.codec <= ZSTD or chunk.raw_length <= EXPANSION_LIMIT * chunk.stored_length, "raw length")
+        content = None
+        if chunk.is_whole:
+            require(crc32c(chunk.stored) == chunk.crc, "damaged chunk")
+            is_frame = chunk.codec == ZSTD
+            stored = decompress(chunk.stored, chunk.raw_length) if is_frame else chunk.stored
+            content = Content(chunk.codec, chunk.raw_length, stored)
+        contents.append((chunk, content))
+    return contents, value_count
+
+
+def group_chunks(data, is_prefix=False):  # section 4.7
+    """Return (the GRUP chunks by rising number, value_count); an empty list for a file that is a scene."""
+    chunks, value_count = read_chunks(data, is_prefix)
+    groups = {}
+    if any(chunk.kind == b"GRUP" for chunk in chunks):
+        for chunk in chunks:
+            require(chunk.kind == b"GRUP" or not chunk.is_critical, "a critical chunk beside groups")
+            if chunk.kind == b"GRUP":
+                require(chunk.codec == RAW and chunk.raw_length == chunk.stored_length, "codec of a group")
+                require(chunk.scale == chunk.plane == 0 and chunk.row_count > 0, "fields of a group")
+                require(chunk.group not in groups, "number of a group")
+                groups[chunk.group] = chunk
+    require(sorted(groups) == list(range(len(groups))), "numbers of groups")
+    return [groups[number] for number in range(len(groups))], value_count

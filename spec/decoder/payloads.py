@@ -1,0 +1,246 @@
+"""Section 8: motion, occupancy, decoder weights, cameras and appearances."""
+
+import itertools
+import math
+
+from .common import ByteReader, Refused, clamp, f32, require, unpack_bits
+from .entropy import EntropyDecoder, log_class
+
+# --- 8.1 MOVE
+
+
+def decode_motion(content):
+    chunk = ByteReader(content.data)
+    rows, nz, ny, nx, step = chunk.unpack("4Hf")
+    require(2 <= rows <= 16384 and all(2 <= n <= 256 for n in (nz, ny, nx)), "size of the motion grid")
+    require(step > 0 and 32768 * step <= 1024, "step of the motion grid")
+    count = 3 * rows * nz * ny * nx
+    if content.is_coded:
+        require(content.raw_length == 12 + 2 * count, "raw length")
+        symbols = decode_motion_symbols(chunk, (rows, nz, ny, nx))
+    else:
+        symbols = chunk.unpack(f"{count}h")
+        chunk.finish()
+    return {"size": (rows, nz, ny, nx), "displacements": [f32(symbol * step) for symbol in symbols]}
+
+
+def decode_motion_symbols(chunk, sizes):
+    """Return the symbols of the MOTION codec, row-major; sizes: nodes along t, z, y, x."""
+    decisions = EntropyDecoder(chunk)
+    v, magnitude = {}, {}  # by (t, z, y, x, component)
+    decoded = [[0] for _ in sizes]  # positions along each axis that are decoded
+
+    def decode_pass(axis, new, references, weights):
+        """Decode the nodes at position `new` of an axis, predicted from up to four reference positions."""
+        others = [decoded[a] for a in range(4) if a != axis]
+        for at in itertools.product(*others):
+
+            def node(position):
+                return (*at[:axis], position, *at[axis:])  # noqa: B023
+
+            previous = []  # the nodes one decoded position back along each of the other axes
+            for a in range(3):
+                index = others[a].index(at[a])
+                if index > 0:
+                    moved = (*at[:a], others[a][index - 1], *at[a + 1 :])
+                    previous.append((*moved[:axis], new, *moved[axis:]))
+            for component in range(3):
+                used = [(k, (*node(references[k]), component)) for k in range(4) if weights[k]]
+                prediction = clamp(sum(weights[k] * v[i] for k, i in used) + 32 >> 6, -32768, 32767)
+                activity = sum(magnitude[i] * (2 if k in (1, 2) else 1) for k, i in used)
+                activity += 3 * sum(magnitude[(*node(new), c)] for c in range(component))
+                activity += sum(magnitude[(*i, c)] for i in previous for c in range(3))
+                residual = decisions.signed(("motion", min(log_class(activity), 19)), unary=4, escape=15)
+                require(-32768 <= prediction + residual <= 32767, "a symbol exceeds 16 bits")
+                v[(*node(new), component)] = prediction + residual
+                magnitude[(*node(new), component)] = abs(residual)
+
+    decode_pass(0, 0, [None] * 4, [0] * 4)
+    for axis, n in enumerate(sizes):
+        decode_pass(axis, n - 1, [None, 0, None, None], [0, 64, 0, 0])
+        decoded[axis].append(n - 1)
+    depth = [(n - 2).bit_length() for n in sizes]
+    for level in range(max(depth), 0, -1):
+        for axis in range(4):
+            if depth[axis] >= level:
+                halve(decoded, axis, decode_pass)
+    decisions.finish()
+    return [v[i] for i in itertools.product(*map(range, sizes), range(3))]
+
+
+def halve(decoded, axis, decode_pass):
+    """Decode the node in the middle of each gap along an axis."""
+    old = decoded[axis]
+    middles = []
+    for index in range(len(old) - 1):
+        if old[index + 1] - old[index] > 1:
+            new = old[index] + old[index + 1] >> 1
+            references = [old[i] if 0 <= i < len(old) else None for i in range(index - 1, index + 3)]
+            decode_pass(axis, new, references, interpolation_weights(new, references))
+            middles.append(new)
+    decoded[axis] = sorted(old + middles)
+
+
+def interpolation_weights(new, references):
+    """Return the weights of cubic interpolation, in 1/64."""
+    weights = [0] * 4
+    for k, s_k in enumerate(references):
+        if s_k is not None:
+            others = [s_j for s_j in references if s_j is not None and s_j != s_k]
+            A = 64 * math.prod(new - s_j for s_j in others)
+            B = math.prod(s_k - s_j for s_j in others)
+            weights[k] = (2 * A + B) // (2 * B)
+    weights[1] += 64 - sum(weights)
+    return weights
+
+
+# --- 8.2 OCCU
+
+# Neighbours of a cell whose bits choose the model, most significant first: steps along slot, z, y, x.
+OCCUPANCY_NEIGHBOURS = [
+    (0, 0, 0, -1),
+    (0, 0, -1, 0),
+    (0, -1, 0, 0),
+    (0, -1, 1, 0),
+    (0, 0, -1, 1),
+    (0, -1, 0, 1),
+    (-1, 0, 0, 0),
+    (-1, 0, 0, -1),
+    (-1, 1, 0, 0),
+    (-1, 0, -1, 0),
+    (-1, -1, 0, 0),
+]
+
+
+def decode_occupancy(content):
+    chunk = ByteReader(content.data)
+    sizes = K, nz, ny, nx = chunk.unpack("4H")
+    require(all(1 <= n <= 16384 for n in sizes), "size of the occupancy grid")
+    count = K * nz * ny * nx
+    if not content.is_coded:
+        return {"cells": sizes, "occupancy": unpack_bits(chunk.remaining(), count)}
+    require(content.raw_length == 8 + -(-count // 8), "raw length")
+    decisions, occupied = EntropyDecoder(chunk), {}
+    for cell in itertools.product(*map(range, sizes)):
+        context = tuple(
+            occupied.get(tuple(a + b for a, b in zip(cell, neighbour)), 0) for neighbour in OCCUPANCY_NEIGHBOURS
+        )
+        occupied[cell] = decisions.adaptive(("occupancy", context))
+    decisions.finish()
+    return {"cells": sizes, "occupancy": list(occupied.values())}
+
+
+# --- 8.3 DECO and HYBR
+
+
+def decode_explicit_decoder(content, feature_count):
+    chunk = ByteReader(content.data)
+    F, H, density_bias = chunk.unpack("HHf")
+    require(F == feature_count and 1 <= H <= 256 and math.isfinite(density_bias), "size of the decoder")
+    counts = {"density_weight": F, "w1": H * 9, "b1": H, "w2": 3 * F * H, "b2": 3 * F}
+    weights = decode_weights(content, chunk, counts)
+    return weights | {"density_bias": density_bias, "hidden": H, "width": 0}
+
+
+def decode_hybrid_decoder(content, feature_count):
+    chunk = ByteReader(content.data)
+    F, G, H, density_bias = chunk.unpack("HHHf")
+    require(F == feature_count and 1 <= G <= 256 and 1 <= H <= 256, "size of the decoder")
+    require(math.isfinite(density_bias), "density bias")
+    counts = {"v": G * F, "v_bias": G, "density_weight": G, "w1": H * 9, "b1": H, "u": H * G, "w2": 3 * H, "b2": 3}
+    weights = decode_weights(content, chunk, counts)
+    return weights | {"density_bias": density_bias, "hidden": H, "width": G}
+
+
+def decode_weights(content, chunk, counts):
+    """Return {array: its weights, row-major}."""
+    if not content.is_coded:
+        weights = {name: chunk.unpack(f"{count}e") for name, count in counts.items()}
+        require(all(math.isfinite(w) for array in weights.values() for w in array), "weights")
+        chunk.finish()
+        return weights
+    require(content.raw_length == chunk.position + 2 * sum(counts.values()), "raw length")
+    exponents = chunk.unpack(f"{len(counts)}b")
+    require(all(-24 <= e <= 15 for e in exponents), "exponents of weights")
+    decisions, weights = EntropyDecoder(chunk), {}
+    for (name, count), e in zip(counts.items(), exponents):
+        integers = [decisions.signed(("weights", name), unary=4, escape=10) for _ in range(count)]
+        require(all(abs(k) <= 2048 and abs(k) * 2.0**e <= 65504 for k in integers), "weights")
+        weights[name] = tuple(k * 2.0**e for k in integers)
+    decisions.finish()
+    return weights
+
+
+# --- 8.4 came
+
+D = 131071**2  # one half, in squares of quaternion components
+
+
+def decode_cameras(content):
+    """Return (width, height, focal x and y, centre x and y, 12 numbers of the pose) of each camera."""
+    chunk = ByteReader(content.data)
+    if content.is_coded:
+        cameras = decode_poses(chunk)
+        require(content.raw_length == 2 + 68 * len(cameras), "raw length")
+    else:
+        (count,) = chunk.unpack("H")
+        cameras = [chunk.unpack("HH16f") for _ in range(count)]
+    chunk.finish()
+    require(1 <= len(cameras) <= 4096, "number of cameras")
+    for width, height, *numbers in cameras:
+        pose = numbers[4:]
+        require(width > 0 and height > 0 and min(numbers[:2]) > 0, "lens of a camera")
+        require(all(abs(a) <= 2**30 for a in numbers), "numbers of a camera")
+        require(all(0.5 <= math.hypot(*pose[column::4]) <= 2 for column in range(3)), "axes of a camera")
+    return cameras
+
+
+def decode_poses(chunk):
+    count, lens_count, e, *corner = chunk.unpack("HHb3i")
+    require(1 <= count <= 4096 and lens_count in (1, count) and -126 <= e <= 30, "poses")
+    lenses = [chunk.unpack("HH4f") for _ in range(lens_count)]
+    cameras = []
+    for number in range(count):
+        rotation, position = (int.from_bytes(chunk.take(7), "little") for _ in range(2))
+        require(position >> 54 == 0, "position of a camera")
+        left_out = rotation >> 54
+        q = [(rotation >> 18 * i & 0x3FFFF) - 131072 for i in range(3)]
+        square = 2 * D - sum(a * a for a in q)
+        require(square >= 0, "rotation of a camera")
+        q.insert(left_out, math.sqrt(square))
+        squares = [square if i == left_out else q[i] * q[i] for i in range(4)]
+        (w, x, y, z), (_, xx, yy, zz) = q, squares
+        rows = [
+            [D - (yy + zz), x * y - w * z, x * z + w * y],
+            [x * y + w * z, D - (xx + zz), y * z - w * x],
+            [x * z - w * y, y * z + w * x, D - (xx + yy)],
+        ]
+        pose = []
+        for i in range(3):
+            pose += [f32(a / D) + 0.0 for a in rows[i]]  # + 0.0 makes -0 a 0
+            pose.append(f32(math.ldexp(corner[i] + (position >> 18 * i & 0x3FFFF), e)))
+        cameras.append((*lenses[number if lens_count > 1 else 0], *pose))
+    return cameras
+
+
+# --- 8.5 appe
+
+
+def decode_appearances(chunk, expected_hidden):
+    """Return {name: embedding}."""
+    count, H = chunk.unpack("HH")
+    require(1 <= count <= 16384 and H == expected_hidden, "number of appearances or of hidden units")
+    embeddings = [chunk.unpack(f"{H}e") for _ in range(count)]
+    require(all(math.isfinite(a) for embedding in embeddings for a in embedding), "embeddings")
+    appearances = {}
+    for embedding in embeddings:
+        (length,) = chunk.unpack("B")
+        try:
+            name = chunk.take(length).decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise Refused("a name is not UTF-8") from error
+        require(name and name not in appearances, "a name is empty or is there twice")
+        require(not any(ord(a) < 0x20 or 0x7F <= ord(a) <= 0x9F for a in name), "a control character in a name")
+        appearances[name] = embedding
+    chunk.finish()
+    return appearances
