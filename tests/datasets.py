@@ -103,7 +103,7 @@ def write_nerfstudio(folder: Path, images: int = 10, times: list[float] | None =
     return rig
 
 
-def write_surrounded(folder: Path, images: int = 40) -> list[Camera]:
+def write_unbounded(folder: Path, images: int = 40) -> list[Camera]:
     """A ball of radius 0.7 before a sky without end, from all around and several heights. Every eighth image tests."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     rig, frames = [], []
@@ -124,7 +124,7 @@ def write_surrounded(folder: Path, images: int = 40) -> list[Camera]:
     return rig
 
 
-def write_unequal(folder: Path, images: int = 32, own_lens: bool = True, unequal: bool = True) -> list[Camera]:
+def write_varying_exposure(folder: Path, images: int = 32, own_lens: bool = True, unequal: bool = True) -> list[Camera]:
     """A patterned ball of radius 0.7 on nothing, from all around; each image has an exposure and a white balance of its own where
     `unequal`, drawn from a fixed seed, and a lens of its own where `own_lens`. Every eighth image tests."""
     (folder / "images").mkdir(parents=True, exist_ok=True)

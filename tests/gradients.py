@@ -9,10 +9,10 @@ from kpc.encoder.field.field import Blend, Field, corners_of
 from kpc.encoder.field.render import Rays, render_reference
 from kpc.encoder.training.optimisers import motion_of, sample_capacity
 from kpc.format.scene.scene import Scene
-from scenes import displaced, surrounded, tiny_scene
+from scenes import tiny_scene, with_contraction, with_motion
 from torch import Tensor
 
-KINDS = [
+FIELD_KINDS = [
     (True, False, False),
     (True, False, True),
     (False, False, False),
@@ -23,18 +23,18 @@ KINDS = [
 """Whether it moves, lies in contracted space, has a motion grid."""
 
 
-def misty(dynamic: bool = True, contracted: bool = False, moved: bool = False) -> Scene:
+def translucent_scene(dynamic: bool = True, contracted: bool = False, moved: bool = False) -> Scene:
     """Every step absorbs a tenth or more: no sample before termination is so faint that it gets no colour."""
     scene = tiny_scene(dynamic=dynamic, time=6)
     weight = scene.decoder.density_weight
     # Before the cameras' even distance, steps outside the box count for less: 1 / r^2, a tenth.
     bias = 4.5 if contracted else 2.0
     scene = replace(scene, decoder=replace(scene.decoder, density_weight=np.abs(weight) / 16, density_bias=bias))
-    scene = surrounded(scene) if contracted else scene
-    return displaced(scene) if moved else scene
+    scene = with_contraction(scene) if contracted else scene
+    return with_motion(scene) if moved else scene
 
 
-def rays_at(scene: Scene, count: int, seed: int = 0) -> Rays:
+def random_rays(scene: Scene, count: int, seed: int = 0) -> Rays:
     """Rays through random pixels of the scene's cameras at random times, and one exactly along each axis."""
     rng = np.random.default_rng(seed)
     origins, directions = (np.concatenate(a) for a in zip(*(c.rays() for c in scene.cameras)))
@@ -125,7 +125,7 @@ def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict
     }
 
 
-class Calling(torch.nn.Module):
+class FieldFunction(torch.nn.Module):
     """Makes a function of a field's parameters out of one that uses the field."""
 
     def __init__(self, field: Field, call: object) -> None:

@@ -395,7 +395,7 @@ def drop_files(window: Window, player: Player, scene_file: Path) -> None:
 
 def go_through_groups(window: Window, scene_file: str) -> None:
     """The scene twice as one clip: each half shows in its time, in the quality and the appearance that were chosen."""
-    groups.write(groups.parts_of([scene_file, scene_file]), "twice.kpc")
+    groups.write(groups.group_inputs([scene_file, scene_file]), "twice.kpc")
     reel = GroupPlayback(open_source("twice.kpc"))
     player = Player(window, reel, Preferences())
     player.type(glfw.KEY_SPACE, 0)
@@ -424,7 +424,7 @@ def go_through_groups(window: Window, scene_file: str) -> None:
 
 def stand_where_groups_are_mixed(window: Window, scene_file: str) -> None:
     """Amid the frames that two groups share the picture is made of both, also once it is sharp."""
-    groups.write([groups.Part.of(scene_file, 0), groups.Part.of(scene_file, 6)], "mixed.kpc")
+    groups.write([groups.GroupInput.of(scene_file, 0), groups.GroupInput.of(scene_file, 6)], "mixed.kpc")
     reel = GroupPlayback(open_source("mixed.kpc"))
     player = Player(window, reel, Preferences())
     player.scrub(0.5)

@@ -58,7 +58,7 @@ def tiny_scene(
     )
 
 
-def surrounded(scene: Scene) -> Scene:
+def with_contraction(scene: Scene) -> Scene:
     """A scene in contracted space: what was in its box, now small in the middle, and a wall all around, out to infinity.
 
     Its even steps end within the wall's nearer part, so that samples of both kinds count.
@@ -72,13 +72,13 @@ def surrounded(scene: Scene) -> Scene:
     return replace(scene, occupancy=occupancy | shell, mapping=Contraction(5.0), step=0.08)
 
 
-def displaced(scene: Scene, seed: int = 5, most: float = 0.06) -> Scene:
+def with_motion(scene: Scene, seed: int = 5, most: float = 0.06) -> Scene:
     """A dynamic scene whose places wander: random displacements of up to `most` at 3 x 2 x 4 nodes, in as many rows as it has."""
     shape = len(scene.scales[0]["xt"]), 3, 2, 4, 3
     return replace(scene, motion=np.random.default_rng(seed).uniform(-most, most, shape).astype(np.float32))
 
 
-def faced(scene: Scene) -> Scene:
+def in_device_coordinates(scene: Scene) -> Scene:
     """A scene in device coordinates of a camera between its cameras and before them, so that some rays begin behind its near
     plane and some beyond. It reaches to a depth of 50."""
     frame = look_at((0.3, 0.9, 2.1), (0.1, 0.05, 0.05), 1, 1, 1.0).camera_to_world[:3]
@@ -86,7 +86,7 @@ def faced(scene: Scene) -> Scene:
     return replace(scene, mapping=DeviceCoordinates(frame, 0.8, 2.0), aabb=aabb)
 
 
-def hybrid(scene: Scene, seed: int = 6, width: int = 6, hidden: int = 7) -> Scene:
+def with_hybrid_decoder(scene: Scene, seed: int = 6, width: int = 6, hidden: int = 7) -> Scene:
     """A scene with a hybrid decoder, of widths that fill no vectors of four, about as dense as before."""
     rng = np.random.default_rng(seed)
     F = scene.decoder.w2.shape[1]
@@ -97,19 +97,21 @@ def hybrid(scene: Scene, seed: int = 6, width: int = 6, hidden: int = 7) -> Scen
     return replace(scene, decoder=HybridDecoder(density_bias=3.5, **weights))
 
 
-def varied(scene: Scene, names: tuple[str, ...] = ("dawn.jpg", "noon.jpg", "dusk.jpg"), seed: int = 7) -> Scene:
+def with_appearances(
+    scene: Scene, names: tuple[str, ...] = ("dawn.jpg", "noon.jpg", "dusk.jpg"), seed: int = 7
+) -> Scene:
     """A scene whose pictures disagree about its colours: an appearance of each name, their codes random, of mean 0."""
     codes = np.random.default_rng(seed).normal(0, 1, (len(names), len(scene.decoder.b1)))
     codes = (codes - codes.mean(0)).astype(np.float32)
     return replace(scene, appearances=tuple(Appearance(name, code) for name, code in zip(names, codes, strict=True)))
 
 
-def one_sided(scene: Scene) -> Scene:
+def view_independent(scene: Scene) -> Scene:
     """Its colours the same from all sides."""
     return replace(scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2))
 
 
-def uneven() -> Scene:
+def unequal_scales() -> Scene:
     """Scales of other channels, rows of time and sizes; the first is the finer one along y."""
     coarse, fine = (
         tiny_scene(1, channels=13, resolution=(12, 44, 10), time=4),
@@ -122,17 +124,17 @@ def uneven() -> Scene:
     return replace(fine, scales=scales, decoder=decoder)
 
 
-def flat() -> Scene:
+def one_texel_deep() -> Scene:
     """Of one texel along z."""
     scene = tiny_scene(5, scales=1, channels=30, resolution=(9, 20, 2))
     planes = {
         name: plane[:1] if name in ("xz", "yz") else plane[:, :1] if name == "zt" else plane
         for name, plane in scene.scales[0].items()
     }
-    return one_sided(replace(scene, scales=(planes,)))
+    return view_independent(replace(scene, scales=(planes,)))
 
 
-def of_first_degree(scene: Scene) -> Scene:
+def linear_per_cell(scene: Scene) -> Scene:
     """Of one scale, in which one plane varies, and rows of time planes are the same all along their axes: so that a grid holds all there is."""
     for name in ("xz", "yz"):
         scene.scales[0][name][:] = 1.0
@@ -141,12 +143,12 @@ def of_first_degree(scene: Scene) -> Scene:
     return scene
 
 
-SPACES: dict[str, Callable[[Scene], Scene]] = {
+VARIANTS: dict[str, Callable[[Scene], Scene]] = {
     "box": lambda scene: scene,
-    "contracted": surrounded,
-    "displaced": displaced,
-    "ndc": faced,
-    "hybrid": hybrid,
+    "contracted": with_contraction,
+    "displaced": with_motion,
+    "ndc": in_device_coordinates,
+    "hybrid": with_hybrid_decoder,
 }
 """What there is besides a plain box and the explicit decoder."""
 
@@ -158,7 +160,7 @@ def without_planes(scene: Scene) -> Scene:
     )
 
 
-def bring(renderer: Renderer, early: Scene, scene: Scene) -> None:
+def stream_planes(renderer: Renderer, early: Scene, scene: Scene) -> None:
     """Have planes arrive, as they do while a scene streams: space planes are put row by row, time planes change in place."""
     for number, scale in enumerate(scene.scales):
         for name in SPACE_PLANES:

@@ -11,7 +11,7 @@ import datasets as make
 import numpy as np
 import pytest
 import torch
-from gradients import backpropagate, misty, rays_at, reference_gradients
+from gradients import backpropagate, random_rays, reference_gradients, translucent_scene
 from kpc.encoder.cli.kpenc import to_scene
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate
@@ -62,9 +62,9 @@ def assert_finite(run: Trainer) -> None:
 @pytest.mark.parametrize("bias", [-1e4, -LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT, 1e4])
 def test_log_densities_far_beyond_the_limit_have_finite_gradients(bias: float) -> None:
     """exp is truncated: beyond the limit the density stands still, and so does its gradient."""
-    scene = misty()
+    scene = translucent_scene()
     scene = replace(scene, decoder=replace(scene.decoder, density_bias=bias))
-    rays = rays_at(scene, 103)
+    rays = random_rays(scene, 103)
     targets = torch.rand(103, 3, generator=torch.Generator().manual_seed(1))
     ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
     for name in ("theta", "density", "basis", "errors"):
@@ -103,7 +103,7 @@ def test_products_of_six_values_at_1e_minus_6_and_1e6(large: int, order: int) ->
 
 def fog(steps: int, optical_depth: float) -> tuple[Scene, Rays]:
     """A box of even fog and a ray along x that crosses it in so many steps."""
-    scene = misty(dynamic=False)
+    scene = translucent_scene(dynamic=False)
     scene = replace(
         scene,
         aabb=BOX,
@@ -143,10 +143,10 @@ def test_transmittance_over_4096_samples(optical_depth: float) -> None:
 
 def test_learning_from_planes_exactly_at_identity() -> None:
     """Time planes start at 1, the kink of their L1 prior, where its gradient is 0; the pictures' gradient gets through."""
-    scene = misty()
+    scene = translucent_scene()
     ones = tuple({name: np.ones_like(p) if "t" in name else p for name, p in scale.items()} for scale in scene.scales)
     scene = replace(scene, scales=ones)
-    rays = rays_at(scene, 203)
+    rays = random_rays(scene, 203)
     ours = backpropagate(scene, rays, torch.zeros(203, 3))
     field = Field.from_scene(scene)
     prior, variation = np.zeros(field.layout.size, np.float32), TrainConfig().variation(1.0)

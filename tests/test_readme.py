@@ -11,7 +11,7 @@ import pytest
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.media import read_image
 from kpc.format.container.scene_io import write
-from kpc.format.scene.cameras import load_shots
+from kpc.format.scene.cameras import load_views
 from scenes import tiny_scene
 
 ROOT = Path(__file__).parent.parent
@@ -53,7 +53,7 @@ def test_every_option_of_every_command_exists(capsys: pytest.CaptureFixture[str]
 def test_the_camera_file_shown_can_be_read(tmp_path: Path) -> None:
     (example,) = blocks("json")
     (tmp_path / "cameras.json").write_text(example)
-    assert load_shots(tmp_path / "cameras.json")[0].time == 0.5
+    assert load_views(tmp_path / "cameras.json")[0].time == 0.5
 
 
 def test_keys_are_those_of_the_player() -> None:

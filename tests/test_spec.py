@@ -14,10 +14,10 @@ from kpc.format.coding import poses, raw_planes
 from kpc.format.common import errors
 from kpc.format.container import container, groups, scene_io
 from kpc.format.scene.scene import ALL_PLANES, LOG_DENSITY_LIMIT, TERMINATION
-from kpc.format.scene.space import FAR, FORWARD, LEAST_DISPARITY
+from kpc.format.scene.space import FAR, MIN_DISPARITY, MIN_FORWARD
 from kpc.player.cpu import reference
 from kpc.tools.vectors import specvectors
-from scenes import SPACES, tiny_scene
+from scenes import VARIANTS, tiny_scene
 
 SPEC = Path(__file__).parent.parent / "spec"
 PAGE = (SPEC / "kpc-format.md").read_text()
@@ -139,7 +139,7 @@ def test_names_and_numbers_are_the_code_s():
     assert f"less than {scene_io.FRAME_TOLERANCE:.4f}" in section(5)
     assert f"e, {poses.FINEST} to {poses.COARSEST}" in section(9) and f"D = {poses.ROOT}^2" in section(9)
     assert f"a[i] - {poses.NOTHING}" in section(9) and f"2^{poses.BITS} p[1]" in section(9)
-    assert f"if c <= {FORWARD:.4f}" in section(11) and f"{1 - LEAST_DISPARITY}" in section(11)
+    assert f"if c <= {MIN_FORWARD:.4f}" in section(11) and f"{1 - MIN_DISPARITY}" in section(11)
     assert f"-{LOG_DENSITY_LIMIT:.0f}, {LOG_DENSITY_LIMIT:.0f}" in section(11)
 
 
@@ -242,7 +242,7 @@ def test_vectors_of_groups_hold_the_vectors_that_they_say(path, twin):
         number, time_in_it = opened.timeline.at(moment["time"])
         assert (number, twin.shown([place[:2] for place in theirs], moment["time"])[0]) == (moment["group"],) * 2
         assert time_in_it == pytest.approx(moment["time_in_it"], abs=1e-6)
-        shares = {str(part): share for part, _, share in opened.timeline.mixed(moment["time"])}
+        shares = {str(part): share for part, _, share in opened.timeline.blend_at(moment["time"])}
         theirs_mixed = twin.mix([place[:2] for place in theirs], moment["time"])
         assert (
             shares
@@ -360,11 +360,11 @@ def assert_described(found: dict, expected: dict) -> None:
             assert one[key] == pytest.approx(other[key], abs=RAY_TOLERANCE), key
 
 
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("space", VARIANTS)
 def test_the_twin_renders_a_scene_as_the_reference_does(twin, space):
     from kpc.format.coding.quantise import quantise_scene
 
-    scene = SPACES[space](tiny_scene(scales=1, channels=4, resolution=(10, 8, 6), time=4))
+    scene = VARIANTS[space](tiny_scene(scales=1, channels=4, resolution=(10, 8, 6), time=4))
     data = scene_io.encode(quantise_scene(scene, [{name: 0.01 for name in scene.scales[0]}]))
     decoded = scene_io.read(data).dequantise()
     slow = twin.decode(data)

@@ -241,7 +241,7 @@ def _encode_groups(options: Options) -> dict[str, Any]:
         else:
             before = None if number == numbers[0] else _part(work, number - 1).with_suffix(".kpck")
             found.append(_encode_group(told, _of_span(setting, span), before))
-    size = _joined([groups.Part.of(_part(work, number), spans[number].start) for number in numbers], options)
+    size = _joined([groups.GroupInput.of(_part(work, number), spans[number].start) for number in numbers], options)
     if not options.keep:
         _clear(work)
     return _of_all(found, [spans[number] for number in numbers], size, options) | {
@@ -255,12 +255,12 @@ def _part(work: Path, number: int) -> Path:
 
 
 def _of_span(setting: Setting, span: groups.Span) -> Setting:
-    return replace(setting, dataset=setting.dataset.between(span.start, span.last))
+    return replace(setting, dataset=setting.dataset.frame_range(span.start, span.last))
 
 
 def _trimmed_for_groups(setting: Setting, options: Options, spans: Sequence[groups.Span]) -> Setting:
     """All groups share a box, found from no more frames than one of them has."""
-    dataset = setting.dataset.thinned(max(span.count for span in spans))
+    dataset = setting.dataset.subsample_frames(max(span.count for span in spans))
     budget_s = share_of(options, 0, spans).time_budget_s
     assert not isinstance(setting.mapping, Contraction)
     aabb, _ = _trimmed(dataset, options.config(dataset), setting.aabb, budget_s, setting.mapping)
@@ -276,7 +276,7 @@ def _encode_group(told: Options, setting: Setting, before: Path | None) -> dict[
         _say(f"it begins where the one before ended, and takes {LATER:.0%} of its steps")
         shorter = replace(told, steps=math.ceil(LATER * told.config(setting.dataset).steps))
         found = _encode_scene(shorter, replace(setting, before=load_checkpoint(before).scene))
-    with cli.written_aside(told.output.with_suffix(".json")) as aside:
+    with cli.atomic_write(told.output.with_suffix(".json")) as aside:
         aside.write_text(json.dumps({"told": _as_told(told), "found": found}))
     if before is not None:
         before.unlink()
@@ -307,7 +307,7 @@ def _as_told(told: Options) -> str:
     return repr(replace(told, resume=False, keep=False))
 
 
-def _joined(parts: Sequence[groups.Part], options: Options) -> int:
+def _joined(parts: Sequence[groups.GroupInput], options: Options) -> int:
     try:
         return groups.write(parts, options.output)
     except OSError as error:
@@ -526,7 +526,7 @@ def _plan(trainer: Trainer) -> str:
     planes = ", ".join("x".join(str(n) for n in row if n) for row in layout.resolution)
     beyond, mapping = "", trainer.mapping
     if isinstance(mapping, Contraction):
-        beyond = f" and all around it, even steps up to {mapping.even:.4g}, rays to {FAR * mapping.even:.4g}"
+        beyond = f" and all around it, even steps up to {mapping.uniform_distance:.4g}, rays to {FAR * mapping.uniform_distance:.4g}"
     elif mapping is not None:
         beyond = f" of device coordinates, near {mapping.near:.4g}, baseline {mapping.baseline:.4g}"
     nodes = (
@@ -618,9 +618,9 @@ def _space_of(dataset: Dataset, options: Options) -> tuple[np.ndarray, SpaceMapp
             "give another with --box x0,y0,z0,x1,y1,z1"
         )
     across = options.config(dataset).samples_across / (aabb[1] - aabb[0]).max()
-    if isinstance(mapping, Contraction) and mapping.even * across > scene_io.SAMPLE_LIMIT:
+    if isinstance(mapping, Contraction) and mapping.uniform_distance * across > scene_io.SAMPLE_LIMIT:
         raise DatasetError(
-            f"{options.source}: the box is too small for cameras that lie {mapping.even:.4g} from its far side; "
+            f"{options.source}: the box is too small for cameras that lie {mapping.uniform_distance:.4g} from its far side; "
             "give a larger one with --box x0,y0,z0,x1,y1,z1, or --space box"
         )
     if not seen_cells(dataset.pictures, aabb, grid_shape(aabb, 64), mapping).any():

@@ -53,7 +53,7 @@ class Options:
 
     def config(self, dataset: Dataset) -> TrainConfig:
         config = PRESETS[self.preset]
-        if config.adapts and dataset.has_alpha and dataset.one_view_at_a_time:
+        if config.adapts and dataset.has_alpha and dataset.is_monocular:
             config = config.for_lone_object()
         appearance, _ = self.appearance_of(dataset)
         config = replace(

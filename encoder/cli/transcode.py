@@ -57,7 +57,7 @@ def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
         coded = codec_model.code(
             codec_model.model_of(scene), trade, TrainConfig().prune_share, _tune_steps(options), shown=True
         )
-        parts.append(groups.Part.of(coded.data, span.start))
+        parts.append(groups.GroupInput.of(coded.data, span.start))
         found.append(figures(coded, coded.size_bytes, trade, JUDGED_BY[1]))
     size = groups.write(parts, options.output)
     return {"file": str(options.output), "source": str(options.source), **together(found, spans, size, options.trade)}

@@ -18,7 +18,7 @@ HOLD_OUT_EVERY = 8
 
 
 @dataclass(frozen=True)
-class View:
+class CapturedView:
     """One file seen through one camera.
 
     Attributes:
@@ -49,7 +49,7 @@ class Capture:
     """A dataset before its pixels are read. `fps` is None where nothing tells it."""
 
     layout: str
-    views: tuple[View, ...]
+    views: tuple[CapturedView, ...]
     fps: float | None
 
 
@@ -65,12 +65,12 @@ def image_view(
     camera_to_world: np.ndarray,
     near: float,
     far: float,
-) -> View:
+) -> CapturedView:
     """A view of an image. `declared` is the raster that the intrinsics belong to, None for the image's own."""
     width, height, has_alpha = image_size(file)
     intrinsics = fit_intrinsics(where, file, intrinsics, declared or (width, height), (width, height))
     pose = check_pose(where, camera_to_world)
-    return View(file, None, time, is_test, width, height, has_alpha, intrinsics, distortion, pose, near, far)
+    return CapturedView(file, None, time, is_test, width, height, has_alpha, intrinsics, distortion, pose, near, far)
 
 
 def fit_intrinsics(
@@ -126,7 +126,7 @@ def natural_key(name: str) -> list[tuple[int, str]]:
     return [(len(numbers[k // 2]), numbers[k // 2]) if k % 2 else (-1, part) for k, part in enumerate(parts)]
 
 
-def held_out(path: Path, names: Sequence[str], holdout: str | None, default: Iterable[bool]) -> list[bool]:
+def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default: Iterable[bool]) -> list[bool]:
     """Which of the files named (relative to `path`) are for testing.
 
     `holdout`: None for the layout's own custom, "none", or a file's name with or without folder and suffix.
@@ -140,9 +140,9 @@ def held_out(path: Path, names: Sequence[str], holdout: str | None, default: Ite
         return [False] * len(names)
     chosen = [holdout in (name, Path(name).name, Path(name).stem) for name in names]
     if not any(chosen):
-        some = ", ".join(Path(name).stem for name in names[:4])
+        shown = ", ".join(Path(name).stem for name in names[:4])
         raise DatasetError(
-            f"{path}: nothing is named {holdout!r} to hold out; there are {some}{' ...' if len(names) > 4 else ''}"
+            f"{path}: nothing is named {holdout!r} to hold out; there are {shown}{' ...' if len(names) > 4 else ''}"
         )
     return chosen
 
@@ -158,12 +158,12 @@ def find_image(root: Path, file: Path, name: str) -> Path | None:
         raise DatasetError(f"{file}: {name!r} leads out of {root} or names no file; make it relative to that folder")
     bare = root / relative
     for candidate in (bare, *(bare.with_name(bare.name + suffix) for suffix in (*IMAGE_SUFFIXES, ".JPG", ".PNG"))):
-        if candidate.suffix.lower() in IMAGE_SUFFIXES and is_file(candidate):
+        if candidate.suffix.lower() in IMAGE_SUFFIXES and file_exists(candidate):
             return candidate
     return None
 
 
-def is_file(path: Path) -> bool:
+def file_exists(path: Path) -> bool:
     """As `Path.is_file`; what no file system could hold is not there."""
     try:
         return path.is_file()
@@ -173,25 +173,28 @@ def is_file(path: Path) -> bool:
         raise
 
 
-def say_missing(file: Path, missing: list[str], total: int) -> None:
+def report_missing(file: Path, missing: list[str], total: int) -> None:
     """One line for all frames whose image is not there.
 
     Raises:
         DatasetError: none is there.
     """
     if len(missing) == total:
-        raise DatasetError(f"{file}: none of its {total} images exists ({plain(missing[0])} ...); copy them beside it")
+        raise DatasetError(
+            f"{file}: none of its {total} images exists ({printable(missing[0])} ...); copy them beside it"
+        )
     if missing:
         print(
-            f"{file}: {len(missing)} of {total} frames have no image and are skipped: {some(missing)}", file=sys.stderr
+            f"{file}: {len(missing)} of {total} frames have no image and are skipped: {first_names(missing)}",
+            file=sys.stderr,
         )
 
 
-def some(names: Sequence[str]) -> str:
+def first_names(names: Sequence[str]) -> str:
     """The first few of them, for a message."""
-    return ", ".join(map(plain, names[:6])) + (" ..." if len(names) > 6 else "")
+    return ", ".join(map(printable, names[:6])) + (" ..." if len(names) > 6 else "")
 
 
-def plain(text: str) -> str:
+def printable(text: str) -> str:
     """On one line and not endless, whatever a file holds."""
     return (text if text.isprintable() else repr(text))[:160]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from kpc.encoder.datasets.capture import Capture, View
+from kpc.encoder.datasets.capture import Capture, CapturedView
 from kpc.encoder.datasets.layouts import blender, colmap, llff, nerfstudio
 from kpc.encoder.datasets.masks import FOLDER, Masks, find_masks, load_masks
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
@@ -63,7 +63,7 @@ class Pictures:
     def __len__(self) -> int:
         return len(self.file)
 
-    def some(self, numbers: np.ndarray) -> "Pictures":
+    def subset(self, numbers: np.ndarray) -> "Pictures":
         """These alone."""
         chosen = {name: values[numbers] for name, values in vars(self).items() if name != "file"}
         return Pictures(file=tuple(self.file[n] for n in numbers), **chosen)
@@ -91,12 +91,12 @@ class Dataset:
     masks: Masks | None = None
 
     @property
-    def one_view_at_a_time(self) -> bool:
+    def is_monocular(self) -> bool:
         """Whether no two pictures to train on show the same instant of a clip."""
         times = self.pictures.time[~self.pictures.is_test]
         return self.is_dynamic and len(np.unique(times)) == len(times)
 
-    def between(self, first: int, last: int) -> "Dataset":
+    def frame_range(self, first: int, last: int) -> "Dataset":
         """Frames `first` to `last` of the clip, as a clip of their own.
 
         Raises:
@@ -112,7 +112,7 @@ class Dataset:
             )
         return chosen
 
-    def thinned(self, frame_count: int) -> "Dataset":
+    def subsample_frames(self, frame_count: int) -> "Dataset":
         """The clip at no more than so many of its frames, evenly spread."""
         clip = self.clip
         if clip.frame_count <= frame_count:
@@ -127,11 +127,11 @@ class Dataset:
     def _some(self, numbers: np.ndarray, times: np.ndarray, clip: Clip) -> "Dataset":
         return replace(
             self,
-            pictures=replace(self.pictures.some(numbers), time=times.astype(np.float32)),
-            pixels=self.pixels.some(numbers),
+            pictures=replace(self.pictures.subset(numbers), time=times.astype(np.float32)),
+            pixels=self.pixels.subset(numbers),
             clip=clip,
             is_dynamic=clip.frame_count > 1,
-            masks=None if self.masks is None else self.masks.some(numbers),
+            masks=None if self.masks is None else self.masks.subset(numbers),
         )
 
     def describe(self) -> str:
@@ -148,7 +148,7 @@ class Dataset:
             clip = self.clip
             frames = _count(clip.frame_count, "frame")
             parts.append(f"dynamic, {frames} at {clip.fps:.5g} fps ({clip.duration_s:.4g} s)")
-            if self.one_view_at_a_time:
+            if self.is_monocular:
                 parts.append("one view at a time")
         else:
             parts.append("static")
@@ -231,7 +231,7 @@ def load_dataset(
         raise DatasetError(f"{error.filename or root}: no permission; chmod it or run as its owner") from error
 
 
-def rays(
+def pixel_rays(
     pictures: Pictures, picture: np.ndarray, column: np.ndarray, row: np.ndarray, mapping: SpaceMapping | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rays through pixel centres: (N,) picture, column and row to origins and unit directions, both (N, 3) float32.
@@ -248,10 +248,10 @@ def rays(
     return _through(x, y, pictures.camera_to_world[picture], mapping)
 
 
-def rays_of_camera(
+def camera_rays(
     camera: Camera, places: np.ndarray, mapping: SpaceMapping | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `rays`, through (N, 2) places on the raster of a pinhole camera, pixels from the left and top edges."""
+    """As `pixel_rays`, through (N, 2) places on the raster of a pinhole camera, pixels from the left and top edges."""
     x, y = ((places - (camera.cx, camera.cy)) / (camera.fl_x, camera.fl_y)).T
     return _through(x, y, camera.camera_to_world[None], mapping)
 
@@ -264,8 +264,8 @@ def _through(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = np.broadcast_to(pose[:, :3, 3], directions.shape)
     if isinstance(mapping, DeviceCoordinates):
-        path = mapping.path(origins, directions)
-        origins, directions = path.begin, path.way
+        path = mapping.rays(origins, directions)
+        origins, directions = path.origins, path.directions
     return origins.astype(np.float32), directions.astype(np.float32)
 
 
@@ -372,7 +372,7 @@ def _load(
     return Dataset(capture.layout, root, pictures, cache, clip, is_dynamic, cache.channels == 4, names, masks)
 
 
-def _common_frames(root: Path, views: tuple[View, ...]) -> int:
+def _common_frames(root: Path, views: tuple[CapturedView, ...]) -> int:
     """Frames that all videos have; 1 where there are none."""
     videos = {view.file.name: view.video for view in views if view.video}
     rates = {round(video.fps, 3) for video in videos.values()}
@@ -428,7 +428,7 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cached_pixels(
-    root: Path, views: tuple[View, ...], frame_count: int, file: Path, downscale: int, progress: bool
+    root: Path, views: tuple[CapturedView, ...], frame_count: int, file: Path, downscale: int, progress: bool
 ) -> PixelCache:
     sources = [
         (view.file.relative_to(root).as_posix(), view.file.stat().st_size, view.file.stat().st_mtime_ns)
@@ -448,13 +448,13 @@ def _cached_pixels(
         def pictures() -> Iterator[np.ndarray]:
             for view in views:
                 for picture in _decoded(view, frame_count):
-                    yield shrunk(picture, downscale)
+                    yield downscale_picture(picture, downscale)
                     bar.advance()
 
         return build_cache(file, fingerprint, pictures(), channels, pixels * channels)
 
 
-def _decoded(view: View, frame_count: int) -> Iterator[np.ndarray]:
+def _decoded(view: CapturedView, frame_count: int) -> Iterator[np.ndarray]:
     if view.video is None:
         yield read_image(view.file)
         return
@@ -465,7 +465,7 @@ def _decoded(view: View, frame_count: int) -> Iterator[np.ndarray]:
         raise MediaError(f"{view.file}: {count} of its {view.video.frame_count} frames decode; encode or copy it anew")
 
 
-def shrunk(picture: np.ndarray, factor: int) -> np.ndarray:
+def downscale_picture(picture: np.ndarray, factor: int) -> np.ndarray:
     """Average blocks of factor^2 pixels of a uint8 (H, W, 3 or 4) picture; what is left over right and below goes.
 
     Straight alpha weighs its colours: rgb = sum(rgb a) / sum(a); where a block is all transparent, the plain mean.

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from kpc.encoder.datasets.capture import View, is_file, some
+from kpc.encoder.datasets.capture import CapturedView, file_exists, first_names
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import image_size, read_image
@@ -39,10 +39,10 @@ class Masks:
         self.counts = np.array([ones.sum() for ones in in_block], np.int64)
         self.crc32c = tuple(tile.crc32c for tile in bits.tiles)
 
-    def some(self, numbers: np.ndarray) -> "Masks":
+    def subset(self, numbers: np.ndarray) -> "Masks":
         """Those of these pictures alone."""
         chosen = copy.copy(self)  # shares the counts of all blocks, whose numbers stay as they are
-        chosen._bits, chosen._sizes = self._bits.some(numbers), [self._sizes[n] for n in numbers]
+        chosen._bits, chosen._sizes = self._bits.subset(numbers), [self._sizes[n] for n in numbers]
         chosen._first_block, chosen.counts = self._first_block[numbers], self.counts[numbers]
         chosen.crc32c = tuple(self.crc32c[n] for n in numbers)
         return chosen
@@ -77,7 +77,7 @@ class Masks:
         return (block - first) * BLOCK + byte * 8 + _NTH[value, rank]
 
 
-def find_masks(root: Path, views: Sequence[View]) -> list[Path | None]:
+def find_masks(root: Path, views: Sequence[CapturedView]) -> list[Path | None]:
     """The mask of each view, None for videos and where there is none.
 
     Raises:
@@ -96,12 +96,15 @@ def find_masks(root: Path, views: Sequence[View]) -> list[Path | None]:
     bare = [view.file.name for view, mask in zip(views, masks) if mask is None and not view.video]
     if bare:
         total = sum(not view.video for view in views)
-        print(f"{folder}: {len(bare)} of {total} images have no mask and are used whole: {some(bare)}", file=sys.stderr)
+        print(
+            f"{folder}: {len(bare)} of {total} images have no mask and are used whole: {first_names(bare)}",
+            file=sys.stderr,
+        )
     return masks
 
 
 def load_masks(
-    root: Path, views: Sequence[View], masks: Sequence[Path | None], file: Path, downscale: int, progress: bool
+    root: Path, views: Sequence[CapturedView], masks: Sequence[Path | None], file: Path, downscale: int, progress: bool
 ) -> Masks | None:
     """Read the masks, or open what was read before; None where there are none.
 
@@ -133,7 +136,7 @@ def load_masks(
 def _find(folder: Path, image: Path) -> Path | None:
     inside = Path(*image.parts[1:]) if image.parts[0] == "images" else image
     for candidate in (folder / f"{inside}.png", (folder / inside).with_suffix(".png")):
-        if is_file(candidate):
+        if file_exists(candidate):
             return candidate
     return None
 

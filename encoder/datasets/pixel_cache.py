@@ -15,7 +15,7 @@ from typing import Any
 
 import google_crc32c
 import numpy as np
-from kpc.format.common.cli import written_aside
+from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError
 
 CACHE_VERSION = 2
@@ -56,7 +56,7 @@ class PixelCache:
             mapping = mmap.mmap(self._fd, size, access=mmap.ACCESS_READ)
             self._mapped = np.frombuffer(mapping, np.uint8).reshape(-1, stored_channels)
 
-    def some(self, numbers: np.ndarray) -> "PixelCache":
+    def subset(self, numbers: np.ndarray) -> "PixelCache":
         """These pictures alone, of the same file; indices of pixels stay as they are."""
         return PixelCache(self.path, tuple(self.tiles[n] for n in numbers), self._stored, self.channels)
 
@@ -133,7 +133,7 @@ def build_cache(
     tiles: list[Tile] = []
     offset, is_opaque = 0, channels == 4
     try:
-        with written_aside(path) as aside, open(aside, "wb", buffering=0) as file:
+        with atomic_write(path) as aside, open(aside, "wb", buffering=0) as file:
             for picture in pictures:
                 pixels = _with_channels(picture, channels)
                 is_opaque = is_opaque and bool((pixels[..., 3] == 255).all())
@@ -148,7 +148,7 @@ def build_cache(
             "channels": shown,
             "tiles": [asdict(tile) for tile in tiles],
         }
-        with written_aside(path.with_suffix(".json")) as aside:
+        with atomic_write(path.with_suffix(".json")) as aside:
             aside.write_text(json.dumps(about))
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numba
 import numpy as np
 import torch
-from kpc.encoder.datasets import Dataset, rays
+from kpc.encoder.datasets import Dataset, pixel_rays
 from kpc.encoder.field import kernels
 from kpc.encoder.field.appearances import FIT_RAYS, fitted_code
 from kpc.encoder.field.field import Field
@@ -47,9 +47,9 @@ class SceneRenderer:
         out = []
         for start in range(0, len(origins), RAYS_AT_ONCE):
             some = slice(start, start + RAYS_AT_ONCE)
-            rays = (np.ascontiguousarray(a[some], np.float32) for a in (origins, directions, times))
+            batch = (np.ascontiguousarray(a[some], np.float32) for a in (origins, directions, times))
             with torch.no_grad():
-                out.append(draw(*rays, None if codes is None else torch.from_numpy(codes[some])))
+                out.append(draw(*batch, None if codes is None else torch.from_numpy(codes[some])))
         colours, opacities, depths = (np.concatenate(parts) for parts in zip(*out, strict=True))
         return colours, opacities, depths
 
@@ -113,7 +113,7 @@ class SceneRenderer:
         pictures = dataset.pictures
         h, w = int(pictures.height[number]), int(pictures.width[number]) - first
         row, column = np.divmod(np.arange(w * h), w)
-        origins, directions = rays(pictures, np.full(w * h, number), column + first, row, self.scene.mapping)
+        origins, directions = pixel_rays(pictures, np.full(w * h, number), column + first, row, self.scene.mapping)
         codes = None if code is None else np.tile(code, (w * h, 1))
         return self.rgb(origins, directions, np.full(w * h, pictures.time[number], np.float32), codes).reshape(h, w, 3)
 
@@ -123,7 +123,7 @@ class SceneRenderer:
         row, column = np.nonzero(dataset.usable(number)[:, : _middle(dataset, number)])
         chosen = rng.permutation(len(row))[:FIT_RAYS]
         row, column, n = row[chosen], column[chosen], len(chosen)
-        origins, directions = rays(pictures, np.full(n, number), column, row, self.scene.mapping)
+        origins, directions = pixel_rays(pictures, np.full(n, number), column, row, self.scene.mapping)
         batch = self.batch(origins, directions, np.full(n, pictures.time[number]))
         return fitted_code(self.scene, self.field, batch, torch.from_numpy(true_picture(dataset, number)[row, column]))
 

@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from kpc.encoder.datasets import rays_of_camera
+from kpc.encoder.datasets import camera_rays
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.training.sampler import RaySampler
-from kpc.format.common.fidelity import psnr, psnr_of
+from kpc.format.common.fidelity import psnr, psnr_from_mse
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 
@@ -43,7 +43,7 @@ class Measured:
 
 def agreement_db(error: float) -> float:
     """PSNR of a mean squared error in squares of 8-bit levels, dB; 100 at most."""
-    return psnr_of(error / 255**2)
+    return psnr_from_mse(error / 255**2)
 
 
 def squares_of(psnr: float) -> float:
@@ -59,7 +59,7 @@ class Probe:
     """N rays that a scene is judged by.
 
     Attributes:
-        origins, directions: (N, 3), times: (N,) float32, as `kpc.encoder.datasets.rays` makes them.
+        origins, directions: (N, 3), times: (N,) float32, as `kpc.encoder.datasets.pixel_rays` makes them.
         appearances: (N,) int64 numbers of their appearances; None for the look without.
         truth: (N, 3) float32, the colours they should have; None where nobody knows.
     """
@@ -90,7 +90,7 @@ class Probe:
         parts = []
         for camera, count in zip(cameras, counts, strict=True):
             places = rng.random((count, 2)) * (camera.width, camera.height)
-            parts.append(rays_of_camera(camera, places, scene.mapping))
+            parts.append(camera_rays(camera, places, scene.mapping))
         origins, directions = (np.concatenate(arrays) for arrays in zip(*parts))
         return Probe(origins, directions, rng.random(total, dtype=np.float32), None, None)
 
@@ -124,7 +124,7 @@ class Probe:
         def measure(scene: Scene) -> Measured:
             colours = expected if scene is uncoded else self._colours(scene)
             mse = float(np.mean(np.square(colours - expected), dtype=np.float64))
-            found = psnr(colours, self.truth) if self.truth is not None else psnr_of(ASSUMED_MSE + mse)
+            found = psnr(colours, self.truth) if self.truth is not None else psnr_from_mse(ASSUMED_MSE + mse)
             return Measured(found, 255**2 * mse)
 
         return measure

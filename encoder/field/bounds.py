@@ -3,7 +3,7 @@
 import numpy as np
 from kpc.encoder.datasets.dataset import Pictures
 from kpc.format.common.errors import DatasetError
-from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping, expand
+from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping, uncontract
 from numba import njit, prange
 
 CLEAR = 0.3
@@ -115,7 +115,7 @@ def device_coordinates_of(pictures: Pictures) -> tuple[DeviceCoordinates, np.nda
     if not (near > typical / 10 and baseline > 0):
         raise DatasetError("the cameras do not face one way; try --space box or contracted")
     mapping = DeviceCoordinates(np.stack([right, np.cross(back, right), back, eye], axis=1), near, baseline)
-    places = mapping.place(corners)
+    places = mapping.to_device(corners)
     return mapping, np.stack([places.min(0), places.max(0)]).astype(np.float32)
 
 
@@ -138,9 +138,9 @@ def seen_cells(
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     centres = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     if isinstance(mapping, Contraction):
-        centres = expand(centres, aabb)
+        centres = uncontract(centres, aabb)
     elif mapping is not None:
-        centres = mapping.expand(centres)
+        centres = mapping.to_world(centres)
     cameras = _distinct_cameras(pictures)
     focus = _focus(pictures, cameras)
     poses = pictures.camera_to_world[cameras, :3].astype(np.float64)

@@ -105,7 +105,7 @@ class TrainConfig:
     """The motion grid is moved every so many steps. Its gradient takes a fifth of a step's time, but with 2 soldier has 0.3 dB
     less after 2,500 steps of `fast` (26.06 and 26.09 dB with two seeds, 26.36 with 1)."""
     appearance_learning_rate: float = 1e-2
-    """Of the codes of appearances. A ball in 28 images of unequal exposure and white balance (`write_unequal` of the tests, 400
+    """Of the codes of appearances. A ball in 28 images of unequal exposure and white balance (`write_varying_exposure` of the tests, 400
     steps) has a held-out PSNR of 25.2 dB with 3e-3, 25.5 with 1e-2, 25.3 with 3e-2, 25.0 with 1e-1, and 20.1 without codes."""
     warmup: int = 50
     """Steps over which the learning rate rises from 0; then it falls along half a cosine to 1 % of its peak."""

@@ -422,7 +422,7 @@ def corners_of(u: Tensor, v: Tensor, columns: Tensor, rows: Tensor) -> tuple[Ten
 
 
 def moved(points: Tensor, times: Tensor, motion: Tensor) -> Tensor:
-    """Places in the planes of (N, 3) points in [0, 1]^3 at (N,) times: `kpc.format.scene.motion.moved`, differentiable."""
+    """Places in the planes of (N, 3) points in [0, 1]^3 at (N,) times: `kpc.format.scene.motion.displace`, differentiable."""
     nodes, shares = torch.zeros_like(times, dtype=torch.int64)[:, None], torch.ones_like(times)[:, None]
     for x, size, stride in zip((times, *points.T.flip(0)), motion.shape, motion.stride(), strict=False):  # t, z, y, x
         lower, share = tap(x, size)

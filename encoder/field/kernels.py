@@ -51,7 +51,7 @@ _parallel = njit(fastmath=_FASTMATH, error_model="numpy", cache=True, parallel=T
 
 def even_of(mapping: SpaceMapping | None) -> np.float32 | None:
     """`even`, as the kernels take it. Rays in device coordinates come as such: to the kernels those are a box."""
-    return np.float32(mapping.even) if isinstance(mapping, Contraction) else None
+    return np.float32(mapping.uniform_distance) if isinstance(mapping, Contraction) else None
 
 
 @_bare
@@ -141,7 +141,7 @@ def _corner(i, ft, fz, fy, fx):
 
 @_inlined
 def _moved(motion, u, v, w, time):
-    """Where in the planes to look for what is at a place, `kpc.format.scene.motion.moved`; `_tap` keeps it within [0, 1]."""
+    """Where in the planes to look for what is at a place, `kpc.format.scene.motion.displace`; `_tap` keeps it within [0, 1]."""
     if motion is None:
         return u, v, w
     t, z, y, x, ft, fz, fy, fx = _node(motion, u, v, w, time)

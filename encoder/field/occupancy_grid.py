@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from kpc.format.scene.grid import SPACE_AND_TIME, dilate
+from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 
 MORE_MARCHED = 0.1
 """Cells that a renderer may march more, as a share, for a grid that is told less often."""
@@ -99,7 +99,7 @@ class OccupancyGrid:
         What moves fills at each instant a small part of the cells that it ever fills. Close by is a cell's own slot or one
         beside it, the cell or a neighbour: what is learnt can go on moving until the next split.
         """
-        self._dense = dilate(self.over_time(density_at, rng, slots, self.LOOKS), SPACE_AND_TIME)
+        self._dense = dilate(self.over_time(density_at, rng, slots, self.LOOKS), SPACE_TIME_AXES)
         self.marched = self._dense & self.occupied
 
     def state(self) -> dict[str, Any]:

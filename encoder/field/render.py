@@ -166,7 +166,7 @@ def _places_of(is_set: Tensor, capacity: int) -> tuple[Tensor, Tensor]:
 def spans_of(rays: Rays, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
     """s where the samples of rays begin and end, (N,) each; they end before they begin where a ray misses the box."""
     if isinstance(mapping, Contraction):
-        return torch.zeros_like(rays.times), torch.full_like(rays.times, mapping.end)
+        return torch.zeros_like(rays.times), torch.full_like(rays.times, mapping.s_end)
     inverse = 1 / rays.directions
     t0, t1 = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse
     near = torch.minimum(t0, t1).nan_to_num(-torch.inf).amax(1).clamp(min=0)
@@ -178,13 +178,17 @@ def places(rays: Rays, s: Tensor, aabb: Tensor, mapping: SpaceMapping | None) ->
     `kpc.format.scene.space.Contraction.stretch`."""
     t = s
     if isinstance(mapping, Contraction):
-        t = torch.where(s <= mapping.even, s, mapping.even / (2 - s.clamp(max=mapping.end) / mapping.even))
+        t = torch.where(
+            s <= mapping.uniform_distance,
+            s,
+            mapping.uniform_distance / (2 - s.clamp(max=mapping.s_end) / mapping.uniform_distance),
+        )
     u = (rays.origins[:, None] + t[..., None] * rays.directions[:, None] - aabb[0]) / (aabb[1] - aabb[0])
     if not isinstance(mapping, Contraction):
         return u, torch.ones_like(t)
     y = 2 * u - 1
     radius = y.abs().amax(-1).clamp(min=1)
-    stretch = ((t / mapping.even).clamp(min=1) / radius).square()
+    stretch = ((t / mapping.uniform_distance).clamp(min=1) / radius).square()
     return y * ((2 - 1 / radius) / radius / 4)[..., None] + 0.5, stretch
 
 

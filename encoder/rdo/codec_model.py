@@ -45,7 +45,7 @@ from kpc.format.common.errors import FormatError, TrainingError, UsageError
 from kpc.format.container import scene_io
 from kpc.format.container.container import MAGIC
 from kpc.format.scene.cameras import Camera
-from kpc.format.scene.motion import STEP
+from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
 
@@ -154,7 +154,7 @@ class Kept:
         if model.coded is None:  # a file that is coded again and again is not to be marched ever longer
             scene = with_fewer_slots(scene, measure, SLOTS_SHARE * error)
             scene = told_cheaply(scene, model.errors_of_flips, measure, error) if grids else scene
-        own = 0 if model.coded is None or model.coded.motion is None else round(model.coded.motion.step / STEP)
+        own = 0 if model.coded is None or model.coded.motion is None else round(model.coded.motion.step / FINEST_STEP)
         coarser = with_coarser_motion(scene, model.curvature.motion if grids else None, measure, error, own)
         if coarser is not scene:
             kept = replace(kept, coded=None)

@@ -17,11 +17,11 @@ from kpc.encoder.evaluation.validation_rays import Measure
 from kpc.encoder.rdo.distortion import BESIDE, bits_of_magnitudes
 from kpc.format.coding.motion_hierarchical import CONTEXTS, context_of, foreseen, passes, told_beside
 from kpc.format.coding.rans import compiled, inlined
-from kpc.format.scene.motion import STEP
+from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Scene
 
 SHARE, MOST_STEPS = 0.1, 64
-"""Of the error that coding may bring, how much of it displacements may; and how many of `kpc.format.scene.motion.STEP` they may be rounded to.
+"""Of the error that coding may bring, how much of it displacements may; and how many of `kpc.format.scene.motion.FINEST_STEP` they may be rounded to.
 Soldier: a motion grid takes 1.2 KB for an error e times smaller, planes 18 KB; at equal slopes it is a fifteenth."""
 PRICE, FINER = 0.1, 0.5
 """Soldier, at equal error of pictures: a motion grid takes as many bytes to 2 % with prices of 0.05 and 0.2; and 5 % more with 1 in place of
@@ -36,7 +36,7 @@ EXPECTED = 0.05 + 0.1 * 2.0 ** (np.arange(CONTEXTS) / 2)
 
 
 def with_coarser_motion(scene: Scene, worth: np.ndarray | None, measure: Measure, most: float, own: int = 0) -> Scene:
-    """The scene with displacements in as coarse a multiple of `kpc.format.scene.motion.STEP` as adds at most SHARE of an error.
+    """The scene with displacements in as coarse a multiple of `kpc.format.scene.motion.FINEST_STEP` as adds at most SHARE of an error.
 
     Itself where there are none, or no multiple is coarser than its own.
 
@@ -49,7 +49,7 @@ def with_coarser_motion(scene: Scene, worth: np.ndarray | None, measure: Measure
         return scene
     multiple, known, error = MOST_STEPS, measure(scene).error, SHARE * most  # of what was left out
     while multiple > own:
-        step = np.float32(multiple * STEP)
+        step = np.float32(multiple * FINEST_STEP)
         wanted = scene.motion / np.float64(step)
         symbols = np.rint(wanted) if worth is None else told_cheaply(wanted, worth)
         candidate = replace(scene, motion=symbols.astype(np.float32) * step)

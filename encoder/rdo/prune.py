@@ -19,7 +19,7 @@ from kpc.format.scene.scene import Decoder, Scene
 from kpc.format.scene.space import Contraction
 
 Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Origins (N, 3), directions (N, 3) and times (N,), float32, as `kpc.encoder.datasets.rays` makes them."""
+"""Origins (N, 3), directions (N, 3) and times (N,), float32, as `kpc.encoder.datasets.pixel_rays` makes them."""
 
 POINTS = 1 << 13
 """Seen points, and as many of occupied space, on which channels are compared."""
@@ -129,7 +129,7 @@ class Seen:
         ends = np.flatnonzero(opacities > 0.5)
         ends = ends if len(ends) else np.arange(len(origins))
         s = np.where(np.isfinite(depths), depths, 0)[ends].astype(np.float32)
-        s = scene.mapping.progress(s) if isinstance(scene.mapping, Contraction) else s
+        s = scene.mapping.parameter(s) if isinstance(scene.mapping, Contraction) else s
         nothing = np.zeros(len(ends))
         rays = render.Rays.of(*(a[ends] for a in (origins, directions, times)), nothing, nothing)
         u, _ = render.places(rays, torch.from_numpy(s)[:, None], torch.from_numpy(scene.aabb), scene.mapping)

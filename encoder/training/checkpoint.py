@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from kpc.format.common.cli import written_aside
+from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import TrainingError
 
 
@@ -15,7 +15,7 @@ def save_state(path: Path, state: dict[str, Any], remedy: str) -> None:
         TrainingError: it cannot be written, with the `remedy` besides free space; what was there is left as it was.
     """
     try:
-        with written_aside(path) as aside:
+        with atomic_write(path) as aside:
             torch.save(state, aside)
     except (OSError, RuntimeError) as error:  # PyTorch reports a full disk as RuntimeError
         reason = error.strerror if isinstance(error, OSError) else str(error).partition("\n")[0]

@@ -503,7 +503,7 @@ def sample_capacity(aabb: np.ndarray, step_length: float, mapping: SpaceMapping 
     longest = (
         np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64))
         if not isinstance(mapping, Contraction)
-        else mapping.end
+        else mapping.s_end
     )
     return int(longest / step_length) + 2
 

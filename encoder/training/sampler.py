@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import torch
-from kpc.encoder.datasets import Dataset, rays
+from kpc.encoder.datasets import Dataset, pixel_rays
 from kpc.encoder.field.render import Rays
 from kpc.encoder.training.importance import TileWeights
 from kpc.format.scene.space import SpaceMapping
@@ -64,7 +64,7 @@ class RaySampler:
         order = np.argsort(pictures.time[picture], kind="stable")
         picture, row, column = picture[order], row[order], column[order]
         inside = row * pictures.width[picture] + column
-        origins, directions = rays(pictures, picture, column, row, self.mapping)
+        origins, directions = pixel_rays(pictures, picture, column, row, self.mapping)
         colours = self.dataset.pixels.read(pictures.offset[picture] + inside).astype(np.float32) / np.float32(255)
         if background is None:
             backgrounds = rng.random((count, 3), dtype=np.float32)

@@ -32,7 +32,7 @@ from kpc.encoder.training.importance import TileWeights, cameras_stand_still
 from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser, log_densities
 from kpc.encoder.training.sampler import RaySampler
 from kpc.format.common.errors import TrainingError
-from kpc.format.common.fidelity import psnr_of
+from kpc.format.common.fidelity import psnr_from_mse
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, SpaceMapping
 
@@ -167,7 +167,7 @@ class Trainer:
             if self.step > 2 * config.occupancy_start:
                 self._steady_rays, self._steady_s = self._steady_rays + count, self._steady_s + now - started
             if now - since > 0.5:
-                psnr = psnr_of(error / drawn)
+                psnr = psnr_from_mse(error / drawn)
                 report(
                     Report(
                         self.step,

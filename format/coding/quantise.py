@@ -17,7 +17,7 @@ from kpc.format.coding.weights import FINEST
 from kpc.format.common.errors import FormatError
 from kpc.format.container.segments import PlaneGuide
 from kpc.format.scene.cameras import Camera
-from kpc.format.scene.motion import QuantisedMotion, places_reached, quantise_motion
+from kpc.format.scene.motion import QuantisedMotion, quantise_motion, reached_cells
 from kpc.format.scene.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
 from kpc.format.scene.space import SpaceMapping
 
@@ -246,7 +246,7 @@ def quantise_scene(
 def reached_by(scene: Scene) -> np.ndarray:
     """(slots, Nz, Ny, Nx) bool: the cells of the planes' [0, 1]^3 in which what is occupied is looked up."""
     occupancy = np.asarray(scene.occupancy, bool)
-    return occupancy if scene.motion is None else places_reached(occupancy, scene.motion)
+    return occupancy if scene.motion is None else reached_cells(occupancy, scene.motion)
 
 
 def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from kpc.format.common import compiling
 from kpc.format.common.errors import FormatError
 from numba import njit
 
-compiling.watch()
+compiling.register()
 
 LOWEST_STATE = 1 << 16
 """The state lies in [2^16, 2^32) between decisions. An encoder begins at 2^16, so there a decoder must end."""

@@ -56,7 +56,7 @@ def _fail(name: str, message: str, code: int) -> int:
 
 
 @contextlib.contextmanager
-def written_aside(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path`; rename it to `path` on success, delete it on any failure.
 
     A reader of `path` therefore never sees a half-written file. The temporary keeps the suffix, since writers choose

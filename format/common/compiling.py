@@ -7,11 +7,11 @@ import time
 from numba.core import event
 
 NOTICE = "compiling for this processor, which takes about half a minute, once"
-LEAST_S = 1.0
+NOTICE_AFTER_S = 1.0
 """Of compiling, until it is worth a word: now and then a small one has been missing."""
 
 
-class Watch(event.Listener):
+class CompilationMonitor(event.Listener):
     """Told by numba when it begins to compile a function and when it is done; one may need another."""
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class Watch(event.Listener):
             if self._depth == 0:
                 self._begun = time.monotonic()
             self._depth += 1
-            tells = self.is_under_way and not self._told and sys.stderr is not None and sys.stderr.isatty()
+            tells = self.is_compiling and not self._told and sys.stderr is not None and sys.stderr.isatty()
             self._told |= tells
         if tells:
             print(NOTICE, file=sys.stderr)
@@ -37,15 +37,15 @@ class Watch(event.Listener):
                 self._spent += time.monotonic() - self._begun
 
     @property
-    def is_under_way(self) -> bool:
+    def is_compiling(self) -> bool:
         """Whether compiling goes on, and has taken LEAST_S already."""
-        return self._depth > 0 and self._spent + time.monotonic() - self._begun >= LEAST_S
+        return self._depth > 0 and self._spent + time.monotonic() - self._begun >= NOTICE_AFTER_S
 
 
-WATCH = Watch()
+MONITOR = CompilationMonitor()
 """What this process compiles, from the import of `kpc.format.coding.rans` on."""
 
 
-def watch() -> None:
+def register() -> None:
     """Have numba tell WATCH."""
-    event.register("numba:compile", WATCH)
+    event.register("numba:compile", MONITOR)

@@ -23,7 +23,7 @@ import ffmpeg
 import imageio_ffmpeg
 import numpy as np
 import OpenEXR
-from kpc.format.common.cli import written_aside
+from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import MediaError
 from PIL import Image, UnidentifiedImageError
 
@@ -165,7 +165,7 @@ def write_video(
     scaled = raw.filter("scale", flags=_SCALE_FLAGS, out_color_matrix="bt709", out_range="limited")
     tags = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
     count = 0
-    with written_aside(path) as aside, tempfile.TemporaryFile() as log:
+    with atomic_write(path) as aside, tempfile.TemporaryFile() as log:
         stream = scaled.output(_url(aside), vcodec="libx264", crf=crf, pix_fmt=pix_fmt, movflags="+faststart", **tags)
         command = stream.global_args("-v", "error", "-y").compile(cmd=ffmpeg_binary())
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
@@ -225,7 +225,7 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
 
 def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> None:
     """Write uint8 (height, width, 3 or 4) as PNG or JPEG, by the suffix."""
-    with written_aside(path) as aside:
+    with atomic_write(path) as aside:
         Image.fromarray(pixels).save(aside, quality=95)  # of JPEG; PNG knows no such thing
 
 

@@ -56,7 +56,7 @@ class Source(Protocol):
     def read_at(self, offset: int, length: int) -> bytes:
         """`length` bytes from `offset`, fewer only at the end."""
 
-    def hold(self, offset: int, length: int) -> None:
+    def will_read(self, offset: int, length: int) -> None:
         """The next reads lie within these bytes, in order; a source to which each costs a journey may fetch them in one."""
 
 
@@ -65,24 +65,24 @@ class RemoteSource(Source, Protocol):
     """A source behind a network (`kpc.format.container.http.HttpSource`, which takes a while to import)."""
 
     attempts: float
-    say: Callable[[str | None], None]
+    report: Callable[[str | None], None]
 
     @property
-    def received(self) -> int:
+    def received_bytes(self) -> int:
         """Bytes that came so far."""
 
     @property
     def has_ranges(self) -> bool:
         """False if the server sends whole files only."""
 
-    def another(self) -> "RemoteSource":
+    def clone(self) -> "RemoteSource":
         """The same file, for another thread to read at the same time."""
 
     def interrupt(self) -> None:
         """Something else is wanted sooner: what another thread is reading fails with InterruptedRead, as soon as may be. What came
         of it is kept for when it is read again."""
 
-    def forget(self) -> None:
+    def discard(self) -> None:
         """Read anew what is asked for next: it came damaged."""
 
     def close(self) -> None:
@@ -462,7 +462,7 @@ class _BytesSource:
     def read_at(self, offset: int, length: int) -> bytes:
         return bytes(self.data[offset : offset + length])
 
-    def hold(self, offset: int, length: int) -> None:
+    def will_read(self, offset: int, length: int) -> None:
         """All bytes are at hand."""
 
 
@@ -486,7 +486,7 @@ class _FileSource:
             opened.seek(offset)
             return opened.read(length)
 
-    def hold(self, offset: int, length: int) -> None:
+    def will_read(self, offset: int, length: int) -> None:
         """The operating system reads ahead."""
 
 

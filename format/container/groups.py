@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import google_crc32c
-from kpc.format.common.cli import written_aside
+from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import FormatError, UsageError
 from kpc.format.container.container import (
     CODEC_RAW,
@@ -72,9 +72,9 @@ class Timeline:
         """
         frame = self.spans[0].start + time * (self.clip.frame_count - 1)
         number = bisect_right(self._takes_over, frame)
-        return number, self.time_in(number, time)
+        return number, self.local_time(number, time)
 
-    def mixed(self, time: float) -> list[tuple[int, float, float]]:
+    def blend_at(self, time: float) -> list[tuple[int, float, float]]:
         """What makes the picture at `time`: a group, the time in it, and its share; of one group, or of two amid frames that they share.
 
         The share of the later one grows evenly from 0 at the first frame that they share to 1 at the last.
@@ -86,23 +86,23 @@ class Timeline:
             if first < frame < last:
                 share = (frame - first) / (last - first)
                 return [
-                    (later - 1, self.time_in(later - 1, time), 1 - share),
-                    (later, self.time_in(later, time), share),
+                    (later - 1, self.local_time(later - 1, time), 1 - share),
+                    (later, self.local_time(later, time), share),
                 ]
         return [(number, time_in_it, 1.0)]
 
-    def time_in(self, number: int, time: float) -> float:
+    def local_time(self, number: int, time: float) -> float:
         """The time in a group at a time of the clip; its first or last where it holds none such."""
         span, frame = self.spans[number], self.spans[0].start + time * (self.clip.frame_count - 1)
         return min(max((frame - span.start) / (span.count - 1), 0.0), 1.0) if span.count > 1 else 0.0
 
-    def time_of(self, number: int, time_in_it: float) -> float:
+    def clip_time(self, number: int, time_in_it: float) -> float:
         """The time of the clip, at a time in a group."""
         span = self.spans[number]
         frame = span.start + time_in_it * (span.count - 1) - self.spans[0].start
         return min(max(frame / max(self.clip.frame_count - 1, 1), 0.0), 1.0)
 
-    def shown(self, number: int) -> tuple[float, float]:
+    def display_span(self, number: int) -> tuple[float, float]:
         """From when to when a group shows, [0, 1] over the clip."""
         frames, start = max(self.clip.frame_count - 1, 1), self.spans[0].start
         ends = [0.0, *((frame - start) / frames for frame in self._takes_over), 1.0]
@@ -193,7 +193,7 @@ class Groups:
         """The bytes of a group, for another thread to read beside those of other groups."""
         source = self.reader.source
         if isinstance(source, RemoteSource) and source.has_ranges:
-            source = source.another()
+            source = source.clone()
         return source if self.is_single else self._slice(number, source)
 
     def cameras(self) -> tuple[Camera, ...]:
@@ -248,7 +248,7 @@ class Groups:
             )
 
 
-class LongScene:
+class GroupedScene:
     """A clip in groups, of which one is held at a time, or two that are mixed.
 
     Attributes:
@@ -270,13 +270,13 @@ class LongScene:
         number, time = self.timeline.at(time)
         return self._scene(number, {number}), time
 
-    def mixed(self, time: float) -> list[tuple[Scene, float, float]]:
+    def blend_at(self, time: float) -> list[tuple[Scene, float, float]]:
         """As `Timeline.mixed`, scenes in place of groups.
 
         Raises:
             As `at`.
         """
-        parts = self.timeline.mixed(time)
+        parts = self.timeline.blend_at(time)
         return [
             (self._scene(number, {number for number, *_ in parts}), time_in_it, share)
             for number, time_in_it, share in parts
@@ -292,17 +292,17 @@ class LongScene:
         return self._held[number]
 
 
-def load(source: AnySource, memory_budget: int = DEFAULT_BUDGET) -> Scene | LongScene:
+def load(source: AnySource, memory_budget: int = DEFAULT_BUDGET) -> Scene | GroupedScene:
     """Read a file: its scene, or of a clip in groups one after the other when it is asked for."""
     groups = Groups(source, memory_budget=memory_budget)
-    return read(groups.open(0)).dequantise() if groups.is_single else LongScene(groups)
+    return read(groups.open(0)).dequantise() if groups.is_single else GroupedScene(groups)
 
 
 # --- writing
 
 
 @dataclass(frozen=True)
-class Part:
+class GroupInput:
     """A scene's file, and the frames of a clip that it is to be."""
 
     source: Source
@@ -311,31 +311,31 @@ class Part:
     value_count: int
 
     @staticmethod
-    def of(source: AnySource, start: int) -> "Part":
+    def of(source: AnySource, start: int) -> "GroupInput":
         """A file that holds a scene, of frames from `start` on."""
         scene = SceneReader(source, in_parts=True)
         clip = scene.head.clip
-        return Part(scene.source, Span(start, clip.frame_count), clip.fps, scene.header.value_count)
+        return GroupInput(scene.source, Span(start, clip.frame_count), clip.fps, scene.header.value_count)
 
 
-def parts_of(files: Sequence[AnySource]) -> list[Part]:
+def group_inputs(files: Sequence[AnySource]) -> list[GroupInput]:
     """The groups of all files. Files of groups know their frames, and are put in order if all do; a scene follows what is before
     it."""
     opened = [Groups(source, in_parts=True) for source in files]
     if not any(groups.is_single for groups in opened):
         opened.sort(key=lambda groups: groups.timeline.spans[0].start)
-    parts: list[Part] = []
+    parts: list[GroupInput] = []
     for groups in opened:
         if groups.is_single:
-            parts.append(Part.of(groups.reader.source, parts[-1].span.last + 1 if parts else 0))
+            parts.append(GroupInput.of(groups.reader.source, parts[-1].span.last + 1 if parts else 0))
         else:
             parts += [
-                Part.of(groups.source_of(number), span.start) for number, span in enumerate(groups.timeline.spans)
+                GroupInput.of(groups.source_of(number), span.start) for number, span in enumerate(groups.timeline.spans)
             ]
     return parts
 
 
-def write(parts: Sequence[Part], path: str | os.PathLike[str]) -> int:
+def write(parts: Sequence[GroupInput], path: str | os.PathLike[str]) -> int:
     """Write a clip in groups; return the size in bytes. A group is in memory at a time. On failure `path` is left as it was.
 
     Raises:
@@ -351,7 +351,7 @@ def write(parts: Sequence[Part], path: str | os.PathLike[str]) -> int:
             f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; encode them alike"
         )
     entries: list[Entry] = []
-    with written_aside(path) as aside, aside.open("wb") as opened:
+    with atomic_write(path) as aside, aside.open("wb") as opened:
         opened.seek(
             HEADER.size + ENTRY.size * len(parts)
         )  # the index, which comes first, holds checksums of what follows

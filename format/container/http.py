@@ -52,7 +52,7 @@ def is_url(text: str) -> bool:
     return text.partition("://")[0].lower() in SCHEMES and "://" in text
 
 
-def say_on_stderr(message: str | None) -> None:
+def report_on_stderr(message: str | None) -> None:
     """What becomes of a connection, for the user of a command; None: all is well again."""
     if message is not None:
         print(message, file=sys.stderr, flush=True)
@@ -78,7 +78,7 @@ class _Answer:
         """Whether `offset` is there, or is what comes next."""
         return self.start <= offset <= self.reached
 
-    def forget(self, offset: int) -> None:
+    def discard(self, offset: int) -> None:
         """What came before `offset`."""
         del self.data[: offset - self.start]
         self.start = offset
@@ -127,11 +127,11 @@ class HttpSource:
         *,
         limit: int = DEFAULT_BUDGET,
         attempts: float = ATTEMPTS,
-        say: Callable[[str | None], None] = say_on_stderr,
+        report: Callable[[str | None], None] = report_on_stderr,
     ) -> None:
-        self.name, self.attempts, self.received, self.has_ranges = _without_secrets(url), attempts, 0, True
+        self.name, self.attempts, self.received_bytes, self.has_ranges = _without_secrets(url), attempts, 0, True
         self._url = self._address = url
-        self._limit, self.say, self._closed = limit, say, threading.Event()
+        self._limit, self.report, self._closed = limit, report, threading.Event()
         self._pools: dict[str | None, urllib3.PoolManager] = {}
         self._size: int | None = None
         self._validator: tuple[str, str] | None = None
@@ -150,14 +150,14 @@ class HttpSource:
         end = min(offset + length, self.size)
         if end <= offset:
             return b""
-        self.hold(offset, length)
+        self.will_read(offset, length)
         self._bring(end)
         if self.has_ranges and offset - self._answer.start > KEPT_BYTES:
-            self._answer.forget(offset)
+            self._answer.discard(offset)
         start = offset - self._answer.start
         return bytes(self._answer.data[start : start + end - offset])
 
-    def hold(self, offset: int, length: int) -> None:
+    def will_read(self, offset: int, length: int) -> None:
         """The next reads lie within these bytes, in order: they cost one request together."""
         answer, end = self._answer, min(offset + length, self.size)
         if answer.start <= offset and end <= answer.stop:
@@ -168,10 +168,10 @@ class HttpSource:
             if answer.data and answer.reached < answer.stop:
                 self._parked = answer
             self._answer = answer = before if before is not None and before.holds(offset) else _Answer(offset, end)
-        answer.forget(offset)
+        answer.discard(offset)
         answer.stop = max(end, answer.reached)
 
-    def another(self) -> "HttpSource":
+    def clone(self) -> "HttpSource":
         """The same file through connections of its own, for another thread; nothing is asked for before it reads. Without ranges it
         would be fetched as a whole once more."""
         other = copy.copy(self)
@@ -181,7 +181,7 @@ class HttpSource:
             threading.Event(),
             threading.Event(),
         )
-        other._answer, other._parked, other._troubled, other.received = _Answer(0, 0), None, False, 0
+        other._answer, other._parked, other._troubled, other.received_bytes = _Answer(0, 0), None, False, 0
         return other
 
     def interrupt(self) -> None:
@@ -190,7 +190,7 @@ class HttpSource:
         if self.has_ranges:
             self._interruption.set()
 
-    def forget(self) -> None:
+    def discard(self) -> None:
         """Read anew what is asked for next: it came damaged."""
         self._answer.drop_connection()
         self._answer, self._parked = (_Answer(0, 0) if self.has_ranges else _Answer(0, self.size)), None
@@ -230,7 +230,7 @@ class HttpSource:
                     raise UnreachableError(f"{self.name}: {trouble}; check the address and the connection") from trouble
                 pause = min(FIRST_PAUSE_S * 2 ** min(failures - 1, 10), LONGEST_PAUSE_S) * random.uniform(0.5, 1.5)
                 pause = max(pause, trouble.pause_s)
-                self.say(f"{self.name}: {trouble}; trying again in {pause:.1f} s")
+                self.report(f"{self.name}: {trouble}; trying again in {pause:.1f} s")
                 self._troubled = True
                 self._closed.wait(pause)
 
@@ -241,9 +241,9 @@ class HttpSource:
             if not piece:
                 raise _Interrupted(f"the connection breaks off at byte {answer.reached} of {self._size}")
             answer.data += piece
-            self.received += len(piece)
+            self.received_bytes += len(piece)
             if self._troubled:
-                self.say(None)
+                self.report(None)
                 self._troubled = False
             answer.check_pace()
             if self._interruption.is_set() and answer.reached < end:
@@ -329,8 +329,8 @@ class HttpSource:
                     f"of {self._limit:,}"
                 )
             if self.has_ranges:
-                self.say(f"{self.name}: the server has no ranges, all of it has to be downloaded")
-                self.say(None)
+                self.report(f"{self.name}: the server has no ranges, all of it has to be downloaded")
+                self.report(None)
             self.has_ranges, self._validator = False, _validator(response)
             if size is None:
                 size = self._read_to_end(answer)
@@ -356,7 +356,7 @@ class HttpSource:
                 raise BudgetError(
                     f"{self.name}: the server has no ranges and sends more than the budget of {self._limit:,} bytes"
                 )
-        self.received += len(answer.data)
+        self.received_bytes += len(answer.data)
         answer.drop_connection()
         return len(answer.data)
 

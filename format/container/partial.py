@@ -26,7 +26,7 @@ class SegmentedPlane:
     """A time plane held as symbols, in segments, of which any may be missing.
 
     `plane[row]` is (columns, M) float32, and (rows, columns, M) its `shape`, so that it can stand where an array does of which
-    only single rows are looked at (`kpc.format.scene.grid.linear`).
+    only single rows are looked at (`kpc.format.scene.grid.sample_linear`).
     """
 
     ndim = 3
@@ -164,7 +164,7 @@ def runs(index: Sequence[Entry], numbers: Iterable[int], most_bytes: float = flo
 def hold(reader: Reader, run: Sequence[int]) -> None:
     """Tell the source that chunks will be read that lie side by side, in their order."""
     start, last = reader.index[run[0]].offset, reader.index[run[-1]]
-    reader.source.hold(start, last.offset + last.stored_length - start)
+    reader.source.will_read(start, last.offset + last.stored_length - start)
 
 
 def _unseen(plane: PlaneHead) -> np.ndarray:

@@ -36,7 +36,7 @@ from kpc.format.coding.quantise import (
 )
 from kpc.format.coding.raw_planes import decode_segment, encode_segment
 from kpc.format.coding.weights import decode_weights, encode_weights
-from kpc.format.common.cli import written_aside
+from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import BudgetError, DatasetError, FormatError
 from kpc.format.container.container import (
     CODEC_MIDPOINTS,
@@ -184,7 +184,7 @@ def write(scene: QuantisedScene, path: str | os.PathLike[str], *, segment_rows: 
 def save(data: bytes, path: str | os.PathLike[str]) -> int:
     """Write what `encode` made; return its size. On failure `path` is left as it was."""
     try:
-        with written_aside(path) as aside:
+        with atomic_write(path) as aside:
             aside.write_bytes(data)
     except OSError as error:
         raise OSError(error.errno, error.strerror, os.fspath(path)) from error
@@ -323,7 +323,7 @@ def _decoder_chunk(kind: str, decoder: AnyDecoder, features: int) -> Chunk:
 
 def _pack_mapping(mapping: SpaceMapping) -> bytes:
     if isinstance(mapping, Contraction):
-        return WARP_STRUCT.pack(CONTRACTED, mapping.even)
+        return WARP_STRUCT.pack(CONTRACTED, mapping.uniform_distance)
     return NDC_STRUCT.pack(DEVICE_COORDINATES, *np.ravel(mapping.frame), mapping.near, mapping.baseline)
 
 
@@ -401,7 +401,7 @@ def read(
         BudgetError: it needs more than `memory_budget`; raised before the memory is taken.
     """
     reader = SceneReader(source, memory_budget=memory_budget, allow_partial=allow_partial)
-    reader.source.hold(0, reader.source.size)
+    reader.source.will_read(0, reader.source.size)
     segments = [
         number for number, entry in enumerate(reader.index) if entry.kind == "PLNE" and reader.available(number)
     ]

@@ -24,8 +24,8 @@ class Slice:
     def read_at(self, offset: int, length: int) -> bytes:
         return self._source.read_at(self._offset + offset, max(min(length, self.size - offset), 0))
 
-    def hold(self, offset: int, length: int) -> None:
-        self._source.hold(self._offset + offset, max(min(length, self.size - offset), 0))
+    def will_read(self, offset: int, length: int) -> None:
+        self._source.will_read(self._offset + offset, max(min(length, self.size - offset), 0))
 
 
 class RemoteSlice(Slice):
@@ -36,8 +36,8 @@ class RemoteSlice(Slice):
         self._remote = source
 
     @property
-    def received(self) -> int:
-        return self._remote.received
+    def received_bytes(self) -> int:
+        return self._remote.received_bytes
 
     @property
     def has_ranges(self) -> bool:
@@ -52,21 +52,21 @@ class RemoteSlice(Slice):
         self._remote.attempts = most
 
     @property
-    def say(self) -> Callable[[str | None], None]:
-        return self._remote.say
+    def report(self) -> Callable[[str | None], None]:
+        return self._remote.report
 
-    @say.setter
-    def say(self, told: Callable[[str | None], None]) -> None:
-        self._remote.say = told
+    @report.setter
+    def report(self, told: Callable[[str | None], None]) -> None:
+        self._remote.report = told
 
     def interrupt(self) -> None:
         self._remote.interrupt()
 
-    def forget(self) -> None:
-        self._remote.forget()
+    def discard(self) -> None:
+        self._remote.discard()
 
     def close(self) -> None:
         self._remote.close()
 
-    def another(self) -> RemoteSource:
-        return RemoteSlice(self._remote.another(), self._offset, self.size, self.name)
+    def clone(self) -> RemoteSource:
+        return RemoteSlice(self._remote.clone(), self._offset, self.size, self.name)

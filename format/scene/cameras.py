@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from kpc.format.common.cli import written_aside
+from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError
 
 LARGEST_FILE = 1 << 26
@@ -69,7 +69,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Shot:
+class View:
     """One picture to take: a camera at a time, and the name of the file that holds (or shall hold) it.
 
     Attributes:
@@ -83,7 +83,7 @@ class Shot:
     at_s: float | None = None
 
 
-def load_shots(path: str | os.PathLike[str]) -> list[Shot]:
+def load_views(path: str | os.PathLike[str]) -> list[View]:
     """Read a `cameras.json`: `w h fl_x fl_y cx cy` and `frames`, each of which may override them, and has `transform_matrix`,
     `time`, `file`, and for paths `at`.
 
@@ -98,7 +98,7 @@ def load_shots(path: str | os.PathLike[str]) -> list[Shot]:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: not JSON ({error})") from error
-    shots: list[Shot] = []
+    shots: list[View] = []
     try:
         for number, frame in enumerate(document["frames"]):
             shots.append(_shot({**document, **frame}, number))
@@ -111,7 +111,7 @@ def load_shots(path: str | os.PathLike[str]) -> list[Shot]:
     return shots
 
 
-def _shot(frame: Mapping[str, Any], number: int) -> Shot:
+def _shot(frame: Mapping[str, Any], number: int) -> View:
     w, h = int(frame["w"]), int(frame["h"])
     if max(w, h) > LARGEST_SIDE:
         raise DatasetError(f"a picture of {w}x{h} is too large, at most {LARGEST_SIDE} a side")
@@ -124,11 +124,11 @@ def _shot(frame: Mapping[str, Any], number: int) -> Shot:
     if not 0.0 <= time <= 1.0:
         raise DatasetError(f"time {time} lies outside [0, 1]")
     at_s = None if frame.get("at") is None else float(frame["at"])
-    return Shot(camera, time, str(frame.get("file", f"{number:04d}.png")), at_s)
+    return View(camera, time, str(frame.get("file", f"{number:04d}.png")), at_s)
 
 
-def save_shots(path: str | os.PathLike[str], shots: Sequence[Shot]) -> None:
-    """Write a `cameras.json` from which `load_shots` reads the same again."""
+def save_views(path: str | os.PathLike[str], shots: Sequence[View]) -> None:
+    """Write a `cameras.json` from which `load_views` reads the same again."""
     shared = _intrinsics(shots[0].camera) if shots else {}
     frames = []
     for shot in shots:
@@ -136,7 +136,7 @@ def save_shots(path: str | os.PathLike[str], shots: Sequence[Shot]) -> None:
         at = {} if shot.at_s is None else {"at": shot.at_s}
         pose = shot.camera.camera_to_world.tolist()
         frames.append({"file": shot.file, "time": shot.time, **at, **own, "transform_matrix": pose})
-    with written_aside(path) as aside:
+    with atomic_write(path) as aside:
         aside.write_text(json.dumps({**shared, "frames": frames}, indent=1))
 
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from kpc.format.common.errors import FormatError
-from kpc.format.scene.grid import linear, tap
+from kpc.format.scene.grid import sample_linear, texel_and_fraction
 
-STEP = 2.0**-11
+FINEST_STEP = 2.0**-11
 """The finest that is stored, in box edges. Displacements then err by at most 1/16 texel of a plane of 256. Held-out PSNR of soldier is the
 same to 0.001 dB down to 2^-13. (How coarse it may be for a file's sake: `kpc.encoder.rdo.rate_control.with_coarser_motion`.)"""
 
@@ -55,21 +55,21 @@ def quantise_motion(offsets: np.ndarray) -> QuantisedMotion:
             "lower learning rate"
         )
     wide_enough = np.nextafter(np.float32(largest / 32767), np.float32(np.inf))
-    step = np.float32(np.clip(wide_enough, STEP, DISPLACEMENT_LIMIT / 32768))
+    step = np.float32(np.clip(wide_enough, FINEST_STEP, DISPLACEMENT_LIMIT / 32768))
     symbols = np.rint(offsets.astype(np.float64) / step).clip(-32768, 32767).astype(np.int16)
     # Of a power of two, so that nothing is rounded anew; 0 where nothing moves.
-    multiple = int(np.gcd.reduce(symbols, axis=None)) or 1 if step == STEP else 1
+    multiple = int(np.gcd.reduce(symbols, axis=None)) or 1 if step == FINEST_STEP else 1
     return QuantisedMotion(symbols // np.int16(multiple), float(step) * multiple)
 
 
-def moved(u: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+def displace(u: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Places (..., 3) in the planes of places u (..., 3) in [0, 1]^3: u + D(u), in [0, 1]^3.
 
-    `offsets`: (Nz, Ny, Nx, 3), a motion grid cut at one time (`kpc.format.scene.grid.linear`).
+    `offsets`: (Nz, Ny, Nx, 3), a motion grid cut at one time (`kpc.format.scene.grid.sample_linear`).
     """
     nz, ny, nx, _ = offsets.shape
     flat = offsets.reshape(-1, 3)
-    (i, f), (j, g), (k, h) = (tap(u[..., axis], size) for axis, size in enumerate((nx, ny, nz)))
+    (i, f), (j, g), (k, h) = (texel_and_fraction(u[..., axis], size) for axis, size in enumerate((nx, ny, nz)))
     out = u.copy()
     for corner in range(8):
         right, up, back = corner & 1, corner >> 1 & 1, corner >> 2
@@ -78,7 +78,7 @@ def moved(u: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return np.clip(out, 0, 1)
 
 
-def places_reached(occupancy: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+def reached_cells(occupancy: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """The cells of the planes' [0, 1]^3 in which points of occupied cells are looked up; shape and type as `occupancy`.
 
     `occupancy`: (slots, Nz, Ny, Nx) bool; `offsets`: (T, Mz, My, Mx, 3), whole. The middles of cells are followed through every
@@ -94,7 +94,7 @@ def places_reached(occupancy: np.ndarray, offsets: np.ndarray) -> np.ndarray:
         low, high = np.full(cells.shape, np.inf, np.float32), np.full(cells.shape, -np.inf, np.float32)
         start, end = slot / slots, (slot + 1) / slots
         for time in [start, *times[(times > start) & (times < end)], end]:
-            reached = moved(middles, linear(offsets, float(time)))[:, ::-1] * shape
+            reached = displace(middles, sample_linear(offsets, float(time)))[:, ::-1] * shape
             low, high = np.minimum(low, reached), np.maximum(high, reached)
         first, last = np.maximum(low - 1, 0).astype(np.int64), np.minimum(high + 1, shape - 1).astype(np.int64)
         _fill(out[slot], first, last)

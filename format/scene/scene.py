@@ -176,10 +176,10 @@ class Scene:
     appearances: tuple[Appearance, ...] = field(default=())
 
     def at(self, time: float) -> "tuple[Scene, float]":
-        """What shows at a time, and the time in it: as of a clip in groups (`kpc.format.container.groups.LongScene`), but always itself."""
+        """What shows at a time, and the time in it: as of a clip in groups (`kpc.format.container.groups.GroupedScene`), but always itself."""
         return self, time
 
-    def mixed(self, time: float) -> "list[tuple[Scene, float, float]]":
+    def blend_at(self, time: float) -> "list[tuple[Scene, float, float]]":
         """What makes the picture at a time, likewise: itself, the time in it, its share."""
         return [(self, time, 1.0)]
 
@@ -198,7 +198,7 @@ class Scene:
         aabb = self.aabb.astype(np.float64)
         if not isinstance(self.mapping, DeviceCoordinates):
             return aabb
-        corners = self.mapping.expand(np.array(list(itertools.product(*aabb.T))))
+        corners = self.mapping.to_world(np.array(list(itertools.product(*aabb.T))))
         return np.stack([corners.min(0), corners.max(0)])
 
     @property
@@ -224,7 +224,7 @@ class Scene:
         some = ", ".join(appearance.name for appearance in self.appearances[:8]) + ", ..." * (len(self.appearances) > 8)
         raise UsageError(f"appearance {name!r}: the scene has no such one, but {some}")
 
-    def appearance_between(self, one: str, other: str, share: float) -> np.ndarray:
+    def interpolate_appearance(self, one: str, other: str, share: float) -> np.ndarray:
         """The code so far from one appearance to another, share in [0, 1]: (1 - share) one + share other, (H,) float32.
 
         Raises:

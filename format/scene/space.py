@@ -13,10 +13,10 @@ FAR = 256.0
 """A ray in contracted space ends at so many times `even`. Seen from within the box, what lies farther would move by less than
 1/256 of the parallax of the box's far side, and by less than a texel of any plane of up to 256."""
 
-FORWARD = 1e-4
+MIN_FORWARD = 1e-4
 """Depth that a ray must gain in a unit of its length to be one that goes forward."""
 
-LEAST_DISPARITY = 1e-6
+MIN_DISPARITY = 1e-6
 """Of a ray's disparity at its start: what lies farther counts as that far."""
 
 
@@ -42,26 +42,26 @@ class Contraction:
         even: world units, > 0. About the distance from the cameras to the far side of the box: within it steps are even.
     """
 
-    even: float
+    uniform_distance: float
 
     @property
-    def end(self) -> float:
+    def s_end(self) -> float:
         """Where a ray ends, in s: (2 - 1/FAR) even."""
-        return (2 - 1 / FAR) * self.even
+        return (2 - 1 / FAR) * self.uniform_distance
 
     def distance(self, s: np.ndarray) -> np.ndarray:
         """t of s >= 0, any shape, in the type of s; beyond the end of a ray as at its end."""
-        ahead = np.minimum(s / s.dtype.type(self.even), s.dtype.type(2 - 1 / FAR))
-        return np.where(ahead <= 1, s, s.dtype.type(self.even) / (2 - np.maximum(ahead, 1)))
+        ahead = np.minimum(s / s.dtype.type(self.uniform_distance), s.dtype.type(2 - 1 / FAR))
+        return np.where(ahead <= 1, s, s.dtype.type(self.uniform_distance) / (2 - np.maximum(ahead, 1)))
 
-    def progress(self, t: np.ndarray) -> np.ndarray:
+    def parameter(self, t: np.ndarray) -> np.ndarray:
         """s of t >= 0, infinity included: the inverse of `distance`."""
-        beyond = t.dtype.type(self.even) / np.maximum(t, t.dtype.type(self.even))
-        return np.where(t <= self.even, t, t.dtype.type(self.even) * (2 - beyond))
+        beyond = t.dtype.type(self.uniform_distance) / np.maximum(t, t.dtype.type(self.uniform_distance))
+        return np.where(t <= self.uniform_distance, t, t.dtype.type(self.uniform_distance) * (2 - beyond))
 
-    def stretch(self, t: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    def density_scale(self, t: np.ndarray, radius: np.ndarray) -> np.ndarray:
         """What a step counts for the density: (max(1, t/even) / max(1, radius))^2."""
-        return np.square(np.maximum(1, t / t.dtype.type(self.even)) / np.maximum(1, radius))
+        return np.square(np.maximum(1, t / t.dtype.type(self.uniform_distance)) / np.maximum(1, radius))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class DeviceCoordinates:
     near: float
     baseline: float
 
-    def place(self, points: np.ndarray) -> np.ndarray:
+    def to_device(self, points: np.ndarray) -> np.ndarray:
         """Coordinates (..., 3) of world points (..., 3) of positive depth."""
         local = (points - self.frame[:, 3]) @ self.frame[:, :3]
         depth = -local[..., 2]
@@ -94,18 +94,18 @@ class DeviceCoordinates:
             [local[..., 0] / depth, local[..., 1] / depth, self.baseline * (1 / self.near - 1 / depth)], axis=-1
         )
 
-    def expand(self, places: np.ndarray) -> np.ndarray:
+    def to_world(self, places: np.ndarray) -> np.ndarray:
         """World points (..., 3) at coordinates (..., 3), the third below baseline / near: the inverse of `place`."""
         depth = 1 / (1 / self.near - places[..., 2] / self.baseline)
         local = np.stack([places[..., 0] * depth, places[..., 1] * depth, -depth], axis=-1)
         return local @ self.frame[:, :3].T + self.frame[:, 3]
 
-    def path(self, origins: np.ndarray, directions: np.ndarray) -> "Path":
+    def rays(self, origins: np.ndarray, directions: np.ndarray) -> "DeviceRays":
         """World rays (N, 3) and (N, 3), from where their depth is `near`, or their origin if that is deeper."""
         dtype = origins.dtype
         eye, axes = self.frame[:, 3].astype(dtype), self.frame[:, :3].astype(dtype)
         o, d = (origins - eye) @ axes, directions @ axes
-        forward = -d[:, 2] > FORWARD
+        forward = -d[:, 2] > MIN_FORWARD
         dz = np.where(forward, -d[:, 2], dtype.type(1))
         start = np.maximum((dtype.type(self.near) + o[:, 2]) / dz, dtype.type(0))
         p = o + start[:, None] * d
@@ -116,11 +116,11 @@ class DeviceCoordinates:
         length = np.linalg.norm(way, axis=1)
         way = np.where(forward[:, None], way / length[:, None], np.array([0, 0, -1], dtype))
         begin = np.where(forward[:, None], begin, np.array([0, 0, -1], dtype))
-        return Path(begin, way, length, start, z / dz)
+        return DeviceRays(begin, way, length, start, z / dz)
 
 
 @dataclass(frozen=True)
-class Path:
+class DeviceRays:
     """Rays in device coordinates: begin + s way, |way| = 1. One that does not go forward begins before the box and leads away.
 
     Attributes:
@@ -129,16 +129,16 @@ class Path:
         start: (N,) its distance t in the world at s = 0; pace: (N,) dt/ds there, times length.
     """
 
-    begin: np.ndarray
-    way: np.ndarray
-    length: np.ndarray
-    start: np.ndarray
-    pace: np.ndarray
+    origins: np.ndarray
+    directions: np.ndarray
+    s_infinity: np.ndarray
+    t_start: np.ndarray
+    t_scale: np.ndarray
 
     def distance(self, s: np.ndarray, rays: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Distances t (n, K) in the world of s (n, K) on n of the rays: depth is depth at the start / (1 - s / length)."""
-        share = np.minimum(s / self.length[rays, None], s.dtype.type(1 - LEAST_DISPARITY))
-        return self.start[rays, None] + self.pace[rays, None] * (share / (1 - share))
+        share = np.minimum(s / self.s_infinity[rays, None], s.dtype.type(1 - MIN_DISPARITY))
+        return self.t_start[rays, None] + self.t_scale[rays, None] * (share / (1 - share))
 
 
 SpaceMapping = Contraction | DeviceCoordinates
@@ -153,7 +153,7 @@ def contract(points: np.ndarray, aabb: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return y * (scale / 4)[..., None] + y.dtype.type(0.5), radius
 
 
-def expand(u: np.ndarray, aabb: np.ndarray) -> np.ndarray:
+def uncontract(u: np.ndarray, aabb: np.ndarray) -> np.ndarray:
     """World points (..., 3) at places inside (0, 1)^3: the inverse of `contract`."""
     z = 4 * u - 2
     reach = np.maximum(np.abs(z).max(axis=-1), 1)

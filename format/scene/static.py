@@ -20,20 +20,20 @@ def static_cells(scene: Scene) -> np.ndarray:
     return _untouched(scene, lambda plane: np.any(plane != 1, axis=2))
 
 
-def unchanging_cells(scene: Scene) -> np.ndarray:
+def constant_cells(scene: Scene) -> np.ndarray:
     """(Nz, Ny, Nx) bool: where nothing changes over the clip, be it 1 or not, nor does whether the cell is occupied."""
     still = _untouched(scene, lambda plane: np.broadcast_to(np.any(plane != plane[:1], axis=(0, 2)), plane.shape[:2]))
     return np.asarray(still.all(axis=0) & (scene.occupancy == scene.occupancy[:1]).all(axis=0))
 
 
-def static_share(scene: Scene) -> float:
+def static_fraction(scene: Scene) -> float:
     """Of the cells of all slots that are occupied, the share that is static; 1 where none is occupied."""
     return _share(static_cells(scene), scene.occupancy)
 
 
-def unchanging_share(scene: Scene) -> float:
+def constant_fraction(scene: Scene) -> float:
     """Of the cells that are ever occupied, the share that never changes; 1 where none is occupied."""
-    return _share(unchanging_cells(scene), scene.occupancy.any(axis=0))
+    return _share(constant_cells(scene), scene.occupancy.any(axis=0))
 
 
 def _share(cells: np.ndarray, occupied: np.ndarray) -> float:
@@ -51,17 +51,17 @@ def _untouched(scene: Scene, differs: Callable[[np.ndarray], np.ndarray]) -> np.
     for scale in scene.scales:
         for name in TIME_PLANES:
             cells = math.prod(shapes[name]) // slots
-            touched = cells_touched(cells_touched(differs(scale[name]), 0, slots), 1, cells)
+            touched = cells_reading(cells_reading(differs(scale[name]), 0, slots), 1, cells)
             out &= ~touched.reshape(shapes[name])
     if scene.motion is not None:
         displaced = (scene.motion != 0).any(axis=(0, 4))
         for axis, count in enumerate((nz, ny, nx)):
-            displaced = cells_touched(displaced, axis, count)
+            displaced = cells_reading(displaced, axis, count)
         out &= ~displaced
     return out
 
 
-def cells_touched(texels: np.ndarray, axis: int, cells: int) -> np.ndarray:
+def cells_reading(texels: np.ndarray, axis: int, cells: int) -> np.ndarray:
     """Texels or nodes (bool) along an axis of corner-aligned positions -> the cells from which reads may touch one that is set:
     cell [c, c+1] / cells meets the closed support [i-1, i+1] / (size-1) of texel i. As `kpc.format.coding.quantise.needed_texels`, the
     other way round."""

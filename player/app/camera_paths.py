@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from kpc.format.common.errors import DatasetError
-from kpc.format.scene.cameras import Camera, Shot, load_shots, save_shots
+from kpc.format.scene.cameras import Camera, View, load_views, save_views
 from kpc.format.scene.rotations import quaternion_of, rotation_of
 
 GAP_S = 2.0
@@ -36,10 +36,10 @@ class CameraPath:
         DatasetError: `at_s` does not grow, or lasts too long; a pose is no turn and shift, say mirrored.
     """
 
-    keyframes: tuple[Shot, ...] = ()
+    keyframes: tuple[View, ...] = ()
 
     def __post_init__(self) -> None:
-        shots: list[Shot] = []
+        shots: list[View] = []
         for shot in self.keyframes:
             before = shots[-1].at_s if shots else None
             at_s = shot.at_s if shot.at_s is not None else 0.0 if before is None else before + GAP_S
@@ -62,7 +62,7 @@ class CameraPath:
         Raises:
             DatasetError: it cannot be read, or its frames make no path; the message names the file.
         """
-        shots = load_shots(path)
+        shots = load_views(path)
         try:
             return CameraPath(tuple(shots))
         except DatasetError as error:
@@ -70,7 +70,7 @@ class CameraPath:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as a `cameras.json`."""
-        save_shots(path, self.keyframes)
+        save_views(path, self.keyframes)
 
     @property
     def start_s(self) -> float:
@@ -83,7 +83,7 @@ class CameraPath:
     def with_keyframe(self, camera: Camera, time: float, gap_s: float = GAP_S) -> "CameraPath":
         """The same, and on to one more, `gap_s` after the last."""
         at_s = self.end_s + gap_s if self.keyframes else 0.0
-        return CameraPath((*self.keyframes, Shot(camera, time, f"{len(self.keyframes):04d}.png", at_s)))
+        return CameraPath((*self.keyframes, View(camera, time, f"{len(self.keyframes):04d}.png", at_s)))
 
     def without(self, number: int) -> "CameraPath":
         """The same, but for a keyframe, from 0 on; the others keep their seconds."""
@@ -116,10 +116,10 @@ class CameraPath:
         camera = Camera(first.width, first.height, float(fl_x), float(fl_y), float(values[9]), float(values[10]), pose)
         return camera, float(values[11] % 1.0 if values[11] > 1.0 else max(values[11], 0.0))
 
-    def shots(self, fps: float) -> list[Shot]:
+    def shots(self, fps: float) -> list[View]:
         """Every frame of a video of it, the first and the last keyframe included where the frames meet them."""
         count = int((self.end_s - self.start_s) * fps + 1e-6) + 1
-        return [Shot(*self.at(self.start_s + number / fps), f"{number:04d}.png") for number in range(count)]
+        return [View(*self.at(self.start_s + number / fps), f"{number:04d}.png") for number in range(count)]
 
     @cached_property
     def _ats(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from kpc.format.common.cli import written_aside
+from kpc.format.common.cli import atomic_write
 from kpc.player.app.controls import SPEEDS
 from kpc.player.quality import LADDER
 
@@ -102,7 +102,7 @@ def save(preferences: Preferences, path: Path) -> None:
         OSError: the folder cannot be written to.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with written_aside(path) as aside:
+    with atomic_write(path) as aside:
         aside.write_text(
             json.dumps({name: value for name, value in asdict(preferences).items() if value is not None}, indent=1)
         )

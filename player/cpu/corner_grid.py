@@ -14,7 +14,7 @@ import math
 from typing import Any
 
 import numpy as np
-from kpc.format.scene.grid import linear, tap
+from kpc.format.scene.grid import sample_linear, texel_and_fraction
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.player.cpu.cpu_renderer import Marching, in_steps
 from kpc.player.cpu.simd import LARGEST, WIDE
@@ -120,7 +120,10 @@ class Baking(Marching):
         are others."""
         scales, kept, rows = self._scene.scales, self._cut, []
         self._cut = {}
-        taps = {count: tap(np.float32(time), count) for count in {len(scale[TIME_PLANES[0]]) for scale in scales}}
+        taps = {
+            count: texel_and_fraction(np.float32(time), count)
+            for count in {len(scale[TIME_PLANES[0]]) for scale in scales}
+        }
         for name in TIME_PLANES:
             row = np.zeros((len(self._places[name[0]]), self._weights.shape[1]), np.float32)
             first = 0
@@ -140,7 +143,7 @@ class Baking(Marching):
     def _at_corners(self, row: np.ndarray, axis: str) -> np.ndarray:
         """A (size, ...) array that is corner-aligned along x, y or z, as fine as the grid is there."""
         places = self._places[axis]
-        return row if len(row) == len(places) else linear(row, places)
+        return row if len(row) == len(places) else sample_linear(row, places)
 
 
 def corners_of(scene: Scene) -> tuple[int, int, int]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from kpc.format.scene.cameras import Camera
-from kpc.format.scene.grid import linear
+from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction
 from kpc.player.cpu.raymarch import cast
@@ -58,7 +58,7 @@ class Marching(ABC):
             motion = self._scene.motion
             if motion is not None and time is not None:
                 self._motion = np.zeros((*motion.shape[1:4], 4), np.float32)
-                self._motion[..., :3] = linear(motion, time)
+                self._motion[..., :3] = sample_linear(motion, time)
             else:
                 self._motion = np.zeros((0, 0, 0, 4), np.float32)
             self._time = time
@@ -127,7 +127,7 @@ class Marching(ABC):
 
 def _even(scene: Scene) -> np.float32 | None:
     """Of contracted space."""
-    return np.float32(scene.mapping.even) if isinstance(scene.mapping, Contraction) else None
+    return np.float32(scene.mapping.uniform_distance) if isinstance(scene.mapping, Contraction) else None
 
 
 def in_steps(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -101,7 +101,7 @@ def _place(scene: Scene, points: np.ndarray) -> np.ndarray:
     if isinstance(scene.mapping, Contraction):
         u = contract(points, scene.aabb)[0]
     else:
-        inside = scene.mapping.place(points) if isinstance(scene.mapping, DeviceCoordinates) else points
+        inside = scene.mapping.to_device(points) if isinstance(scene.mapping, DeviceCoordinates) else points
         u = (inside - scene.aabb[0]) / (scene.aabb[1] - scene.aabb[0])
     return np.clip(u, 0, 1).astype(np.float32)
 
@@ -109,5 +109,5 @@ def _place(scene: Scene, points: np.ndarray) -> np.ndarray:
 def _terms(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """`kpc.player.cpu.reference.once_a_ray` of rays of the world, (N, 3) and (N, 3), in the average look."""
     if isinstance(scene.mapping, DeviceCoordinates):
-        directions = scene.mapping.path(origins, directions).way
+        directions = scene.mapping.rays(origins, directions).directions
     return reference.once_a_ray(scene.decoder, directions, reference.code_of(scene, None))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from kpc.format.coding.rans import compiled
-from kpc.format.scene.grid import linear
+from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, SPACE_PLANES, Decoder, Scene
 from kpc.format.scene.space import Contraction
 from kpc.player.cpu.threads import share_out
@@ -102,7 +102,7 @@ class Thinning:
             row = rows[layout.lines(block)].swapaxes(0, 1)[: plane.shape[0 if block.upright else 1]]
             row = row.reshape(len(row), -1)
             np.multiply(plane, row[:, None] if block.upright else row, out=folded)
-        offsets = None if scene.motion is None else linear(scene.motion, time)
+        offsets = None if scene.motion is None else sample_linear(scene.motion, time)
 
         def add(part: slice) -> None:
             if offsets is not None:
@@ -121,7 +121,7 @@ class Thinning:
 
 @compiled()
 def _displace(places, offsets):
-    """`kpc.format.scene.motion.moved`, in place."""
+    """`kpc.format.scene.motion.displace`, in place."""
     nz, ny, nx = offsets.shape[:3]
     one = np.float32(1)
     for n in range(len(places)):

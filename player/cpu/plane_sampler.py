@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
-from kpc.format.scene.grid import linear
+from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.format.scene.space import DeviceCoordinates
 from kpc.player.cpu.cpu_renderer import Marching, in_steps
@@ -85,7 +85,7 @@ class Lookup(Marching):
             return
         for number, scale in enumerate(self._scene.scales):
             for axis, name in enumerate(TIME_PLANES):
-                self._put(self._rows, number, len(SPACE_PLANES) + axis, _twice(linear(scale[name], time), 0))
+                self._put(self._rows, number, len(SPACE_PLANES) + axis, _twice(sample_linear(scale[name], time), 0))
 
     def _looked_at(self, worker: int) -> tuple[Any, Any]:
         b1 = self._b1 + self._code if len(self._b1) else self._b1

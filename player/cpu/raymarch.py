@@ -348,7 +348,7 @@ def _look_up(found, grid, nodes, samples, cell):
 
 @_part
 def _displace(found, motion, nodes, samples, cell):
-    """`kpc.format.scene.motion.moved`; places still to be clamped."""
+    """`kpc.format.scene.motion.displace`; places still to be clamped."""
     _find(found, nodes, samples, cell)
     _look_up(found, motion, nodes, samples, cell)
     for j in range(_whole(found)):

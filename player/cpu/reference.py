@@ -20,8 +20,8 @@ from enum import Enum
 
 import numpy as np
 from kpc.format.scene.cameras import Camera
-from kpc.format.scene.grid import linear, tap
-from kpc.format.scene.motion import moved
+from kpc.format.scene.grid import sample_linear, texel_and_fraction
+from kpc.format.scene.motion import displace
 from kpc.format.scene.scene import (
     ACTIVATION_LIMIT,
     LOG_DENSITY_LIMIT,
@@ -151,10 +151,12 @@ class Moment:
     def of(scene: Scene, time: float, with_motion: bool = True) -> "Moment":
         """Cut `scene` at `time`; without motion every time plane counts as 1, every displacement as 0."""
         rows: list[dict[str, np.ndarray]] = [
-            {name[0]: linear(scale[name], time) for name in TIME_PLANES} if with_motion and scene.is_dynamic else {}
+            {name[0]: sample_linear(scale[name], time) for name in TIME_PLANES}
+            if with_motion and scene.is_dynamic
+            else {}
             for scale in scene.scales
         ]
-        offsets = None if scene.motion is None or not with_motion else linear(scene.motion, time)
+        offsets = None if scene.motion is None or not with_motion else sample_linear(scene.motion, time)
         return Moment(tuple(rows), scene.occupancy[slot_at(scene, time)], offsets)
 
 
@@ -176,7 +178,7 @@ def sample_range(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> t
     """Where the samples of rays begin and end, (N,) each: as `box_range`; in contracted space in its s."""
     if not isinstance(scene.mapping, Contraction):
         return box_range(scene.aabb, origins, directions)
-    return np.zeros(len(origins), np.float32), np.full(len(origins), scene.mapping.end, np.float32)
+    return np.zeros(len(origins), np.float32), np.full(len(origins), scene.mapping.s_end, np.float32)
 
 
 def places(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -186,13 +188,13 @@ def places(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndar
         return s, (origins[:, None] + s[..., None] * directions[:, None] - scene.aabb[0]) / size, np.ones_like(s)
     t = scene.mapping.distance(s)
     u, radius = contract(origins[:, None] + t[..., None] * directions[:, None], scene.aabb)
-    return t, u, scene.mapping.stretch(t, radius)
+    return t, u, scene.mapping.density_scale(t, radius)
 
 
 def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Sample a (rows, columns, M) plane at (N,) positions, u along columns and v along rows, both in [0, 1]: (N, M)."""
     rows, columns, channels = plane.shape
-    (i, f), (j, g) = tap(u, columns), tap(v, rows)
+    (i, f), (j, g) = texel_and_fraction(u, columns), texel_and_fraction(v, rows)
     flat = plane.reshape(-1, channels)
     corner = j * columns + i
     right, up = np.int32(columns > 1), np.int32(columns if rows > 1 else 0)
@@ -206,7 +208,7 @@ def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def features(scene: Scene, moment: Moment, u: np.ndarray) -> np.ndarray:
     """f at (N, 3) points in [0, 1]^3: (N, F), the product over planes, concatenated over scales (eq. 1 of K-Planes)."""
     if moment.offsets is not None:
-        u = moved(u, moment.offsets)
+        u = displace(u, moment.offsets)
     axis = {"x": u[:, 0], "y": u[:, 1], "z": u[:, 2]}
     out = []
     for scale, rows in zip(scene.scales, moment.rows):
@@ -214,7 +216,7 @@ def features(scene: Scene, moment: Moment, u: np.ndarray) -> np.ndarray:
         for name in SPACE_PLANES:
             product = product * bilinear(scale[name], axis[name[0]], axis[name[1]])
         for letter, row in rows.items():
-            product *= linear(row, axis[letter])
+            product *= sample_linear(row, axis[letter])
         out.append(product)
     return np.concatenate(out, axis=1)
 
@@ -278,8 +280,8 @@ def composite(alphas: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.nda
 def _march(scene: Scene, moment: Moment, code: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Rendering:
     n, path = len(origins), None
     if isinstance(scene.mapping, DeviceCoordinates):
-        path = scene.mapping.path(origins, directions)
-        origins, directions = path.begin, path.way
+        path = scene.mapping.rays(origins, directions)
+        origins, directions = path.origins, path.directions
     near, far = sample_range(scene, origins, directions)
     terms = once_a_ray(scene.decoder, directions, code)
     rgb, depth = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)

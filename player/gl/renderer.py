@@ -12,7 +12,7 @@ import moderngl
 import numpy as np
 from kpc.format.common.errors import DisplayError
 from kpc.format.scene.cameras import Camera
-from kpc.format.scene.grid import linear
+from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, HybridDecoder, Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player.cpu.corner_grid import Baking
@@ -208,8 +208,8 @@ def texels_spanned(scene: Scene, camera: Camera) -> float:
     middle = replace(camera.resized(2, 2), fl_x=camera.fl_x, fl_y=camera.fl_y, cx=1.0, cy=1.0)
     origins, directions = middle.rays()
     if isinstance(scene.mapping, DeviceCoordinates):
-        path = scene.mapping.path(origins, directions)
-        origins, directions = path.begin, path.way
+        path = scene.mapping.rays(origins, directions)
+        origins, directions = path.origins, path.directions
     near, far = sample_range(scene, origins, directions)
     along = np.linspace(near.min(), far.max(), PLACES_ALONG, dtype=np.float32)
     _, u, _ = places(scene, origins, directions, np.tile(along, (4, 1)))
@@ -1024,7 +1024,7 @@ class Renderer:
             box_low=tuple(scene.aabb[0]),
             box_high=tuple(scene.aabb[1]),
             background=tuple(scene.background),
-            even=scene.mapping.even if isinstance(scene.mapping, Contraction) else 0.0,
+            even=scene.mapping.uniform_distance if isinstance(scene.mapping, Contraction) else 0.0,
             **_frame_of(scene.mapping),
         )
         # What draws a compute shader's picture on the screen has vertices of its own.
@@ -1056,7 +1056,7 @@ class Renderer:
 
     def _displace(self, time: float) -> None:
         if time != self._motion_time and self._motion_texture is not None and self.scene.motion is not None:
-            offsets = linear(self.scene.motion, time)
+            offsets = sample_linear(self.scene.motion, time)
             self._motion_texture.write(
                 np.concatenate([offsets, offsets[..., :1]], axis=-1)
             )  # RGBA: RGB is seldom native

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from kpc.format.coding.rans import compiled
-from kpc.format.scene.grid import dilate, linear
+from kpc.format.scene.grid import dilate, sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder, Scene
 from kpc.player.cpu.threads import share_out
 
@@ -142,7 +142,7 @@ class Rows:
         row's end."""
         out = np.ones((self._layout.row_count(), self.width, 4), np.float32)
         for axis, scale, plane in self._planes:
-            row = linear(plane, time)
+            row = sample_linear(plane, time)
             layers = self._layout.layers[scale]
             padded = np.ones((len(row), layers * 4), np.float32)
             padded[:, : row.shape[1]] = row

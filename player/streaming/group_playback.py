@@ -110,11 +110,11 @@ class GroupPlayback:
 
     def time_in(self, time: float) -> float:
         """The time in the group that shows, at a time of the clip."""
-        return self.timeline.time_in(self.number, time)
+        return self.timeline.local_time(self.number, time)
 
     def time_of(self, time_in_it: float) -> float:
         """The time of the clip, at a time in the group that shows."""
-        return self.timeline.time_of(self.number, time_in_it)
+        return self.timeline.clip_time(self.number, time_in_it)
 
     @property
     def complete_scales(self) -> int:
@@ -157,7 +157,7 @@ class GroupPlayback:
     def beside(self, time: float) -> tuple[Renderer, float, float] | None:
         """At a time of the clip, what is to be mixed with the group that shows: the renderer of another, the time in it, and its share of
         the picture. None where nothing is, or where it is not there."""
-        parts = {number: (time_in_it, share) for number, time_in_it, share in self.timeline.mixed(time)}
+        parts = {number: (time_in_it, share) for number, time_in_it, share in self.timeline.blend_at(time)}
         other = self._next
         if (
             self.number not in parts
@@ -189,7 +189,7 @@ class GroupPlayback:
         if self._next is not None and number == self._next.number and self._is_ready(self._next, head):
             self._turn()
         self._waiting = number != self.number
-        self._beside = next((other for other, *_ in self.timeline.mixed(head.time) if other != number), None)
+        self._beside = next((other for other, *_ in self.timeline.blend_at(head.time) if other != number), None)
         ahead = number if self._waiting else self._comes_after(head) if self._beside is None else self._beside
         if self._next is not None and self._next.number != ahead:
             self._let_go(self._next)
@@ -226,7 +226,7 @@ class GroupPlayback:
         number, time_in_it = self.timeline.at(time)
         if number != self.number or not self.stream.can_show(time_in_it, self._rate_in(number, rate)):
             return False
-        return len(self.timeline.mixed(time)) == 1 or self._failure is not None or self.beside(time) is not None
+        return len(self.timeline.blend_at(time)) == 1 or self._failure is not None or self.beside(time) is not None
 
     def close(self) -> None:
         """End all threads, and let go of the source."""
@@ -251,7 +251,7 @@ class GroupPlayback:
         return self._waiting or self._beside is not None and not there
 
     def _is_near(self, head: Playhead) -> bool:
-        _, until = self.timeline.shown(self.number)
+        _, until = self.timeline.display_span(self.number)
         return (until - head.time) * self.clip.duration_s < AHEAD_S
 
     def _is_ready(self, held: LoadedGroup, head: Playhead) -> bool:
@@ -273,7 +273,7 @@ class GroupPlayback:
 
     def _head_in(self, number: int, head: Playhead) -> Playhead:
         loops = head.loop and self.groups.is_single
-        return Playhead(self.timeline.time_in(number, head.time), self._rate_in(number, head.rate), loops)
+        return Playhead(self.timeline.local_time(number, head.time), self._rate_in(number, head.rate), loops)
 
     def _rate_in(self, number: int, rate: float) -> float:
         """Of a group in a second, where it is `rate` of the clip."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from kpc.format.coding.quantise import dequantised
-from kpc.format.common.compiling import NOTICE, WATCH
+from kpc.format.common.compiling import MONITOR, NOTICE
 from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, KpcError
 from kpc.format.container.container import DEFAULT_BUDGET, Reader, RemoteSource, Source
 from kpc.format.container.partial import PartialScene, hold, runs
@@ -101,7 +101,7 @@ class Stream:
         self._came: deque[tuple[float, int]] = deque()
         """When how many bytes had come, over the last RATE_OVER_S."""
         if isinstance(source, RemoteSource):
-            source.attempts, source.say = float("inf"), self._hear
+            source.attempts, source.report = float("inf"), self._hear
         self._thread = threading.Thread(target=self._run, name="fetching", daemon=True)
         self._thread.start()
 
@@ -192,7 +192,11 @@ class Stream:
     @property
     def received(self) -> int:
         """Bytes that came so far, through a network or from a disk."""
-        return self.source.received if isinstance(self.source, RemoteSource) else int(self._stored[self._taken].sum())
+        return (
+            self.source.received_bytes
+            if isinstance(self.source, RemoteSource)
+            else int(self._stored[self._taken].sum())
+        )
 
     @property
     def memory_bytes(self) -> int:
@@ -232,7 +236,7 @@ class Stream:
             return f"no more of the scene will come: {self._failure}"
         if self._trouble is not None:
             return self._trouble
-        if self._stalled and WATCH.is_under_way:
+        if self._stalled and MONITOR.is_compiling:
             return NOTICE
         if self._stalled:
             return f"waiting for the scene, {self.rate / 1e3:,.0f} KB/s"
@@ -324,7 +328,7 @@ class Stream:
         except FormatError:
             if not isinstance(self.source, RemoteSource):
                 raise
-            self.source.forget()
+            self.source.discard()
             symbols, _ = self._reader.segment(number)
         if self.parts.moves[position]:
             return Piece(position, number, symbols)

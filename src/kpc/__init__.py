@@ -16,13 +16,13 @@ from kpc.format.scene.scene import Scene
 if TYPE_CHECKING:
     import numpy as np
 
-    from kpc.format.container.groups import LongScene
+    from kpc.format.container.groups import GroupedScene
     from kpc.player.cpu.reference import Rendering
 
 __all__ = ["Camera", "KpcError", "Scene", "load", "render"]
 
 
-def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int = 2 << 30) -> "Scene | LongScene":
+def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int = 2 << 30) -> "Scene | GroupedScene":
     """Read a .kpc file; its planes are numpy arrays by name: `scene.scales[0]["xy"]`.
 
     A long clip may be in groups, of which one is held at a time, or two that are mixed, and read when a time in it is asked for:
@@ -42,7 +42,7 @@ def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int =
 
 
 def render(
-    scene: "Scene | LongScene", camera: Camera, time: float, appearance: "np.ndarray | None" = None
+    scene: "Scene | GroupedScene", camera: Camera, time: float, appearance: "np.ndarray | None" = None
 ) -> "Rendering":
     """Render one picture with the readable reference renderer; no graphics card is needed.
 
@@ -56,7 +56,7 @@ def render(
     """
     from kpc.player.cpu import reference
 
-    parts = scene.mixed(time) if appearance is None else [(*scene.at(time), 1.0)]
+    parts = scene.blend_at(time) if appearance is None else [(*scene.at(time), 1.0)]
     return reference.mixed(
         [(reference.render(shown, camera, t, appearance=appearance), share) for shown, t, share in parts]
     )

@@ -8,7 +8,7 @@ import datasets as make
 import numpy as np
 import pytest
 import torch
-from gradients import misty, rays_at
+from gradients import random_rays, translucent_scene
 from kpc.encoder.cli import kpenc
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim, true_picture
@@ -25,7 +25,7 @@ from kpc.format.common.errors import UsageError
 from kpc.format.common.fidelity import psnr
 from kpc.format.container.scene_io import encode, read
 from kpc.player.cpu import reference
-from scenes import hybrid, tiny_scene, varied
+from scenes import tiny_scene, with_appearances, with_hybrid_decoder
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = TrainConfig(
@@ -45,7 +45,7 @@ BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
 @pytest.fixture(scope="module")
 def unequal(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("unequal")
-    make.write_unequal(folder / "set")
+    make.write_varying_exposure(folder / "set")
     return load_dataset(folder / "set", folder / "cache", progress=False)
 
 
@@ -75,7 +75,7 @@ def test_photographs_by_many_lenses_have_appearances_and_nothing_else_has(
 ) -> None:
     assert choose_kind(unequal) == ("image", "photographs: 28 of 28 pictures have a lens or size of their own")
     assert choose_kind(rig) == ("none", "a clip, filmed as one")
-    make.write_unequal(tmp_path / "set", images=9, own_lens=False)
+    make.write_varying_exposure(tmp_path / "set", images=9, own_lens=False)
     one_lens = load_dataset(tmp_path / "set", tmp_path / "cache", progress=False)
     assert choose_kind(one_lens) == ("none", "0 of 7 pictures have a lens or size of their own")
     pictures = one_lens.pictures
@@ -135,8 +135,8 @@ def test_rays_carry_the_appearance_of_their_picture(unequal: Dataset, object_ray
 
 @pytest.mark.parametrize("way", ["fused", "plain", "hybrid"])
 def test_gradients_are_those_of_autograd_in_double_precision(way: str) -> None:
-    scene = varied(hybrid(misty()) if way == "hybrid" else misty())
-    rays = replace(rays_at(scene, 160), appearances=torch.from_numpy(np.random.default_rng(3).integers(0, 3, 160)))
+    scene = with_appearances(with_hybrid_decoder(translucent_scene()) if way == "hybrid" else translucent_scene())
+    rays = replace(random_rays(scene, 160), appearances=torch.from_numpy(np.random.default_rng(3).integers(0, 3, 160)))
     targets = torch.from_numpy(np.random.default_rng(1).random((160, 3), np.float32))
     config = replace(CONFIG, appearance="image", appearance_size=0.05, regularise_every=1000)
     field = Field.from_scene(scene)
@@ -162,7 +162,7 @@ def test_gradients_are_those_of_autograd_in_double_precision(way: str) -> None:
 
 def test_the_prior_is_the_mean_square_and_pulls_each_code_to_0() -> None:
     config = replace(CONFIG, appearance_size=0.5)
-    field = Field.from_scene(varied(tiny_scene())).double()
+    field = Field.from_scene(with_appearances(tiny_scene())).double()
     assert field.codes is not None
     value = appearance_priors(field, config)["appearance_size"]
     value.backward()
@@ -264,7 +264,7 @@ def test_the_left_half_tells_the_code_and_the_right_half_is_scored(unequal: Data
 
 def test_masks_count_in_halves(tmp_path: Path, with_codes: Trainer) -> None:
     """A picture whose right half is ignored is not scored; one whose left half is, shows the average."""
-    make.write_unequal(tmp_path / "set")
+    make.write_varying_exposure(tmp_path / "set")
     for k, usable in ((0, np.arange(32) < 16), (8, np.arange(32) >= 16)):
         make.write_mask(tmp_path / f"set/masks/{k:04d}.png", np.broadcast_to(usable, (32, 32)))
     masked = load_dataset(tmp_path / "set", tmp_path / "cache", progress=False)
@@ -276,11 +276,11 @@ def test_masks_count_in_halves(tmp_path: Path, with_codes: Trainer) -> None:
 
 @pytest.mark.parametrize(("contracted", "decoder"), [(False, "explicit"), (True, "explicit"), (False, "hybrid")])
 def test_a_fitted_code_shows_what_it_was_fitted_to(contracted: bool, decoder: str) -> None:
-    scene = misty(contracted=contracted)
-    scene = varied(hybrid(scene) if decoder == "hybrid" else scene)
+    scene = translucent_scene(contracted=contracted)
+    scene = with_appearances(with_hybrid_decoder(scene) if decoder == "hybrid" else scene)
     wanted = scene.appearance("dusk.jpg") / 2
     backgrounds = torch.from_numpy(np.tile(scene.background, (300, 1)))
-    rays = replace(rays_at(scene, 300), jitters=torch.full((300,), 0.5), backgrounds=backgrounds)
+    rays = replace(random_rays(scene, 300), jitters=torch.full((300,), 0.5), backgrounds=backgrounds)
     renderer = SceneRenderer(scene)
     arrays = [a.numpy() for a in (rays.origins, rays.directions, rays.times)]
     targets = renderer.rgb(*arrays, np.tile(wanted, (300, 1)))

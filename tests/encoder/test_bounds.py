@@ -18,7 +18,7 @@ from kpc.encoder.field.bounds import (
 )
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.cameras import Camera
-from kpc.format.scene.space import Contraction, expand
+from kpc.format.scene.space import Contraction, uncontract
 
 
 def pictures_of(
@@ -119,7 +119,7 @@ def test_even_steps_reach_the_far_corner_of_the_box() -> None:
     aabb = np.array([[-1, -2, -1], [1, 2, 3]], np.float32)
     corners = np.stack(np.meshgrid(*aabb.T, indexing="ij"), -1).reshape(-1, 3)
     farthest = np.linalg.norm(rig.camera_to_world[:, None, :3, 3] - corners, axis=2).max(1)
-    even = contraction_of(rig, aabb).even
+    even = contraction_of(rig, aabb).uniform_distance
     assert farthest.min() <= even <= farthest.max() and even == pytest.approx(np.quantile(farthest, 0.9))
 
 
@@ -129,7 +129,7 @@ def test_cells_of_contracted_space_are_seen_where_they_lie() -> None:
     cameras = pictures_of([straight(), straight(0.1)])
     seen = seen_cells(cameras, aabb, (32, 32, 32), Contraction(2.0))
     z, y, x = (np.argwhere(np.ones_like(seen)).T + 0.5) / 32
-    centres = expand(np.stack([x, y, z], axis=1), aabb)
+    centres = uncontract(np.stack([x, y, z], axis=1), aabb)
     assert np.abs(centres).max() == pytest.approx(16)
     depth, clear = -centres[:, 2], 0.02 * 2  # the margin of a view 90 degrees wide and 53 high
     in_view = (depth > 0) & (np.abs(centres[:, 1]) < (0.5 + clear) * depth)

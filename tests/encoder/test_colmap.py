@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from kpc.encoder.datasets import rays
+from kpc.encoder.datasets import pixel_rays
 from kpc.encoder.datasets.layouts import colmap
 from kpc.format.common.errors import KpcError
 from kpc.format.common.media import write_image
@@ -86,7 +86,7 @@ def test_rays_pass_through_what_the_model_projects(tmp_path: Path) -> None:
         u, v = distorted(x / z, y / z, np.array([lens]))
         camera = dataset.camera(k)
         column, row = camera.fl_x * u + camera.cx - 0.5, camera.fl_y * v + camera.cy - 0.5
-        origins, directions = rays(dataset.pictures, np.full(20, k), column, row)
+        origins, directions = pixel_rays(dataset.pictures, np.full(20, k), column, row)
         along = ((points - origins) * directions).sum(1, keepdims=True)
         assert (along > 0).all() and np.abs(origins + along * directions - points).max() < 1e-5
 

@@ -10,11 +10,11 @@ from kpc.encoder.evaluation.validation_rays import Probe
 from kpc.encoder.rdo import curvature as module
 from kpc.encoder.rdo.curvature import curvature
 from kpc.format.scene.scene import Scene
-from scenes import SPACES, tiny_scene, varied
+from scenes import VARIANTS, tiny_scene, with_appearances
 
-KINDS: dict[str, Callable[[Scene], Scene]] = SPACES | {
+KINDS: dict[str, Callable[[Scene], Scene]] = VARIANTS | {
     "still": lambda scene: tiny_scene(3, dynamic=False),
-    "varied": varied,
+    "appearances": with_appearances,
     "no cameras": lambda scene: replace(scene, cameras=()),
     "fewer channels": lambda scene: without_the_last_channels(scene),
 }

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from kpc.encoder.datasets import Dataset, PixelCache, load_dataset, pixel_cache, rays
+from kpc.encoder.datasets import Dataset, PixelCache, load_dataset, pixel_cache, pixel_rays
 from kpc.encoder.datasets.capture import natural_key
-from kpc.encoder.datasets.dataset import shrunk, undistort
+from kpc.encoder.datasets.dataset import downscale_picture, undistort
 from kpc.format.common.errors import DatasetError, KpcError, MediaError
 from kpc.format.common.media import write_image, write_video
 
@@ -36,7 +36,7 @@ def fails(folder: Path, *words: str, **options: object) -> None:
 def all_rays(dataset: Dataset, picture: int) -> tuple[np.ndarray, np.ndarray]:
     camera = dataset.camera(picture)
     row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
-    return rays(dataset.pictures, np.full(len(row), picture), column, row)
+    return pixel_rays(dataset.pictures, np.full(len(row), picture), column, row)
 
 
 # --- layouts
@@ -530,7 +530,7 @@ def test_cache_directory_that_cannot_be_made(tmp_path: Path) -> None:
 @pytest.mark.parametrize("factor", [2, 3, 5])
 def test_shrinking_averages_blocks(factor: int) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (16, 23, 3), dtype=np.uint8)
-    small = shrunk(picture, factor)
+    small = downscale_picture(picture, factor)
     h, w = 16 // factor, 23 // factor
     exact = picture[: h * factor, : w * factor].reshape(h, factor, w, factor, 3).mean((1, 3))
     assert small.shape == (h, w, 3) and np.abs(small - exact).max() <= 0.5
@@ -545,7 +545,7 @@ def test_shrinking_weighs_colours_by_alpha() -> None:
         exact = np.where(
             alpha > 0, (blocks[..., :3] * blocks[..., 3:]).sum((1, 3)) / alpha, blocks[..., :3].mean((1, 3))
         )
-    small = shrunk(picture, 2)
+    small = downscale_picture(picture, 2)
     assert np.abs(small[..., :3] - exact).max() <= 0.5
     assert np.abs(small[..., 3:] - alpha / 4).max() <= 0.5
 
@@ -596,7 +596,7 @@ def test_distorted_rays_pass_through_the_point_they_show(tmp_path: Path) -> None
     local = (points - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]
     x, y = distorted(local[:, 0] / -local[:, 2], local[:, 1] / local[:, 2], coefficients)
     column, row = camera.cx + camera.fl_x * x - 0.5, camera.cy + camera.fl_y * y - 0.5
-    origins, directions = rays(p, np.ones(20, int), column, row)
+    origins, directions = pixel_rays(p, np.ones(20, int), column, row)
     along = ((points - origins) * directions).sum(1, keepdims=True)
     assert np.abs(origins + along * directions - points).max() < 1e-5  # float32 at 4 units
 

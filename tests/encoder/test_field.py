@@ -11,7 +11,7 @@ from kpc.encoder.field.field import Field, Layout, gathered_by_row, motion_nodes
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip
 from kpc.player.cpu import reference
-from scenes import displaced, tiny_scene
+from scenes import tiny_scene, with_motion
 
 BOX = np.array([[0, 0, 0], [4, 2, 1]], np.float32)
 
@@ -63,7 +63,7 @@ def test_time_planes_start_as_the_identity_and_a_seed_repeats() -> None:
 def test_scene_to_field_and_back(kind: str) -> None:
     dynamic = kind != "static"
     scene = tiny_scene(dynamic=dynamic)
-    scene = displaced(scene) if kind == "displaced" else scene
+    scene = with_motion(scene) if kind == "displaced" else scene
     back = Field.from_scene(scene).to_scene(scene.aabb, scene.clip, scene.occupancy, scene.background, scene.step)
     assert back.parameter_count == scene.parameter_count and back.is_dynamic == dynamic
     for ours, theirs in zip(back.scales, scene.scales):

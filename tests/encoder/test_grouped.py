@@ -119,7 +119,7 @@ def test_what_goes_on_begins_with_all_scales(tmp_path):
 
 
 def test_frames_of_a_clip_as_a_clip_of_their_own(clip):
-    some = clip.between(7, 19)
+    some = clip.frame_range(7, 19)
     assert some.clip == Clip(13, clip.clip.fps) and len(some.pictures) == 3 * 13 and some.is_dynamic
     assert np.allclose(np.unique(some.pictures.time), np.arange(13) / 12, atol=1e-6)
     for picture in (0, 20, 38):
@@ -130,15 +130,15 @@ def test_frames_of_a_clip_as_a_clip_of_their_own(clip):
         first = some.pictures.offset[picture : picture + 1]
         assert np.array_equal(some.pixels.read(first), clip.pixels.read(clip.pictures.offset[twin : twin + 1]))
     with pytest.raises(DatasetError, match="no picture to train on"):
-        clip.between(FRAMES + 3, FRAMES + 9)
+        clip.frame_range(FRAMES + 3, FRAMES + 9)
 
 
 def test_a_clip_with_fewer_frames(clip):
-    thin = clip.thinned(5)
+    thin = clip.subsample_frames(5)
     assert thin.clip.frame_count == 5 and len(thin.pictures) == 15
     assert thin.clip.duration_s == pytest.approx(clip.clip.duration_s, rel=0.3)
     assert np.allclose(np.unique(thin.pictures.time), np.rint(np.linspace(0, 25, 5)) / 25, atol=1e-6)
-    assert clip.thinned(FRAMES) is clip
+    assert clip.subsample_frames(FRAMES) is clip
 
 
 def test_masks_of_some_pictures(tmp_path):
@@ -147,7 +147,7 @@ def test_masks_of_some_pictures(tmp_path):
         make.write_mask(tmp_path / f"set/masks/{k:04d}.png.png", np.arange(32) + np.zeros((24, 1)) > 3 * k)
     masks = load_dataset(tmp_path / "set", tmp_path / "cache", progress=False).masks
     numbers = np.array([7, 2, 5])
-    some = masks.some(numbers)
+    some = masks.subset(numbers)
     assert np.array_equal(some.counts, masks.counts[numbers])
     for k, number in enumerate(numbers):
         assert np.array_equal(some.usable(k), masks.usable(int(number)))

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gradients import KINDS, Calling, backpropagate, misty, rays_at, reference_gradients
+from gradients import FIELD_KINDS, FieldFunction, backpropagate, random_rays, reference_gradients, translucent_scene
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig
@@ -25,16 +25,16 @@ from kpc.encoder.field.render import Rays, render_reference
 from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_priors, log_densities, sample_capacity
 from kpc.player.cpu import reference
 from numba.core.dispatcher import Dispatcher
-from scenes import displaced, tiny_scene
+from scenes import tiny_scene, with_motion
 
 COLOUR = 1e-4
 GRADIENT = 1e-3
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FIELD_KINDS)
 def test_backpropagate_is_autograd_through_the_reference(kind: tuple[bool, bool, bool]) -> None:
-    scene = misty(*kind)
-    rays = rays_at(scene, 403)
+    scene = translucent_scene(*kind)
+    rays = random_rays(scene, 403)
     targets = torch.rand(403, 3, generator=torch.Generator().manual_seed(1))
     ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
     assert ours["counts"].sum() == theirs["samples"] > 403
@@ -49,7 +49,7 @@ def test_backpropagate_is_autograd_through_the_reference(kind: tuple[bool, bool,
 def test_backpropagate_gives_faint_samples_no_colour_and_hardly_errs() -> None:
     """A sample of weight below 1e-4 gets no colour: off by less than that, `sample_capacity` times at most."""
     scene = tiny_scene()
-    rays = rays_at(scene, 203)
+    rays = random_rays(scene, 203)
     targets = torch.rand(203, 3, generator=torch.Generator().manual_seed(1))
     ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
     colour = 1e-4 * sample_capacity(scene.aabb, scene.step)
@@ -60,8 +60,8 @@ def test_backpropagate_gives_faint_samples_no_colour_and_hardly_errs() -> None:
 
 
 def test_workers_share_the_rays_and_change_nothing_but_rounding() -> None:
-    scene = misty()
-    rays, targets = rays_at(scene, 103), torch.zeros(103, 3)
+    scene = translucent_scene()
+    rays, targets = random_rays(scene, 103), torch.zeros(103, 3)
     one, three = backpropagate(scene, rays, targets, workers=1), backpropagate(scene, rays, targets, workers=3)
     np.testing.assert_array_equal(one["errors"], three["errors"])
     np.testing.assert_array_equal(one["basis"], three["basis"])
@@ -97,8 +97,8 @@ def test_a_machine_s_first_training_equals_its_second(tmp_path: Path) -> None:
 
 
 def test_rays_that_miss_the_box_show_the_background() -> None:
-    scene = misty()
-    rays = rays_at(scene, 13)
+    scene = translucent_scene()
+    rays = random_rays(scene, 13)
     away = replace(rays, origins=rays.origins + 100)
     ours = backpropagate(scene, away, away.backgrounds)
     assert not ours["counts"].any() and not ours["errors"].any() and not ours["theta"].any() and not ours["basis"].any()
@@ -123,15 +123,15 @@ def test_the_reference_has_the_gradient_of_finite_differences() -> None:
             return render_reference(field, rays, aabb, torch.ones(1, 2, 2, 2), 0.3)[0]
 
         return torch.func.functional_call(
-            Calling(field, rendered), {"field.theta": theta, "field.density": density}, ()
+            FieldFunction(field, rendered), {"field.theta": theta, "field.density": density}, ()
         )
 
     assert torch.autograd.gradcheck(colours, (theta, density))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FIELD_KINDS)
 def test_render_is_the_players_reference(kind: tuple[bool, bool, bool]) -> None:
-    scene = misty(*kind)
+    scene = translucent_scene(*kind)
     renderer = SceneRenderer(scene)
     for time in (0.0, 0.3, 0.5, 1.0):
         for camera in scene.cameras:
@@ -144,7 +144,7 @@ def test_render_is_the_players_reference(kind: tuple[bool, bool, bool]) -> None:
 
 
 def test_render_gives_opacity_depth_and_counts() -> None:
-    scene = misty()
+    scene = translucent_scene()
     field, camera = Field.from_scene(scene), scene.cameras[0]
     origins, directions = camera.rays()
     n = len(origins)
@@ -179,7 +179,7 @@ def test_render_gives_opacity_depth_and_counts() -> None:
 
 @pytest.mark.parametrize("moved", [False, True])
 def test_log_densities(moved: bool) -> None:
-    scene = displaced(tiny_scene()) if moved else tiny_scene()
+    scene = with_motion(tiny_scene()) if moved else tiny_scene()
     field = Field.from_scene(scene)
     rng = np.random.default_rng(0)
     points, times = rng.random((500, 3), np.float32), rng.random(500, np.float32)

@@ -60,7 +60,7 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make.write_n3dv(folder / "n3dv", cameras=4)
     make.write_blender(folder / "blender")
     make.write_nerfstudio(folder / "nerfstudio")
-    make.write_unequal(folder / "unequal")
+    make.write_varying_exposure(folder / "unequal")
     make.write_colmap(folder / "colmap", model="OPENCV", lens=(0.06, -0.08, -0.001, 0.0002))
     for k in range(10):
         make.write_mask(folder / f"colmap/masks/{k:04d}.png.png", np.arange(32) + np.zeros((24, 1)) > k)
@@ -569,7 +569,7 @@ def test_a_box_in_contracted_space_is_taken_as_it_is(run: Kpenc, sets: Path, tmp
     code, out, _ = run(sets / "n3dv", "--json", "--space", "contracted", "--box", "-1,-1,-1,1,1,0.5")
     scene = scene_io.read(tmp_path / "out.kpc")
     assert code == 0 and json.loads(out)["box"] == scene.aabb.tolist() == [[-1, -1, -1], [1, 1, 0.5]]
-    assert scene.mapping is not None and scene.mapping.even > 3  # the cameras' distance
+    assert scene.mapping is not None and scene.mapping.uniform_distance > 3  # the cameras' distance
 
 
 def test_a_box_where_nothing_is(run: Kpenc, sets: Path, tmp_path: Path) -> None:

@@ -7,9 +7,9 @@ import pytest
 from kpc.encoder.evaluation.validation_rays import Measured
 from kpc.encoder.rdo.motion_rdo import MOST_STEPS, SHARE, told_cheaply, with_coarser_motion
 from kpc.format.coding.motion_hierarchical import encode_midpoints
-from kpc.format.scene.motion import STEP
+from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Scene
-from scenes import displaced, tiny_scene
+from scenes import tiny_scene, with_motion
 from test_nodes import swaying
 
 
@@ -21,26 +21,26 @@ def errs(scene: Scene, left_out: float = 1e-3):
 @pytest.mark.parametrize("share", [1e9, 72.0, 12.0, 1.5])
 def test_displacements_are_as_coarse_as_their_error_may_be(share):
     """`share`: of the square of motion.STEP; rounding errs by a twelfth of a step's own."""
-    scene, most = displaced(tiny_scene()), share * STEP**2 / 12 / SHARE
+    scene, most = with_motion(tiny_scene()), share * FINEST_STEP**2 / 12 / SHARE
     found = with_coarser_motion(scene, np.ones(scene.motion.shape), errs(scene), most)
-    symbols = found.motion / np.float32(STEP)
+    symbols = found.motion / np.float32(FINEST_STEP)
     multiple = int(np.gcd.reduce(np.rint(symbols).astype(np.int64), axis=None))
     np.testing.assert_array_equal(symbols, np.rint(symbols))
-    assert errs(scene)(found).error - 1e-3 <= share * STEP**2 / 12
+    assert errs(scene)(found).error - 1e-3 <= share * FINEST_STEP**2 / 12
     assert math.sqrt(share) / 3 < multiple <= MOST_STEPS or share > 1e6
     assert with_coarser_motion(found, np.ones(scene.motion.shape), errs(found), most, own=MOST_STEPS) is found
 
 
 @pytest.mark.parametrize("share, expected", [(1e9, 64), (72.0, 8), (12.0, 3), (1.5, 1)])
 def test_where_no_worth_is_told_they_are_the_nearest(share, expected):
-    scene = displaced(tiny_scene())
-    found = with_coarser_motion(scene, None, errs(scene), share * STEP**2 / 12 / SHARE)
-    step = np.float32(expected * STEP)
+    scene = with_motion(tiny_scene())
+    found = with_coarser_motion(scene, None, errs(scene), share * FINEST_STEP**2 / 12 / SHARE)
+    step = np.float32(expected * FINEST_STEP)
     np.testing.assert_array_equal(found.motion, np.rint(scene.motion / step) * step)
 
 
 def test_scenes_in_which_nothing_may_err_or_nothing_moves_stay():
-    scene = displaced(tiny_scene())
+    scene = with_motion(tiny_scene())
     assert with_coarser_motion(scene, None, errs(scene), 0.0) is scene
     assert with_coarser_motion(scene, None, lambda candidate: Measured(math.nan, math.nan), 1e9) is scene
     assert with_coarser_motion(tiny_scene(), None, errs(scene), 1e9).motion is None

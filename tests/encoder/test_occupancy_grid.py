@@ -2,7 +2,7 @@
 
 import numpy as np
 from kpc.encoder.field.occupancy_grid import MORE_MARCHED, OccupancyGrid, grid_shape, in_fewest_slots
-from kpc.format.scene.grid import SPACE_AND_TIME, dilate
+from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 
 SHAPE = (6, 5, 8)
 
@@ -46,8 +46,8 @@ def test_dilation_reaches_all_26_neighbours_and_no_farther() -> None:
 def test_dilation_along_time_too() -> None:
     one = np.zeros((5, 3, 3, 3), bool)
     one[2, 1, 1, 1] = True
-    np.testing.assert_array_equal(dilate(one, SPACE_AND_TIME).all((1, 2, 3)), [False, True, True, True, False])
-    assert dilate(one, SPACE_AND_TIME).sum() == 81
+    np.testing.assert_array_equal(dilate(one, SPACE_TIME_AXES).all((1, 2, 3)), [False, True, True, True, False])
+    assert dilate(one, SPACE_TIME_AXES).sum() == 81
 
 
 def test_all_that_is_seen_is_occupied_at_first() -> None:

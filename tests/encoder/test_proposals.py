@@ -89,7 +89,7 @@ def test_the_histogram_loss_moves_the_proposal_alone_and_none_that_bounds_what_w
 @pytest.fixture(scope="module")
 def surrounded(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("surrounded")
-    make.write_surrounded(folder / "set")
+    make.write_unbounded(folder / "set")
     return load_dataset(folder / "set", folder / "cache", progress=False)
 
 

@@ -14,7 +14,7 @@ from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import Decoder, Scene
 from kpc.player.cpu import reference
-from scenes import SPACES, tiny_scene, varied
+from scenes import VARIANTS, tiny_scene, with_appearances
 
 pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
 SPARE = 0.05
@@ -62,13 +62,13 @@ def directed(scene: Scene, strength: float) -> Scene:
     return replace(scene, decoder=replace(scene.decoder, w2=strength * scene.decoder.w2))
 
 
-@pytest.mark.parametrize("kind", ["static", *(space for space in SPACES if space != "hybrid")])
+@pytest.mark.parametrize("kind", ["static", *(space for space in VARIANTS if space != "hybrid")])
 def test_a_channel_that_says_nothing_new_goes_at_no_cost(kind: str) -> None:
-    scene = redundant(SPACES.get(kind, lambda scene: scene)(tiny_scene(dynamic=kind != "static")))
+    scene = redundant(VARIANTS.get(kind, lambda scene: scene)(tiny_scene(dynamic=kind != "static")))
     rays = rays_of(scene)
     if kind == "ndc":
-        path = scene.mapping.path(rays[0], rays[1])  # as `datasets.rays` gives them
-        rays = path.begin, path.way, rays[2]
+        path = scene.mapping.rays(rays[0], rays[1])  # as `datasets.rays` gives them
+        rays = path.origins, path.directions, rays[2]
     before, fidelity = SceneRenderer(scene).rgb(*rays), Fidelity(scene, rays)
     pruned = prune(scene, rays, fidelity, SPARE)
     assert [len(kept) for kept in pruned.kept] == [8, 7] and len({2, 3} & set(pruned.kept[1])) == 1
@@ -230,7 +230,7 @@ def test_channels_of_unequal_number_look_the_same_in_every_renderer() -> None:
 
 
 def test_the_direction_stays_where_appearances_act_through_it() -> None:
-    scene = varied(tiny_scene())
+    scene = with_appearances(tiny_scene())
     probes = rays_of(scene)
     pruned = prune(scene, probes, lambda candidate: 30.0, 1.0)  # whatever goes costs nothing
     assert pruned.view_worth_db is None and pruned.scene.decoder.w2.any()

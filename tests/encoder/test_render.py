@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gradients import KINDS, Calling, bilinear, misty, rays_at
+from gradients import FIELD_KINDS, FieldFunction, bilinear, random_rays, translucent_scene
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, HybridField, Layout, SummedField
@@ -13,13 +13,13 @@ from kpc.encoder.field.render import Rays, collected, fused_features, meet, reac
 from kpc.encoder.training.cuda_graphs import Recorder
 from kpc.encoder.training.optimisers import Figures, PlainOptimiser, sample_capacity
 from kpc.player.cpu import reference
-from scenes import hybrid, tiny_scene
+from scenes import tiny_scene, with_hybrid_decoder
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FIELD_KINDS)
 def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bool]) -> None:
-    scene = misty(*kind)
-    rays = rays_at(scene, 403)
+    scene = translucent_scene(*kind)
+    rays = random_rays(scene, 403)
     ours = collected(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
     theirs = samples_of(
         rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step, scene.mapping
@@ -39,9 +39,9 @@ def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bo
 
 @pytest.mark.parametrize("short", [0, 300])
 def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(short: int) -> None:
-    scene = misty()
+    scene = translucent_scene()
     # So many rays that all samples fill vectors of 16: what is left over of one rounds otherwise, on one thread.
-    rays, field = rays_at(scene, 112), Field.from_scene(scene)
+    rays, field = random_rays(scene, 112), Field.from_scene(scene)
     told = rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step
     wanted = samples_of(*told)
     n = len(wanted.ray) - short
@@ -62,8 +62,8 @@ def test_mixed_precision_is_float32_within_its_bound() -> None:
     """The layers' inputs and weights err by 2^-9 of themselves, bfloat16's half step, a number of them summed in float32: less than
     1 % of a colour's range; so do gradients, against the largest of their kind.
     """
-    scene = hybrid(misty())
-    rays = rays_at(scene, 203)
+    scene = with_hybrid_decoder(translucent_scene())
+    rays = random_rays(scene, 203)
     samples = samples_of(rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step)
     rgb, gradients = {}, {}
     for mixed in (False, True):
@@ -92,11 +92,11 @@ def test_gradients_are_added_up_in_float32() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("hybrid_decoder", [False, True])
 def test_a_step_on_a_gpu_waits_for_nothing(hybrid_decoder: bool) -> None:
-    scene = hybrid(misty()) if hybrid_decoder else misty()
+    scene = with_hybrid_decoder(translucent_scene()) if hybrid_decoder else translucent_scene()
     field = Field.from_scene(scene).cuda()
     config = TrainConfig(hybrid=hybrid_decoder)
     optimiser = PlainOptimiser(field, config, scene.occupancy.shape[1:])
-    rays, targets = rays_at(scene, 203), torch.rand(203, 3)
+    rays, targets = random_rays(scene, 203), torch.rand(203, 3)
     told = scene.aabb, scene.occupancy, scene.step, scene.extent
     losses = [optimiser.step(k, 0.0, 0.1, rays, targets, *told)[0] for k in range(Figures.LATE + 2)]
     torch.cuda.set_sync_debug_mode("error")
@@ -110,8 +110,8 @@ def test_a_step_on_a_gpu_waits_for_nothing(hybrid_decoder: bool) -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("moved", [False, True])
 def test_a_recorded_step_on_a_gpu_is_the_step(moved: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = misty(True, False, moved)
-    rays, targets = rays_at(scene, 203), torch.rand(203, 3)
+    scene = translucent_scene(True, False, moved)
+    rays, targets = random_rays(scene, 203), torch.rand(203, 3)
     told = scene.aabb, scene.occupancy, scene.step, scene.extent
     found = []
     for records in (True, False):
@@ -130,8 +130,8 @@ def test_a_recorded_step_on_a_gpu_is_the_step(moved: bool, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("moved", [False, True])
 def test_samples_that_are_not_reached_take_no_part(moved: bool) -> None:
-    scene = misty(True, False, moved)
-    rays, field = rays_at(scene, 203), Field.from_scene(scene).double()
+    scene = translucent_scene(True, False, moved)
+    rays, field = random_rays(scene, 203), Field.from_scene(scene).double()
     rays = rays.apply(torch.Tensor.double)
     samples = samples_of(rays, torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy), scene.step)
     whole = meet(field, rays, samples, field.features, scene.extent)
@@ -153,12 +153,12 @@ def test_samples_that_are_not_reached_take_no_part(moved: bool) -> None:
 
 
 def test_rays_that_meet_nothing_have_no_samples() -> None:
-    scene = misty()
-    rays = rays_at(scene, 13)
+    scene = translucent_scene()
+    rays = random_rays(scene, 13)
     away = replace(rays, origins=rays.origins + 100)
     samples = collected(away, scene.aabb, scene.occupancy, scene.step)
     assert len(samples.ray) == 0
-    field = Field.from_scene(hybrid(scene))
+    field = Field.from_scene(with_hybrid_decoder(scene))
     met = meet(field, away, samples, fused_features(field), scene.extent)
     assert (
         torch.equal(shade(field, away, met), away.backgrounds)
@@ -170,7 +170,7 @@ def test_rays_that_meet_nothing_have_no_samples() -> None:
 @pytest.mark.parametrize("moved", [False, True])
 @pytest.mark.parametrize("dynamic", [False, True])
 def test_fused_features_are_plain_ones_with_their_gradient(dynamic: bool, moved: bool) -> None:
-    scene = misty(dynamic, False, moved and dynamic)
+    scene = translucent_scene(dynamic, False, moved and dynamic)
     ours, theirs = Field.from_scene(scene), Field.from_scene(scene).double()
     generator = torch.Generator().manual_seed(0)
     points, times = torch.rand(500, 3, generator=generator), torch.rand(500, generator=generator)
@@ -200,7 +200,7 @@ def test_the_hybrid_decoder_has_the_gradient_of_finite_differences() -> None:
 
     def met(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         changed = {f"field.{name}": value for name, value in zip(parameters, values)}
-        return torch.func.functional_call(Calling(field, rendered), changed, ())  # type: ignore[no-any-return]
+        return torch.func.functional_call(FieldFunction(field, rendered), changed, ())  # type: ignore[no-any-return]
 
     values = tuple(p.detach().clone().requires_grad_() for p in parameters.values())
     assert torch.autograd.gradcheck(met, values)
@@ -209,9 +209,9 @@ def test_the_hybrid_decoder_has_the_gradient_of_finite_differences() -> None:
         assert gradient.abs().max() > 0, name
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FIELD_KINDS)
 def test_pictures_of_a_hybrid_scene_are_the_reference_s(kind: tuple[bool, bool, bool]) -> None:
-    scene = hybrid(misty(*kind))
+    scene = with_hybrid_decoder(translucent_scene(*kind))
     renderer = SceneRenderer(scene)
     for camera in scene.cameras:
         origins, directions = camera.rays()
@@ -226,7 +226,7 @@ def test_pictures_of_a_hybrid_scene_are_the_reference_s(kind: tuple[bool, bool, 
 
 
 def test_a_hybrid_field_is_its_scene_again() -> None:
-    scene = hybrid(tiny_scene())
+    scene = with_hybrid_decoder(tiny_scene())
     field = Field.from_scene(scene)
     assert isinstance(field, HybridField)
     for name, weights in vars(field.decoder_as_data()).items():

@@ -15,7 +15,7 @@ from kpc.encoder.rdo.sequential_finetune import SPREAD, coded_in_groups, order, 
 from kpc.format.coding.quantise import QuantisedScene
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import Decoder, Scene
-from scenes import displaced, hybrid, tiny_scene, varied
+from scenes import tiny_scene, with_appearances, with_hybrid_decoder, with_motion
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STEP = 0.2
@@ -53,7 +53,7 @@ def test_what_is_coded_first_is_coded_most_coarsely() -> None:
     assert in_order[0] == 1 / in_order[-1] == 2**SPREAD and factors[0, "xt"] == factors[0, "zt"]
 
 
-@pytest.mark.parametrize("make", [tiny_scene, partial(tiny_scene, dynamic=False), lambda: displaced(tiny_scene())])
+@pytest.mark.parametrize("make", [tiny_scene, partial(tiny_scene, dynamic=False), lambda: with_motion(tiny_scene())])
 def test_pictures_come_nearer_to_those_of_the_whole(make: Callable[[], Scene]) -> None:
     scene = make()
     plain, better = choose(scene), tuned(scene, scene, choose, 60)
@@ -62,7 +62,7 @@ def test_pictures_come_nearer_to_those_of_the_whole(make: Callable[[], Scene]) -
 
 
 def test_what_is_coded_first_is_coded_as_it_was_and_nothing_but_planes_and_decoder_changes() -> None:
-    scene = displaced(tiny_scene())
+    scene = with_motion(tiny_scene())
     plain, better = choose(scene), tuned(scene, scene, choose, 20)
     assert np.array_equal(better.scales[-1]["xy"].symbols, plain.scales[-1]["xy"].symbols)
     assert not np.array_equal(better.scales[0]["xy"].symbols, plain.scales[0]["xy"].symbols)
@@ -129,7 +129,7 @@ def test_scales_of_unequal_width_and_appearances_and_the_hybrid_decoder() -> Non
                      decoder=as_wide_as(replace(whole, scales=({n: p[..., :5] for n, p in whole.scales[0].items()}, whole.scales[1])),
                                         whole.decoder))  # fmt: skip
     assert as_wide_as(narrow, evenly_wide(narrow).decoder).w2.tobytes() == narrow.decoder.w2.tobytes()
-    for scene in (narrow, varied(whole), hybrid(whole)):
+    for scene in (narrow, with_appearances(whole), with_hybrid_decoder(whole)):
         plain, better = choose(scene), tuned(scene, scene, choose, 40)
         assert error(scene, better) < error(scene, plain)
         assert [a.code.tolist() for a in better.appearances] == [a.code.tolist() for a in plain.appearances]

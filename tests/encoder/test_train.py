@@ -59,7 +59,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="module")
 def surrounded(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("surrounded")
-    make.write_surrounded(folder / "set")
+    make.write_unbounded(folder / "set")
     return load_dataset(folder / "set", folder / "cache", progress=False)
 
 

@@ -23,7 +23,7 @@ from kpc.format.common.errors import TrainingError
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
-from scenes import SPACES, tiny_scene, varied
+from scenes import VARIANTS, tiny_scene, with_appearances
 
 pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
 TINY = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
@@ -105,11 +105,11 @@ def test_a_checkpoint_gives_the_file_that_training_gave(
     assert {p.name for p in tmp_path.iterdir()} == {"set", "out.kpc", "again.kpc", "model.kpck"}
 
 
-@pytest.mark.parametrize("kind", [*SPACES, "still", "varied", "no cameras"])
+@pytest.mark.parametrize("kind", [*VARIANTS, "still", "appearances", "no cameras"])
 def test_every_kind_of_scene_survives_a_checkpoint(tmp_path: Path, kind: str) -> None:
-    others = {"still": lambda scene: tiny_scene(2, dynamic=False), "varied": varied,
+    others = {"still": lambda scene: tiny_scene(2, dynamic=False), "appearances": with_appearances,
               "no cameras": lambda scene: replace(scene, cameras=())}  # fmt: skip
-    scene = (SPACES | others)[kind](tiny_scene(2))
+    scene = (VARIANTS | others)[kind](tiny_scene(2))
     steps = [{name: 0.01 for name in scale} for scale in scene.scales]
     back = codec_model.load(saved(tmp_path / "m.kpck", scene))
     assert scene_io.encode(quantise_scene(back.scene, steps)) == scene_io.encode(quantise_scene(scene, steps))

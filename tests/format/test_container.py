@@ -104,7 +104,7 @@ class Recorded:
         self.asked.append((offset, length))
         return self.data[offset : offset + length]
 
-    def hold(self, offset: int, length: int) -> None:
+    def will_read(self, offset: int, length: int) -> None:
         pass
 
 

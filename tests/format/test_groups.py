@@ -11,14 +11,14 @@ from kpc.format.common.errors import BudgetError, FormatError, UsageError
 from kpc.format.common.media import read_image
 from kpc.format.container import groups, scene_io
 from kpc.format.container.container import Reader
-from kpc.format.container.groups import Groups, LongScene, Part, Span, Timeline
+from kpc.format.container.groups import GroupedScene, GroupInput, Groups, Span, Timeline
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.cpu import reference
 from kpc.player.cpu.motion_map import dynamic_map
 from kpc.player.viewpoints import fit_camera
 from kpc.tools.cli import kpinfo, kpjoin, kprender
 from kpc.tools.cli.serve import Handler, serving
-from scenes import tiny_scene, varied
+from scenes import tiny_scene, with_appearances
 
 import kpc
 
@@ -38,7 +38,7 @@ def scenes() -> list[bytes]:
 def clip(scenes: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Frames 0 to 10, 8 to 18 and 19 to 29."""
     path = tmp_path_factory.mktemp("groups") / "long.kpc"
-    size = groups.write([Part.of(scene, start) for scene, start in zip(scenes, (0, 8, 19), strict=True)], path)
+    size = groups.write([GroupInput.of(scene, start) for scene, start in zip(scenes, (0, 8, 19), strict=True)], path)
     assert size == path.stat().st_size
     return path
 
@@ -52,18 +52,18 @@ def test_one_group_takes_over_from_another_in_the_middle_of_what_they_share():
     for frame, (number, time) in zip(frames, shown, strict=True):
         span = timeline.spans[number]
         assert time == pytest.approx(min((frame - span.start) / max(span.count - 1, 1), 1) if span.count > 1 else 0)
-    assert [timeline.shown(number) for number in range(3)] == [(0, 8 / 21), (8 / 21, 20.5 / 21), (20.5 / 21, 1)]
-    assert timeline.time_in(0, 1.0) == 1 and timeline.time_in(1, 0.0) == 0 and timeline.time_in(2, 0.3) == 0
+    assert [timeline.display_span(number) for number in range(3)] == [(0, 8 / 21), (8 / 21, 20.5 / 21), (20.5 / 21, 1)]
+    assert timeline.local_time(0, 1.0) == 1 and timeline.local_time(1, 0.0) == 0 and timeline.local_time(2, 0.3) == 0
 
 
 def test_two_groups_are_mixed_amid_the_frames_that_they_share():
     timeline = Timeline((Span(100, 11), Span(106, 15), Span(121, 1)), 25.0)
     for frame in np.arange(100, 121.01, 0.25):
-        parts = {number: (time, share) for number, time, share in timeline.mixed((frame - 100) / 21)}
+        parts = {number: (time, share) for number, time, share in timeline.blend_at((frame - 100) / 21)}
         assert sum(share for _, share in parts.values()) == pytest.approx(1)
         assert list(parts) == ([0, 1] if 106 < frame < 110 else [timeline.at((frame - 100) / 21)[0]])
         for number, (time, share) in parts.items():
-            assert time == timeline.time_in(number, (frame - 100) / 21)
+            assert time == timeline.local_time(number, (frame - 100) / 21)
             assert share == pytest.approx(1 if len(parts) == 1 else abs(frame - (110, 106)[number]) / 4)
 
 
@@ -71,7 +71,7 @@ def test_a_clip_goes_over_from_one_group_to_the_next_without_a_jump(clip):
     """Pictures either side of the middle of shared frames, where one that shows alone jumps, are as near as their times."""
     long, camera = kpc.load(clip), kpc.load(clip).cameras[0].resized(8, 6)
     before, middle, after = (kpc.render(long, camera, frame / 29) for frame in (8.99, 9.0, 9.01))
-    (first, t, _), (second, u, share) = long.mixed(9.0 / 29)
+    (first, t, _), (second, u, share) = long.blend_at(9.0 / 29)
     one, other = reference.render(first, camera, t), reference.render(second, camera, u)
     assert share == pytest.approx(0.5) and np.abs(one.rgb - other.rgb).max() > 0.1
     assert np.abs(middle.rgb - (one.rgb + other.rgb) / 2).max() < 1e-6 and np.array_equal(
@@ -83,7 +83,7 @@ def test_a_clip_goes_over_from_one_group_to_the_next_without_a_jump(clip):
 
 def test_a_clip_shows_its_groups(clip, scenes):
     long = kpc.load(clip)
-    assert isinstance(long, LongScene) and long.clip == Clip(30, 10.0)
+    assert isinstance(long, GroupedScene) and long.clip == Clip(30, 10.0)
     camera = long.cameras[0].resized(12, 9)
     for frame, number in ((0, 0), (8, 0), (10, 1), (18, 1), (18.4, 1), (18.6, 2), (29, 2)):
         start = (0, 8, 19)[number]
@@ -135,9 +135,9 @@ def test_one_group_is_held_at_a_time_or_two_that_are_mixed(clip):
     assert long.at(0.2)[0] is first
     second, _ = long.at(0.5)
     assert second is not first and long.at(0.4)[0] is second and long.at(0.0)[0] is not first
-    assert [len(long.mixed(time)) for time in (0.0, 9 / 29, 0.5)] == [1, 2, 1]
-    mixed = [scene for scene, *_ in long.mixed(9 / 29)]
-    assert long.mixed(9.5 / 29)[0][0] is mixed[0] and long.at(0.5)[0] is mixed[1] and len(long._held) == 1
+    assert [len(long.blend_at(time)) for time in (0.0, 9 / 29, 0.5)] == [1, 2, 1]
+    mixed = [scene for scene, *_ in long.blend_at(9 / 29)]
+    assert long.blend_at(9.5 / 29)[0][0] is mixed[0] and long.at(0.5)[0] is mixed[1] and len(long._held) == 1
 
 
 def test_the_budget_is_that_of_a_group(clip, scenes):
@@ -176,7 +176,7 @@ def test_groups_are_read_from_a_server_one_by_one(clip):
                 == scene_io.read(Groups(clip).open(number)).parameter_count
             )
         source = remote.source_of(1)
-        assert source.read_at(0, 4) == b"\x89KPC" and source.received < clip.stat().st_size
+        assert source.read_at(0, 4) == b"\x89KPC" and source.received_bytes < clip.stat().st_size
         source.close()
         assert kpc.load(f"{url}/long.kpc").at(1.0)[0].parameter_count == kpc.load(clip).at(1.0)[0].parameter_count
 
@@ -201,7 +201,7 @@ def test_a_server_without_ranges_sends_it_once(clip, capfd):
 
 def test_parts_of_a_clip_are_put_in_order(scenes, tmp_path, capsys):
     for number, start in enumerate((40, 48, 59)):
-        groups.write([Part.of(scenes[number], start)], tmp_path / f"{number}.kpc")
+        groups.write([GroupInput.of(scenes[number], start)], tmp_path / f"{number}.kpc")
     assert (
         kpjoin.main([*(str(tmp_path / f"{number}.kpc") for number in (2, 0, 1)), "-o", str(tmp_path / "long.kpc")]) == 0
     )
@@ -219,7 +219,7 @@ def test_other_files_follow_one_another(clip, scenes, tmp_path):
 
 def test_what_does_not_make_a_clip_is_refused(clip, scenes, tmp_path, capsys):
     for name, scene, start in (("early", 0, 0), ("late", 1, 12)):
-        groups.write([Part.of(scenes[scene], start)], tmp_path / f"{name}.kpc")
+        groups.write([GroupInput.of(scenes[scene], start)], tmp_path / f"{name}.kpc")
     slower = tmp_path / "slower.kpc"
     slower.write_bytes(coded(replace(tiny_scene(3, scales=1), clip=Clip(11, 12.5))))
     output = tmp_path / "out.kpc"
@@ -235,7 +235,7 @@ def test_what_does_not_make_a_clip_is_refused(clip, scenes, tmp_path, capsys):
     before = clip.read_bytes()
     assert kpjoin.main([str(clip), str(slower), "-o", str(clip)]) == 2 and clip.read_bytes() == before
     with pytest.raises(UsageError, match="leave no frame out"):
-        groups.write([Part.of(scenes[0], 5), Part.of(scenes[1], 5)], output)
+        groups.write([GroupInput.of(scenes[0], 5), GroupInput.of(scenes[1], 5)], output)
 
 
 # --- the tools
@@ -280,8 +280,11 @@ def test_kprender_goes_from_group_to_group(clip, backend, tmp_path):
 
 
 def test_an_appearance_is_looked_up_in_each_group(tmp_path):
-    one, other = varied(tiny_scene(0, scales=1)), varied(tiny_scene(1, scales=1), names=("noon.jpg",))
-    groups.write([Part.of(coded(one), 0), Part.of(coded(other), 11)], tmp_path / "varied.kpc")
+    one, other = (
+        with_appearances(tiny_scene(0, scales=1)),
+        with_appearances(tiny_scene(1, scales=1), names=("noon.jpg",)),
+    )
+    groups.write([GroupInput.of(coded(one), 0), GroupInput.of(coded(other), 11)], tmp_path / "varied.kpc")
     options = [str(tmp_path / "varied.kpc"), "--size", "8x6", "--backend", "reference", "-o"]
     assert kprender.main([*options, str(tmp_path / "noon"), "--appearance", "noon.jpg", "--orbit", "2"]) == 0
     assert kprender.main([*options, str(tmp_path / "dawn"), "--appearance", "dawn.jpg", "--orbit", "2"]) == 2

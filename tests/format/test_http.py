@@ -67,17 +67,17 @@ def test_bytes_come_by_ranges_and_no_more_than_are_wanted(url: str) -> None:
     assert source.read_at(len(DATA) - 10, 100) == DATA[-10:]
     assert source.read_at(len(DATA), 5) == source.read_at(10**9, 5) == source.read_at(5, 0) == b""
     assert Noting.asked[1:] == ["bytes=300000-304999", "bytes=399990-399999"]
-    assert source.received <= FIRST_BYTES + 5010
+    assert source.received_bytes <= FIRST_BYTES + 5010
     source.close()
 
 
 def test_what_is_held_costs_one_request(url: str) -> None:
     source = HttpSource(url)
-    source.hold(100_000, 50_000)
+    source.will_read(100_000, 50_000)
     for start in range(100_000, 150_000, 7000):
         length = min(7000, 150_000 - start)
         assert source.read_at(start, length) == DATA[start : start + length]
-    source.hold(150_000, 10_000)
+    source.will_read(150_000, 10_000)
     assert source.read_at(155_000, 5000) == DATA[155_000:160_000]
     assert Noting.asked == [f"bytes=0-{FIRST_BYTES - 1}", "bytes=100000-149999", "bytes=150000-159999"]
     source.close()
@@ -85,8 +85,8 @@ def test_what_is_held_costs_one_request(url: str) -> None:
 
 def test_all_of_a_file_takes_two_requests_and_nothing_twice(url: str) -> None:
     source = HttpSource(url)
-    source.hold(0, source.size)
-    assert source.read_at(0, source.size) == DATA and source.received == len(DATA)
+    source.will_read(0, source.size)
+    assert source.read_at(0, source.size) == DATA and source.received_bytes == len(DATA)
     assert Noting.asked == [f"bytes=0-{FIRST_BYTES - 1}", f"bytes={FIRST_BYTES}-399999"]
     source.close()
 
@@ -94,7 +94,7 @@ def test_all_of_a_file_takes_two_requests_and_nothing_twice(url: str) -> None:
 def test_what_was_read_of_a_long_answer_is_let_go(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "KEPT_BYTES", 50_000)
     source = HttpSource(url)
-    source.hold(0, source.size)
+    source.will_read(0, source.size)
     for start in range(0, len(DATA), 10_000):
         assert source.read_at(start, 10_000) == DATA[start : start + 10_000]
         assert len(source._answer.data) <= 50_000 + 10_000 + FIRST_BYTES
@@ -119,9 +119,9 @@ def test_a_server_without_ranges_sends_the_whole_file_once(folder: Path, capsys:
     with serving(folder, handler=Whole) as address:
         source = HttpSource(f"{address}/data.bin")
         assert not source.has_ranges and "no ranges, all of it" in capsys.readouterr().err
-        assert source.read_at(0, 64) == DATA[:64] and source.received < 200_000  # the rest is on its way
+        assert source.read_at(0, 64) == DATA[:64] and source.received_bytes < 200_000  # the rest is on its way
         assert source.read_at(399_000, 1000) == DATA[399_000:] and source.read_at(10, 10) == DATA[10:20]
-        assert len(Noting.asked) == 1 and source.received == len(DATA)
+        assert len(Noting.asked) == 1 and source.received_bytes == len(DATA)
         source.close()
         with pytest.raises(BudgetError, match="no ranges, and the whole of 400,000 bytes"):
             HttpSource(f"{address}/data.bin", limit=399_999)
@@ -161,7 +161,7 @@ def breaking(every: int, ranges: bool = True) -> type[Noting]:
 def test_a_connection_that_breaks_off_is_taken_up_again_where_it_ended(folder: Path) -> None:
     said: list[str | None] = []
     with serving(folder, handler=breaking(30_000)) as address:
-        source = HttpSource(f"{address}/data.bin", say=said.append)
+        source = HttpSource(f"{address}/data.bin", report=said.append)
         assert source.read_at(100_000, 100_000) == DATA[100_000:200_000]
         assert Noting.asked[1:] == [f"bytes={start}-199999" for start in range(100_000, 200_000, 30_000)]
         assert (
@@ -180,11 +180,11 @@ def test_without_ranges_it_begins_again_and_gives_up_where_nothing_new_comes(fol
                 super().send(file, count)
 
     with serving(folder, handler=Reviving) as address:
-        source = HttpSource(f"{address}/data.bin", say=lambda message: None)
+        source = HttpSource(f"{address}/data.bin", report=lambda message: None)
         assert source.read_at(390_000, 10_000) == DATA[390_000:] and len(Noting.asked) == 3
         source.close()
     with serving(folder, handler=breaking(90_000, ranges=False)) as address:
-        source = HttpSource(f"{address}/data.bin", say=lambda message: None)
+        source = HttpSource(f"{address}/data.bin", report=lambda message: None)
         assert source.read_at(0, 90_000) == DATA[:90_000]
         with pytest.raises(UnreachableError, match="breaks off|fails"):
             source.read_at(390_000, 10_000)
@@ -201,7 +201,7 @@ def test_a_busy_server_is_asked_again(folder: Path) -> None:
                 super().do_GET()
 
     with serving(folder, handler=Busy) as address:
-        source = HttpSource(f"{address}/data.bin", say=lambda message: None)
+        source = HttpSource(f"{address}/data.bin", report=lambda message: None)
         assert source.read_at(100_000, 10) == DATA[100_000:100_010] and len(Noting.asked) == 5
         source.close()
 
@@ -224,7 +224,7 @@ def test_silence_is_not_waited_out(folder: Path, monkeypatch: pytest.MonkeyPatch
             release.wait(5)
 
     with serving(folder, handler=Silent) as address:
-        source = HttpSource(f"{address}/data.bin", attempts=2, say=lambda message: None)
+        source = HttpSource(f"{address}/data.bin", attempts=2, report=lambda message: None)
         assert source.read_at(0, 1000) == DATA[:1000]
         with pytest.raises(UnreachableError, match="in time"):
             source.read_at(0, 5000)
@@ -236,7 +236,7 @@ def test_a_trickle_is_not_waited_out(folder: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(http, "PATIENCE_S", 0.3)
     monkeypatch.setattr(http, "LEAST_BYTES_S", 1e6)
     with serving(folder, link=Link(rate=50_000)) as address:
-        source = HttpSource(f"{address}/data.bin", attempts=2, say=lambda message: None)
+        source = HttpSource(f"{address}/data.bin", attempts=2, report=lambda message: None)
         with pytest.raises(UnreachableError, match="too slow"):
             source.read_at(0, 60_000)
         source.close()

@@ -7,15 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kpc.encoder.field import field
 from kpc.format.common.errors import FormatError
-from kpc.format.scene.grid import linear
+from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.motion import (
     DISPLACEMENT_LIMIT,
-    STEP,
+    FINEST_STEP,
     QuantisedMotion,
     _fill,
-    moved,
-    places_reached,
+    displace,
     quantise_motion,
+    reached_cells,
 )
 
 RNG = np.random.default_rng(0)
@@ -40,7 +40,7 @@ def test_moved_is_the_formula_in_numpy_and_pytorch(most: float) -> None:
     times = RNG.random(300, np.float32)
     times[:3] = 0, 1, 0.25  # on rows, too
     wanted = np.array([by_hand(*a, offsets) for a in zip(u.astype(np.float64), times, strict=True)])
-    ours = np.array([moved(p, linear(offsets, float(t))) for p, t in zip(u, times, strict=True)])
+    ours = np.array([displace(p, sample_linear(offsets, float(t))) for p, t in zip(u, times, strict=True)])
     np.testing.assert_allclose(ours, wanted, atol=1e-6 * (1 + most))
     theirs = field.moved(*map(torch.from_numpy, (u, times, offsets))).numpy()
     np.testing.assert_allclose(theirs, wanted, atol=1e-6 * (1 + most))
@@ -60,7 +60,7 @@ def test_rounding(most: float) -> None:
     offsets = RNG.uniform(-most, most, (3, 2, 2, 2, 3)).astype(np.float32)
     offsets[0, 0, 0, 0] = most, -most, 0
     rounded = quantise_motion(offsets)
-    assert rounded.step == STEP or most > 32767 * STEP
+    assert rounded.step == FINEST_STEP or most > 32767 * FINEST_STEP
     # Half a step, and the rounding of the product to float32.
     assert np.abs(rounded.dequantise() - offsets).max() <= rounded.step / 2 + most * 2.0**-23
 
@@ -68,10 +68,10 @@ def test_rounding(most: float) -> None:
 @pytest.mark.parametrize("multiple", [1, 3, 16])
 def test_multiples_of_several_steps_are_stored_as_such(multiple: int) -> None:
     offsets = np.random.default_rng(0).integers(-30, 30, (2, 3, 2, 2, 3)).astype(np.float32) * np.float32(
-        multiple * STEP
+        multiple * FINEST_STEP
     )
     rounded = quantise_motion(offsets)
-    assert rounded.step == multiple * STEP and np.abs(rounded.symbols).max() <= 30
+    assert rounded.step == multiple * FINEST_STEP and np.abs(rounded.symbols).max() <= 30
     np.testing.assert_array_equal(rounded.dequantise(), offsets)
 
 
@@ -100,21 +100,21 @@ def test_no_place_that_is_reached_is_missed(seed: int, stretch: float) -> None:
     offsets *= np.float32(stretch / (6 * max(nodes[1:])))  # no slope beyond `stretch`, summed over three axes
     offsets += rng.uniform(-0.3, 0.3, (nodes[0], 1, 1, 1, 3)).astype(np.float32)  # all of it moves, as fast as it likes
     occupancy = rng.random(rng.integers(1, 9, 4)) < 0.1
-    reached = places_reached(occupancy, offsets)
+    reached = reached_cells(occupancy, offsets)
     slots, shape = len(occupancy), np.array(occupancy.shape[1:])
     for slot, *cell in np.argwhere(occupancy):
         for _ in range(5):
             u, time = ((cell + rng.random(3)) / shape)[::-1], (slot + rng.random()) / slots
-            place = moved(u.astype(np.float32), linear(offsets, time))
+            place = displace(u.astype(np.float32), sample_linear(offsets, time))
             assert reached[slot][tuple(np.minimum((place[::-1] * shape).astype(int), shape - 1))]
 
 
 def test_nothing_occupied_reaches_nothing_and_no_motion_stays_close() -> None:
     still = np.zeros((2, 2, 2, 2, 3), np.float32)
-    assert not places_reached(np.zeros((2, 4, 5, 6), bool), still).any()
+    assert not reached_cells(np.zeros((2, 4, 5, 6), bool), still).any()
     occupancy = np.zeros((1, 8, 8, 8), bool)
     occupancy[0, 3, 4, 5] = True
-    assert places_reached(occupancy, still).sum() == 27
+    assert reached_cells(occupancy, still).sum() == 27
 
 
 def test_boxes_are_filled() -> None:

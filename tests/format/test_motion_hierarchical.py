@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from kpc.format.coding.motion_hierarchical import WEIGHT_BITS, cubic, decode_midpoints, encode_midpoints, passes
 from kpc.format.coding.motion_raster import encode_nodes
 from kpc.format.common.errors import FormatError
-from plain import assert_plain_python_prints_the_same
 from test_nodes import PAINTS, painted, swaying
+from without_numba import assert_same_without_numba
 
 sizes = st.tuples(*4 * [st.integers(2, 6)])
 
@@ -108,7 +108,7 @@ for symbols in (swaying(5, 3, 4, 4), painted("noise", (3, 2, 3, 4, 3), 1), paint
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    assert_plain_python_prints_the_same(PLAIN, "kpc.format.coding.motion_hierarchical:walk")
+    assert_same_without_numba(PLAIN, "kpc.format.coding.motion_hierarchical:walk")
 
 
 # --- damage and hostility

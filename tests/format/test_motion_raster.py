@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kpc.format.coding.motion_raster import LORENZO, NEIGHBOURS, decode_nodes, encode_nodes, encode_with
 from kpc.format.common.errors import FormatError
-from plain import assert_plain_python_prints_the_same
+from without_numba import assert_same_without_numba
 
 shapes = st.tuples(*4 * [st.integers(1, 5)], st.just(3))
 
@@ -112,7 +112,7 @@ for symbols in (swaying(5, 3, 4, 4), painted("noise", (3, 2, 3, 4, 3), 1), paint
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    assert_plain_python_prints_the_same(PLAIN, "kpc.format.coding.motion_raster:walk")
+    assert_same_without_numba(PLAIN, "kpc.format.coding.motion_raster:walk")
 
 
 # --- damage and hostility

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kpc.format.coding.occupancy_codec import decode_cells, encode_cells
 from kpc.format.common.errors import FormatError
-from plain import assert_plain_python_prints_the_same
+from without_numba import assert_same_without_numba
 
 shapes = st.tuples(*4 * [st.integers(1, 7)])
 
@@ -74,7 +74,7 @@ for occupancy in (rolling(3, 8, 9, 10), np.random.default_rng(1).random((2, 5, 1
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    assert_plain_python_prints_the_same(PLAIN, "kpc.format.coding.occupancy_codec:walk")
+    assert_same_without_numba(PLAIN, "kpc.format.coding.occupancy_codec:walk")
 
 
 # --- damage and hostility

@@ -7,21 +7,21 @@ from kpc.format.common.errors import BudgetError
 from kpc.format.container.container import Reader
 from kpc.format.container.partial import PartialScene, SegmentedPlane, runs
 from kpc.format.container.scene_io import SceneReader, read
-from kpc.format.scene.grid import linear
+from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import TIME_PLANES, Scene
 from kpc.player.cpu import reference
 from kpc.tools.cli.serve import serving
 from partial_scenes import coded, opened
-from scenes import SPACES, tiny_scene, varied
+from scenes import VARIANTS, tiny_scene, with_appearances
 
 
 def picture(scene: Scene, time: float) -> np.ndarray:
     return reference.render(scene, scene.cameras[0].resized(24, 18), time).rgb
 
 
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("space", VARIANTS)
 def test_with_all_its_segments_it_is_the_scene(space: str) -> None:
-    partial, whole = opened(varied(SPACES[space](tiny_scene(4, time=10))))
+    partial, whole = opened(with_appearances(VARIANTS[space](tiny_scene(4, time=10))))
     partial.fetch(partial.needed(2, 0.0, 1.0))
     assert len(partial.scene.appearances) == 3
     for time in (0.0, 0.123, 0.5, 1.0):
@@ -52,7 +52,7 @@ def test_what_a_time_needs_suffices_and_nothing_of_it_can_be_spared(segment_rows
         assert np.array_equal(picture(partial.scene, time), picture(whole, time))
         for scale, planes in enumerate(partial.scene.scales):
             for name in TIME_PLANES:
-                assert np.array_equal(linear(planes[name], time), linear(whole.scales[scale][name], time))
+                assert np.array_equal(sample_linear(planes[name], time), sample_linear(whole.scales[scale][name], time))
         rows = 9 * time
         moving = [n for n in needed if partial.entry(n).plane >= 3]
         for entry in map(partial.entry, moving):
@@ -101,7 +101,7 @@ def test_a_scale_and_a_span_over_http_cost_their_bytes_and_two_requests(tmp_path
         index = reader.index
         coarse = index[partial.needed(1, 0.0, 0.05)[-1]]
         assert reader.source.size > 400_000
-        assert reader.source.received <= max(coarse.offset + coarse.stored_length, 1 << 16)  # type: ignore[attr-defined]
+        assert reader.source.received_bytes <= max(coarse.offset + coarse.stored_length, 1 << 16)  # type: ignore[attr-defined]
         reader.source.close()  # type: ignore[attr-defined]
 
 

@@ -29,7 +29,7 @@ from kpc.format.coding.raw_planes import encode_segment
 from kpc.format.common.errors import FormatError
 from kpc.tools.vectors.specvectors import walked
 from numba import njit
-from plain import assert_plain_python_prints_the_same
+from without_numba import assert_same_without_numba
 
 shapes = st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 5))
 
@@ -244,7 +244,7 @@ for symbols, coded, lattice in (
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    assert_plain_python_prints_the_same(PLAIN, "kpc.format.coding.rans:adapt")
+    assert_same_without_numba(PLAIN, "kpc.format.coding.rans:adapt")
 
 
 # --- damage and hostility

@@ -22,11 +22,11 @@ from kpc.format.container.container import (
 )
 from kpc.format.container.scene_io import APPEARANCE_LIMIT, NAME_LIMIT, SceneReader, encode, read, scene_chunks, write
 from kpc.format.scene.cameras import Camera
-from kpc.format.scene.motion import STEP, QuantisedMotion
+from kpc.format.scene.motion import FINEST_STEP, QuantisedMotion
 from kpc.format.scene.scene import TIME_PLANES, Appearance
 from kpc.format.scene.space import Contraction, DeviceCoordinates
 from kpc.tools.vectors.specvectors import seen_through
-from scenes import displaced, faced, tiny_scene, varied
+from scenes import in_device_coordinates, tiny_scene, with_appearances, with_motion
 from test_cells import rolling
 from test_midpoints import drifting
 from test_nodes import swaying
@@ -97,7 +97,7 @@ def test_a_contracted_scene_comes_back_and_says_so_in_a_chunk_of_its_own():
 
 
 def test_device_coordinates_come_back():
-    scene = faced(tiny_scene())
+    scene = in_device_coordinates(tiny_scene())
     coded = quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
     back = read(encode(coded)).mapping
     assert isinstance(back, DeviceCoordinates) and np.array_equal(back.frame, scene.mapping.frame)
@@ -118,7 +118,7 @@ def test_device_coordinates_come_back():
     ],
 )
 def test_device_coordinates_that_make_no_sense_are_not_written(change):
-    scene = faced(tiny_scene())
+    scene = in_device_coordinates(tiny_scene())
     broken = replace(scene, mapping=replace(scene.mapping, **change))
     with pytest.raises(FormatError, match="WARP"):
         encode(quantise_scene(broken, [{name: 0.02 for name in scale} for scale in scene.scales]))
@@ -140,19 +140,19 @@ def test_a_prefix_without_the_mapping_shows_nothing():
 
 
 def test_a_motion_grid_comes_back_and_says_so_in_a_chunk_of_its_own():
-    scene = displaced(tiny_scene(), most=3.0)
+    scene = with_motion(tiny_scene(), most=3.0)
     coded = quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
     data = encode(coded)
     assert_same(read(data), coded)
     assert [e.kind for e in Reader(data).index][:3] == ["SCNE", "MOVE", "DECO"]
     back = read(data).dequantise().motion
-    assert back is not None and np.abs(back - scene.motion).max() <= STEP / 2 + 1e-7
+    assert back is not None and np.abs(back - scene.motion).max() <= FINEST_STEP / 2 + 1e-7
     index = Reader(data).index
     assert np.array_equal(read(data[: index[4].offset], allow_partial=True).dequantise().motion, back)
 
 
 def test_a_motion_grid_counts_against_the_budget():
-    data = encode(replace(quantised(), motion=QuantisedMotion(np.zeros((40, 9, 9, 9, 3), np.int16), STEP)))
+    data = encode(replace(quantised(), motion=QuantisedMotion(np.zeros((40, 9, 9, 9, 3), np.int16), FINEST_STEP)))
     least = 5 * Reader(data).header.value_count
     assert len(data) < least
     with pytest.raises(BudgetError, match="motion grid"):
@@ -160,7 +160,7 @@ def test_a_motion_grid_counts_against_the_budget():
 
 
 def quantised_varied(names: tuple[str, ...] = ("dawn.jpg", "noon.jpg", "dusk.jpg")) -> QuantisedScene:
-    scene = varied(tiny_scene(), names)
+    scene = with_appearances(tiny_scene(), names)
     return quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
 
 
@@ -172,7 +172,7 @@ def test_appearances_come_back_and_say_so_in_a_chunk_of_their_own():
     assert "appe" not in [e.kind for e in Reader(encode(quantised())).index]
     scene = read(data).dequantise()
     assert scene.parameter_count == coded.parameter_count == quantised().parameter_count + 3 * 16
-    for ours, theirs in zip(scene.appearances, varied(tiny_scene()).appearances, strict=True):
+    for ours, theirs in zip(scene.appearances, with_appearances(tiny_scene()).appearances, strict=True):
         np.testing.assert_allclose(ours.code, theirs.code, rtol=2.0**-11)  # float16 rounds to the nearest
 
 
@@ -252,7 +252,7 @@ def test_files_without_context_coded_symbols_stay_readable():
 
 
 def test_grids_are_context_coded_and_count_against_the_budget_all_the_same():
-    scene = replace(quantised(time=6), occupancy=rolling(), motion=QuantisedMotion(swaying(), STEP))
+    scene = replace(quantised(time=6), occupancy=rolling(), motion=QuantisedMotion(swaying(), FINEST_STEP))
     chunks = scene_chunks(scene)
     now = pack(chunks, scene_values := sum(p.symbols.size for scale in scene.scales for p in scale.values()))
     before = pack([replace(chunk, coded={}) for chunk in chunks], scene_values)
@@ -268,7 +268,7 @@ def test_grids_are_context_coded_and_count_against_the_budget_all_the_same():
 
 @pytest.mark.parametrize("motion, codec", [(swaying(), CODEC_SYMBOLS), (drifting(), CODEC_MIDPOINTS)])
 def test_displacements_are_told_in_the_order_that_takes_less(motion, codec):
-    scene = replace(quantised(time=6), motion=QuantisedMotion(motion, STEP))
+    scene = replace(quantised(time=6), motion=QuantisedMotion(motion, FINEST_STEP))
     data = encode(scene)
     assert next(entry.codec for entry in Reader(data).index if entry.kind == "MOVE") == codec
     assert_same(read(data), scene)
@@ -449,11 +449,11 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
         (lambda s: {"mapping": Contraction(float("nan"))}, "WARP"),
         (lambda s: {"mapping": Contraction(float("inf"))}, "WARP"),
         (lambda s: {"mapping": Contraction(40000 * s.step)}, "WARP"),
-        (lambda s: {"motion": QuantisedMotion(np.zeros((1, 2, 2, 2, 3), np.int16), STEP)}, "MOVE"),
-        (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 1, 3), np.int16), STEP)}, "MOVE"),
+        (lambda s: {"motion": QuantisedMotion(np.zeros((1, 2, 2, 2, 3), np.int16), FINEST_STEP)}, "MOVE"),
+        (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 1, 3), np.int16), FINEST_STEP)}, "MOVE"),
         (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int16), 0.0)}, "MOVE"),
         (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int16), 1.0)}, "MOVE"),
-        (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int32), STEP)}, "motion"),
+        (lambda s: {"motion": QuantisedMotion(np.zeros((2, 2, 2, 2, 3), np.int32), FINEST_STEP)}, "motion"),
         (lambda s: {"aabb": np.full((2, 3), np.nan, np.float32)}, "box"),
         (lambda s: {"step": 0.0}, "ray step"),
         (lambda s: {"step": 1e-9}, "ray step"),
@@ -524,7 +524,7 @@ def test_decoding_is_fast():
 
 
 def test_grids_and_planes_count_against_the_budget_together():
-    scene = replace(quantised(time=6), occupancy=rolling(), motion=QuantisedMotion(swaying(), STEP))
+    scene = replace(quantised(time=6), occupancy=rolling(), motion=QuantisedMotion(swaying(), FINEST_STEP))
     data = encode(scene)
     reader = SceneReader(data)
     raw = {entry.kind: entry.raw_length for entry in reader.index}

@@ -9,9 +9,9 @@ import torch
 from kpc.encoder.field import kernels
 from kpc.encoder.field import render as in_pytorch
 from kpc.format.scene.scene import Scene
-from kpc.format.scene.space import FAR, LEAST_DISPARITY, Contraction, DeviceCoordinates, contract, expand
+from kpc.format.scene.space import FAR, MIN_DISPARITY, Contraction, DeviceCoordinates, contract, uncontract
 from kpc.player.cpu.reference import places, render
-from scenes import faced, look_at, surrounded, tiny_scene
+from scenes import in_device_coordinates, look_at, tiny_scene, with_contraction
 
 AABB = np.array([[-1.0, -0.5, 2.0], [3.0, 1.5, 2.5]])
 RNG = np.random.default_rng(0)
@@ -46,7 +46,7 @@ def test_expand_is_the_inverse() -> None:
     p = points(500, 1e6)
     u, radius = contract(p, AABB)
     # Near the border the place is 1/2 - 1/(4 r): rounded to 2^-53, r is known to 4 r 2^-53 of itself.
-    np.testing.assert_array_less(np.abs(expand(u, AABB) - p).max(1), 1e-14 * (1 + radius) ** 2)
+    np.testing.assert_array_less(np.abs(uncontract(u, AABB) - p).max(1), 1e-14 * (1 + radius) ** 2)
 
 
 def test_contraction_has_no_step_at_the_faces_of_the_box() -> None:
@@ -61,24 +61,24 @@ def test_contraction_has_no_step_at_the_faces_of_the_box() -> None:
 def test_s_and_distance_both_ways(even: float) -> None:
     mapping = Contraction(even)
     t = even * np.logspace(-6, np.log10(FAR), 1000)
-    s = mapping.progress(t)
+    s = mapping.parameter(t)
     np.testing.assert_allclose(s, [d if d <= even else even * (2 - even / d) for d in t], rtol=1e-12)
     np.testing.assert_allclose(mapping.distance(s), t, rtol=1e-12)
-    assert (np.diff(s) > 0).all() and s[-1] == pytest.approx(mapping.end)
+    assert (np.diff(s) > 0).all() and s[-1] == pytest.approx(mapping.s_end)
     single = mapping.distance(s.astype(np.float32))
     # s / even is known to 2^-23; what is left up to 2 is as small as 1 / FAR.
     np.testing.assert_allclose(single, t, rtol=2 * FAR * 2.0**-23)
     assert single.dtype == np.float32
-    assert mapping.progress(np.array([1e6 * even, np.inf])) == pytest.approx([(2 - 1e-6) * even, 2 * even])
+    assert mapping.parameter(np.array([1e6 * even, np.inf])) == pytest.approx([(2 - 1e-6) * even, 2 * even])
     assert mapping.distance(np.array([3 * even])) == pytest.approx(FAR * even)
 
 
 @pytest.mark.parametrize("even", [0.7, 40.0])
 def test_every_language_puts_samples_in_the_same_place(even: float) -> None:
     """numpy, PyTorch and the kernels, in float32 against float64; GLSL is held by pictures in test_renderer."""
-    scene = replace(surrounded(tiny_scene(0)), mapping=Contraction(even))
+    scene = replace(with_contraction(tiny_scene(0)), mapping=Contraction(even))
     origins, directions = (a[::60] for a in scene.cameras[0].rays())
-    s = np.linspace(0, scene.mapping.end, 50, dtype=np.float32)[None].repeat(len(origins), 0)
+    s = np.linspace(0, scene.mapping.s_end, 50, dtype=np.float32)[None].repeat(len(origins), 0)
     exact = places(scene, *(a.astype(np.float64) for a in (origins, directions, s)))
     assert exact[0].max() == pytest.approx(FAR * even) and exact[0].min() == 0
     for name, got in {
@@ -111,9 +111,9 @@ def _kernels(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.nd
 def test_a_step_counts_for_the_density_as_the_derivatives_say() -> None:
     """sigma is per unit of contracted length outwards: the sum over steps is its integral along the ray."""
     aabb = np.array([[-1, -1, -1], [1, 1, 1]], np.float64)
-    scene = replace(surrounded(tiny_scene(0)), aabb=aabb, mapping=Contraction(2.0))
+    scene = replace(with_contraction(tiny_scene(0)), aabb=aabb, mapping=Contraction(2.0))
     step = 1e-4
-    s = (np.arange(int(scene.mapping.end / step))[None] + 0.5) * step
+    s = (np.arange(int(scene.mapping.s_end / step))[None] + 0.5) * step
     _, _, stretch = places(scene, np.zeros((1, 3)), np.array([[1.0, 0, 0]]), s)
     # From the middle to 1, then 2 - 1/t up to t = FAR even.
     assert (stretch * step).sum() == pytest.approx(2 - 1 / (2 * FAR), rel=1e-4)
@@ -145,7 +145,7 @@ def test_glsl_skips_empty_space_but_never_a_sample() -> None:
     from kpc.player.gl.renderer import Renderer
     from scenes import look_at
 
-    scene = surrounded(tiny_scene(3))
+    scene = with_contraction(tiny_scene(3))
     occupancy = RNG.random((1, 40, 50, 60)) < 0.002
     scene = replace(scene, occupancy=occupancy, step=0.01)
     renderer = Renderer(gl.context(), scene)
@@ -172,13 +172,13 @@ def test_device_coordinates_are_what_a_pinhole_and_a_pair_of_them_see() -> None:
     ndc = coordinates()
     points = before(ndc, 300)
     right, up, back, eye = ndc.frame.T
-    for point, place in zip(points, ndc.place(points), strict=True):
+    for point, place in zip(points, ndc.to_device(points), strict=True):
         depth = -(point - eye) @ back
         assert place[:2] == pytest.approx([(point - eye) @ right / depth, (point - eye) @ up / depth])
         # A pinhole a baseline to the right sees it moved by baseline / depth.
         moved = (point - eye - ndc.baseline * right) @ right / depth
         assert place[2] == pytest.approx(ndc.baseline / ndc.near - (place[0] - moved), abs=1e-9)
-    np.testing.assert_allclose(ndc.expand(ndc.place(points)), points, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(ndc.to_world(ndc.to_device(points)), points, rtol=1e-9, atol=1e-9)
 
 
 def test_rays_stay_straight_and_distances_come_back() -> None:
@@ -188,19 +188,21 @@ def test_rays_stay_straight_and_distances_come_back() -> None:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions = directions[(forward := -(directions @ ndc.frame[:, 2]) > 0.05)]
     eyes = eyes[forward]
-    path = ndc.path(eyes, directions)
-    np.testing.assert_allclose(np.linalg.norm(path.way, axis=1), 1)
-    s = path.length[:, None] * np.array([0.0, 0.1, 0.5, 0.9, 0.999])
+    path = ndc.rays(eyes, directions)
+    np.testing.assert_allclose(np.linalg.norm(path.directions, axis=1), 1)
+    s = path.s_infinity[:, None] * np.array([0.0, 0.1, 0.5, 0.9, 0.999])
     t = path.distance(s)
     world = eyes[:, None] + t[..., None] * directions[:, None]
-    np.testing.assert_allclose(ndc.place(world), path.begin[:, None] + s[..., None] * path.way[:, None], atol=1e-9)
+    np.testing.assert_allclose(
+        ndc.to_device(world), path.origins[:, None] + s[..., None] * path.directions[:, None], atol=1e-9
+    )
     depths = (ndc.frame[:, 3] - world) @ ndc.frame[:, 2]
     own = (ndc.frame[:, 3] - eyes) @ ndc.frame[:, 2]
     np.testing.assert_allclose(depths[:, 0], np.maximum(own, ndc.near))
     assert (own > ndc.near).any() and (own < 0).any()
-    assert (path.distance(path.length[:, None] * 2) < np.inf).all()  # capped
+    assert (path.distance(path.s_infinity[:, None] * 2) < np.inf).all()  # capped
     assert np.allclose(
-        path.distance(path.length[:, None]), path.start[:, None] + path.pace[:, None] * (1 / LEAST_DISPARITY - 1)
+        path.distance(path.s_infinity[:, None]), path.t_start[:, None] + path.t_scale[:, None] * (1 / MIN_DISPARITY - 1)
     )
 
 
@@ -209,23 +211,23 @@ def test_rays_in_single_precision() -> None:
     eyes = ndc.frame[:, 3] + RNG.uniform(-0.4, 0.4, (500, 3))
     directions = before(ndc, 500) - eyes
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    exact, single = ndc.path(eyes, directions), ndc.path(eyes.astype(np.float32), directions.astype(np.float32))
+    exact, single = ndc.rays(eyes, directions), ndc.rays(eyes.astype(np.float32), directions.astype(np.float32))
     far = -(directions @ ndc.frame[:, 2]) > 0.1
-    np.testing.assert_allclose(single.begin[far], exact.begin[far], atol=2e-5)
-    np.testing.assert_allclose(single.way[far], exact.way[far], atol=2e-4)
-    assert single.begin.dtype == single.way.dtype == np.float32
+    np.testing.assert_allclose(single.origins[far], exact.origins[far], atol=2e-5)
+    np.testing.assert_allclose(single.directions[far], exact.directions[far], atol=2e-4)
+    assert single.origins.dtype == single.directions.dtype == np.float32
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_rays_that_do_not_go_forward_see_the_background(dtype: type) -> None:
-    scene = faced(tiny_scene(0))
+    scene = in_device_coordinates(tiny_scene(0))
     assert isinstance(scene.mapping, DeviceCoordinates)
     right, _, back, eye = scene.mapping.frame.T
     directions = np.array([back, right, right - 1e-5 * back]).astype(dtype)
-    path = scene.mapping.path(np.tile(eye, (3, 1)).astype(dtype), directions)
+    path = scene.mapping.rays(np.tile(eye, (3, 1)).astype(dtype), directions)
     assert (
-        np.isfinite(path.begin).all()
-        and np.isfinite(path.way).all()
+        np.isfinite(path.origins).all()
+        and np.isfinite(path.directions).all()
         and np.isfinite(path.distance(np.ones((3, 1), dtype))).all()
     )
     behind = look_at(tuple(eye), tuple(eye + back), 8, 6, 5.0)
@@ -234,20 +236,20 @@ def test_rays_that_do_not_go_forward_see_the_background(dtype: type) -> None:
 
 
 def test_depth_is_in_the_world() -> None:
-    scene = faced(tiny_scene(4))
+    scene = in_device_coordinates(tiny_scene(4))
     camera = scene.cameras[0]
     seen = render(scene, camera, 0.5)
     origins, directions = camera.rays()
     solid = (seen.opacity > 0.99).ravel()
     ends = (origins + seen.depth.ravel()[:, None] * directions)[solid]
-    places_of_ends = scene.mapping.place(ends.astype(np.float64))
+    places_of_ends = scene.mapping.to_device(ends.astype(np.float64))
     assert solid.sum() > 20
     assert (places_of_ends >= scene.aabb[0] - 0.1).all() and (places_of_ends <= scene.aabb[1] + 0.1).all()
 
 
 def test_bounds_hold_the_box() -> None:
-    scene = faced(tiny_scene(4))
+    scene = in_device_coordinates(tiny_scene(4))
     inside = scene.aabb[0] + RNG.random((500, 3)) * (scene.aabb[1] - scene.aabb[0])
-    world, bounds = scene.mapping.expand(inside), scene.bounds
+    world, bounds = scene.mapping.to_world(inside), scene.bounds
     assert (world >= bounds[0]).all() and (world <= bounds[1]).all()
     assert np.array_equal(tiny_scene(4).bounds, tiny_scene(4).aabb)

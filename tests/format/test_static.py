@@ -9,12 +9,12 @@ import pytest
 from kpc.format.coding.quantise import needed_texels, quantise_scene
 from kpc.format.container.scene_io import write
 from kpc.format.scene.scene import TIME_PLANES, Scene
-from kpc.format.scene.static import cells_touched, static_cells, static_share, unchanging_cells, unchanging_share
+from kpc.format.scene.static import cells_reading, constant_cells, constant_fraction, static_cells, static_fraction
 from kpc.player.cpu import motion_map, reference
 from kpc.player.cpu.motion_map import dynamic_map, still_share
 from kpc.player.cpu.reference import Moment
 from kpc.tools.cli import kpinfo
-from scenes import SPACES, tiny_scene
+from scenes import VARIANTS, tiny_scene
 
 
 def still(scene: Scene) -> Scene:
@@ -47,8 +47,8 @@ def test_a_texel_moves_the_slab_of_cells_that_read_it(plane: str, axis: int) -> 
         True  # between 5/8 and 7/8, closed: cells 4 and 7 touch it at their edges
     )
     assert np.array_equal(static_cells(scene), ~moving)
-    assert static_share(scene) == 0.75 and unchanging_share(scene) == 0.5
-    assert np.array_equal(unchanging_cells(scene), ~moving.any(axis=0))
+    assert static_fraction(scene) == 0.75 and constant_fraction(scene) == 0.5
+    assert np.array_equal(constant_cells(scene), ~moving.any(axis=0))
 
 
 def test_kpinfo_tells_the_shares(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -64,7 +64,7 @@ def test_kpinfo_tells_the_shares(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 def test_what_is_constant_but_not_one_never_changes_and_yet_is_not_static() -> None:
     scene = wavering(box_of_cells(), "yt", slice(None), slice(None))
-    assert static_share(scene) == 0 and unchanging_share(scene) == 1
+    assert static_fraction(scene) == 0 and constant_fraction(scene) == 1
 
 
 def test_only_occupied_cells_count_and_one_that_comes_and_goes_changes() -> None:
@@ -72,17 +72,19 @@ def test_only_occupied_cells_count_and_one_that_comes_and_goes_changes() -> None
     occupancy = np.zeros((4, 8, 8, 8), bool)
     occupancy[:, 0, 0, :4] = True
     assert (
-        static_share(replace(scene, occupancy=occupancy)) == 1 == unchanging_share(replace(scene, occupancy=occupancy))
+        static_fraction(replace(scene, occupancy=occupancy))
+        == 1
+        == constant_fraction(replace(scene, occupancy=occupancy))
     )
     occupancy[2, 0, 0, 0] = False
-    assert unchanging_share(replace(scene, occupancy=occupancy)) == 0.75
-    assert static_share(replace(scene, occupancy=np.zeros_like(occupancy))) == 1
+    assert constant_fraction(replace(scene, occupancy=occupancy)) == 0.75
+    assert static_fraction(replace(scene, occupancy=np.zeros_like(occupancy))) == 1
 
 
 def test_scenes_without_time_planes_are_static() -> None:
     scene = tiny_scene(dynamic=False)
     assert static_cells(scene).shape == scene.occupancy.shape
-    assert static_share(scene) == unchanging_share(scene) == still_share(scene) == 1
+    assert static_fraction(scene) == constant_fraction(scene) == still_share(scene) == 1
 
 
 def test_in_static_cells_features_are_those_of_the_static_scene() -> None:
@@ -103,14 +105,14 @@ def test_in_static_cells_features_are_those_of_the_static_scene() -> None:
 
 
 def test_cells_and_texels_touch_as_the_encoder_has_it() -> None:
-    """`needed_texels` tells which texels a cell needs, `cells_touched` which cells a texel serves."""
+    """`needed_texels` tells which texels a cell needs, `cells_reading` which cells a texel serves."""
     for texels, cells in [(1, 5), (2, 3), (5, 8), (8, 5), (9, 8), (17, 17), (30, 4)]:
         for cell in range(cells):
             occupancy = np.zeros((1, 1, 1, cells), bool)
             occupancy[..., cell] = True
             needed = needed_texels(occupancy, "xt", 1, texels)[0]
             assert [
-                bool(cells_touched(texel, 0, cells)[cell]) for texel in np.eye(texels, dtype=bool)
+                bool(cells_reading(texel, 0, cells)[cell]) for texel in np.eye(texels, dtype=bool)
             ] == needed.tolist()
 
 
@@ -120,13 +122,13 @@ def test_displaced_cells_are_not_static() -> None:
     motion[1, 0, 0, 0] = 0.01  # the node in the corner; its support reaches to 1/4 along x, 1/2 along y and z
     moving = np.zeros((8, 8, 8), bool)
     moving[:5, :5, :3] = True
-    assert np.array_equal(unchanging_cells(replace(scene, motion=motion)), ~moving)
+    assert np.array_equal(constant_cells(replace(scene, motion=motion)), ~moving)
     assert np.array_equal(static_cells(replace(scene, motion=motion)), np.repeat(~moving[None], 4, axis=0))
 
 
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("space", VARIANTS)
 def test_the_map_is_grey_where_nothing_moves(space: str) -> None:
-    scene = SPACES[space](tiny_scene())
+    scene = VARIANTS[space](tiny_scene())
     still_scene = replace(still(scene), motion=None if scene.motion is None else np.zeros_like(scene.motion))
     camera = scene.cameras[0]
     for shown, colourful in ((still_scene, False), (scene, True)):

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from kpc.format.coding.quantise import round_decoder, weights_of
 from kpc.format.coding.weights import COARSEST, FINEST, LARGEST, decode_weights, encode_weights
 from kpc.format.common.errors import FormatError
-from plain import assert_plain_python_prints_the_same
 from scenes import tiny_scene
+from without_numba import assert_same_without_numba
 
 SHAPES = [(5,), (3, 4), (1,), (2, 3, 7)]
 
@@ -74,7 +74,7 @@ def test_weights_of_a_decoder_take_fewer_bytes_than_zstd_makes_of_them() -> None
 
 
 def test_plain_python_codes_the_same() -> None:
-    assert_plain_python_prints_the_same(
+    assert_same_without_numba(
         "from test_weights import encoded, some\n"
         "for seed in range(3):\n"
         "    print(encoded(some(seed, 60 * 6 ** seed)).hex())",

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from kpc.format.common.errors import DatasetError
-from kpc.format.scene.cameras import Camera, Shot, load_shots, save_shots
+from kpc.format.scene.cameras import Camera, View, load_views, save_views
 from kpc.format.scene.rotations import quaternion_of, rotation_of
 from kpc.player.app.camera_paths import GAP_S, CameraPath
 from scenes import look_at
@@ -24,7 +24,7 @@ def path_of(
     times: tuple[float, ...] = (0.0, 0.2, 0.2, 0.9), ats: tuple[float | None, ...] = (0.0, 1.0, 4.0, 5.0)
 ) -> CameraPath:
     return CameraPath(
-        tuple(Shot(view, time, f"{n}.png", at) for n, (view, time, at) in enumerate(zip(VIEWS, times, ats)))
+        tuple(View(view, time, f"{n}.png", at) for n, (view, time, at) in enumerate(zip(VIEWS, times, ats)))
     )
 
 
@@ -134,7 +134,7 @@ def test_a_path_is_kept_in_a_camera_file(tmp_path: Path) -> None:
     path = path_of()
     path.save(tmp_path / "path.json")
     got = CameraPath.load(tmp_path / "path.json")
-    assert len(load_shots(tmp_path / "path.json")) == 4
+    assert len(load_views(tmp_path / "path.json")) == 4
     for one, other in zip(got.keyframes, path.keyframes, strict=True):
         assert (one.time, one.at_s, one.file, one.camera.fl_x, one.camera.width) == (
             other.time, other.at_s, other.file, other.camera.fl_x, other.camera.width
@@ -143,13 +143,13 @@ def test_a_path_is_kept_in_a_camera_file(tmp_path: Path) -> None:
 
 
 def test_views_without_seconds_are_evenly_apart(tmp_path: Path) -> None:
-    save_shots(tmp_path / "c.json", [Shot(view, 0.1, "a.png") for view in VIEWS])
+    save_views(tmp_path / "c.json", [View(view, 0.1, "a.png") for view in VIEWS])
     assert "at" not in json.loads((tmp_path / "c.json").read_text())["frames"][0]
     assert CameraPath.load(tmp_path / "c.json").end_s == 3 * GAP_S
 
 
 def test_keyframes_of_another_size_see_the_same() -> None:
-    path = CameraPath((Shot(VIEWS[0], 0, "a", 0.0), Shot(VIEWS[1].resized(96, 72), 0, "b", 1.0)))
+    path = CameraPath((View(VIEWS[0], 0, "a", 0.0), View(VIEWS[1].resized(96, 72), 0, "b", 1.0)))
     assert path.at(1.0)[0].fl_x == pytest.approx(VIEWS[1].fl_x) and path.at(1.0)[0].width == 48
 
 
@@ -188,14 +188,14 @@ def test_a_path_that_leads_nowhere_is_refused(
 def test_a_camera_file_of_another_kind_is_refused(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "bad.json").write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(DatasetError, match=words):
-        load_shots(tmp_path / "bad.json")
+        load_views(tmp_path / "bad.json")
 
 
 def test_a_camera_file_without_end_is_not_read_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kpc.format.scene.cameras.LARGEST_FILE", 1 << 10)
     (tmp_path / "big.json").write_text(" " * 2000)
     with pytest.raises(DatasetError, match="larger"):
-        load_shots(tmp_path / "big.json")
+        load_views(tmp_path / "big.json")
 
 
 def test_a_camera_with_nan_is_none() -> None:

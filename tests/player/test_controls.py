@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from kpc.format.scene.scene import Clip
 from kpc.player.app.controls import FADE_S, SPEEDS, AppearanceSelection, Playback, View
 from kpc.player.viewpoints import Rig
-from scenes import tiny_scene, varied
+from scenes import tiny_scene, with_appearances
 
 SCENE = tiny_scene(0)
 RIG = Rig.of(SCENE)
@@ -108,7 +108,7 @@ def test_speeds() -> None:
 
 
 def test_appearances_follow_one_another_smoothly_and_end_where_they_began() -> None:
-    scene = varied(tiny_scene())
+    scene = with_appearances(tiny_scene())
     codes = [np.zeros(16, np.float32), *(appearance.code for appearance in scene.appearances)]
     appearance = AppearanceSelection(scene)
     assert appearance.names == ("average", "dawn.jpg", "noon.jpg", "dusk.jpg") and not appearance.code.any()

@@ -14,15 +14,15 @@ from kpc.player.cpu.simd import LARGEST
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LADDER, Quality
 from scenes import (
-    SPACES,
-    bring,
-    displaced,
-    flat,
+    VARIANTS,
+    linear_per_cell,
     look_at,
-    of_first_degree,
-    one_sided,
+    one_texel_deep,
+    stream_planes,
     tiny_scene,
-    uneven,
+    unequal_scales,
+    view_independent,
+    with_motion,
     without_planes,
 )
 
@@ -40,10 +40,10 @@ def baking_of(scene: Scene, camera: Camera = CAMERA, time: float = 0.0) -> Bakin
 
 
 SCENES = {
-    "even": lambda: one_sided(tiny_scene(4, channels=16)),
-    "uneven": uneven,
-    "flat": flat,
-    "displaced": lambda: displaced(one_sided(tiny_scene(4, channels=16))),
+    "even": lambda: view_independent(tiny_scene(4, channels=16)),
+    "unequal scales": unequal_scales,
+    "one texel deep": one_texel_deep,
+    "displaced": lambda: with_motion(view_independent(tiny_scene(4, channels=16))),
 }
 
 
@@ -74,7 +74,7 @@ def test_corners_hold_what_a_sample_there_finds(make) -> None:
 
 
 def test_what_overflows_is_finite() -> None:
-    scene = one_sided(tiny_scene(4, channels=16))
+    scene = view_independent(tiny_scene(4, channels=16))
     for value in (3e38, -3e38, 1e-38):
         for name in SPACE_PLANES:
             scene.scales[1][name][:] = value
@@ -84,7 +84,9 @@ def test_what_overflows_is_finite() -> None:
 
 @pytest.mark.parametrize("change", [{"step": 2.0}, {"termination": 1 / 16}, {"across": 4}, {"resolution": 0.5}])
 def test_qualities_mean_what_they_mean_for_planes(change: dict[str, float]) -> None:
-    scene = displaced(of_first_degree(one_sided(tiny_scene(4, scales=1, channels=32, resolution=(90, 80, 70)))))
+    scene = with_motion(
+        linear_per_cell(view_independent(tiny_scene(4, scales=1, channels=32, resolution=(90, 80, 70))))
+    )
     camera = look_at((4.8, 2.0, 4.4), (0.1, 0.05, 0.05), 61, 45, 60.0) if "across" in change else CAMERA
     assert Baking.serves(scene)
     renderers = [Renderer(gl.context(), scene, replace(quality, **change)) for quality in (BAKED, FOLDED)]
@@ -100,7 +102,7 @@ def test_qualities_mean_what_they_mean_for_planes(change: dict[str, float]) -> N
 @pytest.mark.parametrize("space", ["box", "displaced"])
 def test_pictures_are_near_those_of_the_reference(space: str) -> None:
     """Of a scene of 24 texels, smooth over six. What is exact, or static, looks up planes."""
-    scene = SPACES[space](one_sided(tiny_scene(4, channels=16)))
+    scene = VARIANTS[space](view_independent(tiny_scene(4, channels=16)))
     renderer = Renderer(gl.context(), scene, BAKED)
     assert renderer._marching_kind(moving=True) is (Baking if renderer.casts else None)
     for time in (0.1, 0.5, 0.9):
@@ -118,13 +120,13 @@ def test_pictures_are_near_those_of_the_reference(space: str) -> None:
 
 
 def test_what_it_takes_is_counted() -> None:
-    baking = baking_of(one_sided(tiny_scene(4, channels=16)))
+    baking = baking_of(view_independent(tiny_scene(4, channels=16)))
     taken = baking.grid.nbytes + baking._known.nbytes + sum(plane.nbytes for plane in baking._planes)
     assert taken == Baking.bytes_for(baking._scene) and taken + baking._room.nbytes == baking.memory_bytes
 
 
 def test_a_picture_hangs_on_none_before_it() -> None:
-    scene = displaced(one_sided(tiny_scene(4, channels=16)))
+    scene = with_motion(view_independent(tiny_scene(4, channels=16)))
     renderer = Renderer(gl.context(), scene, LADDER["balanced"])
     for time in (0.1, 0.11, 0.7, 0.12):
         got = renderer.render(CAMERA, time)
@@ -134,26 +136,26 @@ def test_a_picture_hangs_on_none_before_it() -> None:
 
 
 def test_planes_that_arrive_later_count() -> None:
-    scene = one_sided(tiny_scene(4, channels=16))
+    scene = view_independent(tiny_scene(4, channels=16))
     early = without_planes(scene)
     renderer, whole = Renderer(gl.context(), early, BAKED), Renderer(gl.context(), scene, BAKED)
     renderer.render(CAMERA, 0.5)
-    bring(renderer, early, scene)
+    stream_planes(renderer, early, scene)
     np.testing.assert_array_equal(renderer.render(CAMERA, 0.5).rgb, whole.render(CAMERA, 0.5).rgb)
 
 
 def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
-    assert Baking.serves(one_sided(tiny_scene(channels=16)))
-    fine = one_sided(tiny_scene(scales=1, channels=30, resolution=(200, 180, 120)))
+    assert Baking.serves(view_independent(tiny_scene(channels=16)))
+    fine = view_independent(tiny_scene(scales=1, channels=30, resolution=(200, 180, 120)))
     assert np.prod(corners_of(fine)) > MOST_CORNERS
-    mapped = [SPACES[space](one_sided(tiny_scene(channels=16))) for space in ("ndc", "contracted")]
+    mapped = [VARIANTS[space](view_independent(tiny_scene(channels=16))) for space in ("ndc", "contracted")]
     for scene in (
         *mapped,
         tiny_scene(channels=16),
-        one_sided(tiny_scene(channels=16, dynamic=False)),
-        one_sided(tiny_scene()),
+        view_independent(tiny_scene(channels=16, dynamic=False)),
+        view_independent(tiny_scene()),
         fine,
-        SPACES["hybrid"](tiny_scene(channels=16)),
+        VARIANTS["hybrid"](tiny_scene(channels=16)),
     ):
         assert not Baking.serves(scene)
         got, wanted = (Renderer(gl.context(), scene, quality).render(CAMERA, 0.5) for quality in (BAKED, FOLDED))

@@ -16,16 +16,16 @@ from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LADDER, Quality
 from numba import njit
 from scenes import (
-    SPACES,
-    bring,
-    displaced,
-    flat,
+    VARIANTS,
+    linear_per_cell,
     look_at,
-    of_first_degree,
-    one_sided,
+    one_texel_deep,
+    stream_planes,
     tiny_scene,
-    uneven,
-    varied,
+    unequal_scales,
+    view_independent,
+    with_appearances,
+    with_motion,
     without_planes,
 )
 
@@ -71,9 +71,9 @@ VIEWS = {
 def test_pictures_are_those_of_the_reference(kind: type, where: str, view: Camera) -> None:
     """Through a grid, where that holds all there is."""
     scene = tiny_scene(4, scales=1, channels=32)
-    scene = of_first_degree(one_sided(scene)) if kind is Baking else scene
+    scene = linear_per_cell(view_independent(scene)) if kind is Baking else scene
     if where in ("displaced", "contracted"):
-        scene = SPACES[where](scene)
+        scene = VARIANTS[where](scene)
     elif where == "opaque":
         scene = replace(scene, decoder=replace(scene.decoder, density_bias=60.0))
     elif where == "fog":
@@ -95,13 +95,13 @@ def test_pictures_are_those_of_the_reference(kind: type, where: str, view: Camer
 SCENES = {
     "two scales": lambda: tiny_scene(4, channels=16),
     "five channels": lambda: tiny_scene(4, channels=5, scales=3),
-    "uneven": uneven,
-    "one texel along z": flat,
-    "one-sided": lambda: one_sided(tiny_scene(4)),
+    "unequal scales": unequal_scales,
+    "one texel along z": one_texel_deep,
+    "one-sided": lambda: view_independent(tiny_scene(4)),
     "static": lambda: tiny_scene(4, dynamic=False),
-    "appearances": lambda: varied(tiny_scene(4)),
-    "contracted": lambda: SPACES["contracted"](tiny_scene(4)),
-    "contracted and static": lambda: SPACES["contracted"](tiny_scene(4, dynamic=False)),
+    "appearances": lambda: with_appearances(tiny_scene(4)),
+    "contracted": lambda: VARIANTS["contracted"](tiny_scene(4)),
+    "contracted and static": lambda: VARIANTS["contracted"](tiny_scene(4, dynamic=False)),
 }
 
 
@@ -138,8 +138,8 @@ def test_what_overflows_is_no_crash(value: float) -> None:
 @pytest.mark.parametrize("kind", [Lookup, Baking])
 @pytest.mark.parametrize("edges", [(0.0, 1.0, 1.0), (1.0, 1.0, 1e-6)])
 def test_boxes_without_a_volume_show_the_background(edges: tuple[float, float, float], kind: type) -> None:
-    scene = displaced(tiny_scene(4, channels=16))
-    scene = replace(one_sided(scene) if kind is Baking else scene, aabb=np.array([[0, 0, 0], edges], np.float32))
+    scene = with_motion(tiny_scene(4, channels=16))
+    scene = replace(view_independent(scene) if kind is Baking else scene, aabb=np.array([[0, 0, 0], edges], np.float32))
     for camera in (CAMERA, look_at((0.0, 0.0, 0.0), (1.0, 0.4, 0.3), 33, 21, 30.0)):
         got = renderer_of(scene, kind).render(camera, 1.0)
         assert np.isfinite(got.rgb).all() and np.abs(got.rgb - scene.background).max() < 0.02
@@ -158,7 +158,7 @@ def test_planes_are_as_near_as_their_steps() -> None:
 @pytest.mark.parametrize("space", ["box", "displaced", "contracted"])
 def test_rungs_are_as_near_as_by_shaders(rung: str, space: str) -> None:
     """While the clip plays, too."""
-    scene, camera = SPACES[space](tiny_scene(4, channels=16)), CAMERA.resized(160, 120)
+    scene, camera = VARIANTS[space](tiny_scene(4, channels=16)), CAMERA.resized(160, 120)
     by_shaders, itself = Renderer(gl.context(), scene, LADDER[rung]), renderer_of(scene, quality=LADDER[rung])
     by_shaders.casts = False
     for time in (0.4, 0.41, 0.42, 0.43):
@@ -170,7 +170,7 @@ def test_rungs_are_as_near_as_by_shaders(rung: str, space: str) -> None:
 def test_scenes_that_it_would_not_serve_are_marched_by_shaders() -> None:
     assert Lookup.serves(tiny_scene()) and Lookup.serves(tiny_scene(dynamic=False))
     for space in ("ndc", "hybrid"):
-        scene = SPACES[space](tiny_scene(4))
+        scene = VARIANTS[space](tiny_scene(4))
         renderer = Renderer(gl.context(), scene, FOLDED)
         assert not Lookup.serves(scene) and renderer.marched_by.endswith("shaders")
         assert np.isfinite(renderer.render(CAMERA, 0.5).rgb).all()
@@ -183,11 +183,11 @@ def test_scenes_that_it_would_not_serve_are_marched_by_shaders() -> None:
 
 
 def test_planes_that_arrive_later_count() -> None:
-    scene = displaced(tiny_scene(4))
+    scene = with_motion(tiny_scene(4))
     early = without_planes(scene)
     renderer, whole = renderer_of(early), renderer_of(scene)
     renderer.render(CAMERA, 0.5)
-    bring(renderer, early, scene)
+    stream_planes(renderer, early, scene)
     np.testing.assert_array_equal(renderer.render(CAMERA, 0.5).rgb, whole.render(CAMERA, 0.5).rgb)
 
 
@@ -205,9 +205,9 @@ def test_what_it_takes_is_counted() -> None:
 @pytest.mark.parametrize("kind", [Lookup, Baking])
 def test_what_is_rehearsed_is_what_pictures_need(kind: type) -> None:
     """Whether or not anything is displaced, colours have sides or something moves."""
-    for scene in [make() for make in SCENES.values()] if kind is Lookup else [uneven(), flat()]:
+    for scene in [make() for make in SCENES.values()] if kind is Lookup else [unequal_scales(), one_texel_deep()]:
         rehearse(kind, scene)
         before = list(cast.signatures)
-        for shown in (scene, displaced(scene)) if scene.is_dynamic else (scene,):
+        for shown in (scene, with_motion(scene)) if scene.is_dynamic else (scene,):
             renderer_of(shown, kind).render(CAMERA, 0.3)
         assert cast.signatures == before

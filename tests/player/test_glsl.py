@@ -3,7 +3,7 @@
 import gl
 import numpy as np
 import pytest
-from kpc.format.scene.motion import moved
+from kpc.format.scene.motion import displace
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT
 from kpc.format.scene.space import Contraction, contract
 from kpc.player.cpu.reference import sigmoid
@@ -47,19 +47,19 @@ def test_a_place_is_seen_where_its_ray_leaves_the_raster() -> None:
 
 def test_distances_in_contracted_space() -> None:
     mapping = Contraction(EVEN)
-    s = RNG.uniform(0, float(mapping.end), N)
+    s = RNG.uniform(0, float(mapping.s_end), N)
     glsl = '#include "ray.glsl"\n#include "space.glsl"\n'
     t = gl.evaluate(glsl, "vec4(distance_of(a.x, 5.0))", columns(s), CONTRACTED=1)[:, 0]
     # Near the end t is even / (2 - s / even), which multiplies an error of s by (t / even)^2.
     np.testing.assert_allclose(t, mapping.distance(s), rtol=1e-4)
     back = gl.evaluate(glsl, "vec4(progress_of(a.x, 5.0))", columns(t), CONTRACTED=1)[:, 0]
-    np.testing.assert_allclose(back, mapping.progress(t.astype(np.float64)), rtol=1e-6)
+    np.testing.assert_allclose(back, mapping.parameter(t.astype(np.float64)), rtol=1e-6)
     y = RNG.normal(size=(N, 3)) * 10 ** RNG.uniform(-1, 3, (N, 1))
     u = gl.evaluate(glsl, "vec4(contracted(a.xyz), 0.0)", columns(*y.T), CONTRACTED=1)[:, :3]
     wanted, radius = contract(y, np.array([[-1.0, -1, -1], [1, 1, 1]]))
     np.testing.assert_allclose(u, 4 * wanted - 2, atol=1e-6)
     stretch = gl.evaluate(glsl, "vec4(stretch_of(a.xyz, b.x, 5.0))", columns(*y.T), columns(t), CONTRACTED=1)[:, 0]
-    np.testing.assert_allclose(stretch, mapping.stretch(t.astype(np.float64), radius), rtol=1e-5)
+    np.testing.assert_allclose(stretch, mapping.density_scale(t.astype(np.float64), radius), rtol=1e-5)
 
 
 @pytest.mark.parametrize("tau", [1e-6, 1e-2, 1.0])
@@ -134,4 +134,4 @@ def test_places_are_moved(nodes: tuple[int, int, int]) -> None:
     got = gl.evaluate('#include "motion.glsl"\n', f"vec4(moved(grid, {counts}, a.xyz), 0.0)", columns(*u.T), grid=grid)[
         :, :3
     ]
-    np.testing.assert_allclose(got, moved(u, offsets), atol=2e-6)
+    np.testing.assert_allclose(got, displace(u, offsets), atol=2e-6)

@@ -13,7 +13,7 @@ from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import BudgetError
 from kpc.format.container import groups, scene_io
 from kpc.format.container.container import Reader, open_source
-from kpc.format.container.groups import Groups, Part
+from kpc.format.container.groups import GroupInput, Groups
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.gl.renderer import Renderer
 from kpc.player.streaming.group_playback import GroupPlayback
@@ -40,7 +40,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scenes = [
         replace(scene, clip=Clip(11, 2.0), cameras=scene.cameras if k == 0 else ()) for k, scene in enumerate(scenes)
     ]
-    groups.write([Part.of(coded(scene), start) for scene, start in zip(scenes, (0, 8, 19), strict=True)], path)
+    groups.write([GroupInput.of(coded(scene), start) for scene, start in zip(scenes, (0, 8, 19), strict=True)], path)
     return path
 
 

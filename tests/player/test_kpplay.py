@@ -14,13 +14,13 @@ from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.media import read_image
 from kpc.format.container.scene_io import write
 from kpc.tools.cli.serve import Handler, serving
-from scenes import tiny_scene, varied
+from scenes import tiny_scene, with_appearances
 
 
 @pytest.fixture(scope="module")
 def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scene") / "tiny.kpc"
-    scene = varied(tiny_scene(4))
+    scene = with_appearances(tiny_scene(4))
     write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
     return path
 

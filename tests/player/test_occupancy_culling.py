@@ -12,7 +12,7 @@ from kpc.player.gl import renderer as module
 from kpc.player.gl.renderer import Renderer
 from kpc.player.gl.textures import Layout, Rows
 from kpc.player.quality import LADDER, Quality
-from scenes import SPACES, bring, displaced, look_at, tiny_scene, without_planes
+from scenes import VARIANTS, look_at, stream_planes, tiny_scene, with_motion, without_planes
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
 FOLDED = Quality(folded=True)
@@ -51,7 +51,7 @@ def densities_of_folded(scene: Scene, places: np.ndarray, time: float) -> np.nda
 
 
 @pytest.mark.parametrize(
-    "scene", [moving(), moving(5, (9, 20, 1)), displaced(moving())], ids=["even", "odd", "displaced"]
+    "scene", [moving(), moving(5, (9, 20, 1)), with_motion(moving())], ids=["even", "odd", "displaced"]
 )
 def test_densities_are_those_of_folded_planes(scene: Scene) -> None:
     rng, thinning = np.random.default_rng(3), thinning_of(scene)
@@ -92,7 +92,7 @@ def test_nothing_is_empty_where_no_density_is_less() -> None:
 
 @pytest.mark.parametrize("space", ["box", "displaced", "ndc"])
 def test_rays_pass_by_what_is_empty_and_pictures_stay(space: str) -> None:
-    scene = SPACES[space](moving())
+    scene = VARIANTS[space](moving())
     whole, thin = Renderer(gl.context(), scene, FOLDED), Renderer(gl.context(), scene, replace(FOLDED, thin=1 / 100))
     for time in (0.1, 0.5, 0.9):
         wanted, got = whole.render(CAMERA, time), thin.render(CAMERA, time)
@@ -113,7 +113,7 @@ def test_planes_that_arrive_later_count() -> None:
     quality = replace(FOLDED, thin=1 / 100)
     renderer, whole = Renderer(gl.context(), early, quality), Renderer(gl.context(), scene, quality)
     renderer.render(CAMERA, 0.5)
-    bring(renderer, early, scene)
+    stream_planes(renderer, early, scene)
     got, wanted = renderer.render(CAMERA, 0.5), whole.render(CAMERA, 0.5)
     np.testing.assert_array_equal(got.samples, wanted.samples)
     np.testing.assert_array_equal(got.rgb, wanted.rgb)
@@ -123,6 +123,6 @@ def test_scenes_that_it_would_not_serve_keep_their_cells() -> None:
     assert Thinning.serves(moving())
     one_slot = replace(moving(), occupancy=moving().occupancy[:1])
     fine = moving(resolution=(40, 20, 16))  # more than two texels a cell
-    for scene in (one_slot, fine, SPACES["hybrid"](moving()), SPACES["contracted"](moving())):
+    for scene in (one_slot, fine, VARIANTS["hybrid"](moving()), VARIANTS["contracted"](moving())):
         assert not Thinning.serves(scene)
         Renderer(gl.context(), scene, replace(FOLDED, thin=1 / 100)).render(CAMERA, 0.5)

@@ -12,7 +12,7 @@ from kpc.player.cpu.reference import Part, box_range, render
 from kpc.player.gl import renderer as module
 from kpc.player.gl.renderer import COMPUTE_VERSION, TRIAL_AFTER, Renderer
 from kpc.player.quality import DEFAULT, LADDER, Quality, climbed
-from scenes import SPACES, look_at, tiny_scene, varied
+from scenes import VARIANTS, look_at, tiny_scene, with_appearances
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
 
@@ -40,9 +40,9 @@ def test_settings_that_draw_nothing_are_refused(fault: dict[str, float]) -> None
         Quality(**fault)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("space", VARIANTS)
 def test_every_rung_draws_the_scene_and_the_last_exactly(space: str) -> None:
-    scene = SPACES[space](tiny_scene(4))
+    scene = VARIANTS[space](tiny_scene(4))
     renderer, wanted = Renderer(gl.context(), scene), render(scene, CAMERA, 0.62)
     for name, quality in LADDER.items():
         renderer.quality = quality
@@ -51,9 +51,9 @@ def test_every_rung_draws_the_scene_and_the_last_exactly(space: str) -> None:
         assert psnr(got.rgb, wanted.rgb) > (60 if name == "reference" else 20), name
 
 
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("space", VARIANTS)
 def test_compute_shaders_draw_the_same(space: str) -> None:
-    ctx, scene = gl.context(), SPACES[space](tiny_scene(4))
+    ctx, scene = gl.context(), VARIANTS[space](tiny_scene(4))
     if ctx.version_code < COMPUTE_VERSION:
         pytest.skip("this OpenGL has no compute shaders")
     camera = CAMERA.resized(61, 43)  # no whole number of work groups
@@ -123,10 +123,10 @@ def around(angles: np.ndarray) -> list[Camera]:
 
 @pytest.mark.parametrize(
     ("space", "size"),
-    [*((space, (64, 48)) for space in SPACES), *(("box", size) for size in ((33, 17), (1, 1), (4096, 1), (3, 64)))],
+    [*((space, (64, 48)) for space in VARIANTS), *(("box", size) for size in ((33, 17), (1, 1), (4096, 1), (3, 64)))],
 )
 def test_while_a_clip_plays_only_what_has_changed_is_marched_again(space: str, size: tuple[int, int]) -> None:
-    scene, camera, times = SPACES[space](tiny_scene(4)), CAMERA.resized(*size), np.linspace(0.4, 0.5, 9)
+    scene, camera, times = VARIANTS[space](tiny_scene(4)), CAMERA.resized(*size), np.linspace(0.4, 0.5, 9)
     renderer, whole = Renderer(gl.context(), scene, FOLLOWING), Renderer(gl.context(), scene)
     wanted = whole.render(camera, 0.5).rgb
     assert psnr(played(renderer, [camera] * 9, times), wanted) > 40
@@ -255,7 +255,7 @@ def test_a_camera_that_looks_elsewhere_sees_what_is_there() -> None:
 
 
 def test_a_picture_follows_none_of_another_quality_nor_appearance_nor_of_a_scene_less_refined() -> None:
-    scene = varied(tiny_scene(4, scales=3))
+    scene = with_appearances(tiny_scene(4, scales=3))
     dawn, dusk = (scene.appearance(name) for name in ("dawn.jpg", "dusk.jpg"))
     renderer, whole = Renderer(gl.context(), scene, FOLLOWING), Renderer(gl.context(), scene)
 
@@ -466,7 +466,7 @@ def test_each_texel_is_met_by_a_ray() -> None:
 
 @pytest.mark.parametrize("space", ["contracted", "ndc"])
 def test_where_space_is_mapped_texels_are_counted_along_a_ray(space: str) -> None:
-    scene = SPACES[space](tiny_scene(4))
+    scene = VARIANTS[space](tiny_scene(4))
     renderer, whole = Renderer(gl.context(), scene, Quality(blur=0.0005)), Renderer(gl.context(), scene)
     once, twice = (module.texels_spanned(scene, CAMERA.resized(64 * k, 48 * k)) for k in (1, 2))
     assert 0.1 < once < 0.5 and twice == pytest.approx(once / 2, rel=0.01)  # tiny scenes have 8 to 12 texels across
@@ -508,15 +508,15 @@ def test_rays_a_pixel_follow_what_it_spans(monkeypatch: pytest.MonkeyPatch) -> N
     renderer.quality = Quality()
     assert renderer.rays_across(camera) == 1
     for space in ("contracted", "ndc"):
-        assert Renderer(gl.context(), SPACES[space](tiny_scene(4)), Quality(across=4)).rays_across(camera) == 1
+        assert Renderer(gl.context(), VARIANTS[space](tiny_scene(4)), Quality(across=4)).rays_across(camera) == 1
 
 
 # --- shared look-ups, scales, extremes
 
 
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("space", VARIANTS)
 def test_sharing_look_ups_of_coarser_scales_is_close(space: str) -> None:
-    scene = SPACES[space](tiny_scene(4, scales=3, resolution=(48, 40, 32)))
+    scene = VARIANTS[space](tiny_scene(4, scales=3, resolution=(48, 40, 32)))
     renderer, wanted = Renderer(gl.context(), scene, Quality(share=2.0)), render(scene, CAMERA, 0.62)
     got = renderer.render(CAMERA, 0.62)
     assert renderer._scales_shared() == (1 if space == "contracted" else 2)

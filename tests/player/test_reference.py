@@ -10,7 +10,7 @@ from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TERMINATION, Scene
 from kpc.player.cpu import reference
 from kpc.player.cpu.reference import Part, render, render_rays
-from scenes import look_at, tiny_scene, varied
+from scenes import look_at, tiny_scene, with_appearances
 
 
 def plain_bilinear(plane: np.ndarray, u: float, v: float) -> np.ndarray:
@@ -158,7 +158,7 @@ def test_times_outside_the_clip_are_refused(time: float) -> None:
 
 @pytest.mark.parametrize("part", Part)
 def test_an_appearance_is_a_change_of_the_hidden_bias_and_of_colour_alone(part: Part) -> None:
-    scene = varied(tiny_scene(4))
+    scene = with_appearances(tiny_scene(4))
     camera, code = scene.cameras[0].resized(24, 18), scene.appearance("noon.jpg")
     average, shown = (render(scene, camera, 0.3, part=part, appearance=a) for a in (None, code))
     biased = replace(scene, decoder=replace(scene.decoder, b1=scene.decoder.b1 + code))
@@ -171,7 +171,7 @@ def test_an_appearance_is_a_change_of_the_hidden_bias_and_of_colour_alone(part: 
 
 
 def test_codes_that_no_decoder_knows_are_refused() -> None:
-    scene = varied(tiny_scene(4))
+    scene = with_appearances(tiny_scene(4))
     with pytest.raises(ValueError, match="shape"):
         render(scene, scene.cameras[0], 0.3, appearance=np.zeros(15, np.float32))
     with pytest.raises(ValueError, match="0 appearances"):
@@ -179,17 +179,17 @@ def test_codes_that_no_decoder_knows_are_refused() -> None:
 
 
 def test_appearances_by_name_and_between_two() -> None:
-    scene = varied(tiny_scene(4))
+    scene = with_appearances(tiny_scene(4))
     dawn, noon, _ = (appearance.code for appearance in scene.appearances)
     assert scene.appearance("noon.jpg") is noon
-    np.testing.assert_array_equal(scene.appearance_between("dawn.jpg", "noon.jpg", 0), dawn)
-    np.testing.assert_array_equal(scene.appearance_between("dawn.jpg", "noon.jpg", 1), noon)
+    np.testing.assert_array_equal(scene.interpolate_appearance("dawn.jpg", "noon.jpg", 0), dawn)
+    np.testing.assert_array_equal(scene.interpolate_appearance("dawn.jpg", "noon.jpg", 1), noon)
     np.testing.assert_allclose(
-        scene.appearance_between("dawn.jpg", "noon.jpg", 0.25), 0.75 * dawn + 0.25 * noon, atol=1e-6
+        scene.interpolate_appearance("dawn.jpg", "noon.jpg", 0.25), 0.75 * dawn + 0.25 * noon, atol=1e-6
     )
     with pytest.raises(UsageError, match="'night.jpg'.*dawn.jpg, noon.jpg, dusk.jpg$"):
         scene.appearance("night.jpg")
     with pytest.raises(UsageError, match="none.*leave it out"):
         tiny_scene(4).appearance("noon.jpg")
     with pytest.raises(UsageError, match=r"7.jpg, \.\.\.$"):
-        varied(tiny_scene(4), tuple(f"{k}.jpg" for k in range(9))).appearance("noon.jpg")
+        with_appearances(tiny_scene(4), tuple(f"{k}.jpg" for k in range(9))).appearance("noon.jpg")

@@ -18,7 +18,7 @@ from kpc.player.gl.renderer import Look, Renderer
 from kpc.player.quality import LADDER, Quality
 from kpc.player.viewpoints import Rig, fit_camera
 from PIL import Image
-from scenes import SPACES, displaced, hybrid, look_at, surrounded, tiny_scene, varied
+from scenes import VARIANTS, look_at, tiny_scene, with_appearances, with_contraction, with_hybrid_decoder, with_motion
 from test_glsl import cubic
 
 CENTRE = (0.1, 0.05, 0.05)
@@ -57,9 +57,9 @@ def undirected(scene: Scene) -> Scene:
 
 @pytest.mark.parametrize("view", CAMERAS)
 @pytest.mark.parametrize("part", Part)
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("space", VARIANTS)
 def test_gives_the_reference_picture(view: str, part: Part, space: str) -> None:
-    scene = SPACES[space](tiny_scene(4))
+    scene = VARIANTS[space](tiny_scene(4))
     wanted = render(scene, CAMERAS[view], 0.62, part=part)
     check(Renderer(gl.context(), scene).render(CAMERAS[view], 0.62, part=part), wanted)
     if view not in ("looking away",) and part is Part.FULL:
@@ -74,9 +74,9 @@ def test_gives_the_reference_picture(view: str, part: Part, space: str) -> None:
         tiny_scene(8, scales=1, channels=3, resolution=(2, 3, 2), time=1),
         replace(tiny_scene(9), occupancy=np.ones((1, 1, 1, 1), bool)),
         replace(tiny_scene(9), occupancy=np.zeros((2, 300, 2, 3), bool)),
-        surrounded(tiny_scene(6, dynamic=False)),
-        replace(surrounded(tiny_scene(9)), occupancy=np.zeros((2, 300, 2, 3), bool)),
-        displaced(surrounded(tiny_scene(6)), most=0.5),
+        with_contraction(tiny_scene(6, dynamic=False)),
+        replace(with_contraction(tiny_scene(9)), occupancy=np.zeros((2, 300, 2, 3), bool)),
+        with_motion(with_contraction(tiny_scene(6)), most=0.5),
         undirected(tiny_scene(6)),
         without(tiny_scene(4, scales=3), (np.array([1, 4, 6]), np.array([0]), np.arange(8))),
     ],
@@ -105,9 +105,9 @@ def test_appearances_are_those_of_the_reference(part: Part, hidden: int) -> None
     scene = tiny_scene(4)
     d = scene.decoder
     narrow = replace(d, w1=d.w1[:hidden], b1=d.b1[:hidden] + 2, w2=16 / hidden * d.w2[..., :hidden])
-    scene = varied(replace(scene, decoder=narrow))
+    scene = with_appearances(replace(scene, decoder=narrow))
     renderer, pictures = Renderer(gl.context(), scene), []
-    between = scene.appearance_between("dawn.jpg", "dusk.jpg", 0.5)
+    between = scene.interpolate_appearance("dawn.jpg", "dusk.jpg", 0.5)
     for code in (None, *(appearance.code for appearance in scene.appearances), between):
         got, wanted = (
             render_it(CAMERAS["outside"], 0.62, part=part, appearance=code)
@@ -124,7 +124,7 @@ def test_appearances_are_those_of_the_reference(part: Part, hidden: int) -> None
 
 
 def test_appearances_of_a_hybrid_scene_are_those_of_the_reference() -> None:
-    scene = varied(hybrid(tiny_scene(4)))
+    scene = with_appearances(with_hybrid_decoder(tiny_scene(4)))
     renderer, pictures = Renderer(gl.context(), scene), []
     for code in (None, scene.appearance("noon.jpg")):
         got = renderer.render(CAMERAS["outside"], 0.62, appearance=code)
@@ -135,7 +135,7 @@ def test_appearances_of_a_hybrid_scene_are_those_of_the_reference() -> None:
 
 @pytest.mark.parametrize("part", Part)
 def test_an_appearance_comes_to_the_screen(part: Part) -> None:
-    ctx, scene = gl.context(), varied(tiny_scene(4))
+    ctx, scene = gl.context(), with_appearances(tiny_scene(4))
     screen, renderer, camera = ctx.framebuffer([ctx.texture((64, 48), 4)]), Renderer(ctx, scene), CAMERAS["outside"]
     for code in (None, scene.appearance("dusk.jpg")):
         renderer.show(screen, camera, 0.62, part=part, appearance=code)
@@ -164,8 +164,8 @@ def test_a_share_of_a_picture_goes_over_what_is_there(share: float) -> None:
 def test_scenes_without_appearances_have_no_code_in_the_shader() -> None:
     for scene, held in (
         (tiny_scene(4), False),
-        (varied(tiny_scene(4)), True),
-        (varied(undirected(tiny_scene(4))), False),
+        (with_appearances(tiny_scene(4)), True),
+        (with_appearances(undirected(tiny_scene(4))), False),
     ):
         renderer = Renderer(gl.context(), scene)
         renderer.render(CAMERAS["outside"], 0.62)
@@ -205,10 +205,10 @@ def test_one_renderer_serves_many_sizes_and_times() -> None:
     assert renderer.memory_bytes > 1000
 
 
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("space", VARIANTS)
 def test_folding_is_exact_where_nothing_moves_and_close_where_it_does(space: str) -> None:
-    still, moving = tiny_scene(6, dynamic=False), SPACES[space](tiny_scene(4))
-    still = surrounded(still) if space == "contracted" else still
+    still, moving = tiny_scene(6, dynamic=False), VARIANTS[space](tiny_scene(4))
+    still = with_contraction(still) if space == "contracted" else still
     check(
         Renderer(gl.context(), still, Quality(folded=True)).render(CAMERAS["outside"], 0.0),
         render(still, CAMERAS["outside"], 0.0),
@@ -226,9 +226,9 @@ def test_folding_is_exact_where_nothing_moves_and_close_where_it_does(space: str
     check(renderer.render(CAMERAS["outside"], 0.7), render(moving, CAMERAS["outside"], 0.7))
 
 
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("space", VARIANTS)
 def test_shows_every_look_and_part_on_a_screen_of_another_size(space: str) -> None:
-    ctx, scene = gl.context(), SPACES[space](tiny_scene(4))
+    ctx, scene = gl.context(), VARIANTS[space](tiny_scene(4))
     screen = ctx.framebuffer([ctx.texture((70, 50), 4)])
     renderer, pictures = Renderer(ctx, scene), {}
     for look in Look:
@@ -255,7 +255,7 @@ def test_shows_every_look_and_part_on_a_screen_of_another_size(space: str) -> No
 def test_a_scene_too_large_for_the_card_is_refused_by_name(
     limits: dict[str, int], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ctx, scene = gl.context(), displaced(tiny_scene(4))
+    ctx, scene = gl.context(), with_motion(tiny_scene(4))
     if "motion" in words:
         scene = replace(scene, motion=np.zeros((6, 13, 2, 4, 3), np.float32))
     for name, limit in limits.items():

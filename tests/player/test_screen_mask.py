@@ -9,7 +9,7 @@ from kpc.player.cpu.screen_mask import MOST_CELLS, Cover
 from kpc.player.gl import renderer as renderer_module
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LADDER
-from scenes import displaced, hybrid, look_at, tiny_scene
+from scenes import look_at, tiny_scene, with_hybrid_decoder, with_motion
 
 CAMERAS = {
     "near": look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 61, 43, 60.0),
@@ -83,7 +83,7 @@ def test_from_among_what_is_occupied_all_is_drawn() -> None:
 @pytest.mark.parametrize("kind", ["plain", "hybrid", "displaced"])
 @pytest.mark.parametrize("camera", ["near", "far", "beside", "away"])
 def test_pictures_are_the_same(monkeypatch: pytest.MonkeyPatch, kind: str, camera: str) -> None:
-    make = {"plain": lambda s: s, "hybrid": hybrid, "displaced": displaced}[kind]
+    make = {"plain": lambda s: s, "hybrid": with_hybrid_decoder, "displaced": with_motion}[kind]
     scene, view = sparse(make(tiny_scene(3)), 0.02), CAMERAS[camera]
     for name in ("reference", "balanced"):
         pictures = []

@@ -7,7 +7,7 @@ import pytest
 from kpc.format.common.errors import DisplayError
 from kpc.player.gl import shader
 from kpc.player.gl.textures import Layout, block_arrays, decoder_arrays, decoder_shape, planes_shape
-from scenes import hybrid, tiny_scene
+from scenes import tiny_scene, with_hybrid_decoder
 
 VERTICES = {"settle.glsl": ["places.glsl"], "march.glsl": ["blocks.glsl", "squares.glsl"]}
 """Those of fragment shaders that are not drawn all over the viewport, or not always."""
@@ -126,7 +126,7 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     if "GL_ARB_ES3_compatibility" not in ctx.extensions:
         pytest.skip("this OpenGL compiles no GLSL ES 3.00")
     scene = tiny_scene(0, scales=3, channels=5)
-    scene = hybrid(scene) if space == "hybrid" else scene
+    scene = with_hybrid_decoder(scene) if space == "hybrid" else scene
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     blocks = shader.constants(block_arrays(scene, layout))

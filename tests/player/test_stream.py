@@ -25,7 +25,7 @@ from kpc.player.streaming.prefetch import Playhead
 from kpc.player.streaming.stream import Stream
 from kpc.tools.cli.serve import Handler, Link, serving
 from partial_scenes import coded
-from scenes import SPACES, tiny_scene
+from scenes import VARIANTS, tiny_scene
 
 import kpc
 
@@ -73,12 +73,12 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("folded", [False, True])
-@pytest.mark.parametrize("space", [*SPACES, "baked"])
+@pytest.mark.parametrize("space", [*VARIANTS, "baked"])
 def test_once_all_is_there_it_is_the_same_picture(
     space: str, folded: bool, watched: Callable[..., Stream], tmp_path: Path
 ) -> None:
     scene, quality = (
-        SPACES["displaced" if space == "baked" else space](tiny_scene(4, channels=16, time=10)),
+        VARIANTS["displaced" if space == "baked" else space](tiny_scene(4, channels=16, time=10)),
         Quality(folded=folded),
     )
     if space == "baked":
@@ -121,7 +121,7 @@ def test_the_coarse_picture_is_there_long_before_the_rest_and_gets_finer(
         renderer = Renderer(gl.context(), stream.scene)
         for scales in (1, 2, 3):
             until(lambda scales=scales: stream.complete_scales >= scales and stream.can_show(0.0), stream, renderer)
-            found.append((stream.complete_scales, stream.source.received, picture(renderer, whole, 0.0)))  # type: ignore[attr-defined]
+            found.append((stream.complete_scales, stream.source.received_bytes, picture(renderer, whole, 0.0)))  # type: ignore[attr-defined]
         until(lambda: stream.is_settled, stream, renderer)
     wanted = picture(Renderer(gl.context(), whole), whole, 0.0)
     quality = [psnr(rgb, wanted) for *_, rgb in found]
@@ -158,7 +158,7 @@ def test_a_long_clip_plays_in_little_memory(watched: Callable[..., Stream], tmp_
                 if int(60 * time) % 7 == turn:
                     assert np.array_equal(picture(renderer, whole, float(time)), picture(wanted, whole, float(time)))
         assert most > room / 3 and not stream._here.all()
-        assert stream.source.received > 1.2 * len(data)  # type: ignore[attr-defined]  # evicted, and fetched again the second time
+        assert stream.source.received_bytes > 1.2 * len(data)  # type: ignore[attr-defined]  # evicted, and fetched again the second time
 
 
 def test_too_little_memory_is_told_before_any_plane_is_fetched() -> None:
@@ -339,10 +339,10 @@ def test_a_server_without_ranges_plays_from_the_beginning_on(
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         until(lambda: stream.complete_scales >= 1 and stream.can_show(0.0), stream, renderer)
-        assert stream.source.received < 0.7 * len(data)  # type: ignore[attr-defined]
+        assert stream.source.received_bytes < 0.7 * len(data)  # type: ignore[attr-defined]
         until(lambda: stream.is_settled, stream, renderer)
         assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
-        assert stream.source.received == len(data)  # type: ignore[attr-defined]
+        assert stream.source.received_bytes == len(data)  # type: ignore[attr-defined]
     assert "no ranges" in capsys.readouterr().err
 
 

@@ -5,9 +5,9 @@ import pytest
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.container import Reader
 from kpc.format.container.scene_io import write
-from kpc.format.scene.motion import STEP
+from kpc.format.scene.motion import FINEST_STEP
 from kpc.tools.cli import kpinfo
-from scenes import displaced, faced, surrounded, tiny_scene, varied
+from scenes import in_device_coordinates, tiny_scene, with_appearances, with_contraction, with_motion
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_a_static_scene(tmp_path, capsys):
 
 
 def test_a_contracted_scene(tmp_path, capsys):
-    scene = surrounded(tiny_scene())
+    scene = with_contraction(tiny_scene())
     path = tmp_path / "around.kpc"
     write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), path)
     assert kpinfo.main([str(path), "--verify"]) == 0
@@ -78,7 +78,7 @@ def test_a_contracted_scene(tmp_path, capsys):
 
 
 def test_a_scene_in_device_coordinates(tmp_path, capsys):
-    scene = faced(tiny_scene())
+    scene = in_device_coordinates(tiny_scene())
     path = tmp_path / "faced.kpc"
     write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), path)
     assert kpinfo.main([str(path), "--verify"]) == 0
@@ -88,7 +88,7 @@ def test_a_scene_in_device_coordinates(tmp_path, capsys):
 
 
 def test_a_scene_with_a_motion_grid(tmp_path, capsys):
-    scene = displaced(tiny_scene(), most=0.25)
+    scene = with_motion(tiny_scene(), most=0.25)
     path = tmp_path / "moved.kpc"
     write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), path)
     assert kpinfo.main([str(path), "--verify"]) == 0
@@ -99,12 +99,12 @@ def test_a_scene_with_a_motion_grid(tmp_path, capsys):
     motion, codecs = page["motion"], {chunk["kind"]: chunk["codec"] for chunk in page["chunks"]}
     assert codecs["MOVE"] == "rANS"
     assert motion["rows"] == 6 and motion["nodes_zyx"] == [3, 2, 4]
-    assert motion["largest"] == pytest.approx(np.abs(scene.motion).max(), abs=STEP / 2 + 1e-7)
+    assert motion["largest"] == pytest.approx(np.abs(scene.motion).max(), abs=FINEST_STEP / 2 + 1e-7)
 
 
 def test_a_scene_with_appearances(tmp_path, capsys):
     names = tuple(f"{k:02}.jpg" for k in range(11))
-    scene = varied(tiny_scene(), names)
+    scene = with_appearances(tiny_scene(), names)
     path = tmp_path / "varied.kpc"
     write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), path)
     assert kpinfo.main([str(path), "--verify"]) == 0

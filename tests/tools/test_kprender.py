@@ -13,13 +13,13 @@ from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import DisplayError
 from kpc.format.common.media import read_image, read_video
 from kpc.format.container.scene_io import write
-from kpc.format.scene.cameras import load_shots
+from kpc.format.scene.cameras import load_views
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
 from kpc.player.gl import offscreen
 from kpc.tools.cli import kprender
 from PIL import Image
-from scenes import surrounded, tiny_scene, varied
+from scenes import tiny_scene, with_appearances, with_contraction
 
 import kpc
 
@@ -121,7 +121,7 @@ def test_depth_beside_a_png(run, scene_file: Path, tmp_path: Path) -> None:
 
 def test_depth_in_contracted_space_reaches_far_and_says_where_it_stops(run, tmp_path: Path) -> None:
     path, camera = tmp_path / "around.kpc", tmp_path / "c.json"
-    scene = surrounded(tiny_scene(4))
+    scene = with_contraction(tiny_scene(4))
     write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales], skip_unseen=False), path)
     pose = scene.cameras[0].camera_to_world.copy()
     pose[:3, 3] = [0.1, 0.05, 1.4]  # in the open, the wall behind it all
@@ -140,17 +140,17 @@ def test_depth_in_contracted_space_reaches_far_and_says_where_it_stops(run, tmp_
     )
     assert run(path, "--cameras", camera, "--backend", "reference", "--depth", "-o", tmp_path)[0] == 0
     scene = kpc.load(path)
-    wanted = reference.render(scene, load_shots(camera)[0].camera, 0.4).depth
+    wanted = reference.render(scene, load_views(camera)[0].camera, 0.4).depth
     with Image.open(tmp_path / "a_depth.png") as image:
         unit, levels = float(image.text["depth_unit"]), np.asarray(image)
     there = np.isfinite(wanted)
-    limit = kprender.FARTHEST_EVEN * scene.mapping.even
-    assert wanted[there].max() > 2 * scene.mapping.even and unit == pytest.approx(limit / 65534)
+    limit = kprender.FARTHEST_EVEN * scene.mapping.uniform_distance
+    assert wanted[there].max() > 2 * scene.mapping.uniform_distance and unit == pytest.approx(limit / 65534)
     np.testing.assert_allclose(levels[there] * unit, np.minimum(wanted, limit)[there], atol=0.51 * unit)
     assert (levels[~there] == kprender.NOTHING).all()
     assert run(path, "--cameras", camera, "--backend", "reference", "--depth", "-o", tmp_path / "a.mp4")[0] == 0
     (frame,) = read_video(tmp_path / "a.mp4")
-    grey = 255 * (1 - scene.mapping.progress(wanted) / (2 * scene.mapping.even))
+    grey = 255 * (1 - scene.mapping.parameter(wanted) / (2 * scene.mapping.uniform_distance))
     assert np.abs(frame[..., 1].astype(float) - grey).mean() < 6 and grey.std() > 10
 
 
@@ -230,8 +230,8 @@ def test_the_dynamic_map_is_grey_and_of_one_colour_by_either_backend(run, scene_
 
 @pytest.fixture(scope="module")
 def varied_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("varied") / "varied.kpc"
-    scene = varied(tiny_scene(4), ("dawn.jpg", "5:00 pm", "a/b.jpg", "x:y:0.5"))
+    path = tmp_path_factory.mktemp("appearances") / "varied.kpc"
+    scene = with_appearances(tiny_scene(4), ("dawn.jpg", "5:00 pm", "a/b.jpg", "x:y:0.5"))
     write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
     return path
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kpc.encoder.datasets import load_dataset, rays
+from kpc.encoder.datasets import load_dataset, pixel_rays
 from kpc.format.common.media import read_image
-from kpc.format.scene.cameras import Camera, load_shots
+from kpc.format.scene.cameras import Camera, load_views
 from kpc.tools.dev import scene_geometry, scenegen
 from kpc.tools.dev.scene_geometry import BALL, BEAD, CONTENTS, RING, moving_objects
 from kpc.tools.dev.scenegen import FixedCamera, Options, novel_cameras, rig
@@ -36,7 +36,7 @@ def test_files_load_as_a_dataset(folder: Path, tmp_path: Path) -> None:
     assert "N3DV: 3 cameras, 9 pictures of 40x30, 3 held out (cam00), dynamic, 3 frames at 12 fps" in dataset.describe()
     for n, camera in enumerate(rig(TINY)):
         np.testing.assert_allclose(dataset.camera(3 * n).camera_to_world, camera.camera_to_world, atol=1e-12)
-    shots = load_shots(folder / "gt" / "cameras.json")
+    shots = load_views(folder / "gt" / "cameras.json")
     assert {s.file.split("_")[0] for s in shots} == {"cam00", "novel00", "novel01", "novel02", "novel03"}
     for shot in shots:
         assert read_image(folder / "gt" / shot.file).shape == (30, 40, 3)
@@ -69,7 +69,7 @@ def test_surfaces_lie_between_near_and_far(folder: Path, tmp_path: Path) -> None
     p = dataset.pictures
     for n in range(0, len(p), 3):
         row, column = np.divmod(np.arange(40 * 30), 40)
-        origins, directions = (a.T.copy() for a in rays(p, np.full(1200, n), column, row))
+        origins, directions = (a.T.copy() for a in pixel_rays(p, np.full(1200, n), column, row))
         far = np.full(1200, 20, np.float32)
         t = scene_geometry.sphere_trace(scene_geometry.static_distance, origins, directions, 0 * far, far)
         assert np.isfinite(t).all()  # every ray ends on a surface

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from kpc.encoder.datasets import Dataset, load_dataset, rays
+from kpc.encoder.datasets import Dataset, load_dataset, pixel_rays
 from kpc.encoder.evaluation.validation_rays import Measure, Measured, Probe
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.rdo import codec_model
@@ -330,7 +330,7 @@ def _drawn(scene: Scene, dataset: Dataset) -> Probe:
     usable = dataset.is_usable(picture, pixel)
     picture, pixel = picture[usable], pixel[usable]
     row, column = np.divmod(pixel, pictures.width[picture])
-    origins, directions = rays(pictures, picture, column, row, scene.mapping)
+    origins, directions = pixel_rays(pictures, picture, column, row, scene.mapping)
     colours = dataset.pixels.read(pictures.offset[picture] + pixel).astype(np.float32) / np.float32(255)
     truth = colours[:, :3]
     if dataset.has_alpha:

@@ -68,12 +68,12 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
     found: list[Frame] = []
     agreements: list[list[float]] = [[] for _ in timeline.spans]
     for number, span in enumerate(timeline.spans):
-        some = dataset.between(span.start, span.last)
+        some = dataset.frame_range(span.start, span.last)
         renderer = SceneRenderer(with_two_texels(scene_io.read(groups.open(number))).dequantise())
         at = np.rint(some.pictures.time * (span.count - 1)).astype(int) + span.start - first  # frame of each picture
         for picture in sorted(map(int, np.flatnonzero(some.pictures.is_test)), key=lambda p: int(at[p])):
             frame, camera = int(at[picture]), int(some.pictures.camera[picture])
-            shares = {part: share for part, _, share in timeline.mixed(_time(groups, frame))}
+            shares = {part: share for part, _, share in timeline.blend_at(_time(groups, frame))}
             if number not in shares:
                 continue
             seen = np.clip(renderer.picture(some, picture), 0, 1)

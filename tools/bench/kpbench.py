@@ -90,7 +90,7 @@ def _command(argv: list[str]) -> None:
         for record in options.measure(options, origin):
             records.append(record)
             if out is not None:
-                with cli.written_aside(out) as aside:
+                with cli.atomic_write(out) as aside:
                     aside.write_text(_as_json(records))
     finally:  # a failure or Ctrl-C later on takes away nothing that was measured
         if records:
@@ -537,7 +537,7 @@ def _codec(options: argparse.Namespace, origin: results.Record) -> Iterator[resu
             yield records[-1]
         noted += [notes.path] if notes else []
     if options.out is not None:
-        with cli.written_aside(options.out.with_suffix(".csv")) as aside:
+        with cli.atomic_write(options.out.with_suffix(".csv")) as aside:
             aside.write_text(codec_bench.as_csv(records))
         plot.save(plot.rate_distortion(records), options.out.with_suffix(".svg"))
     for path in noted:

@@ -184,7 +184,7 @@ def save(figure: Figure, path: Path) -> None:
     kind = path.suffix.lower()
     if kind not in ENDINGS:
         raise UsageError(f"{path}: plots are {', '.join(ENDINGS)}")
-    with cli.written_aside(path) as aside:
+    with cli.atomic_write(path) as aside:
         figure.savefig(aside, format=kind[1:], metadata={"Date": None} if kind == ".svg" else None)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import moderngl
 import numpy as np
 from kpc.format.common.errors import KpcError
-from kpc.format.common.fidelity import psnr_of
+from kpc.format.common.fidelity import psnr_from_mse
 from kpc.format.container.container import open_source
 from kpc.format.container.partial import PartialScene
 from kpc.format.container.scene_io import SceneReader, encode, read
@@ -144,7 +144,7 @@ def prefixes(job: Arrival) -> list[dict[str, Any]]:
                 "bytes": entry.offset + entry.stored_length,
                 "scale": entry.scale,
                 "row_start": entry.row_start,
-                "psnr": psnr_of(float(np.mean(errors))),
+                "psnr": psnr_from_mse(float(np.mean(errors))),
             }
         )
     return found

@@ -32,7 +32,7 @@ from kpc.format.container.groups import Groups
 from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, HybridDecoder
 from kpc.format.scene.space import FAR, Contraction, SpaceMapping
-from kpc.format.scene.static import static_share, unchanging_share
+from kpc.format.scene.static import constant_fraction, static_fraction
 from kpc.player.cpu.motion_map import STILL, still_share
 
 NAMES_SHOWN = 8
@@ -62,7 +62,7 @@ def _command(argv: list[str]) -> None:
 
     source = open_source(options.scene, limit=options.memory_budget)
     groups = Groups(source, memory_budget=options.memory_budget, allow_partial=not options.verify)
-    source.hold(0, source.size)
+    source.will_read(0, source.size)
     if options.group is not None and not 0 <= options.group < len(groups):
         raise UsageError(f"--group {options.group}: the file has {len(groups)}, numbered from 0")
     if options.verify:
@@ -106,7 +106,7 @@ def describe_groups(groups: Groups) -> dict[str, Any]:
     for number, (span, size) in enumerate(zip(groups.timeline.spans, sizes, strict=True)):
         if whole := groups.available(number):
             head = groups.open(number).head
-        since, until = (round(time * clip.duration_s, 6) for time in groups.timeline.shown(number))
+        since, until = (round(time * clip.duration_s, 6) for time in groups.timeline.display_span(number))
         described.append(
             {
                 "frames": [span.start, span.last],
@@ -202,15 +202,15 @@ def _describe_static(scene: QuantisedScene) -> dict[str, float]:
     """How much of what is occupied stands still: where time planes are 1, where nothing changes, and where little does."""
     decoded = scene.dequantise()
     return {
-        "identity_share": static_share(decoded),
-        "unchanging_share": unchanging_share(decoded),
+        "identity_share": static_fraction(decoded),
+        "unchanging_share": constant_fraction(decoded),
         "still_share": still_share(decoded),
     }
 
 
 def _describe_space(mapping: SpaceMapping | None) -> dict[str, Any]:
     if isinstance(mapping, Contraction):
-        return {"mapping": "contracted", "even": mapping.even, "far": FAR * mapping.even}
+        return {"mapping": "contracted", "even": mapping.uniform_distance, "far": FAR * mapping.uniform_distance}
     if mapping is not None:
         return {"mapping": "ndc", "frame": mapping.frame.tolist(), "near": mapping.near, "baseline": mapping.baseline}
     return {"mapping": "box"}

@@ -32,7 +32,7 @@ def _command(argv: list[str]) -> None:
         raise UsageError(f"{options.scenes[0]}: one file is nothing to join; name two or more")
     if options.output.exists() and any(options.output.samefile(scene) for scene in options.scenes):
         raise UsageError(f"{options.output}: is to be joined itself; write elsewhere with -o")
-    parts = groups.parts_of(options.scenes)
+    parts = groups.group_inputs(options.scenes)
     size = groups.write(parts, options.output)
     clip = groups.Timeline(tuple(part.span for part in parts), parts[0].fps).clip
     print(f"{options.output}: {size:,} bytes, {len(parts)} groups, {clip.frame_count} frames at {clip.fps:g} fps, "

@@ -26,8 +26,8 @@ from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.common.media import write_image, write_video
 from kpc.format.common.progress import progress
-from kpc.format.container.groups import LongScene
-from kpc.format.scene.cameras import Camera, Shot, load_shots
+from kpc.format.container.groups import GroupedScene
+from kpc.format.scene.cameras import Camera, View, load_views
 from kpc.format.scene.scene import Clip, Scene
 from kpc.format.scene.space import Contraction
 from kpc.player.app.camera_paths import CameraPath
@@ -192,7 +192,7 @@ def _appearance(scene: Scene, text: str | None) -> np.ndarray | None:
         ) from error
     cuts = [k for k, letter in enumerate(pair) if letter == ":"]
     cut = next((k for k in cuts if names.issuperset({pair[:k], pair[k + 1 :]})), cuts[0])
-    return scene.appearance_between(pair[:cut], pair[cut + 1 :], so_far)
+    return scene.interpolate_appearance(pair[:cut], pair[cut + 1 :], so_far)
 
 
 def _count(text: str) -> int:
@@ -222,7 +222,7 @@ def _fps(clip: Clip, options: argparse.Namespace) -> float:
     return float(options.fps or min(max(clip.fps, 1.0), FASTEST))
 
 
-def _path_shots(clip: Clip, options: argparse.Namespace) -> list[Shot]:
+def _path_shots(clip: Clip, options: argparse.Namespace) -> list[View]:
     path, fps = CameraPath.load(options.path), _fps(clip, options)
     if (path.end_s - path.start_s) * fps >= MOST:
         raise UsageError(
@@ -231,10 +231,10 @@ def _path_shots(clip: Clip, options: argparse.Namespace) -> list[Shot]:
     return path.shots(fps)
 
 
-def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[Shot]:
+def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[View]:
     """What to take: a camera, a time and a name each."""
     if options.cameras is not None:
-        shots = load_shots(options.cameras)
+        shots = load_views(options.cameras)
     elif options.path is not None:
         shots = _path_shots(clip, options)
     else:
@@ -244,7 +244,7 @@ def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[Shot]:
             else [Rig.of(scene).cameras[0]] * (1 if options.time is not None else clip.frame_count)
         )
         times = np.linspace(0.0, 1.0, len(views))
-        shots = [Shot(camera, float(time), f"{number:04d}") for number, (camera, time) in enumerate(zip(views, times))]
+        shots = [View(camera, float(time), f"{number:04d}") for number, (camera, time) in enumerate(zip(views, times))]
     if options.time is not None:
         shots = [replace(shot, time=options.time) for shot in shots]
     if options.size is not None:
@@ -255,7 +255,7 @@ def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[Shot]:
     return shots
 
 
-def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Render, str]:
+def _backend(loaded: Scene | GroupedScene, options: argparse.Namespace) -> tuple[Render, str]:
     """How to render, and its name. OpenGL is looked for only where it is wanted."""
     _appearance(loaded.at(0.0)[0], options.appearance)
     shown = dynamic_map if options.dynamic_map else _as_it_is
@@ -279,7 +279,7 @@ def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Re
                         ),
                         share,
                     )
-                    for scene, time, share in loaded.mixed(time)
+                    for scene, time, share in loaded.blend_at(time)
                 ]
             )
 
@@ -291,7 +291,7 @@ def _backend(loaded: Scene | LongScene, options: argparse.Namespace) -> tuple[Re
     renderers: list[Renderer] = []
 
     def by_graphics(camera: Camera, time: float) -> Rendering:
-        parts = loaded.mixed(time)
+        parts = loaded.blend_at(time)
         for gone in [one for one in renderers if all(one.scene is not scene for scene, *_ in parts)]:
             gone.release()
             renderers.remove(gone)
@@ -312,7 +312,7 @@ def _as_it_is(scene: Scene, camera: Camera, time: float, rendering: Rendering) -
     return rendering
 
 
-def _paths(out: Path, shots: list[Shot], suffix: str) -> Iterator[Path]:
+def _paths(out: Path, shots: list[View], suffix: str) -> Iterator[Path]:
     """Where each picture goes.
 
     A camera file may come from anywhere: of its names only the last part is used, and none twice.
@@ -340,7 +340,7 @@ def _write(path: Path, rendering: Rendering, depth_unit: float | None) -> None:
         levels[~np.isfinite(rendering.depth)] = NOTHING
         note = PngImagePlugin.PngInfo()
         note.add_text("depth_unit", repr(depth_unit))
-        with cli.written_aside(path.with_name(f"{path.stem}_depth.png")) as aside:
+        with cli.atomic_write(path.with_name(f"{path.stem}_depth.png")) as aside:
             Image.fromarray(levels.astype(np.uint16)).save(aside, pnginfo=note)
 
 
@@ -350,7 +350,7 @@ def _write_exr(path: Path, rendering: Rendering) -> None:
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
     channels = {"RGB": linear, "Z": np.ascontiguousarray(rendering.depth, np.float32)}
     with (
-        cli.written_aside(path) as aside,
+        cli.atomic_write(path) as aside,
         OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as exr,
     ):
         exr.write(str(aside))
@@ -360,22 +360,22 @@ def _colour_pixels(rendering: Rendering) -> np.ndarray:
     return np.rint(np.clip(rendering.rgb, 0, 1) * 255).astype(np.uint8)
 
 
-def _farthest(scene: Scene, shots: list[Shot]) -> float:
+def _farthest(scene: Scene, shots: list[View]) -> float:
     """The greatest distance from a camera to a corner of the scene's bounds: no depth exceeds it. In contracted space, where
     all that is farther counts as that far."""
     if isinstance(scene.mapping, Contraction):
-        return FARTHEST_EVEN * scene.mapping.even
+        return FARTHEST_EVEN * scene.mapping.uniform_distance
     corners = np.array(list(itertools.product(*scene.bounds.T)))
     eyes = np.unique([shot.camera.camera_to_world[:3, 3] for shot in shots], axis=0)
     return float(np.linalg.norm(eyes[:, None] - corners, axis=2).max())
 
 
-def _depth_unit(scene: Scene, shots: list[Shot]) -> float:
+def _depth_unit(scene: Scene, shots: list[View]) -> float:
     """World units to one level of a depth PNG."""
     return _farthest(scene, shots) / (NOTHING - 1)
 
 
-def _depth_pixels(scene: Scene, shots: list[Shot]) -> Callable[[Rendering], np.ndarray]:
+def _depth_pixels(scene: Scene, shots: list[View]) -> Callable[[Rendering], np.ndarray]:
     """Near is white, far is black, and so is nothing; in contracted space evenly by how far along the samples it is."""
     mapping, farthest = scene.mapping, _farthest(scene, shots)
 
@@ -383,7 +383,7 @@ def _depth_pixels(scene: Scene, shots: list[Shot]) -> Callable[[Rendering], np.n
         if not isinstance(mapping, Contraction):
             near = np.where(np.isfinite(rendering.depth), 1 - np.minimum(rendering.depth / farthest, 1), 0)
         else:
-            near = 1 - mapping.progress(rendering.depth) / (2 * mapping.even)
+            near = 1 - mapping.parameter(rendering.depth) / (2 * mapping.uniform_distance)
         return np.repeat(np.rint(near * 255).astype(np.uint8)[..., None], 3, axis=2)
 
     return pixels

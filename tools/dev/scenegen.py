@@ -174,7 +174,7 @@ def generate(target: str | os.PathLike[str], options: Options) -> None:
     rows = [
         _poses_bounds(camera, *bounds) for camera, bounds in zip(cameras, depths, strict=False)
     ]  # novel views have no row
-    with cli.written_aside(folder / "poses_bounds.npy") as aside:
+    with cli.atomic_write(folder / "poses_bounds.npy") as aside:
         np.save(aside, np.array(rows))
     frames = [
         {
@@ -189,7 +189,7 @@ def generate(target: str | os.PathLike[str], options: Options) -> None:
     ]
     c = cameras[0]
     document = {"w": c.width, "h": c.height, "fl_x": c.fl_x, "fl_y": c.fl_y, "cx": c.cx, "cy": c.cy, "frames": frames}
-    with cli.written_aside(folder / "gt" / "cameras.json") as aside:
+    with cli.atomic_write(folder / "gt" / "cameras.json") as aside:
         aside.write_text(json.dumps(document, indent=1))
 
 

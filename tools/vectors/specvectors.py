@@ -102,7 +102,7 @@ def _command(argv: list[str]) -> None:
     for path, data in vectors().items():
         target = Path(argv[0]) / path
         target.parent.mkdir(parents=True, exist_ok=True)
-        with cli.written_aside(target) as aside:
+        with cli.atomic_write(target) as aside:
             aside.write_bytes(data)
 
 
@@ -137,7 +137,7 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
         "frame_count": scene.clip.frame_count,
         "fps": scene.clip.fps,
         "step": scene.step,
-        **({"even": scene.mapping.even} if isinstance(scene.mapping, Contraction) else {}),
+        **({"even": scene.mapping.uniform_distance} if isinstance(scene.mapping, Contraction) else {}),
         **(
             {"frame": scene.mapping.frame.tolist(), "near": scene.mapping.near, "baseline": scene.mapping.baseline}
             if isinstance(scene.mapping, DeviceCoordinates)

@@ -6,7 +6,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from kpc.encoder.datasets.capture import Capture, find_image, held_out, say_missing
+from kpc.encoder.datasets.capture import Capture, find_image, holdout_flags, report_missing
 from kpc.encoder.datasets.layouts.transforms import frame_rate, frame_view, load_transforms
 
 
@@ -29,8 +29,8 @@ def read(path: Path, holdout: str | None) -> Capture:
         document = load_transforms(file)
         names = [frame["file_path"] for frame in document["frames"]]
         images = [find_image(path, file, name) for name in names]
-        say_missing(file, [name for name, image in zip(names, images) if image is None], len(names))
+        report_missing(file, [name for name, image in zip(names, images) if image is None], len(names))
         views += [frame_view(file, n, document, image, split != "train") for n, image in enumerate(images) if image]
         fps = fps or frame_rate(file, document)
-    tests = held_out(path, [str(v.file.relative_to(path)) for v in views], holdout, [v.is_test for v in views])
+    tests = holdout_flags(path, [str(v.file.relative_to(path)) for v in views], holdout, [v.is_test for v in views])
     return Capture("Blender", tuple(replace(v, is_test=t) for v, t in zip(views, tests)), fps)

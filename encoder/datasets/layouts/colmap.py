@@ -16,13 +16,13 @@ import numpy as np
 from kpc.encoder.datasets.capture import (
     HOLD_OUT_EVERY,
     Capture,
-    View,
+    CapturedView,
     find_image,
-    held_out,
+    holdout_flags,
     image_view,
     natural_key,
-    plain,
-    say_missing,
+    printable,
+    report_missing,
 )
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.rotations import rotation_of
@@ -52,7 +52,7 @@ LONGEST_NAME = 4096
 
 @dataclass(frozen=True)
 class _Camera:
-    """Of the raster `size`; intrinsics and distortion as in `View`."""
+    """Of the raster `size`; intrinsics and distortion as in `CapturedView`."""
 
     size: tuple[float, float]
     intrinsics: tuple[float, float, float, float]
@@ -85,10 +85,10 @@ def read(path: Path, holdout: str | None) -> Capture:
     cameras, images = _read_cameras(cameras_file), _read_images(images_file)
     images.sort(key=lambda image: natural_key(image.name))
     found = [(image, find_image(path / "images", images_file, image.name)) for image in images]
-    say_missing(images_file, [image.name for image, file in found if file is None], len(found))
+    report_missing(images_file, [image.name for image, file in found if file is None], len(found))
     there = [(image, file) for image, file in found if file is not None]
     default = [k % HOLD_OUT_EVERY == 0 for k in range(len(there))]
-    tests = held_out(path, [str(file.relative_to(path)) for _, file in there], holdout, default)
+    tests = holdout_flags(path, [str(file.relative_to(path)) for _, file in there], holdout, default)
     views = [_view(images_file, cameras, *item, is_test) for item, is_test in zip(there, tests)]
     return Capture("COLMAP", tuple(views), None)
 
@@ -103,7 +103,7 @@ def _model(path: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def _view(images_file: Path, cameras: dict[int, _Camera], image: _Image, file: Path, is_test: bool) -> View:
+def _view(images_file: Path, cameras: dict[int, _Camera], image: _Image, file: Path, is_test: bool) -> CapturedView:
     where = f"{images_file} image {image.number}"
     if image.camera not in cameras:
         raise DatasetError(f"{where}: is of camera {image.camera}, which the model lacks; export it anew")
@@ -155,7 +155,7 @@ def _read_images(file: Path) -> list[_Image]:
     with _damage(file):
         for number, pose, camera, name in _binary_images(file) if file.suffix == ".bin" else _text_images(file):
             if number in numbers or name in names:
-                raise DatasetError(f"{file}: image {number} ({plain(name)}) is there twice; export the model anew")
+                raise DatasetError(f"{file}: image {number} ({printable(name)}) is there twice; export the model anew")
             numbers.add(number)
             names.add(name)
             images.append(_Image(number, camera, name, _camera_to_world(f"{file} image {number}", pose)))
@@ -225,7 +225,9 @@ def _text_images(file: Path) -> Iterator[tuple[int, tuple[float, ...], int, str]
 
 def _supported(where: str, model: str) -> str:
     if model not in MODELS:
-        raise DatasetError(f"{where}: camera model {plain(model)} is not supported; undistort the images to PINHOLE")
+        raise DatasetError(
+            f"{where}: camera model {printable(model)} is not supported; undistort the images to PINHOLE"
+        )
     return model
 
 
@@ -265,4 +267,4 @@ def _damage(file: Path) -> Iterator[None]:
     try:
         yield
     except (EOFError, ValueError, OverflowError) as error:
-        raise DatasetError(f"{file}: not a COLMAP model ({plain(str(error))}); export or copy it anew") from error
+        raise DatasetError(f"{file}: not a COLMAP model ({printable(str(error))}); export or copy it anew") from error

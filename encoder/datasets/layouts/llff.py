@@ -10,10 +10,10 @@ import numpy as np
 from kpc.encoder.datasets.capture import (
     HOLD_OUT_EVERY,
     Capture,
-    View,
+    CapturedView,
     check_pose,
     fit_intrinsics,
-    held_out,
+    holdout_flags,
     natural_key,
 )
 from kpc.format.common.errors import DatasetError
@@ -46,13 +46,13 @@ def read(path: Path, holdout: str | None) -> Capture:
     if len(rows) != len(files):
         raise DatasetError(f"{path / POSES}: {len(rows)} poses for {len(files)} {kind}; remove what does not match")
     default = [k == 0 if is_video else k % HOLD_OUT_EVERY == 0 for k in range(len(files))]
-    tests = held_out(path, [str(f.relative_to(path)) for f in files], holdout, default)
+    tests = holdout_flags(path, [str(f.relative_to(path)) for f in files], holdout, default)
     views = tuple(_view(path, number, *item) for number, item in enumerate(zip(files, rows, tests)))
     fps = views[0].video.fps if views[0].video else None
     return Capture("N3DV" if is_video else "LLFF", views, fps)
 
 
-def _view(path: Path, number: int, file: Path, row: np.ndarray, is_test: bool) -> View:
+def _view(path: Path, number: int, file: Path, row: np.ndarray, is_test: bool) -> CapturedView:
     where = f"{path / POSES} row {number}"
     down, right, backwards, centre, (h, w, focal) = row[:15].reshape(3, 5).T
     near, far = row[15:]
@@ -62,7 +62,7 @@ def _view(path: Path, number: int, file: Path, row: np.ndarray, is_test: bool) -
     video = probe(file) if file.suffix.lower() in VIDEO_SUFFIXES else None
     width, height, has_alpha = (video.width, video.height, False) if video else image_size(file)
     intrinsics = fit_intrinsics(where, file, (focal, focal, w / 2, h / 2), (w, h), (width, height))
-    return View(file, video, None, is_test, width, height, has_alpha, intrinsics, (0.0,) * 4, pose, near, far)
+    return CapturedView(file, video, None, is_test, width, height, has_alpha, intrinsics, (0.0,) * 4, pose, near, far)
 
 
 def _read_poses(file: Path) -> np.ndarray:

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from kpc.encoder.datasets.capture import HOLD_OUT_EVERY, Capture, find_image, held_out, natural_key, say_missing
+from kpc.encoder.datasets.capture import HOLD_OUT_EVERY, Capture, find_image, holdout_flags, natural_key, report_missing
 from kpc.encoder.datasets.layouts.transforms import frame_rate, frame_view, load_transforms
 from kpc.format.common.errors import DatasetError
 
@@ -26,7 +26,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     document = load_transforms(file)
     frames = sorted(enumerate(document["frames"]), key=lambda item: natural_key(item[1]["file_path"]))
     found = [(number, find_image(path, file, frame["file_path"])) for number, frame in frames]
-    say_missing(file, [document["frames"][n]["file_path"] for n, image in found if image is None], len(found))
+    report_missing(file, [document["frames"][n]["file_path"] for n, image in found if image is None], len(found))
     there = [(number, image) for number, image in found if image is not None]
     names = [os.path.normpath(document["frames"][n]["file_path"]) for n, _ in there]
     train, test = _listed(file, document, "train_filenames"), _listed(file, document, "test_filenames")
@@ -36,7 +36,7 @@ def read(path: Path, holdout: str | None) -> Capture:
         default = [k % HOLD_OUT_EVERY == 0 for k in range(len(there))]
     else:
         default = [name in test if test is not None else name not in (train or ()) for name in names]
-    tests = held_out(path, [str(image.relative_to(path)) for _, image in there], holdout, default)
+    tests = holdout_flags(path, [str(image.relative_to(path)) for _, image in there], holdout, default)
     views = tuple(
         frame_view(file, number, document, image, is_test)
         for (number, image), name, is_test in zip(there, names, tests)

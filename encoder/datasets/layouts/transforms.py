@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from kpc.encoder.datasets.capture import View, image_view
+from kpc.encoder.datasets.capture import CapturedView, image_view
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import image_size
 
@@ -39,7 +39,7 @@ def load_transforms(file: Path) -> dict[str, Any]:
     return document
 
 
-def frame_view(file: Path, number: int, document: dict[str, Any], image: Path, is_test: bool) -> View:
+def frame_view(file: Path, number: int, document: dict[str, Any], image: Path, is_test: bool) -> CapturedView:
     """A frame's view; the frame's own keys go before the document's.
 
     Raises:

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 
-def assert_plain_python_prints_the_same(program: str, kernel: str) -> None:
+def assert_same_without_numba(program: str, kernel: str) -> None:
     """`program`, which may import test modules, prints lines; compiled and not it must print the same, and some.
 
     `kernel`: "module:function" that has to be compiled the first time and must not be the second.
