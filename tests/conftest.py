@@ -25,7 +25,7 @@ def one_thread():
 @pytest.fixture
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures and planes are judged by a few rays, as many as tiny scenes need."""
-    monkeypatch.setattr("kpc.encoder.evaluation.validation_rays.PROBE_RAYS", 512)
+    monkeypatch.setattr("kpc.encoder.evaluation.validation_rays.VALIDATION_RAYS", 512)
     monkeypatch.setattr("kpc.encoder.rdo.curvature.RAYS", 1 << 13)
 
 

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from kpc.encoder.evaluation.evaluate import SceneRenderer
-from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.rdo.curvature import RAYS as CURVATURE_RAYS
-from kpc.encoder.rdo.curvature import curvature
+from kpc.encoder.rdo.curvature import estimate_curvature
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
-from kpc.encoder.rdo.occupancy_rdo import errors_of_flips
-from kpc.encoder.rdo.prune import renderings
-from kpc.encoder.rdo.rate_control import PROBES
-from kpc.encoder.rdo.sequential_finetune import RAYS, steps_after, steps_in_all
+from kpc.encoder.rdo.occupancy_rdo import flip_errors
+from kpc.encoder.rdo.prune import max_renderings
+from kpc.encoder.rdo.rate_control import RENDERINGS
+from kpc.encoder.rdo.sequential_finetune import RAYS, steps_per_group, total_steps
 from kpc.encoder.training.train import Trainer
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.scene.scene import Scene
@@ -69,21 +69,21 @@ def estimate(
     )
 
     pixels = trainer.dataset.pictures.width.astype(np.int64) * trainer.dataset.pictures.height
-    probes = PROBES + (renderings(trainer.field.layout.features) if config.prunes else 0)
+    probes = RENDERINGS + (max_renderings(trainer.field.layout.features) if config.prunes else 0)
     rendered = (probes + 1) * probe_rays + 2 * tested * float(pixels.mean())
     fits_s = 2 * tested * _seconds_a_fit(trainer) if trainer.names and tested else 0.0
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()
     scene = trainer.scene()
     a_coding, a_ray = _seconds_a_coding(scene), _seconds_a_ray(trainer)
-    coding_s = PROBES * a_coding + _seconds_of_errors(scene)
+    coding_s = RENDERINGS * a_coding + _seconds_of_errors(scene)
     if tune_steps is None:
         trained = (
             config.steps
             if time_budget_s is None
             else trainer.step + max(0.0, time_budget_s - trainer.elapsed_s) / max(a_step, 1e-6)
         )
-        tune_steps = steps_after(int(trained), scene, config.tune_steps)
-    if steps := steps_in_all(scene, tune_steps):
+        tune_steps = steps_per_group(int(trained), scene, config.tune_steps)
+    if steps := total_steps(scene, tune_steps):
         a_trained_ray = 1 / trainer.rays_per_second if trainer.rays_per_second else 3 * a_ray
         coding_s += TUNED * (a_coding + steps * RAYS * (a_trained_ray + a_ray))
     return Estimate(train_s, spent_s + rendered * a_ray + coding_s + fits_s, memory)
@@ -107,11 +107,11 @@ def _seconds_a_coding(scene: Scene) -> float:
 
 def _seconds_of_errors(scene: Scene) -> float:
     """What errors cost, `kpc.encoder.rdo.curvature` and `kpc.encoder.rdo.occupancy_rdo`: by a sixteenth of their rays."""
-    probe = Probe.of_cameras(scene, CURVATURE_RAYS // 16)
-    curvature(scene, probe, 2)  # what is done once
+    probe = ValidationRays.from_cameras(scene, CURVATURE_RAYS // 16)
+    estimate_curvature(scene, probe, 2)  # what is done once
     started = time.perf_counter()
-    curvature(scene, probe, CURVATURE_RAYS // 16)
-    errors_of_flips(scene, probe.some(np.arange(2)), 16)
+    estimate_curvature(scene, probe, CURVATURE_RAYS // 16)
+    flip_errors(scene, probe.subset(np.arange(2)), 16)
     return 16 * (time.perf_counter() - started)
 
 
@@ -119,7 +119,7 @@ def _seconds_a_fit(trainer: Trainer) -> float:
     """Finding the appearance of a held-out picture."""
     renderer, held_out = SceneRenderer(trainer.scene()), np.flatnonzero(trainer.dataset.pictures.is_test)
     started = time.perf_counter()
-    renderer.code_of_left_half(trainer.dataset, int(held_out[0]))
+    renderer.fit_left_half(trainer.dataset, int(held_out[0]))
     return time.perf_counter() - started
 
 

@@ -22,27 +22,27 @@ OVERLAP = 2
 (`kpc.format.container.groups`). The error of the default scene over 90 frames in 128x96 pixels (`draft`, 800 steps) changes by 0.027 from one
 frame to the next where a group takes over at once, 0.012 and 0.016 before and after; by 0.014, 0.015 and 0.017 where two are mixed."""
 
-LATER = 0.5
+LATER_STEPS = 0.5
 """Steps of a group that begins where another ended, of those of one that begins anew. Held-out PSNR of the three groups named
 below with 800 steps of `fast` for the first: 27.2, 30.8, 32.9 dB with 1, 27.2, 29.0, 31.1 dB with 0.5; with 2,400 and 0.25 it is 36.0,
 31.5, 33.9 dB, which falls off where they join. Five frames before and after the first join of the run named above, it is 31.0 and 31.5 dB
 with 0.5, 31.0 and 32.9 dB with 1."""
 
-LEAST_FRAMES = 8
+MIN_FRAMES = 8
 """Of a group."""
 
 
-def spans_of(clip: Clip, group_s: float) -> tuple[Span, ...]:
+def split_into_spans(clip: Clip, group_s: float) -> tuple[Span, ...]:
     """The frames of as few groups as show at most `group_s` seconds each, all about equally many.
 
     Raises:
         UsageError: those are too few frames to make a scene of.
     """
     frames = int(group_s * clip.fps + 1e-6)
-    if frames < LEAST_FRAMES:
+    if frames < MIN_FRAMES:
         raise UsageError(
             f"--group {group_s:g}s: {frames} frames at {clip.fps:g} fps are too few for a group; give at least "
-            f"{LEAST_FRAMES / clip.fps:.2g}s"
+            f"{MIN_FRAMES / clip.fps:.2g}s"
         )
     count = -(-clip.frame_count // frames)
     ends = [number * clip.frame_count // count for number in range(count + 1)]
@@ -53,10 +53,10 @@ def spans_of(clip: Clip, group_s: float) -> tuple[Span, ...]:
     return tuple(spans)
 
 
-def share_of(options: Options, number: int, spans: Sequence[Span]) -> Options:
+def options_of_group(options: Options, number: int, spans: Sequence[Span]) -> Options:
     """What a group gets of a file's size, as much as it has of the frames, and of the time for training: LATER counts there."""
     frames = np.array([span.count for span in spans], float)
-    effort = frames * np.where(np.arange(len(spans)), LATER, 1.0)
+    effort = frames * np.where(np.arange(len(spans)), LATER_STEPS, 1.0)
     trade, budget_s = options.trade, options.time_budget_s
     if trade.target_bytes is not None:
         share = frames[number] / frames.sum()
@@ -66,7 +66,7 @@ def share_of(options: Options, number: int, spans: Sequence[Span]) -> Options:
     return replace(options, trade=trade, time_budget_s=budget_s)
 
 
-def begin_with(field: Field, before: Scene) -> None:
+def initialise_from(field: Field, before: Scene) -> None:
     """Let a field begin where a scene of the same layout, but for its rows in time, ended: space planes and decoder as they are
     there, what changes as it is in its last row, all the time.
 

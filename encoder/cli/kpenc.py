@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import torch
 from kpc.encoder.cli.estimate import Estimate, estimate
-from kpc.encoder.cli.grouped import LATER, begin_with, share_of, spans_of
+from kpc.encoder.cli.grouped import LATER_STEPS, initialise_from, options_of_group, split_into_spans
 from kpc.encoder.cli.options import Options, parse
-from kpc.encoder.cli.transcode import check_outputs, figures, reached, recode, together
+from kpc.encoder.cli.transcode import check_outputs, coding_figures, combine_figures, describe_outcome, transcode
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluation.ablations import changed_by
+from kpc.encoder.evaluation.ablations import effective_ablations
 from kpc.encoder.evaluation.evaluate import evaluate
 from kpc.encoder.evaluation.profile import profile
-from kpc.encoder.evaluation.validation_rays import PROBE_RAYS, Probe
+from kpc.encoder.evaluation.validation_rays import VALIDATION_RAYS, ValidationRays
 from kpc.encoder.field.bounds import (
     contraction_of,
     device_coordinates_of,
@@ -36,7 +36,7 @@ from kpc.encoder.field.field import time_rows
 from kpc.encoder.field.occupancy_grid import grid_shape, in_fewest_slots
 from kpc.encoder.rdo.codec_model import Model, code, load_checkpoint, save_checkpoint
 from kpc.encoder.rdo.prune import Pruned
-from kpc.encoder.rdo.sequential_finetune import steps_after
+from kpc.encoder.rdo.sequential_finetune import steps_per_group
 from kpc.encoder.training.temporal_resolution import TimeResolution, fitted_in_time
 from kpc.encoder.training.tight_bounds import trim_box
 from kpc.encoder.training.train import Report, Trainer, box_of_checkpoint
@@ -74,12 +74,12 @@ def _command(argv: list[str]) -> None:
     if only_plan:
         _print_estimate(dry_run(options), options, as_json)
         return
-    result = recode(options) if options.source.is_file() else encode(options)
+    result = transcode(options) if options.source.is_file() else encode(options)
     if as_json:
         print(json.dumps(result, indent=1))
     elif options.source.is_file():
         rate = f"{result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}"
-        print(f"{options.output}: {rate}; {reached(result)}")
+        print(f"{options.output}: {rate}; {describe_outcome(result)}")
     else:
         _print_result(result, options)
 
@@ -99,7 +99,7 @@ def _print_result(result: dict[str, Any], options: Options) -> None:
         f"coding loss {result['coding_loss_db']:.3f} dB"
         + (" on held-out views" if result["test_psnr"] is not None else "")
     )
-    print(reached(result))
+    print(describe_outcome(result))
     if result["identity_share"] is not None:
         print(f"time-plane texels exactly at identity: {result['identity_share']:.1%}")
     if len(result.get("groups", [])) > 1:
@@ -171,11 +171,11 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     scene = to_scene(trainer)
     tune_steps = options.tune_steps
     if tune_steps is None:
-        tune_steps = steps_after(trainer.step, scene, trainer.config.tune_steps)
+        tune_steps = steps_per_group(trainer.step, scene, trainer.config.tune_steps)
     _say(_occupied(scene))
     tuning = f"tuning planes by {tune_steps} steps a group, " if tune_steps else ""
     _say(f"writing: choosing quantisation steps, {tuning}rendering held-out views")
-    probe = Probe.of_training(trainer.sampler, trainer.background)
+    probe = ValidationRays.from_training_views(trainer.sampler, trainer.background)
     if options.keep_checkpoint is not None:
         save_checkpoint(options.keep_checkpoint, scene, probe)
     coded = code(Model(scene, probe), options.trade, trainer.config.prune_share, tune_steps, shown=True)
@@ -184,8 +184,8 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     size = _write(coded.data, options.output, work)
     decoded = scene_io.read(options.output).dequantise()
     test, before = (
-        evaluate(decoded, dataset, most=options.most_tests),
-        evaluate(scene, dataset, most=options.most_tests),
+        evaluate(decoded, dataset, most=options.max_test_pictures),
+        evaluate(scene, dataset, most=options.max_test_pictures),
     )
     if not options.keep:
         _clear(work)
@@ -204,7 +204,7 @@ def _encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         "test_ssim": test and test.ssim,
         "test_pictures": test.pictures if test else 0,
         "coding_loss_db": before.psnr - test.psnr if test and before else coded.loss_db,
-        **figures(coded, size, options.trade, "training views"),
+        **coding_figures(coded, size, options.trade, "training views"),
         "steps": trainer.step,
         "train_s": trainer.elapsed_s,
         "encode_s": time.monotonic() - started,
@@ -217,7 +217,7 @@ def _encode_groups(options: Options) -> dict[str, Any]:
     """Each group as a scene, one after the other, and all of them as one file."""
     started = time.monotonic()
     setting = _setting(options)
-    work, spans = options.work_dir, spans_of(setting.dataset.clip, float(options.group_s or 0))
+    work, spans = options.work_dir, split_into_spans(setting.dataset.clip, float(options.group_s or 0))
     numbers = range(len(spans)) if options.only is None else [options.only]
     if numbers[-1] >= len(spans):
         raise UsageError(f"--only {numbers[-1]}: the clip has {len(spans)} groups, numbered from 0")
@@ -231,7 +231,7 @@ def _encode_groups(options: Options) -> dict[str, Any]:
         span, part = spans[number], _part(work, number)
         _say(f"group {number} of {len(spans)}: frames {span.start} to {span.last}")
         told = replace(
-            share_of(options, number, spans),
+            options_of_group(options, number, spans),
             output=part,
             work=part.with_suffix(""),
             keep_checkpoint=options.keep_checkpoint or part.with_suffix(".kpck"),
@@ -261,7 +261,7 @@ def _of_span(setting: Setting, span: groups.Span) -> Setting:
 def _trimmed_for_groups(setting: Setting, options: Options, spans: Sequence[groups.Span]) -> Setting:
     """All groups share a box, found from no more frames than one of them has."""
     dataset = setting.dataset.subsample_frames(max(span.count for span in spans))
-    budget_s = share_of(options, 0, spans).time_budget_s
+    budget_s = options_of_group(options, 0, spans).time_budget_s
     assert not isinstance(setting.mapping, Contraction)
     aabb, _ = _trimmed(dataset, options.config(dataset), setting.aabb, budget_s, setting.mapping)
     return replace(setting, aabb=aabb, is_final=True)
@@ -273,8 +273,8 @@ def _encode_group(told: Options, setting: Setting, before: Path | None) -> dict[
     if before is None:
         found = _encode_scene(told, setting)
     else:
-        _say(f"it begins where the one before ended, and takes {LATER:.0%} of its steps")
-        shorter = replace(told, steps=math.ceil(LATER * told.config(setting.dataset).steps))
+        _say(f"it begins where the one before ended, and takes {LATER_STEPS:.0%} of its steps")
+        shorter = replace(told, steps=math.ceil(LATER_STEPS * told.config(setting.dataset).steps))
         found = _encode_scene(shorter, replace(setting, before=load_checkpoint(before).scene))
     with cli.atomic_write(told.output.with_suffix(".json")) as aside:
         aside.write_text(json.dumps({"told": _as_told(told), "found": found}))
@@ -325,7 +325,7 @@ def _of_all(
         return None if None in values or not sum(weights) else float(np.average(values, weights=weights))
 
     pictures = [one["test_pictures"] for one in found]
-    return found[0] | together(found, spans, size, options.trade) | {
+    return found[0] | combine_figures(found, spans, size, options.trade) | {
         "file": str(options.output),
         "test_psnr": mean("test_psnr", pictures), "test_ssim": mean("test_ssim", pictures), "test_pictures": sum(pictures),
         "coding_loss_db": mean("coding_loss_db", [span.count for span in spans]),
@@ -338,7 +338,7 @@ def _of_all(
 
 def _not_written(trainer: Trainer, options: Options, started: float) -> dict[str, Any]:
     """What was measured on a model that no file can hold, as far as `encode` says it of others."""
-    test = evaluate(to_scene(trainer), trainer.dataset, most=options.most_tests, field=trainer.field)
+    test = evaluate(to_scene(trainer), trainer.dataset, most=options.max_test_pictures, field=trainer.field)
     if not options.keep:
         _clear(options.work_dir)
     return {
@@ -365,15 +365,18 @@ def dry_run(options: Options) -> Estimate:
     setting = _setting(options)
     groups_count = 1.0
     if options.group_s is not None:
-        spans = spans_of(setting.dataset.clip, options.group_s)
-        groups_count = 1 if options.only is not None else 1 + LATER * (len(spans) - 1)
-        options, setting = share_of(options, options.only or 0, spans), _of_span(setting, spans[options.only or 0])
+        spans = split_into_spans(setting.dataset.clip, options.group_s)
+        groups_count = 1 if options.only is not None else 1 + LATER_STEPS * (len(spans) - 1)
+        options, setting = (
+            options_of_group(options, options.only or 0, spans),
+            _of_span(setting, spans[options.only or 0]),
+        )
     trainer = _trainer(options, setting)
     tested = int(trainer.dataset.pictures.is_test.sum())
     found = estimate(
         trainer,
-        PROBE_RAYS,
-        min(tested, options.most_tests or tested),
+        VALIDATION_RAYS,
+        min(tested, options.max_test_pictures or tested),
         time.monotonic() - started - trainer.elapsed_s,
         options.time_budget_s,
         options.tune_steps,
@@ -398,7 +401,7 @@ def ablations(options: Options) -> list[str]:
     """
     _make_work_dir(options.work_dir)
     dataset = load_dataset(options.source, options.work_dir, holdout=options.holdout, downscale=options.downscale)
-    return changed_by(options.config(dataset))
+    return effective_ablations(options.config(dataset))
 
 
 def _setting(options: Options) -> Setting:
@@ -440,7 +443,7 @@ def _trainer(options: Options, setting: Setting) -> Trainer:
     if resumes:
         trainer.resume(checkpoint)
     elif setting.before is not None:
-        begin_with(trainer.field, setting.before)
+        initialise_from(trainer.field, setting.before)
     if options.resume:
         _say(f"resumed at step {trainer.step}" if trainer.step else f"{checkpoint}: no checkpoint yet; starting afresh")
     return trainer
@@ -566,7 +569,7 @@ def _occupied(scene: Scene) -> str:
 
 def _left_out(scene: Scene, pruned: Pruned, spare_db: float) -> str:
     """What the scene can do without, and what it cost or would cost."""
-    worth, counts = pruned.view_worth_db, [scale["xy"].shape[2] for scale in scene.scales]
+    worth, counts = pruned.view_gain_db, [scale["xy"].shape[2] for scale in scene.scales]
     said = "colour: the same from all sides, as trained"
     if worth is not None:
         said = (
@@ -575,7 +578,7 @@ def _left_out(scene: Scene, pruned: Pruned, spare_db: float) -> str:
             else (f"colour: the same from all sides, direction is worth {worth:.3f} dB")
         )
     left = " + ".join(f"{len(kept)} of {count}" for kept, count in zip(pruned.kept, counts))
-    more = "" if math.isinf(pruned.next_db) else f", {pruned.next_db:.3f} dB with fewer"
+    more = "" if math.isinf(pruned.next_loss_db) else f", {pruned.next_loss_db:.3f} dB with fewer"
     return f"{said}; channels: {left} a scale; costs {pruned.loss_db:.3f} dB{more} ({spare_db:.3f} allowed)"
 
 

@@ -38,13 +38,13 @@ class Options:
     work: Path | None = None
     keep: bool = False
     resume: bool = False
-    most_tests: int | None = None
+    max_test_pictures: int | None = None
     group_s: float | None = None
     only: int | None = None
     trade: Trade = Trade()
     keep_checkpoint: Path | None = None
     tune_steps: int | None = None
-    ablation: str = "as it is"
+    ablation: str = "baseline"
     """Of `kpc.encoder.evaluation.ablations`; no option of the command line."""
 
     @property

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from kpc.encoder.cli.grouped import share_of
+from kpc.encoder.cli.grouped import options_of_group
 from kpc.encoder.cli.options import Options
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.rdo import codec_model
@@ -20,7 +20,7 @@ JUDGED_BY = ("training views", "views of its own, taken to be right to 30 dB")
 """What losses are measured on: those of a checkpoint, and those of a file."""
 
 
-def recode(options: Options) -> dict[str, Any]:
+def transcode(options: Options) -> dict[str, Any]:
     """Write the .kpc file that `options.trade` asks for; what came of it, as a dictionary that JSON can hold.
 
     Raises:
@@ -28,7 +28,7 @@ def recode(options: Options) -> dict[str, Any]:
     """
     started = time.monotonic()
     check_outputs(options)
-    is_coded = codec_model.begins_with(options.source, MAGIC)
+    is_coded = codec_model.starts_with(options.source, MAGIC)
     if is_coded and options.trade.psnr_db is not None:
         raise UsageError(f"--psnr: {options.source} does not know what was filmed; give its checkpoint, or --quality")
     if is_coded and not (clip := groups.Groups(options.source)).is_single:
@@ -38,7 +38,7 @@ def recode(options: Options) -> dict[str, Any]:
     size = scene_io.save(coded.data, options.output)
     return {
         "file": str(options.output), "source": str(options.source),
-        **figures(coded, size, options.trade, JUDGED_BY[is_coded]),
+        **coding_figures(coded, size, options.trade, JUDGED_BY[is_coded]),
         "encode_s": time.monotonic() - started,
     }  # fmt: skip
 
@@ -51,23 +51,29 @@ def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
     """Each group by itself; the coded ones are in memory together."""
     spans, parts, found = source.timeline.spans, [], []
     for number, span in enumerate(spans):
-        trade = share_of(options, number, spans).trade
+        trade = options_of_group(options, number, spans).trade
         reader = source.open(number)
         scene = replace(scene_io.read(reader), cameras=reader.cameras() or source.cameras())
         coded = codec_model.code(
-            codec_model.model_of(scene), trade, TrainConfig().prune_share, _tune_steps(options), shown=True
+            codec_model.model_from_file(scene), trade, TrainConfig().prune_share, _tune_steps(options), shown=True
         )
         parts.append(groups.GroupInput.of(coded.data, span.start))
-        found.append(figures(coded, coded.size_bytes, trade, JUDGED_BY[1]))
+        found.append(coding_figures(coded, coded.size_bytes, trade, JUDGED_BY[1]))
     size = groups.write(parts, options.output)
-    return {"file": str(options.output), "source": str(options.source), **together(found, spans, size, options.trade)}
+    return {
+        "file": str(options.output),
+        "source": str(options.source),
+        **combine_figures(found, spans, size, options.trade),
+    }
 
 
-def together(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size: int, trade: Trade) -> dict[str, Any]:
-    """`figures` of a clip whose groups have those found: sums, and means over frames."""
+def combine_figures(
+    found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size: int, trade: Trade
+) -> dict[str, Any]:
+    """`coding_figures` of a clip whose groups have those found: sums, and means over frames."""
     frames, parameters = [span.count for span in spans], sum(one["parameters"] for one in found)
     means = {}
-    for key in ("probe_psnr", "probe_loss_db", "agreement_db", "identity_share"):
+    for key in ("validation_psnr", "validation_loss_db", "agreement_db", "identity_share"):
         known = [(one[key], count) for one, count in zip(found, frames, strict=True) if one[key] is not None]
         means[key] = sum(value * count for value, count in known) / sum(count for _, count in known) if known else None
     name, value = trade.bound
@@ -77,15 +83,15 @@ def together(found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size
     }  # fmt: skip
 
 
-def figures(coded: codec_model.Coded, size: int, trade: Trade, judged_by: str) -> dict[str, Any]:
+def coding_figures(coded: codec_model.CodedModel, size: int, trade: Trade, judged_by: str) -> dict[str, Any]:
     """What is said of every file that is written."""
     name, value = trade.bound
     return {
         "trade": name,
         "asked": value,
         "judged_by": judged_by,
-        "probe_psnr": coded.psnr,
-        "probe_loss_db": coded.loss_db,
+        "validation_psnr": coded.psnr,
+        "validation_loss_db": coded.loss_db,
         "agreement_db": coded.agreement_db,
         "size_bytes": size,
         "parameters": coded.scene.parameter_count,
@@ -94,13 +100,13 @@ def figures(coded: codec_model.Coded, size: int, trade: Trade, judged_by: str) -
     }
 
 
-def reached(result: dict[str, Any]) -> str:
+def describe_outcome(result: dict[str, Any]) -> str:
     """In words, what was asked for and what that gave."""
     name, asked = result["trade"], result["asked"]
     said = {"max_loss_db": f"at most {asked:g} dB of loss", "target_bytes": f"at most {asked:,.0f} bytes",
             "quality": f"quality {asked:g}", "lam": f"lam {asked:g}", "psnr_db": f"at least {asked:g} dB"}[name]  # fmt: skip
-    lost = f"{result['probe_loss_db']:.3f} dB of loss on {result['judged_by']}"
-    at = f"{result['probe_psnr']:.2f} dB, " if name == "psnr_db" else ""
+    lost = f"{result['validation_loss_db']:.3f} dB of loss on {result['judged_by']}"
+    at = f"{result['validation_psnr']:.2f} dB, " if name == "psnr_db" else ""
     return (
         f"asked for {said}; reached {result['size_bytes']:,} bytes, {at}{lost}, "
         f"{result['agreement_db']:.1f} dB against the uncoded pictures"

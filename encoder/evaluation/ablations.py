@@ -6,37 +6,37 @@ from dataclasses import replace
 from kpc.encoder.field.config import PROGRESSIVE, TrainConfig
 
 ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
-    "as it is": lambda c: c,
-    "the finest scale alone": lambda c: replace(c, resolutions=c.resolutions[-1:]),
-    "the coarsest scale alone": lambda c: replace(c, resolutions=c.resolutions[:1]),
+    "baseline": lambda c: c,
+    "finest scale only": lambda c: replace(c, resolutions=c.resolutions[-1:]),
+    "coarsest scale only": lambda c: replace(c, resolutions=c.resolutions[:1]),
     "half the channels": lambda c: replace(c, channels=max(1, c.channels // 2)),
     "twice the channels": lambda c: replace(c, channels=2 * c.channels),
-    "one colour from all sides": lambda c: replace(c, view_dependent=False, appearance="none"),
+    "view-independent colour": lambda c: replace(c, view_dependent=False, appearance="none"),
     "no time smoothness": lambda c: replace(c, time_smoothness=0.0),
     "time smoothness x 10": lambda c: replace(c, time_smoothness=10 * c.time_smoothness),
     "no sparse transients": lambda c: replace(c, sparse_transients=0.0),
     "sparse transients x 10": lambda c: replace(c, sparse_transients=10 * c.sparse_transients),
     "sparse transients x 100": lambda c: replace(c, sparse_transients=100 * c.sparse_transients),
     "no space variation": lambda c: replace(c, space_variation=0.0, late_space_variation=0.0),
-    "edges never let be": lambda c: replace(c, edges_from=1.0),
+    "quadratic variation throughout": lambda c: replace(c, edges_from=1.0),
     "no distortion loss": lambda c: replace(c, distortion=0.0),
-    "rays drawn evenly": lambda c: replace(c, temporal_start=1.0, object_rays=0.0),
+    "uniform ray sampling": lambda c: replace(c, temporal_start=1.0, object_rays=0.0),
     "no appearances": lambda c: replace(c, appearance="none"),
     "no motion grid": lambda c: replace(c, motion_cells=0),
-    "planes added up": lambda c: replace(c, summed=True, sparse_transients=0.0),
-    "the hybrid decoder": lambda c: replace(c, hybrid=True),
-    "rows of time by the preset": lambda c: replace(c, time_tolerance=0.0),
-    "planes not tuned": lambda c: replace(c, tune_steps=0),
-    "nothing left out": lambda c: replace(c, prune_share=0.0),
+    "planes summed": lambda c: replace(c, summed=True, sparse_transients=0.0),
+    "hybrid decoder": lambda c: replace(c, hybrid=True),
+    "the preset's time rows": lambda c: replace(c, time_tolerance=0.0),
+    "no sequential fine-tuning": lambda c: replace(c, tune_steps=0),
+    "no pruning": lambda c: replace(c, prune_share=0.0),
     "no channel dropout": lambda c: replace(c, channel_dropout=0.0),
     "all scales from the start": lambda c: replace(c, coarse_until=0.0),
-    "finer scales left out at times": lambda c: replace(c, scale_dropout=PROGRESSIVE),
+    "scale dropout": lambda c: replace(c, scale_dropout=PROGRESSIVE),
 }
-"""What is changed, by name, the unchanged run first. Appearances act through what "one colour from all sides" leaves out. Runs with
+"""What is changed, by name, the unchanged run first. Appearances act through what "view-independent colour" leaves out. Runs with
 appearances are scored on right halves of pictures (`evaluate`), those without on whole ones."""
 
 
-def changed_by(config: TrainConfig) -> list[str]:
+def effective_ablations(config: TrainConfig) -> list[str]:
     """The names of the ablations that make a difference to a config, and of the unchanged run."""
     first, *others = ABLATIONS
     return [first] + [name for name in others if ABLATIONS[name](config) != config]

@@ -26,7 +26,7 @@ class SceneRenderer:
 
     def __init__(self, scene: Scene, field: Field | None = None) -> None:
         """`field`: of which the scene is but the surroundings, where no scene can hold it."""
-        self.scene, self.field = scene, field or Field.from_scene(evenly_wide(scene))
+        self.scene, self.field = scene, field or Field.from_scene(pad_channels(scene))
 
     def rgb(
         self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
@@ -96,7 +96,7 @@ class SceneRenderer:
         opacities = met.opacity.numpy()
         return shade(self.field, batch, met, codes).numpy(), opacities, depths / np.maximum(opacities, np.float32(1e-6))
 
-    def meets(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
+    def hits_occupied(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
         """(N,) bool: whether rays pass where anything may be. The others show the background, whatever planes hold."""
         scene = self.scene
         met: np.ndarray = (
@@ -117,7 +117,7 @@ class SceneRenderer:
         codes = None if code is None else np.tile(code, (w * h, 1))
         return self.rgb(origins, directions, np.full(w * h, pictures.time[number], np.float32), codes).reshape(h, w, 3)
 
-    def code_of_left_half(self, dataset: Dataset, number: int) -> np.ndarray:
+    def fit_left_half(self, dataset: Dataset, number: int) -> np.ndarray:
         """The code that suits at most FIT_RAYS usable pixels of the left half of a picture best, `appearances.fitted_code`."""
         pictures, rng = dataset.pictures, np.random.default_rng(number)
         row, column = np.nonzero(dataset.usable(number)[:, : _middle(dataset, number)])
@@ -125,7 +125,7 @@ class SceneRenderer:
         row, column, n = row[chosen], column[chosen], len(chosen)
         origins, directions = pixel_rays(pictures, np.full(n, number), column, row, self.scene.mapping)
         batch = self.batch(origins, directions, np.full(n, pictures.time[number]))
-        return fitted_code(self.scene, self.field, batch, torch.from_numpy(true_picture(dataset, number)[row, column]))
+        return fitted_code(self.scene, self.field, batch, torch.from_numpy(ground_truth(dataset, number)[row, column]))
 
     def batch(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> Rays:
         """Rays as pictures are made of them: samples in the middle of their steps, the scene's background."""
@@ -133,7 +133,7 @@ class SceneRenderer:
         return Rays.of(origins, directions, times, np.full(n, 0.5), np.tile(self.scene.background, (n, 1)))
 
 
-def evenly_wide(scene: Scene) -> Scene:
+def pad_channels(scene: Scene) -> Scene:
     """The same scene with as many channels at every scale as the widest has: the kernels know one number. What is added is 0 and
     weighs nothing; the features of each scale stay in front of it."""
     counts = [scale["xy"].shape[2] for scale in scene.scales]
@@ -151,7 +151,7 @@ def evenly_wide(scene: Scene) -> Scene:
     return replace(scene, scales=scales, decoder=decoder)
 
 
-def as_wide_as(scene: Scene, decoder: AnyDecoder) -> AnyDecoder:
+def unpad_decoder(scene: Scene, decoder: AnyDecoder) -> AnyDecoder:
     """The decoder of `evenly_wide(scene)` without what was added."""
     if not isinstance(decoder, Decoder):
         return decoder
@@ -194,9 +194,9 @@ def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None, field: 
     renderer = SceneRenderer(scene, field)
     scores = []
     for number in map(int, held_out):
-        start, code = first[number], renderer.code_of_left_half(dataset, number) if scene.appearances else None
+        start, code = first[number], renderer.fit_left_half(dataset, number) if scene.appearances else None
         picture = np.clip(renderer.picture(dataset, number, start, code), 0, 1)
-        truth = true_picture(dataset, number)[:, start:]
+        truth = ground_truth(dataset, number)[:, start:]
         if dataset.masks is None:
             scores.append((psnr(picture, truth), ssim(picture, truth)))
         else:
@@ -211,7 +211,7 @@ def _middle(dataset: Dataset, number: int) -> int:
     return int(dataset.pictures.width[number]) // 2
 
 
-def true_picture(dataset: Dataset, number: int) -> np.ndarray:
+def ground_truth(dataset: Dataset, number: int) -> np.ndarray:
     """A picture of the dataset as (H, W, 3) float32 in [0, 1], on white where it is transparent."""
     picture = dataset.pixels.picture(number).astype(np.float32) / np.float32(255)
     if dataset.has_alpha:

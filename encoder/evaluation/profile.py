@@ -51,7 +51,7 @@ def profile(trainer: Trainer) -> dict[str, Any]:
         rays = trainer.rays_a_step
         samples.append(trainer.samples_per_ray)
         plain_s.append(_plain_step(trainer, plain, rays))
-    flops, bytes_ = work(trainer.field.layout, rays * statistics.median(samples))
+    flops, bytes_ = least_work(trainer.field.layout, rays * statistics.median(samples))
     kernel_s = statistics.median(part["kernel"] for part in parts)
     return {
         "device": "cpu",
@@ -85,7 +85,7 @@ def _profile_on_gpu(trainer: Trainer) -> dict[str, Any]:
         trainer.step += 1
         moved.append(traffic.bytes)
     step_s, bytes_ = statistics.median(steps_s), statistics.mean(moved)
-    _, least = work(trainer.field.layout, rays * trainer.samples_per_ray)
+    _, least = least_work(trainer.field.layout, rays * trainer.samples_per_ray)
     limit = _copy_rate()
     return {
         "device": torch.cuda.get_device_name(),
@@ -147,7 +147,7 @@ def _bytes(tensor: torch.Tensor) -> int:
     return numbers * tensor.element_size()
 
 
-def work(layout: Layout, samples: float) -> tuple[float, float]:
+def least_work(layout: Layout, samples: float) -> tuple[float, float]:
     """What `kernels.backpropagate` has to do for so many samples at least: float operations, and bytes of texels read or written.
 
     With P planes a scale and F = S M features, a sample takes 8 P F to interpolate and as many to give the gradient back, P F to

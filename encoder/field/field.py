@@ -297,7 +297,7 @@ class Field(nn.Module):
     @staticmethod
     def from_scene(scene: Scene) -> "Field":
         """The field whose planes, decoder and codes a scene holds. Its planes have at least two texels along either axis
-        (`kpc.encoder.rdo.codec_model.with_two_texels`)."""
+        (`kpc.encoder.rdo.codec_model.widen_single_texels`)."""
         if any(min(plane.shape[:2]) < 2 for scale in scene.scales for plane in scale.values()):
             raise ValueError("a plane has but one texel along an axis")
         shape = {name: scene.scales[0][name].shape for name in scene.scales[0]}

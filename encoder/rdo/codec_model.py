@@ -14,31 +14,31 @@ from typing import Any
 
 import numpy as np
 import torch
-from kpc.encoder.evaluation.validation_rays import Measure, Measured, Probe
-from kpc.encoder.rdo.curvature import Curvature, PerPlane, curvature
-from kpc.encoder.rdo.distortion import Name
-from kpc.encoder.rdo.mode_decision import quantise_by_cost, step_asked_for
-from kpc.encoder.rdo.motion_rdo import with_coarser_motion
-from kpc.encoder.rdo.occupancy_rdo import errors_of_flips, told_cheaply
+from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, ValidationRays
+from kpc.encoder.rdo.curvature import Curvature, PerPlane, estimate_curvature
+from kpc.encoder.rdo.distortion import PlaneKey
+from kpc.encoder.rdo.mode_decision import quantise_by_cost, requested_step
+from kpc.encoder.rdo.motion_rdo import coarsen_motion
+from kpc.encoder.rdo.occupancy_rdo import flip_errors, optimise_occupancy
 from kpc.encoder.rdo.prune import Pruned, prune
 from kpc.encoder.rdo.rate_control import (
     DECODER_SHARE,
-    ERRORS_LEFT,
-    ROUGHLY,
+    ROUGH_TOLERANCE,
     SLOTS_SHARE,
+    TUNED_ERROR,
     Attempt,
-    Quantise,
+    QuantiseFunction,
     Trade,
-    compress,
-    decoder_bits,
-    error_at,
-    loss_at,
+    choose_decoder_bits,
+    loss_of_mse,
+    meet_trade,
+    mse_of_loss,
+    reduce_slots,
     relative_steps,
     significance,
-    with_fewer_slots,
 )
 from kpc.encoder.rdo.rate_search import TOLERANCE
-from kpc.encoder.rdo.sequential_finetune import spread, tuned
+from kpc.encoder.rdo.sequential_finetune import quantise_sequentially, step_factors
 from kpc.encoder.training.checkpoint import save_state
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, quantise_scene, round_decoder, short_above
 from kpc.format.common.errors import FormatError, TrainingError, UsageError
@@ -69,22 +69,22 @@ class Model:
     """
 
     scene: Scene
-    probe: Probe
+    probe: ValidationRays
     coded: QuantisedScene | None = None
 
     @cached_property
     def curvature(self) -> Curvature:
         """What errors cost, `kpc.encoder.rdo.curvature`."""
-        return curvature(self.scene, self.probe)
+        return estimate_curvature(self.scene, self.probe)
 
     @cached_property
-    def errors_of_flips(self) -> np.ndarray:
+    def flip_errors(self) -> np.ndarray:
         """What it costs to tell a cell otherwise than it is, `kpc.encoder.rdo.occupancy_rdo`."""
-        return errors_of_flips(self.scene, self.probe)
+        return flip_errors(self.scene, self.probe)
 
 
 @dataclass(frozen=True)
-class Coded:
+class CodedModel:
     """What became of a model.
 
     Attributes:
@@ -110,14 +110,14 @@ class Coded:
 
 
 @dataclass(frozen=True)
-class Kept:
+class Selection:
     """What of a model is to be coded, and how finely each number of it.
 
     Attributes:
         scene: as it is coded; `coded`: the file that holds just this scene, None where there is none.
         steps: of each plane, up to one factor. significant, together: as of `kpc.encoder.rdo.mode_decision.quantise_by_cost`.
         bits: of the decoder's weights, as of `kpc.format.coding.quantise.round_decoder`.
-        pruned, spare_db: as of `Coded`.
+        pruned, spare_db: as of `CodedModel`.
     """
 
     scene: Scene
@@ -130,35 +130,35 @@ class Kept:
     spare_db: float = 0.0
 
     @staticmethod
-    def all_of(model: Model) -> "Kept":
-        significant = significance(model.curvature.alone)
+    def all_of(model: Model) -> "Selection":
+        significant = significance(model.curvature.diagonal)
         steps: PerPlane = (
             relative_steps(significant)
             if model.coded is None
-            else [{name: step_asked_for(plane) for name, plane in scale.items()} for scale in model.coded.scales]
+            else [{name: requested_step(plane) for name, plane in scale.items()} for scale in model.coded.scales]
         )
-        return Kept(model.scene, model.coded, steps, significant, model.curvature.together)
+        return Selection(model.scene, model.coded, steps, significant, model.curvature.correlation)
 
-    def needed(self, model: Model, measure: Measure, loss_db: float, prune_share: float, grids: bool) -> "Kept":
+    def needed(self, model: Model, measure: Measure, loss_db: float, prune_share: float, grids: bool) -> "Selection":
         """What of all of a model its pictures need, if coding may cost them `loss_db`; other arguments as of `code`."""
         whole, kept = measure(model.scene).psnr, replace(self, spare_db=prune_share * loss_db)
-        error = error_at(whole, loss_db)
+        error = mse_of_loss(whole, loss_db)
         if kept.spare_db > 0 and isinstance(self.scene.decoder, Decoder):  # no other is linear
             pruned = prune(self.scene, model.probe.rays, lambda candidate: measure(candidate).psnr, kept.spare_db)
             kept = replace(kept, pruned=pruned)
-            if self.coded is None or pruned.left_out_any:
-                kept = replace(kept, scene=pruned.scene, coded=None, steps=pruned.of_each_plane(self.steps),
-                               significant=pruned.of_each_plane(self.significant),
-                               together=pruned.of_each_plane(self.together, in_pairs=True))  # fmt: skip
+            if self.coded is None or pruned.removed_any:
+                kept = replace(kept, scene=pruned.scene, coded=None, steps=pruned.select_channels(self.steps),
+                               significant=pruned.select_channels(self.significant),
+                               together=pruned.select_channels(self.together, in_pairs=True))  # fmt: skip
         scene = kept.scene
         if model.coded is None:  # a file that is coded again and again is not to be marched ever longer
-            scene = with_fewer_slots(scene, measure, SLOTS_SHARE * error)
-            scene = told_cheaply(scene, model.errors_of_flips, measure, error) if grids else scene
+            scene = reduce_slots(scene, measure, SLOTS_SHARE * error)
+            scene = optimise_occupancy(scene, model.flip_errors, measure, error) if grids else scene
         own = 0 if model.coded is None or model.coded.motion is None else round(model.coded.motion.step / FINEST_STEP)
-        coarser = with_coarser_motion(scene, model.curvature.motion if grids else None, measure, error, own)
+        coarser = coarsen_motion(scene, model.curvature.motion if grids else None, measure, error, own)
         if coarser is not scene:
             kept = replace(kept, coded=None)
-        return replace(kept, scene=coarser, bits=decoder_bits(coarser, measure, DECODER_SHARE * error))
+        return replace(kept, scene=coarser, bits=choose_decoder_bits(coarser, measure, DECODER_SHARE * error))
 
 
 def code(
@@ -166,10 +166,10 @@ def code(
     trade: Trade,
     prune_share: float,
     tune_steps: int,
-    quantise: Quantise | None = None,
+    quantise: QuantiseFunction | None = None,
     shown: bool = False,
     grids: bool = True,
-) -> Coded:
+) -> CodedModel:
     """What of a model is needed, `kpc.encoder.rdo.prune`, in symbols as coarse or as fine as a trade asks for.
 
     Args:
@@ -185,13 +185,13 @@ def code(
     measure = model.probe.measure(model.scene)
     whole = measure(model.scene).psnr
 
-    def met(kept: Kept, tune_steps: int, tolerance: float) -> Attempt:
+    def met(kept: Selection, tune_steps: int, tolerance: float) -> Attempt:
         def chosen(
             scene: Scene,
             steps: PerPlane,
             reached: np.ndarray,
             significant: PerPlane,
-            only: Collection[Name] | None = None,
+            only: Collection[PlaneKey] | None = None,
         ) -> QuantisedScene:
             if quantise is not None:
                 quantised = quantise(scene, steps, reached, significant)
@@ -201,18 +201,18 @@ def code(
 
         def tune(steps: PerPlane, reached: np.ndarray) -> QuantisedScene:
             if model.coded is None:  # steps of a file were spread when it was made
-                factors = spread(kept.scene)
+                factors = step_factors(kept.scene)
                 steps = [
                     {name: short_above(step * np.float32(factors[s, name])) for name, step in scale.items()}
                     for s, scale in enumerate(steps)
                 ]
 
-            def choose(candidate: Scene, group: Sequence[Name]) -> QuantisedScene:
+            def choose(candidate: Scene, group: Sequence[PlaneKey]) -> QuantisedScene:
                 return chosen(candidate, steps, reached, kept.significant, group)
 
-            return tuned(kept.scene, model.scene, choose, tune_steps, shown)
+            return quantise_sequentially(kept.scene, model.scene, choose, tune_steps, shown)
 
-        return compress(
+        return meet_trade(
             kept.scene,
             kept.steps,
             kept.significant,
@@ -226,17 +226,20 @@ def code(
             tolerance=tolerance,
         )
 
-    def needed(loss_db: float) -> Kept:
+    def needed(loss_db: float) -> Selection:
         return every.needed(model, measure, loss_db, prune_share, grids)
 
-    every = Kept.all_of(model)
+    every = Selection.all_of(model)
     if trade.target_bytes is None:
         kept = needed(trade.loss_db(whole))
     else:  # what that costs is known when it has been tried, and less when bytes are spared elsewhere
         kept, loss_db = every, math.inf
         for _ in range(LOOKS):
-            lost = max(0.0, whole - met(kept, 0, ROUGHLY).measured.psnr)
-            before, loss_db = loss_db, loss_at(whole, (ERRORS_LEFT if tune_steps else 1.0) * error_at(whole, lost))
+            lost = max(0.0, whole - met(kept, 0, ROUGH_TOLERANCE).measured.psnr)
+            before, loss_db = (
+                loss_db,
+                loss_of_mse(whole, (TUNED_ERROR if tune_steps else 1.0) * mse_of_loss(whole, lost)),
+            )
             if loss_db >= LESS * before:
                 break
             kept = needed(loss_db)
@@ -248,8 +251,8 @@ def code(
         )
     if model.coded is not None and (as_it_was := Attempt(model.coded, measure, 0.0)).size_bytes <= found.size_bytes:
         found, pruned = as_it_was, None
-    measured: Measured = found.measured
-    return Coded(
+    measured: Fidelity = found.measured
+    return CodedModel(
         found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, kept.spare_db
     )
 
@@ -260,27 +263,27 @@ def load(path: Path) -> Model:
     Raises:
         UsageError: it is neither. TrainingError: the checkpoint cannot be used. FormatError: the file cannot be read.
     """
-    if begins_with(path, MAGIC):
-        return model_of(scene_io.read(path))
-    if begins_with(path, CHECKPOINT_MAGIC):
+    if starts_with(path, MAGIC):
+        return model_from_file(scene_io.read(path))
+    if starts_with(path, CHECKPOINT_MAGIC):
         return load_checkpoint(path)
     raise UsageError(f"{path}: neither a folder of videos or images, nor a finished checkpoint, nor a .kpc file")
 
 
-def begins_with(path: Path, magic: bytes) -> bool:
+def starts_with(path: Path, magic: bytes) -> bool:
     """Whether a file is of the kind that begins so."""
     with path.open("rb") as opened:
         return opened.read(len(magic)) == magic
 
 
-def model_of(coded: QuantisedScene) -> Model:
+def model_from_file(coded: QuantisedScene) -> Model:
     """A scene as a file holds it, to be coded again."""
-    coded = with_two_texels(coded)
+    coded = widen_single_texels(coded)
     scene = coded.dequantise()
-    return Model(scene, Probe.of_cameras(scene), coded)
+    return Model(scene, ValidationRays.from_cameras(scene), coded)
 
 
-def with_two_texels(coded: QuantisedScene) -> QuantisedScene:
+def widen_single_texels(coded: QuantisedScene) -> QuantisedScene:
     """The same pictures of planes with at least two texels along either axis, as training wants them: files may hold one, all along the axis."""
 
     def widened(plane: QuantisedPlane) -> QuantisedPlane:
@@ -296,7 +299,7 @@ def with_two_texels(coded: QuantisedScene) -> QuantisedScene:
 # --- finished checkpoints
 
 
-def save_checkpoint(path: Path, scene: Scene, probe: Probe) -> None:
+def save_checkpoint(path: Path, scene: Scene, probe: ValidationRays) -> None:
     """Write all that coding asks for, as plain tensors and numbers.
 
     Raises:
@@ -344,7 +347,7 @@ def load_checkpoint(path: Path) -> Model:
             )
         state = _changed(state, torch.Tensor, _as_array)
         scene = _scene_of(state)
-        probe = Probe(**state["probe"])
+        probe = ValidationRays(**state["probe"])
         _check(scene, probe)
         # What no file could hold is found here, by the rules of every reader, before anything is rendered.
         scene_io.scene_chunks(
@@ -376,7 +379,7 @@ def _scene_of(state: Mapping[str, Any]) -> Scene:
     )
 
 
-def _check(scene: Scene, probe: Probe) -> None:
+def _check(scene: Scene, probe: ValidationRays) -> None:
     """What coding relies on beyond the rules of files."""
     for planes in scene.scales:
         for name, plane in planes.items():

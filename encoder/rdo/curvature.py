@@ -18,16 +18,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from kpc.encoder.evaluation.evaluate import SceneRenderer
-from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.field import Layout
 from kpc.encoder.field.render import marched, shade
 from kpc.format.scene.scene import Scene
 
-SIDE = 2
+BLOCK_SIDE = 2
 """Texels along that of a block. Default scene, at equal error of pictures: files are 1 % larger with 4 or 8."""
 RAYS = 1 << 18
 """That planes are judged by. Room and soldier, files at equal error of held-out views: with 1 << 17 one to two percent larger."""
-RAYS_AT_ONCE = 1 << 10
+RAYS_PER_GRADIENT = 1 << 10
 """In one gradient: the more, the more cross terms have to cancel; the fewer, the longer it takes."""
 
 
@@ -40,31 +40,31 @@ class Curvature:
     """What errors in planes cost.
 
     Attributes:
-        alone: (rows, columns, M) float32, none negative: mean squared derivatives of colours by each number.
-        together: (blocks down, blocks along, M, M) float32: of each block of SIDE x SIDE texels, the correlation of derivatives by two
+        diagonal: (rows, columns, M) float32, none negative: mean squared derivatives of colours by each number.
+        correlation: (blocks down, blocks along, M, M) float32: of each block of SIDE x SIDE texels, the correlation of derivatives by two
             channels of a texel, from -1 to 1, and 0 for a channel with itself.
-        motion: (T, Nz, Ny, Nx, 3) float32: as `alone`, of displacements; None where there are none.
+        motion: (T, Nz, Ny, Nx, 3) float32: as `diagonal`, of displacements; None where there are none.
     """
 
-    alone: PerPlane
-    together: PerPlane
+    diagonal: PerPlane
+    correlation: PerPlane
     motion: np.ndarray | None = None
 
 
-def curvature(scene: Scene, probe: Probe, rays: int | None = None) -> Curvature:
+def estimate_curvature(scene: Scene, probe: ValidationRays, rays: int | None = None) -> Curvature:
     """Of a scene's planes, by a probe and by random rays of its cameras, as far as they pass where anything may be; in all RAYS, if not said.
 
     Takes one copy of the planes and of their gradient per core, M numbers for SIDE^2 of them, and nothing that grows with `rays`.
     """
     renderer, rng = SceneRenderer(scene), np.random.default_rng(3)
     field, rays = renderer.field, RAYS if rays is None else rays
-    probe = probe.some(rng.permutation(np.flatnonzero(renderer.meets(*probe.rays)))[:rays])
-    more = Probe.of_surfaces(scene, rays - len(probe.times), seed=2)
+    probe = probe.subset(rng.permutation(np.flatnonzero(renderer.hits_occupied(*probe.rays)))[:rays])
+    more = ValidationRays.through_occupied(scene, rays - len(probe.times), seed=2)
     learnt = [field.theta] if field.motion is None else [field.theta, field.motion]
     squares = [torch.zeros_like(one) for one in learnt]
     products = [{name: _products(np.zeros_like(plane)) for name, plane in scale.items()} for scale in scene.scales]
     for one in (probe, more):
-        for some in one.in_parts(RAYS_AT_ONCE):
+        for some in one.batches(RAYS_PER_GRADIENT):
             batch = renderer.batch(*some.rays)
             _, met = marched(field, batch, scene)
             codes = renderer.codes(some.appearances)
@@ -97,9 +97,11 @@ def _by_plane(layout: Layout, scene: Scene, numbers: np.ndarray) -> list[dict[st
 def _products(plane: np.ndarray) -> np.ndarray:
     """(blocks down, blocks along, M, M): of a (rows, columns, M) plane, products of channels, summed over the texels of each block."""
     rows, columns, M = plane.shape
-    whole = np.pad(plane, ((0, -rows % SIDE), (0, -columns % SIDE), (0, 0)))
+    whole = np.pad(plane, ((0, -rows % BLOCK_SIDE), (0, -columns % BLOCK_SIDE), (0, 0)))
     blocks = (
-        whole.reshape(-(-rows // SIDE), SIDE, -1, SIDE, M).swapaxes(1, 2).reshape(-(-rows // SIDE), -1, SIDE * SIDE, M)
+        whole.reshape(-(-rows // BLOCK_SIDE), BLOCK_SIDE, -1, BLOCK_SIDE, M)
+        .swapaxes(1, 2)
+        .reshape(-(-rows // BLOCK_SIDE), -1, BLOCK_SIDE * BLOCK_SIDE, M)
     )
     return blocks.swapaxes(2, 3) @ blocks
 

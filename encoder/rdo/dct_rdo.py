@@ -19,9 +19,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from kpc.encoder.rdo.curvature import SIDE
-from kpc.encoder.rdo.distortion import LAM, bits_of_magnitudes, others, worths
-from kpc.encoder.rdo.texel_map_rdo import told_texels
+from kpc.encoder.rdo.curvature import BLOCK_SIDE
+from kpc.encoder.rdo.distortion import LAM, cross_channel_errors, distortion_weights, magnitude_bits
+from kpc.encoder.rdo.texel_map_rdo import choose_coded_texels
 from kpc.format.coding.quantise import QuantisedPlane, quantise_plane, short_above
 from kpc.format.coding.rans import compiled, inlined
 from kpc.format.coding.transform import (
@@ -49,27 +49,27 @@ from kpc.format.coding.transform import (
 )
 from kpc.format.container.segments import Told, rows_of_segments
 
-PRICE = 0.03
+TRANSFORM_LAM = 0.03
 """Squared quantisers that a bit is worth: so quantisers are sqrt(LAM / PRICE) steps of the trellis at which bits are worth as much. With more
 levels that would be small become none, and pictures lose of all planes what is quick: soldier, all planes, at equal error of pictures (40 and
 34 dB): files are 7 and 8 % larger with 0.12."""
-STEPS = math.sqrt(LAM / PRICE)
+STEPS_PER_QUANTISER = math.sqrt(LAM / TRANSFORM_LAM)
 """Of those that are asked for, in a quantiser."""
-LEAST_QUANTISER, MOST_QUANTISER = 24, 64
+MIN_QUANTISER, MAX_QUANTISER = 24, 64
 """In 1 / PARTS of a symbol. With less, rounding to symbols errs too much where blocks are fine; with more, it hardly matters."""
-MARGIN = 250
+USABLE_LEVELS = 250
 """Symbols of 256 that a plane's range may take: what is wanted moves."""
 PASSES = 4
 """Searches. With two, errors and what bits are worth are 1 % more, with eight half a percent less."""
-FILLED = 6
+FILL_ITERATIONS = 6
 """Texels from what is needed that are filled in for the first search."""
-SPARING = 0.1
+FIRST_DEAD_ZONE = 0.1
 """What the first search needs less than half a quantiser."""
-TOLD_APART = 20
+MAGNITUDE_BINS = 20
 """Magnitudes of levels whose bits are told apart."""
 
 
-def in_blocks(
+def transform_quantise(
     plane: QuantisedPlane,
     values: np.ndarray,
     step: np.ndarray,
@@ -85,23 +85,25 @@ def in_blocks(
     Args:
         plane: quantised to the nearest: what it leaves out stays so. values: (H, W, M) float32.
         step: (M,) for which bits are worth as much as `kpc.encoder.rdo.distortion.LAM` says.
-        significant, together: as of `kpc.encoder.rdo.trellis.on_trellis`.
+        significant, together: as of `kpc.encoder.rdo.trellis.trellis_quantise`.
         implied: as of `kpc.format.coding.transform.encode_blocks`, for the plane.
         needed: of a time plane, (H, W) bool: the texels that are told. None: those of `kpc.encoder.rdo.texel_map_rdo`.
     """
-    worth, known = worths(significant, plane.coded), plane.coded
+    worth, known = distortion_weights(significant, plane.coded), plane.coded
     if needed is not None:
         known = needed
     elif identity:
-        known = told_texels((values - plane.offset) / step, worth, known)
+        known = choose_coded_texels((values - plane.offset) / step, worth, known)
     if not known.any():
         return None
     wanted = values[known].astype(np.float64)
     reach = 2 * np.abs(wanted - 1).max(0) if identity else np.ptp(wanted, axis=0)
-    quantiser = int(min(MOST_QUANTISER, (PARTS * MARGIN * STEPS * step / np.maximum(reach, 1e-30)).min()))
-    if quantiser < LEAST_QUANTISER:
+    quantiser = int(
+        min(MAX_QUANTISER, (PARTS * USABLE_LEVELS * STEPS_PER_QUANTISER * step / np.maximum(reach, 1e-30)).min())
+    )
+    if quantiser < MIN_QUANTISER:
         return None
-    symbol = short_above((STEPS * PARTS / quantiser * step).astype(np.float32))
+    symbol = short_above((STEPS_PER_QUANTISER * PARTS / quantiser * step).astype(np.float32))
     finer = quantise_plane(values, symbol, identity=identity, needed=known)
     wanted = (values.astype(np.float64) - finer.offset) / finer.step * (PARTS / quantiser)
     rows = rows_of_segments(len(values), identity)
@@ -109,7 +111,7 @@ def in_blocks(
     for start in range(0, len(values), rows):
         own = slice(start, start + rows)
         there = np.ascontiguousarray(known[own])
-        blocks = searched(
+        blocks = search_blocks(
             wanted[own],
             worth[own],
             there,
@@ -125,19 +127,19 @@ def in_blocks(
     )
 
 
-def step_in_blocks(plane: QuantisedPlane) -> np.ndarray:
-    """(M,) float64: for which steps `in_blocks` was asked when it made this plane."""
+def requested_transform_step(plane: QuantisedPlane) -> np.ndarray:
+    """(M,) float64: for which steps `transform_quantise` was asked when it made this plane."""
     assert isinstance(plane.guide, Told)
     quantiser = next(iter(plane.guide.segments.values()))[2]
-    return plane.step.astype(np.float64) * quantiser / (STEPS * PARTS)
+    return plane.step.astype(np.float64) * quantiser / (STEPS_PER_QUANTISER * PARTS)
 
 
 def _own_blocks(together: np.ndarray, start: int, rows: int) -> np.ndarray:
     """What goes together in some rows; segments are whole blocks of it."""
-    return np.ascontiguousarray(together[start // SIDE : -(-(start + rows) // SIDE)])
+    return np.ascontiguousarray(together[start // BLOCK_SIDE : -(-(start + rows) // BLOCK_SIDE)])
 
 
-def searched(
+def search_blocks(
     wanted: np.ndarray, worth: np.ndarray, known: np.ndarray, together: np.ndarray, side: int, quantiser: int
 ) -> Blocks:
     """Blocks of a segment.
@@ -154,7 +156,7 @@ def searched(
     seen = 1 / np.outer(along, along) ** 2
     blocks = Blocks(np.zeros((M, *busy.shape, side, side), np.int64), fineness, quantiser)
     errors = np.zeros((H + 2, W + 2, M), np.float32)
-    counts, end_counts = np.zeros((SIZES * FREQUENCIES, TOLD_APART + 1)), np.zeros((ENDS, 2 * side))
+    counts, end_counts = np.zeros((SIZES * FREQUENCIES, MAGNITUDE_BINS + 1)), np.zeros((ENDS, 2 * side))
     for number in range(PASSES):
         counts, end_counts = _search(wanted, worth, known, busy, blocks.levels, fineness, finer, basis, seen, filled if number == 0 else None,
                                      _bits(counts), _end_bits(end_counts), errors, together)  # fmt: skip
@@ -183,7 +185,7 @@ def _filled(wanted: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
     sums = np.pad(wanted * known[..., None], border)
     mean = sums.sum((0, 1)) / max(weights.sum(), 1)
     filled, done = np.where(weights > 0, sums, mean), weights > 0
-    for _ in range(FILLED):
+    for _ in range(FILL_ITERATIONS):
         sums, weights = _blurred(sums), _blurred(weights)
         new = ~done & (weights > 1e-9)
         filled = np.where(new, sums / np.maximum(weights, 1e-9), filled)
@@ -207,7 +209,7 @@ def _bits(counts: np.ndarray) -> np.ndarray:
     )  # of 36 levels, as `level_context` sums them
     mean = np.repeat(total / 36 + 0.02, FREQUENCIES)
     mean[FREQUENCIES - 1 :: FREQUENCIES] *= 3
-    return bits_of_magnitudes(counts, mean)
+    return magnitude_bits(counts, mean)
 
 
 def _end_bits(counts: np.ndarray) -> np.ndarray:
@@ -226,7 +228,7 @@ def _search(
 
     Args:
         finer: (FINENESSES, N, N) of a level, in quantisers. basis: (N, N), orthonormal. seen: (N, N), what errors cost by how quick they are.
-        price, end_price: bits. errors: as of `kpc.encoder.rdo.distortion.others`, known here.
+        price, end_price: bits. errors: as of `kpc.encoder.rdo.distortion.cross_channel_errors`, known here.
     """
     H, W, M = wanted.shape
     BY, BX = busy.shape
@@ -238,7 +240,7 @@ def _search(
     error, weight, curve, told = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N), np.int64)
     right, bottom = np.zeros(N), np.zeros((BX, N))
     for m in range(M):
-        moved = others(errors, together, m)
+        moved = cross_channel_errors(errors, together, m)
         for by in range(BY):
             for bx in range(BX):
                 Y, X, quantiser, block = by + 1, bx + 1, finer[fineness[by, bx]], levels[m, by, bx]
@@ -299,7 +301,7 @@ def _search(
                 for diagonal in range(last):
                     for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1):
                         context = level_context(here, left, above, past, i, diagonal - i, N)
-                        counts[context, min(here[i, diagonal - i], TOLD_APART)] += 1
+                        counts[context, min(here[i, diagonal - i], MAGNITUDE_BINS)] += 1
                 for y in range(N):
                     for x in range(N):
                         if weight[y, x] > 0:
@@ -323,7 +325,7 @@ def _begin(values, quantiser, basis, block):
                     along += values[y, x] * basis[j, x]
                 total += along * basis[i, y]
             level = total / quantiser[i, j]
-            size = int(abs(level) + 0.5 - (SPARING if i + j else 0.0))
+            size = int(abs(level) + 0.5 - (FIRST_DEAD_ZONE if i + j else 0.0))
             block[i, j] = size if level > 0 else -size
 
 
@@ -391,7 +393,7 @@ def _cheapest(best, usual, worth, bits):
     found, least = usual, np.inf
     for which in range(3):
         level = nearest if which == 0 else usual if which == 2 else nearest - 1 if nearest > usual else nearest + 1
-        cost = worth * (level - best) ** 2 + PRICE * bits[min(abs(level - usual), TOLD_APART)]
+        cost = worth * (level - best) ** 2 + TRANSFORM_LAM * bits[min(abs(level - usual), MAGNITUDE_BINS)]
         if cost < least:
             found, least = level, cost
     return found
@@ -410,11 +412,11 @@ def _trimmed(
         for diagonal in range(before, last):
             for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1):
                 j = diagonal - i
-                saved += price[level_context(here, left, above, past, i, j, N), min(told[i, j], TOLD_APART)]
+                saved += price[level_context(here, left, above, past, i, j, N), min(told[i, j], MAGNITUDE_BINS)]
                 if told[i, j]:
                     factor = block[i, j] * quantiser[i, j]
                     lost += seen[i, j] * factor * (curve[i, j] * factor - 2 * _slope(error, weight, basis, i, j))
-        if lost + PRICE * (end_price[before] - end_price[last] - saved) >= 0:
+        if lost + TRANSFORM_LAM * (end_price[before] - end_price[last] - saved) >= 0:
             break
         for i in range(max(0, last - N), min(last - 1, N - 1) + 1):
             j = last - 1 - i

@@ -16,20 +16,20 @@ from dataclasses import replace
 
 import numpy as np
 from kpc.encoder.rdo.curvature import PerPlane
-from kpc.encoder.rdo.dct_rdo import in_blocks, step_in_blocks
-from kpc.encoder.rdo.distortion import ALONE, Name, cost, worths
-from kpc.encoder.rdo.trellis import THIN, on_trellis, step_on_trellis
+from kpc.encoder.rdo.dct_rdo import requested_transform_step, transform_quantise
+from kpc.encoder.rdo.distortion import NO_CORRELATION, PlaneKey, distortion_weights, total_distortion
+from kpc.encoder.rdo.trellis import LOW_RATE_BITS, requested_trellis_step, trellis_quantise
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels, quantise_scene, reached_by
 from kpc.format.container.segments import Told, encode_coded, guide_at, rows_of_segments
 from kpc.format.scene.scene import TIME_PLANES, Scene
 
-SIDES = 8, 16
+BLOCK_SIDES = 8, 16
 """Of blocks that are tried. Those of 4 never cost least (room, soldier)."""
-SLOPE = 0.9
+DECISION_LAM = 0.9
 """Squared steps that a bit is worth where planes are compared: what errors fall by, on the trellis and in blocks, when steps are made finer. (In
 searches bits are worth less, `kpc.encoder.rdo.distortion.LAM`: what is coarse in one place is made up for in others.)"""
-COHERENT = 1.15
-"""What errors of blocks cost, of what `cost` says: they lack what is quick in all channels and planes alike, and pictures see the sum (soldier, room:
+TRANSFORM_ERROR_FACTOR = 1.15
+"""What errors of blocks cost, of what `total_distortion` says: they lack what is quick in all channels and planes alike, and pictures see the sum (soldier, room:
 1.1 to 1.2)."""
 FEW_BITS, MANY_BITS = 0.25, 1.5
 """A symbol, in blocks: with fewer the trellis, which then always costs more, is not tried; with more larger blocks are not."""
@@ -40,9 +40,9 @@ def quantise_by_cost(
     steps: PerPlane,
     reached: np.ndarray | None = None,
     significant: PerPlane | None = None,
-    only: Collection[Name] | None = None,
+    only: Collection[PlaneKey] | None = None,
     together: PerPlane | None = None,
-    thin: float = THIN,
+    thin: float = LOW_RATE_BITS,
     blocks: bool = True,
 ) -> QuantisedScene:
     """As `quantise_scene`, with symbols that cost least.
@@ -51,7 +51,7 @@ def quantise_by_cost(
         significant: what a squared error costs in each number, relative to others of its channel; (H, W, M), none negative. None: the same.
         only: the planes whose symbols are searched for; others are rounded. None: all.
         together: as of `kpc.encoder.rdo.curvature.Curvature`. None: channels know nothing of each other.
-        thin: as of `kpc.encoder.rdo.trellis.on_trellis`. blocks: whether planes may be told in blocks.
+        thin: as of `kpc.encoder.rdo.trellis.trellis_quantise`. blocks: whether planes may be told in blocks.
     """
     reached = reached_by(scene) if reached is None else reached
     quantised = quantise_scene(scene, steps, reached=reached)
@@ -60,12 +60,12 @@ def quantise_by_cost(
     ]
     chosen = [(s, name) for s, scale in enumerate(scene.scales) for name in scale if only is None or (s, name) in only]
 
-    def found(plane: Name) -> QuantisedPlane:
+    def found(plane: PlaneKey) -> QuantisedPlane:
         s, name = plane
-        values, beside = scene.scales[s][name], ALONE if together is None else together[s][name]
+        values, beside = scene.scales[s][name], NO_CORRELATION if together is None else together[s][name]
         asked = quantised.scales[s][name], values, steps[s][name], matters[s][name], name in TIME_PLANES, beside, thin
         if not blocks:
-            return on_trellis(*asked)
+            return trellis_quantise(*asked)
         needed = needed_texels(reached, name, *values.shape[:2])
         implied = needed if reached is scene.occupancy else needed_texels(scene.occupancy, name, *values.shape[:2])
         return _cheapest(*asked, implied, needed)
@@ -79,9 +79,9 @@ def quantise_by_cost(
     return replace(quantised, scales=scales)
 
 
-def step_asked_for(plane: QuantisedPlane) -> np.ndarray:
+def requested_step(plane: QuantisedPlane) -> np.ndarray:
     """(M,) float64: for which steps `quantise_by_cost` was asked when it made this plane, if it did and 8 bits were enough."""
-    return step_in_blocks(plane) if isinstance(plane.guide, Told) else step_on_trellis(plane)
+    return requested_transform_step(plane) if isinstance(plane.guide, Told) else requested_trellis_step(plane)
 
 
 def _cheapest(
@@ -96,19 +96,22 @@ def _cheapest(
     needed: np.ndarray,
 ) -> QuantisedPlane:
     """The plane that is quantised to the nearest, with the symbols that cost least. `needed`: texels that anything occupied looks up; `implied`:
-    those of which a file need not say so. Others as of `on_trellis`."""
-    root = np.sqrt(worths(significant, plane.coded)) * needed[..., None]
+    those of which a file need not say so. Others as of `trellis_quantise`."""
+    root = np.sqrt(distortion_weights(significant, plane.coded)) * needed[..., None]
 
     def in_all(candidate: QuantisedPlane, size_bytes: int) -> float:
-        factor = COHERENT if isinstance(candidate.guide, Told) else 1
-        return factor * cost(root * ((candidate.dequantise() - values) / step), together) + SLOPE * 8 * size_bytes
+        factor = TRANSFORM_ERROR_FACTOR if isinstance(candidate.guide, Told) else 1
+        return (
+            factor * total_distortion(root * ((candidate.dequantise() - values) / step), together)
+            + DECISION_LAM * 8 * size_bytes
+        )
 
     tried = []
-    for side in SIDES:
+    for side in BLOCK_SIDES:
         found = [
             told
             for which in ((None, needed) if identity else (None,))
-            if (told := in_blocks(plane, values, step, significant, identity, together, side, implied, which))
+            if (told := transform_quantise(plane, values, step, significant, identity, together, side, implied, which))
             is not None
         ]
         if not found:
@@ -118,7 +121,7 @@ def _cheapest(
         if bits > MANY_BITS:
             break
     if not tried or bits > FEW_BITS:
-        steered = on_trellis(plane, values, step, significant, identity, together, thin)
+        steered = trellis_quantise(plane, values, step, significant, identity, together, thin)
         if not tried:
             return steered
         tried.append((in_all(steered, _size(steered, identity, implied)), steered))

@@ -14,28 +14,28 @@ from dataclasses import replace
 
 import numpy as np
 from kpc.encoder.evaluation.validation_rays import Measure
-from kpc.encoder.rdo.distortion import BESIDE, bits_of_magnitudes
+from kpc.encoder.rdo.distortion import EDGE_COUPLING, magnitude_bits
 from kpc.format.coding.motion_hierarchical import CONTEXTS, context_of, foreseen, passes, told_beside
 from kpc.format.coding.rans import compiled, inlined
 from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Scene
 
-SHARE, MOST_STEPS = 0.1, 64
+SHARE, MAX_MULTIPLE = 0.1, 64
 """Of the error that coding may bring, how much of it displacements may; and how many of `kpc.format.scene.motion.FINEST_STEP` they may be rounded to.
 Soldier: a motion grid takes 1.2 KB for an error e times smaller, planes 18 KB; at equal slopes it is a fifteenth."""
-PRICE, FINER = 0.1, 0.5
+MOTION_LAM, LEVEL_LAM_RATIO = 0.1, 0.5
 """Soldier, at equal error of pictures: a motion grid takes as many bytes to 2 % with prices of 0.05 and 0.2; and 5 % more with 1 in place of
 FINER."""
-LEAST_WORTH = 2e-3
+MIN_WEIGHT = 2e-3
 """Of a displacement, as a share of the mean. With 1e-2 soldier's grid takes 5 % more bytes, with 1e-4 10 %."""
 SEARCHES = 5
-TOLD_APART = 40
+MAGNITUDE_BINS = 40
 """Magnitudes of what predictions miss whose bits are told apart."""
 EXPECTED = 0.05 + 0.1 * 2.0 ** (np.arange(CONTEXTS) / 2)
 """Of them, in each context, before anything is known."""
 
 
-def with_coarser_motion(scene: Scene, worth: np.ndarray | None, measure: Measure, most: float, own: int = 0) -> Scene:
+def coarsen_motion(scene: Scene, worth: np.ndarray | None, measure: Measure, most: float, own: int = 0) -> Scene:
     """The scene with displacements in as coarse a multiple of `kpc.format.scene.motion.FINEST_STEP` as adds at most SHARE of an error.
 
     Itself where there are none, or no multiple is coarser than its own.
@@ -47,13 +47,13 @@ def with_coarser_motion(scene: Scene, worth: np.ndarray | None, measure: Measure
     """
     if scene.motion is None:
         return scene
-    multiple, known, error = MOST_STEPS, measure(scene).error, SHARE * most  # of what was left out
+    multiple, known, error = MAX_MULTIPLE, measure(scene).mse, SHARE * most  # of what was left out
     while multiple > own:
         step = np.float32(multiple * FINEST_STEP)
         wanted = scene.motion / np.float64(step)
-        symbols = np.rint(wanted) if worth is None else told_cheaply(wanted, worth)
+        symbols = np.rint(wanted) if worth is None else quantise_motion(wanted, worth)
         candidate = replace(scene, motion=symbols.astype(np.float32) * step)
-        found = measure(candidate).error - known
+        found = measure(candidate).mse - known
         if found <= error:
             return candidate
         multiple = (
@@ -62,13 +62,13 @@ def with_coarser_motion(scene: Scene, worth: np.ndarray | None, measure: Measure
     return scene
 
 
-def told_cheaply(wanted: np.ndarray, worth: np.ndarray) -> np.ndarray:
+def quantise_motion(wanted: np.ndarray, worth: np.ndarray) -> np.ndarray:
     """(T, Nz, Ny, Nx, 3) int64 symbols near to `wanted`, in steps, where an error costs `worth`."""
     symbols, order = np.rint(wanted).astype(np.int64), list(passes(wanted.shape[:4]))
-    root = np.sqrt(np.maximum(worth / max(float(worth.mean()), 1e-30), LEAST_WORTH))
-    errors, counts = root * (symbols - wanted), np.zeros((CONTEXTS, TOLD_APART + 1))
+    root = np.sqrt(np.maximum(worth / max(float(worth.mean()), 1e-30), MIN_WEIGHT))
+    errors, counts = root * (symbols - wanted), np.zeros((CONTEXTS, MAGNITUDE_BINS + 1))
     for _ in range(SEARCHES):
-        bits, missed = bits_of_magnitudes(counts, EXPECTED, 2.0), np.zeros_like(symbols)
+        bits, missed = magnitude_bits(counts, EXPECTED, 2.0), np.zeros_like(symbols)
         counts = np.zeros_like(counts)
         for one in order:
             values, r, aim, weight, err = (np.moveaxis(a, one.axis, 0) for a in (symbols, missed, wanted, root, errors))
@@ -82,7 +82,7 @@ def told_cheaply(wanted: np.ndarray, worth: np.ndarray) -> np.ndarray:
                 one.sides,
                 one.weights,
                 *one.there,
-                PRICE * FINER ** (one.level - 1),
+                MOTION_LAM * LEVEL_LAM_RATIO ** (one.level - 1),
                 bits,
                 counts,
             )
@@ -108,7 +108,7 @@ def _search(values, r, wanted, root, errors, new, sides, weights, first, second,
                         values[new[n], a, b, c, m] = value
                         errors[new[n], a, b, c, m] = own * (value - wanted[new[n], a, b, c, m])
                         r[new[n], a, b, c, m] = abs(value - usual)
-                        counts[context, min(abs(value - usual), TOLD_APART)] += 1
+                        counts[context, min(abs(value - usual), MAGNITUDE_BINS)] += 1
 
 
 @inlined
@@ -121,7 +121,7 @@ def _others(errors, t, a, b, c, m):
                 for n in range(max(c - 1, 0), min(c + 2, errors.shape[3])):
                     distance = abs(i - t) + abs(j - a) + abs(k - b) + abs(n - c)
                     if distance > 0:
-                        total += BESIDE**distance * errors[i, j, k, n, m]
+                        total += EDGE_COUPLING**distance * errors[i, j, k, n, m]
     return total
 
 
@@ -134,7 +134,7 @@ def _cheapest(best, usual, worth, price, bits):
         value = nearest if which == 0 else usual if which == 2 else nearest - 1 if nearest > usual else nearest + 1
         away = abs(value - usual)
         cost = worth * (value - best) ** 2 + price * (
-            bits[min(away, TOLD_APART)] + 2 * math.log2(max(away, TOLD_APART) / TOLD_APART)
+            bits[min(away, MAGNITUDE_BINS)] + 2 * math.log2(max(away, MAGNITUDE_BINS) / MAGNITUDE_BINS)
         )
         if cost < least:
             found, least = min(max(value, -32768), 32767), cost

@@ -15,23 +15,23 @@ from dataclasses import replace
 import numpy as np
 import torch
 from kpc.encoder.evaluation.evaluate import SceneRenderer
-from kpc.encoder.evaluation.validation_rays import Measure, Probe
+from kpc.encoder.evaluation.validation_rays import Measure, ValidationRays
 from kpc.encoder.field.render import marched
 from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS
 from kpc.format.coding.rans import compiled, inlined
 from kpc.format.scene.grid import dilate
 from kpc.format.scene.scene import Scene
 
-MARCHED = 0.5
+MARCH_BITS = 0.5
 """Bits that a cell less to march is worth. With 1 soldier has 2 % fewer cells to march, and 3 % more bytes to tell them."""
-BITS = 0.15
+PLANE_BITS = 0.15
 """Of planes, a parameter, that make errors e times smaller: 0.12 to 0.25 for the default scene, soldier, liam and room."""
 CONTRAST = 0.1
 """Mean squared difference in colour, as a share of the full range, between what is in a cell and what is behind it; and as neighbours on a
 ray err together, some more."""
 SHARE = 0.05
 """Of the error that coding may bring, how much may come of this."""
-WARIER = 8.0
+ERROR_GROWTH = 8.0
 """How much more errors are taken to cost, where that was exceeded; and how often that is tried."""
 TRIES = 3
 RAYS, RAYS_A_CELL = 1 << 19, 8
@@ -40,50 +40,53 @@ FEWER_RAYS = 1 << 18
 """At most, that look for what empty cells would show. Those are marched that are next to occupied ones; where they hide others, it is not known what these show."""
 RAYS_AT_ONCE = 1 << 12
 PASSES = 8
-SURE = 8.0
+MAX_OWN_BITS = 8.0
 """Bits more that a flipped cell itself would take, for which what it does to others is not looked at."""
 
 
-def told_cheaply(scene: Scene, errors: np.ndarray, measure: Measure, most: float) -> Scene:
+def optimise_occupancy(scene: Scene, errors: np.ndarray, measure: Measure, most: float) -> Scene:
     """The scene with cells of its occupancy flipped, where it pays and pictures lose no more than SHARE of `most`; else itself.
 
     Args:
-        errors: `errors_of_flips` of the scene, or of one whose slots this one's stand for, several each.
+        errors: `flip_errors` of the scene, or of one whose slots this one's stand for, several each.
         measure: of pictures, by which it is known what they lose. most: the error that coding may bring, in squares of 8-bit levels.
     """
     if most <= 0:
         return scene
     slots, *cells = scene.occupancy.shape
-    known, lost = measure(scene).error, BITS * scene.parameter_count / most * errors.reshape(slots, -1, *cells).sum(1)
+    known, lost = (
+        measure(scene).mse,
+        PLANE_BITS * scene.parameter_count / most * errors.reshape(slots, -1, *cells).sum(1),
+    )
     for number in range(TRIES):
-        candidate = replace(scene, occupancy=flipped(scene.occupancy, WARIER**number * lost))
-        if measure(candidate).error - known <= SHARE * most:
+        candidate = replace(scene, occupancy=flip_cells(scene.occupancy, ERROR_GROWTH**number * lost))
+        if measure(candidate).mse - known <= SHARE * most:
             return candidate
     return scene
 
 
-def errors_of_flips(scene: Scene, probe: Probe, share: int = 1) -> np.ndarray:
+def flip_errors(scene: Scene, probe: ValidationRays, share: int = 1) -> np.ndarray:
     """(slots, Nz, Ny, Nx) float64: mean squared error of colours, in squares of 8-bit levels, that comes of flipping a cell; 0 of those that are
     neither occupied nor next to one. By one in `share` of the rays that it takes."""
     wide = replace(scene, occupancy=dilate(scene.occupancy))
     rays = RAYS_A_CELL * int(np.count_nonzero(scene.occupancy))
     own, next_to_it = (
-        contributions(one, probe, min(rays, most) // share) for one, most in ((scene, RAYS), (wide, FEWER_RAYS))
+        removal_errors(one, probe, min(rays, most) // share) for one, most in ((scene, RAYS), (wide, FEWER_RAYS))
     )
     return np.where(scene.occupancy, own, next_to_it)
 
 
-def contributions(scene: Scene, probe: Probe, rays: int) -> np.ndarray:
+def removal_errors(scene: Scene, probe: ValidationRays, rays: int) -> np.ndarray:
     """(slots, Nz, Ny, Nx) float64: mean squared error of colours, in squares of 8-bit levels, that comes of not marching a cell.
 
     By a probe and so many random rays of the scene's cameras.
     """
     renderer, slots = SceneRenderer(scene), len(scene.occupancy)
-    probe = probe.some(np.flatnonzero(renderer.meets(*probe.rays)))
-    more = Probe.of_surfaces(scene, rays, seed=5)
+    probe = probe.subset(np.flatnonzero(renderer.hits_occupied(*probe.rays)))
+    more = ValidationRays.through_occupied(scene, rays, seed=5)
     sums = np.zeros(scene.occupancy.size)
     for one in (probe, more):
-        for some in one.in_parts(RAYS_AT_ONCE):
+        for some in one.batches(RAYS_AT_ONCE):
             with torch.no_grad():
                 samples, met = marched(renderer.field, renderer.batch(*some.rays), scene)
             ray, weights = samples.ray.numpy(), met.weights.numpy().astype(np.float64)
@@ -99,20 +102,20 @@ def contributions(scene: Scene, probe: Probe, rays: int) -> np.ndarray:
     return error
 
 
-def flipped(occupancy: np.ndarray, lost: np.ndarray) -> np.ndarray:
+def flip_cells(occupancy: np.ndarray, lost: np.ndarray) -> np.ndarray:
     """(slots, Nz, Ny, Nx) bool `occupancy`, as it is cheapest to tell; `lost`: bits that errors of flipping a cell are worth. Cells that
     are neither occupied nor next to one stay empty."""
     cells = np.array(occupancy, np.uint8, order="C")
-    occupied = np.where(occupancy, MARCHED - lost, np.where(dilate(occupancy), MARCHED + lost, np.inf))
+    occupied = np.where(occupancy, MARCH_BITS - lost, np.where(dilate(occupancy), MARCH_BITS + lost, np.inf))
     for _ in range(PASSES):
-        counts = counted(cells, NEIGHBOURS) + 0.4
+        counts = count_contexts(cells, NEIGHBOURS) + 0.4
         if not _flip(cells, -np.log2(counts / counts.sum(1, keepdims=True)), occupied, NEIGHBOURS):
             break
     return cells.view(bool)
 
 
 @compiled()
-def counted(cells, neighbours):
+def count_contexts(cells, neighbours):
     """(CONTEXTS, 2): how often a cell is empty, and how often occupied, in each context."""
     counts = np.zeros((CONTEXTS, 2))
     for s in range(cells.shape[0]):
@@ -143,7 +146,7 @@ def _flip(cells, bits, occupied, neighbours):
                         - bits[context, is_set]
                         + (-occupied[s, z, y, x] if is_set else occupied[s, z, y, x])
                     )
-                    if not more < SURE:
+                    if not more < MAX_OWN_BITS:
                         continue
                     for k in range(len(neighbours)):  # those in whose contexts it is
                         i, j, v, u = (

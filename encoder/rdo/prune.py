@@ -36,24 +36,24 @@ class Pruned:
         scene: channels differ in number from scale to scale; scales left without any are gone.
         kept: one array of channel numbers for every scale there was.
         loss_db: what all of it costs on the probe rays.
-        view_worth_db: what the direction MLP was worth there; None where colour did not depend on the direction.
-        next_db: what one channel less would have cost in all; infinite where one alone is left.
+        view_gain_db: what the direction MLP was worth there; None where colour did not depend on the direction.
+        next_loss_db: what one channel less would have cost in all; infinite where one alone is left.
         features: channels that there were, over all scales.
     """
 
     scene: Scene
     kept: tuple[np.ndarray, ...]
     loss_db: float
-    view_worth_db: float | None
-    next_db: float
+    view_gain_db: float | None
+    next_loss_db: float
     features: int
 
     @property
-    def left_out_any(self) -> bool:
+    def removed_any(self) -> bool:
         """Whether anything is gone that was worth anything, or a channel."""
         return self.loss_db != 0 or sum(map(len, self.kept)) < self.features
 
-    def of_each_plane(self, numbers: PerPlane, in_pairs: bool = False) -> list[dict[str, np.ndarray]]:
+    def select_channels(self, numbers: PerPlane, in_pairs: bool = False) -> list[dict[str, np.ndarray]]:
         """The part of (..., M) numbers of each plane, or of (..., M, M) `in_pairs`, that belongs to what is left."""
         left = [
             ((..., kept[:, None], kept) if in_pairs else (..., kept), scale)
@@ -63,7 +63,7 @@ class Pruned:
         return [{name: some[part] for name, some in scale.items()} for part, scale in left]
 
 
-def renderings(features: int) -> int:
+def max_renderings(features: int) -> int:
     """Times that `prune` has a scene of so many features rendered, at most."""
     return 3 + math.ceil(math.log2(features))
 
@@ -77,30 +77,30 @@ def prune(scene: Scene, probes: Rays, fidelity: Callable[[Scene], float], spare_
     before = fidelity(scene)
     worth = None
     if not scene.decoder.w2.any():
-        scene = one_colour(scene, probes[1])
+        scene = make_view_independent(scene, probes[1])
     elif not scene.appearances:  # whose codes act through the direction MLP
-        plain = one_colour(scene, probes[1])
+        plain = make_view_independent(scene, probes[1])
         worth = before - fidelity(plain)
         scene = plain if worth <= spare_db else scene
     loss = worth if worth is not None and worth <= spare_db else 0.0
 
-    seen, features = Seen.of(scene, probes), len(scene.decoder.density_weight)
-    order = dispensable(scene.decoder, seen)
-    fewest, least, next_db = 0, loss, math.inf
+    seen, features = SurfaceFeatures.of(scene, probes), len(scene.decoder.density_weight)
+    order = elimination_order(scene.decoder, seen)
+    fewest, least, next_loss_db = 0, loss, math.inf
     best, most = scene, features
     while most - fewest > 1:
         count = (fewest + most) // 2 if fewest or most < features else 1  # most often not even one can go
-        candidate = replace(scene, decoder=passed_on(scene.decoder, seen, order[:count]))
+        candidate = replace(scene, decoder=redistribute(scene.decoder, seen, order[:count]))
         cost = before - fidelity(candidate)
         if cost <= spare_db:
             fewest, least, best = count, cost, candidate
         else:
-            most, next_db = count, cost
+            most, next_loss_db = count, cost
     kept = _kept(scene, order[:fewest])
-    return Pruned(without(best, kept), kept, least, worth, next_db, features)
+    return Pruned(keep_channels(best, kept), kept, least, worth, next_loss_db, features)
 
 
-def one_colour(scene: Scene, directions: np.ndarray) -> Scene:
+def make_view_independent(scene: Scene, directions: np.ndarray) -> Scene:
     """The scene with its mean colour basis over (N, 3) directions in place of the direction MLP, which is stored as one
     hidden unit that says nothing."""
     decoder = scene.decoder
@@ -113,7 +113,7 @@ def one_colour(scene: Scene, directions: np.ndarray) -> Scene:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SurfaceFeatures:
     """Features (N, F) float64 where probe rays end, the colour basis (N, 3, F) in whose light they are seen, and features (K, F)
     there and at random in what is occupied, for the density counts where nothing is, too."""
 
@@ -122,7 +122,7 @@ class Seen:
     all_features: np.ndarray
 
     @staticmethod
-    def of(scene: Scene, probes: Rays) -> "Seen":
+    def of(scene: Scene, probes: Rays) -> "SurfaceFeatures":
         origins, directions, times = (a[:: max(1, len(a) // POINTS)] for a in probes)
         renderer = SceneRenderer(scene)
         _, opacities, depths = renderer.render(origins, directions, times)
@@ -154,10 +154,10 @@ class Seen:
                     (torch.from_numpy(inside[:, :0:-1].copy()), torch.from_numpy(inside[:, 0].copy())),
                 )
             )
-        return Seen(features, _basis(scene, directions[ends]), np.concatenate([features, elsewhere]))
+        return SurfaceFeatures(features, _basis(scene, directions[ends]), np.concatenate([features, elsewhere]))
 
 
-def dispensable(decoder: Decoder, seen: Seen) -> np.ndarray:
+def elimination_order(decoder: Decoder, seen: SurfaceFeatures) -> np.ndarray:
     """All features but one, (F - 1,), what can be missed most easily first.
 
     Taking feature m away and passing it on to the others changes a linear map of weights w by w_m^2 / (G^-1)_mm, mean square, with
@@ -186,7 +186,7 @@ def dispensable(decoder: Decoder, seen: Seen) -> np.ndarray:
     return np.array(order, np.int64)
 
 
-def passed_on(decoder: Decoder, seen: Seen, gone: np.ndarray) -> Decoder:
+def redistribute(decoder: Decoder, seen: SurfaceFeatures, gone: np.ndarray) -> Decoder:
     """The decoder without some features, weights of 0, whose part the others take over as well as they can: f_gone is
     about share . f_left, for the density with a constant that its bias takes."""
     F = len(decoder.density_weight)
@@ -213,7 +213,7 @@ def passed_on(decoder: Decoder, seen: Seen, gone: np.ndarray) -> Decoder:
     )
 
 
-def without(scene: Scene, kept: Sequence[np.ndarray]) -> Scene:
+def keep_channels(scene: Scene, kept: Sequence[np.ndarray]) -> Scene:
     """The scene with some channels of each scale alone, (M',) numbers; scales without any are left out."""
     scales = tuple(
         {name: np.ascontiguousarray(plane[..., channels]) for name, plane in scale.items()}

@@ -10,35 +10,35 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from kpc.encoder.evaluation.validation_rays import Measure, Measured, squares_of
+from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, mse_of_psnr
 from kpc.encoder.field.occupancy_grid import in_fewest_slots
 from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
-from kpc.encoder.rdo.rate_search import TOLERANCE, cheapest, farthest, farthest_tuned
+from kpc.encoder.rdo.rate_search import TOLERANCE, find_limit, find_tuned_limit, minimise
 from kpc.format.coding.quantise import HALF_BITS, QuantisedScene, reached_by, round_decoder, short_above, weights_of
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 
 FINEST, COARSEST = -13.0, 2.0
 """Base-two logarithms of the factors on all steps, between which one is sought for a trained scene."""
-COARSER = 12.0
+RECODE_COARSEST = 12.0
 """The same of the coarsest for a file that is coded again, whether as it is or with something left out; the finest is its own."""
-USUAL, USUALLY_COARSER = -9.5, 1.0
+FIRST_GUESS, RECODE_GUESS = -9.5, 1.0
 """Where searches between them begin."""
-ERRORS_GROW, BYTES_GROW = 2 * math.log(2), 0.5
+ERROR_SLOPE, BYTES_SLOPE = 2 * math.log(2), 0.5
 """What logarithms grow by per octave, of errors with coarser steps, with their square, and of bytes with finer ones, about."""
-ROUGHLY = 0.2
+ROUGH_TOLERANCE = 0.2
 """How far, as `search.TOLERANCE`, a search may end below that is only to tell where to tune, or what a size costs."""
-PROBES = 8
+RENDERINGS = 8
 """Scenes that a search renders, about."""
 
 DEFAULT_LOSS_DB = 0.15
 
-ENOUGH_BYTES, ENOUGH_ERROR = 0.05, 0.1
+TUNED_BYTES_TOLERANCE, TUNED_ERROR_TOLERANCE = 0.05, 0.1
 """A tuned coding this share below the bytes or the error that it may not exceed is good enough: errors are foreseen less well."""
-ERRORS_LEFT, BYTES_MADE = 0.7, 1.01
+TUNED_ERROR, TUNED_BYTES = 0.7, 1.01
 """What tuning makes of errors and of bytes, about: so it is known where to begin."""
-TRUST = 0.8
+SIGNIFICANCE_EXPONENT = 0.8
 """In what curvature says of the differences between texels and channels, `significance`. Room and liam, at equal error of held-out views:
 files are 1 to 2 % larger with 1; 0.7 and 0.9 make no difference."""
 SLOTS_SHARE, MORE_CELLS = 0.05, 1 / 3
@@ -48,14 +48,14 @@ files that are to be small, from 0.4 dB of loss on."""
 DECODER_SHARE, FEWEST_BITS = 0.02, 3
 """Of the error that coding may bring, how much fewer bits of the decoder's weights may; and the fewest. Default scene and room: 1.5 and 2.1 KB in place
 of 1.9 and 2.6 with 7 significant bits, 1.4 and 1.9 with 6; an error of a fiftieth planes undo with a fifth of a kilobyte."""
-LEAST_SIGNIFICANCE = 1e-6
+MIN_SIGNIFICANCE = 1e-6
 """Of a channel, relative to the most important of all numbers."""
 
 Steps = list[dict[str, np.ndarray]]
 """One mapping a scale, plane name -> (M,) quantisation steps."""
-Quantise = Callable[[Scene, PerPlane, np.ndarray, PerPlane], QuantisedScene]
+QuantiseFunction = Callable[[Scene, PerPlane, np.ndarray, PerPlane], QuantisedScene]
 """Of a scene with steps, `reached_by` it and significance: `quantise_by_cost`, or what is to be compared with it."""
-Tune = Callable[[PerPlane, np.ndarray], QuantisedScene]
+TuneFunction = Callable[[PerPlane, np.ndarray], QuantisedScene]
 """A better coding with the same steps, of a scene that is known, `reached_by` which is told."""
 
 
@@ -96,8 +96,8 @@ class Trade:
         if name == "psnr_db":
             return psnr - value if psnr > value else DEFAULT_LOSS_DB
         # Where D falls to a quarter with a bit more, as fine quantisation has it, its slope is -2 ln 2 D.
-        error = error_of(value) if name == "quality" else value / (2 * math.log(2))
-        return loss_at(psnr, error)
+        error = mse_of_quality(value) if name == "quality" else value / (2 * math.log(2))
+        return loss_of_mse(psnr, error)
 
 
 def agreement_of(quality: float) -> float:
@@ -105,19 +105,19 @@ def agreement_of(quality: float) -> float:
     return 20 + quality / 3
 
 
-def error_of(quality: float) -> float:
+def mse_of_quality(quality: float) -> float:
     """The same as a mean squared difference, in squares of 8-bit levels."""
-    return squares_of(agreement_of(quality))
+    return mse_of_psnr(agreement_of(quality))
 
 
-def error_at(psnr: float, loss_db: float) -> float:
+def mse_of_loss(psnr: float, loss_db: float) -> float:
     """The mean squared difference, in squares of 8-bit levels, that takes so many dB from pictures of some PSNR, adding to their own."""
-    return squares_of(psnr) * (10 ** (loss_db / 10) - 1)
+    return mse_of_psnr(psnr) * (10 ** (loss_db / 10) - 1)
 
 
-def loss_at(psnr: float, error: float) -> float:
-    """What `error_at` undoes."""
-    return 10 * math.log10(1 + error / squares_of(psnr))
+def loss_of_mse(psnr: float, error: float) -> float:
+    """What `mse_of_loss` undoes."""
+    return 10 * math.log10(1 + error / mse_of_psnr(psnr))
 
 
 @dataclass(frozen=True)
@@ -138,40 +138,43 @@ class Attempt:
         return len(self.data)
 
     @cached_property
-    def measured(self) -> Measured:
+    def measured(self) -> Fidelity:
         return self.measure(self.quantised.dequantise())
 
     def cost(self, lam: float) -> float:
         """D + lam R."""
-        return self.measured.error + lam * 8 * self.size_bytes / self.quantised.parameter_count
+        return self.measured.mse + lam * 8 * self.size_bytes / self.quantised.parameter_count
 
 
 def significance(alone: PerPlane) -> list[dict[str, np.ndarray]]:
-    """What an error in each number costs, as a share of the most that any does: (h / largest)^TRUST of `Curvature.alone` h, float32.
+    """What an error in each number costs, as a share of the most that any does: (h / largest)^TRUST of `Curvature.diagonal` h, float32.
 
     Of h alone: what is left to cross terms, and to rays that were not drawn, makes the unimportant more important than h has it.
     """
     largest = max(float(h.max()) for scale in alone for h in scale.values()) or 1.0
-    return [{name: (h / np.float32(largest)) ** np.float32(TRUST) for name, h in scale.items()} for scale in alone]
+    return [
+        {name: (h / np.float32(largest)) ** np.float32(SIGNIFICANCE_EXPONENT) for name, h in scale.items()}
+        for scale in alone
+    ]
 
 
-def with_fewer_slots(scene: Scene, measure: Measure, error: float) -> Scene:
+def reduce_slots(scene: Scene, measure: Measure, error: float) -> Scene:
     """The scene with its occupancy in fewer slots, if that adds at most `error`, in squares of 8-bit levels, and MORE_CELLS cells; else
     itself."""
     merged = in_fewest_slots(scene.occupancy, MORE_CELLS)
     if len(merged) == len(scene.occupancy):
         return scene
     candidate = replace(scene, occupancy=merged)
-    return candidate if measure(candidate).error - measure(scene).error <= error else scene
+    return candidate if measure(candidate).mse - measure(scene).mse <= error else scene
 
 
-def decoder_bits(scene: Scene, measure: Measure, error: float) -> dict[str, int]:
+def choose_decoder_bits(scene: Scene, measure: Measure, error: float) -> dict[str, int]:
     """Of each array of the decoder's weights, for `round_decoder`, the fewest bits with which all of them add at most `error`, in squares of
     8-bit levels: first of all arrays alike, then of one after the other, those that take most first. None at all where HALF_BITS are too few."""
-    known, weights = measure(scene).error, weights_of(scene.decoder)
+    known, weights = measure(scene).mse, weights_of(scene.decoder)
 
     def enough(bits: dict[str, int]) -> bool:
-        return measure(replace(scene, decoder=round_decoder(scene.decoder, bits))).error - known <= error
+        return measure(replace(scene, decoder=round_decoder(scene.decoder, bits))).mse - known <= error
 
     alike = (dict.fromkeys(weights, count) for count in range(FEWEST_BITS, HALF_BITS + 1))
     bits = next(filter(enough, alike), {})
@@ -189,7 +192,7 @@ def relative_steps(significant: PerPlane) -> Steps:
     at all. Channels without any get the coarsest step of all.
     """
     return [
-        {name: np.maximum(_means(w), LEAST_SIGNIFICANCE) ** -0.5 for name, w in scale.items()} for scale in significant
+        {name: np.maximum(_means(w), MIN_SIGNIFICANCE) ** -0.5 for name, w in scale.items()} for scale in significant
     ]
 
 
@@ -204,16 +207,16 @@ def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
     return [{name: short_above((step * factor).astype(np.float32)) for name, step in scale.items()} for scale in steps]
 
 
-def compress(
+def meet_trade(
     scene: Scene,
     steps: Steps,
     significant: PerPlane,
     measure: Measure,
     uncoded_psnr: float,
     trade: Trade,
-    as_it_is: QuantisedScene | None = None,
-    quantise: Quantise = quantise_by_cost,
-    tune: Tune | None = None,
+    source_file: QuantisedScene | None = None,
+    quantise: QuantiseFunction = quantise_by_cost,
+    tune: TuneFunction | None = None,
     own_steps: bool = False,
     tolerance: float = TOLERANCE,
 ) -> Attempt:
@@ -221,19 +224,19 @@ def compress(
 
     Args:
         measure: judges a coding; `uncoded_psnr` is that of the scene before anything was left out.
-        as_it_is: the file that holds just this scene, with these steps.
+        source_file: the file that holds just this scene, with these steps.
         tune: what makes a better coding at some steps, and takes its time: the trade is met by such a one.
         own_steps: `steps` are those of a file, of which something may have been left out since: nothing finer makes sense.
-        tolerance: as of `kpc.encoder.rdo.rate_search.farthest`.
+        tolerance: as of `kpc.encoder.rdo.rate_search.find_limit`.
     """
     reached = reached_by(scene)
-    own_steps = own_steps or as_it_is is not None
-    finest, coarsest, guess = (0.0, COARSER, USUALLY_COARSER) if own_steps else (FINEST, COARSEST, USUAL)
+    own_steps = own_steps or source_file is not None
+    finest, coarsest, guess = (0.0, RECODE_COARSEST, RECODE_GUESS) if own_steps else (FINEST, COARSEST, FIRST_GUESS)
     tried: dict[float, Attempt] = {}
 
     def attempt(exponent: float) -> Attempt:
-        if as_it_is is not None and exponent == 0:
-            return Attempt(as_it_is, measure, exponent)
+        if source_file is not None and exponent == 0:
+            return Attempt(source_file, measure, exponent)
         if exponent not in tried:
             tried[exponent] = Attempt(
                 quantise(scene, scaled(steps, 2.0**exponent), reached, significant), measure, exponent
@@ -246,32 +249,32 @@ def compress(
 
     name, bound = trade.bound
     if name == "lam":
-        found = cheapest(finest, coarsest, attempt, lambda found: found.cost(bound))
+        found = minimise(finest, coarsest, attempt, lambda found: found.cost(bound))
         return found if tune is None else min(found, tuned(found.exponent), key=lambda found: found.cost(bound))
     value: Callable[[Attempt], float]
     if name == "target_bytes":
-        if as_it_is is not None and (whole := attempt(0.0)).size_bytes <= bound:
+        if source_file is not None and (whole := attempt(0.0)).size_bytes <= bound:
             return whole
-        start, end, most, slope, value = coarsest, finest, bound, BYTES_GROW, lambda found: found.size_bytes
+        start, end, most, slope, value = coarsest, finest, bound, BYTES_SLOPE, lambda found: found.size_bytes
     elif name == "quality":
         start, end, most, slope, value = (
             finest,
             coarsest,
-            error_of(bound),
-            ERRORS_GROW,
-            lambda found: found.measured.error,
+            mse_of_quality(bound),
+            ERROR_SLOPE,
+            lambda found: found.measured.mse,
         )
     else:
-        start, end, most, slope = finest, coarsest, trade.loss_db(uncoded_psnr), ERRORS_GROW
+        start, end, most, slope = finest, coarsest, trade.loss_db(uncoded_psnr), ERROR_SLOPE
         value = lambda found: uncoded_psnr - found.measured.psnr
     if tune is None:
-        return farthest(start, end, guess, attempt, value, most, slope, tolerance)
+        return find_limit(start, end, guess, attempt, value, most, slope, tolerance)
     by_size = name == "target_bytes"
-    made, enough = (BYTES_MADE, ENOUGH_BYTES) if by_size else (ERRORS_LEFT, ENOUGH_ERROR)
-    spent: Callable[[Attempt], float] = lambda found: found.measured.error if by_size else found.size_bytes
-    found = farthest(start, end, guess, attempt, value, most, slope, ROUGHLY)
-    better = farthest_tuned(start, end, found, tried.values(), tuned, value, most, enough, made, slope)
+    made, enough = (TUNED_BYTES, TUNED_BYTES_TOLERANCE) if by_size else (TUNED_ERROR, TUNED_ERROR_TOLERANCE)
+    spent: Callable[[Attempt], float] = lambda found: found.measured.mse if by_size else found.size_bytes
+    found = find_limit(start, end, guess, attempt, value, most, slope, ROUGH_TOLERANCE)
+    better = find_tuned_limit(start, end, found, tried.values(), tuned, value, most, enough, made, slope)
     if better is not None and value(better) >= (1 - enough) * most and spent(better) < spent(found):
         return better
-    found = farthest(start, end, guess, attempt, value, most, slope, tolerance, tried.values())
+    found = find_limit(start, end, guess, attempt, value, most, slope, tolerance, tried.values())
     return better if better is not None and spent(better) < spent(found) else found

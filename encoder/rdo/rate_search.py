@@ -1,6 +1,6 @@
 """How coarse all steps may be together: searches along the exponent, base two, of one factor on them.
 
-What is made of an exponent, a `Tried`, costs seconds, and minutes where it is tuned, so that few are made: how a value follows steps is
+What is made of an exponent, a `HasExponent`, costs seconds, and minutes where it is tuned, so that few are made: how a value follows steps is
 known well enough to guess where it is met.
 """
 
@@ -10,32 +10,32 @@ from typing import Protocol, TypeVar
 
 TOLERANCE = 0.02
 """A search ends this share below what it may not exceed."""
-GRAIN = 0.02
+MIN_OCTAVES = 0.02
 """Octaves. Steps that differ by less err differently, but on average the same."""
-ATTEMPTS = 16
+MAX_ATTEMPTS = 16
 """A search makes at most so many."""
-LEAP = 0.3
+MIN_LEAP = 0.3
 """Octaves, at least, and twice as many each time, to where a value is sought that has been met on one side only."""
 GOLDEN = (math.sqrt(5) - 1) / 2
-NEAR = 0.3
+COST_OCTAVES = 0.3
 """Octaves within which the least cost is sought; at the least it hardly changes."""
-TUNINGS = 4
+MAX_TUNINGS = 4
 """At most so many codings are tuned: each takes a minute, about. Mostly two are."""
-APART = 0.3
+SLOPE_OCTAVES = 0.3
 """Octaves between two steps that tell how a value follows them."""
 
 
-class Tried(Protocol):
+class HasExponent(Protocol):
     """What was made of an exponent."""
 
     @property
     def exponent(self) -> float: ...
 
 
-Made = TypeVar("Made", bound=Tried)
+Made = TypeVar("Made", bound=HasExponent)
 
 
-def farthest(
+def find_limit(
     start: float,
     end: float,
     guess: float,
@@ -57,24 +57,24 @@ def farthest(
     way = math.copysign(1.0, end - start)
     known = list(tried)
     wanted = math.log(most * (1 - tolerance / 2)) if most > 0 else -math.inf
-    leap, grains = LEAP, 0
-    for number in range(ATTEMPTS + 1):  # and a last look
+    leap, grains = MIN_LEAP, 0
+    for number in range(MAX_ATTEMPTS + 1):  # and a last look
         within = max(
             (one for one in known if value(one) <= most), key=lambda one: way * one.exponent, default=None
         )  # not so with NaN
         beyond = min((one for one in known if not value(one) <= most and (within is None or way * (one.exponent - within.exponent) > 0)),
                      key=lambda one: way * one.exponent, default=None)  # fmt: skip
         if within is not None and (
-            value(within) >= (1 - tolerance) * most or within.exponent == end or number == ATTEMPTS
+            value(within) >= (1 - tolerance) * most or within.exponent == end or number == MAX_ATTEMPTS
         ):
             return within
-        if within is None and (number == ATTEMPTS or beyond is not None and beyond.exponent == start):
+        if within is None and (number == MAX_ATTEMPTS or beyond is not None and beyond.exponent == start):
             break
         if within is not None and beyond is not None:
             apart = beyond.exponent - within.exponent
-            if abs(apart) < GRAIN:
+            if abs(apart) < MIN_OCTAVES:
                 grains += 1
-                exponent = beyond.exponent + way * grains * GRAIN
+                exponent = beyond.exponent + way * grains * MIN_OCTAVES
             else:
                 exponent = within.exponent + apart * min(max(_share(value(within), value(beyond), wanted), 0.1), 0.9)
         elif within is not None or beyond is not None:
@@ -102,7 +102,7 @@ def _share(low: float, high: float, wanted: float) -> float:
     return (wanted - math.log(low)) / math.log(high / low)
 
 
-def farthest_tuned(
+def find_tuned_limit(
     start: float,
     end: float,
     found: Made,
@@ -123,7 +123,7 @@ def farthest_tuned(
     if not 0 < value(found) <= most:
         return None
     slope = math.copysign(slope, end - start)
-    others = [one for one in tried if abs(one.exponent - found.exponent) >= APART and 0 < value(one) < math.inf]
+    others = [one for one in tried if abs(one.exponent - found.exponent) >= SLOPE_OCTAVES and 0 < value(one) < math.inf]
     if others:
         other = min(others, key=lambda one: abs(one.exponent - found.exponent))
         own = math.log(value(other) / value(found)) / (other.exponent - found.exponent)
@@ -132,7 +132,7 @@ def farthest_tuned(
     wanted = math.log(most * (1 - enough / 2))
     exponent, best = found.exponent + (wanted - math.log(made * value(found))) / slope, None
     known: list[tuple[float, float]] = []
-    for _ in range(TUNINGS):
+    for _ in range(MAX_TUNINGS):
         candidate = tuned(_between(start, end, exponent))
         reached = value(candidate)
         if not reached > 0:  # so with NaN
@@ -168,11 +168,11 @@ def _where(known: Sequence[tuple[float, float]], wanted: float, slope: float) ->
     return place + (wanted - value) / slope
 
 
-def cheapest(low: float, high: float, attempt: Callable[[float], Made], cost: Callable[[Made], float]) -> Made:
+def minimise(low: float, high: float, attempt: Callable[[float], Made], cost: Callable[[Made], float]) -> Made:
     """What `attempt` makes of the exponent of least cost, by golden section: it falls, then rises."""
     left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
     one, other = attempt(left), attempt(right)
-    while high - low > NEAR:
+    while high - low > COST_OCTAVES:
         if cost(one) <= cost(other):
             high, right, other = right, left, one
             left = high - GOLDEN * (high - low)

@@ -16,11 +16,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from kpc.encoder.evaluation.evaluate import SceneRenderer, as_wide_as, evenly_wide
-from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.evaluation.evaluate import SceneRenderer, pad_channels, unpad_decoder
+from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
-from kpc.encoder.rdo.distortion import Name
+from kpc.encoder.rdo.distortion import PlaneKey
 from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common.progress import Progress
@@ -38,17 +38,17 @@ SPREAD = 0.2
 with 0.4). With 0.3 room's are 2 % smaller at 43 dB, shelf_hand's 3 % smaller at 33 dB, but 3 larger at 43, where with 0.15 they are as large."""
 
 
-def order(scene: Scene) -> list[list[Name]]:
+def coding_order(scene: Scene) -> list[list[PlaneKey]]:
     """Which planes are coded together: each space plane alone, those of the finest scale first; at last the time planes, scale by scale."""
     finest_first = list(reversed(range(len(scene.scales))))
     groups = [[(s, name)] for s in finest_first for name in SPACE_PLANES]
     return groups + [[(s, name) for name in TIME_PLANES] for s in finest_first if scene.is_dynamic]
 
 
-def spread(scene: Scene) -> dict[Name, float]:
+def step_factors(scene: Scene) -> dict[PlaneKey, float]:
     """By how much coarser than others each plane may be, as planes coded after it make up for some of its errors: 2^SPREAD for the first,
     2^-SPREAD for the last."""
-    groups = order(scene)
+    groups = coding_order(scene)
     return {
         plane: 2.0 ** (SPREAD * (1 - 2 * number / (len(groups) - 1)))
         for number, group in enumerate(groups)
@@ -56,46 +56,46 @@ def spread(scene: Scene) -> dict[Name, float]:
     }
 
 
-def steps_in_all(scene: Scene, steps: int) -> int:
+def total_steps(scene: Scene, steps: int) -> int:
     """Of tuning once, with so many a group; half as many for the decoder alone at last."""
-    return (len(order(scene)) - 1) * steps + steps // 2
+    return (len(coding_order(scene)) - 1) * steps + steps // 2
 
 
-def steps_after(trained: int, scene: Scene, most: int) -> int:
+def steps_per_group(trained: int, scene: Scene, most: int) -> int:
     """A group, after so many steps of training; at most `most`."""
-    return min(most, int(SHARE * trained / (len(order(scene)) - 0.5)))
+    return min(most, int(SHARE * trained / (len(coding_order(scene)) - 0.5)))
 
 
-def tuned(
+def quantise_sequentially(
     scene: Scene,
     whole: Scene,
-    quantise: Callable[[Scene, Sequence[Name]], QuantisedScene],
+    quantise: Callable[[Scene, Sequence[PlaneKey]], QuantisedScene],
     steps: int,
     shown: bool = False,
 ) -> QuantisedScene:
     """A scene quantised group by group.
 
     Args:
-        whole, steps, shown: as of `coded_in_groups`. quantise: a scene, of which only some planes matter.
+        whole, steps, shown: as of `code_sequentially`. quantise: a scene, of which only some planes matter.
     """
-    settled: dict[Name, QuantisedPlane] = {}
+    settled: dict[PlaneKey, QuantisedPlane] = {}
 
-    def coded(candidate: Scene, group: Sequence[Name]) -> dict[Name, np.ndarray]:
+    def coded(candidate: Scene, group: Sequence[PlaneKey]) -> dict[PlaneKey, np.ndarray]:
         quantised = quantise(candidate, group)
         found = {(s, name): quantised.scales[s][name] for s, name in group}
         settled.update(found)
         return {key: plane.dequantise() for key, plane in found.items()}
 
-    rest = quantise(coded_in_groups(scene, whole, coded, steps, shown), ())
+    rest = quantise(code_sequentially(scene, whole, coded, steps, shown), ())
     return replace(
         rest, scales=tuple({name: settled[s, name] for name in scale} for s, scale in enumerate(scene.scales))
     )
 
 
-def coded_in_groups(
+def code_sequentially(
     scene: Scene,
     whole: Scene,
-    coded: Callable[[Scene, Sequence[Name]], Mapping[Name, np.ndarray]],
+    coded: Callable[[Scene, Sequence[PlaneKey]], Mapping[PlaneKey, np.ndarray]],
     steps: int,
     shown: bool = False,
 ) -> Scene:
@@ -103,12 +103,12 @@ def coded_in_groups(
 
     Args:
         whole: whose colours it is to have. coded: some of a scene's planes, as they come back.
-        steps: of training after each group, as `steps_in_all`.
+        steps: of training after each group, as `total_steps`.
         shown: whether progress is.
     """
-    teacher, groups = SceneRenderer(whole), order(scene)
-    settled: set[Name] = set()
-    with Progress("tune", total=steps_in_all(scene, steps), unit="step", shown=shown) as progress:
+    teacher, groups = SceneRenderer(whole), coding_order(scene)
+    settled: set[PlaneKey] = set()
+    with Progress("tune", total=total_steps(scene, steps), unit="step", shown=shown) as progress:
         for number, group in enumerate(groups):
             back = coded(scene, group)
             settled |= back.keys()
@@ -124,10 +124,10 @@ def coded_in_groups(
 
 
 def _taught(
-    scene: Scene, teacher: SceneRenderer, settled: Collection[Name], steps: int, seed: int, progress: Progress
+    scene: Scene, teacher: SceneRenderer, settled: Collection[PlaneKey], steps: int, seed: int, progress: Progress
 ) -> Scene:
     """With planes that are not settled, and the decoder, nearer to what the teacher shows."""
-    field = Field.from_scene(evenly_wide(scene))
+    field = Field.from_scene(pad_channels(scene))
     explicit = isinstance(scene.decoder, Decoder)
     config = replace(
         TrainConfig(),
@@ -155,7 +155,7 @@ def _taught(
         if (s, name) in settled
     ]
     before = [theta[some].copy() for some in kept]
-    probe = Probe.of_surfaces(scene, RAYS * steps, seed=100 + seed)
+    probe = ValidationRays.through_occupied(scene, RAYS * steps, seed=100 + seed)
     for number in range(steps if len(probe.times) >= steps else 0):
         rays = [a[number::steps] for a in probe.rays]
         colours = torch.from_numpy(teacher.rgb(*rays))
@@ -175,4 +175,4 @@ def _taught(
         progress.advance()
     scales = tuple({name: plane if (s, name) in settled else field.plane(s, name).detach().numpy()[..., : plane.shape[2]].copy()
                     for name, plane in scale.items()} for s, scale in enumerate(scene.scales))  # fmt: skip
-    return replace(scene, scales=scales, decoder=as_wide_as(scene, field.decoder_as_data()))
+    return replace(scene, scales=scales, decoder=unpad_decoder(scene, field.decoder_as_data()))

@@ -14,7 +14,7 @@ import numpy as np
 from kpc.format.coding.predictive import MAP_CONTEXTS
 from kpc.format.coding.rans import compiled, inlined
 
-UNCHANGED = 0.6
+IDENTITY_TOLERANCE = 0.6
 """Squared steps, as much as they are worth, in the mean over channels: a texel of a time plane that is nearer to 1 is taken for it. Room and
 liam: from 0.2 to 0.8 files are the same, half a percent smaller than where all channels have to be within a step, and identity is a third
 of the time planes in place of a quarter."""
@@ -23,20 +23,18 @@ MAP_LAM = 1.5
 than where each texel is judged alone; 1.1 % with 4."""
 PASSES = 4
 """Over all texels."""
-LIKELY = (
-    0.05 + 0.9 * np.array([context.bit_count() for context in range(MAP_CONTEXTS)]) / (MAP_CONTEXTS - 1).bit_count()
-)
+PRIOR = 0.05 + 0.9 * np.array([context.bit_count() for context in range(MAP_CONTEXTS)]) / (MAP_CONTEXTS - 1).bit_count()
 """How likely texels are told, by context, before any is known: most are as those around them."""
-BEFORE = 1.0
+PRIOR_COUNT = 1.0
 """Texels that this counts for."""
 
 
-def told_texels(away: np.ndarray, worth: np.ndarray, known: np.ndarray) -> np.ndarray:
+def choose_coded_texels(away: np.ndarray, worth: np.ndarray, known: np.ndarray) -> np.ndarray:
     """(H, W) bool: those of the (H, W) `known` texels of a time plane that are told, by how far they are from 1, (H, W, M) in steps, and by
     what errors are worth."""
     far = (worth * away**2).mean(axis=2)
-    told = known & (far >= UNCHANGED)
-    gain = (away.shape[2] / MAP_LAM) * (far.astype(np.float64) - UNCHANGED)
+    told = known & (far >= IDENTITY_TOLERANCE)
+    gain = (away.shape[2] / MAP_LAM) * (far.astype(np.float64) - IDENTITY_TOLERANCE)
     for _ in range(PASSES):
         _improve(told, known, gain, _bits(told))
     return told
@@ -46,7 +44,7 @@ def _bits(told: np.ndarray) -> np.ndarray:
     """(MAP_CONTEXTS, 2) bits of a texel that is not told, and of one that is."""
     contexts = _contexts(told)
     counts = np.bincount(2 * contexts + told.ravel(), minlength=2 * MAP_CONTEXTS).reshape(-1, 2)
-    shares = counts + BEFORE * np.stack([1 - LIKELY, LIKELY], axis=1)
+    shares = counts + PRIOR_COUNT * np.stack([1 - PRIOR, PRIOR], axis=1)
     bits: np.ndarray = -np.log2(shares / shares.sum(1, keepdims=True))
     return bits
 

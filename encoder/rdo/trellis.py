@@ -12,7 +12,7 @@ errors that the search before left them. So errors next to each other get opposi
 them; and a channel undoes what others err. What an error is worth differs from texel to texel by orders of magnitude
 (`kpc.encoder.rdo.curvature`): where it is worth little, symbols are those that are foreseen.
 
-Where little more than a bit is told of a symbol (`THIN`), they follow the trellis around predictions where it is flat: what is foreseen may
+Where little more than a bit is told of a symbol (`LOW_RATE_BITS`), they follow the trellis around predictions where it is flat: what is foreseen may
 then follow everywhere, as it should where nothing else is said, and not only every other time.
 
 Default scene, `fast`: at equal error of pictures of 1, 2 and 4 squared levels planes take 11 to 14 % fewer bytes than with symbols chosen
@@ -24,8 +24,16 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from kpc.encoder.rdo.distortion import ACROSS, ALONE, BESIDE, LAM, bits_of_magnitudes, others, worths
-from kpc.encoder.rdo.texel_map_rdo import told_texels
+from kpc.encoder.rdo.distortion import (
+    CORNER_COUPLING,
+    EDGE_COUPLING,
+    LAM,
+    NO_CORRELATION,
+    cross_channel_errors,
+    distortion_weights,
+    magnitude_bits,
+)
+from kpc.encoder.rdo.texel_map_rdo import choose_coded_texels
 from kpc.format.coding.predictive import (
     ACTIVITIES,
     ANY,
@@ -51,32 +59,32 @@ from kpc.format.coding.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, q
 from kpc.format.coding.rans import compiled
 from kpc.format.container.segments import rows_of_segments
 
-THIN = 1.3
+LOW_RATE_BITS = 1.3
 """Bits of a symbol below which the trellis goes around predictions. Liam and soldier, large planes alone, at equal slopes: squared errors
 plus what bits are worth are 1 % less at 1.3 bits, 8 at 0.75, 15 at 0.5 and 24 at 0.4."""
-THIN_LAM = 1.0
+LOW_RATE_LAM = 1.0
 """LAM of those. What bits are worth stays what it is: steps are sqrt(LAM / THIN_LAM) of what they are on the trellis. With 0.7 it is 0 to 1 %
 less at 1.3 bits, and 3 to 5 % more at 0.5."""
-FINER = math.sqrt(THIN_LAM / LAM)
+LOW_RATE_STEP_RATIO = math.sqrt(LOW_RATE_LAM / LAM)
 """By how much steps around predictions are finer than those on the trellis at which bits are worth as much."""
 STATES = 8
 PASSES = 4
 """Searches: the first knows but the weights of rounded symbols, not what symbols cost, nor errors of rows below. Two more make files half a
 percent smaller."""
-SETS, MANY = 4, 1 << 17
+PREDICTOR_SETS, MANY_SYMBOLS = 4, 1 << 17
 """Of weights. Around predictions files hold those of the search: one set, but for so many symbols or more."""
-TOLD_APART = 40
+MAGNITUDE_BINS = 40
 """Magnitudes of errors whose bits are told apart."""
 
 
-def on_trellis(
+def trellis_quantise(
     plane: QuantisedPlane,
     values: np.ndarray,
     step: np.ndarray,
     significant: np.ndarray,
     identity: bool,
-    together: np.ndarray = ALONE,
-    thin: float = THIN,
+    together: np.ndarray = NO_CORRELATION,
+    thin: float = LOW_RATE_BITS,
 ) -> QuantisedPlane:
     """A plane that is quantised to the nearest, with other symbols, and around predictions with other steps. What was left out stays so, and
     holds 0; and so does what is so near the identity that it is not worth telling.
@@ -95,22 +103,22 @@ def on_trellis(
     if lattice == ANY or search.bits_of_a_symbol >= thin:
         search.run(PASSES - 1)
         return search.found()
-    finer = short_above((step / FINER).astype(np.float32))
+    finer = short_above((step / LOW_RATE_STEP_RATIO).astype(np.float32))
     around = quantise_plane(values, finer, identity=identity, needed=plane.coded)
     search = _Search(around, values, finer, significant, identity, together, AROUND)
     search.run(PASSES)
     return search.found()
 
 
-def step_on_trellis(plane: QuantisedPlane) -> np.ndarray:
-    """(M,) float64: for which steps `on_trellis` was asked when it made this plane, if it did and 8 bits were enough."""
-    return plane.step.astype(np.float64) * (1.0 if plane.guide is None else FINER)
+def requested_trellis_step(plane: QuantisedPlane) -> np.ndarray:
+    """(M,) float64: for which steps `trellis_quantise` was asked when it made this plane, if it did and 8 bits were enough."""
+    return plane.step.astype(np.float64) * (1.0 if plane.guide is None else LOW_RATE_STEP_RATIO)
 
 
 class _Search:
     """Searches for the symbols of one plane, each knowing what the one before found.
 
-    Args: as of `on_trellis`; `lattice`: as of `kpc.format.coding.predictive`.
+    Args: as of `trellis_quantise`; `lattice`: as of `kpc.format.coding.predictive`.
     """
 
     def __init__(
@@ -124,17 +132,17 @@ class _Search:
         lattice: int,
     ) -> None:
         self.plane, self.identity, self.together, self.lattice = plane, identity, together, lattice
-        self._finer = FINER if lattice == AROUND else 1.0
+        self._finer = LOW_RATE_STEP_RATIO if lattice == AROUND else 1.0
         self.rows = rows_of_segments(len(values), identity)
         coarser = plane.step / step
         self.wanted = (values.astype(np.float64) - plane.offset) / plane.step
         known = np.ascontiguousarray(plane.coded)
-        worth = worths(significant, known)
+        worth = distortion_weights(significant, known)
         if identity:
-            known = told_texels(self.wanted / self._finer, worth, known)
+            known = choose_coded_texels(self.wanted / self._finer, worth, known)
         self.known, self.worth = known, worth * np.float32(coarser**2)
         self.symbols = np.where(known[..., None], plane.symbols, np.int8(0))
-        self.counts = np.zeros((2 * ACTIVITIES, TOLD_APART))
+        self.counts = np.zeros((2 * ACTIVITIES, MAGNITUDE_BINS))
         self.errors = np.zeros((values.shape[0] + 2, values.shape[1] + 2, values.shape[2]), np.float32)
         if identity:
             self.errors[1:-1, 1:-1] = np.where(known[..., None], 0, np.sqrt(self.worth) * -self.wanted)
@@ -142,7 +150,9 @@ class _Search:
     def run(self, times: int) -> None:
         for _ in range(times):
             neighbours = neighbourhoods(self.symbols, self.known)
-            self.weights = fitted(neighbours, SETS if self.lattice != AROUND or len(neighbours) >= MANY else 1)
+            self.weights = fitted(
+                neighbours, PREDICTOR_SETS if self.lattice != AROUND or len(neighbours) >= MANY_SYMBOLS else 1
+            )
             self.symbols, self.counts = _search(
                 self.wanted,
                 self.worth,
@@ -170,7 +180,7 @@ class _Search:
 def _bits(counts: np.ndarray) -> np.ndarray:
     """(2 ACTIVITIES, TOLD_APART) bits of errors by their magnitude, that came so often in each context: at even places, then at odd ones. What is
     expected doubles with every other context."""
-    return bits_of_magnitudes(counts, 0.04 * 2.0 ** (np.tile(np.arange(ACTIVITIES), 2) / 2 - 1.5))
+    return magnitude_bits(counts, 0.04 * 2.0 ** (np.tile(np.arange(ACTIVITIES), 2) / 2 - 1.5))
 
 
 @compiled()
@@ -189,7 +199,7 @@ def _search(
     errors came, as `_bits` counts them. Every so many `rows` a segment begins, which knows of none before. `lattice`: as of
     `kpc.format.coding.predictive`; where any may follow, survivors differ in which of their last three are odd. `price`: of `_bits`, in squared steps.
     `errors`: (H + 2, W + 2, M) float32, u of all texels, one row and one column of 0 around; those of known ones are found anew.
-    `together`: as of `on_trellis`, or ALONE.
+    `together`: as of `trellis_quantise`, or ALONE.
 
     v, r, cross and the names of neighbours as in `kpc.format.coding.predictive`; v0, r0 and errors of survivors are held by their states.
     """
@@ -209,7 +219,7 @@ def _search(
         np.zeros((W, STATES), np.int64),
     )
     for m in range(M):
-        outside_others = others(errors, together, m)
+        outside_others = cross_channel_errors(errors, together, m)
         for y in range(H):
             own = y % rows  # of its segment
             v0, v1, v2 = v[y % 3], v[(y + 2) % 3], v[(y + 1) % 3]
@@ -229,8 +239,9 @@ def _search(
                 root, here = math.sqrt(worth[y, x, m]), errors[y + 1, x + 1, m]
                 outside = (
                     outside_others[y, x]
-                    + BESIDE * (errors[y, x + 1, m] + errors[y + 2, x + 1, m])
-                    + ACROSS * (errors[y, x, m] + errors[y, x + 2, m] + errors[y + 2, x, m] + errors[y + 2, x + 2, m])
+                    + EDGE_COUPLING * (errors[y, x + 1, m] + errors[y + 2, x + 1, m])
+                    + CORNER_COUPLING
+                    * (errors[y, x, m] + errors[y, x + 2, m] + errors[y + 2, x, m] + errors[y + 2, x + 2, m])
                 )
                 for s in range(STATES):
                     if before[s] == np.inf:
@@ -242,7 +253,7 @@ def _search(
                     if not known[y, x]:
                         left = own == 0 or x > 0 and known[y, x - 1]
                         V[X, s], R[X, s] = (w, rw) if left else (v1[X + 1], r1[X + 1])
-                        cost[s], came[x, s], U[x + 1, s] = before[s] + 2 * here * BESIDE * U[x, s], s, here
+                        cost[s], came[x, s], U[x + 1, s] = before[s] + 2 * here * EDGE_COUPLING * U[x, s], s, here
                         continue
                     if own == 0:  # nothing is above but what is to the left
                         v1[x : x + 5], v2[x : x + 5], r1[x : x + 5], r2[x : x + 5] = w, w, rw, rw
@@ -264,7 +275,7 @@ def _search(
                     whole = foreseen(predicted, kind, odd)
                     if odd and kind == AROUND:
                         active += ACTIVITIES
-                    near = outside + BESIDE * U[x, s]
+                    near = outside + EDGE_COUPLING * U[x, s]
                     best = min(max(wanted[y, x, m] - near / root, SYMBOL_MIN), SYMBOL_MAX)  # as far as errors go
                     away = best - whole
                     size = int((abs(away) + (1 if odd and kind == AROUND else 0)) / apart)
@@ -278,7 +289,7 @@ def _search(
                         value = whole + meant(error, kind, odd)
                         if not SYMBOL_MIN <= value <= SYMBOL_MAX:
                             continue
-                        size = min(abs(error), TOLD_APART - 1)
+                        size = min(abs(error), MAGNITUDE_BINS - 1)
                         u = root * (value - wanted[y, x, m])
                         total = before[s] + u * (u + 2 * near) + price[active, size]
                         to = (s << 1 | value & 1) & STATES - 1 if lattice == ANY else next_place(s, value, error, kind)

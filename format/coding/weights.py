@@ -1,7 +1,7 @@
 """Weights of decoders under codec 2: whole multiples of a power of two, told one after the other (spec, section 7).
 
 What they cost is how often each multiple comes, by magnitude, in its array. Neighbours in rows, or other colours, say next to nothing of them.
-Where each array has as few bits as its errors allow (`kpc.encoder.rdo.rate_control.decoder_bits`) shelf_hand's take 0.8 to 1.1 KB from 2.5 to 0.1 dB of loss,
+Where each array has as few bits as its errors allow (`kpc.encoder.rdo.rate_control.choose_decoder_bits`) shelf_hand's take 0.8 to 1.1 KB from 2.5 to 0.1 dB of loss,
 where zstd made 1.2 to 1.5 of float16 that is rounded weight by weight; room's take 1.9 KB at 0.1 dB, in place of 2.6 at 0.15.
 """
 

@@ -11,8 +11,8 @@ import torch
 from gradients import random_rays, translucent_scene
 from kpc.encoder.cli import kpenc
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim, true_picture
-from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim
+from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field import appearances
 from kpc.encoder.field.appearances import choose_kind, fitted_code, number_pictures
 from kpc.encoder.field.config import TrainConfig
@@ -234,7 +234,7 @@ def test_held_out_right_halves_gain(unequal: Dataset, with_codes: Trainer) -> No
     without, quality = SceneRenderer(kpenc.to_scene(trained(unequal))), evaluate(kpenc.to_scene(with_codes), unequal)
     numbers = np.flatnonzero(unequal.pictures.is_test)
     plain = np.mean(
-        [psnr(np.clip(without.picture(unequal, n, 16), 0, 1), true_picture(unequal, n)[:, 16:]) for n in numbers]
+        [psnr(np.clip(without.picture(unequal, n, 16), 0, 1), ground_truth(unequal, n)[:, 16:]) for n in numbers]
     )
     assert quality is not None and quality.pictures == 4 and quality.psnr > plain + 4, (quality, plain)
 
@@ -242,7 +242,7 @@ def test_held_out_right_halves_gain(unequal: Dataset, with_codes: Trainer) -> No
 def test_the_left_half_tells_the_code_and_the_right_half_is_scored(unequal: Dataset, with_codes: Trainer) -> None:
     scene = with_codes.scene()
     renderer, number = SceneRenderer(scene), 8
-    code = renderer.code_of_left_half(unequal, number)
+    code = renderer.fit_left_half(unequal, number)
     assert code.shape == (16,) and np.abs(code).max() > 0.05
 
     class RightHalvesBlack:
@@ -251,10 +251,10 @@ def test_the_left_half_tells_the_code_and_the_right_half_is_scored(unequal: Data
             out[:, 16:] = 0
             return out
 
-    np.testing.assert_array_equal(renderer.code_of_left_half(replace(unequal, pixels=RightHalvesBlack()), number), code)
+    np.testing.assert_array_equal(renderer.fit_left_half(replace(unequal, pixels=RightHalvesBlack()), number), code)
     alone = replace(unequal, pictures=replace(unequal.pictures, is_test=np.arange(32) == number))
     quality = evaluate(scene, alone)
-    half, truth = np.clip(renderer.picture(unequal, number, 16, code), 0, 1), true_picture(unequal, number)[:, 16:]
+    half, truth = np.clip(renderer.picture(unequal, number, 16, code), 0, 1), ground_truth(unequal, number)[:, 16:]
     assert half.shape == (32, 16, 3) and quality is not None
     assert quality.psnr == pytest.approx(psnr(half, truth)) and quality.ssim == pytest.approx(ssim(half, truth))
     np.testing.assert_array_equal(
@@ -271,7 +271,7 @@ def test_masks_count_in_halves(tmp_path: Path, with_codes: Trainer) -> None:
     scene = with_codes.scene()
     quality = evaluate(scene, masked)
     assert quality is not None and quality.pictures == 3
-    assert not SceneRenderer(scene).code_of_left_half(masked, 8).any()
+    assert not SceneRenderer(scene).fit_left_half(masked, 8).any()
 
 
 @pytest.mark.parametrize(("contracted", "decoder"), [(False, "explicit"), (True, "explicit"), (False, "hybrid")])
@@ -293,9 +293,9 @@ def test_a_fitted_code_shows_what_it_was_fitted_to(contracted: bool, decoder: st
 
 def test_codings_are_judged_with_the_codes_of_the_rays(with_codes: Trainer) -> None:
     scene = kpenc.to_scene(with_codes)
-    measure = Probe.of_training(with_codes.sampler, with_codes.background).measure(scene)
+    measure = ValidationRays.from_training_views(with_codes.sampler, with_codes.background).measure(scene)
     turned = tuple(
         replace(a, code=b.code) for a, b in zip(scene.appearances, scene.appearances[1:] + scene.appearances[:1])
     )
     judged = measure(replace(scene, appearances=turned))
-    assert measure(scene).psnr > 25 > judged.psnr + 3 and measure(scene).error == 0 < judged.error
+    assert measure(scene).psnr > 25 > judged.psnr + 3 and measure(scene).mse == 0 < judged.mse

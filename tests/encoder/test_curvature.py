@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kpc.encoder.evaluation.evaluate import SceneRenderer
-from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.rdo import curvature as module
-from kpc.encoder.rdo.curvature import curvature
+from kpc.encoder.rdo.curvature import estimate_curvature
 from kpc.format.scene.scene import Scene
 from scenes import VARIANTS, tiny_scene, with_appearances
 
@@ -30,8 +30,8 @@ def without_the_last_channels(scene: Scene) -> Scene:
     )
 
 
-def probe_of(scene: Scene, count: int) -> Probe:
-    probe = Probe.of_surfaces(scene, count, seed=1)
+def probe_of(scene: Scene, count: int) -> ValidationRays:
+    probe = ValidationRays.through_occupied(scene, count, seed=1)
     return replace(probe, appearances=np.arange(count) % len(scene.appearances) if scene.appearances else None)
 
 
@@ -40,9 +40,9 @@ def test_it_foretells_what_small_errors_do_to_pictures(kind: str, monkeypatch: p
     """Independent errors of variance s^2 move the three colours of a ray by s^2 sum(h) squared, in the mean: of each plane by
     itself, since a large sum would hide a small one."""
     scene = KINDS[kind](tiny_scene(3))
-    monkeypatch.setattr(module, "RAYS_AT_ONCE", 16)  # so few rays: hardly any cross terms, that they need not cancel
+    monkeypatch.setattr(module, "RAYS_PER_GRADIENT", 16)  # so few rays: hardly any cross terms, that they need not cancel
     probe, rng = probe_of(scene, 2000), np.random.default_rng(0)
-    h = curvature(scene, probe, 2000).alone
+    h = estimate_curvature(scene, probe, 2000).diagonal
     renderer = SceneRenderer(scene)
     codes = renderer.codes(probe.appearances)
     before = renderer.rgb(*probe.rays, codes)
@@ -66,14 +66,14 @@ def test_it_foretells_what_errors_of_two_channels_do_together(kind: str, monkeyp
     """Squared moves of colours by the same errors in both channels, less those by errors of opposite signs, are four times what goes
     together: of the two channels of each plane for which that is most."""
     scene = KINDS[kind](tiny_scene(3))
-    monkeypatch.setattr(module, "RAYS_AT_ONCE", 16)
-    monkeypatch.setattr(module, "SIDE", 1)
+    monkeypatch.setattr(module, "RAYS_PER_GRADIENT", 16)
+    monkeypatch.setattr(module, "BLOCK_SIDE", 1)
     probe, rng = probe_of(scene, 2000), np.random.default_rng(0)
-    found = curvature(scene, probe, 2000)
+    found = estimate_curvature(scene, probe, 2000)
     before = SceneRenderer(scene).rgb(*probe.rays)
     for s, scale in enumerate(scene.scales):
         for name, plane in scale.items():
-            roots, correlation = np.sqrt(found.alone[s][name]), found.together[s][name]
+            roots, correlation = np.sqrt(found.diagonal[s][name]), found.correlation[s][name]
             assert np.abs(correlation).max() < 1.001 and not np.einsum("abmm->abm", correlation).any()
             np.testing.assert_array_equal(correlation, correlation.swapaxes(2, 3))
             products = np.einsum("abmn,abm,abn->mn", correlation, roots, roots)
@@ -103,8 +103,8 @@ def test_products_are_summed_over_blocks(rows: int, columns: int) -> None:
 
 def test_what_no_ray_meets_costs_nothing() -> None:
     scene = tiny_scene(3)
-    h = curvature(replace(scene, occupancy=np.zeros_like(scene.occupancy)), probe_of(scene, 100), 100)
-    assert all(not plane.any() for part in (h.alone, h.together) for scale in part for plane in scale.values())
+    h = estimate_curvature(replace(scene, occupancy=np.zeros_like(scene.occupancy)), probe_of(scene, 100), 100)
+    assert all(not plane.any() for part in (h.diagonal, h.correlation) for scale in part for plane in scale.values())
 
 
 def test_what_is_seen_more_costs_more() -> None:
@@ -112,7 +112,7 @@ def test_what_is_seen_more_costs_more() -> None:
     scene = tiny_scene(3)
     occupancy = scene.occupancy.copy()
     occupancy[..., : occupancy.shape[3] // 2] = False
-    h = curvature(replace(scene, occupancy=occupancy), probe_of(scene, 500), 500).alone[1]
+    h = estimate_curvature(replace(scene, occupancy=occupancy), probe_of(scene, 500), 500).diagonal[1]
     for name in ("xy", "xz", "xt"):
         columns = h[name].sum((0, 2))
         assert not columns[: len(columns) // 2 - 2].any() and columns[len(columns) // 2 + 2 : -4].all()
@@ -122,7 +122,7 @@ def test_rays_beyond_those_of_the_probe_that_meet_something_are_drawn_from_the_c
     """All of a probe's rays miss: what is found comes from the others, the same ones each time."""
     scene = tiny_scene(3)
     blind = replace(probe_of(scene, 64), origins=np.full((64, 3), 50, np.float32))
-    once, again = (curvature(scene, blind, 1000).alone for _ in range(2))
+    once, again = (estimate_curvature(scene, blind, 1000).diagonal for _ in range(2))
     assert once[0]["xy"].any()
     for name in once[1]:
         np.testing.assert_array_equal(once[1][name], again[1][name])
@@ -137,6 +137,6 @@ def test_rays_that_pass_where_nothing_is_do_not_count() -> None:
         directions=np.tile(probe.directions, (2, 1)),
         times=np.tile(probe.times, 2),
     )
-    with_them, without = curvature(scene, astray, 64), curvature(scene, probe, 64)
-    for name, found in with_them.alone[1].items():
-        assert found.any() and found.tobytes() == without.alone[1][name].tobytes()
+    with_them, without = estimate_curvature(scene, astray, 64), estimate_curvature(scene, probe, 64)
+    for name, found in with_them.diagonal[1].items():
+        assert found.any() and found.tobytes() == without.diagonal[1][name].tobytes()

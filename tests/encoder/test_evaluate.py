@@ -8,7 +8,7 @@ import datasets as make
 import numpy as np
 import pytest
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim, true_picture
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim
 from kpc.format.common.fidelity import psnr
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
@@ -83,7 +83,7 @@ def test_a_picture_is_what_the_players_reference_renders(blender: Dataset) -> No
 
 
 def test_true_pictures_are_on_white(blender: Dataset) -> None:
-    picture, raw = true_picture(blender, 5), blender.pixels.picture(5) / 255.0
+    picture, raw = ground_truth(blender, 5), blender.pixels.picture(5) / 255.0
     assert raw.shape[2] == 4
     np.testing.assert_allclose(picture, raw[..., :3] * raw[..., 3:] + 1 - raw[..., 3:], atol=1e-6)
     assert (picture[raw[..., 3] == 0] == 1).all()
@@ -93,7 +93,7 @@ def test_true_pictures_without_alpha(tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "set", frames=1)
     dataset = load_dataset(tmp_path / "set", tmp_path / "cache", progress=False)
     np.testing.assert_array_equal(
-        true_picture(dataset, 1), dataset.pixels.picture(1).astype(np.float32) / np.float32(255)
+        ground_truth(dataset, 1), dataset.pixels.picture(1).astype(np.float32) / np.float32(255)
     )
     assert (
         evaluate(tiny_scene(), load_dataset(tmp_path / "set", tmp_path / "cache", holdout="none", progress=False))
@@ -104,7 +104,7 @@ def test_true_pictures_without_alpha(tmp_path: Path) -> None:
 def test_evaluate_is_the_mean_over_held_out_pictures(blender: Dataset) -> None:
     scene, held_out = dim_scene(), np.flatnonzero(blender.pictures.is_test)
     assert len(held_out) == 3
-    pairs = [(np.clip(SceneRenderer(scene).picture(blender, n), 0, 1), true_picture(blender, n)) for n in held_out]
+    pairs = [(np.clip(SceneRenderer(scene).picture(blender, n), 0, 1), ground_truth(blender, n)) for n in held_out]
     quality = evaluate(scene, blender)
     assert quality is not None and quality.pictures == 3
     assert quality.psnr == pytest.approx(np.mean([psnr(*p) for p in pairs]))

@@ -13,7 +13,7 @@ import pytest
 import torch
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.estimate import Estimate
-from kpc.encoder.cli.grouped import LATER, OVERLAP, begin_with, share_of, spans_of
+from kpc.encoder.cli.grouped import LATER_STEPS, OVERLAP, initialise_from, options_of_group, split_into_spans
 from kpc.encoder.cli.options import Options
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.field.config import PRESETS, TrainConfig
@@ -60,30 +60,30 @@ def encode(videos: Path, output: Path, *options: str) -> int:
 
 
 def test_groups_are_about_equally_long_and_share_frames():
-    spans = spans_of(Clip(100, 10.0), 2.5)
+    spans = split_into_spans(Clip(100, 10.0), 2.5)
     assert spans == (Span(0, 27), Span(23, 29), Span(48, 29), Span(73, 27))
     timeline = Timeline(spans, 10.0)
     assert [timeline.at(frame / 99)[0] for frame in range(100)] == [frame // 25 for frame in range(100)]
     for frames in (26, 29, 300, 301):
-        cut = spans_of(Clip(frames, 10.0), 2.5)
+        cut = split_into_spans(Clip(frames, 10.0), 2.5)
         shown = [Timeline(cut, 10.0).at(frame / (frames - 1))[0] for frame in range(frames)]
         assert cut[0].start == 0 and cut[-1].last == frames - 1 and max(np.bincount(shown)) <= 25
         assert np.ptp(np.bincount(shown)) <= 1
-    assert spans_of(Clip(20, 10.0), 2.5) == (Span(0, 20),)
+    assert split_into_spans(Clip(20, 10.0), 2.5) == (Span(0, 20),)
     with pytest.raises(UsageError, match="at least 0.8s"):
-        spans_of(Clip(100, 10.0), 0.3)
+        split_into_spans(Clip(100, 10.0), 0.3)
 
 
 def test_size_and_time_are_shared_out():
-    spans = spans_of(Clip(100, 10.0), 2.5)
+    spans = split_into_spans(Clip(100, 10.0), 2.5)
     options = Options(Path("a"), Path("b"), time_budget_s=100.0, trade=Trade(target_bytes=100_000))
-    shares = [share_of(options, number, spans) for number in range(4)]
+    shares = [options_of_group(options, number, spans) for number in range(4)]
     assert sum(share.trade.target_bytes for share in shares) == pytest.approx(
         100_000 - HEADER.size - 4 * ENTRY.size, abs=4
     )
     assert sum(share.time_budget_s for share in shares) == pytest.approx(100)
-    assert shares[1].time_budget_s / shares[0].time_budget_s == pytest.approx(LATER * 29 / 27)
-    plain = share_of(replace(options, trade=Trade(quality=50), time_budget_s=None), 1, spans)
+    assert shares[1].time_budget_s / shares[0].time_budget_s == pytest.approx(LATER_STEPS * 29 / 27)
+    plain = options_of_group(replace(options, trade=Trade(quality=50), time_budget_s=None), 1, spans)
     assert plain.trade == Trade(quality=50) and plain.time_budget_s is None
 
 
@@ -99,7 +99,7 @@ def test_a_field_begins_as_the_last_row_of_another():
     earlier, later = field(6, 0), field(4, 1)
     occupancy = np.ones((1, 2, 2, 2), bool)
     scene = earlier.to_scene(np.array([[0, 0, 0], [1, 1, 1]], np.float32), Clip(12, 8.0), occupancy, np.ones(3), 0.1)
-    begin_with(later, scene)
+    initialise_from(later, scene)
     points = torch.rand(20, 3, generator=torch.Generator().manual_seed(3))
     at_the_end = earlier.features(points, torch.ones(20))
     for time in (0.0, 0.4, 1.0):
@@ -162,11 +162,11 @@ def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
     assert encode(videos, output, "--json") == 0
     out, err = capsys.readouterr()
     result, opened = json.loads(out), Groups(output)
-    assert opened.timeline.spans == spans_of(Clip(FRAMES, 8.0), 1.2) and len(opened) == 3
+    assert opened.timeline.spans == split_into_spans(Clip(FRAMES, 8.0), 1.2) and len(opened) == 3
     assert [group["frames"] for group in result["groups"]] == [
         [span.start, span.last] for span in opened.timeline.spans
     ]
-    assert result["steps"] == 24 * (1 + 2 * LATER) and result["size_bytes"] == output.stat().st_size
+    assert result["steps"] == 24 * (1 + 2 * LATER_STEPS) and result["size_bytes"] == output.stat().st_size
     assert 5 < result["test_psnr"] < 60 and result["test_pictures"] == FRAMES + 4 * OVERLAP
     assert (
         all(f"group {number} of 3" in err for number in range(3))
@@ -245,11 +245,11 @@ def test_groups_that_are_coded_apart_are_joined(videos, tmp_path, capsys):
     parts = [tmp_path / f"part{number}.kpc" for number in range(3)]
     for number, part in enumerate(parts):
         assert encode(videos, part, "--only", str(number), "--keep-checkpoint", str(part.with_suffix(".kpck"))) == 0
-        assert Groups(part).timeline.spans == spans_of(Clip(FRAMES, 8.0), 1.2)[number : number + 1]
+        assert Groups(part).timeline.spans == split_into_spans(Clip(FRAMES, 8.0), 1.2)[number : number + 1]
         assert part.with_suffix(".kpck").is_file()
     assert kpjoin.main([*map(str, reversed(parts)), "-o", str(tmp_path / "long.kpc")]) == 0
     joined = Groups(tmp_path / "long.kpc")
-    assert joined.timeline.spans == spans_of(Clip(FRAMES, 8.0), 1.2) and joined.clip == Clip(FRAMES, 8.0)
+    assert joined.timeline.spans == split_into_spans(Clip(FRAMES, 8.0), 1.2) and joined.clip == Clip(FRAMES, 8.0)
     assert all(scene_io.read(joined.open(number)).is_dynamic for number in range(3))
 
 
@@ -268,5 +268,5 @@ def test_what_makes_no_sense_is_refused(videos, tmp_path, capsys, options, compl
 def test_a_dry_run_counts_all_groups(videos, tmp_path, monkeypatch):
     monkeypatch.setattr(kpenc, "estimate", lambda trainer, *rest: Estimate(10.0, 4.0, trainer.dataset.clip.frame_count))
     options = Options(videos, tmp_path / "long.kpc", preset="draft", group_s=1.2, device="cpu")
-    assert kpenc.dry_run(options) == Estimate(10 + 20 * LATER, 4 + 8 * LATER, 8 + OVERLAP)
+    assert kpenc.dry_run(options) == Estimate(10 + 20 * LATER_STEPS, 4 + 8 * LATER_STEPS, 8 + OVERLAP)
     assert kpenc.dry_run(replace(options, only=1)) == Estimate(10.0, 4.0, 9 + 2 * OVERLAP)

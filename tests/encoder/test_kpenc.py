@@ -752,7 +752,7 @@ def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
     script = (
         f"import sys\n{preparation}\n"
         "from kpc.encoder import curvature, kpenc, probe\nfrom kpc.encoder.field.config import PRESETS, TrainConfig\n"
-        f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nprobe.PROBE_RAYS = 512\ncurvature.RAYS = 1 << 13\nsys.exit(kpenc.main({argv!r}))"
+        f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nvalidation_rays.VALIDATION_RAYS = 512\ncurvature.RAYS = 1 << 13\nsys.exit(kpenc.main({argv!r}))"
     )
     return subprocess.Popen(
         [sys.executable, "-c", script],

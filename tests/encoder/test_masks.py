@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kpc.encoder.datasets import Dataset, pixel_cache
 from kpc.encoder.datasets.masks import BLOCK
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ssim, true_picture
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim
 from kpc.encoder.training.sampler import RaySampler
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.media import write_image
@@ -312,7 +312,7 @@ def test_evaluation_ignores_what_the_mask_ignores(tmp_path: Path) -> None:
     assert quality.pictures == 2
     renderer, scores = SceneRenderer(tiny_scene()), []
     for number, mask in ((0, usable), (8, np.ones(SIZE, bool))):
-        a, b = np.clip(renderer.picture(dataset, number), 0, 1), true_picture(dataset, number)
+        a, b = np.clip(renderer.picture(dataset, number), 0, 1), ground_truth(dataset, number)
         error = sum(float(np.square(a[j, i] - b[j, i]).sum()) for j, i in zip(*np.nonzero(mask))) / (3 * mask.sum())
         windows = [
             ssim(a[j : j + 11, i : i + 11], b[j : j + 11, i : i + 11])

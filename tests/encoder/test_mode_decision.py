@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from kpc.encoder.rdo import dct_rdo as search
 from kpc.encoder.rdo import mode_decision
-from kpc.encoder.rdo.distortion import ALONE, cost
-from kpc.encoder.rdo.mode_decision import quantise_by_cost, step_asked_for
-from kpc.encoder.rdo.trellis import THIN, on_trellis
+from kpc.encoder.rdo.distortion import NO_CORRELATION, total_distortion
+from kpc.encoder.rdo.mode_decision import quantise_by_cost, requested_step
+from kpc.encoder.rdo.trellis import LOW_RATE_BITS, trellis_quantise
 from kpc.format.coding.predictive import Guide
 from kpc.format.coding.quantise import QuantisedPlane, quantise_plane
 from kpc.format.coding.transform import FINENESSES, USUAL
@@ -29,7 +29,7 @@ def in_blocks(
     steps = np.full(values.shape[2], step)
     rounded = quantise_plane(values, steps, identity=identity, needed=needed)
     significant = np.ones_like(values) if significant is None else significant
-    found = search.in_blocks(rounded, values, steps, significant, identity, ALONE, side)
+    found = search.transform_quantise(rounded, values, steps, significant, identity, NO_CORRELATION, side)
     assert found is not None
     return found
 
@@ -39,10 +39,13 @@ def test_what_hardly_changes_costs_less_in_blocks(step: float) -> None:
     """Errors, as pictures see them, and what bits are worth; the more so, the less is told."""
     values, steps, alike = waves(3), np.full(3, step), np.ones((60, 70, 3), np.float32)
     told, size = in_blocks(values, step)
-    steered = on_trellis(quantise_plane(values, steps, identity=False), values, steps, alike, False)
+    steered = trellis_quantise(quantise_plane(values, steps, identity=False), values, steps, alike, False)
 
     def in_all(plane: QuantisedPlane, size_bytes: int) -> float:
-        return cost((plane.dequantise() - values) / np.float32(step), ALONE) + mode_decision.SLOPE * 8 * size_bytes
+        return (
+            total_distortion((plane.dequantise() - values) / np.float32(step), NO_CORRELATION)
+            + mode_decision.DECISION_LAM * 8 * size_bytes
+        )
 
     gain = in_all(steered, mode_decision._size(steered, False, np.ones((60, 70), bool))) / in_all(told, size)
     assert gain > {1.0: 0.9, 2.0: 1.0, 4.0: 1.1}[step]
@@ -54,7 +57,7 @@ def test_a_time_plane_that_is_nearly_1_is_told_without_a_map_and_is_1_where_noth
     values, steps, everywhere = (1 + swell).astype(np.float32), np.full(3, 1.0), np.ones((48, 96), bool)
     rounded = quantise_plane(values, steps, identity=True)
     found = mode_decision._cheapest(
-        rounded, values, steps, np.ones_like(values), True, ALONE, THIN, everywhere, everywhere
+        rounded, values, steps, np.ones_like(values), True, NO_CORRELATION, LOW_RATE_BITS, everywhere, everywhere
     )
     assert isinstance(found.guide, Told) and found.coded.all()
     assert (found.dequantise()[:, 64:] == 1).all()
@@ -114,7 +117,7 @@ def test_levels_are_near_to_the_best_ones() -> None:
     """Where all is worth the same, cosines are orthogonal: no level is more than one from the plane's own factor, and errors no more than that."""
     values = waves(7, 64, 64)
     plane, _ = in_blocks(values, 1.0)
-    quantiser = 1.0 * search.STEPS
+    quantiser = 1.0 * search.STEPS_PER_QUANTISER
     assert np.sqrt(np.square(plane.dequantise() - values).mean()) < quantiser / 2
     assert np.abs(plane.dequantise() - values).max() < 4 * quantiser
 
@@ -122,15 +125,21 @@ def test_levels_are_near_to_the_best_ones() -> None:
 def test_where_eight_bits_are_too_few_there_are_no_blocks() -> None:
     values, steps = waves(8), np.full(3, 0.01)
     assert (
-        search.in_blocks(
-            quantise_plane(values, steps, identity=False), values, steps, np.ones_like(values), False, ALONE, 8
+        search.transform_quantise(
+            quantise_plane(values, steps, identity=False), values, steps, np.ones_like(values), False, NO_CORRELATION, 8
         )
         is None
     )
     nothing = np.ones((9, 9, 2), np.float32)
     assert (
-        search.in_blocks(
-            quantise_plane(nothing, np.full(2, 0.1), identity=True), nothing, np.full(2, 0.1), nothing, True, ALONE, 8
+        search.transform_quantise(
+            quantise_plane(nothing, np.full(2, 0.1), identity=True),
+            nothing,
+            np.full(2, 0.1),
+            nothing,
+            True,
+            NO_CORRELATION,
+            8,
         )
         is None
     )
@@ -152,7 +161,7 @@ def test_files_keep_what_is_told_and_say_for_which_steps() -> None:
             np.testing.assert_array_equal(ours[name].symbols, theirs[name].symbols)
             np.testing.assert_array_equal(ours[name].coded, theirs[name].coded)
             if isinstance(ours[name].guide, Told):
-                np.testing.assert_allclose(step_asked_for(ours[name]), 0.4, rtol=2**-7)
+                np.testing.assert_allclose(requested_step(ours[name]), 0.4, rtol=2**-7)
     forgotten = replace(
         back, scales=tuple({name: replace(plane, guide=None) for name, plane in scale.items()} for scale in back.scales)
     )

@@ -4,46 +4,46 @@ import math
 
 import numpy as np
 import pytest
-from kpc.encoder.evaluation.validation_rays import Measured
-from kpc.encoder.rdo.motion_rdo import MOST_STEPS, SHARE, told_cheaply, with_coarser_motion
+from kpc.encoder.evaluation.validation_rays import Fidelity
+from kpc.encoder.rdo.motion_rdo import MAX_MULTIPLE, SHARE, coarsen_motion, quantise_motion
 from kpc.format.coding.motion_hierarchical import encode_midpoints
 from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene, with_motion
-from test_nodes import swaying
+from grids import swaying
 
 
 def errs(scene: Scene, left_out: float = 1e-3):
     """A stand-in for pictures, that displacements far from a scene's make worse."""
-    return lambda candidate: Measured(30.0, left_out + float(np.mean((candidate.motion - scene.motion) ** 2)))
+    return lambda candidate: Fidelity(30.0, left_out + float(np.mean((candidate.motion - scene.motion) ** 2)))
 
 
 @pytest.mark.parametrize("share", [1e9, 72.0, 12.0, 1.5])
 def test_displacements_are_as_coarse_as_their_error_may_be(share):
     """`share`: of the square of motion.STEP; rounding errs by a twelfth of a step's own."""
     scene, most = with_motion(tiny_scene()), share * FINEST_STEP**2 / 12 / SHARE
-    found = with_coarser_motion(scene, np.ones(scene.motion.shape), errs(scene), most)
+    found = coarsen_motion(scene, np.ones(scene.motion.shape), errs(scene), most)
     symbols = found.motion / np.float32(FINEST_STEP)
     multiple = int(np.gcd.reduce(np.rint(symbols).astype(np.int64), axis=None))
     np.testing.assert_array_equal(symbols, np.rint(symbols))
-    assert errs(scene)(found).error - 1e-3 <= share * FINEST_STEP**2 / 12
-    assert math.sqrt(share) / 3 < multiple <= MOST_STEPS or share > 1e6
-    assert with_coarser_motion(found, np.ones(scene.motion.shape), errs(found), most, own=MOST_STEPS) is found
+    assert errs(scene)(found).mse - 1e-3 <= share * FINEST_STEP**2 / 12
+    assert math.sqrt(share) / 3 < multiple <= MAX_MULTIPLE or share > 1e6
+    assert coarsen_motion(found, np.ones(scene.motion.shape), errs(found), most, own=MAX_MULTIPLE) is found
 
 
 @pytest.mark.parametrize("share, expected", [(1e9, 64), (72.0, 8), (12.0, 3), (1.5, 1)])
 def test_where_no_worth_is_told_they_are_the_nearest(share, expected):
     scene = with_motion(tiny_scene())
-    found = with_coarser_motion(scene, None, errs(scene), share * FINEST_STEP**2 / 12 / SHARE)
+    found = coarsen_motion(scene, None, errs(scene), share * FINEST_STEP**2 / 12 / SHARE)
     step = np.float32(expected * FINEST_STEP)
     np.testing.assert_array_equal(found.motion, np.rint(scene.motion / step) * step)
 
 
 def test_scenes_in_which_nothing_may_err_or_nothing_moves_stay():
     scene = with_motion(tiny_scene())
-    assert with_coarser_motion(scene, None, errs(scene), 0.0) is scene
-    assert with_coarser_motion(scene, None, lambda candidate: Measured(math.nan, math.nan), 1e9) is scene
-    assert with_coarser_motion(tiny_scene(), None, errs(scene), 1e9).motion is None
+    assert coarsen_motion(scene, None, errs(scene), 0.0) is scene
+    assert coarsen_motion(scene, None, lambda candidate: Fidelity(math.nan, math.nan), 1e9) is scene
+    assert coarsen_motion(tiny_scene(), None, errs(scene), 1e9).motion is None
 
 
 def test_what_matters_is_near_to_what_is_wanted_and_what_does_not_takes_next_to_nothing():
@@ -51,17 +51,17 @@ def test_what_matters_is_near_to_what_is_wanted_and_what_does_not_takes_next_to_
     rounded = np.rint(wanted).astype(np.int16)
     worth = np.zeros(wanted.shape)
     worth[:, :, :3] = 1.0
-    found = told_cheaply(wanted, worth)
+    found = quantise_motion(wanted, worth)
     assert np.abs(found - wanted)[:, :, :3].mean() < 1.5 * np.abs(rounded - wanted).mean()
     assert len(encode_midpoints(found.astype(np.int16))) < 0.75 * len(encode_midpoints(rounded))
 
 
 def test_noise_that_is_worth_telling_is_told_as_it_is():
     wanted = np.random.default_rng(0).uniform(-3e4, 3e4, (4, 3, 3, 3, 3))
-    assert np.abs(told_cheaply(wanted, np.ones(wanted.shape)) - wanted).max() < 2.5
+    assert np.abs(quantise_motion(wanted, np.ones(wanted.shape)) - wanted).max() < 2.5
 
 
 def test_symbols_stay_within_their_16_bits():
     wanted = np.where(np.random.default_rng(0).random((5, 3, 3, 3, 3)) < 0.5, -32768.4, 32767.4)
-    found = told_cheaply(wanted, np.ones(wanted.shape))
+    found = quantise_motion(wanted, np.ones(wanted.shape))
     assert found.min() >= -32768 and found.max() <= 32767

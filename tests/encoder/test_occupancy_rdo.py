@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kpc.encoder.evaluation.validation_rays import Measured, Probe
+from kpc.encoder.evaluation.validation_rays import Fidelity, ValidationRays
 from kpc.encoder.rdo import occupancy_rdo
-from kpc.encoder.rdo.occupancy_rdo import CONTRAST, contributions, counted, flipped, told_cheaply
+from kpc.encoder.rdo.occupancy_rdo import CONTRAST, count_contexts, flip_cells, optimise_occupancy, removal_errors
 from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS, encode_cells
 from kpc.format.coding.rans import adapt, counters, stream
 from kpc.format.scene.grid import dilate
 from scenes import tiny_scene
-from test_cells import rolling
+from grids import rolling
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -28,12 +28,12 @@ def test_contexts_are_those_of_the_coder():
             int(told[place]), table, occupancy_rdo.context_at(told, *place, NEIGHBOURS), 0, at, None, trace
         )
     assert stream(trace) == encode_cells(occupancy)
-    assert counted(told, NEIGHBOURS).sum() == told.size
+    assert count_contexts(told, NEIGHBOURS).sum() == told.size
 
 
 def test_where_errors_cost_nothing_a_ragged_grid_takes_far_fewer_bytes():
     occupancy = rolling()
-    found = flipped(occupancy, np.zeros(occupancy.shape))
+    found = flip_cells(occupancy, np.zeros(occupancy.shape))
     assert len(encode_cells(found)) < 0.7 * len(encode_cells(occupancy))
     assert not (found & ~dilate(occupancy)).any()
     assert np.mean(found != occupancy) < 0.1
@@ -41,26 +41,26 @@ def test_where_errors_cost_nothing_a_ragged_grid_takes_far_fewer_bytes():
 
 def test_what_is_worth_its_bits_stays():
     occupancy = rolling(2, 12, 13, 14)
-    np.testing.assert_array_equal(flipped(occupancy, np.full(occupancy.shape, 1e6)), occupancy)
+    np.testing.assert_array_equal(flip_cells(occupancy, np.full(occupancy.shape, 1e6)), occupancy)
     needed = occupancy & (np.random.default_rng(0).random(occupancy.shape) < 0.3)
-    found = flipped(occupancy, np.where(needed, 1e6, 0.0))
+    found = flip_cells(occupancy, np.where(needed, 1e6, 0.0))
     assert found[needed].all() and not np.array_equal(found, occupancy)
 
 
 def test_cells_that_rays_need_are_known_and_the_others_too():
     """Of a scene with cells that hold nothing, and some that no ray passes."""
-    probe = Probe.of_cameras(SCENE, 500)
-    error = contributions(SCENE, probe, 2000)
+    probe = ValidationRays.from_cameras(SCENE, 500)
+    error = removal_errors(SCENE, probe, 2000)
     assert error.shape == SCENE.occupancy.shape and (error >= 0).all() and (error[~SCENE.occupancy] == 0).all()
     assert 0 < error.max() <= 255**2 * CONTRAST
     thin = replace(SCENE, decoder=replace(SCENE.decoder, density_bias=-30.0))
-    assert contributions(thin, probe, 2000).max() < 1e-6 * error.max()
+    assert removal_errors(thin, probe, 2000).max() < 1e-6 * error.max()
 
 
 def judged(found: list, error: float):
     def measure(candidate):
         found.append(candidate)
-        return Measured(30.0, 1.0 if candidate is SCENE else 1.0 + error)
+        return Fidelity(30.0, 1.0 if candidate is SCENE else 1.0 + error)
 
     return measure
 
@@ -70,19 +70,19 @@ def judged(found: list, error: float):
 )
 def test_a_grid_is_taken_where_pictures_hardly_lose_by_it(error, tries):
     seen: list = []
-    found = told_cheaply(SCENE, np.zeros(SCENE.occupancy.shape), judged(seen, error), 1.0)
+    found = optimise_occupancy(SCENE, np.zeros(SCENE.occupancy.shape), judged(seen, error), 1.0)
     assert len(seen) == 1 + tries and (found is seen[1]) == (tries == 1) and (found is SCENE) == (tries != 1)
 
 
 def test_where_nothing_may_be_lost_nothing_is_looked_at():
-    assert told_cheaply(SCENE, np.zeros(SCENE.occupancy.shape), judged([], 0.0), 0.0) is SCENE
+    assert optimise_occupancy(SCENE, np.zeros(SCENE.occupancy.shape), judged([], 0.0), 0.0) is SCENE
 
 
 def test_slots_that_stand_for_several_lose_what_these_do():
     occupancy = rolling(4, 12, 13, 14)
     merged = replace(SCENE, occupancy=occupancy.reshape(2, 2, 12, 13, 14).any(1))
     errors = np.where(occupancy & (np.random.default_rng(0).random(occupancy.shape) < 0.3), 1e6, 0.0)
-    found = told_cheaply(merged, errors, lambda candidate: Measured(30.0, 0.0), 1.0).occupancy
+    found = optimise_occupancy(merged, errors, lambda candidate: Fidelity(30.0, 0.0), 1.0).occupancy
     assert found.shape == merged.occupancy.shape and found[(errors > 0).reshape(2, 2, 12, 13, 14).any(1)].all()
 
 
@@ -90,6 +90,6 @@ def test_a_scene_without_a_cell_stays_without(monkeypatch):
     monkeypatch.setattr(occupancy_rdo, "RAYS", 100)
     monkeypatch.setattr(occupancy_rdo, "FEWER_RAYS", 100)
     empty = replace(SCENE, occupancy=np.zeros_like(SCENE.occupancy))
-    errors = occupancy_rdo.errors_of_flips(empty, Probe.of_cameras(SCENE, 10))
-    found = told_cheaply(empty, errors, lambda candidate: Measured(30.0, 0.0), 1.0)
+    errors = occupancy_rdo.flip_errors(empty, ValidationRays.from_cameras(SCENE, 10))
+    found = optimise_occupancy(empty, errors, lambda candidate: Fidelity(30.0, 0.0), 1.0)
     assert not found.occupancy.any()

@@ -5,10 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evenly_wide
-from kpc.encoder.evaluation.validation_rays import Probe
-from kpc.encoder.rdo.codec_model import Model, code, model_of
-from kpc.encoder.rdo.prune import Seen, dispensable, one_colour, passed_on, prune, renderings, without
+from kpc.encoder.evaluation.evaluate import SceneRenderer, pad_channels
+from kpc.encoder.evaluation.validation_rays import ValidationRays
+from kpc.encoder.rdo.codec_model import Model, code, model_from_file
+from kpc.encoder.rdo.prune import (
+    SurfaceFeatures,
+    elimination_order,
+    keep_channels,
+    make_view_independent,
+    max_renderings,
+    prune,
+    redistribute,
+)
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container import scene_io
@@ -72,7 +80,7 @@ def test_a_channel_that_says_nothing_new_goes_at_no_cost(kind: str) -> None:
     before, fidelity = SceneRenderer(scene).rgb(*rays), Fidelity(scene, rays)
     pruned = prune(scene, rays, fidelity, SPARE)
     assert [len(kept) for kept in pruned.kept] == [8, 7] and len({2, 3} & set(pruned.kept[1])) == 1
-    assert abs(pruned.loss_db) < 0.01 and pruned.next_db > SPARE
+    assert abs(pruned.loss_db) < 0.01 and pruned.next_loss_db > SPARE
     np.testing.assert_allclose(SceneRenderer(pruned.scene).rgb(*rays), before, atol=0.01)
 
 
@@ -80,10 +88,7 @@ def test_what_is_needed_stays_bit_for_bit() -> None:
     scene = tiny_scene()
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), 1e-4)
     assert (
-        pruned.loss_db == 0
-        and pruned.next_db > 1e-4
-        and pruned.view_worth_db is not None
-        and pruned.view_worth_db > 1e-4
+        pruned.loss_db == 0 and pruned.next_loss_db > 1e-4 and pruned.view_gain_db is not None and pruned.view_gain_db > 1e-4
     )
     for ours, theirs in zip(pruned.scene.scales, scene.scales, strict=True):
         assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
@@ -100,7 +105,7 @@ def test_a_scale_that_nothing_listens_to_is_left_out() -> None:
 def test_one_channel_always_stays() -> None:
     scene = tiny_scene()
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), 1e3)
-    assert sum(len(kept) for kept in pruned.kept) == 1 and len(pruned.scene.scales) == 1 and pruned.next_db == math.inf
+    assert sum(len(kept) for kept in pruned.kept) == 1 and len(pruned.scene.scales) == 1 and pruned.next_loss_db == math.inf
 
 
 @pytest.mark.parametrize("spare", [0.0, 0.3, 2.0])
@@ -110,8 +115,8 @@ def test_the_bill_is_what_pictures_show(spare: float) -> None:
     before = fidelity(scene)
     fidelity.asked = 0
     pruned = prune(scene, rays_of(scene), fidelity, spare)
-    assert fidelity.asked <= renderings(16)
-    assert pruned.loss_db <= spare < pruned.next_db
+    assert fidelity.asked <= max_renderings(16)
+    assert pruned.loss_db <= spare < pruned.next_loss_db
     assert before - fidelity(pruned.scene) == pytest.approx(pruned.loss_db, abs=1e-3)
 
 
@@ -119,13 +124,13 @@ def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
     scene = redundant(directed(tiny_scene(scales=3, resolution=(48, 40, 32)), 0.03))
     rays = rays_of(scene)
     numbers = [{name: np.arange(1.0, 9.0) for name in scale} for scale in scene.scales]
-    model = Model(scene, Probe(*rays, None, Fidelity(scene, rays).truth))
+    model = Model(scene, ValidationRays(*rays, None, Fidelity(scene, rays).truth))
     coded = code(model, Trade(max_loss_db=0.15), SPARE / 0.15, 0)
-    assert coded.pruned is not None and coded.spare_db == pytest.approx(SPARE) and coded.pruned.left_out_any
+    assert coded.pruned is not None and coded.spare_db == pytest.approx(SPARE) and coded.pruned.removed_any
     kept = coded.pruned.kept[1]
-    assert [step.tolist() for step in coded.pruned.of_each_plane(numbers)[1].values()] == [(kept + 1.0).tolist()] * 6
+    assert [step.tolist() for step in coded.pruned.select_channels(numbers)[1].values()] == [(kept + 1.0).tolist()] * 6
     pairs = [{name: np.arange(64.0).reshape(1, 1, 8, 8) for name in scale} for scale in scene.scales]
-    for found in coded.pruned.of_each_plane(pairs, in_pairs=True)[1].values():
+    for found in coded.pruned.select_channels(pairs, in_pairs=True)[1].values():
         np.testing.assert_array_equal(found[0, 0], 8.0 * kept[:, None] + kept)
     # So small a scene's loss leaps by a quarter from one step to the next: how near it comes depends on the processor's rounding.
     assert (SPARE + 0.15) / 2 < coded.loss_db <= 0.15 and coded.size_bytes == len(scene_io.encode(coded.scene))
@@ -137,7 +142,7 @@ def test_of_a_size_what_may_be_left_out_is_a_share_of_what_it_costs() -> None:
     """Not of what it would cost if nothing were."""
     scene = redundant(directed(tiny_scene(scales=3, resolution=(48, 40, 32)), 0.03))
     rays = rays_of(scene)
-    model = Model(scene, Probe(*rays, None, Fidelity(scene, rays).truth))
+    model = Model(scene, ValidationRays(*rays, None, Fidelity(scene, rays).truth))
     coded = code(model, Trade(target_bytes=5_500), 0.1, 0)
     assert coded.spare_db < 4 * 0.1 * coded.loss_db  # else ten times that
 
@@ -146,21 +151,21 @@ def test_of_a_size_what_may_be_left_out_is_a_share_of_what_it_costs() -> None:
 def test_direction_goes_where_it_is_worth_little(strength: float, goes: bool) -> None:
     scene = directed(tiny_scene(), strength)
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), SPARE)
-    assert pruned.view_worth_db is not None and (pruned.view_worth_db <= SPARE) == goes
+    assert pruned.view_gain_db is not None and (pruned.view_gain_db <= SPARE) == goes
     assert pruned.scene.decoder.w2.any() != goes
 
 
 def test_colour_that_never_depended_on_direction_costs_no_weights() -> None:
     scene = directed(tiny_scene(), 0.0)
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), SPARE)
-    assert pruned.view_worth_db is None and pruned.scene.decoder.w1.shape == (1, 9)
-    np.testing.assert_array_equal(one_colour(scene, rays_of(scene)[1]).decoder.b2, scene.decoder.b2)
+    assert pruned.view_gain_db is None and pruned.scene.decoder.w1.shape == (1, 9)
+    np.testing.assert_array_equal(make_view_independent(scene, rays_of(scene)[1]).decoder.b2, scene.decoder.b2)
 
 
 def test_the_mean_basis_is_that_over_the_rays() -> None:
     scene = tiny_scene()
     directions = rays_of(scene)[1]
-    plain = one_colour(scene, directions)
+    plain = make_view_independent(scene, directions)
     assert not plain.decoder.w2.any()
     expected = reference.direction_basis(scene.decoder, directions, np.zeros(16, np.float32)).mean(0)
     np.testing.assert_allclose(plain.decoder.b2, expected, atol=1e-5)
@@ -171,7 +176,7 @@ def test_the_mean_basis_is_that_over_the_rays() -> None:
 def test_one_colour_takes_next_to_nothing_in_the_file() -> None:
     """The decoder's chunk without the MLP: 7 numbers a feature, 10 zeros and a head."""
     scene = tiny_scene()
-    plain = one_colour(scene, rays_of(scene)[1])
+    plain = make_view_independent(scene, rays_of(scene)[1])
     steps = [{name: 0.05 for name in scale} for scale in scene.scales]
     stored = []
     for each in (scene, plain):
@@ -184,9 +189,9 @@ def test_one_colour_takes_next_to_nothing_in_the_file() -> None:
 def test_passing_on_is_least_squares() -> None:
     """What colour and density lose is the least that any share of the others can leave."""
     scene = tiny_scene()
-    seen, gone = Seen.of(scene, rays_of(scene)), np.array([3, 9])
+    seen, gone = SurfaceFeatures.of(scene, rays_of(scene)), np.array([3, 9])
     left = np.setdiff1d(np.arange(16), gone)
-    after = passed_on(scene.decoder, seen, gone)
+    after = redistribute(scene.decoder, seen, gone)
     colour = scene.decoder.b2[:, gone].astype(float)
     best = np.linalg.lstsq(seen.features[:, left], seen.features[:, gone] @ colour.T, rcond=None)[0]
     np.testing.assert_allclose(after.b2[:, left] - scene.decoder.b2[:, left], best.T, atol=2e-2)
@@ -209,20 +214,20 @@ def test_the_order_is_that_of_what_a_linear_map_loses() -> None:
     weight = np.array([0.5, 0.1, 1.0, 2.0, 2.0], np.float32)
     basis = np.stack([weight.astype(float)] * 3)[None].repeat(4096, 0)
     decoder = Decoder(weight, 0.0, np.zeros((1, 9)), np.zeros(1), np.zeros((3, 5, 1)), basis[0].astype(np.float32))
-    order = dispensable(decoder, Seen(features, basis, features))
+    order = elimination_order(decoder, SurfaceFeatures(features, basis, features))
     assert order[0] in (3, 4) and order[1:].tolist() == [1, 0, 2]
 
 
 def test_channels_of_unequal_number_look_the_same_in_every_renderer() -> None:
     """Encoder, its reference, and what is read back from a file."""
-    scene = without(tiny_scene(), (np.array([0, 5, 6]), np.arange(8)))
+    scene = keep_channels(tiny_scene(), (np.array([0, 5, 6]), np.arange(8)))
     camera = scene.cameras[0]
     origins, directions = camera.rays()
     times = np.full(len(origins), 0.5, np.float32)
     ours = SceneRenderer(scene).rgb(origins, directions, times)
     theirs = reference.render(scene, camera, 0.5).rgb.reshape(-1, 3)
     assert np.quantile(np.abs(ours - theirs), 0.99) < 2 / 255
-    even = evenly_wide(scene)
+    even = pad_channels(scene)
     np.testing.assert_allclose(reference.render(even, camera, 0.5).rgb.reshape(-1, 3), theirs, atol=1e-5)
     quantised = quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
     again = scene_io.read(scene_io.encode(quantised)).dequantise()
@@ -233,7 +238,7 @@ def test_the_direction_stays_where_appearances_act_through_it() -> None:
     scene = with_appearances(tiny_scene())
     probes = rays_of(scene)
     pruned = prune(scene, probes, lambda candidate: 30.0, 1.0)  # whatever goes costs nothing
-    assert pruned.view_worth_db is None and pruned.scene.decoder.w2.any()
+    assert pruned.view_gain_db is None and pruned.scene.decoder.w2.any()
     assert pruned.scene.appearances == scene.appearances and len(pruned.scene.decoder.b1) == len(
         scene.appearances[0].code
     )
@@ -245,8 +250,8 @@ def test_a_file_that_something_is_left_out_of_is_coded_between_its_own_steps_and
 ) -> None:
     scene = redundant(tiny_scene(scales=3, resolution=(48, 40, 32)))
     own = quantise_scene(scene, [{name: 0.004 for name in planes} for planes in scene.scales])
-    coded = code(model_of(own), Trade(quality=quality), 0.25, 0)
-    assert coded.pruned is not None and coded.pruned.left_out_any
+    coded = code(model_from_file(own), Trade(quality=quality), 0.25, 0)
+    assert coded.pruned is not None and coded.pruned.removed_any
     assert coded.size_bytes < len(scene_io.encode(own))
     if quality < 50:
         assert 0 <= coded.agreement_db - (20 + quality / 3) < 0.5

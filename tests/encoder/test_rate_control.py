@@ -5,25 +5,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kpc.encoder.evaluation.validation_rays import Measured
+from kpc.encoder.evaluation.validation_rays import Fidelity
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
 from kpc.encoder.rdo.rate_control import (
     FINEST,
-    LEAST_SIGNIFICANCE,
-    TRUST,
+    MIN_SIGNIFICANCE,
+    SIGNIFICANCE_EXPONENT,
     Attempt,
     Steps,
     Trade,
     agreement_of,
-    compress,
-    decoder_bits,
-    error_of,
+    choose_decoder_bits,
+    meet_trade,
+    mse_of_quality,
+    reduce_slots,
     relative_steps,
     scaled,
     significance,
-    with_fewer_slots,
 )
-from kpc.encoder.rdo.rate_search import TUNINGS
+from kpc.encoder.rdo.rate_search import MAX_TUNINGS
 from kpc.format.coding.quantise import QuantisedScene, quantise_scene, round_decoder
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
@@ -56,15 +56,15 @@ def steady(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"{__name__}.{name}", value)
 
 
-def measure(scene: Scene) -> Measured:
+def measure(scene: Scene) -> Fidelity:
     """A stand-in for pictures: noise of 1e-3, and what the planes err."""
     pairs = zip(scene.scales, SCENE.scales)
     error = float(np.mean([np.square(ours[n] - theirs[n]).mean() for ours, theirs in pairs for n in ours]))
-    return Measured(-10 * math.log10(1e-3 + error), 255**2 * error)
+    return Fidelity(-10 * math.log10(1e-3 + error), 255**2 * error)
 
 
 def coded(**trade: float) -> Attempt:
-    return compress(SCENE, EQUAL, ALIKE, measure, 30.0, Trade(**trade))  # type: ignore[arg-type]
+    return meet_trade(SCENE, EQUAL, ALIKE, measure, 30.0, Trade(**trade))  # type: ignore[arg-type]
 
 
 def loss(found: Attempt) -> float:
@@ -93,7 +93,7 @@ def test_without_a_word_the_loss_is_the_default() -> None:
 def test_a_quality_is_an_agreement_with_the_uncoded_scene(quality: float) -> None:
     found = coded(quality=quality)
     assert agreement_of(quality) <= found.measured.agreement_db <= agreement_of(quality) + 0.2
-    assert error_of(quality) == pytest.approx(255**2 * 10 ** (-(20 + quality / 3) / 10))
+    assert mse_of_quality(quality) == pytest.approx(255**2 * 10 ** (-(20 + quality / 3) / 10))
 
 
 def test_a_better_quality_takes_more() -> None:
@@ -141,11 +141,11 @@ def test_where_nothing_is_good_enough_the_finest_is_taken() -> None:
 def test_a_psnr_that_is_not_a_number_does_not_pass() -> None:
     seen = []
 
-    def broken(scene: Scene) -> Measured:
+    def broken(scene: Scene) -> Fidelity:
         seen.append(scene)
-        return measure(scene) if len(seen) < 3 else Measured(math.nan, math.nan)
+        return measure(scene) if len(seen) < 3 else Fidelity(math.nan, math.nan)
 
-    found = compress(SCENE, EQUAL, ALIKE, broken, 30.0, Trade(0.15))
+    found = meet_trade(SCENE, EQUAL, ALIKE, broken, 30.0, Trade(0.15))
     assert math.isfinite(found.measured.psnr) and found.size_bytes > 0
 
 
@@ -154,9 +154,9 @@ def test_a_file_is_never_made_finer_than_it_is() -> None:
     own = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in whole.scales]
     size = len(scene_io.encode(whole))
     for trade in (Trade(quality=100), Trade(target_bytes=size), Trade(max_loss_db=1e-9)):
-        judged = compress(whole.dequantise(), own, ALIKE, measure, measure(whole.dequantise()).psnr, trade, whole)
+        judged = meet_trade(whole.dequantise(), own, ALIKE, measure, measure(whole.dequantise()).psnr, trade, whole)
         assert judged.quantised is whole
-    smaller = compress(whole.dequantise(), own, ALIKE, measure, 30.0, Trade(target_bytes=int(0.8 * size)), whole)
+    smaller = meet_trade(whole.dequantise(), own, ALIKE, measure, 30.0, Trade(target_bytes=int(0.8 * size)), whole)
     assert 0.7 * size < smaller.size_bytes <= 0.8 * size
 
 
@@ -173,8 +173,8 @@ def test_what_errors_cost_is_trusted_so_far() -> None:
     h[1]["yt"][3, 2, 1] = 64
     significant = significance(h)
     assert significant[1]["yt"][3, 2, 1] == 1 and significant[1]["yt"].dtype == np.float32
-    np.testing.assert_allclose(significant[0]["xy"], 64.0**-TRUST, rtol=1e-5)
-    np.testing.assert_allclose(significant[1]["xy"], 256.0**-TRUST, rtol=1e-5)
+    np.testing.assert_allclose(significant[0]["xy"], 64.0**-SIGNIFICANCE_EXPONENT, rtol=1e-5)
+    np.testing.assert_allclose(significant[1]["xy"], 256.0**-SIGNIFICANCE_EXPONENT, rtol=1e-5)
 
 
 def test_steps_follow_the_significance() -> None:
@@ -195,13 +195,13 @@ def test_channels_that_no_ray_reached_get_the_coarsest_step() -> None:
          for scale in SCENE.scales]  # fmt: skip
     for scale in relative_steps(w):
         for step in scale.values():
-            assert step[2] == pytest.approx(LEAST_SIGNIFICANCE**-0.5) and (np.delete(step, 2) == 1).all()
+            assert step[2] == pytest.approx(MIN_SIGNIFICANCE**-0.5) and (np.delete(step, 2) == 1).all()
 
 
 def test_where_nothing_costs_anything_all_steps_are_equal() -> None:
     nothing = significance([{name: np.zeros_like(plane) for name, plane in scale.items()} for scale in SCENE.scales])
     assert len({float(step) for scale in relative_steps(nothing) for steps in scale.values() for step in steps}) == 1
-    assert math.isfinite(compress(SCENE, EQUAL, nothing, measure, 30.0, Trade()).measured.psnr)
+    assert math.isfinite(meet_trade(SCENE, EQUAL, nothing, measure, 30.0, Trade()).measured.psnr)
 
 
 @pytest.mark.parametrize("error, common, slots", [(1.0, 100, 1), (1.0, 50, 2), (0.1, 100, 4)])
@@ -212,7 +212,7 @@ def test_slots_are_fewer_where_they_hold_much_the_same(error: float, common: int
     for k in range(4):
         cells[k, 200 + 10 * k :][:10] = True
     scene = replace(tiny_scene(), occupancy=cells.reshape(4, 5, 5, 10))
-    found = with_fewer_slots(scene, lambda candidate: Measured(30.0, 0.5 + 0.3 * (len(candidate.occupancy) < 4)), error)
+    found = reduce_slots(scene, lambda candidate: Fidelity(30.0, 0.5 + 0.3 * (len(candidate.occupancy) < 4)), error)
     assert len(found.occupancy) == slots and (found is scene) == (slots == 4)
     np.testing.assert_array_equal(found.occupancy.any(0), scene.occupancy.any(0))
 
@@ -222,20 +222,20 @@ def test_weights_of_the_decoder_have_as_few_bits_as_their_error_allows(error: fl
     """Of an array that is seen, and of the others, which are not, the fewest."""
     scene = tiny_scene()
 
-    def measure(candidate: Scene) -> Measured:
+    def measure(candidate: Scene) -> Fidelity:
         exact, rounded = (one.decoder.w1 for one in (scene, candidate))
-        return Measured(
+        return Fidelity(
             30.0, 0.25 + float(np.max(np.abs(rounded - exact)) / 2.0 ** np.frexp(np.abs(exact).max())[1]) ** 2
         )
 
-    found = decoder_bits(scene, measure, error)
+    found = choose_decoder_bits(scene, measure, error)
     assert found == ({} if bits is None else {"density_weight": 3, "w1": bits, "b1": 3, "w2": 3, "b2": 3})
     rounded = round_decoder(scene.decoder, found)
     for name, few in found.items():
         largest = np.abs(getattr(scene.decoder, name)).max()
         multiples = np.ldexp(getattr(rounded, name), few - int(np.frexp(largest)[1])) if largest else np.zeros(1)
         np.testing.assert_array_equal(multiples, np.rint(multiples))
-    assert measure(replace(scene, decoder=rounded)).error <= 0.25 + error or bits is None
+    assert measure(replace(scene, decoder=rounded)).mse <= 0.25 + error or bits is None
 
 
 def test_scaled() -> None:
@@ -256,7 +256,7 @@ def tuned_to(factor: float, seen: list[Attempt] | None = None, power: float = 1.
             seen.append(Attempt(made, measure, 0.0))
         return made
 
-    return compress(SCENE, EQUAL, ALIKE, measure, 30.0, Trade(**trade), tune=tune)  # type: ignore[arg-type]
+    return meet_trade(SCENE, EQUAL, ALIKE, measure, 30.0, Trade(**trade), tune=tune)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("factor", [0.6, 0.85])
@@ -265,7 +265,7 @@ def test_what_is_tuned_meets_the_trade(steady: None, factor: float) -> None:
     for most in (0.05, 0.15, 0.4):
         seen: list[Attempt] = []
         assert 0.9 * most <= loss(tuned_to(factor, seen, max_loss_db=most)) <= most
-        assert 1 <= len(seen) <= TUNINGS
+        assert 1 <= len(seen) <= MAX_TUNINGS
     assert agreement_of(60) <= tuned_to(factor, quality=60).measured.agreement_db <= agreement_of(60) + 0.5
     target = coded(quality=60).size_bytes
     assert 0.9 * target < tuned_to(factor, target_bytes=target).size_bytes <= target
@@ -277,7 +277,7 @@ def test_errors_of_what_is_tuned_may_follow_steps_less_or_more(steady: None, pow
     seen: list[Attempt] = []
     factor = 0.7 * float(2.0**plain.exponent) ** (1 - power)
     assert 0.9 * 0.15 <= loss(tuned_to(factor, seen, power, max_loss_db=0.15)) <= 0.15
-    assert 2 <= len(seen) <= TUNINGS
+    assert 2 <= len(seen) <= MAX_TUNINGS
 
 
 def test_tuning_that_does_harm_is_not_taken() -> None:
@@ -288,11 +288,11 @@ def test_tuning_that_does_harm_is_not_taken() -> None:
 
 
 def test_tuning_that_breaks_leaves_what_was_found() -> None:
-    def broken(scene: Scene) -> Measured:
-        return Measured(math.nan, math.nan) if scene.step == 7 else measure(scene)
+    def broken(scene: Scene) -> Fidelity:
+        return Fidelity(math.nan, math.nan) if scene.step == 7 else measure(scene)
 
     def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
         return replace(quantise_by_cost(SCENE, steps, reached), step=7.0)
 
-    found = compress(SCENE, EQUAL, ALIKE, broken, 30.0, Trade(0.15), tune=tune)
+    found = meet_trade(SCENE, EQUAL, ALIKE, broken, 30.0, Trade(0.15), tune=tune)
     assert found.quantised.step != 7 and 0.07 < loss(found) <= 0.15

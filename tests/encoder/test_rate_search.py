@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from kpc.encoder.rdo.rate_search import ATTEMPTS, NEAR, TUNINGS, cheapest, farthest, farthest_tuned
+from kpc.encoder.rdo.rate_search import COST_OCTAVES, MAX_ATTEMPTS, MAX_TUNINGS, find_limit, find_tuned_limit, minimise
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ def rough(noise: list[float]) -> tuple[Told | None, list[Told]]:
         seen.append(Told(exponent, 0.6 * 2 ** (1.2 * (exponent + 7)) * noise[len(seen)]))
         return seen[-1]
 
-    return farthest_tuned(-13, 2, tried[0], tried, tuned, lambda one: one.error, 1.0, 0.1, 0.7, 1.2), seen
+    return find_tuned_limit(-13, 2, tried[0], tried, tuned, lambda one: one.error, 1.0, 0.1, 0.7, 1.2), seen
 
 
 @pytest.mark.parametrize(
@@ -46,13 +46,13 @@ def test_once_too_little_and_too_much_are_known_it_is_sought_between() -> None:
 
 def test_the_best_of_rough_tunings_is_found() -> None:
     found, seen = rough([1.6, 0.4, 1.5, 0.7])
-    assert found in seen and len(seen) == TUNINGS
+    assert found in seen and len(seen) == MAX_TUNINGS
     assert found.error == max(one.error for one in seen if one.error <= 1)
 
 
 def test_no_tuning_is_found_where_all_err_too_much() -> None:
     found, seen = rough([2.0, 4.0, 8.0, 16.0])
-    assert found is None and len(seen) == TUNINGS
+    assert found is None and len(seen) == MAX_TUNINGS
 
 
 def sought(
@@ -73,7 +73,7 @@ def sought(
         return Told(exponent, error(exponent))
 
     known = [Told(e, error(e)) for e in tried]
-    return farthest(start, end, guess, attempt, lambda one: one.error, most, 1.4, tolerance, known), seen
+    return find_limit(start, end, guess, attempt, lambda one: one.error, most, 1.4, tolerance, known), seen
 
 
 def grown(exponent: float) -> float:
@@ -116,7 +116,7 @@ def test_it_goes_either_way(bytes_wanted: float) -> None:
 
 def test_not_a_number_is_not_good_enough() -> None:
     found, seen = sought(lambda e: grown(e) if e < -11 else math.nan, 0.15)
-    assert -12 < found.exponent < -11 and len(seen) <= ATTEMPTS
+    assert -12 < found.exponent < -11 and len(seen) <= MAX_ATTEMPTS
     assert sought(lambda e: math.nan, 0.15)[0].exponent == -13
 
 
@@ -130,10 +130,10 @@ def test_rough_values_end_a_search(seed: int) -> None:
         )
 
     found, seen = sought(leaping, 0.15)
-    assert 0.7 * 0.15 <= found.error <= 0.15 and len(seen) <= ATTEMPTS
+    assert 0.7 * 0.15 <= found.error <= 0.15 and len(seen) <= MAX_ATTEMPTS
 
 
 def test_the_cheapest_is_found() -> None:
     for least in (-12.9, -7.3, 1.8):
-        found = cheapest(-13.0, 2.0, lambda e: Told(e, abs(e - least)), lambda one: one.error)
-        assert found.error <= NEAR
+        found = minimise(-13.0, 2.0, lambda e: Told(e, abs(e - least)), lambda one: one.error)
+        assert found.error <= COST_OCTAVES

@@ -6,12 +6,20 @@ from functools import partial
 
 import numpy as np
 import pytest
-from kpc.encoder.evaluation.evaluate import as_wide_as, evenly_wide
-from kpc.encoder.evaluation.validation_rays import Probe
+from kpc.encoder.evaluation.evaluate import pad_channels, unpad_decoder
+from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.rdo import sequential_finetune
-from kpc.encoder.rdo.distortion import Name
+from kpc.encoder.rdo.distortion import PlaneKey
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
-from kpc.encoder.rdo.sequential_finetune import SPREAD, coded_in_groups, order, spread, steps_after, steps_in_all, tuned
+from kpc.encoder.rdo.sequential_finetune import (
+    SPREAD,
+    code_sequentially,
+    coding_order,
+    quantise_sequentially,
+    step_factors,
+    steps_per_group,
+    total_steps,
+)
 from kpc.format.coding.quantise import QuantisedScene
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import Decoder, Scene
@@ -26,29 +34,29 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sequential_finetune, "RAYS", 512)
 
 
-def choose(scene: Scene, group: Sequence[Name] | None = None) -> QuantisedScene:
+def choose(scene: Scene, group: Sequence[PlaneKey] | None = None) -> QuantisedScene:
     steps = [{name: np.full(plane.shape[2], STEP) for name, plane in scale.items()} for scale in scene.scales]
     return quantise_by_cost(scene, steps, only=group)
 
 
 def error(scene: Scene, quantised: QuantisedScene) -> float:
-    return Probe.of_cameras(scene, 4096, seed=77).measure(scene)(quantised.dequantise()).error
+    return ValidationRays.from_cameras(scene, 4096, seed=77).measure(scene)(quantised.dequantise()).mse
 
 
 def test_every_plane_has_its_turn_the_finest_first() -> None:
     scene = tiny_scene(scales=3)
-    groups = order(scene)
+    groups = coding_order(scene)
     assert [{s for s, _ in group} for group in groups] == [{s} for s in (2, 2, 2, 1, 1, 1, 0, 0, 0, 2, 1, 0)]
     assert sorted(plane for group in groups for plane in group) == sorted(
         (s, name) for s in range(3) for name in scene.scales[s]
     )
-    assert order(tiny_scene(dynamic=False, scales=1)) == [[(0, "xy")], [(0, "xz")], [(0, "yz")]]
+    assert coding_order(tiny_scene(dynamic=False, scales=1)) == [[(0, "xy")], [(0, "xz")], [(0, "yz")]]
 
 
 def test_what_is_coded_first_is_coded_most_coarsely() -> None:
     scene = tiny_scene(scales=2)
-    factors = spread(scene)
-    in_order = [factors[plane] for group in order(scene) for plane in group]
+    factors = step_factors(scene)
+    in_order = [factors[plane] for group in coding_order(scene) for plane in group]
     assert in_order == sorted(in_order, reverse=True) and len(in_order) == 12
     assert in_order[0] == 1 / in_order[-1] == 2**SPREAD and factors[0, "xt"] == factors[0, "zt"]
 
@@ -56,14 +64,14 @@ def test_what_is_coded_first_is_coded_most_coarsely() -> None:
 @pytest.mark.parametrize("make", [tiny_scene, partial(tiny_scene, dynamic=False), lambda: with_motion(tiny_scene())])
 def test_pictures_come_nearer_to_those_of_the_whole(make: Callable[[], Scene]) -> None:
     scene = make()
-    plain, better = choose(scene), tuned(scene, scene, choose, 60)
+    plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 60)
     assert error(scene, better) < 0.96 * error(scene, plain)
     assert scene_io.read(scene_io.encode(better)).parameter_count == plain.parameter_count
 
 
 def test_what_is_coded_first_is_coded_as_it_was_and_nothing_but_planes_and_decoder_changes() -> None:
     scene = with_motion(tiny_scene())
-    plain, better = choose(scene), tuned(scene, scene, choose, 20)
+    plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 20)
     assert np.array_equal(better.scales[-1]["xy"].symbols, plain.scales[-1]["xy"].symbols)
     assert not np.array_equal(better.scales[0]["xy"].symbols, plain.scales[0]["xy"].symbols)
     assert (
@@ -77,15 +85,15 @@ def test_what_is_coded_first_is_coded_as_it_was_and_nothing_but_planes_and_decod
 
 def test_after_short_training_steps_are_few() -> None:
     scene = tiny_scene(scales=2)
-    assert [steps_after(trained, scene, 100) for trained in (0, 40, 1500, 3750, 30_000)] == [0, 1, 40, 100, 100]
-    assert steps_after(30_000, scene, 0) == 0
-    assert steps_in_all(scene, 40) == 300 and steps_in_all(tiny_scene(scales=1, dynamic=False), 40) == 100
+    assert [steps_per_group(trained, scene, 100) for trained in (0, 40, 1500, 3750, 30_000)] == [0, 1, 40, 100, 100]
+    assert steps_per_group(30_000, scene, 0) == 0
+    assert total_steps(scene, 40) == 300 and total_steps(tiny_scene(scales=1, dynamic=False), 40) == 100
 
 
 @pytest.mark.parametrize("steps", [0, 1])
 def test_few_steps_or_none_are_no_mishap(steps: int) -> None:
     scene = tiny_scene()
-    planes = coded_in_groups(
+    planes = code_sequentially(
         scene, scene, lambda candidate, group: {(s, name): candidate.scales[s][name] for s, name in group}, steps
     )
     assert planes.scales[-1]["xy"].tobytes() == scene.scales[-1]["xy"].tobytes()
@@ -95,7 +103,7 @@ def test_few_steps_or_none_are_no_mishap(steps: int) -> None:
 def test_where_nothing_is_nothing_is_learnt() -> None:
     scene = tiny_scene()
     scene = replace(scene, occupancy=np.zeros_like(scene.occupancy))
-    plain, same = choose(scene), tuned(scene, scene, choose, 5)
+    plain, same = choose(scene), quantise_sequentially(scene, scene, choose, 5)
     for s, scale in enumerate(plain.scales):
         assert all(np.array_equal(plane.symbols, same.scales[s][name].symbols) for name, plane in scale.items())
 
@@ -105,32 +113,34 @@ def test_progress_is_shown_where_it_is_wanted(
 ) -> None:
     monkeypatch.setattr("kpc.format.common.progress.LINE_EVERY_S", 0.0)
     scene = tiny_scene(scales=1, dynamic=False)
-    tuned(scene, scene, choose, 4)
+    quantise_sequentially(scene, scene, choose, 4)
     assert capsys.readouterr() == ("", "")
-    tuned(scene, scene, choose, 4, shown=True)
+    quantise_sequentially(scene, scene, choose, 4, shown=True)
     out, err = capsys.readouterr()
     assert out == "" and err.splitlines()[-1].startswith("tune: 10/10 step, 0 s left")
 
 
 def test_it_comes_out_the_same_each_time() -> None:
     scene = tiny_scene()
-    assert scene_io.encode(tuned(scene, scene, choose, 5)) == scene_io.encode(tuned(scene, scene, choose, 5))
+    assert scene_io.encode(quantise_sequentially(scene, scene, choose, 5)) == scene_io.encode(
+        quantise_sequentially(scene, scene, choose, 5)
+    )
 
 
 def test_a_look_that_is_the_same_from_everywhere_stays_so() -> None:
     scene = tiny_scene()
     scene = replace(scene, decoder=replace(scene.decoder, w2=np.zeros_like(scene.decoder.w2)))  # type: ignore[arg-type]
-    assert not tuned(scene, scene, choose, 5).decoder.w2.any()
+    assert not quantise_sequentially(scene, scene, choose, 5).decoder.w2.any()
 
 
 def test_scales_of_unequal_width_and_appearances_and_the_hybrid_decoder() -> None:
     whole = tiny_scene()
     narrow = replace(whole, scales=({name: plane[..., :5] for name, plane in whole.scales[0].items()}, whole.scales[1]),
-                     decoder=as_wide_as(replace(whole, scales=({n: p[..., :5] for n, p in whole.scales[0].items()}, whole.scales[1])),
+                     decoder=unpad_decoder(replace(whole, scales=({n: p[..., :5] for n, p in whole.scales[0].items()}, whole.scales[1])),
                                         whole.decoder))  # fmt: skip
-    assert as_wide_as(narrow, evenly_wide(narrow).decoder).w2.tobytes() == narrow.decoder.w2.tobytes()
+    assert unpad_decoder(narrow, pad_channels(narrow).decoder).w2.tobytes() == narrow.decoder.w2.tobytes()
     for scene in (narrow, with_appearances(whole), with_hybrid_decoder(whole)):
-        plain, better = choose(scene), tuned(scene, scene, choose, 40)
+        plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 40)
         assert error(scene, better) < error(scene, plain)
         assert [a.code.tolist() for a in better.appearances] == [a.code.tolist() for a in plain.appearances]
         scene_io.read(scene_io.encode(better))

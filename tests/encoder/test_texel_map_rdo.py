@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from kpc.encoder.rdo.texel_map_rdo import MAP_LAM, UNCHANGED, map_context, told_texels
+from kpc.encoder.rdo.texel_map_rdo import IDENTITY_TOLERANCE, MAP_LAM, choose_coded_texels, map_context
 from kpc.format.coding.predictive import MAP_CONTEXTS, walk_map
 from kpc.format.coding.rans import SCALE, adapt, counters
 
@@ -38,11 +38,11 @@ def test_maps_take_fewer_bits_than_they_cost():
         away, known = noisy(seed)
         worth = np.ones(away.shape, np.float32)
         far = (away**2).mean(axis=2)
-        alone, told = known & (far >= UNCHANGED), told_texels(away, worth, known)
+        alone, told = known & (far >= IDENTITY_TOLERANCE), choose_coded_texels(away, worth, known)
         assert not (told & ~known).any()
 
         def cost(chosen, far=far):
-            return 4 * np.where(chosen, UNCHANGED, far).sum() + MAP_LAM * bits_of(chosen)
+            return 4 * np.where(chosen, IDENTITY_TOLERANCE, far).sum() + MAP_LAM * bits_of(chosen)
 
         assert bits_of(told) < 0.9 * bits_of(alone) and cost(told) < cost(alone)
 
@@ -50,5 +50,5 @@ def test_maps_take_fewer_bits_than_they_cost():
 def test_what_is_far_is_told_even_alone_and_what_is_1_is_not():
     away = np.zeros((12, 12, 3))
     away[5, 7] = 10.0
-    told = told_texels(away, np.ones(away.shape, np.float32), np.ones((12, 12), bool))
+    told = choose_coded_texels(away, np.ones(away.shape, np.float32), np.ones((12, 12), bool))
     assert told[5, 7] and told.sum() == 1

@@ -13,10 +13,10 @@ import pytest
 import torch
 from kpc.encoder.cli import kpenc
 from kpc.encoder.evaluation.evaluate import SceneRenderer
-from kpc.encoder.evaluation.validation_rays import ASSUMED_MSE, Probe, around
+from kpc.encoder.evaluation.validation_rays import ASSUMED_MSE, ValidationRays, orbit_cameras
 from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.rdo import codec_model, sequential_finetune
-from kpc.encoder.rdo.mode_decision import step_asked_for
+from kpc.encoder.rdo.mode_decision import requested_step
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import TrainingError
@@ -68,7 +68,7 @@ def refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[...,
 
 def saved(path: Path, scene: Scene) -> Path:
     """A finished checkpoint of a scene."""
-    rays = Probe.of_cameras(scene)
+    rays = ValidationRays.from_cameras(scene)
     truth = SceneRenderer(scene).rgb(*rays.rays)
     numbers = np.arange(512) % len(scene.appearances) if scene.appearances else None
     codec_model.save_checkpoint(path, scene, replace(rays, truth=truth, appearances=numbers))
@@ -94,8 +94,8 @@ def test_a_checkpoint_gives_the_file_that_training_gave(
         "trade",
         "asked",
         "judged_by",
-        "probe_psnr",
-        "probe_loss_db",
+        "validation_psnr",
+        "validation_loss_db",
         "agreement_db",
         "size_bytes",
         "parameters",
@@ -113,7 +113,7 @@ def test_every_kind_of_scene_survives_a_checkpoint(tmp_path: Path, kind: str) ->
     steps = [{name: 0.01 for name in scale} for scale in scene.scales]
     back = codec_model.load(saved(tmp_path / "m.kpck", scene))
     assert scene_io.encode(quantise_scene(back.scene, steps)) == scene_io.encode(quantise_scene(scene, steps))
-    assert back.coded is None and back.probe.measure(scene)(back.scene).error == 0
+    assert back.coded is None and back.probe.measure(scene)(back.scene).mse == 0
 
 
 def test_a_checkpoint_of_a_run_is_told_from_a_finished_one(
@@ -212,10 +212,10 @@ def test_a_file_becomes_smaller(scene_file: Path, tmp_path: Path, kpenc_says: Kp
     result = kpenc_says(scene_file, tmp_path / "smaller.kpc", "--target-size", str(target))
     assert 0.9 * target < result["size_bytes"] == (tmp_path / "smaller.kpc").stat().st_size <= target
     before, after = scene_io.read(scene_file).dequantise(), scene_io.read(tmp_path / "smaller.kpc").dequantise()
-    measured = Probe.of_cameras(before).measure(before)(after)
-    assert result["agreement_db"] == pytest.approx(measured.agreement_db) and measured.error > 0
-    lost = 10 * np.log10(1 + measured.error / 255**2 / ASSUMED_MSE)
-    assert result["probe_loss_db"] == pytest.approx(lost) and "30 dB" in result["judged_by"]
+    measured = ValidationRays.from_cameras(before).measure(before)(after)
+    assert result["agreement_db"] == pytest.approx(measured.agreement_db) and measured.mse > 0
+    lost = 10 * np.log10(1 + measured.mse / 255**2 / ASSUMED_MSE)
+    assert result["validation_loss_db"] == pytest.approx(lost) and "30 dB" in result["judged_by"]
 
 
 def test_a_file_keeps_its_symbols_where_they_are_wanted(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
@@ -229,7 +229,7 @@ def test_a_file_does_not_know_what_was_filmed(scene_file: Path, refused: Callabl
 
 def test_the_ratio_of_steps_stays(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
     kpenc_says(scene_file, tmp_path / "smaller.kpc", "--max-loss", "0.02dB")
-    steps = [[step_asked_for(plane) / step_asked_for(scene.scales[0]["xy"])[0] for scale in scene.scales for plane in scale.values()]
+    steps = [[requested_step(plane) / requested_step(scene.scales[0]["xy"])[0] for scale in scene.scales for plane in scale.values()]
              for scene in (scene_io.read(scene_file), scene_io.read(tmp_path / "smaller.kpc"))]  # fmt: skip
     np.testing.assert_allclose(
         np.concatenate(steps[0]), np.concatenate(steps[1]), rtol=2**-6
@@ -293,7 +293,7 @@ def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
     )
     with pytest.raises(ValueError, match="one texel"):
         SceneRenderer(whole.dequantise())
-    source = codec_model.model_of(whole)
+    source = codec_model.model_from_file(whole)
     camera = scene.cameras[0]
     origins, directions = camera.rays()
     times = np.full(len(origins), 0.4, np.float32)
@@ -307,7 +307,7 @@ def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
     "name", ["appearances", "cells-one", "contracted", "device-coordinates", "dynamic", "hybrid-moved", "limits-large"]
 )
 def test_files_of_all_kinds_are_coded_again(name: str) -> None:
-    source = codec_model.model_of(scene_io.read(VECTORS / f"{name}.kpc"))
+    source = codec_model.model_from_file(scene_io.read(VECTORS / f"{name}.kpc"))
     coded = codec_model.code(source, Trade(), TrainConfig().prune_share, 1)
     assert coded.loss_db <= 0.15 and len(scene_io.encode(scene_io.read(coded.data))) == coded.size_bytes
     assert coded.size_bytes <= len(scene_io.encode(source.coded))  # type: ignore[arg-type]
@@ -319,7 +319,7 @@ def test_files_of_all_kinds_are_coded_again(name: str) -> None:
 def test_cameras_around_a_scene_without_any_see_it() -> None:
     scene = replace(tiny_scene(4), cameras=())
     corners = np.stack(np.meshgrid(*scene.bounds.T), -1).reshape(-1, 3)
-    for camera in around(scene):
+    for camera in orbit_cameras(scene):
         local = (corners - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]
         pixel = local[:, :2] / -local[:, 2:] * (camera.fl_x, -camera.fl_y) + (camera.cx, camera.cy)
         assert (local[:, 2] < 0).all() and (pixel > 0).all() and (pixel < (camera.width, camera.height)).all()
@@ -330,9 +330,9 @@ def test_cameras_around_a_scene_without_any_see_it() -> None:
 
 def test_a_probe_of_surfaces_meets_them_from_all_cameras() -> None:
     scene = tiny_scene(4)
-    rays, others = (Probe.of_surfaces(scene, 2000, seed) for seed in (1, 2))
-    assert len(rays.times) == 2000 and SceneRenderer(scene).meets(*rays.rays).all()
-    assert not SceneRenderer(scene).meets(*Probe.of_cameras(scene, 2000).rays).all()
+    rays, others = (ValidationRays.through_occupied(scene, 2000, seed) for seed in (1, 2))
+    assert len(rays.times) == 2000 and SceneRenderer(scene).hits_occupied(*rays.rays).all()
+    assert not SceneRenderer(scene).hits_occupied(*ValidationRays.from_cameras(scene, 2000).rays).all()
     eyes = [tuple(np.float32(camera.camera_to_world[:3, 3])) for camera in scene.cameras]
     assert {tuple(origin) for origin in rays.origins[:200]} == set(eyes)
     assert not np.array_equal(rays.times, others.times)
@@ -341,16 +341,16 @@ def test_a_probe_of_surfaces_meets_them_from_all_cameras() -> None:
 def test_a_probe_of_surfaces_has_what_there_is() -> None:
     scene = tiny_scene(4)
     nothing = replace(scene, occupancy=np.zeros_like(scene.occupancy))
-    assert Probe.of_surfaces(nothing, 100, seed=1).origins.shape == (0, 3)
+    assert ValidationRays.through_occupied(nothing, 100, seed=1).origins.shape == (0, 3)
     speck = np.zeros_like(scene.occupancy)
     speck[:, 4, 5, 6] = True
-    few = Probe.of_surfaces(replace(scene, occupancy=speck), 100, seed=1)
+    few = ValidationRays.through_occupied(replace(scene, occupancy=speck), 100, seed=1)
     assert 0 < len(few.times) < 100
 
 
 def test_a_probe_of_cameras_goes_through_their_pixels() -> None:
     scene = tiny_scene(4)
-    rays = Probe.of_cameras(scene)
+    rays = ValidationRays.from_cameras(scene)
     assert rays.truth is None and len(rays.times) == 512 and 0 <= rays.times.min() < rays.times.max() < 1
     eyes = {tuple(np.float32(camera.camera_to_world[:3, 3])) for camera in scene.cameras}
     assert {tuple(origin) for origin in rays.origins} == eyes

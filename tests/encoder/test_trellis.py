@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kpc.encoder.rdo import distortion, trellis
-from kpc.encoder.rdo.distortion import ALONE
+from kpc.encoder.rdo.distortion import NO_CORRELATION
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
-from kpc.encoder.rdo.trellis import STATES, TOLD_APART
+from kpc.encoder.rdo.trellis import MAGNITUDE_BINS, STATES
 from kpc.format.coding.predictive import (
     ACTIVITIES,
     TRELLIS,
@@ -41,7 +41,7 @@ def steered(scene: Scene, step: float, significant: list[dict[str, np.ndarray]] 
 
 
 NO_WEIGHTS = np.zeros((1, WEIGHTS), np.int8)
-FREE = np.zeros((2 * ACTIVITIES, TOLD_APART))
+FREE = np.zeros((2 * ACTIVITIES, MAGNITUDE_BINS))
 """Every error costs nothing."""
 
 
@@ -50,7 +50,7 @@ def searched(
     known: np.ndarray,
     bits: np.ndarray = FREE,
     distortion: np.ndarray | None = None,
-    together: np.ndarray = ALONE,
+    together: np.ndarray = NO_CORRELATION,
 ) -> np.ndarray:
     distortion = np.ones(wanted.shape, np.float32) if distortion is None else distortion
     errors = np.zeros((wanted.shape[0] + 2, wanted.shape[1] + 2, wanted.shape[2]), np.float32)
@@ -118,7 +118,7 @@ def test_a_channel_undoes_what_others_err() -> None:
     apart = searched(wanted, known)
     np.testing.assert_array_equal(searched(wanted, known, together=together), apart)
     for sign in (1, -1):
-        together[..., 0, 1] = together[..., 1, 0] = sign / distortion.TOGETHER
+        together[..., 0, 1] = together[..., 1, 0] = sign / distortion.CHANNEL_COUPLING
         errors, errors_apart = (symbols - wanted for symbols in (searched(wanted, known, together=together), apart))
         shown, shown_apart = (seen(e[..., :1] + sign * e[..., 1:]) for e in (errors, errors_apart))
         assert shown < 0.6 * shown_apart
@@ -131,12 +131,12 @@ def test_what_goes_together_is_told_block_by_block() -> None:
     together = np.random.default_rng(2).normal(size=(3, 3, 3, 3)).astype(np.float32)
     c = np.zeros((7, 8))
     for y, x in np.ndindex(5, 6):
-        c[y + 1, x + 1] = distortion.TOGETHER * (together[y // 2, x // 2, 1] @ errors[y + 1, x + 1])
-    kernel = np.array([distortion.BESIDE, 1, distortion.BESIDE])
+        c[y + 1, x + 1] = distortion.CHANNEL_COUPLING * (together[y // 2, x // 2, 1] @ errors[y + 1, x + 1])
+    kernel = np.array([distortion.EDGE_COUPLING, 1, distortion.EDGE_COUPLING])
     weights = np.outer(kernel, kernel)  # ACROSS is BESIDE squared
     expected = [[(weights * c[y : y + 3, x : x + 3]).sum() for x in range(6)] for y in range(5)]
-    assert distortion.ACROSS == distortion.BESIDE**2
-    np.testing.assert_allclose(distortion.others(errors, together, 1), expected, rtol=1e-4, atol=1e-5)
+    assert distortion.CORNER_COUPLING == distortion.EDGE_COUPLING**2
+    np.testing.assert_allclose(distortion.cross_channel_errors(errors, together, 1), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_seen_is_what_bilinear_look_ups_see() -> None:
@@ -170,7 +170,7 @@ def test_states_part_and_meet_as_a_code_of_8_states_wants() -> None:
 def test_a_price_buys_errors_that_are_nearer_to_what_is_expected() -> None:
     rng = np.random.default_rng(2)
     wanted, known = rng.normal(0, 2, (30, 40, 2)), rng.random((30, 40)) < 0.8
-    dear = np.broadcast_to(10.0 * np.arange(TOLD_APART), FREE.shape).copy()
+    dear = np.broadcast_to(10.0 * np.arange(MAGNITUDE_BINS), FREE.shape).copy()
     free, bought = searched(wanted, known), searched(wanted, known, dear)
     assert np.abs(bought).sum() < 0.9 * np.abs(free).sum()
     assert np.square(wanted - bought)[known].sum() > np.square(wanted - free)[known].sum()
@@ -180,7 +180,7 @@ def test_errors_go_where_they_are_worth_little() -> None:
     """The right half is worth a hundredth: what is saved there is given out on the left."""
     rng = np.random.default_rng(5)
     wanted, known = rng.normal(0, 6, (30, 40, 2)), np.ones((30, 40), bool)
-    dear = np.broadcast_to(np.arange(float(TOLD_APART)), FREE.shape).copy()
+    dear = np.broadcast_to(np.arange(float(MAGNITUDE_BINS)), FREE.shape).copy()
     distortion = np.ones(wanted.shape, np.float32)
     distortion[:, 20:] = 0.01
     alike, told = (np.abs(wanted - searched(wanted, known, dear, w)) for w in (None, distortion))
@@ -206,7 +206,7 @@ def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float)
     def size(plane: QuantisedPlane) -> int:
         return len(encode_symbols(plane.symbols, plane.coded, plane.guide))
 
-    economical = trellis.on_trellis(
+    economical = trellis.trellis_quantise(
         quantise_plane(values, step, identity=False), values, np.full(3, step), np.ones_like(values), False
     )
     as_bad = next(
@@ -220,20 +220,20 @@ def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float)
 def test_where_eight_bits_are_too_few_any_symbol_may_follow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of the trellis would err by four thirds of what the nearest do, and at a step so much coarser than the one asked for bits are
     worth little: what is seen of errors is less than of those of the nearest, but where they are worth next to nothing."""
-    monkeypatch.setattr(distortion, "LEAST_WORTH", 1e-4)
+    monkeypatch.setattr(distortion, "MIN_WEIGHT", 1e-4)
     values = np.random.default_rng(4).uniform(-100, 100, (20, 40, 2)).astype(np.float32)
     nearest, step = quantise_plane(values, 0.2, identity=False), np.full(2, 0.2)
     significant = np.ones_like(values)
     significant[:, 20:] = 1e-9
-    free = trellis.on_trellis(nearest, values, step, np.ones_like(values), False)
-    told = trellis.on_trellis(nearest, values, step, significant, False)
+    free = trellis.trellis_quantise(nearest, values, step, np.ones_like(values), False)
+    told = trellis.trellis_quantise(nearest, values, step, significant, False)
     assert (
         not follows_trellis(free.symbols, free.coded) and np.abs(free.symbols - nearest.symbols.astype(int)).max() <= 1
     )
     errors = [seen((plane.dequantise() - values)[:, :20]) for plane in (nearest, free, told)]
     assert errors[1] < errors[0] and errors[2] < 1.1 * errors[0]
     assert len(encode_symbols(told.symbols, told.coded)) < 0.95 * len(encode_symbols(nearest.symbols, nearest.coded))
-    steered = trellis.on_trellis(nearest, values, nearest.step, np.ones_like(values), False)
+    steered = trellis.trellis_quantise(nearest, values, nearest.step, np.ones_like(values), False)
     assert follows_trellis(steered.symbols, steered.coded)
 
 
@@ -245,7 +245,7 @@ def test_what_was_left_out_stays_so_and_steps_stay(step: float) -> None:
     assert any(plane.guide is not None for scale in after.scales for plane in scale.values()) == (step == 0.05)
     for ours, theirs in zip(after.scales, before.scales):
         for name in ours:
-            np.testing.assert_allclose(trellis.step_on_trellis(ours[name]), theirs[name].step, rtol=2**-7)
+            np.testing.assert_allclose(trellis.requested_trellis_step(ours[name]), theirs[name].step, rtol=2**-7)
             assert (
                 not ours[name].symbols[~ours[name].coded].any() and not (ours[name].coded & ~theirs[name].coded).any()
             )
@@ -282,10 +282,10 @@ def test_what_is_hardly_told_goes_around_predictions(identity: bool) -> None:
             (errors / 2.0).ravel() @ (errors / 2.0).ravel() * seen(errors) / np.mean(np.square(errors))
         ) + distortion.LAM * 8 * sum(map(len, bodies))
 
-    around = trellis.on_trellis(rounded, values, step, alike, identity)
+    around = trellis.trellis_quantise(rounded, values, step, alike, identity)
     assert around.guide is not None
-    np.testing.assert_allclose(trellis.step_on_trellis(around), step, rtol=2**-7)
-    on_trellis = trellis.on_trellis(rounded, values, step, alike, identity, thin=0.0)
+    np.testing.assert_allclose(trellis.requested_trellis_step(around), step, rtol=2**-7)
+    on_trellis = trellis.trellis_quantise(rounded, values, step, alike, identity, thin=0.0)
     assert on_trellis.guide is None and cost(around) < 0.92 * cost(on_trellis)
 
 

@@ -27,9 +27,9 @@ from kpc.format.scene.scene import TIME_PLANES, Appearance
 from kpc.format.scene.space import Contraction, DeviceCoordinates
 from kpc.tools.vectors.specvectors import seen_through
 from scenes import in_device_coordinates, tiny_scene, with_appearances, with_motion
-from test_cells import rolling
+from grids import rolling
 from test_midpoints import drifting
-from test_nodes import swaying
+from grids import swaying
 
 import kpc
 

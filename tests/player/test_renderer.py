@@ -8,7 +8,7 @@ import gl
 import moderngl
 import numpy as np
 import pytest
-from kpc.encoder.rdo.prune import without
+from kpc.encoder.rdo.prune import keep_channels
 from kpc.format.common.errors import DisplayError
 from kpc.format.container import scene_io
 from kpc.format.scene.cameras import Camera
@@ -78,7 +78,7 @@ def test_gives_the_reference_picture(view: str, part: Part, space: str) -> None:
         replace(with_contraction(tiny_scene(9)), occupancy=np.zeros((2, 300, 2, 3), bool)),
         with_motion(with_contraction(tiny_scene(6)), most=0.5),
         undirected(tiny_scene(6)),
-        without(tiny_scene(4, scales=3), (np.array([1, 4, 6]), np.array([0]), np.arange(8))),
+        keep_channels(tiny_scene(4, scales=3), (np.array([1, 4, 6]), np.array([0]), np.arange(8))),
     ],
     ids=[
         "static",

@@ -25,14 +25,14 @@ from typing import Any
 
 import numpy as np
 from kpc.encoder.datasets import Dataset, load_dataset, pixel_rays
-from kpc.encoder.evaluation.validation_rays import Measure, Measured, Probe
+from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, ValidationRays
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.rdo import codec_model
 from kpc.encoder.rdo.codec_model import Model
-from kpc.encoder.rdo.distortion import Name
+from kpc.encoder.rdo.distortion import PlaneKey
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
-from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, Quantise, Trade
-from kpc.encoder.rdo.sequential_finetune import coded_in_groups
+from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, QuantiseFunction, Trade
+from kpc.encoder.rdo.sequential_finetune import code_sequentially
 from kpc.format.coding.quantise import quantise_scene, round_decoder
 from kpc.format.common.errors import KpcError, TrainingError
 from kpc.format.container import scene_io
@@ -53,7 +53,7 @@ TUNE_STEPS = TrainConfig().tune_steps
 RIVALS = {rival.name: rival for rival in baselines.RIVALS}
 OURS = "kpc"
 GRIDS_AS_THEY_ARE = "kpc, grids as they are"
-WITHOUT: dict[str, Quantise | None] = {
+WITHOUT: dict[str, QuantiseFunction | None] = {
     "kpc without tuning": None,
     GRIDS_AS_THEY_ARE: None,
     "kpc, channels apart": quantise_by_cost,
@@ -157,7 +157,7 @@ def measure(
     return coders
 
 
-def in_parallel(jobs: Sequence[Job], views: Probe | None, processes: int) -> Iterator[Point | None]:
+def in_parallel(jobs: Sequence[Job], views: ValidationRays | None, processes: int) -> Iterator[Point | None]:
     """Points of all jobs, in their order, judged by `views`, or by the probe the scene comes with, in processes of their own, none with more
     than its share of the cores."""
     before = os.environ.get("NUMBA_NUM_THREADS")
@@ -233,7 +233,7 @@ def tuned_through(rival: Rival, setting: int, scene: Scene) -> tuple[Scene, list
     make up for its errors, as with our own coder; and what the groups take."""
     codings: list[Coding] = []
 
-    def coded(candidate: Scene, group: Sequence[Name]) -> dict[Name, np.ndarray]:
+    def coded(candidate: Scene, group: Sequence[PlaneKey]) -> dict[PlaneKey, np.ndarray]:
         planes = baselines.tidied(candidate)
         scales = sorted({s for s, _ in group})
         codings.append(
@@ -245,7 +245,7 @@ def tuned_through(rival: Rival, setting: int, scene: Scene) -> tuple[Scene, list
             (s, name): plane for s, back in zip(scales, codings[-1].planes, strict=True) for name, plane in back.items()
         }
 
-    back = coded_in_groups(scene, scene, coded, TUNE_STEPS)
+    back = code_sequentially(scene, scene, coded, TUNE_STEPS)
     return replace(back, decoder=round_decoder(back.decoder)), codings
 
 
@@ -256,7 +256,7 @@ def _point(
     others_size: int,
     took: tuple[float, float],
     uncoded_psnr: float,
-    judged: Measured,
+    judged: Fidelity,
 ) -> Point:
     size = planes_size + others_size
     return {
@@ -266,11 +266,11 @@ def _point(
     }  # fmt: skip
 
 
-_views: Probe | None = None
+_views: ValidationRays | None = None
 """What this process judges by; None for the probe a scene comes with."""
 
 
-def _judge_by(views: Probe | None) -> None:
+def _judge_by(views: ValidationRays | None) -> None:
     global _views
     _views = views
     if multiprocessing.parent_process() is not None:
@@ -278,7 +278,7 @@ def _judge_by(views: Probe | None) -> None:
 
 
 @lru_cache(1)
-def _source(path: Path) -> tuple[Model, Measured, Measure]:
+def _source(path: Path) -> tuple[Model, Fidelity, Measure]:
     source = codec_model.load(path)
     measured = (_views or source.probe).measure(source.scene)
     return source, measured(source.scene), measured
@@ -309,7 +309,7 @@ def stored_bytes(data: bytes) -> dict[str, int]:
     return stored | {"index": len(data) - sum(stored.values())}
 
 
-def held_out_views(scene: Scene, folder: Path) -> Probe:
+def held_out_views(scene: Scene, folder: Path) -> ValidationRays:
     """Random pixels of all pictures of a dataset that are held out.
 
     Raises:
@@ -320,7 +320,7 @@ def held_out_views(scene: Scene, folder: Path) -> Probe:
         return _drawn(scene, dataset)
 
 
-def _drawn(scene: Scene, dataset: Dataset) -> Probe:
+def _drawn(scene: Scene, dataset: Dataset) -> ValidationRays:
     pictures, rng = dataset.pictures, np.random.default_rng(2)
     held_out = np.flatnonzero(pictures.is_test)
     if not len(held_out):
@@ -335,7 +335,7 @@ def _drawn(scene: Scene, dataset: Dataset) -> Probe:
     truth = colours[:, :3]
     if dataset.has_alpha:
         truth = truth * colours[:, 3:] + scene.background * (1 - colours[:, 3:])
-    return Probe(origins, directions, pictures.time[picture].astype(np.float32), None, truth)
+    return ValidationRays(origins, directions, pictures.time[picture].astype(np.float32), None, truth)
 
 
 # --- what is shown

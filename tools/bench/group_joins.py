@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 from kpc.encoder.datasets import Dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, true_picture
-from kpc.encoder.rdo.codec_model import with_two_texels
+from kpc.encoder.evaluation.evaluate import SceneRenderer, ground_truth
+from kpc.encoder.rdo.codec_model import widen_single_texels
 from kpc.format.common.fidelity import psnr
 from kpc.format.container import scene_io
 from kpc.format.container.groups import Groups
@@ -69,7 +69,7 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
     agreements: list[list[float]] = [[] for _ in timeline.spans]
     for number, span in enumerate(timeline.spans):
         some = dataset.frame_range(span.start, span.last)
-        renderer = SceneRenderer(with_two_texels(scene_io.read(groups.open(number))).dequantise())
+        renderer = SceneRenderer(widen_single_texels(scene_io.read(groups.open(number))).dequantise())
         at = np.rint(some.pictures.time * (span.count - 1)).astype(int) + span.start - first  # frame of each picture
         for picture in sorted(map(int, np.flatnonzero(some.pictures.is_test)), key=lambda p: int(at[p])):
             frame, camera = int(at[picture]), int(some.pictures.camera[picture])
@@ -84,7 +84,7 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
                 earlier = begun.pop((frame, camera))
                 agreements[number].append(psnr(earlier, seen))
                 seen = (1 - shares[number]) * earlier + shares[number] * seen
-            error = seen - true_picture(some, picture)
+            error = seen - ground_truth(some, picture)
             change = None if camera not in last_of else float(np.sqrt(np.mean(np.square(error - last_of[camera]))))
             last_of[camera] = error
             shown, _ = timeline.at(_time(groups, frame))

@@ -174,7 +174,7 @@ def _encodes(
                 job = replace(
                     _job(options, source, seed, kept / f"{label}{suffix}.kpc", work),
                     steps=options.steps,
-                    most_tests=options.test_views,
+                    max_test_pictures=options.test_views,
                     keep_checkpoint=kept / f"{label}{suffix}.kpck" if options.keep_scenes else None,
                     **changes,
                 )
@@ -224,7 +224,7 @@ def _groups(options: argparse.Namespace, origin: results.Record) -> Iterator[res
             work = Path(scratch) / f"{record['name']}.work"
             job = replace(
                 _job(options, source, options.seed, kept / f"{record['name']}-groups.kpc", work), steps=options.steps,
-                most_tests=options.test_views, group_s=options.group, keep=True,
+                max_test_pictures=options.test_views, group_s=options.group, keep=True,
             )  # fmt: skip
             print(f"kpbench: {record['name']}, {options.preset}, groups of {options.group:g} s", file=sys.stderr)
             device, found = _alone(_encode_once, job)
