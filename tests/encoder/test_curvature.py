@@ -40,7 +40,9 @@ def test_it_foretells_what_small_errors_do_to_pictures(kind: str, monkeypatch: p
     """Independent errors of variance s^2 move the three colours of a ray by s^2 sum(h) squared, in the mean: of each plane by
     itself, since a large sum would hide a small one."""
     scene = KINDS[kind](tiny_scene(3))
-    monkeypatch.setattr(module, "RAYS_PER_GRADIENT", 16)  # so few rays: hardly any cross terms, that they need not cancel
+    monkeypatch.setattr(
+        module, "RAYS_PER_GRADIENT", 16
+    )  # so few rays: hardly any cross terms, that they need not cancel
     probe, rng = probe_of(scene, 2000), np.random.default_rng(0)
     h = estimate_curvature(scene, probe, 2000).diagonal
     renderer = SceneRenderer(scene)

@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from grids import swaying
 from kpc.encoder.evaluation.validation_rays import Fidelity
 from kpc.encoder.rdo.motion_rdo import MAX_MULTIPLE, SHARE, coarsen_motion, quantise_motion
 from kpc.format.coding.motion_hierarchical import encode_midpoints
 from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene, with_motion
-from grids import swaying
 
 
 def errs(scene: Scene, left_out: float = 1e-3):

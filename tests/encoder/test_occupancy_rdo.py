@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grids import rolling
 from kpc.encoder.evaluation.validation_rays import Fidelity, ValidationRays
 from kpc.encoder.rdo import occupancy_rdo
 from kpc.encoder.rdo.occupancy_rdo import CONTRAST, count_contexts, flip_cells, optimise_occupancy, removal_errors
@@ -12,7 +13,6 @@ from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS, encode_cells
 from kpc.format.coding.rans import adapt, counters, stream
 from kpc.format.scene.grid import dilate
 from scenes import tiny_scene
-from grids import rolling
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

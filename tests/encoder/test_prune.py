@@ -88,7 +88,10 @@ def test_what_is_needed_stays_bit_for_bit() -> None:
     scene = tiny_scene()
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), 1e-4)
     assert (
-        pruned.loss_db == 0 and pruned.next_loss_db > 1e-4 and pruned.view_gain_db is not None and pruned.view_gain_db > 1e-4
+        pruned.loss_db == 0
+        and pruned.next_loss_db > 1e-4
+        and pruned.view_gain_db is not None
+        and pruned.view_gain_db > 1e-4
     )
     for ours, theirs in zip(pruned.scene.scales, scene.scales, strict=True):
         assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
@@ -105,7 +108,11 @@ def test_a_scale_that_nothing_listens_to_is_left_out() -> None:
 def test_one_channel_always_stays() -> None:
     scene = tiny_scene()
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), 1e3)
-    assert sum(len(kept) for kept in pruned.kept) == 1 and len(pruned.scene.scales) == 1 and pruned.next_loss_db == math.inf
+    assert (
+        sum(len(kept) for kept in pruned.kept) == 1
+        and len(pruned.scene.scales) == 1
+        and pruned.next_loss_db == math.inf
+    )
 
 
 @pytest.mark.parametrize("spare", [0.0, 0.3, 2.0])
