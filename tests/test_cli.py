@@ -1,6 +1,8 @@
 """What commands raise becomes an exit code and a line, or goes on as a bug."""
 
 import errno
+import importlib
+import importlib.metadata
 from collections.abc import Callable
 
 import pytest
@@ -33,3 +35,15 @@ def test_what_a_user_can_mend_is_one_line(
 def test_bugs_keep_their_traceback(error: Exception, cause: Exception | None) -> None:
     with pytest.raises(type(error)):
         cli.run(raising(error, cause), "kpx", [])
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["encoder.cli.kpenc", "player.app.kpplay", "tools.cli.kprender", "tools.cli.kpinfo", "tools.cli.kpjoin",
+     "tools.bench.kpbench"],
+)  # fmt: skip
+def test_every_command_prints_its_version(module: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        importlib.import_module(f"kpc.{module}").main(["--version"])
+    assert exit_.value.code == 0
+    assert capsys.readouterr().out == f"{module.rpartition('.')[2]} {importlib.metadata.version('kpc')}\n"

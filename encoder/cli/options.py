@@ -84,6 +84,7 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
         description="A folder of posed videos or images becomes a .kpc file. A finished checkpoint, or a .kpc file, is "
         "coded anew, without pictures and without training: name it, -o, and one of the trades.",
     )
+    cli.add_version_option(parser)
     parser.add_argument(
         "source",
         type=Path,

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import errno
+import importlib.metadata
 import math
 import os
 import sys
@@ -41,6 +42,11 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         where = f"{error.filename}: " if error.filename is not None else ""
         return _fail(name, f"{where}{error.strerror or error}", 1)
     return 0
+
+
+def add_version_option(parser: argparse.ArgumentParser) -> None:
+    """Give a command's parser `--version`, which prints the version of KPC and exits."""
+    parser.add_argument("--version", action="version", version=f"%(prog)s {importlib.metadata.version('kpc')}")
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

@@ -68,6 +68,7 @@ def _command(argv: list[str]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="kpplay", description="Fly through a .kpc scene. Press H for the keys.")
+    cli.add_version_option(parser)
     parser.add_argument("scene", help="a .kpc file, or its http address")
     parser.add_argument(
         "--size",

@@ -570,6 +570,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; JSON on stdout or in --out, a table on stderr."
     )
+    cli.add_version_option(parser)
     kinds = parser.add_subparsers(
         dest="kind", required=True, metavar="encode|curve|ablate|step|groups|player|stream|window|steady|codec|entropy"
     )

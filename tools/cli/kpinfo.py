@@ -45,6 +45,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="kpinfo", description="Show what is inside a .kpc file.")
+    cli.add_version_option(parser)
     parser.add_argument("scene", help="a .kpc file, or its http address")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--group", type=int, metavar="N", help="of a clip in groups, describe this one, from 0 on")

@@ -25,6 +25,7 @@ def _command(argv: list[str]) -> None:
         description="Several .kpc files become one clip. Groups of a clip know their frames and are put in order; other files "
         "follow one another as they are named.",
     )
+    cli.add_version_option(parser)
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE", help=".kpc files")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the .kpc file to write")
     options = parser.parse_args(argv)

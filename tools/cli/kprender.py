@@ -89,6 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="kprender", description="Render a .kpc scene to pictures or a video, without a window."
     )
+    cli.add_version_option(parser)
     parser.add_argument("scene", help="a .kpc file, or its http address")
     parser.add_argument(
         "-o",
