@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kpc.format.coding.predictive import ANY, WEIGHTS, decode_symbols, encode_with
+from kpc.format.coding.predictive import SCALAR, WEIGHT_COUNT, decode_symbols, encode_with_weights
 from kpc.format.coding.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_scene
 from kpc.format.common.errors import BudgetError
 from kpc.format.container.scene_io import encode, read
@@ -88,7 +88,9 @@ def test_sizes_of_planes(shape):
     y, x, m = np.ogrid[: shape[0], : shape[1], : shape[2]]
     symbols = ((x * y // 97 + 3 * m + x) % 251 - 125).astype(np.int8)
     coded = np.ones(shape[:2], bool)
-    found, where = decode_symbols(encode_with(np.zeros((1, WEIGHTS), np.int8), symbols, coded, ANY), *shape)
+    found, where = decode_symbols(
+        encode_with_weights(np.zeros((1, WEIGHT_COUNT), np.int8), symbols, coded, SCALAR), *shape
+    )
     assert np.array_equal(found, symbols) and np.array_equal(where, coded)
 
 

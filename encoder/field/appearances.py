@@ -14,7 +14,7 @@ from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.render import Rays, marched, shade
 from kpc.format.common.errors import UsageError
-from kpc.format.container.scene_io import APPEARANCE_LIMIT, is_name
+from kpc.format.container.scene_io import APPEARANCE_LIMIT, is_valid_name
 from kpc.format.scene.scene import Scene
 from torch import Tensor
 
@@ -85,10 +85,10 @@ def _counted(files: list[str]) -> list[str]:
 
 
 def _storable(names: Sequence[str]) -> tuple[str, ...]:
-    """The names, but a number where a file cannot hold one (`kpc.format.container.scene_io.is_name`) or has it already."""
+    """The names, but a number where a file cannot hold one (`kpc.format.container.scene_io.is_valid_name`) or has it already."""
     out: dict[str, None] = {}
     for number, name in enumerate(names):
-        while not is_name(name) or name in out:
+        while not is_valid_name(name) or name in out:
             name, number = f"#{number}", number + len(names)
         out[name] = None
     return tuple(out)

@@ -40,7 +40,7 @@ from kpc.encoder.rdo.rate_control import (
 from kpc.encoder.rdo.rate_search import TOLERANCE
 from kpc.encoder.rdo.sequential_finetune import quantise_sequentially, step_factors
 from kpc.encoder.training.checkpoint import save_state
-from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, quantise_scene, round_decoder, short_above
+from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, bfloat16_ceil, quantise_scene, round_decoder
 from kpc.format.common.errors import FormatError, TrainingError, UsageError
 from kpc.format.container import scene_io
 from kpc.format.container.container import MAGIC
@@ -203,7 +203,7 @@ def code(
             if model.coded is None:  # steps of a file were spread when it was made
                 factors = step_factors(kept.scene)
                 steps = [
-                    {name: short_above(step * np.float32(factors[s, name])) for name, step in scale.items()}
+                    {name: bfloat16_ceil(step * np.float32(factors[s, name])) for name, step in scale.items()}
                     for s, scale in enumerate(steps)
                 ]
 

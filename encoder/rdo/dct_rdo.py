@@ -7,7 +7,7 @@ Of each block in its turn, those levels are sought, one after the other, that ma
 with `worth` as in `kpc.encoder.rdo.distortion`, and what is wanted moved by what the errors of other channels make of it. Texels that nobody needs
 count for nothing, so what is there follows from the others; cosines are orthogonal only where all texels are worth the same, so a search
 knows what all levels of a block make together, and each is found again where the others now are (coordinate descent). How pictures see
-an error depends on how quick it is, `kpc.format.coding.transform.coarser`. Then the quickest are left out as long as that pays. Bits are counted in the
+an error depends on how quick it is, `kpc.format.coding.transform.frequency_weights`. Then the quickest are left out as long as that pays. Bits are counted in the
 contexts of the coder, from what the search before chose; the first begins with the cosines of the plane itself, what nobody needs filled
 in from around.
 
@@ -22,32 +22,32 @@ import numpy as np
 from kpc.encoder.rdo.curvature import BLOCK_SIDE
 from kpc.encoder.rdo.distortion import LAM, cross_channel_errors, distortion_weights, magnitude_bits
 from kpc.encoder.rdo.texel_map_rdo import choose_coded_texels
-from kpc.format.coding.quantise import QuantisedPlane, quantise_plane, short_above
-from kpc.format.coding.rans import compiled, inlined
+from kpc.format.coding.quantise import QuantisedPlane, bfloat16_ceil, quantise_plane
 from kpc.format.coding.transform import (
-    ENDS,
-    FINENESSES,
-    FREQUENCIES,
+    DEFAULT_OFFSET,
+    END_CONTEXTS,
+    FREQUENCY_CLASSES,
     LARGEST,
-    PARTS,
-    SIZES,
-    USUAL,
-    Blocks,
-    around,
-    blocks_of,
-    coarser,
-    cosines,
+    MAGNITUDE_CONTEXTS,
+    OFFSET_COUNT,
+    UNITS_PER_SYMBOL,
+    TransformBlocks,
+    border_sum,
+    coded_blocks,
+    dct_basis,
     decode_blocks,
+    empty_magnitudes,
     encode_blocks,
     end_context,
-    foreseen_mean,
+    frequency_weights,
     largest_side,
     last_diagonal,
     level_context,
-    quantisers,
-    sum_across,
+    predict_mean,
+    step_table,
 )
-from kpc.format.container.segments import Told, rows_of_segments
+from kpc.format.common.jit import compiled, inlined
+from kpc.format.container.segments import TransformSegments, rows_per_segment
 
 TRANSFORM_LAM = 0.03
 """Squared quantisers that a bit is worth: so quantisers are sqrt(LAM / PRICE) steps of the trellis at which bits are worth as much. With more
@@ -99,14 +99,17 @@ def transform_quantise(
     wanted = values[known].astype(np.float64)
     reach = 2 * np.abs(wanted - 1).max(0) if identity else np.ptp(wanted, axis=0)
     quantiser = int(
-        min(MAX_QUANTISER, (PARTS * USABLE_LEVELS * STEPS_PER_QUANTISER * step / np.maximum(reach, 1e-30)).min())
+        min(
+            MAX_QUANTISER,
+            (UNITS_PER_SYMBOL * USABLE_LEVELS * STEPS_PER_QUANTISER * step / np.maximum(reach, 1e-30)).min(),
+        )
     )
     if quantiser < MIN_QUANTISER:
         return None
-    symbol = short_above((STEPS_PER_QUANTISER * PARTS / quantiser * step).astype(np.float32))
+    symbol = bfloat16_ceil((STEPS_PER_QUANTISER * UNITS_PER_SYMBOL / quantiser * step).astype(np.float32))
     finer = quantise_plane(values, symbol, identity=identity, needed=known)
-    wanted = (values.astype(np.float64) - finer.offset) / finer.step * (PARTS / quantiser)
-    rows = rows_of_segments(len(values), identity)
+    wanted = (values.astype(np.float64) - finer.offset) / finer.step * (UNITS_PER_SYMBOL / quantiser)
+    rows = rows_per_segment(len(values), identity)
     symbols, told = np.zeros(values.shape, np.int8), {}
     for start in range(0, len(values), rows):
         own = slice(start, start + rows)
@@ -122,16 +125,16 @@ def transform_quantise(
         of_occupancy = None if implied is None else implied[own]
         told[start] = encode_blocks(blocks, there, of_occupancy)
         symbols[own], _ = decode_blocks(told[start], *symbols[own].shape, implied=of_occupancy)
-    return replace(finer, symbols=symbols, coded=known, guide=Told(told), starts=tuple(told)), sum(
+    return replace(finer, symbols=symbols, coded=known, side_info=TransformSegments(told), starts=tuple(told)), sum(
         map(len, told.values())
     )
 
 
 def requested_transform_step(plane: QuantisedPlane) -> np.ndarray:
     """(M,) float64: for which steps `transform_quantise` was asked when it made this plane."""
-    assert isinstance(plane.guide, Told)
-    quantiser = next(iter(plane.guide.segments.values()))[2]
-    return plane.step.astype(np.float64) * quantiser / (STEPS_PER_QUANTISER * PARTS)
+    assert isinstance(plane.side_info, TransformSegments)
+    quantiser = next(iter(plane.side_info.segments.values()))[2]
+    return plane.step.astype(np.float64) * quantiser / (STEPS_PER_QUANTISER * UNITS_PER_SYMBOL)
 
 
 def _own_blocks(together: np.ndarray, start: int, rows: int) -> np.ndarray:
@@ -141,24 +144,27 @@ def _own_blocks(together: np.ndarray, start: int, rows: int) -> np.ndarray:
 
 def search_blocks(
     wanted: np.ndarray, worth: np.ndarray, known: np.ndarray, together: np.ndarray, side: int, quantiser: int
-) -> Blocks:
+) -> TransformBlocks:
     """Blocks of a segment.
 
     Args:
         wanted: (H, W, M) float64, in quantisers. worth: (H, W, M) float32. known: (H, W) bool.
     """
     H, W, M = wanted.shape
-    busy = blocks_of(known, side)
-    filled, fineness = _filled(wanted, known, side), _fineness(worth, known, busy, side)
-    finer = quantisers(side, quantiser) / quantiser
-    basis = cosines(side) / (128 * math.sqrt(side))
-    along = coarser(side) / 64
+    busy = coded_blocks(known, side)
+    filled, step_offsets = _filled(wanted, known, side), _fineness(worth, known, busy, side)
+    finer = step_table(side, quantiser) / quantiser
+    basis = dct_basis(side) / (128 * math.sqrt(side))
+    along = frequency_weights(side) / 64
     seen = 1 / np.outer(along, along) ** 2
-    blocks = Blocks(np.zeros((M, *busy.shape, side, side), np.int64), fineness, quantiser)
+    blocks = TransformBlocks(np.zeros((M, *busy.shape, side, side), np.int64), step_offsets, quantiser)
     errors = np.zeros((H + 2, W + 2, M), np.float32)
-    counts, end_counts = np.zeros((SIZES * FREQUENCIES, MAGNITUDE_BINS + 1)), np.zeros((ENDS, 2 * side))
+    counts, end_counts = (
+        np.zeros((MAGNITUDE_CONTEXTS * FREQUENCY_CLASSES, MAGNITUDE_BINS + 1)),
+        np.zeros((END_CONTEXTS, 2 * side)),
+    )
     for number in range(PASSES):
-        counts, end_counts = _search(wanted, worth, known, busy, blocks.levels, fineness, finer, basis, seen, filled if number == 0 else None,
+        counts, end_counts = _search(wanted, worth, known, busy, blocks.levels, step_offsets, finer, basis, seen, filled if number == 0 else None,
                                      _bits(counts), _end_bits(end_counts), errors, together)  # fmt: skip
     return blocks
 
@@ -174,7 +180,7 @@ def _fineness(worth: np.ndarray, known: np.ndarray, busy: np.ndarray, side: int)
         return total
 
     mean = summed(worth.mean(axis=2) * known) / np.maximum(summed(known.astype(np.float32)), 1)
-    return np.clip(np.rint(USUAL + np.log2(np.maximum(mean, 1e-6)) / 2), 0, FINENESSES - 1).astype(np.int64)
+    return np.clip(np.rint(DEFAULT_OFFSET + np.log2(np.maximum(mean, 1e-6)) / 2), 0, OFFSET_COUNT - 1).astype(np.int64)
 
 
 def _filled(wanted: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
@@ -205,10 +211,10 @@ def _bits(counts: np.ndarray) -> np.ndarray:
     """(contexts, TOLD_APART + 1) bits of levels by their magnitude, that came so often in each context. What is expected is the mean of the levels
     that the context stands for."""
     total = (
-        0.75 * 2.0 ** (np.arange(SIZES) / 2 + 1) * (np.arange(SIZES) > 0)
+        0.75 * 2.0 ** (np.arange(MAGNITUDE_CONTEXTS) / 2 + 1) * (np.arange(MAGNITUDE_CONTEXTS) > 0)
     )  # of 36 levels, as `level_context` sums them
-    mean = np.repeat(total / 36 + 0.02, FREQUENCIES)
-    mean[FREQUENCIES - 1 :: FREQUENCIES] *= 3
+    mean = np.repeat(total / 36 + 0.02, FREQUENCY_CLASSES)
+    mean[FREQUENCY_CLASSES - 1 :: FREQUENCY_CLASSES] *= 3
     return magnitude_bits(counts, mean)
 
 
@@ -221,7 +227,7 @@ def _end_bits(counts: np.ndarray) -> np.ndarray:
 
 @compiled()
 def _search(
-    wanted, worth, known, busy, levels, fineness, finer, basis, seen, filled, price, end_price, errors, together
+    wanted, worth, known, busy, levels, step_offsets, finer, basis, seen, filled, price, end_price, errors, together
 ):
     """Find `levels` anew, of which the search before is known, or `filled`; counts of levels and ends in their contexts, as `_bits` and
     `_end_bits` take them.
@@ -234,7 +240,7 @@ def _search(
     BY, BX = busy.shape
     N = len(basis)
     counts, end_counts = np.zeros(price.shape), np.zeros(end_price.shape)
-    size, before = around(BY, BX, N), around(BY, BX, N)
+    size, before = empty_magnitudes(BY, BX, N), empty_magnitudes(BY, BX, N)
     end, end_before = np.zeros((BY + 1, BX + 1), np.int64), np.zeros((BY + 1, BX + 1), np.int64)
     mean = np.zeros((BY + 1, BX + 1))
     error, weight, curve, told = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N), np.int64)
@@ -243,15 +249,15 @@ def _search(
         moved = cross_channel_errors(errors, together, m)
         for by in range(BY):
             for bx in range(BX):
-                Y, X, quantiser, block = by + 1, bx + 1, finer[fineness[by, bx]], levels[m, by, bx]
+                Y, X, quantiser, block = by + 1, bx + 1, finer[step_offsets[by, bx]], levels[m, by, bx]
                 here, left, above, past = size[Y, X], size[Y, X - 1], size[Y - 1, X], before[Y, X]
-                mean[Y, X] = foreseen_mean(mean, by, bx)
+                mean[Y, X] = predict_mean(mean, by, bx)
                 here[:], end[Y, X] = 0, 0
                 if not busy[by, bx]:
                     continue
                 expected, beside, over = mean[Y, X], bx > 0 and busy[by, bx - 1], by > 0 and busy[by - 1, bx]
                 if beside or over:
-                    expected = sum_across(right, bottom[bx], beside, over) / 4 + expected / 2
+                    expected = border_sum(right, bottom[bx], beside, over) / 4 + expected / 2
                 foreseen = int(math.floor(expected / quantiser[0, 0] + 0.5))
                 if filled is not None:
                     _begin(filled[by * N : by * N + N, bx * N : bx * N + N, m], quantiser, basis, block)

@@ -12,7 +12,7 @@ and a bit is worth LAM of that.
 
 import numpy as np
 from kpc.encoder.rdo.curvature import BLOCK_SIDE
-from kpc.format.coding.rans import compiled
+from kpc.format.common.jit import compiled
 
 PlaneKey = tuple[int, str]
 """A plane: scale and name."""

@@ -19,8 +19,8 @@ from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.rdo.dct_rdo import requested_transform_step, transform_quantise
 from kpc.encoder.rdo.distortion import NO_CORRELATION, PlaneKey, distortion_weights, total_distortion
 from kpc.encoder.rdo.trellis import LOW_RATE_BITS, requested_trellis_step, trellis_quantise
-from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels, quantise_scene, reached_by
-from kpc.format.container.segments import Told, encode_coded, guide_at, rows_of_segments
+from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels, quantise_scene
+from kpc.format.container.segments import TransformSegments, encode_segment, rows_per_segment, side_info_at
 from kpc.format.scene.scene import TIME_PLANES, Scene
 
 BLOCK_SIDES = 8, 16
@@ -53,7 +53,7 @@ def quantise_by_cost(
         together: as of `kpc.encoder.rdo.curvature.Curvature`. None: channels know nothing of each other.
         thin: as of `kpc.encoder.rdo.trellis.trellis_quantise`. blocks: whether planes may be told in blocks.
     """
-    reached = reached_by(scene) if reached is None else reached
+    reached = looked_up_cells(scene) if reached is None else reached
     quantised = quantise_scene(scene, steps, reached=reached)
     matters = significant or [
         {name: np.ones(plane.shape, np.float32) for name, plane in scale.items()} for scale in scene.scales
@@ -81,7 +81,11 @@ def quantise_by_cost(
 
 def requested_step(plane: QuantisedPlane) -> np.ndarray:
     """(M,) float64: for which steps `quantise_by_cost` was asked when it made this plane, if it did and 8 bits were enough."""
-    return requested_transform_step(plane) if isinstance(plane.guide, Told) else requested_trellis_step(plane)
+    return (
+        requested_transform_step(plane)
+        if isinstance(plane.side_info, TransformSegments)
+        else requested_trellis_step(plane)
+    )
 
 
 def _cheapest(
@@ -100,7 +104,7 @@ def _cheapest(
     root = np.sqrt(distortion_weights(significant, plane.coded)) * needed[..., None]
 
     def in_all(candidate: QuantisedPlane, size_bytes: int) -> float:
-        factor = TRANSFORM_ERROR_FACTOR if isinstance(candidate.guide, Told) else 1
+        factor = TRANSFORM_ERROR_FACTOR if isinstance(candidate.side_info, TransformSegments) else 1
         return (
             factor * total_distortion(root * ((candidate.dequantise() - values) / step), together)
             + DECISION_LAM * 8 * size_bytes
@@ -130,8 +134,12 @@ def _cheapest(
 
 def _size(plane: QuantisedPlane, identity: bool, implied: np.ndarray) -> int:
     """Bytes of its segments."""
-    rows = rows_of_segments(len(plane.symbols), identity)
+    rows = rows_per_segment(len(plane.symbols), identity)
     segments = [
-        (slice(start, start + rows), guide_at(plane.guide, start)) for start in range(0, len(plane.symbols), rows)
+        (slice(start, start + rows), side_info_at(plane.side_info, start))
+        for start in range(0, len(plane.symbols), rows)
     ]
-    return sum(len(encode_coded(plane.symbols[own], plane.coded[own], guide, implied[own])) for own, guide in segments)
+    return sum(
+        len(encode_segment(plane.symbols[own], plane.coded[own], side_info, implied[own]))
+        for own, side_info in segments
+    )

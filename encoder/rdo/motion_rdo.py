@@ -1,6 +1,6 @@
 """Which displacements a motion grid is told: as coarse as pictures allow, and where they matter little, whatever takes few bits.
 
-Symbols are found in the order in which they are told (`kpc.format.coding.motion_hierarchical`), again and again, each of several that makes least of
+Symbols are found in the order in which they are told (`kpc.format.coding.motion_codec`), again and again, each of several that makes least of
 
     u^2 + 2 u * sum over neighbours of BESIDE^distance * their u + PRICE * FINER^level * bits(symbol | those before it)
 
@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 from kpc.encoder.evaluation.validation_rays import Measure
 from kpc.encoder.rdo.distortion import EDGE_COUPLING, magnitude_bits
-from kpc.format.coding.motion_hierarchical import CONTEXTS, context_of, foreseen, passes, told_beside
-from kpc.format.coding.rans import compiled, inlined
+from kpc.format.coding.motion_codec import CONTEXTS, coding_passes, interpolate, neighbour_residuals, residual_context
+from kpc.format.common.jit import compiled, inlined
 from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Scene
 
@@ -64,7 +64,7 @@ def coarsen_motion(scene: Scene, worth: np.ndarray | None, measure: Measure, mos
 
 def quantise_motion(wanted: np.ndarray, worth: np.ndarray) -> np.ndarray:
     """(T, Nz, Ny, Nx, 3) int64 symbols near to `wanted`, in steps, where an error costs `worth`."""
-    symbols, order = np.rint(wanted).astype(np.int64), list(passes(wanted.shape[:4]))
+    symbols, order = np.rint(wanted).astype(np.int64), list(coding_passes(wanted.shape[:4]))
     root = np.sqrt(np.maximum(worth / max(float(worth.mean()), 1e-30), MIN_WEIGHT))
     errors, counts = root * (symbols - wanted), np.zeros((CONTEXTS, MAGNITUDE_BINS + 1))
     for _ in range(SEARCHES):
@@ -91,16 +91,16 @@ def quantise_motion(wanted: np.ndarray, worth: np.ndarray) -> np.ndarray:
 
 @compiled()
 def _search(values, r, wanted, root, errors, new, sides, weights, first, second, third, price, bits, counts):
-    """Find the symbols of a `Pass` anew, as `kpc.format.coding.motion_hierarchical.walk` goes through them."""
+    """Find the symbols of a `Pass` anew, as `kpc.format.coding.motion_codec.walk` goes through them."""
     for n in range(new.size):
         for i in range(first.size):
             for j in range(second.size):
                 for k in range(third.size):
                     a, b, c = first[i], second[j], third[k]
-                    beside = told_beside(r, new[n], first, second, third, i, j, k)
+                    beside = neighbour_residuals(r, new[n], first, second, third, i, j, k)
                     for m in range(values.shape[4]):
-                        usual = foreseen(values, sides[n], weights[n], a, b, c, m)
-                        context = context_of(r, new[n], sides[n], weights[n], beside, a, b, c, m)
+                        usual = interpolate(values, sides[n], weights[n], a, b, c, m)
+                        context = residual_context(r, new[n], sides[n], weights[n], beside, a, b, c, m)
                         own = root[new[n], a, b, c, m]
                         away = _others(errors, new[n], a, b, c, m) / own
                         best = wanted[new[n], a, b, c, m] - min(max(away, -1.0), 1.0)

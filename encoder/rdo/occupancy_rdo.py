@@ -18,7 +18,7 @@ from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import Measure, ValidationRays
 from kpc.encoder.field.render import marched
 from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS
-from kpc.format.coding.rans import compiled, inlined
+from kpc.format.common.jit import compiled, inlined
 from kpc.format.scene.grid import dilate
 from kpc.format.scene.scene import Scene
 

@@ -15,7 +15,14 @@ from kpc.encoder.field.occupancy_grid import in_fewest_slots
 from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
 from kpc.encoder.rdo.rate_search import TOLERANCE, find_limit, find_tuned_limit, minimise
-from kpc.format.coding.quantise import HALF_BITS, QuantisedScene, reached_by, round_decoder, short_above, weights_of
+from kpc.format.coding.quantise import (
+    HALF_BITS,
+    QuantisedScene,
+    bfloat16_ceil,
+    decoder_arrays,
+    looked_up_cells,
+    round_decoder,
+)
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 
@@ -54,9 +61,9 @@ MIN_SIGNIFICANCE = 1e-6
 Steps = list[dict[str, np.ndarray]]
 """One mapping a scale, plane name -> (M,) quantisation steps."""
 QuantiseFunction = Callable[[Scene, PerPlane, np.ndarray, PerPlane], QuantisedScene]
-"""Of a scene with steps, `reached_by` it and significance: `quantise_by_cost`, or what is to be compared with it."""
+"""Of a scene with steps, `looked_up_cells` it and significance: `quantise_by_cost`, or what is to be compared with it."""
 TuneFunction = Callable[[PerPlane, np.ndarray], QuantisedScene]
-"""A better coding with the same steps, of a scene that is known, `reached_by` which is told."""
+"""A better coding with the same steps, of a scene that is known, `looked_up_cells` which is told."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +178,7 @@ def reduce_slots(scene: Scene, measure: Measure, error: float) -> Scene:
 def choose_decoder_bits(scene: Scene, measure: Measure, error: float) -> dict[str, int]:
     """Of each array of the decoder's weights, for `round_decoder`, the fewest bits with which all of them add at most `error`, in squares of
     8-bit levels: first of all arrays alike, then of one after the other, those that take most first. None at all where HALF_BITS are too few."""
-    known, weights = measure(scene).mse, weights_of(scene.decoder)
+    known, weights = measure(scene).mse, decoder_arrays(scene.decoder)
 
     def enough(bits: dict[str, int]) -> bool:
         return measure(replace(scene, decoder=round_decoder(scene.decoder, bits))).mse - known <= error
@@ -203,8 +210,10 @@ def _means(values: np.ndarray) -> np.ndarray:
 
 
 def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
-    """All steps times a factor, as float32 of 8 significant bits, `short_above`."""
-    return [{name: short_above((step * factor).astype(np.float32)) for name, step in scale.items()} for scale in steps]
+    """All steps times a factor, as float32 of 8 significant bits, `bfloat16_ceil`."""
+    return [
+        {name: bfloat16_ceil((step * factor).astype(np.float32)) for name, step in scale.items()} for scale in steps
+    ]
 
 
 def meet_trade(
@@ -229,7 +238,7 @@ def meet_trade(
         own_steps: `steps` are those of a file, of which something may have been left out since: nothing finer makes sense.
         tolerance: as of `kpc.encoder.rdo.rate_search.find_limit`.
     """
-    reached = reached_by(scene)
+    reached = looked_up_cells(scene)
     own_steps = own_steps or source_file is not None
     finest, coarsest, guess = (0.0, RECODE_COARSEST, RECODE_GUESS) if own_steps else (FINEST, COARSEST, FIRST_GUESS)
     tried: dict[float, Attempt] = {}

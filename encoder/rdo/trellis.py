@@ -1,7 +1,7 @@
 """Which symbol a number becomes: trellis-coded quantisation, with an eye on what symbols cost.
 
 Symbols lie half as far apart as plain rounding to the same number of bits would have them, but along a row only every other one may
-follow (`kpc.format.coding.predictive.next_state`). A Viterbi search finds the path through a row of least
+follow (`kpc.format.coding.predictive.trellis_transition`). A Viterbi search finds the path through a row of least
 
     u^2 + 2 u (BESIDE * sum of u of the four texels around + ACROSS * sum of u of the four at the corners + others)
         + LAM * bits(symbol | those before it),        u = sqrt(worth) (symbol - value / step)
@@ -36,28 +36,28 @@ from kpc.encoder.rdo.distortion import (
 from kpc.encoder.rdo.texel_map_rdo import choose_coded_texels
 from kpc.format.coding.predictive import (
     ACTIVITIES,
-    ANY,
-    AROUND,
-    FLAT,
-    SLOPES,
+    DEPENDENT,
+    FLAT_ACTIVITY,
+    GRADIENT_CLASSES,
+    INITIAL_RESIDUAL,
+    SCALAR,
     TRELLIS,
-    UNKNOWN,
-    Guide,
+    PredictionWeights,
     activity,
     begin_row,
-    factors,
-    fitted,
-    foreseen,
-    look_above,
-    meant,
-    neighbourhoods,
-    next_place,
+    collect_neighbours,
+    fit_weights,
+    next_trellis_state,
     predict,
-    remember,
+    residual_to_offset,
+    round_prediction,
+    sum_above,
+    tap_weights,
+    update_cross_channel,
 )
-from kpc.format.coding.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, quantise_plane, short_above
-from kpc.format.coding.rans import compiled
-from kpc.format.container.segments import rows_of_segments
+from kpc.format.coding.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, bfloat16_ceil, quantise_plane
+from kpc.format.common.jit import compiled
+from kpc.format.container.segments import rows_per_segment
 
 LOW_RATE_BITS = 1.3
 """Bits of a symbol below which the trellis goes around predictions. Liam and soldier, large planes alone, at equal slopes: squared errors
@@ -97,22 +97,22 @@ def trellis_quantise(
         together: as of `kpc.encoder.rdo.curvature.Curvature`, or ALONE.
         thin: bits of a symbol below which it goes around predictions.
     """
-    lattice = TRELLIS if np.median(plane.step / step) < 2 else ANY
+    lattice = TRELLIS if np.median(plane.step / step) < 2 else SCALAR
     search = _Search(plane, values, step, significant, identity, together, lattice)
     search.run(1)
-    if lattice == ANY or search.bits_of_a_symbol >= thin:
+    if lattice == SCALAR or search.bits_of_a_symbol >= thin:
         search.run(PASSES - 1)
         return search.found()
-    finer = short_above((step / LOW_RATE_STEP_RATIO).astype(np.float32))
+    finer = bfloat16_ceil((step / LOW_RATE_STEP_RATIO).astype(np.float32))
     around = quantise_plane(values, finer, identity=identity, needed=plane.coded)
-    search = _Search(around, values, finer, significant, identity, together, AROUND)
+    search = _Search(around, values, finer, significant, identity, together, DEPENDENT)
     search.run(PASSES)
     return search.found()
 
 
 def requested_trellis_step(plane: QuantisedPlane) -> np.ndarray:
     """(M,) float64: for which steps `trellis_quantise` was asked when it made this plane, if it did and 8 bits were enough."""
-    return plane.step.astype(np.float64) * (1.0 if plane.guide is None else LOW_RATE_STEP_RATIO)
+    return plane.step.astype(np.float64) * (1.0 if plane.side_info is None else LOW_RATE_STEP_RATIO)
 
 
 class _Search:
@@ -132,8 +132,8 @@ class _Search:
         lattice: int,
     ) -> None:
         self.plane, self.identity, self.together, self.lattice = plane, identity, together, lattice
-        self._finer = LOW_RATE_STEP_RATIO if lattice == AROUND else 1.0
-        self.rows = rows_of_segments(len(values), identity)
+        self._finer = LOW_RATE_STEP_RATIO if lattice == DEPENDENT else 1.0
+        self.rows = rows_per_segment(len(values), identity)
         coarser = plane.step / step
         self.wanted = (values.astype(np.float64) - plane.offset) / plane.step
         known = np.ascontiguousarray(plane.coded)
@@ -149,9 +149,9 @@ class _Search:
 
     def run(self, times: int) -> None:
         for _ in range(times):
-            neighbours = neighbourhoods(self.symbols, self.known)
-            self.weights = fitted(
-                neighbours, PREDICTOR_SETS if self.lattice != AROUND or len(neighbours) >= MANY_SYMBOLS else 1
+            neighbours = collect_neighbours(self.symbols, self.known)
+            self.weights = fit_weights(
+                neighbours, PREDICTOR_SETS if self.lattice != DEPENDENT or len(neighbours) >= MANY_SYMBOLS else 1
             )
             self.symbols, self.counts = _search(
                 self.wanted,
@@ -170,8 +170,10 @@ class _Search:
         return float((self.counts * _bits(self.counts)).sum() / max(self.counts.sum(), 1))
 
     def found(self) -> QuantisedPlane:
-        if self.lattice == AROUND:  # what is coded tells what is foreseen
-            return replace(self.plane, symbols=self.symbols, coded=self.known, guide=Guide(self.weights))
+        if self.lattice == DEPENDENT:  # what is coded tells what is foreseen
+            return replace(
+                self.plane, symbols=self.symbols, coded=self.known, side_info=PredictionWeights(self.weights)
+            )
         return replace(
             self.plane, symbols=self.symbols, coded=self.symbols.any(axis=2) if self.identity else self.known
         )
@@ -204,8 +206,8 @@ def _search(
     v, r, cross and the names of neighbours as in `kpc.format.coding.predictive`; v0, r0 and errors of survivors are held by their states.
     """
     H, W, M = wanted.shape
-    sets, classes = factors(weights), SLOPES * len(weights) >> 3
-    apart = 1 if lattice == ANY else 2  # of symbols that may follow
+    sets, classes = tap_weights(weights), GRADIENT_CLASSES * len(weights) >> 3
+    apart = 1 if lattice == SCALAR else 2  # of symbols that may follow
     symbols, counts = np.zeros((H, W, M), np.int8), np.zeros(price.shape)
     v, r = np.zeros((3, W + 4), np.int32), np.zeros((3, W + 4), np.int32)
     leaning, steep, restless = np.zeros((len(sets), W), np.int32), np.zeros(W, np.int32), np.zeros(W, np.int32)
@@ -225,9 +227,9 @@ def _search(
             v0, v1, v2 = v[y % 3], v[(y + 2) % 3], v[(y + 1) % 3]
             r0, r1, r2, past = r[y % 3], r[(y + 2) % 3], r[(y + 1) % 3], cross[y]
             begin_row(v0, v1, v2, own, 0)
-            begin_row(r0, r1, r2, own, UNKNOWN)
+            begin_row(r0, r1, r2, own, INITIAL_RESIDUAL)
             if own > 0:
-                look_above(sets, v1, v2, r1, r2, past, m, leaning, steep, restless)
+                sum_above(sets, v1, v2, r1, r2, past, m, leaning, steep, restless)
             for s in range(STATES):
                 V[:2, s], R[:2, s] = v0[:2], r0[:2]
             cost[:] = np.inf
@@ -257,7 +259,7 @@ def _search(
                         continue
                     if own == 0:  # nothing is above but what is to the left
                         v1[x : x + 5], v2[x : x + 5], r1[x : x + 5], r2[x : x + 5] = w, w, rw, rw
-                        look_above(
+                        sum_above(
                             sets,
                             v1[x:],
                             v2[x:],
@@ -270,15 +272,15 @@ def _search(
                             restless[x : x + 1],
                         )
                     predicted, gradient = predict(sets, classes, w, ww, int(v1[X - 1]), x, leaning, steep)
-                    active, odd = activity(restless[x], rw, rww, gradient, m), s & 1 if lattice != ANY else 0
-                    kind = TRELLIS if lattice == AROUND and active >= FLAT else lattice
-                    whole = foreseen(predicted, kind, odd)
-                    if odd and kind == AROUND:
+                    active, odd = activity(restless[x], rw, rww, gradient, m), s & 1 if lattice != SCALAR else 0
+                    kind = TRELLIS if lattice == DEPENDENT and active >= FLAT_ACTIVITY else lattice
+                    whole = round_prediction(predicted, kind, odd)
+                    if odd and kind == DEPENDENT:
                         active += ACTIVITIES
                     near = outside + EDGE_COUPLING * U[x, s]
                     best = min(max(wanted[y, x, m] - near / root, SYMBOL_MIN), SYMBOL_MAX)  # as far as errors go
                     away = best - whole
-                    size = int((abs(away) + (1 if odd and kind == AROUND else 0)) / apart)
+                    size = int((abs(away) + (1 if odd and kind == DEPENDENT else 0)) / apart)
                     inside = size if away > 0 else -size
                     for error in (
                         inside - 1,
@@ -286,13 +288,17 @@ def _search(
                         inside + 1,
                         0,
                     ):  # those around it, the next that costs less, what is foreseen
-                        value = whole + meant(error, kind, odd)
+                        value = whole + residual_to_offset(error, kind, odd)
                         if not SYMBOL_MIN <= value <= SYMBOL_MAX:
                             continue
                         size = min(abs(error), MAGNITUDE_BINS - 1)
                         u = root * (value - wanted[y, x, m])
                         total = before[s] + u * (u + 2 * near) + price[active, size]
-                        to = (s << 1 | value & 1) & STATES - 1 if lattice == ANY else next_place(s, value, error, kind)
+                        to = (
+                            (s << 1 | value & 1) & STATES - 1
+                            if lattice == SCALAR
+                            else next_trellis_state(s, value, error, kind)
+                        )
                         if total < cost[to]:
                             cost[to], came[x, to], context[x, to], missed[x, to] = total, s, active, size
                             V[X, to], R[X, to], U[x + 1, to] = value, abs((value << 7) - predicted) >> 3, u
@@ -306,7 +312,7 @@ def _search(
                 s = came[x, s]
             v0[W + 2 :], r0[W + 2 :] = v0[W + 1], r0[W + 1]
             if own > 0:
-                remember(cross[y - 1], r2, r1, r0, m)
+                update_cross_channel(cross[y - 1], r2, r1, r0, m)
             if own == rows - 1 or y == H - 1:
-                remember(cross[y], r1 if own > 0 else r0, r0, r0, m)
+                update_cross_channel(cross[y], r1 if own > 0 else r0, r0, r0, m)
     return symbols, counts

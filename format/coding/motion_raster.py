@@ -11,8 +11,9 @@ Naming as in `kpc.format.coding.predictive`: r is by how much predictions missed
 
 import numpy as np
 from kpc.format.coding.predictive import FIT_VALUES, least_absolute
-from kpc.format.coding.rans import compiled, counters, doublings, ended, inlined, integer, opened, stream
+from kpc.format.coding.rans import check_end, code_signed, encode_trace, log_class, new_models, open_stream
 from kpc.format.common.errors import FormatError
+from kpc.format.common.jit import compiled, inlined
 
 NEIGHBOURS = 15
 """Number k is one step back along time if its bit 3 is set, along z if bit 2, y bit 1, x bit 0; weight k - 1 is its own."""
@@ -21,7 +22,7 @@ WEIGHT_BITS = 10
 LORENZO = np.array([-1 << WEIGHT_BITS if k.bit_count() % 2 == 0 else 1 << WEIGHT_BITS for k in range(1, 16)], np.int16)
 
 UNARY, ESCAPES = 4, 15
-"""Of `kpc.format.coding.rans.integer`: errors reach +-65535."""
+"""Of `kpc.format.coding.rans.code_signed`: errors reach +-65535."""
 DECISIONS = 2 + 2 * (UNARY + ESCAPES)
 """Counters of a context, of which there are CONTEXTS: how large r is around."""
 CONTEXTS = 20
@@ -41,7 +42,7 @@ def encode_with(weights: np.ndarray, symbols: np.ndarray) -> bytes:
     symbols = np.array(symbols, order="C")  # compiled for this layout; and `walk` writes
     trace = np.empty(symbols.size * MOST_DECISIONS, np.int16)
     _, at, _ = walk(symbols, np.stack([LORENZO, weights]).astype(np.int64), 0, 0, None, trace)
-    return weights.astype("<i2").tobytes() + stream(trace[:at])
+    return weights.astype("<i2").tobytes() + encode_trace(trace[:at])
 
 
 def decode_nodes(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
@@ -53,12 +54,12 @@ def decode_nodes(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
     if len(body) < 2 * NEIGHBOURS:
         raise FormatError("motion: cut off within its weights")
     weights = np.stack([LORENZO, np.frombuffer(body, "<i2", NEIGHBOURS)]).astype(np.int64)
-    state, words = opened(body[2 * NEIGHBOURS :], "motion")
+    state, words = open_stream(body[2 * NEIGHBOURS :], "motion")
     symbols = np.zeros(shape, np.int16)
     state, at, fit = walk(symbols, weights, state, 0, words, None)
     if not fit:
         raise FormatError("motion: a symbol leaves its 16 bits")
-    ended(state, at, words, "motion")
+    check_end(state, at, words, "motion")
     return symbols
 
 
@@ -83,7 +84,7 @@ def walk(symbols, weights, state, at, words, trace):
         weights: (2, NEIGHBOURS) int64: of nodes that lack neighbours, and of the others.
     """
     T, Z, Y, X, M = symbols.shape
-    table = counters(CONTEXTS * DECISIONS)
+    table = new_models(CONTEXTS * DECISIONS)
     r = np.zeros((2, Z, Y, X, M), np.int64)  # of this row and the one before
     for t in range(T):
         for z in range(Z):
@@ -94,7 +95,7 @@ def walk(symbols, weights, state, at, words, trace):
                         predicted = _predicted(symbols, inner, t, z, y, x, m)
                         context = _context(r, t, z, y, x, m)
                         error = int(symbols[t, z, y, x, m]) - predicted
-                        error, state, at = integer(
+                        error, state, at = code_signed(
                             error, table, context * DECISIONS, UNARY, ESCAPES, state, at, words, trace
                         )
                         value = predicted + error
@@ -132,4 +133,4 @@ def _context(r, t, z, y, x, m):
     if x > 0:
         total, count = total + r[now, z, y, x - 1, m], count + 1
     mean = (int(total) // count if count > 0 else UNKNOWN) + 2
-    return min(doublings(mean) - 2, CONTEXTS - 1)
+    return min(log_class(mean) - 2, CONTEXTS - 1)

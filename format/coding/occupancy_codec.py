@@ -4,7 +4,8 @@ A cell is most often as its neighbours are, and as it was. Which of these agree 
 """
 
 import numpy as np
-from kpc.format.coding.rans import adapt, compiled, counters, ended, opened, stream
+from kpc.format.coding.rans import check_end, code_bit_adaptive, encode_trace, new_models, open_stream
+from kpc.format.common.jit import compiled
 
 NEIGHBOURS = np.array(
     [
@@ -25,32 +26,32 @@ NEIGHBOURS = np.array(
 CONTEXTS = 1 << len(NEIGHBOURS)
 
 
-def encode_cells(occupancy: np.ndarray) -> bytes:
+def encode_occupancy(occupancy: np.ndarray) -> bytes:
     """Code (slots, Nz, Ny, Nx) bool."""
     cells = np.array(occupancy, np.uint8, order="C")
     trace = np.empty(cells.size, np.int16)
     walk(cells, 0, 0, None, trace)
-    return stream(trace)
+    return encode_trace(trace)
 
 
-def decode_cells(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
-    """Undo `encode_cells`: bool of that shape.
+def decode_occupancy(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
+    """Undo `encode_occupancy`: bool of that shape.
 
     Raises:
         FormatError: the body is cut or too long.
     """
-    state, words = opened(body, "occupancy")
+    state, words = open_stream(body, "occupancy")
     cells = np.zeros(shape, np.uint8)
     state, at = walk(cells, state, 0, words, None)
-    ended(state, at, words, "occupancy")
+    check_end(state, at, words, "occupancy")
     return cells.view(bool)
 
 
 @compiled()
 def walk(cells, state, at, words, trace):
-    """Code (slots, Nz, Ny, Nx) uint8 `cells` of 0 and 1, or decode into them: (state, at). The rest as `kpc.format.coding.rans.decide`."""
+    """Code (slots, Nz, Ny, Nx) uint8 `cells` of 0 and 1, or decode into them: (state, at). The rest as `kpc.format.coding.rans.code_bit`."""
     S, Z, Y, X = cells.shape
-    table, nowhere = counters(CONTEXTS), np.zeros(X, np.uint8)
+    table, nowhere = new_models(CONTEXTS), np.zeros(X, np.uint8)
     for s in range(S):
         for z in range(Z):
             for y in range(Y):
@@ -78,7 +79,7 @@ def walk(cells, state, at, words, trace):
                         | int(above[x]) << 1
                         | int(behind[x])
                     )
-                    left, state, at = adapt(int(here[x]), table, context, state, at, words, trace)
+                    left, state, at = code_bit_adaptive(int(here[x]), table, context, state, at, words, trace)
                     here[x] = left
                     past = now
                 if words is not None and at > words.size:

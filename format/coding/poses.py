@@ -35,15 +35,15 @@ SKEWED = 1e-3
 """How far products of a pose's axes may be from those of a turn."""
 
 
-def rigid(cameras: Sequence[Camera]) -> bool:
-    """Whether poses are turns and places, and so may be `rounded`."""
+def are_rigid(cameras: Sequence[Camera]) -> bool:
+    """Whether poses are turns and places, and so may be `round_poses`."""
     axes = _poses(cameras)[:, :, :3]
     products = axes.transpose(0, 2, 1) @ axes
     return bool((np.abs(products - np.eye(3)) < SKEWED).all() and (np.linalg.det(axes) > 0).all())
 
 
-def rounded(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-    """`rigid` cameras with poses as they come back from a file."""
+def round_poses(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """`are_rigid` cameras with poses as they come back from a file."""
     exponent, corner, words = _as_words(_poses(cameras))
     return tuple(
         replace(camera, camera_to_world=np.vstack([pose, [0, 0, 0, 1]]))
@@ -52,12 +52,12 @@ def rounded(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
 
 
 def encode_poses(cameras: Sequence[Camera]) -> bytes | None:
-    """Code cameras; None where their poses are not `rounded`.
+    """Code cameras; None where their poses are not `round_poses`.
 
     Raises:
         struct.error: a number does not fit its field.
     """
-    if not rigid(cameras):
+    if not are_rigid(cameras):
         return None
     exponent, corner, words = _as_words(_poses(cameras))
     if not np.array_equal(_from_words(exponent, corner, words), _poses(cameras)):

@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from kpc.format.coding.poses import rigid, rounded
-from kpc.format.coding.rans import compiled
+from kpc.format.coding.poses import are_rigid, round_poses
 from kpc.format.coding.weights import FINEST
 from kpc.format.common.errors import FormatError
-from kpc.format.container.segments import PlaneGuide
+from kpc.format.common.jit import compiled
+from kpc.format.container.segments import PlaneSideInfo
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import QuantisedMotion, quantise_motion, reached_cells
 from kpc.format.scene.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
@@ -39,7 +39,7 @@ class QuantisedPlane:
         symbols: (H, W, M) int8; 0 wherever `coded` is False.
         step: (M,) float32 > 0; offset: (M,) float32, exactly 1 on time planes.
         coded: (H, W) bool, the texels whose symbols the file stores.
-        guide: by which symbols were chosen, if by any; one that they do not follow does no harm.
+        side_info: by which symbols were chosen, if by any; one that they do not follow does no harm.
         starts: the first rows of the segments that symbols were chosen for; none: those that are usual, `kpc.format.container.segments`.
     """
 
@@ -47,15 +47,15 @@ class QuantisedPlane:
     step: np.ndarray
     offset: np.ndarray
     coded: np.ndarray
-    guide: PlaneGuide | None = None
+    side_info: PlaneSideInfo | None = None
     starts: tuple[int, ...] = ()
 
     def dequantise(self) -> np.ndarray:
         """(H, W, M) float32."""
-        return dequantised(self.symbols, self.step, self.offset)
+        return dequantise_symbols(self.symbols, self.step, self.offset)
 
 
-def dequantised(symbols: np.ndarray, step: np.ndarray, offset: np.ndarray) -> np.ndarray:
+def dequantise_symbols(symbols: np.ndarray, step: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """(..., M) float32 of (..., M) int8: symbol * step + offset, rounded after the product and after the sum."""
     values = symbols.astype(np.float32)
     values *= step
@@ -109,7 +109,9 @@ def quantise_plane(
         step = _at_least(step, (high - low) / (SYMBOL_MAX - SYMBOL_MIN))
         mean = wanted.mean(0).astype(np.float32) if len(wanted) else np.ones(channels, np.float32)
         offset = np.clip(
-            shortened(mean), high - SYMBOL_MAX * step.astype(np.float64), low - SYMBOL_MIN * step.astype(np.float64)
+            bfloat16_floor(mean),
+            high - SYMBOL_MAX * step.astype(np.float64),
+            low - SYMBOL_MIN * step.astype(np.float64),
         )
         offset = offset.astype(np.float32)
 
@@ -124,16 +126,16 @@ def _at_least(step: np.ndarray, bound: np.ndarray) -> np.ndarray:
     """`step`, raised to `bound` where it falls short; rounded up, so that the bound still holds."""
     single = bound.astype(np.float32)
     single = np.where(single < bound, np.nextafter(single, np.float32(np.inf)), single)
-    return np.where(step < bound, short_above(single), step)
+    return np.where(step < bound, bfloat16_ceil(single), step)
 
 
-def short_above(values: np.ndarray) -> np.ndarray:
+def bfloat16_ceil(values: np.ndarray) -> np.ndarray:
     """float32 numbers of 8 significant bits, at least as large as positive float32 ones and at most 1 / 128 larger: a file holds them in
     little more than half the bytes."""
-    return shortened((values.view(np.uint32) + np.uint32(0xFFFF)).view(np.float32))
+    return bfloat16_floor((values.view(np.uint32) + np.uint32(0xFFFF)).view(np.float32))
 
 
-def shortened(values: np.ndarray) -> np.ndarray:
+def bfloat16_floor(values: np.ndarray) -> np.ndarray:
     """float32 numbers without all but their first 8 significant bits."""
     return (values.view(np.uint32) & np.uint32(0xFFFF0000)).view(np.float32)
 
@@ -211,7 +213,7 @@ def quantise_scene(
         FormatError: a value is NaN or infinite; the message names the scale and the plane.
     """
     if skip_unseen and reached is None:
-        reached = reached_by(scene)
+        reached = reached_cells(scene)
     scales = []
     for number, (planes, plane_steps) in enumerate(zip(scene.scales, steps, strict=True)):
         scales.append(
@@ -239,11 +241,11 @@ def quantise_scene(
         round_cameras(scene.cameras),
         scene.mapping,
         None if scene.motion is None else quantise_motion(scene.motion),
-        tuple(Appearance(appearance.name, half(appearance.code, "appearances")) for appearance in scene.appearances),
+        tuple(Appearance(appearance.name, to_half(appearance.code, "appearances")) for appearance in scene.appearances),
     )
 
 
-def reached_by(scene: Scene) -> np.ndarray:
+def reached_cells(scene: Scene) -> np.ndarray:
     """(slots, Nz, Ny, Nx) bool: the cells of the planes' [0, 1]^3 in which what is occupied is looked up."""
     occupancy = np.asarray(scene.occupancy, bool)
     return occupancy if scene.motion is None else reached_cells(occupancy, scene.motion)
@@ -255,10 +257,10 @@ def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) ->
     Args:
         occupancy: (slots, Nz, Ny, Nx) bool. plane: its name, such as "xy" or "zt".
     """
-    return needed_rows(seen_along(occupancy, plane), rows, columns, range(rows))
+    return needed_rows(project_occupancy(occupancy, plane), rows, columns, range(rows))
 
 
-def seen_along(occupancy: np.ndarray, plane: str) -> np.ndarray:
+def project_occupancy(occupancy: np.ndarray, plane: str) -> np.ndarray:
     """(cells down, cells across) bool: where any cell is occupied, seen along the axes that a plane does not have."""
     axes = {"t": 0, "z": 1, "y": 2, "x": 3}
     across, down = axes[plane[0]], axes[plane[1]]
@@ -268,7 +270,7 @@ def seen_along(occupancy: np.ndarray, plane: str) -> np.ndarray:
 
 
 def needed_rows(seen: np.ndarray, rows: int, columns: int, some: range) -> np.ndarray:
-    """Some rows of `needed_texels`, by `seen_along`. Takes no more memory than they do, and a row of cells."""
+    """Some rows of `needed_texels`, by `project_occupancy`. Takes no more memory than they do, and a row of cells."""
     needed = np.empty((len(some), columns), bool)
     _mark_met(
         seen,
@@ -313,13 +315,13 @@ def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) ->
     if not np.isfinite(decoder.density_bias):
         raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
     shorter = {
-        name: half(_to_places(value, bits[name]) if bits and name in bits else value)
-        for name, value in weights_of(decoder).items()
+        name: to_half(_to_places(value, bits[name]) if bits and name in bits else value)
+        for name, value in decoder_arrays(decoder).items()
     }
     return replace(decoder, **shorter, density_bias=float(np.float32(decoder.density_bias)))
 
 
-def weights_of(decoder: AnyDecoder) -> dict[str, np.ndarray]:
+def decoder_arrays(decoder: AnyDecoder) -> dict[str, np.ndarray]:
     """Its arrays: all but the density bias."""
     return {name: value for name, value in vars(decoder).items() if name != "density_bias"}
 
@@ -336,7 +338,7 @@ def _to_places(values: np.ndarray, bits: int) -> np.ndarray:
     return np.ldexp(np.rint(np.ldexp(values, -place)), place)
 
 
-def half(weights: np.ndarray, what: str = "decoder") -> np.ndarray:
+def to_half(weights: np.ndarray, what: str = "decoder") -> np.ndarray:
     """Numbers rounded to float16, as float32.
 
     Raises:
@@ -351,8 +353,8 @@ def round_cameras(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
     """Cameras with focal lengths and principal points rounded to CAMERA_BITS, and poses to turns and places, `kpc.format.coding.poses`; where they
     are more than those, to float32."""
     lenses = tuple(_with_short_lens(camera) for camera in cameras)
-    if lenses and rigid(lenses):
-        return rounded(lenses)
+    if lenses and are_rigid(lenses):
+        return round_poses(lenses)
     return tuple(
         replace(camera, camera_to_world=camera.camera_to_world.astype(np.float32).astype(np.float64))
         for camera in lenses

@@ -7,15 +7,9 @@ so an encoder first writes down every decision and its probability (the *trace*)
 Compiled with numba; with NUMBA_DISABLE_JIT=1 the same lines run as plain Python.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-from kpc.format.common import compiling
 from kpc.format.common.errors import FormatError
-from numba import njit
-
-compiling.register()
+from kpc.format.common.jit import compiled, inlined
 
 LOWEST_STATE = 1 << 16
 """The state lies in [2^16, 2^32) between decisions. An encoder begins at 2^16, so there a decoder must end."""
@@ -23,39 +17,22 @@ SCALE_BITS = 12
 SCALE = 1 << SCALE_BITS
 WORD_BITS = 16
 
-EVEN = 1 << 15
+EVEN_PROBABILITY = 1 << 15
 """A counter that knows nothing."""
-PATIENCE = 120
+ADAPTATION_LIMIT = 120
 """Decisions after which a counter no longer slows down: it forgets with a time constant of that many."""
-RATES = np.array([327680 // (5 * n + 8) for n in range(PATIENCE + 1)])
+RATES = np.array([327680 // (5 * n + 8) for n in range(ADAPTATION_LIMIT + 1)])
 """How far, out of 2^16, the nth decision moves its counter: 1 / (n + 1.6), a little faster than the plain mean of n."""
 
 
-def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """numba's njit, cached on disk where numba finds a folder to write to (the package's, else the user's), without a GIL."""
-
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        try:
-            return njit(cache=True, nogil=True, **options)(function)
-        except RuntimeError:  # no such folder at all: compiled anew by each process
-            return njit(nogil=True, **options)(function)
-
-    return decorate
-
-
-inlined = compiled(forceinline=True, _nrt=False)
-"""`compiled` into its callers, without counting who holds an array, for what makes and returns none. Atomic as it is, to count them at every
-call takes a decoder three quarters of its time; numba has no public name for leaving that out."""
-
-
 @compiled()
-def counters(count):
+def new_models(count):
     """(count,) int32 of counters that know nothing: the probability of a 1 out of 2^16, times 256, plus decisions seen."""
-    return np.full(count, EVEN << 8, np.int32)
+    return np.full(count, EVEN_PROBABILITY << 8, np.int32)
 
 
 @inlined
-def decide(bit, probability, state, at, words, trace):
+def code_bit(bit, probability, state, at, words, trace):
     """One decision of a given probability of 1, out of SCALE: (bit, state, at).
 
     Encoding (`words` is None): trace[at] = probability, negative for a 0. Decoding (`trace` is None): the bit comes from `state`
@@ -81,21 +58,21 @@ def decide(bit, probability, state, at, words, trace):
 
 
 @inlined
-def adapt(bit, table, which, state, at, words, trace):
-    """`decide` with the probability of a counter, which then learns the bit."""
+def code_bit_adaptive(bit, table, which, state, at, words, trace):
+    """`code_bit` with the probability of a counter, which then learns the bit."""
     counter = int(table[which])
     p, n = counter >> 8, counter & 255
-    bit, state, at = decide(bit, p >> 16 - SCALE_BITS, state, at, words, trace)
+    bit, state, at = code_bit(bit, p >> 16 - SCALE_BITS, state, at, words, trace)
     if bit:
         p += (65536 - p) * RATES[n] >> 16
     else:
         p -= p * RATES[n] >> 16
-    table[which] = p << 8 | min(n + 1, PATIENCE)
+    table[which] = p << 8 | min(n + 1, ADAPTATION_LIMIT)
     return bit, state, at
 
 
 @inlined
-def doublings(number):
+def log_class(number):
     """The logarithm of a number from 0 on, two for each doubling: 0, 1, 2, 3, then 4 from 4 on, 5 from 6 on, 6 from 8 on."""
     bits = 0
     while number >> bits:
@@ -104,33 +81,33 @@ def doublings(number):
 
 
 @inlined
-def integer(value, table, first, unary, escapes, state, at, words, trace):
+def code_signed(value, table, first, unary, escapes, state, at, words, trace):
     """Code or decode an integer in the context whose 2 + 2 (unary + escapes) counters begin at `first`: (value, state, at).
 
     Magnitudes of 1 to `unary` take a decision each; of larger ones the number of bits, up to `escapes`, comes first.
     """
-    bit, state, at = adapt(1 if value != 0 else 0, table, first, state, at, words, trace)
+    bit, state, at = code_bit_adaptive(1 if value != 0 else 0, table, first, state, at, words, trace)
     if not bit:
         return 0, state, at
-    positive, state, at = adapt(1 if value > 0 else 0, table, first + 1, state, at, words, trace)
+    positive, state, at = code_bit_adaptive(1 if value > 0 else 0, table, first + 1, state, at, words, trace)
     first += 2 if positive else 2 + unary + escapes
-    magnitude, state, at = natural(abs(value), table, first, unary, escapes, state, at, words, trace)
+    magnitude, state, at = code_unsigned(abs(value), table, first, unary, escapes, state, at, words, trace)
     return magnitude if positive else -magnitude, state, at
 
 
 @inlined
-def natural(value, table, first, unary, escapes, state, at, words, trace):
+def code_unsigned(value, table, first, unary, escapes, state, at, words, trace):
     """Code or decode a number from 1 on, by unary + escapes counters from `first` on: (value, state, at)."""
     beyond, found = value - 1, 0
     while found < unary:
-        bit, state, at = adapt(1 if beyond > found else 0, table, first + found, state, at, words, trace)
+        bit, state, at = code_bit_adaptive(1 if beyond > found else 0, table, first + found, state, at, words, trace)
         if not bit:
             break
         found += 1
     if found == unary:  # Exp-Golomb: as many ones as bits follow, a zero, the bits
         rest, bits = beyond - unary + 1, 0
         while bits < escapes:
-            bit, state, at = adapt(
+            bit, state, at = code_bit_adaptive(
                 1 if rest >> bits + 1 != 0 else 0, table, first + unary + bits, state, at, words, trace
             )
             if not bit:
@@ -138,14 +115,14 @@ def natural(value, table, first, unary, escapes, state, at, words, trace):
             bits += 1
         low = 1
         for place in range(bits - 1, -1, -1):
-            bit, state, at = decide(rest >> place & 1, SCALE >> 1, state, at, words, trace)
+            bit, state, at = code_bit(rest >> place & 1, SCALE >> 1, state, at, words, trace)
             low = low << 1 | bit
         found += low - 1
     return found + 1, state, at
 
 
 @compiled()
-def words_of(trace):
+def trace_words(trace):
     """A trace as the words that a decoder reads, the first two of them its state: (N,) uint16."""
     backwards = np.empty(trace.size + 2, np.uint16)
     state, count = LOWEST_STATE, 0
@@ -165,13 +142,13 @@ def words_of(trace):
     return backwards[: count + 2][::-1].copy()
 
 
-def stream(trace: np.ndarray) -> bytes:
-    """A trace as the bytes that `opened` takes: state (u32) and words (u16)."""
-    return bytes(words_of(trace).astype("<u2").tobytes())
+def encode_trace(trace: np.ndarray) -> bytes:
+    """A trace as the bytes that `open_stream` takes: state (u32) and words (u16)."""
+    return bytes(trace_words(trace).astype("<u2").tobytes())
 
 
-def opened(body: bytes, what: str) -> tuple[int, np.ndarray]:
-    """The first state and the (N,) uint16 words of a `stream`; `what` it is of, for messages.
+def open_stream(body: bytes, what: str) -> tuple[int, np.ndarray]:
+    """The first state and the (N,) uint16 words of a `encode_trace`; `what` it is of, for messages.
 
     Raises:
         FormatError: it is cut, or its state is none.
@@ -184,7 +161,7 @@ def opened(body: bytes, what: str) -> tuple[int, np.ndarray]:
     return state, np.frombuffer(body, "<u2", offset=4).astype(np.uint16)
 
 
-def ended(state: int, at: int, words: np.ndarray, what: str) -> None:
+def check_end(state: int, at: int, words: np.ndarray, what: str) -> None:
     """Check that after the last decision all words are taken and the state is an encoder's first.
 
     Raises:

@@ -16,7 +16,7 @@ FILTER_COUNT = 4
 MAP_ABSENT, MAP_PRESENT = 0, 1
 
 
-def encode_segment(symbols: np.ndarray, coded: np.ndarray) -> list[bytes]:
+def encode_raw_segment(symbols: np.ndarray, coded: np.ndarray) -> list[bytes]:
     """Pack (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False; each channel gets the filter of least entropy.
 
     Returns:
@@ -32,8 +32,8 @@ def encode_segment(symbols: np.ndarray, coded: np.ndarray) -> list[bytes]:
     return [bytes([flag]) + coded_map + filters.tobytes(), *(candidates[f][m].tobytes() for m, f in enumerate(filters))]
 
 
-def decode_segment(payload: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Undo `encode_segment`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels.
+def decode_raw_segment(payload: bytes, rows: int, columns: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Undo `encode_raw_segment`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels.
 
     Raises:
         FormatError: the payload does not have the one length that its map implies, or names an unknown filter.

@@ -9,8 +9,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from kpc.format.coding.rans import compiled, counters, ended, integer, opened, stream
+from kpc.format.coding.rans import check_end, code_signed, encode_trace, new_models, open_stream
 from kpc.format.common.errors import FormatError
+from kpc.format.common.jit import compiled
 
 UNARY, ESCAPES = 4, 10
 DECISIONS = 2 + 2 * (UNARY + ESCAPES)
@@ -37,7 +38,7 @@ def encode_weights(arrays: Sequence[np.ndarray]) -> bytes | None:
         multiples.append(wholes >> shift)
     trace = np.empty(sum(map(len, multiples)) * MOST_DECISIONS, np.int16)
     _, at = _walk(multiples, 0, None, trace)
-    return np.array(powers, np.int8).tobytes() + stream(trace[:at])
+    return np.array(powers, np.int8).tobytes() + encode_trace(trace[:at])
 
 
 def decode_weights(body: bytes, shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
@@ -49,10 +50,10 @@ def decode_weights(body: bytes, shapes: Sequence[tuple[int, ...]]) -> list[np.nd
     powers = np.frombuffer(body[: len(shapes)], np.int8).tolist()
     if any(not FINEST <= power <= COARSEST for power in powers):
         raise FormatError("weights: a power of two is not one of float16's")
-    state, words = opened(body[len(shapes) :], "weights")
+    state, words = open_stream(body[len(shapes) :], "weights")
     multiples = [np.zeros(math.prod(shape), np.int64) for shape in shapes]
     state, at = _walk(multiples, state, words, None)
-    ended(state, at, words, "weights")
+    check_end(state, at, words, "weights")
     arrays = [np.ldexp(wholes.astype(np.float64), power) for wholes, power in zip(multiples, powers, strict=True)]
     if any((abs(wholes) > LARGEST).any() for wholes in multiples) or any(
         (abs(values) > HALF_LIMIT).any() for values in arrays
@@ -75,9 +76,9 @@ def _walk(
 
 @compiled()
 def walk(values, state, at, words, trace):
-    """Code or decode the multiples of an array, by counters of its own: (state, at). The rest as `kpc.format.coding.rans.decide`."""
-    table = counters(DECISIONS)
+    """Code or decode the multiples of an array, by counters of its own: (state, at). The rest as `kpc.format.coding.rans.code_bit`."""
+    table = new_models(DECISIONS)
     for i in range(values.size):
-        value, state, at = integer(values[i], table, 0, UNARY, ESCAPES, state, at, words, trace)
+        value, state, at = code_signed(values[i], table, 0, UNARY, ESCAPES, state, at, words, trace)
         values[i] = value
     return state, at

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from typing import cast
 
 import numpy as np
-from kpc.format.coding.quantise import dequantised
+from kpc.format.coding.quantise import dequantise_symbols
 from kpc.format.container.container import Entry, Reader
 from kpc.format.container.scene_io import KNOWN_KINDS, PlaneHead, SceneReader
 from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, Scene
@@ -48,7 +48,7 @@ class SegmentedPlane:
         return (
             self._missing
             if symbols is None
-            else dequantised(symbols[int(row) - start], self._head.step, self._head.offset)
+            else dequantise_symbols(symbols[int(row) - start], self._head.step, self._head.offset)
         )
 
     def put(self, start: int, symbols: np.ndarray) -> None:
@@ -88,7 +88,7 @@ class PartialScene:
         first_picture = {
             number for number, entry in enumerate(reader.index) if entry.kind in KNOWN_KINDS and entry.kind != "PLNE"
         }
-        hold(reader, runs(reader.index, sorted(first_picture.union(self.needed(1, 0.0, 0.0))))[0])
+        announce(reader, adjacent_runs(reader.index, sorted(first_picture.union(self.needed(1, 0.0, 0.0))))[0])
         motion = reader.motion()
         self._planes: list[dict[str, np.ndarray]] = []
         starts: dict[tuple[int, str], list[int]] = {}
@@ -119,8 +119,8 @@ class PartialScene:
 
     def fetch(self, numbers: Iterable[int]) -> None:
         """Read chunks and put them into the scene; those that lie side by side in one go."""
-        for run in runs(self.reader.index, numbers):
-            hold(self.reader, run)
+        for run in adjacent_runs(self.reader.index, numbers):
+            announce(self.reader, run)
             for number in run:
                 self.put(number, self.reader.segment(number)[0])
 
@@ -131,7 +131,7 @@ class PartialScene:
         if name in TIME_PLANES:
             self._segmented(entry).put(entry.row_start, symbols)
         else:
-            self._planes[entry.scale][name] = dequantised(symbols, plane.step, plane.offset)
+            self._planes[entry.scale][name] = dequantise_symbols(symbols, plane.step, plane.offset)
 
     def drop(self, number: int) -> None:
         """Take a segment out of the scene again."""
@@ -146,7 +146,7 @@ class PartialScene:
         return cast(SegmentedPlane, self._planes[entry.scale][ALL_PLANES[entry.plane]])
 
 
-def runs(index: Sequence[Entry], numbers: Iterable[int], most_bytes: float = float("inf")) -> list[list[int]]:
+def adjacent_runs(index: Sequence[Entry], numbers: Iterable[int], most_bytes: float = float("inf")) -> list[list[int]]:
     """Chunks, in the order given, in groups that lie side by side in the file; a group of several is at most `most_bytes`."""
     found: list[list[int]] = []
     end = size = 0
@@ -161,7 +161,7 @@ def runs(index: Sequence[Entry], numbers: Iterable[int], most_bytes: float = flo
     return found
 
 
-def hold(reader: Reader, run: Sequence[int]) -> None:
+def announce(reader: Reader, run: Sequence[int]) -> None:
     """Tell the source that chunks will be read that lie side by side, in their order."""
     start, last = reader.index[run[0]].offset, reader.index[run[-1]]
     reader.source.will_read(start, last.offset + last.stored_length - start)

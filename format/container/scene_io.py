@@ -22,9 +22,9 @@ from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
-from kpc.format.coding.motion_hierarchical import decode_midpoints, encode_midpoints
+from kpc.format.coding.motion_codec import decode_motion, encode_motion
 from kpc.format.coding.motion_raster import decode_nodes, encode_nodes
-from kpc.format.coding.occupancy_codec import decode_cells, encode_cells
+from kpc.format.coding.occupancy_codec import decode_occupancy, encode_occupancy
 from kpc.format.coding.poses import decode_poses, encode_poses
 from kpc.format.coding.quantise import (
     VALUE_LIMIT,
@@ -32,9 +32,9 @@ from kpc.format.coding.quantise import (
     QuantisedScene,
     needed_rows,
     needed_texels,
-    seen_along,
+    project_occupancy,
 )
-from kpc.format.coding.raw_planes import decode_segment, encode_segment
+from kpc.format.coding.raw_planes import decode_raw_segment, encode_raw_segment
 from kpc.format.coding.weights import decode_weights, encode_weights
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import BudgetError, DatasetError, FormatError
@@ -52,15 +52,15 @@ from kpc.format.container.container import (
     pack,
 )
 from kpc.format.container.segments import (
-    SegmentGuide,
+    SegmentSideInfo,
+    choose_codec,
     codec_of,
-    decode_coded,
-    form_of,
-    guide_at,
-    guide_together,
-    rows_of_segments,
-    segment_guide,
-    wants_occupancy,
+    decode_segment,
+    merge_side_info,
+    needs_occupancy,
+    rows_per_segment,
+    side_info_at,
+    side_info_of,
 )
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import DISPLACEMENT_LIMIT, QuantisedMotion
@@ -90,7 +90,7 @@ NDC_STRUCT = struct.Struct("<I12ddd")
 """which mapping (DEVICE_COORDINATES), rows of the frame, near, baseline"""
 MOTION_STRUCT = struct.Struct("<4Hf")
 """T, Nz, Ny, Nx, step"""
-MOTION_CODECS = {CODEC_SYMBOLS: decode_nodes, CODEC_MIDPOINTS: decode_midpoints}
+MOTION_CODECS = {CODEC_SYMBOLS: decode_nodes, CODEC_MIDPOINTS: decode_motion}
 """What decodes a motion grid that is context-coded."""
 DECODER_STRUCT = struct.Struct("<HHf")
 """features, hidden, density_bias"""
@@ -237,11 +237,13 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> l
     for _, number, of_plane, start, stop in sorted(segments):
         plane = scene.scales[number][ALL_PLANES[of_plane]]
         segment, coded = plane.symbols[start:stop], plane.coded[start:stop]
-        form = form_of(segment, coded, guide_at(plane.guide, start), implied[number][ALL_PLANES[of_plane]][start:stop])
+        form = choose_codec(
+            segment, coded, side_info_at(plane.side_info, start), implied[number][ALL_PLANES[of_plane]][start:stop]
+        )
         chunks.append(
             Chunk(
                 "PLNE",
-                encode_segment(segment, coded),
+                encode_raw_segment(segment, coded),
                 number,
                 of_plane,
                 start,
@@ -256,7 +258,7 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> l
 def _segments_of(plane: QuantisedPlane, over_time: bool, segment_rows: int | None) -> list[tuple[int, int]]:
     """First rows, and the rows after the last."""
     rows = len(plane.symbols)
-    usual = rows_of_segments(rows, over_time)
+    usual = rows_per_segment(rows, over_time)
     starts = plane.starts or range(0, rows, segment_rows if segment_rows and over_time else usual)
     return list(pairwise([*starts, rows]))
 
@@ -341,7 +343,7 @@ def _motion_chunk(motion: QuantisedMotion) -> Chunk:
         symbol_count=len(raw),
         coded={
             CODEC_SYMBOLS: lambda: head + encode_nodes(symbols),
-            CODEC_MIDPOINTS: lambda: head + encode_midpoints(symbols),
+            CODEC_MIDPOINTS: lambda: head + encode_motion(symbols),
         },
     )
 
@@ -352,7 +354,9 @@ def _occupancy_chunk(occupancy: np.ndarray) -> Chunk:
     slots_last = np.moveaxis(occupancy, 0, -1)  # a cell that never changes makes a run of equal bits
     head = OCCUPANCY_STRUCT.pack(*occupancy.shape)
     raw = head + np.packbits(slots_last, bitorder="little").tobytes()
-    return Chunk("OCCU", [raw], coded={CODEC_SYMBOLS: lambda: head + encode_cells(occupancy)}, symbol_count=len(raw))
+    return Chunk(
+        "OCCU", [raw], coded={CODEC_SYMBOLS: lambda: head + encode_occupancy(occupancy)}, symbol_count=len(raw)
+    )
 
 
 def _cameras_chunk(cameras: tuple[Camera, ...]) -> Chunk:
@@ -370,7 +374,7 @@ def _pack_appearances(appearances: tuple[Appearance, ...], hidden: int) -> bytes
     if any(np.shape(code) != (hidden,) for code in codes):
         raise FormatError(f"appearances: codes of shapes {sorted({np.shape(code) for code in codes})}, not {(hidden,)}")
     if any(not np.array_equal(code, code.astype(np.float16)) for code in codes):
-        raise FormatError("appearances: the codes are not rounded to float16 (kpc.format.coding.quantise.half)")
+        raise FormatError("appearances: the codes are not rounded to float16 (kpc.format.coding.quantise.to_half)")
     names = [
         appearance.name.encode(errors="surrogatepass") for appearance in appearances
     ]  # the parser refuses surrogates
@@ -422,9 +426,11 @@ def read(
     for entry in reader.index:
         if entry.kind == "PLNE":
             starts.setdefault((entry.scale, ALL_PLANES[entry.plane]), []).append(entry.row_start)
-    guides: dict[tuple[int, str], dict[int, SegmentGuide | None]] = {}
+    guides: dict[tuple[int, str], dict[int, SegmentSideInfo | None]] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for number, (decoded, coded, guide) in zip(segments, pool.map(reader.guided_segment, segments), strict=True):
+        for number, (decoded, coded, side_info) in zip(
+            segments, pool.map(reader.segment_with_side_info, segments), strict=True
+        ):
             entry = reader.index[number]
             name = ALL_PLANES[entry.plane]
             plane, rows = scales[entry.scale][name], slice(entry.row_start, entry.row_start + entry.row_count)
@@ -432,10 +438,10 @@ def read(
                 scales[entry.scale][name] = replace(plane, symbols=decoded, coded=coded)
             else:
                 plane.symbols[rows], plane.coded[rows] = decoded, coded
-            guides.setdefault((entry.scale, name), {})[entry.row_start] = guide
+            guides.setdefault((entry.scale, name), {})[entry.row_start] = side_info
     for (s, name), of_segments in guides.items():
         scales[s][name] = replace(
-            scales[s][name], guide=guide_together(of_segments), starts=tuple(sorted(starts[s, name]))
+            scales[s][name], side_info=merge_side_info(of_segments), starts=tuple(sorted(starts[s, name]))
         )
     for number, entry in enumerate(reader.index):
         if entry.kind not in KNOWN_KINDS and reader.available(number):
@@ -508,17 +514,17 @@ class SceneReader(Reader):
 
     def segment(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Decode a PLNE chunk: (row_count, W, M) int8 symbols and (row_count, W) bool coded texels."""
-        symbols, coded, _ = self.guided_segment(number)
+        symbols, coded, _ = self.segment_with_side_info(number)
         return symbols, coded
 
-    def guided_segment(self, number: int) -> tuple[np.ndarray, np.ndarray, SegmentGuide | None]:
+    def segment_with_side_info(self, number: int) -> tuple[np.ndarray, np.ndarray, SegmentSideInfo | None]:
         """The same, and by which the symbols were chosen, if by any."""
         entry = self.index[number]
         plane = self.head.scales[entry.scale][ALL_PLANES[entry.plane]]
         texels, shape = entry.row_count * plane.columns, (entry.row_count, plane.columns, plane.channels)
         if entry.codec not in (CODEC_SYMBOLS, CODEC_THIRD):
             payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * (1 + texels))
-            return *self._parsed(lambda raw: decode_segment(raw, *shape), payload), None
+            return *self._parsed(lambda raw: decode_raw_segment(raw, *shape), payload), None
         if entry.raw_length != texels * plane.channels:
             raise FormatError(
                 f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
@@ -531,10 +537,10 @@ class SceneReader(Reader):
             )
 
         implied = None
-        if wants_occupancy(body):
+        if needs_occupancy(body):
             rows = range(entry.row_start, entry.row_start + entry.row_count)
             implied = needed_rows(self._seen_along(ALL_PLANES[entry.plane]), plane.rows, plane.columns, rows)
-        return self._parsed(lambda body: (*decode_coded(body, *shape, implied), segment_guide(body)), body)
+        return self._parsed(lambda body: (*decode_segment(body, *shape, implied), side_info_of(body)), body)
 
     def mapping(self) -> SpaceMapping | None:
         """The WARP chunk; None, a scene that is its box, if the file has no such chunk."""
@@ -586,11 +592,11 @@ class SceneReader(Reader):
         return self._occupancy
 
     def _seen_along(self, plane: str) -> np.ndarray:
-        """`kpc.format.coding.quantise.seen_along` of the occupancy."""
+        """`kpc.format.coding.quantise.project_occupancy` of the occupancy."""
         if plane not in self._seen:
             occupancy = self.occupancy()
             self._afford(occupancy.size, "what its occupancy implies")
-            self._seen[plane] = seen_along(occupancy, plane)
+            self._seen[plane] = project_occupancy(occupancy, plane)
         return self._seen[plane]
 
     @cached_property
@@ -874,7 +880,7 @@ def _parse_coded_occupancy(body: bytes, raw_length: int) -> np.ndarray:
     shape = _occupancy_shape(cursor)
     if raw_length != OCCUPANCY_STRUCT.size + -(-math.prod(shape) // 8):
         raise FormatError(f"OCCU: claims {raw_length:,} bytes, not those of a grid of {shape} cells")
-    return decode_cells(cursor.rest(), shape)
+    return decode_occupancy(cursor.rest(), shape)
 
 
 def _occupancy_shape(cursor: "_Cursor") -> tuple[int, ...]:
@@ -933,7 +939,7 @@ def _parse_appearances(raw: bytes, expected_hidden: int) -> tuple[Appearance, ..
             name = cursor.take(length).decode()
         except UnicodeDecodeError as error:
             raise FormatError(f"appe: the name of appearance {number} is not UTF-8") from error
-        if not is_name(name) or name in known:
+        if not is_valid_name(name) or name in known:
             raise FormatError(
                 f"appe: the name of appearance {number} is empty, holds a control character, or is there twice"
             )
@@ -943,7 +949,7 @@ def _parse_appearances(raw: bytes, expected_hidden: int) -> tuple[Appearance, ..
     return tuple(appearances)
 
 
-def is_name(text: str) -> bool:
+def is_valid_name(text: str) -> bool:
     """Whether an appearance may be called so: 1 to NAME_LIMIT bytes of UTF-8, no control characters, which a terminal
     might obey."""
     encoded = text.encode(errors="replace")

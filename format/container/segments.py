@@ -5,7 +5,15 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from kpc.format.coding.predictive import IMPLIED, THIRD, Guide, decode_symbols, encode_symbols, guide_of, map_flags
+from kpc.format.coding.predictive import (
+    IMPLIED,
+    THIRD,
+    PredictionWeights,
+    decode_symbols,
+    encode_symbols,
+    map_mode,
+    weights_in,
+)
 from kpc.format.coding.transform import decode_blocks, holds_blocks
 from kpc.format.common.errors import FormatError
 from kpc.format.container.container import CODEC_SYMBOLS, CODEC_THIRD
@@ -16,7 +24,7 @@ counters that know nothing. With 16 rows files of room and soldier are two and t
 frames have it, shelf_hand's are. And rows, of which segments have a multiple: blocks do not end with them (`kpc.format.coding.transform`)."""
 
 
-def rows_of_segments(rows: int, over_time: bool) -> int:
+def rows_per_segment(rows: int, over_time: bool) -> int:
     """In each segment, but the last, of a plane of so many rows: all of a space plane's."""
     if not over_time:
         return rows
@@ -25,7 +33,7 @@ def rows_of_segments(rows: int, over_time: bool) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class TransformSegments:
     """A plane that is told in blocks. Its symbols follow from these, which cannot be found from them.
 
     Attributes:
@@ -35,42 +43,42 @@ class Told:
     segments: Mapping[int, bytes]
 
 
-PlaneGuide = Guide | Told
-SegmentGuide = Guide | bytes
+PlaneSideInfo = PredictionWeights | TransformSegments
+SegmentSideInfo = PredictionWeights | bytes
 
 
-def guide_at(guide: PlaneGuide | None, start: int) -> SegmentGuide | None:
+def side_info_at(side_info: PlaneSideInfo | None, start: int) -> SegmentSideInfo | None:
     """Of the segment that begins in a row."""
-    return guide.segments.get(start) if isinstance(guide, Told) else guide
+    return side_info.segments.get(start) if isinstance(side_info, TransformSegments) else side_info
 
 
-def guide_together(guides: Mapping[int, SegmentGuide | None]) -> PlaneGuide | None:
+def merge_side_info(guides: Mapping[int, SegmentSideInfo | None]) -> PlaneSideInfo | None:
     """Of a plane whose segments, by their first rows, have these: of those in blocks if there are any, else the one that all have that have any
     (what has none was smaller as it is)."""
-    if bodies := {start: guide for start, guide in guides.items() if isinstance(guide, bytes)}:
-        return Told(bodies)
-    known = [guide for guide in guides.values() if isinstance(guide, Guide)]
-    return known[0] if known and all(guide == known[0] for guide in known) else None
+    if bodies := {start: side_info for start, side_info in guides.items() if isinstance(side_info, bytes)}:
+        return TransformSegments(bodies)
+    known = [side_info for side_info in guides.values() if isinstance(side_info, PredictionWeights)]
+    return known[0] if known and all(side_info == known[0] for side_info in known) else None
 
 
-def encode_coded(
-    symbols: np.ndarray, coded: np.ndarray, guide: SegmentGuide | None = None, implied: np.ndarray | None = None
+def encode_segment(
+    symbols: np.ndarray, coded: np.ndarray, side_info: SegmentSideInfo | None = None, implied: np.ndarray | None = None
 ) -> bytes:
-    """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: as their guide has it, if it does, else symbol by symbol. `implied`:
+    """Code (H, W, M) int8 symbols, 0 wherever (H, W) `coded` is False: as their side_info has it, if it does, else symbol by symbol. `implied`:
     `kpc.format.coding.quantise.needed_texels`, if a reader knows them."""
-    return form_of(symbols, coded, guide, implied)[1]()
+    return choose_codec(symbols, coded, side_info, implied)[1]()
 
 
-def form_of(
-    symbols: np.ndarray, coded: np.ndarray, guide: SegmentGuide | None, implied: np.ndarray | None
+def choose_codec(
+    symbols: np.ndarray, coded: np.ndarray, side_info: SegmentSideInfo | None, implied: np.ndarray | None
 ) -> tuple[int, Callable[[], bytes]]:
-    """The codec of what `encode_coded` makes, and what makes it."""
-    if isinstance(guide, bytes):
-        if _tells(guide, symbols, coded, implied):
-            return codec_of(guide), partial(bytes, guide)
-        guide = None
-    codec = CODEC_THIRD if map_flags(coded, implied) & THIRD else CODEC_SYMBOLS
-    return codec, partial(encode_symbols, symbols, coded, guide, implied)
+    """The codec of what `encode_segment` makes, and what makes it."""
+    if isinstance(side_info, bytes):
+        if _tells(side_info, symbols, coded, implied):
+            return codec_of(side_info), partial(bytes, side_info)
+        side_info = None
+    codec = CODEC_THIRD if map_mode(coded, implied) & THIRD else CODEC_SYMBOLS
+    return codec, partial(encode_symbols, symbols, coded, side_info, implied)
 
 
 def _tells(body: bytes, symbols: np.ndarray, coded: np.ndarray, implied: np.ndarray | None) -> bool:
@@ -83,15 +91,15 @@ def _tells(body: bytes, symbols: np.ndarray, coded: np.ndarray, implied: np.ndar
 
 
 def codec_of(body: bytes) -> int:
-    """Of what `encode_coded` made."""
+    """Of what `encode_segment` made."""
     return CODEC_THIRD if len(body) > 1 and body[1] & THIRD else CODEC_SYMBOLS
 
 
-def decode_coded(
+def decode_segment(
     body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Undo `encode_coded`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels. `implied`: those, where the
-    body `wants_occupancy`.
+    """Undo `encode_segment`: (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels. `implied`: those, where the
+    body `needs_occupancy`.
 
     Raises:
         FormatError: the body is cut, too long, or says what only a damaged one would.
@@ -100,15 +108,15 @@ def decode_coded(
     return decode(body, rows, columns, channels, implied)
 
 
-def wants_occupancy(body: bytes) -> bool:
+def needs_occupancy(body: bytes) -> bool:
     """Whether occupancy says which texels are coded."""
     return len(body) > 1 and body[1] & IMPLIED != 0
 
 
-def segment_guide(body: bytes) -> SegmentGuide | None:
-    """Of what `decode_coded` decodes.
+def side_info_of(body: bytes) -> SegmentSideInfo | None:
+    """Of what `decode_segment` decodes.
 
     Raises:
-        FormatError: as `decode_coded`.
+        FormatError: as `decode_segment`.
     """
-    return bytes(body) if holds_blocks(body) else guide_of(body)
+    return bytes(body) if holds_blocks(body) else weights_in(body)

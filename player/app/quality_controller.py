@@ -11,7 +11,7 @@ LEVEL_NAMES = tuple(LADDER)
 TOO_SLOW, ROOM = 1.1, 0.85
 """Of the time a picture may take: down from above the one; up if the finer rung is expected to stay below the other."""
 DOWN_AFTER, UP_AFTER = 3, 12
-"""Pictures seen on a rung before it is left: slowness hurts at once, fineness can wait."""
+"""Pictures seen on a rung before it is left: slowness hurts at once, step_offsets can wait."""
 GUESS = 1.5
 """How much longer the next rung takes, until it has been tried."""
 UNSETTLED = 1

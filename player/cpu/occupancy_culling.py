@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from kpc.format.coding.rans import compiled
+from kpc.format.common.jit import compiled
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, SPACE_PLANES, Decoder, Scene
 from kpc.format.scene.space import Contraction

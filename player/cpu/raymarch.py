@@ -13,7 +13,7 @@ may look at 290,000.
 import math
 
 import numpy as np
-from kpc.format.coding.rans import compiled
+from kpc.format.common.jit import compiled
 from kpc.format.scene import space
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
 from kpc.player.cpu.reference import PARALLEL

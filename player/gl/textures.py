@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from kpc.format.coding.rans import compiled
+from kpc.format.common.jit import compiled
 from kpc.format.scene.grid import dilate, sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder, Scene
 from kpc.player.cpu.threads import share_out

@@ -15,11 +15,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from kpc.format.coding.quantise import dequantised
+from kpc.format.coding.quantise import dequantise_symbols
 from kpc.format.common.compiling import MONITOR, NOTICE
 from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, KpcError
 from kpc.format.container.container import DEFAULT_BUDGET, Reader, RemoteSource, Source
-from kpc.format.container.partial import PartialScene, hold, runs
+from kpc.format.container.partial import PartialScene, adjacent_runs, announce
 from kpc.format.container.scene_io import SceneReader
 from kpc.format.scene.scene import ALL_PLANES, Scene
 from kpc.player.cpu.corner_grid import Baking
@@ -309,8 +309,8 @@ class Stream:
             self._taken[position], self._under_way = True, position
         number = int(self.parts.numbers[position])
         if number not in held:
-            held = runs(self._reader.index, map(int, self.parts.numbers[wanted[:RUN_CHUNKS]]), RUN_BYTES)[0]
-            hold(self._reader, held)
+            held = adjacent_runs(self._reader.index, map(int, self.parts.numbers[wanted[:RUN_CHUNKS]]), RUN_BYTES)[0]
+            announce(self._reader, held)
         return position, held
 
     def _is_full(self, position: int) -> bool:
@@ -333,7 +333,7 @@ class Stream:
         if self.parts.moves[position]:
             return Piece(position, number, symbols)
         plane = self.parts.head_of(number)
-        return Piece(position, number, self._layout.texels(dequantised(symbols, plane.step, plane.offset)))
+        return Piece(position, number, self._layout.texels(dequantise_symbols(symbols, plane.step, plane.offset)))
 
     def _hear(self, message: str | None) -> None:
         self._trouble = message

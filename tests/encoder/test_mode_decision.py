@@ -9,11 +9,11 @@ from kpc.encoder.rdo import mode_decision
 from kpc.encoder.rdo.distortion import NO_CORRELATION, total_distortion
 from kpc.encoder.rdo.mode_decision import quantise_by_cost, requested_step
 from kpc.encoder.rdo.trellis import LOW_RATE_BITS, trellis_quantise
-from kpc.format.coding.predictive import Guide
+from kpc.format.coding.predictive import PredictionWeights
 from kpc.format.coding.quantise import QuantisedPlane, quantise_plane
-from kpc.format.coding.transform import FINENESSES, USUAL
+from kpc.format.coding.transform import DEFAULT_OFFSET, OFFSET_COUNT
 from kpc.format.container import scene_io
-from kpc.format.container.segments import Told
+from kpc.format.container.segments import TransformSegments
 from scenes import tiny_scene
 from test_trellis import waves
 
@@ -59,7 +59,7 @@ def test_a_time_plane_that_is_nearly_1_is_told_without_a_map_and_is_1_where_noth
     found = mode_decision._cheapest(
         rounded, values, steps, np.ones_like(values), True, NO_CORRELATION, LOW_RATE_BITS, everywhere, everywhere
     )
-    assert isinstance(found.guide, Told) and found.coded.all()
+    assert isinstance(found.side_info, TransformSegments) and found.coded.all()
     assert (found.dequantise()[:, 64:] == 1).all()
     mapped = in_blocks(values, 1.0, identity=True, side=16)[0]
     assert (
@@ -94,9 +94,9 @@ def test_errors_are_smaller_where_they_are_worth_more() -> None:
         and size < 0.9 * as_ever
     )
     told = search._fineness(significant, np.ones((64, 64), bool), np.ones((8, 8), bool), 8)
-    assert (told[:, 4:] > told[:, :4]).all() and told.min() >= 0 and told.max() < FINENESSES
+    assert (told[:, 4:] > told[:, :4]).all() and told.min() >= 0 and told.max() < OFFSET_COUNT
     assert (
-        search._fineness(np.ones_like(significant), np.ones((64, 64), bool), np.ones((8, 8), bool), 8) == USUAL
+        search._fineness(np.ones_like(significant), np.ones((64, 64), bool), np.ones((8, 8), bool), 8) == DEFAULT_OFFSET
     ).all()
 
 
@@ -104,9 +104,9 @@ def test_time_planes_are_told_by_segments_and_the_identity_stays() -> None:
     values = np.ones((96, 40, 3), np.float32)
     values[:64, 20:] += waves(6, 64, 20) / 10
     plane, size = in_blocks(values, 0.5, identity=True)
-    assert isinstance(plane.guide, Told) and sorted(plane.guide.segments) == [0, 32, 64]
+    assert isinstance(plane.side_info, TransformSegments) and sorted(plane.side_info.segments) == [0, 32, 64]
     assert (
-        size == sum(map(len, plane.guide.segments.values())) and len(plane.guide.segments[64]) < 20
+        size == sum(map(len, plane.side_info.segments.values())) and len(plane.side_info.segments[64]) < 20
     )  # nothing to tell
     assert (
         (plane.dequantise()[:, :20] == 1).all() and not plane.coded[:, :20].any() and plane.coded[:64, 20:].mean() > 0.5
@@ -151,8 +151,8 @@ def test_files_keep_what_is_told_and_say_for_which_steps() -> None:
         {name: np.full(plane.shape[2], 0.4, np.float32) for name, plane in scale.items()} for scale in scene.scales
     ]
     quantised = quantise_by_cost(scene, steps)
-    kinds = {type(plane.guide) for scale in quantised.scales for plane in scale.values()}
-    assert Told in kinds
+    kinds = {type(plane.side_info) for scale in quantised.scales for plane in scale.values()}
+    assert TransformSegments in kinds
     data = scene_io.encode(quantised)
     back = scene_io.read(data)
     assert scene_io.encode(back) == data
@@ -160,10 +160,11 @@ def test_files_keep_what_is_told_and_say_for_which_steps() -> None:
         for name in ours:
             np.testing.assert_array_equal(ours[name].symbols, theirs[name].symbols)
             np.testing.assert_array_equal(ours[name].coded, theirs[name].coded)
-            if isinstance(ours[name].guide, Told):
+            if isinstance(ours[name].side_info, TransformSegments):
                 np.testing.assert_allclose(requested_step(ours[name]), 0.4, rtol=2**-7)
     forgotten = replace(
-        back, scales=tuple({name: replace(plane, guide=None) for name, plane in scale.items()} for scale in back.scales)
+        back,
+        scales=tuple({name: replace(plane, side_info=None) for name, plane in scale.items()} for scale in back.scales),
     )
     assert len(scene_io.encode(forgotten)) > len(data)
     assert (
@@ -171,4 +172,7 @@ def test_files_keep_what_is_told_and_say_for_which_steps() -> None:
         == back.scales[0]["xy"].symbols.tobytes()
     )
     without = quantise_by_cost(scene, steps, blocks=False)
-    assert {type(plane.guide) for scale in without.scales for plane in scale.values()} <= {Guide, type(None)}
+    assert {type(plane.side_info) for scale in without.scales for plane in scale.values()} <= {
+        PredictionWeights,
+        type(None),
+    }

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from grids import swaying
+from codec_inputs import swaying
 from kpc.encoder.evaluation.validation_rays import Fidelity
 from kpc.encoder.rdo.motion_rdo import MAX_MULTIPLE, SHARE, coarsen_motion, quantise_motion
-from kpc.format.coding.motion_hierarchical import encode_midpoints
+from kpc.format.coding.motion_codec import encode_motion
 from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene, with_motion
@@ -53,7 +53,7 @@ def test_what_matters_is_near_to_what_is_wanted_and_what_does_not_takes_next_to_
     worth[:, :, :3] = 1.0
     found = quantise_motion(wanted, worth)
     assert np.abs(found - wanted)[:, :, :3].mean() < 1.5 * np.abs(rounded - wanted).mean()
-    assert len(encode_midpoints(found.astype(np.int16))) < 0.75 * len(encode_midpoints(rounded))
+    assert len(encode_motion(found.astype(np.int16))) < 0.75 * len(encode_motion(rounded))
 
 
 def test_noise_that_is_worth_telling_is_told_as_it_is():

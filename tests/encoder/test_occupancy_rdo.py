@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grids import rolling
+from codec_inputs import rolling
 from kpc.encoder.evaluation.validation_rays import Fidelity, ValidationRays
 from kpc.encoder.rdo import occupancy_rdo
 from kpc.encoder.rdo.occupancy_rdo import CONTRAST, count_contexts, flip_cells, optimise_occupancy, removal_errors
-from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS, encode_cells
-from kpc.format.coding.rans import adapt, counters, stream
+from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS, encode_occupancy
+from kpc.format.coding.rans import code_bit_adaptive, encode_trace, new_models
 from kpc.format.scene.grid import dilate
 from scenes import tiny_scene
 
@@ -22,19 +22,19 @@ SCENE = tiny_scene()
 def test_contexts_are_those_of_the_coder():
     """The same grid, coded cell by cell in the contexts that the search sees."""
     occupancy = rolling(3, 6, 7, 8)
-    told, table, trace, at = occupancy.astype(np.uint8), counters(CONTEXTS), np.empty(occupancy.size, np.int16), 0
+    told, table, trace, at = occupancy.astype(np.uint8), new_models(CONTEXTS), np.empty(occupancy.size, np.int16), 0
     for place in np.ndindex(told.shape):
-        _, _, at = adapt(
+        _, _, at = code_bit_adaptive(
             int(told[place]), table, occupancy_rdo.context_at(told, *place, NEIGHBOURS), 0, at, None, trace
         )
-    assert stream(trace) == encode_cells(occupancy)
+    assert encode_trace(trace) == encode_occupancy(occupancy)
     assert count_contexts(told, NEIGHBOURS).sum() == told.size
 
 
 def test_where_errors_cost_nothing_a_ragged_grid_takes_far_fewer_bytes():
     occupancy = rolling()
     found = flip_cells(occupancy, np.zeros(occupancy.shape))
-    assert len(encode_cells(found)) < 0.7 * len(encode_cells(occupancy))
+    assert len(encode_occupancy(found)) < 0.7 * len(encode_occupancy(occupancy))
     assert not (found & ~dilate(occupancy)).any()
     assert np.mean(found != occupancy) < 0.1
 

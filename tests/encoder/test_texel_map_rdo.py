@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 from kpc.encoder.rdo.texel_map_rdo import IDENTITY_TOLERANCE, MAP_LAM, choose_coded_texels, map_context
-from kpc.format.coding.predictive import MAP_CONTEXTS, walk_map
-from kpc.format.coding.rans import SCALE, adapt, counters
+from kpc.format.coding.predictive import MAP_CONTEXTS, code_map
+from kpc.format.coding.rans import SCALE, code_bit_adaptive, new_models
 
 
 def bits_of(told):
     """That a file takes for a map."""
     trace = np.empty(told.size, np.int16)
-    walk_map(told.copy(), 0, 0, None, trace)
+    code_map(told.copy(), 0, 0, None, trace)
     return -np.log2(np.where(trace > 0, trace, SCALE + trace) / SCALE).sum()
 
 
@@ -25,11 +25,11 @@ def noisy(seed, channels=4):
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1), (2, 2), (9, 14)])
 def test_contexts_are_those_of_the_file(shape):
     told = np.random.default_rng(3).random(shape) < 0.5
-    table, expected, at = counters(MAP_CONTEXTS), np.empty(told.size, np.int16), 0
+    table, expected, at = new_models(MAP_CONTEXTS), np.empty(told.size, np.int16), 0
     for y, x in np.ndindex(shape):
-        _, _, at = adapt(int(told[y, x]), table, map_context(told, y, x), 0, at, None, expected)
+        _, _, at = code_bit_adaptive(int(told[y, x]), table, map_context(told, y, x), 0, at, None, expected)
     trace = np.empty(told.size, np.int16)
-    walk_map(told.copy(), 0, 0, None, trace)
+    code_map(told.copy(), 0, 0, None, trace)
     assert np.array_equal(trace, expected)
 
 

@@ -11,15 +11,15 @@ from kpc.encoder.rdo.trellis import MAGNITUDE_BINS, STATES
 from kpc.format.coding.predictive import (
     ACTIVITIES,
     TRELLIS,
-    WEIGHTS,
+    WEIGHT_COUNT,
     encode_symbols,
     follows_trellis,
-    guide_of,
-    next_state,
+    trellis_transition,
+    weights_in,
 )
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, quantise_plane, quantise_scene
 from kpc.format.container import scene_io
-from kpc.format.container.segments import rows_of_segments
+from kpc.format.container.segments import rows_per_segment
 from kpc.format.scene.scene import TIME_PLANES, Scene
 from scenes import tiny_scene
 
@@ -40,7 +40,7 @@ def steered(scene: Scene, step: float, significant: list[dict[str, np.ndarray]] 
     return quantise_by_cost(scene, steps, significant=significant, blocks=False)
 
 
-NO_WEIGHTS = np.zeros((1, WEIGHTS), np.int8)
+NO_WEIGHTS = np.zeros((1, WEIGHT_COUNT), np.int8)
 FREE = np.zeros((2 * ACTIVITIES, MAGNITUDE_BINS))
 """Every error costs nothing."""
 
@@ -75,7 +75,7 @@ def test_without_a_price_the_path_is_the_nearest_of_all() -> None:
             longer = {}
             for (state, path), error in paths.items():
                 for symbol in range(-12 + state % 2, 13, 2):
-                    longer[next_state(state, symbol), (*path, symbol)] = error + (value - symbol) ** 2
+                    longer[trellis_transition(state, symbol), (*path, symbol)] = error + (value - symbol) ** 2
             best = {}  # of paths that end in the same state but differ in nothing that is still to come
             for (state, path), error in longer.items():
                 if state not in best or error < best[state][1]:
@@ -160,11 +160,15 @@ def test_errors_next_to_each_other_make_up_for_each_other() -> None:
 
 
 def test_states_part_and_meet_as_a_code_of_8_states_wants() -> None:
-    steps = {state: [next_state(state, symbol) for symbol in (state % 2, state % 2 + 2)] for state in range(STATES)}
+    steps = {
+        state: [trellis_transition(state, symbol) for symbol in (state % 2, state % 2 + 2)] for state in range(STATES)
+    }
     assert all(a != b for a, b in steps.values())
     came = [to for pair in steps.values() for to in pair]
     assert sorted(came) == sorted(2 * list(range(STATES)))  # two ways into each
-    assert next_state(0, 0) == next_state(0, -4) == 0 and next_state(0, -2) == next_state(0, 2)
+    assert trellis_transition(0, 0) == trellis_transition(0, -4) == 0 and trellis_transition(
+        0, -2
+    ) == trellis_transition(0, 2)
 
 
 def test_a_price_buys_errors_that_are_nearer_to_what_is_expected() -> None:
@@ -204,7 +208,7 @@ def test_planes_take_fewer_bytes_than_rounded_ones_that_err_as_much(step: float)
         return seen(plane.dequantise() - values)
 
     def size(plane: QuantisedPlane) -> int:
-        return len(encode_symbols(plane.symbols, plane.coded, plane.guide))
+        return len(encode_symbols(plane.symbols, plane.coded, plane.side_info))
 
     economical = trellis.trellis_quantise(
         quantise_plane(values, step, identity=False), values, np.full(3, step), np.ones_like(values), False
@@ -242,7 +246,7 @@ def test_what_was_left_out_stays_so_and_steps_stay(step: float) -> None:
     """Steps around predictions are others, but it is known what was asked for."""
     scene = noisy()
     before, after = quantised(scene, step), steered(scene, step)
-    assert any(plane.guide is not None for scale in after.scales for plane in scale.values()) == (step == 0.05)
+    assert any(plane.side_info is not None for scale in after.scales for plane in scale.values()) == (step == 0.05)
     for ours, theirs in zip(after.scales, before.scales):
         for name in ours:
             np.testing.assert_allclose(trellis.requested_trellis_step(ours[name]), theirs[name].step, rtol=2**-7)
@@ -251,7 +255,7 @@ def test_what_was_left_out_stays_so_and_steps_stay(step: float) -> None:
             )
             if name not in TIME_PLANES:
                 np.testing.assert_array_equal(ours[name].coded, theirs[name].coded)
-            elif ours[name].guide is None:
+            elif ours[name].side_info is None:
                 np.testing.assert_array_equal(ours[name].coded, ours[name].symbols.any(2))
 
 
@@ -273,20 +277,20 @@ def test_what_is_hardly_told_goes_around_predictions(identity: bool) -> None:
     rounded = quantise_plane(values, step, identity=identity)
 
     def cost(plane: QuantisedPlane) -> float:
-        segments = range(0, len(values), rows_of_segments(len(values), identity))
+        segments = range(0, len(values), rows_per_segment(len(values), identity))
         parts = [slice(start, start + segments.step) for start in segments]
-        bodies = [encode_symbols(plane.symbols[rows], plane.coded[rows], plane.guide) for rows in parts]
-        assert all(guide_of(body) == plane.guide for body in bodies)
+        bodies = [encode_symbols(plane.symbols[rows], plane.coded[rows], plane.side_info) for rows in parts]
+        assert all(weights_in(body) == plane.side_info for body in bodies)
         errors = plane.dequantise() - values
         return float(
             (errors / 2.0).ravel() @ (errors / 2.0).ravel() * seen(errors) / np.mean(np.square(errors))
         ) + distortion.LAM * 8 * sum(map(len, bodies))
 
     around = trellis.trellis_quantise(rounded, values, step, alike, identity)
-    assert around.guide is not None
+    assert around.side_info is not None
     np.testing.assert_allclose(trellis.requested_trellis_step(around), step, rtol=2**-7)
     on_trellis = trellis.trellis_quantise(rounded, values, step, alike, identity, thin=0.0)
-    assert on_trellis.guide is None and cost(around) < 0.92 * cost(on_trellis)
+    assert on_trellis.side_info is None and cost(around) < 0.92 * cost(on_trellis)
 
 
 def test_files_keep_what_symbols_were_chosen_by() -> None:
@@ -295,9 +299,10 @@ def test_files_keep_what_symbols_were_chosen_by() -> None:
     back = scene_io.read(data)
     assert scene_io.encode(back) == data
     for ours, theirs in zip(back.scales, scene.scales):
-        assert all(ours[name].guide == theirs[name].guide for name in ours)
+        assert all(ours[name].side_info == theirs[name].side_info for name in ours)
     forgotten = replace(
-        back, scales=tuple({name: replace(plane, guide=None) for name, plane in scale.items()} for scale in back.scales)
+        back,
+        scales=tuple({name: replace(plane, side_info=None) for name, plane in scale.items()} for scale in back.scales),
     )
     assert len(scene_io.encode(forgotten)) > len(data)
 

@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 import zstandard
+from codec_inputs import GRID_PATTERNS, grid_pattern, swaying
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kpc.format.coding.motion_raster import LORENZO, NEIGHBOURS, decode_nodes, encode_nodes, encode_with
@@ -13,40 +14,16 @@ from without_numba import assert_same_without_numba
 
 shapes = st.tuples(*4 * [st.integers(1, 5)], st.just(3))
 
-PAINTS = {
-    "noise": lambda rng, shape: rng.integers(-32768, 32768, shape),
-    "extremes": lambda rng, shape: rng.choice([-32768, 32767], shape),
-    "small": lambda rng, shape: rng.integers(-2, 3, shape),
-    "slopes": lambda rng, shape: rng.integers(-30, 31, shape).cumsum(0).cumsum(1).cumsum(2).cumsum(3),
-    "constant": lambda rng, shape: np.full(shape, rng.choice([-32768, -1, 0, 32767])),
-}
-
-
-def painted(paint: str, shape: tuple[int, ...], seed: int) -> np.ndarray:
-    return PAINTS[paint](np.random.default_rng(seed), shape).astype(np.int16)
-
-
-def swaying(rows: int = 20, nz: int = 8, ny: int = 6, nx: int = 6) -> np.ndarray:
-    """(rows, nz, ny, nx, 3) int16: waves that travel, and a little noise."""
-    rng = np.random.default_rng(0)
-    places = np.indices((rows, nz, ny, nx))
-    waves = [
-        300 * np.sin(sum(np.tensordot(k, places, 1) for k in rng.normal(0, 0.3, (1, 4))) + 9 * rng.random())
-        for _ in range(9)
-    ]
-    field = np.stack([sum(waves[c::3]) for c in range(3)], -1)
-    return np.rint(field + rng.normal(0, 0.5, field.shape)).astype(np.int16)
-
 
 def assert_decodes(body: bytes, symbols: np.ndarray) -> None:
     found = decode_nodes(body, symbols.shape)
     assert found.dtype == np.int16 and found.shape == symbols.shape and np.array_equal(found, symbols)
 
 
-@given(paint=st.sampled_from(sorted(PAINTS)), shape=shapes, seed=st.integers(0, 2**32 - 1))
+@given(paint=st.sampled_from(sorted(GRID_PATTERNS)), shape=shapes, seed=st.integers(0, 2**32 - 1))
 @settings(deadline=None)
 def test_symbols_come_back(paint, shape, seed):
-    symbols = painted(paint, shape, seed)
+    symbols = grid_pattern(paint, shape, seed)
     assert_decodes(encode_nodes(symbols), symbols)
 
 
@@ -55,7 +32,7 @@ def test_symbols_come_back(paint, shape, seed):
 def test_any_weights_will_do(shape, seed, extreme):
     rng = np.random.default_rng(seed)
     weights = rng.choice([-32768, 32767], NEIGHBOURS) if extreme else rng.integers(-1500, 1501, NEIGHBOURS)
-    symbols = painted("noise", shape, seed)
+    symbols = grid_pattern("noise", shape, seed)
     assert_decodes(encode_with(weights.astype(np.int16), symbols), symbols)
 
 
@@ -63,7 +40,7 @@ def test_any_weights_will_do(shape, seed, extreme):
 def test_long_and_thin_grids_come_back(axis):
     shape = [1, 1, 1, 1, 3]
     shape[axis] = 500
-    symbols = painted("extremes", tuple(shape), axis)
+    symbols = grid_pattern("extremes", tuple(shape), axis)
     assert_decodes(encode_nodes(symbols), symbols)
 
 
@@ -85,7 +62,7 @@ def test_a_product_of_what_changes_along_single_axes_is_hit_by_lorenzo():
 
 
 def test_noise_takes_hardly_more_than_it_holds():
-    symbols = painted("noise", (10, 6, 6, 6, 3), 0)
+    symbols = grid_pattern("noise", (10, 6, 6, 6, 3), 0)
     assert len(encode_nodes(symbols)) < 1.15 * symbols.nbytes
 
 
@@ -100,10 +77,10 @@ def test_arrays_may_have_any_layout_and_are_left_as_they_are():
 PLAIN = """
 import hashlib
 import numpy as np
-from test_nodes import painted, swaying
+from codec_inputs import grid_pattern, swaying
 from kpc.format.coding.motion_raster import decode_nodes, encode_with
 
-for symbols in (swaying(5, 3, 4, 4), painted("noise", (3, 2, 3, 4, 3), 1), painted("extremes", (2, 3, 3, 2, 3), 2)):
+for symbols in (swaying(5, 3, 4, 4), grid_pattern("noise", (3, 2, 3, 4, 3), 1), grid_pattern("extremes", (2, 3, 3, 2, 3), 2)):
     weights = np.random.default_rng(3).integers(-1500, 1501, 15).astype(np.int16)
     body = encode_with(weights, symbols)
     assert np.array_equal(decode_nodes(body, symbols.shape), symbols)
@@ -166,7 +143,7 @@ def test_a_symbol_that_leaves_its_16_bits_is_refused():
 
 def test_a_stream_that_ends_early_is_given_up_at_once():
     """Within a row of nodes of its end; all of these would take half a minute and more."""
-    body = encode_nodes(painted("noise", (2, 2, 2, 8, 3), 0))
+    body = encode_nodes(grid_pattern("noise", (2, 2, 2, 8, 3), 0))
     start = time.perf_counter()
     with pytest.raises(FormatError, match="motion"):
         decode_nodes(body, (1000, 40, 100, 100, 3))

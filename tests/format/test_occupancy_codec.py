@@ -5,30 +5,21 @@ import time
 import numpy as np
 import pytest
 import zstandard
+from codec_inputs import rolling
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kpc.format.coding.occupancy_codec import decode_cells, encode_cells
+from kpc.format.coding.occupancy_codec import decode_occupancy, encode_occupancy
 from kpc.format.common.errors import FormatError
 from without_numba import assert_same_without_numba
 
 shapes = st.tuples(*4 * [st.integers(1, 7)])
 
 
-def rolling(slots: int = 5, nz: int = 32, ny: int = 36, nx: int = 40) -> np.ndarray:
-    """(slots, nz, ny, nx) bool: where waves that travel are high, with borders that fray."""
-    rng = np.random.default_rng(0)
-    places = np.indices((slots, nz, ny, nx))
-    height = sum(
-        np.sin(np.tensordot(rng.normal(0, (0.1, 0.3, 0.3, 0.3)), places, 1) + 9 * rng.random()) for _ in range(6)
-    )
-    return height + rng.normal(0, 0.2, (nz, ny, nx)) > 1.5
-
-
 @given(shape=shapes, seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.02, 0.5, 0.98, 1.0]))
 @settings(deadline=None)
 def test_cells_come_back(shape, seed, share):
     occupancy = np.random.default_rng(seed).random(shape) < share
-    found = decode_cells(encode_cells(occupancy), shape)
+    found = decode_occupancy(encode_occupancy(occupancy), shape)
     assert found.dtype == bool and found.shape == shape and np.array_equal(found, occupancy)
 
 
@@ -38,37 +29,37 @@ def test_long_and_thin_grids_come_back(axis, others):
     shape = [others] * 4
     shape[axis] = 1000
     occupancy = np.random.default_rng(axis).random(shape) < 0.3
-    assert np.array_equal(decode_cells(encode_cells(occupancy), tuple(shape)), occupancy)
+    assert np.array_equal(decode_occupancy(encode_occupancy(occupancy), tuple(shape)), occupancy)
 
 
 def test_what_stays_and_hangs_together_takes_far_less_than_with_zstd():
     occupancy = rolling()
     packed = np.packbits(np.moveaxis(occupancy, 0, -1), bitorder="little").tobytes()
-    assert len(encode_cells(occupancy)) < 0.7 * len(zstandard.ZstdCompressor(level=19).compress(packed))
+    assert len(encode_occupancy(occupancy)) < 0.7 * len(zstandard.ZstdCompressor(level=19).compress(packed))
 
 
 def test_noise_takes_hardly_more_than_it_holds():
     noise = np.random.default_rng(0).random((4, 20, 20, 40)) < 0.5
-    assert len(encode_cells(noise)) < 1.12 * noise.size / 8
+    assert len(encode_occupancy(noise)) < 1.12 * noise.size / 8
 
 
 def test_arrays_may_have_any_layout_and_are_left_as_they_are():
     occupancy = rolling(2, 5, 6, 7)
     across = np.asfortranarray(occupancy)
     occupancy.flags.writeable = across.flags.writeable = False
-    assert encode_cells(across) == encode_cells(occupancy)
+    assert encode_occupancy(across) == encode_occupancy(occupancy)
 
 
 # The same lines, not compiled.
 PLAIN = """
 import hashlib
 import numpy as np
-from test_cells import rolling
-from kpc.format.coding.occupancy_codec import decode_cells, encode_cells
+from codec_inputs import rolling
+from kpc.format.coding.occupancy_codec import decode_occupancy, encode_occupancy
 
 for occupancy in (rolling(3, 8, 9, 10), np.random.default_rng(1).random((2, 5, 1, 7)) < 0.5):
-    body = encode_cells(occupancy)
-    assert np.array_equal(decode_cells(body, occupancy.shape), occupancy)
+    body = encode_occupancy(occupancy)
+    assert np.array_equal(decode_occupancy(body, occupancy.shape), occupancy)
     print(hashlib.sha256(body).hexdigest())
 """
 
@@ -85,20 +76,20 @@ SHAPE = (3, 8, 9, 10)
 
 def decodes_or_is_refused(body: bytes, shape: tuple[int, ...] = SHAPE) -> bool:
     try:
-        return decode_cells(body, shape).shape == shape
+        return decode_occupancy(body, shape).shape == shape
     except FormatError:
         return False
 
 
 def test_every_truncation_and_excess_is_refused():
-    body = encode_cells(rolling(*SHAPE))
+    body = encode_occupancy(rolling(*SHAPE))
     assert decodes_or_is_refused(body)
     assert not any(decodes_or_is_refused(body[:length]) for length in range(len(body)))
     assert not any(decodes_or_is_refused(body + more) for more in (b"\0", b"\0\0", b"\xff\xff"))
 
 
 def test_flipped_bits_are_refused_or_mean_something_else():
-    body, accepted = encode_cells(rolling(*SHAPE)), 0
+    body, accepted = encode_occupancy(rolling(*SHAPE)), 0
     for position in range(8 * len(body)):
         damaged = bytearray(body)
         damaged[position >> 3] ^= 1 << (position & 7)
@@ -113,7 +104,7 @@ def test_any_bytes_decode_or_are_refused(body, shape):
 
 
 def test_a_body_of_another_shape_is_refused():
-    body = encode_cells(rolling(*SHAPE))
+    body = encode_occupancy(rolling(*SHAPE))
     assert not any(
         decodes_or_is_refused(body, other) for other in ((4, 8, 9, 10), (2, 8, 9, 10), (3, 8, 9, 11), (1, 1, 1, 1))
     )
@@ -121,8 +112,8 @@ def test_a_body_of_another_shape_is_refused():
 
 def test_a_stream_that_ends_early_is_given_up_at_once():
     """Within a row of its end; all of these cells would take a minute and more."""
-    body = encode_cells(np.random.default_rng(0).random((1, 1, 1, 500)) < 0.5)
+    body = encode_occupancy(np.random.default_rng(0).random((1, 1, 1, 500)) < 0.5)
     start = time.perf_counter()
     with pytest.raises(FormatError, match="do not end"):
-        decode_cells(body, (4096, 100, 100, 100))
+        decode_occupancy(body, (4096, 100, 100, 100))
     assert time.perf_counter() - start < 2.0

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from kpc.format.common.errors import BudgetError
 from kpc.format.container.container import Reader
-from kpc.format.container.partial import PartialScene, SegmentedPlane, runs
+from kpc.format.container.partial import PartialScene, SegmentedPlane, adjacent_runs
 from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import TIME_PLANES, Scene
@@ -107,5 +107,5 @@ def test_a_scale_and_a_span_over_http_cost_their_bytes_and_two_requests(tmp_path
 
 def test_runs_are_chunks_side_by_side() -> None:
     index = Reader(coded(tiny_scene(4, time=10))).index
-    assert runs(index, [4, 5, 6, 9, 10, 3]) == [[4, 5, 6], [9, 10], [3]]
-    assert runs(index, [4, 5, 6], most_bytes=1) == [[4], [5], [6]] and runs(index, []) == []
+    assert adjacent_runs(index, [4, 5, 6, 9, 10, 3]) == [[4, 5, 6], [9, 10], [3]]
+    assert adjacent_runs(index, [4, 5, 6], most_bytes=1) == [[4], [5], [6]] and adjacent_runs(index, []) == []

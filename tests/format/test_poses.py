@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from kpc.format.coding.poses import decode_poses, encode_poses, rigid, rounded
+from kpc.format.coding.poses import are_rigid, decode_poses, encode_poses, round_poses
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rotations import rotation_of
 
@@ -42,7 +42,7 @@ def captures(draw):
 
 @given(captures())
 def test_rounded_cameras_come_back_as_they_are(cameras):
-    near = rounded(cameras)
+    near = round_poses(cameras)
     body = encode_poses(near)
     if body is not None:  # else one lies so near to two quaternions that either may be taken
         assert decode_poses(body, 9) == numbers_of(near)
@@ -54,7 +54,7 @@ def test_rounded_cameras_come_back_as_they_are(cameras):
 
 def test_most_cameras_take_fourteen_bytes_each():
     rng = np.random.default_rng(1)
-    near = rounded([camera(rng.standard_normal(4), rng.standard_normal(3)) for _ in range(500)])
+    near = round_poses([camera(rng.standard_normal(4), rng.standard_normal(3)) for _ in range(500)])
     assert len(encode_poses(near)) == 17 + 20 + 14 * 500
     assert decode_poses(encode_poses(near), 500) == numbers_of(near)
 
@@ -63,7 +63,7 @@ def test_most_cameras_take_fourteen_bytes_each():
     "quaternion", [(1, 0, 0, 0), (1, 1, 0, 0), (1, -1, 0, 0), (0, 0, 1, 1), (0, 1, 0, 0), (-1, 0, 0, 1)]
 )
 def test_right_angles_are_exact(quaternion):
-    near = rounded([camera(quaternion, (1.0, 2.0, 3.0))])
+    near = round_poses([camera(quaternion, (1.0, 2.0, 3.0))])
     assert np.array_equal(near[0].camera_to_world, np.rint(near[0].camera_to_world))
     assert decode_poses(encode_poses(near), 1) == numbers_of(near)
 
@@ -72,7 +72,7 @@ def test_right_angles_are_exact(quaternion):
 def test_what_is_more_than_a_turn_is_left_to_others(change):
     one = camera((1, 0, 0, 0), (0, 0, 0))
     one.camera_to_world[:3, :3] = change
-    assert not rigid([one]) and encode_poses([one]) is None
+    assert not are_rigid([one]) and encode_poses([one]) is None
 
 
 def test_what_is_not_rounded_is_left_to_others():

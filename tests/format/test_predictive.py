@@ -4,50 +4,34 @@ from types import FunctionType
 import numpy as np
 import pytest
 import zstandard
+from codec_inputs import PLANE_PATTERNS, followed, on_trellis, plane_pattern, textured
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kpc.format.coding import predictive as module
 from kpc.format.coding.predictive import (
     ACTIVITIES,
-    ANY,
-    AROUND,
+    DEPENDENT,
     LATTICE_BIT,
+    SCALAR,
     SET_COUNTS,
     TRELLIS,
-    WEIGHTS,
-    Guide,
+    WEIGHT_COUNT,
+    PredictionWeights,
+    collect_neighbours,
     decode_symbols,
     encode_symbols,
-    encode_with,
-    fitted,
+    encode_with_weights,
+    fit_weights,
     follows_trellis,
-    guide_of,
-    neighbourhoods,
-    next_state,
+    trellis_transition,
+    weights_in,
 )
-from kpc.format.coding.raw_planes import encode_segment
+from kpc.format.coding.raw_planes import encode_raw_segment
 from kpc.format.common.errors import FormatError
-from kpc.tools.vectors.specvectors import walked
 from numba import njit
 from without_numba import assert_same_without_numba
 
 shapes = st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 5))
-
-PAINTS = {
-    "noise": lambda rng, shape: rng.integers(-128, 128, shape),
-    "extremes": lambda rng, shape: rng.choice([-128, 127], shape),
-    "ramps": lambda rng, shape: rng.integers(-3, 4, shape).cumsum(0).cumsum(1),  # wraps in the corner
-    "nearly flat": lambda rng, shape: rng.random(shape) < 0.05,
-    "constant": lambda rng, shape: np.full(shape, rng.choice([-128, -1, 0, 127])),
-}
-
-
-def painted(paint: str, shape: tuple[int, int, int], seed: int, share: float) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    symbols = PAINTS[paint](rng, shape).astype(np.int8)
-    coded = rng.random(shape[:2]) < share
-    symbols[~coded] = 0
-    return symbols, coded
 
 
 def assert_decodes(body: bytes, symbols: np.ndarray, coded: np.ndarray) -> None:
@@ -57,65 +41,42 @@ def assert_decodes(body: bytes, symbols: np.ndarray, coded: np.ndarray) -> None:
 
 
 @given(
-    paint=st.sampled_from(sorted(PAINTS)),
+    paint=st.sampled_from(sorted(PLANE_PATTERNS)),
     shape=shapes,
     seed=st.integers(0, 2**32 - 1),
     share=st.sampled_from([0.0, 0.3, 0.8, 1.0]),
 )
 @settings(deadline=None)
 def test_symbols_come_back(paint, shape, seed, share):
-    symbols, coded = painted(paint, shape, seed, share)
+    symbols, coded = plane_pattern(paint, shape, seed, share)
     assert_decodes(encode_symbols(symbols, coded), symbols, coded)
 
 
 @given(shape=shapes, seed=st.integers(0, 2**32 - 1), count=st.sampled_from(SET_COUNTS), extreme=st.booleans())
 @settings(deadline=None)
 def test_any_weights_will_do(shape, seed, count, extreme):
-    symbols, coded = painted("noise", shape, seed, 0.8)
+    symbols, coded = plane_pattern("noise", shape, seed, 0.8)
     rng = np.random.default_rng(seed)
-    weights = rng.choice([-128, 127], (count, WEIGHTS)) if extreme else rng.integers(-128, 128, (count, WEIGHTS))
-    assert_decodes(encode_with(weights.astype(np.int8), symbols, coded, ANY), symbols, coded)
-
-
-def textured(rows: int = 60, columns: int = 70, channels: int = 6) -> tuple[np.ndarray, np.ndarray]:
-    """Smooth waves and noise, stronger on one side, within an ellipse."""
-    rng = np.random.default_rng(0)
-    y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij")
-    waves = sum(
-        np.multiply.outer(np.sin(a * x + b * y + c), 25 * rng.normal(0, 1, channels))
-        for a, b, c in rng.normal(0, 3, (4, 3))
+    weights = (
+        rng.choice([-128, 127], (count, WEIGHT_COUNT)) if extreme else rng.integers(-128, 128, (count, WEIGHT_COUNT))
     )
-    symbols = np.clip(np.rint(waves + (1.5 + x)[..., None] * rng.normal(0, 1, waves.shape)), -128, 127).astype(np.int8)
-    coded = x * x + y * y < 0.9
-    symbols[~coded] = 0
-    return symbols, coded
+    assert_decodes(encode_with_weights(weights.astype(np.int8), symbols, coded, SCALAR), symbols, coded)
 
 
 @given(
-    paint=st.sampled_from(sorted(PAINTS)),
+    paint=st.sampled_from(sorted(PLANE_PATTERNS)),
     shape=shapes,
     seed=st.integers(0, 2**32 - 1),
     share=st.sampled_from([0.3, 0.8, 1.0]),
 )
 @settings(deadline=None)
 def test_symbols_on_the_trellis_come_back(paint, shape, seed, share):
-    symbols, coded = painted(paint, shape, seed, share)
+    symbols, coded = plane_pattern(paint, shape, seed, share)
     symbols = on_trellis(symbols, coded)
     assert follows_trellis(symbols, coded)
     body = encode_symbols(symbols, coded)
-    assert body[1] >> LATTICE_BIT == TRELLIS and guide_of(body) is None
+    assert body[1] >> LATTICE_BIT == TRELLIS and weights_in(body) is None
     assert_decodes(body, symbols, coded)
-
-
-def on_trellis(symbols: np.ndarray, coded: np.ndarray) -> np.ndarray:
-    """The symbols, the last bit of each changed where it has to be."""
-    symbols = symbols.copy()
-    for y, m in np.ndindex(len(symbols), symbols.shape[2]):
-        state = 0
-        for x in np.flatnonzero(coded[y]):
-            symbols[y, x, m] = symbols[y, x, m] & ~1 | state & 1
-            state = next_state(state, int(symbols[y, x, m]))
-    return symbols
 
 
 def test_the_trellis_saves_a_bit_a_symbol():
@@ -127,7 +88,7 @@ def test_the_trellis_saves_a_bit_a_symbol():
 
 
 @given(
-    paint=st.sampled_from(sorted(PAINTS)),
+    paint=st.sampled_from(sorted(PLANE_PATTERNS)),
     shape=shapes,
     seed=st.integers(0, 2**32 - 1),
     share=st.sampled_from([0.3, 0.8, 1.0]),
@@ -135,31 +96,28 @@ def test_the_trellis_saves_a_bit_a_symbol():
 )
 @settings(deadline=None)
 def test_symbols_around_predictions_come_back(paint, shape, seed, share, count):
-    symbols, coded = painted(paint, shape, seed, share)
-    guide = Guide(np.random.default_rng(seed).integers(-128, 128, (count, WEIGHTS)).astype(np.int8))
-    symbols = followed(symbols, coded, guide)
-    body = encode_symbols(symbols, coded, guide)
+    symbols, coded = plane_pattern(paint, shape, seed, share)
+    side_info = PredictionWeights(
+        np.random.default_rng(seed).integers(-128, 128, (count, WEIGHT_COUNT)).astype(np.int8)
+    )
+    symbols = followed(symbols, coded, side_info)
+    body = encode_symbols(symbols, coded, side_info)
     assert_decodes(body, symbols, coded)
-    assert guide_of(body) == guide and body == encode_with(guide.weights, symbols, coded, AROUND)
-
-
-def followed(symbols: np.ndarray, coded: np.ndarray, guide: Guide) -> np.ndarray:
-    """Symbols near to these, none at the ends of 8 bits, that follow a guide."""
-    symbols = np.clip(symbols, -126, 126)
-    walked(symbols, coded, guide.weights, AROUND)
-    return symbols
+    assert weights_in(body) == side_info and body == encode_with_weights(side_info.weights, symbols, coded, DEPENDENT)
 
 
 @pytest.mark.parametrize("flat", [0, ACTIVITIES])
 def test_around_predictions_errors_of_odd_places_are_odd_or_none(monkeypatch, flat):
     """By the definition, told here once more: of segments whose weights are 0, so that what is foreseen is the mean of left and above; were
     all flat, or nothing."""
-    monkeypatch.setattr(module, "FLAT", flat)
-    for name in ("walk_map", "walk"):
+    monkeypatch.setattr(module, "FLAT_ACTIVITY", flat)
+    for name in ("code_map", "code_symbols"):
         monkeypatch.setattr(module, name, njit(FunctionType(vars(module)[name].py_func.__code__, vars(module), name)))
     v = np.random.default_rng(5).integers(-40, 40, (9, 30, 2)).astype(np.int8)
-    trace = np.empty(v.size * module.MOST_DECISIONS, np.int16)
-    module.walk(v, np.ones((9, 30), bool), AROUND, np.zeros((1, WEIGHTS), np.int8), 0, 0, None, trace, None)
+    trace = np.empty(v.size * module.MAX_DECISIONS, np.int16)
+    module.code_symbols(
+        v, np.ones((9, 30), bool), DEPENDENT, np.zeros((1, WEIGHT_COUNT), np.int8), 0, 0, None, trace, None
+    )
     assert follows_trellis(v, np.ones((9, 30), bool)) == (flat == 0)
     odd_ones, v = 0, v.astype(int)
     for y, m in np.ndindex(9, 2) if flat else ():
@@ -171,18 +129,18 @@ def test_around_predictions_errors_of_odd_places_are_odd_or_none(monkeypatch, fl
             size, rest = divmod(abs(away) + (place & 1), 2)
             assert rest == 0 or away == 0
             odd_ones += away != 0 and place & 1
-            place = next_state(place, 2 * size)
+            place = trellis_transition(place, 2 * size)
     assert odd_ones > 100 or not flat
 
 
 def test_what_leaves_its_guide_is_told_without():
     symbols, coded = textured(40, 50, 3)
     symbols //= 16
-    guide = Guide(fitted(neighbourhoods(symbols, coded), 1))
-    assert encode_with(guide.weights, symbols, coded, AROUND) is None
-    assert encode_symbols(symbols, coded, guide) == encode_symbols(symbols, coded)
-    follows = followed(symbols, coded, guide)
-    assert len(encode_symbols(follows, coded, guide)) < 0.95 * len(encode_symbols(follows, coded))
+    side_info = PredictionWeights(fit_weights(collect_neighbours(symbols, coded), 1))
+    assert encode_with_weights(side_info.weights, symbols, coded, DEPENDENT) is None
+    assert encode_symbols(symbols, coded, side_info) == encode_symbols(symbols, coded)
+    follows = followed(symbols, coded, side_info)
+    assert len(encode_symbols(follows, coded, side_info)) < 0.95 * len(encode_symbols(follows, coded))
 
 
 def test_one_symbol_off_the_trellis_is_enough_to_leave_it():
@@ -198,7 +156,7 @@ def test_smooth_planes_take_far_less_than_with_zstd():
     symbols, coded = textured()
     body = encode_symbols(symbols, coded)
     assert_decodes(body, symbols, coded)
-    frame = zstandard.ZstdCompressor(level=19).compress(b"".join(encode_segment(symbols, coded)))
+    frame = zstandard.ZstdCompressor(level=19).compress(b"".join(encode_raw_segment(symbols, coded)))
     assert len(body) < 0.85 * len(frame)
 
 
@@ -212,7 +170,7 @@ def test_arrays_may_have_any_layout_and_are_left_as_they_are():
 
 
 def test_noise_takes_hardly_more_than_it_holds():
-    symbols, coded = painted("noise", (40, 40, 4), 0, 1.0)
+    symbols, coded = plane_pattern("noise", (40, 40, 4), 0, 1.0)
     assert len(encode_symbols(symbols, coded)) < 1.15 * symbols.size
 
 
@@ -228,23 +186,23 @@ def test_what_is_not_coded_costs_its_map_and_a_map_without_surprises_little():
 PLAIN = """
 import hashlib
 import numpy as np
-from test_symbols import followed, on_trellis, painted, textured
-from kpc.format.coding.predictive import ANY, AROUND, TRELLIS, Guide, decode_symbols, encode_with
+from codec_inputs import followed, on_trellis, plane_pattern, textured
+from kpc.format.coding.predictive import DEPENDENT, SCALAR, TRELLIS, PredictionWeights, decode_symbols, encode_with_weights
 
 smooth, coded = textured(14, 12, 3)
 weights = np.random.default_rng(3).integers(-128, 128, (4, 9)).astype(np.int8)
 for symbols, coded, lattice in (
-        (smooth, coded, ANY), (on_trellis(smooth, coded), coded, TRELLIS), (*painted("noise", (7, 9, 3), 1, 0.7), ANY),
-        (*painted("extremes", (9, 5, 2), 2, 1.0), ANY), (followed(smooth, coded, Guide(weights)), coded, AROUND),
-        (followed(smooth // 30, coded, Guide(weights // 8)), coded, AROUND)):
-    body = encode_with(weights // 8 if symbols.max() < 8 else weights, symbols, coded, lattice)
+        (smooth, coded, SCALAR), (on_trellis(smooth, coded), coded, TRELLIS), (*plane_pattern("noise", (7, 9, 3), 1, 0.7), SCALAR),
+        (*plane_pattern("extremes", (9, 5, 2), 2, 1.0), SCALAR), (followed(smooth, coded, PredictionWeights(weights)), coded, DEPENDENT),
+        (followed(smooth // 30, coded, PredictionWeights(weights // 8)), coded, DEPENDENT)):
+    body = encode_with_weights(weights // 8 if symbols.max() < 8 else weights, symbols, coded, lattice)
     assert np.array_equal(decode_symbols(body, *symbols.shape)[0], symbols)
     print(hashlib.sha256(body).hexdigest())
 """
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    assert_same_without_numba(PLAIN, "kpc.format.coding.rans:adapt")
+    assert_same_without_numba(PLAIN, "kpc.format.coding.rans:code_bit_adaptive")
 
 
 # --- damage and hostility
@@ -300,7 +258,7 @@ def test_a_body_of_another_shape_is_refused(small):
 
 def test_a_stream_that_ends_early_is_given_up_at_once():
     """Within a row of its end: the hundreds of millions of symbols after it would take ten seconds and more."""
-    symbols, coded = painted("noise", (8, 8, 1), 0, 1.0)
+    symbols, coded = plane_pattern("noise", (8, 8, 1), 0, 1.0)
     body = encode_symbols(symbols, coded)
     start = time.perf_counter()
     with pytest.raises(FormatError, match="plane segment"):
@@ -315,15 +273,18 @@ def test_a_stream_that_ends_early_is_given_up_at_once():
         (lambda body: b"\3" + body[1:], "number of sets"),
         (lambda body: b"\0" + body[1:], "number of sets"),
         (lambda body: body[:1] + b"\x06" + body[2:], "or flag"),
-        (lambda body: body[: 2 + WEIGHTS + 3], "cut off"),
+        (lambda body: body[: 2 + WEIGHT_COUNT + 3], "cut off"),
         (lambda body: body + b"\0", "cut off"),
         (lambda body: body + b"\0\0", "do not end"),
-        (lambda body: body[: 2 + WEIGHTS] + b"\xff\xff\0\0" + body[2 + WEIGHTS + 4 :], "first state"),
+        (lambda body: body[: 2 + WEIGHT_COUNT] + b"\xff\xff\0\0" + body[2 + WEIGHT_COUNT + 4 :], "first state"),
     ],
 )
 def test_what_is_wrong_is_said(change, complaint):
-    body = encode_with(
-        np.zeros((1, WEIGHTS), np.int8), np.arange(8, dtype=np.int8).reshape(2, 2, 2), np.ones((2, 2), bool), ANY
+    body = encode_with_weights(
+        np.zeros((1, WEIGHT_COUNT), np.int8),
+        np.arange(8, dtype=np.int8).reshape(2, 2, 2),
+        np.ones((2, 2), bool),
+        SCALAR,
     )
     with pytest.raises(FormatError, match=complaint):
         decode_symbols(change(body), 2, 2, 2)

@@ -7,8 +7,8 @@ from kpc.format.coding.raw_planes import (
     FILTER_NONE,
     FILTER_PLANE,
     FILTER_UP,
-    decode_segment,
-    encode_segment,
+    decode_raw_segment,
+    encode_raw_segment,
 )
 from kpc.format.common.errors import FormatError
 
@@ -16,7 +16,7 @@ shapes = st.tuples(st.integers(1, 9), st.integers(1, 9), st.integers(1, 4))
 
 
 def packed(symbols: np.ndarray, coded: np.ndarray) -> bytes:
-    return b"".join(encode_segment(symbols, coded))
+    return b"".join(encode_raw_segment(symbols, coded))
 
 
 @given(shape=shapes, seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.3, 0.8, 1.0]), smooth=st.booleans())
@@ -28,7 +28,7 @@ def test_symbols_come_back(shape, seed, share, smooth):
     symbols = symbols.astype(np.int8)
     coded = rng.random(shape[:2]) < share
     symbols[~coded] = 0
-    decoded, where = decode_segment(packed(symbols, coded), *shape)
+    decoded, where = decode_raw_segment(packed(symbols, coded), *shape)
     assert decoded.dtype == np.int8 and np.array_equal(decoded, symbols)
     assert where.dtype == bool and np.array_equal(where, coded)
 
@@ -51,14 +51,14 @@ def test_decoding_is_what_the_spec_says_texel_by_texel():
                 v[y + 1, x + 1] = (r + [0, left, up, left + up - corner][c]) % 256
                 if coded[y, x]:
                     expected[y, x, c] = v[y + 1, x + 1] - 256 * (v[y + 1, x + 1] > 127)
-    assert np.array_equal(decode_segment(payload, rows, columns, channels)[0], expected)
+    assert np.array_equal(decode_raw_segment(payload, rows, columns, channels)[0], expected)
 
 
 def test_the_filter_fits_the_channel():
     rng = np.random.default_rng(0)
     across, down = rng.integers(-60, 60, (1, 32)), rng.integers(-60, 60, (32, 1))
     symbols = np.stack([0 * across + down, across + 0 * down, across + down, rng.integers(-2, 2, (32, 32))], axis=2)
-    header, *residuals = encode_segment(symbols.astype(np.int8), np.ones((32, 32), bool))
+    header, *residuals = encode_raw_segment(symbols.astype(np.int8), np.ones((32, 32), bool))
     assert list(header[1:]) == [FILTER_LEFT, FILTER_UP, FILTER_PLANE, FILTER_NONE]
     assert len(residuals) == 4
     assert np.count_nonzero(np.frombuffer(residuals[2], np.uint8)) <= 63  # its borders, no more
@@ -73,7 +73,7 @@ def test_uncoded_texels_cost_their_map_and_nothing_else():
 @given(payload=st.binary(max_size=64), shape=shapes)
 def test_any_bytes_decode_or_are_refused(payload, shape):
     try:
-        symbols, coded = decode_segment(payload, *shape)
+        symbols, coded = decode_raw_segment(payload, *shape)
     except FormatError:
         return
     assert symbols.shape == shape and not symbols[~coded].any()
@@ -94,4 +94,4 @@ def test_any_bytes_decode_or_are_refused(payload, shape):
 )
 def test_what_is_wrong_is_said(payload, complaint):
     with pytest.raises(FormatError, match=complaint):
-        decode_segment(payload, 2, 2, 1)
+        decode_raw_segment(payload, 2, 2, 1)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grids import rolling, swaying
+from codec_inputs import drifting, rolling, swaying
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kpc.format.coding.quantise import QuantisedScene, quantise_scene
@@ -28,7 +28,6 @@ from kpc.format.scene.scene import TIME_PLANES, Appearance
 from kpc.format.scene.space import Contraction, DeviceCoordinates
 from kpc.tools.vectors.specvectors import seen_through
 from scenes import in_device_coordinates, tiny_scene, with_appearances, with_motion
-from test_midpoints import drifting
 
 import kpc
 

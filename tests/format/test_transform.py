@@ -6,24 +6,23 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from codec_inputs import random_blocks
 from kpc.format.coding import transform
-from kpc.format.coding.predictive import WEIGHTS, Guide, encode_symbols
+from kpc.format.coding.predictive import WEIGHT_COUNT, PredictionWeights, encode_symbols
 from kpc.format.coding.transform import (
-    FINENESSES,
+    DEFAULT_OFFSET,
     HEAD,
     LARGEST,
-    PARTS,
     SIDES,
-    USUAL,
-    Blocks,
-    blocks_in,
-    blocks_of,
-    coarser,
-    cosines,
+    UNITS_PER_SYMBOL,
+    TransformBlocks,
+    dct_basis,
     decode_blocks,
+    decode_levels,
     encode_blocks,
+    frequency_weights,
     largest_side,
-    quantisers,
+    step_table,
 )
 from kpc.format.common.errors import FormatError
 from kpc.format.container import segments
@@ -42,34 +41,23 @@ def twin() -> ModuleType:
     return module
 
 
-def some(side: int, rows: int, columns: int, share: float, seed: int, channels: int = 3) -> tuple[Blocks, np.ndarray]:
-    """Blocks and coded texels, of which the first 20 columns hold none, if there are more."""
-    rng = np.random.default_rng(seed)
-    coded = rng.random((rows, columns)) < share
-    coded[:, :20] &= columns <= 20 or share == 1
-    shape = (channels, *blocks_of(coded, side).shape, side, side)
-    levels = np.trunc(rng.laplace(0, 3, shape) / (1 + np.add.outer(np.arange(side), np.arange(side)))).astype(np.int64)
-    levels[..., 0, 0] *= 7
-    return Blocks(levels, rng.integers(0, FINENESSES, shape[1:3]), int(rng.integers(1, 100))), coded
-
-
-def float_symbols(told: Blocks, coded: np.ndarray) -> np.ndarray:
+def float_symbols(told: TransformBlocks, coded: np.ndarray) -> np.ndarray:
     """What exact cosines make of levels, before they are rounded."""
     side, k = told.levels.shape[-1], np.arange(told.levels.shape[-1])
     basis = np.cos(np.pi * np.outer(k, 2 * k + 1) / (2 * side)) * np.sqrt(2 / side)
     basis[0] /= np.sqrt(2)
-    factors = told.levels * quantisers(side, told.quantiser)[told.fineness] / PARTS
+    factors = told.levels * step_table(side, told.quantiser)[told.step_offsets] / UNITS_PER_SYMBOL
     texels = basis.T @ factors @ basis
-    down, across = told.fineness.shape
+    down, across = told.step_offsets.shape
     whole = texels.transpose(1, 3, 2, 4, 0).reshape(down * side, across * side, -1)
     return np.where(coded[..., None], whole[: coded.shape[0], : coded.shape[1]], 0)
 
 
 @pytest.mark.parametrize("side", SIDES)
 def test_cosines_are_nearly_orthogonal(side: int) -> None:
-    rows = cosines(side) / (128 * np.sqrt(side))
+    rows = dct_basis(side) / (128 * np.sqrt(side))
     np.testing.assert_allclose(rows @ rows.T, np.eye(side), atol=0.01)
-    assert (np.diff(coarser(side)) >= 0).all() and coarser(side)[0] == 52  # 64 / sqrt(1.5)
+    assert (np.diff(frequency_weights(side)) >= 0).all() and frequency_weights(side)[0] == 52  # 64 / sqrt(1.5)
 
 
 @pytest.mark.parametrize(("side", "rows", "columns"), SIZES)
@@ -78,7 +66,7 @@ def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(
     side: int, rows: int, columns: int, share: float
 ) -> None:
     for seed in range(4):
-        told, coded = some(side, rows, columns, share, seed)
+        told, coded = random_blocks(side, rows, columns, share, seed)
         symbols, where = decode_blocks(encode_blocks(told, coded), rows, columns, 3)
         np.testing.assert_array_equal(
             symbols, decode_blocks(encode_blocks(told, coded, borders=False), rows, columns, 3)[0]
@@ -86,11 +74,13 @@ def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(
         np.testing.assert_array_equal(where, coded)
         for borders in (True, False):
             body = encode_blocks(told, coded, borders=borders)
-            assert encode_blocks(blocks_in(body, rows, columns, 3), coded, borders=borders) == body
+            assert encode_blocks(decode_levels(body, rows, columns, 3), coded, borders=borders) == body
         exact = float_symbols(told, coded)
         # A rounded cosine errs by 1 / 256 of 1 at most, in each of two sums over levels; then half a symbol, and a 1 / 16 after the first sum.
         side_sum = (
-            np.abs(told.levels * quantisers(side, told.quantiser)[told.fineness] / PARTS).sum((3, 4)).max(initial=0)
+            np.abs(told.levels * step_table(side, told.quantiser)[told.step_offsets] / UNITS_PER_SYMBOL)
+            .sum((3, 4))
+            .max(initial=0)
         )
         bound = 0.5 + 1 / 16 + 2 * side_sum * 2 / side * np.sqrt(2) / 256
         assert np.abs(np.clip(exact, -128, 127) - symbols).max(initial=0) <= bound
@@ -104,7 +94,7 @@ def test_the_spec_s_own_decoder_agrees(
     twin: ModuleType, codec: int, side: int, rows: int, columns: int, share: float
 ) -> None:
     for seed in range(3):
-        told, coded = some(side, rows, columns, share, seed + 10)
+        told, coded = random_blocks(side, rows, columns, share, seed + 10)
         told.levels[0, 0, 0, -1, -1], told.levels[-1, -1, -1, 0, -1] = (
             -1,
             LARGEST,
@@ -136,7 +126,7 @@ def test_the_largest_side_never_makes_much_more_of_a_segment_than_it_is() -> Non
 
 def test_where_hardly_anything_changes_blocks_take_next_to_nothing() -> None:
     coded = np.ones((64, 64), bool)
-    flat = Blocks(np.zeros((8, 4, 4, 16, 16), np.int64), np.full((4, 4), USUAL), 64)
+    flat = TransformBlocks(np.zeros((8, 4, 4, 16, 16), np.int64), np.full((4, 4), DEFAULT_OFFSET), 64)
     flat.levels[..., 0, 0] = 5  # foreseen from the second block on
     body = encode_blocks(flat, coded)
     assert len(body) < 60
@@ -151,32 +141,32 @@ def test_borders_say_what_a_smooth_plane_goes_on_as() -> None:
     noise = np.random.default_rng(4).normal(0, 40, smooth.shape)
     sizes = []
     for values in (smooth, noise):
-        basis = cosines(8) / (128 * np.sqrt(8))
+        basis = dct_basis(8) / (128 * np.sqrt(8))
         factors = basis @ values.reshape(12, 8, 12, 8, 3).transpose(4, 0, 2, 1, 3) @ basis.T
-        levels = np.rint(factors * PARTS / quantisers(8, 48)[USUAL]).astype(np.int64)
-        told = Blocks(levels, np.full((12, 12), USUAL), 48)
+        levels = np.rint(factors * UNITS_PER_SYMBOL / step_table(8, 48)[DEFAULT_OFFSET]).astype(np.int64)
+        told = TransformBlocks(levels, np.full((12, 12), DEFAULT_OFFSET), 48)
         sizes.append([len(encode_blocks(told, np.ones((96, 96), bool), borders=borders)) for borders in (False, True)])
     assert sizes[0][1] < 0.9 * sizes[0][0] and sizes[1][1] < 1.01 * sizes[1][0]
 
 
 def test_a_map_that_is_implied_is_not_told() -> None:
-    told, coded = some(8, 37, 50, 0.6, 8)
+    told, coded = random_blocks(8, 37, 50, 0.6, 8)
     body, longer = encode_blocks(told, coded, coded), encode_blocks(told, coded)
     assert len(body) < len(longer) - 100
     np.testing.assert_array_equal(decode_blocks(body, 37, 50, 3, coded)[0], decode_blocks(longer, 37, 50, 3)[0])
-    assert segments.encode_coded(*decode_blocks(body, 37, 50, 3, coded), body, coded) == body
+    assert segments.encode_segment(*decode_blocks(body, 37, 50, 3, coded), body, coded) == body
     with pytest.raises(FormatError, match="an occupancy that is not known"):
         decode_blocks(body, 37, 50, 3)
-    other = segments.encode_coded(*decode_blocks(body, 37, 50, 3, coded), body, ~coded)  # a guide is no use then
+    other = segments.encode_segment(*decode_blocks(body, 37, 50, 3, coded), body, ~coded)  # a side_info is no use then
     assert not transform.holds_blocks(other)
 
 
 def test_a_body_is_read_to_its_end_and_no_further() -> None:
-    told, coded = some(8, 20, 20, 1.0, 5)
+    told, coded = random_blocks(8, 20, 20, 1.0, 5)
     body = encode_blocks(told, coded)
     for cut in range(len(body)):
         with pytest.raises(FormatError, match=r"plane segment"):
-            segments.decode_coded(body[:cut], 20, 20, 3)
+            segments.decode_segment(body[:cut], 20, 20, 3)
     with pytest.raises(FormatError, match="do not end where they should"):
         decode_blocks(body + b"\0\0", 20, 20, 3)
     for at, value in ((0, 5), (0, 0), (2, 0)):
@@ -191,44 +181,47 @@ def test_no_body_makes_a_symbol_leave_its_eight_bits() -> None:
     rng = np.random.default_rng(8)
     read = 0
     for _ in range(300):
-        told, coded = some(int(rng.choice(SIDES)), 17, 18, 1.0, int(rng.integers(1 << 30)))
+        told, coded = random_blocks(int(rng.choice(SIDES)), 17, 18, 1.0, int(rng.integers(1 << 30)))
         told.levels[:] = rng.integers(-LARGEST // 2, LARGEST // 2, told.levels.shape)
-        body = encode_blocks(Blocks(told.levels, told.fineness, 255), coded)
+        body = encode_blocks(TransformBlocks(told.levels, told.step_offsets, 255), coded)
         symbols, _ = decode_blocks(body, 17, 18, 3)
         read += int(symbols.min() == -128 and symbols.max() == 127)
     assert read == 300
 
 
 def test_a_guide_is_followed_only_where_symbols_are_its_own() -> None:
-    told, coded = some(8, 20, 20, 0.8, 6)
+    told, coded = random_blocks(8, 20, 20, 0.8, 6)
     body = encode_blocks(told, coded)
     symbols, _ = decode_blocks(body, 20, 20, 3)
-    assert segments.encode_coded(symbols, coded, body) == body and segments.segment_guide(body) == body
+    assert segments.encode_segment(symbols, coded, body) == body and segments.side_info_of(body) == body
     moved = symbols.copy()
     moved[tuple(np.argwhere(coded)[0])] ^= 1
-    other = segments.encode_coded(moved, coded, body)
+    other = segments.encode_segment(moved, coded, body)
     assert not transform.holds_blocks(other)
-    np.testing.assert_array_equal(segments.decode_coded(other, 20, 20, 3)[0], moved)
+    np.testing.assert_array_equal(segments.decode_segment(other, 20, 20, 3)[0], moved)
 
 
 def test_guides_of_segments_are_one_of_the_plane() -> None:
-    told, coded = some(8, 20, 20, 0.8, 6)
+    told, coded = random_blocks(8, 20, 20, 0.8, 6)
     body = encode_blocks(told, coded)
-    plane = segments.guide_together({0: body, 20: body})
+    plane = segments.merge_side_info({0: body, 20: body})
     assert (
-        isinstance(plane, segments.Told)
-        and segments.guide_at(plane, 20) == body
-        and segments.guide_at(plane, 3) is None
+        isinstance(plane, segments.TransformSegments)
+        and segments.side_info_at(plane, 20) == body
+        and segments.side_info_at(plane, 3) is None
     )
-    part = segments.guide_together({0: body, 20: None})  # of which one was smaller without
+    part = segments.merge_side_info({0: body, 20: None})  # of which one was smaller without
     assert (
-        isinstance(part, segments.Told)
-        and segments.guide_at(part, 20) is None
-        and segments.guide_together({0: None}) is None
+        isinstance(part, segments.TransformSegments)
+        and segments.side_info_at(part, 20) is None
+        and segments.merge_side_info({0: None}) is None
     )
-    one, other = Guide(np.ones((1, WEIGHTS), np.int8)), Guide(np.zeros((1, WEIGHTS), np.int8))
+    one, other = (
+        PredictionWeights(np.ones((1, WEIGHT_COUNT), np.int8)),
+        PredictionWeights(np.zeros((1, WEIGHT_COUNT), np.int8)),
+    )
     assert (
-        segments.guide_together({0: one, 20: None, 30: one}) == one
-        and segments.guide_together({0: one, 20: other}) is None
+        segments.merge_side_info({0: one, 20: None, 30: one}) == one
+        and segments.merge_side_info({0: one, 20: other}) is None
     )
     assert HEAD == 3

@@ -5,7 +5,7 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kpc.format.coding.quantise import round_decoder, weights_of
+from kpc.format.coding.quantise import decoder_arrays, round_decoder
 from kpc.format.coding.weights import COARSEST, FINEST, LARGEST, decode_weights, encode_weights
 from kpc.format.common.errors import FormatError
 from scenes import tiny_scene
@@ -68,7 +68,7 @@ def test_what_has_too_many_digits_is_left_to_other_codecs() -> None:
 def test_weights_of_a_decoder_take_fewer_bytes_than_zstd_makes_of_them() -> None:
     """At the errors that rounding each to so many significant bits makes, which is best for zstd."""
     decoder = tiny_scene(6, channels=24).decoder
-    arrays = list(weights_of(round_decoder(decoder, dict.fromkeys(weights_of(decoder), 6))).values())
+    arrays = list(decoder_arrays(round_decoder(decoder, dict.fromkeys(decoder_arrays(decoder), 6))).values())
     halves = b"".join(values.astype("<f2").tobytes() for values in arrays)
     assert len(encoded(arrays)) < 0.8 * len(zstandard.ZstdCompressor(level=19).compress(halves)) < 0.9 * len(halves)
 

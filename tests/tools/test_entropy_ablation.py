@@ -2,20 +2,19 @@ import json
 
 import numpy as np
 import pytest
+from codec_inputs import followed, random_blocks, textured
 from kpc.format.coding import predictive, transform
-from kpc.format.coding.predictive import SET_COUNTS, Guide, encode_symbols
+from kpc.format.coding.predictive import SET_COUNTS, PredictionWeights, encode_symbols
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.scene_io import write
-from kpc.format.container.segments import encode_coded
+from kpc.format.container.segments import encode_segment
 from kpc.tools.bench import entropy_ablation, kpbench, results
 from scenes import tiny_scene
-from test_blocks import some
-from test_symbols import followed, textured
 
 
 def in_blocks(side=8, rows=60, columns=92, share=0.7, by_occupancy=False):
     """A segment."""
-    told, coded = some(side, rows, columns, share, seed=3)
+    told, coded = random_blocks(side, rows, columns, share, seed=3)
     implied = coded if by_occupancy else None
     body = transform.encode_blocks(told, coded, implied)
     values, _ = transform.decode_blocks(body, rows, columns, 3, implied)
@@ -24,11 +23,11 @@ def in_blocks(side=8, rows=60, columns=92, share=0.7, by_occupancy=False):
 
 def test_with_nothing_changed_the_coder_is_the_coder():
     values, coded = textured(20, 24, 3)
-    guide = Guide(np.int8([[3, -5, 8, 0, 1, -2, 4, 0, 1]]))
-    for values, guide in ((values, None), (followed(values, coded, guide), guide)):
+    side_info = PredictionWeights(np.int8([[3, -5, 8, 0, 1, -2, 4, 0, 1]]))
+    for values, side_info in ((values, None), (followed(values, coded, side_info), side_info)):
         for implied in (coded, ~coded):
-            body = encode_symbols(values, coded, guide, implied)
-            segment = entropy_ablation.Segment(values, coded, implied, guide, body)
+            body = encode_symbols(values, coded, side_info, implied)
+            segment = entropy_ablation.Segment(values, coded, implied, side_info, body)
             assert entropy_ablation._bytes(segment, entropy_ablation._compiled(predictive, {}), SET_COUNTS) == len(body)
 
 
@@ -36,7 +35,7 @@ def test_with_nothing_changed_the_coder_is_the_coder():
 def test_with_nothing_changed_blocks_are_as_they_were(by_occupancy):
     segment, walks = in_blocks(by_occupancy=by_occupancy), entropy_ablation._compiled(transform, {})
     assert entropy_ablation._bytes_in_blocks(segment, walks, borders=True) == len(segment.body)
-    told = transform.blocks_in(segment.body, *segment.symbols.shape, segment.implied)
+    told = transform.decode_levels(segment.body, *segment.symbols.shape, segment.implied)
     assert entropy_ablation._bytes_in_blocks(segment, walks, borders=False) == len(
         transform.encode_blocks(told, segment.coded, borders=False)
     )
@@ -62,7 +61,7 @@ def test_a_map_is_told_where_occupancy_does_not():
     assert idea.has(segment) and not idea.has(in_blocks()) and not idea.has(in_blocks(share=1.0))
     assert idea.sized()(segment) > len(segment.body)
     values, coded = textured(20, 24, 3)
-    by_symbols = entropy_ablation.Segment(values, coded, coded, None, encode_coded(values, coded, None, coded))
+    by_symbols = entropy_ablation.Segment(values, coded, coded, None, encode_segment(values, coded, None, coded))
     assert idea.sized()(by_symbols) == len(encode_symbols(values, coded)) > len(by_symbols.body)
 
 

@@ -14,14 +14,22 @@ from typing import Any
 
 import numpy as np
 from kpc.format.coding import predictive, rans, transform
-from kpc.format.coding.predictive import ANY, AROUND, MOST_DECISIONS, SET_COUNTS, TRELLIS, WEIGHTS, fitted
+from kpc.format.coding.predictive import (
+    DEPENDENT,
+    MAX_DECISIONS,
+    SCALAR,
+    SET_COUNTS,
+    TRELLIS,
+    WEIGHT_COUNT,
+    fit_weights,
+)
 from kpc.format.coding.quantise import needed_texels
-from kpc.format.coding.rans import words_of
-from kpc.format.coding.transform import DECISIONS as LEVEL_DECISIONS
-from kpc.format.coding.transform import FREQUENCIES, blocks_in
+from kpc.format.coding.rans import trace_words
+from kpc.format.coding.transform import FREQUENCY_CLASSES, decode_levels
+from kpc.format.coding.transform import MODELS_PER_CONTEXT as LEVEL_DECISIONS
 from kpc.format.container.container import pack
 from kpc.format.container.scene_io import SceneReader, read, scene_chunks
-from kpc.format.container.segments import SegmentGuide, encode_coded, guide_at
+from kpc.format.container.segments import SegmentSideInfo, encode_segment, side_info_at
 from kpc.format.scene.scene import ALL_PLANES
 from numba import njit
 
@@ -34,15 +42,15 @@ TABLE_BITS = 12
 class Segment:
     """(H, W, M) int8 symbols of a plane segment, (H, W) bool coded texels, those that follow from occupancy, how it is told, and so told."""
 
-    predictive: np.ndarray
+    symbols: np.ndarray
     coded: np.ndarray
     implied: np.ndarray
-    guide: SegmentGuide | None
+    side_info: SegmentSideInfo | None
     body: bytes
 
     @property
     def is_in_blocks(self) -> bool:
-        return isinstance(self.guide, bytes)
+        return isinstance(self.side_info, bytes)
 
     @property
     def tells_map(self) -> bool:
@@ -62,16 +70,16 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
         if chunk.kind == "PLNE":
             name = ALL_PLANES[chunk.plane]
             plane = quantised.scales[chunk.scale][name]
-            rows, guide = (
+            rows, side_info = (
                 slice(chunk.row_start, chunk.row_start + chunk.row_count),
-                guide_at(plane.guide, chunk.row_start),
+                side_info_at(plane.side_info, chunk.row_start),
             )
             told = (
                 plane.symbols[rows],
                 plane.coded[rows],
                 needed_texels(quantised.occupancy, name, *plane.coded.shape)[rows],
             )
-            segments.append(Segment(*told, guide, encode_coded(*told[:2], guide, told[2])))
+            segments.append(Segment(*told, side_info, encode_segment(*told[:2], side_info, told[2])))
     values = sum(plane.symbols.size for planes in quantised.scales for plane in planes.values())
     found = {
         "nothing": _decoded(pack(chunks, values))
@@ -142,13 +150,13 @@ def _no_pull(rest, cosines, i, j, beside, over):
 @njit
 def _frequency_alone(here, left, above, before, i, j, side):
     """In place of `level_context`."""
-    return min(5 * (i + j) // side, FREQUENCIES - 2) if i + j else FREQUENCIES - 1
+    return min(5 * (i + j) // side, FREQUENCY_CLASSES - 2) if i + j else FREQUENCY_CLASSES - 1
 
 
 @njit
 def _without_frequency(here, left, above, before, i, j, side):
     context = transform.level_context(here, left, above, before, i, j, side)
-    return context if i + j == 0 else context // FREQUENCIES * FREQUENCIES
+    return context if i + j == 0 else context // FREQUENCY_CLASSES * FREQUENCY_CLASSES
 
 
 @njit
@@ -159,33 +167,33 @@ def _without_before(here, left, above, before, i, j, side):
 @njit
 def _even_levels():
     """In place of `level_counters`."""
-    return rans.counters(transform.SIZES * FREQUENCIES * LEVEL_DECISIONS)
+    return rans.new_models(transform.MAGNITUDE_CONTEXTS * FREQUENCY_CLASSES * LEVEL_DECISIONS)
 
 
 @njit
 def _even_signs():
     """In place of `sign_counters`."""
-    return rans.counters(len(transform.AGREES))
+    return rans.new_models(len(transform.SIGN_PROBABILITIES))
 
 
 CALLERS = {
     predictive: (
         "begin_row",
-        "remember",
-        "next_state",
-        "next_place",
+        "update_cross_channel",
+        "trellis_transition",
+        "next_trellis_state",
         "predict",
         "nearest",
-        "foreseen",
-        "meant",
-        "told",
+        "round_prediction",
+        "residual_to_offset",
+        "offset_to_residual",
         "activity",
-        "natural",
-        "integer",
-        "walk_map",
-        "walk",
+        "code_unsigned",
+        "code_signed",
+        "code_map",
+        "code_symbols",
     ),
-    transform: ("walk_signs", "walk_levels"),
+    transform: ("code_signs", "code_levels"),
 }
 """What calls what may be changed, and that itself, each before those that call it."""
 
@@ -203,32 +211,34 @@ def _compiled(module: ModuleType, changes: dict[str, Any]) -> Walks:
 def _bytes(
     segment: Segment, walks: Walks, counts: tuple[int, ...], size: Callable[[np.ndarray], float] | None = None
 ) -> int:
-    """What a segment takes that is told symbol by symbol, with the best number of sets of weights, or with none; with those of its guide, if it has
+    """What a segment takes that is told symbol by symbol, with the best number of sets of weights, or with none; with those of its side_info, if it has
     one. `size` is of a trace, else of its words."""
     told, coded = np.array(segment.symbols, order="C"), np.ascontiguousarray(segment.coded)  # `walk` writes
-    neighbours, guide = predictive.neighbourhoods(told, coded), segment.guide
-    trace = np.empty(coded.size + len(neighbours) * MOST_DECISIONS, np.int16)
-    if isinstance(guide, predictive.Guide):
-        lattice, tried = AROUND, [guide.weights]
+    neighbours, side_info = predictive.collect_neighbours(told, coded), segment.side_info
+    trace = np.empty(coded.size + len(neighbours) * MAX_DECISIONS, np.int16)
+    if isinstance(side_info, predictive.PredictionWeights):
+        lattice, tried = DEPENDENT, [side_info.weights]
     else:
-        lattice = TRELLIS if predictive.follows_trellis(told, coded) else ANY
-        tried = [fitted(neighbours, count) for count in counts] or [np.zeros((1, WEIGHTS), np.int8)]
+        lattice = TRELLIS if predictive.follows_trellis(told, coded) else SCALAR
+        tried = [fit_weights(neighbours, count) for count in counts] or [np.zeros((1, WEIGHT_COUNT), np.int8)]
     sizes = []
     for weights in tried:
         at = 0
         if segment.tells_map:
-            _, at = walks["walk_map"](coded, 0, at, None, trace)
+            _, at = walks["code_map"](coded, 0, at, None, trace)
             trace[:at] -= 8192 * (size is not None)  # counters of the map are others
-        _, at, _ = walks["walk"](told, coded, lattice, weights, 0, at, None, trace, None)
+        _, at, _ = walks["code_symbols"](told, coded, lattice, weights, 0, at, None, trace, None)
         sizes.append(
-            2 + (weights.size if counts or guide else 0) + (size(trace[:at]) if size else 2 * len(words_of(trace[:at])))
+            2
+            + (weights.size if counts or side_info else 0)
+            + (size(trace[:at]) if size else 2 * len(trace_words(trace[:at])))
         )
     return round(min(sizes))
 
 
-def _told(segment: Segment) -> transform.Blocks:
+def _told(segment: Segment) -> transform.TransformBlocks:
     rows, columns, channels = segment.symbols.shape
-    return blocks_in(segment.body, rows, columns, channels, segment.implied)
+    return decode_levels(segment.body, rows, columns, channels, segment.implied)
 
 
 def _bytes_in_blocks(segment: Segment, walks: Walks, borders: bool) -> int:
@@ -260,7 +270,7 @@ class OfSymbols:
     steers: bool = False
 
     def has(self, segment: Segment) -> bool:
-        return not segment.is_in_blocks and not (self.steers and segment.guide is not None)
+        return not segment.is_in_blocks and not (self.steers and segment.side_info is not None)
 
     def sized(self) -> Sized:
         return partial(_bytes, walks=_compiled(predictive, self.changes), counts=self.counts, size=self.size)
@@ -293,19 +303,19 @@ class OfMaps:
 def _with_map(segment: Segment) -> int:
     if segment.is_in_blocks:
         return len(transform.encode_blocks(_told(segment), segment.coded))
-    return len(encode_coded(segment.symbols, segment.coded, segment.guide))
+    return len(encode_segment(segment.symbols, segment.coded, segment.side_info))
 
 
 LEFT_OUT: dict[str, OfSymbols | OfBlocks | OfMaps] = {
     "maps that follow from occupancy": OfMaps(),
     "one set of weights": OfSymbols({}, (1,)),
     "no weights: mean of left and above": OfSymbols({}, ()),
-    "no contexts of activity": OfSymbols({"context_of": _by_part}),
-    "no contexts of the fraction": OfSymbols({"context_of": _by_activity}),
-    "no errors of channels before": OfSymbols({"remember": _forget}, steers=True),
-    "stored tables for counters that learn": OfSymbols({"adapt": _note}, size=_tables),
+    "no contexts of activity": OfSymbols({"residual_context": _by_part}),
+    "no contexts of the fraction": OfSymbols({"residual_context": _by_activity}),
+    "no errors of channels before": OfSymbols({"update_cross_channel": _forget}, steers=True),
+    "stored tables for counters that learn": OfSymbols({"code_bit_adaptive": _note}, size=_tables),
     "blocks: nothing of borders": OfBlocks({}, borders=False),
-    "blocks: no signs by borders": OfBlocks({"pull_of": _no_pull}),
+    "blocks: no signs by borders": OfBlocks({"sign_bias": _no_pull}),
     "blocks: no levels around": OfBlocks({"level_context": _frequency_alone}),
     "blocks: no frequency": OfBlocks({"level_context": _without_frequency}),
     "blocks: no channel before": OfBlocks({"level_context": _without_before}),

@@ -154,7 +154,7 @@ def _lengthened(scene: Path, folder: Path) -> Path:
     """A clip LONGER times as long: its time planes over and over."""
     short = read(scene)
     scales = tuple({name: replace(plane, symbols=np.tile(plane.symbols, (LONGER, 1, 1)), coded=np.tile(plane.coded, (LONGER, 1)),
-                                  guide=None, starts=())
+                                  side_info=None, starts=())
                     if name in TIME_PLANES else plane for name, plane in scale.items()} for scale in short.scales)  # fmt: skip
     motion = (
         None

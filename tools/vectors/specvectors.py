@@ -22,28 +22,28 @@ from typing import Any
 import google_crc32c
 import numpy as np
 import zstandard
-from kpc.format.coding.motion_hierarchical import encode_midpoints
+from kpc.format.coding.motion_codec import encode_motion
 from kpc.format.coding.motion_raster import LORENZO, NEIGHBOURS
 from kpc.format.coding.motion_raster import encode_with as encode_nodes_with
-from kpc.format.coding.occupancy_codec import encode_cells
+from kpc.format.coding.occupancy_codec import encode_occupancy
 from kpc.format.coding.poses import BITS, LENS, NOTHING, ROOT, WORD
 from kpc.format.coding.poses import HEAD as POSES_HEAD
 from kpc.format.coding.predictive import (
-    ANY,
-    AROUND,
+    DEPENDENT,
     LATTICE_BIT,
-    MOST_DECISIONS,
+    MAX_DECISIONS,
+    SCALAR,
     TRELLIS,
-    WEIGHTS,
-    Guide,
-    encode_with,
+    WEIGHT_COUNT,
+    PredictionWeights,
+    code_symbols,
+    encode_with_weights,
     follows_trellis,
-    next_state,
-    walk,
+    trellis_transition,
 )
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels
-from kpc.format.coding.rans import stream
-from kpc.format.coding.transform import FINENESSES, HEAD, Blocks, blocks_of, encode_blocks, largest_side
+from kpc.format.coding.rans import encode_trace
+from kpc.format.coding.transform import HEAD, OFFSET_COUNT, TransformBlocks, coded_blocks, encode_blocks, largest_side
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.container import container
@@ -232,34 +232,34 @@ def context_coded(
     them. `flat`: symbols near to the scene's that are around predictions where it is flat. `implied`: maps follow from occupancy.
     """
     if weights is None:
-        weights = (_noise((sets, WEIGHTS), 61) / 4).astype(np.int8)
+        weights = (_noise((sets, WEIGHT_COUNT), 61) / 4).astype(np.int8)
         weights[0, 0], weights[-1, -1] = -128, 127
     if flat:
-        scene = around(scene, Guide(weights), segment_rows)
+        scene = around(scene, PredictionWeights(weights), segment_rows)
     chunks = []
     for chunk in scene_chunks(scene, segment_rows=segment_rows):
         if chunk.kind == "PLNE":
             plane = scene.scales[chunk.scale][ALL_PLANES[chunk.plane]]
             rows = slice(chunk.row_start, chunk.row_start + chunk.row_count)
             symbols, coded = plane.symbols[rows], plane.coded[rows]
-            lattice = AROUND if flat else TRELLIS if follows_trellis(symbols, coded) else ANY
-            body = encode_with(weights, symbols, coded, lattice, _needed(scene, chunk) if implied else None)
+            lattice = DEPENDENT if flat else TRELLIS if follows_trellis(symbols, coded) else SCALAR
+            body = encode_with_weights(weights, symbols, coded, lattice, _needed(scene, chunk) if implied else None)
             chunks.append(_forced(chunk, body, codec_of(body)))
         else:
             chunks.append(replace(chunk, coded={}))
     return pack(chunks, _value_count(scene))
 
 
-def around(scene: QuantisedScene, guide: Guide, segment_rows: int) -> QuantisedScene:
-    """The scene with near symbols, none at the ends of 8 bits, that follow a guide in each segment."""
+def around(scene: QuantisedScene, side_info: PredictionWeights, segment_rows: int) -> QuantisedScene:
+    """The scene with near symbols, none at the ends of 8 bits, that follow a side_info in each segment."""
 
     def moved(plane: QuantisedPlane, rows: int) -> QuantisedPlane:
         segments = [
             np.clip(plane.symbols[start : start + rows], -126, 126) for start in range(0, len(plane.symbols), rows)
         ]
         for number, symbols in enumerate(segments):
-            walked(symbols, plane.coded[rows * number : rows * (number + 1)], guide.weights, AROUND)
-        return replace(plane, symbols=np.concatenate(segments), guide=guide)
+            walked(symbols, plane.coded[rows * number : rows * (number + 1)], side_info.weights, DEPENDENT)
+        return replace(plane, symbols=np.concatenate(segments), side_info=side_info)
 
     return replace(
         scene,
@@ -290,12 +290,12 @@ def in_blocks(
         plane = scene.scales[chunk.scale][ALL_PLANES[chunk.plane]]
         coded = plane.coded[chunk.row_start : chunk.row_start + chunk.row_count]
         N = min(side, largest_side(*coded.shape))
-        grid, seed = blocks_of(coded, N).shape, 100 + 10 * chunk.plane + chunk.scale
+        grid, seed = coded_blocks(coded, N).shape, 100 + 10 * chunk.plane + chunk.scale
         levels = _noise((plane.symbols.shape[2], *grid, N, N), seed) / 128 * spread
         levels *= np.float32(1) / (1 + np.add.outer(np.arange(N), np.arange(N), dtype=np.float32)) ** 2
-        fineness = np.abs(_noise(grid, seed + 1)).astype(np.int64) % FINENESSES
+        step_offsets = np.abs(_noise(grid, seed + 1)).astype(np.int64) % OFFSET_COUNT
         return encode_blocks(
-            Blocks(np.trunc(levels).astype(np.int64), fineness, quantiser),
+            TransformBlocks(np.trunc(levels).astype(np.int64), step_offsets, quantiser),
             coded,
             _needed(scene, chunk) if implied else None,
             borders=codec == CODEC_THIRD,
@@ -337,9 +337,9 @@ def _needed(scene: QuantisedScene, chunk: Chunk) -> np.ndarray:
 
 def walked(symbols: np.ndarray, coded: np.ndarray, weights: np.ndarray, lattice: int) -> bytes:
     """A segment that tells (H, W, M) symbols up to the first that leaves its 8 bits, each moved so that it follows the lattice."""
-    trace = np.empty(symbols.size * MOST_DECISIONS, np.int16)
-    _, at, _ = walk(symbols, np.ascontiguousarray(coded), lattice, weights, 0, 0, None, trace, None)
-    return bytes([len(weights), lattice << LATTICE_BIT]) + weights.tobytes() + stream(trace[:at])
+    trace = np.empty(symbols.size * MAX_DECISIONS, np.int16)
+    _, at, _ = code_symbols(symbols, np.ascontiguousarray(coded), lattice, weights, 0, 0, None, trace, None)
+    return bytes([len(weights), lattice << LATTICE_BIT]) + weights.tobytes() + encode_trace(trace[:at])
 
 
 def coded_grids(scene: QuantisedScene) -> bytes:
@@ -463,7 +463,7 @@ def _on_trellis(scene: QuantisedScene) -> QuantisedScene:
             place = 0
             for x in np.flatnonzero(plane.coded[y]):
                 symbols[y, x, c] = symbols[y, x, c] & ~1 | place & 1
-                place = next_state(place, int(symbols[y, x, c]))
+                place = trellis_transition(place, int(symbols[y, x, c]))
         return replace(plane, symbols=symbols)
 
     return replace(scene, scales=tuple({name: moved(plane) for name, plane in scale.items()} for scale in scene.scales))
@@ -845,9 +845,9 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
     broken = "FormatError"
 
     symbols = np.array([[[0, 1], [100, -7]], [[-128, 127], [3, 3]]], np.int16)
-    weights = np.zeros((1, WEIGHTS), np.int8)
+    weights = np.zeros((1, WEIGHT_COUNT), np.int8)
     whole = np.ones((2, 2), bool)
-    coarse = encode_with(weights, symbols.astype(np.int8), whole, ANY)
+    coarse = encode_with_weights(weights, symbols.astype(np.int8), whole, SCALAR)
     small = _scene(dynamic=False, sizes=[(2, 2, 2, 2, 0)])
     small_chunks = scene_chunks(small)
     small_xy = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "PLNE")
@@ -860,13 +860,13 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         )
 
     told = context(coarse)
-    four = Blocks(np.trunc(_noise((2, 1, 1, 4, 4), 71) / 8).astype(np.int64), np.full((1, 1), 2), 40)
+    four = TransformBlocks(np.trunc(_noise((2, 1, 1, 4, 4), 71) / 8).astype(np.int64), np.full((1, 1), 2), 40)
     in_four, from_borders = (encode_blocks(four, whole, borders=borders) for borders in (False, True))
     third = partial(context, codec=CODEC_THIRD)
     small_entry = HEADER.size + ENTRY.size * small_xy
-    state_at = 2 + WEIGHTS
+    state_at = 2 + WEIGHT_COUNT
     small_occu = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "OCCU")
-    cells = struct.pack("<4H", 1, 3, 3, 5) + encode_cells(_noise((1, 3, 3, 5), 99) > 0)
+    cells = struct.pack("<4H", 1, 3, 3, 5) + encode_occupancy(_noise((1, 3, 3, 5), 99) > 0)
 
     def occupied(body: bytes, length: int = 8 + 6) -> bytes:
         """A file whose occupancy is so coded, and claims to stand for so many bytes."""
@@ -883,7 +883,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         """A file with a motion grid that is so coded, and claims to stand for so many bytes."""
         return claiming([chunks[scne], Chunk("MOVE", [body]), *chunks[deco:]], 1, values, length, codec)
 
-    halves = nodes[:12] + encode_midpoints(grid.symbols)
+    halves = nodes[:12] + encode_motion(grid.symbols)
     moving_halves = partial(moving, codec=CODEC_MIDPOINTS)
 
     small_deco = next(number for number, chunk in enumerate(small_chunks) if chunk.kind == "DECO")
@@ -927,7 +927,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
             },
         ),
     )
-    nothing = encode_with(weights, vast.scales[0]["xy"].symbols, vast.scales[0]["xy"].coded, TRELLIS)
+    nothing = encode_with_weights(weights, vast.scales[0]["xy"].symbols, vast.scales[0]["xy"].coded, TRELLIS)
     hollow = [
         replace(chunk, coded={}, parts=[nothing] if number == small_xy else chunk.parts)
         for number, chunk in enumerate(scene_chunks(vast))
@@ -1016,8 +1016,8 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         **damaged_words("borders", third, from_borders, HEAD),
         **damaged_words("symbols", context, coarse, state_at),
         "symbols-bomb": (resealed(bomb_symbols), broken, "more than 15 bytes can hold"),
-        "symbols-range": (context(walked(symbols + 200, whole, weights, ANY)), broken, "leaves its 8 bits"),
-        "around-range": (context(walked(0 * symbols + 200, whole, weights, AROUND)), broken, "leaves its 8 bits"),
+        "symbols-range": (context(walked(symbols + 200, whole, weights, SCALAR)), broken, "leaves its 8 bits"),
+        "around-range": (context(walked(0 * symbols + 200, whole, weights, DEPENDENT)), broken, "leaves its 8 bits"),
         "symbols-count": (resealed(patched(told, small_entry + 24, "<I", 7)), broken, "claims 7 symbols"),
         "symbols-elsewhere": (
             resealed(patched(good, entry[deco] + 16, "<H", 2)),
@@ -1051,7 +1051,7 @@ def _invalid() -> dict[str, tuple[bytes, str, str]]:
         ),
         **damaged_words("midpoints", moving_halves, halves, 12),
         "midpoints-range": (
-            moving_halves(struct.pack("<4Hf", 2, 2, 2, 2, grid.step) + encode_midpoints(leaving), 12 + 6 * 16),
+            moving_halves(struct.pack("<4Hf", 2, 2, 2, 2, grid.step) + encode_motion(leaving), 12 + 6 * 16),
             broken,
             "leaves its 16 bits",
         ),
@@ -1259,7 +1259,7 @@ def _painted(
 def _in_all_contexts() -> bytes:
     """Planes full of ends of the range under weights that fail them, and one that hardly changes: with the other vectors, found by trial
     to have symbols in every context that there can be."""
-    weights = _noise((2, WEIGHTS), 3025).astype(np.int8)
+    weights = _noise((2, WEIGHT_COUNT), 3025).astype(np.int8)
     weights[0, 8] = 24
 
     def paint(shape: tuple[int, int, int], number: int) -> np.ndarray:

@@ -12,15 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from kpc.format.coding.motion_raster import CONTEXTS, DECISIONS, ESCAPES, MOST_DECISIONS, UNARY
-from kpc.format.coding.rans import compiled, counters, doublings, ended, inlined, integer, opened, stream
+from kpc.format.coding.rans import check_end, code_signed, encode_trace, log_class, new_models, open_stream
 from kpc.format.common.errors import FormatError
+from kpc.format.common.jit import compiled, inlined
 
 WEIGHT_BITS = 6
 """Weights are multiples of 2^-WEIGHT_BITS."""
 
 
 @dataclass(frozen=True)
-class Pass:
+class CodingPass:
     """Nodes that are told one after the other: `new` along an axis, and all that are there along the others.
 
     Attributes:
@@ -40,16 +41,16 @@ class Pass:
     level: int
 
 
-def passes(sizes: tuple[int, ...]) -> Iterator[Pass]:
+def coding_passes(sizes: tuple[int, ...]) -> Iterator[CodingPass]:
     """All nodes of a grid of four sizes, each at least 2, once; whatever a node is foreseen by comes before it."""
     there = [np.zeros(1, np.int64) for _ in sizes]
     halvings = [(size - 2).bit_length() for size in sizes]
     first = max(halvings) + 1
 
-    def told(axis: int, new: list[int], sides: list[list[int]], weights: list[list[int]], level: int) -> Pass:
+    def told(axis: int, new: list[int], sides: list[list[int]], weights: list[list[int]], level: int) -> CodingPass:
         others = tuple(places for other, places in enumerate(there) if other != axis)
         there[axis] = np.sort(np.append(there[axis], new)) if any(new) else there[axis]
-        return Pass(axis, np.array(new), np.array(sides), np.array(weights), others, level)
+        return CodingPass(axis, np.array(new), np.array(sides), np.array(weights), others, level)
 
     yield told(0, [0], [[0] * 4], [[0] * 4], first)
     for axis, size in enumerate(sizes):
@@ -65,12 +66,12 @@ def passes(sizes: tuple[int, ...]) -> Iterator[Pass]:
                     axis,
                     new,
                     [[0 if place is None else place for place in four] for four in around],
-                    [cubic(middle, four) for middle, four in zip(new, around, strict=True)],
+                    [cubic_weights(middle, four) for middle, four in zip(new, around, strict=True)],
                     level,
                 )
 
 
-def cubic(middle: int, places: list[int | None]) -> list[int]:
+def cubic_weights(middle: int, places: list[int | None]) -> list[int]:
     """What values at four places, or as many of them as are there, count in the polynomial through them, at a place in the middle."""
     weights = []
     for own in places:
@@ -85,32 +86,32 @@ def cubic(middle: int, places: list[int | None]) -> list[int]:
     return weights
 
 
-def encode_midpoints(symbols: np.ndarray) -> bytes:
+def encode_motion(symbols: np.ndarray) -> bytes:
     """Code (T, Nz, Ny, Nx, 3) int16, the sizes at least 2."""
     trace = np.empty(symbols.size * MOST_DECISIONS, np.int16)
     _, at, _ = _walk(symbols.astype(np.int32), 0, None, trace)
-    return stream(trace[:at])
+    return encode_trace(trace[:at])
 
 
-def decode_midpoints(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
-    """Undo `encode_midpoints`: int16 of that shape.
+def decode_motion(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
+    """Undo `encode_motion`: int16 of that shape.
 
     Raises:
         FormatError: the body is cut, too long, or says what only a damaged one would.
     """
-    state, words = opened(body, "motion")
+    state, words = open_stream(body, "motion")
     symbols = np.zeros(shape, np.int32)
     state, at, fit = _walk(symbols, state, words, None)
     if not fit:
         raise FormatError("motion: a symbol leaves its 16 bits")
-    ended(state, at, words, "motion")
+    check_end(state, at, words, "motion")
     return symbols.astype(np.int16)
 
 
 def _walk(symbols: np.ndarray, state: int, words: np.ndarray | None, trace: np.ndarray | None) -> tuple[int, int, bool]:
     """Code int32 `symbols`, or decode into them: (state, at, whether all fit 16 bits)."""
-    table, missed, at, fit = counters(CONTEXTS * DECISIONS), np.zeros(symbols.shape, np.int32), 0, True
-    for one in passes(symbols.shape[:4]):
+    table, missed, at, fit = new_models(CONTEXTS * DECISIONS), np.zeros(symbols.shape, np.int32), 0, True
+    for one in coding_passes(symbols.shape[:4]):
         values, r = (np.moveaxis(a, one.axis, 0) for a in (symbols, missed))
         state, at, fit = walk(values, r, one.new, one.sides, one.weights, *one.there, table, state, at, words, trace)
         if not fit or words is not None and at > words.size:
@@ -120,18 +121,18 @@ def _walk(symbols: np.ndarray, state: int, words: np.ndarray | None, trace: np.n
 
 @compiled()
 def walk(values, r, new, sides, weights, first, second, third, table, state, at, words, trace):
-    """Code or decode the nodes of a `Pass`, along whose axis (n, ., ., ., M) `values` and `r` go first."""
+    """Code or decode the nodes of a `CodingPass`, along whose axis (n, ., ., ., M) `values` and `r` go first."""
     for n in range(new.size):
         for i in range(first.size):
             for j in range(second.size):
                 for k in range(third.size):
                     a, b, c = first[i], second[j], third[k]
-                    beside = told_beside(r, new[n], first, second, third, i, j, k)
+                    beside = neighbour_residuals(r, new[n], first, second, third, i, j, k)
                     for m in range(values.shape[4]):
-                        predicted = foreseen(values, sides[n], weights[n], a, b, c, m)
-                        context = context_of(r, new[n], sides[n], weights[n], beside, a, b, c, m)
+                        predicted = interpolate(values, sides[n], weights[n], a, b, c, m)
+                        context = residual_context(r, new[n], sides[n], weights[n], beside, a, b, c, m)
                         error = values[new[n], a, b, c, m] - predicted
-                        error, state, at = integer(
+                        error, state, at = code_signed(
                             error, table, context * DECISIONS, UNARY, ESCAPES, state, at, words, trace
                         )
                         value = predicted + error
@@ -145,7 +146,7 @@ def walk(values, r, new, sides, weights, first, second, third, table, state, at,
 
 
 @inlined
-def told_beside(r, new, first, second, third, i, j, k):
+def neighbour_residuals(r, new, first, second, third, i, j, k):
     """The sum of r of the same pass at the nodes one back along the other axes."""
     total = 0
     for m in range(r.shape[4]):
@@ -159,7 +160,7 @@ def told_beside(r, new, first, second, third, i, j, k):
 
 
 @inlined
-def foreseen(values, sides, weights, a, b, c, m):
+def interpolate(values, sides, weights, a, b, c, m):
     """The weighted sum of those at the sides, as a symbol."""
     total = 1 << WEIGHT_BITS - 1
     for k in range(4):
@@ -169,7 +170,7 @@ def foreseen(values, sides, weights, a, b, c, m):
 
 
 @inlined
-def context_of(r, new, sides, weights, beside, a, b, c, m):
+def residual_context(r, new, sides, weights, beside, a, b, c, m):
     """Of the r around, the logarithm."""
     total = beside
     for k in range(4):
@@ -177,4 +178,4 @@ def context_of(r, new, sides, weights, beside, a, b, c, m):
             total += (2 if k == 1 or k == 2 else 1) * r[sides[k], a, b, c, m]
     for one in range(m):
         total += 3 * r[new, a, b, c, one]
-    return min(doublings(total), CONTEXTS - 1)
+    return min(log_class(total), CONTEXTS - 1)

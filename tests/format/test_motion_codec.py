@@ -5,49 +5,42 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from codec_inputs import GRID_PATTERNS, drifting, grid_pattern, swaying
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kpc.format.coding.motion_hierarchical import WEIGHT_BITS, cubic, decode_midpoints, encode_midpoints, passes
+from kpc.format.coding.motion_codec import WEIGHT_BITS, coding_passes, cubic_weights, decode_motion, encode_motion
 from kpc.format.coding.motion_raster import encode_nodes
 from kpc.format.common.errors import FormatError
-from test_nodes import PAINTS, painted, swaying
 from without_numba import assert_same_without_numba
 
 sizes = st.tuples(*4 * [st.integers(2, 6)])
 
 
-def drifting() -> np.ndarray:
-    """(25, 11, 6, 6, 3) int16: what bends slowly, and some noise."""
-    t, z, y, x = np.indices((25, 11, 6, 6))
-    slow = np.stack([np.sin(t / 9 + z / 7 + c) * np.cos(y / 6 - x / 8) for c in range(3)], -1)
-    return np.rint(40 * (slow + np.random.default_rng(0).normal(0, 0.02, slow.shape))).astype(np.int16)
-
-
 def assert_decodes(body: bytes, symbols: np.ndarray) -> None:
-    found = decode_midpoints(body, symbols.shape)
+    found = decode_motion(body, symbols.shape)
     assert found.dtype == np.int16 and found.shape == symbols.shape and np.array_equal(found, symbols)
 
 
-@given(paint=st.sampled_from(sorted(PAINTS)), shape=sizes, seed=st.integers(0, 2**32 - 1))
+@given(paint=st.sampled_from(sorted(GRID_PATTERNS)), shape=sizes, seed=st.integers(0, 2**32 - 1))
 @settings(deadline=None)
 def test_symbols_come_back(paint, shape, seed):
-    symbols = painted(paint, (*shape, 3), seed)
-    assert_decodes(encode_midpoints(symbols), symbols)
+    symbols = grid_pattern(paint, (*shape, 3), seed)
+    assert_decodes(encode_motion(symbols), symbols)
 
 
 @pytest.mark.parametrize("axis", range(4))
 def test_long_and_thin_grids_come_back(axis):
     shape = [2, 2, 2, 2, 3]
     shape[axis] = 500
-    symbols = painted("extremes", tuple(shape), axis)
-    assert_decodes(encode_midpoints(symbols), symbols)
+    symbols = grid_pattern("extremes", tuple(shape), axis)
+    assert_decodes(encode_motion(symbols), symbols)
 
 
 @given(shape=sizes | st.tuples(st.integers(2, 40), *3 * [st.integers(2, 4)]))
 @settings(deadline=None)
 def test_each_node_is_told_once_and_after_those_it_is_foreseen_by(shape):
     told = np.zeros(shape, bool)
-    for one in passes(shape):
+    for one in coding_passes(shape):
         along = np.moveaxis(told, one.axis, 0)
         for new, sides, weights in zip(one.new, one.sides, one.weights, strict=True):
             nodes = (..., *np.ix_(*one.there))
@@ -61,7 +54,7 @@ def test_each_node_is_told_once_and_after_those_it_is_foreseen_by(shape):
 def test_weights_are_those_of_the_polynomial_through_all_that_are_there(places):
     there = [place for place in places if place is not None]
     middle = (places[1] + places[2]) // 2
-    weights = cubic(middle, places)
+    weights = cubic_weights(middle, places)
     assert sum(weights) == 1 << WEIGHT_BITS and all(
         weight == 0 for weight, place in zip(weights, places, strict=True) if place is None
     )
@@ -76,31 +69,31 @@ def test_weights_are_those_of_the_polynomial_through_all_that_are_there(places):
 
 def test_a_field_that_is_a_little_noisy_takes_less_than_by_what_lies_on_one_side():
     symbols = drifting()
-    body = encode_midpoints(symbols)
+    body = encode_motion(symbols)
     assert_decodes(body, symbols)
     assert len(body) < 0.96 * len(encode_nodes(symbols))
 
 
 def test_noise_takes_hardly_more_than_it_holds():
-    symbols = painted("noise", (10, 6, 6, 6, 3), 0)
-    assert len(encode_midpoints(symbols)) < 1.15 * symbols.nbytes
+    symbols = grid_pattern("noise", (10, 6, 6, 6, 3), 0)
+    assert len(encode_motion(symbols)) < 1.15 * symbols.nbytes
 
 
 def test_arrays_may_have_any_layout_and_are_left_as_they_are():
     symbols = swaying(4, 3, 4, 5)
     across = np.asfortranarray(symbols)
     symbols.flags.writeable = across.flags.writeable = False
-    assert encode_midpoints(across) == encode_midpoints(symbols)
+    assert encode_motion(across) == encode_motion(symbols)
 
 
 # The same lines, not compiled.
 PLAIN = """
 import hashlib
 import numpy as np
-from test_nodes import painted, swaying
-from kpc.format.coding.motion_hierarchical import decode_midpoints, encode_midpoints
+from codec_inputs import grid_pattern, swaying
+from kpc.format.coding.motion_codec import decode_midpoints, encode_midpoints
 
-for symbols in (swaying(5, 3, 4, 4), painted("noise", (3, 2, 3, 4, 3), 1), painted("extremes", (2, 3, 3, 2, 3), 2)):
+for symbols in (swaying(5, 3, 4, 4), grid_pattern("noise", (3, 2, 3, 4, 3), 1), grid_pattern("extremes", (2, 3, 3, 2, 3), 2)):
     body = encode_midpoints(symbols)
     assert np.array_equal(decode_midpoints(body, symbols.shape), symbols)
     print(hashlib.sha256(body).hexdigest())
@@ -108,7 +101,7 @@ for symbols in (swaying(5, 3, 4, 4), painted("noise", (3, 2, 3, 4, 3), 1), paint
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    assert_same_without_numba(PLAIN, "kpc.format.coding.motion_hierarchical:walk")
+    assert_same_without_numba(PLAIN, "kpc.format.coding.motion_codec:walk")
 
 
 # --- damage and hostility
@@ -119,13 +112,13 @@ SHAPE = (4, 3, 4, 4, 3)
 
 def decodes_or_is_refused(body: bytes, shape: tuple[int, ...] = SHAPE) -> bool:
     try:
-        return decode_midpoints(body, shape).shape == shape
+        return decode_motion(body, shape).shape == shape
     except FormatError:
         return False
 
 
 def test_every_truncation_and_excess_is_refused():
-    body = encode_midpoints(swaying(*SHAPE[:4]))
+    body = encode_motion(swaying(*SHAPE[:4]))
     assert decodes_or_is_refused(body)
     assert not any(decodes_or_is_refused(body[:length]) for length in range(len(body)))
     assert not any(decodes_or_is_refused(body + more) for more in (b"\0", b"\0\0", b"\xff\xff"))
@@ -138,7 +131,7 @@ def test_any_bytes_decode_or_are_refused(body, shape):
 
 
 def test_a_body_of_another_shape_is_refused():
-    body = encode_midpoints(swaying(*SHAPE[:4]))
+    body = encode_motion(swaying(*SHAPE[:4]))
     assert not any(
         decodes_or_is_refused(body, other)
         for other in ((5, *SHAPE[1:]), (3, *SHAPE[1:]), (4, 4, 4, 3, 3), (2, 2, 2, 2, 3))
@@ -149,12 +142,12 @@ def test_a_symbol_that_leaves_its_16_bits_is_refused():
     symbols = np.zeros((2, 2, 2, 2, 3), np.int32)
     symbols[0, 0, 0, 0, 0] = 40_000
     with pytest.raises(FormatError, match="16 bits"):
-        decode_midpoints(encode_midpoints(symbols), symbols.shape)
+        decode_motion(encode_motion(symbols), symbols.shape)
 
 
 def test_a_stream_that_ends_early_is_given_up_at_once():
-    body = encode_midpoints(painted("noise", (2, 2, 2, 8, 3), 0))
+    body = encode_motion(grid_pattern("noise", (2, 2, 2, 8, 3), 0))
     start = time.perf_counter()
     with pytest.raises(FormatError, match="motion"):
-        decode_midpoints(body, (1000, 40, 100, 100, 3))
+        decode_motion(body, (1000, 40, 100, 100, 3))
     assert time.perf_counter() - start < 2.0
