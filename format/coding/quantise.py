@@ -213,7 +213,7 @@ def quantise_scene(
         FormatError: a value is NaN or infinite; the message names the scale and the plane.
     """
     if skip_unseen and reached is None:
-        reached = reached_cells(scene)
+        reached = looked_up_cells(scene)
     scales = []
     for number, (planes, plane_steps) in enumerate(zip(scene.scales, steps, strict=True)):
         scales.append(
@@ -245,7 +245,7 @@ def quantise_scene(
     )
 
 
-def reached_cells(scene: Scene) -> np.ndarray:
+def looked_up_cells(scene: Scene) -> np.ndarray:
     """(slots, Nz, Ny, Nx) bool: the cells of the planes' [0, 1]^3 in which what is occupied is looked up."""
     occupancy = np.asarray(scene.occupancy, bool)
     return occupancy if scene.motion is None else reached_cells(occupancy, scene.motion)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from kpc.format.coding.quantise import needed_texels, reached_cells
+from kpc.format.coding.quantise import looked_up_cells, needed_texels
 from kpc.format.common.errors import MediaError
 from kpc.format.scene.scene import TIME_PLANES
 from kpc.tools.bench import baselines
@@ -72,7 +72,7 @@ def test_all_that_undoes_a_coding_is_counted() -> None:
 
 
 def test_what_nobody_reads_is_evened_out_and_the_rest_is_as_it_was() -> None:
-    reached = reached_cells(SCENE)
+    reached = looked_up_cells(SCENE)
     for tidy, scale in zip(tidied(SCENE), SCENE.scales, strict=True):
         for name, plane in scale.items():
             needed = needed_texels(reached, name, *plane.shape[:2])

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import zstandard
-from kpc.format.coding.quantise import needed_texels, reached_cells
+from kpc.format.coding.quantise import looked_up_cells, needed_texels
 from kpc.format.common.errors import MediaError
 from kpc.format.common.media import ffmpeg_binary
 from kpc.format.scene.scene import TIME_PLANES, Scene
@@ -73,7 +73,7 @@ class Rival(ABC):
 
 def tidied(scene: Scene) -> Planes:
     """The planes of a scene; texels that nobody reads hold the mean of the others, on time planes 1."""
-    reached, scales = reached_cells(scene), []
+    reached, scales = looked_up_cells(scene), []
     for scale in scene.scales:
         tidy = {}
         for name, plane in scale.items():
