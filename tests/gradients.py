@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 from kpc.encoder.field import kernels
-from kpc.encoder.field.field import Blend, Field, corners_of
+from kpc.encoder.field.field import Field, WeightedRowSum, bilinear_corners
 from kpc.encoder.field.render import Rays, render_reference
-from kpc.encoder.training.optimisers import motion_of, sample_capacity
+from kpc.encoder.training.optimisers import max_samples_per_ray, motion_array
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene, with_contraction, with_motion
 from torch import Tensor
@@ -43,7 +43,7 @@ def random_rays(scene: Scene, count: int, seed: int = 0) -> Rays:
     origins = np.concatenate([origins[chosen], centre - 3 * np.eye(3)])
     directions = np.concatenate([directions[chosen], np.eye(3)])
     arrays = (origins, directions, rng.random(count), rng.random(count), rng.random((count, 3)))
-    return Rays.of(*arrays)
+    return Rays.from_arrays(*arrays)
 
 
 DISTORTION = 0.3
@@ -67,7 +67,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         field.density.detach().numpy(),
         grad_density,
         layout.channels,
-        motion_of(field),
+        motion_array(field),
         grad_motion,
         True,
         scene.aabb,
@@ -85,7 +85,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
         rays.backgrounds.numpy(),
         peaks,
         np.float32(DISTORTION),
-        sample_capacity(scene.aabb, scene.step, scene.mapping),
+        max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
     )
     return {
         "theta": grad.sum(0),
@@ -101,10 +101,10 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
 def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict[str, np.ndarray]:
     """The same by autograd through `render_reference`, in float64."""
     field = Field.from_scene(scene).double()
-    rays = rays.apply(torch.Tensor.double)
+    rays = rays.map(torch.Tensor.double)
     basis = field.basis(rays.directions).detach().requires_grad_()
     # The kernels give the gradient of the basis, the field goes without one.
-    field.once_a_ray = lambda directions, codes: basis  # type: ignore[method-assign]
+    field.ray_terms = lambda directions, codes: basis  # type: ignore[method-assign]
     field.colours = lambda latent, terms, ray: torch.sigmoid(torch.einsum("nf,ncf->nc", latent, terms[ray]))  # type: ignore[method-assign]
     aabb, occupancy = torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy)
     rgb, distortion, weights, cells = render_reference(field, rays, aabb, occupancy, scene.step, mapping=scene.mapping)
@@ -136,6 +136,6 @@ class FieldFunction(torch.nn.Module):
 def bilinear(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """A plane (rows, columns, M) as `Field.features` reads it, u (N,) along its columns, v along its rows: (N, M)."""
     rows, columns, M = plane.shape
-    corners, shares = corners_of(u, v, torch.tensor(columns), torch.tensor(rows))
-    (values,) = Blend.apply(plane.reshape(-1, M), corners[None], shares[None])
+    corners, shares = bilinear_corners(u, v, torch.tensor(columns), torch.tensor(rows))
+    (values,) = WeightedRowSum.apply(plane.reshape(-1, M), corners[None], shares[None])
     return values

@@ -20,7 +20,7 @@ from kpc.encoder.field.bounds import find_box
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, Layout, priors
 from kpc.encoder.field.render import Rays
-from kpc.encoder.training.optimisers import add_priors
+from kpc.encoder.training.optimisers import add_prior_gradients
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import write_image
@@ -150,7 +150,7 @@ def test_learning_from_planes_exactly_at_identity() -> None:
     ours = backpropagate(scene, rays, torch.zeros(203, 3))
     field = Field.from_scene(scene)
     prior, variation = np.zeros(field.layout.size, np.float32), TrainConfig().variation(1.0)
-    add_priors(field, field.theta.detach().numpy(), prior, TrainConfig(), variation, 1.0)
+    add_prior_gradients(field, field.theta.detach().numpy(), prior, TrainConfig(), variation, 1.0)
     sum(priors(field, TrainConfig(), variation).values()).backward()
     for _, name, start, rows, columns in field.layout.planes():
         part = slice(start, start + rows * columns * field.layout.channels)

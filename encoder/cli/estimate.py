@@ -92,7 +92,7 @@ def estimate(
 def _seconds_a_step(trainer: Trainer, to: int) -> float:
     """Of a run, on the second half of its way to a step."""
     ticks: list[float] = []
-    trainer.run_to(to, lambda: ticks.append(trainer.elapsed_s))
+    trainer.run_until(to, lambda: ticks.append(trainer.elapsed_s))
     half = len(ticks) // 2
     return (trainer.elapsed_s - ticks[half]) / max(1, len(ticks) - 1 - half)
 

@@ -24,22 +24,22 @@ from kpc.encoder.evaluation.evaluate import evaluate
 from kpc.encoder.evaluation.profile import profile
 from kpc.encoder.evaluation.validation_rays import VALIDATION_RAYS, ValidationRays
 from kpc.encoder.field.bounds import (
-    contraction_of,
-    device_coordinates_of,
     find_box,
-    find_inner_box,
-    reaches_beyond,
-    seen_cells,
+    find_contraction_box,
+    fit_contraction,
+    fit_device_coordinates,
+    is_unbounded,
+    visible_cells,
 )
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows
-from kpc.encoder.field.occupancy_grid import grid_shape, in_fewest_slots
+from kpc.encoder.field.occupancy_grid import grid_shape, merge_slots
 from kpc.encoder.rdo.codec_model import Model, code, load_checkpoint, save_checkpoint
 from kpc.encoder.rdo.prune import Pruned
 from kpc.encoder.rdo.sequential_finetune import steps_per_group
-from kpc.encoder.training.temporal_resolution import TimeResolution, fitted_in_time
+from kpc.encoder.training.temporal_resolution import TimeResolution, fit_frames_per_row
 from kpc.encoder.training.tight_bounds import trim_box
-from kpc.encoder.training.train import Report, Trainer, box_of_checkpoint
+from kpc.encoder.training.train import Report, Trainer, load_checkpoint_box
 from kpc.format.common import cli
 from kpc.format.common.errors import DatasetError, TrainingError, UsageError
 from kpc.format.common.memory import peak_memory_bytes
@@ -427,7 +427,7 @@ def _trainer(options: Options, setting: Setting) -> Trainer:
     dataset, aabb, mapping = setting.dataset, setting.aabb, setting.mapping
     appearance, why = options.appearance_of(dataset)
     _say(f"appearance: {'none' if appearance == 'none' else f'a code for each {appearance}'} ({why})")
-    config, in_time = fitted_in_time(options.config(dataset), dataset)
+    config, in_time = fit_frames_per_row(options.config(dataset), dataset)
     if dataset.is_dynamic:
         _say(_rows_in_time(config, dataset, in_time))
     if setting.before is not None:
@@ -435,7 +435,7 @@ def _trainer(options: Options, setting: Setting) -> Trainer:
     resumes, survey_s = options.resume and checkpoint.exists(), 0.0
     if not setting.is_final:
         if resumes:
-            aabb = box_of_checkpoint(checkpoint)
+            aabb = load_checkpoint_box(checkpoint)
         else:
             aabb, survey_s = _trimmed(dataset, config, aabb, options.time_budget_s, mapping)
     trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping)
@@ -453,8 +453,8 @@ def to_scene(trainer: Trainer) -> Scene:
     """The trained field with its final occupancy and a few of the cameras, the most central first."""
     dataset = trainer.dataset
     slots = min(8, dataset.clip.frame_count) if dataset.is_dynamic else 1
-    occupancy = in_fewest_slots(
-        trainer.grid.over_time(trainer.density_at, np.random.default_rng(trainer.config.seed), slots)
+    occupancy = merge_slots(
+        trainer.grid.sample_slots(trainer.density_at, np.random.default_rng(trainer.config.seed), slots)
     )
     return replace(trainer.scene(occupancy), cameras=tuple(dataset.camera(p) for p in _spread_of_cameras(dataset)))
 
@@ -595,7 +595,7 @@ def _spread_of_cameras(dataset: Dataset) -> list[int]:
 
 def _space_of(dataset: Dataset, options: Options) -> tuple[np.ndarray, SpaceMapping | None, str]:
     """The box asked for or found, (2, 3) float32, within what a file can hold; how space beyond it is held; and why so."""
-    beyond, why = reaches_beyond(dataset.pictures, dataset.has_alpha)
+    beyond, why = is_unbounded(dataset.pictures, dataset.has_alpha)
     space = options.space if options.space != "auto" else "contracted" if beyond else "box"
     if space == "ndc" and options.box is not None:
         raise UsageError(
@@ -604,17 +604,17 @@ def _space_of(dataset: Dataset, options: Options) -> tuple[np.ndarray, SpaceMapp
     mapping: SpaceMapping | None = None
     try:
         if space == "ndc":
-            mapping, aabb = device_coordinates_of(dataset.pictures)
+            mapping, aabb = fit_device_coordinates(dataset.pictures)
         elif options.box is not None:
             aabb = np.array(options.box, np.float32).reshape(2, 3)
         elif space == "contracted":
-            aabb = find_inner_box(dataset.pictures)
+            aabb = find_contraction_box(dataset.pictures)
         else:
             aabb = find_box(dataset.pictures, dataset.has_alpha)
     except DatasetError as error:
         raise DatasetError(f"{options.source}: {error}") from error
     if space == "contracted":
-        mapping = contraction_of(dataset.pictures, aabb)
+        mapping = fit_contraction(dataset.pictures, aabb)
     if not (np.abs(aabb) <= scene_io.BOX_LIMIT).all() or not (aabb[1] - aabb[0] >= 1 / scene_io.BOX_LIMIT).all():
         raise DatasetError(
             f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; "
@@ -626,7 +626,7 @@ def _space_of(dataset: Dataset, options: Options) -> tuple[np.ndarray, SpaceMapp
             f"{options.source}: the box is too small for cameras that lie {mapping.uniform_distance:.4g} from its far side; "
             "give a larger one with --box x0,y0,z0,x1,y1,z1, or --space box"
         )
-    if not seen_cells(dataset.pictures, aabb, grid_shape(aabb, 64), mapping).any():
+    if not visible_cells(dataset.pictures, aabb, grid_shape(aabb, 64), mapping).any():
         raise DatasetError(
             f"{options.source}: the box lies outside every camera's view; give another with --box x0,y0,z0,x1,y1,z1"
         )

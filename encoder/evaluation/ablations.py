@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from kpc.encoder.field.config import PROGRESSIVE, TrainConfig
+from kpc.encoder.field.config import PROGRESSIVE_SCALE_DROPOUT, TrainConfig
 
 ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "baseline": lambda c: c,
@@ -17,8 +17,8 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "no sparse transients": lambda c: replace(c, sparse_transients=0.0),
     "sparse transients x 10": lambda c: replace(c, sparse_transients=10 * c.sparse_transients),
     "sparse transients x 100": lambda c: replace(c, sparse_transients=100 * c.sparse_transients),
-    "no space variation": lambda c: replace(c, space_variation=0.0, late_space_variation=0.0),
-    "quadratic variation throughout": lambda c: replace(c, edges_from=1.0),
+    "no space variation": lambda c: replace(c, space_variation=0.0, robust_space_variation=0.0),
+    "quadratic variation throughout": lambda c: replace(c, robust_tv_from=1.0),
     "no distortion loss": lambda c: replace(c, distortion=0.0),
     "uniform ray sampling": lambda c: replace(c, temporal_start=1.0, object_rays=0.0),
     "no appearances": lambda c: replace(c, appearance="none"),
@@ -30,7 +30,7 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "no pruning": lambda c: replace(c, prune_share=0.0),
     "no channel dropout": lambda c: replace(c, channel_dropout=0.0),
     "all scales from the start": lambda c: replace(c, coarse_until=0.0),
-    "scale dropout": lambda c: replace(c, scale_dropout=PROGRESSIVE),
+    "scale dropout": lambda c: replace(c, scale_dropout=PROGRESSIVE_SCALE_DROPOUT),
 }
 """What is changed, by name, the unchanged run first. Appearances act through what "view-independent colour" leaves out. Runs with
 appearances are scored on right halves of pictures (`evaluate`), those without on whole ones."""

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from kpc.encoder.datasets import Dataset, pixel_rays
 from kpc.encoder.field import kernels
-from kpc.encoder.field.appearances import FIT_RAYS, fitted_code
+from kpc.encoder.field.appearances import FIT_RAYS, fit_code
 from kpc.encoder.field.field import Field
-from kpc.encoder.field.render import Rays, marched, sample_counts, shade
-from kpc.encoder.training.optimisers import sample_capacity
+from kpc.encoder.field.render import Rays, count_samples, march_scene, shade
+from kpc.encoder.training.optimisers import max_samples_per_ray
 from kpc.format.common.fidelity import psnr
 from kpc.format.scene.scene import AnyDecoder, Decoder, Scene
 from kpc.format.scene.space import Contraction
@@ -76,7 +76,7 @@ class SceneRenderer:
             basis,
             np.arange(len(o)),
             scene.background,
-            sample_capacity(scene.aabb, scene.step, scene.mapping),
+            max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
             8 * numba.get_num_threads(),
         )
         return colours, opacities, depths
@@ -86,7 +86,7 @@ class SceneRenderer:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         scene = self.scene
         batch = self.batch(o, d, t)
-        samples, met = marched(self.field, batch, scene)
+        samples, met = march_scene(self.field, batch, scene)
         along = (
             samples.s.numpy()
             if not isinstance(scene.mapping, Contraction)
@@ -100,7 +100,7 @@ class SceneRenderer:
         """(N,) bool: whether rays pass where anything may be. The others show the background, whatever planes hold."""
         scene = self.scene
         met: np.ndarray = (
-            sample_counts(
+            count_samples(
                 self.batch(origins, directions, times), scene.aabb, scene.occupancy, scene.step, scene.mapping
             )
             > 0
@@ -125,12 +125,12 @@ class SceneRenderer:
         row, column, n = row[chosen], column[chosen], len(chosen)
         origins, directions = pixel_rays(pictures, np.full(n, number), column, row, self.scene.mapping)
         batch = self.batch(origins, directions, np.full(n, pictures.time[number]))
-        return fitted_code(self.scene, self.field, batch, torch.from_numpy(ground_truth(dataset, number)[row, column]))
+        return fit_code(self.scene, self.field, batch, torch.from_numpy(ground_truth(dataset, number)[row, column]))
 
     def batch(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> Rays:
         """Rays as pictures are made of them: samples in the middle of their steps, the scene's background."""
         n = len(origins)
-        return Rays.of(origins, directions, times, np.full(n, 0.5), np.tile(self.scene.background, (n, 1)))
+        return Rays.from_arrays(origins, directions, times, np.full(n, 0.5), np.tile(self.scene.background, (n, 1)))
 
 
 def pad_channels(scene: Scene) -> Scene:

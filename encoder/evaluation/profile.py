@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from kpc.encoder.field.field import Layout
-from kpc.encoder.training.optimisers import PlainOptimiser
+from kpc.encoder.training.optimisers import TorchOptimiser
 from kpc.encoder.training.train import Trainer
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -39,16 +39,16 @@ def profile(trainer: Trainer) -> dict[str, Any]:
     if config.steps < STEPS * config.occupancy_start + ROUNDS * FUSED_STEPS:
         raise ValueError(f"{config.steps} steps are too few to profile one")
     trainer.optimiser.config = replace(config, coarse_until=0.0)  # as in most of the run
-    trainer.run_to(STEPS * config.occupancy_start)
-    plain = PlainOptimiser(copy.deepcopy(trainer.field), config, trainer.grid.seen.shape, trainer.mapping)
+    trainer.run_until(STEPS * config.occupancy_start)
+    plain = TorchOptimiser(copy.deepcopy(trainer.field), config, trainer.grid.visible.shape, trainer.mapping)
     fused_s, plain_s, parts, samples, rays = [], [], [], [], 0
     for _ in range(ROUNDS):
         before = dict(trainer.watch.seconds)
         started = trainer.elapsed_s
-        trainer.run_to(trainer.step + FUSED_STEPS)
+        trainer.run_until(trainer.step + FUSED_STEPS)
         fused_s.append((trainer.elapsed_s - started) / FUSED_STEPS)
         parts.append({name: (s - before.get(name, 0.0)) / FUSED_STEPS for name, s in trainer.watch.seconds.items()})
-        rays = trainer.rays_a_step
+        rays = trainer.rays_per_step
         samples.append(trainer.samples_per_ray)
         plain_s.append(_plain_step(trainer, plain, rays))
     flops, bytes_ = least_work(trainer.field.layout, rays * statistics.median(samples))
@@ -66,21 +66,21 @@ def profile(trainer: Trainer) -> dict[str, Any]:
 def _profile_on_gpu(trainer: Trainer) -> dict[str, Any]:
     """As `profile`; `bytes`: what the operations of a step move, as `Traffic` counts them; `memory_gb_s`: what the device moves at most."""
     config, optimiser = trainer.config, trainer.optimiser
-    assert isinstance(optimiser, PlainOptimiser)
+    assert isinstance(optimiser, TorchOptimiser)
     if config.steps < STEPS * config.occupancy_start + (ROUNDS + 1) * FUSED_STEPS:
         raise ValueError(f"{config.steps} steps are too few to profile one")
-    trainer.run_to(STEPS * config.occupancy_start)
+    trainer.run_until(STEPS * config.occupancy_start)
     steps_s, moved = [], []
     for _ in range(ROUNDS):
         torch.cuda.synchronize()
         started = time.perf_counter()
-        trainer.run_to(trainer.step + FUSED_STEPS)
+        trainer.run_until(trainer.step + FUSED_STEPS)
         torch.cuda.synchronize()
         steps_s.append((time.perf_counter() - started) / FUSED_STEPS)
-    rays = trainer.rays_a_step
+    rays = trainer.rays_per_step
     for _ in range(config.regularise_every):
         step = _drawn(trainer, optimiser, rays)
-        with Traffic() as traffic, optimiser.as_written():
+        with Traffic() as traffic, optimiser.eager():
             step()
         trainer.step += 1
         moved.append(traffic.bytes)
@@ -158,7 +158,7 @@ def least_work(layout: Layout, samples: float) -> tuple[float, float]:
     return samples * F * (17 * planes + 38), samples * 48 * planes * F
 
 
-def _plain_step(trainer: Trainer, plain: PlainOptimiser, count: int) -> float:
+def _plain_step(trainer: Trainer, plain: TorchOptimiser, count: int) -> float:
     """Seconds of a step with `count` rays, the field's decoder included, by as many threads as the machine has cores."""
     step, threads = _drawn(trainer, plain, count), torch.get_num_threads()
     torch.set_num_threads(os.cpu_count() or 1)
@@ -170,7 +170,7 @@ def _plain_step(trainer: Trainer, plain: PlainOptimiser, count: int) -> float:
         torch.set_num_threads(threads)
 
 
-def _drawn(trainer: Trainer, optimiser: PlainOptimiser, count: int) -> Callable[[], object]:
+def _drawn(trainer: Trainer, optimiser: TorchOptimiser, count: int) -> Callable[[], object]:
     """A step of `optimiser` with `count` rays, which are drawn at once."""
     batch, targets = trainer.sampler.draw(trainer.rng, count, None if trainer.dataset.has_alpha else trainer.background)
     return partial(
@@ -181,7 +181,7 @@ def _drawn(trainer: Trainer, optimiser: PlainOptimiser, count: int) -> Callable[
         batch,
         targets,
         trainer.aabb,
-        trainer.grid.marched,
+        trainer.grid.active,
         trainer.step_length,
         trainer.extent,
     )

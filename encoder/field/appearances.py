@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.field import Field
-from kpc.encoder.field.render import Rays, marched, shade
+from kpc.encoder.field.render import Rays, march_scene, shade
 from kpc.format.common.errors import UsageError
 from kpc.format.container.scene_io import APPEARANCE_LIMIT, is_valid_name
 from kpc.format.scene.scene import Scene
@@ -24,11 +24,11 @@ FIT_STEPS = 100
 FIT_RATE = 0.05
 """Of Adam. The ball of `TrainConfig.appearance_learning_rate` has 25.4 dB with 0.02, 25.5 with 0.05 and 0.1, and 25.6 after 300
 steps."""
-FIT_FAINTEST = 1e-3
+FIT_MIN_WEIGHT = 1e-3
 """Samples of a smaller weight have no say."""
 
 
-def choose_kind(dataset: Dataset) -> tuple[str, str]:
+def choose_appearance(dataset: Dataset) -> tuple[str, str]:
     """Whether every training picture has an appearance of its own ("image") or none has ("none"), and why, in words for the log.
 
     They have where they are a photo collection: nothing moves, and most of them have a lens or size that no other has.
@@ -47,7 +47,7 @@ def choose_kind(dataset: Dataset) -> tuple[str, str]:
     return "image", f"photographs: {alone} of {total} pictures have a lens or size of their own"
 
 
-def number_pictures(dataset: Dataset, kind: str) -> tuple[np.ndarray, tuple[str, ...]]:
+def assign_appearances(dataset: Dataset, kind: str) -> tuple[np.ndarray, tuple[str, ...]]:
     """The appearance of each picture, (P,) int64, -1 where it has none because it is held out or `kind` is "none"; and the names,
     all different. With "camera", pictures of one camera share theirs; with "image", none do.
 
@@ -94,7 +94,7 @@ def _storable(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def fitted_code(scene: Scene, field: Field, rays: Rays, targets: Tensor) -> np.ndarray:
+def fit_code(scene: Scene, field: Field, rays: Rays, targets: Tensor) -> np.ndarray:
     """The code with which a scene shows rays most nearly as (N, 3) `targets`: (H,) float32, from 0 by FIT_STEPS steps of Adam on
     the mean squared error, all else frozen. The same rays give the same code. `field`: `Field.from_scene(scene)`.
     """
@@ -102,8 +102,8 @@ def fitted_code(scene: Scene, field: Field, rays: Rays, targets: Tensor) -> np.n
     if not len(targets):
         return code.detach().numpy()
     with torch.no_grad():
-        _, met = marched(field, rays, scene)
-        seen = met.weights > FIT_FAINTEST
+        _, met = march_scene(field, rays, scene)
+        seen = met.weights > FIT_MIN_WEIGHT
         met = replace(met, ray=met.ray[seen], latent=met.latent[seen], weights=met.weights[seen])
     optimiser = torch.optim.Adam([code], lr=FIT_RATE)
     for _ in range(FIT_STEPS):

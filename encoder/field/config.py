@@ -110,8 +110,8 @@ class TrainConfig:
     warmup: int = 50
     """Steps over which the learning rate rises from 0; then it falls along half a cosine to 1 % of its peak."""
     seed: int = 0
-    adapts: bool = True
-    """Whether `for_lone_object` may change all this for a scene of its kind."""
+    adapts_to_object: bool = True
+    """Whether `for_single_object` may change all this for a scene of its kind."""
 
     # --- the priors; each is a weight on a mean over the texels of a plane, summed over planes and scales
     space_variation: float = 5e-3
@@ -119,13 +119,13 @@ class TrainConfig:
     both better at 5e-3 (held-out PSNR +0.6 and +0.3 dB)."""
     transient_variation: float = 2e-4
     """Total variation of the space-time planes, along space only. 5e-3 costs soldier 0.3 dB."""
-    edges_from: float = 0.7
+    robust_tv_from: float = 0.7
     """Share of the run from which on total variation lets edges be; 1 for never. As K-Planes has it, it sums squares of differences d between
     neighbours: so shapes are found, but what is sharp is soft. From then on it is e^2 log(1 + d^2 / e^2), which grows as the bits do that tell d.
-    From the start it does not hold few pictures together: the default scene loses 3 dB with `late_space_variation` 5e-3."""
+    From the start it does not hold few pictures together: the default scene loses 3 dB with `robust_space_variation` 5e-3."""
     edge: float = 0.1
     """e of that."""
-    late_space_variation: float = 2e-2
+    robust_space_variation: float = 2e-2
     """`space_variation` from then on. Held-out PSNR of room (`balanced`) and of the default scene (`fast`) as trained, and of their files: with squares to
     the end 30.68 dB, 30.58 at 1.01 bits a parameter; 33.74, 33.44 at 0.58. With 2e-2 30.76 dB, 30.66 at 0.99 bits; 33.83, 33.50 at 0.59. With 5e-3
     31.11 dB, 30.98 at 1.04 bits; 34.09, 33.60 at 0.57: more at equal size, but room loses 0.13 dB when coded so, 0.10 with 2e-2."""
@@ -133,11 +133,11 @@ class TrainConfig:
     """Squared second difference in time. K-Planes finds the best near 0.01."""
     sparse_transients: float = 1e-4
     """L1 distance of the space-time planes from 1. K-Planes uses 1e-4."""
-    motion_smoothness: float = 0.3
+    motion_smoothness_time: float = 0.3
     """Squared second difference of the motion grid in time. With rows half as far apart it has to be ten times that, for the same."""
-    motion_bending: float = 1.0
+    motion_smoothness_space: float = 1.0
     """The same in space."""
-    appearance_size: float = 1e-3
+    appearance_decay: float = 1e-3
     """Mean square of the codes of appearances. The same ball has 25.4 dB with 0, 25.2 with 1e-4, 25.5 with 1e-3, 25.2 with 1e-2,
     24.5 with 1e-1; in images that are equal, 26.4 dB with codes and 26.5 without."""
     distortion: float = 1e-3
@@ -214,7 +214,7 @@ class TrainConfig:
             "prune_share",
             "dropout_until",
             "coarse_until",
-            "edges_from",
+            "robust_tv_from",
         ):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"{name} must be from 0 to 1, not {getattr(self, name)}")
@@ -227,16 +227,16 @@ class TrainConfig:
 
     def variation(self, fraction: float) -> Variation:
         """At a fraction of the run."""
-        if fraction < self.edges_from:
+        if fraction < self.robust_tv_from:
             return Variation(self.space_variation, self.transient_variation, 0.0)
-        return Variation(self.late_space_variation, self.transient_variation, self.edge**-2)
+        return Variation(self.robust_space_variation, self.transient_variation, self.edge**-2)
 
     @property
     def prunes(self) -> bool:
         """Whether anything may be left out: the explicit decoder alone is linear, as `kpc.encoder.rdo.prune` wants it."""
         return self.prune_share > 0 and not self.hybrid
 
-    def for_lone_object(self) -> "TrainConfig":
+    def for_single_object(self) -> "TrainConfig":
         """For an object without surroundings that one moving camera has seen: soldier, and D-NeRF's scenes.
 
         A motion grid leads every instant back to one pose; rows of time may then be twice as far apart. What is left asks for
@@ -245,7 +245,7 @@ class TrainConfig:
         `fast`: 23.5 dB as it was, 24.2 with 16 channels at (32, 64, 128), 24.7 with 32, 25.0 without the direction. 64 are better
         only step by step: with channel dropout in the first half and the coarse scale first, 27.1 dB in 303 s, and 32 after twice the
         steps 27.3 in 339 s; 27.4 if each step leaves out 0.4 of them and not a quarter; and a sample costs half in the player.
-        Edges let be (`edges_from`) change nothing, 27.57 dB and 27.55 with them (`fast`). Half the resolution needs
+        Edges let be (`robust_tv_from`) change nothing, 27.57 dB and 27.55 with them (`fast`). Half the resolution needs
         half the samples: 25.0 dB in 69 s, 24.9 in 92 s with all of them. A motion grid of 6 cells gives 25.9 dB, of 10
         26.05, of 14 25.8 (with bending held in the same proportion to the cells: 0.1, 1, 3); with 4 frames to a row
         26.2, with 6 26.1, with 1 24.9. After 8,000 steps it is 27.1 dB, and 27.3 with (32, 128) in place of (32, 80):
@@ -262,13 +262,13 @@ class TrainConfig:
             channel_dropout=0.4,
             coarse_until=0.3,
             view_dependent=False,
-            edges_from=1.0,
+            robust_tv_from=1.0,
             samples_across=max(32, self.samples_across // 2),
             steps=3 * self.steps,
         )
 
 
-PROGRESSIVE = 0.1
+PROGRESSIVE_SCALE_DROPOUT = 0.1
 """`scale_dropout` of scenes that are to be seen while they arrive."""
 
 PRESETS = {
@@ -292,7 +292,7 @@ PRESETS = {
         samples_across=512,
         cells_across=128,
         steps=40000,
-        late_space_variation=5e-3,
+        robust_space_variation=5e-3,
     ),
     # K-Planes' own settings (section 3.1 and its appendix), but for the march through occupied cells. It wants a GPU.
     "paper": TrainConfig(
@@ -305,7 +305,7 @@ PRESETS = {
         occupancy_every=32,
         learning_rate=1e-2,
         space_variation=1e-3,
-        edges_from=1.0,
-        adapts=False,
+        robust_tv_from=1.0,
+        adapts_to_object=False,
     ),
 }

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 
-MORE_MARCHED = 0.1
+MERGE_TOLERANCE = 0.1
 """Cells that a renderer may march more, as a share, for a grid that is told less often."""
 
 DensityAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -22,7 +22,7 @@ def grid_shape(aabb: np.ndarray, cells_across: int) -> tuple[int, int, int]:
     return nz, ny, nx
 
 
-def in_fewest_slots(occupancy: np.ndarray, more: float = MORE_MARCHED) -> np.ndarray:
+def merge_slots(occupancy: np.ndarray, more: float = MERGE_TOLERANCE) -> np.ndarray:
     """(slots, Nz, Ny, Nx) bool in as few slots of equal length as leave no more than this share more cells occupied on average: each
     holds all that those that it stands for hold.
 
@@ -47,7 +47,7 @@ class OccupancyGrid:
         log_density: (Nz, Ny, Nx) float32, decaying maximum of the samples taken in a cell.
         peak: (Nz, Ny, Nx) float32, decaying maximum of the weights that training rays have found in a cell.
         occupied: (Nz, Ny, Nx) bool; cells that too few cameras see are never occupied.
-        marched: (slots, Nz, Ny, Nx) bool, of the occupied cells those in which rays take samples while each slot of the clip
+        active: (slots, Nz, Ny, Nx) bool, of the occupied cells those in which rays take samples while each slot of the clip
             lasts: one slot until `split`.
     """
 
@@ -63,12 +63,12 @@ class OccupancyGrid:
 
     def __init__(self, seen: np.ndarray, threshold: float) -> None:
         """`threshold`: log density, per longest edge of the box, below which a cell counts as empty."""
-        self.seen = seen
+        self.visible = seen
         self.threshold = threshold
         self.log_density = np.full(seen.shape, -np.inf, np.float32)
         self.peak = np.ones(seen.shape, np.float32)
         self.occupied = seen.copy()
-        self.marched = self.occupied[None]
+        self.active = self.occupied[None]
         self._dense = np.ones((1, *seen.shape), bool)
         self._known = False
 
@@ -79,10 +79,10 @@ class OccupancyGrid:
         points and times a cell.
         """
         np.maximum(self.peak * np.float32(self.PEAK_DECAY), peaks, out=self.peak)
-        matters = dilate(self.peak > self.PEAK_LEAST) & self.seen
+        matters = dilate(self.peak > self.PEAK_LEAST) & self.visible
         chosen = matters
         if self._known:
-            chosen = matters & (self.occupied | (rng.random(self.seen.shape, dtype=np.float32) < 1 / 16))
+            chosen = matters & (self.occupied | (rng.random(self.visible.shape, dtype=np.float32) < 1 / 16))
         self._known = True
         self.log_density -= self.DENSITY_DECAY
         cells = np.argwhere(chosen)
@@ -91,7 +91,7 @@ class OccupancyGrid:
                 self.log_density[chosen], self._look(density_at, cells, rng, 0.0, 1.0)
             )
         self.occupied = matters & (self.log_density > self._least())
-        self.marched = self._dense & self.occupied
+        self.active = self._dense & self.occupied
 
     def split(self, density_at: DensityAt, slots: int, rng: np.random.Generator) -> None:
         """From now on march, in each of `slots` equal parts of the clip, only where density is or was close by.
@@ -99,8 +99,8 @@ class OccupancyGrid:
         What moves fills at each instant a small part of the cells that it ever fills. Close by is a cell's own slot or one
         beside it, the cell or a neighbour: what is learnt can go on moving until the next split.
         """
-        self._dense = dilate(self.over_time(density_at, rng, slots, self.LOOKS), SPACE_TIME_AXES)
-        self.marched = self._dense & self.occupied
+        self._dense = dilate(self.sample_slots(density_at, rng, slots, self.LOOKS), SPACE_TIME_AXES)
+        self.active = self._dense & self.occupied
 
     def state(self) -> dict[str, Any]:
         return {
@@ -114,29 +114,31 @@ class OccupancyGrid:
     def load(self, state: dict[str, Any]) -> None:
         names = ("log_density", "peak", "occupied", "dense")
         self.log_density, self.peak, self.occupied, self._dense = (state[name].cpu().numpy() for name in names)
-        self.marched = self._dense & self.occupied
+        self.active = self._dense & self.occupied
         self._known = bool(state["known"])
 
     def _least(self) -> float:
         """The log density that fills a cell. While all is thin it is the average: an empty grid could never be filled again."""
-        known = self.log_density[self.seen]
+        known = self.log_density[self.visible]
         return min(self.threshold, math.log(max(float(np.exp(known.astype(np.float64)).mean()), 1e-30)))
 
     def _look(
         self, density_at: DensityAt, cells: np.ndarray, rng: np.random.Generator, start: float, end: float
     ) -> np.ndarray:
         """Log density at a random point of each cell and a random time in [start, end]."""
-        points = (cells + rng.random(cells.shape, dtype=np.float32)) / np.array(self.seen.shape, np.float32)
+        points = (cells + rng.random(cells.shape, dtype=np.float32)) / np.array(self.visible.shape, np.float32)
         times = start + (end - start) * rng.random(len(cells), dtype=np.float32)
         return density_at(np.ascontiguousarray(points[:, ::-1], np.float32), times.astype(np.float32))
 
-    def over_time(self, density_at: DensityAt, rng: np.random.Generator, slots: int, samples: int = 16) -> np.ndarray:
+    def sample_slots(
+        self, density_at: DensityAt, rng: np.random.Generator, slots: int, samples: int = 16
+    ) -> np.ndarray:
         """The grid to store: (slots, Nz, Ny, Nx) bool, what is occupied while each slot of the clip lasts.
 
         Each cell that is occupied is looked at `samples` times in every slot.
         """
         cells, least = np.argwhere(self.occupied), self._least()
-        out = np.zeros((slots, *self.seen.shape), bool)
+        out = np.zeros((slots, *self.visible.shape), bool)
         for slot in range(slots):
             best = np.full(len(cells), -np.inf, np.float32)
             for _ in range(samples):

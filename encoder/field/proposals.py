@@ -11,18 +11,18 @@ import numpy as np
 import torch
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, plan_layout
-from kpc.encoder.field.render import Rays, Samples, cells_of, fused_features, places, spans_of
+from kpc.encoder.field.render import Rays, Samples, cell_indices, fused_features, plane_coordinates, ray_spans
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import SpaceMapping
 from torch import Tensor, nn
 
-PADDING = 0.01
+WEIGHT_PADDING = 0.01
 """Added to each weight before samples are drawn by them, so that no part of a ray is given up for good."""
 
-ANNEALED = 500
+ANNEAL_STEPS = 500
 """Steps over which the weights come into force, from all being equal; before, they are the weights of fields that know nothing."""
 
-Level = tuple[Tensor, Tensor]
+ProposalLevel = tuple[Tensor, Tensor]
 """Of N rays cut into K intervals: edges (N, K + 1), s rising along each ray, and weights (N, K)."""
 
 
@@ -51,18 +51,18 @@ class Proposals(nn.Module):
         cells: tuple[int, int, int],
         step: int,
         fused: bool,
-    ) -> tuple[Samples, Tensor, list[Level]]:
+    ) -> tuple[Samples, Tensor, list[ProposalLevel]]:
         """Samples for the field that is to be had, as many on every ray; their edges (N, K + 1); what each proposal made of them.
 
         Args:
             cells: (Nz, Ny, Nx) of the occupancy grid. step: number of the training step. fused: whether the kernels look the
                 planes up.
         """
-        near, far = spans_of(rays, aabb, mapping)
+        near, far = ray_spans(rays, aabb, mapping)
         extent = (aabb[1] - aabb[0]).max()
-        force = min(1.0, 10 * step / (9 * step + ANNEALED))  # mip-NeRF 360's schedule: fast at first
+        force = min(1.0, 10 * step / (9 * step + ANNEAL_STEPS))  # mip-NeRF 360's schedule: fast at first
         edges = _evenly(near, far, self.counts[0], rays.jitters)
-        levels: list[Level] = []
+        levels: list[ProposalLevel] = []
         for field, count in zip(self.fields, self.counts[1:], strict=True):
             assert isinstance(field, Field)
             samples = _between(rays, edges, aabb, mapping, cells)
@@ -72,7 +72,7 @@ class Proposals(nn.Module):
             trans = torch.exp(torch.cumsum(tau, 1).neg() + tau)
             weights = trans * (1 - torch.exp(-tau))
             levels.append((edges, weights))
-            edges = resampled(edges, weights.detach() ** force, count, rays.jitters)
+            edges = resample_edges(edges, weights.detach() ** force, count, rays.jitters)
         return _between(rays, edges, aabb, mapping, cells), edges, levels
 
 
@@ -88,7 +88,7 @@ def _between(
 ) -> Samples:
     """A sample in the middle of each interval."""
     middle = (edges[:, 1:] + edges[:, :-1]) / 2
-    u, stretch = places(rays, middle, aabb, mapping)
+    u, stretch = plane_coordinates(rays, middle, aabb, mapping)
     u = u.clamp(0, 1)
     ray = torch.arange(len(middle), device=middle.device)[:, None].expand_as(middle).flatten()
     return Samples(
@@ -97,17 +97,17 @@ def _between(
         middle.flatten(),
         (edges[:, 1:] - edges[:, :-1]).flatten(),
         stretch.flatten(),
-        cells_of(u, cells).flatten(0, 1),
+        cell_indices(u, cells).flatten(0, 1),
     )
 
 
-def resampled(edges: Tensor, weights: Tensor, count: int, jitters: Tensor) -> Tensor:
+def resample_edges(edges: Tensor, weights: Tensor, count: int, jitters: Tensor) -> Tensor:
     """Edges (N, count + 1) of new intervals that all hold as much of the weights (N, K) between edges (N, K + 1).
 
     The inverse of the cumulative weights, read at even steps moved by jitters (N,) in [0, 1); no gradient.
     """
     with torch.no_grad():
-        padded = weights + PADDING / weights.shape[1]
+        padded = weights + WEIGHT_PADDING / weights.shape[1]
         cumulative = torch.nn.functional.pad(torch.cumsum(padded / padded.sum(1, keepdim=True), 1), (1, 0)).clamp(max=1)
         at = torch.arange(count + 1, device=edges.device, dtype=edges.dtype) / count
         at = (at + (jitters[:, None] - 0.5) / count * ((at > 0) & (at < 1))).contiguous()
@@ -118,7 +118,7 @@ def resampled(edges: Tensor, weights: Tensor, count: int, jitters: Tensor) -> Te
         return start + share * (end - start)
 
 
-def histogram_loss(edges: Tensor, weights: Tensor, level: Level) -> Tensor:
+def histogram_loss(edges: Tensor, weights: Tensor, level: ProposalLevel) -> Tensor:
     """How far a proposal underrates what was found, arXiv:2111.12077, eq. 13; the gradient is for the proposal alone.
 
     mean over rays of sum_i max(0, w_i - bound_i)^2 / w_i, where bound_i is the sum of the proposal's weights in all its intervals

@@ -1,8 +1,8 @@
 """Rendering of ray batches in PyTorch, with gradients: the readable reference of `kpc.encoder.field.kernels`, and what trains where those
 do not serve: on a GPU, and with the hybrid decoder.
 
-Three parts, each with a plain version for any device: which samples rays take (`samples_of`), what the field holds there
-(`Field.features`), and what becomes of it (`meet`, `shade`). On the CPU `collected` and `FusedFeatures` stand in for the first two.
+Three parts, each with a plain version for any device: which samples rays take (`sample_rays`), what the field holds there
+(`Field.features`), and what becomes of it (`weigh_samples`, `shade`). On the CPU `sample_rays_fused` and `FusedFeatures` stand in for the first two.
 """
 
 import math
@@ -19,7 +19,7 @@ from kpc.format.scene.scene import TERMINATION, Scene
 from kpc.format.scene.space import Contraction, SpaceMapping
 from torch import Tensor
 
-OPAQUE = 50.0
+OPAQUE_TAU = 50.0
 """Optical thickness of a sample beyond which more makes no difference to what lies behind it."""
 
 
@@ -36,12 +36,12 @@ class Rays:
     appearances: Tensor | None = None
 
     @staticmethod
-    def of(*arrays: np.ndarray, appearances: np.ndarray | None = None) -> "Rays":
+    def from_arrays(*arrays: np.ndarray, appearances: np.ndarray | None = None) -> "Rays":
         """Of the first five members as arrays of any float type, and of int64 appearances."""
         floats = (torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays)
         return Rays(*floats, None if appearances is None else torch.from_numpy(appearances))
 
-    def apply(self, change: Callable[[Tensor], Tensor]) -> "Rays":
+    def map(self, change: Callable[[Tensor], Tensor]) -> "Rays":
         """The same with every member changed."""
         return Rays(*(None if value is None else change(value) for value in vars(self).values()))
 
@@ -66,7 +66,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Met:
+class RayWeights:
     """What N rays meet, but for its colour: n samples, in the order of their rays.
 
     Attributes:
@@ -100,12 +100,12 @@ def render_reference(
     Returns:
         Colours (N, 3); the distortion; of the n samples reached their weights (n,), and their cells (n, 3) int64.
     """
-    samples = samples_of(rays, aabb, occupancy, step, mapping)
-    met = meet(field, rays, samples, field.features, float((aabb[1] - aabb[0]).max()), kept)
+    samples = sample_rays(rays, aabb, occupancy, step, mapping)
+    met = weigh_samples(field, rays, samples, field.features, float((aabb[1] - aabb[0]).max()), kept)
     return shade(field, rays, met), met.distortion, met.weights[met.reached], samples.cell[met.reached]
 
 
-def samples_of(
+def sample_rays(
     rays: Rays,
     aabb: Tensor,
     occupancy: Tensor,
@@ -123,13 +123,13 @@ def samples_of(
     ray can take, and `capacity` nobody waits: there are `capacity` samples, those left over are of no length, on the last ray,
     and those beyond are lost.
     """
-    near, far = spans_of(rays, aabb, mapping)
+    near, far = ray_spans(rays, aabb, mapping)
     if most is None:
         most = max(1, math.ceil(float((far - near).clamp(min=0).max()) / step))
     k = torch.arange(most, device=near.device)
     s = near[:, None] + (k + rays.jitters[:, None]) * step
-    u, stretch = places(rays, s, aabb, mapping)
-    cell = cells_of(u, tuple(occupancy.shape[1:]))
+    u, stretch = plane_coordinates(rays, s, aabb, mapping)
+    cell = cell_indices(u, tuple(occupancy.shape[1:]))
     slot = (rays.times * occupancy.shape[0]).long().clamp(max=occupancy.shape[0] - 1)[:, None]
     taken = occupancy[slot, cell[..., 0], cell[..., 1], cell[..., 2]].bool() & (s < far[:, None])
     if capacity is None:
@@ -146,8 +146,8 @@ def samples_of(
     )
 
 
-def reached(samples: Samples, is_reached: Tensor, capacity: int) -> Samples:
-    """Those samples that are reached (n,) bool, with room for `capacity` as in `samples_of`."""
+def select_reached(samples: Samples, is_reached: Tensor, capacity: int) -> Samples:
+    """Those samples that are reached (n,) bool, with room for `capacity` as in `sample_rays`."""
     chosen, there = _places_of(is_reached, capacity)
     kept = Samples(*(values[chosen] for values in vars(samples).values()))
     return replace(kept, length=kept.length * there)
@@ -158,12 +158,12 @@ def _places_of(is_set: Tensor, capacity: int) -> tuple[Tensor, Tensor]:
     there were, (capacity,) bool."""
     n = is_set.numel()
     number = torch.where(is_set, is_set.cumsum(0) - 1, capacity).clamp(max=capacity)
-    places = torch.full((capacity + 1,), n - 1, device=is_set.device)
-    places.scatter_(0, number, torch.arange(n, device=is_set.device))
-    return places[:capacity], torch.arange(capacity, device=is_set.device) < is_set.sum()
+    positions = torch.full((capacity + 1,), n - 1, device=is_set.device)
+    positions.scatter_(0, number, torch.arange(n, device=is_set.device))
+    return positions[:capacity], torch.arange(capacity, device=is_set.device) < is_set.sum()
 
 
-def spans_of(rays: Rays, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
+def ray_spans(rays: Rays, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
     """s where the samples of rays begin and end, (N,) each; they end before they begin where a ray misses the box."""
     if isinstance(mapping, Contraction):
         return torch.zeros_like(rays.times), torch.full_like(rays.times, mapping.s_end)
@@ -173,7 +173,7 @@ def spans_of(rays: Rays, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Te
     return near, torch.maximum(t0, t1).nan_to_num(torch.inf).amin(1)
 
 
-def places(rays: Rays, s: Tensor, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
+def plane_coordinates(rays: Rays, s: Tensor, aabb: Tensor, mapping: SpaceMapping | None) -> tuple[Tensor, Tensor]:
     """Of samples at s (N, K) on N rays: their places (N, K, 3) in [0, 1]^3, and what a unit of s there counts (N, K),
     `kpc.format.scene.space.Contraction.stretch`."""
     t = s
@@ -192,19 +192,19 @@ def places(rays: Rays, s: Tensor, aabb: Tensor, mapping: SpaceMapping | None) ->
     return y * ((2 - 1 / radius) / radius / 4)[..., None] + 0.5, stretch
 
 
-def cells_of(u: Tensor, cells: tuple[int, ...]) -> Tensor:
+def cell_indices(u: Tensor, cells: tuple[int, ...]) -> Tensor:
     """The cells z, y, x of a grid (Nz, Ny, Nx) that hold places (..., 3): (..., 3) int64."""
     return torch.stack([(u[..., axis] * n).long().clamp(0, n - 1) for axis, n in zip((2, 1, 0), cells)], dim=-1)
 
 
-def meet(
+def weigh_samples(
     field: Field,
     rays: Rays,
     samples: Samples,
     features: Callable[[Tensor, Tensor], Tensor],
     extent: float,
     kept: Tensor | None = None,
-) -> Met:
+) -> RayWeights:
     """Spend the light of N rays on their samples, front to back.
 
     With tau = sigma * stretch * length / extent: alpha = 1 - exp(-tau), weight = trans * alpha; a ray ends once its transmittance
@@ -222,22 +222,22 @@ def meet(
     length = samples.length / extent
     tau = log_density.exp() * length * samples.stretch
     # A running sum over all rays must not meet numbers so large that the rest is lost beside them.
-    trans = torch.exp(-_before(tau.clamp(max=OPAQUE), first, last))
+    trans = torch.exp(-_before(tau.clamp(max=OPAQUE_TAU), first, last))
     lit = trans >= TERMINATION
     weights = torch.where(lit, trans * (1 - torch.exp(-tau)), 0)
     opacity = torch.zeros_like(rays.backgrounds[:, 0]).index_add(0, ray, weights)
     along = ((samples.s - samples.s[first]) / extent).to(weights.dtype)
     apart = along * _before(weights, first, last) - _before(weights * along, first, last)
     distortion = (2 * weights * apart + weights.square() * length / 3).sum() / N
-    return Met(ray, latent, weights, lit, opacity, distortion)
+    return RayWeights(ray, latent, weights, lit, opacity, distortion)
 
 
-def shade(field: Field, rays: Rays, met: Met, codes: Tensor | None = None) -> Tensor:
+def shade(field: Field, rays: Rays, met: RayWeights, codes: Tensor | None = None) -> Tensor:
     """Colours (N, 3): sum of weight * colour + what is left * background.
 
     `codes`: (N, H) or (H,) of appearances in place of those that the rays name.
     """
-    terms = field.once_a_ray(rays.directions, field.codes_of(rays.appearances) if codes is None else codes)
+    terms = field.ray_terms(rays.directions, field.appearance_codes(rays.appearances) if codes is None else codes)
     colours = field.colours(met.latent, terms, met.ray)
     rgb = torch.zeros_like(rays.backgrounds).index_add(0, met.ray, met.weights[:, None] * colours)
     return rgb + (1 - met.opacity)[:, None] * rays.backgrounds
@@ -268,21 +268,21 @@ def _before(values: Tensor, first: Tensor, last: Tensor) -> Tensor:
     return summed
 
 
-def sample_counts(
+def count_samples(
     rays: Rays, aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None = None
 ) -> np.ndarray:
-    """(N,) int64: how many of `samples_of` each ray takes, on the CPU, by the kernel."""
+    """(N,) int64: how many of `sample_rays` each ray takes, on the CPU, by the kernel."""
     counts: np.ndarray = kernels.collect(
         *_as_collected(rays, aabb, occupancy, step, mapping), None, None, None, None, None, 8 * numba.get_num_threads()
     )
     return counts
 
 
-def collected(
+def sample_rays_fused(
     rays: Rays, aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None = None
 ) -> Samples:
-    """`samples_of` on the CPU, by the kernel."""
-    counts = sample_counts(rays, aabb, occupancy, step, mapping)
+    """`sample_rays` on the CPU, by the kernel."""
+    counts = count_samples(rays, aabb, occupancy, step, mapping)
     ends = np.cumsum(counts)
     n = int(ends[-1]) if len(ends) else 0
     points, s, stretch = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
@@ -308,10 +308,10 @@ def _as_collected(
     return aabb, kernels.even_of(mapping), occupancy.view(np.uint8), np.float32(step), *where
 
 
-def marched(field: Field, rays: Rays, scene: Scene) -> tuple[Samples, Met]:
+def march_scene(field: Field, rays: Rays, scene: Scene) -> tuple[Samples, RayWeights]:
     """The samples that rays take of a scene as it is drawn, and what they meet there in its field, by the kernels on the CPU."""
-    samples = collected(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
-    return samples, meet(field, rays, samples, fused_features(field), scene.extent)
+    samples = sample_rays_fused(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
+    return samples, weigh_samples(field, rays, samples, fused_features(field), scene.extent)
 
 
 class FusedFeatures(torch.autograd.Function):

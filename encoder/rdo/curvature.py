@@ -20,7 +20,7 @@ import torch
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.field import Layout
-from kpc.encoder.field.render import marched, shade
+from kpc.encoder.field.render import march_scene, shade
 from kpc.format.scene.scene import Scene
 
 BLOCK_SIDE = 2
@@ -66,7 +66,7 @@ def estimate_curvature(scene: Scene, probe: ValidationRays, rays: int | None = N
     for one in (probe, more):
         for some in one.batches(RAYS_PER_GRADIENT):
             batch = renderer.batch(*some.rays)
-            _, met = marched(field, batch, scene)
+            _, met = march_scene(field, batch, scene)
             codes = renderer.codes(some.appearances)
             colours = shade(field, batch, met, None if codes is None else torch.from_numpy(codes))
             signs = torch.from_numpy(rng.choice(np.float32([-1, 1]), tuple(colours.shape)))

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import Measure, ValidationRays
-from kpc.encoder.field.render import marched
+from kpc.encoder.field.render import march_scene
 from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS
 from kpc.format.common.jit import compiled, inlined
 from kpc.format.scene.grid import dilate
@@ -88,7 +88,7 @@ def removal_errors(scene: Scene, probe: ValidationRays, rays: int) -> np.ndarray
     for one in (probe, more):
         for some in one.batches(RAYS_AT_ONCE):
             with torch.no_grad():
-                samples, met = marched(renderer.field, renderer.batch(*some.rays), scene)
+                samples, met = march_scene(renderer.field, renderer.batch(*some.rays), scene)
             ray, weights = samples.ray.numpy(), met.weights.numpy().astype(np.float64)
             slot = np.minimum((some.times * slots).astype(np.int64), slots - 1)[ray]
             cell = np.ravel_multi_index((slot, *samples.cell.numpy().T), scene.occupancy.shape)

@@ -131,8 +131,8 @@ class SurfaceFeatures:
         s = np.where(np.isfinite(depths), depths, 0)[ends].astype(np.float32)
         s = scene.mapping.parameter(s) if isinstance(scene.mapping, Contraction) else s
         nothing = np.zeros(len(ends))
-        rays = render.Rays.of(*(a[ends] for a in (origins, directions, times)), nothing, nothing)
-        u, _ = render.places(rays, torch.from_numpy(s)[:, None], torch.from_numpy(scene.aabb), scene.mapping)
+        rays = render.Rays.from_arrays(*(a[ends] for a in (origins, directions, times)), nothing, nothing)
+        u, _ = render.plane_coordinates(rays, torch.from_numpy(s)[:, None], torch.from_numpy(scene.aabb), scene.mapping)
         slots, *cells = scene.occupancy.shape
         rng = np.random.default_rng(0)
         occupied = np.argwhere(scene.occupancy)

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, mse_of_psnr
-from kpc.encoder.field.occupancy_grid import in_fewest_slots
+from kpc.encoder.field.occupancy_grid import merge_slots
 from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
 from kpc.encoder.rdo.rate_search import TOLERANCE, find_limit, find_tuned_limit, minimise
@@ -168,7 +168,7 @@ def significance(alone: PerPlane) -> list[dict[str, np.ndarray]]:
 def reduce_slots(scene: Scene, measure: Measure, error: float) -> Scene:
     """The scene with its occupancy in fewer slots, if that adds at most `error`, in squares of 8-bit levels, and MORE_CELLS cells; else
     itself."""
-    merged = in_fewest_slots(scene.occupancy, MORE_CELLS)
+    merged = merge_slots(scene.occupancy, MORE_CELLS)
     if len(merged) == len(scene.occupancy):
         return scene
     candidate = replace(scene, occupancy=merged)

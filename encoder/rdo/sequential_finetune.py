@@ -21,7 +21,7 @@ from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
 from kpc.encoder.rdo.distortion import PlaneKey
-from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser
+from kpc.encoder.training.optimisers import FusedOptimiser, TorchOptimiser
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common.progress import Progress
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
@@ -146,7 +146,7 @@ def _taught(
     optimiser = (
         FusedOptimiser(field, config, cells, scene.mapping)
         if explicit
-        else PlainOptimiser(field, config, cells, scene.mapping, fused=True)
+        else TorchOptimiser(field, config, cells, scene.mapping, fused=True)
     )
     theta, M = field.theta.detach().numpy(), field.layout.channels
     kept = [
@@ -175,4 +175,4 @@ def _taught(
         progress.advance()
     scales = tuple({name: plane if (s, name) in settled else field.plane(s, name).detach().numpy()[..., : plane.shape[2]].copy()
                     for name, plane in scale.items()} for s, scale in enumerate(scene.scales))  # fmt: skip
-    return replace(scene, scales=scales, decoder=unpad_decoder(scene, field.decoder_as_data()))
+    return replace(scene, scales=scales, decoder=unpad_decoder(scene, field.export_decoder()))

@@ -12,7 +12,7 @@ Work = Callable[..., Tensor]
 
 
 @dataclass(frozen=True)
-class Recording:
+class CapturedGraph:
     """What was recorded: it reads `inputs` and writes `result` and `gradients`, always the same memory."""
 
     graph: torch.cuda.CUDAGraph
@@ -21,7 +21,7 @@ class Recording:
     gradients: list[Tensor | None]
 
 
-class Recorder:
+class GraphCache:
     """Does work that a key names: as it is when the key, with inputs of such shapes, comes up first, then recorded.
 
     A key has to tell all else that work goes by.
@@ -34,7 +34,7 @@ class Recorder:
         """`parameters`: all that work may give a gradient to."""
         self.parameters = list(parameters)
         self._seen: set[Hashable] = set()
-        self._recordings: dict[Hashable, Recording] = {}
+        self._recordings: dict[Hashable, CapturedGraph] = {}
 
     def run(self, key: Hashable, inputs: Sequence[Tensor], work: Work) -> Tensor:
         """work(*inputs), with parameters that have no gradient yet. The result, and gradients, hold until the next call."""
@@ -52,7 +52,7 @@ class Recorder:
             parameter.grad = gradient
         return recording.result
 
-    def _recorded(self, inputs: Sequence[Tensor], work: Work) -> Recording:
+    def _recorded(self, inputs: Sequence[Tensor], work: Work) -> CapturedGraph:
         if len(self._recordings) >= self.MOST:
             self._recordings.clear()
             self._seen.clear()
@@ -60,4 +60,4 @@ class Recorder:
         graph, there = torch.cuda.CUDAGraph(), [value.to(self.parameters[0].device, copy=True) for value in inputs]
         with torch.cuda.graph(graph, pool=pool):  # one pool: what one leaves there is used before the next begins
             result = work(*there)
-        return Recording(graph, there, result, [parameter.grad for parameter in self.parameters])
+        return CapturedGraph(graph, there, result, [parameter.grad for parameter in self.parameters])

@@ -38,7 +38,7 @@ class TileWeights:
     """
 
     def __init__(self, dataset: Dataset, floor: float) -> None:
-        """Read all training pictures of a dataset for which `cameras_stand_still`, a band at a time."""
+        """Read all training pictures of a dataset for which `has_static_cameras`, a band at a time."""
         self.dataset = dataset
         pictures = dataset.pictures
         self.train = np.flatnonzero(~pictures.is_test)
@@ -53,7 +53,7 @@ class TileWeights:
         self.weights = np.zeros(-(-int(self.ends[-1]) // _BLOCK) * _BLOCK, np.uint8)
         """Row by row, picture by picture, filled up with 0 to whole blocks."""
         starts = self.ends - tiles
-        for numbers in of_each_camera(dataset):
+        for numbers in group_by_camera(dataset):
             for some, row, weights in _tile_weights(dataset, numbers, floor, self.tile):
                 place = np.searchsorted(self.train, some)
                 first = starts[place] + row // self.tile * self.across[place]
@@ -100,12 +100,12 @@ class TileWeights:
         return usable
 
 
-def cameras_stand_still(dataset: Dataset) -> bool:
+def has_static_cameras(dataset: Dataset) -> bool:
     """Whether every training camera of a moving scene has several pictures, so that one can be compared with another."""
-    return dataset.is_dynamic and all(len(numbers) > 1 for numbers in of_each_camera(dataset))
+    return dataset.is_dynamic and all(len(numbers) > 1 for numbers in group_by_camera(dataset))
 
 
-def of_each_camera(dataset: Dataset) -> list[np.ndarray]:
+def group_by_camera(dataset: Dataset) -> list[np.ndarray]:
     """The training pictures of one pose, lens and size in the order of their times, for each there is."""
     pictures = dataset.pictures
     train = np.flatnonzero(~pictures.is_test)
@@ -128,13 +128,13 @@ def _tile_weights(
         first = max(start - WINDOW, 0)
         near = numbers[first : start + 3 * WINDOW]
         for row in range(0, height, rows):
-            band = np.stack([faded(pixels.picture(int(p), row, min(row + rows, height))) for p in near])
-            changes = largest_change(band, WINDOW)[start - first :][: len(some)]
+            band = np.stack([premultiply_alpha(pixels.picture(int(p), row, min(row + rows, height))) for p in near])
+            changes = max_temporal_difference(band, WINDOW)[start - first :][: len(some)]
             usable = np.stack([dataset.usable(int(p))[row : row + rows] for p in some])
             yield some, row, _tile_means(np.maximum(changes, np.uint8(round(255 * floor))), usable, tile)
 
 
-def largest_change(pictures: np.ndarray, radius: int) -> np.ndarray:
+def max_temporal_difference(pictures: np.ndarray, radius: int) -> np.ndarray:
     """The largest |a - b| over channels and over the pictures b up to `radius` before and after each picture a.
 
     (K, H, W, C) uint8 to (K, H, W) uint8.
@@ -159,7 +159,7 @@ def _running(extreme: np.ufunc, values: np.ndarray, radius: int) -> np.ndarray:
     return extreme(spans[: len(values)], spans[length - span : length - span + len(values)])
 
 
-def faded(picture: np.ndarray) -> np.ndarray:
+def premultiply_alpha(picture: np.ndarray) -> np.ndarray:
     """Straight alpha multiplied in: what is transparent has no colour that could change."""
     if picture.shape[2] == 3:
         return picture

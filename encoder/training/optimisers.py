@@ -14,9 +14,18 @@ import torch
 from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig, Variation
 from kpc.encoder.field.field import Field, appearance_priors, motion_priors, priors
-from kpc.encoder.field.proposals import Level, Proposals, histogram_loss
-from kpc.encoder.field.render import Rays, Samples, collected, fused_features, meet, reached, samples_of, shade
-from kpc.encoder.training.cuda_graphs import Recorder
+from kpc.encoder.field.proposals import ProposalLevel, Proposals, histogram_loss
+from kpc.encoder.field.render import (
+    Rays,
+    Samples,
+    fused_features,
+    sample_rays,
+    sample_rays_fused,
+    select_reached,
+    shade,
+    weigh_samples,
+)
+from kpc.encoder.training.cuda_graphs import GraphCache
 from kpc.format.scene.scene import SPACE_PLANES
 from kpc.format.scene.space import Contraction, SpaceMapping
 
@@ -43,7 +52,7 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
 
 
-def kept_channels(field: Field, config: TrainConfig, step: int, fraction: float) -> torch.Tensor:
+def feature_mask(field: Field, config: TrainConfig, step: int, fraction: float) -> torch.Tensor:
     """Factors on the features for one step, at a fraction of the run, (F,) float32 on the CPU: 0 where `channel_dropout` leaves a
     channel out, at all scales alike, `scale_dropout` a scale and all finer ones, or `coarse_until` all but the coarsest.
 
@@ -101,18 +110,18 @@ class FusedOptimiser:
         `rate`."""
         layout, config = self.field.layout, self.config
         with self.watch("decoder"):
-            kept = kept_channels(self.field, config, number, fraction)
+            kept = feature_mask(self.field, config, number, fraction)
             scales = int(kept.view(-1, layout.channels).any(1).sum())  # the finer ones take no part, nor any time
             F = scales * layout.channels
             kept = kept[:F]
             basis = self.field.b2[None]
             if config.view_dependent:
-                basis = self.field.basis(batch.directions, self.field.codes_of(batch.appearances))
+                basis = self.field.basis(batch.directions, self.field.appearance_codes(batch.appearances))
             basis = (basis[..., :F] * kept).contiguous()
             density = torch.cat([self.field.density.detach()[:F] * kept, self.field.density.detach()[-1:]])
             grad_basis = np.zeros((len(basis) if config.view_dependent else self.workers, *basis.shape[1:]), np.float32)
             grad_density = np.zeros((self.workers, F + 1), np.float32)
-            motion = motion_of(self.field)
+            motion = motion_array(self.field)
             grad_motion = None if motion is None else np.zeros((self.workers, *motion.shape), np.float32)
             moving = motion is not None and number % config.motion_every == 0
         with self.watch("kernel"):
@@ -142,11 +151,11 @@ class FusedOptimiser:
                 batch.backgrounds.numpy(),
                 self._peaks,
                 np.float32(config.distortion),
-                sample_capacity(aabb, step_length, self.mapping),
+                max_samples_per_ray(aabb, step_length, self.mapping),
             )
         with self.watch("priors"):
             if number % config.regularise_every == 0:
-                add_priors(
+                add_prior_gradients(
                     self.field, self.theta, self.grad[0], config, config.variation(fraction), config.regularise_every
                 )
         with self.watch("decoder"):
@@ -191,7 +200,7 @@ class FusedOptimiser:
         self.decoder.load_state_dict(state["decoder"])
 
 
-class Figures:
+class DeferredReadback:
     """Small tensors from a device, read LATE steps after they were made, so that nobody waits; on the CPU at once."""
 
     LATE = 8
@@ -214,8 +223,8 @@ class Figures:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a step of `PlainOptimiser` goes by besides tensors.
+class StepPlan:
+    """What a step of `TorchOptimiser` goes by besides tensors.
 
     Attributes:
         number: of the step where proposals are sampled, whose schedule it sets; else 0.
@@ -233,7 +242,7 @@ class Plan:
     rooms: tuple[int, int] | None
 
 
-class PlainOptimiser:
+class TorchOptimiser:
     """A step in plain PyTorch, on any device that PyTorch knows; or `fused`, on the CPU: kernels for the planes.
 
     On a GPU nothing in a step waits for it: shapes do not depend on what it computes, and `step` returns numbers that it worked
@@ -256,7 +265,7 @@ class PlainOptimiser:
         self._on_gpu = self.device.type != "cpu"
         self._records = self._on_gpu and proposals is None
         self._peaks = torch.zeros(cells, device=self.device)
-        self._figures = Figures(self.device)
+        self._figures = DeferredReadback(self.device)
         self._taken_a_ray = self._reached_a_ray = math.inf
         self._rooms = (0, 0)
         self._occupancy: tuple[np.ndarray, torch.Tensor] | None = None
@@ -271,7 +280,7 @@ class PlainOptimiser:
             each.mixed = config.mixed_precision and self._on_gpu
         self.planes = _adam([([each.theta for each in self.fields], config.learning_rate)])
         self.decoder = _decoder_optimiser(field, config, [each.density for each in self.fields[1:]])
-        self._recorder = Recorder(
+        self._recorder = GraphCache(
             [
                 p
                 for optimiser in (self.planes, self.decoder)
@@ -281,7 +290,7 @@ class PlainOptimiser:
         )
 
     @contextlib.contextmanager
-    def as_written(self) -> Iterator[None]:
+    def eager(self) -> Iterator[None]:
         """While it lasts, steps are not replayed but done operation by operation."""
         records, self._records = self._records, False
         try:
@@ -310,8 +319,8 @@ class PlainOptimiser:
         """As `FusedOptimiser.step`."""
         config, rays = self.config, len(targets)
         variation = config.variation(fraction) if number % config.regularise_every == 0 else None
-        most = sample_capacity(aabb, step_length, self.mapping)
-        plan = Plan(
+        most = max_samples_per_ray(aabb, step_length, self.mapping)
+        plan = StepPlan(
             number if self.proposals is not None else 0,
             step_length,
             extent,
@@ -325,7 +334,7 @@ class PlainOptimiser:
                 self._aabb = self._there(torch.from_numpy(aabb))
             if self._occupancy is None or self._occupancy[0] is not occupancy:
                 self._occupancy = occupancy, self._there(torch.from_numpy(occupancy))
-            kept = kept_channels(self.field, config, number, fraction)
+            kept = feature_mask(self.field, config, number, fraction)
             numbers = [] if batch.appearances is None else [self._there(batch.appearances)]
             inputs = [self._there(_packed(batch, targets)), self._there(kept), self._occupancy[1], *numbers]
         with self.watch("gradient"):
@@ -343,7 +352,7 @@ class PlainOptimiser:
         with self.watch("priors"):
             for each in self.fields if variation is not None and self.fused else ():
                 theta, grad = each.theta.detach().numpy(), each.theta.grad.numpy()
-                add_priors(each, theta, grad, config, variation, config.regularise_every)
+                add_prior_gradients(each, theta, grad, config, variation, config.regularise_every)
         with self.watch("adam"):
             self.planes.step()
             self.decoder.step()
@@ -352,7 +361,7 @@ class PlainOptimiser:
 
     def _backpropagate(
         self,
-        plan: Plan,
+        plan: StepPlan,
         packed: torch.Tensor,
         kept: torch.Tensor,
         occupancy: torch.Tensor,
@@ -362,7 +371,7 @@ class PlainOptimiser:
         field, config = self.field, self.config
         batch, targets = _unpacked(packed, appearances)
         assert self._aabb is not None
-        levels: list[Level] = []
+        levels: list[ProposalLevel] = []
         if self.proposals is None:
             samples = self._samples(plan, batch, occupancy)
         else:
@@ -373,9 +382,11 @@ class PlainOptimiser:
         if plan.rooms is not None and self.proposals is None:
             # What lies behind the end of its ray takes no part: half of the samples, of which the gradient is spared.
             with torch.no_grad():
-                seen = meet(field, batch, samples, self.features, plan.extent, kept).reached & (samples.length > 0)
-            samples = reached(samples, seen, plan.rooms[1])
-        met = meet(field, batch, samples, self.features, plan.extent, kept)
+                seen = weigh_samples(field, batch, samples, self.features, plan.extent, kept).reached & (
+                    samples.length > 0
+                )
+            samples = select_reached(samples, seen, plan.rooms[1])
+        met = weigh_samples(field, batch, samples, self.features, plan.extent, kept)
         error = (shade(field, batch, met) - targets).square().mean()
         loss = error + config.distortion * met.distortion
         for level in levels:
@@ -395,13 +406,13 @@ class PlainOptimiser:
         counts = torch.stack([taken, (met.reached & (samples.length > 0)).sum()]) / len(targets)
         return torch.cat([error.detach()[None], counts])
 
-    def _samples(self, plan: Plan, batch: Rays, occupancy: torch.Tensor) -> Samples:
+    def _samples(self, plan: StepPlan, batch: Rays, occupancy: torch.Tensor) -> Samples:
         assert self._aabb is not None
         if self.fused:
-            return collected(batch, self._aabb.numpy(), occupancy.numpy(), plan.step_length, self.mapping)
+            return sample_rays_fused(batch, self._aabb.numpy(), occupancy.numpy(), plan.step_length, self.mapping)
         if plan.rooms is None:
-            return samples_of(batch, self._aabb, occupancy, plan.step_length, self.mapping)
-        return samples_of(
+            return sample_rays(batch, self._aabb, occupancy, plan.step_length, self.mapping)
+        return sample_rays(
             batch, self._aabb, occupancy, plan.step_length, self.mapping, most=plan.most, capacity=plan.rooms[0]
         )
 
@@ -461,7 +472,7 @@ def _total(weighed: dict[str, torch.Tensor]) -> torch.Tensor:
     return torch.stack(list(weighed.values())).sum()
 
 
-def add_priors(
+def add_prior_gradients(
     field: Field, theta: np.ndarray, grad: np.ndarray, config: TrainConfig, variation: Variation, times: float
 ) -> None:
     """Add `times` the gradient of `kpc.encoder.field.field.priors` to grad."""
@@ -486,19 +497,19 @@ def log_densities(field: Field, points: np.ndarray, times: np.ndarray) -> np.nda
         layout.resolution,
         field.density.detach().numpy(),
         layout.channels,
-        motion_of(field),
+        motion_array(field),
         np.asarray(points, np.float32),
         np.asarray(times, np.float32),
         8 * numba.get_num_threads(),
     )
 
 
-def motion_of(field: Field) -> np.ndarray | None:
+def motion_array(field: Field) -> np.ndarray | None:
     """The motion grid as the kernels take it."""
     return None if field.motion is None else field.motion.detach().numpy()
 
 
-def sample_capacity(aabb: np.ndarray, step_length: float, mapping: SpaceMapping | None = None) -> int:
+def max_samples_per_ray(aabb: np.ndarray, step_length: float, mapping: SpaceMapping | None = None) -> int:
     """Samples a ray can take at most: the box's diagonal in steps, or all of a ray through contracted space."""
     longest = (
         np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64))

@@ -75,7 +75,7 @@ class RaySampler:
             targets = targets * colours[:, 3:] + backgrounds * (1 - colours[:, 3:])
         jitters = rng.random(count, dtype=np.float32)
         numbers = None if self.appearances is None else self.appearances[picture]
-        batch = Rays.of(origins, directions, pictures.time[picture], jitters, backgrounds, appearances=numbers)
+        batch = Rays.from_arrays(origins, directions, pictures.time[picture], jitters, backgrounds, appearances=numbers)
         return batch, torch.from_numpy(targets)
 
     def _frame(self, alpha: np.ndarray) -> tuple[int, int, int, int]:

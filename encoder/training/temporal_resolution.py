@@ -12,7 +12,7 @@ import numpy as np
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows
-from kpc.encoder.training.importance import cameras_stand_still, faded, of_each_camera
+from kpc.encoder.training.importance import group_by_camera, has_static_cameras, premultiply_alpha
 
 CAMERAS, SPANS, SPAN = 6, 3, 240
 """At most so many cameras are looked at, each over so many spans of the clip of so many pictures at most."""
@@ -52,19 +52,19 @@ class TimeResolution:
     changing: float
 
 
-def fitted_in_time(config: TrainConfig, dataset: Dataset) -> tuple[TrainConfig, TimeResolution | None]:
+def fit_frames_per_row(config: TrainConfig, dataset: Dataset) -> tuple[TrainConfig, TimeResolution | None]:
     """A config whose `frames_per_row` is what the pictures ask for, and what was measured.
 
     The config as it is and None where the pictures cannot tell: cameras that move, a motion grid, or `time_tolerance` 0. Follows
     from the dataset and the config alone, so a run that is resumed finds the same.
     """
-    if not config.time_tolerance or config.motion_cells or not cameras_stand_still(dataset):
+    if not config.time_tolerance or config.motion_cells or not has_static_cameras(dataset):
         return config, None
-    found = measure(dataset, config.time_tolerance)
+    found = measure_time_resolution(dataset, config.time_tolerance)
     return (config if found is None else replace(config, frames_per_row=float(found.frames_per_row))), found
 
 
-def measure(dataset: Dataset, tolerance: float) -> TimeResolution | None:
+def measure_time_resolution(dataset: Dataset, tolerance: float) -> TimeResolution | None:
     """The widest spacing of rows, in frames, whose error is at most `tolerance` (a share of the full range).
 
     For n colours y over time of a pixel and the hat functions H of the rows, least squares leave |y - H H^+ y|^2, of which noise of
@@ -75,7 +75,7 @@ def measure(dataset: Dataset, tolerance: float) -> TimeResolution | None:
     Memory: VALUES pixels at a time, whatever the length of the clip.
     """
     frame_count = dataset.clip.frame_count
-    cameras = of_each_camera(dataset)
+    cameras = group_by_camera(dataset)
     if min(len(numbers) for numbers in cameras) < SEEN_OFTEN * frame_count:
         return None
     spacings = _spacings(frame_count)
@@ -147,7 +147,9 @@ def _spans(dataset: Dataset, cameras: list[np.ndarray]) -> Iterator[tuple[np.nda
             row, column = row[kept], column[kept]
             colours = np.empty((len(some), len(row), pixels.channels), np.float32)
             for k, number in enumerate(some):
-                shown = np.concatenate([faded(pixels.picture(int(number), int(line), int(line) + 1)) for line in lines])
+                shown = np.concatenate(
+                    [premultiply_alpha(pixels.picture(int(number), int(line), int(line) + 1)) for line in lines]
+                )
                 colours[k] = shown[row, column]
             yield pictures.time[some], colours / np.float32(255)
 

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import torch
 from kpc.encoder.datasets import Dataset
-from kpc.encoder.field.appearances import number_pictures
-from kpc.encoder.field.bounds import seen_cells
+from kpc.encoder.field.appearances import assign_appearances
+from kpc.encoder.field.bounds import visible_cells
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import (
     Field,
     HybridField,
     SummedField,
     appearance_priors,
-    motion_nodes,
+    motion_grid_shape,
     motion_priors,
     plan_layout,
     priors,
@@ -28,8 +28,8 @@ from kpc.encoder.field.field import (
 from kpc.encoder.field.occupancy_grid import OccupancyGrid, grid_shape
 from kpc.encoder.field.proposals import Proposals
 from kpc.encoder.training.checkpoint import save_state
-from kpc.encoder.training.importance import TileWeights, cameras_stand_still
-from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser, log_densities
+from kpc.encoder.training.importance import TileWeights, has_static_cameras
+from kpc.encoder.training.optimisers import FusedOptimiser, TorchOptimiser, log_densities
 from kpc.encoder.training.sampler import RaySampler
 from kpc.format.common.errors import TrainingError
 from kpc.format.common.fidelity import psnr_from_mse
@@ -74,8 +74,8 @@ class Trainer:
         self.step_length = self.extent / steps_across
         self.rng = np.random.default_rng(config.seed)
         layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
-        nodes = motion_nodes(config, self.aabb, layout)
-        appearances, self.names = number_pictures(dataset, config.appearance)
+        nodes = motion_grid_shape(config, self.aabb, layout)
+        appearances, self.names = assign_appearances(dataset, config.appearance)
         kind, hidden = (SummedField if config.summed else Field), config.hidden
         if config.hybrid:
             kind, hidden = HybridField, config.hybrid_width
@@ -85,16 +85,16 @@ class Trainer:
             torch.nn.init.zeros_(self.field.w1)
         shape = grid_shape(self.aabb, config.cells_across)
         threshold = math.log(-math.log(1 - config.occupancy_alpha) * steps_across)
-        self.grid = OccupancyGrid(seen_cells(dataset.pictures, self.aabb, shape, mapping), threshold)
+        self.grid = OccupancyGrid(visible_cells(dataset.pictures, self.aabb, shape, mapping), threshold)
         self.slots = min(config.occupancy_slots, dataset.clip.frame_count) if dataset.is_dynamic else 1
         on_cpu = self.device.type == "cpu"
         proposals = (
             Proposals(config, self.aabb, dataset.clip, dataset.is_dynamic).to(self.device) if config.proposals else None
         )
-        self.optimiser: FusedOptimiser | PlainOptimiser = (
+        self.optimiser: FusedOptimiser | TorchOptimiser = (
             FusedOptimiser(self.field, config, shape, mapping)
             if on_cpu and proposals is None and not (config.hybrid or config.summed)
-            else PlainOptimiser(self.field, config, shape, mapping, fused=on_cpu, proposals=proposals)
+            else TorchOptimiser(self.field, config, shape, mapping, fused=on_cpu, proposals=proposals)
         )
         self.watch = self.optimiser.watch
         self.step = 0
@@ -104,7 +104,7 @@ class Trainer:
         # Objects with alpha are shown on white. Elsewhere what the box leaves open is grey: the least wrong guess.
         self.background = np.full(3, 1.0 if dataset.has_alpha else 0.5, np.float32)
         self._weights: TileWeights | None = None
-        self._can_weigh = cameras_stand_still(dataset)
+        self._can_weigh = has_static_cameras(dataset)
         self._steady_rays, self._steady_s = 0, 0.0
 
     def run(
@@ -140,7 +140,7 @@ class Trainer:
                     and self.step % config.occupancy_split_every == 0
                 ):
                     self.grid.split(self.density_at, self.slots, self.rng)
-            count = self.rays_a_step
+            count = self.rays_per_step
             background = None if self.dataset.has_alpha else self.background
             with self.watch("rays"):
                 weights = self._weights_at(fraction)
@@ -153,7 +153,7 @@ class Trainer:
                 batch,
                 targets,
                 self.aabb,
-                self.grid.marched,
+                self.grid.active,
                 self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1),
                 self.extent,
             )
@@ -186,7 +186,7 @@ class Trainer:
         if checkpoint is not None:
             self._try_to_save(checkpoint)
 
-    def run_to(self, step: int, watch: Callable[[], None] = lambda: None) -> None:
+    def run_until(self, step: int, watch: Callable[[], None] = lambda: None) -> None:
         """Train as `run` does, without a report, but only to a step on the way; `watch` is called before each.
 
         Raises:
@@ -204,7 +204,7 @@ class Trainer:
                 raise
 
     @property
-    def rays_a_step(self) -> int:
+    def rays_per_step(self) -> int:
         """As many as keep a step's samples within bounds, now."""
         return int(np.clip(self.config.samples / max(self.samples_per_ray, 1e-3), 256, self.config.rays))
 
@@ -216,7 +216,7 @@ class Trainer:
     def scene(self, occupancy: np.ndarray | None = None) -> Scene:
         """The field as it stands, with an occupancy (slots, Nz, Ny, Nx), or with that of training; the planes are copied."""
         if occupancy is None:
-            occupancy = self.grid.marched
+            occupancy = self.grid.active
         return self.field.to_scene(
             self.aabb, self.dataset.clip, occupancy, self.background, self.step_length, self.mapping, self.names
         )
@@ -325,7 +325,7 @@ class Trainer:
             raise _unusable(path, error) from error
 
 
-def box_of_checkpoint(path: Path) -> np.ndarray:
+def load_checkpoint_box(path: Path) -> np.ndarray:
     """The (2, 3) box of the run that wrote a checkpoint.
 
     Raises:

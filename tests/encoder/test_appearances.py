@@ -14,11 +14,11 @@ from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field import appearances
-from kpc.encoder.field.appearances import choose_kind, fitted_code, number_pictures
+from kpc.encoder.field.appearances import assign_appearances, choose_appearance, fit_code
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, appearance_priors
 from kpc.encoder.field.render import render_reference
-from kpc.encoder.training.optimisers import FusedOptimiser, PlainOptimiser
+from kpc.encoder.training.optimisers import FusedOptimiser, TorchOptimiser
 from kpc.encoder.training.train import Trainer
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import UsageError
@@ -73,30 +73,30 @@ def with_codes(unequal: Dataset) -> Trainer:
 def test_photographs_by_many_lenses_have_appearances_and_nothing_else_has(
     unequal: Dataset, rig: Dataset, tmp_path: Path
 ) -> None:
-    assert choose_kind(unequal) == ("image", "photographs: 28 of 28 pictures have a lens or size of their own")
-    assert choose_kind(rig) == ("none", "a clip, filmed as one")
+    assert choose_appearance(unequal) == ("image", "photographs: 28 of 28 pictures have a lens or size of their own")
+    assert choose_appearance(rig) == ("none", "a clip, filmed as one")
     make.write_varying_exposure(tmp_path / "set", images=9, own_lens=False)
     one_lens = load_dataset(tmp_path / "set", tmp_path / "cache", progress=False)
-    assert choose_kind(one_lens) == ("none", "0 of 7 pictures have a lens or size of their own")
+    assert choose_appearance(one_lens) == ("none", "0 of 7 pictures have a lens or size of their own")
     pictures = one_lens.pictures
     for own, kind in ((3, "none"), (4, "image")):  # more than half of seven; the others share one size
         width = pictures.width.copy()
         width[np.flatnonzero(~pictures.is_test)[:own]] = 33 + np.arange(own)
-        assert choose_kind(replace(one_lens, pictures=replace(pictures, width=width)))[0] == kind
+        assert choose_appearance(replace(one_lens, pictures=replace(pictures, width=width)))[0] == kind
 
 
 def test_each_image_or_each_camera_has_its_own(rig: Dataset, unequal: Dataset) -> None:
     held_out = rig.pictures.is_test
     assert held_out.sum() == 3 and rig.camera_names == ("cam00", "cam01", "cam02")
-    numbers, names = number_pictures(rig, "camera")
+    numbers, names = assign_appearances(rig, "camera")
     assert names == ("cam01", "cam02") and numbers.tolist() == [-1] * 3 + [0] * 3 + [1] * 3
-    numbers, names = number_pictures(rig, "image")
+    numbers, names = assign_appearances(rig, "image")
     assert names == tuple(f"cam0{c}.mp4#{f}" for c in (1, 2) for f in range(3)) and numbers.tolist() == [-1] * 3 + list(
         range(6)
     )
-    numbers, names = number_pictures(rig, "none")
+    numbers, names = assign_appearances(rig, "none")
     assert names == () and (numbers == -1).all()
-    numbers, names = number_pictures(unequal, "image")
+    numbers, names = assign_appearances(unequal, "image")
     assert names[:2] == ("0001.png", "0002.png") and numbers[:3].tolist() == [-1, 0, 1]
 
 
@@ -104,19 +104,19 @@ def test_names_that_clash_or_that_no_file_can_hold_give_way(unequal: Dataset) ->
     files = ("a/1.jpg", "b/1.jpg", "c/x\ny.jpg", "d/" + "z" * 300, "e/\ud800.jpg", "#4")
     some = replace(unequal.pictures, file=files + unequal.pictures.file[6:], is_test=np.arange(32) >= 6)
     dataset = replace(unequal, pictures=some)
-    assert number_pictures(dataset, "image")[1] == ("a/1.jpg", "b/1.jpg", "#2", "#3", "#4", "#5")
-    assert number_pictures(dataset, "camera")[1] == tuple(f"000{k}" for k in range(6))
+    assert assign_appearances(dataset, "image")[1] == ("a/1.jpg", "b/1.jpg", "#2", "#3", "#4", "#5")
+    assert assign_appearances(dataset, "camera")[1] == tuple(f"000{k}" for k in range(6))
     stems = replace(dataset, camera_names=("1",) * 32)
-    assert number_pictures(stems, "camera")[1][:3] == ("a/1.jpg", "b/1.jpg", "#2")
+    assert assign_appearances(stems, "camera")[1][:3] == ("a/1.jpg", "b/1.jpg", "#2")
 
 
 def test_more_than_a_file_holds_are_refused(unequal: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(appearances, "APPEARANCE_LIMIT", 27)
     with pytest.raises(UsageError, match="28 appearances, a file holds 27; give --appearance camera"):
-        number_pictures(unequal, "image")
+        assign_appearances(unequal, "image")
     with pytest.raises(UsageError, match="--appearance none"):
-        number_pictures(unequal, "camera")
-    assert choose_kind(unequal)[0] == "none"
+        assign_appearances(unequal, "camera")
+    assert choose_appearance(unequal)[0] == "none"
 
 
 @pytest.mark.parametrize("object_rays", [0.0, 0.5])
@@ -138,9 +138,9 @@ def test_gradients_are_those_of_autograd_in_double_precision(way: str) -> None:
     scene = with_appearances(with_hybrid_decoder(translucent_scene()) if way == "hybrid" else translucent_scene())
     rays = replace(random_rays(scene, 160), appearances=torch.from_numpy(np.random.default_rng(3).integers(0, 3, 160)))
     targets = torch.from_numpy(np.random.default_rng(1).random((160, 3), np.float32))
-    config = replace(CONFIG, appearance="image", appearance_size=0.05, regularise_every=1000)
+    config = replace(CONFIG, appearance="image", appearance_decay=0.05, regularise_every=1000)
     field = Field.from_scene(scene)
-    optimiser = (FusedOptimiser if way == "fused" else PlainOptimiser)(field, config, scene.occupancy.shape[1:])
+    optimiser = (FusedOptimiser if way == "fused" else TorchOptimiser)(field, config, scene.occupancy.shape[1:])
     twin = copy.deepcopy(field).double()
     optimiser.step(1, 0.0, 0.0, rays, targets, scene.aabb, scene.occupancy, scene.step, scene.extent)  # at a rate of 0
 
@@ -150,7 +150,7 @@ def test_gradients_are_those_of_autograd_in_double_precision(way: str) -> None:
     rgb, distortion, *_ = render_reference(
         twin, floats, torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy), scene.step
     )
-    prior = appearance_priors(twin, config)["appearance_size"]
+    prior = appearance_priors(twin, config)["appearance_decay"]
     ((rgb - targets.double()).square().mean() + config.distortion * distortion + prior).backward()
     assert twin.codes is not None and twin.codes.grad.abs().max() > 1e-4
     for name in ("codes", "w1", "b1", "w2", "b2"):
@@ -161,10 +161,10 @@ def test_gradients_are_those_of_autograd_in_double_precision(way: str) -> None:
 
 
 def test_the_prior_is_the_mean_square_and_pulls_each_code_to_0() -> None:
-    config = replace(CONFIG, appearance_size=0.5)
+    config = replace(CONFIG, appearance_decay=0.5)
     field = Field.from_scene(with_appearances(tiny_scene())).double()
     assert field.codes is not None
-    value = appearance_priors(field, config)["appearance_size"]
+    value = appearance_priors(field, config)["appearance_decay"]
     value.backward()
     codes = field.codes.detach()
     assert value.item() == pytest.approx(0.5 * float((codes**2).sum()) / 48)
@@ -284,11 +284,11 @@ def test_a_fitted_code_shows_what_it_was_fitted_to(contracted: bool, decoder: st
     renderer = SceneRenderer(scene)
     arrays = [a.numpy() for a in (rays.origins, rays.directions, rays.times)]
     targets = renderer.rgb(*arrays, np.tile(wanted, (300, 1)))
-    code = fitted_code(scene, renderer.field, rays, torch.from_numpy(targets))
-    np.testing.assert_array_equal(code, fitted_code(scene, renderer.field, rays, torch.from_numpy(targets)))
+    code = fit_code(scene, renderer.field, rays, torch.from_numpy(targets))
+    np.testing.assert_array_equal(code, fit_code(scene, renderer.field, rays, torch.from_numpy(targets)))
     shown = renderer.rgb(*arrays, np.tile(code, (300, 1)))
     assert psnr(shown, targets) > psnr(renderer.rgb(*arrays), targets) + 12
-    assert not fitted_code(scene, renderer.field, rays.apply(lambda a: a[:0]), torch.zeros(0, 3)).any()
+    assert not fit_code(scene, renderer.field, rays.map(lambda a: a[:0]), torch.zeros(0, 3)).any()
 
 
 def test_codings_are_judged_with_the_codes_of_the_rays(with_codes: Trainer) -> None:

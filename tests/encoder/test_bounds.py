@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from kpc.encoder.datasets import Pictures
 from kpc.encoder.field.bounds import (
-    CLEAR,
-    INNER,
-    contraction_of,
-    device_coordinates_of,
+    CLEARANCE,
+    CONTRACTION_BOX,
     find_box,
-    find_inner_box,
-    reaches_beyond,
-    seen_cells,
+    find_contraction_box,
+    fit_contraction,
+    fit_device_coordinates,
+    is_unbounded,
+    visible_cells,
 )
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.cameras import Camera
@@ -95,23 +95,23 @@ def test_cameras_that_look_away_from_each_other_share_no_point() -> None:
 
 def test_pictures_reach_beyond_a_box_where_nothing_bounds_them() -> None:
     rig = make.ring(5)
-    assert reaches_beyond(pictures_of(rig), has_alpha=False)[0]
-    assert not reaches_beyond(pictures_of(rig), has_alpha=True)[0]
-    assert not reaches_beyond(pictures_of(rig, near=1.0, far=4.0), has_alpha=False)[0]
-    assert reaches_beyond(pictures_of(rig, near=1.0), has_alpha=False)[0]
-    words = {reaches_beyond(pictures_of(rig, near), alpha)[1] for near in (np.nan, 1.0) for alpha in (False, True)}
+    assert is_unbounded(pictures_of(rig), has_alpha=False)[0]
+    assert not is_unbounded(pictures_of(rig), has_alpha=True)[0]
+    assert not is_unbounded(pictures_of(rig, near=1.0, far=4.0), has_alpha=False)[0]
+    assert is_unbounded(pictures_of(rig, near=1.0), has_alpha=False)[0]
+    words = {is_unbounded(pictures_of(rig, near), alpha)[1] for near in (np.nan, 1.0) for alpha in (False, True)}
     assert len(words) == 2 and all(words)
 
 
 def test_an_inner_box_is_about_what_the_cameras_look_at() -> None:
     rig = make.ring(5)
-    half = INNER * np.linalg.norm(rig[0].camera_to_world[:3, 3])
-    np.testing.assert_allclose(find_inner_box(pictures_of(rig)), [[-half] * 3, [half] * 3], atol=1e-5)
+    half = CONTRACTION_BOX * np.linalg.norm(rig[0].camera_to_world[:3, 3])
+    np.testing.assert_allclose(find_contraction_box(pictures_of(rig)), [[-half] * 3, [half] * 3], atol=1e-5)
     # Parallel ones look at nothing in common: then it is about them.
     apart = pictures_of([straight(), straight(1.0)])
-    np.testing.assert_allclose(find_inner_box(apart), [[-0.5, -1, -1], [1.5, 1, 1]], atol=1e-6)
+    np.testing.assert_allclose(find_contraction_box(apart), [[-0.5, -1, -1], [1.5, 1, 1]], atol=1e-6)
     with pytest.raises(DatasetError, match="--box"):
-        find_inner_box(pictures_of([straight()]))
+        find_contraction_box(pictures_of([straight()]))
 
 
 def test_even_steps_reach_the_far_corner_of_the_box() -> None:
@@ -119,7 +119,7 @@ def test_even_steps_reach_the_far_corner_of_the_box() -> None:
     aabb = np.array([[-1, -2, -1], [1, 2, 3]], np.float32)
     corners = np.stack(np.meshgrid(*aabb.T, indexing="ij"), -1).reshape(-1, 3)
     farthest = np.linalg.norm(rig.camera_to_world[:, None, :3, 3] - corners, axis=2).max(1)
-    even = contraction_of(rig, aabb).uniform_distance
+    even = fit_contraction(rig, aabb).uniform_distance
     assert farthest.min() <= even <= farthest.max() and even == pytest.approx(np.quantile(farthest, 0.9))
 
 
@@ -127,7 +127,7 @@ def test_cells_of_contracted_space_are_seen_where_they_lie() -> None:
     """A row of cells ahead of the cameras, out to infinity, and one behind them."""
     aabb = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
     cameras = pictures_of([straight(), straight(0.1)])
-    seen = seen_cells(cameras, aabb, (32, 32, 32), Contraction(2.0))
+    seen = visible_cells(cameras, aabb, (32, 32, 32), Contraction(2.0))
     z, y, x = (np.argwhere(np.ones_like(seen)).T + 0.5) / 32
     centres = uncontract(np.stack([x, y, z], axis=1), aabb)
     assert np.abs(centres).max() == pytest.approx(16)
@@ -140,13 +140,13 @@ def test_cells_of_contracted_space_are_seen_where_they_lie() -> None:
 
 
 def test_device_coordinates_of_a_row_of_cameras() -> None:
-    mapping, box = device_coordinates_of(pictures_of([straight(-0.5), straight(0.5)], near=1.0, far=4.0))
+    mapping, box = fit_device_coordinates(pictures_of([straight(-0.5), straight(0.5)], near=1.0, far=4.0))
     np.testing.assert_allclose(mapping.frame, np.eye(4)[:3], atol=1e-12)
     assert mapping.near == pytest.approx(1) and mapping.baseline == pytest.approx(1)
     # x / z from -0.5 - 1 at the near plane to 0.5 + 1, y / z half as wide as one camera sees, 1 / 1 - 1 / 4 deep.
     np.testing.assert_allclose(box, [[-1.5, -0.5, 0], [1.5, 0.5, 0.75]], atol=1e-6)
     shape = (3, 4, 6)
-    seen = seen_cells(pictures_of([straight(-0.5), straight(0.5)], near=1.0, far=4.0), box, shape, mapping)
+    seen = visible_cells(pictures_of([straight(-0.5), straight(0.5)], near=1.0, far=4.0), box, shape, mapping)
     assert (
         seen[-1, :, 1:-1].all() and not seen[0, :, 0].any()
     )  # at the far end both see nearly all, at the near end not the sides
@@ -155,7 +155,7 @@ def test_device_coordinates_of_a_row_of_cameras() -> None:
 def test_device_coordinates_stand_as_far_forward_as_the_foremost_camera() -> None:
     ahead = straight()
     ahead.camera_to_world[2, 3] = -0.4
-    mapping, box = device_coordinates_of(pictures_of([straight(-0.5), straight(0.5), ahead], near=1.0, far=4.0))
+    mapping, box = fit_device_coordinates(pictures_of([straight(-0.5), straight(0.5), ahead], near=1.0, far=4.0))
     assert mapping.frame[2, 3] == pytest.approx(-0.4) and mapping.near == pytest.approx(0.6)
     assert box[1, 2] < mapping.baseline / mapping.near
 
@@ -165,9 +165,9 @@ def test_device_coordinates_stand_as_far_forward_as_the_foremost_camera() -> Non
 )
 def test_rigs_without_device_coordinates(rig: list[Camera]) -> None:
     with pytest.raises(DatasetError, match="do not face one way"):
-        device_coordinates_of(pictures_of(rig, near=1.0, far=4.0))
+        fit_device_coordinates(pictures_of(rig, near=1.0, far=4.0))
     with pytest.raises(DatasetError, match="near and far"):
-        device_coordinates_of(pictures_of([straight(), straight(1.0)]))
+        fit_device_coordinates(pictures_of([straight(), straight(1.0)]))
 
 
 def test_near_without_far_is_not_enough() -> None:
@@ -179,13 +179,13 @@ def test_cells_count_as_seen_from_two_cameras() -> None:
     box = np.array([[-2, -0.1, -2.2], [3, 0.1, -1.8]], np.float32)  # a bar 2 in front, in cells of 0.5
     shape = (1, 1, 10)
     x = -2 + 0.5 * (np.arange(10) + 0.5)
-    both = seen_cells(pictures_of([straight(), straight(1.0)]), box, shape)
+    both = visible_cells(pictures_of([straight(), straight(1.0)]), box, shape)
     assert both.shape == shape and both.dtype == bool
     margin = 0.02 * 2 * 2  # of the picture's width, 2 away
     np.testing.assert_array_equal(both[0, 0], (np.abs(x) < 2 + margin) & (np.abs(x - 1) < 2 + margin))
-    either = seen_cells(pictures_of([straight(), straight(1.0)]), box, shape, at_least=1)
+    either = visible_cells(pictures_of([straight(), straight(1.0)]), box, shape, at_least=1)
     assert either.all()
-    alone = seen_cells(pictures_of([straight(), straight(1.0)], tests=(1,)), box, shape)
+    alone = visible_cells(pictures_of([straight(), straight(1.0)], tests=(1,)), box, shape)
     np.testing.assert_array_equal(alone[0, 0], np.abs(x) < 2 + margin)
 
 
@@ -193,14 +193,14 @@ def test_cells_behind_and_nearer_than_near_are_not_seen() -> None:
     box = np.array([[-0.1, -0.1, -4], [0.1, 0.1, 4]], np.float32)
     rig = pictures_of([straight(), straight(0.05)], near=2.0, far=9.0)
     z = -4 + 0.5 * (np.arange(16) + 0.5)
-    np.testing.assert_array_equal(seen_cells(rig, box, (16, 1, 1))[:, 0, 0], -z > 1.8)
+    np.testing.assert_array_equal(visible_cells(rig, box, (16, 1, 1))[:, 0, 0], -z > 1.8)
 
 
 def test_the_same_camera_twice_is_one() -> None:
     box = np.array([[-0.1, -0.1, -4], [0.1, 0.1, -1]], np.float32)
     twice_and_turned = pictures_of([straight(), straight(), straight(turned=True)])
-    assert not seen_cells(twice_and_turned, box, (2, 2, 2)).any()
-    assert seen_cells(pictures_of([straight(), straight()]), box, (2, 2, 2)).all()
+    assert not visible_cells(twice_and_turned, box, (2, 2, 2)).any()
+    assert visible_cells(pictures_of([straight(), straight()]), box, (2, 2, 2)).all()
 
 
 def test_nothing_is_right_before_a_camera() -> None:
@@ -208,11 +208,11 @@ def test_nothing_is_right_before_a_camera() -> None:
     distance = np.linalg.norm(rig[0].camera_to_world[:3, 3])
     aabb = np.array([[-distance] * 3, [distance] * 3], np.float32)
     shape = (40, 40, 40)
-    seen = seen_cells(pictures_of(rig), aabb, shape)
+    seen = visible_cells(pictures_of(rig), aabb, shape)
     z, y, x = (np.argwhere(seen).T + 0.5) / 40
     centres = aabb[0] + np.stack([x, y, z], axis=1) * (aabb[1] - aabb[0])
     nearest = min(np.linalg.norm(centres - c.camera_to_world[:3, 3], axis=1).min() for c in rig)
-    assert seen.any() and CLEAR * distance <= nearest < (CLEAR + 0.1) * distance
+    assert seen.any() and CLEARANCE * distance <= nearest < (CLEARANCE + 0.1) * distance
 
 
 def test_cameras_that_look_apart_have_no_clearance() -> None:
@@ -220,7 +220,7 @@ def test_cameras_that_look_apart_have_no_clearance() -> None:
     apart = [replace(c, camera_to_world=c.camera_to_world @ turned) for c in make.ring(6, width=20, height=20)]
     distance = np.linalg.norm(apart[0].camera_to_world[:3, 3])
     aabb = np.array([[-2 * distance] * 3, [2 * distance] * 3], np.float32)
-    seen = seen_cells(pictures_of(apart), aabb, (40, 40, 40), at_least=1)
+    seen = visible_cells(pictures_of(apart), aabb, (40, 40, 40), at_least=1)
     z, y, x = (np.argwhere(seen).T + 0.5) / 40
     centres = aabb[0] + np.stack([x, y, z], axis=1) * (aabb[1] - aabb[0])
-    assert np.linalg.norm(centres - apart[0].camera_to_world[:3, 3], axis=1).min() < CLEAR * distance / 2
+    assert np.linalg.norm(centres - apart[0].camera_to_world[:3, 3], axis=1).min() < CLEARANCE * distance / 2

@@ -7,7 +7,15 @@ import pytest
 import torch
 from gradients import bilinear
 from kpc.encoder.field.config import PRESETS, TrainConfig
-from kpc.encoder.field.field import Field, Layout, gathered_by_row, motion_nodes, motion_priors, plan_layout, scattered
+from kpc.encoder.field.field import (
+    Field,
+    Layout,
+    motion_grid_shape,
+    motion_priors,
+    plan_layout,
+    scatter_rows,
+    scatter_rows_sparse,
+)
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip
 from kpc.player.cpu import reference
@@ -83,16 +91,16 @@ def test_the_motion_grid_starts_at_rest_with_cells_as_near_to_cubes_as_may_be() 
         replace(PRESETS["draft"], motion_cells=6),
     )
     layout = plan_layout(config, box, clip, is_dynamic=True)
-    assert motion_nodes(config, box, layout) == (15, 7, 2, 4)
-    field = Field(layout, 4, motion_nodes=(15, 7, 2, 4))
+    assert motion_grid_shape(config, box, layout) == (15, 7, 2, 4)
+    field = Field(layout, 4, motion_shape=(15, 7, 2, 4))
     assert field.motion is not None and not field.motion.any() and field.motion.shape == (15, 7, 2, 4, 3)
-    assert motion_nodes(replace(config, motion_cells=0), box, layout) is None
-    assert motion_nodes(config, box, plan_layout(config, box, clip, is_dynamic=False)) is None
+    assert motion_grid_shape(replace(config, motion_cells=0), box, layout) is None
+    assert motion_grid_shape(config, box, plan_layout(config, box, clip, is_dynamic=False)) is None
 
 
 def test_motion_priors_do_not_mind_even_motion_and_measure_the_rest() -> None:
-    config = replace(PRESETS["draft"], motion_smoothness=3.0, motion_bending=0.5)
-    field = Field(Layout.of(np.array([[3, 3, 3, 5]]), 2), 4, motion_nodes=(5, 4, 3, 3))
+    config = replace(PRESETS["draft"], motion_smoothness_time=3.0, motion_smoothness_space=0.5)
+    field = Field(Layout.of(np.array([[3, 3, 3, 5]]), 2), 4, motion_shape=(5, 4, 3, 3))
     t, z, y, x = torch.meshgrid(*(torch.arange(float(n)) for n in (5, 4, 3, 3)), indexing="ij")
     even = torch.stack([2 * t - x, 0.5 * z + y, x + y + z - t], -1)
     with torch.no_grad():
@@ -102,8 +110,8 @@ def test_motion_priors_do_not_mind_even_motion_and_measure_the_rest() -> None:
         field.motion[2, 1, 1, 1, 0] += 1.0  # in time 1 - 2 1; the same along z, but along y and x one difference each
     n = field.motion.numel()
     found = motion_priors(field, config)
-    assert found["motion_smoothness"].item() == pytest.approx(3.0 * 6 / n, rel=1e-4)
-    assert found["motion_bending"].item() == pytest.approx(0.5 * (5 + 4 + 4) / n, rel=1e-4)
+    assert found["motion_smoothness_time"].item() == pytest.approx(3.0 * 6 / n, rel=1e-4)
+    assert found["motion_smoothness_space"].item() == pytest.approx(0.5 * (5 + 4 + 4) / n, rel=1e-4)
 
 
 def test_the_scene_is_a_copy() -> None:
@@ -191,10 +199,10 @@ def test_colours_are_those_of_the_basis() -> None:
     latent, directions = torch.randn(40, 5).double(), torch.nn.functional.normalize(torch.randn(7, 3).double(), dim=1)
     ray = torch.arange(40) % 7
     wanted = torch.sigmoid(torch.einsum("nf,ncf->nc", latent, field.basis(directions)[ray]))
-    torch.testing.assert_close(field.colours(latent, field.once_a_ray(directions), ray), wanted)
+    torch.testing.assert_close(field.colours(latent, field.ray_terms(directions), ray), wanted)
 
 
 def test_what_is_gathered_by_row_is_what_is_scattered() -> None:
     values, rows, shares = torch.randn(500, 8), torch.randint(0, 60, (500, 4)), torch.rand(500, 4)
     rows[rows == 7] = 8  # to one goes nothing
-    torch.testing.assert_close(gathered_by_row(values, rows, shares, 60), scattered(values, rows, shares, 60))
+    torch.testing.assert_close(scatter_rows_sparse(values, rows, shares, 60), scatter_rows(values, rows, shares, 60))

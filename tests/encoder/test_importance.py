@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.training import importance
-from kpc.encoder.training.importance import SMALLEST_TILE, TileWeights, cameras_stand_still, largest_change
+from kpc.encoder.training.importance import SMALLEST_TILE, TileWeights, has_static_cameras, max_temporal_difference
 from kpc.format.common.media import write_image
 
 FLOOR = 0.1
@@ -101,7 +101,7 @@ def test_uniform_draws_would_be_noticed(rig: Dataset) -> None:
 def test_pictures_of_other_sizes_and_masks_are_honoured(tmp_path: Path, masked: bool) -> None:
     write_stills(tmp_path / "set", [(33, 17), (16, 8), (7, 5)], masked=masked)
     dataset = load(tmp_path)
-    assert cameras_stand_still(dataset) and (dataset.masks is not None) == masked
+    assert has_static_cameras(dataset) and (dataset.masks is not None) == masked
     assert_drawn_as_stated(dataset, chances(dataset, FLOOR))
 
 
@@ -150,7 +150,7 @@ def test_largest_change_is_that_over_the_window(radius: int) -> None:
     expected = [
         np.abs(wide[max(k - radius, 0) : k + radius + 1] - wide[k]).max(axis=(0, 3)) for k in range(len(pictures))
     ]  # fmt: skip
-    np.testing.assert_array_equal(largest_change(pictures, radius), expected)
+    np.testing.assert_array_equal(max_temporal_difference(pictures, radius), expected)
 
 
 def test_colours_that_are_transparent_do_not_change(tmp_path: Path) -> None:
@@ -166,10 +166,10 @@ def test_colours_that_are_transparent_do_not_change(tmp_path: Path) -> None:
 
 
 def test_only_cameras_that_stand_still_can_tell(rig: Dataset, moving: Dataset, tmp_path: Path) -> None:
-    assert cameras_stand_still(rig) and not cameras_stand_still(moving)
-    assert not cameras_stand_still(replace(rig, is_dynamic=False))
+    assert has_static_cameras(rig) and not has_static_cameras(moving)
+    assert not has_static_cameras(replace(rig, is_dynamic=False))
     write_stills(tmp_path / "set", [(16, 8), (16, 8)], times=3)
     dataset = load(tmp_path)
-    assert cameras_stand_still(dataset)
+    assert has_static_cameras(dataset)
     shown_once = replace(dataset.pictures, is_test=np.array([False, True, True, False, False, False]))
-    assert not cameras_stand_still(replace(dataset, pictures=shown_once))
+    assert not has_static_cameras(replace(dataset, pictures=shown_once))

@@ -22,7 +22,14 @@ from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, Layout, priors
 from kpc.encoder.field.render import Rays, render_reference
-from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_priors, log_densities, sample_capacity
+from kpc.encoder.training.optimisers import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    add_prior_gradients,
+    log_densities,
+    max_samples_per_ray,
+)
 from kpc.player.cpu import reference
 from numba.core.dispatcher import Dispatcher
 from scenes import tiny_scene, with_motion
@@ -47,12 +54,12 @@ def test_backpropagate_is_autograd_through_the_reference(kind: tuple[bool, bool,
 
 
 def test_backpropagate_gives_faint_samples_no_colour_and_hardly_errs() -> None:
-    """A sample of weight below 1e-4 gets no colour: off by less than that, `sample_capacity` times at most."""
+    """A sample of weight below 1e-4 gets no colour: off by less than that, `max_samples_per_ray` times at most."""
     scene = tiny_scene()
     rays = random_rays(scene, 203)
     targets = torch.rand(203, 3, generator=torch.Generator().manual_seed(1))
     ours, theirs = backpropagate(scene, rays, targets), reference_gradients(scene, rays, targets)
-    colour = 1e-4 * sample_capacity(scene.aabb, scene.step)
+    colour = 1e-4 * max_samples_per_ray(scene.aabb, scene.step)
     np.testing.assert_allclose(ours["errors"], theirs["errors"], atol=6 * colour)
     for name in ("theta", "density"):
         difference = np.linalg.norm(ours[name] - theirs[name]) / np.linalg.norm(theirs[name])
@@ -82,7 +89,7 @@ def test_a_machine_s_first_training_equals_its_second(tmp_path: Path) -> None:
     places = rng.random((500, 3), np.float32), rng.random(500, np.float32)
     np.savez(tmp_path / "in.npz", theta, field.layout.table, field.layout.resolution, density, *places)
     script = (
-        "import sys, numpy\nfrom kpc.encoder import kernels\n"
+        "import sys, numpy\nfrom kpc.encoder.field import kernels\n"
         "theta, table, resolution, density, points, times = numpy.load(sys.argv[1]).values()\n"
         f"logs = kernels.log_densities(theta, table, resolution, density, {field.layout.channels}, None, points, times, 2)\n"
         "sys.stdout.buffer.write(logs.tobytes())"
@@ -166,7 +173,7 @@ def test_render_gives_opacity_depth_and_counts() -> None:
         field.basis(torch.from_numpy(directions)).detach().numpy(),
         np.arange(n),
         scene.background,
-        sample_capacity(scene.aabb, scene.step),
+        max_samples_per_ray(scene.aabb, scene.step),
         4,
     )
     theirs = reference.render_rays(scene, origins, directions, 0.4)
@@ -210,10 +217,10 @@ def test_priors_are_the_gradient_of_their_twin(dynamic: bool, late: bool, alone:
         field.theta += 0.1 * torch.randn(field.layout.size, generator=torch.Generator().manual_seed(0))
         field.theta[-50:] = 1.0  # the kink of |1 - P|, where the gradient is 0 by agreement
     config = TrainConfig(**{name: weight if alone in (None, name) else 0.0 for name, weight in WEIGHTS.items()})
-    variation = replace(config, late_space_variation=config.space_variation).variation(float(late))
+    variation = replace(config, robust_space_variation=config.space_variation).variation(float(late))
     assert (variation.steep > 0) is late
     grad = np.ones(field.layout.size, np.float32)
-    add_priors(field, field.theta.detach().numpy(), grad, config, variation, 4.0)
+    add_prior_gradients(field, field.theta.detach().numpy(), grad, config, variation, 4.0)
     field = field.double()
     (4 * sum(priors(field, config, variation).values())).backward()
     expected = field.theta.grad.numpy()
@@ -246,4 +253,4 @@ def test_adam_is_pytorchs() -> None:
 
 def test_sample_capacity_is_never_reached() -> None:
     aabb = np.array([[0, 0, 0], [1, 2, 3]], np.float32)
-    assert sample_capacity(aabb, 0.1) >= math.sqrt(14) / 0.1 + 1
+    assert max_samples_per_ray(aabb, 0.1) >= math.sqrt(14) / 0.1 + 1

@@ -1,7 +1,7 @@
 """The occupancy grid: what it keeps, what it empties, and what is stored of it."""
 
 import numpy as np
-from kpc.encoder.field.occupancy_grid import MORE_MARCHED, OccupancyGrid, grid_shape, in_fewest_slots
+from kpc.encoder.field.occupancy_grid import MERGE_TOLERANCE, OccupancyGrid, grid_shape, merge_slots
 from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 
 SHAPE = (6, 5, 8)
@@ -103,13 +103,13 @@ def test_cells_that_are_not_seen_stay_empty() -> None:
     seen[:, :, :4] = False
     g = settled(grid(seen), lambda p, t: np.full(len(p), 5.0, np.float32), np.ones(SHAPE, np.float32), updates=20)
     np.testing.assert_array_equal(g.occupied, seen)
-    assert not g.over_time(ball, np.random.default_rng(0), 3)[:, ~seen].any()
+    assert not g.sample_slots(ball, np.random.default_rng(0), 3)[:, ~seen].any()
 
 
 def test_over_time_follows_what_moves() -> None:
     g = settled(grid(), moving, np.ones(SHAPE, np.float32))
     assert g.occupied.all()
-    slots = g.over_time(moving, np.random.default_rng(0), 4)
+    slots = g.sample_slots(moving, np.random.default_rng(0), 4)
     assert slots.shape == (4, *SHAPE) and slots.dtype == bool
     for slot, first_half in enumerate((True, True, False, False)):
         assert (slots[slot, :, :, :4] == first_half).all() and (slots[slot, :, :, 4:] != first_half).all()
@@ -118,20 +118,20 @@ def test_over_time_follows_what_moves() -> None:
 def test_a_split_grid_is_marched_where_density_is_or_was_close_by() -> None:
     """Of what moves at half time, the slots beside it hold both places; what no slot holds is not marched at all."""
     g = settled(grid(), moving, np.ones(SHAPE, np.float32))
-    np.testing.assert_array_equal(g.marched, g.occupied[None])
+    np.testing.assert_array_equal(g.active, g.occupied[None])
     g.split(moving, 6, np.random.default_rng(0))
-    lower, upper = g.marched[..., :3].all((1, 2, 3)), g.marched[..., 5:].all((1, 2, 3))  # 4 is a neighbour of both
+    lower, upper = g.active[..., :3].all((1, 2, 3)), g.active[..., 5:].all((1, 2, 3))  # 4 is a neighbour of both
     np.testing.assert_array_equal(lower, [True, True, True, True, False, False])
     np.testing.assert_array_equal(upper, [False, False, True, True, True, True])
-    assert not g.marched[4:, ..., :3].any() and not g.marched[:2, ..., 5:].any()
+    assert not g.active[4:, ..., :3].any() and not g.active[:2, ..., 5:].any()
 
 
 def test_an_update_empties_cells_in_every_slot() -> None:
     g = settled(grid(), lambda p, t: np.maximum(ball(p, t), corner(p, t)), np.ones(SHAPE, np.float32))
     g.split(ball, 4, np.random.default_rng(0))
-    assert g.marched[:, 3, 2, 4].all()
+    assert g.active[:, 3, 2, 4].all()
     settled(g, corner, np.ones(SHAPE, np.float32), updates=201)
-    assert not g.marched[:, 3, 2, 4].any()
+    assert not g.active[:, 3, 2, 4].any()
 
 
 def test_while_all_is_thin_a_split_leaves_the_thicker_half() -> None:
@@ -140,8 +140,8 @@ def test_while_all_is_thin_a_split_leaves_the_thicker_half() -> None:
 
     g = settled(grid(), thin, np.ones(SHAPE, np.float32), 3)
     g.split(thin, 3, np.random.default_rng(0))
-    assert g.marched[..., :4].all() and not g.marched[..., 4:].any()
-    assert g.over_time(thin, np.random.default_rng(0), 2)[..., :4].all()
+    assert g.active[..., :4].all() and not g.active[..., 4:].any()
+    assert g.sample_slots(thin, np.random.default_rng(0), 2)[..., :4].all()
 
 
 def test_points_lie_in_their_cells_and_times_in_their_slot() -> None:
@@ -153,7 +153,7 @@ def test_points_lie_in_their_cells_and_times_in_their_slot() -> None:
         asked.append((points, times))
         return np.full(len(points), 5.0, np.float32)
 
-    grid(seen).over_time(density, np.random.default_rng(0), 2, samples=8)
+    grid(seen).sample_slots(density, np.random.default_rng(0), 2, samples=8)
     points = np.concatenate([p for p, _ in asked])
     np.testing.assert_array_equal(np.floor(points * [8, 5, 6]), np.tile([6, 4, 1], (16, 1)))
     times = np.concatenate([t for _, t in asked])
@@ -166,7 +166,7 @@ def test_state_goes_into_another_grid() -> None:
     two.load(one.state())
     settled(one, moving, np.ones(SHAPE, np.float32), updates=3)
     settled(two, moving, np.ones(SHAPE, np.float32), updates=3)
-    for name in ("log_density", "peak", "occupied", "marched"):
+    for name in ("log_density", "peak", "occupied", "active"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
@@ -181,7 +181,7 @@ def test_slots_are_as_few_as_what_moves_allows() -> None:
         turning[slot, slot] = True
     for before, slots in ((still, 1), (noisy, 1), (halves, 2), (turning, 8), (still[:5], 1), (turning[:5], 5), (still[:1], 1),
                           (np.zeros_like(still), 1)):  # fmt: skip
-        after = in_fewest_slots(before)
-        assert len(after) == slots and after.dtype == bool and after.mean() <= (1 + MORE_MARCHED) * before.mean()
+        after = merge_slots(before)
+        assert len(after) == slots and after.dtype == bool and after.mean() <= (1 + MERGE_TOLERANCE) * before.mean()
         whole = np.repeat(after, len(before) // slots, axis=0)
         assert (whole | before == whole).all() and (after.any(0) == before.any(0)).all()

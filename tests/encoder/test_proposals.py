@@ -8,7 +8,7 @@ from kpc.encoder.cli import kpenc
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import evaluate
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.proposals import PADDING, histogram_loss, resampled
+from kpc.encoder.field.proposals import WEIGHT_PADDING, histogram_loss, resample_edges
 from kpc.encoder.training.train import Trainer
 from kpc.format.scene.space import Contraction
 
@@ -40,9 +40,9 @@ def intervals(rays: int, count: int, seed: int) -> tuple[torch.Tensor, torch.Ten
 
 def test_new_intervals_hold_even_shares_of_the_weights() -> None:
     edges, weights = intervals(20, 30, 0)
-    new = resampled(edges, weights, 12, torch.full((20,), 0.5))
+    new = resample_edges(edges, weights, 12, torch.full((20,), 0.5))
     for e, w, n in zip(edges.numpy(), weights.numpy(), new.numpy()):
-        padded = w + PADDING / 30
+        padded = w + WEIGHT_PADDING / 30
         cumulative = np.append(0, np.cumsum(padded / padded.sum()))
         np.testing.assert_allclose(np.interp(n, e, cumulative), np.linspace(0, 1, 13), atol=1e-4)
     assert torch.equal(new[:, 0], edges[:, 0]) and torch.allclose(new[:, -1], edges[:, -1], atol=1e-5)
@@ -51,13 +51,13 @@ def test_new_intervals_hold_even_shares_of_the_weights() -> None:
 @pytest.mark.parametrize("jitter", [0.0, 0.3, 0.999])
 def test_jitter_keeps_edges_in_order_and_within(jitter: float) -> None:
     edges, weights = intervals(20, 30, 1)
-    new = resampled(edges, weights, 12, torch.full((20,), jitter))
+    new = resample_edges(edges, weights, 12, torch.full((20,), jitter))
     assert (new.diff(dim=1) >= 0).all() and (new >= edges[:, :1]).all() and (new <= edges[:, -1:]).all()
 
 
 def test_rays_without_weight_or_length_get_even_or_no_intervals() -> None:
     edges = torch.stack([torch.linspace(1, 2, 9), torch.full((9,), 3.0)])
-    new = resampled(edges, torch.zeros(2, 8), 4, torch.full((2,), 0.5))
+    new = resample_edges(edges, torch.zeros(2, 8), 4, torch.full((2,), 0.5))
     assert torch.allclose(new[0], torch.linspace(1, 2, 5)) and torch.equal(new[1], torch.full((5,), 3.0))
 
 

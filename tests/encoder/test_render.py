@@ -9,9 +9,17 @@ from gradients import FIELD_KINDS, FieldFunction, bilinear, random_rays, translu
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, HybridField, Layout, SummedField
-from kpc.encoder.field.render import Rays, collected, fused_features, meet, reached, samples_of, shade
-from kpc.encoder.training.cuda_graphs import Recorder
-from kpc.encoder.training.optimisers import Figures, PlainOptimiser, sample_capacity
+from kpc.encoder.field.render import (
+    Rays,
+    fused_features,
+    sample_rays,
+    sample_rays_fused,
+    select_reached,
+    shade,
+    weigh_samples,
+)
+from kpc.encoder.training.cuda_graphs import GraphCache
+from kpc.encoder.training.optimisers import DeferredReadback, TorchOptimiser, max_samples_per_ray
 from kpc.player.cpu import reference
 from scenes import tiny_scene, with_hybrid_decoder
 
@@ -20,8 +28,8 @@ from scenes import tiny_scene, with_hybrid_decoder
 def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bool]) -> None:
     scene = translucent_scene(*kind)
     rays = random_rays(scene, 403)
-    ours = collected(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
-    theirs = samples_of(
+    ours = sample_rays_fused(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
+    theirs = sample_rays(
         rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step, scene.mapping
     )
     # A sample within rounding of a cell's face may count here and not there: rays of as many samples have the same ones.
@@ -43,15 +51,15 @@ def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(sh
     # So many rays that all samples fill vectors of 16: what is left over of one rounds otherwise, on one thread.
     rays, field = random_rays(scene, 112), Field.from_scene(scene)
     told = rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step
-    wanted = samples_of(*told)
+    wanted = sample_rays(*told)
     n = len(wanted.ray) - short
     assert len(wanted.ray) % 16 == 0
-    found = samples_of(*told, most=sample_capacity(scene.aabb, scene.step), capacity=n + (0 if short else 500))
+    found = sample_rays(*told, most=max_samples_per_ray(scene.aabb, scene.step), capacity=n + (0 if short else 500))
     for name in ("ray", "points", "s", "length", "stretch", "cell"):
         assert torch.equal(getattr(found, name)[:n], getattr(wanted, name)[:n]), name
     assert len(found.ray) == n + (0 if short else 500) and not found.length[n:].any() and short < n
     if not short:
-        one, two = (meet(field, rays, s, field.features, scene.extent) for s in (wanted, found))
+        one, two = (weigh_samples(field, rays, s, field.features, scene.extent) for s in (wanted, found))
         assert torch.equal(shade(field, rays, one), shade(field, rays, two)) and torch.equal(
             one.weights, two.weights[:n]
         )
@@ -64,12 +72,12 @@ def test_mixed_precision_is_float32_within_its_bound() -> None:
     """
     scene = with_hybrid_decoder(translucent_scene())
     rays = random_rays(scene, 203)
-    samples = samples_of(rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step)
+    samples = sample_rays(rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step)
     rgb, gradients = {}, {}
     for mixed in (False, True):
         field = Field.from_scene(scene)
         field.mixed = mixed
-        rgb[mixed] = shade(field, rays, meet(field, rays, samples, field.features, scene.extent))
+        rgb[mixed] = shade(field, rays, weigh_samples(field, rays, samples, field.features, scene.extent))
         rgb[mixed].square().mean().backward()
         gradients[mixed] = {name: p.grad for name, p in field.named_parameters()}
         assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in field.parameters())
@@ -95,10 +103,10 @@ def test_a_step_on_a_gpu_waits_for_nothing(hybrid_decoder: bool) -> None:
     scene = with_hybrid_decoder(translucent_scene()) if hybrid_decoder else translucent_scene()
     field = Field.from_scene(scene).cuda()
     config = TrainConfig(hybrid=hybrid_decoder)
-    optimiser = PlainOptimiser(field, config, scene.occupancy.shape[1:])
+    optimiser = TorchOptimiser(field, config, scene.occupancy.shape[1:])
     rays, targets = random_rays(scene, 203), torch.rand(203, 3)
     told = scene.aabb, scene.occupancy, scene.step, scene.extent
-    losses = [optimiser.step(k, 0.0, 0.1, rays, targets, *told)[0] for k in range(Figures.LATE + 2)]
+    losses = [optimiser.step(k, 0.0, 0.1, rays, targets, *told)[0] for k in range(DeferredReadback.LATE + 2)]
     torch.cuda.set_sync_debug_mode("error")
     try:
         losses += [optimiser.step(k, 0.0, 0.1, rays, targets, *told)[0] for k in range(20)]
@@ -116,9 +124,9 @@ def test_a_recorded_step_on_a_gpu_is_the_step(moved: bool, monkeypatch: pytest.M
     found = []
     for records in (True, False):
         if not records:
-            monkeypatch.setattr(Recorder, "run", lambda self, key, inputs, work: work(*inputs))
+            monkeypatch.setattr(GraphCache, "run", lambda self, key, inputs, work: work(*inputs))
         field = Field.from_scene(scene).cuda()
-        optimiser = PlainOptimiser(field, TrainConfig(learning_rate=1e-3), scene.occupancy.shape[1:])
+        optimiser = TorchOptimiser(field, TrainConfig(learning_rate=1e-3), scene.occupancy.shape[1:])
         losses = [optimiser.step(k, 0.0, 1.0, rays, targets, *told)[0] for k in range(60)]
         assert bool(optimiser._recorder._recordings) == records
         found.append((losses[-1], field.theta.detach().cpu(), optimiser.peaks()))
@@ -132,18 +140,18 @@ def test_a_recorded_step_on_a_gpu_is_the_step(moved: bool, monkeypatch: pytest.M
 def test_samples_that_are_not_reached_take_no_part(moved: bool) -> None:
     scene = translucent_scene(True, False, moved)
     rays, field = random_rays(scene, 203), Field.from_scene(scene).double()
-    rays = rays.apply(torch.Tensor.double)
-    samples = samples_of(rays, torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy), scene.step)
-    whole = meet(field, rays, samples, field.features, scene.extent)
+    rays = rays.map(torch.Tensor.double)
+    samples = sample_rays(rays, torch.from_numpy(scene.aabb).double(), torch.from_numpy(scene.occupancy), scene.step)
+    whole = weigh_samples(field, rays, samples, field.features, scene.extent)
     assert not whole.reached.all()
     shown = shade(field, rays, whole)
     shown.square().sum().backward()
     wanted, field.theta.grad = field.theta.grad, None
     count = int(whole.reached.sum())
     for room in (count, count + 100):
-        some = reached(samples, whole.reached, room)
+        some = select_reached(samples, whole.reached, room)
         assert len(some.ray) == room and (some.ray.diff() >= 0).all()
-        met = meet(field, rays, some, field.features, scene.extent)
+        met = weigh_samples(field, rays, some, field.features, scene.extent)
         found = shade(field, rays, met)
         torch.testing.assert_close(found, shown)
         torch.testing.assert_close(met.distortion, whole.distortion)
@@ -156,10 +164,10 @@ def test_rays_that_meet_nothing_have_no_samples() -> None:
     scene = translucent_scene()
     rays = random_rays(scene, 13)
     away = replace(rays, origins=rays.origins + 100)
-    samples = collected(away, scene.aabb, scene.occupancy, scene.step)
+    samples = sample_rays_fused(away, scene.aabb, scene.occupancy, scene.step)
     assert len(samples.ray) == 0
     field = Field.from_scene(with_hybrid_decoder(scene))
-    met = meet(field, away, samples, fused_features(field), scene.extent)
+    met = weigh_samples(field, away, samples, fused_features(field), scene.extent)
     assert (
         torch.equal(shade(field, away, met), away.backgrounds)
         and not met.opacity.any()
@@ -191,11 +199,11 @@ def test_the_hybrid_decoder_has_the_gradient_of_finite_differences() -> None:
     directions = torch.nn.functional.normalize(torch.randn(4, 3, generator=generator, dtype=torch.float64), dim=1)
     chances = (torch.rand(4, generator=generator).double() for _ in range(2))
     rays = Rays(-2 * directions, directions, *chances, torch.rand(4, 3, generator=generator).double())
-    samples = samples_of(rays, aabb, torch.ones(1, 2, 2, 2), 0.3)
+    samples = sample_rays(rays, aabb, torch.ones(1, 2, 2, 2), 0.3)
     parameters = dict(field.named_parameters())
 
     def rendered() -> tuple[torch.Tensor, torch.Tensor]:
-        met = meet(field, rays, samples, field.features, 2.0)
+        met = weigh_samples(field, rays, samples, field.features, 2.0)
         return shade(field, rays, met), met.distortion
 
     def met(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -229,7 +237,7 @@ def test_a_hybrid_field_is_its_scene_again() -> None:
     scene = with_hybrid_decoder(tiny_scene())
     field = Field.from_scene(scene)
     assert isinstance(field, HybridField)
-    for name, weights in vars(field.decoder_as_data()).items():
+    for name, weights in vars(field.export_decoder()).items():
         np.testing.assert_array_equal(weights, getattr(scene.decoder, name), err_msg=name)
 
 

@@ -12,7 +12,7 @@ from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows
 from kpc.encoder.training import temporal_resolution
-from kpc.encoder.training.temporal_resolution import fitted_in_time, measure
+from kpc.encoder.training.temporal_resolution import fit_frames_per_row, measure_time_resolution
 from kpc.format.common.media import write_image
 
 FRAMES = 49
@@ -79,7 +79,7 @@ def by_definition(dataset: Dataset, spacing: int) -> float:
 
 def test_errors_are_those_of_least_squares(clips: Callable[[float], Dataset]) -> None:
     for period in (8, 24):
-        found = measure(clips(period), 0.05)
+        found = measure_time_resolution(clips(period), 0.05)
         assert found is not None and found.error <= 0.05 < found.next_error
         assert found.error == pytest.approx(by_definition(clips(period), found.frames_per_row), rel=1e-3, abs=1e-5)
         wider = temporal_resolution._spacings(FRAMES)[
@@ -92,7 +92,7 @@ def test_errors_are_those_of_least_squares(clips: Callable[[float], Dataset]) ->
 def test_slow_things_need_fewer_rows(clips: Callable[[float], Dataset]) -> None:
     chosen = []
     for period in (3, 12, 24, 96):
-        found = measure(clips(period), 0.02)
+        found = measure_time_resolution(clips(period), 0.02)
         assert found is not None
         chosen.append(found.frames_per_row)
     assert chosen == sorted(chosen) and chosen[0] == 1 and len(set(chosen)) == 4 and chosen[-1] >= 12
@@ -100,7 +100,7 @@ def test_slow_things_need_fewer_rows(clips: Callable[[float], Dataset]) -> None:
 
 def test_what_changes_evenly_needs_its_ends_only(tmp_path: Path) -> None:
     dataset = film(tmp_path, lambda t: t / (FRAMES - 1))
-    found = measure(dataset, 0.02)
+    found = measure_time_resolution(dataset, 0.02)
     assert found is not None and time_rows(FRAMES, found.frames_per_row) == 2 and math.isnan(found.next_error)
 
 
@@ -108,8 +108,8 @@ def test_noise_asks_for_no_rows_and_hides_no_motion(tmp_path: Path) -> None:
     """Noise of 0.04, as much as the tolerance: by itself it would ask for rows that are not needed."""
     for name, period in (("slow", 48), ("fast", 6)):
         (tmp_path / name).mkdir()
-        clean = measure(film(tmp_path / name / "clean", wave(period)), 0.04)
-        noisy = measure(film(tmp_path / name / "noisy", wave(period), noise=0.04), 0.04)
+        clean = measure_time_resolution(film(tmp_path / name / "clean", wave(period)), 0.04)
+        noisy = measure_time_resolution(film(tmp_path / name / "noisy", wave(period), noise=0.04), 0.04)
         assert clean is not None and noisy is not None
         assert noisy.frames_per_row == clean.frames_per_row
         assert noisy.noise == pytest.approx(0.04, rel=0.15) and noisy.error == pytest.approx(clean.error, abs=0.008)
@@ -117,44 +117,47 @@ def test_noise_asks_for_no_rows_and_hides_no_motion(tmp_path: Path) -> None:
 
 def test_a_scene_that_hardly_changes_has_two_rows(tmp_path: Path) -> None:
     dataset = film(tmp_path, lambda t: 0.02 * np.sin(t), noise=0.004)
-    found = measure(dataset, 0.01)
+    found = measure_time_resolution(dataset, 0.01)
     assert found is not None and found.changing == 0 and time_rows(FRAMES, found.frames_per_row) == 2
 
 
 def test_only_pixels_that_masks_leave_count(tmp_path: Path) -> None:
     dataset = film(tmp_path, wave(5), masked=True)
-    found = measure(dataset, 0.02)
+    found = measure_time_resolution(dataset, 0.02)
     assert found is not None and found.changing == 0
 
 
 def test_bounded_work_finds_the_same(clips: Callable[[float], Dataset], monkeypatch: pytest.MonkeyPatch) -> None:
     """Few pixels, few lines, three short spans of a clip that is the same everywhere; never more values at a time than stated."""
-    whole = measure(clips(8), 0.05)
+    whole = measure_time_resolution(clips(8), 0.05)
     for name, value in (("VALUES", 1600), ("LINES", 5), ("SPAN", 16), ("CAMERAS", 1)):
         monkeypatch.setattr(temporal_resolution, name, value)
-    taken = list(temporal_resolution._spans(clips(8), temporal_resolution.of_each_camera(clips(8))))
+    taken = list(temporal_resolution._spans(clips(8), temporal_resolution.group_by_camera(clips(8))))
     assert [colours.shape[:2] for _, colours in taken] == [(16, 100)] * 3
     assert taken[0][0][0] == 0 and taken[2][0][-1] == 1
-    some = measure(clips(8), 0.05)
+    some = measure_time_resolution(clips(8), 0.05)
     assert some is not None and whole is not None
     assert some.frames_per_row == whole.frames_per_row and some.error == pytest.approx(whole.error, abs=0.01)
 
 
 def test_the_config_gets_what_was_measured(clips: Callable[[float], Dataset], moving: Dataset) -> None:
     config = TrainConfig(time_tolerance=0.02)
-    fitted, found = fitted_in_time(config, clips(24))
+    fitted, found = fit_frames_per_row(config, clips(24))
     assert found is not None and fitted == replace(config, frames_per_row=found.frames_per_row) != config
-    assert fitted_in_time(config, clips(24)) == (fitted, found)  # a run that is resumed finds the same
+    assert fit_frames_per_row(config, clips(24)) == (fitted, found)  # a run that is resumed finds the same
     for other, dataset in (
         (config, moving),
         (replace(config, time_tolerance=0.0), clips(24)),
         (replace(config, motion_cells=4), clips(24)),
     ):
-        assert fitted_in_time(other, dataset) == (other, None)
+        assert fit_frames_per_row(other, dataset) == (other, None)
 
 
 def test_cameras_that_show_little_of_the_clip_cannot_tell(clips: Callable[[float], Dataset]) -> None:
     """Between the frames that a camera does not show anything may have happened."""
     pictures = clips(8).pictures
     seldom = replace(pictures, is_test=(pictures.camera == 1) & (np.arange(len(pictures)) % 3 > 0))
-    assert measure(clips(8), 0.05) is not None and measure(replace(clips(8), pictures=seldom), 0.05) is None
+    assert (
+        measure_time_resolution(clips(8), 0.05) is not None
+        and measure_time_resolution(replace(clips(8), pictures=seldom), 0.05) is None
+    )

@@ -12,11 +12,11 @@ import torch
 from kpc.encoder.cli.kpenc import to_scene
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import evaluate
-from kpc.encoder.field.bounds import contraction_of, find_box
+from kpc.encoder.field.bounds import find_box, fit_contraction
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.render import Rays
-from kpc.encoder.training.optimisers import PlainOptimiser, kept_channels
+from kpc.encoder.training.optimisers import TorchOptimiser, feature_mask
 from kpc.encoder.training.sampler import RaySampler
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.errors import TrainingError
@@ -81,7 +81,7 @@ def assert_same(one: Trainer, two: Trainer) -> None:
     assert one.step == two.step
     for (name, a), b in zip(one.field.named_parameters(), two.field.parameters()):
         assert torch.equal(a, b), name
-    np.testing.assert_array_equal(one.grid.marched, two.grid.marched)
+    np.testing.assert_array_equal(one.grid.active, two.grid.active)
     np.testing.assert_array_equal(one.grid.log_density, two.grid.log_density)
     assert one.rng.bit_generator.state == two.rng.bit_generator.state
 
@@ -128,7 +128,7 @@ def test_resuming_ends_bitwise_where_an_uninterrupted_run_does(
     }
     whole = trained(moving, **changes)
     assert whole.field.codes is not None and whole.field.codes.any(1).all()
-    assert len(whole.grid.marched) == whole.slots > 1
+    assert len(whole.grid.active) == whole.slots > 1
     first = trainer(moving, **changes)
     with pytest.raises(KeyboardInterrupt):
         first.run(ignore, interrupted=lambda: first.step == stop_at)
@@ -191,7 +191,7 @@ def test_contraction_holds_a_background_that_a_box_cannot(surrounded: Dataset) -
     """A ball before a sky at infinity, filmed from all around: the walls of a box are near, and shift against the sky."""
     changes = dict(steps=250, resolutions=(16, 48), cells_across=24)
     config, inner, large = replace(CONFIG, **changes), 1.5 * BOX, find_box(surrounded.pictures, False)  # type: ignore[arg-type]
-    contracted = Trainer(surrounded, config, inner, "cpu", mapping=contraction_of(surrounded.pictures, inner))
+    contracted = Trainer(surrounded, config, inner, "cpu", mapping=fit_contraction(surrounded.pictures, inner))
     boxed = Trainer(surrounded, config, large, "cpu")
     psnrs = []
     for run in (contracted, boxed):
@@ -447,7 +447,7 @@ def test_finer_scales_are_left_out_now_and_then(moving: Dataset) -> None:
     """Each step all, or the scales from any but the first on; what is left is as it was."""
     run = trainer(moving, resolutions=(8, 12, 16), scale_dropout=0.5)
     M = run.field.layout.channels
-    kept = torch.stack([kept_channels(run.field, run.config, step, 0.0) for step in range(400)]).view(400, 3, M)
+    kept = torch.stack([feature_mask(run.field, run.config, step, 0.0) for step in range(400)]).view(400, 3, M)
     assert torch.equal(kept, kept[..., :1].expand_as(kept)) and set(kept.unique().tolist()) == {0.0, 1.0}
     left = kept[:, :, 0].sum(1)
     assert (kept[:, :-1] >= kept[:, 1:]).all() and set(left.tolist()) == {1.0, 2.0, 3.0}
@@ -481,12 +481,12 @@ def test_the_coarsest_scale_begins_alone_and_dropout_ends(moving: Dataset) -> No
         (0.5, 3, M),
         (1.0, 3, M),
     ):
-        kept = kept_channels(run.field, run.config, 7, fraction).view(3, M)
+        kept = feature_mask(run.field, run.config, 7, fraction).view(3, M)
         assert kept.any(1).sum() == scales and kept[:scales].bool().sum() == scales * channels
     before = run.field.theta.detach().clone()
     batch, targets = run.sampler.draw(run.rng, 256)
     run.optimiser.config = replace(run.config, regularise_every=1000)
-    run.optimiser.step(1, 0.1, 1.0, batch, targets, run.aabb, run.grid.marched, run.step_length, run.extent)
+    run.optimiser.step(1, 0.1, 1.0, batch, targets, run.aabb, run.grid.active, run.step_length, run.extent)
     moved, finer = run.field.theta != before, int(run.field.layout.table[1].min())
     assert moved[:finer].any() and not moved[finer:].any()
 
@@ -494,16 +494,16 @@ def test_the_coarsest_scale_begins_alone_and_dropout_ends(moving: Dataset) -> No
 def test_dropped_channels_take_no_part(moving: Dataset) -> None:
     """Every scale leaves out the same ones, each step others, and the mean over steps is 1."""
     run = trainer(moving, channel_dropout=0.25)
-    kept = torch.stack([kept_channels(run.field, run.config, step, 0.0) for step in range(400)])
+    kept = torch.stack([feature_mask(run.field, run.config, step, 0.0) for step in range(400)])
     M = run.field.layout.channels
     assert kept.shape == (400, 2 * M) and torch.equal(kept[:, :M], kept[:, M:])
     assert ((kept == 0).sum(1) == 2 * M // 4).all() and len(torch.unique(kept, dim=0)) > 10
     torch.testing.assert_close(kept.mean(0), torch.ones(2 * M), atol=0.15, rtol=0)
-    assert torch.equal(kept_channels(run.field, CONFIG, 3, 0.0), torch.ones(2 * M))
+    assert torch.equal(feature_mask(run.field, CONFIG, 3, 0.0), torch.ones(2 * M))
     before = run.field.theta.detach().clone()
     batch, targets = run.sampler.draw(run.rng, 256)
     run.optimiser.field, run.optimiser.config = run.field, replace(run.config, regularise_every=1000)
-    run.optimiser.step(1, 0.0, 1.0, batch, targets, run.aabb, run.grid.marched, run.step_length, run.extent)
+    run.optimiser.step(1, 0.0, 1.0, batch, targets, run.aabb, run.grid.active, run.step_length, run.extent)
     moved = (run.field.theta != before).view(-1, M).any(0)
     assert torch.equal(moved, kept[1, :M] != 0)
 
@@ -514,13 +514,13 @@ def test_random_backgrounds_are_what_shines_through(moving: Dataset) -> None:
     assert bool((targets == batch.backgrounds).all(1).any())  # alpha is 0 somewhere
 
 
-def plain_twin(fused: Trainer) -> PlainOptimiser:
+def plain_twin(fused: Trainer) -> TorchOptimiser:
     """The optimiser of other devices, on a copy of a trainer's field."""
     motion = fused.field.motion
     nodes = None if motion is None else motion.shape[:4]
-    field = Field(fused.field.layout, fused.config.hidden, motion_nodes=nodes, appearances=len(fused.names))
+    field = Field(fused.field.layout, fused.config.hidden, motion_shape=nodes, appearances=len(fused.names))
     field.load_state_dict(fused.field.state_dict())
-    return PlainOptimiser(field, fused.config, fused.grid.seen.shape, fused.mapping)  # type: ignore[arg-type]
+    return TorchOptimiser(field, fused.config, fused.grid.visible.shape, fused.mapping)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("mapping", [None, Contraction(4.0)])
@@ -557,7 +557,7 @@ def test_plain_pytorch_takes_the_same_steps(
     plain = plain_twin(run)
     for number in range(3):
         batch, targets = run.sampler.draw(run.rng, 256)
-        args = (number, 0.0, 0.1, batch, targets, run.aabb, run.grid.marched, run.step_length, run.extent)
+        args = (number, 0.0, 0.1, batch, targets, run.aabb, run.grid.active, run.step_length, run.extent)
         (ours, samples), (theirs, their_samples) = run.optimiser.step(*args), plain.step(*args)
         # Samples below 1e-4 go without colour in the kernels, 83 a ray at most; and what the steps before have left.
         assert ours == pytest.approx(theirs, rel=0.02) and samples == pytest.approx(their_samples, rel=0.01)
@@ -601,7 +601,7 @@ def test_the_whole_loop_runs_on_plain_pytorch(moving: Dataset, tmp_path: Path) -
 def test_the_hybrid_decoder_without_direction_sees_the_same_from_everywhere(moving: Dataset) -> None:
     field = trained(moving, view_dependent=False, hybrid=True, steps=20).field
     directions = torch.nn.functional.normalize(torch.randn(8, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    assert field.b1.any() and torch.equal(field.once_a_ray(directions), field.b1.expand(8, -1))
+    assert field.b1.any() and torch.equal(field.ray_terms(directions), field.b1.expand(8, -1))
 
 
 def test_a_colour_without_direction_keeps_it_out(moving: Dataset) -> None:

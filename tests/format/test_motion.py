@@ -42,7 +42,7 @@ def test_moved_is_the_formula_in_numpy_and_pytorch(most: float) -> None:
     wanted = np.array([by_hand(*a, offsets) for a in zip(u.astype(np.float64), times, strict=True)])
     ours = np.array([displace(p, sample_linear(offsets, float(t))) for p, t in zip(u, times, strict=True)])
     np.testing.assert_allclose(ours, wanted, atol=1e-6 * (1 + most))
-    theirs = field.moved(*map(torch.from_numpy, (u, times, offsets))).numpy()
+    theirs = field.displace(*map(torch.from_numpy, (u, times, offsets))).numpy()
     np.testing.assert_allclose(theirs, wanted, atol=1e-6 * (1 + most))
     assert (np.mean((wanted == 0) | (wanted == 1)) > 0.2) == (
         most > 1
@@ -52,7 +52,7 @@ def test_moved_is_the_formula_in_numpy_and_pytorch(most: float) -> None:
 def test_pytorch_has_the_gradient_of_finite_differences() -> None:
     points, times = torch.rand(20, 3, dtype=torch.float64) * 0.6 + 0.2, torch.rand(20, dtype=torch.float64)
     motion = (0.1 * torch.randn(3, 2, 3, 2, 3, dtype=torch.float64)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda motion: field.moved(points, times, motion), (motion,))
+    assert torch.autograd.gradcheck(lambda motion: field.displace(points, times, motion), (motion,))
 
 
 @pytest.mark.parametrize("most", [1e-9, 0.1, 3.0, DISPLACEMENT_LIMIT / 2])

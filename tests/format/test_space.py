@@ -93,7 +93,7 @@ def test_every_language_puts_samples_in_the_same_place(even: float) -> None:
 def _torch(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
     o, d, *rest = map(torch.from_numpy, (origins, directions, s, scene.aabb))
     nothing = torch.zeros(len(o))
-    u, stretch = in_pytorch.places(in_pytorch.Rays(o, d, nothing, nothing, nothing), *rest, scene.mapping)
+    u, stretch = in_pytorch.plane_coordinates(in_pytorch.Rays(o, d, nothing, nothing, nothing), *rest, scene.mapping)
     return scene.mapping.distance(s), u.numpy(), stretch.numpy()
 
 

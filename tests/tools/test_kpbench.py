@@ -151,7 +151,7 @@ def test_ablate_changes_one_thing_at_a_time(
 
 def test_every_ablation_changes_something_somewhere() -> None:
     plain = PRESETS["balanced"]
-    lone, unequal = plain.for_lone_object(), replace(plain, appearance="image")
+    lone, unequal = plain.for_single_object(), replace(plain, appearance="image")
     assert set(effective_ablations(plain)) | set(effective_ablations(lone)) | set(effective_ablations(unequal)) == set(
         ABLATIONS
     )
