@@ -19,8 +19,8 @@ from kpc.player.app.preferences import Preferences, preferences_path
 from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.window import Player, Window
 from kpc.player.cpu.reference import Part
-from kpc.player.gl.renderer import Look
-from kpc.player.quality import DEFAULT, climbed
+from kpc.player.gl.renderer import DisplayMode
+from kpc.player.quality import DEFAULT, neighbouring_level
 from kpc.player.streaming.group_playback import GroupPlayback
 from pytest import approx, raises
 
@@ -72,7 +72,8 @@ def main(scene_file: str) -> None:
     press(glfw.KEY_RIGHT_BRACKET, glfw.KEY_L)
     assert player.playback.speed == 2.0 and not player.playback.loop
     for key, look in zip(
-        (glfw.KEY_2, glfw.KEY_3, glfw.KEY_4, glfw.KEY_1), (Look.DEPTH, Look.SAMPLES, Look.OCCUPANCY, Look.COLOUR)
+        (glfw.KEY_2, glfw.KEY_3, glfw.KEY_4, glfw.KEY_1),
+        (DisplayMode.DEPTH, DisplayMode.SAMPLES, DisplayMode.OCCUPANCY, DisplayMode.COLOUR),
     ):
         press(key)
         assert player.look is look
@@ -113,7 +114,7 @@ def main(scene_file: str) -> None:
 
     rung = player.quality.level
     press(glfw.KEY_MINUS)
-    assert player.quality.level == climbed(rung, -1) and rung == DEFAULT
+    assert player.quality.level == neighbouring_level(rung, -1) and rung == DEFAULT
     press(glfw.KEY_EQUAL)
     assert player.quality.level == rung
     press(glfw.KEY_U)
@@ -506,7 +507,7 @@ def remember(scene_file: str) -> None:
         False,
         False,
     ]
-    assert [one.quality for one in seen] == [DEFAULT, climbed(DEFAULT, -1), "fine", DEFAULT]
+    assert [one.quality for one in seen] == [DEFAULT, neighbouring_level(DEFAULT, -1), "fine", DEFAULT]
     assert [one.target_fps for one in seen] == [None, 25.0, None, None]
 
 

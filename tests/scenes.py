@@ -7,8 +7,8 @@ import numpy as np
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates
+from kpc.player.atlas import Layout
 from kpc.player.gl.renderer import Renderer
-from kpc.player.gl.textures import Layout
 
 
 def tiny_scene(

@@ -24,7 +24,7 @@ from kpc.player.app import preferences
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.preferences import TARGET_FPS, WINDOW_SIDES, Preferences
 from kpc.player.app.resolution_controller import GPU_FPS
-from kpc.player.quality import LADDER
+from kpc.player.quality import LEVELS
 from kpc.player.viewpoints import Rig
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
         help="for the scene, on the processor's side and on the graphics card's together (default: %(default)s bytes)",
     )
     parser.add_argument(
-        "--quality", choices=list(LADDER), help="how finely to draw (default: as it was; else what the device is up to)"
+        "--quality", choices=list(LEVELS), help="how finely to draw (default: as it was; else what the device is up to)"
     )
     parser.add_argument(
         "--target-fps",

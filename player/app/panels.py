@@ -15,8 +15,8 @@ from kpc.player.app.preferences import TARGET_FPS
 from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.time_plane_pictures import moving_part, time_plane_picture, time_planes
 from kpc.player.cpu.reference import Part
-from kpc.player.gl.renderer import Look
-from kpc.player.quality import LADDER
+from kpc.player.gl.renderer import DisplayMode
+from kpc.player.quality import LEVELS
 
 if TYPE_CHECKING:
     from kpc.player.app.window import Player
@@ -54,7 +54,12 @@ KEYS = (
     ("H", "these keys"),
     ("Esc", "quit"),
 )
-DISPLAY_MODE_NAMES = {Look.COLOUR: "colour", Look.DEPTH: "depth", Look.SAMPLES: "samples", Look.OCCUPANCY: "occupancy"}
+DISPLAY_MODE_NAMES = {
+    DisplayMode.COLOUR: "colour",
+    DisplayMode.DEPTH: "depth",
+    DisplayMode.SAMPLES: "samples",
+    DisplayMode.OCCUPANCY: "occupancy",
+}
 PART_NAMES = {Part.FULL: "all", Part.STATIC: "static only", Part.DYNAMIC: "dynamic only"}
 
 LABEL_EM = 5.2
@@ -108,7 +113,7 @@ def _status(player: "Player", bottom: float) -> float:
         imgui.text_disabled("{}x{} of {}x{}".format(*player.raster, *player.canvas.size))
         imgui.text_disabled(f"{player.samples:.1f} samples a ray, {player.renderer.memory_bytes / 1e6:.0f} MB")
         imgui.text_disabled(player.device.split("(")[0].strip()[:32])
-        imgui.text_disabled(f"by {player.renderer.marched_by}")
+        imgui.text_disabled(f"by {player.renderer.drawn_by}")
         if isinstance(player.scene.decoder, HybridDecoder):
             imgui.text_disabled("hybrid decoder: plays slower")
         if not stream.is_settled:
@@ -160,7 +165,7 @@ def _quality(player: "Player") -> None:
         player.target_fps = min(max(fps, TARGET_FPS[0]), TARGET_FPS[1])
     if changed or (moved and held):
         dial.hold(player.target_fps if held else None)
-    if player.scene.is_dynamic and LADDER[dial.level].folded:
+    if player.scene.is_dynamic and LEVELS[dial.level].folded:
         _label("exact")
         _, player.exact = imgui.checkbox("##exact", player.exact)
         imgui.set_item_tooltip("Samples time planes beside the space planes, and does not multiply them in: slower.")

@@ -12,7 +12,7 @@ from typing import Any
 
 from kpc.format.common.cli import atomic_write
 from kpc.player.app.controls import SPEEDS
-from kpc.player.quality import LADDER
+from kpc.player.quality import LEVELS
 
 LARGEST = 1 << 16
 WINDOW_SIDES = range(64, 16385)
@@ -58,7 +58,7 @@ def _is_size(value: Any) -> bool:
 
 _IS_RIGHT: dict[str, Callable[[Any], bool]] = {
     "size": _is_size,
-    "quality": lambda value: isinstance(value, str) and value in LADDER,
+    "quality": lambda value: isinstance(value, str) and value in LEVELS,
     "target_fps": _is_between(*TARGET_FPS),
     "speed": lambda value: _is_between(SPEEDS[0], SPEEDS[-1])(value) and value in SPEEDS,
     "loop": _is_flag,

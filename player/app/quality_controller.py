@@ -5,9 +5,9 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from kpc.player.app.resolution_controller import GPU_FPS, ResolutionController
-from kpc.player.quality import DEFAULT, LADDER, climbed
+from kpc.player.quality import DEFAULT, LEVELS, neighbouring_level
 
-LEVEL_NAMES = tuple(LADDER)
+LEVEL_NAMES = tuple(LEVELS)
 TOO_SLOW, ROOM = 1.1, 0.85
 """Of the time a picture may take: down from above the one; up if the finer rung is expected to stay below the other."""
 DOWN_AFTER, UP_AFTER = 3, 12
@@ -116,7 +116,7 @@ class QualityController:
 
     def _move(self, rungs: int, seconds: float) -> None:
         self._left = self.level, seconds
-        self.level = climbed(self.level, rungs, self.skipped)
+        self.level = neighbouring_level(self.level, rungs, self.skipped)
         self._restart()
 
     def _learn(self, seconds: float) -> None:
@@ -125,7 +125,7 @@ class QualityController:
             (lower, fast), (upper, slow) = sorted(
                 (self._left, (self.level, seconds)), key=lambda pair: LEVEL_NAMES.index(pair[0])
             )
-            if upper == climbed(lower, 1, self.skipped):
+            if upper == neighbouring_level(lower, 1, self.skipped):
                 self._growth[lower] = max(slow / max(fast, 1e-6), 1.0)
             self._left = None
 

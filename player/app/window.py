@@ -27,8 +27,8 @@ from kpc.player.app.preferences import TEXT_SIZES, Preferences
 from kpc.player.app.quality_controller import LEVEL_NAMES, quality_controller_for
 from kpc.player.app.recording import Recording, frames_due
 from kpc.player.cpu.reference import Part
-from kpc.player.gl.renderer import Look, Renderer, is_software
-from kpc.player.quality import LADDER, climbed
+from kpc.player.gl.renderer import DisplayMode, Renderer, is_software
+from kpc.player.quality import LEVELS, neighbouring_level
 from kpc.player.streaming.group_playback import GroupPlayback
 from kpc.player.streaming.prefetch import Playhead
 from kpc.player.viewpoints import Rig, presets
@@ -229,7 +229,7 @@ class Player:
             stream.clip, playing=stream.clip.duration_s > 0, speed=preferences.speed, loop=preferences.loop
         )
         self.appearance = AppearanceSelection(scene)
-        self.part, self.look, self.exact = Part.FULL, Look.COLOUR, False
+        self.part, self.look, self.exact = Part.FULL, DisplayMode.COLOUR, False
         self.path, self.ride_s, self.riding = CameraPath(), 0.0, False
         self._keyed_at: float | None = None
         self.film: Recording | None = None
@@ -269,7 +269,7 @@ class Player:
         return self.stream.renderer
 
     def _make_renderer(self, scene: Scene) -> Renderer:
-        return Renderer(self.ctx, scene, LADDER[self.quality.level])
+        return Renderer(self.ctx, scene, LEVELS[self.quality.level])
 
     def _go_on_from(self, before: "Player") -> None:
         self.view, self.playback, self.path, self.part, self.look = (
@@ -351,7 +351,7 @@ class Player:
         if self._mishaps > MOST_MISHAPS:
             raise error
         self.complain(str(error))
-        self.quality.choose(climbed(self.quality.level, -1))
+        self.quality.choose(neighbouring_level(self.quality.level, -1))
 
     def _advance(self, seconds: float) -> None:
         """Let the clip, or the camera path, go on, unless what comes next is not there yet."""
@@ -580,11 +580,11 @@ class Player:
             self._drawn, self._moved, self._is_sharp, self._sharp_rows = wanted, now, False, 0
             self._picture(dial.resolution.scale, dial.level)
             self._is_paced = True
-            drawn, resting = self.renderer.quality, LADDER[dial.still_level]
+            drawn, resting = self.renderer.quality, LEVELS[dial.still_level]
             is_whole = (
                 self.raster == self.canvas.size
-                and not (drawn.tolerance or drawn.blur)
-                and drawn.across == resting.across
+                and not (drawn.reprojection_tolerance or drawn.interpolation_tolerance)
+                and drawn.rays_across == resting.rays_across
             )
             self._is_sharp = is_whole and dial.level == dial.still_level
         elif not self._is_sharp and now - self._moved > SHARPEN_AFTER_S:
@@ -628,11 +628,11 @@ class Player:
     def _set_quality(self, rung: str, still: bool) -> None:
         """That of a rung, but for what is set by hand; a picture that stands still is marched pixel by pixel. A processor sends several
         rays through a pixel of that alone: before, more pixels tell more."""
-        quality = LADDER[rung]
+        quality = LEVELS[rung]
         if still:
-            quality = replace(quality, tolerance=0.0, blur=0.0)
+            quality = replace(quality, reprojection_tolerance=0.0, interpolation_tolerance=0.0)
         elif is_software(self.ctx):
-            quality = replace(quality, across=1)
+            quality = replace(quality, rays_across=1)
         self.renderer.quality = replace(quality, folded=quality.folded and not self.exact)
 
     def _show(self, target: moderngl.Framebuffer, camera: Camera) -> None:
@@ -648,11 +648,11 @@ class Player:
                 camera,
                 time,
                 part=self.part,
-                look=self.look,
+                mode=self.look,
                 depths=self.depths,
                 most_samples=self.most_samples,
                 appearance=code,
-                share=share,
+                opacity=share,
             )
         self.ctx.finish()
         self.draw_s = clock.monotonic() - started
@@ -749,7 +749,7 @@ class Player:
             parts = list(PART_NAMES)
             self.part = parts[(parts.index(self.part) + 1) % len(parts)]
         elif key in (glfw.KEY_MINUS, glfw.KEY_EQUAL):
-            self.quality.choose(climbed(self.quality.level, 1 if key == glfw.KEY_EQUAL else -1))
+            self.quality.choose(neighbouring_level(self.quality.level, 1 if key == glfw.KEY_EQUAL else -1))
             self.say(
                 f"quality: {self.quality.level}, {LEVEL_NAMES.index(self.quality.level) + 1} of {len(LEVEL_NAMES)}"
             )

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from kpc.format.scene.grid import sample_linear, texel_and_fraction
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
+from kpc.player.atlas import Layout, pad_to_multiple
 from kpc.player.cpu.cpu_renderer import Marching, in_steps
 from kpc.player.cpu.simd import LARGEST, WIDE
 from kpc.player.cpu.threads import WORKERS
-from kpc.player.gl.textures import Layout, filled
 
 MOST_CORNERS = 1 << 22
 """Of a grid, 64 MB. With soldier's planes twice as fine, 3,900,000 corners, a picture of 320x240 takes 0.4 of the time that it takes by planes, one
@@ -29,7 +29,7 @@ LEAST_LOOKED_UP = 24
 follow the picture before: baked, a picture of 320x240 took 1.15 of the time, one of 640x480 1.7, and both were 3 to 4 dB farther from exact ones."""
 
 
-class Baking(Marching):
+class CornerGrid(Marching):
     """The grid of a scene at a time, as far as samples have looked at it.
 
     Attributes:
@@ -49,7 +49,7 @@ class Baking(Marching):
         """Rows of time planes at corners, by plane, scale and number."""
         self._places = {axis: np.linspace(0, 1, count, dtype=np.float32) for axis, count in zip("zyx", self.grid.shape)}
         weights = np.concatenate([scene.decoder.b2, scene.decoder.density_weight[None]])
-        self._weights = self._weights_in_steps = filled(weights.astype(np.float32), 1, WIDE)
+        self._weights = self._weights_in_steps = pad_to_multiple(weights.astype(np.float32), 1, WIDE)
         self._rows: tuple[np.ndarray, ...] = ()
 
     @staticmethod
@@ -77,7 +77,7 @@ class Baking(Marching):
             planes[block.plane].append(self._at_corners(across.swapaxes(0, 1), block.plane[1]))
         weights, taken = self._weights.astype(np.float64), []
         for parts in planes.values():
-            plane = filled(np.concatenate(parts, axis=2), 2, WIDE)
+            plane = pad_to_multiple(np.concatenate(parts, axis=2), 2, WIDE)
             whole, step = in_steps(plane.reshape(-1, plane.shape[2]))
             taken.append(whole)
             weights = weights * step

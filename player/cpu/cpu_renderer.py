@@ -9,7 +9,7 @@ from kpc.format.scene.cameras import Camera
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction
-from kpc.player.cpu.raymarch import cast
+from kpc.player.cpu.raymarch import march_blocks
 from kpc.player.cpu.threads import from_both_ends
 
 MOST_STEPS = 32767
@@ -52,7 +52,7 @@ class Marching(ABC):
         self._time = math.nan
 
     def go_to(self, time: float | None, code: np.ndarray) -> None:
-        """March pictures of a time in [0, 1], or of what is static, with the code of an appearance (`kpc.player.cpu.reference.code_of`), from now on."""
+        """March pictures of a time in [0, 1], or of what is static, with the code of an appearance (`kpc.player.cpu.reference.appearance_code`), from now on."""
         if time != self._time:
             self._prepare(time)
             motion = self._scene.motion
@@ -70,7 +70,7 @@ class Marching(ABC):
 
     @abstractmethod
     def _looked_at(self, worker: int) -> tuple[Any, Any]:
-        """`baked` and `looked_up` of `cast`."""
+        """`baked` and `looked_up` of `march_blocks`."""
 
     @staticmethod
     @abstractmethod
@@ -92,7 +92,7 @@ class Marching(ABC):
         """Write what march.glsl gives of some blocks of a picture.
 
         Args:
-            free: (Nz, Ny, Nx) uint8, `kpc.player.gl.textures.distances` to what is occupied at the time.
+            free: (Nz, Ny, Nx) uint8, `kpc.player.atlas.empty_distances` to what is occupied at the time.
             blocks: (N, 2) of row and column, rows from below, each of `side` x `side` pixels.
             step: world units.
             first: column and row of the pixel that comes first in `seen`, (h, w, 4) rgb and opacity, and `met`, (h, w, 2) sum of weight t and
@@ -116,7 +116,7 @@ class Marching(ABC):
         motion = self._motion
 
         def work(worker: int, part: slice) -> None:
-            cast(
+            march_blocks(
                 blocks[part], side, first, size, lens, axes, begin, edges, even, stride, tau, least, background,
                 free.reshape(-1), free.shape[::-1], motion.reshape(-1, 4), motion.shape[2::-1], *self._looked_at(worker), seen, met,
             )  # fmt: skip
@@ -138,10 +138,10 @@ def in_steps(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rehearse(kind: type[Marching], scene: Scene) -> None:
-    """Have `cast` compiled for a kind of marching and scene, which takes five seconds, or loaded, before a picture waits for it: march no block of nothing."""
+    """Have `march_blocks` compiled for a kind of marching and scene, which takes five seconds, or loaded, before a picture waits for it: march no block of nothing."""
     size, nothing = (1, 1), np.zeros((0, 2), np.int64)
     one, three, four = np.float32(1), np.zeros(3, np.float32), np.zeros((1, 4), np.float32)
-    cast(
+    march_blocks(
         nothing, 1, (0, 0), size, four[0], np.zeros((3, 3), np.float32), three, three, _even(scene), one, one, one, three,
         np.zeros(1, np.uint8), (1, 1, 1), four, (1, 1, 1), *kind.rehearsed(scene), np.zeros((1, 1, 4), np.float32), np.zeros((1, 1, 2), np.float32),
     )  # fmt: skip

@@ -15,7 +15,7 @@ from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, contract
 from kpc.player.cpu import reference
-from kpc.player.cpu.reference import Moment, Rendering
+from kpc.player.cpu.reference import Rendering, SceneAtTime
 from kpc.player.viewpoints import Rig
 
 INSTANTS = (np.arange(8) + 0.5) / 8
@@ -33,7 +33,7 @@ MUTED = 0.6, 0.2
 MOVING = np.array([1.0, 0.25, 0.05], np.float32)
 
 
-def dynamic_map(scene: Scene, camera: Camera, time: float, rendering: Rendering) -> Rendering:
+def motion_colours(scene: Scene, camera: Camera, time: float, rendering: Rendering) -> Rendering:
     """A rendering of `scene` with new colours: grey where what is seen at `time` is there all over the clip, from STILL to LIVELY
     more and more of one colour where it is not. Looked at is the place at the mean depth of each ray."""
     origins, directions = camera.rays()
@@ -51,7 +51,7 @@ def dynamic_map(scene: Scene, camera: Camera, time: float, rendering: Rendering)
     return replace(rendering, rgb=(muted + share[..., None] * (coloured - muted)).astype(np.float32))
 
 
-def still_share(scene: Scene) -> float:
+def motionless_share(scene: Scene) -> float:
     """Of the cells that are ever occupied, the share whose middle at no instant changes by more than STILL, seen as the opening
     camera looks; 1 where none is occupied."""
     ever = scene.occupancy.any(axis=0)
@@ -85,7 +85,7 @@ def _change(now: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def _looks(scene: Scene, u: np.ndarray, terms: np.ndarray, time: float) -> np.ndarray:
     """q of places (N, 3) in [0, 1]^3 at a time, given the `_terms` of as many rays or of one: (N, 4)."""
-    moment, decoder = Moment.of(scene, time), scene.decoder
+    moment, decoder = SceneAtTime.of(scene, time), scene.decoder
     cells = np.array(moment.occupied.shape[::-1])
     x, y, z = np.clip((u * cells).astype(np.int32), 0, cells - 1).T
     edges = (scene.aabb[1] - scene.aabb[0]) * (2 if isinstance(scene.mapping, Contraction) else 1)
@@ -107,7 +107,7 @@ def _place(scene: Scene, points: np.ndarray) -> np.ndarray:
 
 
 def _terms(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """`kpc.player.cpu.reference.once_a_ray` of rays of the world, (N, 3) and (N, 3), in the average look."""
+    """`kpc.player.cpu.reference.ray_terms` of rays of the world, (N, 3) and (N, 3), in the average look."""
     if isinstance(scene.mapping, DeviceCoordinates):
         directions = scene.mapping.rays(origins, directions).directions
-    return reference.once_a_ray(scene.decoder, directions, reference.code_of(scene, None))
+    return reference.ray_terms(scene.decoder, directions, reference.appearance_code(scene, None))

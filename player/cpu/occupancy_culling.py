@@ -14,8 +14,8 @@ from kpc.format.common.jit import compiled
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, SPACE_PLANES, Decoder, Scene
 from kpc.format.scene.space import Contraction
+from kpc.player.atlas import Layout, decoder_arrays
 from kpc.player.cpu.threads import share_out
-from kpc.player.gl.textures import Layout, decoder_arrays
 
 TEXELS_A_CELL = 2.0
 """Along an edge of a cell, of the finest scale: between corners farther apart there may be something that they do not see."""
@@ -44,7 +44,7 @@ class Corners:
         return Corners(slot, places.astype(np.float32), np.flatnonzero(at))
 
 
-class Thinning:
+class OccupancyCulling:
     """The densities of a scene at the corners of its occupied cells, from its planes.
 
     Attributes:

@@ -7,14 +7,14 @@ import numpy as np
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.format.scene.space import DeviceCoordinates
+from kpc.player.atlas import Layout, pad_to_multiple
 from kpc.player.cpu.cpu_renderer import Marching, in_steps
 from kpc.player.cpu.raymarch import LANES
 from kpc.player.cpu.simd import CHANNELS, LARGEST, NARROW, WIDE
 from kpc.player.cpu.threads import WORKERS
-from kpc.player.gl.textures import Layout, filled
 
 
-class Lookup(Marching):
+class PlaneSampler(Marching):
     """The planes of a scene in whole numbers, and the rows of a time.
 
     Channels go in groups, of NARROW where no scale has more, else of WIDE: all texels of a plane have those of the first, then all have those of the next.
@@ -121,14 +121,16 @@ class Lookup(Marching):
     def _put(self, into: np.ndarray, scale: int, which: int, texels: np.ndarray) -> None:
         """(..., channels) where it lies."""
         for number, group in enumerate(range(self._first_group[scale], self._first_group[scale + 1])):
-            part = filled(texels[..., self._wide * number : self._wide * (number + 1)], texels.ndim - 1, self._wide)
+            part = pad_to_multiple(
+                texels[..., self._wide * number : self._wide * (number + 1)], texels.ndim - 1, self._wide
+            )
             first = self._firsts[group, which]
             into[first : first + part.size] = part.reshape(-1)
 
     def _as_it_lies(self, weights: np.ndarray) -> np.ndarray:
         """(..., CHANNELS, F) float64 as (..., CHANNELS F): each group's features of each of the channels."""
         parts = [
-            filled(part, part.ndim - 1, self._wide)
+            pad_to_multiple(part, part.ndim - 1, self._wide)
             for part in np.split(weights, np.cumsum(self._channels)[:-1], axis=-1)
         ]
         whole = np.concatenate(parts, axis=-1).astype(np.float64)

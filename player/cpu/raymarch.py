@@ -46,11 +46,11 @@ E1, E2, E3, E4, E5 = (F(math.log(2) ** power / math.factorial(power)) for power 
 
 _FAST = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
 _part = compiled(forceinline=True, _nrt=False, **_FAST)
-"""Of `cast`: what makes no array."""
+"""Of `march_blocks`: what makes no array."""
 
 
 @compiled(**_FAST)
-def cast(
+def march_blocks(
     blocks,
     side,
     origin,

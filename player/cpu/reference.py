@@ -68,7 +68,7 @@ class Rendering:
     samples: np.ndarray
 
 
-def mixed(parts: Sequence[tuple[Rendering, float]]) -> Rendering:
+def blend(parts: Sequence[tuple[Rendering, float]]) -> Rendering:
     """Pictures of one camera and their shares as one: colours and opacity in these shares, depth of the one whose share is largest, samples
     of all."""
     rgb, opacity = (
@@ -81,7 +81,7 @@ def mixed(parts: Sequence[tuple[Rendering, float]]) -> Rendering:
 def render(
     scene: Scene, camera: Camera, time: float, *, part: Part = Part.FULL, appearance: np.ndarray | None = None
 ) -> Rendering:
-    """Render `scene` as `camera` sees it at `time` in [0, 1] over the clip, and as `code_of` says of `appearance`."""
+    """Render `scene` as `camera` sees it at `time` in [0, 1] over the clip, and as `appearance_code` says of `appearance`."""
     origins, directions = camera.rays()
     flat = render_rays(scene, origins, directions, time, part=part, appearance=appearance)
     shape = (camera.height, camera.width)
@@ -98,14 +98,14 @@ def render_rays(
     appearance: np.ndarray | None = None,
 ) -> Rendering:
     """Render rays, (N, 3) float32 origins and unit directions in world coordinates. Memory does not grow with N but for
-    the result. `appearance` as in `code_of`."""
+    the result. `appearance` as in `appearance_code`."""
     if not 0.0 <= time <= 1.0:
         raise ValueError(f"time {time} lies outside [0, 1]")
     if part is Part.DYNAMIC:
         full = render_rays(scene, origins, directions, time, appearance=appearance)
         static = render_rays(scene, origins, directions, time, part=Part.STATIC, appearance=appearance)
         return Rendering(np.abs(full.rgb - static.rgb), full.depth, full.opacity, full.samples)
-    moment, code = Moment.of(scene, time, with_motion=part is Part.FULL), code_of(scene, appearance)
+    moment, code = SceneAtTime.of(scene, time, with_motion=part is Part.FULL), appearance_code(scene, appearance)
     n = len(origins)
     out = Rendering(np.empty((n, 3), np.float32), *(np.empty(n, t) for t in (np.float32, np.float32, np.int32)))
     for start in range(0, n, RAYS_AT_ONCE):
@@ -116,7 +116,7 @@ def render_rays(
     return out
 
 
-def code_of(scene: Scene, appearance: np.ndarray | None) -> np.ndarray:
+def appearance_code(scene: Scene, appearance: np.ndarray | None) -> np.ndarray:
     """The code to show a scene with, (H,) float32: 0, the average look, for None.
 
     Raises:
@@ -133,7 +133,7 @@ def code_of(scene: Scene, appearance: np.ndarray | None) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Moment:
+class SceneAtTime:
     """What of a scene depends on the time alone.
 
     Attributes:
@@ -148,7 +148,7 @@ class Moment:
     offsets: np.ndarray | None
 
     @staticmethod
-    def of(scene: Scene, time: float, with_motion: bool = True) -> "Moment":
+    def of(scene: Scene, time: float, with_motion: bool = True) -> "SceneAtTime":
         """Cut `scene` at `time`; without motion every time plane counts as 1, every displacement as 0."""
         rows: list[dict[str, np.ndarray]] = [
             {name[0]: sample_linear(scale[name], time) for name in TIME_PLANES}
@@ -157,10 +157,10 @@ class Moment:
             for scale in scene.scales
         ]
         offsets = None if scene.motion is None or not with_motion else sample_linear(scene.motion, time)
-        return Moment(tuple(rows), scene.occupancy[slot_at(scene, time)], offsets)
+        return SceneAtTime(tuple(rows), scene.occupancy[occupancy_slot(scene, time)], offsets)
 
 
-def slot_at(scene: Scene, time: float) -> int:
+def occupancy_slot(scene: Scene, time: float) -> int:
     """The slot of the occupancy grid that holds at `time`: floor(time slots), the last one at time 1."""
     slots = len(scene.occupancy)
     return min(int(time * slots), slots - 1)
@@ -181,7 +181,9 @@ def sample_range(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> t
     return np.zeros(len(origins), np.float32), np.full(len(origins), scene.mapping.s_end, np.float32)
 
 
-def places(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
+def sample_positions(
+    scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray
+) -> tuple[np.ndarray, ...]:
     """Of samples at s (N, K) on N rays: distance t (N, K), place u (N, K, 3) in the planes, what a step counts (N, K)."""
     if not isinstance(scene.mapping, Contraction):
         size = (scene.aabb[1] - scene.aabb[0]).astype(np.float32)
@@ -205,7 +207,7 @@ def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return out
 
 
-def features(scene: Scene, moment: Moment, u: np.ndarray) -> np.ndarray:
+def features(scene: Scene, moment: SceneAtTime, u: np.ndarray) -> np.ndarray:
     """f at (N, 3) points in [0, 1]^3: (N, F), the product over planes, concatenated over scales (eq. 1 of K-Planes)."""
     if moment.offsets is not None:
         u = displace(u, moment.offsets)
@@ -247,14 +249,14 @@ def direction_basis(decoder: Decoder, directions: np.ndarray, code: np.ndarray) 
     return np.einsum("cfh,nh->ncf", decoder.w2, hidden, optimize=True) + decoder.b2
 
 
-def once_a_ray(decoder: AnyDecoder, directions: np.ndarray, code: np.ndarray) -> np.ndarray:
+def ray_terms(decoder: AnyDecoder, directions: np.ndarray, code: np.ndarray) -> np.ndarray:
     """What `colour` takes of unit directions (N, 3): their basis, or with a hybrid decoder their part of its hidden layer."""
     terms = hidden_layer if isinstance(decoder, HybridDecoder) else direction_basis
     return terms(decoder, directions, code).astype(np.float32)  # type: ignore[arg-type]
 
 
 def colour(decoder: AnyDecoder, f: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """rgb of features (N, F), given `once_a_ray` of their rays: (N, 3). `kpc.format.scene.scene`."""
+    """rgb of features (N, F), given `ray_terms` of their rays: (N, 3). `kpc.format.scene.scene`."""
     if isinstance(decoder, HybridDecoder):
         hidden = np.clip(terms + activations(decoder, f) @ decoder.u.T, 0, ACTIVATION_LIMIT)
         return sigmoid(hidden @ decoder.w2.T + decoder.b2)
@@ -277,13 +279,15 @@ def composite(alphas: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.nda
     return weights, through[np.arange(len(trans)), reached.sum(axis=1)], reached
 
 
-def _march(scene: Scene, moment: Moment, code: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Rendering:
+def _march(
+    scene: Scene, moment: SceneAtTime, code: np.ndarray, origins: np.ndarray, directions: np.ndarray
+) -> Rendering:
     n, path = len(origins), None
     if isinstance(scene.mapping, DeviceCoordinates):
         path = scene.mapping.rays(origins, directions)
         origins, directions = path.origins, path.directions
     near, far = sample_range(scene, origins, directions)
-    terms = once_a_ray(scene.decoder, directions, code)
+    terms = ray_terms(scene.decoder, directions, code)
     rgb, depth = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
     trans, samples = np.ones(n, np.float32), np.zeros(n, np.int32)
     step = np.float32(scene.step)
@@ -292,7 +296,7 @@ def _march(scene: Scene, moment: Moment, code: np.ndarray, origins: np.ndarray, 
     rays, first = np.flatnonzero(near < far), 0
     while len(rays):
         s = near[rays, None] + (np.arange(first, first + STEPS_AT_ONCE, dtype=np.float32) + np.float32(0.5)) * step
-        t, u, stretch = places(scene, origins[rays], directions[rays], s)
+        t, u, stretch = sample_positions(scene, origins[rays], directions[rays], s)
         x, y, z = np.clip((u * cells).astype(np.int32), 0, cells - 1).transpose(2, 0, 1)
         row, column = np.nonzero(moment.occupied[z, y, x] & (s < far[rays, None]))
 

@@ -15,7 +15,7 @@ MOST_CELLS = 8192
 
 
 @dataclass(frozen=True, eq=False)
-class Cover:
+class ScreenMask:
     """Cubes around all that is occupied.
 
     Attributes:
@@ -27,7 +27,7 @@ class Cover:
     reach: float
 
     @staticmethod
-    def of(occupied: np.ndarray, aabb: np.ndarray) -> "Cover":
+    def of(occupied: np.ndarray, aabb: np.ndarray) -> "ScreenMask":
         """Of a (Nz, Ny, Nx) bool grid over a box. What has occupied cells all around is left out: who sees it sees them."""
         cell = (aabb[1] - aabb[0]).astype(np.float64) / occupied.shape[::-1]
         while np.count_nonzero(occupied) > MOST_CELLS:
@@ -35,7 +35,7 @@ class Cover:
         amid = np.pad(occupied, 1)
         shell = occupied & dilate(~amid)[1:-1, 1:-1, 1:-1]
         z, y, x = np.nonzero(shell)
-        return Cover(aabb[0] + cell * (np.stack([x, y, z], axis=-1) + 0.5), float(np.linalg.norm(cell) / 2))
+        return ScreenMask(aabb[0] + cell * (np.stack([x, y, z], axis=-1) + 0.5), float(np.linalg.norm(cell) / 2))
 
     def blocks(self, camera: Camera, side: int) -> np.ndarray | None:
         """(rows, columns) bool of blocks of `side` x `side` pixels, rows from below, the first of which begins with the lowest pixels;

@@ -13,31 +13,31 @@ import numpy as np
 from kpc.format.common.errors import DisplayError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.grid import sample_linear
-from kpc.format.scene.scene import SPACE_PLANES, HybridDecoder, Scene
+from kpc.format.scene.scene import SPACE_PLANES, Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
-from kpc.player.cpu.corner_grid import Baking
-from kpc.player.cpu.cpu_renderer import BLOCK, Marching, probes_of, rehearse
-from kpc.player.cpu.occupancy_culling import Thinning
-from kpc.player.cpu.plane_sampler import Lookup
-from kpc.player.cpu.reference import Part, Rendering, code_of, places, sample_range, slot_at
-from kpc.player.cpu.screen_mask import Cover
-from kpc.player.gl import shader
-from kpc.player.gl.targets import EVERYWHERE, Bounds, Canvas, Target, first_channel, read, read_into, room_on, write
-from kpc.player.gl.textures import (
+from kpc.player.atlas import (
     LARGEST_FLOAT,
     Layout,
-    Rows,
+    TimeRows,
     block_arrays,
     decoder_arrays,
     decoder_shape,
-    distances,
-    filled,
+    empty_distances,
     multiplied,
+    pad_to_multiple,
     planes_shape,
 )
-from kpc.player.quality import LADDER, Quality
+from kpc.player.cpu.corner_grid import CornerGrid
+from kpc.player.cpu.cpu_renderer import BLOCK, Marching, probes_of, rehearse
+from kpc.player.cpu.occupancy_culling import OccupancyCulling
+from kpc.player.cpu.plane_sampler import PlaneSampler
+from kpc.player.cpu.reference import Part, Rendering, appearance_code, occupancy_slot, sample_positions, sample_range
+from kpc.player.cpu.screen_mask import ScreenMask
+from kpc.player.gl import shader
+from kpc.player.gl.targets import EVERYWHERE, Bounds, Canvas, Target, first_channel, read, read_into, room_on, write
+from kpc.player.quality import LEVELS, Quality
 
-REFINED = 2
+FOLDING_UPSAMPLING = 2
 """Texels of a folded plane to one of the scene's, along the folded row. The error of folding falls with its square."""
 PLANES_UNIT, ROWS_UNIT, CELLS_UNIT, MOTION_UNIT = 0, 1, 2, 3
 DOUBTS_UNIT = 4
@@ -83,7 +83,7 @@ CONSTANTS = 8192
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
 
 
-class Look(Enum):
+class DisplayMode(Enum):
     """What to put on the screen."""
 
     COLOUR = 0
@@ -212,7 +212,7 @@ def texels_spanned(scene: Scene, camera: Camera) -> float:
         origins, directions = path.origins, path.directions
     near, far = sample_range(scene, origins, directions)
     along = np.linspace(near.min(), far.max(), PLACES_ALONG, dtype=np.float32)
-    _, u, _ = places(scene, origins, directions, np.tile(along, (4, 1)))
+    _, u, _ = sample_positions(scene, origins, directions, np.tile(along, (4, 1)))
     finest = scene.scales[-1]
     texels = np.array([finest["xy"].shape[1], finest["xy"].shape[0], finest["xz"].shape[0]]) - 1
     seen = ((u > 0) & (u < 1)).all(axis=(0, 2))
@@ -269,7 +269,12 @@ class Renderer:
     """
 
     def __init__(
-        self, ctx: moderngl.Context, scene: Scene, quality: Quality = LADDER["reference"], compute: bool | None = None
+        self,
+        ctx: moderngl.Context,
+        scene: Scene,
+        quality: Quality = LEVELS["reference"],
+        compute: bool | None = None,
+        processor: bool | None = None,
     ) -> None:
         self.ctx = ctx
         self.scene = scene
@@ -278,9 +283,9 @@ class Renderer:
         self._is_software = is_software(ctx)
         self._folds_in_memory = self._is_software
         self._folds_in_half = not self._is_software
-        self.casts = marches_itself(ctx)
-        self._served_by = [kind for kind in (Baking, Lookup) if kind.serves(scene)]
-        self._thins = self._is_software and Thinning.serves(scene)
+        self.casts = marches_itself(ctx) if processor is None else processor
+        self._served_by = [kind for kind in (CornerGrid, PlaneSampler) if kind.serves(scene)]
+        self._thins = self._is_software and OccupancyCulling.serves(scene)
         marching = self._marching_kind(scene.is_dynamic)
         if marching is not None:  # until it is needed there is much else to do, decoding for one
             threading.Thread(target=rehearse, args=(marching, scene), name="rehearsing", daemon=True).start()
@@ -288,12 +293,12 @@ class Renderer:
         self.layout = Layout.of(scene)
         most = ctx.info["GL_MAX_TEXTURE_SIZE"]
         _refuse_too_large(scene, self.layout, ctx.info)
-        finer = Layout.of(scene, REFINED)
+        finer = Layout.of(scene, FOLDING_UPSAMPLING)
         self.folded_layout = finer if max(finer.size) <= most else self.layout
         with room_on(ctx, "the scene"):
             self._planes = _texture(ctx, self.layout.size)
             self._folded: Folded | FoldedInMemory | None = None
-            self._rows = Rows(scene, self.layout) if scene.is_dynamic else None
+            self._rows = TimeRows(scene, self.layout) if scene.is_dynamic else None
             lines, width = self.layout.row_count(), 1 if self._rows is None else self._rows.width
             self._row_texture = _texture(ctx, (width, lines))
             self._motion_texture: moderngl.Texture3D | None = None
@@ -304,7 +309,7 @@ class Renderer:
             self._cells.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._middle, self._finest_texel = scene.aabb.mean(0), scene.extent / _texels_across(scene.scales[-1])
         self._distances: dict[int, np.ndarray] = {}
-        self._covers: dict[int, Cover] = {}
+        self._covers: dict[int, ScreenMask] = {}
         self._view_covered: tuple[object, np.ndarray | None] | None = None
         weights = decoder_arrays(scene.decoder, scene, self.layout)
         if sum(map(len, weights.values())) > CONSTANTS:
@@ -320,9 +325,9 @@ class Renderer:
         self._motion_time: float | None = None
         self._folded_time: float | None = None
         self._is_refined = False
-        self._in_memory: dict[type[Marching | Thinning], Any] = {}
+        self._in_memory: dict[type[Marching | OccupancyCulling], Any] = {}
         """What works on planes in memory, and ..."""
-        self._stale: set[type[Marching | Thinning]] = set()
+        self._stale: set[type[Marching | OccupancyCulling]] = set()
         """... which of it has planes as they were."""
         self._cells_written: np.ndarray | None = None
         self._thinned: tuple[object, np.ndarray] | None = None
@@ -371,29 +376,35 @@ class Renderer:
         self._canvas = None
 
     @property
-    def in_half(self) -> bool:
-        """Whether samples look up float16: planes that were folded on a graphics card."""
+    def _in_half(self) -> bool:
         return self.quality.folded and self._rows is not None and self._folds_in_half
+
+    @property
+    def plane_dtype(self) -> str:
+        """The type of the planes that shaders look up: "f2" of those folded on a graphics card, else "f4"."""
+        return "f2" if self._in_half else "f4"
 
     def _marching_kind(self, moving: bool) -> type[Marching] | None:
         """How a processor marches a picture itself, of what moves or what is static; None where shaders do."""
-        if not self.casts or not self.quality.folded or self.quality.scales is not None:
+        if not self.casts or not self.quality.folded:
             return None
-        kinds = [kind for kind in self._served_by if kind is not Baking or moving and self.quality.baked > 0]
+        kinds = [
+            kind for kind in self._served_by if kind is not CornerGrid or moving and self.quality.grid_termination > 0
+        ]
         return kinds[0] if kinds else None
 
     @property
-    def marched_by(self) -> str:
+    def drawn_by(self) -> str:
         """What marches a picture of what moves, for people to read."""
         by_itself = self._marching_kind(moving=self._rows is not None) is not None
         return "the processor itself" if by_itself else f"{'compute' if self.compute else 'fragment'} shaders"
 
     @property
-    def texels_a_sample(self) -> float:
+    def texels_per_sample(self) -> float:
         """Look-ups in textures of planes and rows that a sample takes, each of four channels with its neighbours; 0 where there are no textures."""
         if self._marching_kind(moving=self._rows is not None) is not None:
             return 0.0
-        layers, shared = self.layout.layers, self._scales_shared()
+        layers, shared = self.layout.layers, 0
         planes = 3 if self.quality.folded or self._rows is None else 6
         return float(planes * sum(count / 2 if scale < shared else count for scale, count in enumerate(layers)))
 
@@ -443,26 +454,26 @@ class Renderer:
         time: float,
         *,
         part: Part = Part.FULL,
-        look: Look = Look.COLOUR,
+        mode: DisplayMode = DisplayMode.COLOUR,
         depths: tuple[float, float] = (0.0, 1.0),
         most_samples: float = 64.0,
         appearance: np.ndarray | None = None,
-        share: float = 1.0,
+        opacity: float = 1.0,
     ) -> None:
         """Draw what `camera` sees over the whole of `screen`, stretched to its size, `appearance` as in `reference.code_of`.
 
-        Depth goes from bright to dark over `depths`, world units; samples up to `most_samples`. Of what `screen` shows, 1 - `share`
+        Depth goes from bright to dark over `depths`, world units; samples up to `most_samples`. Of what `screen` shows, 1 - `opacity`
         remains.
         """
-        if look is Look.OCCUPANCY:
+        if mode is DisplayMode.OCCUPANCY:
             target = self.march(camera, time, part=Part.STATIC, program="cells.glsl", small=True)
         else:
             shown = Part.STATIC if part is Part.STATIC else Part.FULL
             target = self.march(camera, time, part=shown, appearance=appearance, small=True)
-        without, view = target, Look.COLOUR.value if look is Look.OCCUPANCY else look.value
-        if part is Part.DYNAMIC and look is Look.COLOUR:
+        without, view = target, DisplayMode.COLOUR.value if mode is DisplayMode.OCCUPANCY else mode.value
+        if part is Part.DYNAMIC and mode is DisplayMode.COLOUR:
             without, view = self.march(camera, time, part=Part.STATIC, appearance=appearance, small=True), 1
-        bounds = target.drawn if view == Look.COLOUR.value and share == 1 else EVERYWHERE
+        bounds = target.drawn if view == DisplayMode.COLOUR.value and opacity == 1 else EVERYWHERE
         if bounds != EVERYWHERE:
             beyond = 3 / np.array(target.seen.size)  # pixels that its edge, its pixels and those in between reach
             bounds = (*(bounds[:2] - beyond), *(bounds[2:] + beyond))
@@ -477,17 +488,17 @@ class Renderer:
             viewport=tuple(map(float, into.size)),
             depths=depths,
             most_samples=most_samples,
-            share=1.0 if canvas else share,
+            share=1.0 if canvas else opacity,
         )
         target.seen.use(SEEN_UNIT)
         target.met.use(MET_UNIT)
         without.seen.use(WITHOUT_UNIT)
-        self._show_on(into, vertices, bounds, over=not canvas and share < 1)
+        self._show_on(into, vertices, bounds, over=not canvas and opacity < 1)
         if canvas:
             enlarge, vertices = self._program("enlarge.glsl", self.layout)
-            _set(enlarge, shown_small=SEEN_UNIT, viewport=tuple(map(float, screen.size)), share=share)
+            _set(enlarge, shown_small=SEEN_UNIT, viewport=tuple(map(float, screen.size)), share=opacity)
             canvas.shown.use(SEEN_UNIT)
-            self._show_on(screen, vertices, bounds, over=share < 1)
+            self._show_on(screen, vertices, bounds, over=opacity < 1)
 
     def _show_on(
         self, screen: moderngl.Framebuffer, vertices: moderngl.VertexArray, bounds: Bounds, over: bool
@@ -534,7 +545,7 @@ class Renderer:
         elif quality.resolution < 1:
             camera = camera.resized(*(max(1, round(side * quality.resolution)) for side in size))
         marching = self._marching_kind(moving) if program == "march.glsl" else None
-        if marching is Baking:
+        if marching is CornerGrid:
             target = self._march_baked(part, camera, time)
         else:
             target = self._march_planes(part, camera, time, program, appearance, marching)
@@ -553,8 +564,8 @@ class Renderer:
     ) -> Target:
         """A picture for which samples look up planes; it may follow the one before."""
         quality, scene, moving = self.quality, self.scene, part is Part.FULL and self._rows is not None
-        code, thin = code_of(scene, appearance), moving and quality.folded
-        free = self._free_at(slot_at(scene, time), time if thin else None)
+        code, thin = appearance_code(scene, appearance), moving and quality.folded
+        free = self._free_at(occupancy_slot(scene, time), time if thin else None)
         self._marches_to_trial -= 1
         if self._marches_to_trial == 0:
             self.compute = self.is_compute_faster(camera, time)
@@ -566,7 +577,7 @@ class Renderer:
         self._pictures += 1
         before = self._shots.pop((part, raster), None)
         before = before if before is not None and self._pictures - before.count <= LATELY else None
-        if program == "march.glsl" and quality.tolerance:
+        if program == "march.glsl" and quality.reprojection_tolerance:
             return self._followed(draw, part, before, Shot(camera, time, code.tobytes(), quality, self._pictures))
         target = self._target(part, raster)
         if program == "march.glsl":
@@ -590,8 +601,8 @@ class Renderer:
             self._cells.write(free)
             self._cells_written = free
         layout = self.folded_layout if folded else self.layout
-        drawn = min(quality.scales or layout.scales, layout.scales)
-        shared = 0 if isinstance(scene.decoder, HybridDecoder) else min(self._scales_shared(), drawn - 1)
+        drawn = layout.scales
+        shared = 0
         code_vectors, stride = _vectors(code), scene.step * quality.step
 
         def draw(
@@ -682,9 +693,14 @@ class Renderer:
 
     def _march_baked(self, part: Part, camera: Camera, time: float) -> Target:
         """A picture that a processor marches itself, through a grid of what planes come to: all of what may see something."""
-        target, free = self._target(part, (camera.width, camera.height)), self._free_at(slot_at(self.scene, time), None)
+        target, free = (
+            self._target(part, (camera.width, camera.height)),
+            self._free_at(occupancy_slot(self.scene, time), None),
+        )
         self._shots.pop((part, target.seen.size), None)
-        draw = self._by_processor(self._kept(Baking), time, free, np.empty(0, np.float32), self.quality.baked)
+        draw = self._by_processor(
+            self._kept(CornerGrid), time, free, np.empty(0, np.float32), self.quality.grid_termination
+        )
         self._draw_all(draw, part, target, camera)
         return target
 
@@ -736,8 +752,10 @@ class Renderer:
 
     def _draw_alone(self, draw: Callable[..., None], part: Part, target: Target, camera: Camera) -> float:
         """A picture that follows no other. Tells the share of its pixels that were marched, where a processor draws."""
-        spanned = self._texels_spanned(camera) if self.quality.blur else math.inf
-        return self._draw_coarse_to_fine(draw, part, target, camera, spanned, self.quality.blur**2)[0]
+        spanned = self._texels_spanned(camera) if self.quality.interpolation_tolerance else math.inf
+        return self._draw_coarse_to_fine(draw, part, target, camera, spanned, self.quality.interpolation_tolerance**2)[
+            0
+        ]
 
     def _draw_coarse_to_fine(
         self, draw: Callable[..., None], part: Part, target: Target, camera: Camera, spanned: float, bearable: float
@@ -812,7 +830,7 @@ class Renderer:
         probes.met.use(MET_PROBES_UNIT)
         picture.seen.use(SEEN_UNIT)
         doubt, vertices = self._program("doubt.glsl", self.layout, moved=moved)
-        tolerance = shot.quality.tolerance * (MOVED_TOLERANCE if moved else 1.0)
+        tolerance = shot.quality.reprojection_tolerance * (MOVED_TOLERANCE if moved else 1.0)
         _set(doubt, seen_predicted=SEEN_UNIT, tolerance=tolerance, size=tuple(map(float, size)), **common)
         doubts.framebuffer.clear()
         self._draw(doubts.framebuffer, vertices, within=bounds)
@@ -856,11 +874,6 @@ class Renderer:
         self._draw(new.framebuffer, vertices, within=bounds)
         return new
 
-    def _scales_shared(self) -> int:
-        """How many scales, from the coarsest on, have texels that are long enough for two samples to share a look-up."""
-        step = self.quality.step * self.scene.step / self.scene.extent
-        return sum(1 / _texels_across(scale) >= self.quality.share * step for scale in self.scene.scales)
-
     def _resampled(self, marched: Target, target: Target, across: int) -> Target:
         """A picture of one size in another: the mean of `across` rays across a pixel, or stretched."""
         if across == 1:
@@ -899,7 +912,7 @@ class Renderer:
         if not self._is_software or self.scene.mapping is not None or self._slot is None:
             return None
         if self._slot not in self._covers:
-            self._covers[self._slot] = Cover.of(self.scene.occupancy[self._slot], self.scene.aabb)
+            self._covers[self._slot] = ScreenMask.of(self.scene.occupancy[self._slot], self.scene.aabb)
         view = self._slot, camera.width, _lens_of(camera)
         if self._view_covered is None or self._view_covered[0] != view:
             blocks = self._covers[self._slot].blocks(camera, BLOCK)
@@ -911,7 +924,7 @@ class Renderer:
         if self.scene.mapping is not None:
             return 1
         room = math.isqrt(max(1, PIXELS_MARCHED // (camera.width * camera.height)))
-        return max(1, min(math.floor(self._texels_spanned(camera)), self.quality.across, room))
+        return max(1, min(math.floor(self._texels_spanned(camera)), self.quality.rays_across, room))
 
     def _texels_spanned(self, camera: Camera) -> float:
         """By a pixel, of the finest scale: in the middle of the box; where space is mapped, the most along the ray in the picture's middle."""
@@ -1035,18 +1048,18 @@ class Renderer:
     def _free_at(self, slot: int, time: float | None) -> np.ndarray:
         """How far around each cell all is empty: of a slot; at a `time`, 1 in those, too, that `quality` has rays pass by then."""
         self._slot = slot
-        if time is None or not self.quality.thin or not self._thins or self._rows is None:
+        if time is None or not self.quality.culling_alpha or not self._thins or self._rows is None:
             return self._free(slot)
-        key = slot, time, self.quality.thin
+        key = slot, time, self.quality.culling_alpha
         if self._thinned is None or self._thinned[0] != key:
-            empty = self._kept(Thinning).empty(slot, self._rows.at(time), time, self.quality.thin)
+            empty = self._kept(OccupancyCulling).empty(slot, self._rows.at(time), time, self.quality.culling_alpha)
             self._thinned = key, self._free(slot) | empty  # 0 in what is occupied, 1 in what is so and empty
         return self._thinned[1]
 
     def _free(self, slot: int) -> np.ndarray:
         """How far around each cell of a slot all is empty."""
         if slot not in self._distances:
-            self._distances[slot] = distances(self.scene.occupancy[slot])
+            self._distances[slot] = empty_distances(self.scene.occupancy[slot])
         return self._distances[slot]
 
     def _cut(self, time: float) -> None:
@@ -1099,7 +1112,7 @@ class Renderer:
             program,
             refined=PLANES_UNIT,
             refined_texel=tuple(1 / side for side in into.size),
-            largest=LARGEST_HALF if self.in_half else float(LARGEST_FLOAT),
+            largest=LARGEST_HALF if self._in_half else float(LARGEST_FLOAT),
             **more,
         )
         for source, block in zip(self.layout.blocks, self.folded_layout.blocks):
@@ -1179,7 +1192,7 @@ def _set(program: moderngl.Program | moderngl.ComputeShader, **values: object) -
 
 def _vectors(code: np.ndarray) -> list[tuple[float, ...]]:
     """A code as a uniform array of vec4s, padded with 0."""
-    return [tuple(map(float, vector)) for vector in filled(code, 0).reshape(-1, 4)]
+    return [tuple(map(float, vector)) for vector in pad_to_multiple(code, 0).reshape(-1, 4)]
 
 
 def _lens_of(camera: Camera) -> dict[str, object]:

@@ -22,11 +22,11 @@ from kpc.format.container.container import DEFAULT_BUDGET, Reader, RemoteSource,
 from kpc.format.container.partial import PartialScene, adjacent_runs, announce
 from kpc.format.container.scene_io import SceneReader
 from kpc.format.scene.scene import ALL_PLANES, Scene
-from kpc.player.cpu.corner_grid import Baking
-from kpc.player.cpu.occupancy_culling import Thinning
-from kpc.player.cpu.plane_sampler import Lookup
-from kpc.player.gl.renderer import REFINED, Renderer
-from kpc.player.gl.textures import Layout, Rows
+from kpc.player.atlas import Layout, TimeRows
+from kpc.player.cpu.corner_grid import CornerGrid
+from kpc.player.cpu.occupancy_culling import OccupancyCulling
+from kpc.player.cpu.plane_sampler import PlaneSampler
+from kpc.player.gl.renderer import FOLDING_UPSAMPLING, Renderer
 from kpc.player.streaming.prefetch import Playhead, fetch_order, min_segment_bytes, segments_to_keep
 
 RUN_BYTES, RUN_CHUNKS = 1 << 18, 256
@@ -211,10 +211,13 @@ class Stream:
         scene, layout = self.scene, self._layout
         texels = layout.size[0] * layout.size[1]
         if scene.is_dynamic:
-            finer = Layout.of(scene, REFINED)
-            texels += 2 * finer.size[0] * finer.size[1] + (1 + REFINED) * Rows(scene, layout).width * layout.row_count()
-            texels += 2 * layout.size[0] * layout.size[1] if Thinning.serves(scene) else 0
-        marching = sum(kind.bytes_for(scene) for kind in (Baking, Lookup) if kind.serves(scene))
+            finer = Layout.of(scene, FOLDING_UPSAMPLING)
+            texels += (
+                2 * finer.size[0] * finer.size[1]
+                + (1 + FOLDING_UPSAMPLING) * TimeRows(scene, layout).width * layout.row_count()
+            )
+            texels += 2 * layout.size[0] * layout.size[1] if OccupancyCulling.serves(scene) else 0
+        marching = sum(kind.bytes_for(scene) for kind in (CornerGrid, PlaneSampler) if kind.serves(scene))
         largest = max(layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
         motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
         decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw

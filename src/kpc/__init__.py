@@ -57,6 +57,6 @@ def render(
     from kpc.player.cpu import reference
 
     parts = scene.blend_at(time) if appearance is None else [(*scene.at(time), 1.0)]
-    return reference.mixed(
+    return reference.blend(
         [(reference.render(shown, camera, t, appearance=appearance), share) for shown, t, share in parts]
     )

@@ -14,7 +14,7 @@ from kpc.format.container.container import Reader
 from kpc.format.container.groups import GroupedScene, GroupInput, Groups, Span, Timeline
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.cpu import reference
-from kpc.player.cpu.motion_map import dynamic_map
+from kpc.player.cpu.motion_map import motion_colours
 from kpc.player.viewpoints import fit_camera
 from kpc.tools.cli import kpinfo, kpjoin, kprender
 from kpc.tools.cli.serve import Handler, serving
@@ -116,7 +116,7 @@ def test_what_moves_is_told_and_shown_of_the_group_that_shows(clip, scenes, tmp_
         assert kpinfo.main([str(clip), "--group", str(number), "--json"]) == 0
         shares = json.loads(capsys.readouterr().out)["static"]
         alone, camera = kpc.load(scenes[number]), fit_camera(kpc.load(clip).cameras[0], 24, 18)
-        expected = dynamic_map(alone, camera, own, reference.render(alone, camera, own)).rgb
+        expected = motion_colours(alone, camera, own, reference.render(alone, camera, own)).rgb
         assert np.abs(read_image(tmp_path / "map.png") - 255 * np.clip(expected, 0, 1)).max() <= 1
         assert (shares == {"identity_share": 1, "unchanging_share": 1, "still_share": 1}) == (number == 2)
 

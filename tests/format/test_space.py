@@ -10,7 +10,7 @@ from kpc.encoder.field import kernels
 from kpc.encoder.field import render as in_pytorch
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import FAR, MIN_DISPARITY, Contraction, DeviceCoordinates, contract, uncontract
-from kpc.player.cpu.reference import places, render
+from kpc.player.cpu.reference import render, sample_positions
 from scenes import in_device_coordinates, look_at, tiny_scene, with_contraction
 
 AABB = np.array([[-1.0, -0.5, 2.0], [3.0, 1.5, 2.5]])
@@ -79,10 +79,10 @@ def test_every_language_puts_samples_in_the_same_place(even: float) -> None:
     scene = replace(with_contraction(tiny_scene(0)), mapping=Contraction(even))
     origins, directions = (a[::60] for a in scene.cameras[0].rays())
     s = np.linspace(0, scene.mapping.s_end, 50, dtype=np.float32)[None].repeat(len(origins), 0)
-    exact = places(scene, *(a.astype(np.float64) for a in (origins, directions, s)))
+    exact = sample_positions(scene, *(a.astype(np.float64) for a in (origins, directions, s)))
     assert exact[0].max() == pytest.approx(FAR * even) and exact[0].min() == 0
     for name, got in {
-        "numpy": places(scene, origins, directions, s),
+        "numpy": sample_positions(scene, origins, directions, s),
         "torch": _torch(scene, origins, directions, s),
         "kernels": _kernels(scene, origins, directions, s),
     }.items():
@@ -114,7 +114,7 @@ def test_a_step_counts_for_the_density_as_the_derivatives_say() -> None:
     scene = replace(with_contraction(tiny_scene(0)), aabb=aabb, mapping=Contraction(2.0))
     step = 1e-4
     s = (np.arange(int(scene.mapping.s_end / step))[None] + 0.5) * step
-    _, _, stretch = places(scene, np.zeros((1, 3)), np.array([[1.0, 0, 0]]), s)
+    _, _, stretch = sample_positions(scene, np.zeros((1, 3)), np.array([[1.0, 0, 0]]), s)
     # From the middle to 1, then 2 - 1/t up to t = FAR even.
     assert (stretch * step).sum() == pytest.approx(2 - 1 / (2 * FAR), rel=1e-4)
 

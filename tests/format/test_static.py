@@ -11,8 +11,8 @@ from kpc.format.container.scene_io import write
 from kpc.format.scene.scene import TIME_PLANES, Scene
 from kpc.format.scene.static import cells_reading, constant_cells, constant_fraction, static_cells, static_fraction
 from kpc.player.cpu import motion_map, reference
-from kpc.player.cpu.motion_map import dynamic_map, still_share
-from kpc.player.cpu.reference import Moment
+from kpc.player.cpu.motion_map import motion_colours, motionless_share
+from kpc.player.cpu.reference import SceneAtTime
 from kpc.tools.cli import kpinfo
 from scenes import VARIANTS, tiny_scene
 
@@ -56,7 +56,7 @@ def test_kpinfo_tells_the_shares(tmp_path: Path, capsys: pytest.CaptureFixture[s
     write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
     assert kpinfo.main([str(tmp_path / "scene.kpc"), "--json"]) == 0
     shares = json.loads(capsys.readouterr().out)["static"]
-    assert shares["identity_share"] == 0.75 and shares["unchanging_share"] == 0.5 <= shares["still_share"] <= 1
+    assert shares["identity_share"] == 0.75 and shares["unchanging_share"] == 0.5 <= shares["motionless_share"] <= 1
     assert kpinfo.main([str(tmp_path / "scene.kpc")]) == 0
     page = capsys.readouterr().out
     assert "75.0% of the occupied space-time is identity; 50.0% of the occupied space never changes" in page
@@ -84,7 +84,7 @@ def test_only_occupied_cells_count_and_one_that_comes_and_goes_changes() -> None
 def test_scenes_without_time_planes_are_static() -> None:
     scene = tiny_scene(dynamic=False)
     assert static_cells(scene).shape == scene.occupancy.shape
-    assert static_fraction(scene) == constant_fraction(scene) == still_share(scene) == 1
+    assert static_fraction(scene) == constant_fraction(scene) == motionless_share(scene) == 1
 
 
 def test_in_static_cells_features_are_those_of_the_static_scene() -> None:
@@ -100,7 +100,7 @@ def test_in_static_cells_features_are_those_of_the_static_scene() -> None:
         inside = cells[cells[:, 0] == slot][:, 1:]
         u = ((inside + rng.uniform(size=inside.shape)) / shape)[:, ::-1].astype(np.float32)
         for time in (slot + rng.uniform(size=4)) / slots:
-            full, static = Moment.of(scene, time), Moment.of(scene, time, with_motion=False)
+            full, static = SceneAtTime.of(scene, time), SceneAtTime.of(scene, time, with_motion=False)
             assert np.array_equal(reference.features(scene, full, u), reference.features(scene, static, u))
 
 
@@ -133,10 +133,10 @@ def test_the_map_is_grey_where_nothing_moves(space: str) -> None:
     camera = scene.cameras[0]
     for shown, colourful in ((still_scene, False), (scene, True)):
         rendering = reference.render(shown, camera, 0.4)
-        picture = dynamic_map(shown, camera, 0.4, rendering)
+        picture = motion_colours(shown, camera, 0.4, rendering)
         assert picture.depth is rendering.depth and picture.rgb.shape == rendering.rgb.shape
         assert (np.ptp(picture.rgb, axis=2).max() > 0.2) == colourful
-    assert still_share(still_scene) == 1 > still_share(scene)
+    assert motionless_share(still_scene) == 1 > motionless_share(scene)
 
 
 def test_a_share_is_that_of_cells_evenly_spread(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,12 +156,12 @@ def test_the_map_colours_what_moves_while_it_is_there() -> None:
     occupancy[1, :, :, 6:] = False
     scene, camera = replace(scene, occupancy=occupancy), scene.cameras[0]
     rendering = reference.render(scene, camera, 0.2)
-    red = np.ptp(dynamic_map(scene, camera, 0.2, rendering).rgb, axis=2) > 0.1
+    red = np.ptp(motion_colours(scene, camera, 0.2, rendering).rgb, axis=2) > 0.1
     origins, directions = camera.rays()
     sure = (rendering.opacity > 0.99).reshape(-1)
     x = (origins + np.where(sure, rendering.depth.reshape(-1), 0)[:, None] * directions)[sure, 0]
     right = x > scene.aabb[:, 0].mean()
     assert right.any() and not right.all()
     assert red.reshape(-1)[sure][right].mean() > 0.8 and not red.reshape(-1)[sure][~right].any()
-    late = dynamic_map(scene, camera, 0.8, reference.render(scene, camera, 0.8))
+    late = motion_colours(scene, camera, 0.8, reference.render(scene, camera, 0.8))
     assert np.ptp(late.rgb, axis=2).max() < 0.1

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
-from kpc.player.cpu.corner_grid import MOST_CORNERS, Baking, corners_of
+from kpc.player.cpu.corner_grid import MOST_CORNERS, CornerGrid, corners_of
 from kpc.player.cpu.raymarch import BAKED as CORNER_BAKED
-from kpc.player.cpu.reference import Moment, Part, features, render
+from kpc.player.cpu.reference import Part, SceneAtTime, features, render
 from kpc.player.cpu.simd import LARGEST
 from kpc.player.gl.renderer import Renderer
-from kpc.player.quality import LADDER, Quality
+from kpc.player.quality import LEVELS, Quality
 from scenes import (
     VARIANTS,
     linear_per_cell,
@@ -27,16 +27,16 @@ from scenes import (
 )
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
-FOLDED, BAKED = Quality(folded=True), Quality(folded=True, baked=TERMINATION)
+FOLDED, BAKED = Quality(folded=True), Quality(folded=True, grid_termination=TERMINATION)
 
 
-def baking_of(scene: Scene, camera: Camera = CAMERA, time: float = 0.0) -> Baking:
+def baking_of(scene: Scene, camera: Camera = CAMERA, time: float = 0.0) -> CornerGrid:
     """As it is after a picture."""
     renderer = Renderer(gl.context(), scene, BAKED)
     if not renderer.casts:
         pytest.skip("a graphics card, which bakes nothing")
     renderer.march(camera, time)
-    return renderer._kept(Baking)
+    return renderer._kept(CornerGrid)
 
 
 SCENES = {
@@ -56,7 +56,7 @@ def test_corners_hold_what_a_sample_there_finds(make) -> None:
     weights = np.concatenate([decoder.b2, decoder.density_weight[None]]).astype(np.float64)
     for time in (0.0, 0.37, 1.0):
         baking = baking_of(scene, time=time)
-        wanted = features(still, Moment.of(still, time), at.astype(np.float32)) @ weights.T
+        wanted = features(still, SceneAtTime.of(still, time), at.astype(np.float32)) @ weights.T
         wanted[:, 3] += decoder.density_bias
         known = (baking._known & CORNER_BAKED).any(0).reshape(-1)
         # Each of a plane's numbers is off by half a step at most, of 32767 to the largest.
@@ -82,18 +82,18 @@ def test_what_overflows_is_finite() -> None:
         assert np.isfinite(baking.grid).all() and np.abs(baking.grid).max() <= LARGEST
 
 
-@pytest.mark.parametrize("change", [{"step": 2.0}, {"termination": 1 / 16}, {"across": 4}, {"resolution": 0.5}])
+@pytest.mark.parametrize("change", [{"step": 2.0}, {"termination": 1 / 16}, {"rays_across": 4}, {"resolution": 0.5}])
 def test_qualities_mean_what_they_mean_for_planes(change: dict[str, float]) -> None:
     scene = with_motion(
         linear_per_cell(view_independent(tiny_scene(4, scales=1, channels=32, resolution=(90, 80, 70))))
     )
-    camera = look_at((4.8, 2.0, 4.4), (0.1, 0.05, 0.05), 61, 45, 60.0) if "across" in change else CAMERA
-    assert Baking.serves(scene)
+    camera = look_at((4.8, 2.0, 4.4), (0.1, 0.05, 0.05), 61, 45, 60.0) if "rays_across" in change else CAMERA
+    assert CornerGrid.serves(scene)
     renderers = [Renderer(gl.context(), scene, replace(quality, **change)) for quality in (BAKED, FOLDED)]
     renderers[1].casts = False
     if "termination" in change:
-        renderers[0].quality = replace(BAKED, baked=change["termination"])
-    assert renderers[0].rays_across(camera) > 1 or "across" not in change
+        renderers[0].quality = replace(BAKED, grid_termination=change["termination"])
+    assert renderers[0].rays_across(camera) > 1 or "rays_across" not in change
     got, wanted = (renderer.render(camera, 0.6) for renderer in renderers)
     np.testing.assert_allclose(got.rgb, wanted.rgb, atol=2e-3)
     assert np.mean(got.samples == wanted.samples) > 0.99 and wanted.samples.sum() > 100
@@ -104,7 +104,7 @@ def test_pictures_are_near_those_of_the_reference(space: str) -> None:
     """Of a scene of 24 texels, smooth over six. What is exact, or static, looks up planes."""
     scene = VARIANTS[space](view_independent(tiny_scene(4, channels=16)))
     renderer = Renderer(gl.context(), scene, BAKED)
-    assert renderer._marching_kind(moving=True) is (Baking if renderer.casts else None)
+    assert renderer._marching_kind(moving=True) is (CornerGrid if renderer.casts else None)
     for time in (0.1, 0.5, 0.9):
         got, wanted = renderer.render(CAMERA, time), render(scene, CAMERA, time)
         assert -10 * np.log10(np.mean((got.rgb - wanted.rgb) ** 2)) > 40
@@ -113,26 +113,26 @@ def test_pictures_are_near_those_of_the_reference(space: str) -> None:
     np.testing.assert_array_equal(
         still.rgb, Renderer(gl.context(), scene, FOLDED).render(CAMERA, 0.9, part=Part.STATIC).rgb
     )
-    renderer.quality = LADDER["reference"]
-    assert renderer.marched_by == "fragment shaders"
+    renderer.quality = LEVELS["reference"]
+    assert renderer.drawn_by == "fragment shaders"
     exact = renderer.render(CAMERA, 0.9)
-    np.testing.assert_array_equal(exact.rgb, Renderer(gl.context(), scene, LADDER["reference"]).render(CAMERA, 0.9).rgb)
+    np.testing.assert_array_equal(exact.rgb, Renderer(gl.context(), scene, LEVELS["reference"]).render(CAMERA, 0.9).rgb)
 
 
 def test_what_it_takes_is_counted() -> None:
     baking = baking_of(view_independent(tiny_scene(4, channels=16)))
     taken = baking.grid.nbytes + baking._known.nbytes + sum(plane.nbytes for plane in baking._planes)
-    assert taken == Baking.bytes_for(baking._scene) and taken + baking._room.nbytes == baking.memory_bytes
+    assert taken == CornerGrid.bytes_for(baking._scene) and taken + baking._room.nbytes == baking.memory_bytes
 
 
 def test_a_picture_hangs_on_none_before_it() -> None:
     scene = with_motion(view_independent(tiny_scene(4, channels=16)))
-    renderer = Renderer(gl.context(), scene, LADDER["balanced"])
+    renderer = Renderer(gl.context(), scene, LEVELS["balanced"])
     for time in (0.1, 0.11, 0.7, 0.12):
         got = renderer.render(CAMERA, time)
     if not renderer.casts:
         pytest.skip("a graphics card, which bakes nothing")
-    np.testing.assert_array_equal(got.rgb, Renderer(gl.context(), scene, LADDER["balanced"]).render(CAMERA, 0.12).rgb)
+    np.testing.assert_array_equal(got.rgb, Renderer(gl.context(), scene, LEVELS["balanced"]).render(CAMERA, 0.12).rgb)
 
 
 def test_planes_that_arrive_later_count() -> None:
@@ -145,7 +145,7 @@ def test_planes_that_arrive_later_count() -> None:
 
 
 def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
-    assert Baking.serves(view_independent(tiny_scene(channels=16)))
+    assert CornerGrid.serves(view_independent(tiny_scene(channels=16)))
     fine = view_independent(tiny_scene(scales=1, channels=30, resolution=(200, 180, 120)))
     assert np.prod(corners_of(fine)) > MOST_CORNERS
     mapped = [VARIANTS[space](view_independent(tiny_scene(channels=16))) for space in ("ndc", "contracted")]
@@ -157,6 +157,6 @@ def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
         fine,
         VARIANTS["hybrid"](tiny_scene(channels=16)),
     ):
-        assert not Baking.serves(scene)
+        assert not CornerGrid.serves(scene)
         got, wanted = (Renderer(gl.context(), scene, quality).render(CAMERA, 0.5) for quality in (BAKED, FOLDED))
         np.testing.assert_array_equal(got.rgb, wanted.rgb)

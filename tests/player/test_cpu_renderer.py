@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
-from kpc.player.cpu.corner_grid import Baking
+from kpc.player.cpu.corner_grid import CornerGrid
 from kpc.player.cpu.cpu_renderer import in_steps, rehearse
-from kpc.player.cpu.plane_sampler import Lookup
-from kpc.player.cpu.raymarch import _FAST, _within, cast
+from kpc.player.cpu.plane_sampler import PlaneSampler
+from kpc.player.cpu.raymarch import _FAST, _within, march_blocks
 from kpc.player.cpu.reference import Part, render
 from kpc.player.gl.renderer import Renderer
-from kpc.player.quality import LADDER, Quality
+from kpc.player.quality import LEVELS, Quality
 from numba import njit
 from scenes import (
     VARIANTS,
@@ -30,15 +30,15 @@ from scenes import (
 )
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
-FOLDED, BAKED = Quality(folded=True), Quality(folded=True, baked=TERMINATION)
-QUALITY = {Lookup: FOLDED, Baking: BAKED}
+FOLDED, BAKED = Quality(folded=True), Quality(folded=True, grid_termination=TERMINATION)
+QUALITY = {PlaneSampler: FOLDED, CornerGrid: BAKED}
 
 
-def renderer_of(scene: Scene, kind: type = Lookup, quality: Quality | None = None) -> Renderer:
+def renderer_of(scene: Scene, kind: type = PlaneSampler, quality: Quality | None = None) -> Renderer:
     renderer = Renderer(gl.context(), scene, quality or QUALITY[kind])
     if not renderer.casts:
         pytest.skip("a graphics card, which marches everything")
-    assert renderer._marching_kind(scene.is_dynamic) is kind and renderer.marched_by == "the processor itself"
+    assert renderer._marching_kind(scene.is_dynamic) is kind and renderer.drawn_by == "the processor itself"
     return renderer
 
 
@@ -65,13 +65,13 @@ VIEWS = {
 @pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
 @pytest.mark.parametrize(
     "kind, where",
-    [(kind, where) for kind in (Lookup, Baking) for where in ("box", "displaced", "opaque", "fog")]
-    + [(Lookup, "contracted")],
+    [(kind, where) for kind in (PlaneSampler, CornerGrid) for where in ("box", "displaced", "opaque", "fog")]
+    + [(PlaneSampler, "contracted")],
 )
 def test_pictures_are_those_of_the_reference(kind: type, where: str, view: Camera) -> None:
     """Through a grid, where that holds all there is."""
     scene = tiny_scene(4, scales=1, channels=32)
-    scene = linear_per_cell(view_independent(scene)) if kind is Baking else scene
+    scene = linear_per_cell(view_independent(scene)) if kind is CornerGrid else scene
     if where in ("displaced", "contracted"):
         scene = VARIANTS[where](scene)
     elif where == "opaque":
@@ -135,11 +135,13 @@ def test_what_overflows_is_no_crash(value: float) -> None:
     assert np.isfinite(renderer_of(scene).render(CAMERA, 0.3).rgb).all()
 
 
-@pytest.mark.parametrize("kind", [Lookup, Baking])
+@pytest.mark.parametrize("kind", [PlaneSampler, CornerGrid])
 @pytest.mark.parametrize("edges", [(0.0, 1.0, 1.0), (1.0, 1.0, 1e-6)])
 def test_boxes_without_a_volume_show_the_background(edges: tuple[float, float, float], kind: type) -> None:
     scene = with_motion(tiny_scene(4, channels=16))
-    scene = replace(view_independent(scene) if kind is Baking else scene, aabb=np.array([[0, 0, 0], edges], np.float32))
+    scene = replace(
+        view_independent(scene) if kind is CornerGrid else scene, aabb=np.array([[0, 0, 0], edges], np.float32)
+    )
     for camera in (CAMERA, look_at((0.0, 0.0, 0.0), (1.0, 0.4, 0.3), 33, 21, 30.0)):
         got = renderer_of(scene, kind).render(camera, 1.0)
         assert np.isfinite(got.rgb).all() and np.abs(got.rgb - scene.background).max() < 0.02
@@ -154,12 +156,12 @@ def test_planes_are_as_near_as_their_steps() -> None:
     ).all()
 
 
-@pytest.mark.parametrize("rung", ["quick", "balanced", "fine", "finer"])
+@pytest.mark.parametrize("rung", ["fast", "balanced", "fine", "finer"])
 @pytest.mark.parametrize("space", ["box", "displaced", "contracted"])
 def test_rungs_are_as_near_as_by_shaders(rung: str, space: str) -> None:
     """While the clip plays, too."""
     scene, camera = VARIANTS[space](tiny_scene(4, channels=16)), CAMERA.resized(160, 120)
-    by_shaders, itself = Renderer(gl.context(), scene, LADDER[rung]), renderer_of(scene, quality=LADDER[rung])
+    by_shaders, itself = Renderer(gl.context(), scene, LEVELS[rung]), renderer_of(scene, quality=LEVELS[rung])
     by_shaders.casts = False
     for time in (0.4, 0.41, 0.42, 0.43):
         wanted = render(scene, camera, time).rgb
@@ -168,18 +170,17 @@ def test_rungs_are_as_near_as_by_shaders(rung: str, space: str) -> None:
 
 
 def test_scenes_that_it_would_not_serve_are_marched_by_shaders() -> None:
-    assert Lookup.serves(tiny_scene()) and Lookup.serves(tiny_scene(dynamic=False))
+    assert PlaneSampler.serves(tiny_scene()) and PlaneSampler.serves(tiny_scene(dynamic=False))
     for space in ("ndc", "hybrid"):
         scene = VARIANTS[space](tiny_scene(4))
         renderer = Renderer(gl.context(), scene, FOLDED)
-        assert not Lookup.serves(scene) and renderer.marched_by.endswith("shaders")
+        assert not PlaneSampler.serves(scene) and renderer.drawn_by.endswith("shaders")
         assert np.isfinite(renderer.render(CAMERA, 0.5).rgb).all()
     scene = tiny_scene(4)
-    for quality in (LADDER["reference"], Quality(folded=True, scales=1)):
-        renderer = Renderer(gl.context(), scene, quality)
-        assert renderer.marched_by == "fragment shaders"
-        renderer.render(CAMERA, 0.5)
-        assert not renderer._in_memory
+    renderer = Renderer(gl.context(), scene, LEVELS["reference"])
+    assert renderer.drawn_by == "fragment shaders"
+    renderer.render(CAMERA, 0.5)
+    assert not renderer._in_memory
 
 
 def test_planes_that_arrive_later_count() -> None:
@@ -196,18 +197,24 @@ def test_what_it_takes_is_counted() -> None:
         renderer = renderer_of(scene := make())
         before = renderer.memory_bytes
         renderer.render(CAMERA, 0.5)
-        lookup = renderer._kept(Lookup)
+        lookup = renderer._kept(PlaneSampler)
         taken = lookup._planes.nbytes + lookup._rows.nbytes + lookup._seen_from.nbytes
-        assert taken == Lookup.bytes_for(scene) or not scene.decoder.w2.any() and taken < Lookup.bytes_for(scene)
-        assert renderer.memory_bytes >= before + lookup.memory_bytes >= Lookup.bytes_for(scene) + lookup._room.nbytes
+        assert (
+            taken == PlaneSampler.bytes_for(scene)
+            or not scene.decoder.w2.any()
+            and taken < PlaneSampler.bytes_for(scene)
+        )
+        assert (
+            renderer.memory_bytes >= before + lookup.memory_bytes >= PlaneSampler.bytes_for(scene) + lookup._room.nbytes
+        )
 
 
-@pytest.mark.parametrize("kind", [Lookup, Baking])
+@pytest.mark.parametrize("kind", [PlaneSampler, CornerGrid])
 def test_what_is_rehearsed_is_what_pictures_need(kind: type) -> None:
     """Whether or not anything is displaced, colours have sides or something moves."""
-    for scene in [make() for make in SCENES.values()] if kind is Lookup else [unequal_scales(), one_texel_deep()]:
+    for scene in [make() for make in SCENES.values()] if kind is PlaneSampler else [unequal_scales(), one_texel_deep()]:
         rehearse(kind, scene)
-        before = list(cast.signatures)
+        before = list(march_blocks.signatures)
         for shown in (scene, with_motion(scene)) if scene.is_dynamic else (scene,):
             renderer_of(shown, kind).render(CAMERA, 0.3)
-        assert cast.signatures == before
+        assert march_blocks.signatures == before

@@ -6,12 +6,12 @@ import gl
 import numpy as np
 import pytest
 from kpc.format.scene.scene import Scene
-from kpc.player.cpu.occupancy_culling import Thinning
-from kpc.player.cpu.reference import Moment, Part, features, render, slot_at
+from kpc.player.atlas import Layout, TimeRows
+from kpc.player.cpu.occupancy_culling import OccupancyCulling
+from kpc.player.cpu.reference import Part, SceneAtTime, features, occupancy_slot, render
 from kpc.player.gl import renderer as module
 from kpc.player.gl.renderer import Renderer
-from kpc.player.gl.textures import Layout, Rows
-from kpc.player.quality import LADDER, Quality
+from kpc.player.quality import LEVELS, Quality
 from scenes import VARIANTS, look_at, stream_planes, tiny_scene, with_motion, without_planes
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
@@ -26,9 +26,9 @@ def moving(channels: int = 8, resolution: tuple[int, int, int] = (24, 20, 16)) -
     )
 
 
-def thinning_of(scene: Scene) -> Thinning:
+def thinning_of(scene: Scene) -> OccupancyCulling:
     renderer = Renderer(gl.context(), scene, FOLDED)
-    return renderer._kept(Thinning)
+    return renderer._kept(OccupancyCulling)
 
 
 @pytest.fixture(autouse=True, params=[False, True], ids=["shaders", "processor"])
@@ -38,7 +38,7 @@ def who_marches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
 
 def densities_of_folded(scene: Scene, places: np.ndarray, time: float) -> np.ndarray:
     """The reference's, of a scene whose rows at a time are multiplied into its planes, texel by texel."""
-    moment = Moment.of(scene, time)
+    moment = SceneAtTime.of(scene, time)
     scales = tuple(
         {"xy": scale["xy"] * rows["x"], "xz": scale["xz"] * rows["z"][:, None], "yz": scale["yz"] * rows["y"]}
         for scale, rows in zip(scene.scales, moment.rows, strict=True)
@@ -55,7 +55,7 @@ def densities_of_folded(scene: Scene, places: np.ndarray, time: float) -> np.nda
 )
 def test_densities_are_those_of_folded_planes(scene: Scene) -> None:
     rng, thinning = np.random.default_rng(3), thinning_of(scene)
-    rows = Rows(scene, Layout.of(scene))
+    rows = TimeRows(scene, Layout.of(scene))
     for time in (0.0, 0.37, 1.0):
         places = np.concatenate(
             [rng.random((1 << 16, 3), np.float32), np.eye(3, dtype=np.float32), np.ones((1, 3), np.float32)]
@@ -66,9 +66,9 @@ def test_densities_are_those_of_folded_planes(scene: Scene) -> None:
 
 def test_a_cell_is_empty_whose_corners_are() -> None:
     scene = moving()
-    thinning, rows = thinning_of(scene), Rows(scene, Layout.of(scene))
+    thinning, rows = thinning_of(scene), TimeRows(scene, Layout.of(scene))
     for time in (0.1, 0.2, 0.9):
-        slot = slot_at(scene, time)
+        slot = occupancy_slot(scene, time)
         occupied = scene.occupancy[slot]
         corners = np.argwhere(np.ones([side + 1 for side in occupied.shape], bool))[:, ::-1] / np.array(
             occupied.shape[::-1]
@@ -86,14 +86,17 @@ def test_a_cell_is_empty_whose_corners_are() -> None:
 def test_nothing_is_empty_where_no_density_is_less() -> None:
     scene = moving()
     scene = replace(scene, decoder=replace(scene.decoder, density_bias=-100.0))
-    empty = thinning_of(scene).empty(0, Rows(scene, Layout.of(scene)).at(0.0), 0.0, 1e-12)
+    empty = thinning_of(scene).empty(0, TimeRows(scene, Layout.of(scene)).at(0.0), 0.0, 1e-12)
     assert not empty.any()
 
 
 @pytest.mark.parametrize("space", ["box", "displaced", "ndc"])
 def test_rays_pass_by_what_is_empty_and_pictures_stay(space: str) -> None:
     scene = VARIANTS[space](moving())
-    whole, thin = Renderer(gl.context(), scene, FOLDED), Renderer(gl.context(), scene, replace(FOLDED, thin=1 / 100))
+    whole, thin = (
+        Renderer(gl.context(), scene, FOLDED),
+        Renderer(gl.context(), scene, replace(FOLDED, culling_alpha=1 / 100)),
+    )
     for time in (0.1, 0.5, 0.9):
         wanted, got = whole.render(CAMERA, time), thin.render(CAMERA, time)
         assert got.samples.sum() < 0.9 * wanted.samples.sum()
@@ -103,14 +106,14 @@ def test_rays_pass_by_what_is_empty_and_pictures_stay(space: str) -> None:
         thin.render(CAMERA, 0.9, part=Part.STATIC).samples, whole.render(CAMERA, 0.9, part=Part.STATIC).samples
     )
     thin.render(CAMERA, 0.9)
-    thin.quality = LADDER["reference"]
+    thin.quality = LEVELS["reference"]
     assert np.mean(thin.render(CAMERA, 0.9).samples == render(scene, CAMERA, 0.9).samples) > 0.99
 
 
 def test_planes_that_arrive_later_count() -> None:
     scene = moving()
     early = without_planes(scene)
-    quality = replace(FOLDED, thin=1 / 100)
+    quality = replace(FOLDED, culling_alpha=1 / 100)
     renderer, whole = Renderer(gl.context(), early, quality), Renderer(gl.context(), scene, quality)
     renderer.render(CAMERA, 0.5)
     stream_planes(renderer, early, scene)
@@ -120,9 +123,9 @@ def test_planes_that_arrive_later_count() -> None:
 
 
 def test_scenes_that_it_would_not_serve_keep_their_cells() -> None:
-    assert Thinning.serves(moving())
+    assert OccupancyCulling.serves(moving())
     one_slot = replace(moving(), occupancy=moving().occupancy[:1])
     fine = moving(resolution=(40, 20, 16))  # more than two texels a cell
     for scene in (one_slot, fine, VARIANTS["hybrid"](moving()), VARIANTS["contracted"](moving())):
-        assert not Thinning.serves(scene)
-        Renderer(gl.context(), scene, replace(FOLDED, thin=1 / 100)).render(CAMERA, 0.5)
+        assert not OccupancyCulling.serves(scene)
+        Renderer(gl.context(), scene, replace(FOLDED, culling_alpha=1 / 100)).render(CAMERA, 0.5)

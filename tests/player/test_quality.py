@@ -11,7 +11,7 @@ from kpc.player.cpu.cpu_renderer import probes_of
 from kpc.player.cpu.reference import Part, box_range, render
 from kpc.player.gl import renderer as module
 from kpc.player.gl.renderer import COMPUTE_VERSION, TRIAL_AFTER, Renderer
-from kpc.player.quality import DEFAULT, LADDER, Quality, climbed
+from kpc.player.quality import DEFAULT, LEVELS, Quality, neighbouring_level
 from scenes import VARIANTS, look_at, tiny_scene, with_appearances
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
@@ -28,13 +28,13 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_the_ladder_ends_at_what_the_format_says() -> None:
-    names = list(LADDER)
-    assert LADDER[names[-1]] == Quality() and DEFAULT in names
-    assert [climbed(names[0], n) for n in range(-1, len(names) + 1)] == [names[0], *names, names[-1]]
+    names = list(LEVELS)
+    assert LEVELS[names[-1]] == Quality() and DEFAULT in names
+    assert [neighbouring_level(names[0], n) for n in range(-1, len(names) + 1)] == [names[0], *names, names[-1]]
 
 
 @pytest.mark.parametrize("fault", [{"step": 0.5}, {"step": np.nan}, {"termination": 0.0}, {"termination": 1.0}, {"resolution": 0.0},
-                                   {"resolution": 1.5}, {"scales": 0}, {"across": 0}, {"tolerance": -0.1}, {"tolerance": np.nan}])  # fmt: skip
+                                   {"resolution": 1.5}, {"rays_across": 0}, {"reprojection_tolerance": -0.1}, {"reprojection_tolerance": np.nan}])  # fmt: skip
 def test_settings_that_draw_nothing_are_refused(fault: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(fault))):
         Quality(**fault)  # type: ignore[arg-type]
@@ -44,7 +44,7 @@ def test_settings_that_draw_nothing_are_refused(fault: dict[str, float]) -> None
 def test_every_rung_draws_the_scene_and_the_last_exactly(space: str) -> None:
     scene = VARIANTS[space](tiny_scene(4))
     renderer, wanted = Renderer(gl.context(), scene), render(scene, CAMERA, 0.62)
-    for name, quality in LADDER.items():
+    for name, quality in LEVELS.items():
         renderer.quality = quality
         got = renderer.render(CAMERA, 0.62)
         assert got.rgb.shape == wanted.rgb.shape
@@ -58,11 +58,11 @@ def test_compute_shaders_draw_the_same(space: str) -> None:
         pytest.skip("this OpenGL has no compute shaders")
     camera = CAMERA.resized(61, 43)  # no whole number of work groups
     renderer, pictures = Renderer(ctx, scene), {}
-    bent = LADDER["balanced"]
+    bent = LEVELS["balanced"]
     qualities = {
-        "reference": LADDER["reference"],
-        "fine": replace(LADDER["fine"], blur=0.0),
-        "balanced": replace(bent, blur=0.0),
+        "reference": LEVELS["reference"],
+        "fine": replace(LEVELS["fine"], interpolation_tolerance=0.0),
+        "balanced": replace(bent, interpolation_tolerance=0.0),
         "bent": bent,
     }
     for renderer.compute in (False, True):
@@ -101,7 +101,7 @@ def test_a_card_tries_both_kinds_of_shaders_once_and_keeps_to_the_faster(monkeyp
 
 
 TOLERANCE = 5 / 255
-FOLLOWING = Quality(tolerance=TOLERANCE)
+FOLLOWING = Quality(reprojection_tolerance=TOLERANCE)
 
 
 def played(renderer: Renderer, cameras: list[Camera], times: np.ndarray) -> np.ndarray:
@@ -145,12 +145,12 @@ def test_while_a_clip_plays_only_what_has_changed_is_marched_again(space: str, s
 def test_what_was_seen_from_far_away_is_whole_from_near(rung: str) -> None:
     """Of a picture's targets, as much is shown as was drawn into them."""
     ctx, scene = gl.context(), tiny_scene(4)
-    renderer, shown = Renderer(ctx, scene, LADDER[rung]), []
+    renderer, shown = Renderer(ctx, scene, LEVELS[rung]), []
     far, near = (
         look_at((24.0, 10.0, 22.0), (0.1, 0.05, 0.05), 64, 48, 70.0),
         look_at((0.9, 0.5, 0.8), (0.1, 0.05, 0.05), 64, 48, 40.0),
     )
-    for drawer, cameras in ((renderer, (far, near)), (Renderer(ctx, scene, LADDER[rung]), (near,))):
+    for drawer, cameras in ((renderer, (far, near)), (Renderer(ctx, scene, LEVELS[rung]), (near,))):
         screen = ctx.simple_framebuffer((64, 48), 4)
         for camera in cameras:
             drawer.show(screen, camera, 0.4)
@@ -264,7 +264,7 @@ def test_a_picture_follows_none_of_another_quality_nor_appearance_nor_of_a_scene
         return float(np.abs(got - wanted).max())
 
     assert differs(0.40, dawn) < 1e-5 < differs(0.41, dawn) and differs(0.42, dusk) < 1e-5
-    renderer.quality = replace(FOLLOWING, scales=1)
+    renderer.quality = replace(FOLLOWING, step=2.0)
     renderer.render(CAMERA, 0.43, appearance=dusk)
     renderer.quality = FOLLOWING
     assert differs(0.44, dusk) < 1e-5 < differs(0.45, dusk)
@@ -313,7 +313,7 @@ def test_a_picture_of_some_time_ago_is_not_followed(others: int) -> None:
 
 def test_after_a_jump_only_what_follows_badly_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MOST_DOUBTED", 0.0)
-    renderer = Renderer(gl.context(), tiny_scene(4), LADDER["balanced"])
+    renderer = Renderer(gl.context(), tiny_scene(4), LEVELS["balanced"])
     for time, alone in ((0.1, 0), (0.9, 0), (0.91, module.ALONE_FOR), (0.92, module.ALONE_FOR - 1)):
         renderer.render(CAMERA, time)
         (shot,) = renderer._shots.values()
@@ -342,7 +342,7 @@ def test_compute_shaders_follow_the_same_way() -> None:
 
 def test_steady_playback_makes_nothing_new() -> None:
     ctx, scene = gl.context(), tiny_scene(4)
-    screen, renderer = ctx.simple_framebuffer((64, 48), 4), Renderer(ctx, scene, LADDER[DEFAULT])
+    screen, renderer = ctx.simple_framebuffer((64, 48), 4), Renderer(ctx, scene, LEVELS[DEFAULT])
     for n in range(12):
         renderer.show(screen, CAMERA, 0.4 + n / 100)
         if n == 3:
@@ -353,8 +353,8 @@ def test_steady_playback_makes_nothing_new() -> None:
 @pytest.mark.parametrize("software", [True, False])
 def test_where_all_is_in_doubt_pictures_are_whole_for_a_while(monkeypatch: pytest.MonkeyPatch, software: bool) -> None:
     monkeypatch.setattr(module, "MOST_DOUBTED", 0.0)
-    renderer = Renderer(gl.context(), tiny_scene(4), LADDER["balanced"])
-    whole = Renderer(gl.context(), tiny_scene(4), replace(LADDER["balanced"], tolerance=0.0))
+    renderer = Renderer(gl.context(), tiny_scene(4), LEVELS["balanced"])
+    whole = Renderer(gl.context(), tiny_scene(4), replace(LEVELS["balanced"], reprojection_tolerance=0.0))
     renderer._is_software = whole._is_software = software
     turns = []
     for k in range(2 + 2 * (module.ALONE_FOR + 1)):
@@ -378,7 +378,7 @@ def test_interpolated_pixels_are_off_by_no_more_than_may_be(size: tuple[int, int
     pictures, shares = {}, {}
     blurs = (0.0, 1e-6, 0.002, 0.01, 1.0)
     for blur in blurs:
-        renderer = Renderer(gl.context(), scene, Quality(blur=blur))
+        renderer = Renderer(gl.context(), scene, Quality(interpolation_tolerance=blur))
         renderer._is_software, draw = software, renderer._draw_alone
         renderer._draw_alone = lambda *args, blur=blur, draw=draw: shares.setdefault(blur, draw(*args))
         pictures[blur] = renderer.render(camera, 0.4)
@@ -427,13 +427,16 @@ def test_how_far_blocks_are_off_is_told_by_bends(size: tuple[int, int]) -> None:
 def test_what_was_drawn_before_is_gone() -> None:
     """A processor draws, and empties, only where there is something."""
     scene = tiny_scene(4, resolution=(33, 17, 17))
-    renderer, blurred = Renderer(gl.context(), scene, Quality(tolerance=0.02)), Quality(blur=0.005)
+    renderer, blurred = (
+        Renderer(gl.context(), scene, Quality(reprojection_tolerance=0.02)),
+        Quality(interpolation_tolerance=0.005),
+    )
     for number, away in enumerate(((2.0, 1.0), (-3.0, 4.0), (0.5, -9.0), (6.0, 2.0))):
         camera = look_at((away[0], away[1], 3.0), (0.1 * number - 0.2, 0.0, 0.0), 96, 64, 70.0)
-        for quality in (blurred, Quality(tolerance=0.02), blurred):
+        for quality in (blurred, Quality(reprojection_tolerance=0.02), blurred):
             renderer.quality = quality
             for time in (0.3, 0.31):
-                alone = Renderer(gl.context(), scene, replace(quality, tolerance=0.0))
+                alone = Renderer(gl.context(), scene, replace(quality, reprojection_tolerance=0.0))
                 alone._covered = lambda camera: None  # all of the picture
                 assert psnr(renderer.render(camera, time).rgb, alone.render(camera, time).rgb) > (
                     60 if quality is blurred else 40
@@ -456,7 +459,11 @@ def test_what_was_drawn_before_is_gone() -> None:
 def test_each_texel_is_met_by_a_ray() -> None:
     """A picture with less than a ray a texel goes before none."""
     scene = tiny_scene(4, resolution=(33, 17, 17))
-    renderer, texel, middle = Renderer(gl.context(), scene, Quality(blur=2.0)), scene.extent / 32, scene.aabb.mean(0)
+    renderer, texel, middle = (
+        Renderer(gl.context(), scene, Quality(interpolation_tolerance=2.0)),
+        scene.extent / 32,
+        scene.aabb.mean(0),
+    )
     for texels, coarser in ((0.51, 0), (0.49, 1), (0.26, 1), (0.24, 2)):
         camera = look_at(tuple(middle + np.array([0, 0, 100 * texels * texel])), tuple(middle), 64, 48, 70.0)
         renderer.render(replace(camera, fl_x=100.0, fl_y=100.0), 0.5)
@@ -467,7 +474,10 @@ def test_each_texel_is_met_by_a_ray() -> None:
 @pytest.mark.parametrize("space", ["contracted", "ndc"])
 def test_where_space_is_mapped_texels_are_counted_along_a_ray(space: str) -> None:
     scene = VARIANTS[space](tiny_scene(4))
-    renderer, whole = Renderer(gl.context(), scene, Quality(blur=0.0005)), Renderer(gl.context(), scene)
+    renderer, whole = (
+        Renderer(gl.context(), scene, Quality(interpolation_tolerance=0.0005)),
+        Renderer(gl.context(), scene),
+    )
     once, twice = (module.texels_spanned(scene, CAMERA.resized(64 * k, 48 * k)) for k in (1, 2))
     assert 0.1 < once < 0.5 and twice == pytest.approx(once / 2, rel=0.01)  # tiny scenes have 8 to 12 texels across
     camera = CAMERA.resized(128, 96)
@@ -487,7 +497,7 @@ def test_what_is_far_away_is_a_mean_of_rays(compute: bool) -> None:
     many = render(scene, camera.resized(32 * 12, 24 * 12), 0.62).rgb.reshape(24, 12, 32, 12, 3).mean((1, 3))
     errors = {}
     for across in (1, 2, 4):
-        renderer = Renderer(ctx, scene, Quality(across=across))
+        renderer = Renderer(ctx, scene, Quality(rays_across=across))
         renderer.compute = compute
         assert renderer.rays_across(camera) == across
         errors[across] = np.abs(renderer.render(camera, 0.62).rgb - many).mean()
@@ -496,7 +506,7 @@ def test_what_is_far_away_is_a_mean_of_rays(compute: bool) -> None:
 
 def test_rays_a_pixel_follow_what_it_spans(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tiny_scene(4, resolution=(33, 17, 17))
-    renderer, middle = Renderer(gl.context(), scene, Quality(across=4)), scene.aabb.mean(0)
+    renderer, middle = Renderer(gl.context(), scene, Quality(rays_across=4)), scene.aabb.mean(0)
     texel = scene.extent / 32
     for texels, across in ((0.5, 1), (1.9, 1), (2.1, 2), (3.1, 3), (50, 4)):
         away = 100 * texels * texel  # a pixel is a hundredth of the distance
@@ -508,28 +518,10 @@ def test_rays_a_pixel_follow_what_it_spans(monkeypatch: pytest.MonkeyPatch) -> N
     renderer.quality = Quality()
     assert renderer.rays_across(camera) == 1
     for space in ("contracted", "ndc"):
-        assert Renderer(gl.context(), VARIANTS[space](tiny_scene(4)), Quality(across=4)).rays_across(camera) == 1
+        assert Renderer(gl.context(), VARIANTS[space](tiny_scene(4)), Quality(rays_across=4)).rays_across(camera) == 1
 
 
 # --- shared look-ups, scales, extremes
-
-
-@pytest.mark.parametrize("space", VARIANTS)
-def test_sharing_look_ups_of_coarser_scales_is_close(space: str) -> None:
-    scene = VARIANTS[space](tiny_scene(4, scales=3, resolution=(48, 40, 32)))
-    renderer, wanted = Renderer(gl.context(), scene, Quality(share=2.0)), render(scene, CAMERA, 0.62)
-    got = renderer.render(CAMERA, 0.62)
-    assert renderer._scales_shared() == (1 if space == "contracted" else 2)
-    assert psnr(got.rgb, wanted.rgb) > 45 and np.mean(got.samples == wanted.samples) > 0.98
-
-
-def test_fewer_scales_are_a_coarser_picture() -> None:
-    scene, pictures = tiny_scene(4, scales=3), []
-    for scales in (1, 2, 3, 9, None):
-        pictures.append(Renderer(gl.context(), scene, Quality(scales=scales)).render(CAMERA, 0.62).rgb)
-    one, two, three, *more = pictures
-    assert all(np.array_equal(three, picture) for picture in more)
-    assert min(psnr(one, two), psnr(two, three), psnr(one, three)) < 40
 
 
 def fog(density: float, step: float = 0.04) -> Scene:
@@ -559,7 +551,9 @@ def test_fog_of_any_density_against_float64(density: float, step: float) -> None
         samples = np.ceil((far[0] - near[0]) / step - 0.5)
         left = np.exp(-np.minimum(density, np.exp(20.0)) * step / size.max() * samples)
         for name in ("reference", "finer", "fine", "balanced"):
-            quality = replace(LADDER[name], across=1)  # the ray in the middle of a pixel that sees more than the box
+            quality = replace(
+                LEVELS[name], rays_across=1
+            )  # the ray in the middle of a pixel that sees more than the box
             got = Renderer(gl.context(), scene, quality).render(camera, 0.0).opacity[0, 0]
             error = 1e-6 + samples * 2.0**-22 + density * step / size.max() * left * 2
             expected = 1.0 if quality.termination > TERMINATION and left < quality.termination else 1 - left
@@ -571,7 +565,7 @@ def test_fog_of_any_density_against_float64(density: float, step: float) -> None
 @pytest.mark.parametrize("edges", [(0.0, 1.0, 1.0), (1.0, 1.0, 1e-6)])
 def test_boxes_without_a_volume_show_the_background(edges: tuple[float, float, float]) -> None:
     scene = replace(tiny_scene(4), aabb=np.array([[0, 0, 0], edges], np.float32))
-    for name, quality in LADDER.items():
+    for name, quality in LEVELS.items():
         got = Renderer(gl.context(), scene, quality).render(CAMERA, 1.0)
         assert np.isfinite(got.rgb).all() and np.abs(got.rgb - scene.background).max() < 0.02, name
 
@@ -579,11 +573,11 @@ def test_boxes_without_a_volume_show_the_background(edges: tuple[float, float, f
 def test_folded_planes_in_half_floats_are_near_those_in_floats(monkeypatch: pytest.MonkeyPatch) -> None:
     """On graphics cards; a processor is told here that it is one."""
     ctx, scene = gl.context(), tiny_scene(4)
-    exact = Renderer(ctx, scene, LADDER["finer"])
+    exact = Renderer(ctx, scene, LEVELS["finer"])
     exact.casts = False
     monkeypatch.setattr(module, "is_software", lambda ctx: False)
-    half = Renderer(ctx, scene, LADDER["finer"], compute=False)
-    assert (exact.in_half, half.in_half) == (False, True)
+    half = Renderer(ctx, scene, LEVELS["finer"], compute=False)
+    assert (exact.plane_dtype, half.plane_dtype) == ("f4", "f2")
     wanted, found = exact.render(CAMERA, 0.4).rgb, half.render(CAMERA, 0.4).rgb
     assert half.memory_bytes < exact.memory_bytes and not np.array_equal(found, wanted)
     assert np.abs(found - wanted).max() < 0.01
@@ -591,4 +585,4 @@ def test_folded_planes_in_half_floats_are_near_those_in_floats(monkeypatch: pyte
     bright = replace(
         scene, scales=tuple({name: 1e4 * plane for name, plane in scale.items()} for scale in scene.scales)
     )
-    assert np.isfinite(Renderer(ctx, bright, LADDER["finer"], compute=False).render(CAMERA, 0.4).rgb).all()
+    assert np.isfinite(Renderer(ctx, bright, LEVELS["finer"], compute=False).render(CAMERA, 0.4).rgb).all()

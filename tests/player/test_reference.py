@@ -138,7 +138,7 @@ def test_bilinear_and_linear_meet_texels_at_corners() -> None:
     plane = np.random.default_rng(0).random((4, 6, 3), np.float32)
     u, v = np.meshgrid(np.linspace(0, 1, 6, dtype=np.float32), np.linspace(0, 1, 4, dtype=np.float32))
     assert reference.bilinear(plane, u.ravel(), v.ravel()) == pytest.approx(plane.reshape(-1, 3), abs=1e-6)
-    assert reference.linear(plane[0], np.float32(0.5)) == pytest.approx((plane[0, 2] + plane[0, 3]) / 2)
+    assert reference.sample_linear(plane[0], np.float32(0.5)) == pytest.approx((plane[0, 2] + plane[0, 3]) / 2)
 
 
 def test_compositing_spends_what_there_is() -> None:

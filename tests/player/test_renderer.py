@@ -14,8 +14,8 @@ from kpc.format.container import scene_io
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part, Rendering, render
-from kpc.player.gl.renderer import Look, Renderer
-from kpc.player.quality import LADDER, Quality
+from kpc.player.gl.renderer import DisplayMode, Renderer
+from kpc.player.quality import LEVELS, Quality
 from kpc.player.viewpoints import Rig, fit_camera
 from PIL import Image
 from scenes import VARIANTS, look_at, tiny_scene, with_appearances, with_contraction, with_hybrid_decoder, with_motion
@@ -150,7 +150,7 @@ def test_a_share_of_a_picture_goes_over_what_is_there(share: float) -> None:
     pictures = []
     for scene, part in ((one, 1.0), (other, share)):
         renderer = Renderer(ctx, scene)
-        renderer.show(screen, camera, 0.62, share=part)
+        renderer.show(screen, camera, 0.62, opacity=part)
         pictures.append(renderer.render(camera, 0.62).rgb.clip(0, 1))
     shown = np.frombuffer(screen.read(components=4, alignment=1), np.uint8).reshape(48, 64, 4)[::-1] / 255
     assert np.abs(pictures[0] - pictures[1]).max() > 0.2
@@ -231,9 +231,9 @@ def test_shows_every_look_and_part_on_a_screen_of_another_size(space: str) -> No
     ctx, scene = gl.context(), VARIANTS[space](tiny_scene(4))
     screen = ctx.framebuffer([ctx.texture((70, 50), 4)])
     renderer, pictures = Renderer(ctx, scene), {}
-    for look in Look:
+    for look in DisplayMode:
         for part in Part:
-            renderer.show(screen, CAMERAS["outside"], 0.62, part=part, look=look, depths=(2.0, 4.0), most_samples=20.0)
+            renderer.show(screen, CAMERAS["outside"], 0.62, part=part, mode=look, depths=(2.0, 4.0), most_samples=20.0)
             pictures[look, part] = 255 * shown_on(screen)
     renderer.check()
     for (look, part), picture in pictures.items():
@@ -242,7 +242,7 @@ def test_shows_every_look_and_part_on_a_screen_of_another_size(space: str) -> No
         (render(scene, CAMERAS["outside"].resized(70, 50), 0.62).rgb * 255).astype(np.uint8), np.uint8
     )
     assert (
-        np.mean(np.abs(pictures[Look.COLOUR, Part.FULL].astype(float).ravel() - whole)) < 6
+        np.mean(np.abs(pictures[DisplayMode.COLOUR, Part.FULL].astype(float).ravel() - whole)) < 6
     )  # a stretched, filtered copy
 
 
@@ -346,7 +346,7 @@ def test_conformance_files_are_drawn_at_every_quality(name: str) -> None:
         return
     camera = fit_camera(Rig.of(scene).cameras[0], 32, 24)
     renderer = Renderer(gl.context(), scene)
-    for quality in LADDER.values():
+    for quality in LEVELS.values():
         renderer.quality = quality
         drawn = renderer.render(camera, 0.4)
         assert np.isfinite(drawn.rgb).all()
@@ -377,7 +377,7 @@ def test_a_small_picture_is_enlarged_by_more_than_straight_lines() -> None:
 
     for share in (0.25, 1.0):  # and over what is there
         screens[2].clear(0.2, 0.4, 0.6, 1.0)
-        renderer.show(screens[2], camera, 0.62, share=share)
+        renderer.show(screens[2], camera, 0.62, opacity=share)
         np.testing.assert_allclose(
             shown_on(screens[2]), share * large + (1 - share) * np.array([0.2, 0.4, 0.6]), atol=1.5 / 255
         )

@@ -4,11 +4,11 @@ import gl
 import numpy as np
 import pytest
 from kpc.format.scene.scene import Scene
-from kpc.player.cpu.reference import render, slot_at
-from kpc.player.cpu.screen_mask import MOST_CELLS, Cover
+from kpc.player.cpu.reference import occupancy_slot, render
+from kpc.player.cpu.screen_mask import MOST_CELLS, ScreenMask
 from kpc.player.gl import renderer as renderer_module
 from kpc.player.gl.renderer import Renderer
-from kpc.player.quality import LADDER
+from kpc.player.quality import LEVELS
 from scenes import look_at, tiny_scene, with_hybrid_decoder, with_motion
 
 CAMERAS = {
@@ -30,7 +30,7 @@ def sparse(scene: Scene, share: float, seed: int = 0) -> Scene:
 @pytest.mark.parametrize("share", [0.003, 0.05, 1.0])
 def test_no_ray_of_the_other_blocks_has_a_sample(camera: str, share: float) -> None:
     scene, view, side = sparse(tiny_scene(3), share), CAMERAS[camera], 4
-    blocks = Cover.of(scene.occupancy[slot_at(scene, 0.4)], scene.aabb).blocks(view, side)
+    blocks = ScreenMask.of(scene.occupancy[occupancy_slot(scene, 0.4)], scene.aabb).blocks(view, side)
     assert blocks is not None and blocks.shape == (-(-view.height // side), -(-view.width // side))
     pixels = blocks.repeat(side, 0).repeat(side, 1)[: view.height, : view.width][::-1]
     assert not render(scene, view, 0.4).samples[~pixels].any()
@@ -43,7 +43,7 @@ def test_no_ray_of_the_other_blocks_has_a_sample(camera: str, share: float) -> N
 def test_many_cells_are_covered_by_fewer_cubes() -> None:
     occupied = np.random.default_rng(1).random((70, 61, 83)) < 0.3
     aabb = np.array([[-1.0, -2.0, 0.0], [3.0, 1.0, 2.5]])
-    cover = Cover.of(occupied, aabb)
+    cover = ScreenMask.of(occupied, aabb)
     assert len(cover.centres) <= MOST_CELLS
     cell = (aabb[1] - aabb[0]) / occupied.shape[::-1]
     z, y, x = np.nonzero(occupied)
@@ -62,7 +62,7 @@ def test_many_cells_are_covered_by_fewer_cubes() -> None:
 
 
 def test_nothing_occupied_covers_nothing() -> None:
-    blocks = Cover.of(np.zeros((5, 6, 7), bool), np.array([[0.0, 0, 0], [1, 1, 1]])).blocks(CAMERAS["near"], 4)
+    blocks = ScreenMask.of(np.zeros((5, 6, 7), bool), np.array([[0.0, 0, 0], [1, 1, 1]])).blocks(CAMERAS["near"], 4)
     assert blocks is not None and not blocks.any()
 
 
@@ -70,14 +70,14 @@ def test_from_among_what_is_occupied_all_is_drawn() -> None:
     scene = tiny_scene(3)
     inside = look_at((0.1, 0.05, 0.05), (1.0, 0.0, 0.0), 32, 24, 30.0)
     assert (
-        Cover.of(np.ones((8, 8, 8), bool), scene.aabb).blocks(
+        ScreenMask.of(np.ones((8, 8, 8), bool), scene.aabb).blocks(
             look_at(tuple(scene.aabb[0]), (0.0, 0.0, 0.0), 8, 8, 9.0), 4
         )
         is None
     )
     filled = np.zeros((8, 8, 8), bool)
     filled[3:5, 3:5, 3:5] = True
-    assert Cover.of(filled, scene.aabb).blocks(inside, 4) is None
+    assert ScreenMask.of(filled, scene.aabb).blocks(inside, 4) is None
 
 
 @pytest.mark.parametrize("kind", ["plain", "hybrid", "displaced"])
@@ -89,7 +89,7 @@ def test_pictures_are_the_same(monkeypatch: pytest.MonkeyPatch, kind: str, camer
         pictures = []
         for most_covered in (renderer_module.MOST_COVERED, -1.0):
             monkeypatch.setattr(renderer_module, "MOST_COVERED", most_covered)
-            renderer = Renderer(gl.context(), scene, LADDER[name])
+            renderer = Renderer(gl.context(), scene, LEVELS[name])
             renderer._is_software = True
             pictures.append([renderer.render(view, time) for time in (0.3, 0.31, 0.32, 0.7, 0.7)])
         for one, other in zip(*pictures, strict=True):

@@ -5,8 +5,8 @@ import gl
 import numpy as np
 import pytest
 from kpc.format.common.errors import DisplayError
+from kpc.player.atlas import Layout, block_arrays, decoder_arrays, decoder_shape, planes_shape
 from kpc.player.gl import shader
-from kpc.player.gl.textures import Layout, block_arrays, decoder_arrays, decoder_shape, planes_shape
 from scenes import tiny_scene, with_hybrid_decoder
 
 VERTICES = {"settle.glsl": ["places.glsl"], "march.glsl": ["blocks.glsl", "squares.glsl"]}

@@ -17,7 +17,7 @@ from kpc.format.common.errors import BudgetError
 from kpc.format.container import http
 from kpc.format.container.container import Reader, open_source
 from kpc.format.scene.scene import Scene
-from kpc.player.cpu.corner_grid import Baking
+from kpc.player.cpu.corner_grid import CornerGrid
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import Quality
 from kpc.player.streaming import stream as module
@@ -83,8 +83,8 @@ def test_once_all_is_there_it_is_the_same_picture(
     )
     if space == "baked":
         scene = replace(scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2))
-        quality = Quality(folded=folded, baked=1 / 16)
-        assert Baking.serves(scene)
+        quality = Quality(folded=folded, grid_termination=1 / 16)
+        assert CornerGrid.serves(scene)
     data = coded(scene)
     (tmp_path / "scene.kpc").write_bytes(data)
     whole = kpc.load(data)

@@ -14,7 +14,7 @@ from kpc.encoder.evaluation.ablations import ABLATIONS, effective_ablations
 from kpc.encoder.field.config import PRESETS
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.scene_io import write
-from kpc.player.quality import DEFAULT, LADDER
+from kpc.player.quality import DEFAULT, LEVELS
 from kpc.tools.bench import kpbench, machine_limits, plot, results
 from kpc.tools.bench.provenance import data_hash
 from scenes import tiny_scene
@@ -170,7 +170,7 @@ def test_player_measures_every_quality(tmp_path: Path, capsys: pytest.CaptureFix
     records = results.load([out])
     assert said.out == "" and "within 1/255" in said.err and f"{DEFAULT} (default)" in said.err
     assert [(r["name"], r["settings"]["quality"]) for r in records] == [
-        (name, quality) for name in ("moving", "still") for quality in LADDER
+        (name, quality) for name in ("moving", "still") for quality in LEVELS
     ]  # fmt: skip
     for record in records:
         (run,) = record["repeats"]
@@ -225,7 +225,7 @@ def test_what_was_measured_survives_a_failure(tmp_path: Path, capsys: pytest.Cap
     bad.write_bytes(b"nonsense")
     assert kpbench.main(["player", str(good), str(bad), "--size", "8x6", "--frames", "1"]) == 1
     said = capsys.readouterr()
-    assert [record["name"] for record in json.loads(said.out)] == ["good"] * len(LADDER)
+    assert [record["name"] for record in json.loads(said.out)] == ["good"] * len(LEVELS)
     assert said.err.splitlines()[-1].startswith(f"kpbench: {bad}: ")
 
 

@@ -40,7 +40,7 @@ from kpc.format.common.fidelity import psnr
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
-from kpc.player.quality import DEFAULT, LADDER
+from kpc.player.quality import DEFAULT, LEVELS
 from kpc.tools.bench import results
 from kpc.tools.bench.provenance import commit, data_hash, machine, versions
 from kpc.tools.dev.processes import end_with_parent
@@ -320,8 +320,8 @@ def _player(options: argparse.Namespace, origin: results.Record) -> Iterator[res
         print(f"kpbench: {record['name']}", file=sys.stderr)
         repeats = [_alone(_play_once, job) for _ in range(options.repeats)]  # first: drivers keep compiled shaders
         renderer, accuracy = _alone(_compare, job)
-        for name, quality in LADDER.items():
-            settings = {"quality": name, **asdict(quality), "share": str(quality.share), **common}
+        for name, quality in LEVELS.items():
+            settings = {"quality": name, **asdict(quality), **common}
             yield record | {"seed": None, "renderer": renderer, "settings": settings, "accuracy": accuracy[name],
                             "repeats": [repeat[name] for repeat in repeats]}  # fmt: skip
 
@@ -357,7 +357,7 @@ def _play_once(job: Play) -> dict[str, results.Record]:
 
     renderers, found = {}, {}
     ways = ("fragment", "compute") if tries_compute(ctx) else ("fragment",)
-    for name, quality in LADDER.items():
+    for name, quality in LEVELS.items():
         for way in ways:
             started = clock.perf_counter()
             renderers[name, way] = renderer = Renderer(ctx, scene, quality, compute=way == "compute")
@@ -379,8 +379,8 @@ def _play_once(job: Play) -> dict[str, results.Record]:
         for key, renderer in renderers.items():
             took[key] += [draw(renderer, float(time)) for time in times[first : first + TURN]]
     median = {key: float(np.median(each[WARM_UP:], axis=0)[0]) for key, each in took.items()}
-    best = {name: found[name, min(ways, key=lambda way: median[name, way])] for name in LADDER}
-    for name in LADDER:
+    best = {name: found[name, min(ways, key=lambda way: median[name, way])] for name in LEVELS}
+    for name in LEVELS:
         key = name, best[name]["way"]
         renderer, frame_ms, cpu_ms = renderers[key], *zip(*took[key][WARM_UP:], strict=True)
         renderer.check()
@@ -396,10 +396,12 @@ def _play_once(job: Play) -> dict[str, results.Record]:
             "peak_memory_bytes": peak_memory_bytes(),
         }
         if (
-            renderer.quality.tolerance == 0 and renderer.rays_across(camera) == 1 and renderer.texels_a_sample
+            renderer.quality.reprojection_tolerance == 0
+            and renderer.rays_across(camera) == 1
+            and renderer.texels_per_sample
         ):  # all it shows has been marched for it
-            texels = renderer.texels_a_sample * float(renderer.render(camera, 1.0).samples.sum())
-            peak = texel_rate(ctx, key[1] == "compute", "f2" if renderer.in_half else "f4")
+            texels = renderer.texels_per_sample * float(renderer.render(camera, 1.0).samples.sum())
+            peak = texel_rate(ctx, key[1] == "compute", renderer.plane_dtype)
             best[name] |= {"texels_a_frame": texels, "share_of_texel_rate": texels / (1e-3 * median[key]) / peak}
     return best
 
@@ -410,7 +412,7 @@ def _stream(options: argparse.Namespace, origin: results.Record) -> Iterator[res
 
     for source in options.scenes:
         settings = {"size": "{}x{}".format(*options.size), "rate": streaming_bench.RATE, "delay": streaming_bench.DELAY}
-        job = streaming_bench.Arrival(source, options.size, LADDER[DEFAULT])
+        job = streaming_bench.Arrival(source, options.size, LEVELS[DEFAULT])
         record = _record("stream", source, origin, settings)
         print(f"kpbench: {record['name']}", file=sys.stderr)
         repeats = [_alone(streaming_bench.measure, job) for _ in range(options.repeats)]
@@ -472,16 +474,15 @@ def _compare(job: Play) -> tuple[str, dict[str, results.Record]]:
 
     ctx = offscreen.open_context()
     scene = scene_io.read(job.scene).dequantise()
-    folding, folding_psnr, folding_most = Renderer(ctx, scene, Quality(folded=True)), [], 0.0
-    folding.casts = False  # a processor that marches itself folds nothing
+    folding, folding_psnr, folding_most = Renderer(ctx, scene, Quality(folded=True), processor=False), [], 0.0
     times = _frame_times(scene, LEAD_IN, MIDDLE)
     smaller = min(1.0, (COMPARED / (job.size[0] * job.size[1])) ** 0.5)
     size = round(smaller * job.size[0]), round(smaller * job.size[1])
     common = {"time": MIDDLE, "frames": LEAD_IN, "size": "{}x{}".format(*size)}
-    found: dict[str, results.Record] = {name: dict(common) for name in LADDER}
+    found: dict[str, results.Record] = {name: dict(common) for name in LEVELS}
     for suffix, cameras in (("", [Rig.of(scene).cameras[0]] * LEAD_IN), ("_turning", orbit(scene, 360)[:LEAD_IN])):
-        renderers = {name: Renderer(ctx, scene, quality) for name, quality in LADDER.items()}
-        each: dict[str, list[float]] = {name: [] for name in LADDER}
+        renderers = {name: Renderer(ctx, scene, quality) for name, quality in LEVELS.items()}
+        each: dict[str, list[float]] = {name: [] for name in LEVELS}
         for view, time in zip(cameras, times, strict=True):
             camera = fit_camera(view, *size)
             exact = np.clip(renderers["reference"].render(camera, float(time)).rgb, 0, 1)

@@ -33,7 +33,7 @@ from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, HybridDecoder
 from kpc.format.scene.space import FAR, Contraction, SpaceMapping
 from kpc.format.scene.static import constant_fraction, static_fraction
-from kpc.player.cpu.motion_map import STILL, still_share
+from kpc.player.cpu.motion_map import STILL, motionless_share
 
 NAMES_SHOWN = 8
 CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd", CODEC_SYMBOLS: "rANS", CODEC_MIDPOINTS: "rANS"}
@@ -205,7 +205,7 @@ def _describe_static(scene: QuantisedScene) -> dict[str, float]:
     return {
         "identity_share": static_fraction(decoded),
         "unchanging_share": constant_fraction(decoded),
-        "still_share": still_share(decoded),
+        "motionless_share": motionless_share(decoded),
     }
 
 
@@ -287,7 +287,7 @@ def _page(info: dict[str, Any]) -> str:
         f"  identity    {info['identity_share']:.1%} of the time-plane texels are exactly 1",
         "  static      {identity_share:.1%} of the occupied space-time is identity; {unchanging_share:.1%} of the occupied space "
         "never changes,".format(**info["static"]),
-        f"              about {info['static']['still_share']:.0%} by less than {STILL:g} of white and of full opacity",
+        f"              about {info['static']['motionless_share']:.0%} by less than {STILL:g} of white and of full opacity",
         f"  don't care  {info['dont_care_share']:.1%} of the space-plane texels are not stored",
     ]
     if info["missing_chunks"]:

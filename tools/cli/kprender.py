@@ -32,9 +32,9 @@ from kpc.format.scene.scene import Clip, Scene
 from kpc.format.scene.space import Contraction
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
-from kpc.player.cpu.motion_map import dynamic_map
+from kpc.player.cpu.motion_map import motion_colours
 from kpc.player.cpu.reference import Part, Rendering
-from kpc.player.quality import LADDER
+from kpc.player.quality import LEVELS
 from kpc.player.viewpoints import Rig, fit_camera, orbit
 from PIL import Image, PngImagePlugin
 
@@ -164,7 +164,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--quality",
-        choices=tuple(LADDER),
+        choices=tuple(LEVELS),
         default="reference",
         help="gl: a rung of the player's ladder, from fastest to what the format says exactly (default: %(default)s)",
     )
@@ -259,11 +259,11 @@ def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[View]:
 def _backend(loaded: Scene | GroupedScene, options: argparse.Namespace) -> tuple[Render, str]:
     """How to render, and its name. OpenGL is looked for only where it is wanted."""
     _appearance(loaded.at(0.0)[0], options.appearance)
-    shown = dynamic_map if options.dynamic_map else _as_it_is
+    shown = motion_colours if options.dynamic_map else _as_it_is
     if options.backend == "reference":
 
         def by_reference(camera: Camera, time: float) -> Rendering:
-            return reference.mixed(
+            return reference.blend(
                 [
                     (
                         shown(
@@ -300,11 +300,11 @@ def _backend(loaded: Scene | GroupedScene, options: argparse.Namespace) -> tuple
         for scene, time, share in parts:
             renderer = next((one for one in renderers if one.scene is scene), None)
             if renderer is None:
-                renderers.append(renderer := Renderer(ctx, scene, LADDER[options.quality]))
+                renderers.append(renderer := Renderer(ctx, scene, LEVELS[options.quality]))
             look = _appearance(scene, options.appearance)
             picture = renderer.render(camera, time, part=options.part, appearance=look)
             pictures.append((shown(scene, camera, time, picture), share))
-        return reference.mixed(pictures)
+        return reference.blend(pictures)
 
     return by_graphics, offscreen.describe(ctx)
 

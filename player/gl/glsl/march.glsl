@@ -17,7 +17,7 @@
 #include "decoder.glsl"
 #include "probes.glsl"
 #include "tiles.glsl"
-#include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.gl.textures), as the next
+#include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.atlas), as the next
 #include "plane_blocks"     // blocks, layer_widths, last_texels, layers, first_layers
 
 const float TERMINATION = 1.0 / 1024.0;  // as in kpc.format.scene.scene

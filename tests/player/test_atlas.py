@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES
+from kpc.player.atlas import FARTHEST, Layout, TimeRows, decoder_arrays, empty_distances
 from kpc.player.cpu import reference
-from kpc.player.gl.textures import FARTHEST, Layout, Rows, decoder_arrays, distances
 from scenes import tiny_scene
 
 
@@ -47,7 +47,7 @@ def test_a_refined_layout_has_room_between_texels_along_the_folded_axis() -> Non
 def test_rows_are_the_time_planes_cut() -> None:
     scene = tiny_scene(1, channels=6)
     layout, at = Layout.of(scene), 0.43
-    rows = Rows(scene, layout).at(at)
+    rows = TimeRows(scene, layout).at(at)
     for s, scale in enumerate(scene.scales):
         for axis, name in enumerate(TIME_PLANES):
             size = scale[name].shape[1]
@@ -59,7 +59,7 @@ def test_rows_are_the_time_planes_cut() -> None:
 
 
 def test_refined_rows_are_straight_between_those_of_the_scene() -> None:
-    rows = Rows(scene := tiny_scene(1, channels=6), Layout.of(scene))
+    rows = TimeRows(scene := tiny_scene(1, channels=6), Layout.of(scene))
     whole, finer = rows.at(0.43), rows.at(0.43, 3)
     assert finer.shape == (len(whole), 3 * (rows.width - 1) + 1, 4) and np.array_equal(finer[:, ::3], whole)
     assert finer[:, 4::3] == pytest.approx((2 * whole[:, 1:-1] + whole[:, 2:]) / 3, abs=1e-6)
@@ -67,14 +67,14 @@ def test_refined_rows_are_straight_between_those_of_the_scene() -> None:
 
 def test_a_row_of_ones_stays_exactly_one() -> None:
     scene = tiny_scene(1)
-    rows = Rows(scene, Layout.of(scene)).at(0.777)
+    rows = TimeRows(scene, Layout.of(scene)).at(0.777)
     assert np.mean(rows == 1.0) > 0.5
 
 
 @settings(max_examples=40, deadline=None)
 @given(hnp.arrays(bool, st.tuples(*[st.integers(1, 7)] * 3)))
 def test_distances_are_those_to_the_nearest_occupied_cell(occupied: np.ndarray) -> None:
-    got = distances(occupied)
+    got = empty_distances(occupied)
     cells = np.argwhere(occupied)
     for index in np.ndindex(occupied.shape):
         wanted = np.abs(cells - index).max(axis=1).min() if len(cells) else FARTHEST

@@ -8,7 +8,7 @@ from kpc.format.scene.grid import dilate, sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, AnyDecoder, HybridDecoder, Scene
 from kpc.player.cpu.threads import share_out
 
-FOLDED_AXIS = {"xy": "x", "xz": "z", "yz": "y"}
+FOLDING_AXIS = {"xy": "x", "xz": "z", "yz": "y"}
 """Along which axis of a plane a row is folded into it: each axis once."""
 FARTHEST = 255
 """Distances are stored in a byte."""
@@ -32,7 +32,7 @@ class Block:
     @property
     def upright(self) -> bool:
         """Whether the row that is folded into the plane runs along its rows, else along its columns."""
-        return FOLDED_AXIS[self.plane] == self.plane[1]
+        return FOLDING_AXIS[self.plane] == self.plane[1]
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Layout:
         for s, scale in enumerate(scene.scales):
             for name in SPACE_PLANES:
                 size = {name[1]: scale[name].shape[0], name[0]: scale[name].shape[1]}
-                size[FOLDED_AXIS[name]] = refined * (size[FOLDED_AXIS[name]] - 1) + 1
+                size[FOLDING_AXIS[name]] = refined * (size[FOLDING_AXIS[name]] - 1) + 1
                 shapes.append((s, name, size[name[1]], size[name[0]]))
         area = sum(rows * columns * layers[s] for s, _, rows, columns in shapes)
         width = max(int(np.ceil(np.sqrt(area))), max(columns * layers[s] for s, *_, columns in shapes))
@@ -91,7 +91,7 @@ class Layout:
     def texels(plane: np.ndarray) -> np.ndarray:
         """(rows, layers * columns, 4) float32: a (rows, columns, M) plane as it lies in its block."""
         rows, columns, _ = plane.shape
-        padded = filled(plane.astype(np.float32), 2)
+        padded = pad_to_multiple(plane.astype(np.float32), 2)
         return np.ascontiguousarray(padded.reshape(rows, columns, -1, 4).swapaxes(1, 2)).reshape(rows, -1, 4)
 
     def place(self, block: Block) -> tuple[float, float, float, float]:
@@ -113,7 +113,7 @@ class Layout:
 
     def lines(self, block: Block) -> slice:
         """The lines of the rows' texture that are folded into a block, a layer each."""
-        first = self.first_row("xyz".index(FOLDED_AXIS[block.plane]), block.scale)
+        first = self.first_row("xyz".index(FOLDING_AXIS[block.plane]), block.scale)
         return slice(first, first + self.layers[block.scale])
 
     def row_count(self) -> int:
@@ -124,7 +124,7 @@ class Layout:
         return axis * self.features + self.first_layers[scale]
 
 
-class Rows:
+class TimeRows:
     """The time planes of a scene, ready to be cut: at a time, each is one row along x, y or z.
 
     Bilinear interpolation is separable, so that interpolating in time first, once a frame, loses nothing.
@@ -156,7 +156,7 @@ class Rows:
 
 
 def multiplied(refined: np.ndarray, rows: np.ndarray, layout: Layout, block: Block, room: np.ndarray) -> np.ndarray:
-    """fold.glsl by the processor: a block of a refined atlas, (height, width, 4) float32, times the `Rows` of a time. In `room`, for as many
+    """fold.glsl by the processor: a block of a refined atlas, (height, width, 4) float32, times the `TimeRows` of a time. In `room`, for as many
     numbers."""
     plane, row = refined[layout.part(block)], rows[layout.lines(block)]
     product = room[: plane.size].reshape(plane.shape)
@@ -183,7 +183,7 @@ def _multiply(plane, rows, width, upright, product):
                     product[y, column, channel] = min(max(number, -LARGEST_FLOAT), LARGEST_FLOAT)
 
 
-def distances(occupied: np.ndarray) -> np.ndarray:
+def empty_distances(occupied: np.ndarray) -> np.ndarray:
     """Chebyshev distance of each cell of a (Nz, Ny, Nx) bool grid to the nearest that is set: uint8, at most 255.
 
     A cell at distance D is the middle of a block of 2 D - 1 cells a side in which none is set.
@@ -240,12 +240,12 @@ def decoder_arrays(decoder: AnyDecoder, scene: Scene, layout: Layout) -> dict[st
     arrays = {"density_bias": np.array([decoder.density_bias, 0, 0, 0])}
     if isinstance(decoder, HybridDecoder):
         arrays |= {
-            "from_features": filled(spread(decoder.v), 0),
-            "from_features_bias": filled(decoder.v_bias, 0),
-            "density_weight": filled(decoder.density_weight, 0),
+            "from_features": pad_to_multiple(spread(decoder.v), 0),
+            "from_features_bias": pad_to_multiple(decoder.v_bias, 0),
+            "density_weight": pad_to_multiple(decoder.density_weight, 0),
             "w1": _direction_layer(decoder),
-            "passed_on": filled(filled(decoder.u, 0), 1),
-            "w2": filled(decoder.w2, 1),
+            "passed_on": pad_to_multiple(pad_to_multiple(decoder.u, 0), 1),
+            "w2": pad_to_multiple(decoder.w2, 1),
             "b2": np.append(decoder.b2, 0),
         }
     else:
@@ -273,10 +273,10 @@ def block_arrays(scene: Scene, layout: Layout) -> dict[str, np.ndarray]:
 
 def _direction_layer(decoder: AnyDecoder) -> np.ndarray:
     """w1 and b1, (H, 12), H filled up to a multiple of four."""
-    return filled(np.concatenate([decoder.w1, decoder.b1[:, None], np.zeros((len(decoder.b1), 2))], axis=1), 0)
+    return pad_to_multiple(np.concatenate([decoder.w1, decoder.b1[:, None], np.zeros((len(decoder.b1), 2))], axis=1), 0)
 
 
-def filled(array: np.ndarray, axis: int, multiple: int = 4) -> np.ndarray:
+def pad_to_multiple(array: np.ndarray, axis: int, multiple: int = 4) -> np.ndarray:
     """With zeros added along an axis up to a multiple of four, or of another number; itself where that is so already."""
     if array.shape[axis] % multiple == 0:
         return array
