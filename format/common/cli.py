@@ -1,4 +1,4 @@
-"""What every command shares: errors as one line, Ctrl-C, files written aside and renamed, quantities as words."""
+"""What all commands share: one-line errors and exit codes, atomic file writes, and parsers of option values."""
 
 import argparse
 import contextlib
@@ -15,10 +15,16 @@ from kpc.format.common.errors import KpcError, UsageError
 
 
 def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None = None) -> int:
-    """Call `command(argv)` and turn what it raises into an exit code.
+    """Run a command and turn the exceptions it raises into an exit code and one line on stderr.
 
-    0: done. 1: a KpcError or an error of the operating system that names a file, printed as one line on stderr.
-    2: a usage error. 130: interrupted. Anything else is a bug and is raised on, with its traceback.
+    Args:
+        command: the command, called with its arguments.
+        name: of the program, printed before every error.
+        argv: its arguments; None for those of the process.
+
+    Returns:
+        0 for success; 1 for a KpcError, or an error of the operating system that names a file or a full disk; 2 for a
+        usage error; 130 after Ctrl-C. Any other exception is a bug and is raised with its traceback.
     """
     try:
         command(sys.argv[1:] if argv is None else argv)
@@ -26,15 +32,13 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         return _fail(name, str(error), 2)
     except KpcError as error:
         return _fail(name, str(error), 1)
-    except (
-        KeyboardInterrupt,
-        SystemError,
-    ) as error:  # the latter is what compiled functions make of one that reaches them
+    except (KeyboardInterrupt, SystemError) as error:
+        # A Ctrl-C that arrives inside a compiled function surfaces as a SystemError.
         if not any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):
             raise
         return _fail(name, "interrupted", 130)
     except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output has gone: nothing is left to tell it
+        sys.stderr.close()  # The reader of the output is gone; Python must not complain on exit.
         return 1
     except OSError as error:
         if error.filename is None and error.errno != errno.ENOSPC:
@@ -50,7 +54,7 @@ def add_version_option(parser: argparse.ArgumentParser) -> None:
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception, what caused it, and so on."""
+    """Yield an exception, its cause, the cause of that, and so on."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__
@@ -63,40 +67,40 @@ def _fail(name: str, message: str, code: int) -> int:
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path beside `path`; rename it to `path` on success, delete it on any failure.
+    """Yield a temporary path in the folder of `path`, and rename it to `path` on success or delete it on failure.
 
-    A reader of `path` therefore never sees a half-written file. The temporary keeps the suffix, since writers choose
-    their container by it.
+    A reader of `path` therefore never sees a half-written file. The temporary file keeps the suffix, since writers of
+    images and videos choose the file format by it.
     """
     target = Path(path)
     handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
     os.close(handle)
-    aside = Path(name)
+    temporary = Path(name)
     try:
-        yield aside
+        yield temporary
         umask = os.umask(0)
         os.umask(umask)
-        aside.chmod(0o666 & ~umask)  # mkstemp makes it private
-        os.replace(aside, target)
+        temporary.chmod(0o666 & ~umask)  # mkstemp created it readable by its owner alone
+        os.replace(temporary, target)
     except BaseException:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
 def duration_s(text: str) -> float:
-    """Seconds of "90", "90s", "10m" or "1.5h"."""
+    """Parse a duration such as "90", "90s", "10m" or "1.5h" into seconds."""
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:], None)
     try:
         value = float(text[:-1]) * unit if unit else float(text)
     except ValueError:
         value = -1.0
     if not 0 < value < 1e9:
-        raise argparse.ArgumentTypeError(f"{text!r} is no duration; write 90s, 10m or 1.5h")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a duration; write for example 90s, 10m or 1.5h")
     return value
 
 
 def frame_rate(low: float, high: float) -> Callable[[str], float]:
-    """A parser of pictures a second, from `low` to `high`."""
+    """Return a parser of frame rates from `low` to `high` frames per second."""
 
     def parse(text: str) -> float:
         try:
@@ -111,18 +115,18 @@ def frame_rate(low: float, high: float) -> Callable[[str], float]:
 
 
 def decibels(text: str) -> float:
-    """The number of "0.1" or "0.1dB"."""
+    """Parse a quality loss such as "0.1" or "0.1dB" into decibels."""
     try:
         value = float(text.lower().removesuffix("db"))
     except ValueError:
         value = math.nan
     if not 0 < value < 100:
-        raise argparse.ArgumentTypeError(f"{text!r} is no loss; write 0.1dB")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a loss of quality; write for example 0.1dB")
     return value
 
 
 def byte_count(text: str) -> int:
-    """Bytes of "300000", "300KB" or "2MB", of 1,000 and 1,000,000 bytes."""
+    """Parse a size such as "300000", "300KB" (1 KB = 1,000 bytes) or "2MB" into bytes."""
     number = text.upper().removesuffix("B")
     unit = {"K": 10**3, "M": 10**6}.get(number[-1:], 1)
     try:
@@ -130,20 +134,17 @@ def byte_count(text: str) -> int:
     except ValueError:
         value = math.nan
     if not 1 <= value < 1e12:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size; write 300KB or 2MB")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write for example 300KB or 2MB")
     return int(value)
 
 
 def box_corners(text: str) -> tuple[float, ...]:
-    """The six numbers of "x0,y0,z0,x1,y1,z1"."""
+    """Parse the corners of a box, "x0,y0,z0,x1,y1,z1", into six numbers."""
     try:
         numbers = tuple(float(n) for n in text.split(","))
     except ValueError:
         numbers = ()
-    if (
-        len(numbers) != 6
-        or not all(map(math.isfinite, numbers))
-        or not all(a < b for a, b in zip(numbers[:3], numbers[3:]))
-    ):
+    is_finite = len(numbers) == 6 and all(map(math.isfinite, numbers))
+    if not is_finite or not all(low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
         raise argparse.ArgumentTypeError(f"{text!r} is not x0,y0,z0,x1,y1,z1 with each lower bound below the upper")
     return numbers

@@ -1,4 +1,8 @@
-"""Kernels are compiled when they are first needed, which takes half a minute in all, once: numba keeps them on disk. Says so meanwhile."""
+"""Detection of numba's compilation, to explain the delay when kernels are used for the first time.
+
+Kernels are compiled on first use, about half a minute in all, and numba caches them on disk. Meanwhile a notice is
+printed on terminals.
+"""
 
 import sys
 import threading
@@ -7,30 +11,33 @@ import time
 from numba.core import event
 
 NOTICE = "compiling for this processor, which takes about half a minute, once"
+
+# Seconds of compilation before the notice is due: now and then a single small kernel is missing from the cache.
 NOTICE_AFTER_S = 1.0
-"""Of compiling, until it is worth a word: now and then a small one has been missing."""
 
 
 class CompilationMonitor(event.Listener):
-    """Told by numba when it begins to compile a function and when it is done; one may need another."""
+    """Measures how long numba compiles, and prints NOTICE once on a terminal. Compilations may nest."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._depth = 0
         self._begun = self._spent = 0.0
-        self._told = False
+        self._notified = False
 
     def on_start(self, _: event.Event) -> None:
+        """Record that numba begins to compile a function."""
         with self._lock:
             if self._depth == 0:
                 self._begun = time.monotonic()
             self._depth += 1
-            tells = self.is_compiling and not self._told and sys.stderr is not None and sys.stderr.isatty()
-            self._told |= tells
-        if tells:
+            notify = self.is_compiling and not self._notified and sys.stderr is not None and sys.stderr.isatty()
+            self._notified |= notify
+        if notify:
             print(NOTICE, file=sys.stderr)
 
     def on_end(self, _: event.Event) -> None:
+        """Record that numba is done with a function."""
         with self._lock:
             self._depth -= 1
             if self._depth == 0:
@@ -38,14 +45,14 @@ class CompilationMonitor(event.Listener):
 
     @property
     def is_compiling(self) -> bool:
-        """Whether compiling goes on, and has taken LEAST_S already."""
+        """Whether numba is compiling and has spent at least NOTICE_AFTER_S on it so far."""
         return self._depth > 0 and self._spent + time.monotonic() - self._begun >= NOTICE_AFTER_S
 
 
+# Monitors this process, from the import of `kpc.format.coding.rans` on.
 MONITOR = CompilationMonitor()
-"""What this process compiles, from the import of `kpc.format.coding.rans` on."""
 
 
 def register() -> None:
-    """Have numba tell WATCH."""
+    """Have numba report its compilations to MONITOR."""
     event.register("numba:compile", MONITOR)

@@ -1,29 +1,29 @@
-"""Everything KPC raises on purpose.
+"""Every error that KPC raises on purpose.
 
     KpcError
-     ├─ UsageError      the command line asks for something that makes no sense (exit code 2)
-     ├─ DatasetError    a folder of videos or images cannot be used
-     ├─ MediaError      ffmpeg, an image or a video failed
-     ├─ FormatError     a .kpc file is damaged, hostile or of an unknown version
-     │   └─ BudgetError   it would need more memory than the reader was given
-     ├─ NetworkError    a server does not give what it should
-     │   ├─ UnreachableError   it cannot be reached, or breaks off again and again; it may do so no longer
-     │   └─ InterruptedRead    what was being read is not wanted so soon any more; nothing is wrong
-     ├─ TrainingError   training cannot start or go on
-     └─ DisplayError    no OpenGL, or no window to be had
-         └─ ContextLostError   the graphics card was reset, and all that it held is gone
+     ├─ UsageError               the command line or an argument asks for something impossible (exit code 2)
+     ├─ DatasetError             a folder of videos or images cannot be used
+     ├─ MediaError               ffmpeg failed, or an image or video cannot be read or written
+     ├─ FormatError              a .kpc file is damaged, hostile or of an unsupported version
+     │   └─ BudgetError          reading it would need more memory than the reader was given
+     ├─ NetworkError             a server's answer cannot be used
+     │   ├─ UnreachableError     the server cannot be reached, or connections keep breaking off
+     │   └─ InterruptedRead      a read was cancelled in favour of a more urgent one; nothing is wrong
+     ├─ TrainingError            training cannot start or continue
+     └─ DisplayError             there is no OpenGL, or no window can be opened
+         └─ ContextLostError     the graphics card was reset and everything on it is lost
 
-A message is one line: it names the file (or the option) and the remedy. `kpc.format.common.cli.run` alone turns it into a line
-on stderr and an exit code; anything else that is raised is a bug and keeps its traceback.
+A message is one line that names the file or option and the remedy. `kpc.format.common.cli.run` alone prints it and
+chooses the exit code. Any other exception is a bug and keeps its traceback.
 """
 
 
 class KpcError(Exception):
-    """Base of every error KPC raises on purpose."""
+    """Base class of every error that KPC raises on purpose."""
 
 
 class UsageError(KpcError):
-    """The command line asks for something that makes no sense."""
+    """The command line or an argument asks for something impossible."""
 
 
 class DatasetError(KpcError):
@@ -31,36 +31,36 @@ class DatasetError(KpcError):
 
 
 class MediaError(KpcError):
-    """ffmpeg, an image or a video failed."""
+    """ffmpeg failed, or an image or video cannot be read or written."""
 
 
 class FormatError(KpcError):
-    """A .kpc file is damaged, hostile or of an unknown version."""
+    """A .kpc file is damaged, hostile or of an unsupported version."""
 
 
 class BudgetError(FormatError):
-    """A .kpc file would need more memory than the reader was given."""
+    """Reading a .kpc file would need more memory than the reader was given."""
 
 
 class NetworkError(KpcError):
-    """A server does not give what it should."""
+    """A server's answer cannot be used."""
 
 
 class UnreachableError(NetworkError):
-    """A server cannot be reached, or breaks off again and again; it may do so no longer."""
+    """A server cannot be reached, or connections keep breaking off; trying again later may help."""
 
 
 class InterruptedRead(NetworkError):
-    """What was being read is not wanted so soon any more; nothing is wrong."""
+    """A read was cancelled in favour of a more urgent one; nothing is wrong."""
 
 
 class TrainingError(KpcError):
-    """Training cannot start or go on."""
+    """Training cannot start or continue."""
 
 
 class DisplayError(KpcError):
-    """No OpenGL, or no window to be had."""
+    """There is no OpenGL, or no window can be opened."""
 
 
 class ContextLostError(DisplayError):
-    """The graphics card was reset, and all that it held is gone."""
+    """The graphics card was reset and everything on it is lost."""

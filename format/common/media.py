@@ -1,8 +1,8 @@
-"""Videos through ffmpeg, pictures through Pillow and OpenEXR.
+"""Reading and writing of videos (through ffmpeg) and images (through Pillow and OpenEXR).
 
-Colour. Whatever a file's tags say about matrix, range and chroma layout, `read_video` gives R'G'B' in [0, 255]. Where
-the tags are silent, players' custom is followed: limited range, BT.601 below 720 lines and BT.709 from there on. HDR
-transfer curves (PQ, HLG) are refused rather than shown wrong.
+Colour: `read_video` returns R'G'B' in [0, 255] and honours the file's tags for matrix, range and chroma layout. Where
+tags are missing it does as players do: limited range, BT.601 below 720 lines and BT.709 from there on. HDR transfer
+curves (PQ, HLG) are refused, since they would be shown wrong.
 """
 
 import contextlib
@@ -30,19 +30,21 @@ from PIL import Image, UnidentifiedImageError
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 
+# Options of ffmpeg's scale filter for an exact colour conversion.
 _SCALE_FLAGS = "bicubic+accurate_rnd+full_chroma_int+full_chroma_inp"
 
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video's container and first frame say.
+    """Properties of a video, from its container and its stream header.
 
     Attributes:
-        width, height: pixels, after the display rotation that phones write.
+        width, height: pixels, after the display rotation that phones record.
         frame_count: coded frames.
-        fps: frames a second; 29.97 and its like stand for n * 1000/1001 exactly.
-        pix_fmt: ffmpeg's name, e.g. "yuv420p10le".
-        matrix: "bt601", "bt709", "bt2020" or "rgb"; full_range: False for 16..235.
+        fps: frames per second; rates such as 29.97 are exactly n * 1000/1001.
+        pix_fmt: ffmpeg's name of the pixel format, such as "yuv420p10le".
+        matrix: colour matrix, "bt601", "bt709", "bt2020" or "rgb".
+        full_range: whether values use the full range; False for 16..235.
     """
 
     width: int
@@ -56,7 +58,11 @@ class VideoInfo:
 
 @functools.cache
 def ffmpeg_binary() -> str:
-    """The ffmpeg to run: PATH's own, else the one that imageio-ffmpeg brings."""
+    """Return the ffmpeg to run: the one on PATH, else the one that the package imageio-ffmpeg brings.
+
+    Raises:
+        MediaError: there is none.
+    """
     found = shutil.which("ffmpeg")
     if found:
         return found
@@ -69,10 +75,10 @@ def ffmpeg_binary() -> str:
 
 
 def probe(path: str | os.PathLike[str]) -> VideoInfo:
-    """Size, length and colour tags of a video. Its packets are counted, not decoded.
+    """Return a video's size, length and colour tags. Packets are counted, not decoded.
 
     Raises:
-        MediaError: no such file, not a video, damaged, or HDR.
+        MediaError: the file is missing, damaged, not a video, or HDR.
     """
     _require_file(path)
     stream = ffmpeg.input(_url(path)).output("pipe:", format="null", codec="copy", map="0:V:0")
@@ -80,16 +86,16 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
         cmd=ffmpeg_binary()
     )
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
-    said = done.stderr.decode(errors="replace")
-    found = _STREAM.search(said)
+    log = done.stderr.decode(errors="replace")
+    found = _STREAM.search(log)
     counts = re.findall(r"^frame=\s*(\d+)", done.stdout.decode(errors="replace"), re.MULTILINE)
     if done.returncode != 0 or found is None or not counts or int(counts[-1]) == 0:
-        raise MediaError(f"{path}: not a video ffmpeg can read ({_last_words(said)}); encode or copy it anew")
+        raise MediaError(f"{path}: not a video ffmpeg can read ({_main_error(log)}); encode or copy it anew")
     pix_fmt, tags, width, height = found["pix_fmt"], found["tags"] or "", int(found["width"]), int(found["height"])
     if re.search(r"smpte2084|arib-std-b67", tags):
         raise MediaError(f"{path}: HDR video ({tags}); tone-map it to BT.709 first")
-    turned = re.search(r"rotation of (-?\d+)", said[found.end() : _end_of_stream(said, found.end())])
-    if turned and int(turned[1]) % 180 == 90:
+    rotated = re.search(r"rotation of (-?\d+)", log[found.end() : _end_of_stream(log, found.end())])
+    if rotated and int(rotated[1]) % 180 == 90:
         width, height = height, width
     return VideoInfo(
         width,
@@ -105,10 +111,18 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
 def read_video(
     path: str | os.PathLike[str], info: VideoInfo | None = None, limit: int | None = None
 ) -> Iterator[np.ndarray]:
-    """Decode a video: its first `limit` frames, uint8 (height, width, 3), each coded one once whatever its time stamp.
+    """Decode a video, frame by frame. Every coded frame is returned once, whatever its time stamp.
+
+    Args:
+        path: of the video.
+        info: its properties, if `probe` has already been called.
+        limit: the most frames to decode; None for all.
+
+    Yields:
+        (height, width, 3) uint8 R'G'B'.
 
     Raises:
-        MediaError: ffmpeg fails or complains, or the file ends inside a frame.
+        MediaError: ffmpeg fails or reports an error, or the file ends inside a frame.
     """
     info = info or probe(path)
     rgb = info.matrix == "rgb"
@@ -137,20 +151,27 @@ def read_video(
             process.kill()
             process.stdout.close()
             process.wait()
-        said = _read_log(log)
-    if code != 0 or said or data:
-        raise MediaError(f"{path}: does not decode ({_last_words(said)}); encode or copy it anew")
+        message = _read_log(log)
+    if code != 0 or message or data:
+        raise MediaError(f"{path}: does not decode ({_main_error(message)}); encode or copy it anew")
 
 
 def write_video(
     path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float, *, crf: int = 18, pix_fmt: str = "yuv420p"
 ) -> int:
-    """Code uint8 (height, width, 3) frames as H.264, tagged BT.709 limited range; the number of frames written.
+    """Encode frames as H.264, tagged BT.709 limited range, and return the number of frames written.
 
-    An odd size is made even by repeating the last row or column where `pix_fmt` needs it.
+    Where `pix_fmt` subsamples chroma, an odd size is made even by repeating the last row or column.
+
+    Args:
+        path: of the video; its suffix chooses the container.
+        frames: (height, width, 3) uint8 R'G'B'.
+        fps: frames per second.
+        crf: constant rate factor of x264, from 0 (lossless) to 51.
+        pix_fmt: ffmpeg's name of the pixel format.
 
     Raises:
-        MediaError: no frames, frames of different sizes, or ffmpeg fails.
+        MediaError: there are no frames, frames differ in size, or ffmpeg fails.
     """
     frames = iter(frames)
     first = next(frames, None)
@@ -165,8 +186,10 @@ def write_video(
     scaled = raw.filter("scale", flags=_SCALE_FLAGS, out_color_matrix="bt709", out_range="limited")
     tags = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
     count = 0
-    with atomic_write(path) as aside, tempfile.TemporaryFile() as log:
-        stream = scaled.output(_url(aside), vcodec="libx264", crf=crf, pix_fmt=pix_fmt, movflags="+faststart", **tags)
+    with atomic_write(path) as temporary, tempfile.TemporaryFile() as log:
+        stream = scaled.output(
+            _url(temporary), vcodec="libx264", crf=crf, pix_fmt=pix_fmt, movflags="+faststart", **tags
+        )
         command = stream.global_args("-v", "error", "-y").compile(cmd=ffmpeg_binary())
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
         assert process.stdin is not None
@@ -189,13 +212,17 @@ def write_video(
                 process.stdin.close()
         if code != 0:
             raise MediaError(
-                f"{path}: ffmpeg cannot write it ({_last_words(_read_log(log))}); it needs libx264 and free disk space"
+                f"{path}: ffmpeg cannot write it ({_main_error(_read_log(log))}); it needs libx264 and disk space"
             )
     return count
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int, bool]:
-    """Width, height and whether there is an alpha channel, read from a picture's header."""
+    """Return width, height and whether there is an alpha channel, from an image's header.
+
+    Raises:
+        MediaError: as `read_image`.
+    """
     with _image_errors(path):
         if _is_exr(path):
             with OpenEXR.File(os.fspath(path), header_only=True) as exr:
@@ -208,13 +235,16 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int, bool]:
 
 
 def read_image(path: str | os.PathLike[str]) -> np.ndarray:
-    """A PNG, JPEG or EXR as uint8 (height, width, 3), or 4 channels with straight alpha where the file has it.
+    """Read a PNG, JPEG or EXR image.
 
-    An EXIF orientation is not applied: poses and intrinsics belong to the pixels as stored. An EXR holds linear light
-    with associated alpha: its colours are divided by alpha, clipped to [0, 1] and sent through the sRGB curve.
+    An EXIF orientation is not applied, since poses and intrinsics refer to the pixels as stored. An EXR holds linear
+    light with associated alpha: colours are divided by alpha, clipped to [0, 1] and converted by the sRGB curve.
+
+    Returns:
+        (height, width, 3) uint8, or 4 channels with straight alpha if the file has alpha.
 
     Raises:
-        MediaError: the file is missing, damaged or of another kind.
+        MediaError: the file is missing, damaged or of another format.
     """
     with _image_errors(path):
         if _is_exr(path):
@@ -224,20 +254,21 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> None:
-    """Write uint8 (height, width, 3 or 4) as PNG or JPEG, by the suffix."""
-    with atomic_write(path) as aside:
-        Image.fromarray(pixels).save(aside, quality=95)  # of JPEG; PNG knows no such thing
+    """Write a (height, width, 3 or 4) uint8 image as PNG or JPEG, chosen by the suffix."""
+    with atomic_write(path) as temporary:
+        Image.fromarray(pixels).save(temporary, quality=95)  # the quality concerns JPEG only
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
-    """The sRGB transfer curve (IEC 61966-2-1) on values clipped to [0, 1]; NaN counts as 0.
+    """Apply the sRGB transfer curve (IEC 61966-2-1) to values, which are clipped to [0, 1]; NaN counts as 0.
 
-    12.92 x up to 0.0031308, from there on 1.055 x^(1/2.4) - 0.055
+    12.92 x  where x <= 0.0031308,  1.055 x^(1/2.4) - 0.055  elsewhere
     """
     clipped = np.clip(np.nan_to_num(linear), 0.0, 1.0)
     return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * np.power(clipped, 1 / 2.4) - 0.055)
 
 
+# The line of ffmpeg's log that describes a video stream.
 _STREAM = re.compile(
     r"Stream #0:\d+[^\n]*?: Video: (?P<codec>[^\n]*?), (?P<pix_fmt>[a-z][a-z0-9_]*)(?:\((?P<tags>[^)\n]*)\))?"
     r", (?P<width>\d+)x(?P<height>\d+)(?P<rest>(?:(?!attached pic)[^\n])*)$",
@@ -247,16 +278,16 @@ _STREAM = re.compile(
 
 @functools.cache
 def _each_frame_once() -> dict[str, str]:
-    """The option that keeps ffmpeg from dropping or doubling frames to hold a rate; it was renamed in version 5.1."""
-    said = subprocess.run(
+    """Return the option that keeps ffmpeg from dropping or repeating frames; it was renamed in ffmpeg 5.1."""
+    options = subprocess.run(
         [ffmpeg_binary(), "-hide_banner", "-h", "long"], stdin=subprocess.DEVNULL, capture_output=True, check=False
     )
-    return {"fps_mode" if b"-fps_mode" in said.stdout else "vsync": "passthrough"}
+    return {"fps_mode" if b"-fps_mode" in options.stdout else "vsync": "passthrough"}
 
 
-def _end_of_stream(said: str, start: int) -> int:
-    end = said.find("Stream ", start)
-    return len(said) if end < 0 else end
+def _end_of_stream(log: str, start: int) -> int:
+    end = log.find("Stream ", start)
+    return len(log) if end < 0 else end
 
 
 def _fps(rest: str) -> float:
@@ -269,7 +300,7 @@ def _fps(rest: str) -> float:
 
 
 def _matrix(pix_fmt: str, tags: str, height: int) -> str:
-    """The first of "matrix/primaries/transfer" decides; ffmpeg prints one word where all three agree."""
+    """Return the colour matrix, from the first of ffmpeg's "matrix/primaries/transfer" (one word where all agree)."""
     if re.match(r"gbr|rgb|bgr|argb|abgr|pal8|0rgb|0bgr", pix_fmt):
         return "rgb"
     for word in re.split(r",\s*", tags):
@@ -301,7 +332,7 @@ def _image_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     """Turn what Pillow and OpenEXR raise about `path` into a MediaError."""
     _require_file(path)
     try:
-        with warnings.catch_warnings(action="ignore"):  # a large picture is not worth a warning
+        with warnings.catch_warnings(action="ignore"):  # Pillow warns of large images
             yield
     except PermissionError as error:
         raise MediaError(f"{path}: no permission to read it; chmod it or run as its owner") from error
@@ -315,7 +346,7 @@ def _image_errors(path: str | os.PathLike[str]) -> Iterator[None]:
         RuntimeError,
         TypeError,
     ) as error:
-        raise MediaError(f"{path}: not a picture that can be read ({error}); export or copy it anew") from error
+        raise MediaError(f"{path}: not an image that can be read ({error}); export or copy it anew") from error
 
 
 def _is_exr(path: str | os.PathLike[str]) -> bool:
@@ -323,13 +354,17 @@ def _is_exr(path: str | os.PathLike[str]) -> bool:
 
 
 def _require_file(path: str | os.PathLike[str]) -> None:
-    """A pipe or a device would make a reader wait for ever."""
+    """Refuse what is not a regular file: a pipe or device would make a reader wait forever."""
     if not Path(path).is_file():
-        raise MediaError(f"{path}: no such file" if not Path(path).exists() else f"{path}: not a regular file")
+        raise MediaError(
+            f"{path}: no such file; check the path"
+            if not Path(path).exists()
+            else f"{path}: not a regular file; copy it to one"
+        )
 
 
 def _url(path: str | os.PathLike[str]) -> str:
-    """A path that ffmpeg takes for nothing but a file, whatever characters it holds."""
+    """Return a URL that ffmpeg takes for a local file, whatever characters the path contains."""
     return f"file:{Path(path).absolute()}"
 
 
@@ -338,8 +373,9 @@ def _read_log(log: IO[bytes]) -> str:
     return log.read().decode(errors="replace").strip()
 
 
-def _last_words(said: str) -> str:
-    lines = [line.strip() for line in said.splitlines() if line.strip()]
+def _main_error(log: str) -> str:
+    """Return the line of ffmpeg's log that most likely names the error, without its prefix."""
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
     errors = [
         line for line in lines if re.search(r"error|invalid|denied|no such|not found|partial|corrupt|fail", line, re.I)
     ]

@@ -1,4 +1,4 @@
-"""How much memory this process takes."""
+"""Memory use of this process."""
 
 import re
 import sys
@@ -6,12 +6,12 @@ from pathlib import Path
 
 
 def peak_memory_bytes() -> int:
-    """The most memory this process has had resident so far."""
-    try:  # unlike ru_maxrss, not inherited from the process that started this one
+    """Return the largest resident set size of this process so far."""
+    try:  # Unlike ru_maxrss, VmHWM is not inherited from the parent process.
         status = Path("/proc/self/status").read_text()
         return 1024 * int(re.findall(r"^VmHWM:\s*(\d+) kB", status, re.MULTILINE)[0])
     except (OSError, IndexError):
-        import resource  # Unix only
+        import resource  # absent on Windows
 
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak if sys.platform == "darwin" else 1024 * peak

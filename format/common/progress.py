@@ -10,39 +10,47 @@ from tqdm import tqdm
 
 T = TypeVar("T")
 
+# Seconds between two lines where stderr is not a terminal.
 LINE_EVERY_S = 10.0
 
 
 class Progress:
-    """Shows how far a task of `total` units is; used as a context manager, fed by `advance`.
+    """Reports the progress of a task on stderr, as a context manager.
 
-    with Progress("decode", total=300, unit="frame") as progress:
-        progress.advance()
-        progress.note("psnr 27.1")
+        with Progress("decode", total=300, unit="frame") as progress:
+            progress.advance()
+            progress.note("psnr 27.1")
+
+    Args:
+        label: name of the task.
+        total: units of work in all; None if unknown.
+        unit: name of a unit.
+        shown: False to report nothing.
     """
 
     def __init__(self, label: str, total: float | None = None, unit: str = "", *, shown: bool = True) -> None:
         self.label, self.total, self.unit, self.shown = label, total, unit, shown
         self.done, self.text = 0.0, ""
-        self.said = time.monotonic()
+        self.reported_at = time.monotonic()
+        # Units done and the time at the first call of `advance`. The remaining time is estimated from there on, since
+        # before it kernels are compiled and caches filled.
         self.first: tuple[float, float] | None = None
-        """What was done, and when, at the first call of `advance`: before it kernels are compiled and caches filled."""
         self.bar = None
         if shown and sys.stderr.isatty():
             layout = "{l_bar}{bar}| {n:.0f}/{total:.0f} [{elapsed}<{remaining}]{postfix}" if total else None
             self.bar = tqdm(total=total, desc=label, unit=unit or "it", leave=False, file=sys.stderr, bar_format=layout)
 
     def advance(self, count: float = 1) -> None:
-        """`count` more units are done."""
+        """Record that `count` more units are done."""
         self.done += count
         self.first = self.first or (self.done, time.monotonic())
         if self.bar is not None:
             self.bar.update(count)
-        elif self.shown and time.monotonic() - self.said >= LINE_EVERY_S:
-            self._say()
+        elif self.shown and time.monotonic() - self.reported_at >= LINE_EVERY_S:
+            self._print_line()
 
     def note(self, text: str) -> None:
-        """Words to show behind the bar, or at the end of the next line."""
+        """Set the text shown behind the bar, or at the end of the next line."""
         self.text = text
         if self.bar is not None:
             self.bar.set_postfix_str(text, refresh=False)
@@ -56,21 +64,21 @@ class Progress:
         if self.bar is not None:
             self.bar.close()
 
-    def _say(self) -> None:
-        self.said = time.monotonic()
+    def _print_line(self) -> None:
+        self.reported_at = time.monotonic()
         parts = [f"{self.label}: {self.done:.0f}"]
         if self.total:
             parts = [f"{self.label}: {self.done:.0f}/{self.total:.0f} {self.unit}".rstrip()]
-            done, when = self.first or (0.0, self.said)
+            done, when = self.first or (0.0, self.reported_at)
             if self.done > done:
-                parts.append(f"{(self.said - when) * (self.total - self.done) / (self.done - done):.0f} s left")
+                parts.append(f"{(self.reported_at - when) * (self.total - self.done) / (self.done - done):.0f} s left")
         print(", ".join(parts + ([self.text] if self.text else [])), file=sys.stderr, flush=True)
 
 
 def progress(
     items: Iterable[T], label: str, total: int | None = None, unit: str = "", *, shown: bool = True
 ) -> Iterator[T]:
-    """Pass `items` on and show how many have been used."""
+    """Yield `items` and report how many have been consumed; see `Progress` for the other arguments."""
     if total is None and isinstance(items, Sized):
         total = len(items)
     with Progress(label, total, unit, shown=shown) as bar:

@@ -1,7 +1,7 @@
-"""Pinhole cameras and the JSON that lists them.
+"""Pinhole cameras, and the `cameras.json` file that lists views to render.
 
-World: right-handed. Camera: x right, y up, looking along -z (OpenGL). Pixel (i, j) covers [i, i+1] x [j, j+1], row 0 on
-top, so that its centre is (i + 0.5, j + 0.5).
+The world is right-handed. Camera axes follow OpenGL: x right, y up, looking along -z. Pixel (i, j) covers
+[i, i+1] x [j, j+1] with row j = 0 at the top, so its centre is (i + 0.5, j + 0.5).
 """
 
 import json
@@ -15,20 +15,25 @@ import numpy as np
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError
 
-LARGEST_FILE = 1 << 26
-"""Bytes of a camera file: a hundred thousand frames, and some."""
-LARGEST_SIDE = 1 << 16
+# The largest `cameras.json` that is read, in bytes: enough for more than a hundred thousand frames.
+MAX_FILE_BYTES = 1 << 26
+
+# The largest image side that `cameras.json` may name, in pixels.
+MAX_SIDE = 1 << 16
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion.
+    """A pinhole camera without lens distortion.
 
     Attributes:
-        width, height: picture size, pixels.
-        fl_x, fl_y: focal length, pixels.
-        cx, cy: principal point, pixels from the left and top edges.
-        camera_to_world: (4, 4) float64, OpenGL convention.
+        width, height: image size in pixels.
+        fl_x, fl_y: focal lengths in pixels, > 0.
+        cx, cy: principal point in pixels from the left and top edges.
+        camera_to_world: (4, 4) float64 pose, OpenGL convention.
+
+    Raises:
+        DatasetError: a value is out of range or not finite.
     """
 
     width: int
@@ -44,21 +49,24 @@ class Camera:
         if np.shape(self.camera_to_world) != (4, 4):
             raise DatasetError(f"camera: pose has shape {np.shape(self.camera_to_world)}, not 4x4")
         if not all(math.isfinite(n) for n in numbers):
-            raise DatasetError("camera: pose or intrinsics hold NaN or infinity; correct the camera file")
+            raise DatasetError("camera: pose or intrinsics hold NaN or infinity; correct them")
         if self.width < 1 or self.height < 1:
-            raise DatasetError(f"camera: picture size {self.width}x{self.height} is empty")
+            raise DatasetError(f"camera: picture size {self.width}x{self.height} is empty; give at least 1x1")
         if self.fl_x <= 0 or self.fl_y <= 0:
             raise DatasetError(f"camera: focal length {self.fl_x} x {self.fl_y} must be positive")
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same view on another raster; each axis is scaled on its own."""
+        """Return the same view at another image size; each axis is scaled independently."""
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fl_x * sx, self.fl_y * sy, self.cx * sx, self.cy * sy, self.camera_to_world)
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and unit directions of all pixels, row by row: two (height * width, 3) float32 arrays.
+        """Return the rays through all pixel centres, row by row.
 
-        d = normalise(R [(i + 0.5 - cx) / fl_x, -(j + 0.5 - cy) / fl_y, -1])
+            d = normalise(R [(i + 0.5 - cx) / fl_x, -(j + 0.5 - cy) / fl_y, -1])
+
+        Returns:
+            Origins and unit directions in the world, both (height * width, 3) float32.
         """
         i, j = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         local = np.stack([(i - self.cx) / self.fl_x, -(j - self.cy) / self.fl_y, -np.ones_like(i)], axis=-1)
@@ -70,11 +78,13 @@ class Camera:
 
 @dataclass(frozen=True)
 class View:
-    """One picture to take: a camera at a time, and the name of the file that holds (or shall hold) it.
+    """One frame of `cameras.json`: a camera, a time, and the image file that belongs to it.
 
     Attributes:
-        time: [0, 1] over the clip.
-        at_s: when a path through such views passes it, seconds; None: not said.
+        camera: the camera.
+        time: in [0, 1] over the clip.
+        file: name of the image that shows this view, or that rendering it writes.
+        at_s: when a camera path passes through the view, in seconds from its start; None if the file does not say.
     """
 
     camera: Camera
@@ -84,37 +94,42 @@ class View:
 
 
 def load_views(path: str | os.PathLike[str]) -> list[View]:
-    """Read a `cameras.json`: `w h fl_x fl_y cx cy` and `frames`, each of which may override them, and has `transform_matrix`,
-    `time`, `file`, and for paths `at`.
+    """Read the views of a `cameras.json`.
+
+    The document has the intrinsics `w h fl_x fl_y cx cy` and a list `frames`. Each frame has a `transform_matrix` and
+    may have `time`, `file`, `at` (keyframes of a camera path, seconds) and intrinsics that replace those of the
+    document.
 
     Raises:
-        DatasetError: the file is too large, or a key is missing or of the wrong kind; the message names the file and the frame.
+        DatasetError: the file is too large or not JSON, or a key is missing or malformed; the message names the frame.
     """
     with open(path, "rb") as file:
-        content = file.read(LARGEST_FILE + 1)
-    if len(content) > LARGEST_FILE:
-        raise DatasetError(f"{path}: larger than {LARGEST_FILE >> 20} MiB, which no camera file is")
+        content = file.read(MAX_FILE_BYTES + 1)
+    if len(content) > MAX_FILE_BYTES:
+        raise DatasetError(
+            f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, so it is not a camera file; check the path"
+        )
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: not JSON ({error})") from error
-    shots: list[View] = []
+        raise DatasetError(f"{path}: not JSON ({error}); write it anew") from error
+    views: list[View] = []
     try:
         for number, frame in enumerate(document["frames"]):
-            shots.append(_shot({**document, **frame}, number))
+            views.append(_parse_view({**document, **frame}, number))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise DatasetError(f"{path}: frame {len(shots)}: missing or malformed {error}") from error
+        raise DatasetError(f"{path}: frame {len(views)}: missing or malformed {error}; correct the file") from error
     except DatasetError as error:
-        raise DatasetError(f"{path}: frame {len(shots)}: {error}") from error
-    if not shots:
-        raise DatasetError(f"{path}: lists no frames")
-    return shots
+        raise DatasetError(f"{path}: frame {len(views)}: {error}") from error
+    if not views:
+        raise DatasetError(f"{path}: lists no frames; add some")
+    return views
 
 
-def _shot(frame: Mapping[str, Any], number: int) -> View:
+def _parse_view(frame: Mapping[str, Any], number: int) -> View:
     w, h = int(frame["w"]), int(frame["h"])
-    if max(w, h) > LARGEST_SIDE:
-        raise DatasetError(f"a picture of {w}x{h} is too large, at most {LARGEST_SIDE} a side")
+    if max(w, h) > MAX_SIDE:
+        raise DatasetError(f"an image of {w}x{h} is too large; at most {MAX_SIDE} pixels a side are allowed")
     camera = Camera(
         w, h, float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"])),
         float(frame.get("cx", w / 2)), float(frame.get("cy", h / 2)),
@@ -127,17 +142,17 @@ def _shot(frame: Mapping[str, Any], number: int) -> View:
     return View(camera, time, str(frame.get("file", f"{number:04d}.png")), at_s)
 
 
-def save_views(path: str | os.PathLike[str], shots: Sequence[View]) -> None:
-    """Write a `cameras.json` from which `load_views` reads the same again."""
-    shared = _intrinsics(shots[0].camera) if shots else {}
+def save_views(path: str | os.PathLike[str], views: Sequence[View]) -> None:
+    """Write a `cameras.json` that `load_views` reads back unchanged."""
+    shared = _intrinsics(views[0].camera) if views else {}
     frames = []
-    for shot in shots:
-        own = {key: value for key, value in _intrinsics(shot.camera).items() if shared[key] != value}
-        at = {} if shot.at_s is None else {"at": shot.at_s}
-        pose = shot.camera.camera_to_world.tolist()
-        frames.append({"file": shot.file, "time": shot.time, **at, **own, "transform_matrix": pose})
-    with atomic_write(path) as aside:
-        aside.write_text(json.dumps({**shared, "frames": frames}, indent=1))
+    for view in views:
+        own = {key: value for key, value in _intrinsics(view.camera).items() if shared[key] != value}
+        at = {} if view.at_s is None else {"at": view.at_s}
+        pose = view.camera.camera_to_world.tolist()
+        frames.append({"file": view.file, "time": view.time, **at, **own, "transform_matrix": pose})
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps({**shared, "frames": frames}, indent=1))
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:

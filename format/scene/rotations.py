@@ -1,12 +1,19 @@
-"""Rotations as unit quaternions (w, x, y, z), and as matrices."""
+"""Conversion between rotation matrices and unit quaternions (w, x, y, z)."""
 
 import numpy as np
 
 
 def quaternion_of(rotation: np.ndarray) -> np.ndarray:
-    """(..., 4): w x y z of (..., 3, 3) rotations, w >= 0; of a matrix that is nearly one, of the nearest (Bar-Itzhack 2000).
+    """Return the unit quaternions (w, x, y, z), w >= 0, of rotation matrices.
 
-    It is the eigenvector of the largest eigenvalue of a symmetric matrix made of the rotation's entries.
+    The quaternion is the eigenvector with the largest eigenvalue of a symmetric matrix of the rotation's entries
+    (Bar-Itzhack 2000). A matrix that is only nearly a rotation gives the nearest one.
+
+    Args:
+        rotation: (..., 3, 3) float.
+
+    Returns:
+        (..., 4) float64.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(rotation, (-2, -1), (0, 1))
     symmetric = np.array([
@@ -20,7 +27,7 @@ def quaternion_of(rotation: np.ndarray) -> np.ndarray:
 
 
 def rotation_of(quaternion: np.ndarray) -> np.ndarray:
-    """The (3, 3) rotation of (w, x, y, z), of any length but 0."""
+    """Return the (3, 3) rotation matrix of a quaternion (w, x, y, z) of any length but 0."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

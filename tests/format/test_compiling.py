@@ -1,4 +1,4 @@
-"""That kernels are being compiled is said, once it takes a while."""
+"""A notice is printed once compilation takes a while."""
 
 import io
 import sys
@@ -22,59 +22,59 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def started(watch: CompilationMonitor, number: int = 1) -> None:
+def started(monitor: CompilationMonitor, number: int = 1) -> None:
     for _ in range(number):
-        watch.on_start(event.Event("numba:compile", event.EventStatus.START))
+        monitor.on_start(event.Event("numba:compile", event.EventStatus.START))
 
 
-def ended(watch: CompilationMonitor, number: int = 1) -> None:
+def ended(monitor: CompilationMonitor, number: int = 1) -> None:
     for _ in range(number):
-        watch.on_end(event.Event("numba:compile", event.EventStatus.END))
+        monitor.on_end(event.Event("numba:compile", event.EventStatus.END))
 
 
-def test_a_terminal_is_told_once_when_it_takes_a_while(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
-    watch, terminal = CompilationMonitor(), Terminal()
+def test_a_terminal_gets_one_notice_once_compilation_takes_a_while(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, terminal = CompilationMonitor(), Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    started(watch, 2)
-    assert not watch.is_compiling
+    started(monitor, 2)
+    assert not monitor.is_compiling
     clock[0] += 0.9 * NOTICE_AFTER_S
-    ended(watch, 2)
-    assert not watch.is_compiling and terminal.getvalue() == ""
-    clock[0] += 60.0  # in between nothing is compiled
-    started(watch)
-    assert not watch.is_compiling
+    ended(monitor, 2)
+    assert not monitor.is_compiling and terminal.getvalue() == ""
+    clock[0] += 60.0  # idle time does not count
+    started(monitor)
+    assert not monitor.is_compiling
     clock[0] += 0.2 * NOTICE_AFTER_S
-    assert watch.is_compiling
-    started(watch, 2)  # another function that the first needs
-    started(watch)
+    assert monitor.is_compiling
+    started(monitor, 2)  # functions needed by the first
+    started(monitor)
     assert terminal.getvalue() == f"{NOTICE}\n"
-    ended(watch, 4)
-    assert not watch.is_compiling
+    ended(monitor, 4)
+    assert not monitor.is_compiling
 
 
-def test_no_file_is_told(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_printed_into_files(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
     for stream in (io.StringIO(), None):
-        watch = CompilationMonitor()
+        monitor = CompilationMonitor()
         monkeypatch.setattr(sys, "stderr", stream)
-        started(watch)
+        started(monitor)
         clock[0] += 2 * NOTICE_AFTER_S
-        started(watch)
-        assert watch.is_compiling and (stream is None or stream.getvalue() == "")
+        started(monitor)
+        assert monitor.is_compiling and (stream is None or stream.getvalue() == "")
 
 
-def test_numba_tells_what_it_compiles(clock: list[float]) -> None:
+def test_numba_reports_its_compilations(clock: list[float]) -> None:
     import kpc.format.coding.rans  # noqa: F401
 
-    seen, on_start = [], MONITOR.on_start
-    MONITOR.on_start = lambda event: (seen.append(event.kind), on_start(event))
+    kinds, on_start = [], MONITOR.on_start
+    MONITOR.on_start = lambda event: (kinds.append(event.kind), on_start(event))
     try:
         njit(lambda x: x + 1)(1)
     finally:
         del MONITOR.on_start
-    assert "numba:compile" in seen and MONITOR._depth == 0
+    assert "numba:compile" in kinds and MONITOR._depth == 0
 
 
-def test_a_player_that_waits_for_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_player_waiting_for_compilation_shows_the_notice(monkeypatch: pytest.MonkeyPatch) -> None:
     from kpc.player.streaming.stream import Stream
 
     stream = Stream.__new__(Stream)

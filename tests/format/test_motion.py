@@ -12,7 +12,7 @@ from kpc.format.scene.motion import (
     DISPLACEMENT_LIMIT,
     FINEST_STEP,
     QuantisedMotion,
-    _fill,
+    _fill_boxes,
     displace,
     quantise_motion,
     reached_cells,
@@ -119,5 +119,5 @@ def test_nothing_occupied_reaches_nothing_and_no_motion_stays_close() -> None:
 
 def test_boxes_are_filled() -> None:
     grid = np.zeros((3, 4, 5), bool)
-    _fill(grid, np.array([[0, 1, 2], [2, 3, 4]]), np.array([[1, 1, 4], [2, 3, 4]]))
+    _fill_boxes(grid, np.array([[0, 1, 2], [2, 3, 4]]), np.array([[1, 1, 4], [2, 3, 4]]))
     assert grid.sum() == 7 and grid[:2, 1, 2:].all() and grid[2, 3, 4]

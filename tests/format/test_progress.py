@@ -1,4 +1,4 @@
-"""A bar on a terminal, a line every ten seconds elsewhere, nothing when told so."""
+"""A bar on a terminal, a line every ten seconds elsewhere, nothing if hidden."""
 
 import io
 import sys
@@ -33,7 +33,7 @@ def test_lines_every_ten_seconds(clock: Clock, capsys: pytest.CaptureFixture[str
     assert err.splitlines() == ["decode: 20/100 frame, 40 s left, fine", "decode: 40/100 frame, 30 s left, fine"]
 
 
-def test_what_comes_before_the_first_unit_does_not_count(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_time_before_the_first_unit_is_not_extrapolated(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     with Progress("train", 1000) as bar:
         clock.now = 30.0
         bar.advance()
@@ -57,7 +57,7 @@ def test_hidden(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == ""
 
 
-def test_iterable_is_passed_on() -> None:
+def test_items_of_an_iterable_are_yielded() -> None:
     assert list(progress([1, 2, 3], "count")) == [1, 2, 3]
     assert list(progress((k for k in "ab"), "letters", total=2)) == ["a", "b"]
 

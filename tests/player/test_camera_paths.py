@@ -192,7 +192,7 @@ def test_a_camera_file_of_another_kind_is_refused(tmp_path: Path, text: str, wor
 
 
 def test_a_camera_file_without_end_is_not_read_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("kpc.format.scene.cameras.LARGEST_FILE", 1 << 10)
+    monkeypatch.setattr("kpc.format.scene.cameras.MAX_FILE_BYTES", 1 << 10)
     (tmp_path / "big.json").write_text(" " * 2000)
     with pytest.raises(DatasetError, match="larger"):
         load_views(tmp_path / "big.json")
