@@ -32,7 +32,9 @@ def ended(monitor: CompilationMonitor, number: int = 1) -> None:
         monitor.on_end(event.Event("numba:compile", event.EventStatus.END))
 
 
-def test_a_terminal_gets_one_notice_once_compilation_takes_a_while(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_gets_one_notice_once_compilation_takes_a_while(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monitor, terminal = CompilationMonitor(), Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     started(monitor, 2)
