@@ -1,16 +1,19 @@
-"""Long clips: a file of groups, each a scene of its own over some of the clip's frames (spec/kpc-format.md, section 4).
+"""Long clips: files that hold several groups, each a scene over some of the clip's frames (spec/kpc-format.md, section
+4).
 
-    GRUP chunk    a whole .kpc file: one group. Its entry in the index says which frames of the clip those of the scene are.
+    GRUP chunk    a whole .kpc file: one group. Its index entry says which frames of the clip the group covers.
 
-A group is coded, fetched, held and let go as any scene is, with planes, occupancy, motion and decoder of its own; so encoding and
-playing take the memory of a group or two, however long the clip. In the frames that two groups share the picture goes over from one
-to the other: what each misses of the truth is its own, and would be seen to jump.
+Each group has planes, occupancy, motion grid and decoder of its own and is encoded, fetched and released like any
+scene. Encoding and playing therefore take the memory of one or two groups, however long the clip. Over frames that two
+groups share the picture is blended from one to the other, since a hard switch between their different errors would be
+visible.
 
-    groups = Groups("long.kpc")                 a file without groups is one group, itself
-    number, time = groups.timeline.at(0.7)      which group shows, and where in it that is
+    groups = Groups("long.kpc")                    # a file without groups counts as one group
+    number, time = groups.timeline.at(0.7)         # the group shown, and the time in it
     scene = read(groups.open(number)).dequantise()
 """
 
+import itertools
 import os
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -41,21 +44,26 @@ from kpc.format.scene.scene import Clip, Scene
 
 @dataclass(frozen=True)
 class Span:
-    """Frames `start` to `last` of a clip, `count` of them."""
+    """The frames `start` to `last` of a clip, `count` of them."""
 
     start: int
     count: int
 
     @property
     def last(self) -> int:
+        """The last frame, inclusive."""
         return self.start + self.count - 1
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Which frames of a clip each of its groups holds, in their order; the clip begins with the first frame of the first.
+    """Which frames of a clip each of its groups covers.
 
-    Neighbours share frames, or one begins where the other ends.
+    Neighbouring groups share frames, or one begins right after the other ends.
+
+    Attributes:
+        spans: the frames of each group, in order; the clip begins with the first frame of the first group.
+        fps: frames per second.
     """
 
     spans: tuple[Span, ...]
@@ -63,23 +71,25 @@ class Timeline:
 
     @property
     def clip(self) -> Clip:
+        """The time axis of the whole clip."""
         return Clip(self.spans[-1].last - self.spans[0].start + 1, self.fps)
 
     def at(self, time: float) -> tuple[int, float]:
-        """The group that shows at `time`, [0, 1] over the clip, and the time in that group, [0, 1] over its own.
+        """Return the group shown at `time` in [0, 1] over the clip, and the time in [0, 1] within that group.
 
-        One takes over from another in the middle between its own first frame and the other's last.
+        A group takes over in the middle between its first frame and the last frame of the group before it.
         """
         frame = self.spans[0].start + time * (self.clip.frame_count - 1)
-        number = bisect_right(self._takes_over, frame)
+        number = bisect_right(self._switch_frames, frame)
         return number, self.local_time(number, time)
 
     def blend_at(self, time: float) -> list[tuple[int, float, float]]:
-        """What makes the picture at `time`: a group, the time in it, and its share; of one group, or of two amid frames that they share.
+        """Return the (group, time in it, weight) triples blended at `time` in [0, 1] over the clip.
 
-        The share of the later one grows evenly from 0 at the first frame that they share to 1 at the last.
+        There are two of them between shared frames, else one. The weight of the later group grows linearly from 0 at
+        the first shared frame to 1 at the last.
         """
-        number, time_in_it = self.at(time)
+        number, local_time = self.at(time)
         frame = self.spans[0].start + time * (self.clip.frame_count - 1)
         for later in range(max(number, 1), min(number + 2, len(self.spans))):
             first, last = self.spans[later].start, self.spans[later - 1].last
@@ -89,48 +99,48 @@ class Timeline:
                     (later - 1, self.local_time(later - 1, time), 1 - share),
                     (later, self.local_time(later, time), share),
                 ]
-        return [(number, time_in_it, 1.0)]
+        return [(number, local_time, 1.0)]
 
     def local_time(self, number: int, time: float) -> float:
-        """The time in a group at a time of the clip; its first or last where it holds none such."""
+        """Return the time in [0, 1] within a group at a time of the clip, clamped to the frames of the group."""
         span, frame = self.spans[number], self.spans[0].start + time * (self.clip.frame_count - 1)
         return min(max((frame - span.start) / (span.count - 1), 0.0), 1.0) if span.count > 1 else 0.0
 
-    def clip_time(self, number: int, time_in_it: float) -> float:
-        """The time of the clip, at a time in a group."""
+    def clip_time(self, number: int, local_time: float) -> float:
+        """Return the time of the clip at a time in [0, 1] within a group: the inverse of `local_time`."""
         span = self.spans[number]
-        frame = span.start + time_in_it * (span.count - 1) - self.spans[0].start
+        frame = span.start + local_time * (span.count - 1) - self.spans[0].start
         return min(max(frame / max(self.clip.frame_count - 1, 1), 0.0), 1.0)
 
     def display_span(self, number: int) -> tuple[float, float]:
-        """From when to when a group shows, [0, 1] over the clip."""
+        """Return from when to when a group is the one shown, in [0, 1] over the clip."""
         frames, start = max(self.clip.frame_count - 1, 1), self.spans[0].start
-        ends = [0.0, *((frame - start) / frames for frame in self._takes_over), 1.0]
+        ends = [0.0, *((frame - start) / frames for frame in self._switch_frames), 1.0]
         return ends[number], ends[number + 1]
 
     @cached_property
-    def _takes_over(self) -> list[float]:
-        """Where in the clip, in frames, each group but the first takes over."""
-        return [(before.last + after.start) / 2 for before, after in zip(self.spans, self.spans[1:])]
+    def _switch_frames(self) -> list[float]:
+        """The frame of the clip at which each group but the first takes over."""
+        return [(before.last + after.start) / 2 for before, after in itertools.pairwise(self.spans)]
 
 
 class Groups:
-    """Random access to the groups of a file. One without GRUP chunks is taken for a single group: itself.
+    """Random access to the groups of a file. A file without GRUP chunks counts as a single group.
 
-    Opening reads header and index, and of the first group header, index and SCNE.
+    Opening reads header and index of the file, and header, index and SCNE chunk of the first group.
 
     Args:
         source: as for `Reader`.
-        memory_budget: bytes that a group may take.
+        memory_budget: bytes that one group may take.
         allow_partial, in_parts: as for `SceneReader`.
 
     Attributes:
-        timeline: when which group shows.
+        timeline: which group is shown when.
         reader: of the file.
-        is_single: whether the file is but a scene.
+        is_single: whether the file is a scene without groups.
 
     Raises:
-        FormatError, BudgetError: as `SceneReader`, or the groups do not make a clip.
+        FormatError, BudgetError: as `SceneReader`, or the groups do not make up a clip.
     """
 
     def __init__(
@@ -152,7 +162,8 @@ class Groups:
             )
             spans: tuple[Span, ...] = (Span(0, self._first.head.clip.frame_count),)
         else:
-            if isinstance(source, RemoteSource) and not source.has_ranges:  # groups are read at the same time
+            if isinstance(source, RemoteSource) and not source.has_ranges:
+                # Groups are read concurrently, but such a server sends everything in one response.
                 self.reader.source = open_source(source.read_at(0, source.size))
             spans = self._spans()
             self._first = self._opened(0, self._slice(0, self.reader.source))
@@ -164,24 +175,29 @@ class Groups:
 
     @property
     def clip(self) -> Clip:
+        """The time axis of the whole clip."""
         return self.timeline.clip
 
     @property
     def size_bytes(self) -> list[int]:
-        """Of each group."""
+        """The size of each group in bytes."""
         if self.is_single:
             return [self.reader.header.file_length]
         return [self.reader.index[chunk].stored_length for chunk in self._chunks]
 
     def available(self, number: int) -> bool:
-        """Whether all of a group is there; False only in a partial file."""
+        """Return whether a group is complete; False only in a partial file."""
         return self.is_single or self.reader.available(self._chunks[number])
 
     def open(self, number: int, apart: bool = False) -> SceneReader:
-        """The scene of a group; `apart`: through a source of its own, for another thread to read beside those of other groups.
+        """Open the scene of a group.
+
+        Args:
+            number: of the group, from 0 on.
+            apart: whether to open a source of its own, so that another thread can read it beside other groups.
 
         Raises:
-            FormatError, BudgetError: as `SceneReader`, or the index tells of another scene.
+            FormatError, BudgetError: as `SceneReader`, or the group contradicts the index.
         """
         if number == 0 and not apart:
             return self._first
@@ -190,24 +206,22 @@ class Groups:
         return scene
 
     def source_of(self, number: int) -> Source:
-        """The bytes of a group, for another thread to read beside those of other groups."""
+        """Return the bytes of a group as a source that another thread can read beside other groups."""
         source = self.reader.source
         if isinstance(source, RemoteSource) and source.has_ranges:
             source = source.clone()
         return source if self.is_single else self._slice(number, source)
 
     def cameras(self) -> tuple[Camera, ...]:
-        """Those of the first group stand for all."""
+        """Return the cameras of the first group, which stand for all."""
         return self._first.cameras()
 
     def _spans(self) -> tuple[Span, ...]:
-        """Of all groups, which are put in order; checked against one another."""
+        """Sort the groups by number and return their frames, after checking them."""
         entries = self.reader.index
         for number, entry in enumerate(entries):
             if entry.is_critical and entry.kind != GROUP_KIND:
-                raise FormatError(
-                    f"{self.name}: chunk {number} ({entry.kind}) lies beside groups, not in one; update kpc"
-                )
+                raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) lies outside the groups; update kpc")
             if entry.kind == GROUP_KIND and (
                 entry.codec != CODEC_RAW
                 or entry.raw_length != entry.stored_length
@@ -216,11 +230,12 @@ class Groups:
                 or not entry.row_count
             ):
                 raise FormatError(
-                    f"{self.name}: chunk {number} ({GROUP_KIND}) claims a codec, a place among the planes, or no frame"
+                    f"{self.name}: chunk {number} ({GROUP_KIND}) has a codec, a plane position or "
+                    "no frames; encode the clip again"
                 )
         self._chunks.sort(key=lambda chunk: entries[chunk].group)
         if [entries[chunk].group for chunk in self._chunks] != list(range(len(self._chunks))):
-            raise FormatError(f"{self.name}: its groups are not numbered from 0 on, each once")
+            raise FormatError(f"{self.name}: its groups are not numbered consecutively from 0; join them again")
         spans = tuple(Span(entries[chunk].row_start, entries[chunk].row_count) for chunk in self._chunks)
         check_spans(spans, self.name)
         return spans
@@ -239,21 +254,24 @@ class Groups:
         if clip != Clip(span.count, self.timeline.fps):
             raise FormatError(
                 f"{scene.name}: holds {clip.frame_count} frames at {clip.fps:g} fps, not {span.count} at "
-                f"{self.timeline.fps:g} as the file says"
+                f"{self.timeline.fps:g} as the index says; encode the clip again"
             )
         if scene.head.value_count > self.reader.header.value_count:
             raise FormatError(
                 f"{scene.name}: holds {scene.head.value_count:,} values, more than the header's "
-                f"{self.reader.header.value_count:,}"
+                f"{self.reader.header.value_count:,}; encode the clip again"
             )
 
 
 class GroupedScene:
-    """A clip in groups, of which one is held at a time, or two that are mixed.
+    """A clip in groups, with the interface of `Scene` that rendering at a time needs.
+
+    One group is held in memory at a time, or two while they are blended.
 
     Attributes:
-        clip: of all groups together. cameras: a few that the first group was filmed from.
-        timeline: when which group shows.
+        clip: the time axis of the whole clip.
+        cameras: some of the cameras that the first group was captured with.
+        timeline: which group is shown when.
     """
 
     def __init__(self, groups: Groups) -> None:
@@ -262,7 +280,7 @@ class GroupedScene:
         self.timeline, self.clip, self.cameras = groups.timeline, groups.clip, groups.cameras()
 
     def at(self, time: float) -> tuple[Scene, float]:
-        """The scene that shows at `time`, [0, 1] over the clip, and the time in it. It is read unless it is the last that was.
+        """Return the scene shown at `time` in [0, 1] over the clip, and the time in it; read it if it is not held.
 
         Raises:
             FormatError, BudgetError, NetworkError: as `read`.
@@ -271,21 +289,18 @@ class GroupedScene:
         return self._scene(number, {number}), time
 
     def blend_at(self, time: float) -> list[tuple[Scene, float, float]]:
-        """As `Timeline.mixed`, scenes in place of groups.
+        """Return the (scene, time in it, weight) triples blended at `time` in [0, 1] over the clip.
 
         Raises:
-            As `at`.
+            FormatError, BudgetError, NetworkError: as `read`.
         """
         parts = self.timeline.blend_at(time)
-        return [
-            (self._scene(number, {number for number, *_ in parts}), time_in_it, share)
-            for number, time_in_it, share in parts
-        ]
+        wanted = {number for number, *_ in parts}
+        return [(self._scene(number, wanted), local_time, weight) for number, local_time, weight in parts]
 
     def _scene(self, number: int, wanted: set[int]) -> Scene:
-        self._held = {
-            held: scene for held, scene in self._held.items() if held in wanted
-        }  # let go before there is another
+        # Release what is no longer needed before another group is read.
+        self._held = {held: scene for held, scene in self._held.items() if held in wanted}
         if number not in self._held:
             scene = read(self._groups.open(number)).dequantise()
             self._held[number] = replace(scene, cameras=scene.cameras or self.cameras)
@@ -293,17 +308,21 @@ class GroupedScene:
 
 
 def load(source: AnySource, memory_budget: int = DEFAULT_BUDGET) -> Scene | GroupedScene:
-    """Read a file: its scene, or of a clip in groups one after the other when it is asked for."""
+    """Read a file: its scene, or a clip in groups, each of which is read when it is needed."""
     groups = Groups(source, memory_budget=memory_budget)
     return read(groups.open(0)).dequantise() if groups.is_single else GroupedScene(groups)
 
 
-# --- writing
-
-
 @dataclass(frozen=True)
 class GroupInput:
-    """A scene's file, and the frames of a clip that it is to be."""
+    """A scene file that becomes a group of a clip.
+
+    Attributes:
+        source: the file.
+        span: the frames of the clip that it covers.
+        fps: frames per second.
+        value_count: number of values in its planes, from its header.
+    """
 
     source: Source
     span: Span
@@ -312,15 +331,17 @@ class GroupInput:
 
     @staticmethod
     def of(source: AnySource, start: int) -> "GroupInput":
-        """A file that holds a scene, of frames from `start` on."""
+        """Open a scene file that covers the frames from `start` on."""
         scene = SceneReader(source, in_parts=True)
         clip = scene.head.clip
         return GroupInput(scene.source, Span(start, clip.frame_count), clip.fps, scene.header.value_count)
 
 
 def group_inputs(files: Sequence[AnySource]) -> list[GroupInput]:
-    """The groups of all files. Files of groups know their frames, and are put in order if all do; a scene follows what is before
-    it."""
+    """Return the groups of all files, as inputs of `write`.
+
+    Files of groups know their frames; if all files do, they are sorted. A scene follows the file before it.
+    """
     opened = [Groups(source, in_parts=True) for source in files]
     if not any(groups.is_single for groups in opened):
         opened.sort(key=lambda groups: groups.timeline.spans[0].start)
@@ -336,10 +357,12 @@ def group_inputs(files: Sequence[AnySource]) -> list[GroupInput]:
 
 
 def write(parts: Sequence[GroupInput], path: str | os.PathLike[str]) -> int:
-    """Write a clip in groups; return the size in bytes. A group is in memory at a time. On failure `path` is left as it was.
+    """Write a clip in groups and return its size in bytes.
+
+    One group is in memory at a time. On failure an existing file at `path` is left unchanged.
 
     Raises:
-        UsageError: the parts do not make a clip.
+        UsageError: the parts do not make up a clip.
     """
     try:
         check_spans([part.span for part in parts], [part.source.name for part in parts])
@@ -348,55 +371,49 @@ def write(parts: Sequence[GroupInput], path: str | os.PathLike[str]) -> int:
     odd = next((part for part in parts if part.fps != parts[0].fps), None)
     if odd is not None:
         raise UsageError(
-            f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; encode them alike"
+            f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; "
+            "encode both at one rate"
         )
     entries: list[Entry] = []
-    with atomic_write(path) as aside, aside.open("wb") as opened:
-        opened.seek(
-            HEADER.size + ENTRY.size * len(parts)
-        )  # the index, which comes first, holds checksums of what follows
+    with atomic_write(path) as temporary, temporary.open("wb") as opened:
+        # Header and index come first but hold checksums of the groups, so they are written last.
+        opened.seek(HEADER.size + ENTRY.size * len(parts))
         for number, part in enumerate(parts):
             body, span = part.source.read_at(0, part.source.size), part.span
             opened.write(body)
-            entries.append(
-                Entry(
-                    GROUP_KIND,
-                    number,
-                    0,
-                    0,
-                    span.start,
-                    span.count,
-                    CODEC_RAW,
-                    len(body),
-                    len(body),
-                    google_crc32c.value(body),
-                )
-            )
-        size = opened.tell()
+            crc, size = google_crc32c.value(body), len(body)
+            entries.append(Entry(GROUP_KIND, number, 0, 0, span.start, span.count, CODEC_RAW, size, size, crc))
+        size_bytes = opened.tell()
         opened.seek(0)
         opened.write(header_and_index(entries, max(part.value_count for part in parts)))
-    return size
+    return size_bytes
 
 
 def check_spans(spans: Sequence[Span], names: str | Sequence[str]) -> None:
-    """Refuse frames that do not make a clip: each group begins and ends after the one before, none is left out between them, and none is
-    in three.
+    """Check that the frames of groups make up a clip.
 
-    `names`: of the file, or of one for each group, for messages.
+    Each group must begin and end later than the one before, without a gap, and no frame may be in more than two groups.
+
+    Args:
+        spans: the frames of each group.
+        names: of the file, or of one file per group, for messages.
+
+    Raises:
+        FormatError: they do not, or there are more than FRAME_LIMIT frames.
     """
-    called = [f"{names}: group {k}" for k in range(len(spans))] if isinstance(names, str) else names
-    for number, (before, after) in enumerate(zip(spans, spans[1:])):
+    labels = [f"{names}: group {k}" for k in range(len(spans))] if isinstance(names, str) else names
+    for number, (before, after) in enumerate(itertools.pairwise(spans)):
         if not before.start < after.start <= before.last + 1 or not before.last < after.last:
-            one, other = called[number : number + 2]
+            one, other = labels[number : number + 2]
             raise FormatError(
                 f"{one} holds frames {before.start} to {before.last}, {other} frames {after.start} to {after.last}: "
-                "each must begin and end later than the one before, and leave no frame out"
+                "each must begin and end later than the one before, and leave no frame out; join them again"
             )
-    for number, (before, after) in enumerate(zip(spans, spans[2:])):
+    for number, (before, after) in enumerate(zip(spans, spans[2:], strict=False)):
         if after.start <= before.last:
             raise FormatError(
-                f"{called[number + 2]} begins with frame {after.start}, which two groups before it hold: a frame may be in "
-                "two groups, not in three"
+                f"{labels[number + 2]} begins with frame {after.start}, which two groups before it hold: "
+                "a frame may be in two groups at most"
             )
     if (frames := spans[-1].last - spans[0].start + 1) > FRAME_LIMIT:
-        raise FormatError(f"{called[-1]}: {frames:,} frames are more than {FRAME_LIMIT:,}")
+        raise FormatError(f"{labels[-1]}: {frames:,} frames exceed the limit of {FRAME_LIMIT:,}; split the clip")

@@ -329,8 +329,8 @@ class HttpSource:
             if (size or 0) > self._limit:
                 download.close_response()
                 raise BudgetError(
-                    f"{self.name}: the server does not support range requests, and the whole file of {size:,} bytes is more than "
-                    f"the budget of {self._limit:,} bytes; download it first"
+                    f"{self.name}: the server does not support range requests, and the whole file of "
+                    f"{size:,} bytes is more than the budget of {self._limit:,} bytes; download it first"
                 )
             if self.has_ranges:
                 self.report(f"{self.name}: the server does not support range requests, so the whole file is downloaded")
@@ -358,8 +358,8 @@ class HttpSource:
             if len(download.data) > self._limit:
                 download.close_response()
                 raise BudgetError(
-                    f"{self.name}: the server does not support range requests and sends more than the budget of {self._limit:,} "
-                    "bytes; download it first"
+                    f"{self.name}: the server does not support range requests and sends more than the budget of "
+                    f"{self._limit:,} bytes; download it first"
                 )
         self.received_bytes += len(download.data)
         download.close_response()

@@ -1,4 +1,4 @@
-"""Clips in groups: when which shows, what may be joined, and that one group at a time is held."""
+"""Clips in groups: which group is shown when, which files can be joined, and that one group is held at a time."""
 
 import json
 from dataclasses import replace
@@ -15,16 +15,17 @@ from kpc.format.container.groups import GroupedScene, GroupInput, Groups, Span, 
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.cpu import reference
 from kpc.player.cpu.motion_map import motion_colours
-from kpc.player.viewpoints import fit_camera
+from kpc.player.viewpoints import fit_camera, orbit
 from kpc.tools.cli import kpinfo, kpjoin, kprender
 from kpc.tools.cli.serve import Handler, serving
+from PIL import Image
 from scenes import tiny_scene, with_appearances
 
 import kpc
 
 
 def coded(scene: Scene) -> bytes:
-    return scene_io.encode(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]))
+    return scene_io.encode(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def clip(scenes: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_one_group_takes_over_from_another_in_the_middle_of_what_they_share():
+def test_a_group_takes_over_in_the_middle_of_the_shared_frames():
     timeline = Timeline((Span(100, 11), Span(106, 15), Span(121, 1)), 25.0)
     assert timeline.clip == Clip(22, 25.0)
     frames = np.arange(100, 121.01, 0.5)
@@ -56,7 +57,7 @@ def test_one_group_takes_over_from_another_in_the_middle_of_what_they_share():
     assert timeline.local_time(0, 1.0) == 1 and timeline.local_time(1, 0.0) == 0 and timeline.local_time(2, 0.3) == 0
 
 
-def test_two_groups_are_mixed_amid_the_frames_that_they_share():
+def test_two_groups_are_blended_between_shared_frames():
     timeline = Timeline((Span(100, 11), Span(106, 15), Span(121, 1)), 25.0)
     for frame in np.arange(100, 121.01, 0.25):
         parts = {number: (time, share) for number, time, share in timeline.blend_at((frame - 100) / 21)}
@@ -67,8 +68,8 @@ def test_two_groups_are_mixed_amid_the_frames_that_they_share():
             assert share == pytest.approx(1 if len(parts) == 1 else abs(frame - (110, 106)[number]) / 4)
 
 
-def test_a_clip_goes_over_from_one_group_to_the_next_without_a_jump(clip):
-    """Pictures either side of the middle of shared frames, where one that shows alone jumps, are as near as their times."""
+def test_a_clip_passes_from_group_to_group_without_a_jump(clip):
+    """In the middle of the shared frames, where a hard switch would jump, pictures differ as little as their times."""
     long, camera = kpc.load(clip), kpc.load(clip).cameras[0].resized(8, 6)
     before, middle, after = (kpc.render(long, camera, frame / 29) for frame in (8.99, 9.0, 9.01))
     (first, t, _), (second, u, share) = long.blend_at(9.0 / 29)
@@ -81,47 +82,33 @@ def test_a_clip_goes_over_from_one_group_to_the_next_without_a_jump(clip):
     assert np.abs(before.rgb - after.rgb).max() < 0.02
 
 
-def test_a_clip_shows_its_groups(clip, scenes):
+def test_a_clip_renders_as_its_groups_do(clip, scenes):
     long = kpc.load(clip)
     assert isinstance(long, GroupedScene) and long.clip == Clip(30, 10.0)
     camera = long.cameras[0].resized(12, 9)
     for frame, number in ((0, 0), (8, 0), (10, 1), (18, 1), (18.4, 1), (18.6, 2), (29, 2)):
         start = (0, 8, 19)[number]
         alone = kpc.load(scenes[number])
-        seen = kpc.render(alone, camera, min(max((frame - start) / 10, 0), 1))
-        assert np.allclose(kpc.render(long, camera, frame / 29).rgb, seen.rgb, atol=1e-6), frame
-    assert long.at(1.0)[0].cameras == long.cameras  # which the last group has not
+        expected = kpc.render(alone, camera, min(max((frame - start) / 10, 0), 1))
+        assert np.allclose(kpc.render(long, camera, frame / 29).rgb, expected.rgb, atol=1e-6), frame
+    assert long.at(1.0)[0].cameras == long.cameras  # although the last group has none
 
 
-def test_what_moves_is_told_and_shown_of_the_group_that_shows(clip, scenes, tmp_path, capsys):
+def test_the_motion_map_and_kpinfo_describe_the_group_shown(clip, scenes, tmp_path, capsys):
+    picture = tmp_path / "map.png"
+    small = ["--size", "24x18", "--backend", "reference", "-o", str(picture)]
     for number, time, own in ((1, 13 / 29, 0.5), (2, 1.0, 1.0)):
-        assert (
-            kprender.main(
-                [
-                    str(clip),
-                    "--dynamic-map",
-                    "--time",
-                    str(time),
-                    "--size",
-                    "24x18",
-                    "--backend",
-                    "reference",
-                    "-o",
-                    str(tmp_path / "map.png"),
-                ]
-            )
-            == 0
-        )
+        assert kprender.main([str(clip), "--dynamic-map", "--time", str(time), *small]) == 0
         capsys.readouterr()
         assert kpinfo.main([str(clip), "--group", str(number), "--json"]) == 0
         shares = json.loads(capsys.readouterr().out)["static"]
         alone, camera = kpc.load(scenes[number]), fit_camera(kpc.load(clip).cameras[0], 24, 18)
         expected = motion_colours(alone, camera, own, reference.render(alone, camera, own)).rgb
-        assert np.abs(read_image(tmp_path / "map.png") - 255 * np.clip(expected, 0, 1)).max() <= 1
+        assert np.abs(read_image(picture) - 255 * np.clip(expected, 0, 1)).max() <= 1
         assert (shares == {"identity_share": 1, "unchanging_share": 1, "still_share": 1}) == (number == 2)
 
 
-def test_a_scene_is_a_clip_of_one_group(scenes):
+def test_a_scene_counts_as_a_clip_of_one_group(scenes):
     groups = Groups(scenes[1])
     assert groups.is_single and len(groups) == 1 and groups.clip == Clip(11, 10.0)
     assert scene_io.read(groups.open(0)).parameter_count == scene_io.read(scenes[1]).parameter_count
@@ -129,18 +116,18 @@ def test_a_scene_is_a_clip_of_one_group(scenes):
     assert isinstance(scene, Scene) and scene.at(0.3) == (scene, 0.3)
 
 
-def test_one_group_is_held_at_a_time_or_two_that_are_mixed(clip):
+def test_one_group_is_held_or_two_while_they_are_blended(clip):
     long = kpc.load(clip)
     first, _ = long.at(0.0)
     assert long.at(0.2)[0] is first
     second, _ = long.at(0.5)
     assert second is not first and long.at(0.4)[0] is second and long.at(0.0)[0] is not first
     assert [len(long.blend_at(time)) for time in (0.0, 9 / 29, 0.5)] == [1, 2, 1]
-    mixed = [scene for scene, *_ in long.blend_at(9 / 29)]
-    assert long.blend_at(9.5 / 29)[0][0] is mixed[0] and long.at(0.5)[0] is mixed[1] and len(long._held) == 1
+    blended = [scene for scene, *_ in long.blend_at(9 / 29)]
+    assert long.blend_at(9.5 / 29)[0][0] is blended[0] and long.at(0.5)[0] is blended[1] and len(long._held) == 1
 
 
-def test_the_budget_is_that_of_a_group(clip, scenes):
+def test_the_memory_budget_applies_to_a_single_group(clip, scenes):
     needed = [5 * Reader(scene).header.value_count for scene in scenes]
     assert needed[1] == max(needed) and Reader(clip).header.value_count == max(needed) // 5
     long = kpc.load(clip, memory_budget=needed[1] - 1)
@@ -149,12 +136,12 @@ def test_the_budget_is_that_of_a_group(clip, scenes):
         long.at(0.5)
 
 
-def test_old_ways_of_reading_refuse_a_clip_in_groups(clip):
+def test_reading_a_single_scene_refuses_a_clip_in_groups(clip):
     with pytest.raises(FormatError, match="a clip in groups"):
         scene_io.read(clip)
 
 
-def test_a_file_that_is_cut_off_has_the_groups_before(clip):
+def test_a_truncated_file_has_the_groups_before_the_cut(clip):
     data = clip.read_bytes()
     cut = data[: Reader(clip).index[1].offset + 2000]
     with pytest.raises(FormatError, match="cut off"):
@@ -162,7 +149,7 @@ def test_a_file_that_is_cut_off_has_the_groups_before(clip):
     partial = Groups(cut, allow_partial=True)
     assert [partial.available(number) for number in range(3)] == [True, False, False]
     assert scene_io.read(partial.open(0)).clip.frame_count == 11
-    assert partial.open(1).head.clip.frame_count == 11  # as far as it is there
+    assert partial.open(1).head.clip.frame_count == 11  # its head is complete
     with pytest.raises(FormatError):
         partial.open(2)
 
@@ -181,7 +168,7 @@ def test_groups_are_read_from_a_server_one_by_one(clip):
         assert kpc.load(f"{url}/long.kpc").at(1.0)[0].parameter_count == kpc.load(clip).at(1.0)[0].parameter_count
 
 
-class Whole(Handler):
+class WithoutRanges(Handler):
     """A server without ranges."""
 
     def send_head(self):
@@ -189,17 +176,14 @@ class Whole(Handler):
         return super().send_head()
 
 
-def test_a_server_without_ranges_sends_it_once(clip, capfd):
-    with serving(clip.parent, handler=Whole) as url:
+def test_a_server_without_ranges_sends_the_file_once(clip, capfd):
+    with serving(clip.parent, handler=WithoutRanges) as url:
         remote = Groups(f"{url}/long.kpc")
         assert [scene_io.read(remote.open(number)).clip.frame_count for number in range(3)] == [11, 11, 11]
         assert remote.source_of(1).read_at(0, 4) == b"\x89KPC"
 
 
-# --- joining
-
-
-def test_parts_of_a_clip_are_put_in_order(scenes, tmp_path, capsys):
+def test_joined_groups_are_sorted(scenes, tmp_path, capsys):
     for number, start in enumerate((40, 48, 59)):
         groups.write([GroupInput.of(scenes[number], start)], tmp_path / f"{number}.kpc")
     assert (
@@ -211,13 +195,13 @@ def test_parts_of_a_clip_are_put_in_order(scenes, tmp_path, capsys):
     assert [joined.source_of(number).read_at(0, 1 << 20) for number in range(3)] == scenes
 
 
-def test_other_files_follow_one_another(clip, scenes, tmp_path):
+def test_scenes_follow_the_file_before_them(clip, scenes, tmp_path):
     (tmp_path / "last.kpc").write_bytes(scenes[0])
     assert kpjoin.main([str(clip), str(tmp_path / "last.kpc"), "-o", str(tmp_path / "both.kpc")]) == 0
     assert Groups(tmp_path / "both.kpc").timeline.spans[2:] == (Span(19, 11), Span(30, 11))
 
 
-def test_what_does_not_make_a_clip_is_refused(clip, scenes, tmp_path, capsys):
+def test_files_that_do_not_make_up_a_clip_are_refused(clip, scenes, tmp_path, capsys):
     for name, scene, start in (("early", 0, 0), ("late", 1, 12)):
         groups.write([GroupInput.of(scenes[scene], start)], tmp_path / f"{name}.kpc")
     slower = tmp_path / "slower.kpc"
@@ -238,12 +222,7 @@ def test_what_does_not_make_a_clip_is_refused(clip, scenes, tmp_path, capsys):
         groups.write([GroupInput.of(scenes[0], 5), GroupInput.of(scenes[1], 5)], output)
 
 
-# --- the tools
-
-
 def test_kpinfo_lists_the_groups(clip, capsys):
-    import json
-
     assert kpinfo.main([str(clip), "--verify"]) == 0
     page = capsys.readouterr().out
     assert "30 frames at 10 fps, 2.90 s, in 3 groups" in page and "verified" in page
@@ -256,7 +235,7 @@ def test_kpinfo_lists_the_groups(clip, capsys):
     assert kpinfo.main([str(clip), "--group", "3"]) == 2
 
 
-def test_kpinfo_finds_the_damage_in_a_group(clip, tmp_path, capsys):
+def test_kpinfo_finds_a_damaged_group(clip, tmp_path, capsys):
     data = bytearray(clip.read_bytes())
     data[-5] ^= 1
     (tmp_path / "damaged.kpc").write_bytes(data)
@@ -265,25 +244,19 @@ def test_kpinfo_finds_the_damage_in_a_group(clip, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("backend", ["reference", "gl"])
-def test_kprender_goes_from_group_to_group(clip, backend, tmp_path):
-    from PIL import Image
-
+def test_kprender_renders_across_groups(clip, backend, tmp_path):
     options = [str(clip), "--orbit", "4", "--size", "16x12", "--backend", backend, "-o", str(tmp_path / "pictures")]
     assert kprender.main(options) == 0
     long = kpc.load(clip)
-    from kpc.player.viewpoints import fit_camera, orbit
-
     for number, camera in enumerate(orbit(long.at(0.0)[0], 4)):
-        seen = np.rint(np.clip(kpc.render(long, fit_camera(camera, 16, 12), number / 3).rgb, 0, 1) * 255)
+        expected = np.rint(np.clip(kpc.render(long, fit_camera(camera, 16, 12), number / 3).rgb, 0, 1) * 255)
         picture = np.asarray(Image.open(tmp_path / "pictures" / f"{number:04d}.png"), float)
-        assert np.abs(picture - seen).max() <= 1, number
+        assert np.abs(picture - expected).max() <= 1, number
 
 
-def test_an_appearance_is_looked_up_in_each_group(tmp_path):
-    one, other = (
-        with_appearances(tiny_scene(0, scales=1)),
-        with_appearances(tiny_scene(1, scales=1), names=("noon.jpg",)),
-    )
+def test_an_appearance_must_exist_in_every_group_rendered(tmp_path):
+    one = with_appearances(tiny_scene(0, scales=1))
+    other = with_appearances(tiny_scene(1, scales=1), names=("noon.jpg",))
     groups.write([GroupInput.of(coded(one), 0), GroupInput.of(coded(other), 11)], tmp_path / "varied.kpc")
     options = [str(tmp_path / "varied.kpc"), "--size", "8x6", "--backend", "reference", "-o"]
     assert kprender.main([*options, str(tmp_path / "noon"), "--appearance", "noon.jpg", "--orbit", "2"]) == 0
