@@ -1,9 +1,11 @@
-"""Feeds the player every key and drag it knows, and looks at what they do: `press_every_key.py scene.kpc`."""
+"""Press every key, drag in every way, and check what the player does: `press_every_key.py scene.kpc`."""
 
+import contextlib
+import os
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,369 +13,393 @@ from kpc.format.common.errors import DisplayError
 from kpc.format.common.media import read_image, read_video
 from kpc.format.container import groups
 from kpc.format.container.container import open_source
-from kpc.player.app import kpplay, panels
+from kpc.player.app import kpplay
+from kpc.player.app import player as player_module
 from kpc.player.app import window as window_module
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.desktop import glfw, imgui
+from kpc.player.app.input import KEY_BINDINGS
+from kpc.player.app.player import MAX_RETRIES, Player
 from kpc.player.app.preferences import Preferences, preferences_path
 from kpc.player.app.quality_controller import LEVEL_NAMES
-from kpc.player.app.window import Player, Window
-from kpc.player.cpu.reference import Part
-from kpc.player.gl.renderer import DisplayMode
+from kpc.player.app.recording import FILM_FPS
+from kpc.player.app.window import Window
 from kpc.player.quality import DEFAULT, neighbouring_level
 from kpc.player.streaming.group_playback import GroupPlayback
 from pytest import approx, raises
 
+PATIENCE_S = 20.0
+LEFT, RIGHT = 0, 1  # buttons of the mouse
+
 
 def main(scene_file: str) -> None:
-    ask_for_less()
+    opening_asks_for_older_opengl()
     window = Window("test", (320, 240))
     stream = GroupPlayback(open_source(scene_file))
     player = Player(window, stream, Preferences(text_size=0.9, speed=1.0))
     while not stream.is_settled:
         player.frame()
 
-    def press(*keys: int, mods: int = 0) -> None:
-        for key in keys:
-            window._key(None, key, 0, glfw.PRESS, mods)
-            player.frame()
-
-    def drag(button: int, x: float, y: float) -> None:
-        window._moved(None, 250, 60)
-        player.frame()
-        window._clicked(None, button, glfw.PRESS, 0)
-        player.frame()
-        window._moved(None, 250 + x, 60 + y)
-        player.frame()
-        window._clicked(None, button, glfw.RELEASE, 0)
-        player.frame()
-
-    def canvas() -> np.ndarray:
-        player._picture(1.0, "reference", still=True)
-        return player._pixels().astype(int)
-
-    player.frame()
-    assert player.playback.playing
-    can_show, stream.can_show = stream.can_show, lambda *where: False  # type: ignore[method-assign]
-    before = player.playback.time
-    time.sleep(0.05)
-    player.frame()
-    assert player.playback.time == before and player.playback.playing  # what is not there is waited for
-    stream.can_show = can_show  # type: ignore[method-assign]
-    time.sleep(0.05)
-    player.frame()
-    assert player.playback.time != before
-    press(glfw.KEY_SPACE)
-    assert not player.playback.playing
-    press(glfw.KEY_HOME, glfw.KEY_RIGHT)
-    assert player.playback.time == approx(0.1)
-    press(glfw.KEY_END)
-    assert player.playback.time == 1.0
-    press(glfw.KEY_RIGHT_BRACKET, glfw.KEY_L)
-    assert player.playback.speed == 2.0 and not player.playback.loop
-    for key, look in zip(
-        (glfw.KEY_2, glfw.KEY_3, glfw.KEY_4, glfw.KEY_1),
-        (DisplayMode.DEPTH, DisplayMode.SAMPLES, DisplayMode.OCCUPANCY, DisplayMode.COLOUR),
-    ):
-        press(key)
-        assert player.look is look
-    for part in (Part.STATIC, Part.DYNAMIC, Part.FULL):
-        press(glfw.KEY_C)
-        assert player.part is part
-    for folded in (False, True):
-        press(glfw.KEY_F)
-        player._picture(1.0, "fine")
-        assert player.renderer.quality.folded is folded
-
-    average = canvas()
-    for number, name in enumerate(("dawn.jpg", "noon.jpg", "dusk.jpg"), 1):
-        press(glfw.KEY_V)
-        assert player.appearance.number == number and player.appearance.names[number] == name
-    player.appearance.advance(1.0)
-    assert np.abs(canvas() - average).max() > 10
-    press(glfw.KEY_V)
-    player.appearance.advance(1.0)
-    assert np.abs(canvas() - average).max() <= 1  # where a value lies between two levels, it may round to either
-
-    before = player.view
-    drag(0, 30, 10)
-    assert player.view.focus == approx(before.focus) and not np.allclose(player.view.axes, before.axes)
-    turned = player.view
-    drag(1, 30, 10)
-    assert np.allclose(player.view.axes, turned.axes) and not np.allclose(player.view.focus, turned.focus)
-    window._scrolled(None, 0, 2)
-    player.frame()
-    assert player.view.distance == approx(0.81 * before.distance)
-    press(glfw.KEY_N)
-    assert player.camera_number == 1
-    press(glfw.KEY_R)
-    assert player.view.eye == approx(before.eye)
-
-    press(glfw.KEY_B)
-    assert player.preset_number == 0 and player.view.eye != approx(before.eye)
-
-    rung = player.quality.level
-    press(glfw.KEY_MINUS)
-    assert player.quality.level == neighbouring_level(rung, -1) and rung == DEFAULT
-    press(glfw.KEY_EQUAL)
-    assert player.quality.level == rung
-    press(glfw.KEY_U)
-    assert player.quality.target_s == approx(1 / 30)
-    press(glfw.KEY_U, glfw.KEY_T, glfw.KEY_G)
-    assert player.quality.target_s is None and player.show_planes and player.show_graphs
-    player.quality.choose(rung)  # where it stood is the machine's business
-    before_size = player.text_size
-    press(glfw.KEY_EQUAL, mods=glfw.MOD_CONTROL)
-    assert player.text_size > before_size
-
-    press(glfw.KEY_J)
-    assert player.notice_is_error and not player.riding  # there is no path yet
-    follow_a_path(player, press)
-    see_every_pixel_once(window, player)
-    see_the_same_however_coarsely(player)
-    come_to_rest(player)
-    run_out_of_room(player)
-    drop_files(window, player, Path(scene_file))
-
-    press(glfw.KEY_H, glfw.KEY_P)
-    glfw.set_window_size(window.handle, 200, 260)
-    time.sleep(0.05)
-    glfw.poll_events()
-    player.frame()
-    assert player.canvas.size == window.pixels
-    press(glfw.KEY_TAB, glfw.KEY_ESCAPE)
-    assert glfw.window_should_close(window.handle)
-    kept = player.preferences()
-    assert kept == Preferences((200, 260), DEFAULT, None, 2.0, False, False, True, True, player.text_size)
-    player.run()
-    press(glfw.KEY_O)
-    player.run(1)
-    told = player.close()  # a film that is being written is finished
-    assert told is not None and told.startswith("saved ") and len(list(read_video(player.film.path))) >= 1
-    go_through_groups(window, scene_file)
-    stand_where_groups_are_mixed(window, scene_file)
-    begin_on_a_card(window, scene_file)
+    keys_of_the_clip(player)
+    keys_of_what_is_shown(player)
+    keys_and_drags_of_the_camera(player)
+    keys_of_quality_and_panels(player)
+    player.press(glfw.KEY_J)
+    assert player.snapshot().notice_is_error and not player.snapshot().follows_path  # there is no path yet
+    camera_path(player)
+    videos(player)
+    panels_reach_the_window_edges(player)
+    files_cannot_be_written(player)
+    every_pixel_is_used(player)
+    field_of_view_does_not_depend_on_the_raster(player)
+    stills_are_refined_in_bands(player)
+    drawing_fails(player)
+    dropped_files(player, Path(scene_file))
+    resized_and_closed(player)
+    groups_of_a_clip(window, scene_file)
+    blended_groups(window, scene_file)
+    defaults_on_a_graphics_card(window, scene_file)
     stream.close()
     window.close()
-    lose_the_card(scene_file)
-    remember(scene_file)
+    reset_of_the_graphics_card(scene_file)
+    settings_are_saved(scene_file)
 
 
-def ask_for_less() -> None:
-    """Where there is no OpenGL 4.3, as on macOS, 3.3 is asked for; where there is neither, that is told."""
+def press(player: Player, *keys: int) -> None:
+    for key in keys:
+        player.press(key)
+
+
+def drag(player: Player, button: int, x: float, y: float) -> None:
+    """Drag by so many units, outside the panels."""
+    window = player.window
+    window.move_pointer(250, 60)
+    player.frame()
+    window.press_button(button, True)
+    player.frame()
+    window.move_pointer(250 + x, 60 + y)
+    player.frame()
+    window.press_button(button, False)
+    player.frame()
+
+
+def exact_picture(player: Player) -> np.ndarray:
+    """What the player shows, drawn without approximations, (height, width, 3) integers."""
+    player.scene_view.draw("reference", still=True)
+    return player.scene_view.pixels().astype(int)
+
+
+def frames_until(player: Player, condition: Callable[[], object]) -> None:
+    """Show frames until a condition holds."""
+    until = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < until
+        glfw.poll_events()
+        player.frame()
+
+
+@contextlib.contextmanager
+def replaced(owner: object, **values: object) -> Iterator[None]:
+    """Replace attributes for a while."""
+    before = {name: getattr(owner, name) for name in values}
+    for name, value in values.items():
+        setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(owner, name, value)
+
+
+def opening_asks_for_older_opengl() -> None:
+    """Where there is no OpenGL 4.3, as on macOS, 3.3 is asked for; where there is neither, an error says so."""
     create = glfw.create_window
-    asked: list[object] = []
+    attempts: list[object] = []
 
-    def none_above(most: int) -> Callable[..., object]:
+    def failing(times: int) -> Callable[..., object]:
         def attempt(*arguments: object) -> object:
-            asked.append(arguments)
-            return create(*arguments) if len(asked) > most else None
+            attempts.append(arguments)
+            return create(*arguments) if len(attempts) > times else None
 
         return attempt
 
-    glfw.create_window = none_above(1)
-    window = Window("test", (64, 64))
-    assert len(asked) == 2 and window.ctx.version_code >= 330
+    with replaced(glfw, create_window=failing(1)):
+        window = Window("test", (64, 64))
+    assert len(attempts) == 2 and window.ctx.version_code >= 330
     window.close()
     window.close()
-    asked.clear()
-    glfw.create_window = none_above(2)
-    with raises(DisplayError, match="kprender"):
+    attempts.clear()
+    with replaced(glfw, create_window=failing(2)), raises(DisplayError, match="kprender"):
         Window("test", (64, 64))
-    glfw.create_window = create
 
 
-def follow_a_path(player: Player, press: Callable[..., None]) -> None:
-    """Two keyframes, the way between them, a film of it, and its file."""
-    player.playback.seek(0.2)
-    press(glfw.KEY_R, glfw.KEY_K)
-    first = player.view.eye
-    player.playback.seek(0.6)
-    press(glfw.KEY_N, glfw.KEY_K, glfw.KEY_K, glfw.KEY_BACKSPACE)
-    second = player.view.eye
-    assert (
-        [shot.time for shot in player.path.keyframes] == approx([0.2, 0.6])
-        and player.path.end_s == 2.0
-        and player.show_path
-    )
-    player.path = player.path.spaced(1, 0.2)
+def keys_of_the_clip(player: Player) -> None:
+    stream = player.state.stream
+    player.frame()
+    assert player.snapshot().playing
+    before = player.snapshot().time
+    with replaced(stream, can_show=lambda *position: False):
+        time.sleep(0.05)
+        player.frame()
+        assert player.snapshot().time == before and player.snapshot().playing  # the clip waits for what has not arrived
+    time.sleep(0.05)
+    player.frame()
+    assert player.snapshot().time != before
+    press(player, glfw.KEY_SPACE)
+    assert not player.snapshot().playing
+    press(player, glfw.KEY_HOME, glfw.KEY_RIGHT)
+    assert player.snapshot().time == approx(0.1)
+    press(player, glfw.KEY_END)
+    assert player.snapshot().time == 1.0
+    press(player, glfw.KEY_RIGHT_BRACKET, glfw.KEY_L)
+    assert player.snapshot().speed == 2.0 and not player.snapshot().loop
 
-    press(glfw.KEY_J)
-    assert player.riding
+
+def keys_of_what_is_shown(player: Player) -> None:
+    modes = {glfw.KEY_2: "depth", glfw.KEY_3: "samples", glfw.KEY_4: "occupancy", glfw.KEY_1: "colour"}
+    for key, mode in modes.items():
+        press(player, key)
+        assert player.snapshot().display_mode == mode
+    for part in ("static", "dynamic", "full"):
+        press(player, glfw.KEY_C)
+        assert player.snapshot().part == part
+    for folds in (False, True):
+        press(player, glfw.KEY_F)
+        player.scene_view.draw("fine")
+        assert player.snapshot().folds is folds
+
+    average, appearance = exact_picture(player), player.state.appearance
+    for name in ("dawn.jpg", "noon.jpg", "dusk.jpg"):
+        press(player, glfw.KEY_V)
+        assert player.snapshot().appearance == name
+    appearance.advance(1.0)
+    assert np.abs(exact_picture(player) - average).max() > 10
+    press(player, glfw.KEY_V)
+    appearance.advance(1.0)
+    assert np.abs(exact_picture(player) - average).max() <= 1  # a value between two levels may be rounded to either
+
+
+def keys_and_drags_of_the_camera(player: Player) -> None:
+    before = player.snapshot().view
+    drag(player, LEFT, 30, 10)
+    turned = player.snapshot().view
+    assert turned.focus == approx(before.focus) and not np.allclose(turned.axes, before.axes)
+    drag(player, RIGHT, 30, 10)
+    panned = player.snapshot().view
+    assert np.allclose(panned.axes, turned.axes) and not np.allclose(panned.focus, turned.focus)
+    player.window.scroll(0, 2)
+    player.frame()
+    assert player.snapshot().view.distance == approx(0.81 * before.distance)
+    press(player, glfw.KEY_N)
+    assert player.snapshot().camera_number == 1
+    press(player, glfw.KEY_R)
+    assert player.snapshot().view.eye == approx(before.eye)
+    press(player, glfw.KEY_B)
+    assert player.snapshot().preset_number == 0 and player.snapshot().view.eye != approx(before.eye)
+
+
+def keys_of_quality_and_panels(player: Player) -> None:
+    level = player.snapshot().level
+    press(player, glfw.KEY_MINUS)
+    assert player.snapshot().level == neighbouring_level(level, -1) and level == DEFAULT
+    press(player, glfw.KEY_EQUAL)
+    assert player.snapshot().level == level
+    press(player, glfw.KEY_U)
+    assert player.snapshot().target_s == approx(1 / FILM_FPS)
+    press(player, glfw.KEY_U, glfw.KEY_T, glfw.KEY_G)
+    assert player.snapshot().target_s is None and player.snapshot().panels == {"controls", "planes", "graphs"}
+    player.state.quality.choose(level)  # the level that U chose depends on the machine
+    text_size = player.state.text_size
+    player.press(glfw.KEY_EQUAL, glfw.MOD_CONTROL)
+    assert player.state.text_size > text_size
+
+
+def camera_path(player: Player) -> None:
+    """Add two keyframes, follow the path between them, and save it."""
+    state = player.state
+    state.playback.seek(0.2)
+    press(player, glfw.KEY_R, glfw.KEY_K)
+    first = player.snapshot().view.eye
+    state.playback.seek(0.6)
+    press(player, glfw.KEY_N, glfw.KEY_K, glfw.KEY_K, glfw.KEY_BACKSPACE)
+    second, path = player.snapshot().view.eye, state.follower.path
+    assert [keyframe.time for keyframe in path.keyframes] == approx([0.2, 0.6])
+    assert path.end_s == 2.0 and "path" in player.snapshot().panels
+    state.follower.path = path.spaced(1, 0.2)
+
+    press(player, glfw.KEY_J)
+    assert player.snapshot().follows_path
     time.sleep(0.06)
     player.frame()
-    assert 0.2 < player.playback.time < 0.6 and player.view.eye != approx(first) and player.view.eye != approx(second)
+    between = player.snapshot()
+    assert 0.2 < between.time < 0.6 and between.view.eye != approx(first) and between.view.eye != approx(second)
     time.sleep(0.25)
     player.frame()
-    assert not player.riding and player.view.eye == approx(second) and player.playback.time == approx(0.6)
+    end = player.snapshot()
+    assert not end.follows_path and end.view.eye == approx(second) and end.time == approx(0.6)
 
-    press(glfw.KEY_S, mods=glfw.MOD_CONTROL)
-    assert not player.notice_is_error and "path.json" in player.notice
+    player.press(glfw.KEY_S, glfw.MOD_CONTROL)
+    notice = player.snapshot().notice
+    assert not player.snapshot().notice_is_error and "path.json" in notice
     (file,) = Path().glob("*-path.json")
-    assert CameraPath.load(file).end_s == approx(0.2) and str(file) in player.notice
+    assert CameraPath.load(file).end_s == approx(0.2) and str(file) in notice
 
-    for shift in (glfw.MOD_SHIFT, 0):
-        press(glfw.KEY_O, mods=shift)
-        film = player.film
-        assert film is not None
-        if not shift:
+
+def videos(player: Player) -> None:
+    """Record the camera path, the window, and a window whose size changes."""
+    second = player.snapshot().view.eye
+    for modifiers in (glfw.MOD_SHIFT, 0):
+        player.press(glfw.KEY_O, modifiers)
+        recording = player.filming.recording
+        assert recording is not None
+        if not modifiers:
             time.sleep(0.2)
             player.frame()
-            press(glfw.KEY_O)
-        until = time.monotonic() + 20
-        while player.film is not None and time.monotonic() < until:
-            player.frame()
-        assert str(film.path) in player.notice and not player.notice_is_error, player.notice
-        frames = list(read_video(film.path))
-        if shift:
-            assert len(frames) == 7 and player.view.eye == approx(second)  # 0.2 s at 30 a second, both ends
+            press(player, glfw.KEY_O)
+        frames_until(player, lambda: not player.snapshot().films)
+        end = player.snapshot()
+        assert str(recording.path) in end.notice and not end.notice_is_error, end.notice
+        frames = list(read_video(recording.path))
+        if modifiers:
+            assert len(frames) == 7 and end.view.eye == approx(second)  # 0.2 s at 30 fps, with both ends
             assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 2
         else:
             assert 3 <= len(frames) <= 20
-        assert frames[0].shape == (*player.canvas.size[::-1], 3)
+        assert frames[0].shape == (*end.canvas[::-1], 3)
 
-    press(glfw.KEY_O)
+    press(player, glfw.KEY_O)
     glfw.set_window_size(player.window.handle, 420, 330)
     time.sleep(0.05)
-    until = time.monotonic() + 20
-    while player.film is not None and time.monotonic() < until:
-        glfw.poll_events()
-        player.frame()
-    assert player.film is None and player.canvas.size == (420, 330)
-    reach_into_corners(player)
-    Path("nowhere").touch()
-    player.folder = Path("nowhere")  # no folder: what goes wrong is told, and nothing ends
-    press(glfw.KEY_P)
-    assert player.notice_is_error and "nowhere" in player.notice, player.notice
-    player.folder = Path()
+    frames_until(player, lambda: not player.snapshot().films)
+    assert player.snapshot().canvas == (420, 330)
 
 
-def reach_into_corners(player: Player) -> None:
-    """As the controls do of a window that is larger than it was: in its top left, and all along its bottom."""
+def panels_reach_the_window_edges(player: Player) -> None:
+    """Panels of an enlarged window lie in its top left corner, and all along its lower edge."""
     player.frame()
-    player._begin(0.0)
-    panels.show(player)
-    player._finish()
-    width, height = player.canvas.size
-    screen = np.frombuffer(player.ctx.screen.read(viewport=(0, 0, width, height), alignment=1), np.uint8).reshape(
-        height, width, 3
-    )[::-1]
-    assert player.ctx.error in (
-        "GL_NO_ERROR",
-        "GL_INVALID_OPERATION",
-    )  # moderngl reads from an attachment that no window's own has
-    over = np.any(screen != player._pixels(), axis=2)
-    top, left = over.any(1).argmax(), over.any(0).argmax()
-    bottom, right = height - over.any(1)[::-1].argmax(), width - over.any(0)[::-1].argmax()
+    player.present_panels()
+    ctx, (width, height) = player.window.ctx, player.snapshot().canvas
+    data = ctx.screen.read(viewport=(0, 0, width, height), alignment=1)
+    screen = np.frombuffer(data, np.uint8).reshape(height, width, 3)[::-1]
+    # moderngl reads from an attachment that a window's own framebuffer does not have
+    assert ctx.error in ("GL_NO_ERROR", "GL_INVALID_OPERATION")
+    covered = np.any(screen != player.scene_view.pixels(), axis=2)
+    top, left = covered.any(1).argmax(), covered.any(0).argmax()
+    bottom, right = height - covered.any(1)[::-1].argmax(), width - covered.any(0)[::-1].argmax()
     assert top < 16 and left < 16 and bottom > height - 16 and right > width - 60, (top, left, bottom, right)
 
 
-def see_the_same_however_coarsely(player: Player) -> None:
-    show, whole, seen = player._show, player.view.camera(*player.canvas.size), []
-    player._show = lambda target, camera: seen.append(camera)  # type: ignore[method-assign]
-    for scale in (0.125, 0.297, 0.42, 0.841):
-        player._picture(scale, "fast")
-    player._show = show  # type: ignore[method-assign]
-    for camera in seen:
-        assert len(seen) == 4 and (camera.fl_x / camera.width, camera.cx / camera.width) == approx(
-            (whole.fl_x / whole.width, whole.cx / whole.width)
-        )
-        assert (camera.fl_y / camera.height, camera.cy / camera.height) == approx(
-            (whole.fl_y / whole.height, whole.cy / whole.height)
-        )
+def files_cannot_be_written(player: Player) -> None:
+    """An error is shown, and the player continues."""
+    Path("nowhere").touch()
+    with replaced(player.files, folder=Path("nowhere")):
+        press(player, glfw.KEY_P)
+    assert player.snapshot().notice_is_error and "nowhere" in player.snapshot().notice, player.snapshot().notice
 
 
-def see_every_pixel_once(window: Window, player: Player) -> None:
-    """Where the system counts two or three pixels to its unit, and where it wants larger text instead."""
-    size, pixels, scale = Window.size, Window.pixels, Window.text_scale
-    heights: list[float] = []
-    show = panels.show
+def every_pixel_is_used(player: Player) -> None:
+    """Also where a screen unit has two pixels, and where the system asks for larger text instead."""
+    window, io = player.window, player.imgui.io
+    text_heights: list[float] = []
+    build = player.panels.build
 
-    def measure(player: Player) -> None:
-        heights.append(imgui.get_font_size() * player.imgui.io.display_framebuffer_scale.x)
-        show(player)
+    def measuring() -> None:
+        text_heights.append(imgui.get_font_size() * io.display_framebuffer_scale.x)
+        build()
 
-    for units, count, text in (
+    for units, pixels, scale in (
         ((320, 240), (320, 240), 1.0),
         ((160, 120), (320, 240), 2.0),
         ((320, 240), (320, 240), 2.0),
     ):
-        Window.size, Window.pixels, Window.text_scale = units, count, text  # type: ignore[assignment, method-assign]
-        panels.show = measure
-        player.frame()
-        panels.show = show
-        assert player.canvas.size == count
-        io = player.imgui.io
-        assert (
-            io.display_size.x * io.display_framebuffer_scale.x,
-            io.display_size.y * io.display_framebuffer_scale.y,
-        ) == count
-        before = player.view
-        window._moved(None, 0.9 * units[0], 0.3 * units[1])
-        player.show_hud = False
-        player.frame()
-        window._clicked(None, 0, glfw.PRESS, 0)
-        player.frame()
-        window._moved(None, 0.9 * units[0] + 0.1 * units[1], 0.3 * units[1])
-        player.frame()
-        window._clicked(None, 0, glfw.RELEASE, 0)
-        player.frame()
-        player.show_hud = True
-        turned = np.arccos(np.clip((np.trace(player.view.axes.T @ before.axes) - 1) / 2, -1, 1))
-        assert turned == approx(0.1 * np.pi, rel=1e-3)  # of the window's height, whatever its units
-        assert window.plain_size == (units if count != units else tuple(n / text for n in units))
-    assert heights[1:] == approx([2 * heights[0]] * 2, rel=0.05)  # sizes of text are whole
-    Window.size, Window.pixels, Window.text_scale = size, pixels, scale  # type: ignore[method-assign]
+        with replaced(Window, size=units, pixels=pixels, text_scale=scale):
+            with replaced(player.panels, build=measuring):
+                player.frame()
+            assert player.snapshot().canvas == pixels
+            shown = (
+                io.display_size.x * io.display_framebuffer_scale.x,
+                io.display_size.y * io.display_framebuffer_scale.y,
+            )
+            assert shown == pixels
+            before = player.snapshot().view
+            window.move_pointer(0.9 * units[0], 0.3 * units[1])
+            with replaced(player.state.visible, controls=False):
+                player.frame()
+                window.press_button(LEFT, True)
+                player.frame()
+                window.move_pointer(0.9 * units[0] + 0.1 * units[1], 0.3 * units[1])
+                player.frame()
+                window.press_button(LEFT, False)
+                player.frame()
+            turned = np.arccos(np.clip((np.trace(player.snapshot().view.axes.T @ before.axes) - 1) / 2, -1, 1))
+            assert turned == approx(0.1 * np.pi, rel=1e-3)  # a tenth of the window's height, whatever its units
+            assert window.unscaled_size == (units if pixels != units else tuple(n / scale for n in units))
+    assert text_heights[1:] == approx([2 * text_heights[0]] * 2, rel=0.05)  # sizes of text are integers
     player.frame()
 
 
-def come_to_rest(player: Player) -> None:
-    """What stands still is drawn anew, row by row, as finely as at once."""
-    player.playback.playing = False
-    player.show_hud = False
-    band_s, window_module.BAND_S = window_module.BAND_S, 1e-6
-    player.look_from(player.view.orbit(0.1, 0.0))
-    player.quality.resolution.scale = 0.25
-    player.frame()
-    coarse = player._pixels().astype(int)
-    time.sleep(0.3)
-    turns = 0
-    while not player._is_sharp:
+def field_of_view_does_not_depend_on_the_raster(player: Player) -> None:
+    renderer, cameras = player.scene_view.renderer, []
+    canvas = player.snapshot().canvas
+    whole = player.snapshot().view.camera(*canvas)
+    with replaced(renderer, show=lambda target, camera, *_, **__: cameras.append(camera)):
+        for scale in (0.125, 0.297, 0.42, 0.841):
+            player.scene_view.draw("fast", scale)
+    assert len(cameras) == 4
+    for camera in cameras:
+        assert camera.fl_x / camera.width == approx(whole.fl_x / whole.width)
+        assert camera.cx / camera.width == approx(whole.cx / whole.width)
+        assert camera.fl_y / camera.height == approx(whole.fl_y / whole.height)
+        assert camera.cy / camera.height == approx(whole.cy / whole.height)
+
+
+def stills_are_refined_in_bands(player: Player) -> None:
+    """Refining row by row gives the picture that drawing it at once gives."""
+    state, scene_view = player.state, player.scene_view
+    state.playback.playing = False
+    with replaced(state.visible, controls=False), replaced(scene_view, band_s=1e-6):
+        state.look_from(state.view.orbit(0.1, 0.0))
+        state.quality.resolution.scale = 0.25
         player.frame()
-        turns += 1
-    fine = player._pixels().astype(int)
-    player._still()
-    assert turns == player.canvas.height and np.abs(fine - player._pixels()).max() <= 1 < np.abs(fine - coarse).max()
-    window_module.BAND_S, player.show_hud = band_s, True
+        coarse = scene_view.pixels().astype(int)
+        time.sleep(0.3)
+        frames = 0
+        while not player.snapshot().is_sharp:
+            player.frame()
+            frames += 1
+        fine = scene_view.pixels().astype(int)
+        scene_view.draw_still()
+        whole = scene_view.pixels()
+        assert frames == player.snapshot().canvas[1] and np.abs(fine - whole).max() <= 1 < np.abs(fine - coarse).max()
 
 
-def run_out_of_room(player: Player) -> None:
-    """What the card refuses is told, and drawn more coarsely; what it refuses again and again ends the player."""
-    show, rung = player.renderer.show, player.quality.level
+def drawing_fails(player: Player) -> None:
+    """Errors of the graphics card are shown and the quality is lowered; repeated errors end the player."""
+    renderer, state, level = player.scene_view.renderer, player.state, player.snapshot().level
 
     def refuse(*_: object, **__: object) -> None:
-        raise DisplayError("no room for a picture")
+        raise DisplayError("no memory for a picture")
 
-    player.renderer.show = refuse  # type: ignore[method-assign]
-    for _ in range(window_module.MOST_MISHAPS):
-        player.look_from(player.view.orbit(0.1, 0.0))
-        player.frame()
-        assert player.notice_is_error and "no room" in player.notice
-    assert LEVEL_NAMES.index(player.quality.level) < LEVEL_NAMES.index(rung)
-    player.look_from(player.view.orbit(0.1, 0.0))
-    with raises(DisplayError, match="no room"):
-        player.frame()
-    imgui.end_frame()
-    player.renderer.show, player._mishaps = show, 0  # type: ignore[method-assign]
-    player.quality.choose(rung)
+    with replaced(renderer, show=refuse):
+        for _ in range(MAX_RETRIES):
+            state.look_from(state.view.orbit(0.1, 0.0))
+            player.frame()
+            assert player.snapshot().notice_is_error and "no memory" in player.snapshot().notice
+        assert LEVEL_NAMES.index(player.snapshot().level) < LEVEL_NAMES.index(level)
+        state.look_from(state.view.orbit(0.1, 0.0))
+        with raises(DisplayError, match="no memory"):
+            player.frame()
+        imgui.end_frame()
+    player.forget_failures()
+    state.quality.choose(level)
     player.frame()
 
 
-def drop_files(window: Window, player: Player, scene_file: Path) -> None:
-    """A camera path, things that are none, and another scene."""
+def dropped_files(player: Player, scene_file: Path) -> None:
+    """Drop files that cannot be read, a camera path, and another scene."""
     (path,) = Path().glob("*-path.json")
-    keyframes = player.path.keyframes
-    player.path = CameraPath()
+    keyframes = player.snapshot().keyframes
+    player.state.follower.replace(CameraPath())
     Path("text.kpc").write_text("no scene")
     for file, words in (
         ("text.kpc", "text.kpc"),
@@ -381,135 +407,146 @@ def drop_files(window: Window, player: Player, scene_file: Path) -> None:
         ("none.json", "none.json"),
         ("text.kpc.JSON", "JSON"),
     ):
-        window._drop(None, [file])
+        player.window.drop([file])
         player.frame()
-        assert player.notice_is_error and words in player.notice and player.successor is None, player.notice
-    window._drop(None, [str(path)])
+        shown = player.snapshot()
+        assert shown.notice_is_error and words in shown.notice and player.successor is None, shown.notice
+    player.window.drop([str(path)])
     player.frame()
-    assert len(player.path.keyframes) == len(keyframes) and not player.notice_is_error
-    window._drop(None, [str(scene_file)])
+    assert player.snapshot().keyframes == keyframes > 0 and not player.snapshot().notice_is_error
+    player.window.drop([str(scene_file)])
     player.run()
-    assert player.successor is not None and not glfw.window_should_close(window.handle)
+    assert player.successor is not None and not player.state.should_close
     player.successor.close()
-    player.successor = None
+    player.actions.successor = None
 
 
-def go_through_groups(window: Window, scene_file: str) -> None:
-    """The scene twice as one clip: each half shows in its time, in the quality and the appearance that were chosen."""
+def resized_and_closed(player: Player) -> None:
+    window = player.window
+    press(player, glfw.KEY_H, glfw.KEY_P)
+    glfw.set_window_size(window.handle, 200, 260)
+    time.sleep(0.05)
+    glfw.poll_events()
+    player.frame()
+    assert player.snapshot().canvas == window.pixels
+    press(player, glfw.KEY_TAB, glfw.KEY_ESCAPE)
+    assert player.state.should_close
+    settings = player.preferences()
+    assert settings == Preferences((200, 260), DEFAULT, None, 2.0, False, False, True, True, player.state.text_size)
+    player.run()
+    press(player, glfw.KEY_O)
+    recording = player.filming.recording
+    player.run(1)
+    player.frame()
+    report = player.close()  # a video that is being written is finished
+    assert report is not None and report.startswith("saved ") and len(list(read_video(recording.path))) >= 1
+    assert all(binding.help for binding in KEY_BINDINGS)
+
+
+def groups_of_a_clip(window: Window, scene_file: str) -> None:
+    """Each group of a clip is shown at its time, with the quality and the appearance that were chosen."""
     groups.write(groups.group_inputs([scene_file, scene_file]), "twice.kpc")
-    reel = GroupPlayback(open_source("twice.kpc"))
-    player = Player(window, reel, Preferences())
-    player.type(glfw.KEY_SPACE, 0)
-    player.appearance.select(2)
-    player.type(glfw.KEY_MINUS, 0)
-    chosen, times = player.quality.level, []
+    stream = GroupPlayback(open_source("twice.kpc"))
+    player = Player(window, stream, Preferences())
+    press(player, glfw.KEY_SPACE)
+    player.state.appearance.select(2)
+    press(player, glfw.KEY_MINUS)
+    level, times = player.snapshot().level, []
     for key, number in ((glfw.KEY_END, 1), (glfw.KEY_LEFT, 1), (glfw.KEY_HOME, 0)):
-        player.type(key, 0)
-        until = time.monotonic() + 20
-        while not (reel.number == number and reel.is_settled and player._is_sharp):
-            assert time.monotonic() < until
-            player.frame()
-        assert player.scene is reel.scene and player.appearance.scene is reel.scene and player.appearance.number == 2
-        assert player.quality.level == chosen
-        times.append((player.playback.time, reel.time_in(player.playback.time)))
+        player.press(key)
+        frames_until(player, lambda n=number: stream.number == n and stream.is_settled and player.snapshot().is_sharp)
+        assert player.state.scene is player.state.appearance.scene is stream.scene
+        assert player.snapshot().appearance == "noon.jpg" and player.snapshot().level == level
+        times.append((player.snapshot().time, stream.time_in(player.snapshot().time)))
     assert np.allclose(times, [(1.0, 1.0), (20 / 21, 0.9), (0.0, 0.0)], atol=1e-6)
-    player.type(glfw.KEY_SPACE, 0)  # from here it plays over the join
-    until = time.monotonic() + 20
-    while player.playback.time < 0.6:
-        assert time.monotonic() < until
-        player.frame()
-    assert reel.number == 1
+    press(player, glfw.KEY_SPACE)  # from here the clip plays into the second group
+    frames_until(player, lambda: player.snapshot().time >= 0.6)
+    assert stream.number == 1
     player.close()
-    reel.close()
+    stream.close()
 
 
-def stand_where_groups_are_mixed(window: Window, scene_file: str) -> None:
-    """Amid the frames that two groups share the picture is made of both, also once it is sharp."""
+def blended_groups(window: Window, scene_file: str) -> None:
+    """Within the frames that two groups share the picture is a blend of both, also once it is refined."""
     groups.write([groups.GroupInput.of(scene_file, 0), groups.GroupInput.of(scene_file, 6)], "mixed.kpc")
-    reel = GroupPlayback(open_source("mixed.kpc"))
-    player = Player(window, reel, Preferences())
-    player.scrub(0.5)
-    until = time.monotonic() + 20
-    while not (reel.is_settled and reel.beside(0.5) and player._is_sharp):
-        assert time.monotonic() < until
-        player.frame()
-    other, time_in_it, share = reel.beside(0.5)
-    camera = player.view.camera(*player.canvas.size)
-    alone, beside = (
-        renderer.render(camera, at).rgb.clip(0, 1)
-        for renderer, at in ((reel.renderer, reel.time_in(0.5)), (other, time_in_it))
-    )
-    assert share == 0.5 and np.abs(alone - beside).max() > 0.1
-    assert np.abs(player._pixels() / 255 - (alone + beside) / 2).max() < 2 / 255
+    stream = GroupPlayback(open_source("mixed.kpc"))
+    player = Player(window, stream, Preferences())
+    player.state.scrub(0.5)
+    frames_until(player, lambda: stream.is_settled and stream.blended_with(0.5) and player.snapshot().is_sharp)
+    other, time_in_group, share = stream.blended_with(0.5)
+    camera = player.snapshot().view.camera(*player.snapshot().canvas)
+    first = stream.renderer.render(camera, stream.time_in(0.5)).rgb.clip(0, 1)
+    second = other.render(camera, time_in_group).rgb.clip(0, 1)
+    assert share == 0.5 and np.abs(first - second).max() > 0.1
+    assert np.abs(player.scene_view.pixels() / 255 - (first + second) / 2).max() < 2 / 255
     player.close()
-    reel.close()
+    stream.close()
 
 
-def lose_the_card(scene_file: str) -> None:
-    """Once, after a frame: another window goes on where that one was. Again and again: it is given up."""
-    made: list[object] = []
-    real = window_module._reset_status
+def reset_of_the_graphics_card(scene_file: str) -> None:
+    """After a reset another window continues; after many the player ends."""
+    windows: list[object] = []
 
-    def reset_by(turns: int) -> Callable[[], Callable[[], int]]:
-        def look_up() -> Callable[[], int]:
-            turn = iter(range(1_000_000))
-            made.append(window_module.Window)
-            return lambda: 0x8255 if len(made) <= turns and next(turn) == 1 else 0
+    def resets_of_first(count: int) -> Callable[[], Callable[[], int]]:
+        """The first `count` windows report a reset in their second frame."""
 
-        return look_up
+        def query() -> Callable[[], int]:
+            frame = iter(range(1_000_000))
+            windows.append(object())
+            return lambda: 0x8255 if len(windows) <= count and next(frame) == 1 else 0
 
-    window_module._reset_status = reset_by(1)
-    assert kpplay.main([scene_file, "--size", "300x200", "--frames", "4", "--screenshot", "reset.png"]) == 0
-    assert len(made) == 2 and read_image("reset.png").shape == (200, 300, 3)
-    made.clear()
-    window_module._reset_status, kpplay.MOST_RESETS = reset_by(99), 1
-    assert kpplay.main([scene_file, "--size", "300x200", "--frames", "4"]) == 1 and len(made) == kpplay.MOST_RESETS + 1
-    window_module._reset_status = real
+        return query
 
-
-def begin_on_a_card(window: Window, scene_file: str) -> None:
-    """A graphics card holds a rate from the reference on, as long as nothing else is asked for; the control shows it, and it is remembered."""
-    real, window_module.is_software = window_module.is_software, lambda ctx: False
-    for asked, quality, fps in ((Preferences(), LEVEL_NAMES[-1], 50.0), (Preferences(quality="fine"), "fine", None)):
-        reel = GroupPlayback(open_source(scene_file))
-        player = Player(window, reel, asked)
-        assert player.preferences().quality == player.quality.level == quality
-        assert player.preferences().target_fps == approx(fps) if fps else player.quality.target_s is None
-        assert player.target_fps == approx(fps or window_module.FILM_FPS)
-        player.target_fps = 42.0
-        assert Player(window, reel, asked, before=player).target_fps == 42.0
-        player.close()
-        reel.close()
-    window_module.is_software = real
+    with replaced(window_module, reset_status_query=resets_of_first(1)):
+        assert kpplay.main([scene_file, "--size", "300x200", "--frames", "4", "--screenshot", "reset.png"]) == 0
+    assert len(windows) == 2 and read_image("reset.png").shape == (200, 300, 3)
+    windows.clear()
+    with replaced(window_module, reset_status_query=resets_of_first(99)), replaced(kpplay, MAX_RESETS=1):
+        assert kpplay.main([scene_file, "--size", "300x200", "--frames", "4"]) == 1 and len(windows) == 2
 
 
-def remember(scene_file: str) -> None:
-    """What was set in one run is there in the next, unless it is told otherwise; also where nothing can be written."""
-    run, seen = Player.run, []
+def defaults_on_a_graphics_card(window: Window, scene_file: str) -> None:
+    """A graphics card begins with the reference and holds a frame rate, unless a quality is asked for."""
+    with replaced(player_module, is_software=lambda ctx: False):
+        for settings, level, fps in (
+            (Preferences(), LEVEL_NAMES[-1], 50.0),
+            (Preferences(quality="fine"), "fine", None),
+        ):
+            stream = GroupPlayback(open_source(scene_file))
+            player = Player(window, stream, settings)
+            assert player.preferences().quality == player.snapshot().level == level
+            assert player.preferences().target_fps == approx(fps) if fps else player.snapshot().target_s is None
+            assert player.state.target_fps == approx(fps or FILM_FPS)
+            player.state.target_fps = 42.0
+            resumed = Player(window, stream, settings, resume_from=player)
+            assert resumed.state.target_fps == 42.0
+            resumed.close()
+            player.close()
+            stream.close()
 
-    def changed(player: Player, frames: int | None = None) -> None:
+
+def settings_are_saved(scene_file: str) -> None:
+    """Settings of one run hold in the next, unless an option replaces them; and kpplay also ends well if it cannot save them."""
+    settings: list[Preferences] = []
+
+    def run(player: Player, frames: int | None = None) -> None:
         player.frame()
-        seen.append(player.preferences())
-        player.type(glfw.KEY_MINUS, 0)
-        player.type(glfw.KEY_G, 0)
+        settings.append(player.preferences())
+        press(player, glfw.KEY_MINUS, glfw.KEY_G)
 
-    Player.run = changed  # type: ignore[method-assign]
-    assert kpplay.main([scene_file, "--size", "300x200"]) == 0
-    assert kpplay.main([scene_file, "--target-fps", "25"]) == 0
-    assert kpplay.main([scene_file, "--quality", "fine"]) == 0
-    shutil.rmtree(preferences_path().parent)
-    preferences_path().parent.write_text("no folder")
-    assert kpplay.main([scene_file]) == 0
-    Player.run = run  # type: ignore[method-assign]
-    assert [one.size for one in seen[:3]] == 3 * [(300, 200)] and [one.graphs for one in seen] == [
-        False,
-        True,
-        False,
-        False,
-    ]
-    assert [one.quality for one in seen] == [DEFAULT, neighbouring_level(DEFAULT, -1), "fine", DEFAULT]
-    assert [one.target_fps for one in seen] == [None, 25.0, None, None]
+    with replaced(Player, run=run):
+        assert kpplay.main([scene_file, "--size", "300x200"]) == 0
+        assert kpplay.main([scene_file, "--target-fps", "25"]) == 0
+        assert kpplay.main([scene_file, "--quality", "fine"]) == 0
+        shutil.rmtree(preferences_path().parent)
+        preferences_path().parent.write_text("not a folder")
+        assert kpplay.main([scene_file]) == 0
+    assert [one.size for one in settings[:3]] == 3 * [(300, 200)]
+    assert [one.graphs for one in settings] == [False, True, False, False]
+    assert [one.quality for one in settings] == [DEFAULT, neighbouring_level(DEFAULT, -1), "fine", DEFAULT]
+    assert [one.target_fps for one in settings] == [None, 25.0, None, None]
 
 
 if __name__ == "__main__":
+    assert os.environ.get("XDG_CONFIG_HOME"), "set XDG_CONFIG_HOME: the settings there are deleted"
     main(sys.argv[1])

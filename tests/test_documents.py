@@ -69,9 +69,12 @@ def test_the_camera_file_shown_can_be_read(tmp_path: Path) -> None:
 
 
 def test_the_keys_shown_are_those_of_the_player() -> None:
-    from kpc.player.app.panels import KEYS
+    from kpc.player.app.input import KEY_BINDINGS
 
-    assert "".join(f"| {key} | {meaning} |\n" for key, meaning in KEYS) in (ROOT / "docs" / "playing.md").read_text()
+    assert (
+        "".join(f"| {binding.keys} | {binding.help} |\n" for binding in KEY_BINDINGS)
+        in (ROOT / "docs" / "playing.md").read_text()
+    )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())

@@ -71,7 +71,7 @@ WITHOUT_TORCH = without("torch")
 
 
 VIEWERS = (
-    *("player.gl.renderer", "player.app.kpplay", "player.app.window"),
+    *("player.gl.renderer", "player.app.kpplay", "player.app.player"),
     *(
         "tools.cli.kprender",
         "tools.cli.kpinfo",

@@ -1,4 +1,4 @@
-"""The mathematics of looking around and of playing: no window, no OpenGL."""
+"""Camera movement, playback of the clip, and selection of an appearance. No window, no OpenGL."""
 
 import math
 from dataclasses import dataclass, replace
@@ -8,23 +8,28 @@ from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.viewpoints import Rig, fit_camera
 
-STEEPEST = math.radians(1.0)
-"""Orbiting stops this far from looking straight up or down."""
-FADE_S = 0.4
-"""From one appearance to the next."""
+# Orbiting stops at this angle from looking straight up or down, radians.
+MIN_POLAR_ANGLE = math.radians(1.0)
+# Seconds that the blend from one appearance to the next takes.
+BLEND_S = 0.4
+# Playback speeds to choose from, clip seconds per second.
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+# Distance over that before, for each notch of the wheel, and bounds of the distance, world units.
+ZOOM_FACTOR, MIN_DISTANCE, MAX_DISTANCE = 0.9, 1e-4, 1e6
+# The name of what is shown without an appearance embedding.
+AVERAGE = "average"
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera that turns around a point.
+    """A camera that orbits around a point.
 
     Attributes:
-        lens: whose intrinsics to use; its pose is not looked at.
-        focus: (3,) the point it looks at, world coordinates.
-        distance: from the eye to it, world units.
-        axes: (3, 3) columns right, up, backward in the world, orthonormal.
-        up: (3,) unit vector; orbiting turns around it.
+        lens: the camera whose intrinsics to use; its pose is ignored.
+        focus: (3,) the point it orbits around, world coordinates.
+        distance: from the eye to the focus, world units.
+        axes: (3, 3) columns right, up, backward in world coordinates, orthonormal.
+        up: (3,) unit vector, the axis of horizontal orbits.
     """
 
     lens: Camera
@@ -35,7 +40,7 @@ class View:
 
     @staticmethod
     def of(rig: Rig, camera: Camera) -> "View":
-        """Exactly what `camera` sees; turning around the point of its axis that lies nearest to the rig's focus."""
+        """Return the view of a camera. It orbits around the point of the camera's axis that is nearest to the rig's focus."""
         axes, eye = camera.camera_to_world[:3, :3], camera.camera_to_world[:3, 3]
         away = float(np.linalg.norm(rig.focus - eye))
         distance = max(float((rig.focus - eye) @ -axes[:, 2]), 0.1 * away, 1e-3)
@@ -43,45 +48,50 @@ class View:
 
     @property
     def eye(self) -> np.ndarray:
+        """(3,) the camera's position, world coordinates."""
         return self.focus + self.distance * self.axes[:, 2]
 
     def camera(self, width: int, height: int) -> Camera:
-        """The camera on a raster of this size."""
+        """Return the camera for a raster of this size."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = self.axes, self.eye
         return replace(fit_camera(self.lens, width, height), camera_to_world=pose)
 
-    def orbit(self, sideways: float, upwards: float) -> "View":
-        """Drag the scene by these angles, radians: the eye goes the other way around the focus."""
-        turned = _rotation(self.up, -sideways) @ self.axes
-        pitched = _rotation(turned[:, 0], upwards) @ turned
+    def orbit(self, right: float, up: float) -> "View":
+        """Drag the scene by two angles in radians; the eye moves the other way around the focus."""
+        turned = _rotation(self.up, -right) @ self.axes
+        pitched = _rotation(turned[:, 0], up) @ turned
         old, new = (math.acos(np.clip(axes[:, 2] @ self.up, -1.0, 1.0)) for axes in (turned, pitched))
-        steep = min(new, math.pi - new) < STEEPEST and min(new, math.pi - new) < min(old, math.pi - old)
-        overturned = pitched[:, 1] @ self.up < 0.0 < turned[:, 1] @ self.up
-        return replace(self, axes=_orthonormal(turned if steep or overturned else pitched))
+        polar, polar_before = min(new, math.pi - new), min(old, math.pi - old)
+        is_too_steep = polar < MIN_POLAR_ANGLE and polar < polar_before
+        is_upside_down = pitched[:, 1] @ self.up < 0.0 < turned[:, 1] @ self.up
+        return replace(self, axes=_orthonormal(turned if is_too_steep or is_upside_down else pitched))
 
-    def pan(self, sideways: float, upwards: float) -> "View":
-        """Drag the focus along the picture's plane, in heights of the picture, so that it stays under the pointer."""
+    def pan(self, right: float, up: float) -> "View":
+        """Drag the focus parallel to the image plane, in heights of the picture, so that it stays under the pointer."""
         height = self.distance * self.lens.height / self.lens.fl_y
-        return replace(self, focus=self.focus - height * (sideways * self.axes[:, 0] + upwards * self.axes[:, 1]))
+        return replace(self, focus=self.focus - height * (right * self.axes[:, 0] + up * self.axes[:, 1]))
 
     def zoom(self, notches: float) -> "View":
-        """Come nearer by a tenth for each notch of the wheel."""
-        return replace(self, distance=float(np.clip(self.distance * 0.9 ** np.clip(notches, -100, 100), 1e-4, 1e6)))
+        """Move closer by a tenth of the distance for each notch of the wheel."""
+        distance = self.distance * ZOOM_FACTOR ** np.clip(notches, -100, 100)
+        return replace(self, distance=float(np.clip(distance, MIN_DISTANCE, MAX_DISTANCE)))
 
     def fly(self, right: float, up: float, forward: float) -> "View":
-        """Move eye and focus along the camera's own axes, world units."""
+        """Move eye and focus along the camera's axes, world units."""
         return replace(self, focus=self.focus + self.axes @ np.array([right, up, -forward]))
 
 
 @dataclass
 class Playback:
-    """Where a clip is.
+    """The position in a clip.
 
     Attributes:
-        time: [0, 1] over the clip.
-        speed: clip seconds to one real second.
-        loop: begin again at the end, else stop there.
+        clip: number and rate of its frames.
+        time: in [0, 1] over the clip.
+        playing: whether time advances.
+        speed: clip seconds per second.
+        loop: whether to begin again at the end, else to stop there.
     """
 
     clip: Clip
@@ -91,7 +101,7 @@ class Playback:
     loop: bool = True
 
     def advance(self, seconds: float) -> None:
-        """Let real time pass."""
+        """Advance by some real time."""
         if not self.playing or self.clip.duration_s == 0.0:
             return
         time = self.time + seconds * self.speed / self.clip.duration_s
@@ -100,14 +110,14 @@ class Playback:
         self.time = time % 1.0 if time > 1.0 else time
 
     def after(self, seconds: float) -> "Playback":
-        """Where it will be then."""
+        """Return the position after some real time."""
         later = replace(self)
         later.advance(seconds)
         return later
 
     @property
     def rate(self) -> float:
-        """Of the clip in a real second; 0 while it does not play."""
+        """The fraction of the clip that is played per second; 0 while paused."""
         return self.speed / self.clip.duration_s if self.playing and self.clip.duration_s > 0 else 0.0
 
     def toggle(self) -> None:
@@ -117,37 +127,40 @@ class Playback:
             self.time = 0.0
 
     def seek(self, time: float) -> None:
+        """Go to a time, clamped to [0, 1]."""
         self.time = min(max(time, 0.0), 1.0)
 
     def step(self, frames: int) -> None:
-        """Pause, and go to a whole frame so many frames on."""
+        """Pause, round to a whole frame, and go `frames` frames forward."""
         self.playing = False
         last = self.clip.frame_count - 1
         if last > 0:
             self.seek((round(self.time * last) + frames) / last)
 
-    def faster(self, steps: int) -> None:
-        """Go so many steps along SPEEDS."""
-        nearest = min(range(len(SPEEDS)), key=lambda i: abs(SPEEDS[i] - self.speed))
-        self.speed = SPEEDS[min(max(nearest + steps, 0), len(SPEEDS) - 1)]
+    @property
+    def speed_number(self) -> int:
+        """The position in SPEEDS of the speed nearest to the present one."""
+        return min(range(len(SPEEDS)), key=lambda number: abs(SPEEDS[number] - self.speed))
 
-
-AVERAGE = "average"
-"""The look without an appearance."""
+    def change_speed(self, steps: int) -> None:
+        """Go `steps` speeds up in SPEEDS."""
+        self.speed = SPEEDS[min(max(self.speed_number + steps, 0), len(SPEEDS) - 1)]
 
 
 class AppearanceSelection:
-    """Which appearance of a scene is shown: the average first, then each of them; a change takes FADE_S.
+    """The appearance embedding that is shown: the average or that of a picture; a change is blended over BLEND_S.
+
+    Args:
+        scene: the scene.
+        selected: the name to begin with; the average if the scene has no such appearance.
 
     Attributes:
-        scene: whose appearances they are.
         names: AVERAGE, then those of the scene's appearances.
-        number: of the one shown, or on its way.
-        progress: of that change, [0, 1].
+        number: position in `names` of the one that is shown or being blended in.
+        progress: of the blend, [0, 1].
     """
 
     def __init__(self, scene: Scene, selected: str = AVERAGE) -> None:
-        """`selected`: the name to begin with; where the scene has it not, the average."""
         self.scene = scene
         self.names = (AVERAGE, *(appearance.name for appearance in scene.appearances))
         average = np.zeros(len(scene.decoder.b1), np.float32)
@@ -156,36 +169,41 @@ class AppearanceSelection:
         self._before = self._codes[self.number]
 
     @property
+    def name(self) -> str:
+        """The name of the appearance that is shown or being blended in."""
+        return self.names[self.number]
+
+    @property
     def code(self) -> np.ndarray | None:
-        """(H,) what to show now: (1 - s) before + s next, s = p^2 (3 - 2 p) of the progress p; None in a scene without any."""
+        """(H,) float32, the embedding to show: (1 - s) before + s next, s = p^2 (3 - 2 p) for progress p; None if there is none."""
         if len(self._codes) == 1:
             return None
         share = np.float32(self.progress * self.progress * (3 - 2 * self.progress))
         return (1 - share) * self._before + share * self._codes[self.number]
 
     def select(self, number: int) -> None:
-        """Begin to change into another, from whatever is shown now."""
+        """Begin to blend from what is shown to another appearance."""
         shown = self.code
         if shown is not None and number != self.number:
             self._before, self.number, self.progress = shown, number, 0.0
 
     def next(self) -> None:
-        """Begin to change into the next; after the last, the average."""
+        """Begin to blend to the next appearance; after the last, to the average."""
         self.select((self.number + 1) % len(self._codes))
 
     def advance(self, seconds: float) -> None:
-        """Let real time pass."""
-        self.progress = min(self.progress + seconds / FADE_S, 1.0)
+        """Advance the blend."""
+        self.progress = min(self.progress + seconds / BLEND_S, 1.0)
 
 
 def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Turn by `angle` around a unit vector, counter-clockwise seen from its tip (Rodrigues)."""
+    """Return the rotation by `angle` around a unit vector, counter-clockwise seen from its tip (Rodrigues' formula)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
 
 
 def _orthonormal(axes: np.ndarray) -> np.ndarray:
-    """The nearest rotation: many small turns must not add up to a skew."""
+    """Return the nearest rotation, so that many small rotations do not add up to a skew."""
     u, _, vt = np.linalg.svd(axes)
     return u @ vt

@@ -1,10 +1,11 @@
-"""Dear ImGui drawn with moderngl."""
+"""Dear ImGui, drawn with moderngl."""
 
 import ctypes
 
 import moderngl
 import numpy as np
 from kpc.player.app.desktop import imgui
+from kpc.player.app.widgets import ACCENT
 from kpc.player.gl import shader
 
 _VERTEX = f"""{shader.GL33}
@@ -12,35 +13,42 @@ uniform vec2 display;
 in vec2 position;
 in vec2 uv;
 in vec4 colour;
-out vec2 at;
+out vec2 texture_position;
 out vec4 tint;
 void main() {{
-    at = uv;
+    texture_position = uv;
     tint = colour;
     gl_Position = vec4(position.x / display.x * 2.0 - 1.0, 1.0 - position.y / display.y * 2.0, 0.0, 1.0);
 }}
 """
 _FRAGMENT = f"""{shader.GL33}
 uniform sampler2D sheet;
-in vec2 at;
+in vec2 texture_position;
 in vec4 tint;
-out vec4 shown;
-void main() {{ shown = tint * texture(sheet, at); }}
+out vec4 result;
+void main() {{ result = tint * texture(sheet, texture_position); }}
 """
 
 
 class ImGuiRenderer:
-    """The ImGui context of one window. Feed `io` with events, build widgets after `begin`, then `draw`."""
+    """The ImGui context of one window: pass events to `io`, build widgets after `begin`, then `draw`.
+
+    Args:
+        ctx: the OpenGL context.
+
+    Attributes:
+        io: where ImGui takes events.
+    """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.ctx = ctx
         self._context = imgui.create_context()
         self.io = imgui.get_io()
-        self.io.set_ini_filename("")  # leave no files behind
+        self.io.set_ini_filename("")  # write no files
         self.io.backend_flags |= imgui.BackendFlags_.renderer_has_textures
-        most = ctx.info["GL_MAX_TEXTURE_SIZE"]
-        imgui.get_platform_io().renderer_texture_max_width = most
-        imgui.get_platform_io().renderer_texture_max_height = most
+        max_side = ctx.info["GL_MAX_TEXTURE_SIZE"]
+        imgui.get_platform_io().renderer_texture_max_width = max_side
+        imgui.get_platform_io().renderer_texture_max_height = max_side
         self.io.fonts.add_font_default_vector()
         _style()
         self._program = ctx.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
@@ -55,7 +63,11 @@ class ImGuiRenderer:
     ) -> None:
         """Start a frame.
 
-        Sizes are in screen units and in pixels; `content_scale` is how large the system draws its text.
+        Args:
+            window: (width, height) of the window, screen units.
+            framebuffer: (width, height) of the window, pixels.
+            content_scale: size of the text, pixels per pixel of a screen of ordinary density.
+            seconds: since the last frame.
         """
         self._pixels = framebuffer
         ratio = framebuffer[0] / max(window[0], 1), framebuffer[1] / max(window[1], 1)
@@ -70,7 +82,7 @@ class ImGuiRenderer:
         imgui.render()
         data = imgui.get_draw_data()
         self._update_textures()
-        width, height = self._pixels  # for a window's own, moderngl keeps the size that it began with
+        width, height = self._pixels  # moderngl does not follow changes of a window's own framebuffer
         framebuffer.use()
         framebuffer.viewport = (0, 0, width, height)
         display = self._program["display"]
@@ -93,16 +105,18 @@ class ImGuiRenderer:
         framebuffer.scissor = (0, 0, width, height)
         self.ctx.enable_only(moderngl.NOTHING)
 
-    def adopt(self, texture: moderngl.Texture) -> moderngl.Texture:
-        """A texture that widgets show: `imgui.ImTextureRef(texture.glo)`."""
+    def make_texture(self, size: tuple[int, int]) -> moderngl.Texture:
+        """Return an RGB texture of (width, height) that widgets can show as `imgui.ImTextureRef(texture.glo)`."""
+        texture = self.ctx.texture(size, 3, alignment=1)
         self._textures[texture.glo] = texture
         return texture
 
-    def forget(self, texture: moderngl.Texture) -> None:
-        """One that none will show any more."""
+    def drop_texture(self, texture: moderngl.Texture) -> None:
+        """Release a texture of `make_texture`."""
         self._textures.pop(texture.glo).release()
 
     def close(self) -> None:
+        """Destroy the ImGui context."""
         for texture in imgui.get_platform_io().textures:
             texture.set_tex_id(0)
             texture.status = imgui.ImTextureStatus.destroyed
@@ -127,7 +141,7 @@ class ImGuiRenderer:
         self._indices.write(ctypes.string_at(indices.data_address(), index_bytes))
 
     def _update_textures(self) -> None:
-        """ImGui bakes glyphs as they come up and asks for its textures to follow."""
+        """Update the textures of glyphs, which ImGui rasterises when they are first used."""
         status = imgui.ImTextureStatus
         for wanted in imgui.get_platform_io().textures:
             if wanted.status == status.want_create:
@@ -149,6 +163,7 @@ def _texels(texture: imgui.ImTextureData) -> np.ndarray:
 
 
 def _style() -> None:
+    """Set colours and sizes of all widgets."""
     imgui.style_colors_dark()
     style = imgui.get_style()
     style.window_rounding = style.frame_rounding = style.grab_rounding = 5.0
@@ -156,7 +171,6 @@ def _style() -> None:
     style.window_padding = imgui.ImVec2(10, 8)
     style.item_spacing = imgui.ImVec2(8, 5)
     style.font_size_base = 15.0
-    accent = imgui.ImVec4(0.95, 0.62, 0.25, 1.0)
     style.set_color_(imgui.Col_.window_bg, imgui.ImVec4(0.06, 0.07, 0.09, 0.72))
     style.set_color_(imgui.Col_.text_disabled, imgui.ImVec4(0.74, 0.76, 0.80, 1.0))
     style.cell_padding = imgui.ImVec2(8, 2)
@@ -165,7 +179,7 @@ def _style() -> None:
     style.set_color_(imgui.Col_.frame_bg_active, imgui.ImVec4(1.0, 1.0, 1.0, 0.20))
     style.set_color_(imgui.Col_.button, imgui.ImVec4(1.0, 1.0, 1.0, 0.10))
     style.set_color_(imgui.Col_.button_hovered, imgui.ImVec4(1.0, 1.0, 1.0, 0.22))
-    style.set_color_(imgui.Col_.button_active, accent)
-    style.set_color_(imgui.Col_.check_mark, accent)
-    style.set_color_(imgui.Col_.slider_grab, accent)
-    style.set_color_(imgui.Col_.slider_grab_active, accent)
+    style.set_color_(imgui.Col_.button_active, ACCENT)
+    style.set_color_(imgui.Col_.check_mark, ACCENT)
+    style.set_color_(imgui.Col_.slider_grab, ACCENT)
+    style.set_color_(imgui.Col_.slider_grab_active, ACCENT)

@@ -1,11 +1,12 @@
-"""kpplay: fly through a scene in a window.
+"""kpplay: play a scene in a window.
 
 kpplay scene.kpc
 kpplay https://host/scene.kpc                          plays while it arrives
 kpplay scene.kpc --size 1280x720
-kpplay scene.kpc --quality fast                        from fastest to reference; --target-fps 30 chooses by itself
-kpplay scene.kpc --path path.json --folder films       a camera path to follow; where films and screenshots go
-kpplay scene.kpc --frames 30 --screenshot out.png      draw so many frames, save the window, leave
+kpplay scene.kpc --quality fast                        a quality level, from fastest to reference
+kpplay scene.kpc --target-fps 30                       changes the quality to hold a frame rate
+kpplay scene.kpc --path path.json --folder videos      a camera path to follow; where videos and screenshots go
+kpplay scene.kpc --frames 30 --screenshot out.png      show 30 frames, save the window, and exit
 """
 
 import argparse
@@ -30,12 +31,14 @@ from kpc.player.viewpoints import Rig
 if TYPE_CHECKING:
     from kpc.player.streaming.group_playback import GroupPlayback
 
-HEIGHT = 720
-MOST_RESETS = 3
-"""Of the graphics card, before it is given up."""
+# Height of the window on a first run, and bounds of its width, which follows from the scene's first camera.
+DEFAULT_HEIGHT, MIN_WIDTH, MAX_WIDTH = 720, 480, 1600
+# Resets of the graphics card after which kpplay gives up.
+MAX_RESETS = 3
 
 
 def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit status."""
     return cli.run(_command, "kpplay", argv)
 
 
@@ -44,56 +47,58 @@ def _command(argv: list[str]) -> None:
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames} is not positive")
     if options.screenshot is not None and Path(options.screenshot).suffix.lower() != ".png":
-        raise UsageError(f"--screenshot {options.screenshot} is no .png")
+        raise UsageError(f"--screenshot {options.screenshot} is not a .png file")
     if not Path(options.folder).is_dir():
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), options.folder)
     path = None if options.path is None else CameraPath.load(options.path)
 
-    from kpc.player.streaming.group_playback import (
-        GroupPlayback,
-    )  # only now: what is wrong with the options is told without OpenGL's libraries
+    # Imported here so that errors in the options are reported without OpenGL's libraries.
+    from kpc.player.streaming.group_playback import GroupPlayback
 
-    lasting = (
-        preferences.preferences_path() if options.frames is None else None
-    )  # counted frames are a test, which leaves no trace
+    # A run of a fixed number of frames is a test: it neither reads nor writes settings.
+    file = preferences.preferences_path() if options.frames is None else None
     stream = GroupPlayback(open_source(options.scene, limit=options.memory), memory=options.memory)
-    wanted = _over(preferences.load(lasting) if lasting else Preferences(), options)
-    last = _play(stream, wanted, options, path)
-    if lasting is not None:
+    settings = _merged(preferences.load(file) if file else Preferences(), options)
+    last_settings = _play(stream, settings, options, path)
+    if file is not None:
         try:
-            preferences.save(last, lasting)
+            preferences.save(last_settings, file)
         except OSError as error:
-            print(f"kpplay: settings are not remembered: {lasting}: {error.strerror or error}", file=sys.stderr)
+            print(f"kpplay: settings were not saved: {file}: {error.strerror or error}", file=sys.stderr)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="kpplay", description="Fly through a .kpc scene. Press H for the keys.")
+    parser = argparse.ArgumentParser(
+        prog="kpplay", description="Play a .kpc scene in a window. Press H there for the list of keys."
+    )
     cli.add_version_option(parser)
     parser.add_argument("scene", help="a .kpc file, or its http address")
     parser.add_argument(
         "--size",
         type=_size,
         metavar="WxH",
-        help=f"of the window (default: as it was; {HEIGHT} high, as wide as the camera)",
+        help=f"size of the window (default: as last time; at first {DEFAULT_HEIGHT} high, with the camera's aspect ratio)",
     )
     parser.add_argument(
         "--memory",
         type=cli.byte_count,
         default=DEFAULT_BUDGET,
         metavar="500MB",
-        help="for the scene, on the processor's side and on the graphics card's together (default: %(default)s bytes)",
+        help="limit for the scene, in main memory and on the graphics card together (default: %(default)s bytes)",
     )
     parser.add_argument(
-        "--quality", choices=list(LEVELS), help="how finely to draw (default: as it was; else what the device is up to)"
+        "--quality",
+        choices=list(LEVELS),
+        help="quality level, which then stays (default: as last time; at first chosen for the device)",
     )
     parser.add_argument(
         "--target-fps",
         type=cli.frame_rate(*TARGET_FPS),
         metavar="F",
-        help="hold so many frames a second by moving the quality "
-        f"(default: as it was; else a graphics card holds {GPU_FPS:.0f})",
+        help="hold this frame rate by changing the quality "
+        f"(default: as last time; at first {GPU_FPS:.0f} on a graphics card)",
     )
-    parser.add_argument("--path", metavar="JSON", help="a camera path, as saved before, for J to follow")
+    parser.add_argument("--path", metavar="JSON", help="a saved camera path, which the key J follows")
     parser.add_argument(
         "--folder",
         default=".",
@@ -101,68 +106,71 @@ def _parser() -> argparse.ArgumentParser:
         help="for screenshots, videos and camera paths (default: the working directory)",
     )
     parser.add_argument(
-        "--frames", type=int, metavar="N", help="leave after N frames, and neither take nor leave settings"
+        "--frames", type=int, metavar="N", help="exit after N frames; settings are neither read nor saved"
     )
-    parser.add_argument("--screenshot", metavar="PNG", help="save the window when leaving")
+    parser.add_argument("--screenshot", metavar="PNG", help="save the window at the end")
     return parser
 
 
-def _over(remembered: Preferences, options: argparse.Namespace) -> Preferences:
-    """What is asked for goes before what is remembered; a quality that is asked for is not moved by itself."""
-    target_fps = options.target_fps or (None if options.quality else remembered.target_fps)
+def _merged(saved: Preferences, options: argparse.Namespace) -> Preferences:
+    """Return settings in which options replace saved ones. A quality that is asked for is not changed automatically."""
+    target_fps = options.target_fps or (None if options.quality else saved.target_fps)
     return replace(
-        remembered,
-        size=options.size or remembered.size,
-        quality=options.quality or remembered.quality,
+        saved,
+        size=options.size or saved.size,
+        quality=options.quality or saved.quality,
         target_fps=target_fps,
     )
 
 
 def _play(
-    stream: "GroupPlayback", wanted: Preferences, options: argparse.Namespace, path: CameraPath | None
+    stream: "GroupPlayback", settings: Preferences, options: argparse.Namespace, path: CameraPath | None
 ) -> Preferences:
-    """From the first scene to the last that is dragged in, and over a graphics card that is reset; what to remember."""
-    from kpc.player.app.window import Player, Window  # only now: a scene that cannot be read is told without a display
+    """Play the scene, and others that are dropped on the window, also after resets of the card; return the settings to save."""
+    # Imported here so that a scene that cannot be read is reported without a display.
+    from kpc.player.app.player import Player
+    from kpc.player.app.window import Window
     from kpc.player.streaming.group_playback import GroupPlayback
 
-    window = Window("kpplay", wanted.size or _opening_size(stream))
-    before, resets = None, 0
+    window = Window("kpplay", settings.size or _default_size(stream))
+    interrupted, resets = None, 0
     try:
         while True:
-            window.name(f"{Path(stream.source.name).name} - kpplay")
-            player = Player(window, stream, wanted, before=before, folder=Path(options.folder))
-            player.path, path = path or player.path, None
-            before = None
+            window.set_title(f"{Path(stream.source.name).name} - kpplay")
+            player = Player(window, stream, settings, resume_from=interrupted, folder=Path(options.folder))
+            if path is not None:
+                player.state.follower.replace(path)
+            path = interrupted = None
             try:
                 player.run(options.frames)
                 if options.screenshot is not None and player.successor is None:
                     player.screenshot(Path(options.screenshot))
             except ContextLostError:
-                resets, before = resets + 1, player
-                if resets > MOST_RESETS:
+                resets, interrupted = resets + 1, player
+                if resets > MAX_RESETS:
                     raise
             finally:
-                wanted = player.preferences()
-                if (told := player.close()) is not None:
-                    print(f"kpplay: {told}", file=sys.stderr)
-            if before is not None:
+                settings = player.preferences()
+                if (report := player.close()) is not None:
+                    print(f"kpplay: {report}", file=sys.stderr)
+            if interrupted is not None:
                 window.close()
                 stream.close()
-                window = Window("kpplay", wanted.size or _opening_size(stream))
+                window = Window("kpplay", settings.size or _default_size(stream))
                 stream = GroupPlayback(open_source(stream.source.name, limit=options.memory), memory=options.memory)
             elif player.successor is not None:
                 stream.close()
                 stream = player.successor
             else:
-                return wanted
+                return settings
     finally:
-        stream.close()  # before the window goes that it wakes
+        stream.close()  # before the window, which its threads wake
         window.close()
 
 
-def _opening_size(stream: "GroupPlayback") -> tuple[int, int]:
+def _default_size(stream: "GroupPlayback") -> tuple[int, int]:
     camera = Rig.of(stream.scene).cameras[0]
-    return min(max(round(HEIGHT * camera.width / camera.height), 480), 1600), HEIGHT
+    return min(max(round(DEFAULT_HEIGHT * camera.width / camera.height), MIN_WIDTH), MAX_WIDTH), DEFAULT_HEIGHT
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -1,7 +1,6 @@
-"""What the player remembers from one run to the next, in a small JSON file in the platform's folder for settings.
+"""Settings of the player that are kept from one run to the next, in a small JSON file.
 
-The file may have been changed by anybody: it is read no further than LARGEST, and every value that is not as it should be counts
-as not there.
+The file may contain anything: at most MAX_BYTES of it are read, and invalid values are ignored.
 """
 
 import json
@@ -14,23 +13,28 @@ from kpc.format.common.cli import atomic_write
 from kpc.player.app.controls import SPEEDS
 from kpc.player.quality import LEVELS
 
-LARGEST = 1 << 16
+# Bytes of the file that are read.
+MAX_BYTES = 1 << 16
+# Width and height of a window, screen units.
 WINDOW_SIDES = range(64, 16385)
+# Lowest and highest frame rate to hold.
 TARGET_FPS = (1.0, 240.0)
+# Smallest and largest text, relative to the system's text size.
 TEXT_SIZES = (0.5, 3.0)
 
 
 @dataclass(frozen=True)
 class Preferences:
-    """The defaults are those of a first run.
+    """Settings; the defaults are those of a first run.
 
     Attributes:
-        size: of the window, screen units; None: as the scene's first camera asks for.
-        quality: a rung of LADDER; None: as the device asks for.
-        target_fps: hold so many frames a second by moving along the ladder; None: stay.
-        speed: one of SPEEDS; loop: begin again at the clip's end.
-        controls, graphs, planes: whether these are shown.
-        text_size: of the controls, 1 as the system asks for.
+        size: (width, height) of the window, screen units; None: derived from the scene's first camera.
+        quality: name of a quality level; None: the device's default.
+        target_fps: frame rate to hold by changing the quality; None: the quality stays.
+        speed: one of SPEEDS.
+        loop: whether the clip begins again at its end.
+        controls, graphs, planes: whether these panels are shown.
+        text_size: of the panels, 1 for the system's text size.
     """
 
     size: tuple[int, int] | None = None
@@ -48,7 +52,7 @@ def _is_between(low: float, high: float) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, float | int) and not isinstance(value, bool) and low <= value <= high
 
 
-def _is_flag(value: Any) -> bool:
+def _is_bool(value: Any) -> bool:
     return isinstance(value, bool)
 
 
@@ -56,21 +60,21 @@ def _is_size(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(isinstance(n, int) and n in WINDOW_SIDES for n in value)
 
 
-_IS_RIGHT: dict[str, Callable[[Any], bool]] = {
+_IS_VALID: dict[str, Callable[[Any], bool]] = {
     "size": _is_size,
     "quality": lambda value: isinstance(value, str) and value in LEVELS,
     "target_fps": _is_between(*TARGET_FPS),
     "speed": lambda value: _is_between(SPEEDS[0], SPEEDS[-1])(value) and value in SPEEDS,
-    "loop": _is_flag,
-    "controls": _is_flag,
-    "graphs": _is_flag,
-    "planes": _is_flag,
+    "loop": _is_bool,
+    "controls": _is_bool,
+    "graphs": _is_bool,
+    "planes": _is_bool,
     "text_size": _is_between(*TEXT_SIZES),
 }
 
 
 def preferences_path() -> Path:
-    """The file: under $XDG_CONFIG_HOME or ~/.config, ~/Library/Application Support, or %APPDATA%."""
+    """Return the path of the file, in $XDG_CONFIG_HOME or ~/.config, ~/Library/Application Support, or %APPDATA%."""
     from kpc.player.app.desktop import hello_imgui
 
     return (
@@ -79,27 +83,27 @@ def preferences_path() -> Path:
 
 
 def load(path: Path) -> Preferences:
-    """What the file says, as far as that is valid; the defaults where it is not, or where there is no file to read."""
+    """Read a file; defaults replace invalid values, and everything if the file cannot be read."""
     try:
-        if not path.is_file():  # a pipe would make us wait for ever
+        if not path.is_file():  # reading a pipe might never return
             return Preferences()
         with path.open("rb") as file:
-            said = json.loads(file.read(LARGEST))
+            found = json.loads(file.read(MAX_BYTES))
     except (OSError, ValueError, RecursionError):
         return Preferences()
-    if not isinstance(said, dict):
+    if not isinstance(found, dict):
         return Preferences()
-    right = {name: said[name] for name, is_right in _IS_RIGHT.items() if name in said and is_right(said[name])}
-    if "size" in right:
-        right["size"] = tuple(right["size"])
-    return Preferences(**right)
+    valid = {name: found[name] for name, is_valid in _IS_VALID.items() if name in found and is_valid(found[name])}
+    if "size" in valid:
+        valid["size"] = tuple(valid["size"])
+    return Preferences(**valid)
 
 
 def save(preferences: Preferences, path: Path) -> None:
-    """Write the file, and the folder it lies in.
+    """Write a file, and make its folder.
 
     Raises:
-        OSError: the folder cannot be written to.
+        OSError: the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as aside:

@@ -1,12 +1,14 @@
-"""What a player should hold of a scene, and what it should fetch next: no thread, no network, no OpenGL.
+"""What a player keeps of a scene, and what it fetches next. No threads, no network, no OpenGL.
 
-    first  segments at the playhead of the scales that are shown already
-    0      scale 0: its space planes, and its time planes' segments at the playhead: the first coarse picture
-    1      while it plays, segments of scale 0 that will be needed within URGENT_S
-    2, 3   the same of scale 1, and so on: the picture gets finer
-    last   all other segments, those first that the playhead comes to first
+Segments are fetched in this order:
 
-Held is what the playhead comes to first, as far as memory goes; what lies behind it goes first.
+    first   segments at the playhead, of the scales that are shown already
+    0       scale 0: its space planes, and the segments of its time planes at the playhead; they make the first coarse picture
+    1       while the clip plays, segments of scale 0 that will be needed within URGENT_S
+    2, 3    the same for scale 1, and so on
+    last    all other segments, in the order in which the playhead reaches them
+
+Memory is given to the segments that the playhead reaches first; those behind it are dropped first.
 """
 
 from dataclasses import dataclass
@@ -14,18 +16,18 @@ from dataclasses import dataclass
 import numpy as np
 from kpc.format.container.partial import PartialScene
 
+# Segments that will be needed within so many seconds are fetched before a finer scale.
 URGENT_S = 1.0
-"""Segments needed so soon come before a finer scale."""
 
 
 @dataclass(frozen=True)
 class Playhead:
-    """Where the clip is, and where it goes.
+    """The position in a clip, and how it moves.
 
     Attributes:
-        time: [0, 1] over the clip.
-        rate: of the clip in a second; 0 while it does not play.
-        loop: after the end comes the beginning.
+        time: in [0, 1] over the clip.
+        rate: fraction of the clip that is played per second; 0 while paused.
+        loop: whether the clip begins again after its end.
     """
 
     time: float = 0.0
@@ -34,9 +36,15 @@ class Playhead:
 
 
 def distances_ahead(scene: PartialScene, head: Playhead) -> np.ndarray:
-    """(N,) how far ahead of the playhead each segment is needed, of the clip; 0 for what is needed now.
+    """Return how far ahead of the playhead each segment is needed.
 
-    Behind it, with a loop, that is where it comes around again; without one, farther than all that is ahead.
+    Args:
+        scene: the scene, with N segments.
+        head: the playhead.
+
+    Returns:
+        (N,) fractions of the clip; 0 for segments that are needed now. A segment behind the playhead is reached again after the
+        loop; without a loop it is farther than all that are ahead.
     """
     behind = 1 + np.maximum(scene.since, 0) - head.time if head.loop else 2 + head.time - scene.until
     ahead = np.where(scene.since >= head.time, scene.since - head.time, behind)
@@ -44,7 +52,16 @@ def distances_ahead(scene: PartialScene, head: Playhead) -> np.ndarray:
 
 
 def fetch_order(scene: PartialScene, head: Playhead, shown: int = 0) -> np.ndarray:
-    """(N,) positions in the scene's arrays, what to fetch first first; of `shown` scales the space planes are all there."""
+    """Return the order in which to fetch segments; see the module.
+
+    Args:
+        scene: the scene, with N segments.
+        head: the playhead.
+        shown: number of scales, from the coarsest on, whose space planes have arrived.
+
+    Returns:
+        (N,) positions in the arrays of the scene.
+    """
     distance = distances_ahead(scene, head)
     soon = (distance > 0) & (distance < head.rate * URGENT_S)
     stage = np.where(distance == 0, 2 * scene.scales, np.where(soon, 2 * scene.scales + 1, 2 * scene.scales.max() + 2))
@@ -52,18 +69,27 @@ def fetch_order(scene: PartialScene, head: Playhead, shown: int = 0) -> np.ndarr
     return np.lexsort((scene.numbers, scene.scales, distance, stage))
 
 
-def segments_to_keep(scene: PartialScene, head: Playhead, room_bytes: int) -> np.ndarray:
-    """(N,) bool: segments of time planes that fit, nearest first. Space planes always do: they lie elsewhere."""
+def segments_to_keep(scene: PartialScene, head: Playhead, available_bytes: int) -> np.ndarray:
+    """Return which segments to hold: those of time planes that fit, nearest first, and all space planes.
+
+    Args:
+        scene: the scene, with N segments.
+        head: the playhead.
+        available_bytes: for segments of time planes; space planes are held elsewhere.
+
+    Returns:
+        (N,) bool.
+    """
     order = np.lexsort((scene.numbers, scene.scales, distances_ahead(scene, head)))
-    held = np.zeros(len(order), bool)
-    held[order] = np.cumsum(np.where(scene.moves, scene.sizes, 0)[order]) <= room_bytes
-    return np.asarray(held | ~scene.moves)
+    keep = np.zeros(len(order), bool)
+    keep[order] = np.cumsum(np.where(scene.moves, scene.sizes, 0)[order]) <= available_bytes
+    return np.asarray(keep | ~scene.moves)
 
 
 def min_segment_bytes(scene: PartialScene) -> int:
-    """Bytes of the segments that are needed at once, at the time that needs most."""
+    """Return the bytes of the segments of time planes that are needed at once, at the time that needs most."""
     sizes = scene.sizes[scene.moves]
     times = np.concatenate([scene.since[scene.moves], scene.until[scene.moves]])
     changes = np.concatenate([sizes, -sizes])
-    order = np.lexsort((-changes, times))  # at one time, what begins counts before what ends
+    order = np.lexsort((-changes, times))  # at equal times, beginnings count before ends
     return int(changes[order].cumsum().max(initial=0))

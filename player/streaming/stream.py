@@ -1,11 +1,11 @@
-"""A scene that plays while it arrives: a thread fetches and decodes, the window's thread takes over what is finished.
+"""Playback of a scene while it arrives: one thread fetches and decodes, the window's thread takes over what is finished.
 
-    fetching thread      what to fetch next (`kpc.player.streaming.prefetch`) -> source -> CRC32C, decoding -> finished pieces
-    window's thread      `set_playhead` says where the playhead is; `upload` takes finished pieces, so many bytes a frame
+    fetching thread   what to fetch next (`kpc.player.streaming.prefetch`) -> source -> CRC32C, decoding -> finished segments
+    window's thread   `set_playhead` sets the position; `upload` takes over finished segments, a limited number of bytes a frame
 
-The window's thread waits for nothing but a lock that is never held for long. Segments of time planes lie in memory as symbols
-and are dropped when the playhead has passed and the room is needed; space planes go to the graphics card and are gone from here.
-A file on a disk takes the same way as one on a server: it is only sooner there.
+The window's thread waits for nothing but a lock that is held briefly. Segments of time planes stay in memory as symbols and are
+dropped when the playhead has passed them and the memory is needed; space planes are kept on the graphics card only. Local files
+are read in the same way as those of a server.
 """
 
 import threading
@@ -29,43 +29,52 @@ from kpc.player.cpu.plane_sampler import PlaneSampler
 from kpc.player.gl.renderer import FOLDING_UPSAMPLING, Renderer
 from kpc.player.streaming.prefetch import Playhead, fetch_order, min_segment_bytes, segments_to_keep
 
+# The most that is fetched with one request, bytes and chunks, so that a jump of the playhead does not wait long.
 RUN_BYTES, RUN_CHUNKS = 1 << 18, 256
-"""Fetched with one request at most, so that a playhead that jumps does not wait long."""
+# The most bytes that are handed to the graphics card in a frame; they take about a millisecond.
 UPLOAD_BYTES = 1 << 22
-"""Handed to the graphics card in a frame at most, about a millisecond's worth."""
+# Seconds of the clip that must have arrived before playback continues after it had to wait.
 RESUME_S = 0.5
-"""So much of the clip must be there before it plays on after a pause."""
+# Seconds over which the rate of arriving bytes is averaged.
 RATE_OVER_S = 1.0
 
 
 @dataclass
 class Piece:
-    """A decoded segment: symbols of a time plane, or texels of a space plane, of which `done` rows are uploaded."""
+    """A decoded segment.
+
+    Attributes:
+        position: in the arrays of the `PartialScene`.
+        number: of its chunk.
+        data: symbols of a time plane, or texels of a space plane.
+        uploaded_rows: rows of a space plane that are on the graphics card.
+    """
 
     position: int
     number: int
     data: np.ndarray
-    done: int = 0
+    uploaded_rows: int = 0
 
 
 class Stream:
-    """A scene on its way.
+    """A scene that is arriving.
 
-    Opening it waits for header, index, and all that there can be no picture without but planes; then the thread begins.
+    The constructor waits for the header, the index and every chunk but planes; then the fetching thread starts.
 
     Args:
-        source: of the scene's file, or a reader of it, whose header and index are taken over.
-        memory: bytes that the scene may take, on the processor's side and on the graphics card's together. Pictures, shaders and
-            the program itself are not counted.
-        arrived: called by the fetching thread whenever there is something new; may wake the window.
+        source: the scene's file, or a reader of it, whose header and index are used.
+        memory: bytes that the scene may take in main memory and on the graphics card together. Pictures, shaders and the program
+            itself do not count.
+        arrived: called by the fetching thread when a segment has arrived; may wake the window.
 
     Attributes:
         memory: as given.
-        scene: what is there of it; `upload` changes it.
-        version: grows whenever it has changed.
+        scene: what has arrived; `upload` changes it.
+        version: a number that grows whenever the scene has changed.
 
     Raises:
-        KpcError: as `SceneReader` and `HttpSource`; BudgetError if `memory` is too little to play the scene at all.
+        KpcError: as `SceneReader` and `HttpSource`.
+        BudgetError: `memory` is too little to play the scene.
     """
 
     def __init__(
@@ -79,71 +88,75 @@ class Stream:
         self._layout = Layout.of(self.scene)
         fixed, least = self.fixed_bytes, min_segment_bytes(self.parts)
         if fixed + least > memory:
-            raise BudgetError(
-                f"{source.name}: takes {fixed + least:,} bytes to play, more than the {memory:,} of --memory"
-            )
-        self._room = memory - fixed
+            raise BudgetError(f"{source.name}: playing takes {fixed + least:,} bytes, more than --memory {memory:,}")
+        self._segment_memory = memory - fixed
         self._stored = np.array([self.parts.entry(number).stored_length for number in self.parts.numbers])
-        self._taken = np.zeros(len(self._stored), bool)
-        """Fetched or being fetched, and not dropped since."""
-        self._here = np.zeros(len(self._stored), bool)
-        """Uploaded, or put into the scene."""
-        self._head, self._keep = Playhead(), segments_to_keep(self.parts, Playhead(), self._room)
-        self._is_long = not self._keep.all()
+        self._requested = np.zeros(len(self._stored), bool)  # fetched or being fetched, and not dropped since
+        self._loaded = np.zeros(len(self._stored), bool)  # uploaded, or put into the scene
+        self._head, self._keep = Playhead(), segments_to_keep(self.parts, Playhead(), self._segment_memory)
+        self._exceeds_memory = not self._keep.all()
         self._finished: deque[Piece] = deque()
         self._change = threading.Condition()
         self._closed = False
-        self._under_way: int | None = None
+        self._fetching: int | None = None
         self._trouble: str | None = None
         self._failure: KpcError | OSError | None = None
         self._bug: BaseException | None = None
         self._stalled = True
-        self._came: deque[tuple[float, int]] = deque()
-        """When how many bytes had come, over the last RATE_OVER_S."""
+        self._history: deque[tuple[float, int]] = deque()  # (time, bytes received until then) over the last RATE_OVER_S
         if isinstance(source, RemoteSource):
-            source.attempts, source.report = float("inf"), self._hear
+            source.attempts, source.report = float("inf"), self._set_trouble
         self._thread = threading.Thread(target=self._run, name="fetching", daemon=True)
         self._thread.start()
 
-    # --- the window's thread
+    # --- called by the window's thread
 
     def set_playhead(self, head: Playhead) -> None:
-        """Say where the clip is. What it has left far behind is dropped if the room is needed."""
+        """Set the position in the clip. Segments far behind it are dropped if the memory is needed."""
         with self._change:
             self._head = head
-            if self._is_long:
-                self._keep = segments_to_keep(self.parts, head, self._room)
-                self._drop(self._here & ~self._keep)
-            if (self._keep & ~self._taken).any():
+            if self._exceeds_memory:
+                self._keep = segments_to_keep(self.parts, head, self._segment_memory)
+                self._drop(self._loaded & ~self._keep)
+            if (self._keep & ~self._requested).any():
                 self._change.notify_all()
-                self._hurry(head.time)
+                self._interrupt_for(head.time)
 
-    def upload(self, renderer: Renderer, most_bytes: float = UPLOAD_BYTES) -> bool:
-        """Take over finished pieces; whether the picture may have changed.
+    def upload(self, renderer: Renderer, max_bytes: float = UPLOAD_BYTES) -> bool:
+        """Take over finished segments.
+
+        Args:
+            renderer: the renderer of the scene.
+            max_bytes: of space planes to upload at most, to within a row.
+
+        Returns:
+            Whether the picture may have changed.
 
         Raises:
-            BaseException: what should not have happened in the fetching thread.
+            BaseException: an unexpected error of the fetching thread.
         """
         if self._bug is not None:
             raise self._bug
         changed = refresh = False
-        while most_bytes > 0 and self._finished:
+        while max_bytes > 0 and self._finished:
             piece = self._finished[0]
             if self.parts.moves[piece.position]:
                 self.parts.put(piece.number, piece.data)
-                refresh, done = True, True
+                refresh = is_done = True
             else:
                 entry, row = self.parts.entry(piece.number), piece.data[0].nbytes
-                end = min(piece.done + max(int(most_bytes // row), 1), len(piece.data))
-                renderer.put(entry.scale, ALL_PLANES[entry.plane], piece.data[piece.done : end], piece.done)
-                most_bytes -= (end - piece.done) * row
-                piece.done, done = end, end == len(piece.data)
+                end = min(piece.uploaded_rows + max(int(max_bytes // row), 1), len(piece.data))
+                renderer.put(
+                    entry.scale, ALL_PLANES[entry.plane], piece.data[piece.uploaded_rows : end], piece.uploaded_rows
+                )
+                max_bytes -= (end - piece.uploaded_rows) * row
+                piece.uploaded_rows, is_done = end, end == len(piece.data)
             changed = True
-            if done:
+            if is_done:
                 with self._change:
                     self._finished.popleft()
-                    self._here[piece.position] = True
-                    self._drop(self._here & ~self._keep)
+                    self._loaded[piece.position] = True
+                    self._drop(self._loaded & ~self._keep)
                     self._change.notify_all()
         if refresh:
             renderer.refresh()
@@ -151,63 +164,71 @@ class Stream:
         return changed
 
     def can_show(self, time: float, rate: float = 0.0) -> bool:
-        """Whether a clip that plays may go on to `time`. After a pause, only once RESUME_S from there on are there, too.
+        """Return whether the picture at `time` can be drawn; after it could not, only once the next RESUME_S have arrived, too.
 
-        All that the scales need whose space planes are there must be, and at least scale 0: a picture once fine stays fine.
+        It needs the segments at `time` of all scales whose space planes have arrived, and of scale 0 at least: a picture does
+        not become coarser again.
+
+        Args:
+            time: of the clip, [0, 1].
+            rate: fraction of the clip that is played per second.
         """
         end = min(time + rate * RESUME_S, 1.0) if self._stalled else time
         needed = self.parts.is_needed(time, end) & (self.parts.scales < max(self.complete_scales, 1)) & self._keep
-        self._stalled = bool((needed & ~self._here).any())
+        self._stalled = bool((needed & ~self._loaded).any())
         return not self._stalled
 
     @property
     def complete_scales(self) -> int:
-        """Scales from the coarsest on whose space planes are all there."""
-        missing = self.parts.scales[~self.parts.moves & ~self._here]
+        """The number of scales, from the coarsest on, whose space planes have arrived."""
+        missing = self.parts.scales[~self.parts.moves & ~self._loaded]
         return int(missing.min()) if len(missing) else int(self.parts.scales.max()) + 1
 
     @property
     def is_settled(self) -> bool:
-        """Whether all is there that fits the memory, or nothing more will come."""
+        """Whether everything that fits the memory has arrived, or nothing more will."""
         if self._failure is not None:
             return True
         with self._change:
-            return not (self._keep & ~self._here).any()
+            return not (self._keep & ~self._loaded).any()
 
     @property
     def loaded_fraction(self) -> float:
-        """Of the bytes of all planes."""
-        return float(self._stored[self._here].sum() / max(self._stored.sum(), 1))
+        """The fraction of the bytes of all planes that has arrived."""
+        return float(self._stored[self._loaded].sum() / max(self._stored.sum(), 1))
 
     @property
-    def rate(self) -> float:
-        """Bytes a second that came lately."""
+    def bytes_per_s(self) -> float:
+        """Bytes that arrived in the last second."""
         now = clock.monotonic()
-        self._came.append((now, self.received))
-        while self._came[0][0] < now - RATE_OVER_S:
-            self._came.popleft()
-        (since, before), (until, after) = self._came[0], self._came[-1]
+        self._history.append((now, self.received))
+        while self._history[0][0] < now - RATE_OVER_S:
+            self._history.popleft()
+        (since, before), (until, after) = self._history[0], self._history[-1]
         return (after - before) / (until - since) if until > since else 0.0
 
     @property
     def received(self) -> int:
-        """Bytes that came so far, through a network or from a disk."""
+        """Bytes that have arrived so far, from a server or a disk."""
         return (
             self.source.received_bytes
             if isinstance(self.source, RemoteSource)
-            else int(self._stored[self._taken].sum())
+            else int(self._stored[self._requested].sum())
         )
 
     @property
     def memory_bytes(self) -> int:
-        """Of the segments of time planes that are there or on their way."""
+        """Bytes of the segments of time planes that have arrived or are being fetched."""
         with self._change:
-            return int(self.parts.sizes[self._taken & self.parts.moves].sum())
+            return int(self.parts.sizes[self._requested & self.parts.moves].sum())
 
     @property
     def fixed_bytes(self) -> int:
-        """What the scene takes but for its segments of time: textures, and what folding, thinning and marching by a processor take; occupancy and its distances; motion;
-        planes that wait to be uploaded, and one in the making; what the source holds."""
+        """Bytes that the scene takes besides segments of time planes.
+
+        They are those of the textures; of folding, occupancy culling and ray marching on the processor; of occupancy and its
+        distances; of motion; of planes that wait to be uploaded and one that is being decoded; and of the source.
+        """
         scene, layout = self.scene, self._layout
         texels = layout.size[0] * layout.size[1]
         if scene.is_dynamic:
@@ -229,48 +250,48 @@ class Stream:
 
     @property
     def failure(self) -> str | None:
-        """Why no more will come."""
+        """Why nothing more will arrive; None if it will."""
         return None if self._failure is None else str(self._failure)
 
     @property
     def message(self) -> str | None:
-        """What the user should know; None while all goes well."""
+        """A message for the user; None if everything works."""
         if self._failure is not None:
-            return f"no more of the scene will come: {self._failure}"
+            return f"loading stopped: {self._failure}"
         if self._trouble is not None:
             return self._trouble
         if self._stalled and MONITOR.is_compiling:
             return NOTICE
         if self._stalled:
-            return f"waiting for the scene, {self.rate / 1e3:,.0f} KB/s"
+            return f"loading, {self.bytes_per_s / 1e3:,.0f} KB/s"
         return None
 
     def close(self) -> None:
-        """End the thread, and let go of the source."""
+        """End the thread, and close the source."""
         self.arrived = lambda: None
         with self._change:
             self._closed = True
             self._change.notify_all()
         if isinstance(self.source, RemoteSource):
             self.source.close()
-        self._thread.join(timeout=0.5)  # on a dead line it may take longer, which nobody has to wait for
+        self._thread.join(timeout=0.5)  # if the server does not answer, the thread ends later
 
-    def _hurry(self, time: float) -> None:
-        """Under the lock: what the picture needs now does not wait for the end of something else, far as that is on a slow line."""
+    def _interrupt_for(self, time: float) -> None:
+        """With the lock held: interrupt a request if segments that the picture needs now would have to wait for it."""
         now = self.parts.is_needed(time, time) & (self.parts.scales < max(self.complete_scales, 1))
         if (
-            self._under_way is not None
-            and not now[self._under_way]
-            and (now & self._keep & ~self._taken).any()
+            self._fetching is not None
+            and not now[self._fetching]
+            and (now & self._keep & ~self._requested).any()
             and isinstance(self.source, RemoteSource)
         ):
             self.source.interrupt()
 
     def _drop(self, which: np.ndarray) -> None:
-        """Under the lock: segments leave the scene."""
+        """With the lock held: drop segments of time planes."""
         for position in np.flatnonzero(which & self.parts.moves):
             self.parts.drop(int(self.parts.numbers[position]))
-            self._here[position] = self._taken[position] = False
+            self._loaded[position] = self._requested[position] = False
 
     # --- the fetching thread
 
@@ -283,33 +304,33 @@ class Stream:
                     piece = self._fetched(position)
                 except InterruptedRead:
                     with self._change:
-                        self._taken[position], self._under_way = False, None
+                        self._requested[position], self._fetching = False, None
                     continue
                 with self._change:
                     self._finished.append(piece)
-                    self._under_way = None
+                    self._fetching = None
                 self.arrived()
         except (KpcError, OSError) as error:
             if not self._closed:
                 self._failure = error
                 self.arrived()
-        except BaseException as error:  # a bug: told where it is seen, with its traceback
+        except BaseException as error:  # unexpected: raised again in the window's thread
             self._bug = error
             self.arrived()
 
     def _next(self, held: list[int]) -> tuple[int, list[int]] | None:
-        """Wait until something is to be fetched; its position, and the chunks held by the source. None once closed."""
+        """Wait for a segment to fetch; return its position and the chunks that the source holds, None once closed."""
         with self._change:
             while not self._closed:
                 order = fetch_order(self.parts, self._head, self.complete_scales)
-                wanted = order[(self._keep & ~self._taken)[order]]
+                wanted = order[(self._keep & ~self._requested)[order]]
                 if len(wanted) and not self._is_full(int(wanted[0])):
                     break
                 self._change.wait()
             if self._closed:
                 return None
             position = int(wanted[0])
-            self._taken[position], self._under_way = True, position
+            self._requested[position], self._fetching = True, position
         number = int(self.parts.numbers[position])
         if number not in held:
             held = adjacent_runs(self._reader.index, map(int, self.parts.numbers[wanted[:RUN_CHUNKS]]), RUN_BYTES)[0]
@@ -317,14 +338,17 @@ class Stream:
         return position, held
 
     def _is_full(self, position: int) -> bool:
-        """Whether the window's thread must take over or drop something first."""
+        """Whether the window's thread must take over or drop segments first."""
         if not self.parts.moves[position]:
             waiting = sum(piece.data.nbytes for piece in tuple(self._finished) if not self.parts.moves[piece.position])
             return waiting >= UPLOAD_BYTES
-        return int(self.parts.sizes[self._taken & self.parts.moves].sum() + self.parts.sizes[position]) > self._room
+        return (
+            int(self.parts.sizes[self._requested & self.parts.moves].sum() + self.parts.sizes[position])
+            > self._segment_memory
+        )
 
     def _fetched(self, position: int) -> Piece:
-        """A segment, decoded and ready for its place. One that came damaged is fetched a second time."""
+        """Fetch and decode a segment. One that arrives damaged is fetched a second time."""
         number = int(self.parts.numbers[position])
         try:
             symbols, _ = self._reader.segment(number)
@@ -338,6 +362,6 @@ class Stream:
         plane = self.parts.head_of(number)
         return Piece(position, number, self._layout.texels(dequantise_symbols(symbols, plane.step, plane.offset)))
 
-    def _hear(self, message: str | None) -> None:
+    def _set_trouble(self, message: str | None) -> None:
         self._trouble = message
         self.arrived()

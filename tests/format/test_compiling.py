@@ -84,7 +84,7 @@ def test_a_player_waiting_for_compilation_shows_the_notice(monkeypatch: pytest.M
     monkeypatch.setattr(Stream, "rate", 2000.0)
     for stalled, compiles, wanted in (
         (True, True, NOTICE),
-        (True, False, "waiting for the scene, 2 KB/s"),
+        (True, False, "loading, 2 KB/s"),
         (False, True, None),
     ):
         stream._stalled = stalled

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kpc.format.scene.scene import Clip
-from kpc.player.app.controls import FADE_S, SPEEDS, AppearanceSelection, Playback, View
+from kpc.player.app.controls import BLEND_S, SPEEDS, AppearanceSelection, Playback, View
 from kpc.player.viewpoints import Rig
 from scenes import tiny_scene, with_appearances
 
@@ -101,9 +101,9 @@ def test_a_still_scene_has_nothing_to_play() -> None:
 def test_speeds() -> None:
     playback = Playback(Clip(11, 10.0))
     for _ in range(10):
-        playback.faster(1)
+        playback.change_speed(1)
     assert playback.speed == SPEEDS[-1]
-    playback.faster(-1)
+    playback.change_speed(-1)
     assert playback.speed == SPEEDS[-2]
 
 
@@ -116,17 +116,17 @@ def test_appearances_follow_one_another_smoothly_and_end_where_they_began() -> N
         before = appearance.code
         appearance.next()
         np.testing.assert_allclose(appearance.code, before, atol=1e-6)  # nothing jumps
-        appearance.advance(FADE_S / 2)
+        appearance.advance(BLEND_S / 2)
         np.testing.assert_allclose(appearance.code, (before + codes[number]) / 2, atol=1e-6)
-        appearance.advance(FADE_S)
+        appearance.advance(BLEND_S)
         np.testing.assert_allclose(appearance.code, codes[number], atol=1e-6)
         assert appearance.number == number and appearance.progress == 1
     appearance.next()
-    appearance.advance(FADE_S / 4)
+    appearance.advance(BLEND_S / 4)
     shown = appearance.code
     appearance.select(3)  # in the midst of another change
     np.testing.assert_allclose(appearance.code, shown, atol=1e-6)
-    appearance.advance(FADE_S / 4)
+    appearance.advance(BLEND_S / 4)
     half_way = appearance.code
     appearance.select(3)  # where it is going anyway
     np.testing.assert_array_equal(appearance.code, half_way)

@@ -82,7 +82,7 @@ def assert_shows(reel: GroupPlayback, path: object, time: float) -> None:
     whole = kpc.load(path)  # type: ignore[arg-type]
     camera = kpc.load(path).cameras[0].resized(16, 12)  # type: ignore[arg-type]
     drawn = reel.renderer.render(camera, reel.time_in(time)).rgb
-    if (beside := reel.beside(time)) is not None:
+    if (beside := reel.blended_with(time)) is not None:
         other, time_in_it, share = beside
         drawn = (1 - share) * drawn + share * other.render(camera, time_in_it).rgb
     assert np.abs(drawn - kpc.render(whole, camera, time).rgb).max() < 2 / 255
@@ -99,14 +99,18 @@ def test_each_group_shows_in_its_time(clip, opened):
 
 def test_the_next_group_is_there_before_it_shows(clip, opened):
     reel, head = opened(clip), Playhead(0.1, RATE)
-    wait_for(reel, head, lambda: reel._next is not None and reel._next.is_warm and reel._next.stream.is_settled)
-    assert reel.number == 0 and reel._next.number == 1
+    wait_for(
+        reel,
+        head,
+        lambda: reel.next_group is not None and reel.next_group.is_warm and reel.next_group.stream.is_settled,
+    )
+    assert reel.number == 0 and reel.next_group.number == 1
     assert reel.can_show(8 / 29, RATE)
     reel.set_playhead(Playhead(9.1 / 29, RATE))
     assert reel.number == 1 and reel.can_show(9.1 / 29, RATE)  # in the same turn
     assert_shows(reel, clip, 9.1 / 29)
     version = reel.version
-    wait_for(reel, Playhead(0.6, RATE), lambda: reel._next is not None and reel._next.number == 2)
+    wait_for(reel, Playhead(0.6, RATE), lambda: reel.next_group is not None and reel.next_group.number == 2)
     assert reel.version >= version
 
 
@@ -116,11 +120,11 @@ def test_two_groups_are_mixed_amid_the_frames_that_they_share(clip, opened):
     for frame, number in ((8.5, 0), (9.5, 1), (8.5, 0), (25, 2), (9.25, 1), (12, 1), (9.75, 1)):
         time = frame / 29
         settled(reel, time, number)
-        assert (reel.beside(time) is not None) == (8 < frame < 10)
-        if reel.beside(time) is not None:
-            assert reel._next.number == 1 - number and reel.version_at(time) == (
+        assert (reel.blended_with(time) is not None) == (8 < frame < 10)
+        if reel.blended_with(time) is not None:
+            assert reel.next_group.number == 1 - number and reel.version_at(time) == (
                 reel.version,
-                reel._next.stream.version,
+                reel.next_group.stream.version,
             )
         assert_shows(reel, clip, time)
 
@@ -139,8 +143,8 @@ def test_a_clip_does_not_go_on_into_frames_of_a_group_that_is_not_there(clip, op
     gate = held_up(reel, monkeypatch)
     settled(reel, 0.0, 0)
     reel.set_playhead(Playhead(8.5 / 29))
-    assert reel.number == 0 and reel.beside(8.5 / 29) is None
-    assert not reel.can_show(8.5 / 29) and reel.can_show(8 / 29) and not reel.is_settled and "waiting" in reel.message
+    assert reel.number == 0 and reel.blended_with(8.5 / 29) is None
+    assert not reel.can_show(8.5 / 29) and reel.can_show(8 / 29) and not reel.is_settled and "loading" in reel.message
     gate.set()
     settled(reel, 8.5 / 29, 0)
 
@@ -148,9 +152,9 @@ def test_a_clip_does_not_go_on_into_frames_of_a_group_that_is_not_there(clip, op
 def test_after_the_last_comes_the_first_where_it_loops(clip, opened):
     reel = opened(clip)
     settled(reel, 0.99, 2)
-    wait_for(reel, Playhead(0.99, RATE, loop=True), lambda: reel._next is not None and reel._next.number == 0)
+    wait_for(reel, Playhead(0.99, RATE, loop=True), lambda: reel.next_group is not None and reel.next_group.number == 0)
     reel.set_playhead(Playhead(0.99, RATE, loop=False))
-    assert reel._next is None
+    assert reel.next_group is None
 
 
 def test_two_groups_are_held_at_most_and_their_threads_end(clip, opened):
@@ -191,7 +195,7 @@ def test_a_scene_is_a_reel_of_one(opened):
     data = coded(tiny_scene(3))
     reel = opened(data)
     settled(reel, 0.7, 0)
-    assert reel._next is None and reel.time_in(0.7) == 0.7
+    assert reel.next_group is None and reel.time_in(0.7) == 0.7
     assert_shows(reel, data, 0.7)
 
 

@@ -205,7 +205,7 @@ def test_a_window_that_is_left_to_itself_is_measured(scene_file: Path, display: 
 def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
     done = kpplay(scene_file)
     assert done.returncode == 1 and done.stderr.count("\n") == 1
-    assert done.stderr.startswith("kpplay: no window to be had") and "kprender" in done.stderr
+    assert done.stderr.startswith("kpplay: cannot open a window") and "kprender" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -236,7 +236,7 @@ def test_every_key_and_drag(scene_file: Path, display: str, tmp_path: Path) -> N
     done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     reset, unwritten = done.stderr.splitlines()
-    assert reset == "kpplay: the graphics card was reset; start kpplay anew, or update the graphics driver"
-    assert unwritten.startswith("kpplay: settings are not remembered")
+    assert reset == "kpplay: the graphics card was reset; restart kpplay, or update the graphics driver"
+    assert unwritten.startswith("kpplay: settings were not saved")
     saved = list(tmp_path.glob("tiny-*.png"))
     assert len(saved) == 1 and read_image(saved[0]).shape == (330, 420, 3)

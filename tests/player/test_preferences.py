@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from kpc.player.app.preferences import _IS_RIGHT, LARGEST, Preferences, load, preferences_path, save
+from kpc.player.app.preferences import _IS_VALID, MAX_BYTES, Preferences, load, preferences_path, save
 
 MINE = Preferences((800, 600), "fine", 30.0, 0.5, False, False, True, True, 1.5)
 
@@ -20,7 +20,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
 
 
 def test_every_field_is_checked() -> None:
-    assert set(_IS_RIGHT) == set(Preferences.__dataclass_fields__)
+    assert set(_IS_VALID) == set(Preferences.__dataclass_fields__)
 
 
 @pytest.mark.parametrize(("name", "values"), {
@@ -42,7 +42,7 @@ def test_a_wrong_value_counts_as_not_there(tmp_path: Path, name: str, values: li
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"\xff\xfe", b"[]", b"null", b"[" * 60_000, b'{"a": 1}', b" " * (2 * LARGEST)]
+    "content", [b"", b"\xff\xfe", b"[]", b"null", b"[" * 60_000, b'{"a": 1}', b" " * (2 * MAX_BYTES)]
 )
 def test_another_file_is_none(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "player.json").write_bytes(content)
@@ -52,18 +52,18 @@ def test_another_file_is_none(tmp_path: Path, content: bytes) -> None:
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.dictionaries(
-        st.sampled_from(sorted(_IS_RIGHT)),
+        st.sampled_from(sorted(_IS_VALID)),
         st.recursive(
             st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=8),
             lambda inner: st.lists(inner, max_size=3),
         ),
     )
 )
-def test_whatever_it_says_the_player_starts(tmp_path: Path, said: dict[str, object]) -> None:
-    (tmp_path / "player.json").write_text(json.dumps(said))
+def test_whatever_it_says_the_player_starts(tmp_path: Path, found: dict[str, object]) -> None:
+    (tmp_path / "player.json").write_text(json.dumps(found))
     got = load(tmp_path / "player.json")
-    assert {name: getattr(got, name) for name in _IS_RIGHT if name not in said} == {
-        name: getattr(Preferences(), name) for name in _IS_RIGHT if name not in said
+    assert {name: getattr(got, name) for name in _IS_VALID if name not in found} == {
+        name: getattr(Preferences(), name) for name in _IS_VALID if name not in found
     }
 
 
@@ -77,6 +77,6 @@ def test_lies_in_the_folder_the_platform_has_for_it(tmp_path: Path) -> None:
     """In a process of its own: the platform is asked once."""
     program = "from kpc.player.app.preferences import preferences_path; print(preferences_path())"
     env = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path), "APPDATA": str(tmp_path), "HOME": str(tmp_path)}
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=env, check=True).stdout
-    assert said.startswith(str(tmp_path)) and said.strip().endswith(os.path.join("kpc", "player.json"))
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=env, check=True).stdout
+    assert found.startswith(str(tmp_path)) and found.strip().endswith(os.path.join("kpc", "player.json"))
     assert preferences_path().is_absolute()

@@ -33,7 +33,7 @@ def test_frames_come_out_in_order(tmp_path: Path) -> None:
 
 
 def test_a_full_queue_refuses_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording, "WAITING_BYTES", 1)
+    monkeypatch.setattr(recording, "QUEUE_BYTES", 1)
 
     def slow(path: Path, frames: object, fps: float) -> None:
         for _ in frames:

@@ -157,13 +157,13 @@ def test_a_long_clip_plays_in_little_memory(watched: Callable[..., Stream], tmp_
                 assert segments <= stream.memory_bytes <= room
                 if int(60 * time) % 7 == turn:
                     assert np.array_equal(picture(renderer, whole, float(time)), picture(wanted, whole, float(time)))
-        assert most > room / 3 and not stream._here.all()
+        assert most > room / 3 and not stream._loaded.all()
         assert stream.source.received_bytes > 1.2 * len(data)  # type: ignore[attr-defined]  # evicted, and fetched again the second time
 
 
 def test_too_little_memory_is_told_before_any_plane_is_fetched() -> None:
     data = long_scene()
-    with pytest.raises(BudgetError, match=r"takes [\d,]+ bytes to play, more than the 3,000,000 of --memory"):
+    with pytest.raises(BudgetError, match=r"playing takes [\d,]+ bytes, more than --memory 3,000,000"):
         Stream(open_source(data), memory=3_000_000)
     assert "fetching" not in [thread.name for thread in threading.enumerate()]
 
@@ -214,7 +214,7 @@ def test_a_jump_does_not_wait_for_the_end_of_a_large_chunk(watched: Callable[...
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         until(
-            lambda: stream.complete_scales == 2 and stream.can_show(0.0) and stream._under_way is not None,
+            lambda: stream.complete_scales == 2 and stream.can_show(0.0) and stream._fetching is not None,
             stream,
             renderer,
         )
@@ -243,7 +243,7 @@ def test_a_player_that_stalls_goes_on_by_itself(watched: Callable[..., Stream], 
     with serving(tmp_path, handler=Halting) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
-        assert (stream.message or "").startswith("waiting for the scene, ")
+        assert (stream.message or "").startswith("loading, ")
         until(lambda: stream.can_show(0.0), stream, renderer)
         assert stream.message is None
         time = 0.0
@@ -251,7 +251,7 @@ def test_a_player_that_stalls_goes_on_by_itself(watched: Callable[..., Stream], 
             stream.set_playhead(Playhead(time, 0.1))
             time += 0.01
             assert time < 1
-        assert (stream.message or "").startswith("waiting for the scene, ")
+        assert (stream.message or "").startswith("loading, ")
         release.set()
         until(lambda: stream.can_show(time, 0.1), stream, renderer)
         assert stream.message is None
@@ -290,7 +290,7 @@ def test_the_window_waits_for_nothing_while_the_line_is_dead(
             stream.set_playhead(Playhead(frame / 200, 0.1))
             stream.upload(renderer)
             stream.can_show(frame / 200)
-            stream.message, stream.loaded_fraction, stream.rate
+            stream.message, stream.loaded_fraction, stream.bytes_per_s
             slowest = max(slowest, clock.monotonic() - started)
         release.set()
     assert slowest < 0.25  # a request would have waited for longer
@@ -366,7 +366,7 @@ def test_a_file_that_changes_is_told_and_what_is_there_still_plays(
         until(lambda: stream.failure is not None, stream, renderer)
         until(lambda: not stream._finished, stream, renderer)
         assert "changed on the server" in (stream.failure or "") and stream.is_settled
-        assert (stream.message or "").startswith("no more of the scene will come: ")
+        assert (stream.message or "").startswith("loading stopped: ")
         stream.upload(renderer)
         assert picture(renderer, stream.scene, 0.0).std() > 0.01 or stream.complete_scales == 0
 
@@ -443,7 +443,7 @@ def test_a_large_plane_goes_up_over_several_frames(watched: Callable[..., Stream
     end = clock.monotonic() + PATIENCE_S
     while not stream.is_settled and clock.monotonic() < end:
         written.clear()
-        stream.upload(renderer, most_bytes=20_000)
+        stream.upload(renderer, max_bytes=20_000)
         assert sum(written) <= 20_000 + 96 * 2 * 16
     assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
 

@@ -46,21 +46,21 @@ def measure(job: Pacing) -> dict[str, Any]:
             before, now = now, clock.perf_counter()
             glfw.poll_events()
             if job.turn:
-                player.look_from(player.view.orbit(math.radians(job.turn) * (now - before), 0.0))
+                player.state.look_from(player.state.view.orbit(math.radians(job.turn) * (now - before), 0.0))
             player.frame()
             if now - began < LEAD_IN_S:
                 continue
             seconds.append(clock.perf_counter() - now)
-            rasters.append(player.raster)
+            rasters.append(player.scene_view.raster)
             if now - began - LEAD_IN_S >= job.seconds * len(kept) / COMPARED:
-                kept.append((player.view, player.playback.time, player._pixels()))
+                kept.append((player.state.view, player.state.playback.time, player.scene_view.pixels()))
         each = []
-        for player.view, player.playback.time, shown in kept:
-            player._picture(1.0, "reference", still=True)
-            each.append(psnr(shown / 255, player._pixels() / 255))
+        for player.state.view, player.state.playback.time, shown in kept:
+            player.scene_view.draw("reference", still=True)
+            each.append(psnr(shown / 255, player.scene_view.pixels() / 255))
         middle = statistics.median_high(rasters)
         return {
-            "renderer": offscreen.describe(player.ctx),
+            "renderer": offscreen.describe(player.window.ctx),
             "fps": len(seconds) / sum(seconds),
             "frame_ms_p95": 1e3 * float(np.percentile(seconds, 95)),
             "raster": "{}x{}".format(*middle),

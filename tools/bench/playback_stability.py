@@ -14,9 +14,10 @@ import numpy as np
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.container.container import open_source
 from kpc.player.app.desktop import glfw
+from kpc.player.app.player import Player
 from kpc.player.app.preferences import Preferences
 from kpc.player.app.resolution_controller import ResolutionController
-from kpc.player.app.window import Player, Window
+from kpc.player.app.window import Window
 from kpc.player.gl import offscreen
 from kpc.player.streaming.group_playback import GroupPlayback
 
@@ -45,13 +46,13 @@ def measure(job: Steady) -> dict[str, Any]:
         DisplayError: there is no display.
     """
     with in_window(job.scene, job.size, Preferences(graphs=True, planes=True)) as player:
-        window, stream = player.window, player.stream
-        player.show_path = True
-        player.quality.resolution = ResolutionController(
+        window, stream = player.window, player.state.stream
+        player.state.visible.path = True
+        player.state.quality.resolution = ResolutionController(
             budget_s=3600.0
         )  # the raster stays as it is, however busy the machine
         for _ in range(2):
-            player.add_keyframe()
+            player.actions.add_keyframe()
         while not stream.is_settled:
             player.frame()
         made = count_makers(window.ctx)
@@ -62,7 +63,7 @@ def measure(job: Steady) -> dict[str, Any]:
             if number == warm:
                 made.clear()
             glfw.poll_events()
-            player.view = player.view.orbit(TURN, 0.0)
+            player.state.view = player.state.view.orbit(TURN, 0.0)
             player.frame()
             if number >= warm and number % every == 0:
                 numbers.append(number)
@@ -79,7 +80,7 @@ def measure(job: Steady) -> dict[str, Any]:
             "held_bytes": held,
             "made_on_card": sum(made.values()),
             "made": dict(made),
-            "gpu_memory_bytes": player.renderer.memory_bytes,
+            "gpu_memory_bytes": player.scene_view.renderer.memory_bytes,
         }
 
 

@@ -1,0 +1,215 @@
+"""What keys and panels can make a player do."""
+
+from kpc.format.common.media import write_image
+from kpc.format.container.container import open_source
+from kpc.player.app.camera_paths import CameraPath
+from kpc.player.app.controls import View
+from kpc.player.app.filming import Filming
+from kpc.player.app.output_files import OutputFiles
+from kpc.player.app.preferences import TEXT_SIZES
+from kpc.player.app.quality_controller import LEVEL_NAMES
+from kpc.player.app.scene_view import SceneView
+from kpc.player.app.state import PlayerState
+from kpc.player.cpu.reference import Part
+from kpc.player.gl.renderer import DisplayMode
+from kpc.player.quality import neighbouring_level
+from kpc.player.streaming.group_playback import GroupPlayback
+
+# Display modes and parts of the scene, as the panels name them; the keys 1, 2 ... and C follow this order.
+DISPLAY_MODE_NAMES = {
+    DisplayMode.COLOUR: "colour",
+    DisplayMode.DEPTH: "depth",
+    DisplayMode.SAMPLES: "samples",
+    DisplayMode.OCCUPANCY: "occupancy",
+}
+PART_NAMES = {Part.FULL: "everything", Part.STATIC: "static", Part.DYNAMIC: "dynamic"}
+# Factor between two sizes of the text.
+TEXT_STEP = 1.1
+NO_PATH = "there is no camera path yet; press K to add a keyframe"
+
+
+class Actions:
+    """The commands of a player.
+
+    Attributes:
+        successor: the scene that was opened last, which is to follow the one that is shown.
+    """
+
+    def __init__(self, state: PlayerState, scene_view: SceneView, filming: Filming, files: OutputFiles) -> None:
+        self.state, self.scene_view, self.filming, self.files = state, scene_view, filming, files
+        self.successor: GroupPlayback | None = None
+
+    # --- the clip
+
+    def play_or_pause(self) -> None:
+        """Play or pause the clip; if the camera follows the path, stop that."""
+        if self.state.follower.is_active:
+            self.state.follower.is_active = False
+        else:
+            self.state.playback.toggle()
+
+    def step(self, frames: int) -> None:
+        """Pause and go `frames` frames forward."""
+        self.state.playback.step(frames)
+        self.state.follower.is_active = False
+
+    def seek(self, time: float) -> None:
+        """Go to a time in [0, 1] without pausing."""
+        self.state.playback.seek(time)
+        self.state.follower.is_active = False
+
+    def change_speed(self, steps: int) -> None:
+        """Choose the next faster speed, or with -1 the next slower one."""
+        self.state.playback.change_speed(steps)
+
+    def toggle_loop(self) -> None:
+        """Switch looping on or off."""
+        self.state.playback.loop = not self.state.playback.loop
+
+    # --- the camera
+
+    def to_camera(self, number: int) -> None:
+        """Go to a camera of the scene, counted from 0."""
+        self.state.camera_number = number
+        self.state.look_from(View.of(self.state.rig, self.state.rig.cameras[number]))
+
+    def next_camera(self) -> None:
+        """Go to the next camera of the scene."""
+        self.to_camera((self.state.camera_number + 1) % len(self.state.rig.cameras))
+
+    def to_preset(self, number: int) -> None:
+        """Go to a named viewpoint, counted from 0."""
+        self.state.preset_number = number
+        name, camera = list(self.state.presets.items())[number]
+        self.state.look_from(View.of(self.state.rig, camera))
+        self.state.notify(f"viewpoint: {name}")
+
+    def next_preset(self) -> None:
+        """Go to the next named viewpoint."""
+        self.to_preset((self.state.preset_number + 1) % len(self.state.presets))
+
+    # --- what is shown, and how
+
+    def next_appearance(self) -> None:
+        """Blend into the next appearance."""
+        self.state.appearance.next()
+
+    def show_mode(self, number: int) -> None:
+        """Choose a display mode, in the order of DISPLAY_MODE_NAMES."""
+        self.state.display_mode = list(DISPLAY_MODE_NAMES)[number]
+
+    def next_part(self) -> None:
+        """Show the next part of a dynamic scene."""
+        if self.state.scene.is_dynamic:
+            parts = list(PART_NAMES)
+            self.state.part = parts[(parts.index(self.state.part) + 1) % len(parts)]
+
+    def toggle_exact(self) -> None:
+        """Sample the time planes of a dynamic scene, or fold them into the space planes."""
+        if self.state.scene.is_dynamic:
+            self.state.exact = not self.state.exact
+
+    def change_quality(self, levels: int) -> None:
+        """Choose the quality level that is `levels` higher, and keep it."""
+        quality = self.state.quality
+        quality.choose(neighbouring_level(quality.level, levels))
+        position = LEVEL_NAMES.index(quality.level) + 1
+        self.state.notify(f"quality: {quality.level}, level {position} of {len(LEVEL_NAMES)}")
+
+    def toggle_target_rate(self) -> None:
+        """Hold the target frame rate by changing the quality, or keep the present quality."""
+        quality = self.state.quality
+        quality.hold(self.state.target_fps if quality.target_s is None else None)
+
+    def change_text_size(self, steps: int) -> None:
+        """Enlarge the text of the panels, or with -1 reduce it."""
+        size = self.state.text_size * TEXT_STEP**steps
+        self.state.text_size = min(max(size, TEXT_SIZES[0]), TEXT_SIZES[1])
+
+    def toggle_panel(self, name: str) -> None:
+        """Show or hide a panel, a field of VisiblePanels. Static scenes have no time planes to show."""
+        if name != "planes" or self.state.scene.is_dynamic:
+            setattr(self.state.visible, name, not getattr(self.state.visible, name))
+
+    # --- the camera path
+
+    def add_keyframe(self) -> None:
+        """Add the present camera and time to the camera path."""
+        state, follower = self.state, self.state.follower
+        camera = state.view.camera(*self.scene_view.canvas.size)
+        follower.append(camera, state.playback.time, state.playback.playing)
+        state.visible.path = True
+        state.notify(f"keyframe {len(follower.path.keyframes)} at {follower.path.end_s:.1f} s")
+
+    def remove_last_keyframe(self) -> None:
+        """Remove the last keyframe, if there is one."""
+        if not self.state.follower.is_empty:
+            self.state.follower.remove(len(self.state.follower.path.keyframes) - 1)
+
+    def follow_or_stop(self) -> None:
+        """Let the camera follow the path from where it left it, or stop."""
+        follower = self.state.follower
+        if follower.is_empty:
+            self.state.notify_error(NO_PATH)
+        elif follower.is_active:
+            follower.is_active = False
+        else:
+            follower.start()
+            self.state.playback.playing = False
+
+    def to_path_position(self, seconds: float) -> None:
+        """Go to a position on the camera path, and pause there."""
+        camera, time = self.state.follower.path.at(seconds)
+        self.state.look_from(View.of(self.state.rig, camera))
+        self.state.scrub(time)
+        self.state.follower.position_s = seconds
+
+    # --- files
+
+    def start_or_stop_filming(self, along_path: bool) -> None:
+        """Begin a video of the window or of the camera path, or end the one that is being written."""
+        if self.filming.recording is None and along_path and self.state.follower.is_empty:
+            self.state.notify_error(NO_PATH)
+        else:
+            self.filming.start_or_stop(along_path)
+
+    def save_picture(self) -> None:
+        """Save the picture without panels at the quality of a still."""
+        self.scene_view.draw_still()
+        with self.state.reporting_errors(self.files.folder.absolute()):
+            path = self.files.next_path(".png")
+            write_image(path, self.scene_view.pixels())
+            self.state.notify(f"saved {path}")
+
+    def save_path(self) -> None:
+        """Save the camera path."""
+        if self.state.follower.is_empty:
+            self.state.notify_error(NO_PATH)
+            return
+        with self.state.reporting_errors(self.files.folder.absolute()):
+            path = self.files.next_path("-path.json")
+            self.state.follower.path.save(path)
+            self.state.notify(f"saved {path}; kprender --path makes a video of it")
+
+    def open(self, file: str) -> None:
+        """Load a camera path (.json), or open another scene, which becomes the successor."""
+        state = self.state
+        with state.reporting_errors(file):
+            if file.lower().endswith(".json"):
+                state.follower.replace(CameraPath.load(file))
+                state.visible.path = True
+                state.notify(
+                    f"loaded {len(state.follower.path.keyframes)} keyframes from {file}; press J to follow them"
+                )
+                return
+            stream = GroupPlayback(open_source(file, limit=state.stream.memory), memory=state.stream.memory)
+            try:
+                stream.draw_with(self.scene_view.make_renderer)
+                self.successor = stream
+            except BaseException:
+                stream.close()
+                raise
+
+    def quit(self) -> None:
+        """End the player."""
+        self.state.should_close = True

@@ -1,0 +1,284 @@
+"""A scene in a window: the main loop, and what happens in a frame."""
+
+import time as clock
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from kpc.format.common.errors import ContextLostError, DisplayError
+from kpc.format.common.media import write_image
+from kpc.player.app.actions import Actions
+from kpc.player.app.controls import View
+from kpc.player.app.desktop import glfw
+from kpc.player.app.filming import Filming
+from kpc.player.app.imgui_renderer import ImGuiRenderer
+from kpc.player.app.input import Input
+from kpc.player.app.output_files import OutputFiles
+from kpc.player.app.panels import Panels
+from kpc.player.app.preferences import Preferences
+from kpc.player.app.quality_controller import quality_controller_for
+from kpc.player.app.scene_view import SceneView
+from kpc.player.app.state import PlayerState
+from kpc.player.app.window import Window
+from kpc.player.gl.renderer import is_software
+from kpc.player.quality import neighbouring_level
+from kpc.player.streaming.group_playback import GroupPlayback
+from kpc.player.streaming.prefetch import Playhead
+
+# Times that drawing may fail, say for want of memory, each followed by a lower quality, before the player gives up.
+MAX_RETRIES = 3
+# Seconds to wait for events while nothing changes, and while the window is minimised.
+IDLE_S, ICONIFIED_S = 0.05, 0.1
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What a player shows at the moment, for tests.
+
+    Attributes:
+        time: of the clip, [0, 1].
+        playing, speed, loop: of the clip.
+        view: the camera.
+        camera_number, preset_number: that were chosen last.
+        appearance: its name.
+        part, display_mode: names, in lower case.
+        folds: whether the picture was drawn with folded time planes.
+        level: name of the quality level; target_s: seconds that a frame may take, if the level follows from that.
+        keyframes: of the camera path; follows_path: whether the camera follows it.
+        films: whether a video is being written.
+        panels: names of the panels that are switched on.
+        notice, notice_is_error: the last message.
+        canvas, raster: (width, height) of the canvas, and of the picture before it was scaled to it.
+        is_sharp: whether the picture has the quality of a still.
+    """
+
+    time: float
+    playing: bool
+    speed: float
+    loop: bool
+    view: View
+    camera_number: int
+    preset_number: int
+    appearance: str
+    part: str
+    display_mode: str
+    folds: bool
+    level: str
+    target_s: float | None
+    keyframes: int
+    follows_path: bool
+    films: bool
+    panels: frozenset[str]
+    notice: str
+    notice_is_error: bool
+    canvas: tuple[int, int]
+    raster: tuple[int, int]
+    is_sharp: bool
+
+
+class Player:
+    """A scene in a window, from the first frame to the last, also while it arrives.
+
+    Args:
+        window: where to show it.
+        stream: the clip.
+        preferences: the settings to begin with.
+        resume_from: a player of the same scene whose context was lost; this one continues where that one stopped.
+        folder: for screenshots, videos and camera paths.
+
+    Attributes:
+        state: what is shown, and how.
+        scene_view: the picture of the scene.
+        actions: what keys and panels do.
+        filming: the video that is written.
+    """
+
+    def __init__(
+        self,
+        window: Window,
+        stream: GroupPlayback,
+        preferences: Preferences = Preferences(),
+        *,
+        resume_from: "Player | None" = None,
+        folder: Path = Path(),
+    ) -> None:
+        self.window = window
+        stream.arrived = glfw.post_empty_event
+        quality = quality_controller_for(is_software(window.ctx), preferences.quality, preferences.target_fps)
+        self.state = PlayerState(stream, preferences, quality)
+        if resume_from is not None:
+            self.state.resume(resume_from.state)
+        self.scene_view = SceneView(window.ctx, self.state, window.pixels)
+        self.imgui = ImGuiRenderer(window.ctx)
+        window.io = self.imgui.io
+        self.files = OutputFiles(folder, stream.source.name)
+        self.filming = Filming(self.state, self.scene_view, self.files)
+        self.actions = Actions(self.state, self.scene_view, self.filming, self.files)
+        self.input = Input(window, self.state, self.actions)
+        self.panels = Panels(self.imgui, self.state, self.scene_view, self.actions)
+        self._retries, self._last_frame_at = 0, clock.monotonic()
+        if resume_from is None:
+            self.state.notify("Press H for the list of keys")
+        else:
+            self.state.notify_error("the graphics card was reset; the scene has been loaded again")
+
+    @property
+    def successor(self) -> GroupPlayback | None:
+        """The scene that is to follow this one."""
+        return self.actions.successor
+
+    def preferences(self) -> Preferences:
+        """Return the settings to remember."""
+        return self.state.preferences(self.window.unscaled_size)
+
+    def run(self, frames: int | None = None) -> None:
+        """Show frames until the window is closed or another scene is opened.
+
+        Args:
+            frames: end after so many, counted once all of the scene has arrived that is to arrive.
+        """
+        shown, stream = 0, self.state.stream
+        while not self._is_over and (frames is None or shown < frames):
+            may_wait = frames is None or not stream.is_settled
+            if may_wait and self.scene_view.is_sharp and self.filming.recording is None:
+                glfw.wait_events_timeout(IDLE_S)  # nothing changes: use next to no time
+            else:
+                glfw.poll_events()
+            self.frame()
+            shown += stream.is_settled
+
+    def frame(self) -> None:
+        """Handle events, advance the clip, draw the scene and the panels over it, and show them."""
+        now = clock.monotonic()
+        seconds, self._last_frame_at = now - self._last_frame_at, now
+        self.state.statistics.record_interval(seconds)
+        pixels = self.window.pixels
+        if min(pixels) < 1 or self.window.is_iconified:
+            glfw.wait_events_timeout(ICONIFIED_S)
+            return
+        self.window.check()
+        measuring_s, is_timed = self.scene_view.measuring_s, False
+        if pixels != self.scene_view.canvas.size:
+            self.scene_view.resize(pixels)
+        self._begin_panels(seconds)
+        self.input.update(seconds)
+        try:
+            self._advance(seconds)
+            self.state.appearance.advance(seconds)
+            if self.filming.is_along_path:
+                self.scene_view.is_sharp = False  # `filming` draws each frame
+            else:
+                is_timed = self.scene_view.update(now)
+            self.scene_view.renderer.check()
+        except ContextLostError:
+            raise
+        except DisplayError as error:
+            self._retry_after(error)
+        self.filming.update(now)
+        self.state.statistics.record_frame(seconds)
+        self.panels.build()
+        self._present()
+        if is_timed:  # the frame without waiting for the screen, and without measuring statistics
+            self.state.quality.record(clock.monotonic() - now - (self.scene_view.measuring_s - measuring_s))
+        glfw.swap_buffers(self.window.handle)
+        self.window.release_unused()
+
+    def screenshot(self, path: Path) -> None:
+        """Save the window with its panels at full resolution as a PNG file."""
+        self._begin_panels(1 / 60)
+        self.scene_view.draw_still()
+        self.panels.build()
+        self.imgui.draw(self.scene_view.canvas)
+        write_image(path, self.scene_view.pixels())
+        self.scene_view.invalidate()
+
+    def close(self) -> str | None:
+        """Finish the video that is being written and release the panels; return what to report of the video."""
+        report = self.filming.close()
+        self.window.io = None
+        self.imgui.close()
+        return report
+
+    # --- for tests
+
+    def press(self, key: int, modifiers: int = 0) -> None:
+        """Press a key, and show a frame."""
+        self.window.press_key(key, modifiers)
+        self.frame()
+
+    def present_panels(self) -> None:
+        """Build the panels and show them over the canvas, without drawing the scene or swapping buffers."""
+        self._begin_panels(0.0)
+        self.panels.build()
+        self._present()
+
+    def forget_failures(self) -> None:
+        """Allow MAX_RETRIES failures again."""
+        self._retries = 0
+
+    def snapshot(self) -> Snapshot:
+        """Return what the player shows."""
+        state, playback, follower = self.state, self.state.playback, self.state.follower
+        return Snapshot(
+            time=playback.time,
+            playing=playback.playing,
+            speed=playback.speed,
+            loop=playback.loop,
+            view=state.view,
+            camera_number=state.camera_number,
+            preset_number=state.preset_number,
+            appearance=state.appearance.name,
+            part=state.part.name.lower(),
+            display_mode=state.display_mode.name.lower(),
+            folds=self.scene_view.renderer.quality.folded,
+            level=state.quality.level,
+            target_s=state.quality.target_s,
+            keyframes=len(follower.path.keyframes),
+            follows_path=follower.is_active,
+            films=self.filming.recording is not None,
+            panels=frozenset(name for name, is_shown in vars(state.visible).items() if is_shown),
+            notice=state.notice.text,
+            notice_is_error=state.notice.is_error,
+            canvas=self.scene_view.canvas.size,
+            raster=self.scene_view.raster,
+            is_sharp=self.scene_view.is_sharp,
+        )
+
+    # --- parts of a frame
+
+    @property
+    def _is_over(self) -> bool:
+        return self.window.should_close or self.state.should_close or self.successor is not None
+
+    def _advance(self, seconds: float) -> None:
+        """Advance the clip, or the camera along its path, unless what would be shown has not arrived yet."""
+        state, follower = self.state, self.state.follower
+        playback, position_s, view = state.playback.after(seconds), follower.position_s, state.view
+        if self.filming.is_along_path:
+            playback = replace(playback, time=self.filming.path_time)
+        elif follower.is_active:
+            position_s = follower.position_after(seconds, state.playback.loop)
+            camera, time = follower.path.at(position_s)
+            playback, view = replace(playback, time=time), View.of(state.rig, camera)
+        state.stream.set_playhead(Playhead(playback.time, state.playback.rate, state.playback.loop))
+        state.stream.upload()
+        state.follow_scene()
+        if state.stream.can_show(playback.time, state.playback.rate):
+            state.playback, follower.position_s, state.view = playback, position_s, view
+
+    def _retry_after(self, error: DisplayError) -> None:
+        """Report that drawing failed and lower the quality; give up after MAX_RETRIES."""
+        self._retries += 1
+        if self._retries > MAX_RETRIES:
+            raise error
+        self.state.notify_error(str(error))
+        self.state.quality.choose(neighbouring_level(self.state.quality.level, -1))
+
+    def _begin_panels(self, seconds: float) -> None:
+        text_scale = self.state.text_size * self.window.text_scale
+        self.imgui.begin(self.window.size, self.scene_view.canvas.size, text_scale, seconds)
+
+    def _present(self) -> None:
+        """Copy the canvas to the screen and draw the panels over it."""
+        ctx = self.window.ctx
+        ctx.copy_framebuffer(ctx.screen, self.scene_view.canvas)
+        self.imgui.draw(ctx.screen)

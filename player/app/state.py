@@ -1,0 +1,187 @@
+"""What a player shows and how: the state that input, panels and drawing share. No window, no OpenGL calls."""
+
+import contextlib
+import time as clock
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from kpc.format.common.errors import KpcError
+from kpc.format.scene.scene import Scene
+from kpc.player.app.controls import AppearanceSelection, Playback, View
+from kpc.player.app.path_follower import PathFollower
+from kpc.player.app.preferences import Preferences
+from kpc.player.app.quality_controller import QualityController
+from kpc.player.app.recording import FILM_FPS
+from kpc.player.cpu.reference import Part
+from kpc.player.gl.renderer import DisplayMode
+from kpc.player.streaming.group_playback import GroupPlayback
+from kpc.player.viewpoints import Rig, presets
+
+# Seconds for which a message and an error message stay on the screen.
+NOTICE_S, ERROR_NOTICE_S = 4.0, 12.0
+# Frames whose times the graphs show.
+HISTORY_FRAMES = 240
+
+
+@dataclass
+class Notice:
+    """A message on the screen.
+
+    Attributes:
+        text: the message.
+        until: the time of `time.monotonic` at which it disappears.
+        is_error: whether it reports an error.
+    """
+
+    text: str = ""
+    until: float = 0.0
+    is_error: bool = False
+
+
+@dataclass
+class VisiblePanels:
+    """Which panels are shown. `controls` hides all others but `keys`."""
+
+    controls: bool = True
+    graphs: bool = False
+    planes: bool = False
+    path: bool = False
+    keys: bool = False
+
+
+class FrameStatistics:
+    """Times of the last frames, and statistics of the picture.
+
+    Attributes:
+        history: (2, HISTORY_FRAMES) float32, milliseconds between frames and milliseconds that pictures took; frame n is in
+            column n % HISTORY_FRAMES.
+        frames: frames so far.
+        frame_s: seconds between two frames, smoothed.
+        draw_s: seconds that the last picture took.
+        samples: samples per ray, on average.
+        max_samples: samples per ray at the upper end of the colour scale.
+        depth_range: nearest and farthest depth of the colour scale, world units.
+    """
+
+    def __init__(self) -> None:
+        self.history = np.zeros((2, HISTORY_FRAMES), np.float32)
+        self.frames = 0
+        self.frame_s = self.draw_s = 0.0
+        self.samples, self.max_samples, self.depth_range = 0.0, 16.0, (0.0, 1.0)
+
+    def record_interval(self, seconds: float) -> None:
+        """Update the smoothed time between frames."""
+        self.frame_s += 0.1 * (seconds - self.frame_s) if self.frame_s else seconds
+
+    def record_frame(self, seconds: float) -> None:
+        """Append a frame to the history.
+
+        Args:
+            seconds: since the frame before.
+        """
+        self.history[:, self.frames % HISTORY_FRAMES] = 1e3 * seconds, 1e3 * self.draw_s
+        self.frames += 1
+
+
+class PlayerState:
+    """State of a player.
+
+    Args:
+        stream: the clip that plays.
+        preferences: the settings to begin with.
+        quality: chooses quality level and resolution.
+
+    Attributes:
+        rig: the cameras of the scene; presets: named viewpoints.
+        camera_number: the camera that was chosen last, from 0; preset_number: likewise, or -1.
+        view: the camera that the picture is drawn from.
+        playback: the position in the clip.
+        appearance: the appearance embedding that is shown.
+        part: the part of the scene that is shown.
+        display_mode: what of each ray is shown.
+        exact: whether time planes are sampled beside the space planes even where the quality level folds them.
+        target_fps: the frame rate to hold when the quality controller is switched on.
+        follower: the camera path.
+        visible: the panels that are shown.
+        text_size: of the panels; 1 is the system's text size.
+        should_close: whether the player is to end.
+    """
+
+    def __init__(self, stream: GroupPlayback, preferences: Preferences, quality: QualityController) -> None:
+        self.stream, self.quality = stream, quality
+        self.target_fps = preferences.target_fps or (1 / quality.target_s if quality.target_s else FILM_FPS)
+        self.rig, self.presets = Rig.of(self.scene), presets(self.scene)
+        self.camera_number, self.preset_number = 0, -1
+        self.view = View.of(self.rig, self.rig.cameras[0])
+        has_duration = stream.clip.duration_s > 0
+        self.playback = Playback(stream.clip, playing=has_duration, speed=preferences.speed, loop=preferences.loop)
+        self.appearance = AppearanceSelection(self.scene)
+        self.part, self.display_mode, self.exact = Part.FULL, DisplayMode.COLOUR, False
+        self.follower = PathFollower()
+        self.visible = VisiblePanels(preferences.controls, preferences.graphs, preferences.planes)
+        self.text_size = preferences.text_size
+        self.statistics, self.notice = FrameStatistics(), Notice()
+        self.should_close = False
+
+    @property
+    def scene(self) -> Scene:
+        """The scene that is shown; for a clip in groups, the group."""
+        return self.stream.scene
+
+    def resume(self, before: "PlayerState") -> None:
+        """Continue where another player of the same scene stopped."""
+        self.view, self.playback, self.part, self.display_mode = (
+            before.view, before.playback, before.part, before.display_mode
+        )  # fmt: skip
+        self.quality, self.target_fps, self.exact = before.quality, before.target_fps, before.exact
+        self.follower.replace(before.follower.path)
+        self.appearance.select(before.appearance.number)
+        self.visible.controls, self.visible.path = before.visible.controls, before.visible.path
+
+    def preferences(self, window_size: tuple[int, int]) -> Preferences:
+        """Return the settings to remember."""
+        holds_rate = self.quality.target_s is not None
+        return Preferences(
+            size=window_size,
+            quality=self.quality.chosen_level,
+            target_fps=self.target_fps if holds_rate else None,
+            speed=self.playback.speed,
+            loop=self.playback.loop,
+            controls=self.visible.controls,
+            graphs=self.visible.graphs,
+            planes=self.visible.planes,
+            text_size=self.text_size,
+        )
+
+    def look_from(self, view: View) -> None:
+        """Move the camera at once, and stop following the camera path."""
+        self.view, self.follower.is_active = view, False
+
+    def scrub(self, time: float) -> None:
+        """Pause the clip at a time in [0, 1], and stop following the camera path."""
+        self.playback.playing = self.follower.is_active = False
+        self.playback.seek(time)
+
+    def follow_scene(self) -> None:
+        """Keep the appearance that is selected when another group of the clip is shown."""
+        if self.appearance.scene is not self.scene:
+            self.appearance = AppearanceSelection(self.scene, self.appearance.name)
+
+    def notify(self, text: str) -> None:
+        """Show a message."""
+        self.notice = Notice(text, clock.monotonic() + NOTICE_S)
+
+    def notify_error(self, text: str) -> None:
+        """Show an error message, for longer."""
+        self.notice = Notice(text, clock.monotonic() + ERROR_NOTICE_S, is_error=True)
+
+    @contextlib.contextmanager
+    def reporting_errors(self, subject: object) -> Iterator[None]:
+        """Show errors of the block as a message; `subject`, say a file name, precedes those of the operating system."""
+        try:
+            yield
+        except KpcError as error:
+            self.notify_error(str(error))
+        except OSError as error:
+            self.notify_error(f"{subject}: {error.strerror or error}")

@@ -1,0 +1,114 @@
+"""Building blocks of the panels: bare ImGui windows, messages, labelled controls. Lengths in em are heights of the text."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from typing import TypeVar
+
+from kpc.player.app.desktop import imgui
+
+# Colours of what is active, and of errors.
+ACCENT, ERROR = imgui.ImVec4(0.95, 0.62, 0.25, 1.0), imgui.ImVec4(1.0, 0.45, 0.38, 1.0)
+# Widths of the labels before controls, of the controls, and of the panels on the right, em.
+LABEL_EM, CONTROL_EM, PANEL_EM = 5.2, 9.5, 19.0
+# Distances of the panels from the window's edges and from each other, em.
+MARGIN_EM, SPACING_EM = 0.8, 0.4
+# Width of the panels along the lower edge, at most, em.
+MAX_BAR_EM = 60.0
+# Width of a message over the room it has.
+MESSAGE_SHARE = 0.88
+
+Value = TypeVar("Value")
+
+
+def em(count: float = 1.0) -> float:
+    """Return `count` heights of the text, in screen units."""
+    return count * imgui.get_font_size()
+
+
+def window_size() -> tuple[float, float]:
+    """Return (width, height) of the player's window, screen units."""
+    size = imgui.get_io().display_size
+    return size.x, size.y
+
+
+@contextlib.contextmanager
+def panel(name: str, flags: int = 0, fits_content: bool = True, scrolls: bool = False) -> Iterator[None]:
+    """Build a window without decoration that cannot be moved."""
+    bare = imgui.WindowFlags_.no_decoration | imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_nav
+    if scrolls:
+        bare &= ~imgui.WindowFlags_.no_scrollbar
+    imgui.begin(f"##{name}", None, bare | flags | (imgui.WindowFlags_.always_auto_resize if fits_content else 0))
+    try:
+        yield
+    finally:
+        imgui.end()
+
+
+def place_next(
+    x: float,
+    y: float,
+    pivot_x: float = 0.0,
+    pivot_y: float = 0.0,
+    max_height: float | None = None,
+    min_width: float = 0.0,
+) -> None:
+    """Place the next window: the point at (pivot_x, pivot_y) of its size lies at (x, y)."""
+    imgui.set_next_window_pos(imgui.ImVec2(x, y), imgui.Cond_.always, imgui.ImVec2(pivot_x, pivot_y))
+    if max_height is not None:
+        imgui.set_next_window_size_constraints(imgui.ImVec2(min_width, 0), imgui.ImVec2(1e5, max(max_height, 1.0)))
+
+
+def place_bar(bottom: float) -> None:
+    """Place the next window along the lower edge, above `bottom`."""
+    width = window_size()[0]
+    place_next(width / 2, bottom, 0.5, 1.0)
+    imgui.set_next_window_size(imgui.ImVec2(min(width - em(2 * MARGIN_EM), em(MAX_BAR_EM)), 0))
+
+
+def message(
+    name: str, text: str, across: tuple[float, float], y: float, pivot_y: float, colour: imgui.ImVec4 | None = None
+) -> None:
+    """Show a wrapped text.
+
+    Args:
+        name: of its window.
+        text: to show.
+        across: left and right end of the room it is centred in, screen units.
+        y, pivot_y: see `place_next`.
+        colour: of the text; None for the usual one.
+    """
+    place_next(sum(across) / 2, y, 0.5, pivot_y)
+    with panel(name, imgui.WindowFlags_.no_inputs):
+        imgui.push_text_wrap_pos(MESSAGE_SHARE * (across[1] - across[0]))
+        if colour is not None:
+            imgui.push_style_color(imgui.Col_.text, colour)
+        imgui.text(text)
+        if colour is not None:
+            imgui.pop_style_color()
+        imgui.pop_text_wrap_pos()
+
+
+def label(text: str) -> None:
+    """Begin a line of a label and a control."""
+    imgui.align_text_to_frame_padding()
+    imgui.text_disabled(text)
+    imgui.same_line(em(LABEL_EM))
+    imgui.set_next_item_width(em(CONTROL_EM))
+
+
+def choice(name: str, present: Value, names: dict[Value, str]) -> Value:
+    """Build a labelled list to choose from; return the value that is chosen."""
+    label(name)
+    values: Sequence[Value] = list(names)
+    changed, chosen = imgui.combo(f"##{name}", values.index(present), list(names.values()))
+    return values[chosen] if changed else present
+
+
+def toggle(name: str, is_on: bool) -> bool:
+    """Build a button that stays down; return whether it is down."""
+    if is_on:
+        imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(ACCENT.x, ACCENT.y, ACCENT.z, 0.55))
+    pressed = imgui.button(name)
+    if is_on:
+        imgui.pop_style_color()
+    return is_on != pressed
