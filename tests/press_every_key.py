@@ -139,12 +139,10 @@ def keys_of_the_clip(player: Player) -> None:
     assert player.snapshot().playing
     before = player.snapshot().time
     with replaced(stream, can_show=lambda *position: False):
-        time.sleep(0.05)
-        player.frame()
+        player.frame(seconds=0.05)
         assert player.snapshot().time == before and player.snapshot().playing  # the clip waits for what has not arrived
-    time.sleep(0.05)
-    player.frame()
-    assert player.snapshot().time != before
+    player.frame(seconds=0.05)
+    assert player.snapshot().time == approx(before + 0.05 / player.state.playback.clip.duration_s)
     press(player, glfw.KEY_SPACE)
     assert not player.snapshot().playing
     press(player, glfw.KEY_HOME, glfw.KEY_RIGHT)
@@ -227,14 +225,12 @@ def camera_path(player: Player) -> None:
     assert path.end_s == 2.0 and "path" in player.snapshot().panels
     state.follower.path = path.spaced(1, 0.2)
 
-    press(player, glfw.KEY_J)
+    player.press(glfw.KEY_J, seconds=0.0)
     assert player.snapshot().follows_path
-    time.sleep(0.06)
-    player.frame()
+    player.frame(seconds=0.06)
     between = player.snapshot()
     assert 0.2 < between.time < 0.6 and between.view.eye != approx(first) and between.view.eye != approx(second)
-    time.sleep(0.25)
-    player.frame()
+    player.frame(seconds=0.25)
     end = player.snapshot()
     assert not end.follows_path and end.view.eye == approx(second) and end.time == approx(0.6)
 

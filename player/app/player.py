@@ -146,10 +146,16 @@ class Player:
             self.frame()
             shown += stream.is_settled
 
-    def frame(self) -> None:
-        """Handle events, advance the clip, draw the scene and the panels over it, and show them."""
+    def frame(self, seconds: float | None = None) -> None:
+        """Handle events, advance the clip, draw the scene and the panels over it, and show them.
+
+        Args:
+            seconds: to advance by; None: the time since the last frame.
+        """
         now = clock.monotonic()
-        seconds, self._last_frame_at = now - self._last_frame_at, now
+        if seconds is None:
+            seconds = now - self._last_frame_at
+        self._last_frame_at = now
         self.state.statistics.record_interval(seconds)
         pixels = self.window.pixels
         if min(pixels) < 1 or self.window.is_iconified:
@@ -200,10 +206,10 @@ class Player:
 
     # --- for tests
 
-    def press(self, key: int, modifiers: int = 0) -> None:
-        """Press a key, and show a frame."""
+    def press(self, key: int, modifiers: int = 0, seconds: float | None = None) -> None:
+        """Press a key, and show a frame; see `Window.press_key` and `frame`."""
         self.window.press_key(key, modifiers)
-        self.frame()
+        self.frame(seconds)
 
     def present_panels(self) -> None:
         """Build the panels and show them over the canvas, without drawing the scene or swapping buffers."""

@@ -55,7 +55,7 @@ class Window:
             self.handle, lambda window, button, action, mods: self.press_button(button, action == glfw.PRESS)
         )
         glfw.set_scroll_callback(self.handle, lambda window, x, y: self.scroll(x, y))
-        glfw.set_drop_callback(self.handle, lambda window, paths: self.drop(paths))  # type: ignore[arg-type]  # C's arguments
+        glfw.set_drop_callback(self.handle, self._drop_event)  # type: ignore[arg-type]  # the stub means C's arguments
 
     # --- events, as the system sends them or as a test does
 
@@ -183,6 +183,9 @@ class Window:
 
     def _keep_error(self, code: int, message: bytes | str) -> None:
         self._last_error = message.decode(errors="replace") if isinstance(message, bytes) else message
+
+    def _drop_event(self, window: object, paths: list[str]) -> None:
+        self.drop(paths)
 
     def _key_event(self, window: object, key: int, scancode: int, action: int, modifiers: int) -> None:
         if action in (glfw.PRESS, glfw.REPEAT):

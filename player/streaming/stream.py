@@ -81,14 +81,14 @@ class Stream:
         self, source: Source | Reader, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None
     ) -> None:
         self._reader = SceneReader(source, memory_budget=memory, in_parts=True)
-        source = self._reader.source
-        self.source, self.memory, self.arrived, self.version = source, memory, arrived, 0
+        self.source: Source = self._reader.source
+        self.memory, self.arrived, self.version = memory, arrived, 0
         self.parts = PartialScene(self._reader)
         self.scene: Scene = self.parts.scene
         self._layout = Layout.of(self.scene)
         fixed, least = self.fixed_bytes, min_segment_bytes(self.parts)
         if fixed + least > memory:
-            raise BudgetError(f"{source.name}: playing takes {fixed + least:,} bytes, more than --memory {memory:,}")
+            raise BudgetError(f"{self.source.name}: playing takes {fixed + least:,} bytes, more than --memory {memory:,}")
         self._segment_memory = memory - fixed
         self._stored = np.array([self.parts.entry(number).stored_length for number in self.parts.numbers])
         self._requested = np.zeros(len(self._stored), bool)  # fetched or being fetched, and not dropped since
@@ -104,8 +104,8 @@ class Stream:
         self._bug: BaseException | None = None
         self._stalled = True
         self._history: deque[tuple[float, int]] = deque()  # (time, bytes received until then) over the last RATE_OVER_S
-        if isinstance(source, RemoteSource):
-            source.attempts, source.report = float("inf"), self._set_trouble
+        if isinstance(self.source, RemoteSource):
+            self.source.attempts, self.source.report = float("inf"), self._set_trouble
         self._thread = threading.Thread(target=self._run, name="fetching", daemon=True)
         self._thread.start()
 
