@@ -88,7 +88,9 @@ class Stream:
         self._layout = Layout.of(self.scene)
         fixed, least = self.fixed_bytes, min_segment_bytes(self.parts)
         if fixed + least > memory:
-            raise BudgetError(f"{self.source.name}: playing takes {fixed + least:,} bytes, more than --memory {memory:,}")
+            raise BudgetError(
+                f"{self.source.name}: playing takes {fixed + least:,} bytes, more than --memory {memory:,}"
+            )
         self._segment_memory = memory - fixed
         self._stored = np.array([self.parts.entry(number).stored_length for number in self.parts.numbers])
         self._requested = np.zeros(len(self._stored), bool)  # fetched or being fetched, and not dropped since
