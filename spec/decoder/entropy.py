@@ -68,9 +68,9 @@ class EntropyDecoder:
         """Decode an integer with the models of a context."""
         if not self.adaptive((context, "nonzero")):
             return 0
-        is_positive = self.adaptive((context, "positive"))
-        magnitude = self.positive(lambda k: self.adaptive((context, is_positive, k)), unary, escape)
-        return magnitude if is_positive else -magnitude
+        if self.adaptive((context, "positive")):
+            return self.positive(lambda k: self.adaptive((context, "above", k)), unary, escape)
+        return -self.positive(lambda k: self.adaptive((context, "below", k)), unary, escape)
 
     def finish(self):
         require(self.next_word == len(self.words) and self.state == 1 << 16, "words and decisions do not end together")

@@ -1,4 +1,4 @@
-"""Section 8: motion, occupancy, decoder weights, cameras and appearances."""
+"""Sections 6.3 to 6.7 and 8: motion, occupancy, decoder weights, cameras and appearances."""
 
 import itertools
 import math
@@ -6,22 +6,22 @@ import math
 from .common import ByteReader, Refused, clamp, f32, require, unpack_bits
 from .entropy import EntropyDecoder, log_class
 
-# --- 8.1 MOVE
+# --- 6.3 MOVE, 8.1 MOTION
 
 
 def decode_motion(content):
     chunk = ByteReader(content.data)
-    rows, nz, ny, nx, step = chunk.unpack("4Hf")
-    require(2 <= rows <= 16384 and all(2 <= n <= 256 for n in (nz, ny, nx)), "size of the motion grid")
+    nt, nz, ny, nx, step = chunk.unpack("4Hf")
+    require(2 <= nt <= 16384 and all(2 <= n <= 256 for n in (nz, ny, nx)), "size of the motion grid")
     require(step > 0 and 32768 * step <= 1024, "step of the motion grid")
-    count = 3 * rows * nz * ny * nx
+    count = 3 * nt * nz * ny * nx
     if content.is_coded:
         require(content.raw_length == 12 + 2 * count, "raw length")
-        symbols = decode_motion_symbols(chunk, (rows, nz, ny, nx))
+        symbols = decode_motion_symbols(chunk, (nt, nz, ny, nx))
     else:
         symbols = chunk.unpack(f"{count}h")
         chunk.finish()
-    return {"size": (rows, nz, ny, nx), "displacements": [f32(symbol * step) for symbol in symbols]}
+    return {"size": (nt, nz, ny, nx), "displacements": [f32(symbol * step) for symbol in symbols]}
 
 
 def decode_motion_symbols(chunk, sizes):
@@ -59,10 +59,10 @@ def decode_motion_symbols(chunk, sizes):
     for axis, n in enumerate(sizes):
         decode_pass(axis, n - 1, [None, 0, None, None], [0, 64, 0, 0])
         decoded[axis].append(n - 1)
-    depth = [(n - 2).bit_length() for n in sizes]
-    for level in range(max(depth), 0, -1):
+    halvings = [(n - 2).bit_length() for n in sizes]
+    for halving in range(max(halvings), 0, -1):
         for axis in range(4):
-            if depth[axis] >= level:
+            if halvings[axis] >= halving:
                 halve(decoded, axis, decode_pass)
     decisions.finish()
     return [v[i] for i in itertools.product(*map(range, sizes), range(3))]
@@ -94,7 +94,7 @@ def interpolation_weights(new, references):
     return weights
 
 
-# --- 8.2 OCCU
+# --- 6.4 OCCU, 8.2 OCCUPANCY
 
 # Neighbours of a cell whose bits choose the model, most significant first: steps along slot, z, y, x.
 OCCUPANCY_NEIGHBOURS = [
@@ -130,26 +130,42 @@ def decode_occupancy(content):
     return {"cells": sizes, "occupancy": list(occupied.values())}
 
 
-# --- 8.3 DECO and HYBR
+# --- 6.5 DECO and HYBR, 8.3 WEIGHTS
 
 
 def decode_explicit_decoder(content, feature_count):
     chunk = ByteReader(content.data)
-    F, H, density_bias = chunk.unpack("HHf")
-    require(F == feature_count and 1 <= H <= 256 and math.isfinite(density_bias), "size of the decoder")
-    counts = {"density_weight": F, "w1": H * 9, "b1": H, "w2": 3 * F * H, "b2": 3 * F}
+    features, hidden, density_bias = chunk.unpack("HHf")
+    require(features == feature_count and 1 <= hidden <= 256, "size of the decoder")
+    require(math.isfinite(density_bias), "density bias")
+    counts = {
+        "density_weight": features,
+        "w1": hidden * 9,
+        "b1": hidden,
+        "w2": 3 * features * hidden,
+        "b2": 3 * features,
+    }
     weights = decode_weights(content, chunk, counts)
-    return weights | {"density_bias": density_bias, "hidden": H, "width": 0}
+    return weights | {"density_bias": density_bias, "hidden": hidden, "width": 0}
 
 
 def decode_hybrid_decoder(content, feature_count):
     chunk = ByteReader(content.data)
-    F, G, H, density_bias = chunk.unpack("HHHf")
-    require(F == feature_count and 1 <= G <= 256 and 1 <= H <= 256, "size of the decoder")
+    features, width, hidden, density_bias = chunk.unpack("HHHf")
+    require(features == feature_count and 1 <= width <= 256 and 1 <= hidden <= 256, "size of the decoder")
     require(math.isfinite(density_bias), "density bias")
-    counts = {"v": G * F, "v_bias": G, "density_weight": G, "w1": H * 9, "b1": H, "u": H * G, "w2": 3 * H, "b2": 3}
+    counts = {
+        "v": width * features,
+        "v_bias": width,
+        "density_weight": width,
+        "w1": hidden * 9,
+        "b1": hidden,
+        "u": hidden * width,
+        "w2": 3 * hidden,
+        "b2": 3,
+    }
     weights = decode_weights(content, chunk, counts)
-    return weights | {"density_bias": density_bias, "hidden": H, "width": G}
+    return weights | {"density_bias": density_bias, "hidden": hidden, "width": width}
 
 
 def decode_weights(content, chunk, counts):
@@ -171,7 +187,7 @@ def decode_weights(content, chunk, counts):
     return weights
 
 
-# --- 8.4 came
+# --- 6.6 came, 8.4 POSES
 
 D = 131071**2  # one half, in squares of quaternion components
 
@@ -223,14 +239,14 @@ def decode_poses(chunk):
     return cameras
 
 
-# --- 8.5 appe
+# --- 6.7 appe
 
 
 def decode_appearances(chunk, expected_hidden):
     """Return {name: embedding}."""
-    count, H = chunk.unpack("HH")
-    require(1 <= count <= 16384 and H == expected_hidden, "number of appearances or of hidden units")
-    embeddings = [chunk.unpack(f"{H}e") for _ in range(count)]
+    count, hidden = chunk.unpack("HH")
+    require(1 <= count <= 16384 and hidden == expected_hidden, "number of appearances or of hidden units")
+    embeddings = [chunk.unpack(f"{hidden}e") for _ in range(count)]
     require(all(math.isfinite(a) for embedding in embeddings for a in embedding), "embeddings")
     appearances = {}
     for embedding in embeddings:

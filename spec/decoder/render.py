@@ -69,22 +69,22 @@ def box_interval(origin, direction, low, high):
 
 def ndc_ray(scene, origin, direction):
     """Return (origin, direction, its distances in the world) of a ray in NDC; None if it sees the background."""
-    *axes, eye = scene["frame"]
-    x, y, z = (sum(a * (o - e) for a, o, e in zip(axis, origin, eye)) for axis in axes)
-    a, b, c = (sum(a * d for a, d in zip(axis, direction)) for axis in axes)
-    z, c = -z, -c
-    if c <= 0.0001:
+    *axes, eye = scene["reference_pose"]
+    o_x, o_y, o_z = (sum(a * (o - e) for a, o, e in zip(axis, origin, eye)) for axis in axes)
+    d_x, d_y, d_z = (sum(a * d for a, d in zip(axis, direction)) for axis in axes)
+    o_z, d_z = -o_z, -d_z
+    if d_z <= 0.0001:
         return None
     near, baseline = scene["near"], scene["baseline"]
-    r_0 = max(0.0, (near - z) / c)
-    x, y, z = x + r_0 * a, y + r_0 * b, z + r_0 * c
-    start = [x / z, y / z, baseline * (1 / near - 1 / z)]
-    g = [a / c - x / z, b / c - y / z, baseline / z]
+    r_0 = max(0.0, (near - o_z) / d_z)
+    x_0, y_0, z_0 = o_x + r_0 * d_x, o_y + r_0 * d_y, o_z + r_0 * d_z
+    start = [x_0 / z_0, y_0 / z_0, baseline * (1 / near - 1 / z_0)]
+    g = [d_x / d_z - x_0 / z_0, d_y / d_z - y_0 / z_0, baseline / z_0]
     length = math.hypot(*g)
 
     def world_distance(r):
-        h = min(r / length, 0.999999)
-        return r_0 + z / c * h / (1 - h)
+        m = min(r / length, 0.999999)
+        return r_0 + z_0 / d_z * m / (1 - m)
 
     return start, [e / length for e in g], world_distance
 
@@ -156,21 +156,21 @@ def sigmoid(x):
 def view_terms(scene, direction, embedding):
     """Return what is constant along a ray: the colour basis or, of a hybrid decoder, the hidden layer's view part."""
     x, y, z = direction
-    e = [x, y, z, x * x, y * y, z * z, x * y, y * z, z * x]
-    hidden = [a + b for a, b in zip(layer(scene["w1"], scene["b1"], e), embedding)]
+    view = [x, y, z, x * x, y * y, z * z, x * y, y * z, z * x]
+    hidden_layer = [a + b for a, b in zip(layer(scene["w1"], scene["b1"], view), embedding)]
     if scene["width"]:
-        return hidden
-    F = len(scene["density_weight"])
-    basis = layer(scene["w2"], scene["b2"], [max(a, 0.0) for a in hidden])
-    return [basis[c * F : (c + 1) * F] for c in range(3)]
+        return hidden_layer
+    features = len(scene["density_weight"])
+    colour_basis = layer(scene["w2"], scene["b2"], [max(a, 0.0) for a in hidden_layer])
+    return [colour_basis[c * features : (c + 1) * features] for c in range(3)]
 
 
 def density_and_colour(scene, f, view):
     if scene["width"]:
-        h = clip(layer(scene["v"], scene["v_bias"], f))
-        logits = layer(scene["w2"], scene["b2"], clip(layer(scene["u"], view, h)))
+        first_layer = clip(layer(scene["v"], scene["v_bias"], f))
+        logits = layer(scene["w2"], scene["b2"], clip(layer(scene["u"], view, first_layer)))
     else:
-        h = f
-        logits = [dot(f, basis) for basis in view]
-    sigma = math.exp(clamp(dot(h, scene["density_weight"]) + scene["density_bias"], -20.0, 20.0))
+        first_layer = f
+        logits = [dot(f, colour_basis) for colour_basis in view]
+    sigma = math.exp(clamp(dot(first_layer, scene["density_weight"]) + scene["density_bias"], -20.0, 20.0))
     return sigma, [sigmoid(logit) for logit in logits]

@@ -60,14 +60,14 @@ def decode_warp(chunk, scene):  # section 6.2
         require(2 * linear_range / scene["ray_step"] <= SAMPLE_LIMIT, "linear range")
         chunk.finish()
         return {"mapping": mapping, "linear_range": linear_range}
-    *frame, near, baseline = chunk.unpack("12ddd")
+    *pose, near, baseline = chunk.unpack("12ddd")
     chunk.finish()
     require(all(1 / BOX_LIMIT <= a <= BOX_LIMIT for a in (near, baseline)), "near or baseline")
-    require(all(abs(a) <= BOX_LIMIT for a in frame), "frame")
-    axes = [frame[column::4] for column in range(4)]  # the columns: right, up, backward, eye
+    require(all(abs(a) <= BOX_LIMIT for a in pose), "reference pose")
+    axes = [pose[column::4] for column in range(4)]  # the columns: right, up, backward, eye
     for i in range(3):
         for j in range(3):
             product = sum(a * b for a, b in zip(axes[i], axes[j]))
-            require(abs(product - (i == j)) < 0.0001, "axes of the frame")
+            require(abs(product - (i == j)) < 0.0001, "axes of the reference pose")
     require(scene["aabb"][1][2] < baseline / near, "box")
-    return {"mapping": mapping, "frame": axes, "near": near, "baseline": baseline}
+    return {"mapping": mapping, "reference_pose": axes, "near": near, "baseline": baseline}

@@ -1,4 +1,4 @@
-"""Section 7.6: the TRANSFORM plane codec."""
+"""Section 7.5: the TRANSFORM plane codec."""
 
 from .common import clamp
 from .entropy import log_class
@@ -27,8 +27,8 @@ def basis(N, i, y):
     """Return 128 sqrt(2) cos(pi i (2 y + 1) / (2 N)), rounded; 128 for i = 0."""
     if i == 0:
         return 128
-    k = 16 // N * i * (2 * y + 1) % 64
-    k = min(k, 64 - k)
+    angle = 16 // N * i * (2 * y + 1) % 64
+    k = min(angle, 64 - angle)
     return COSINE[k] if k <= 16 else -COSINE[32 - k]
 
 
@@ -37,14 +37,14 @@ def diagonal(N, number):
     return [(i, number - i) for i in range(N) if 0 <= number - i < N]
 
 
-def decode_qoffsets(decisions, is_coded):
-    """Return {(by, bx): quantiser offset}; is_coded: {(by, bx): whether a texel is coded}, in raster order."""
+def decode_qoffsets(decisions, is_active):
+    """Return {(by, bx): quantiser offset}; is_active: {(by, bx): whether a texel is coded}, in raster order."""
     qoffset = {}
-    for by, bx in is_coded:
+    for by, bx in is_active:
         left = qoffset[by, bx - 1] if bx else qoffset[by - 1, bx] if by else 3
         above = qoffset[by - 1, bx] if by else left
         expected = left + above + 1 >> 1
-        if is_coded[by, bx]:
+        if is_active[by, bx]:
             node = 1
             for _ in range(3):
                 node = 2 * node + decisions.adaptive(("qoffset", expected, node))
@@ -65,18 +65,18 @@ def quantisation_steps(N, base_step, qoffset):
 
 def decode_symbols(decisions, coded, H, W, M, N, base_step):
     """Return {(y, x, c): symbol} of the coded texels."""
-    is_coded = {
+    is_active = {
         (by, bx): any(coded.get((by * N + y, bx * N + x)) for y in range(N) for x in range(N))
         for by in range(-(-H // N))
         for bx in range(-(-W // N))
     }
-    qoffset = decode_qoffsets(decisions, is_coded)
+    qoffset = decode_qoffsets(decisions, is_active)
     symbols, end, magnitude = {}, {}, {}  # end and magnitude by (c, by, bx) and (c, by, bx, i, j), 0 where absent
     for c in range(M):
         dc, right_edge, bottom_edge = {}, {}, {}
-        for by, bx in is_coded:
+        for by, bx in is_active:
             dc[by, bx] = median_prediction(dc, by, bx)
-            if not is_coded[by, bx]:
+            if not is_active[by, bx]:
                 continue
             qstep = quantisation_steps(N, base_step, qoffset[by, bx])
             left_edge, top_edge = right_edge.get((by, bx - 1)), bottom_edge.get((by - 1, bx))
@@ -103,10 +103,10 @@ def median_prediction(dc, by, bx):
     return clamp(left + above - corner, min(left, above), max(left, above))
 
 
-def predict_dc(expected, left_edge, top_edge, qstep):
+def predict_dc(expected_dc, left_edge, top_edge, qstep):
     if left_edge or top_edge:
-        expected = 4 * (sum(left_edge or top_edge) + sum(top_edge or left_edge)) + expected >> 1
-    return (expected + qstep[0, 0] // 2) // qstep[0, 0]
+        expected_dc = 4 * (sum(left_edge or top_edge) + sum(top_edge or left_edge)) + expected_dc >> 1
+    return (expected_dc + qstep[0, 0] // 2) // qstep[0, 0]
 
 
 def decode_end(decisions, total, N):
@@ -127,7 +127,7 @@ def decode_levels(decisions, magnitude, c, by, bx, end, N):
         for i, j in diagonal(N, number):
             higher = 2 * known(here, i, j + 1) + 2 * known(here, i + 1, j)
             higher += known(here, i + 1, j + 1) + known(here, i, j + 2) + known(here, i + 2, j)
-            beside = sum(known(b, i + k, j + m) for b in (left, above) for k, m in ((0, 0), (0, 1), (1, 0)))
+            beside = sum(known(b, i + di, j + dj) for b in (left, above) for di, dj in ((0, 0), (0, 1), (1, 0)))
             total = 3 * higher + 2 * beside + 3 * known(previous, i, j)
             magnitude_class = min(log_class(total), 15)
             frequency_class = min(5 * (i + j) // N, 7) if i + j else 8
@@ -153,8 +153,8 @@ def decode_signs(decisions, level, qstep, end, left_edge, top_edge, N):
     top_residual = [8 * v for v in top_edge or [0] * N]
     shift = 7 + LOG2[N]
 
-    def subtract(i, j, value):
-        at_left, at_top = basis(N, j, 0) * value + 64 >> 7, basis(N, i, 0) * value + 64 >> 7
+    def subtract(i, j, a):
+        at_left, at_top = basis(N, j, 0) * a + 64 >> 7, basis(N, i, 0) * a + 64 >> 7
         for k in range(N):
             left_residual[k] -= basis(N, i, k) * at_left + (1 << shift - 1) >> shift
             top_residual[k] -= basis(N, j, k) * at_top + (1 << shift - 1) >> shift

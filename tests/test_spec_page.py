@@ -1,0 +1,155 @@
+"""The page of the format is consistent: links, sections, tables, and worked examples that the readable decoder makes."""
+
+import re
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SPEC = Path(__file__).parent.parent / "spec"
+sys.path.insert(0, str(SPEC))  # the readable decoder is no part of the package
+
+from decoder import container, trace, transform  # noqa: E402
+
+PAGE = (SPEC / "kpc-format.md").read_text()
+LINES = PAGE.splitlines()
+HEADINGS = [re.fullmatch(r"(#{2,3}) (\d+(?:\.\d+)?)\.? (.*)", line) for line in LINES if re.match(r"#{2,3} \d", line)]
+TYPES = {
+    "char": "s",
+    "i8": "b",
+    "u8": "B",
+    "i32": "i",
+    "u16": "H",
+    "u32": "I",
+    "u64": "Q",
+    "f32": "f",
+    "f64": "d",
+}
+
+
+def section(number: str) -> str:
+    """Return the text of a section or subsection."""
+    starts = {match[2]: PAGE.index(match[0]) for match in HEADINGS if match}
+    later = [at for name, at in starts.items() if at > starts[number] and not name.startswith(f"{number}.")]
+    return PAGE[starts[number] : min(later, default=len(PAGE))]
+
+
+def byte_tables(text: str) -> list[struct.Struct]:
+    """Return the structure of each byte table of a text; its byte column must add up."""
+    found = []
+    for block in re.findall(r"(?:^\|.*\n)+", text, re.M):
+        rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()]
+        if rows[0][:2] != ["byte", "type"]:
+            continue
+        layout = "<"
+        for position, kind, *_ in rows[2:]:
+            assert struct.calcsize(layout) == int(position), (kind, position)
+            name, count = re.fullmatch(r"(\w+?)(?:\[(\d+)\])?", kind).groups()
+            layout += (count or "") + TYPES[name]
+        found.append(struct.Struct(layout))
+    return found
+
+
+def spelled(structure: struct.Struct) -> str:
+    """Return a format in which "2f" is written "ff"."""
+    return re.sub(r"(\d+)([a-rt-zA-Z])", lambda match: match[2] * int(match[1]), structure.format)
+
+
+def numbers_after(label: str, count: int) -> list[int]:
+    """Return the first numbers that follow a label in section 7.5."""
+    text = section("7.5")
+    assert text.count(label) == 1, label
+    return [int(number) for number in re.findall(r"\d+", text.split(label)[1])[:count]]
+
+
+def test_no_line_exceeds_120_columns():
+    assert [line for line in LINES if len(line) > 120] == []
+
+
+def test_links_lead_to_headings_and_files():
+    slugs = {re.sub(r"[^\w\- ]", "", line.lstrip("# ").lower()).replace(" ", "-") for line in LINES if line[:1] == "#"}
+    for target in re.findall(r"\]\(([^)]+)\)", PAGE):
+        assert target[1:] in slugs if target.startswith("#") else (SPEC / target).exists(), target
+
+
+def test_every_section_is_in_the_contents_and_numbered_in_order():
+    contents = PAGE.split("## Contents")[1].split("\n## ")[0]
+    numbers = [match[2] for match in HEADINGS]
+    tops = [number for number in numbers if "." not in number]
+    assert tops == [str(number) for number in range(1, len(tops) + 1)]
+    for top in tops:
+        under = [number for number in numbers if number.startswith(f"{top}.")]
+        assert under == [f"{top}.{number}" for number in range(1, len(under) + 1)]
+    assert [number for number in re.findall(r"^(\d+)\. \[", contents, re.M)] == tops
+
+
+def test_references_name_sections_that_exist():
+    numbers = {match[2] for match in HEADINGS}
+    for listed in re.findall(r"[Ss]ections? ((?:\d+(?:\.\d+)?(?:, | and | to )?)+)", PAGE):
+        for number in re.findall(r"\d+(?:\.\d+)?", listed):
+            if f"[9], section {number}" not in PAGE:
+                assert number in numbers, number
+    count = len(re.findall(r"^\d+\. ", section("15"), re.M))
+    assert {int(number) for number in re.findall(r" \[(\d+)\]", PAGE)} == set(range(1, count + 1))
+
+
+def test_header_and_index_tables_are_those_of_the_readable_decoder():
+    assert [spelled(table) for table in byte_tables(section("4.1"))] == [spelled(container.HEADER)]
+    assert [spelled(table) for table in byte_tables(section("4.2"))] == [spelled(container.ENTRY)]
+
+
+@pytest.mark.parametrize(
+    "number, sizes",
+    {"6.1": [58, 10], "6.2": [12, 116], "6.3": [12], "6.4": [8], "6.5": [8, 10], "6.6": [68], "8.4": [17]}.items(),
+)
+def test_sizes_in_the_text_are_those_of_the_tables(number, sizes):
+    assert [table.size for table in byte_tables(section(number))] == sizes
+    if number != "8.4":
+        assert [int(size) for size in re.findall(r"\b(\d+) bytes\b", section(number))] == sizes
+
+
+def test_codecs_and_kinds_are_those_of_the_readable_decoder():
+    rows = re.findall(r"^\| (\d) \| ([A-Z]+) \| ([\w, ]+) \|", section("4.4"), re.M)
+    assert [int(number) for number, *_ in rows] == list(range(8))
+    for number, name, kinds in rows:
+        assert getattr(container, name) == int(number)
+        if int(number) > container.ZSTD:
+            known = {kind.decode() for kind, codecs in container.CODECS.items() if int(number) in codecs}
+            assert known == set(kinds.split(", "))
+    kinds = re.findall(r"^\| ([A-Za-z]{4}) \|", section("4.3"), re.M)
+    assert {kind for kind in kinds if kind != "kind"} == {kind.decode() for kind in container.CODECS} | {"GRUP"}
+
+
+def test_transform_tables_are_those_of_their_formulas_and_of_the_readable_decoder():
+    k = np.arange(17)
+    assert numbers_after("64 sqrt(2)^(3 - k):", 8) == transform.OFFSET_SCALE
+    assert np.rint(64 * np.sqrt(2) ** (3.0 - k[:8])).tolist() == transform.OFFSET_SCALE
+    for N, scale in transform.FREQUENCY_SCALE.items():
+        assert numbers_after(f"N = {N}:", N) == scale
+        assert np.rint(64 / np.sqrt(1 + np.cos(np.pi * k[:N] / N) / 2)).tolist() == scale
+    assert numbers_after("128 sqrt(2) cos(pi k / 32):", 17) == transform.COSINE
+    assert np.rint(128 * np.sqrt(2) * np.cos(np.pi * k / 32)).tolist() == transform.COSINE
+    usual, dc = section("7.5").split("level_model for frequency_class 8")
+    titles = "number 0", "number 1", "numbers 2 to 5"
+    for title, prior, of_dc in zip(titles, transform.LEVEL_PRIOR, transform.DC_PRIOR, strict=True):
+        assert [int(number) for number in usual.split(f" {title} ")[1].split()[:16]] == prior
+        assert int(dc.split(f" {title} ")[1].split()[0]) == of_dc
+    assert numbers_after("sign_model for sign_class 0 .. 19:", 20) == transform.SIGN_PRIOR
+
+
+def test_worked_examples_are_what_the_readable_decoder_does():
+    assert trace.PREDICTIVE_EXAMPLE.hex(" ") in section("13.2")
+    assert trace.TRANSFORM_EXAMPLE.hex(" ") in section("13.3")
+    for number, tables in (("13.2", trace.predictive_example()), ("13.3", trace.transform_example())):
+        for table in tables:
+            assert table in section(number)
+
+
+def test_the_trace_of_a_file_leaves_the_decoder_as_it_was():
+    assert container is sys.modules["decoder.container"]
+    plain = sys.modules["decoder.entropy"].EntropyDecoder
+    trace.predictive_example()
+    assert sys.modules["decoder.planes"].EntropyDecoder is plain
+    assert sys.modules["decoder.payloads"].EntropyDecoder is plain
