@@ -29,18 +29,18 @@ def shown_group(spans, time):
     """Return (number, local time) of the group shown at a time of the clip; spans: (row_start, row_count) of each."""
     first = [start for start, _ in spans]
     last = [start + count - 1 for start, count in spans]
-    f = first[0] + time * (last[-1] - first[0])
-    g = sum(f >= (last[n - 1] + first[n]) / 2 for n in range(1, len(spans)))
-    return g, clamp((f - first[g]) / (last[g] - first[g]), 0.0, 1.0) if last[g] > first[g] else 0.0
+    current = first[0] + time * (last[-1] - first[0])
+    g = sum(current >= (last[i - 1] + first[i]) / 2 for i in range(1, len(spans)))
+    return g, clamp((current - first[g]) / (last[g] - first[g]), 0.0, 1.0) if last[g] > first[g] else 0.0
 
 
 def blend(spans, time):
     """Return {number: weight} of the one or two groups that make the picture at a time of the clip."""
     first = [start for start, _ in spans]
     last = [start + count - 1 for start, count in spans]
-    f = first[0] + time * (last[-1] - first[0])
-    for n in range(1, len(spans)):
-        if first[n] < f < last[n - 1]:
-            share = (f - first[n]) / (last[n - 1] - first[n])
-            return {n - 1: 1 - share, n: share}
+    current = first[0] + time * (last[-1] - first[0])
+    for i in range(1, len(spans)):
+        if first[i] < current < last[i - 1]:
+            share = (current - first[i]) / (last[i - 1] - first[i])
+            return {i - 1: 1 - share, i: share}
     return {shown_group(spans, time)[0]: 1.0}

@@ -27,7 +27,7 @@ def decode_motion(content):
 def decode_motion_symbols(chunk, sizes):
     """Return the symbols of the MOTION codec, row-major; sizes: nodes along t, z, y, x."""
     decisions = EntropyDecoder(chunk)
-    v, magnitude = {}, {}  # by (t, z, y, x, component)
+    v, mag = {}, {}  # by (t, z, y, x, component)
     decoded = [[0] for _ in sizes]  # positions along each axis that are decoded
 
     def decode_pass(axis, new, references, weights):
@@ -47,13 +47,13 @@ def decode_motion_symbols(chunk, sizes):
             for component in range(3):
                 used = [(k, (*node(references[k]), component)) for k in range(4) if weights[k]]
                 prediction = clamp(sum(weights[k] * v[i] for k, i in used) + 32 >> 6, -32768, 32767)
-                activity = sum(magnitude[i] * (2 if k in (1, 2) else 1) for k, i in used)
-                activity += 3 * sum(magnitude[(*node(new), c)] for c in range(component))
-                activity += sum(magnitude[(*i, c)] for i in previous for c in range(3))
+                activity = sum(mag[i] * (2 if k in (1, 2) else 1) for k, i in used)
+                activity += 3 * sum(mag[(*node(new), c)] for c in range(component))
+                activity += sum(mag[(*i, c)] for i in previous for c in range(3))
                 residual = decisions.signed(("motion", min(log_class(activity), 19)), unary=4, escape=15)
                 require(-32768 <= prediction + residual <= 32767, "a symbol exceeds 16 bits")
                 v[(*node(new), component)] = prediction + residual
-                magnitude[(*node(new), component)] = abs(residual)
+                mag[(*node(new), component)] = abs(residual)
 
     decode_pass(0, 0, [None] * 4, [0] * 4)
     for axis, n in enumerate(sizes):

@@ -37,8 +37,9 @@ def render_ray(scene, origin, direction, time, appearance=None):
         p = [o + r * d for o, d in zip(origin, direction)]
         u = [(a - b) / (c - b) for a, b, c in zip(p, low, high)]
         if mapping == CONTRACTION:
-            q = max(1.0, *(abs(2 * a - 1) for a in u))
-            u = [0.5 + (2 * a - 1) * (2 - 1 / q) / (4 * q) for a in u]
+            centred = [2 * a - 1 for a in u]
+            q = max(1.0, *map(abs, centred))
+            u = [0.5 + a * (2 - 1 / q) / (4 * q) for a in centred]
             length *= (max(1.0, r / scene["linear_range"]) / q) ** 2
         i, j, m = (clamp(math.floor(a * n), 0, n - 1) for a, n in zip(u, (nx, ny, nz)))
         if not scene["occupancy"][((slot * nz + m) * ny + j) * nx + i]:
@@ -46,9 +47,9 @@ def render_ray(scene, origin, direction, time, appearance=None):
         f = features(scene, dict(zip("xyzt", [*displaced(scene["motion"], u, time), time])))
         sigma, rgb = density_and_colour(scene, f, view)
         alpha = 1 - math.exp(-sigma * length / extent)
-        weight = T * alpha
-        colour = [a + weight * b for a, b in zip(colour, rgb)]
-        depth += weight * world_distance(r)
+        contribution = T * alpha
+        colour = [a + contribution * b for a, b in zip(colour, rgb)]
+        depth += contribution * world_distance(r)
         T *= 1 - alpha
     opacity = 1 - T
     rgb = [a + T * b for a, b in zip(colour, scene["background"])]
@@ -79,14 +80,14 @@ def ndc_ray(scene, origin, direction):
     r_0 = max(0.0, (near - o_z) / d_z)
     x_0, y_0, z_0 = o_x + r_0 * d_x, o_y + r_0 * d_y, o_z + r_0 * d_z
     start = [x_0 / z_0, y_0 / z_0, baseline * (1 / near - 1 / z_0)]
-    g = [d_x / d_z - x_0 / z_0, d_y / d_z - y_0 / z_0, baseline / z_0]
-    length = math.hypot(*g)
+    slope = [d_x / d_z - x_0 / z_0, d_y / d_z - y_0 / z_0, baseline / z_0]
+    reach = math.hypot(*slope)
 
     def world_distance(r):
-        m = min(r / length, 0.999999)
-        return r_0 + z_0 / d_z * m / (1 - m)
+        ratio = min(r / reach, 0.999999)
+        return r_0 + z_0 / d_z * ratio / (1 - ratio)
 
-    return start, [e / length for e in g], world_distance
+    return start, [a / reach for a in slope], world_distance
 
 
 def interpolation(position, count):

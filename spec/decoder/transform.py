@@ -41,9 +41,9 @@ def decode_qoffsets(decisions, is_active):
     """Return {(by, bx): quantiser offset}; is_active: {(by, bx): whether a texel is coded}, in raster order."""
     qoffset = {}
     for by, bx in is_active:
-        left = qoffset[by, bx - 1] if bx else qoffset[by - 1, bx] if by else 3
-        above = qoffset[by - 1, bx] if by else left
-        expected = left + above + 1 >> 1
+        left_qoffset = qoffset[by, bx - 1] if bx else qoffset[by - 1, bx] if by else 3
+        above_qoffset = qoffset[by - 1, bx] if by else left_qoffset
+        expected = left_qoffset + above_qoffset + 1 >> 1
         if is_active[by, bx]:
             node = 1
             for _ in range(3):
@@ -71,7 +71,7 @@ def decode_symbols(decisions, coded, H, W, M, N, base_step):
         for bx in range(-(-W // N))
     }
     qoffset = decode_qoffsets(decisions, is_active)
-    symbols, end, magnitude = {}, {}, {}  # end and magnitude by (c, by, bx) and (c, by, bx, i, j), 0 where absent
+    symbols, end, mag = {}, {}, {}  # end and mag by (c, by, bx) and (c, by, bx, i, j), 0 where absent
     for c in range(M):
         dc, right_edge, bottom_edge = {}, {}, {}
         for by, bx in is_active:
@@ -83,7 +83,7 @@ def decode_symbols(decisions, coded, H, W, M, N, base_step):
             dc_prediction = predict_dc(dc[by, bx], left_edge, top_edge, qstep)
             neighbours = (c, by, bx - 1), (c, by - 1, bx), (c - 1, by, bx)
             end[c, by, bx] = block_end = decode_end(decisions, sum(end.get(block, 0) for block in neighbours), N)
-            level = decode_levels(decisions, magnitude, c, by, bx, block_end, N)
+            level = decode_levels(decisions, mag, c, by, bx, block_end, N)
             level[0, 0] = level.get((0, 0), 0) + dc_prediction
             coefficient = decode_signs(decisions, level, qstep, block_end, left_edge, top_edge, N)
             dc[by, bx] = coefficient[0, 0]
@@ -99,8 +99,8 @@ def decode_symbols(decisions, coded, H, W, M, N, base_step):
 def median_prediction(dc, by, bx):
     if by == 0 or bx == 0:
         return dc[by, bx - 1] if bx else dc[by - 1, bx] if by else 0
-    left, above, corner = dc[by, bx - 1], dc[by - 1, bx], dc[by - 1, bx - 1]
-    return clamp(left + above - corner, min(left, above), max(left, above))
+    dc_left, dc_above, dc_corner = dc[by, bx - 1], dc[by - 1, bx], dc[by - 1, bx - 1]
+    return clamp(dc_left + dc_above - dc_corner, min(dc_left, dc_above), max(dc_left, dc_above))
 
 
 def predict_dc(expected_dc, left_edge, top_edge, qstep):
@@ -115,11 +115,11 @@ def decode_end(decisions, total, N):
     return min(value - 1, 2 * N - 1)
 
 
-def decode_levels(decisions, magnitude, c, by, bx, end, N):
+def decode_levels(decisions, mag, c, by, bx, end, N):
     """Return {(i, j): level}, without a sign but for (0, 0), and note their magnitudes."""
 
     def known(block, i, j):
-        return magnitude.get((*block, i, j), 0)
+        return mag.get((*block, i, j), 0)
 
     here, left, above, previous = (c, by, bx), (c, by, bx - 1), (c, by - 1, bx), (c - 1, by, bx)
     level = {}
@@ -131,10 +131,10 @@ def decode_levels(decisions, magnitude, c, by, bx, end, N):
             total = 3 * higher + 2 * beside + 3 * known(previous, i, j)
             magnitude_class = min(log_class(total), 15)
             frequency_class = min(5 * (i + j) // N, 7) if i + j else 8
-            size = decode_magnitude(decisions, magnitude_class, frequency_class)
-            magnitude[c, by, bx, i, j] = level[i, j] = size
-            if size and (i, j) == (0, 0) and not decisions.literal(1):
-                level[i, j] = -size
+            magnitude = decode_magnitude(decisions, magnitude_class, frequency_class)
+            mag[c, by, bx, i, j] = level[i, j] = magnitude
+            if magnitude and (i, j) == (0, 0) and not decisions.literal(1):
+                level[i, j] = -magnitude
     return level
 
 
@@ -167,18 +167,18 @@ def decode_signs(decisions, level, qstep, end, left_edge, top_edge, N):
         for i, j in diagonal(N, number):
             if level[i, j] == 0:
                 continue
-            size = min(level[i, j] * qstep[i, j], 32767)
+            amplitude = min(level[i, j] * qstep[i, j], 32767)
             bias = correlation(left_residual, i, j) if left_edge else 0
             bias += correlation(top_residual, j, i) if top_edge else 0
             if bias == 0:
                 is_positive = decisions.literal(1)
             else:
-                sign_class = log_class(abs(bias)) + log_class(size) - 2 * log_class(qstep[0, 0]) - 2 * LOG2[N] - 3
+                sign_class = log_class(abs(bias)) + log_class(amplitude) - 2 * log_class(qstep[0, 0]) - 2 * LOG2[N] - 3
                 sign_class = clamp(sign_class, 0, 19)
                 agrees = decisions.adaptive(("sign", sign_class), (256 * SIGN_PRIOR[sign_class], 8))
                 is_positive = agrees == (bias > 0)
             level[i, j] = level[i, j] if is_positive else -level[i, j]
-            subtract(i, j, size if is_positive else -size)
+            subtract(i, j, amplitude if is_positive else -amplitude)
     return {(i, j): clamp(value * qstep[i, j], -32768, 32767) for (i, j), value in level.items()}
 
 
