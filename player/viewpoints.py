@@ -1,4 +1,4 @@
-"""Where to look from: what the cameras a scene was filmed with have in common, and paths that stay near them."""
+"""Viewpoints of a scene: what its cameras have in common, named viewpoints, and paths that stay near the cameras."""
 
 import math
 from dataclasses import dataclass, replace
@@ -7,22 +7,22 @@ import numpy as np
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 
-SURROUND_GAP = math.radians(160)
-"""Cameras that leave no wider gap around their focus are a ring."""
-INSIDE = 0.7
-"""Share of a forward-facing rig's angles that a path uses: beyond its cameras nothing was seen."""
-SMALL_SWAY = (math.radians(2), math.radians(1))
-"""Least half angles of a path, sideways and upwards; that of a single camera."""
+# Cameras surround their focus if they leave no wider gap between their azimuths, radians.
+MAX_SURROUND_GAP = math.radians(160)
+# The fraction of the angles between cameras on one side that viewpoints use: what lies beyond was not filmed.
+USED_FRACTION = 0.7
+# Least amplitudes of a path in azimuth and elevation, radians; those for a single camera.
+MIN_AMPLITUDES = (math.radians(2), math.radians(1))
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a scene, as a whole.
+    """The cameras of a scene.
 
     Attributes:
-        focus: (3,) the point they look at.
+        focus: (3,) the point they look at, world coordinates.
         up: (3,) unit vector.
-        cameras: those of the scene, or one made up where it has none.
+        cameras: those of the scene; a default camera if it has none.
     """
 
     focus: np.ndarray
@@ -31,12 +31,17 @@ class Rig:
 
     @staticmethod
     def of(scene: Scene) -> "Rig":
-        cameras = scene.cameras or (_made_up(scene.bounds),)
+        """Return the rig of a scene."""
+        cameras = scene.cameras or (_default_camera(scene.bounds),)
         poses = np.stack([camera.camera_to_world for camera in cameras])
         return Rig(_focus(poses, scene.bounds), _up(poses), cameras)
 
     def angles(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Azimuth, elevation (radians) and distance of each camera, seen from the focus; the first has azimuth 0."""
+        """Return the cameras' positions in spherical coordinates around the focus.
+
+        Returns:
+            Azimuths and elevations in radians, and distances, each (N,). The azimuth of the first camera is 0.
+        """
         offsets = np.stack([camera.camera_to_world[:3, 3] for camera in self.cameras]) - self.focus
         distance = np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
         elevation = np.arcsin(np.clip(offsets @ self.up / distance, -1, 1))
@@ -45,7 +50,7 @@ class Rig:
         return azimuth, elevation, distance
 
     def compass(self) -> tuple[np.ndarray, np.ndarray]:
-        """Two level unit vectors: from the focus towards the first camera, and to the right as that camera sees it."""
+        """Return two horizontal unit vectors: from the focus to the first camera, and to the right of that camera."""
         pose = self.cameras[0].camera_to_world
         for towards in (pose[:3, 3] - self.focus, pose[:3, 1], pose[:3, 0]):
             ahead = towards - (towards @ self.up) * self.up
@@ -55,7 +60,7 @@ class Rig:
         return ahead, np.cross(self.up, ahead)
 
     def camera(self, azimuth: float, elevation: float, distance: float) -> Camera:
-        """The first camera, moved to a place given as by `angles` and turned to the focus."""
+        """Return the first camera at other spherical coordinates (see `angles`), turned to the focus."""
         ahead, side = self.compass()
         level = math.cos(azimuth) * ahead + math.sin(azimuth) * side
         eye = self.focus + distance * (math.cos(elevation) * level + math.sin(elevation) * self.up)
@@ -63,68 +68,84 @@ class Rig:
 
 
 def orbit(scene: Scene, count: int) -> list[Camera]:
-    """`count` cameras along a closed path around what the scene's cameras look at.
+    """Return cameras along a closed path around the focus.
 
-    Cameras all around: a full circle at their mean height and distance, from the first one on. Cameras on one side: an
-    ellipse that stays well inside their angles.
+    If the scene's cameras surround the focus, the path is a full circle at their mean elevation and distance that
+    starts at the first camera; otherwise an ellipse within their angles.
+
+    Args:
+        scene: the scene.
+        count: number of cameras.
     """
     rig = Rig.of(scene)
     azimuth, elevation, distance = rig.angles()
-    turns = 2 * math.pi * np.arange(count) / count
+    phases = 2 * math.pi * np.arange(count) / count
     if surround_focus(azimuth):
-        return [rig.camera(turn, float(elevation.mean()), float(distance.mean())) for turn in turns]
-    (middle_a, middle_e), sway_a, sway_e = _sways(azimuth, elevation)
+        return [rig.camera(phase, float(elevation.mean()), float(distance.mean())) for phase in phases]
+    (middle_a, middle_e), amplitude_a, amplitude_e = _centre_and_amplitudes(azimuth, elevation)
     far = float(np.median(distance))
-    return [rig.camera(middle_a + sway_a * math.sin(turn), middle_e + sway_e * math.cos(turn), far) for turn in turns]
+    return [
+        rig.camera(middle_a + amplitude_a * math.sin(phase), middle_e + amplitude_e * math.cos(phase), far)
+        for phase in phases
+    ]
 
 
-def _sways(azimuth: np.ndarray, elevation: np.ndarray) -> tuple[tuple[float, float], float, float]:
-    """Of a rig on one side: azimuth and elevation in the middle of its angles, and how far from there it is safe to go in each."""
-    (middle_a, sway_a), (middle_e, sway_e) = (
-        (float(angles.max() + angles.min()) / 2, max(INSIDE * float(angles.max() - angles.min()) / 2, least))
-        for angles, least in zip((azimuth, elevation), SMALL_SWAY, strict=True)
+def _centre_and_amplitudes(azimuth: np.ndarray, elevation: np.ndarray) -> tuple[tuple[float, float], float, float]:
+    """Return the central azimuth and elevation of cameras on one side, and amplitudes that stay within them."""
+    (middle_a, amplitude_a), (middle_e, amplitude_e) = (
+        (float(angles.max() + angles.min()) / 2, max(USED_FRACTION * float(angles.max() - angles.min()) / 2, least))
+        for angles, least in zip((azimuth, elevation), MIN_AMPLITUDES, strict=True)
     )
-    return (middle_a, middle_e), sway_a, sway_e
+    return (middle_a, middle_e), amplitude_a, amplitude_e
 
 
 def presets(scene: Scene) -> dict[str, Camera]:
-    """Places to look from, by name, all towards what the scene's cameras look at.
+    """Return viewpoints by name; all look at the focus.
 
-    Cameras all around: its sides, and from above. Cameras on one side: the ends of the angles that were seen. Always: near, far.
+    If the scene's cameras surround the focus, they are its sides and the view from above; otherwise the centre and the
+    ends of the cameras' angles. "near" and "far" are always there.
     """
     rig = Rig.of(scene)
     azimuth, elevation, distance = rig.angles()
     far, level = float(np.median(distance)), float(elevation.mean())
     if surround_focus(azimuth):
-        around = {
+        sides = {
             "front": (0.0, level),
             "right": (0.5, level),
             "back": (1.0, level),
             "left": (-0.5, level),
             "above": (0.0, 1.4),
         }
-        places = {name: (math.pi * turn, height, far) for name, (turn, height) in around.items()}
+        positions = {name: (math.pi * turn, height, far) for name, (turn, height) in sides.items()}
     else:
-        middle, sway_a, sway_e = _sways(azimuth, elevation)
-        ways = {"middle": (0, 0), "left": (-1, 0), "right": (1, 0), "above": (0, 1), "below": (0, -1)}
-        places = {name: (middle[0] + x * sway_a, middle[1] + y * sway_e, far) for name, (x, y) in ways.items()}
-    first = next(iter(places.values()))
-    places |= {"near": (*first[:2], 0.6 * far), "far": (*first[:2], 1.6 * far)}
-    return {name: rig.camera(*place) for name, place in places.items()}
+        middle, amplitude_a, amplitude_e = _centre_and_amplitudes(azimuth, elevation)
+        directions = {"middle": (0, 0), "left": (-1, 0), "right": (1, 0), "above": (0, 1), "below": (0, -1)}
+        positions = {
+            name: (middle[0] + x * amplitude_a, middle[1] + y * amplitude_e, far) for name, (x, y) in directions.items()
+        }
+    first = next(iter(positions.values()))
+    positions |= {"near": (*first[:2], 0.6 * far), "far": (*first[:2], 1.6 * far)}
+    return {name: rig.camera(*position) for name, position in positions.items()}
 
 
 def surround_focus(azimuth: np.ndarray) -> bool:
-    """Whether directions, radians, leave no wide gap on the circle."""
+    """Return whether cameras at these azimuths, (N,) radians, surround their focus."""
     around = np.sort(azimuth)
     gaps = np.diff(np.append(around, around[0] + 2 * math.pi))
-    return len(azimuth) > 2 and float(gaps.max()) < SURROUND_GAP
+    return len(azimuth) > 2 and float(gaps.max()) < MAX_SURROUND_GAP
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The (4, 4) camera-to-world pose at `eye` that looks at `target`, `up` upwards. The two points must differ."""
+    """Return the (4, 4) camera-to-world matrix of a camera.
+
+    Args:
+        eye: (3,) its position.
+        target: (3,) the point it looks at; it must differ from `eye`.
+        up: (3,) unit vector that points up in the picture.
+    """
     backward = (eye - target) / np.linalg.norm(eye - target)
     right = np.cross(up, backward)
-    if np.linalg.norm(right) < 1e-6:  # straight up or down: any right will do
+    if np.linalg.norm(right) < 1e-6:  # looking along `up`, any right axis will do
         right = np.cross(np.eye(3)[np.argmin(np.abs(backward))], backward)
     right /= np.linalg.norm(right)
     pose = np.eye(4)
@@ -133,7 +154,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def fit_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The same view on a raster of another shape: the vertical field of view stays, square pixels stay square."""
+    """Return a camera for a raster of another size; vertical field of view and shape of pixels stay the same."""
     scale = height / camera.height
     return Camera(
         width,
@@ -146,21 +167,28 @@ def fit_camera(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-def _made_up(aabb: np.ndarray) -> Camera:
-    """A camera that sees the whole box from outside, z upwards."""
+def _default_camera(aabb: np.ndarray) -> Camera:
+    """Return a camera outside a bounding box, (2, 3), that sees all of it, with z up."""
     centre, reach = aabb.mean(axis=0).astype(np.float64), float(np.linalg.norm(aabb[1] - aabb[0]))
     eye = centre + 1.2 * reach * np.array([0.0, -math.cos(0.35), math.sin(0.35)])
     return Camera(640, 480, 600.0, 600.0, 320.0, 240.0, look_at(eye, centre, np.array([0.0, 0.0, 1.0])))
 
 
 def _focus(poses: np.ndarray, aabb: np.ndarray) -> np.ndarray:
-    """The point of least squared distance to the optical axes; where they meet nowhere in front of the cameras, the
-    point of the first one's axis nearest to the middle of the box."""
+    """Return the point with the least sum of squared distances to the optical axes.
+
+    If that is not a point in front of the cameras within the bounding box (with a margin), return the point of the
+    first axis that is nearest to the centre of the box.
+
+    Args:
+        poses: (N, 4, 4) camera-to-world matrices.
+        aabb: (2, 3) bounding box.
+    """
     eyes, forward = poses[:, :3, 3], -poses[:, :3, 2]
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    total = across.sum(axis=0)
+    projections = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    total = projections.sum(axis=0)
     if np.linalg.cond(total) < 1e4:
-        focus = np.linalg.solve(total, np.einsum("nij,nj->i", across, eyes))
+        focus = np.linalg.solve(total, np.einsum("nij,nj->i", projections, eyes))
         margin = 0.25 * (aabb[1] - aabb[0])
         if np.all(focus > aabb[0] - margin) and np.all(focus < aabb[1] + margin) and _in_front(focus, eyes, forward):
             return focus
@@ -169,11 +197,12 @@ def _focus(poses: np.ndarray, aabb: np.ndarray) -> np.ndarray:
 
 
 def _in_front(point: np.ndarray, eyes: np.ndarray, forward: np.ndarray) -> bool:
+    """Return whether a point is in front of nearly all cameras; eyes and forward: (N, 3)."""
     return bool(np.mean(np.einsum("ni,ni->n", point - eyes, forward) > 0) > 0.9)
 
 
 def _up(poses: np.ndarray) -> np.ndarray:
-    """The direction to which all right axes are perpendicular, if they single one out; else the mean upward axis."""
+    """Return the direction perpendicular to all right axes if they determine one, else the mean of the up axes."""
     rights, mean = poses[:, :3, 0], poses[:, :3, 1].mean(axis=0)
     values, vectors = np.linalg.eigh(rights.T @ rights / len(rights))
     up = vectors[:, 0]

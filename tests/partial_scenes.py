@@ -10,7 +10,7 @@ import kpc
 
 def coded(scene: Scene, segment_rows: int = 3) -> bytes:
     """Return the file of a scene, quantised with a step of 0.01."""
-    steps = [{name: 0.01 for name in scale} for scale in scene.scales]
+    steps = [dict.fromkeys(scale, 0.01) for scale in scene.scales]
     return encode(quantise_scene(scene, steps), segment_rows=segment_rows)
 
 

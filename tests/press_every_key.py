@@ -522,7 +522,7 @@ def defaults_on_a_graphics_card(window: Window, scene_file: str) -> None:
 
 
 def settings_are_saved(scene_file: str) -> None:
-    """Settings of one run hold in the next, unless an option replaces them; and kpplay also ends well if it cannot save them."""
+    """Settings of one run hold in the next unless an option replaces them; an error in saving them is reported."""
     settings: list[Preferences] = []
 
     def run(player: Player, frames: int | None = None) -> None:

@@ -1,7 +1,8 @@
-"""Camera paths: keyframes, and the smooth way from one to the next. No window, no OpenGL.
+"""Camera paths: keyframes, and a smooth interpolation between them. No window, no OpenGL.
 
-A path is kept in a `cameras.json` like any other (`kpc.format.scene.cameras`), whose frames are the keyframes; `at` says when each is
-passed. So a file made in the player's window makes a video with `kprender --path`, and pictures of its keyframes with `--cameras`.
+A path is stored in a `cameras.json` (`kpc.format.scene.cameras`) whose frames are the keyframes; `at` is the time of
+each. So a file that was saved in the player's window makes a video with `kprender --path`, and pictures of its
+keyframes with `--cameras`.
 """
 
 import itertools
@@ -14,91 +15,98 @@ from kpc.format.common.errors import DatasetError
 from kpc.format.scene.cameras import Camera, View, load_views, save_views
 from kpc.format.scene.rotations import quaternion_of, rotation_of
 
+# Seconds between two keyframes if the file does not say.
 GAP_S = 2.0
-"""From one keyframe to the next where nothing else is said."""
-LONGEST_S = 86_400.0
+# The longest path, seconds.
+MAX_DURATION_S = 86_400.0
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPath:
-    """A way through keyframes, which it passes exactly.
+    """A smooth path that passes through keyframes exactly.
 
-    Between two it is cubic in seconds, with one velocity at each keyframe (Catmull and Rom's, for gaps of any length): the eye; the
-    quaternion, made a unit vector again; logarithms of focal lengths; the principal point. The clip only runs forwards: to a
-    keyframe of an earlier time it goes through the clip's end, as when it loops; between keyframes neither too far nor back
-    (Fritsch and Butland's slopes).
+    Between two keyframes these are cubic in time: the position; the quaternion, which is then normalised; the
+    logarithms of the focal lengths; the principal point. The velocities at keyframes are those of a Catmull-Rom spline
+    with non-uniform knots. The clip's time only runs forwards: a keyframe with an earlier time is reached through the
+    end of the clip, as when it loops. Its velocities are those of Fritsch and Butland (SIAM J. Sci. Stat. Comput. 5,
+    1984), so that it is monotonic.
 
     Attributes:
-        keyframes: Shots whose `at_s` begins anywhere and grows from one to the next; those without are GAP_S apart. All have the
-            size of the first; others are refitted to it.
+        keyframes: views whose `at_s` increases; without `at_s` they are GAP_S apart. All get the size of the first.
 
     Raises:
-        DatasetError: `at_s` does not grow, or lasts too long; a pose is no turn and shift, say mirrored.
+        DatasetError: `at_s` does not increase, or exceeds MAX_DURATION_S; a pose is not a rotation and a translation.
     """
 
     keyframes: tuple[View, ...] = ()
 
     def __post_init__(self) -> None:
-        shots: list[View] = []
-        for shot in self.keyframes:
-            before = shots[-1].at_s if shots else None
-            at_s = shot.at_s if shot.at_s is not None else 0.0 if before is None else before + GAP_S
-            if not 0.0 <= at_s <= LONGEST_S or (before is not None and at_s <= before):
-                after = "lies outside a day" if before is None else f"does not follow {before:g} s within a day"
-                raise DatasetError(f"keyframe {len(shots) + 1} of the camera path is at {at_s:g} s, which {after}")
-            shots.append(replace(shot, at_s=at_s))
-        for number, shot in enumerate(shots, 1):
-            axes = shot.camera.camera_to_world[:3, :3]
+        views: list[View] = []
+        for view in self.keyframes:
+            before = views[-1].at_s if views else None
+            at_s = view.at_s if view.at_s is not None else 0.0 if before is None else before + GAP_S
+            if not 0.0 <= at_s <= MAX_DURATION_S or (before is not None and at_s <= before):
+                reason = "lies outside a day" if before is None else f"does not follow {before:g} s within a day"
+                raise DatasetError(f"keyframe {len(views) + 1} of the camera path is at {at_s:g} s, which {reason}")
+            views.append(replace(view, at_s=at_s))
+        for number, view in enumerate(views, 1):
+            axes = view.camera.camera_to_world[:3, :3]
             if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3 or np.linalg.det(axes) < 0:
                 raise DatasetError(
-                    f"keyframe {number} of the camera path: its pose is scaled, skewed or mirrored; turn and shift only"
+                    f"keyframe {number} of the camera path: its pose is scaled, skewed or mirrored, not rigid"
                 )
-        object.__setattr__(self, "keyframes", tuple(shots))
+        object.__setattr__(self, "keyframes", tuple(views))
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "CameraPath":
-        """Of a `cameras.json`.
+        """Read a path from a `cameras.json`.
 
         Raises:
-            DatasetError: it cannot be read, or its frames make no path; the message names the file.
+            DatasetError: the file cannot be read, or its frames make no path; the message names the file.
         """
-        shots = load_views(path)
+        views = load_views(path)
         try:
-            return CameraPath(tuple(shots))
+            return CameraPath(tuple(views))
         except DatasetError as error:
             raise DatasetError(f"{path}: {error}") from error
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write it as a `cameras.json`."""
+        """Write the path to a `cameras.json`."""
         save_views(path, self.keyframes)
 
     @property
     def start_s(self) -> float:
+        """The time of the first keyframe, seconds."""
         return float(self.keyframes[0].at_s or 0.0) if self.keyframes else 0.0
 
     @property
     def end_s(self) -> float:
+        """The time of the last keyframe, seconds."""
         return float(self.keyframes[-1].at_s or 0.0) if self.keyframes else 0.0
 
     def with_keyframe(self, camera: Camera, time: float, gap_s: float = GAP_S) -> "CameraPath":
-        """The same, and on to one more, `gap_s` after the last."""
+        """Return the path with one more keyframe, `gap_s` seconds after the last."""
         at_s = self.end_s + gap_s if self.keyframes else 0.0
         return CameraPath((*self.keyframes, View(camera, time, f"{len(self.keyframes):04d}.png", at_s)))
 
     def without(self, number: int) -> "CameraPath":
-        """The same, but for a keyframe, from 0 on; the others keep their seconds."""
+        """Return the path without a keyframe, counted from 0; the others keep their times."""
         return CameraPath(self.keyframes[:number] + self.keyframes[number + 1 :])
 
     def spaced(self, number: int, gap_s: float) -> "CameraPath":
-        """The same, with so many seconds between a keyframe, from 1 on, and the one before; those after it move along."""
+        """Return the path with `gap_s` seconds before keyframe `number`, from 1 on; later keyframes are shifted."""
         later = float(self.keyframes[number - 1].at_s or 0.0) + gap_s - float(self.keyframes[number].at_s or 0.0)
-        moved = (replace(shot, at_s=float(shot.at_s or 0.0) + later) for shot in self.keyframes[number:])
+        moved = (replace(view, at_s=float(view.at_s or 0.0) + later) for view in self.keyframes[number:])
         return CameraPath((*self.keyframes[:number], *moved))
 
     def at(self, seconds: float) -> tuple[Camera, float]:
-        """The camera and the clip's time in [0, 1], `seconds` into the path; before and after it, where it begins and ends."""
+        """Return the camera and the clip's time in [0, 1] at a time of the path, clamped to its beginning and end.
+
+        Raises:
+            ValueError: the path has no keyframes.
+        """
         if not self.keyframes:
-            raise ValueError("a path without keyframes leads nowhere")
+            raise ValueError("the path has no keyframes")
         first, ats = self.keyframes[0].camera, self._ats
         if len(ats) == 1:
             return first, self.keyframes[0].time
@@ -116,34 +124,34 @@ class CameraPath:
         camera = Camera(first.width, first.height, float(fl_x), float(fl_y), float(values[9]), float(values[10]), pose)
         return camera, float(values[11] % 1.0 if values[11] > 1.0 else max(values[11], 0.0))
 
-    def shots(self, fps: float) -> list[View]:
-        """Every frame of a video of it, the first and the last keyframe included where the frames meet them."""
+    def views(self, fps: float) -> list[View]:
+        """Return the views of a video at `fps` frames per second, beginning at the first keyframe."""
         count = int((self.end_s - self.start_s) * fps + 1e-6) + 1
         return [View(*self.at(self.start_s + number / fps), f"{number:04d}.png") for number in range(count)]
 
     @cached_property
     def _ats(self) -> np.ndarray:
-        return np.array([shot.at_s for shot in self.keyframes])
+        return np.array([view.at_s for view in self.keyframes])
 
     @cached_property
     def _values(self) -> np.ndarray:
-        """(N, 12): eye, quaternion, log focal lengths, principal point, the clip's time and 1 for each time it has begun anew."""
+        """(N, 12): position, quaternion, log focal lengths, principal point, clip time plus the number of loops."""
         first = self.keyframes[0].camera
-        cameras = [shot.camera.resized(first.width, first.height) for shot in self.keyframes]
-        turns = np.stack([quaternion_of(camera.camera_to_world[:3, :3]) for camera in cameras])
-        for before, turn in itertools.pairwise(turns):
-            turn *= 1.0 if before @ turn >= 0 else -1.0  # q and -q are the same turn: take the short way
-        lenses = np.array([[np.log(c.fl_x), np.log(c.fl_y), c.cx, c.cy] for c in cameras])
+        cameras = [view.camera.resized(first.width, first.height) for view in self.keyframes]
+        rotations = np.stack([quaternion_of(camera.camera_to_world[:3, :3]) for camera in cameras])
+        for before, rotation in itertools.pairwise(rotations):
+            rotation *= 1.0 if before @ rotation >= 0 else -1.0  # q and -q are the same rotation: take the nearer one
+        intrinsics = np.array([[np.log(c.fl_x), np.log(c.fl_y), c.cx, c.cy] for c in cameras])
         eyes, times = (
             np.stack([c.camera_to_world[:3, 3] for c in cameras]),
-            np.array([shot.time for shot in self.keyframes]),
+            np.array([view.time for view in self.keyframes]),
         )
-        rounds = np.concatenate([[0], np.cumsum(np.diff(times) < 0)])
-        return np.concatenate([eyes, turns, lenses, (times + rounds)[:, None]], axis=1)
+        loops = np.concatenate([[0], np.cumsum(np.diff(times) < 0)])
+        return np.concatenate([eyes, rotations, intrinsics, (times + loops)[:, None]], axis=1)
 
     @cached_property
     def _speeds(self) -> np.ndarray:
-        """(N, 12): how fast the values change at each keyframe."""
+        """(N, 12): the derivative of the values at each keyframe, per second."""
         gaps = np.diff(self._ats)[:, None]
         slopes = np.diff(self._values, axis=0) / gaps
         a, b, before, after = slopes[:-1], slopes[1:], gaps[:-1], gaps[1:]
@@ -153,9 +161,9 @@ class CameraPath:
         return np.concatenate([slopes[:1], inner, slopes[-1:]])
 
 
-def _hermite(ends: np.ndarray, speeds: np.ndarray, share: float) -> np.ndarray:
-    """The cubic that has these values and speeds, of the whole way, at both ends, a share of the way along."""
-    s, t = share, 1.0 - share
+def _hermite(ends: np.ndarray, speeds: np.ndarray, position: float) -> np.ndarray:
+    """Evaluate the cubic Hermite polynomial on [0, 1]; ends and speeds: (2, K) values and derivatives at 0 and 1."""
+    s, t = position, 1.0 - position
     return np.asarray(t * t * ((1 + 2 * s) * ends[0] + s * speeds[0]) + s * s * ((1 + 2 * t) * ends[1] - t * speeds[1]))
 
 

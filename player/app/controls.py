@@ -40,7 +40,7 @@ class View:
 
     @staticmethod
     def of(rig: Rig, camera: Camera) -> "View":
-        """Return the view of a camera. It orbits around the point of the camera's axis that is nearest to the rig's focus."""
+        """Return the view of a camera, orbiting around the point of its axis that is nearest to the rig's focus."""
         axes, eye = camera.camera_to_world[:3, :3], camera.camera_to_world[:3, 3]
         away = float(np.linalg.norm(rig.focus - eye))
         distance = max(float((rig.focus - eye) @ -axes[:, 2]), 0.1 * away, 1e-3)
@@ -175,7 +175,10 @@ class AppearanceSelection:
 
     @property
     def code(self) -> np.ndarray | None:
-        """(H,) float32, the embedding to show: (1 - s) before + s next, s = p^2 (3 - 2 p) for progress p; None if there is none."""
+        """(H,) float32, the embedding to show; None if the scene has none.
+
+        It is (1 - s) before + s next, with s = p^2 (3 - 2 p) for progress p.
+        """
         if len(self._codes) == 1:
             return None
         share = np.float32(self.progress * self.progress * (3 - 2 * self.progress))

@@ -1,9 +1,10 @@
 """The only place where glfw and imgui are imported, in the order and with the library that the desktop needs.
 
-On Linux, glfw has one library for X11 and one for Wayland, and imgui-bundle has a glfw library of its own for X11. If imgui-bundle
-is imported first, glfw uses its library. If glfw is imported first, imgui-bundle uses glfw's, and fails to load if that is the one
-for Wayland, which lacks the functions for X11. So glfw is imported second, after PYGLFW_LIBRARY was set to its library for Wayland
-where there is no X server. PYGLFW_LIBRARY_VARIANT=wayland asks for that library anywhere.
+On Linux, glfw has one library for X11 and one for Wayland, and imgui-bundle has a glfw library of its own for X11. If
+imgui-bundle is imported first, glfw uses its library. If glfw is imported first, imgui-bundle uses glfw's, and fails to
+load if that is the one for Wayland, which lacks the functions for X11. So glfw is imported second, after PYGLFW_LIBRARY
+was set to its library for Wayland where there is no X server. PYGLFW_LIBRARY_VARIANT=wayland asks for that library
+anywhere.
 """
 
 import importlib.util

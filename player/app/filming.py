@@ -40,7 +40,8 @@ class Filming:
         """Begin a video, or end the one that is being written.
 
         Args:
-            along_path: record the camera path frame by frame, however long a frame takes; else the window as it is used.
+            along_path: record the camera path frame by frame, however long a frame takes; else the window as it is
+                used.
         """
         if self.recording is not None:
             self.recording.end()

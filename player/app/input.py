@@ -9,7 +9,8 @@ from kpc.player.app.desktop import glfw, imgui
 from kpc.player.app.state import PlayerState
 from kpc.player.app.window import Window
 
-# Seconds in which the flying camera crosses the longest edge of the scene's bounding box, and how much faster it is with Shift.
+# Seconds in which the flying camera crosses the longest edge of the scene's bounding box, and how much faster it is
+# with Shift.
 CROSSING_S, SHIFT_FACTOR = 4.0, 4.0
 # The camera flies no farther than in so many seconds at once, however long a frame took.
 MAX_FLY_S = 0.1
@@ -148,7 +149,10 @@ class Input:
             self.actions.open(file)
 
     def _move_pointer(self) -> None:
-        """Orbit, pan and zoom where no panel takes the pointer. Dragging over the window's height orbits by half a turn."""
+        """Orbit, pan and zoom where no panel takes the pointer.
+
+        Dragging over the height of the window orbits by half a turn.
+        """
         io, state = imgui.get_io(), self.state
         if io.want_capture_mouse:
             return

@@ -77,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
         "--size",
         type=_size,
         metavar="WxH",
-        help=f"size of the window (default: as last time; at first {DEFAULT_HEIGHT} high, with the camera's aspect ratio)",
+        help=f"size of the window (default: as last time; at first {DEFAULT_HEIGHT} high, shaped as the pictures)",
     )
     parser.add_argument(
         "--memory",
@@ -126,7 +126,7 @@ def _merged(saved: Preferences, options: argparse.Namespace) -> Preferences:
 def _play(
     stream: "GroupPlayback", settings: Preferences, options: argparse.Namespace, path: CameraPath | None
 ) -> Preferences:
-    """Play the scene, and others that are dropped on the window, also after resets of the card; return the settings to save."""
+    """Play the scene and others that are dropped on the window; return the settings to save."""
     # Imported here so that a scene that cannot be read is reported without a display.
     from kpc.player.app.player import Player
     from kpc.player.app.window import Window

@@ -9,7 +9,8 @@ class OutputFiles:
 
     Args:
         folder: where the files go.
-        source_name: file name or address of the scene; its stem, without characters that some systems refuse, begins all names.
+        source_name: file name or address of the scene; its stem, without characters that some systems refuse, begins
+            all names.
     """
 
     def __init__(self, folder: Path, source_name: str) -> None:

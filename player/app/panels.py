@@ -194,7 +194,7 @@ class Panels:
             for (name, target_s), values in zip(rows, statistics.history, strict=True):
                 shown = values[:count] if count else np.zeros(1, np.float32)
                 median, slow = np.percentile(shown, (50, 95))
-                imgui.text_disabled(f"{name}: median {median:.1f} ms, 95 % {slow:.1f} ms")
+                imgui.text_disabled(f"{name} {median:.1f} ms (95 %: {slow:.1f})")
                 highest = 1.25 * float(max(slow, 1.0, 1e3 * (target_s or 0.0)))
                 corner, extent = (
                     imgui.get_cursor_screen_pos(),

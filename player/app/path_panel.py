@@ -9,6 +9,8 @@ from kpc.player.app.path_follower import MAX_GAP_S, MIN_GAP_S
 from kpc.player.app.state import PlayerState
 from kpc.player.app.widgets import MARGIN_EM, PANEL_EM, em, panel, place_next, window_size
 
+# What the panel says before there are keyframes.
+NO_KEYFRAMES = "No keyframes yet. Move the camera and\npress K, at least twice, or drop a\nsaved path on the window."
 # Keyframes that are visible without scrolling.
 VISIBLE_KEYFRAMES = 8
 # The slider along a path ends at least this long after its start, for ImGui refuses an empty range.
@@ -41,9 +43,7 @@ class PathPanel:
                 actions.save_path()
             imgui.end_disabled()
             if follower.is_empty:
-                imgui.text_disabled(
-                    "No keyframes yet. Move the camera and\npress K, twice or more, or drop a\nsaved path on the window."
-                )
+                imgui.text_disabled(NO_KEYFRAMES)
                 return
             self._slider()
             row = imgui.get_frame_height_with_spacing()

@@ -96,7 +96,7 @@ class Player:
         self,
         window: Window,
         stream: GroupPlayback,
-        preferences: Preferences = Preferences(),
+        preferences: Preferences = Preferences(),  # noqa: B008  # it is immutable
         *,
         resume_from: "Player | None" = None,
         folder: Path = Path(),

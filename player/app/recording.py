@@ -1,4 +1,4 @@
-"""Videos that are written while the window continues: a thread passes frames to ffmpeg, and the window never waits for it."""
+"""Videos that are written while the window continues: a thread passes frames to ffmpeg, so the window never waits."""
 
 import queue
 import threading

@@ -1,134 +1,136 @@
-"""Choose the resolution at which frames are drawn so that they come in time: no window, no OpenGL."""
+"""Choose the resolution of frames so that they come in time. No window, no OpenGL."""
 
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
-GPU_FPS = 50.0
-"""Pictures a second that a graphics card is to come up with where nothing else is asked for."""
+# Frames per second that a graphics card is to reach, and a processor, unless another rate is asked for.
+GPU_FPS, PROCESSOR_FPS = 50.0, 15.0
+# Factor between the sides of neighbouring resolutions; the card is asked for few different sizes, and keeps their
+# textures.
+STEP = 2**0.25
+# The smallest scale, and the one at which a processor begins so that the first picture appears soon.
+MIN_SCALE, PROCESSOR_SCALE = STEP**-12, STEP**-8
+# Steps by which the resolution may be too high before it is lowered.
+SLACK_STEPS = 0.5
+# The resolution is raised after so many consecutive frames that leave time for it; after twice as many for each time
+# that it was lowered from there, up to MAX_PATIENCE.
+UP_AFTER, MAX_PATIENCE = 3, 96
+# Steps that it may be raised or lowered at once.
+MAX_STEPS = 3
+# Weight of the newest frame in the mean time of its resolution.
+NEW_WEIGHT = 0.25
+# Weight of the fictitious frame of no pixels that takes no time; see `_fit`.
+ORIGIN_WEIGHT = 0.5
+# A frame that takes this many times the mean counts as if it took no longer than that. After AGREED_FRAMES consecutive
+# frames that differ from the expected time by this factor, all measurements are discarded.
+OUTLIER_FACTOR, AGREED_FRAMES = 4.0, 4
+# The first SETTLING_FRAMES at a resolution count only if they take LATE_FACTOR times the budget, or the first alone
+# HOPELESS_FACTOR times.
+SETTLING_FRAMES, LATE_FACTOR, HOPELESS_FACTOR = 4, 2.5, 8.0
+# How far the time of a new resolution may differ from what the nearest known one suggests before all times are
+# rescaled.
+PLAUSIBLE_FACTOR = 1.25
+# Frames after which the time of a resolution that was not used again is discarded.
+MAX_AGE_FRAMES = 300
 
 
 @dataclass
 class ResolutionController:
-    """How finely to draw so that pictures come in time: the side of the drawn raster over that of the window.
+    """Chooses the scale of the raster, its side over that of the window.
 
-    A picture takes a + b scale^2 seconds. Both are fitted to a mean time of each raster tried, and, with less weight, to one of no
-    pixels that takes no time: so a is 0 until several sizes say otherwise. When a raster takes longer than it did, all do. What is
-    known of a raster is forgotten when it has not been drawn for OLD pictures; all is, when times are EXCEPTION times what was
-    expected, or as many times less, for AGREED pictures on end.
+    A frame takes a + b scale^2 seconds. Both are fitted to the mean times of the resolutions that were used, and, with
+    less weight, to no time for no pixels, so that a is 0 until several resolutions show otherwise. If the time of one
+    resolution changes, the times of all are changed by the same factor.
 
-    The first picture on a raster follows no other, as the next ones may, and textures are made for it; and the later a picture comes, the more
-    the next has to draw. So the first NEW ones count only where one takes HOPELESS times the budget, or two on end LATE times. And no
-    picture counts as longer than the one before it: what one alone has to do tells little of the next.
+    The first frame at a resolution is drawn without reprojection and makes textures, and a late frame leaves more for
+    the next one to draw; hence SETTLING_FRAMES. For the same reason no frame counts as longer than the one before it.
 
     Attributes:
-        budget_s: seconds a picture may take.
-        scale: in [LEAST, 1], a power of STEP: the card is asked for few different rasters, and keeps them.
+        budget_s: seconds that a frame may take.
+        scale: in [MIN_SCALE, 1], a power of STEP.
     """
-
-    STEP = 2**0.25
-    LEAST = STEP**-12
-    SLACK = 0.5
-    """Steps that the raster may be too large before it shrinks. It grows after UP_AFTER pictures on end that left room for a finer one; after
-    twice as many for each time that it shrank from there, up to MOST_PATIENCE."""
-    UP_AFTER, MOST_PATIENCE = 3, 96
-    MOST_AT_ONCE = 3
-    """Steps down or up."""
-    FRESH = 0.25
-    """Share of the last picture in the mean time of its raster."""
-    AT_NOTHING = 0.5
-    """Weight of the raster of no pixels."""
-    EXCEPTION = 4.0
-    """A picture that takes so many times as long as the last counts as if it took no longer than that."""
-    AGREED = 4
-    NEW, LATE, HOPELESS = 4, 2.5, 8.0
-    UNLIKE = 1.25
-    """A raster takes at most so many times as long as the next known one and as it would in proportion to its pixels, or as much less: what differs
-    more says that all rasters take another time by now."""
-    OLD = 300
 
     budget_s: float
     scale: float = 1.0
-    _times: dict[int, float] = field(default_factory=dict, repr=False)
-    """By steps down from the whole raster."""
-    _drawn: dict[int, int] = field(default_factory=dict, repr=False)
-    """The number of the last picture on it."""
-    _number: int = field(default=0, repr=False)
-    _patience: dict[int, int] = field(default_factory=dict, repr=False)
-    """Of a raster: how many pictures on a coarser one must leave room for it."""
-    _spare: int = field(default=0, repr=False)
-    """Pictures on end that left room for a finer raster."""
-    _on: int | None = field(default=None, repr=False)
-    """The raster of the last picture."""
-    _since: int = field(default=0, repr=False)
-    """Pictures on it, since another."""
-    _last: float = field(default=0.0, repr=False)
-    """The time of the last picture."""
-    _odd: int = field(default=0, repr=False)
-    """Pictures on end that took a time of another order."""
+    # Resolutions are given as steps down from scale 1.
+    _times: dict[int, float] = field(default_factory=dict, repr=False)  # mean time of each resolution
+    _used: dict[int, int] = field(default_factory=dict, repr=False)  # number of the last frame at each resolution
+    _number: int = field(default=0, repr=False)  # of the last frame
+    _patience: dict[int, int] = field(default_factory=dict, repr=False)  # frames that must leave time for a resolution
+    _in_time: int = field(default=0, repr=False)  # consecutive frames that left time for a higher resolution
+    _last_steps: int | None = field(default=None, repr=False)  # the resolution of the last frame
+    _since_change: int = field(default=0, repr=False)  # frames at that resolution
+    _last_s: float = field(default=0.0, repr=False)  # time of the last frame
+    _outliers: int = field(default=0, repr=False)  # consecutive frames with unexpected times
 
     @staticmethod
     def of(software: bool) -> "ResolutionController":
-        """For a processor that stands in for a graphics card, or for one: the first picture comes soon, if coarsely."""
+        """Return the controller of a graphics card, or of a processor that draws in its place."""
         return (
-            ResolutionController(1 / 15, ResolutionController.STEP**-8)
-            if software
-            else ResolutionController(1 / GPU_FPS)
+            ResolutionController(1 / PROCESSOR_FPS, PROCESSOR_SCALE) if software else ResolutionController(1 / GPU_FPS)
         )
 
     def record(self, seconds: float, budget_s: float | None = None) -> None:
-        """Take in how long a picture took at the present scale, and may take."""
-        steps, budget = -round(math.log(self.scale, self.STEP)), budget_s or self.budget_s
-        self._since = self._since + 1 if steps == self._on else 1
-        self._on, before, self._last = steps, self._last, seconds
-        if seconds < self.HOPELESS * budget:
-            seconds = min(seconds, before if self._since > 1 else 0.0)
-            if self._since <= self.NEW and seconds < self.LATE * budget:
+        """Record the time of a frame that was drawn at the present scale, and choose that of the next.
+
+        Args:
+            seconds: that the frame took.
+            budget_s: seconds that a frame may take; None: `self.budget_s`.
+        """
+        steps, budget = -round(math.log(self.scale, STEP)), budget_s or self.budget_s
+        self._since_change = self._since_change + 1 if steps == self._last_steps else 1
+        self._last_steps, before, self._last_s = steps, self._last_s, seconds
+        if seconds < HOPELESS_FACTOR * budget:
+            seconds = min(seconds, before if self._since_change > 1 else 0.0)
+            if self._since_change <= SETTLING_FRAMES and seconds < LATE_FACTOR * budget:
                 return
-        self._take_in(steps, max(seconds, 1e-6))
-        fixed, growing = self._fit()
-        # where what no raster changes takes most of the time, a coarser one does more harm than good
-        wanted = -math.log(max(budget - fixed, 0.5 * fixed) / growing, self.STEP) / 2
-        self._spare = self._spare + 1 if wanted <= steps - 1 else 0
-        if self._spare >= self._patience.get(steps - 1, self.UP_AFTER):
-            finer = range(max(math.ceil(wanted), steps - self.MOST_AT_ONCE), steps)
-            steps = next(step for step in finer if self._spare >= self._patience.get(step, self.UP_AFTER))
-            self._spare = 0
-        elif wanted > steps + self.SLACK:
-            self._patience[steps] = min(2 * self._patience.get(steps, self.UP_AFTER), self.MOST_PATIENCE)
-            steps = min(math.ceil(wanted), steps + self.MOST_AT_ONCE)
-        self.scale = min(max(self.STEP**-steps, self.LEAST), 1.0)
+        self._update_times(steps, max(seconds, 1e-6))
+        fixed_s, pixels_s = self._fit()
+        # If most of the time does not depend on the resolution, lowering it does more harm than good.
+        wanted = -math.log(max(budget - fixed_s, 0.5 * fixed_s) / pixels_s, STEP) / 2
+        self._in_time = self._in_time + 1 if wanted <= steps - 1 else 0
+        if self._in_time >= self._patience.get(steps - 1, UP_AFTER):
+            higher = range(max(math.ceil(wanted), steps - MAX_STEPS), steps)
+            steps = next(step for step in higher if self._in_time >= self._patience.get(step, UP_AFTER))
+            self._in_time = 0
+        elif wanted > steps + SLACK_STEPS:
+            self._patience[steps] = min(2 * self._patience.get(steps, UP_AFTER), MAX_PATIENCE)
+            steps = min(math.ceil(wanted), steps + MAX_STEPS)
+        self.scale = min(max(STEP**-steps, MIN_SCALE), 1.0)
 
     def forget(self) -> None:
-        """What follows has nothing to do with what was."""
-        self._times, self._drawn, self._patience, self._odd = {}, {}, {}, 0
+        """Discard all measurements."""
+        self._times, self._used, self._patience, self._outliers = {}, {}, {}, 0
 
-    def _take_in(self, steps: int, seconds: float) -> None:
+    def _update_times(self, steps: int, seconds: float) -> None:
+        """Update the mean time of a resolution, and scale those of the others by the same factor."""
         if self._times:
-            fixed, growing = self._fit()
-            ratio = seconds / (fixed + growing * self.scale**2)
-            self._odd = 0 if 1 / self.EXCEPTION < ratio < self.EXCEPTION else self._odd + 1
-        if self._odd == self.AGREED:
+            fixed_s, pixels_s = self._fit()
+            ratio = seconds / (fixed_s + pixels_s * self.scale**2)
+            self._outliers = 0 if 1 / OUTLIER_FACTOR < ratio < OUTLIER_FACTOR else self._outliers + 1
+        if self._outliers == AGREED_FRAMES:
             self.forget()
         self._number += 1
-        self._drawn[steps] = self._number
+        self._used[steps] = self._number
         if steps not in self._times and self._times:
-            near = min(self._times, key=lambda step: abs(step - steps))
-            least, most = sorted((self._times[near], self._times[near] * self.STEP ** (2 * (near - steps))))
-            likely = min(max(seconds, least / self.UNLIKE), most * self.UNLIKE)
-            self._times = {step: time * seconds / likely for step, time in self._times.items()}
+            nearest = min(self._times, key=lambda step: abs(step - steps))
+            proportional = self._times[nearest] * STEP ** (2 * (nearest - steps))
+            lowest, highest = sorted((self._times[nearest], proportional))
+            plausible = min(max(seconds, lowest / PLAUSIBLE_FACTOR), highest * PLAUSIBLE_FACTOR)
+            self._times = {step: time * seconds / plausible for step, time in self._times.items()}
         before = self._times.setdefault(steps, seconds)
-        changed = 1.0 + self.FRESH * (min(seconds / before, self.EXCEPTION) - 1.0)
-        known = (step for step, number in self._drawn.items() if self._number - number < self.OLD)
-        self._times = {step: changed * self._times[step] for step in known}
-        self._drawn = {step: self._drawn[step] for step in self._times}
+        factor = 1.0 + NEW_WEIGHT * (min(seconds / before, OUTLIER_FACTOR) - 1.0)
+        recent = (step for step, number in self._used.items() if self._number - number < MAX_AGE_FRAMES)
+        self._times = {step: factor * self._times[step] for step in recent}
+        self._used = {step: self._used[step] for step in self._times}
 
     def _fit(self) -> tuple[float, float]:
-        """(a, b), neither negative, by least squares."""
-        x = np.array([self.STEP ** (-2 * steps) for steps in self._times])
+        """Fit time = a + b scale^2 to all times and, with ORIGIN_WEIGHT, to (0, 0) by least squares; return a and b."""
+        x = np.array([STEP ** (-2 * steps) for steps in self._times])
         y = np.array(list(self._times.values()))
-        n, xx, xy = len(x) + self.AT_NOTHING, x @ x, x @ y
-        growing = (n * xy - x.sum() * y.sum()) / (n * xx - x.sum() ** 2)
-        fixed = (y.sum() - growing * x.sum()) / n
-        return (0.0, xy / xx) if fixed < 0.0 else (fixed, max(growing, 1e-9))
+        n, xx, xy = len(x) + ORIGIN_WEIGHT, x @ x, x @ y
+        slope = (n * xy - x.sum() * y.sum()) / (n * xx - x.sum() ** 2)
+        intercept = (y.sum() - slope * x.sum()) / n
+        return (0.0, xy / xx) if intercept < 0.0 else (intercept, max(slope, 1e-9))

@@ -1,4 +1,4 @@
-"""The picture of the scene: a canvas of the window's size, drawn fast while something changes and refined when nothing does."""
+"""The picture of the scene: a canvas that is drawn fast while something changes, and refined when nothing does."""
 
 import math
 import time as clock
@@ -92,8 +92,9 @@ class SceneView:
         appearance = state.appearance.number, state.appearance.progress
         version = state.stream.version_at(state.playback.time)
         wanted = (
-            state.view, state.playback.time, state.part, state.display_mode, quality.chosen_level, state.exact, appearance, version
-        )  # fmt: skip
+            *(state.view, state.playback.time, state.part, state.display_mode),
+            *(quality.chosen_level, state.exact, appearance, version),
+        )
         if state.stream.complete_scales == 0:
             self.is_sharp = True  # there is nothing to refine
         elif wanted != self._drawn:
@@ -152,7 +153,11 @@ class SceneView:
             self.is_sharp, self.raster = True, (width, height)
 
     def _set_quality(self, level: str, still: bool) -> None:
-        """Set the renderer's quality. A still marches every pixel; while something changes, a processor sends one ray a pixel."""
+        """Set the renderer's quality.
+
+        For a still every pixel is marched. While something changes, a processor sends one ray per pixel: a higher
+        resolution shows more.
+        """
         quality = LEVELS[level]
         if still:
             quality = replace(quality, reprojection_tolerance=0.0, interpolation_tolerance=0.0)

@@ -54,8 +54,8 @@ class FrameStatistics:
     """Times of the last frames, and statistics of the picture.
 
     Attributes:
-        history: (2, HISTORY_FRAMES) float32, milliseconds between frames and milliseconds that pictures took; frame n is in
-            column n % HISTORY_FRAMES.
+        history: (2, HISTORY_FRAMES) float32, milliseconds between frames and milliseconds that pictures took; frame n
+            is in column n % HISTORY_FRAMES.
         frames: frames so far.
         frame_s: seconds between two frames, smoothed.
         draw_s: seconds that the last picture took.

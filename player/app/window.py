@@ -117,7 +117,10 @@ class Window:
 
     @property
     def unscaled_size(self) -> tuple[int, int]:
-        """The size to ask for to get a window of this size again: where units are pixels, glfw multiplies by `text_scale`."""
+        """The size to ask for to get a window of this size again.
+
+        Where screen units are pixels, glfw multiplies the size that is asked for by `text_scale`.
+        """
         (width, height), ratio = self.size, self.pixels[0] / max(self.size[0], 1)
         scale = max(self.text_scale / max(ratio, 1e-6), 1e-6)
         return round(width / scale), round(height / scale)
@@ -142,7 +145,10 @@ class Window:
             raise ContextLostError("the graphics card was reset; restart kpplay, or update the graphics driver")
 
     def release_unused(self) -> None:
-        """Release OpenGL objects that are no longer referenced. moderngl's `gc` fails on those that were released before."""
+        """Release OpenGL objects that are no longer referenced.
+
+        moderngl's own `gc` fails on objects that were released explicitly.
+        """
         while self.ctx.objects:
             unused = self.ctx.objects.popleft()
             if not isinstance(unused, moderngl.InvalidObject):

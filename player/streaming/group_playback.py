@@ -1,11 +1,11 @@
-"""Playback of a clip in groups while it arrives: the group that is shown and the next one, each a `Stream` with a renderer.
+"""Playback of a clip in groups while it arrives: the group that is shown and the next one, each a `Stream`.
 
-    set_playhead   the group at the playhead is shown once it is ready; the next one is fetched ahead, others are released
-    blended_with   the group to blend with the one that is shown, within the frames that both have
-    upload         hands what has arrived to the renderers; the next group's renderer and shaders are made well before it is shown
+    set_playhead   shows the group at the playhead once it is ready, fetches the next one ahead, releases others
+    blended_with   returns the group to blend with the one that is shown, within the frames that both have
+    upload         hands what has arrived to the renderers, and makes that of the next group well before it is shown
 
-One thread opens groups, and each `Stream` has a thread that fetches; the window's thread waits for none of them. A file without
-groups is played as a single group that is always shown.
+One thread opens groups, and each `Stream` has a thread that fetches; the window's thread waits for none of them. A file
+without groups is played as a single group that is always shown.
 """
 
 import threading

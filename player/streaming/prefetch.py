@@ -3,7 +3,7 @@
 Segments are fetched in this order:
 
     first   segments at the playhead, of the scales that are shown already
-    0       scale 0: its space planes, and the segments of its time planes at the playhead; they make the first coarse picture
+    0       scale 0, for a first coarse picture: its space planes, and segments of its time planes at the playhead
     1       while the clip plays, segments of scale 0 that will be needed within URGENT_S
     2, 3    the same for scale 1, and so on
     last    all other segments, in the order in which the playhead reaches them
@@ -43,8 +43,8 @@ def distances_ahead(scene: PartialScene, head: Playhead) -> np.ndarray:
         head: the playhead.
 
     Returns:
-        (N,) fractions of the clip; 0 for segments that are needed now. A segment behind the playhead is reached again after the
-        loop; without a loop it is farther than all that are ahead.
+        (N,) fractions of the clip; 0 for segments that are needed now. A segment behind the playhead is reached again
+        after the loop; without a loop it is farther than all that are ahead.
     """
     behind = 1 + np.maximum(scene.since, 0) - head.time if head.loop else 2 + head.time - scene.until
     ahead = np.where(scene.since >= head.time, scene.since - head.time, behind)

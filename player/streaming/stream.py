@@ -1,11 +1,11 @@
-"""Playback of a scene while it arrives: one thread fetches and decodes, the window's thread takes over what is finished.
+"""Playback of a scene while it arrives: one thread fetches and decodes, the window's thread takes over the result.
 
-    fetching thread   what to fetch next (`kpc.player.streaming.prefetch`) -> source -> CRC32C, decoding -> finished segments
-    window's thread   `set_playhead` sets the position; `upload` takes over finished segments, a limited number of bytes a frame
+    fetching thread   chooses a segment (`kpc.player.streaming.prefetch`), reads it, checks its CRC32C, decodes it
+    window's thread   `set_playhead` sets the position; `upload` takes over segments, a limited number of bytes a frame
 
-The window's thread waits for nothing but a lock that is held briefly. Segments of time planes stay in memory as symbols and are
-dropped when the playhead has passed them and the memory is needed; space planes are kept on the graphics card only. Local files
-are read in the same way as those of a server.
+The window's thread waits for nothing but a lock that is held briefly. Segments of time planes stay in memory as symbols
+and are dropped when the playhead has passed them and the memory is needed; space planes are kept on the graphics card
+only. Local files are read in the same way as those of a server.
 """
 
 import threading
@@ -63,8 +63,8 @@ class Stream:
 
     Args:
         source: the scene's file, or a reader of it, whose header and index are used.
-        memory: bytes that the scene may take in main memory and on the graphics card together. Pictures, shaders and the program
-            itself do not count.
+        memory: bytes that the scene may take in main memory and on the graphics card together. Pictures, shaders and
+            the program itself do not count.
         arrived: called by the fetching thread when a segment has arrived; may wake the window.
 
     Attributes:
@@ -166,9 +166,10 @@ class Stream:
         return changed
 
     def can_show(self, time: float, rate: float = 0.0) -> bool:
-        """Return whether the picture at `time` can be drawn; after it could not, only once the next RESUME_S have arrived, too.
+        """Return whether the picture at `time` can be drawn; after a wait, only once the next RESUME_S are there.
 
-        It needs the segments at `time` of all scales whose space planes have arrived, and of scale 0 at least: a picture does
+        It needs the segments at `time` of all scales whose space planes have arrived, and of scale 0 at least: a
+            picture does
         not become coarser again.
 
         Args:
@@ -228,8 +229,9 @@ class Stream:
     def fixed_bytes(self) -> int:
         """Bytes that the scene takes besides segments of time planes.
 
-        They are those of the textures; of folding, occupancy culling and ray marching on the processor; of occupancy and its
-        distances; of motion; of planes that wait to be uploaded and one that is being decoded; and of the source.
+        They are those of the textures; of folding, occupancy culling and ray marching on the processor; of occupancy
+        and its distances; of motion; of planes that wait to be uploaded and one that is being decoded; and of the
+        source.
         """
         scene, layout = self.scene, self._layout
         texels = layout.size[0] * layout.size[1]

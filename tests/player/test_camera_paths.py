@@ -1,3 +1,4 @@
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -24,7 +25,9 @@ def path_of(
     times: tuple[float, ...] = (0.0, 0.2, 0.2, 0.9), ats: tuple[float | None, ...] = (0.0, 1.0, 4.0, 5.0)
 ) -> CameraPath:
     return CameraPath(
-        tuple(View(view, time, f"{n}.png", at) for n, (view, time, at) in enumerate(zip(VIEWS, times, ats)))
+        tuple(
+            View(view, time, f"{n}.png", at) for n, (view, time, at) in enumerate(zip(VIEWS, times, ats, strict=False))
+        )
     )
 
 
@@ -65,7 +68,7 @@ def test_goes_smoothly_and_turns_no_way_round() -> None:
     turned = np.arccos(np.clip((np.einsum("nij,nij->n", axes[1:], axes[:-1]) - 1) / 2, -1, 1)).sum()
     direct = [
         np.arccos((np.trace(a.camera_to_world[:3, :3].T @ b.camera_to_world[:3, :3]) - 1) / 2)
-        for a, b in zip(VIEWS, VIEWS[1:])
+        for a, b in itertools.pairwise(VIEWS)
     ]
     assert turned < 1.15 * sum(direct)
 
@@ -84,7 +87,7 @@ def test_an_earlier_time_is_reached_through_the_end_of_the_clip() -> None:
 
 def test_one_keyframe_is_a_still() -> None:
     path = CameraPath().with_keyframe(VIEWS[1], 0.3)
-    assert path.at(7.0) == (VIEWS[1], 0.3) and len(path.shots(30)) == 1 and path.start_s == path.end_s == 0.0
+    assert path.at(7.0) == (VIEWS[1], 0.3) and len(path.views(30)) == 1 and path.start_s == path.end_s == 0.0
 
 
 def test_keyframes_come_and_go() -> None:
@@ -125,7 +128,7 @@ def test_whatever_the_keyframes_every_camera_is_one(
 
 
 def test_frames_of_a_video_are_evenly_spaced_and_include_both_ends() -> None:
-    shots = path_of().shots(10)
+    shots = path_of().views(10)
     assert len(shots) == 51 and shots[10].time == pytest.approx(0.2) and shots[-1].time == pytest.approx(0.9)
     assert shots[0].camera.camera_to_world == pytest.approx(VIEWS[0].camera_to_world, abs=1e-9)
 
@@ -170,7 +173,7 @@ MIRRORED = np.diag([-1.0, 1, 1, 1])
 def test_a_path_that_leads_nowhere_is_refused(
     tmp_path: Path, poses: list[np.ndarray], ats: list[float], words: str
 ) -> None:
-    frames = [{"transform_matrix": pose.tolist(), "at": at} for pose, at in zip(poses, ats)]
+    frames = [{"transform_matrix": pose.tolist(), "at": at} for pose, at in zip(poses, ats, strict=False)]
     (tmp_path / "bad.json").write_text(json.dumps({"w": 4, "h": 4, "fl_x": 4, "frames": frames}))
     with pytest.raises(DatasetError, match=words) as caught:
         CameraPath.load(tmp_path / "bad.json")

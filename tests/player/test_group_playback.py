@@ -29,7 +29,7 @@ RATE = 0.2
 
 
 def coded(scene: Scene) -> bytes:
-    return scene_io.encode(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]))
+    return scene_io.encode(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]))
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from scenes import tiny_scene, with_appearances
 def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scene") / "tiny.kpc"
     scene = with_appearances(tiny_scene(4))
-    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), path)
     return path
 
 
@@ -43,8 +43,8 @@ def display() -> Iterator[str]:
         )
     )
     os.close(writer)
-    with os.fdopen(reader) as said:
-        number = said.readline().strip()
+    with os.fdopen(reader) as output:
+        number = output.readline().strip()
     try:
         if not number:
             pytest.skip("Xvfb does not start")
@@ -56,13 +56,15 @@ def display() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def wayland(display: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """The environment of a compositor that offers no X server, two pixels to each of its units. It has a window of one, for its keys and pointer:
-    without any, glfw stumbles."""
+    """The environment of a compositor without an X server, with two pixels to a screen unit.
+
+    The compositor runs in an X window, for glfw fails without a keyboard and a pointer.
+    """
     if shutil.which("weston") is None:
         pytest.skip("no weston (Debian: apt install weston)")
     folder = tmp_path_factory.mktemp("wayland")
     folder.chmod(0o700)
-    told = {"XDG_RUNTIME_DIR": str(folder), "WAYLAND_DISPLAY": "kpc"}
+    variables = {"XDG_RUNTIME_DIR": str(folder), "WAYLAND_DISPLAY": "kpc"}
     command = [
         "weston",
         "--backend=x11-backend.so",
@@ -73,7 +75,10 @@ def wayland(display: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         "--idle-time=0",
     ]
     server = subprocess.Popen(
-        command, env={**os.environ, **told, "DISPLAY": display}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        command,
+        env={**os.environ, **variables, "DISPLAY": display},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     try:
         for _ in range(100):
@@ -82,18 +87,18 @@ def wayland(display: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
             time.sleep(0.1)
         if not (folder / "kpc").exists():
             pytest.skip("weston does not start")
-        yield told
+        yield variables
     finally:
         server.terminate()
         server.wait()
 
 
 def kpplay(
-    *arguments: object, display: str | None = None, told: Mapping[str, str] = MappingProxyType({})
+    *arguments: object, display: str | None = None, variables: Mapping[str, str] = MappingProxyType({})
 ) -> subprocess.CompletedProcess[str]:
     env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "PYGLFW_LIBRARY")} | (
         {"DISPLAY": display} if display else {}
-    ) | dict(told)  # fmt: skip
+    ) | dict(variables)  # fmt: skip
     command = [sys.executable, "-W", "error", "-m", "kpc.player.app.kpplay", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, env=env, timeout=60, check=False)
 
@@ -110,12 +115,14 @@ def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> No
     assert picture[12:100, 12:100].mean() < 180  # the HUD
 
 
-@pytest.mark.parametrize("session", [{}, {"XDG_SESSION_TYPE": "wayland"}], ids=["untold", "told"])
-def test_plays_where_there_is_no_x_server(
+@pytest.mark.parametrize("session", [{}, {"XDG_SESSION_TYPE": "wayland"}], ids=["unset", "set"])
+def test_plays_without_an_x_server(
     scene_file: Path, wayland: dict[str, str], session: dict[str, str], tmp_path: Path
 ) -> None:
     shot = tmp_path / "shot.png"
-    done = kpplay(scene_file, "--size", "300x200", "--frames", 20, "--screenshot", shot, told={**wayland, **session})
+    done = kpplay(
+        scene_file, "--size", "300x200", "--frames", 20, "--screenshot", shot, variables={**wayland, **session}
+    )
     assert done.returncode == 0 and done.stdout == "" and "Traceback" not in done.stderr, done.stderr
     picture = read_image(shot).astype(int)
     assert picture.shape == (400, 600, 3)  # what the compositor counts
@@ -132,9 +139,9 @@ def test_plays_from_a_server(scene_file: Path, display: str, tmp_path: Path) -> 
     assert np.abs(read_image(shot).astype(int)[150:170, 260:280] - background).max() > 20
 
 
-def test_a_server_that_fails_is_told_in_the_window(scene_file: Path, display: str, tmp_path: Path) -> None:
+def test_a_failing_server_is_reported_in_the_window(scene_file: Path, display: str, tmp_path: Path) -> None:
     class Failing(Handler):
-        """Gives a little at a time, and after the first picture nothing."""
+        """Sends small ranges, and nothing after the first picture."""
 
         def do_GET(self) -> None:
             first, last = map(int, self.headers["Range"].removeprefix("bytes=").split("-"))
@@ -144,18 +151,18 @@ def test_a_server_that_fails_is_told_in_the_window(scene_file: Path, display: st
             self.headers.replace_header("Range", f"bytes={first}-{min(last, first + 1999)}")
             super().do_GET()
 
-    shots = [tmp_path / "whole.png", tmp_path / "told.png"]
-    for handler, shot in zip((Handler, Failing), shots):
+    shots = [tmp_path / "whole.png", tmp_path / "failed.png"]
+    for handler, shot in zip((Handler, Failing), shots, strict=False):
         with serving(scene_file.parent, handler=handler) as url:
             done = kpplay(f"{url}/tiny.kpc", "--size", "400x300", "--frames", 2, "--screenshot", shot, display=display)
         assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
-    whole, told = (
+    whole, failed = (
         read_image(shot).astype(int)[22:38, 250:390] for shot in shots
     )  # where the message is, right of the HUD
-    assert told.max() > 200 > 100 > told.min() and np.abs(whole - told).max() > 100
+    assert failed.max() > 200 > 100 > failed.min() and np.abs(whole - failed).max() > 100
 
 
-def test_long_playback_makes_nothing_anew(scene_file: Path, display: str) -> None:
+def test_long_playback_allocates_nothing_on_the_card(scene_file: Path, display: str) -> None:
     command = [
         sys.executable,
         "-m",
@@ -176,7 +183,7 @@ def test_long_playback_makes_nothing_anew(scene_file: Path, display: str) -> Non
     assert "made on the card" in done.stderr and record["renderer"]
 
 
-def test_a_window_that_is_left_to_itself_is_measured(scene_file: Path, display: str) -> None:
+def test_kpbench_measures_a_window(scene_file: Path, display: str) -> None:
     command = [
         sys.executable,
         "-m",
@@ -224,13 +231,15 @@ def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
         (["{scene}", "--target-fps", "0"], 2, "--target-fps"),
     ],
 )
-def test_bad_input_is_told_before_a_window_opens(scene_file: Path, arguments: list[str], code: int, words: str) -> None:
+def test_bad_input_is_reported_before_a_window_opens(
+    scene_file: Path, arguments: list[str], code: int, words: str
+) -> None:
     done = kpplay(*[a.format(scene=scene_file) for a in arguments])
     assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr
 
 
 def test_every_key_and_drag(scene_file: Path, display: str, tmp_path: Path) -> None:
-    """In a process of its own: Mesa lets none hold both a GLX and an EGL context, and other tests do the latter."""
+    """In a process of its own: with Mesa none can hold both a GLX and an EGL context, and other tests use EGL."""
     command = [sys.executable, "-W", "error", str(Path(__file__).parents[1] / "press_every_key.py"), str(scene_file)]
     env = {**os.environ, "DISPLAY": display, "XDG_CONFIG_HOME": str(tmp_path / "settings")}
     done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, timeout=60, check=False)

@@ -290,7 +290,7 @@ def test_the_window_waits_for_nothing_while_the_line_is_dead(
             stream.set_playhead(Playhead(frame / 200, 0.1))
             stream.upload(renderer)
             stream.can_show(frame / 200)
-            stream.message, stream.loaded_fraction, stream.bytes_per_s
+            _ = stream.message, stream.loaded_fraction, stream.bytes_per_s
             slowest = max(slowest, clock.monotonic() - started)
         release.set()
     assert slowest < 0.25  # a request would have waited for longer

@@ -31,7 +31,7 @@ def test_a_plane_that_says_nothing_is_grey() -> None:
 
 
 def test_many_instants_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(time_plane_pictures, "MOST_ROWS", 5)
+    monkeypatch.setattr(time_plane_pictures, "MAX_INSTANTS", 5)
     scene = tiny_scene(4, time=40)
     assert time_plane_picture(scene, "zt", 1).shape == (scene.scales[1]["zt"].shape[1], 5, 3)
 
@@ -43,7 +43,7 @@ def test_static_scenes_have_none() -> None:
 
 def test_what_has_not_arrived_is_grey() -> None:
     scene = tiny_scene(4)
-    data = encode(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]))
+    data = encode(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]))
     part = PartialScene(SceneReader(data, in_parts=True))
     assert (time_plane_picture(part.scene, "xt", 1) == 128).all()
     part.fetch(part.needed(scales=2, start=0.0, end=1.0))

@@ -229,7 +229,7 @@ def _path_shots(clip: Clip, options: argparse.Namespace) -> list[View]:
         raise UsageError(
             f"--path {options.path}: {path.end_s - path.start_s:g} s at {fps:g} fps are more than {MOST} pictures"
         )
-    return path.shots(fps)
+    return path.views(fps)
 
 
 def _shots(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[View]:
