@@ -73,11 +73,11 @@ def press(player: Player, *keys: int) -> None:
 def drag(player: Player, button: int, x: float, y: float) -> None:
     """Drag by so many units, outside the panels."""
     window = player.window
-    window.move_pointer(250, 60)
+    window.move_pointer(285, 60)
     player.frame()
     window.press_button(button, True)
     player.frame()
-    window.move_pointer(250 + x, 60 + y)
+    window.move_pointer(285 + x, 60 + y)
     player.frame()
     window.press_button(button, False)
     player.frame()
