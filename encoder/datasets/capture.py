@@ -1,4 +1,4 @@
-"""What every layout is read into: a list of views, each an image or the video of a camera that stands still."""
+"""What every dataset layout is read into: a list of views, each an image or the video of a static camera."""
 
 import errno
 import math
@@ -13,21 +13,24 @@ import numpy as np
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import IMAGE_SUFFIXES, VideoInfo, image_size
 
+# Where neither the dataset nor the user names test images, every eighth is one, as in LLFF (arXiv:1905.00889).
 HOLD_OUT_EVERY = 8
-"""Where neither the dataset nor the user names test images, every eighth is one (LLFF's custom, arXiv:1905.00889)."""
 
 
 @dataclass(frozen=True)
 class CapturedView:
-    """One file seen through one camera.
+    """One file of a dataset, with the camera that captured it.
 
     Attributes:
         file: an image, or a video if `video` is given.
-        time: as the dataset tells it, in any unit; None for videos and where nothing is told.
-        width, height, has_alpha: of the file as it is.
-        intrinsics: fl_x fl_y cx cy, pixels of that raster; distortion: k1 k2 p1 p2 (OpenCV's model).
+        video: properties of the video.
+        time: as given by the dataset, in any unit; None for videos and where it gives none.
+        is_test: whether it is held out from training.
+        width, height, has_alpha: of the file, before downscaling.
+        intrinsics: fl_x fl_y cx cy in pixels of that size.
+        distortion: k1 k2 p1 p2 of OpenCV's lens model.
         camera_to_world: (4, 4) float64, OpenGL convention.
-        near, far: depth along the optical axis, NaN where unknown.
+        near, far: depth range along the optical axis, NaN if unknown.
     """
 
     file: Path
@@ -46,7 +49,13 @@ class CapturedView:
 
 @dataclass(frozen=True)
 class Capture:
-    """A dataset before its pixels are read. `fps` is None where nothing tells it."""
+    """A dataset before its pixels are read.
+
+    Attributes:
+        layout: name of the layout.
+        views: all files that are used.
+        fps: frames per second; None if the dataset does not give it.
+    """
 
     layout: str
     views: tuple[CapturedView, ...]
@@ -66,7 +75,7 @@ def image_view(
     near: float,
     far: float,
 ) -> CapturedView:
-    """A view of an image. `declared` is the raster that the intrinsics belong to, None for the image's own."""
+    """Return the view of an image. `declared` is the image size of the calibration; None if it is the image's own."""
     width, height, has_alpha = image_size(file)
     intrinsics = fit_intrinsics(where, file, intrinsics, declared or (width, height), (width, height))
     pose = check_pose(where, camera_to_world)
@@ -80,11 +89,17 @@ def fit_intrinsics(
     declared: tuple[float, float],
     actual: tuple[int, int],
 ) -> tuple[float, float, float, float]:
-    """Scale fl_x fl_y cx cy from the declared raster to the actual one, each axis on its own.
+    """Scale fl_x fl_y cx cy from the declared to the actual image size, each axis independently.
+
+    Args:
+        where: the calibration's file and entry, for messages.
+        file: the image or video.
+        intrinsics: fl_x fl_y cx cy in pixels of the declared size.
+        declared, actual: width and height.
 
     Raises:
-        DatasetError: the focal length is not a positive number, or the two rasters differ in shape by more than 1 %
-            and a pixel's rounding: then the picture was cropped, and nobody says where.
+        DatasetError: the focal length is not positive, or the aspect ratios differ by more than 1 % and a pixel of
+            rounding: then the image was cropped, and it is unknown where.
     """
     fl_x, fl_y, cx, cy = intrinsics
     if not (all(map(math.isfinite, intrinsics)) and fl_x > 0 and fl_y > 0):
@@ -94,45 +109,53 @@ def fit_intrinsics(
     sx, sy = actual[0] / declared[0], actual[1] / declared[1]
     if abs(declared[0] * sy - actual[0]) > 1 + 0.01 * actual[0]:
         raise DatasetError(
-            f"{file}: is {actual[0]}x{actual[1]}, but {where} is for {declared[0]:g}x{declared[1]:g}, another shape; "
-            "undo the crop or correct the size there"
+            f"{file}: is {actual[0]}x{actual[1]}, but {where} is for {declared[0]:g}x{declared[1]:g}, another aspect "
+            "ratio; undo the crop or correct the size there"
         )
     return fl_x * sx, fl_y * sy, cx * sx, cy * sy
 
 
 def check_pose(where: str, pose: np.ndarray) -> np.ndarray:
-    """The pose as (4, 4) float64 with a scale taken out of its axes.
+    """Return a pose as (4, 4) float64 with its axes normalised.
 
     Raises:
-        DatasetError: not 3x4 or 4x4, NaN or infinity, or axes that are not at right angles or left-handed.
+        DatasetError: the pose is not 3x4 or 4x4, holds NaN or infinity, or its axes are not orthogonal and
+            right-handed.
     """
     if pose.shape not in ((3, 4), (4, 4)):
-        raise DatasetError(f"{where}: pose has shape {pose.shape}, not 4x4")
+        raise DatasetError(f"{where}: pose has shape {pose.shape}, not 4x4; export it anew")
     if not np.isfinite(pose).all():
         raise DatasetError(f"{where}: pose holds NaN or infinity; remove the camera or calibrate it anew")
     lengths = np.linalg.norm(pose[:3, :3], axis=0)
     axes = pose[:3, :3] / np.where(lengths > 0, lengths, 1)
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-2 or np.linalg.det(axes) < 0:
-        raise DatasetError(f"{where}: pose is not a rotation and a position; calibrate the camera anew")
+        raise DatasetError(f"{where}: pose is not a rotation and a translation; calibrate the camera anew")
     checked = np.eye(4)
     checked[:3, :3], checked[:3, 3] = axes, pose[:3, 3]
     return checked
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """Sorts cam2 before cam10. A number goes by its length, then by its digits: no name is too long or too odd for that."""
+    """Return a sort key that puts cam2 before cam10.
+
+    Numbers are compared by length, then by digits, so that they may be of any length.
+    """
     parts = re.split(r"(\d+)", name)
     numbers = [part.lstrip("0") for part in parts[1::2]]
     return [(len(numbers[k // 2]), numbers[k // 2]) if k % 2 else (-1, part) for k, part in enumerate(parts)]
 
 
 def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default: Iterable[bool]) -> list[bool]:
-    """Which of the files named (relative to `path`) are for testing.
+    """Return for each file whether it is held out for testing.
 
-    `holdout`: None for the layout's own custom, "none", or a file's name with or without folder and suffix.
+    Args:
+        path: the dataset's folder, for messages.
+        names: of the files, relative to it.
+        holdout: a file's name with or without folder and suffix, "none", or None for the layout's default.
+        default: the layout's default for each file.
 
     Raises:
-        DatasetError: no file has that name.
+        DatasetError: no file has the name `holdout`.
     """
     if holdout is None:
         return list(default)
@@ -148,14 +171,22 @@ def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default
 
 
 def find_image(root: Path, file: Path, name: str) -> Path | None:
-    """The image that `file` knows by a name relative to `root`, with or without its suffix; None if there is none.
+    """Find an image by a name relative to `root`, with or without its suffix.
+
+    Args:
+        root: the folder of images.
+        file: the file that lists the name, for messages.
+        name: as listed.
+
+    Returns:
+        The image's path, or None if it does not exist.
 
     Raises:
-        DatasetError: it leads out of `root`. (A link inside the folder may: who put it there meant it.)
+        DatasetError: the name leads out of `root`. (Symbolic links inside it may: whoever put them there meant it.)
     """
     relative = os.path.normpath(name.replace("\\", "/"))
     if os.path.isabs(relative) or relative.split(os.sep)[0] in (os.curdir, os.pardir) or "\0" in relative:
-        raise DatasetError(f"{file}: {name!r} leads out of {root} or names no file; make it relative to that folder")
+        raise DatasetError(f"{file}: {name!r} leads out of {root} or is no file name; make it relative to that folder")
     bare = root / relative
     for candidate in (bare, *(bare.with_name(bare.name + suffix) for suffix in (*IMAGE_SUFFIXES, ".JPG", ".PNG"))):
         if candidate.suffix.lower() in IMAGE_SUFFIXES and file_exists(candidate):
@@ -164,7 +195,7 @@ def find_image(root: Path, file: Path, name: str) -> Path | None:
 
 
 def file_exists(path: Path) -> bool:
-    """As `Path.is_file`; what no file system could hold is not there."""
+    """Return whether a file exists; unlike `Path.is_file`, return False for a name that is too long to exist."""
     try:
         return path.is_file()
     except OSError as error:
@@ -174,10 +205,10 @@ def file_exists(path: Path) -> bool:
 
 
 def report_missing(file: Path, missing: list[str], total: int) -> None:
-    """One line for all frames whose image is not there.
+    """Print one line about all frames whose image does not exist.
 
     Raises:
-        DatasetError: none is there.
+        DatasetError: none of the images exists.
     """
     if len(missing) == total:
         raise DatasetError(
@@ -191,10 +222,10 @@ def report_missing(file: Path, missing: list[str], total: int) -> None:
 
 
 def first_names(names: Sequence[str]) -> str:
-    """The first few of them, for a message."""
+    """Return the first few names, for a message."""
     return ", ".join(map(printable, names[:6])) + (" ..." if len(names) > 6 else "")
 
 
 def printable(text: str) -> str:
-    """On one line and not endless, whatever a file holds."""
+    """Return text from a file in printable form, on one line and of limited length, for a message."""
     return (text if text.isprintable() else repr(text))[:160]

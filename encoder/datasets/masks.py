@@ -1,6 +1,6 @@
-"""Masks of still images: which pixels may be trained and tested on, kept as bits in a file beside the pixel cache.
+"""Masks of images: which pixels may be used for training and testing. They are cached as bits beside the pixel cache.
 
-For `images/x/name.jpg` the mask is `masks/x/name.jpg.png` (COLMAP's custom) or `masks/x/name.png`; 0 stands for ignored.
+The mask of `images/x/name.jpg` is `masks/x/name.jpg.png` (as in COLMAP) or `masks/x/name.png`; 0 means ignored.
 """
 
 import copy
@@ -15,62 +15,73 @@ from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import image_size, read_image
 from kpc.format.common.progress import Progress
 
+# The folder of masks within a dataset.
 FOLDER = "masks"
 
+# Pixels per block of the rank index: a block takes 8 bytes of memory, and drawing a pixel reads 64 bytes.
 BLOCK = 512
-"""Pixels that are counted together: 8 bytes of memory each, and 64 bytes to read for every pixel drawn."""
 
-_BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)  # of each byte, in the order of their pixels
+# For every byte: its bits in pixel order (256, 8), their sum (256,), and the position of its n-th set bit (256, 8).
+_BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
 _ONES = _BITS.sum(axis=1, dtype=np.int16)
-_NTH = np.argsort(1 - _BITS.astype(np.int8), axis=1, kind="stable")  # (256, 8): where a byte's n-th one is
+_NTH = np.argsort(1 - _BITS.astype(np.int8), axis=1, kind="stable")
 
 
 class Masks:
-    """Which pixels are usable: a bit each, row by row, every picture filled up with zeros to whole blocks.
+    """The usable pixels of all pictures: one bit per pixel, row by row, each picture padded with zeros to whole blocks.
 
-    `counts`: (P,) int64, usable pixels of each picture. `crc32c`: of each picture's bits.
+    Attributes:
+        counts: (P,) int64, number of usable pixels of each picture.
+        crc32c: checksum of each picture's bits.
     """
 
     def __init__(self, bits: PixelCache, sizes: Sequence[tuple[int, int]]) -> None:
         self._bits, self._sizes = bits, sizes
         in_block = [_ONES[bits.picture(n)[0]].sum(axis=1) for n in range(len(sizes))]
-        self._before = np.concatenate([[0], np.cumsum(np.concatenate(in_block), dtype=np.int64)])  # of all pictures
+        self._before = np.concatenate(
+            [[0], np.cumsum(np.concatenate(in_block), dtype=np.int64)]
+        )  # usable pixels before each block
         self._first_block = np.array([tile.offset for tile in bits.tiles], np.int64)
         self.counts = np.array([ones.sum() for ones in in_block], np.int64)
         self.crc32c = tuple(tile.crc32c for tile in bits.tiles)
 
     def subset(self, numbers: np.ndarray) -> "Masks":
-        """Those of these pictures alone."""
-        chosen = copy.copy(self)  # shares the counts of all blocks, whose numbers stay as they are
+        """Return the masks of the given pictures."""
+        chosen = copy.copy(self)  # shares the counts of blocks, whose numbers stay the same
         chosen._bits, chosen._sizes = self._bits.subset(numbers), [self._sizes[n] for n in numbers]
         chosen._first_block, chosen.counts = self._first_block[numbers], self.counts[numbers]
         chosen.crc32c = tuple(self.crc32c[n] for n in numbers)
         return chosen
 
     def usable(self, picture: int) -> np.ndarray:
-        """(height, width) bool."""
+        """Return the usable pixels of a picture, (height, width) bool."""
         width, height = self._sizes[picture]
         bits = np.unpackbits(self._bits.picture(picture), count=width * height)
         return bits.astype(bool).reshape(height, width)
 
     def is_usable(self, picture: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-        """Of pixels counted row by row, (N,) as their pictures: (N,) bool."""
+        """Return whether pixels, counted row by row, of the given pictures are usable; (N,) int64 to (N,) bool."""
         block, bit = np.divmod(pixel, BLOCK)
         data = self._bits.read(self._first_block[picture] + block)
         value = np.take_along_axis(data, bit[:, None] // 8, axis=1)[:, 0]
         return _BITS[value, bit % 8].astype(bool)
 
     def nth_usable(self, picture: np.ndarray, rank: np.ndarray) -> np.ndarray:
-        """Pixels, counted row by row, that are usable number `rank` of their pictures: both (N,), as the result, int64.
+        """Return the pixel, counted row by row, that is usable pixel number `rank` of its picture.
 
-        `rank` must be less than `counts[picture]`. Exact, whatever share is masked out.
+        Args:
+            picture: (N,) int64.
+            rank: (N,) int64, less than `counts[picture]`.
+
+        Returns:
+            (N,) int64.
         """
         first = self._first_block[picture]
         rank = self._before[first] + rank
         block = np.searchsorted(self._before, rank, side="right") - 1
         rank = rank - self._before[block]
         data = self._bits.read(block)
-        after = np.cumsum(_ONES[data], axis=1)  # ones up to each byte, itself included
+        after = np.cumsum(_ONES[data], axis=1)  # set bits up to each byte, inclusive
         byte = (after <= rank[:, None]).sum(axis=1)
         value = np.take_along_axis(data, byte[:, None], axis=1)[:, 0]
         rank = rank - np.take_along_axis(after, byte[:, None], axis=1)[:, 0] + _ONES[value]
@@ -78,26 +89,27 @@ class Masks:
 
 
 def find_masks(root: Path, views: Sequence[CapturedView]) -> list[Path | None]:
-    """The mask of each view, None for videos and where there is none.
+    """Find the mask of each view; None for videos and for images without one.
 
     Raises:
-        DatasetError: a mask has not the size of its image. MediaError: it cannot be read.
+        DatasetError: a mask differs in size from its image.
+        MediaError: a mask cannot be read.
     """
     folder = root / FOLDER
     if not folder.is_dir():
         return [None] * len(views)
     masks = [None if view.video else _find(folder, view.file.relative_to(root)) for view in views]
-    for view, mask in zip(views, masks):
+    for view, mask in zip(views, masks, strict=True):
         if mask is not None and (size := image_size(mask)[:2]) != (view.width, view.height):
             raise DatasetError(
                 f"{mask}: is {size[0]}x{size[1]}, but {view.file.name} is {view.width}x{view.height}; "
-                "make the mask anew in that size"
+                "make the mask anew at that size"
             )
-    bare = [view.file.name for view, mask in zip(views, masks) if mask is None and not view.video]
-    if bare:
+    unmasked = [view.file.name for view, mask in zip(views, masks, strict=True) if mask is None and not view.video]
+    if unmasked:
         total = sum(not view.video for view in views)
         print(
-            f"{folder}: {len(bare)} of {total} images have no mask and are used whole: {first_names(bare)}",
+            f"{folder}: {len(unmasked)} of {total} images have no mask and are used entirely: {first_names(unmasked)}",
             file=sys.stderr,
         )
     return masks
@@ -106,14 +118,19 @@ def find_masks(root: Path, views: Sequence[CapturedView]) -> list[Path | None]:
 def load_masks(
     root: Path, views: Sequence[CapturedView], masks: Sequence[Path | None], file: Path, downscale: int, progress: bool
 ) -> Masks | None:
-    """Read the masks, or open what was read before; None where there are none.
+    """Read the masks, or open their cache; return None if there are none.
 
     Args:
-        file: where to keep them.
-        downscale: a pixel is usable if all downscale^2 of its block are.
+        root: the dataset's folder.
+        views: of the dataset.
+        masks: the mask of each view, from `find_masks`.
+        file: the cache file.
+        downscale: a downscaled pixel is usable if all downscale^2 pixels of its block are.
+        progress: whether to report progress on stderr.
 
     Raises:
-        DatasetError: the disk is full. MediaError: a mask cannot be read.
+        DatasetError: the disk is full.
+        MediaError: a mask cannot be read.
     """
     if not any(masks):
         return None
@@ -125,7 +142,7 @@ def load_masks(
         with Progress(f"masks of {root.name}", len(views), "mask", shown=progress) as bar:
 
             def packed() -> Iterator[np.ndarray]:
-                for mask, size in zip(masks, sizes):
+                for mask, size in zip(masks, sizes, strict=True):
                     yield _packed(mask, size, downscale)
                     bar.advance()
 
@@ -142,14 +159,15 @@ def _find(folder: Path, image: Path) -> Path | None:
 
 
 def _source(root: Path, mask: Path | None) -> tuple[str, int, int] | None:
+    """Return what identifies the content of a mask: name, size and time of modification."""
     if mask is None:
         return None
-    about = mask.stat()
-    return mask.relative_to(root).as_posix(), about.st_size, about.st_mtime_ns
+    stat = mask.stat()
+    return mask.relative_to(root).as_posix(), stat.st_size, stat.st_mtime_ns
 
 
 def _packed(mask: Path | None, size: tuple[int, int], downscale: int) -> np.ndarray:
-    """(1, blocks, BLOCK / 8) uint8."""
+    """Return the bits of one mask, (1, blocks, BLOCK / 8) uint8; all set if there is no mask."""
     width, height = size
     usable = np.ones((height, width), bool)
     if mask is not None:

@@ -1,4 +1,4 @@
-"""All pictures of a dataset, or their masks, decoded once into one flat file that outlasts the run."""
+"""A cache of decoded pictures, or of masks: one flat file on disk that later runs reuse."""
 
 import errno
 import hashlib
@@ -18,18 +18,28 @@ import numpy as np
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError
 
+# Part of every fingerprint: caches of another version are rebuilt.
 CACHE_VERSION = 2
 
+# Caches up to this size are mapped into memory and may become resident entirely; larger ones are read pixel by pixel.
 MAPPED_BYTES = 1 << 30
-"""Up to this size the cache is mapped into memory, and may all become resident; a larger one is read pixel by pixel."""
 
+# Bytes of a cache that are verified against their CRCs on opening: all of a small one, an even sample of a large one.
 VERIFIED_BYTES = 256 << 20
-"""How much of a cache is held against its CRCs as it is opened: all of a small one, an even sample of a large one."""
+
+# Files of interrupted builds are deleted after this many seconds without a write: a live build writes more often.
+ABANDONED_S = 600
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One picture in the cache: `offset` is its first pixel."""
+    """One picture in the cache.
+
+    Attributes:
+        offset: index of its first pixel.
+        width, height: pixels.
+        crc32c: checksum of its bytes.
+    """
 
     offset: int
     width: int
@@ -38,11 +48,17 @@ class Tile:
 
 
 class PixelCache:
-    """A flat file of uint8 pixels, `stored_channels` bytes each, picture after picture, row by row.
+    """A flat file of uint8 pixels, picture after picture, row by row.
 
-    A mapping that is read at random drags whole pages in, up to 2 MB for three bytes (kernels with large folios), and
-    all of them count as resident. A file larger than `MAPPED_BYTES` is therefore read with pread, which keeps nothing:
-    about 1 us a pixel, where the mapping takes 0.1.
+    Random reads from a memory mapping bring in whole pages, up to 2 MB for three bytes where the kernel uses large
+    folios, and all of them count as resident. Files larger than MAPPED_BYTES are therefore read with pread, which keeps
+    nothing in the process: about 1 us per pixel instead of 0.1.
+
+    Args:
+        path: of the file.
+        tiles: the pictures in it.
+        stored_channels: bytes per pixel in the file.
+        channels: how many of them are returned.
     """
 
     def __init__(self, path: Path, tiles: tuple[Tile, ...], stored_channels: int, channels: int) -> None:
@@ -57,21 +73,25 @@ class PixelCache:
             self._mapped = np.frombuffer(mapping, np.uint8).reshape(-1, stored_channels)
 
     def subset(self, numbers: np.ndarray) -> "PixelCache":
-        """These pictures alone, of the same file; indices of pixels stay as they are."""
+        """Return the cache of the given pictures in the same file; indices of pixels stay the same."""
         return PixelCache(self.path, tuple(self.tiles[n] for n in numbers), self._stored, self.channels)
 
     def read(self, indices: np.ndarray) -> np.ndarray:
-        """Pixels by their index in the cache: (N,) int64 to (N, channels) uint8."""
+        """Read pixels by their index in the cache, (N,) int64 to (N, channels) uint8.
+
+        Raises:
+            DatasetError: the file has been truncated.
+        """
         if self._mapped is not None:
             return self._mapped[indices][:, : self.channels]
         fd, stored = self._fd, self._stored
         data = b"".join([os.pread(fd, stored, offset) for offset in (indices * stored).tolist()])
         if len(data) != len(indices) * stored:
-            raise DatasetError(f"{self.path}: shorter than it was; delete it to have it rebuilt")
+            raise DatasetError(f"{self.path}: shorter than it was; delete it, and it will be rebuilt")
         return np.frombuffer(data, np.uint8).reshape(-1, stored)[:, : self.channels]
 
     def picture(self, number: int, top: int = 0, bottom: int | None = None) -> np.ndarray:
-        """A picture, or its rows from `top` up to `bottom`: (rows, width, channels) uint8."""
+        """Read a picture, or its rows from `top` up to `bottom`, as (rows, width, channels) uint8."""
         return self._raw(number, top, bottom)[..., : self.channels]
 
     def _raw(self, number: int, top: int = 0, bottom: int | None = None) -> np.ndarray:
@@ -80,11 +100,11 @@ class PixelCache:
         size = rows * tile.width * self._stored
         data = os.pread(self._fd, size, (tile.offset + top * tile.width) * self._stored)
         if len(data) != size:
-            raise DatasetError(f"{self.path}: shorter than it was; delete it to have it rebuilt")
+            raise DatasetError(f"{self.path}: shorter than it was; delete it, and it will be rebuilt")
         return np.frombuffer(data, np.uint8).reshape(rows, tile.width, self._stored)
 
     def is_intact(self) -> bool:
-        """Whether the file has its length and the pictures checked have their CRCs."""
+        """Return whether the file has the right length and the verified pictures match their CRCs."""
         stored = self._stored
         end = max((t.offset + t.width * t.height for t in self.tiles), default=0) * stored
         if os.fstat(self._fd).st_size != end:
@@ -94,18 +114,18 @@ class PixelCache:
 
 
 def fingerprint_of(*what: Any) -> str:
-    """Of what a cache is built from, as far as JSON can hold it, and of how it is built."""
+    """Return a hash of what a cache is built from; the arguments must be serialisable as JSON."""
     return hashlib.sha256(json.dumps([CACHE_VERSION, *what]).encode()).hexdigest()
 
 
 def open_cache(path: Path, fingerprint: str) -> PixelCache | None:
-    """The cache at `path`, if it was built from what `fingerprint` stands for and is whole."""
+    """Open the cache at `path`; return None unless it has this fingerprint and is intact."""
     try:
-        about = json.loads(path.with_suffix(".json").read_text())
-        if about["fingerprint"] != fingerprint:
+        description = json.loads(path.with_suffix(".json").read_text())
+        if description["fingerprint"] != fingerprint:
             return None
-        tiles = tuple(Tile(**tile) for tile in about["tiles"])
-        cache = PixelCache(path, tiles, int(about["stored_channels"]), int(about["channels"]))
+        tiles = tuple(Tile(**tile) for tile in description["tiles"])
+        cache = PixelCache(path, tiles, int(description["stored_channels"]), int(description["channels"]))
         return cache if cache.is_intact() else None
     except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError, DatasetError):
         return None
@@ -114,26 +134,33 @@ def open_cache(path: Path, fingerprint: str) -> PixelCache | None:
 def build_cache(
     path: Path, fingerprint: str, pictures: Iterable[np.ndarray], channels: int, size_bytes: int
 ) -> PixelCache:
-    """Write uint8 (height, width, any number of channels) to `path`, and what is in it to a JSON beside it.
+    """Write pictures to `path`, and their description to a JSON file beside it.
 
-    Pictures without alpha get an opaque one where `channels` is 4; if all prove opaque, the cache gives 3 channels.
+    With 4 channels, pictures without alpha become opaque; if all turn out to be opaque, the cache returns 3 channels.
 
     Args:
-        size_bytes: an upper bound of what it will take, to refuse early.
+        path: of the cache.
+        fingerprint: of what it is built from.
+        pictures: (height, width, C) uint8.
+        channels: channels to store.
+        size_bytes: an upper bound of its size, to refuse early if the disk has less space.
 
     Raises:
         DatasetError: the disk is full.
         MediaError: from `pictures`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    _sweep(path)
-    too_small = f"{path.parent}: the disk is full: decoded pictures need {size_bytes / 1e9:.1f} GB; give --downscale 2"
+    _delete_abandoned(path)
+    disk_full = (
+        f"{path.parent}: the disk is full: decoded pictures need {size_bytes / 1e9:.1f} GB; free some space or give "
+        "--downscale 2"
+    )
     if shutil.disk_usage(path.parent).free < size_bytes:
-        raise DatasetError(too_small)
+        raise DatasetError(disk_full)
     tiles: list[Tile] = []
     offset, is_opaque = 0, channels == 4
     try:
-        with atomic_write(path) as aside, open(aside, "wb", buffering=0) as file:
+        with atomic_write(path) as temporary, open(temporary, "wb", buffering=0) as file:
             for picture in pictures:
                 pixels = _with_channels(picture, channels)
                 is_opaque = is_opaque and bool((pixels[..., 3] == 255).all())
@@ -142,17 +169,17 @@ def build_cache(
                 tiles.append(Tile(offset, width, height, _crc(pixels)))
                 offset += width * height
         shown = 3 if is_opaque else channels
-        about = {
+        description = {
             "fingerprint": fingerprint,
             "stored_channels": channels,
             "channels": shown,
             "tiles": [asdict(tile) for tile in tiles],
         }
-        with atomic_write(path.with_suffix(".json")) as aside:
-            aside.write_text(json.dumps(about))
+        with atomic_write(path.with_suffix(".json")) as temporary:
+            temporary.write_text(json.dumps(description))
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise DatasetError(too_small) from error
+            raise DatasetError(disk_full) from error
         raise
     return PixelCache(path, tuple(tiles), channels, shown)
 
@@ -172,8 +199,8 @@ def _crc(pixels: np.ndarray) -> int:
     return int(google_crc32c.value(pixels.tobytes()))
 
 
-def _sweep(path: Path) -> None:
-    """Delete what builds that were killed left behind; a build that lives wrote within the last minutes."""
+def _delete_abandoned(path: Path) -> None:
+    """Delete what killed builds left behind."""
     for leftover in path.parent.glob(f".{path.stem}.*{path.suffix}"):
-        if time.time() - leftover.stat().st_mtime > 600:
+        if time.time() - leftover.stat().st_mtime > ABANDONED_S:
             leftover.unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """Where the scene is: its axis-aligned box, and which parts of it the cameras see."""
 
 import numpy as np
-from kpc.encoder.datasets.dataset import Pictures
+from kpc.encoder.datasets import Pictures
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping, uncontract
 from numba import njit, prange

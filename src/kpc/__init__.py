@@ -1,4 +1,4 @@
-"""KPC: 4D video you can fly through.
+"""KPC: a codec and player for 4D radiance fields.
 
 import kpc
 
@@ -7,6 +7,7 @@ picture = kpc.render(scene, scene.cameras[0], time=0.5).rgb     # (H, W, 3) floa
 """
 
 import os
+from importlib import metadata
 from typing import TYPE_CHECKING, BinaryIO
 
 from kpc.format.common.errors import KpcError
@@ -19,22 +20,29 @@ if TYPE_CHECKING:
     from kpc.format.container.groups import GroupedScene
     from kpc.player.cpu.reference import Rendering
 
-__all__ = ["Camera", "KpcError", "Scene", "load", "render"]
+__all__ = ["Camera", "KpcError", "Scene", "__version__", "load", "render"]
+
+try:
+    __version__ = metadata.version("kpc")
+except metadata.PackageNotFoundError:  # run from a source tree that is not installed
+    __version__ = "0+unknown"
 
 
 def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int = 2 << 30) -> "Scene | GroupedScene":
-    """Read a .kpc file; its planes are numpy arrays by name: `scene.scales[0]["xy"]`.
+    """Read a .kpc file into numpy arrays, such as `scene.scales[0]["xy"]`.
 
-    A long clip may be in groups, of which one is held at a time, or two that are mixed, and read when a time in it is asked for:
-    `scene.at(time)` is the scene of the group that shows, and the time in it.
+    A long clip may consist of groups. They are read when a time within them is needed, and one is held at a time, or
+    two while they are blended: `scene.at(time)` returns the `Scene` of the group shown at a time, and the time within
+    it.
 
     Args:
-        path: of the file, or its http or https URL; or its bytes, or an open binary file.
-        memory_budget: bytes the scene, or one group, may take.
+        path: of the file, or its http or https URL, or its bytes, or an open binary file.
+        memory_budget: the most bytes that the scene, or one group, may take in memory.
 
     Raises:
-        FormatError: the file is damaged, hostile or of an unknown version; BudgetError if it is too large.
-        NetworkError: the server of a URL does not give it.
+        FormatError: the file is damaged, hostile or of an unsupported version.
+        BudgetError: the scene is larger than `memory_budget`.
+        NetworkError: the server of a URL does not deliver the file.
     """
     from kpc.format.container import groups
 
@@ -44,19 +52,21 @@ def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int =
 def render(
     scene: "Scene | GroupedScene", camera: Camera, time: float, appearance: "np.ndarray | None" = None
 ) -> "Rendering":
-    """Render one picture with the readable reference renderer; no graphics card is needed.
+    """Render one picture with the reference renderer in numpy; no graphics card is needed.
 
     Args:
+        scene: from `load`.
+        camera: its size is that of the picture.
         time: in [0, 1] over the clip.
-        appearance: a code, `scene.appearance(name)`, where the scene has any; None for their average. Of a clip in groups, that of
-            the group: `scene.at(time)[0].appearance(name)`; then no other is mixed with it.
+        appearance: a code, `scene.appearance(name)`; None for the average look. For a clip in groups it is a code of
+            the group shown, `scene.at(time)[0].appearance(name)`, and that group is not blended with its neighbour.
 
     Returns:
-        `.rgb` (H, W, 3) float32 in [0, 1], `.depth` (H, W), `.opacity` (H, W).
+        A `Rendering` with `rgb` (H, W, 3) float32 in [0, 1], `depth` (H, W) and `opacity` (H, W).
     """
     from kpc.player.cpu import reference
 
     parts = scene.blend_at(time) if appearance is None else [(*scene.at(time), 1.0)]
-    return reference.blend(
-        [(reference.render(shown, camera, t, appearance=appearance), share) for shown, t, share in parts]
+    return reference.mixed(
+        [(reference.render(shown, camera, t, appearance=appearance), weight) for shown, t, weight in parts]
     )

@@ -180,9 +180,9 @@ def test_missing_images_are_named_in_one_line(tmp_path: Path, capsys: pytest.Cap
         ((1, "OPENCV", 32, 24, (*PINHOLE, 0.0, np.inf, 0.0, 0.0)), ("camera 1", "NaN or infinity")),
         ((1, "PINHOLE", 32, 24, (40.0, -40.0, 16.0, 12.0)), ("camera 1", "must be positive")),
         ((1, "PINHOLE", 0, 24, PINHOLE), ("camera 1", "must be positive")),
-        ((1, "PINHOLE", 1 << 63, 24, PINHOLE), ("another shape",)),
-        ((1, "PINHOLE", 24, 32, PINHOLE), ("another shape",)),
-        ((2, "PINHOLE", 32, 24, PINHOLE), ("camera 1, which the model lacks",)),
+        ((1, "PINHOLE", 1 << 63, 24, PINHOLE), ("another aspect ratio",)),
+        ((1, "PINHOLE", 24, 32, PINHOLE), ("another aspect ratio",)),
+        ((2, "PINHOLE", 32, 24, PINHOLE), ("camera 1 is missing from the model",)),
     ],
 )
 def test_impossible_cameras(tmp_path: Path, binary: bool, camera: make.ColmapCamera, words: tuple[str, ...]) -> None:
@@ -210,11 +210,11 @@ def test_impossible_poses(tmp_path: Path, binary: bool, pose: tuple[float, ...])
 def test_what_is_there_twice_or_not_at_all(tmp_path: Path, binary: bool) -> None:
     camera = (1, "PINHOLE", 32, 24, PINHOLE)
     suffix = ".bin" if binary else ".txt"
-    fails(model_of(tmp_path / "set", [camera, camera], three(), binary), f"cameras{suffix}", "camera 1 is there twice")
+    fails(model_of(tmp_path / "set", [camera, camera], three(), binary), f"cameras{suffix}", "camera 1 is listed twice")
     images = three("0000.png", "0001.png", "0001.png")
-    fails(model_of(tmp_path / "set", [camera], images, binary), f"images{suffix}", "image 2 (0001.png) is there twice")
+    fails(model_of(tmp_path / "set", [camera], images, binary), f"images{suffix}", "image 2 (0001.png) is listed twice")
     images = [(4, *image[1:]) for image in three()]
-    fails(model_of(tmp_path / "set", [camera], images, binary), "image 4", "is there twice")
+    fails(model_of(tmp_path / "set", [camera], images, binary), "image 4", "is listed twice")
     fails(model_of(tmp_path / "set", [camera], [], binary), f"images{suffix}", "lists no images")
 
 
@@ -232,7 +232,7 @@ def test_names_must_not_leave_the_folder(tmp_path: Path, binary: bool, name: str
 @pytest.mark.parametrize(
     "text, words",
     [
-        ("", "image 0: is of camera 1, which the model lacks"),
+        ("", "image 0: its camera 1 is missing from the model"),
         ("1", "a line of 1 words"),
         ("1 PINHOLE", "a line of 2 words"),
         ("1 PINHOLE 32 24 40 41", "2 parameters, but PINHOLE has 4"),

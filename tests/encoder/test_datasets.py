@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kpc.encoder.datasets import Dataset, PixelCache, load_dataset, pixel_cache, pixel_rays
 from kpc.encoder.datasets.capture import natural_key
-from kpc.encoder.datasets.dataset import downscale_picture, undistort
+from kpc.encoder.datasets.loading import downscale_picture
+from kpc.encoder.datasets.rays import undistort
 from kpc.format.common.errors import DatasetError, KpcError, MediaError
 from kpc.format.common.media import write_image, write_video
 
@@ -278,7 +279,7 @@ def test_poses_that_do_not_match(tmp_path: Path) -> None:
     fails(changed(0, 0, 9.0), "row 0", "not a rotation")
     fails(changed(1, 15, -1.0), "row 1", "near")
     fails(changed(1, 16, 0.5), "row 1", "far")
-    fails(changed(1, 9, 99.0), "another shape")
+    fails(changed(1, 9, 99.0), "another aspect ratio")
     (folder / "poses_bounds.npy").write_bytes(b"not numpy")
     fails(folder, "poses_bounds.npy", "not a numpy array")
     np.save(folder / "poses_bounds.npy", np.array([{"a": 1}], object), allow_pickle=True)
@@ -327,7 +328,7 @@ def test_videos_at_different_rates(tmp_path: Path) -> None:
         ("fl_x", None, "fl_x"),
         ("fl_x", "long", "fl_x"),
         ("w", 0, "empty"),
-        ("h", 99, "another shape"),
+        ("h", 99, "another aspect ratio"),
         ("frames", [], "no frames"),
         ("frames", "none", "no frames"),
         ("camera_model", "OPENCV_FISHEYE", "OPENCV_FISHEYE"),

@@ -96,7 +96,7 @@ def test_without_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     (tmp_path / "set" / "masks").mkdir()
     assert load(tmp_path / "set").masks is None
     (line,) = capsys.readouterr().err.splitlines()
-    assert "masks: 10 of 10 images have no mask and are used whole: 0000.png" in line
+    assert "masks: 10 of 10 images have no mask and are used entirely: 0000.png" in line
 
 
 def test_videos_have_no_masks(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_images_without_a_mask_are_said(tmp_path: Path, capsys: pytest.CaptureFi
     folder = masked(tmp_path / "set", {k: some(k) for k in range(8)})
     said = load(folder).describe()
     (line,) = capsys.readouterr().err.splitlines()
-    assert "2 of 10 images have no mask and are used whole: 0008.png, 0009.png" in line
+    assert "2 of 10 images have no mask and are used entirely: 0008.png, 0009.png" in line
     share = sum((~some(k)).sum() for k in range(8)) / (10 * 24 * 32)
     assert f"masks ({share:.1%} ignored)" in said
 

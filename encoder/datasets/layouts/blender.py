@@ -1,6 +1,6 @@
-"""NeRF-synthetic and D-NeRF: `transforms_{train,val,test}.json` with `camera_angle_x`, optional `time`, straight alpha.
+"""The layout of NeRF-synthetic and D-NeRF: `transforms_{train,val,test}.json` and images with straight alpha.
 
-(https://github.com/bmild/nerf, https://github.com/albertpumarola/D-NeRF)
+Sources: https://github.com/bmild/nerf, https://github.com/albertpumarola/D-NeRF
 """
 
 from dataclasses import replace
@@ -11,11 +11,12 @@ from kpc.encoder.datasets.layouts.transforms import frame_rate, frame_view, load
 
 
 def recognise(path: Path) -> bool:
+    """Return whether the folder has this layout."""
     return (path / "transforms_train.json").is_file()
 
 
 def read(path: Path, holdout: str | None) -> Capture:
-    """Trains on the train split, tests on the test split (val where there is no other); holdout "none" trains on all.
+    """Read the folder. Test pictures are the test split, or val without one; holdout "none" trains on all splits.
 
     Raises:
         DatasetError, MediaError: a split or an image cannot be used.
@@ -29,8 +30,8 @@ def read(path: Path, holdout: str | None) -> Capture:
         document = load_transforms(file)
         names = [frame["file_path"] for frame in document["frames"]]
         images = [find_image(path, file, name) for name in names]
-        report_missing(file, [name for name, image in zip(names, images) if image is None], len(names))
+        report_missing(file, [name for name, image in zip(names, images, strict=True) if image is None], len(names))
         views += [frame_view(file, n, document, image, split != "train") for n, image in enumerate(images) if image]
         fps = fps or frame_rate(file, document)
     tests = holdout_flags(path, [str(v.file.relative_to(path)) for v in views], holdout, [v.is_test for v in views])
-    return Capture("Blender", tuple(replace(v, is_test=t) for v, t in zip(views, tests)), fps)
+    return Capture("Blender", tuple(replace(v, is_test=t) for v, t in zip(views, tests, strict=True)), fps)

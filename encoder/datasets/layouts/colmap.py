@@ -1,6 +1,6 @@
-"""COLMAP: a sparse model in `sparse/0/` (or `sparse/`) as binary or text, beside `images/`.
+"""The layout of COLMAP: a sparse model in `sparse/0/` (or `sparse/`), binary or text, beside `images/`.
 
-(https://colmap.github.io/format.html, https://colmap.github.io/cameras.html)
+Sources: https://colmap.github.io/format.html, https://colmap.github.io/cameras.html
 """
 
 import contextlib
@@ -27,6 +27,7 @@ from kpc.encoder.datasets.capture import (
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.rotations import rotation_of
 
+# The supported camera models: number in binary files, and parameters in order.
 MODELS = {
     "SIMPLE_PINHOLE": (0, "f cx cy"),
     "PINHOLE": (1, "fx fy cx cy"),
@@ -34,9 +35,8 @@ MODELS = {
     "RADIAL": (3, "f cx cy k1 k2"),
     "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2"),
 }
-"""The camera models that our rays can follow: their number in a binary file, and their parameters in order."""
-
-_NUMBERED = {number: name for name, (number, _) in MODELS.items()} | {
+# Names of all camera models by number, so that messages can name unsupported ones.
+_MODEL_NAMES = {number: name for name, (number, _) in MODELS.items()} | {
     5: "OPENCV_FISHEYE",
     6: "FULL_OPENCV",
     7: "FOV",
@@ -46,13 +46,13 @@ _NUMBERED = {number: name for name, (number, _) in MODELS.items()} | {
     11: "RAD_TAN_THIN_PRISM_FISHEYE",
 }
 
-LONGEST_NAME = 4096
-"""Bytes of an image's name; no file system takes more."""
+# The longest image name in bytes; no file system takes longer ones.
+MAX_NAME_BYTES = 4096
 
 
 @dataclass(frozen=True)
 class _Camera:
-    """Of the raster `size`; intrinsics and distortion as in `CapturedView`."""
+    """A camera; `intrinsics` are in pixels of the image size `size`, and `distortion` is k1 k2 p1 p2."""
 
     size: tuple[float, float]
     intrinsics: tuple[float, float, float, float]
@@ -61,6 +61,8 @@ class _Camera:
 
 @dataclass(frozen=True)
 class _Image:
+    """A posed image, with the number of its camera."""
+
     number: int
     camera: int
     name: str
@@ -68,14 +70,17 @@ class _Image:
 
 
 def recognise(path: Path) -> bool:
+    """Return whether the folder has this layout."""
     return _model(path) is not None
 
 
 def read(path: Path, holdout: str | None) -> Capture:
-    """Every eighth existing image tests, by natural order of names. There is no time, and depths are not known.
+    """Read the folder. Test pictures are every eighth existing image, in natural order of names.
+
+    The model gives neither times nor depth ranges.
 
     Raises:
-        DatasetError: the model is damaged, contradicts itself, or has a camera of a model that is not in MODELS.
+        DatasetError: the model is damaged or inconsistent, or has a camera model that is not in MODELS.
         MediaError: an image cannot be read.
     """
     model = _model(path)
@@ -86,15 +91,15 @@ def read(path: Path, holdout: str | None) -> Capture:
     images.sort(key=lambda image: natural_key(image.name))
     found = [(image, find_image(path / "images", images_file, image.name)) for image in images]
     report_missing(images_file, [image.name for image, file in found if file is None], len(found))
-    there = [(image, file) for image, file in found if file is not None]
-    default = [k % HOLD_OUT_EVERY == 0 for k in range(len(there))]
-    tests = holdout_flags(path, [str(file.relative_to(path)) for _, file in there], holdout, default)
-    views = [_view(images_file, cameras, *item, is_test) for item, is_test in zip(there, tests)]
+    existing = [(image, file) for image, file in found if file is not None]
+    default = [k % HOLD_OUT_EVERY == 0 for k in range(len(existing))]
+    tests = holdout_flags(path, [str(file.relative_to(path)) for _, file in existing], holdout, default)
+    views = [_view(images_file, cameras, *item, is_test) for item, is_test in zip(existing, tests, strict=True)]
     return Capture("COLMAP", tuple(views), None)
 
 
 def _model(path: Path) -> tuple[Path, Path] | None:
-    """The files of cameras and images, binary where there are both."""
+    """Return the files of cameras and images, binary if both forms exist; None without a model."""
     for folder in (path / "sparse" / "0", path / "sparse"):
         for suffix in (".bin", ".txt"):
             files = folder / f"cameras{suffix}", folder / f"images{suffix}"
@@ -106,7 +111,7 @@ def _model(path: Path) -> tuple[Path, Path] | None:
 def _view(images_file: Path, cameras: dict[int, _Camera], image: _Image, file: Path, is_test: bool) -> CapturedView:
     where = f"{images_file} image {image.number}"
     if image.camera not in cameras:
-        raise DatasetError(f"{where}: is of camera {image.camera}, which the model lacks; export it anew")
+        raise DatasetError(f"{where}: its camera {image.camera} is missing from the model; export the model anew")
     camera = cameras[image.camera]
     return image_view(
         file,
@@ -127,24 +132,25 @@ def _read_cameras(file: Path) -> dict[int, _Camera]:
     with _damage(file):
         for number, model, size, params in _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file):
             if number in found:
-                raise DatasetError(f"{file}: camera {number} is there twice; export the model anew")
+                raise DatasetError(f"{file}: camera {number} is listed twice; export the model anew")
             found[number] = _camera(f"{file} camera {number}", model, size, params)
     return found
 
 
 def _camera(where: str, model: str, size: tuple[int, int], params: tuple[float, ...]) -> _Camera:
-    """Pixel coordinates are ours: the middle of the first pixel is at (0.5, 0.5)."""
+    """Return a camera from COLMAP's parameters, whose pixel coordinates are ours: pixel centres are at + 0.5."""
     names = MODELS[model][1].split()
     if len(params) != len(names):
         raise DatasetError(f"{where}: {len(params)} parameters, but {model} has {len(names)}; export the model anew")
     if not all(map(math.isfinite, params)):
         raise DatasetError(f"{where}: holds NaN or infinity; calibrate it anew")
-    value = dict(zip(names, params))
+    value = dict(zip(names, params, strict=True))
     fl_x = value["f"] if "f" in value else value["fx"]
     fl_y = value.get("fy", fl_x)
     if not (fl_x > 0 and fl_y > 0 and min(size) > 0):
         raise DatasetError(
-            f"{where}: focal length {fl_x:g} x {fl_y:g} and size {size[0]}x{size[1]} must be positive; calibrate it anew"
+            f"{where}: focal length {fl_x:g} x {fl_y:g} and size {size[0]}x{size[1]} must be positive; "
+            "calibrate it anew"
         )
     k1, k2, p1, p2 = (value.get(name, 0.0) for name in ("k1", "k2", "p1", "p2"))
     return _Camera((float(size[0]), float(size[1])), (fl_x, fl_y, value["cx"], value["cy"]), (k1, k2, p1, p2))
@@ -155,7 +161,7 @@ def _read_images(file: Path) -> list[_Image]:
     with _damage(file):
         for number, pose, camera, name in _binary_images(file) if file.suffix == ".bin" else _text_images(file):
             if number in numbers or name in names:
-                raise DatasetError(f"{file}: image {number} ({printable(name)}) is there twice; export the model anew")
+                raise DatasetError(f"{file}: image {number} ({printable(name)}) is listed twice; export the model anew")
             numbers.add(number)
             names.add(name)
             images.append(_Image(number, camera, name, _camera_to_world(f"{file} image {number}", pose)))
@@ -165,26 +171,25 @@ def _read_images(file: Path) -> list[_Image]:
 
 
 def _camera_to_world(where: str, pose: tuple[float, ...]) -> np.ndarray:
-    """(4, 4), OpenGL, from the quaternion w x y z and the translation of x_camera = R x_world + t (y down, z forward)."""
+    """Return the (4, 4) OpenGL pose of x_camera = R x_world + t (y down, z forward); `pose` is w x y z of R, then t."""
     length = math.hypot(*pose[:4])
     if not (all(map(math.isfinite, pose)) and 0 < length < math.inf):
         raise DatasetError(f"{where}: pose holds NaN, infinity or no rotation; remove the image or calibrate it anew")
-    rotation = rotation_of(np.array(pose[:4]) / length)  # which would overflow with some of them
+    rotation = rotation_of(np.array(pose[:4]) / length)  # normalised first, since large entries would overflow
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = rotation.T * [1, -1, -1]
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # what overflows is refused with the other poses that are not finite
+    # A translation that overflows is refused later, with other poses that are not finite.
+    with np.errstate(over="ignore", invalid="ignore"):
         camera_to_world[:3, 3] = -rotation.T @ np.array(pose[4:])
     return camera_to_world
 
 
 def _binary_cameras(file: Path) -> Iterator[tuple[int, str, tuple[int, int], tuple[float, ...]]]:
     with open(file, "rb") as stream:
-        for _ in range(_take(stream, "<Q")[0]):
-            number, model_number, width, height = _take(stream, "<IiQQ")
-            model = _supported(f"{file} camera {number}", _NUMBERED.get(model_number, f"number {model_number}"))
-            yield number, model, (width, height), _take(stream, f"<{len(MODELS[model][1].split())}d")
+        for _ in range(_unpack(stream, "<Q")[0]):
+            number, model_number, width, height = _unpack(stream, "<IiQQ")
+            model = _supported(f"{file} camera {number}", _MODEL_NAMES.get(model_number, f"number {model_number}"))
+            yield number, model, (width, height), _unpack(stream, f"<{len(MODELS[model][1].split())}d")
 
 
 def _text_cameras(file: Path) -> Iterator[tuple[int, str, tuple[int, int], tuple[float, ...]]]:
@@ -201,10 +206,10 @@ def _text_cameras(file: Path) -> Iterator[tuple[int, str, tuple[int, int], tuple
 def _binary_images(file: Path) -> Iterator[tuple[int, tuple[float, ...], int, str]]:
     with open(file, "rb") as stream:
         left = os.fstat(stream.fileno()).st_size
-        for _ in range(_take(stream, "<Q")[0]):
-            number, *pose, camera = _take(stream, "<I7dI")
+        for _ in range(_unpack(stream, "<Q")[0]):
+            number, *pose, camera = _unpack(stream, "<I7dI")
             name = _name(stream)
-            points_bytes = _take(stream, "<Q")[0] * struct.calcsize("<ddQ")
+            points_bytes = _unpack(stream, "<Q")[0] * struct.calcsize("<ddQ")
             if points_bytes > left - stream.tell():
                 raise EOFError("it ends early")
             stream.seek(points_bytes, os.SEEK_CUR)
@@ -212,7 +217,7 @@ def _binary_images(file: Path) -> Iterator[tuple[int, tuple[float, ...], int, st
 
 
 def _text_images(file: Path) -> Iterator[tuple[int, tuple[float, ...], int, str]]:
-    """Two lines an image; the second, of points, may be empty or, at the end of the file, missing."""
+    """Read two lines per image; the second, its points, may be empty or missing at the end of the file."""
     with _text(file) as lines:
         for line in _records(lines):
             words = line.split(maxsplit=9)
@@ -231,8 +236,9 @@ def _supported(where: str, model: str) -> str:
     return model
 
 
-def _take(stream: BinaryIO, layout: str) -> tuple[int, ...]:
-    """The next numbers of a binary file, by a layout of `struct`. Nothing is ever read by a count alone."""
+def _unpack(stream: BinaryIO, layout: str) -> tuple[int, ...]:
+    """Read the next numbers of a binary file, by a format of `struct`; nothing is allocated by a count from the
+    file."""
     data = stream.read(struct.calcsize(layout))
     if len(data) < struct.calcsize(layout):
         raise EOFError("it ends early")
@@ -244,8 +250,8 @@ def _name(stream: BinaryIO) -> str:
     while (byte := stream.read(1)) != b"\0":
         if not byte:
             raise EOFError("it ends early")
-        if len(name) == LONGEST_NAME:
-            raise ValueError(f"a name of more than {LONGEST_NAME} bytes")
+        if len(name) == MAX_NAME_BYTES:
+            raise ValueError(f"a name of more than {MAX_NAME_BYTES} bytes")
         name += byte
     return os.fsdecode(bytes(name))
 
@@ -255,7 +261,7 @@ def _text(file: Path) -> TextIO:
 
 
 def _records(lines: TextIO) -> Iterator[str]:
-    """Stripped lines that are neither empty nor a comment. Between two of them the caller may read on."""
+    """Yield stripped lines that are neither empty nor comments. The caller may read lines in between."""
     while line := lines.readline():
         if line.strip() and not line.lstrip().startswith("#"):
             yield line.strip()
@@ -263,7 +269,7 @@ def _records(lines: TextIO) -> Iterator[str]:
 
 @contextlib.contextmanager
 def _damage(file: Path) -> Iterator[None]:
-    """Turn what reading a file that is not as documented raises into a DatasetError."""
+    """Turn the exceptions raised by a malformed file into a DatasetError."""
     try:
         yield
     except (EOFError, ValueError, OverflowError) as error:

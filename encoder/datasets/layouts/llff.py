@@ -1,7 +1,9 @@
-"""LLFF and Neural 3D Video: `poses_bounds.npy` beside `cam*.mp4`, or beside `images/`.
+"""The layouts of LLFF and Neural 3D Video: `poses_bounds.npy` beside `images/` or beside `cam*.mp4`.
 
-Row n of `poses_bounds.npy` belongs to the n-th file in natural order: 15 numbers are a 3x5 matrix by rows with columns
-[down right backwards centre | (h w f)], then come near and far depth. (https://github.com/Fyusion/LLFF)
+Row n of `poses_bounds.npy` belongs to the n-th file in natural order. Its first 15 numbers are a 3x5 matrix by rows,
+with the columns [down right backwards centre | (h w f)]; near and far depth follow.
+
+Source: https://github.com/Fyusion/LLFF
 """
 
 from pathlib import Path
@@ -19,18 +21,21 @@ from kpc.encoder.datasets.capture import (
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import IMAGE_SUFFIXES, VIDEO_SUFFIXES, image_size, probe
 
-POSES = "poses_bounds.npy"
+POSES = "poses_bounds.npy"  # the file of poses and depth ranges
 
 
 def recognise(path: Path) -> bool:
+    """Return whether the folder has this layout."""
     return (path / POSES).is_file()
 
 
 def read(path: Path, holdout: str | None) -> Capture:
-    """Videos if there are any, else `images/`. Held out by default: the first video, or every eighth image.
+    """Read the folder: its videos if there are any, else `images/`.
+
+    Test pictures are those of the first video, or every eighth image.
 
     Raises:
-        DatasetError: as many poses as files are needed, finite, with a positive focal length and 0 < near < far.
+        DatasetError: there are not as many poses as files, or a pose, focal length or depth range is invalid.
         MediaError: a file cannot be read.
     """
     videos = [f for f in path.iterdir() if f.suffix.lower() in VIDEO_SUFFIXES]
@@ -39,15 +44,17 @@ def read(path: Path, holdout: str | None) -> Capture:
     if not files and (path / "images").is_dir():
         files = [f for f in (path / "images").iterdir() if f.suffix.lower() in IMAGE_SUFFIXES]
     if not files:
-        raise DatasetError(f"{path}: {POSES}, but neither cam*.mp4 nor images/ beside it; copy the videos there")
+        raise DatasetError(f"{path}: has {POSES}, but neither cam*.mp4 nor images/; copy the videos or images there")
     files.sort(key=lambda file: natural_key(file.name))
     rows = _read_poses(path / POSES)
     kind = "videos" if is_video else "images"
     if len(rows) != len(files):
-        raise DatasetError(f"{path / POSES}: {len(rows)} poses for {len(files)} {kind}; remove what does not match")
+        raise DatasetError(
+            f"{path / POSES}: {len(rows)} poses for {len(files)} {kind}; remove those that do not belong together"
+        )
     default = [k == 0 if is_video else k % HOLD_OUT_EVERY == 0 for k in range(len(files))]
     tests = holdout_flags(path, [str(f.relative_to(path)) for f in files], holdout, default)
-    views = tuple(_view(path, number, *item) for number, item in enumerate(zip(files, rows, tests)))
+    views = tuple(_view(path, number, *item) for number, item in enumerate(zip(files, rows, tests, strict=True)))
     fps = views[0].video.fps if views[0].video else None
     return Capture("N3DV" if is_video else "LLFF", views, fps)
 

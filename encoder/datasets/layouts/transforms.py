@@ -1,4 +1,7 @@
-"""What Blender's and nerfstudio's `transforms*.json` share: a camera and a list of frames that may override it."""
+"""Reading of `transforms*.json`, common to the layouts of Blender and nerfstudio.
+
+The document describes a camera and lists frames, which may override it.
+"""
 
 import json
 import math
@@ -10,6 +13,7 @@ from kpc.encoder.datasets.capture import CapturedView, image_view
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import image_size
 
+# Camera models of nerfstudio that are not a pinhole with k1 k2 p1 p2.
 _UNSUPPORTED = {
     "OPENCV_FISHEYE",
     "EQUIRECTANGULAR",
@@ -21,10 +25,10 @@ _UNSUPPORTED = {
 
 
 def load_transforms(file: Path) -> dict[str, Any]:
-    """The JSON object, with a list `frames` of objects that have `file_path` and `transform_matrix`.
+    """Read the document and check that it has a list `frames` of objects with `file_path` and `transform_matrix`.
 
     Raises:
-        DatasetError: it is not that.
+        DatasetError: it is not JSON or lacks those.
     """
     try:
         document = json.loads(file.read_text())
@@ -40,10 +44,17 @@ def load_transforms(file: Path) -> dict[str, Any]:
 
 
 def frame_view(file: Path, number: int, document: dict[str, Any], image: Path, is_test: bool) -> CapturedView:
-    """A frame's view; the frame's own keys go before the document's.
+    """Return the view of a frame, whose keys override those of the document.
+
+    Args:
+        file: the document's path, for messages.
+        number: of the frame.
+        document: from `load_transforms`.
+        image: the frame's image.
+        is_test: whether it is held out.
 
     Raises:
-        DatasetError: a number is missing, malformed, or of a camera model other than a pinhole with k1 k2 p1 p2.
+        DatasetError: a number is missing or malformed, or the camera is not a pinhole with at most k1 k2 p1 p2.
     """
     where = f"{file} frame {number}"
     keys = {**{k: v for k, v in document.items() if k != "frames"}, **document["frames"][number]}
@@ -81,17 +92,17 @@ def frame_view(file: Path, number: int, document: dict[str, Any], image: Path, i
 
 
 def frame_rate(file: Path, document: dict[str, Any]) -> float | None:
-    """The key `fps`, an extension of ours; None where it is absent."""
+    """Return the frame rate from the key `fps`, an extension of KPC; None if it is absent."""
     if document.get("fps") is None:
         return None
     fps = _number(str(file), document, "fps")
     if not (math.isfinite(fps) and fps > 0):
-        raise DatasetError(f"{file}: fps {fps:g} must be positive; correct it")
+        raise DatasetError(f"{file}: fps {fps:g} must be a positive number; correct it")
     return fps
 
 
 def _focal(where: str, keys: dict[str, Any], width: float) -> float:
-    """fl_x in pixels, from itself or from the horizontal angle of view: width / 2 / tan(angle / 2)."""
+    """Return fl_x in pixels, from that key or from the horizontal angle of view: width / 2 / tan(angle / 2)."""
     if "fl_x" in keys or "camera_angle_x" not in keys:
         return _number(where, keys, "fl_x")
     angle = _number(where, keys, "camera_angle_x")
@@ -100,8 +111,13 @@ def _focal(where: str, keys: dict[str, Any], width: float) -> float:
     return width / 2 / math.tan(angle / 2)
 
 
-def _number(where: str, keys: dict[str, Any], key: str, otherwise: float | None = None) -> float:
-    value = keys.get(key, otherwise)
+def _number(where: str, keys: dict[str, Any], key: str, default: float | None = None) -> float:
+    """Return a number of the document, or its default.
+
+    Raises:
+        DatasetError: it is missing without a default, or not a number.
+    """
+    value = keys.get(key, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise DatasetError(f"{where}: {key} is {'missing' if value is None else 'not a number'}; add it or export anew")
     return float(value)

@@ -1,0 +1,266 @@
+"""Loading of datasets: recognise the layout, check it, and decode its pictures, masks and times."""
+
+import hashlib
+import math
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from kpc.encoder.datasets.capture import Capture, CapturedView
+from kpc.encoder.datasets.dataset import Dataset, Pictures
+from kpc.encoder.datasets.layouts import blender, colmap, llff, nerfstudio
+from kpc.encoder.datasets.masks import FOLDER, find_masks, load_masks
+from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
+from kpc.format.common.errors import DatasetError, MediaError
+from kpc.format.common.media import read_image, read_video
+from kpc.format.common.progress import Progress
+from kpc.format.scene.scene import Clip
+
+# The first layout that recognises a folder reads it: formats to which a COLMAP model is exported precede COLMAP's own.
+LAYOUTS = (llff, blender, nerfstudio, colmap)
+
+# Frame rate of images with times whose dataset does not give one, frames per second.
+ASSUMED_FPS = 30.0
+
+
+def load_dataset(
+    path: str | os.PathLike[str],
+    cache_dir: str | os.PathLike[str],
+    *,
+    holdout: str | None = None,
+    downscale: int = 1,
+    progress: bool = True,
+) -> Dataset:
+    """Read a dataset: recognise its layout by its content, decode its pictures and masks, and read its cameras.
+
+    Decoded pictures are cached on disk and reused.
+
+    Args:
+        path: the dataset's folder.
+        cache_dir: made if it does not exist; holds one pixels-*.bin per dataset and downscale.
+        holdout: the file to hold out for testing, "none", or None for the layout's default.
+        downscale: every block of downscale^2 pixels is averaged to one; the remainder on the right and below is
+            cropped. A block is usable if all its pixels are.
+        progress: whether to report progress on stderr.
+
+    Raises:
+        DatasetError: the folder does not exist, has no known layout, is inconsistent, its masks leave nothing to train
+            on, or the cache's disk is full.
+        MediaError: a video, image or mask cannot be read.
+    """
+    root = Path(path)
+    try:
+        capture = _recognise(root, holdout)
+        _check(root, capture, downscale)
+        return _load(root, capture, find_masks(root, capture.views), Path(cache_dir), downscale, progress)
+    except PermissionError as error:
+        raise DatasetError(
+            f"{error.filename or root}: no permission to read it; change its permissions or run as its owner"
+        ) from error
+
+
+def _recognise(root: Path, holdout: str | None) -> Capture:
+    """Read the folder as the first layout that recognises it."""
+    if not root.is_dir():
+        problem = "not a directory" if root.exists() else "no such directory"
+        raise DatasetError(f"{root}: {problem}; give a folder of posed videos or images")
+    if not any(root.iterdir()):
+        raise DatasetError(f"{root}: empty directory; give a folder of posed videos or images")
+    for layout in LAYOUTS:
+        if layout.recognise(root):
+            return layout.read(root, holdout)
+    raise DatasetError(
+        f"{root}: no dataset layout recognised; it needs one of: poses_bounds.npy (N3DV, LLFF), transforms_train.json "
+        "(Blender, D-NeRF), transforms.json (nerfstudio, instant-ngp), sparse/0 with cameras and images (COLMAP)"
+    )
+
+
+def _check(root: Path, capture: Capture, downscale: int) -> None:
+    """Refuse captures that cannot be trained on."""
+    train = [view for view in capture.views if not view.is_test]
+    if not train:
+        raise DatasetError(
+            f"{root}: every picture is held out, none is left to train on; give --holdout none or add cameras"
+        )
+    centres = np.stack([view.camera_to_world[:3, 3] for view in train])
+    if np.ptp(centres, axis=0).max() <= 1e-6 * max(1.0, np.abs(centres).max()):
+        raise DatasetError(
+            f"{root}: a single camera that does not move ({train[0].file.name}): depth cannot be reconstructed from "
+            "one viewpoint; add cameras"
+        )
+    for view in capture.views:
+        if downscale < 1 or min(view.width, view.height) < downscale:
+            raise DatasetError(
+                f"{view.file}: {view.width}x{view.height} cannot be downscaled by {downscale}; lower --downscale"
+            )
+
+
+def _load(
+    root: Path, capture: Capture, mask_files: list[Path | None], cache_dir: Path, downscale: int, progress: bool
+) -> Dataset:
+    views, frame_count = capture.views, _common_frames(root, capture.views)
+    lengths = [frame_count if view.video else 1 for view in views]
+    view_of = np.repeat(np.arange(len(views)), lengths)  # the view of each picture
+    frame = np.concatenate([np.arange(n) for n in lengths])
+    key = hashlib.sha256(f"{root.resolve()} {downscale}".encode()).hexdigest()[:12]
+    cache = _cached_pixels(root, views, frame_count, cache_dir / f"pixels-{key}.bin", downscale, progress)
+    masks = load_masks(root, views, mask_files, cache_dir / f"pixels-{key}-masks.bin", downscale, progress)
+    times, clip = _times(root, capture, view_of, frame, frame_count)
+    intrinsics = np.array([v.intrinsics for v in views])[view_of] / downscale
+    distortion = np.array([v.distortion for v in views])[view_of]
+    poses = np.stack([v.camera_to_world for v in views])[view_of]
+    files = tuple(views[v].file.relative_to(root).as_posix() for v in view_of)
+    camera, first = _distinct(np.concatenate([poses.reshape(-1, 16), intrinsics, distortion], axis=1))
+    pictures = Pictures(
+        file=files,
+        camera=camera,
+        time=times.astype(np.float32),
+        is_test=np.array([v.is_test for v in views])[view_of],
+        offset=np.array([t.offset for t in cache.tiles], np.int64),
+        width=np.array([t.width for t in cache.tiles], np.int32),
+        height=np.array([t.height for t in cache.tiles], np.int32),
+        intrinsics=intrinsics,
+        distortion=distortion,
+        camera_to_world=poses,
+        near=np.array([v.near for v in views], np.float32)[view_of],
+        far=np.array([v.far for v in views], np.float32)[view_of],
+    )
+    names = tuple(Path(files[p]).stem for p in first)
+    if masks is not None and not masks.counts[~pictures.is_test].any():
+        raise DatasetError(
+            f"{root / FOLDER}: 0 means ignored, and that is every pixel to train on; invert the masks or move them away"
+        )
+    is_dynamic = clip.frame_count > 1
+    return Dataset(capture.layout, root, pictures, cache, clip, is_dynamic, cache.channels == 4, names, masks)
+
+
+def _common_frames(root: Path, views: tuple[CapturedView, ...]) -> int:
+    """Return the number of frames that all videos have, at least; 1 without videos."""
+    videos = {view.file.name: view.video for view in views if view.video}
+    rates = {round(video.fps, 3) for video in videos.values()}
+    if len(rates) > 1:
+        raise DatasetError(f"{root}: videos run at {min(rates):g} to {max(rates):g} fps; convert them to the same rate")
+    counts = {name: video.frame_count for name, video in videos.items()}
+    fewest, most = min(counts.values(), default=1), max(counts.values(), default=1)
+    if fewest < most:
+        short = min(counts, key=lambda name: counts[name])
+        print(
+            f"{root}: videos have {fewest} ({short}) to {most} frames; the first {fewest} of each are used",
+            file=sys.stderr,
+        )
+    return fewest
+
+
+def _times(
+    root: Path, capture: Capture, view_of: np.ndarray, frame: np.ndarray, frame_count: int
+) -> tuple[np.ndarray, Clip]:
+    """Return the time of each picture in [0, 1], and the clip.
+
+    For videos the time is frame / (frames - 1). For images it is the dataset's if all are within [0, 1], else shifted
+    and scaled to [0, 1]; the frame count of their clip follows from the median step between times of training images.
+    """
+    if capture.views[0].video:
+        return frame / max(frame_count - 1, 1), Clip(frame_count, float(capture.fps or ASSUMED_FPS))
+    given = [view.time for view in capture.views]
+    if all(time is None for time in given):
+        return np.zeros(len(view_of)), Clip(1, ASSUMED_FPS)
+    if any(time is None or not math.isfinite(time) for time in given):
+        number = next(k for k, time in enumerate(given) if time is None or not math.isfinite(time))
+        name = capture.views[number].file.name
+        raise DatasetError(
+            f"{root}: {name} has no valid time while other images have one; give every image a time, or none"
+        )
+    times = np.array(given, np.float64)
+    low, high = times.min(), times.max()
+    if low < 0 or high > 1:
+        print(f"{root}: times run from {low:g} to {high:g}; scaled to [0, 1]", file=sys.stderr)
+        times = (times - low) / (high - low) if high > low else np.zeros_like(times)
+    steps = np.diff(np.unique(np.round(times[[not view.is_test for view in capture.views]], 6)))
+    count = min(1 + round(1 / float(np.median(steps))), len(times)) if len(steps) else 1
+    return times, Clip(count, float(capture.fps or ASSUMED_FPS))
+
+
+def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number distinct rows in order of first appearance: (P,) int32 numbers, and the first row of each number."""
+    _, first, inverse = np.unique(np.round(rows, 9), axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return rank[inverse.ravel()].astype(np.int32), first[order]
+
+
+def _cached_pixels(
+    root: Path, views: tuple[CapturedView, ...], frame_count: int, file: Path, downscale: int, progress: bool
+) -> PixelCache:
+    """Open the cache of decoded pictures if it is up to date, else build it."""
+    sources = [
+        (view.file.relative_to(root).as_posix(), view.file.stat().st_size, view.file.stat().st_mtime_ns)
+        for view in views
+    ]
+    fingerprint = fingerprint_of(sources, frame_count, downscale)
+    cache = open_cache(file, fingerprint)
+    if cache is not None:
+        return cache
+    total = sum(frame_count if view.video else 1 for view in views)
+    channels = 4 if any(view.has_alpha for view in views) else 3
+    pixels = sum(
+        (view.width // downscale) * (view.height // downscale) * (frame_count if view.video else 1) for view in views
+    )
+    with Progress(f"decoding {root.name}", total, "picture", shown=progress) as bar:
+
+        def pictures() -> Iterator[np.ndarray]:
+            for view in views:
+                for picture in _decoded(view, frame_count):
+                    yield downscale_picture(picture, downscale)
+                    bar.advance()
+
+        return build_cache(file, fingerprint, pictures(), channels, pixels * channels)
+
+
+def _decoded(view: CapturedView, frame_count: int) -> Iterator[np.ndarray]:
+    """Yield the image of a view, or the first `frame_count` frames of its video."""
+    if view.video is None:
+        yield read_image(view.file)
+        return
+    count = 0
+    for picture in read_video(view.file, view.video, frame_count):
+        yield picture
+        count += 1
+    if count != frame_count:
+        raise MediaError(
+            f"{view.file}: only {count} of its {view.video.frame_count} frames can be decoded; encode or copy it anew"
+        )
+
+
+def downscale_picture(picture: np.ndarray, factor: int) -> np.ndarray:
+    """Average blocks of factor^2 pixels; the remainder on the right and below is cropped.
+
+    Colours are weighted by straight alpha, rgb = sum(rgb a) / sum(a); fully transparent blocks take the unweighted
+    mean.
+
+    Args:
+        picture: (H, W, 3 or 4) uint8.
+        factor: side of a block, pixels.
+    """
+    if factor == 1:
+        return picture
+    height, width = picture.shape[0] // factor, picture.shape[1] // factor
+    shape = (height, factor, width, factor, picture.shape[2])
+    blocks = picture[: height * factor, : width * factor].reshape(shape).astype(np.uint32)
+    area = factor * factor
+    mean = (_block_sum(blocks) + area // 2) // area
+    if picture.shape[2] == 4:
+        alpha = _block_sum(blocks[..., 3:])
+        rgb = _block_sum(blocks[..., :3] * blocks[..., 3:])
+        mean[..., :3] = np.where(alpha > 0, (rgb + alpha // 2) // np.maximum(alpha, 1), mean[..., :3])
+    return mean.astype(np.uint8)
+
+
+def _block_sum(blocks: np.ndarray) -> np.ndarray:
+    """Sum (H, factor, W, factor, C) uint32 to (H, W, C); adding slices is several times faster than sum((1, 3))."""
+    total = np.zeros_like(blocks[:, 0, :, 0])
+    for j, i in np.ndindex(blocks.shape[1], blocks.shape[3]):
+        total += blocks[:, j, :, i]
+    return total
