@@ -67,6 +67,6 @@ def render(
     from kpc.player.cpu import reference
 
     parts = scene.blend_at(time) if appearance is None else [(*scene.at(time), 1.0)]
-    return reference.mixed(
+    return reference.blend(
         [(reference.render(shown, camera, t, appearance=appearance), weight) for shown, t, weight in parts]
     )
