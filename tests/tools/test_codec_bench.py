@@ -10,7 +10,7 @@ import pytest
 from datasets import write_n3dv
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container import scene_io
-from kpc.tools.bench import codec_bench, kpbench, plot, results
+from kpc.tools.bench import codec_bench, kpbench, plot, results, tables
 from kpc.tools.bench.baselines import Bytes, Half, Planes, Video
 from kpc.tools.bench.codec_bench import headline
 from kpc.tools.bench.rd_curves import Point, bd_rate, size_at
@@ -64,10 +64,10 @@ def test_what_a_table_shows() -> None:
 def test_sizes_at_equal_loss_beside_the_smallest_at_hand() -> None:
     curves = {"kpc": points(0.6), "kpc without tuning": points(0.1), "PNG": points(2.0), "AV1": points(1.0), "HEVC": []}
     records = [{"name": "scene", "coder": coder, "points": curve} for coder, curve in curves.items()]
-    head, row = results._loss_table(records)
+    head, row = tables.loss_table(records)
     assert head == ["scene", "0.05 dB", "0.1 dB", "0.2 dB", "0.5 dB", "1 dB", "2 dB"]
     assert row == ["scene", "-", *(f"{0.6 * 2 ** (3 - loss):.0f} KB, 40% (AV1)" for loss in (0.1, 0.2, 0.5, 1.0, 2.0))]
-    assert results._loss_table(records[:1])[1][2:] == [
+    assert tables.loss_table(records[:1])[1][2:] == [
         f"{0.6 * 2 ** (3 - loss):.0f} KB" for loss in (0.1, 0.2, 0.5, 1.0, 2.0)
     ]
 
@@ -135,7 +135,7 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
         assert found["setting"] == f"quality {quality}"
         # A file's own rounding is not much finer; and errors leap where a plane of so few texels leaves the trellis for predictions.
         assert 0 <= found["agreement_db"] - (20 + quality / 3) < 1.5
-    assert "| scene | 60 | 70 | 80 | 90 |" in results.markdown(records)
+    assert "| scene | 60 | 70 | 80 | 90 |" in tables.markdown(records)
     others = codec_bench.others_bytes(scene_file)
     assert min(p["size_bytes"] for p in halves["points"]) > others > 100
     assert all(found["size_bytes"] - found["planes_bytes"] == others for found in halves["points"])
@@ -143,8 +143,8 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
         of_planes = found["shares"].get("PLNE", 0) + found["shares"]["index"]
         assert found["planes_bytes"] == pytest.approx(of_planes * found["size_bytes"])
     assert halves["bd_rate_planes"] < halves["bd_rate"] < 0
-    assert all("its own probe" == record["settings"]["judged_by"] for record in records)
-    assert "kpc is smaller by" in said.err and "Coding, beside what is at hand" in results.markdown(records)
+    assert all(record["settings"]["evaluated_on"] == "its own validation rays" for record in records)
+    assert "kpc is smaller by" in said.err and "Coding, beside general-purpose codecs" in tables.markdown(records)
     with (tmp_path / "codec.csv").open() as table:
         rows = list(csv.DictReader(table))
     assert len(rows) == 6 + 7 * 4 + 6 + 5 and [len(one["points"]) for one in without] == [4] * 7
@@ -181,7 +181,7 @@ def test_what_was_measured_before_an_end_is_not_measured_again(
     assert not notes.exists() and len(results.load([out])[0]["points"]) == 6
     # Of another state of the code nothing is taken over.
     notes.write_text(json.dumps({"commit": "another"}) + "\n" + json.dumps([asked[0], None]) + "\n")
-    assert codec_bench.Notes(notes, {"commit": "this"}).read() == {}
+    assert codec_bench.PointLog(notes, {"commit": "this"}).read() == {}
 
 
 def test_a_rival_that_is_tuned_comes_nearer_and_codes_every_plane_once(
@@ -219,7 +219,7 @@ def test_held_out_views_judge(few: None, scene_file: Path, tmp_path: Path, monke
     out = tmp_path / "codec.json"
     assert kpbench.main(["codec", str(scene_file), "--dataset", str(tmp_path / "set"), "--out", str(out)]) == 0
     records = results.load([out])
-    assert records[0]["settings"]["judged_by"] == "held-out views of set"
+    assert records[0]["settings"]["evaluated_on"] == "held-out views of set"
     psnrs = {round(p["psnr"] + p["loss_db"], 6) for record in records for p in record["points"]}
     assert len(psnrs) == 1 and 3 < psnrs.pop() < 25  # one uncoded scene, and not what these pictures show
 

@@ -15,7 +15,7 @@ from kpc.encoder.field.config import PRESETS
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.scene_io import write
 from kpc.player.quality import DEFAULT, LEVELS
-from kpc.tools.bench import kpbench, machine_limits, plot, results
+from kpc.tools.bench import harness, kpbench, machine_limits, plot, results, tables
 from kpc.tools.bench.provenance import data_hash
 from scenes import tiny_scene
 
@@ -36,7 +36,7 @@ def here(monkeypatch: pytest.MonkeyPatch, one_thread: None, few_rays: None) -> N
         work, job = pickle.loads(pickle.dumps((work, job)))
         return pickle.loads(pickle.dumps(work(job)))
 
-    monkeypatch.setattr(kpbench, "_alone", alone)
+    monkeypatch.setattr(harness, "isolated", alone)
     monkeypatch.setitem(PRESETS, "draft", SMALL)
 
 
@@ -58,7 +58,7 @@ def test_encode_records_every_repeat(here: None, tmp_path: Path, capsys: pytest.
     assert record["data_sha256"] == data_hash(tmp_path / "tiny")
     assert record["settings"] == {"preset": "draft", "steps": 3, "time_budget_s": None, "downscale": 1, "test_views": 1,
                                   "space": "auto", "box": [-1, -1, -1, 1, 1, 1], "psnr_db": 3.0}  # fmt: skip
-    assert all(run["trade"] == "psnr_db" for run in record["repeats"]) and "--psnr 3" in results.markdown([record])
+    assert all(run["trade"] == "psnr_db" for run in record["repeats"]) and "--psnr 3" in tables.markdown([record])
     assert [run["seed"] for run in record["repeats"]] == [5, 6]
     for run in record["repeats"]:
         kept = tmp_path / "kept" / run["file"]
@@ -66,7 +66,7 @@ def test_encode_records_every_repeat(here: None, tmp_path: Path, capsys: pytest.
         assert run["test_pictures"] == 1 and run["test_psnr"] > 3 and run["peak_memory_bytes"] > 1 << 26
     names = [f"tiny-draft-{seed}.{kind}" for seed in (5, 6) for kind in ("kpc", "kpck")]
     assert sorted(p.name for p in (tmp_path / "kept").iterdir()) == names
-    assert "PSNR dB" in said.err and results.markdown([record])
+    assert "PSNR dB" in said.err and tables.markdown([record])
 
 
 def test_step_sets_training_beside_plain_pytorch_and_the_machine(
@@ -90,7 +90,7 @@ def test_step_sets_training_beside_plain_pytorch_and_the_machine(
     (run,) = record["repeats"]
     assert run["rays_per_s"] > run["plain_rays_per_s"] > 0 and run["limits"]["gflops"] > 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["step.json", "tiny"]
-    assert "plain PyTorch" in capsys.readouterr().err and "faster" in results.markdown([record])
+    assert "plain PyTorch" in capsys.readouterr().err and "speedup" in tables.markdown([record])
 
 
 def test_curve_encodes_anew_for_each_time(here: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -110,7 +110,7 @@ def test_curve_encodes_anew_for_each_time(here: None, tmp_path: Path, capsys: py
         assert run["size_bytes"] == (tmp_path / "kept" / run["file"]).stat().st_size
     assert len(list((tmp_path / "kept").glob("*.kpc"))) == 2
     assert records[0]["repeats"][0]["steps"] < records[1]["repeats"][0]["steps"]
-    assert said.out == "" and "training" in said.err and "against time" in results.markdown(records)
+    assert said.out == "" and "training" in said.err and "against time" in tables.markdown(records)
     assert plot.main([str(out), "-o", str(tmp_path / "curve.svg")]) == 0
     assert "held-out PSNR, dB" in (tmp_path / "curve.svg").read_text()
 
@@ -145,7 +145,7 @@ def test_ablate_changes_one_thing_at_a_time(
     whole, half, added = (record["repeats"][0] for record in records)
     assert added["test_psnr"] > 5 and "size_bytes" not in added  # no file can hold it
     assert whole["parameters"] > 1.8 * half["parameters"] and whole["steps"] == half["steps"] == 3
-    assert "changed" in capsys.readouterr().err and "half the channels" in results.markdown(records)
+    assert "variant" in capsys.readouterr().err and "half the channels" in tables.markdown(records)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ablate.json", "tiny"]
 
 
@@ -180,9 +180,9 @@ def test_player_measures_every_quality(tmp_path: Path, capsys: pytest.CaptureFix
         assert run["gpu_memory_bytes"] > 0 and record["accuracy"]["samples_per_ray"] > 0 and record["renderer"]
         if record["settings"]["quality"] == "reference":
             assert record["accuracy"]["psnr"] > 50 and record["accuracy"]["within_one_level"] > 0.999
-            assert record["accuracy"]["psnr_turning"] > 50 and run["times_reference"] == 1
-            assert record["accuracy"]["psnr_least"] == record["accuracy"]["psnr_least_turning"] == 100
-            most, folding = record["accuracy"]["folding_most"], record["accuracy"]["folding_psnr"]
+            assert record["accuracy"]["psnr_moving"] > 50 and run["speedup_over_reference"] == 1
+            assert record["accuracy"]["psnr_min"] == record["accuracy"]["psnr_min_moving"] == 100
+            most, folding = record["accuracy"]["folding_max_error"], record["accuracy"]["folding_psnr"]
             assert (
                 (most < 1e-5 and folding == 100)
                 if record["name"] == "still"
@@ -191,32 +191,32 @@ def test_player_measures_every_quality(tmp_path: Path, capsys: pytest.CaptureFix
         else:
             assert "folding_psnr" not in record["accuracy"]
         if record["settings"]["quality"] == DEFAULT:
-            assert min(record["accuracy"]["psnr_least"], record["accuracy"]["psnr_least_turning"]) > 35
+            assert min(record["accuracy"]["psnr_min"], record["accuracy"]["psnr_min_moving"]) > 35
     assert plot.main([str(out), "-o", str(tmp_path / "player.svg")]) == 0
-    assert "milliseconds a frame" in (tmp_path / "player.svg").read_text()
+    assert "milliseconds per frame" in (tmp_path / "player.svg").read_text()
 
 
 def test_stream_measures_how_soon_scenes_are_seen(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gl.context()
-    monkeypatch.setattr(kpbench, "_alone", lambda work, job: work(job))
+    monkeypatch.setattr(harness, "isolated", lambda work, job: work(job))
     moving, still = tiny_file(tmp_path / "moving.kpc", True), tiny_file(tmp_path / "still.kpc", False)
     out = tmp_path / "out.json"
     assert kpbench.main(["stream", str(moving), str(still), "--size", "48x36", "--out", str(out)]) == 0
     first, second = results.load([out])
-    assert "first picture ms" in capsys.readouterr().err and "| still | " in results.markdown([second])
+    assert "first picture ms" in capsys.readouterr().err and "| still | " in tables.markdown([second])
     for record in (first, second):
         (run,) = record["repeats"]
-        for place in ("disk", "line"):
-            stages = ("open", "first_picture", "finest_picture", "all")
+        for place in ("disk", "network"):
+            stages = ("open", "first_picture", "full_detail", "complete")
             open_ms, first_ms, finest_ms, all_ms = (run[f"{place}_{stage}_ms"] for stage in stages)
             assert 0 < open_ms < first_ms < finest_ms <= all_ms
-        assert 0 < run["line_first_picture_bytes"] <= run["size_bytes"]
+        assert 0 < run["network_first_picture_bytes"] <= run["size_bytes"]
         sizes, quality = ([prefix[key] for prefix in record["prefixes"]] for key in ("bytes", "psnr"))
         assert sizes == sorted(sizes) and sizes[-1] == run["size_bytes"] and quality[-1] > 80 > quality[0]
-    assert first["repeats"][0]["jumps"] >= first["repeats"][0]["jumps_that_waited"] > 0
-    assert "jump_ms" not in second["repeats"][0]
+    assert first["repeats"][0]["seeks"] >= first["repeats"][0]["seeks_that_waited"] > 0
+    assert "seek_ms" not in second["repeats"][0]
 
 
 def test_what_was_measured_survives_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,18 +5,19 @@ from pathlib import Path
 
 import pytest
 from kpc.format.common.errors import FormatError
-from kpc.tools.bench import plot, results
+from kpc.tools.bench import plot
+from kpc.tools.bench.records import Record
 
 MACHINE = {"cpu": "Test CPU", "cores": 2, "memory_bytes": 8 << 30, "os": "Linux", "python": "3.11"}
 
 
-def record(name: str, seconds: float, psnrs: list[float | None], **changes: object) -> results.Record:
+def record(name: str, seconds: float, psnrs: list[float | None], **changes: object) -> Record:
     runs = [
         dict(test_psnr=psnr, test_ssim=None if psnr is None else psnr / 40, size_bytes=1000 * seconds, train_s=seconds + k,
              encode_s=2 * seconds, steps=100)
         for k, psnr in enumerate(psnrs)
     ]  # fmt: skip
-    made: results.Record = dict(kind="curve", name=name, commit="0" * 40, command="kpbench curve", renderer="cpu")
+    made: Record = dict(kind="curve", name=name, commit="0" * 40, command="kpbench curve", renderer="cpu")
     return made | dict(machine=MACHINE, settings={"preset": "fast"}, repeats=runs) | changes
 
 

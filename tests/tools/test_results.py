@@ -3,17 +3,18 @@ from pathlib import Path
 
 import pytest
 from kpc.format.common.errors import FormatError
-from kpc.tools.bench import results
+from kpc.tools.bench import results, tables
+from kpc.tools.bench.records import Record, median
 
 MACHINE = {"cpu": "Test CPU", "cores": 2, "memory_bytes": 8 << 30, "os": "Linux", "python": "3.11"}
 
 
-def encode_record(name: str, psnrs: list[float | None], **changes: object) -> results.Record:
-    run: results.Record = dict(
+def encode_record(name: str, psnrs: list[float | None], **changes: object) -> Record:
+    run: Record = dict(
         test_ssim=0.9, size_bytes=345678, bits_per_parameter=1.25, identity_share=None, coding_loss_db=0.1
     )
     run |= dict(train_s=100.0, encode_s=120.0, rays_per_s=23456.0, peak_memory_bytes=9e8)
-    record: results.Record = dict(
+    record: Record = dict(
         kind="encode", name=name, commit="0123456789abcdef", command=f"kpbench encode {name}", renderer="cpu"
     )
     record |= dict(machine=MACHINE, settings={"preset": "fast"}, repeats=[run | {"test_psnr": psnr} for psnr in psnrs])
@@ -22,29 +23,27 @@ def encode_record(name: str, psnrs: list[float | None], **changes: object) -> re
 
 def test_a_cell_is_the_median_of_the_repeats_that_have_it() -> None:
     record = encode_record("room", [30.0, None, 32.0, 33.0])
-    assert results.median(record, "test_psnr") == 32.0
-    assert results.median(record, "identity_share") is None
-    head, row = results.cells("encode", [record])
+    assert median(record, "test_psnr") == 32.0
+    assert median(record, "identity_share") is None
+    head, row = tables.cells("encode", [record])
     assert dict(zip(head, row))["PSNR dB"] == "32.00" and dict(zip(head, row))["identity"] == "-"
     assert dict(zip(head, row))["file KB"] == "346" and dict(zip(head, row))["rays/s"] == "23,456"
 
 
 def test_tables_are_split_by_machine_and_say_where_they_come_from() -> None:
     other = encode_record("liam", [28.0], machine=MACHINE | {"cores": 64}, commit="f" * 40 + "+dirty")
-    text = results.markdown([encode_record("room", [30.0, 31.0]), other, encode_record("fox", [20.0, 21.0])])
+    text = tables.markdown([encode_record("room", [30.0, 31.0]), other, encode_record("fox", [20.0, 21.0])])
     first, second = text.split("**Encoding**")[1:]
     assert "Test CPU, 2 cores, 8 GiB" in first and "| room | fast | 30.50 |" in first and "| fox |" in first
     assert "Commit 012345678; median of 2 runs; `kpbench encode room`; `kpbench encode fox`." in first
     assert "64 cores" in second and "Commit fffffffff+dirty; median of 1 run;" in second
 
 
-def player_records(name: str, size: str = "320x240", renderer: str = "llvmpipe") -> list[results.Record]:
-    accuracy = dict.fromkeys(("samples_per_ray", "psnr_least", "psnr_turning", "within_one_level"), 0.5) | {
-        "psnr": 41.6
-    }
+def player_records(name: str, size: str = "320x240", renderer: str = "llvmpipe") -> list[Record]:
+    accuracy = dict.fromkeys(("samples_per_ray", "psnr_min", "psnr_moving", "within_one_level"), 0.5) | {"psnr": 41.6}
     return [
         encode_record(name, [30.0], kind="player", accuracy=accuracy, renderer=renderer, repeats=[{"fps": 31.4}],
-                      settings={"quality": quality, "default": "balanced", "size": size})
+                      settings={"quality": quality, "default_quality": "balanced", "size": size})
         for quality in ("fast", "balanced", "fine", "reference")
     ]  # fmt: skip
 
@@ -52,7 +51,7 @@ def player_records(name: str, size: str = "320x240", renderer: str = "llvmpipe")
 def test_documents_show_only_the_default_quality_and_the_reference() -> None:
     each = [*player_records("room"), encode_record("liam", [1.0])]
     document = "".join(f"<!-- {kind}: begin -->\n<!-- {kind}: end -->\n" for kind in ("player", "encode"))
-    every, few = results.markdown(each), results.written(document, each)
+    every, few = tables.markdown(each), results.with_tables(document, each)
     assert every.count("| room |") == 4 and few.count("| room |") == 2 and few.count("| liam |") == 1
     assert "| balanced (default) |" in few and "| reference |" in few
 
@@ -64,7 +63,7 @@ def test_at_a_glance_each_scene_that_a_processor_plays_is_beside_its_encoding() 
     )
     played = [player_records("room-fast", "640x480"), player_records("room-fast"), player_records("room-fast", "640x480", "NVIDIA"),
               player_records("fox-fast", "640x480")]  # fmt: skip
-    head, _, *rows = results.glance([scene, asked, *(record for records in played for record in records)]).splitlines()
+    head, _, *rows = tables.glance([scene, asked, *(record for records in played for record in records)]).splitlines()
     assert rows == ["| room | fast | 30.00 | 0.900 | 346 | 2 | 2 | 31 | 42 |"] and head.count("|") == rows[0].count("|")
 
 
@@ -95,7 +94,7 @@ def test_records_without_a_place_are_named_and_nothing_is_written(
     document.write_text("<!-- step: begin --><!-- step: end -->")
     records.write_text(json.dumps([encode_record("room", [30.0])]))
     assert results.main([str(records), "--into", str(document)]) == 1
-    assert "no place for tables of encode" in capsys.readouterr().err
+    assert "no markers for tables of encode" in capsys.readouterr().err
     assert document.read_text() == "<!-- step: begin --><!-- step: end -->"
 
 
@@ -113,11 +112,11 @@ def test_documents_without_a_pair_of_markers_a_name_are_refused(tmp_path: Path, 
     document = tmp_path / "a.md"
     document.write_text(text)
     with pytest.raises(FormatError, match="needs lines such as"):
-        results.names_in(document)
+        results.marked_names(document)
 
 
 @pytest.mark.parametrize("document", ["README.md", "docs/benchmarks.md"])
 def test_committed_records_make_the_tables_of_the_documents(document: str) -> None:
     root = Path(__file__).parents[2]
     text = (root / document).read_text()
-    assert results.written(text, results.load(sorted((root / "docs" / "bench").glob("*.json")))) == text
+    assert results.with_tables(text, results.load(sorted((root / "docs" / "bench").glob("*.json")))) == text

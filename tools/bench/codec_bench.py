@@ -89,7 +89,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Notes:
+class PointLog:
     """A file that points are noted in as they are found, a line each, so that a bench that was interrupted goes on.
 
     Attributes:
@@ -118,10 +118,10 @@ class Notes:
 
 
 def measure(
-    scene: Path, dataset: Path | None, processes: int, ablate: bool, notes: Notes | None = None
+    scene: Path, dataset: Path | None, processes: int, ablate: bool, log: PointLog | None = None
 ) -> list[dict[str, Any]]:
     """The coders, ours first, then, to `ablate`, WITHOUT: each its name, its points (or why it has none) and by how much ours is smaller.
-    What `notes` hold is not measured again.
+    What `log` holds is not measured again.
 
     Raises:
         KpcError: the scene or the dataset cannot be used, or a coder failed.
@@ -141,12 +141,12 @@ def measure(
     missing = {name: why for name, rival in others_at_hand.items() if (why := rival.missing())}
     jobs += [Job(scene, name, setting) for name, rival in others_at_hand.items() if name not in missing
              for setting in reversed(rival.settings)]  # fmt: skip
-    points = {} if notes is None else notes.begin()
+    points = {} if log is None else log.begin()
     left = [job for job in jobs if job.key not in points]
     for job, found_point in zip(left, in_parallel(left, views, processes), strict=True):
         points[job.key] = found_point
-        if notes is not None:
-            notes.add(job.key, found_point)
+        if log is not None:
+            log.add(job.key, found_point)
     coders = []
     for name in (*ours, *others_at_hand):
         found = [one for job in jobs if job.coder == name and (one := points[job.key]) is not None]

@@ -82,9 +82,9 @@ def measure(scene: Path) -> dict[str, dict[str, float]]:
             segments.append(Segment(*told, side_info, encode_segment(*told[:2], side_info, told[2])))
     values = sum(plane.symbols.size for planes in quantised.scales for plane in planes.values())
     found = {
-        "nothing": _decoded(pack(chunks, values))
+        "baseline": _decoded(pack(chunks, values))
         | {"file_bytes": scene.stat().st_size, "read_ms": _median_ms(partial(read, scene.read_bytes()))},
-        "all of them: zstd": _decoded(
+        "zstd": _decoded(
             pack([replace(chunk, coded={}) if chunk.kind == "PLNE" else chunk for chunk in chunks], values)
         ),
     }
@@ -307,19 +307,19 @@ def _with_map(segment: Segment) -> int:
 
 
 LEFT_OUT: dict[str, OfSymbols | OfBlocks | OfMaps] = {
-    "maps that follow from occupancy": OfMaps(),
-    "one set of weights": OfSymbols({}, (1,)),
-    "no weights: mean of left and above": OfSymbols({}, ()),
-    "no contexts of activity": OfSymbols({"residual_context": _by_part}),
-    "no contexts of the fraction": OfSymbols({"residual_context": _by_activity}),
-    "no errors of channels before": OfSymbols({"update_cross_channel": _forget}, steers=True),
-    "stored tables for counters that learn": OfSymbols({"code_bit_adaptive": _note}, size=_tables),
-    "blocks: nothing of borders": OfBlocks({}, borders=False),
-    "blocks: no signs by borders": OfBlocks({"sign_bias": _no_pull}),
-    "blocks: no levels around": OfBlocks({"level_context": _frequency_alone}),
-    "blocks: no frequency": OfBlocks({"level_context": _without_frequency}),
-    "blocks: no channel before": OfBlocks({"level_context": _without_before}),
-    "blocks: counters that know nothing at first": OfBlocks(
+    "signalled significance maps": OfMaps(),
+    "one set of prediction weights": OfSymbols({}, (1,)),
+    "prediction by the mean of left and above": OfSymbols({}, ()),
+    "no activity contexts": OfSymbols({"residual_context": _by_part}),
+    "no fraction contexts": OfSymbols({"residual_context": _by_activity}),
+    "no residuals of earlier channels": OfSymbols({"update_cross_channel": _forget}, steers=True),
+    "static probability tables": OfSymbols({"code_bit_adaptive": _note}, size=_tables),
+    "transform: no boundary prediction": OfBlocks({}, borders=False),
+    "transform: no sign contexts": OfBlocks({"sign_bias": _no_pull}),
+    "transform: no neighbouring levels": OfBlocks({"level_context": _frequency_alone}),
+    "transform: no frequency contexts": OfBlocks({"level_context": _without_frequency}),
+    "transform: no earlier channel": OfBlocks({"level_context": _without_before}),
+    "transform: uniform initial probabilities": OfBlocks(
         {"level_counters": _even_levels, "sign_counters": _even_signs}
     ),
 }

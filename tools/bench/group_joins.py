@@ -30,7 +30,7 @@ class Frame:
     frame: int
     group: int
     psnr: float
-    change: float | None
+    error_change: float | None
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Join:
 
     frame: int
     agreement_db: float
-    before: float
-    after: float
-    change: float
-    usual_change: float
-    high_change: float
+    psnr_before: float
+    psnr_after: float
+    error_change: float
+    median_error_change: float
+    p95_error_change: float
 
 
 def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
@@ -106,12 +106,14 @@ def _joins(groups: Groups, frames: list[Frame], agreements: list[list[float]]) -
         {start, *range(after.start - first + 1, before.last - first + 1)}
         for start, before, after in zip(starts, spans, spans[1:], strict=False)
     ]
-    others = [f.change for f in frames if f.change is not None and not any(f.frame in some for some in shared)] or [0.0]
+    others = [
+        f.error_change for f in frames if f.error_change is not None and not any(f.frame in some for some in shared)
+    ] or [0.0]
     found = []
     for start, some, agreement in zip(starts, shared, agreements[1:], strict=True):
         before = [f.psnr for f in frames if start - AROUND <= f.frame < start]
         after = [f.psnr for f in frames if start <= f.frame < start + AROUND]
-        change = max(f.change for f in frames if f.frame in some and f.change is not None)
+        change = max(f.error_change for f in frames if f.frame in some and f.error_change is not None)
         numbers = (np.mean(before), np.mean(after), change, np.median(others), np.quantile(others, 0.95))
         found.append(Join(start, float(np.mean(agreement)) if agreement else float("nan"), *map(float, numbers)))
     return found

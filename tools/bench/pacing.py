@@ -1,5 +1,6 @@
-"""What kpbench measures of a window that is left to itself: how often it shows a picture, on how fine a raster, and how near to the exact one."""
+"""What `kpbench window` measures: frame rate, resolution and accuracy of a window under quality control."""
 
+import itertools
 import math
 import statistics
 import time as clock
@@ -12,27 +13,28 @@ from kpc.format.common.fidelity import psnr
 from kpc.player.app.desktop import glfw
 from kpc.player.app.preferences import Preferences
 from kpc.player.gl import offscreen
+from kpc.tools.bench.harness import size_text
 from kpc.tools.bench.playback_stability import in_window
 
+# Time until the resolution has settled.
 LEAD_IN_S = 5.0
-"""Until the raster has settled."""
+
+# Number of pictures, evenly spread over the duration, that are compared with the reference.
 COMPARED = 12
-"""Pictures of what is shown, evenly over the time, that are compared with exact ones."""
 
 
 @dataclass(frozen=True)
 class Pacing:
-    """What one run is told."""
+    """One run: a scene, the size of the window, the duration, and how fast the camera orbits the scene meanwhile."""
 
     scene: Path
     size: tuple[int, int]
     seconds: int
-    turn: float
-    """Degrees a second around the scene."""
+    turn: float  # degrees per second
 
 
 def measure(job: Pacing) -> dict[str, Any]:
-    """Play in a window, as kpplay begins, for so long.
+    """Play in a window with the settings that kpplay starts with.
 
     Raises:
         DisplayError: there is no display.
@@ -54,18 +56,19 @@ def measure(job: Pacing) -> dict[str, Any]:
             rasters.append(player.scene_view.raster)
             if now - began - LEAD_IN_S >= job.seconds * len(kept) / COMPARED:
                 kept.append((player.state.view, player.state.playback.time, player.scene_view.pixels()))
-        each = []
+        psnrs = []
         for player.state.view, player.state.playback.time, shown in kept:
             player.scene_view.draw("reference", still=True)
-            each.append(psnr(shown / 255, player.scene_view.pixels() / 255))
+            psnrs.append(psnr(shown / 255, player.scene_view.pixels() / 255))
         middle = statistics.median_high(rasters)
+        changes = sum(a != b for a, b in itertools.pairwise(rasters))
         return {
             "renderer": offscreen.describe(player.window.ctx),
             "fps": len(seconds) / sum(seconds),
             "frame_ms_p95": 1e3 * float(np.percentile(seconds, 95)),
-            "raster": "{}x{}".format(*middle),
+            "raster": size_text(middle),
             "raster_share": middle[0] * middle[1] / (job.size[0] * job.size[1]),
-            "rasters_a_minute": 60 * sum(a != b for a, b in zip(rasters, rasters[1:])) / sum(seconds),
-            "psnr": float(np.mean(each)),
-            "psnr_least": min(each),
+            "raster_changes_per_minute": 60 * changes / sum(seconds),
+            "psnr": float(np.mean(psnrs)),
+            "psnr_min": min(psnrs),
         }

@@ -1,4 +1,4 @@
-"""What kpbench measures of long playback: that it takes no more memory the longer it lasts, and makes nothing anew on the card."""
+"""What `kpbench steady` measures: whether long playback takes ever more memory or creates graphics objects."""
 
 import contextlib
 import os
@@ -21,26 +21,46 @@ from kpc.player.app.window import Window
 from kpc.player.gl import offscreen
 from kpc.player.streaming.group_playback import GroupPlayback
 
-MAKERS = ("texture", "texture3d", "texture_array", "texture_cube", "depth_texture", "buffer", "framebuffer", "simple_framebuffer",
-          "renderbuffer", "vertex_array", "simple_vertex_array", "program", "sampler", "compute_shader", "query")  # fmt: skip
-"""What of a moderngl context makes something on the card."""
-WARM_SHARE = 0.2
-"""Of the frames, that come before those that are compared: caches fill, arenas grow to what a frame takes."""
-LOOKS_AT_MEMORY = 100
+# The methods of a moderngl context that create an object on the graphics card.
+CREATORS = (
+    "buffer",
+    "compute_shader",
+    "depth_texture",
+    "framebuffer",
+    "program",
+    "query",
+    "renderbuffer",
+    "sampler",
+    "simple_framebuffer",
+    "simple_vertex_array",
+    "texture",
+    "texture3d",
+    "texture_array",
+    "texture_cube",
+    "vertex_array",
+)
+
+# Share of the frames that are not measured: until then caches fill and allocators grow to what a frame needs.
+WARM_UP_SHARE = 0.2
+
+# Number of samples of the memory in use.
+MEMORY_SAMPLES = 100
+
+# Angle in radians by which the camera orbits per frame.
 TURN = 0.01
 
 
 @dataclass(frozen=True)
-class Steady:
-    """What one run is told."""
+class LongPlay:
+    """One run: a scene, the size of the window, and the number of frames to draw."""
 
     scene: Path
     size: tuple[int, int]
     frames: int
 
 
-def measure(job: Steady) -> dict[str, Any]:
-    """Play in a window, all panels shown, the camera turning, for so many frames.
+def measure(job: LongPlay) -> dict[str, Any]:
+    """Play in a window with all panels open while the camera orbits the scene.
 
     Raises:
         DisplayError: there is no display.
@@ -48,45 +68,51 @@ def measure(job: Steady) -> dict[str, Any]:
     with in_window(job.scene, job.size, Preferences(graphs=True, planes=True)) as player:
         window, stream = player.window, player.state.stream
         player.state.visible.path = True
-        player.state.quality.resolution = ResolutionController(
-            budget_s=3600.0
-        )  # the raster stays as it is, however busy the machine
+        # With so large a budget, the resolution never changes, however busy the machine is.
+        player.state.quality.resolution = ResolutionController(budget_s=3600.0)
         for _ in range(2):
             player.actions.add_keyframe()
         while not stream.is_settled:
             player.frame()
-        made = count_makers(window.ctx)
-        every = max(job.frames // LOOKS_AT_MEMORY, 1)
-        numbers, held, warm = [], [], int(WARM_SHARE * job.frames)
+        created = count_created(window.ctx)
+        every = max(job.frames // MEMORY_SAMPLES, 1)
+        numbers, memory, warm = [], [], int(WARM_UP_SHARE * job.frames)
         started = clock.perf_counter()
         for number in range(job.frames):
             if number == warm:
-                made.clear()
+                created.clear()
             glfw.poll_events()
             player.state.view = player.state.view.orbit(TURN, 0.0)
             player.frame()
             if number >= warm and number % every == 0:
                 numbers.append(number)
-                held.append(memory_bytes())
+                memory.append(memory_bytes())
         seconds = clock.perf_counter() - started
-        slope = float(np.polyfit(numbers, held, 1)[0]) if len(held) > 1 else 0.0
+        slope = float(np.polyfit(numbers, memory, 1)[0]) if len(memory) > 1 else 0.0
         return {
             "renderer": offscreen.describe(window.ctx),
             "fps": job.frames / seconds,
-            "first_bytes": held[0],
-            "last_bytes": held[-1],
-            "most_bytes": max(held),
+            "first_bytes": memory[0],
+            "last_bytes": memory[-1],
+            "peak_bytes": max(memory),
             "bytes_per_1000_frames": 1000 * slope,
+<<<<<<< HEAD
             "held_bytes": held,
             "made_on_card": sum(made.values()),
             "made": dict(made),
             "gpu_memory_bytes": player.scene_view.renderer.memory_bytes,
+=======
+            "memory_samples_bytes": memory,
+            "gpu_objects_created": sum(created.values()),
+            "gpu_objects_by_kind": dict(created),
+            "gpu_memory_bytes": player.renderer.memory_bytes,
+>>>>>>> d7d8040 (Split kpbench and its tables by duty, with plain keys in records)
         }
 
 
 @contextlib.contextmanager
 def in_window(scene: Path, size: tuple[int, int], preferences: Preferences) -> Iterator[Player]:
-    """A player that waits for no screen.
+    """Open a player whose window does not wait for the refresh of the screen.
 
     Raises:
         DisplayError: there is no display.
@@ -100,24 +126,24 @@ def in_window(scene: Path, size: tuple[int, int], preferences: Preferences) -> I
             yield player
 
 
-def count_makers(ctx: moderngl.Context) -> Counter[str]:
-    """How often each of MAKERS is called from now on."""
-    made: Counter[str] = Counter()
+def count_created(ctx: moderngl.Context) -> Counter[str]:
+    """Return a counter of the objects that `ctx` creates from now on, by the method of CREATORS."""
+    created: Counter[str] = Counter()
 
-    def counted(name: str, make: Callable[..., Any]) -> Callable[..., Any]:
+    def counted(name: str, create: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            made[name] += 1
-            return make(*args, **kwargs)
+            created[name] += 1
+            return create(*args, **kwargs)
 
         return call
 
-    for name in MAKERS:
+    for name in CREATORS:
         setattr(ctx, name, counted(name, getattr(ctx, name)))
-    return made
+    return created
 
 
 def memory_bytes() -> int:
-    """That this process holds now; where the system does not tell, the most it has held."""
+    """Return the memory that this process uses now, or its peak where the system reports only that."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:

@@ -1,13 +1,13 @@
-"""Quality and size against seconds of training, from records of `kpbench curve`; rate against distortion, from `kpbench codec`;
-PSNR frame by frame, from `kpbench groups`; milliseconds a frame against nearness to the reference, from `kpbench player`.
+"""Draw benchmark records.
 
-python -m kpc.tools.bench.plot docs/bench/curve.json -o docs/curve.svg
-python -m kpc.tools.bench.plot docs/bench/codec.json -o docs/codec.svg
-python -m kpc.tools.bench.plot docs/bench/groups.json -o docs/groups.svg
-python -m kpc.tools.bench.plot docs/bench/player.json -o docs/player.svg
+    python -m kpc.tools.bench.plot docs/bench/curve.json -o docs/curve.svg
+    python -m kpc.tools.bench.plot docs/bench/codec.json -o docs/codec.svg
+    python -m kpc.tools.bench.plot docs/bench/groups.json -o docs/groups.svg
+    python -m kpc.tools.bench.plot docs/bench/player.json -o docs/player.svg
 
-Of training: one panel for each of PSNR, SSIM and file size; a line for each dataset and preset goes through the medians of its repeats,
-which are dots. Time runs on a logarithmic axis. The ending of the name chooses SVG, PNG or PDF. Needs kpc[bench].
+Records of `kpbench curve` give quality and size against training time, those of `codec` rate against distortion, those
+of `groups` the PSNR of each frame, those of `player` accuracy against frame time. The suffix of the output chooses SVG,
+PNG or PDF. Needs `pip install kpc[bench]`.
 """
 
 import argparse
@@ -18,32 +18,41 @@ from pathlib import Path
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, UsageError
 from kpc.tools.bench import results
+from kpc.tools.bench.records import Record, median
+from kpc.tools.bench.tables import is_ours
 from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+# Panels of the training plot: the key of a repeat, the title, and the unit of the axis.
 PANELS = (("test_psnr", "held-out PSNR, dB", 1.0), ("test_ssim", "held-out SSIM", 1.0), ("size_bytes", "file, KB", 1e3))
-"""Keys of a repeat, what they are, and their units."""
-ENDINGS = (".svg", ".png", ".pdf")
+
+SUFFIXES = (".svg", ".png", ".pdf")
+
 PANEL_INCHES = (3.6, 3.2)
 RATE_PANEL_INCHES = (4.6, 4.0)
-DASHES = ("-", "--", ":", "-.", (0, (1, 3)))
-"""Of our own coder, whole and with something left out, in one colour."""
-DEEPEST_DB = 3.5
-"""Of loss that is drawn; kpbench codec compares down to 3 dB."""
 
-rcParams["svg.fonttype"] = "none"  # text stays text
+# Line styles of KPC's own coder, complete and with parts left out; all of them have one colour.
+DASHES = ("-", "--", ":", "-.", (0, (1, 3)))
+
+# The rate-distortion plot shows losses down to this; `kpc.tools.bench.rd_curves` compares down to 3 dB.
+DEEPEST_DB = 3.5
+
+rcParams["svg.fonttype"] = "none"  # keep text as text
 rcParams["svg.hashsalt"] = "kpc"  # the same records give the same file
 
 
-def curves(records: Sequence[results.Record]) -> Figure:
-    """The plot of records of `kpbench curve`; a panel for which no run has a value is left out.
+def curves(records: Sequence[Record]) -> Figure:
+    """Draw quality and size against training time from records of `kpbench curve`.
+
+    There is a panel for each of PSNR, SSIM and file size for which some run has a value, and in it for each dataset
+    and preset a line through the medians of the repeats, with a dot for each repeat.
 
     Raises:
         FormatError: there is nothing to draw.
     """
-    lines: dict[str, list[results.Record]] = {}
+    lines: dict[str, list[Record]] = {}
     for record in records:
         if record["kind"] == "curve":
             lines.setdefault(f"{record['name']}, {record['settings']['preset']}", []).append(record)
@@ -52,46 +61,55 @@ def curves(records: Sequence[results.Record]) -> Figure:
         raise FormatError("no records of kpbench curve to draw; write some with kpbench curve --out")
     width, height = PANEL_INCHES
     figure = Figure(figsize=(width * len(panels), height), layout="constrained")
-    for axes, (key, title, unit) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
+    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (key, title, unit) in zip(all_axes, panels, strict=True):
         for number, (name, line) in enumerate(lines.items()):
             dots = [(seconds / 60, value / unit) for seconds, value in _dots(line, key)]
-            medians = sorted((results.median(record, "train_s"), results.median(record, key)) for record in line
-                             if _dots([record], key))  # fmt: skip
+            medians = sorted(
+                (median(record, "train_s"), median(record, key)) for record in line if _dots([record], key)
+            )
             axes.plot([s / 60 for s, _ in medians], [v / unit for _, v in medians], color=f"C{number}", label=name)
-            axes.plot(*zip(*dots), "o", markersize=4, color=f"C{number}") if dots else None
+            if dots:
+                axes.plot(*zip(*dots, strict=True), "o", markersize=4, color=f"C{number}")
         axes.set(xlabel="training, minutes", title=title)
         _logarithmic(axes)
     axes.legend()
     return figure
 
 
-def rate_distortion(records: Sequence[results.Record]) -> Figure:
-    """The plot of records of `kpbench codec`: a panel a scene, PSNR against bits per parameter, a line a coder, down to DEEPEST_DB below
-    the best.
+def rate_distortion(records: Sequence[Record]) -> Figure:
+    """Draw PSNR against bits per parameter from records of `kpbench codec`: a panel per scene, a line per coder.
 
     Raises:
         FormatError: there is nothing to draw.
     """
-    scenes: dict[str, list[results.Record]] = {}
+    scenes: dict[str, list[Record]] = {}
     for record in records:
         if record["kind"] == "codec" and record["points"]:
             scenes.setdefault(record["name"], []).append(record)
     if not scenes:
         raise FormatError("no records of kpbench codec to draw; write some with kpbench codec --out")
     names = list(dict.fromkeys(record["coder"] for coders in scenes.values() for record in coders))
-    ours = [name for name in names if results.is_ours(name)]
-    looks = {name: {"color": "C0", "linestyle": DASHES[number % len(DASHES)]} for number, name in enumerate(ours)}
-    looks |= {name: {"color": f"C{1 + number}"} for number, name in enumerate(n for n in names if n not in ours)}
+    ours = [name for name in names if is_ours(name)]
+    styles = {name: {"color": "C0", "linestyle": DASHES[number % len(DASHES)]} for number, name in enumerate(ours)}
+    styles |= {name: {"color": f"C{1 + number}"} for number, name in enumerate(n for n in names if n not in ours)}
     lines = {}
     width, height = RATE_PANEL_INCHES
     figure = Figure(figsize=(width * len(scenes), height), layout="constrained")
-    for axes, (name, coders) in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes.items()):
+    all_axes = figure.subplots(1, len(scenes), squeeze=False)[0]
+    for axes, (name, coders) in zip(all_axes, scenes.items(), strict=True):
         for record in coders:
             points = sorted(record["points"], key=lambda point: float(point["size_bytes"]))
-            is_whole = record["coder"] == "kpc"
-            lines[record["coder"]], = axes.plot(
-                [p["bits_per_parameter"] for p in points], [p["psnr"] for p in points], marker="o", markersize=3,
-                linewidth=2.2 if is_whole else 1, zorder=3 if is_whole else 2, **looks[record["coder"]])  # fmt: skip
+            is_complete = record["coder"] == "kpc"
+            (lines[record["coder"]],) = axes.plot(
+                [p["bits_per_parameter"] for p in points],
+                [p["psnr"] for p in points],
+                marker="o",
+                markersize=3,
+                linewidth=2.2 if is_complete else 1,
+                zorder=3 if is_complete else 2,
+                **styles[record["coder"]],
+            )
         best = max(p["psnr"] for record in coders for p in record["points"])
         axes.set(xlabel="bits per parameter", ylabel="PSNR, dB", title=name, ylim=(best - DEEPEST_DB, best + 0.1))
         _logarithmic(axes)
@@ -99,9 +117,10 @@ def rate_distortion(records: Sequence[results.Record]) -> Figure:
     return figure
 
 
-def per_frame(records: Sequence[results.Record]) -> Figure:
-    """The plot of records of `kpbench groups`: a panel a clip, held-out PSNR of each frame, and how much its error changed from the
-    frame before; groups join at the upright lines.
+def per_frame(records: Sequence[Record]) -> Figure:
+    """Draw the held-out PSNR of each frame, and how much its error differs from that of the frame before.
+
+    The records are those of `kpbench groups`; groups join at the vertical lines.
 
     Raises:
         FormatError: there is nothing to draw.
@@ -111,13 +130,15 @@ def per_frame(records: Sequence[results.Record]) -> Figure:
         raise FormatError("no records of kpbench groups to draw; write some with kpbench groups --out")
     width, height = RATE_PANEL_INCHES
     figure = Figure(figsize=(2 * width * len(clips), 1.5 * height), layout="constrained")
-    for column, record in zip(figure.subplots(2, len(clips), squeeze=False, sharex="col").T, clips):
+    columns = figure.subplots(2, len(clips), squeeze=False, sharex="col").T
+    titles = ("held-out PSNR, dB", "change of the error between frames, 8-bit levels")
+    for column, record in zip(columns, clips, strict=True):
         for camera in sorted({frame["camera"] for frame in record["frames"]}):
             frames = [frame for frame in record["frames"] if frame["camera"] == camera]
             column[0].plot([f["frame"] for f in frames], [f["psnr"] for f in frames], label=camera)
-            changed = [f for f in frames if f["change"] is not None]
-            column[1].plot([f["frame"] for f in changed], [255 * f["change"] for f in changed])
-        for axes, title in zip(column, ("held-out PSNR, dB", "change of the error from frame to frame, 8-bit levels")):
+            changed = [f for f in frames if f["error_change"] is not None]
+            column[1].plot([f["frame"] for f in changed], [255 * f["error_change"] for f in changed])
+        for axes, title in zip(column, titles, strict=True):
             for join in record["joins"]:
                 axes.axvline(join["frame"] - 0.5, color="0.6", linestyle="--", linewidth=1)
             axes.set(title=f"{record['name']}: {title}")
@@ -127,9 +148,10 @@ def per_frame(records: Sequence[results.Record]) -> Figure:
     return figure
 
 
-def qualities(records: Sequence[results.Record]) -> Figure:
-    """The plot of records of `kpbench player`: PSNR to the reference against milliseconds a frame, a line for each scene and size
-    through the rungs of the ladder, the default ringed. The reference itself is left out.
+def quality_levels(records: Sequence[Record]) -> Figure:
+    """Draw PSNR to the reference against frame time from records of `kpbench player`.
+
+    There is a line for each scene and size through all quality levels but the reference; the default is ringed.
 
     Raises:
         FormatError: there is nothing to draw.
@@ -138,36 +160,27 @@ def qualities(records: Sequence[results.Record]) -> Figure:
     for record in records:
         if record["kind"] == "player" and record["settings"]["quality"] != "reference":
             settings = record["settings"]
-            lines.setdefault(f"{record['name']}, {settings['size']}", []).append(
-                (
-                    results.median(record, "frame_ms_median") or 0.0,
-                    record["accuracy"]["psnr"],
-                    settings["quality"] == settings["default"],
-                )
-            )
+            is_default = settings["quality"] == settings["default_quality"]
+            point = (median(record, "frame_ms_median") or 0.0, record["accuracy"]["psnr"], is_default)
+            lines.setdefault(f"{record['name']}, {settings['size']}", []).append(point)
     if not lines:
         raise FormatError("no records of kpbench player to draw; write some with kpbench player --out")
     figure = Figure(figsize=RATE_PANEL_INCHES, layout="constrained")
     axes = figure.subplots()
     for number, (name, points) in enumerate(lines.items()):
-        axes.plot(
-            [ms for ms, *_ in points],
-            [psnr for _, psnr, _ in points],
-            marker="o",
-            markersize=3,
-            color=f"C{number}",
-            label=name,
-        )
-        axes.plot(*zip(*[(ms, psnr) for ms, psnr, default in points if default]), "o", markersize=9, markerfacecolor="none",
-                  color=f"C{number}")  # fmt: skip
-    axes.set(xlabel="milliseconds a frame", ylabel="PSNR to the reference, dB")
+        times, psnrs, _ = zip(*points, strict=True)
+        axes.plot(times, psnrs, marker="o", markersize=3, color=f"C{number}", label=name)
+        for frame_ms, psnr, is_default in points:
+            if is_default:
+                axes.plot(frame_ms, psnr, "o", markersize=9, markerfacecolor="none", color=f"C{number}")
+    axes.set(xlabel="milliseconds per frame", ylabel="PSNR to the reference, dB")
     _logarithmic(axes)
     axes.legend(fontsize=8)
     return figure
 
 
 def _logarithmic(axes: Axes) -> None:
-    """Along x, with plain numbers at 1, 2 and 5; and a grid."""
+    """Make the x axis logarithmic, labelled at 1, 2 and 5 times powers of ten, and draw a grid."""
     axes.set(xscale="log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -176,41 +189,37 @@ def _logarithmic(axes: Axes) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a plot as its ending says.
+    """Write a figure in the format that the suffix of `path` names.
 
     Raises:
-        UsageError: the ending is of no kind that can be written.
+        UsageError: it names no format of SUFFIXES.
     """
-    kind = path.suffix.lower()
-    if kind not in ENDINGS:
-        raise UsageError(f"{path}: plots are {', '.join(ENDINGS)}")
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise UsageError(f"{path}: plots are {', '.join(SUFFIXES)}")
     with cli.atomic_write(path) as aside:
-        figure.savefig(aside, format=kind[1:], metadata={"Date": None} if kind == ".svg" else None)
+        figure.savefig(aside, format=suffix[1:], metadata={"Date": None} if suffix == ".svg" else None)
 
 
-def _dots(line: Sequence[results.Record], key: str) -> list[tuple[float, float]]:
-    """Seconds and values of all repeats that have both."""
+def _dots(line: Sequence[Record], key: str) -> list[tuple[float, float]]:
+    """Return seconds of training and value of all repeats that have both."""
     runs = (run for record in line for run in record["repeats"])
     return [(run["train_s"], run[key]) for run in runs if run.get("train_s") and run.get(key) is not None]
 
 
 def main(argv: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
     return cli.run(_command, "plot", argv)
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(
-        "plot", description="Quality and size against training, rate against distortion, or time against truth."
-    )
-    parser.add_argument(
-        "records", type=Path, nargs="+", help="files that kpbench curve, codec, groups or player --out wrote"
-    )
+    parser = argparse.ArgumentParser("plot", description="Draw records of kpbench curve, codec, groups or player.")
+    parser.add_argument("records", type=Path, nargs="+", help="files that kpbench --out wrote")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .svg, .png or .pdf file to write")
     options = parser.parse_args(argv)
     records = results.load(options.records)
-    draw = {"codec": rate_distortion, "groups": per_frame, "player": qualities}.get(
-        records[0]["kind"] if records else "", curves
-    )
+    kinds = {"codec": rate_distortion, "groups": per_frame, "player": quality_levels}
+    draw = kinds.get(records[0]["kind"] if records else "", curves)
     save(draw(records), options.output)
     print(options.output)
 

@@ -1,6 +1,6 @@
 """Benchmark records: what `kpbench` writes, and the files that hold them.
 
-A record is a JSON object. All kinds have the keys `kind`, `name` (of the dataset or scene), `date`, `commit`, `command`,
+A record is a JSON object. All kinds have the keys `kind`, `name` (dataset or scene), `date`, `commit`, `command`,
 `machine`, `versions`, `load_average`, `data_sha256`, `settings`, `seed`, `renderer` and `repeats`, the list of what
 each run measured; some have more.
 """

@@ -97,7 +97,7 @@ def _command(argv: list[str]) -> None:
         raise FormatError(f"{', '.join(map(str, options.into))}: no markers for tables of {', '.join(sorted(missing))}")
     for document in options.into:
         text = with_tables(document.read_text(), records)
-        with cli.written_aside(document) as aside:
+        with cli.atomic_write(document) as aside:
             aside.write_text(text)
         print(document)
 

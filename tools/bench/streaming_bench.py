@@ -37,15 +37,15 @@ TIMES = (0.1, 0.5, 0.9)
 
 
 @dataclass(frozen=True)
-class Arrival:
-    """What one run is told."""
+class Loading:
+    """One run: a scene, the size of its pictures, and their quality level."""
 
     scene: Path
     size: tuple[int, int]
     quality: Quality
 
 
-def measure(job: Arrival) -> dict[str, Any]:
+def measure(job: Loading) -> dict[str, Any]:
     """The first picture from a disk and over a slow line, a jump of the playhead on a fast one."""
     ctx = offscreen.open_context()
     screen = ctx.simple_framebuffer(job.size, components=4)
@@ -53,7 +53,7 @@ def measure(job: Arrival) -> dict[str, Any]:
     _arrival(ctx, screen, job, str(job.scene))  # drivers keep compiled shaders; all that follows finds them
     found |= {f"disk_{key}": value for key, value in _arrival(ctx, screen, job, str(job.scene)).items()}
     with served(job.scene, "--rate", RATE, "--delay", DELAY) as url:
-        found |= {f"line_{key}": value for key, value in _arrival(ctx, screen, job, url).items()}
+        found |= {f"network_{key}": value for key, value in _arrival(ctx, screen, job, url).items()}
     if read(job.scene).is_dynamic:
         with TemporaryDirectory() as folder:
             with served(_lengthened(job.scene, Path(folder))) as url:
@@ -61,7 +61,7 @@ def measure(job: Arrival) -> dict[str, Any]:
     return found
 
 
-def _arrival(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, source: str) -> dict[str, Any]:
+def _arrival(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Loading, source: str) -> dict[str, Any]:
     """From the address to the first coarse picture, to the first with all scales, and to the last byte.
 
     The first is drawn as finely as the player begins, which on a processor is a quarter of the size."""
@@ -85,12 +85,12 @@ def _arrival(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, 
         "open_ms": 1e3 * (opened - begun),
         "first_picture_ms": 1e3 * (first - begun),
         "first_picture_bytes": received,
-        "finest_picture_ms": 1e3 * (sharp - begun),
-        "all_ms": 1e3 * (ended - begun),
+        "full_detail_ms": 1e3 * (sharp - begun),
+        "complete_ms": 1e3 * (ended - begun),
     }
 
 
-def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, url: str) -> dict[str, Any]:
+def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Loading, url: str) -> dict[str, Any]:
     """From a jump of the playhead to the picture there, in so little memory that its segments have to be fetched."""
     with ExitStack() as stack:
         probe = Stream(open_source(url))
@@ -113,15 +113,15 @@ def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Arrival, ur
             draws.append(1e3 * (clock.perf_counter() - there))
     together = [wait + drawn for wait, drawn in zip(waits, draws)]
     return {
-        "jumps": SEEKS,
-        "jumps_that_waited": missed,
-        "jump_wait_ms": float(np.median(waits)),
-        "jump_ms": float(np.median(together)),
-        "jump_ms_p95": float(np.percentile(together, 95)),
+        "seeks": SEEKS,
+        "seeks_that_waited": missed,
+        "seek_wait_ms": float(np.median(waits)),
+        "seek_ms": float(np.median(together)),
+        "seek_ms_p95": float(np.percentile(together, 95)),
     }
 
 
-def prefixes(job: Arrival) -> list[dict[str, Any]]:
+def prefixes(job: Loading) -> list[dict[str, Any]]:
     """How near the picture of each prefix is to that of the whole file, where a scale, or a segment over all scales, ends."""
     ctx, whole = offscreen.open_context(), read(job.scene).dequantise()
     camera = fit_camera(Rig.of(whole).cameras[0], *job.size)
@@ -168,7 +168,7 @@ def _lengthened(scene: Path, folder: Path) -> Path:
     return path
 
 
-def _drawing(screen: moderngl.Framebuffer, renderer: Renderer, job: Arrival) -> Callable[..., None]:
+def _drawing(screen: moderngl.Framebuffer, renderer: Renderer, job: Loading) -> Callable[..., None]:
     camera = Rig.of(renderer.scene).cameras[0]
 
     def draw(time: float, scale: float = 1.0) -> None:

@@ -332,9 +332,7 @@ def tables(kind: str, records: Iterable[Record]) -> str:
         runs = sorted({len(record["repeats"]) for record in rows})
         commits = ", ".join(dict.fromkeys(_short(record["commit"]) for record in rows))
         commands = "; ".join(dict.fromkeys(f"`{record['command']}`" for record in rows))
-        parts.append(
-            f"Commit {commits}; median of {' or '.join(map(str, runs))} run{'s' * (runs != [1])}; {commands}."
-        )
+        parts.append(f"Commit {commits}; median of {' or '.join(map(str, runs))} run{'s' * (runs != [1])}; {commands}.")
     return "\n\n".join(parts)
 
 
