@@ -1,6 +1,6 @@
-"""What kpbench measures of scenes that play while they arrive.
+"""What `kpbench stream` measures: scenes that play while they load.
 
-The server is a process of its own, so that the player's does not lend it its time.
+The server runs in a process of its own, so that it takes no time from the player's process.
 """
 
 import subprocess
@@ -29,11 +29,17 @@ from kpc.player.streaming.prefetch import Playhead, min_segment_bytes
 from kpc.player.streaming.stream import Stream
 from kpc.player.viewpoints import Rig, fit_camera
 
+# Bit rate and latency of the slow link, as options of kpc.tools.cli.serve.
 RATE, DELAY = "10Mbit", "20ms"
+
+# Number of seeks of the playhead.
 SEEKS = 12
-LONGER = 16
-"""Jumps are measured in a clip that is played so many times in a row: in a short one all that there is has soon come."""
-TIMES = (0.1, 0.5, 0.9)
+
+# Seeks are measured in a clip repeated this many times: a short one would soon be loaded completely.
+REPETITIONS = 16
+
+# Times in [0, 1] at which prefixes are compared with the whole file.
+COMPARED_TIMES = (0.1, 0.5, 0.9)
 
 
 @dataclass(frozen=True)
@@ -46,25 +52,25 @@ class Loading:
 
 
 def measure(job: Loading) -> dict[str, Any]:
-    """The first picture from a disk and over a slow line, a jump of the playhead on a fast one."""
+    """Measure loading from disk (`disk_`) and over a slow link (`network_`), and seeking over a fast link."""
     ctx = offscreen.open_context()
     screen = ctx.simple_framebuffer(job.size, components=4)
     found: dict[str, Any] = {"size_bytes": job.scene.stat().st_size}
-    _arrival(ctx, screen, job, str(job.scene))  # drivers keep compiled shaders; all that follows finds them
-    found |= {f"disk_{key}": value for key, value in _arrival(ctx, screen, job, str(job.scene)).items()}
+    _load(ctx, screen, job, str(job.scene))  # fills the driver's shader cache for all measurements that follow
+    found |= {f"disk_{key}": value for key, value in _load(ctx, screen, job, str(job.scene)).items()}
     with served(job.scene, "--rate", RATE, "--delay", DELAY) as url:
-        found |= {f"network_{key}": value for key, value in _arrival(ctx, screen, job, url).items()}
+        found |= {f"network_{key}": value for key, value in _load(ctx, screen, job, url).items()}
     if read(job.scene).is_dynamic:
-        with TemporaryDirectory() as folder:
-            with served(_lengthened(job.scene, Path(folder))) as url:
-                found |= _jumps(ctx, screen, job, url)
+        with TemporaryDirectory() as folder, served(_repeated(job.scene, Path(folder))) as url:
+            found |= _seeks(ctx, screen, job, url)
     return found
 
 
-def _arrival(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Loading, source: str) -> dict[str, Any]:
-    """From the address to the first coarse picture, to the first with all scales, and to the last byte.
+def _load(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Loading, source: str) -> dict[str, Any]:
+    """Return the times from opening to the first coarse picture, the first one of all scales, and the last byte.
 
-    The first is drawn as finely as the player begins, which on a processor is a quarter of the size."""
+    The first picture has the resolution that the player starts with.
+    """
     begun = clock.perf_counter()
     with ExitStack() as stack:
         stream = Stream(open_source(source))
@@ -72,72 +78,74 @@ def _arrival(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Loading, 
         opened = clock.perf_counter()
         renderer = Renderer(ctx, stream.scene, job.quality)
         draw = _drawing(screen, renderer, job)
-        _until(stream, renderer, lambda: stream.complete_scales > 0 and stream.can_show(0.0))
+        _upload_until(stream, renderer, lambda: stream.complete_scales > 0 and stream.can_show(0.0))
         received = stream.received
         draw(0.0, ResolutionController.of(is_software(ctx)).scale)
         first = clock.perf_counter()
-        _until(stream, renderer, lambda: stream.complete_scales == len(stream.scene.scales) and stream.can_show(0.0))
+        all_scales = len(stream.scene.scales)
+        _upload_until(stream, renderer, lambda: stream.complete_scales == all_scales and stream.can_show(0.0))
         draw(0.0)
-        sharp = clock.perf_counter()
-        _until(stream, renderer, lambda: stream.is_settled)
-        ended = clock.perf_counter()
+        full_detail = clock.perf_counter()
+        _upload_until(stream, renderer, lambda: stream.is_settled)
+        complete = clock.perf_counter()
     return {
         "open_ms": 1e3 * (opened - begun),
         "first_picture_ms": 1e3 * (first - begun),
         "first_picture_bytes": received,
-        "full_detail_ms": 1e3 * (sharp - begun),
-        "complete_ms": 1e3 * (ended - begun),
+        "full_detail_ms": 1e3 * (full_detail - begun),
+        "complete_ms": 1e3 * (complete - begun),
     }
 
 
-def _jumps(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Loading, url: str) -> dict[str, Any]:
-    """From a jump of the playhead to the picture there, in so little memory that its segments have to be fetched."""
+def _seeks(ctx: moderngl.Context, screen: moderngl.Framebuffer, job: Loading, url: str) -> dict[str, Any]:
+    """Return the times from a seek to its picture, with so little memory that segments have to be fetched again."""
     with ExitStack() as stack:
-        probe = Stream(open_source(url))
-        stack.callback(probe.close)
-        stream = Stream(open_source(url), memory=probe.fixed_bytes + min_segment_bytes(probe.parts))
+        measured = Stream(open_source(url))
+        stack.callback(measured.close)
+        stream = Stream(open_source(url), memory=measured.fixed_bytes + min_segment_bytes(measured.parts))
         stack.callback(stream.close)
         renderer = Renderer(ctx, stream.scene, job.quality)
         draw = _drawing(screen, renderer, job)
-        _until(stream, renderer, lambda: stream.is_settled)
+        _upload_until(stream, renderer, lambda: stream.is_settled)
         draw(0.0)
-        waits, draws, missed = [], [], 0
+        waits, draws, waited = [], [], 0
         for time in np.random.default_rng(0).permutation(np.linspace(0.0, 1.0, SEEKS)):
             started = clock.perf_counter()
             stream.set_playhead(Playhead(float(time)))
-            missed += not stream.can_show(float(time))
-            _until(stream, renderer, lambda time=float(time): stream.can_show(time))  # type: ignore[misc]
-            there = clock.perf_counter()
+            waited += not stream.can_show(float(time))
+            _upload_until(stream, renderer, lambda time=float(time): stream.can_show(time))  # type: ignore[misc]
+            loaded = clock.perf_counter()
             draw(float(time), ResolutionController.of(is_software(ctx)).scale)
-            waits.append(1e3 * (there - started))
-            draws.append(1e3 * (clock.perf_counter() - there))
-    together = [wait + drawn for wait, drawn in zip(waits, draws)]
+            waits.append(1e3 * (loaded - started))
+            draws.append(1e3 * (clock.perf_counter() - loaded))
+    totals = [wait + drawn for wait, drawn in zip(waits, draws, strict=True)]
     return {
         "seeks": SEEKS,
-        "seeks_that_waited": missed,
+        "seeks_that_waited": waited,
         "seek_wait_ms": float(np.median(waits)),
-        "seek_ms": float(np.median(together)),
-        "seek_ms_p95": float(np.percentile(together, 95)),
+        "seek_ms": float(np.median(totals)),
+        "seek_ms_p95": float(np.percentile(totals, 95)),
     }
 
 
 def prefixes(job: Loading) -> list[dict[str, Any]]:
-    """How near the picture of each prefix is to that of the whole file, where a scale, or a segment over all scales, ends."""
+    """Return the PSNR of prefixes of the file to the whole, at each end of a scale or of a segment of all scales."""
     ctx, whole = offscreen.open_context(), read(job.scene).dequantise()
     camera = fit_camera(Rig.of(whole).cameras[0], *job.size)
     scene = PartialScene(SceneReader(str(job.scene), in_parts=True))
     reference = Renderer(ctx, whole)
-    wanted = [reference.render(camera, time).rgb.clip(0, 1) for time in TIMES]
+    wanted = [reference.render(camera, time).rgb.clip(0, 1) for time in COMPARED_TIMES]
     entries = [scene.entry(int(number)) for number in scene.numbers]
     found = []
-    for at, (entry, number) in enumerate(zip(entries, scene.numbers)):
+    for at, (entry, number) in enumerate(zip(entries, scene.numbers, strict=True)):
         scene.fetch([int(number)])
         after = entries[at + 1] if at + 1 < len(entries) else None
         if after is not None and (after.scale, after.row_start) == (entry.scale, entry.row_start):
             continue
         renderer = Renderer(ctx, scene.scene)
         errors = [
-            np.mean((renderer.render(camera, time).rgb.clip(0, 1) - rgb) ** 2) for time, rgb in zip(TIMES, wanted)
+            np.mean((renderer.render(camera, time).rgb.clip(0, 1) - rgb) ** 2)
+            for time, rgb in zip(COMPARED_TIMES, wanted, strict=True)
         ]
         found.append(
             {
@@ -150,25 +158,34 @@ def prefixes(job: Loading) -> list[dict[str, Any]]:
     return found
 
 
-def _lengthened(scene: Path, folder: Path) -> Path:
-    """A clip LONGER times as long: its time planes over and over."""
-    short = read(scene)
-    scales = tuple({name: replace(plane, symbols=np.tile(plane.symbols, (LONGER, 1, 1)), coded=np.tile(plane.coded, (LONGER, 1)),
-                                  side_info=None, starts=())
-                    if name in TIME_PLANES else plane for name, plane in scale.items()} for scale in short.scales)  # fmt: skip
-    motion = (
-        None
-        if short.motion is None
-        else replace(short.motion, symbols=np.tile(short.motion.symbols, (LONGER, 1, 1, 1, 1)))
+def _repeated(path: Path, folder: Path) -> Path:
+    """Write the clip at `path` repeated REPETITIONS times into `folder`, and return the new file."""
+    scene = read(path)
+    scales = []
+    for scale in scene.scales:
+        planes = dict(scale)
+        for name in TIME_PLANES:
+            plane = scale[name]
+            symbols, coded = np.tile(plane.symbols, (REPETITIONS, 1, 1)), np.tile(plane.coded, (REPETITIONS, 1))
+            planes[name] = replace(plane, symbols=symbols, coded=coded, side_info=None, starts=())
+        scales.append(planes)
+    motion = scene.motion
+    if motion is not None:
+        motion = replace(motion, symbols=np.tile(motion.symbols, (REPETITIONS, 1, 1, 1, 1)))
+    repeated = replace(
+        scene,
+        clip=Clip(scene.clip.frame_count * REPETITIONS, scene.clip.fps),
+        scales=tuple(scales),
+        motion=motion,
+        occupancy=np.tile(scene.occupancy, (REPETITIONS, 1, 1, 1)),
     )
-    long = replace(short, clip=Clip(short.clip.frame_count * LONGER, short.clip.fps), scales=scales, motion=motion,
-                   occupancy=np.tile(short.occupancy, (LONGER, 1, 1, 1)))  # fmt: skip
-    path = folder / scene.name
-    path.write_bytes(encode(long, compress=False))
-    return path
+    out = folder / path.name
+    out.write_bytes(encode(repeated, compress=False))
+    return out
 
 
 def _drawing(screen: moderngl.Framebuffer, renderer: Renderer, job: Loading) -> Callable[..., None]:
+    """Return a function that draws the scene's first camera at a time, at a fraction of the size of the screen."""
     camera = Rig.of(renderer.scene).cameras[0]
 
     def draw(time: float, scale: float = 1.0) -> None:
@@ -179,8 +196,8 @@ def _drawing(screen: moderngl.Framebuffer, renderer: Renderer, job: Loading) -> 
     return draw
 
 
-def _until(stream: Stream, renderer: Renderer, condition: Callable[[], bool]) -> None:
-    """Take over what arrives, as frames do, until the condition holds."""
+def _upload_until(stream: Stream, renderer: Renderer, condition: Callable[[], bool]) -> None:
+    """Upload what arrives, as the player does each frame, until the condition holds."""
     while not condition():
         if stream.failure is not None:
             raise KpcError(stream.failure)
@@ -190,7 +207,7 @@ def _until(stream: Stream, renderer: Renderer, condition: Callable[[], bool]) ->
 
 @contextmanager
 def served(scene: Path, *options: str) -> Iterator[str]:
-    """The URL of a scene on a server of its own, on this machine."""
+    """Serve a scene from a process of its own while the context lasts, and return its URL."""
     command = [sys.executable, "-m", "kpc.tools.cli.serve", str(scene.absolute().parent), "--port", "0", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
         try:
