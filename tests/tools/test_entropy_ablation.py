@@ -87,6 +87,7 @@ def test_records(tmp_path, monkeypatch):
     assert records["baseline"]["plane_bytes"] < records["zstd"]["plane_bytes"]
     assert records["baseline"]["decode_ms"] > 0
     assert (
-        records["baseline"]["file_bytes"] == (tmp_path / "tiny.kpc").stat().st_size and records["baseline"]["read_ms"] > 0
+        records["baseline"]["file_bytes"] == (tmp_path / "tiny.kpc").stat().st_size
+        and records["baseline"]["read_ms"] > 0
     )
     assert "reading ms" in tables.markdown(json.loads(out.read_text()))

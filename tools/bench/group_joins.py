@@ -1,4 +1,4 @@
-"""How steady a clip in groups is where one takes over from another: its held-out views, frame by frame, beside the truth."""
+"""How steady a clip in groups is where one group takes over from another, measured on held-out views."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,8 +12,8 @@ from kpc.format.common.fidelity import psnr
 from kpc.format.container import scene_io
 from kpc.format.container.groups import Groups
 
+# Number of frames before and after a join whose mean PSNR is compared.
 AROUND = 5
-"""Frames before and after a join whose mean PSNR is compared."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,11 @@ class Frame:
     """A frame of a held-out camera.
 
     Attributes:
-        frame: of the clip. group: the one that shows it, or has the larger share of it. psnr: dB.
-        change: how much its error is another than that of the frame before, root mean square; None for the first. What a viewer
-            sees as flicker, or as a jump.
+        frame: its number in the clip.
+        group: the group that shows it, or has the larger share of it.
+        psnr: in dB.
+        error_change: RMS difference between its error and that of the frame before, which is visible as flicker or as a
+            jump; None for the first frame.
     """
 
     camera: str
@@ -35,14 +37,14 @@ class Frame:
 
 @dataclass(frozen=True)
 class Join:
-    """Where a group takes over.
+    """A frame at which a group takes over.
 
     Attributes:
-        frame: the first that it shows, or has the larger share of.
-        agreement_db: mean PSNR of what both groups make of the frames that are mixed of both, one against the other.
-        before, after: mean PSNR of AROUND frames.
-        change: the largest of that frame and those that both groups share; usual_change, high_change: median and 95th percentile of
-            those of all other frames.
+        frame: the first that the group shows, or has the larger share of.
+        agreement_db: mean PSNR between the pictures of both groups, over the frames that are blended of both.
+        psnr_before, psnr_after: mean PSNR of AROUND frames.
+        error_change: the largest of this frame and the blended ones.
+        median_error_change, p95_error_change: median and 95th percentile over all other frames.
     """
 
     frame: int
@@ -55,38 +57,41 @@ class Join:
 
 
 def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
-    """`frames` and `joins` of a clip in groups, as plain data, on the held-out pictures of what it was encoded from.
+    """Compare a clip in groups with the held-out pictures of its dataset.
 
-    Memory: a group, and of each camera the pictures of frames that are mixed.
+    One group is in memory at a time, and for each camera the pictures of blended frames.
+
+    Returns:
+        `frames` and `joins`, the fields of `Frame` and `Join` as plain data.
     """
     groups = Groups(scene)
     timeline, first = groups.timeline, groups.timeline.spans[0].start
-    begun: dict[
-        tuple[int, int], np.ndarray
-    ] = {}  # what a group makes of frames that are mixed of it and the next; by camera
-    last_of: dict[int, np.ndarray] = {}
+    blending: dict[tuple[int, int], np.ndarray] = {}  # by frame and camera: the earlier group's picture
+    last_error: dict[int, np.ndarray] = {}  # by camera
     found: list[Frame] = []
     agreements: list[list[float]] = [[] for _ in timeline.spans]
     for number, span in enumerate(timeline.spans):
         some = dataset.frame_range(span.start, span.last)
         renderer = SceneRenderer(widen_single_texels(scene_io.read(groups.open(number))).dequantise())
-        at = np.rint(some.pictures.time * (span.count - 1)).astype(int) + span.start - first  # frame of each picture
-        for picture in sorted(map(int, np.flatnonzero(some.pictures.is_test)), key=lambda p: int(at[p])):
-            frame, camera = int(at[picture]), int(some.pictures.camera[picture])
+        frames = np.rint(some.pictures.time * (span.count - 1)).astype(int) + span.start - first  # of each picture
+        for picture in sorted(map(int, np.flatnonzero(some.pictures.is_test)), key=lambda p: int(frames[p])):
+            frame, camera = int(frames[picture]), int(some.pictures.camera[picture])
             shares = {part: share for part, _, share in timeline.blend_at(_time(groups, frame))}
             if number not in shares:
                 continue
-            seen = np.clip(renderer.picture(some, picture), 0, 1)
+            rendered = np.clip(renderer.picture(some, picture), 0, 1)
             if number < max(shares):
-                begun[frame, camera] = seen
+                blending[frame, camera] = rendered
                 continue
             if number > min(shares):
-                earlier = begun.pop((frame, camera))
-                agreements[number].append(psnr(earlier, seen))
-                seen = (1 - shares[number]) * earlier + shares[number] * seen
-            error = seen - ground_truth(some, picture)
-            change = None if camera not in last_of else float(np.sqrt(np.mean(np.square(error - last_of[camera]))))
-            last_of[camera] = error
+                earlier = blending.pop((frame, camera))
+                agreements[number].append(psnr(earlier, rendered))
+                rendered = (1 - shares[number]) * earlier + shares[number] * rendered
+            error = rendered - ground_truth(some, picture)
+            change = None
+            if camera in last_error:
+                change = float(np.sqrt(np.mean(np.square(error - last_error[camera]))))
+            last_error[camera] = error
             shown, _ = timeline.at(_time(groups, frame))
             found.append(Frame(some.camera_names[camera], frame, shown, psnr(error, 0), change))
     return {
@@ -102,18 +107,25 @@ def _time(groups: Groups, frame: int) -> float:
 def _joins(groups: Groups, frames: list[Frame], agreements: list[list[float]]) -> list[Join]:
     spans, first = groups.timeline.spans, groups.timeline.spans[0].start
     starts = [min(frame.frame for frame in frames if frame.group == number) for number in range(1, len(spans))]
-    shared = [
+    joined = [
         {start, *range(after.start - first + 1, before.last - first + 1)}
-        for start, before, after in zip(starts, spans, spans[1:], strict=False)
+        for start, before, after in zip(starts, spans[:-1], spans[1:], strict=True)
     ]
-    others = [
-        f.error_change for f in frames if f.error_change is not None and not any(f.frame in some for some in shared)
-    ] or [0.0]
+    changes = {f: f.error_change for f in frames if f.error_change is not None}
+    others = [change for f, change in changes.items() if not any(f.frame in some for some in joined)] or [0.0]
     found = []
-    for start, some, agreement in zip(starts, shared, agreements[1:], strict=True):
+    for start, some, agreement in zip(starts, joined, agreements[1:], strict=True):
         before = [f.psnr for f in frames if start - AROUND <= f.frame < start]
         after = [f.psnr for f in frames if start <= f.frame < start + AROUND]
-        change = max(f.error_change for f in frames if f.frame in some and f.error_change is not None)
-        numbers = (np.mean(before), np.mean(after), change, np.median(others), np.quantile(others, 0.95))
-        found.append(Join(start, float(np.mean(agreement)) if agreement else float("nan"), *map(float, numbers)))
+        found.append(
+            Join(
+                frame=start,
+                agreement_db=float(np.mean(agreement)) if agreement else float("nan"),
+                psnr_before=float(np.mean(before)),
+                psnr_after=float(np.mean(after)),
+                error_change=max(change for f, change in changes.items() if f.frame in some),
+                median_error_change=float(np.median(others)),
+                p95_error_change=float(np.quantile(others, 0.95)),
+            )
+        )
     return found

@@ -147,7 +147,11 @@ def _texel_rates(stage: _Stage, renderer: Renderer, shader: str, frame_ms: float
 
     It is empty unless every pixel shown was marched for this very frame by shaders.
     """
-    if renderer.quality.reprojection_tolerance or renderer.rays_across(stage.camera) != 1 or not renderer.texels_per_sample:
+    if (
+        renderer.quality.reprojection_tolerance
+        or renderer.rays_across(stage.camera) != 1
+        or not renderer.texels_per_sample
+    ):
         return {}
     texels = renderer.texels_per_sample * float(renderer.render(stage.camera, 1.0).samples.sum())
     peak = texel_rate(stage.ctx, shader == "compute", renderer.plane_dtype)
