@@ -96,17 +96,10 @@ def measure(job: LongPlay) -> dict[str, Any]:
             "last_bytes": memory[-1],
             "peak_bytes": max(memory),
             "bytes_per_1000_frames": 1000 * slope,
-<<<<<<< HEAD
-            "held_bytes": held,
-            "made_on_card": sum(made.values()),
-            "made": dict(made),
-            "gpu_memory_bytes": player.scene_view.renderer.memory_bytes,
-=======
             "memory_samples_bytes": memory,
             "gpu_objects_created": sum(created.values()),
             "gpu_objects_by_kind": dict(created),
-            "gpu_memory_bytes": player.renderer.memory_bytes,
->>>>>>> d7d8040 (Split kpbench and its tables by duty, with plain keys in records)
+            "gpu_memory_bytes": player.scene_view.renderer.memory_bytes,
         }
 
 
