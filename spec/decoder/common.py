@@ -33,7 +33,7 @@ def f32(x):
 
 
 def unpack_bits(data, count):
-    require(len(data) == -(-count // 8), "a bit string of another length")
+    require(len(data) == -(-count // 8), "a bit string has another length")
     unpacked = [data[i // 8] >> i % 8 & 1 for i in range(8 * len(data))]
     require(not any(unpacked[count:]), "unused bits are not 0")
     return unpacked[:count]

@@ -67,34 +67,39 @@ def read_chunks(data, is_prefix):  # sections 4.1 and 4.2
     _, version, header_length, chunk_count, index_length, index_crc, *fields = HEADER.unpack(data[: HEADER.size])
     file_length, value_count, largest_raw, header_crc = fields
     require(header_length != 0, "a draft of the format; encode it again")
-    require(version == 1, "unknown version")
-    require(crc32c(data[:44]) == header_crc, "damaged header")
-    require(header_length == HEADER.size, "header length")
-    require(1 <= chunk_count <= 65536 and 1 <= index_length <= 64 + 40 * chunk_count, "number of chunks")
-    require(file_length >= HEADER.size + max(index_length, 8 * chunk_count), "file length")
-    require(len(data) <= file_length if is_prefix else len(data) == file_length, "file length")
-    require(max(value_count, largest_raw) <= file_length * EXPANSION_LIMIT, "claims of the header")
+    require(version == 1, "unknown version of the format")
+    require(crc32c(data[:44]) == header_crc, "the header is damaged")
+    require(header_length == HEADER.size, "invalid header length")
+    require(1 <= chunk_count <= 65536 and 1 <= index_length <= 64 + 40 * chunk_count, "invalid number of chunks")
+    require(file_length >= HEADER.size + max(index_length, 8 * chunk_count), "invalid file length")
+    require(len(data) <= file_length if is_prefix else len(data) == file_length, "invalid file length")
+    require(
+        max(value_count, largest_raw) <= file_length * EXPANSION_LIMIT,
+        "invalid value_count or largest_raw",
+    )
     index = data[HEADER.size : HEADER.size + index_length]
-    require(len(index) == index_length and crc32c(index) == index_crc, "damaged index")
+    require(len(index) == index_length and crc32c(index) == index_crc, "the index is damaged")
     table = decompress(index, ENTRY.size * chunk_count)
     chunks, start = [], HEADER.size + index_length
     for number in range(chunk_count):
         chunk = Chunk(*ENTRY.unpack(table[number::chunk_count]))
-        require(chunk.kind.isalpha() and chunk.raw_length <= largest_raw, "index entry")
+        require(chunk.kind.isalpha() and chunk.raw_length <= largest_raw, "invalid index entry")
         chunk.stored = data[start : start + chunk.stored_length]
         require(is_prefix or chunk.is_whole, "a chunk is cut off")
         start += chunk.stored_length
         chunks.append(chunk)
-    require(start == file_length, "chunks and the end of the file")
+    require(start == file_length, "chunks do not fill the file")
     return chunks, value_count
 
 
 def decompress(frame, length):  # section 4.5
     try:
-        require(zstandard.get_frame_parameters(frame).content_size == length, "content size of a Zstandard frame")
+        parameters = zstandard.get_frame_parameters(frame)
+        require(parameters.content_size == length, "invalid content size of a Zstandard frame")
+        require(parameters.dict_id == 0, "a Zstandard frame uses a dictionary")
         return zstandard.ZstdDecompressor().decompress(frame, max_output_size=length, allow_extra_data=False)
     except zstandard.ZstdError as error:
-        raise Refused("Zstandard") from error
+        raise Refused("invalid Zstandard frame") from error
 
 
 def scene_contents(data, is_prefix):  # sections 4.3 and 4.4
@@ -106,13 +111,13 @@ def scene_contents(data, is_prefix):  # sections 4.3 and 4.4
         if chunk.kind not in CODECS:
             continue
         position = chunk.scale, chunk.plane, chunk.row_start, chunk.row_count
-        require(chunk.group == 0 and (chunk.kind == b"PLNE" or not any(position)), "fields of an index entry")
+        require(chunk.group == 0 and (chunk.kind == b"PLNE" or not any(position)), "invalid fields of an index entry")
         require(chunk.codec in (RAW, ZSTD, *CODECS[chunk.kind]), "unknown codec")
-        require(chunk.codec != RAW or chunk.raw_length == chunk.stored_length, "raw length")
-        require(chunk.codec <= ZSTD or chunk.raw_length <= EXPANSION_LIMIT * chunk.stored_length, "raw length")
+        require(chunk.codec != RAW or chunk.raw_length == chunk.stored_length, "invalid raw length")
+        require(chunk.codec <= ZSTD or chunk.raw_length <= EXPANSION_LIMIT * chunk.stored_length, "invalid raw length")
         content = None
         if chunk.is_whole:
-            require(crc32c(chunk.stored) == chunk.crc, "damaged chunk")
+            require(crc32c(chunk.stored) == chunk.crc, "a chunk is damaged")
             is_frame = chunk.codec == ZSTD
             stored = decompress(chunk.stored, chunk.raw_length) if is_frame else chunk.stored
             content = Content(chunk.codec, chunk.raw_length, stored)
@@ -126,11 +131,11 @@ def group_chunks(data, is_prefix=False):  # section 4.7
     groups = {}
     if any(chunk.kind == b"GRUP" for chunk in chunks):
         for chunk in chunks:
-            require(chunk.kind == b"GRUP" or not chunk.is_critical, "a critical chunk beside groups")
+            require(chunk.kind == b"GRUP" or not chunk.is_critical, "a critical chunk lies beside groups")
             if chunk.kind == b"GRUP":
-                require(chunk.codec == RAW and chunk.raw_length == chunk.stored_length, "codec of a group")
-                require(chunk.scale == chunk.plane == 0 and chunk.row_count > 0, "fields of a group")
-                require(chunk.group not in groups, "number of a group")
+                require(chunk.codec == RAW and chunk.raw_length == chunk.stored_length, "invalid codec of a group")
+                require(chunk.scale == chunk.plane == 0 and chunk.row_count > 0, "invalid fields of a group")
+                require(chunk.group not in groups, "invalid number of a group")
                 groups[chunk.group] = chunk
-    require(sorted(groups) == list(range(len(groups))), "numbers of groups")
+    require(sorted(groups) == list(range(len(groups))), "invalid numbers of groups")
     return [groups[number] for number in range(len(groups))], value_count

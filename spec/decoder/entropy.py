@@ -20,7 +20,7 @@ class EntropyDecoder:
         (self.state,) = chunk.unpack("I")
         require(self.state >= 1 << 16, "the initial rANS state is below 65536")
         words = chunk.remaining()
-        require(len(words) % 2 == 0, "half a word")
+        require(len(words) % 2 == 0, "the coded data ends within a word")
         self.words = list(struct.unpack(f"<{len(words) // 2}H", words))
         self.next_word = 0
         self.models = {}  # (P, count) by name
@@ -33,7 +33,7 @@ class EntropyDecoder:
         else:
             bit, self.state = 0, (4096 - p) * high + low - p
         if self.state < 1 << 16:
-            require(self.next_word < len(self.words), "too few words")
+            require(self.next_word < len(self.words), "the coded data has too few words")
             self.state = self.state << 16 | self.words[self.next_word]
             self.next_word += 1
         return bit
@@ -73,4 +73,5 @@ class EntropyDecoder:
         return -self.positive(lambda k: self.adaptive((context, "below", k)), unary, escape)
 
     def finish(self):
-        require(self.next_word == len(self.words) and self.state == 1 << 16, "words and decisions do not end together")
+        require(self.next_word == len(self.words), "the coded data has too many words")
+        require(self.state == 1 << 16, "the final rANS state is not 65536")

@@ -15,13 +15,13 @@ def decode_groups(data, is_prefix=False):
     first = [chunk.row_start for chunk in chunks]
     last = [chunk.row_start + chunk.row_count - 1 for chunk in chunks]
     for g in range(len(chunks) - 1):
-        require(first[g] < first[g + 1] <= last[g] + 1 and last[g] < last[g + 1], "frames of groups")
-    require(all(last[g] < first[g + 2] for g in range(len(chunks) - 2)), "a frame in three groups")
-    require(last[-1] - first[0] + 1 <= 1 << 24, "number of frames")
+        require(first[g] < first[g + 1] <= last[g] + 1 and last[g] < last[g + 1], "invalid frames of groups")
+    require(all(last[g] < first[g + 2] for g in range(len(chunks) - 2)), "a frame is in three groups")
+    require(last[-1] - first[0] + 1 <= 1 << 24, "invalid number of frames")
     scenes = [decode(chunk.stored) for chunk in chunks if chunk.is_whole]
     for chunk, scene in zip(chunks, scenes):
-        require(scene["frame_count"] == chunk.row_count and scene["fps"] == scenes[0]["fps"], "clip of a group")
-        require(scene["value_count"] <= value_count, "value count of a group")
+        require(scene["frame_count"] == chunk.row_count and scene["fps"] == scenes[0]["fps"], "invalid clip of a group")
+        require(scene["value_count"] <= value_count, "invalid value count of a group")
     return [(chunk.row_start, chunk.row_count, chunk.stored) for chunk in chunks], scenes
 
 

@@ -12,11 +12,11 @@ from .entropy import EntropyDecoder, log_class
 def decode_motion(content):
     chunk = ByteReader(content.data)
     nt, nz, ny, nx, step = chunk.unpack("4Hf")
-    require(2 <= nt <= 16384 and all(2 <= n <= 256 for n in (nz, ny, nx)), "size of the motion grid")
-    require(step > 0 and 32768 * step <= 1024, "step of the motion grid")
+    require(2 <= nt <= 16384 and all(2 <= n <= 256 for n in (nz, ny, nx)), "invalid size of the motion grid")
+    require(step > 0 and 32768 * step <= 1024, "invalid step of the motion grid")
     count = 3 * nt * nz * ny * nx
     if content.is_coded:
-        require(content.raw_length == 12 + 2 * count, "raw length")
+        require(content.raw_length == 12 + 2 * count, "invalid raw length")
         symbols = decode_motion_symbols(chunk, (nt, nz, ny, nx))
     else:
         symbols = chunk.unpack(f"{count}h")
@@ -115,11 +115,11 @@ OCCUPANCY_NEIGHBOURS = [
 def decode_occupancy(content):
     chunk = ByteReader(content.data)
     sizes = K, nz, ny, nx = chunk.unpack("4H")
-    require(all(1 <= n <= 16384 for n in sizes), "size of the occupancy grid")
+    require(all(1 <= n <= 16384 for n in sizes), "invalid size of the occupancy grid")
     count = K * nz * ny * nx
     if not content.is_coded:
         return {"cells": sizes, "occupancy": unpack_bits(chunk.remaining(), count)}
-    require(content.raw_length == 8 + -(-count // 8), "raw length")
+    require(content.raw_length == 8 + -(-count // 8), "invalid raw length")
     decisions, occupied = EntropyDecoder(chunk), {}
     for cell in itertools.product(*map(range, sizes)):
         context = tuple(
@@ -136,8 +136,8 @@ def decode_occupancy(content):
 def decode_explicit_decoder(content, feature_count):
     chunk = ByteReader(content.data)
     features, hidden, density_bias = chunk.unpack("HHf")
-    require(features == feature_count and 1 <= hidden <= 256, "size of the decoder")
-    require(math.isfinite(density_bias), "density bias")
+    require(features == feature_count and 1 <= hidden <= 256, "invalid size of the decoder")
+    require(math.isfinite(density_bias), "invalid density bias")
     counts = {
         "density_weight": features,
         "w1": hidden * 9,
@@ -152,8 +152,8 @@ def decode_explicit_decoder(content, feature_count):
 def decode_hybrid_decoder(content, feature_count):
     chunk = ByteReader(content.data)
     features, width, hidden, density_bias = chunk.unpack("HHHf")
-    require(features == feature_count and 1 <= width <= 256 and 1 <= hidden <= 256, "size of the decoder")
-    require(math.isfinite(density_bias), "density bias")
+    require(features == feature_count and 1 <= width <= 256 and 1 <= hidden <= 256, "invalid size of the decoder")
+    require(math.isfinite(density_bias), "invalid density bias")
     counts = {
         "v": width * features,
         "v_bias": width,
@@ -172,16 +172,16 @@ def decode_weights(content, chunk, counts):
     """Return {array: its weights, row-major}."""
     if not content.is_coded:
         weights = {name: chunk.unpack(f"{count}e") for name, count in counts.items()}
-        require(all(math.isfinite(w) for array in weights.values() for w in array), "weights")
+        require(all(math.isfinite(w) for array in weights.values() for w in array), "a weight exceeds its range")
         chunk.finish()
         return weights
-    require(content.raw_length == chunk.position + 2 * sum(counts.values()), "raw length")
+    require(content.raw_length == chunk.position + 2 * sum(counts.values()), "invalid raw length")
     exponents = chunk.unpack(f"{len(counts)}b")
-    require(all(-24 <= e <= 15 for e in exponents), "exponents of weights")
+    require(all(-24 <= e <= 15 for e in exponents), "invalid exponents of weights")
     decisions, weights = EntropyDecoder(chunk), {}
     for (name, count), e in zip(counts.items(), exponents):
         integers = [decisions.signed(("weights", name), unary=4, escape=10) for _ in range(count)]
-        require(all(abs(k) <= 2048 and abs(k) * 2.0**e <= 65504 for k in integers), "weights")
+        require(all(abs(k) <= 2048 and abs(k) * 2.0**e <= 65504 for k in integers), "a weight exceeds its range")
         weights[name] = tuple(k * 2.0**e for k in integers)
     decisions.finish()
     return weights
@@ -197,32 +197,32 @@ def decode_cameras(content):
     chunk = ByteReader(content.data)
     if content.is_coded:
         cameras = decode_poses(chunk)
-        require(content.raw_length == 2 + 68 * len(cameras), "raw length")
+        require(content.raw_length == 2 + 68 * len(cameras), "invalid raw length")
     else:
         (count,) = chunk.unpack("H")
         cameras = [chunk.unpack("HH16f") for _ in range(count)]
     chunk.finish()
-    require(1 <= len(cameras) <= 4096, "number of cameras")
+    require(1 <= len(cameras) <= 4096, "invalid number of cameras")
     for width, height, *numbers in cameras:
         pose = numbers[4:]
-        require(width > 0 and height > 0 and min(numbers[:2]) > 0, "lens of a camera")
-        require(all(abs(a) <= 2**30 for a in numbers), "numbers of a camera")
-        require(all(0.5 <= math.hypot(*pose[column::4]) <= 2 for column in range(3)), "axes of a camera")
+        require(width > 0 and height > 0 and min(numbers[:2]) > 0, "invalid lens of a camera")
+        require(all(abs(a) <= 2**30 for a in numbers), "invalid numbers of a camera")
+        require(all(0.5 <= math.hypot(*pose[column::4]) <= 2 for column in range(3)), "invalid axes of a camera")
     return cameras
 
 
 def decode_poses(chunk):
     count, lens_count, e, *corner = chunk.unpack("HHb3i")
-    require(1 <= count <= 4096 and lens_count in (1, count) and -126 <= e <= 30, "poses")
+    require(1 <= count <= 4096 and lens_count in (1, count) and -126 <= e <= 30, "invalid number of cameras or lenses")
     lenses = [chunk.unpack("HH4f") for _ in range(lens_count)]
     cameras = []
     for number in range(count):
         rotation, position = (int.from_bytes(chunk.take(7), "little") for _ in range(2))
-        require(position >> 54 == 0, "position of a camera")
+        require(position >> 54 == 0, "invalid position of a camera")
         left_out = rotation >> 54
         q = [(rotation >> 18 * i & 0x3FFFF) - 131072 for i in range(3)]
         square = 2 * D - sum(a * a for a in q)
-        require(square >= 0, "rotation of a camera")
+        require(square >= 0, "invalid rotation of a camera")
         q.insert(left_out, math.sqrt(square))
         squares = [square if i == left_out else q[i] * q[i] for i in range(4)]
         (w, x, y, z), (_, xx, yy, zz) = q, squares
@@ -245,9 +245,9 @@ def decode_poses(chunk):
 def decode_appearances(chunk, expected_hidden):
     """Return {name: embedding}."""
     count, hidden = chunk.unpack("HH")
-    require(1 <= count <= 16384 and hidden == expected_hidden, "number of appearances or of hidden units")
+    require(1 <= count <= 16384 and hidden == expected_hidden, "invalid number of appearances or of hidden units")
     embeddings = [chunk.unpack(f"{hidden}e") for _ in range(count)]
-    require(all(math.isfinite(a) for embedding in embeddings for a in embedding), "embeddings")
+    require(all(math.isfinite(a) for embedding in embeddings for a in embedding), "an embedding is not finite")
     appearances = {}
     for embedding in embeddings:
         (length,) = chunk.unpack("B")
@@ -256,7 +256,7 @@ def decode_appearances(chunk, expected_hidden):
         except UnicodeDecodeError as error:
             raise Refused("a name is not UTF-8") from error
         require(name and name not in appearances, "a name is empty or is there twice")
-        require(not any(ord(a) < 0x20 or 0x7F <= ord(a) <= 0x9F for a in name), "a control character in a name")
+        require(not any(ord(a) < 0x20 or 0x7F <= ord(a) <= 0x9F for a in name), "a name holds a control character")
         appearances[name] = embedding
     chunk.finish()
     return appearances

@@ -13,21 +13,21 @@ def decode_segment(scene, name, plane, row_start, row_count, content):
     chunk = ByteReader(content.data)
     if not content.is_coded:
         return decode_raw(chunk, H, W, M)
-    require(content.raw_length == H * W * M, "number of symbols")
+    require(content.raw_length == H * W * M, "invalid number of symbols")
     implied = scene, name, plane["rows"], plane["columns"], row_start, row_count
     if content.codec == PREDICTIVE:
         set_count, flags = chunk.unpack("BB")
-        require(set_count in (1, 2, 4, 8) and flags >> 4 == 0, "weight sets or flags")
+        require(set_count in (1, 2, 4, 8) and flags >> 4 == 0, "invalid weight sets or flags")
         map_mode, quantiser = flags & 3, flags >> 2
-        require(map_mode <= 2 and quantiser <= 2, "map mode or quantiser")
+        require(map_mode <= 2 and quantiser <= 2, "invalid map mode or quantiser")
         weights = [chunk.unpack("9b") for _ in range(set_count)]
         decisions = EntropyDecoder(chunk)
         coded = map_of(map_mode, decisions, H, W, implied)
         symbols = predictive.decode_symbols(decisions, coded, H, W, M, quantiser, weights)
     else:
         N, map_mode, base_step = chunk.unpack("BBB")
-        require(N in (4, 8, 16) and (N == 4 or N <= 2 * min(H, W)), "side of a block")
-        require(map_mode <= 2 and base_step > 0, "map mode or step")
+        require(N in (4, 8, 16) and (N == 4 or N <= 2 * min(H, W)), "invalid side of a block")
+        require(map_mode <= 2 and base_step > 0, "invalid map mode or step")
         decisions = EntropyDecoder(chunk)
         coded = map_of(map_mode, decisions, H, W, implied)
         symbols = transform.decode_symbols(decisions, coded, H, W, M, N, base_step)
@@ -43,7 +43,7 @@ def map_of(map_mode, decisions, H, W, implied):
 
 def decode_raw(chunk, H, W, M):  # section 7.3
     (map_mode,) = chunk.unpack("B")
-    require(map_mode < IMPLIED, "map mode")
+    require(map_mode < IMPLIED, "invalid map mode")
     coded = all_coded(H, W)
     if map_mode == STORED:
         stored = unpack_bits(chunk.take(-(-H * W // 8)), H * W)

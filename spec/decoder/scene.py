@@ -28,22 +28,22 @@ def decode(data, is_prefix=False):
         if kind == "PLNE":
             segments.append((chunk.scale, chunk.plane, chunk.row_start, chunk.row_count, content))
         else:
-            require(kind not in single, f"two {kind} chunks")
+            require(kind not in single, f"there are two {kind} chunks")
             single[kind] = content
-    require(("DECO" in single) != ("HYBR" in single), "one decoder is needed")
+    require(("DECO" in single) != ("HYBR" in single), "there must be either DECO or HYBR")
     for kind in ("SCNE", "DECO", "HYBR", "OCCU", "WARP", "MOVE"):
         is_required = kind in ("SCNE", "OCCU") or kind in single
-        require(not is_required or single.get(kind) is not None, f"no {kind} chunk")
+        require(not is_required or single.get(kind) is not None, f"there is no {kind} chunk")
 
     scene = decode_scne(ByteReader(single["SCNE"].data))
     planes = [plane for scale in scene["scales"] for plane in scale.values()]
-    require(sum(p["rows"] * p["columns"] * p["channels"] for p in planes) == value_count, "value count")
+    require(sum(p["rows"] * p["columns"] * p["channels"] for p in planes) == value_count, "invalid value count")
     feature_count = sum(scale["xy"]["channels"] for scale in scene["scales"])
     scene |= {"value_count": value_count, "mapping": 0, "motion": None, "cameras": [], "appearances": {}}
     if "WARP" in single:
         scene |= decode_warp(ByteReader(single["WARP"].data), scene)
     if "MOVE" in single:
-        require("xt" in scene["scales"][0], "motion of a static scene")
+        require("xt" in scene["scales"][0], "a static scene has no motion")
         scene["motion"] = decode_motion(single["MOVE"])
     if "DECO" in single:
         scene |= decode_explicit_decoder(single["DECO"], feature_count)
@@ -65,7 +65,7 @@ def decode_planes(scene, segments):
         plane |= {"coded": [0] * texels, "symbols": [0] * (texels * plane["channels"])}
         plane |= {"next_row": 0, "segment_count": 0, "is_held": False}
     for scale, number, row_start, row_count, content in sorted(segments, key=lambda segment: segment[:3]):
-        require(scale < len(scales) and number < 6 and PLANES[number] in scales[scale], "a segment of no plane")
+        require(scale < len(scales) and number < 6 and PLANES[number] in scales[scale], "a segment is of no plane")
         name = PLANES[number]
         plane = scales[scale][name]
         require(row_count > 0 and row_start == plane["next_row"], "segments overlap or leave rows out")
@@ -83,7 +83,7 @@ def decode_planes(scene, segments):
     for scale in scales:
         for name, plane in scale.items():
             require(plane["next_row"] == plane["rows"], "segments leave rows out")
-            require("t" in name or plane["segment_count"] == 1, "a space plane in several segments")
+            require("t" in name or plane["segment_count"] == 1, "a space plane has several segments")
             if "t" not in name and not plane["is_held"]:  # section 10: a space plane that is missing is 0
                 plane["offset"] = [0.0] * plane["channels"]
             plane["values"] = dequantise(plane)
