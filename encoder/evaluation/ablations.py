@@ -1,12 +1,20 @@
-"""Training runs with one thing changed, to measure what it is worth: `kpbench ablate` (K-Planes, arXiv:2301.10241, section 4.4)."""
+"""Variants of a training run with one thing changed, to measure what it gains: `kpbench ablate`.
+
+The selection follows K-Planes (arXiv:2301.10241), section 4.4.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
 
 from kpc.encoder.field.config import PROGRESSIVE_SCALE_DROPOUT, TrainConfig
 
+BASELINE = "baseline"
+
+# What each ablation changes, by name; the unchanged run comes first. "view-independent colour" also removes appearance
+# embeddings, which act through the direction MLP. Runs with appearance embeddings are scored on the right halves of
+# pictures (`kpc.encoder.evaluation.evaluate`), runs without on whole pictures.
 ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
-    "baseline": lambda c: c,
+    BASELINE: lambda c: c,
     "finest scale only": lambda c: replace(c, resolutions=c.resolutions[-1:]),
     "coarsest scale only": lambda c: replace(c, resolutions=c.resolutions[:1]),
     "half the channels": lambda c: replace(c, channels=max(1, c.channels // 2)),
@@ -32,11 +40,8 @@ ABLATIONS: dict[str, Callable[[TrainConfig], TrainConfig]] = {
     "all scales from the start": lambda c: replace(c, coarse_until=0.0),
     "scale dropout": lambda c: replace(c, scale_dropout=PROGRESSIVE_SCALE_DROPOUT),
 }
-"""What is changed, by name, the unchanged run first. Appearances act through what "view-independent colour" leaves out. Runs with
-appearances are scored on right halves of pictures (`evaluate`), those without on whole ones."""
 
 
 def effective_ablations(config: TrainConfig) -> list[str]:
-    """The names of the ablations that make a difference to a config, and of the unchanged run."""
-    first, *others = ABLATIONS
-    return [first] + [name for name in others if ABLATIONS[name](config) != config]
+    """Return the names of the baseline and of all ablations that change `config`."""
+    return [name for name in ABLATIONS if name == BASELINE or ABLATIONS[name](config) != config]
