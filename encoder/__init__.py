@@ -1,10 +1,10 @@
-"""From a dataset to a scene. Needs PyTorch, the extra `kpc[encoder]`, which viewers do without."""
+"""The encoder: from posed pictures to a .kpc file. Needs PyTorch (the extra `kpc[encoder]`), which viewers do not."""
 
 import sys
 
 
 def main(argv: list[str] | None = None) -> int:
-    """`kpenc`, or one line on how to get it where only the viewer is installed."""
+    """Run `kpenc`; where only the viewer is installed, print how to install the encoder and return 1."""
     try:
         from kpc.encoder.cli import kpenc
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""How good a scene is: pictures rendered on the CPU, PSNR and SSIM against the held-out ones."""
+"""Quality of a scene: pictures rendered on the CPU, and their PSNR and SSIM against held-out pictures."""
 
 from dataclasses import dataclass, replace
 
@@ -17,33 +17,49 @@ from kpc.format.scene.space import Contraction
 from torch.nn.functional import conv2d
 
 WHITE = np.ones(3, np.float32)
-
-RAYS_AT_ONCE = 1 << 16
+RAYS_AT_ONCE = 1 << 16  # bounds the memory of rendering
 
 
 class SceneRenderer:
-    """Renders rays of a scene with the kernels; the same pictures as `kpc.player.cpu.reference`, much faster."""
+    """Renders rays of a scene with the training kernels.
+
+    The pictures are those of `kpc.player.cpu.reference`, much faster.
+    """
 
     def __init__(self, scene: Scene, field: Field | None = None) -> None:
-        """`field`: of which the scene is but the surroundings, where no scene can hold it."""
+        """Prepare a scene for rendering.
+
+        Args:
+            scene: bounds, occupancy, cameras and background; also the planes and the decoder where `field` is None.
+            field: the planes and the decoder, where no scene can hold them (`TrainConfig.summed`).
+        """
         self.scene, self.field = scene, field or Field.from_scene(pad_channels(scene))
 
     def rgb(
         self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
     ) -> np.ndarray:
-        """(N, 3) float32 colours of (N, 3) origins, (N, 3) unit directions and (N,) times; rays as `datasets.rays` makes them.
-        `codes`: (N, H) of their appearances, None for the average."""
+        """Return the colours of rays, (N, 3) float32; arguments as for `render`."""
         return self.render(origins, directions, times, codes)[0]
 
     def codes(self, appearances: np.ndarray | None) -> np.ndarray | None:
-        """(N, H) the codes of appearances by their numbers (N,), None for None."""
+        """Return the (N, H) appearance embeddings of (N,) indices; None for None."""
         return None if appearances is None else np.stack([a.code for a in self.scene.appearances])[appearances]
 
     def render(
         self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray, codes: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Colours (N, 3), opacities (N,), mean depths (N,) along the same rays, as those measure, float32. `codes` as in `rgb`."""
-        draw = self._marched if type(self.field) is Field else self._composited
+        """Render rays.
+
+        Args:
+            origins: (N, 3), in the space of the planes (`kpc.encoder.datasets.rays`).
+            directions: (N, 3) unit vectors.
+            times: (N,) in [0, 1].
+            codes: (N, H) appearance embeddings; None for the average appearance.
+
+        Returns:
+            Colours (N, 3), opacities (N,) and mean depths (N,) in world units along the rays, all float32.
+        """
+        draw = self._render_fused if type(self.field) is Field else self._render_composited
         out = []
         for start in range(0, len(origins), RAYS_AT_ONCE):
             some = slice(start, start + RAYS_AT_ONCE)
@@ -53,7 +69,7 @@ class SceneRenderer:
         colours, opacities, depths = (np.concatenate(parts) for parts in zip(*out, strict=True))
         return colours, opacities, depths
 
-    def _marched(
+    def _render_fused(
         self, o: np.ndarray, d: np.ndarray, t: np.ndarray, codes: torch.Tensor | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         scene, field, layout = self.scene, self.field, self.field.layout
@@ -81,7 +97,7 @@ class SceneRenderer:
         )
         return colours, opacities, depths
 
-    def _composited(
+    def _render_composited(
         self, o: np.ndarray, d: np.ndarray, t: np.ndarray, codes: torch.Tensor | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         scene = self.scene
@@ -97,7 +113,7 @@ class SceneRenderer:
         return shade(self.field, batch, met, codes).numpy(), opacities, depths / np.maximum(opacities, np.float32(1e-6))
 
     def hits_occupied(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """(N,) bool: whether rays pass where anything may be. The others show the background, whatever planes hold."""
+        """Return (N,) bool: whether rays pass through occupied cells. All others show the background."""
         scene = self.scene
         met: np.ndarray = (
             count_samples(
@@ -108,8 +124,17 @@ class SceneRenderer:
         return met
 
     def picture(self, dataset: Dataset, number: int, first: int = 0, code: np.ndarray | None = None) -> np.ndarray:
-        """The scene as a picture of the dataset shows it, its lens included, from column `first` on: (H, W - first, 3) float32.
-        `code`: (H,) of the appearance to show it in, None for the average."""
+        """Render the view of a picture of the dataset, with its lens distortion.
+
+        Args:
+            dataset: holds the picture's camera and time.
+            number: index of the picture.
+            first: first column to render.
+            code: (H,) appearance embedding; None for the average appearance.
+
+        Returns:
+            (height, width - first, 3) float32.
+        """
         pictures = dataset.pictures
         h, w = int(pictures.height[number]), int(pictures.width[number]) - first
         row, column = np.divmod(np.arange(w * h), w)
@@ -118,7 +143,7 @@ class SceneRenderer:
         return self.rgb(origins, directions, np.full(w * h, pictures.time[number], np.float32), codes).reshape(h, w, 3)
 
     def fit_left_half(self, dataset: Dataset, number: int) -> np.ndarray:
-        """The code that suits at most FIT_RAYS usable pixels of the left half of a picture best, `appearances.fitted_code`."""
+        """Fit an appearance embedding to at most FIT_RAYS usable pixels of the left half of a picture."""
         pictures, rng = dataset.pictures, np.random.default_rng(number)
         row, column = np.nonzero(dataset.usable(number)[:, : _middle(dataset, number)])
         chosen = rng.permutation(len(row))[:FIT_RAYS]
@@ -128,31 +153,33 @@ class SceneRenderer:
         return fit_code(self.scene, self.field, batch, torch.from_numpy(ground_truth(dataset, number)[row, column]))
 
     def batch(self, origins: np.ndarray, directions: np.ndarray, times: np.ndarray) -> Rays:
-        """Rays as pictures are made of them: samples in the middle of their steps, the scene's background."""
+        """Return rays as pictures use them: samples in the middle of their steps, on the scene's background."""
         n = len(origins)
         return Rays.from_arrays(origins, directions, times, np.full(n, 0.5), np.tile(self.scene.background, (n, 1)))
 
 
 def pad_channels(scene: Scene) -> Scene:
-    """The same scene with as many channels at every scale as the widest has: the kernels know one number. What is added is 0 and
-    weighs nothing; the features of each scale stay in front of it."""
+    """Return the scene with as many channels at every scale as the widest has, since the kernels take one number.
+
+    Added channels come last, are 0 and have decoder weights of 0, so that the pictures are the same.
+    """
     counts = [scale["xy"].shape[2] for scale in scene.scales]
     most = max(counts)
     if min(counts) == most:
         return scene
 
-    def widened(weights: np.ndarray, axis: int) -> np.ndarray:
+    def widen(weights: np.ndarray, axis: int) -> np.ndarray:
         parts = np.split(weights, np.cumsum(counts)[:-1], axis=axis)
-        return np.concatenate([_filled_up(part, axis, most) for part in parts], axis=axis)
+        return np.concatenate([_pad_axis(part, axis, most) for part in parts], axis=axis)
 
     d = scene.decoder
-    decoder = replace(d, density_weight=widened(d.density_weight, 0), w2=widened(d.w2, 1), b2=widened(d.b2, 1))
-    scales = tuple({name: _filled_up(plane, 2, most) for name, plane in scale.items()} for scale in scene.scales)
+    decoder = replace(d, density_weight=widen(d.density_weight, 0), w2=widen(d.w2, 1), b2=widen(d.b2, 1))
+    scales = tuple({name: _pad_axis(plane, 2, most) for name, plane in scale.items()} for scale in scene.scales)
     return replace(scene, scales=scales, decoder=decoder)
 
 
 def unpad_decoder(scene: Scene, decoder: AnyDecoder) -> AnyDecoder:
-    """The decoder of `evenly_wide(scene)` without what was added."""
+    """Return the decoder of `pad_channels(scene)` without the added channels."""
     if not isinstance(decoder, Decoder):
         return decoder
     counts = [scale["xy"].shape[2] for scale in scene.scales]
@@ -160,13 +187,13 @@ def unpad_decoder(scene: Scene, decoder: AnyDecoder) -> AnyDecoder:
     return replace(decoder, density_weight=decoder.density_weight[kept], w2=decoder.w2[:, kept], b2=decoder.b2[:, kept])
 
 
-def _filled_up(values: np.ndarray, axis: int, size: int) -> np.ndarray:
+def _pad_axis(values: np.ndarray, axis: int, size: int) -> np.ndarray:
     return np.pad(values, [(0, size - n if k == axis else 0) for k, n in enumerate(values.shape)])
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Means over the pictures that were compared."""
+    """Means over the pictures that were compared: PSNR in dB, SSIM, and their number."""
 
     psnr: float
     ssim: float
@@ -174,14 +201,20 @@ class Quality:
 
 
 def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None, field: Field | None = None) -> Quality | None:
-    """PSNR and SSIM over the held-out pictures, or over `most` of them evenly spaced; None where none are held out.
+    """Return the mean PSNR and SSIM over held-out pictures; None where none are held out.
 
-    Pictures with alpha are composited on white, the background such scenes are stored with. What a mask ignores does not
-    count, and a picture not at all where its mask leaves no window of SSIM.
+    Pictures with alpha are composited on white, the background that such scenes are stored with. Masked pixels do not
+    count, nor does a picture whose mask leaves no window of SSIM.
 
-    Where the scene has appearances, a picture that was not trained on has none yet: a code is fitted to its left half, and its
-    right half alone counts (K-Planes, section 4.3; the protocol is that of NeRF in the Wild, arXiv:2008.02268). `field` as in
-    `SceneRenderer`.
+    Held-out pictures have no appearance embedding of their own. Where the scene has embeddings, one is fitted to the
+    left half of each picture and only the right half is scored (K-Planes, section 4.3; the protocol is that of NeRF in
+    the Wild, arXiv:2008.02268).
+
+    Args:
+        scene: to be rendered.
+        dataset: with its held-out pictures.
+        most: at most this many pictures, evenly spaced.
+        field: as for `SceneRenderer`.
     """
     held_out = np.flatnonzero(dataset.pictures.is_test)
     first = {int(number): _middle(dataset, int(number)) if scene.appearances else 0 for number in held_out}
@@ -207,12 +240,12 @@ def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None, field: 
 
 
 def _middle(dataset: Dataset, number: int) -> int:
-    """The first column of a picture's right half."""
+    """Return the first column of a picture's right half."""
     return int(dataset.pictures.width[number]) // 2
 
 
 def ground_truth(dataset: Dataset, number: int) -> np.ndarray:
-    """A picture of the dataset as (H, W, 3) float32 in [0, 1], on white where it is transparent."""
+    """Return a picture of the dataset as (H, W, 3) float32 in [0, 1], on white where it is transparent."""
     picture = dataset.pixels.picture(number).astype(np.float32) / np.float32(255)
     if dataset.has_alpha:
         return picture[..., :3] * picture[..., 3:] + WHITE * (1 - picture[..., 3:])
@@ -220,12 +253,15 @@ def ground_truth(dataset: Dataset, number: int) -> np.ndarray:
 
 
 def ssim(a: np.ndarray, b: np.ndarray, usable: np.ndarray | None = None) -> float:
-    """Structural similarity of (H, W, 3) pictures in [0, 1], the mean over pixels and channels.
+    """Return the structural similarity of two pictures, the mean over pixels and channels.
 
-    With (H, W) bool `usable`, the mean over windows whose central pixel is. They may reach over others.
+    Wang et al. 2004, eq. 13: Gaussian window of 11 x 11 with sigma 1.5, K1 = 0.01, K2 = 0.03. Only windows that lie
+    inside the picture count; smaller pictures take a smaller window.
 
-    Wang et al. 2004, eq. 13: Gaussian window of 11 x 11 with sigma 1.5, K1 = 0.01, K2 = 0.03; only windows that lie inside
-    the picture count (smaller pictures take a smaller window).
+    Args:
+        a: (H, W, 3) in [0, 1].
+        b: (H, W, 3) in [0, 1].
+        usable: (H, W) bool; only windows whose central pixel is usable count. They may reach over other pixels.
     """
     size = _window(*a.shape[:2])
     x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
@@ -250,7 +286,7 @@ def _window(height: int, width: int) -> int:
 
 
 def _centres(usable: np.ndarray) -> np.ndarray:
-    """The part of an (H, W) array that the central pixels of SSIM's windows lie in, row by row of windows."""
+    """Return the part of an (H, W) array that the central pixels of SSIM's windows lie in."""
     height, width = usable.shape
     size = _window(height, width)
     return usable[size // 2 : size // 2 + height - size + 1, size // 2 : size // 2 + width - size + 1]

@@ -1,4 +1,7 @@
-"""Where the time of a training step goes, and how near the kernels come to what the machine can do: `kpbench step`."""
+"""Profile of a training step: where its time goes, and how close the kernels come to the machine's limits.
+
+Used by `kpbench step`.
+"""
 
 import copy
 import math
@@ -17,21 +20,25 @@ from kpc.encoder.training.train import Trainer
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+# Steps before the profile, in multiples of the first step with an occupancy grid: by then the grid has formed and has
+# been split in time.
 STEPS = 8
-"""Steps before the profile, in multiples of the first with an occupancy grid: the grid has formed, and been split in time."""
 ROUNDS = 3
-FUSED_STEPS = 50
-"""Each round takes so many steps as training does, then one in plain PyTorch on the same kind of batch."""
+FUSED_STEPS = 50  # steps with the fused optimiser in a round; one step in plain PyTorch on a like batch follows
 
 
 def profile(trainer: Trainer) -> dict[str, Any]:
-    """Train for a while, then watch; what was found, in SI units and a step each, as a dictionary that JSON can hold.
+    """Train until the occupancy grid has settled, then measure steps.
 
-    Both optimisers work on the same field, grid and number of rays, by turns, with all cores. On a GPU there is one; of what it moves the
-    dictionary says how much, and how much the GPU could have moved.
+    On a CPU the fused optimiser and plain PyTorch take turns, on the same field, grid and number of rays, with all
+    cores. On a GPU there is only one optimiser; its memory traffic is compared with the GPU's copy rate.
+
+    Returns:
+        The measurements, in SI units per step, as a dictionary that JSON can hold.
 
     Raises:
-        ValueError: the run has fewer steps than that takes. TrainingError: as `Trainer.run`.
+        ValueError: the run has too few steps.
+        TrainingError: as for `Trainer.run`.
     """
     config = trainer.config
     if trainer.device.type != "cpu":
@@ -64,7 +71,7 @@ def profile(trainer: Trainer) -> dict[str, Any]:
 
 
 def _profile_on_gpu(trainer: Trainer) -> dict[str, Any]:
-    """As `profile`; `bytes`: what the operations of a step move, as `Traffic` counts them; `memory_gb_s`: what the device moves at most."""
+    """Profile on a GPU. `bytes`: memory traffic of a step (`Traffic`); `memory_gb_s`: the device's copy rate."""
     config, optimiser = trainer.config, trainer.optimiser
     assert isinstance(optimiser, TorchOptimiser)
     if config.steps < STEPS * config.occupancy_start + (ROUNDS + 1) * FUSED_STEPS:
@@ -79,7 +86,7 @@ def _profile_on_gpu(trainer: Trainer) -> dict[str, Any]:
         steps_s.append((time.perf_counter() - started) / FUSED_STEPS)
     rays = trainer.rays_per_step
     for _ in range(config.regularise_every):
-        step = _drawn(trainer, optimiser, rays)
+        step = _prepare_step(trainer, optimiser, rays)
         with Traffic() as traffic, optimiser.eager():
             step()
         trainer.step += 1
@@ -91,13 +98,14 @@ def _profile_on_gpu(trainer: Trainer) -> dict[str, Any]:
         "device": torch.cuda.get_device_name(),
         "rays": rays, "samples_per_ray": trainer.samples_per_ray, "parameters": trainer.field.theta.numel(),
         "step_s": step_s, "rays_per_s": rays / step_s, "bytes": bytes_, "least_bytes": least,
-        "memory_gb_s": limit / 1e9, "share_of_memory": bytes_ / step_s / limit, "least_share_of_memory": least / step_s / limit,
+        "memory_gb_s": limit / 1e9, "share_of_memory": bytes_ / step_s / limit,
+        "least_share_of_memory": least / step_s / limit,
         "gpu_memory_bytes": torch.cuda.max_memory_allocated(),
     }  # fmt: skip
 
 
 def _copy_rate() -> float:
-    """Bytes a second that the GPU reads and writes, in copying what fits no cache."""
+    """Return the bytes a second that the GPU reads and writes when it copies more than fits its caches."""
     one = torch.empty(1 << 28, device="cuda")
     other, seconds = torch.empty_like(one), []
     for _ in range(10):
@@ -110,11 +118,12 @@ def _copy_rate() -> float:
 
 
 class Traffic(TorchDispatchMode):
-    """Counts what operations move, as if no cache kept anything from one to the next: what they read and what they write, once; of tables
-    only the rows that they look up.
+    """Counts the memory traffic of operations, as if no cache kept anything between two of them.
+
+    Each operation's inputs are counted once and its outputs once; of a table only the rows that are looked up.
 
     Attributes:
-        bytes: so far.
+        bytes: traffic so far.
     """
 
     LOOK_UPS = ("index", "index_select", "gather", "_embedding_bag", "_embedding_bag_forward_only")
@@ -126,41 +135,48 @@ class Traffic(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
         out = func(*args, **(kwargs or {}))
         name = func.overloadpacket.__name__
-        made = [a for a in tree_leaves(out) if isinstance(a, torch.Tensor)]
-        read = [a for a in tree_leaves((args, kwargs)) if isinstance(a, torch.Tensor)]
-        sparse = [a for a in read if a.layout == torch.sparse_csr]
-        if func.is_view or any(a.layout == torch.sparse_csr for a in made):
+        outputs = [a for a in tree_leaves(out) if isinstance(a, torch.Tensor)]
+        inputs = [a for a in tree_leaves((args, kwargs)) if isinstance(a, torch.Tensor)]
+        sparse = [a for a in inputs if a.layout == torch.sparse_csr]
+        if func.is_view or any(a.layout == torch.sparse_csr for a in outputs):
             return out
-        if sparse:  # a row of what it is multiplied with for each entry, its number and its value; and what comes of it
-            self.bytes += sparse[0]._nnz() * (made[0].shape[1] + 2) * 4 + made[0].nbytes
+        if sparse:  # each entry reads a row of the dense factor, its column index and its value
+            self.bytes += sparse[0]._nnz() * (outputs[0].shape[1] + 2) * 4 + outputs[0].nbytes
         elif name in self.LOOK_UPS:
-            a_row = read[1].numel() / len(made[0]) if name.startswith("_embedding_bag") else 1
-            self.bytes += sum(map(_bytes, read[1:])) + (1 + a_row) * _bytes(made[0])
+            rows_per_output = inputs[1].numel() / len(outputs[0]) if name.startswith("_embedding_bag") else 1
+            self.bytes += sum(map(_bytes, inputs[1:])) + (1 + rows_per_output) * _bytes(outputs[0])
         else:
-            self.bytes += sum(map(_bytes, [*read, *made]))
+            self.bytes += sum(map(_bytes, [*inputs, *outputs]))
         return out
 
 
 def _bytes(tensor: torch.Tensor) -> int:
-    """Of the memory that a tensor reaches, what is repeated counted once."""
+    """Return the bytes of memory that a tensor covers; repeated elements (stride 0) count once."""
     numbers = math.prod(size for size, stride in zip(tensor.shape, tensor.stride(), strict=True) if stride)
     return numbers * tensor.element_size()
 
 
 def least_work(layout: Layout, samples: float) -> tuple[float, float]:
-    """What `kernels.backpropagate` has to do for so many samples at least: float operations, and bytes of texels read or written.
+    """Return a lower bound on what `kernels.backpropagate` has to do.
 
-    With P planes a scale and F = S M features, a sample takes 8 P F to interpolate and as many to give the gradient back, P F to
-    multiply, 14 F for the product's derivatives, 6 F for the density and 18 F for three colours, each with its gradient. It reads
-    four texels of 4 F bytes a plane, and reads and writes as much of the gradient.
+    With P planes per scale and F = S M features, a sample takes 8 P F operations to interpolate and as many to scatter
+    the gradient, P F to multiply, 14 F for the product's derivatives, 6 F for the density and 18 F for three colours,
+    each with its gradient. It reads four texels of 4 F bytes per plane, and reads and writes as much of the gradient.
+
+    Args:
+        layout: of the field.
+        samples: number of samples along all rays.
+
+    Returns:
+        Floating-point operations, and bytes of texels read or written.
     """
     planes, F = (6 if layout.is_dynamic else 3), layout.features
     return samples * F * (17 * planes + 38), samples * 48 * planes * F
 
 
 def _plain_step(trainer: Trainer, plain: TorchOptimiser, count: int) -> float:
-    """Seconds of a step with `count` rays, the field's decoder included, by as many threads as the machine has cores."""
-    step, threads = _drawn(trainer, plain, count), torch.get_num_threads()
+    """Return the seconds of a step with `count` rays in plain PyTorch, with as many threads as there are cores."""
+    step, threads = _prepare_step(trainer, plain, count), torch.get_num_threads()
     torch.set_num_threads(os.cpu_count() or 1)
     try:
         started = time.perf_counter()
@@ -170,8 +186,8 @@ def _plain_step(trainer: Trainer, plain: TorchOptimiser, count: int) -> float:
         torch.set_num_threads(threads)
 
 
-def _drawn(trainer: Trainer, optimiser: TorchOptimiser, count: int) -> Callable[[], object]:
-    """A step of `optimiser` with `count` rays, which are drawn at once."""
+def _prepare_step(trainer: Trainer, optimiser: TorchOptimiser, count: int) -> Callable[[], object]:
+    """Draw `count` rays and return a function that takes one step with them."""
     batch, targets = trainer.sampler.draw(trainer.rng, count, None if trainer.dataset.has_alpha else trainer.background)
     return partial(
         optimiser.step,

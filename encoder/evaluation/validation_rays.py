@@ -94,7 +94,7 @@ class ValidationRays:
         for camera, count in zip(cameras, counts, strict=True):
             pixels = rng.random((count, 2)) * (camera.width, camera.height)
             parts.append(camera_rays(camera, pixels, scene.mapping))
-        origins, directions = (np.concatenate(arrays) for arrays in zip(*parts))
+        origins, directions = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         return ValidationRays(origins, directions, rng.random(total, dtype=np.float32), None, None)
 
     @staticmethod
@@ -112,7 +112,9 @@ class ValidationRays:
             missing -= len(parts[-1].times)
             if not missing:
                 break
-        return ValidationRays(*(np.concatenate(arrays) for arrays in zip(*(part.rays for part in parts))), None, None)
+        return ValidationRays(
+            *(np.concatenate(arrays) for arrays in zip(*(part.rays for part in parts), strict=True)), None, None
+        )
 
     def subset(self, indices: np.ndarray) -> "ValidationRays":
         """Return the rays with the given indices."""
