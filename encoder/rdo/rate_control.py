@@ -1,11 +1,15 @@
-"""From a scene to symbols: how coarse each channel of each plane may be, how much each texel matters, and how coarse all may be together.
+"""Rate control: from a scene and a rate-distortion target to quantised planes.
 
-One factor on all steps states the trade between size and fidelity. A user names what it should bring (`Trade`), and it is sought
-(`kpc.encoder.rdo.rate_search`).
+One factor on all quantisation steps sets the trade-off between size and fidelity. A user states what is wanted
+(`Trade`), and the factor that brings it is searched for (`kpc.encoder.rdo.rate_search`). Relative to each other, the
+steps of all channels are such that a bit spent on any of them gains the same (`relative_steps`).
+
+Distortion D is an MSE on the 8-bit scale (`kpc.encoder.evaluation.validation_rays`), rate R is in bits per parameter
+of the model. Figures behind the constants: docs/design/rate-distortion.md, "Rate control".
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,57 +30,49 @@ from kpc.format.coding.quantise import (
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 
+# Base-two logarithms of the factors on all steps, between which one is searched for a trained scene.
 FINEST, COARSEST = -13.0, 2.0
-"""Base-two logarithms of the factors on all steps, between which one is sought for a trained scene."""
-RECODE_COARSEST = 12.0
-"""The same of the coarsest for a file that is coded again, whether as it is or with something left out; the finest is its own."""
-FIRST_GUESS, RECODE_GUESS = -9.5, 1.0
-"""Where searches between them begin."""
+RECODE_COARSEST = 12.0  # the coarsest for a file that is coded again; the finest is the file's own, 0
+FIRST_GUESS, RECODE_GUESS = -9.5, 1.0  # where searches begin
+# Expected change of log value per octave: of errors, with the square of coarser steps; of bytes, with finer steps.
 ERROR_SLOPE, BYTES_SLOPE = 2 * math.log(2), 0.5
-"""What logarithms grow by per octave, of errors with coarser steps, with their square, and of bytes with finer ones, about."""
-ROUGH_TOLERANCE = 0.2
-"""How far, as `search.TOLERANCE`, a search may end below that is only to tell where to tune, or what a size costs."""
-RENDERINGS = 8
-"""Scenes that a search renders, about."""
+ROUGH_TOLERANCE = 0.2  # tolerance of searches that only locate where to tune, or what a size costs
+RENDERINGS = 8  # scenes that a search renders, about
 
-DEFAULT_LOSS_DB = 0.15
+DEFAULT_LOSS_DB = 0.15  # PSNR that coding may cost where no target is given
 
+# A fine-tuned coding this share below the bytes or the error that it may not exceed is good enough: its error is
+# predicted less well.
 TUNED_BYTES_TOLERANCE, TUNED_ERROR_TOLERANCE = 0.05, 0.1
-"""A tuned coding this share below the bytes or the error that it may not exceed is good enough: errors are foreseen less well."""
-TUNED_ERROR, TUNED_BYTES = 0.7, 1.01
-"""What tuning makes of errors and of bytes, about: so it is known where to begin."""
-SIGNIFICANCE_EXPONENT = 0.8
-"""In what curvature says of the differences between texels and channels, `significance`. Room and liam, at equal error of held-out views:
-files are 1 to 2 % larger with 1; 0.7 and 0.9 make no difference."""
+TUNED_ERROR, TUNED_BYTES = 0.7, 1.01  # error and bytes with fine-tuning, as a share of those without, about
+SIGNIFICANCE_EXPONENT = 0.8  # of curvature in `significance`; 1 makes files 1 to 2 % larger
+# Share of the allowed error that fewer slots of the occupancy may take, and how many more cells, at most, a player then
+# has to march.
 SLOTS_SHARE, MORE_CELLS = 0.05, 1 / 3
-"""Of the error that coding may bring, how much of it fewer slots of the occupancy may; and by how many more cells, at most, players have to
-march. Soldier: 4 slots for 8 take 6.7 KB in place of 12.4, and a picture of 640x480 on two cores 80 ms in place of 64; so it is left to
-files that are to be small, from 0.4 dB of loss on."""
+# Share of the allowed error that fewer bits of the decoder's weights may take, and the fewest bits.
 DECODER_SHARE, FEWEST_BITS = 0.02, 3
-"""Of the error that coding may bring, how much fewer bits of the decoder's weights may; and the fewest. Default scene and room: 1.5 and 2.1 KB in place
-of 1.9 and 2.6 with 7 significant bits, 1.4 and 1.9 with 6; an error of a fiftieth planes undo with a fifth of a kilobyte."""
-MIN_SIGNIFICANCE = 1e-6
-"""Of a channel, relative to the most important of all numbers."""
+MIN_SIGNIFICANCE = 1e-6  # of a channel, relative to the most important of all values
 
+# Quantisation steps, (M,) per plane: one mapping per scale, from the plane's name.
 Steps = list[dict[str, np.ndarray]]
-"""One mapping a scale, plane name -> (M,) quantisation steps."""
+# Quantises a scene, given the steps, the cells that are looked up (`looked_up_cells`) and the significance of each
+# value.
 QuantiseFunction = Callable[[Scene, PerPlane, np.ndarray, PerPlane], QuantisedScene]
-"""Of a scene with steps, `looked_up_cells` it and significance: `quantise_by_cost`, or what is to be compared with it."""
+# Quantises a fixed scene with fine-tuning, given the steps and the cells that are looked up.
 TuneFunction = Callable[[PerPlane, np.ndarray], QuantisedScene]
-"""A better coding with the same steps, of a scene that is known, `looked_up_cells` which is told."""
 
 
 @dataclass(frozen=True)
 class Trade:
-    """What is given up for what: one of these alone, else DEFAULT_LOSS_DB.
+    """The rate-distortion target: at most one of these is set; none stands for a loss of DEFAULT_LOSS_DB.
 
     Attributes:
-        max_loss_db: PSNR that coding may cost on training views, what is left out included, dB.
-        target_bytes: the best file of at most this size.
-        quality: from 1 to 100: pictures agree with those of the uncoded scene to `agreement_of` dB.
-        lam: least D + lam R, with D the mean squared difference of colours from those of the uncoded scene, in squares of 8-bit
-            levels, and R bits of the file per parameter of the model.
-        psnr_db: the smallest file of at least this PSNR on training views, dB; where the model itself has less, as without a trade.
+        max_loss_db: PSNR that coding may cost on training views, pruning included, dB.
+        target_bytes: size that the file may not exceed.
+        quality: from 1 to 100; the PSNR of coded against uncoded pictures is at least `agreement_of` it, dB.
+        lam: lambda of the Lagrangian cost J = D + lambda R that is minimised.
+        psnr_db: PSNR that the file reaches at least on training views, dB. Where the model itself does not reach it, as
+            if no target was set.
     """
 
     max_loss_db: float | None = None
@@ -87,14 +83,18 @@ class Trade:
 
     @property
     def bound(self) -> tuple[str, float]:
-        """Which of them it is, and how much."""
+        """The name of the attribute that is set, and its value."""
         for name in ("target_bytes", "quality", "lam", "psnr_db", "max_loss_db"):
             if (value := getattr(self, name)) is not None:
                 return name, float(value)
         return "max_loss_db", DEFAULT_LOSS_DB
 
     def loss_db(self, psnr: float) -> float:
-        """What coding may cost, about, where the uncoded scene has so many dB: D adds to its own mean squared error. Of a size nobody knows."""
+        """Return the PSNR that coding may cost, about, dB; NaN for a size, of which that is not known.
+
+        Args:
+            psnr: of the uncoded scene, dB. D is assumed to add to its mean squared error.
+        """
         name, value = self.bound
         if name == "target_bytes":
             return math.nan
@@ -102,34 +102,34 @@ class Trade:
             return value
         if name == "psnr_db":
             return psnr - value if psnr > value else DEFAULT_LOSS_DB
-        # Where D falls to a quarter with a bit more, as fine quantisation has it, its slope is -2 ln 2 D.
-        error = mse_of_quality(value) if name == "quality" else value / (2 * math.log(2))
-        return loss_of_mse(psnr, error)
+        # At high rate D falls to a quarter with each bit, so that its slope is -2 ln 2 D = -lambda.
+        mse = mse_of_quality(value) if name == "quality" else value / (2 * math.log(2))
+        return loss_of_mse(psnr, mse)
 
 
 def agreement_of(quality: float) -> float:
-    """PSNR of coded against uncoded pictures, dB, that a quality from 1 to 100 stands for: 20 + quality / 3."""
+    """Return the PSNR of coded against uncoded pictures, dB, of a quality from 1 to 100: 20 + quality / 3."""
     return 20 + quality / 3
 
 
 def mse_of_quality(quality: float) -> float:
-    """The same as a mean squared difference, in squares of 8-bit levels."""
+    """Return the MSE, on the 8-bit scale, of a quality from 1 to 100."""
     return mse_of_psnr(agreement_of(quality))
 
 
 def mse_of_loss(psnr: float, loss_db: float) -> float:
-    """The mean squared difference, in squares of 8-bit levels, that takes so many dB from pictures of some PSNR, adding to their own."""
+    """Return the MSE, on the 8-bit scale, that costs pictures of a PSNR `loss_db` when it adds to their own."""
     return mse_of_psnr(psnr) * (10 ** (loss_db / 10) - 1)
 
 
-def loss_of_mse(psnr: float, error: float) -> float:
-    """What `mse_of_loss` undoes."""
-    return 10 * math.log10(1 + error / mse_of_psnr(psnr))
+def loss_of_mse(psnr: float, mse: float) -> float:
+    """Return the loss in dB; the inverse of `mse_of_loss`."""
+    return 10 * math.log10(1 + mse / mse_of_psnr(psnr))
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A scene quantised, with steps times two to the power of `exponent`; what that gave is found out when asked for."""
+    """A scene quantised with steps scaled by 2^exponent; its file and its fidelity are computed on demand."""
 
     quantised: QuantisedScene
     measure: Measure
@@ -137,7 +137,7 @@ class Attempt:
 
     @cached_property
     def data(self) -> bytes:
-        """Its file."""
+        """The encoded file."""
         return scene_io.encode(self.quantised)
 
     @property
@@ -149,141 +149,205 @@ class Attempt:
         return self.measure(self.quantised.dequantise())
 
     def cost(self, lam: float) -> float:
-        """D + lam R."""
+        """Return the Lagrangian cost J = D + lambda R."""
         return self.measured.mse + lam * 8 * self.size_bytes / self.quantised.parameter_count
 
 
-def significance(alone: PerPlane) -> list[dict[str, np.ndarray]]:
-    """What an error in each number costs, as a share of the most that any does: (h / largest)^TRUST of `Curvature.diagonal` h, float32.
+def significance(diagonal: PerPlane) -> list[dict[str, np.ndarray]]:
+    """Return the relative cost of a squared error in each value: (h / max h)^SIGNIFICANCE_EXPONENT, float32.
 
-    Of h alone: what is left to cross terms, and to rays that were not drawn, makes the unimportant more important than h has it.
+    The exponent allows for what the diagonal h of the curvature misses: cross terms, and rays that were not drawn,
+    make unimportant values more important.
+
+    Args:
+        diagonal: `Curvature.diagonal`.
     """
-    largest = max(float(h.max()) for scale in alone for h in scale.values()) or 1.0
-    return [
-        {name: (h / np.float32(largest)) ** np.float32(SIGNIFICANCE_EXPONENT) for name, h in scale.items()}
-        for scale in alone
-    ]
+    largest = max(float(h.max()) for scale in diagonal for h in scale.values()) or 1.0
+    exponent = np.float32(SIGNIFICANCE_EXPONENT)
+    return [{name: (h / np.float32(largest)) ** exponent for name, h in scale.items()} for scale in diagonal]
 
 
-def reduce_slots(scene: Scene, measure: Measure, error: float) -> Scene:
-    """The scene with its occupancy in fewer slots, if that adds at most `error`, in squares of 8-bit levels, and MORE_CELLS cells; else
-    itself."""
+def reduce_slots(scene: Scene, measure: Measure, mse: float) -> Scene:
+    """Merge time slots of the occupancy if that adds at most `mse` (8-bit scale) and a share MORE_CELLS of cells."""
     merged = merge_slots(scene.occupancy, MORE_CELLS)
     if len(merged) == len(scene.occupancy):
         return scene
     candidate = replace(scene, occupancy=merged)
-    return candidate if measure(candidate).mse - measure(scene).mse <= error else scene
+    return candidate if measure(candidate).mse - measure(scene).mse <= mse else scene
 
 
-def choose_decoder_bits(scene: Scene, measure: Measure, error: float) -> dict[str, int]:
-    """Of each array of the decoder's weights, for `round_decoder`, the fewest bits with which all of them add at most `error`, in squares of
-    8-bit levels: first of all arrays alike, then of one after the other, those that take most first. None at all where HALF_BITS are too few."""
+def choose_decoder_bits(scene: Scene, measure: Measure, mse: float) -> dict[str, int]:
+    """Return the fewest bits per weight, for each array of the decoder, which together add at most `mse`.
+
+    The bits are lowered for all arrays alike first, then for one array after the other, the largest first.
+
+    Args:
+        scene: with the decoder.
+        measure: judges scenes.
+        mse: on the 8-bit scale.
+
+    Returns:
+        Bits by the array's name, for `round_decoder`; empty where HALF_BITS are too few.
+    """
     known, weights = measure(scene).mse, decoder_arrays(scene.decoder)
 
-    def enough(bits: dict[str, int]) -> bool:
-        return measure(replace(scene, decoder=round_decoder(scene.decoder, bits))).mse - known <= error
+    def suffices(bits: dict[str, int]) -> bool:
+        return measure(replace(scene, decoder=round_decoder(scene.decoder, bits))).mse - known <= mse
 
-    alike = (dict.fromkeys(weights, count) for count in range(FEWEST_BITS, HALF_BITS + 1))
-    bits = next(filter(enough, alike), {})
+    uniform = (dict.fromkeys(weights, count) for count in range(FEWEST_BITS, HALF_BITS + 1))
+    bits = next(filter(suffices, uniform), {})
     for name in sorted(bits, key=lambda name: -weights[name].size):
-        while bits[name] > FEWEST_BITS and enough(fewer := bits | {name: bits[name] - 1}):
+        while bits[name] > FEWEST_BITS and suffices(fewer := bits | {name: bits[name] - 1}):
             bits = fewer
     return bits
 
 
 def relative_steps(significant: PerPlane) -> Steps:
-    """Steps up to one common factor, such that a bit spent on any channel buys about the same.
+    """Return quantisation steps, up to a common factor, at which a bit spent on any channel gains the same.
 
-    A uniform quantiser of step d errs by d^2 / 12 times a constant; the error costs `significant` w of it; its rate falls by one bit
-    with each doubling of d. At equal slopes the mean of w d^2 is the same everywhere: d = 1 / sqrt(mean w), over texels that matter
-    at all. Channels without any get the coarsest step of all.
+    The error of a uniform quantiser of step d is proportional to d^2; it costs w, its significance, per unit. The rate
+    falls by one bit with each doubling of d. Slopes are equal where the mean of w d^2 is: d = 1 / sqrt(mean w), the
+    mean over texels of nonzero significance. Channels without any get the coarsest step of all.
+
+    Args:
+        significant: (H, W, M) per plane.
     """
     return [
-        {name: np.maximum(_means(w), MIN_SIGNIFICANCE) ** -0.5 for name, w in scale.items()} for scale in significant
+        {name: np.maximum(_nonzero_means(w), MIN_SIGNIFICANCE) ** -0.5 for name, w in scale.items()}
+        for scale in significant
     ]
 
 
-def _means(values: np.ndarray) -> np.ndarray:
-    """(M,) float64 of (H, W, M), over texels that are not 0."""
+def _nonzero_means(values: np.ndarray) -> np.ndarray:
+    """Return (M,) float64 means of the nonzero values of (H, W, M)."""
     flat = values.reshape(-1, values.shape[-1])
     return flat.sum(0, dtype=np.float64) / np.maximum(np.count_nonzero(flat, axis=0), 1)
 
 
 def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
-    """All steps times a factor, as float32 of 8 significant bits, `bfloat16_ceil`."""
+    """Return all steps times a factor, rounded up to float32 of 8 significant bits."""
     return [
         {name: bfloat16_ceil((step * factor).astype(np.float32)) for name, step in scale.items()} for scale in steps
     ]
 
 
-def meet_trade(
-    scene: Scene,
-    steps: Steps,
-    significant: PerPlane,
-    measure: Measure,
-    uncoded_psnr: float,
-    trade: Trade,
-    source_file: QuantisedScene | None = None,
-    quantise: QuantiseFunction = quantise_by_cost,
-    tune: TuneFunction | None = None,
-    own_steps: bool = False,
-    tolerance: float = TOLERANCE,
-) -> Attempt:
-    """The quantisation that a trade asks for; of a size that no file has, the smallest.
+@dataclass(frozen=True)
+class _Goal:
+    """A limit on size or error, for `find_limit`: `value` rises from exponent `start` to `end`."""
 
-    Args:
-        measure: judges a coding; `uncoded_psnr` is that of the scene before anything was left out.
-        source_file: the file that holds just this scene, with these steps.
-        tune: what makes a better coding at some steps, and takes its time: the trade is met by such a one.
-        own_steps: `steps` are those of a file, of which something may have been left out since: nothing finer makes sense.
-        tolerance: as of `kpc.encoder.rdo.rate_search.find_limit`.
-    """
-    reached = looked_up_cells(scene)
-    own_steps = own_steps or source_file is not None
-    finest, coarsest, guess = (0.0, RECODE_COARSEST, RECODE_GUESS) if own_steps else (FINEST, COARSEST, FIRST_GUESS)
-    tried: dict[float, Attempt] = {}
-
-    def attempt(exponent: float) -> Attempt:
-        if source_file is not None and exponent == 0:
-            return Attempt(source_file, measure, exponent)
-        if exponent not in tried:
-            tried[exponent] = Attempt(
-                quantise(scene, scaled(steps, 2.0**exponent), reached, significant), measure, exponent
-            )
-        return tried[exponent]
-
-    def tuned(exponent: float) -> Attempt:
-        assert tune is not None
-        return Attempt(tune(scaled(steps, 2.0**exponent), reached), measure, exponent)
-
-    name, bound = trade.bound
-    if name == "lam":
-        found = minimise(finest, coarsest, attempt, lambda found: found.cost(bound))
-        return found if tune is None else min(found, tuned(found.exponent), key=lambda found: found.cost(bound))
+    start: float
+    end: float
+    limit: float
+    slope: float
     value: Callable[[Attempt], float]
-    if name == "target_bytes":
-        if source_file is not None and (whole := attempt(0.0)).size_bytes <= bound:
-            return whole
-        start, end, most, slope, value = coarsest, finest, bound, BYTES_SLOPE, lambda found: found.size_bytes
-    elif name == "quality":
-        start, end, most, slope, value = (
-            finest,
-            coarsest,
-            mse_of_quality(bound),
-            ERROR_SLOPE,
-            lambda found: found.measured.mse,
+
+
+@dataclass(frozen=True)
+class RateController:
+    """Finds the quantisation of a scene that meets a rate-distortion target.
+
+    Attributes:
+        scene: to be coded.
+        steps: of its planes, up to a common factor; of a file that is coded again, its own.
+        significant: cost of a squared error in each value, (H, W, M) per plane.
+        measure: judges a coding.
+        uncoded_psnr: of the scene before anything was pruned, dB.
+        source_file: the file that holds just this scene, with these steps.
+        quantise: chooses the symbols.
+        tune: quantises with fine-tuning, which is better and slow. Where given, its result is to meet the target.
+        own_steps: whether `steps` are those of a file that was pruned since; finer steps then gain nothing.
+    """
+
+    scene: Scene
+    steps: Steps
+    significant: PerPlane
+    measure: Measure
+    uncoded_psnr: float
+    source_file: QuantisedScene | None = None
+    quantise: QuantiseFunction = quantise_by_cost
+    tune: TuneFunction | None = None
+    own_steps: bool = False
+
+    @cached_property
+    def _looked_up(self) -> np.ndarray:
+        return looked_up_cells(self.scene)
+
+    @cached_property
+    def _tried(self) -> dict[float, Attempt]:
+        return {}
+
+    def meet(self, trade: Trade, tolerance: float = TOLERANCE) -> Attempt:
+        """Return the quantisation that meets a target; of a size that no file has, the smallest.
+
+        Args:
+            trade: the target.
+            tolerance: as for `kpc.encoder.rdo.rate_search.find_limit`.
+        """
+        own_steps = self.own_steps or self.source_file is not None
+        finest, coarsest, guess = (0.0, RECODE_COARSEST, RECODE_GUESS) if own_steps else (FINEST, COARSEST, FIRST_GUESS)
+        name, bound = trade.bound
+        if name == "lam":
+            found = minimise(finest, coarsest, self._attempt, lambda one: one.cost(bound))
+            if self.tune is None:
+                return found
+            return min(found, self._tuned(found.exponent), key=lambda one: one.cost(bound))
+        if name == "target_bytes" and self.source_file is not None:
+            whole = self._attempt(0.0)
+            if whole.size_bytes <= bound:
+                return whole
+        goal = self._goal(trade, finest, coarsest)
+        if self.tune is None:
+            return self._search(goal, guess, tolerance)
+        return self._search_tuned(goal, guess, tolerance, name == "target_bytes")
+
+    def _attempt(self, exponent: float) -> Attempt:
+        if self.source_file is not None and exponent == 0:
+            return Attempt(self.source_file, self.measure, exponent)
+        if exponent not in self._tried:
+            steps = scaled(self.steps, 2.0**exponent)
+            quantised = self.quantise(self.scene, steps, self._looked_up, self.significant)
+            self._tried[exponent] = Attempt(quantised, self.measure, exponent)
+        return self._tried[exponent]
+
+    def _tuned(self, exponent: float) -> Attempt:
+        assert self.tune is not None
+        return Attempt(self.tune(scaled(self.steps, 2.0**exponent), self._looked_up), self.measure, exponent)
+
+    def _goal(self, trade: Trade, finest: float, coarsest: float) -> _Goal:
+        name, bound = trade.bound
+        if name == "target_bytes":
+            return _Goal(coarsest, finest, bound, BYTES_SLOPE, lambda one: one.size_bytes)
+        if name == "quality":
+            return _Goal(finest, coarsest, mse_of_quality(bound), ERROR_SLOPE, lambda one: one.measured.mse)
+        limit = trade.loss_db(self.uncoded_psnr)
+        return _Goal(finest, coarsest, limit, ERROR_SLOPE, lambda one: self.uncoded_psnr - one.measured.psnr)
+
+    def _search(self, goal: _Goal, guess: float, tolerance: float, tried: Iterable[Attempt] = ()) -> Attempt:
+        return find_limit(
+            goal.start, goal.end, guess, self._attempt, goal.value, goal.limit, goal.slope, tolerance, tried
         )
-    else:
-        start, end, most, slope = finest, coarsest, trade.loss_db(uncoded_psnr), ERROR_SLOPE
-        value = lambda found: uncoded_psnr - found.measured.psnr
-    if tune is None:
-        return find_limit(start, end, guess, attempt, value, most, slope, tolerance)
-    by_size = name == "target_bytes"
-    made, enough = (TUNED_BYTES, TUNED_BYTES_TOLERANCE) if by_size else (TUNED_ERROR, TUNED_ERROR_TOLERANCE)
-    spent: Callable[[Attempt], float] = lambda found: found.measured.mse if by_size else found.size_bytes
-    found = find_limit(start, end, guess, attempt, value, most, slope, ROUGH_TOLERANCE)
-    better = find_tuned_limit(start, end, found, tried.values(), tuned, value, most, enough, made, slope)
-    if better is not None and value(better) >= (1 - enough) * most and spent(better) < spent(found):
-        return better
-    found = find_limit(start, end, guess, attempt, value, most, slope, tolerance, tried.values())
-    return better if better is not None and spent(better) < spent(found) else found
+
+    def _search_tuned(self, goal: _Goal, guess: float, tolerance: float, by_size: bool) -> Attempt:
+        """Meet the goal with fine-tuning, unless a coding without is better."""
+        gain, enough = (TUNED_BYTES, TUNED_BYTES_TOLERANCE) if by_size else (TUNED_ERROR, TUNED_ERROR_TOLERANCE)
+
+        def spent(one: Attempt) -> float:
+            return one.measured.mse if by_size else one.size_bytes
+
+        found = self._search(goal, guess, ROUGH_TOLERANCE)
+        better = find_tuned_limit(
+            goal.start,
+            goal.end,
+            found,
+            self._tried.values(),
+            self._tuned,
+            goal.value,
+            goal.limit,
+            enough,
+            gain,
+            goal.slope,
+        )
+        if better is not None and goal.value(better) >= (1 - enough) * goal.limit and spent(better) < spent(found):
+            return better
+        found = self._search(goal, guess, tolerance, self._tried.values())
+        return better if better is not None and spent(better) < spent(found) else found

@@ -1,28 +1,21 @@
-"""How coarse all steps may be together: searches along the exponent, base two, of one factor on them.
+"""Searches for one common factor on all quantisation steps, along its base-two logarithm, the exponent.
 
-What is made of an exponent, a `HasExponent`, costs seconds, and minutes where it is tuned, so that few are made: how a value follows steps is
-known well enough to guess where it is met.
+An attempt, what is made of an exponent, takes seconds, and minutes with fine-tuning. How size and error follow the
+steps is known well enough to extrapolate, so that few attempts suffice.
 """
 
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol, TypeVar
 
-TOLERANCE = 0.02
-"""A search ends this share below what it may not exceed."""
-MIN_OCTAVES = 0.02
-"""Octaves. Steps that differ by less err differently, but on average the same."""
-MAX_ATTEMPTS = 16
-"""A search makes at most so many."""
-MIN_LEAP = 0.3
-"""Octaves, at least, and twice as many each time, to where a value is sought that has been met on one side only."""
+TOLERANCE = 0.02  # a search ends within this share below the limit
+MIN_OCTAVES = 0.02  # steps closer than this differ in their errors, but not on average
+MAX_ATTEMPTS = 16  # attempts of a search
+MIN_LEAP = 0.3  # first leap, in octaves, while the value is known on one side only; it doubles each time
 GOLDEN = (math.sqrt(5) - 1) / 2
-COST_OCTAVES = 0.3
-"""Octaves within which the least cost is sought; at the least it hardly changes."""
-MAX_TUNINGS = 4
-"""At most so many codings are tuned: each takes a minute, about. Mostly two are."""
-SLOPE_OCTAVES = 0.3
-"""Octaves between two steps that tell how a value follows them."""
+COST_OCTAVES = 0.3  # the least cost is located this closely; near it the cost hardly changes
+MAX_TUNINGS = 4  # fine-tuned attempts, about a minute each; most searches take two
+SLOPE_OCTAVES = 0.3  # distance of two attempts, at least, from which a slope is taken
 
 
 class HasExponent(Protocol):
@@ -41,62 +34,80 @@ def find_limit(
     guess: float,
     attempt: Callable[[float], Made],
     value: Callable[[Made], float],
-    most: float,
+    limit: float,
     slope: float,
     tolerance: float = TOLERANCE,
     tried: Iterable[Made] = (),
 ) -> Made:
-    """What `attempt` makes of the exponent farthest from `start` towards `end`, along which `value` rises, where that is `most` or less; of
-    `start` where nowhere.
+    """Find the exponent farthest from `start` whose value is at most `limit`.
 
-    Begins at the `guess`, or with what was `tried`, and goes on as far as a logarithm of the value with this slope, per octave, wants it,
-    but ever farther, until the value is known on both sides. Between them it goes by the line through both, but never nearer to either
-    than a tenth of the way. Where both sides come within GRAIN, `value` is rough: then what lies a few grains on. Ends when the tolerance
-    is met, or after ATTEMPTS.
+    The search extrapolates log value linearly, in growing leaps, until the limit is bracketed. Then it interpolates
+    between both sides, but never within a tenth of either. Where both sides are closer than MIN_OCTAVES, the value is
+    noisy, and exponents beyond are tried in steps of MIN_OCTAVES.
+
+    Args:
+        start: exponent that is returned where no value is within the limit.
+        end: exponent on the other side; values rise towards it.
+        guess: exponent of the first attempt, unless some were `tried`.
+        attempt: makes an attempt of an exponent.
+        value: of an attempt.
+        limit: what the value may not exceed.
+        slope: expected change of log value per octave.
+        tolerance: the search ends with a value within this share below the limit, or after MAX_ATTEMPTS.
+        tried: attempts made before.
     """
-    way = math.copysign(1.0, end - start)
+    direction = math.copysign(1.0, end - start)
     known = list(tried)
-    wanted = math.log(most * (1 - tolerance / 2)) if most > 0 else -math.inf
-    leap, grains = MIN_LEAP, 0
-    for number in range(MAX_ATTEMPTS + 1):  # and a last look
+    wanted = math.log(limit * (1 - tolerance / 2)) if limit > 0 else -math.inf
+    leap, noisy = MIN_LEAP, 0
+    for number in range(MAX_ATTEMPTS + 1):  # the last round only returns what was found
+        # NaN counts as beyond the limit.
         within = max(
-            (one for one in known if value(one) <= most), key=lambda one: way * one.exponent, default=None
-        )  # not so with NaN
-        beyond = min((one for one in known if not value(one) <= most and (within is None or way * (one.exponent - within.exponent) > 0)),
-                     key=lambda one: way * one.exponent, default=None)  # fmt: skip
+            (one for one in known if value(one) <= limit), key=lambda one: direction * one.exponent, default=None
+        )
+        beyond = min(
+            (
+                one
+                for one in known
+                if not value(one) <= limit and (within is None or direction * (one.exponent - within.exponent) > 0)
+            ),
+            key=lambda one: direction * one.exponent,
+            default=None,
+        )
         if within is not None and (
-            value(within) >= (1 - tolerance) * most or within.exponent == end or number == MAX_ATTEMPTS
+            value(within) >= (1 - tolerance) * limit or within.exponent == end or number == MAX_ATTEMPTS
         ):
             return within
-        if within is None and (number == MAX_ATTEMPTS or beyond is not None and beyond.exponent == start):
+        if within is None and (number == MAX_ATTEMPTS or (beyond is not None and beyond.exponent == start)):
             break
         if within is not None and beyond is not None:
-            apart = beyond.exponent - within.exponent
-            if abs(apart) < MIN_OCTAVES:
-                grains += 1
-                exponent = beyond.exponent + way * grains * MIN_OCTAVES
+            distance = beyond.exponent - within.exponent
+            if abs(distance) < MIN_OCTAVES:
+                noisy += 1
+                exponent = beyond.exponent + direction * noisy * MIN_OCTAVES
             else:
-                exponent = within.exponent + apart * min(max(_share(value(within), value(beyond), wanted), 0.1), 0.9)
+                share = min(max(_share(value(within), value(beyond), wanted), 0.1), 0.9)
+                exponent = within.exponent + distance * share
         elif within is not None or beyond is not None:
             nearest = within if within is not None else beyond
             assert nearest is not None
             reached = value(nearest)
             missing = abs(wanted - math.log(reached)) / slope if 0 < reached < math.inf else 0.0
-            exponent = nearest.exponent + math.copysign(max(missing, leap), way if nearest is within else -way)
+            sign = direction if nearest is within else -direction
+            exponent = nearest.exponent + math.copysign(max(missing, leap), sign)
             leap *= 2
         else:
             exponent = guess
-        known.append(attempt(_between(start, end, exponent)))
+        known.append(attempt(_clamp(exponent, start, end)))
     return attempt(start)
 
 
-def _between(start: float, end: float, exponent: float) -> float:
-    """It, or the one of the two that it lies beyond."""
+def _clamp(exponent: float, start: float, end: float) -> float:
     return min(max(exponent, min(start, end)), max(start, end))
 
 
 def _share(low: float, high: float, wanted: float) -> float:
-    """Of the way between two places, where on a line of logarithms a wanted one is met; half where they tell nothing."""
+    """Interpolate log values: return where `wanted` lies from `low` (0) to `high` (1); 0.5 where they say nothing."""
     if not (0 < low < high < math.inf) or math.isinf(wanted):
         return 0.5
     return (wanted - math.log(low)) / math.log(high / low)
@@ -109,47 +120,64 @@ def find_tuned_limit(
     tried: Iterable[Made],
     tuned: Callable[[float], Made],
     value: Callable[[Made], float],
-    most: float,
+    limit: float,
     enough: float,
-    made: float,
+    gain: float,
     slope: float,
 ) -> Made | None:
-    """A coding that is tuned, whose value is `most` or less, by the share `enough` where a few tunings come so near; None where none has it.
+    """Find a fine-tuned attempt whose value is at most `limit`, in few attempts.
 
-    It is sought where its value should be so, tuning making the share `made` of what it is without: how the logarithm of the value
-    follows that of the steps is known from what was `tried`, of which `found` is the best without tuning, and ever better from what was
-    tuned; where nothing tells, `slope`, per octave towards the `end`, is taken.
+    The exponent is extrapolated: from `found`, with the slope of the attempts that were `tried`, then with ever better
+    slopes from the fine-tuned attempts.
+
+    Args:
+        start: as for `find_limit`.
+        end: as for `find_limit`.
+        found: the best attempt without fine-tuning.
+        tried: other attempts without fine-tuning.
+        tuned: makes a fine-tuned attempt of an exponent.
+        value: of an attempt.
+        limit: what the value may not exceed.
+        enough: the search ends with a value within this share below the limit, or after MAX_TUNINGS.
+        gain: expected ratio of values with and without fine-tuning.
+        slope: expected change of log value per octave towards `end`, where no attempt says more.
+
+    Returns:
+        The attempt with the largest value within the limit; None where there is none.
     """
-    if not 0 < value(found) <= most:
+    if not 0 < value(found) <= limit:
         return None
     slope = math.copysign(slope, end - start)
     others = [one for one in tried if abs(one.exponent - found.exponent) >= SLOPE_OCTAVES and 0 < value(one) < math.inf]
     if others:
         other = min(others, key=lambda one: abs(one.exponent - found.exponent))
-        own = math.log(value(other) / value(found)) / (other.exponent - found.exponent)
-        if own * slope > 0:
-            slope = own
-    wanted = math.log(most * (1 - enough / 2))
-    exponent, best = found.exponent + (wanted - math.log(made * value(found))) / slope, None
+        measured = math.log(value(other) / value(found)) / (other.exponent - found.exponent)
+        if measured * slope > 0:
+            slope = measured
+    wanted = math.log(limit * (1 - enough / 2))
+    exponent, best = found.exponent + (wanted - math.log(gain * value(found))) / slope, None
     known: list[tuple[float, float]] = []
     for _ in range(MAX_TUNINGS):
-        candidate = tuned(_between(start, end, exponent))
+        candidate = tuned(_clamp(exponent, start, end))
         reached = value(candidate)
-        if not reached > 0:  # so with NaN
+        if not reached > 0:  # true for NaN
             break
-        if reached <= most and (best is None or reached > value(best)):
+        if reached <= limit and (best is None or reached > value(best)):
             best = candidate
-        if (1 - enough) * most <= reached <= most:
+        if (1 - enough) * limit <= reached <= limit:
             break
         known.append((candidate.exponent, math.log(reached)))
-        exponent = _where(known, wanted, slope)
+        exponent = _extrapolate(known, wanted, slope)
     return best
 
 
-def _where(known: Sequence[tuple[float, float]], wanted: float, slope: float) -> float:
-    """The place of a wanted value between the farthest known (place, value) below it and the next above that; where it is not known on both sides, on
-    the line through the two nearest to it; where there is but one, or that line is steeper or flatter than the slope by more than a factor
-    of three, on one through the latest with that slope."""
+def _extrapolate(known: Sequence[tuple[float, float]], wanted: float, slope: float) -> float:
+    """Return the exponent at which a log value is expected, from known (exponent, log value) pairs.
+
+    Interpolates between the farthest pair below the value and the next pair above it. Where the value is not bracketed,
+    extrapolates the line through the two nearest pairs; where there is one pair only, or that line differs from `slope`
+    by more than a factor of three, a line of that slope through the latest pair.
+    """
     below = max((point for point in known if point[1] <= wanted), key=lambda point: slope * point[0], default=None)
     above = min(
         (point for point in known if point[1] > wanted and below is not None and slope * (point[0] - below[0]) > 0),
@@ -159,17 +187,17 @@ def _where(known: Sequence[tuple[float, float]], wanted: float, slope: float) ->
     if below is not None and above is not None:
         return below[0] + (wanted - below[1]) / (above[1] - below[1]) * (above[0] - below[0])
     nearest = sorted(known, key=lambda point: abs(point[1] - wanted))[:2]
-    place, value = known[-1]
+    exponent, value = known[-1]
     if len(nearest) == 2 and nearest[0][0] != nearest[1][0]:
         (one, low), (other, high) = nearest
-        own = (high - low) / (other - one)
-        if 1 / 3 < own / slope < 3:
-            place, value, slope = one, low, own
-    return place + (wanted - value) / slope
+        measured = (high - low) / (other - one)
+        if 1 / 3 < measured / slope < 3:
+            exponent, value, slope = one, low, measured
+    return exponent + (wanted - value) / slope
 
 
 def minimise(low: float, high: float, attempt: Callable[[float], Made], cost: Callable[[Made], float]) -> Made:
-    """What `attempt` makes of the exponent of least cost, by golden section: it falls, then rises."""
+    """Return the attempt of least cost by golden-section search; the cost falls, then rises, from `low` to `high`."""
     left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
     one, other = attempt(left), attempt(right)
     while high - low > COST_OCTAVES:

@@ -196,7 +196,7 @@ def test_one_colour_takes_next_to_nothing_in_the_file() -> None:
 def test_passing_on_is_least_squares() -> None:
     """What colour and density lose is the least that any share of the others can leave."""
     scene = tiny_scene()
-    seen, gone = SurfaceFeatures.of(scene, rays_of(scene)), np.array([3, 9])
+    seen, gone = SurfaceFeatures.sample(scene, rays_of(scene)), np.array([3, 9])
     left = np.setdiff1d(np.arange(16), gone)
     after = redistribute(scene.decoder, seen, gone)
     colour = scene.decoder.b2[:, gone].astype(float)

@@ -12,11 +12,11 @@ from kpc.encoder.rdo.rate_control import (
     MIN_SIGNIFICANCE,
     SIGNIFICANCE_EXPONENT,
     Attempt,
+    RateController,
     Steps,
     Trade,
     agreement_of,
     choose_decoder_bits,
-    meet_trade,
     mse_of_quality,
     reduce_slots,
     relative_steps,
@@ -64,7 +64,7 @@ def measure(scene: Scene) -> Fidelity:
 
 
 def coded(**trade: float) -> Attempt:
-    return meet_trade(SCENE, EQUAL, ALIKE, measure, 30.0, Trade(**trade))  # type: ignore[arg-type]
+    return RateController(SCENE, EQUAL, ALIKE, measure, 30.0).meet(Trade(**trade))  # type: ignore[arg-type]
 
 
 def loss(found: Attempt) -> float:
@@ -145,7 +145,7 @@ def test_a_psnr_that_is_not_a_number_does_not_pass() -> None:
         seen.append(scene)
         return measure(scene) if len(seen) < 3 else Fidelity(math.nan, math.nan)
 
-    found = meet_trade(SCENE, EQUAL, ALIKE, broken, 30.0, Trade(0.15))
+    found = RateController(SCENE, EQUAL, ALIKE, broken, 30.0).meet(Trade(0.15))
     assert math.isfinite(found.measured.psnr) and found.size_bytes > 0
 
 
@@ -154,9 +154,13 @@ def test_a_file_is_never_made_finer_than_it_is() -> None:
     own = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in whole.scales]
     size = len(scene_io.encode(whole))
     for trade in (Trade(quality=100), Trade(target_bytes=size), Trade(max_loss_db=1e-9)):
-        judged = meet_trade(whole.dequantise(), own, ALIKE, measure, measure(whole.dequantise()).psnr, trade, whole)
+        judged = RateController(whole.dequantise(), own, ALIKE, measure, measure(whole.dequantise()).psnr, whole).meet(
+            trade
+        )
         assert judged.quantised is whole
-    smaller = meet_trade(whole.dequantise(), own, ALIKE, measure, 30.0, Trade(target_bytes=int(0.8 * size)), whole)
+    smaller = RateController(whole.dequantise(), own, ALIKE, measure, 30.0, whole).meet(
+        Trade(target_bytes=int(0.8 * size))
+    )
     assert 0.7 * size < smaller.size_bytes <= 0.8 * size
 
 
@@ -201,7 +205,7 @@ def test_channels_that_no_ray_reached_get_the_coarsest_step() -> None:
 def test_where_nothing_costs_anything_all_steps_are_equal() -> None:
     nothing = significance([{name: np.zeros_like(plane) for name, plane in scale.items()} for scale in SCENE.scales])
     assert len({float(step) for scale in relative_steps(nothing) for steps in scale.values() for step in steps}) == 1
-    assert math.isfinite(meet_trade(SCENE, EQUAL, nothing, measure, 30.0, Trade()).measured.psnr)
+    assert math.isfinite(RateController(SCENE, EQUAL, nothing, measure, 30.0).meet(Trade()).measured.psnr)
 
 
 @pytest.mark.parametrize("error, common, slots", [(1.0, 100, 1), (1.0, 50, 2), (0.1, 100, 4)])
@@ -256,7 +260,7 @@ def tuned_to(factor: float, seen: list[Attempt] | None = None, power: float = 1.
             seen.append(Attempt(made, measure, 0.0))
         return made
 
-    return meet_trade(SCENE, EQUAL, ALIKE, measure, 30.0, Trade(**trade), tune=tune)  # type: ignore[arg-type]
+    return RateController(SCENE, EQUAL, ALIKE, measure, 30.0, tune=tune).meet(Trade(**trade))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("factor", [0.6, 0.85])
@@ -294,5 +298,5 @@ def test_tuning_that_breaks_leaves_what_was_found() -> None:
     def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
         return replace(quantise_by_cost(SCENE, steps, reached), step=7.0)
 
-    found = meet_trade(SCENE, EQUAL, ALIKE, broken, 30.0, Trade(0.15), tune=tune)
+    found = RateController(SCENE, EQUAL, ALIKE, broken, 30.0, tune=tune).meet(Trade(0.15))
     assert found.quantised.step != 7 and 0.07 < loss(found) <= 0.15
