@@ -34,7 +34,8 @@ from kpc.encoder.field.bounds import (
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows
 from kpc.encoder.field.occupancy_grid import grid_shape, merge_slots
-from kpc.encoder.rdo.codec_model import Model, code, load_checkpoint, save_checkpoint
+from kpc.encoder.rdo.codec_model import Model, code, load_checkpoint
+from kpc.encoder.rdo.model_checkpoint import save_checkpoint
 from kpc.encoder.rdo.prune import Pruned
 from kpc.encoder.rdo.sequential_finetune import steps_per_group
 from kpc.encoder.training.temporal_resolution import TimeResolution, fit_frames_per_row

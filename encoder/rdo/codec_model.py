@@ -1,23 +1,21 @@
-"""What training made, ready to be coded, again and again: a finished checkpoint, or a .kpc file.
+"""Coding of a trained model, as often as wanted: from a finished checkpoint, or from a .kpc file.
 
-A checkpoint holds the scene in full precision, and training pixels to judge codings by. A file holds the scene as it was coded, and is
-judged by its own pictures.
+A checkpoint holds the scene in full precision, and training pixels on which codings are judged. A file holds the
+scene as it was coded, and is judged by its own pictures.
 """
 
 import math
-import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, ValidationRays
 from kpc.encoder.rdo.curvature import Curvature, PerPlane, estimate_curvature
 from kpc.encoder.rdo.distortion import PlaneKey
 from kpc.encoder.rdo.mode_decision import quantise_by_cost, requested_step
+from kpc.encoder.rdo.model_checkpoint import CHECKPOINT_MAGIC, read_checkpoint
 from kpc.encoder.rdo.motion_rdo import coarsen_motion
 from kpc.encoder.rdo.occupancy_rdo import flip_errors, optimise_occupancy
 from kpc.encoder.rdo.prune import Pruned, prune
@@ -28,10 +26,10 @@ from kpc.encoder.rdo.rate_control import (
     TUNED_ERROR,
     Attempt,
     QuantiseFunction,
+    RateController,
     Trade,
     choose_decoder_bits,
     loss_of_mse,
-    meet_trade,
     mse_of_loss,
     reduce_slots,
     relative_steps,
@@ -39,23 +37,17 @@ from kpc.encoder.rdo.rate_control import (
 )
 from kpc.encoder.rdo.rate_search import TOLERANCE
 from kpc.encoder.rdo.sequential_finetune import quantise_sequentially, step_factors
-from kpc.encoder.training.checkpoint import save_state
-from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, bfloat16_ceil, quantise_scene, round_decoder
-from kpc.format.common.errors import FormatError, TrainingError, UsageError
+from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, bfloat16_ceil, round_decoder
+from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.container import scene_io
 from kpc.format.container.container import MAGIC
-from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import FINEST_STEP
-from kpc.format.scene.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
-from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
+from kpc.format.scene.scene import Decoder, Scene
 
-CHECKPOINT_MAGIC = b"PK"
-"""PyTorch writes ZIP archives."""
-VERSION = 1
-"""Of a finished checkpoint."""
-LOOKS, LESS = 4, 0.75
-"""At what a size costs, at most: with all of a model, then with what it needs if that is what it may cost, as long as that is less, by so much.
-Soldier in 42,500 bytes loses 0.63 dB; with one look 0.99, by what left-out channels, cells and displacements cost."""
+# For a target size, the loss that it costs is estimated at most MAX_ESTIMATES times: first with the whole model, then
+# with what is selected at the loss found before, as long as the loss falls below ESTIMATE_RATIO of it each time
+# (docs/design/rate-distortion.md, "Rate control").
+MAX_ESTIMATES, ESTIMATE_RATIO = 4, 0.75
 
 
 @dataclass(frozen=True)
@@ -63,37 +55,38 @@ class Model:
     """A scene to be coded.
 
     Attributes:
-        scene: as trained, or as a file holds it.
-        probe: rays to judge codings by.
-        coded: the file as it is; None for a scene in full precision.
+        scene: as trained, or as decoded from a file.
+        validation: rays on which codings are judged.
+        coded: the file's quantised scene; None for a scene in full precision.
     """
 
     scene: Scene
-    probe: ValidationRays
+    validation: ValidationRays
     coded: QuantisedScene | None = None
 
     @cached_property
     def curvature(self) -> Curvature:
-        """What errors cost, `kpc.encoder.rdo.curvature`."""
-        return estimate_curvature(self.scene, self.probe)
+        """What errors in planes cost (`kpc.encoder.rdo.curvature`)."""
+        return estimate_curvature(self.scene, self.validation)
 
     @cached_property
     def flip_errors(self) -> np.ndarray:
-        """What it costs to tell a cell otherwise than it is, `kpc.encoder.rdo.occupancy_rdo`."""
-        return flip_errors(self.scene, self.probe)
+        """What flipping a cell of the occupancy costs (`kpc.encoder.rdo.occupancy_rdo`)."""
+        return flip_errors(self.scene, self.validation)
 
 
 @dataclass(frozen=True)
 class CodedModel:
-    """What became of a model.
+    """A coded model.
 
     Attributes:
-        scene: what the file is to hold. data: that file.
-        loss_db: PSNR that coding costs on the probe rays, all that was left out included.
+        scene: what the file holds.
+        data: the file.
         psnr: of its pictures against what was filmed, dB.
-        agreement_db: PSNR of its pictures against those of the model.
-        pruned: what was left out; None if nothing was to be.
-        spare_db: that could have been spent on it.
+        loss_db: PSNR that coding costs on the validation rays, pruning included, dB.
+        agreement_db: PSNR of its pictures against those of the model, dB.
+        pruned: what was pruned; None if nothing was to be.
+        spare_db: loss that pruning was allowed, dB.
     """
 
     scene: QuantisedScene
@@ -111,26 +104,31 @@ class CodedModel:
 
 @dataclass(frozen=True)
 class Selection:
-    """What of a model is to be coded, and how finely each number of it.
+    """What of a model is coded, and at which relative precision.
 
     Attributes:
-        scene: as it is coded; `coded`: the file that holds just this scene, None where there is none.
-        steps: of each plane, up to one factor. significant, together: as of `kpc.encoder.rdo.mode_decision.quantise_by_cost`.
-        bits: of the decoder's weights, as of `kpc.format.coding.quantise.round_decoder`.
-        pruned, spare_db: as of `CodedModel`.
+        scene: what is coded.
+        coded: the file that holds just this scene; None where there is none.
+        steps: quantisation steps of each plane, up to a common factor.
+        significant: as for `kpc.encoder.rdo.mode_decision.quantise_by_cost`.
+        correlation: as for `kpc.encoder.rdo.mode_decision.quantise_by_cost`.
+        bits: of the decoder's weights, as for `kpc.format.coding.quantise.round_decoder`.
+        pruned: as in `CodedModel`.
+        spare_db: as in `CodedModel`.
     """
 
     scene: Scene
     coded: QuantisedScene | None
     steps: PerPlane
     significant: PerPlane
-    together: PerPlane
+    correlation: PerPlane
     bits: Mapping[str, int] = field(default_factory=dict)
     pruned: Pruned | None = None
     spare_db: float = 0.0
 
     @staticmethod
     def all_of(model: Model) -> "Selection":
+        """Select the whole model."""
         significant = significance(model.curvature.diagonal)
         steps: PerPlane = (
             relative_steps(significant)
@@ -139,26 +137,127 @@ class Selection:
         )
         return Selection(model.scene, model.coded, steps, significant, model.curvature.correlation)
 
-    def needed(self, model: Model, measure: Measure, loss_db: float, prune_share: float, grids: bool) -> "Selection":
-        """What of all of a model its pictures need, if coding may cost them `loss_db`; other arguments as of `code`."""
-        whole, kept = measure(model.scene).psnr, replace(self, spare_db=prune_share * loss_db)
-        error = mse_of_loss(whole, loss_db)
-        if kept.spare_db > 0 and isinstance(self.scene.decoder, Decoder):  # no other is linear
-            pruned = prune(self.scene, model.probe.rays, lambda candidate: measure(candidate).psnr, kept.spare_db)
-            kept = replace(kept, pruned=pruned)
-            if self.coded is None or pruned.removed_any:
-                kept = replace(kept, scene=pruned.scene, coded=None, steps=pruned.select_channels(self.steps),
-                               significant=pruned.select_channels(self.significant),
-                               together=pruned.select_channels(self.together, in_pairs=True))  # fmt: skip
-        scene = kept.scene
-        if model.coded is None:  # a file that is coded again and again is not to be marched ever longer
-            scene = reduce_slots(scene, measure, SLOTS_SHARE * error)
-            scene = optimise_occupancy(scene, model.flip_errors, measure, error) if grids else scene
-        own = 0 if model.coded is None or model.coded.motion is None else round(model.coded.motion.step / FINEST_STEP)
-        coarser = coarsen_motion(scene, model.curvature.motion if grids else None, measure, error, own)
+    def reduce(self, model: Model, measure: Measure, loss_db: float, prune_share: float, grids: bool) -> "Selection":
+        """Prune and coarsen all but the planes, as far as a share of the allowed loss permits.
+
+        Args:
+            model: of which this is the whole.
+            measure: judges scenes.
+            loss_db: that coding may cost in all, dB.
+            prune_share: as for `code`.
+            grids: as for `code`.
+        """
+        whole, chosen = measure(model.scene).psnr, replace(self, spare_db=prune_share * loss_db)
+        mse = mse_of_loss(whole, loss_db)
+        if chosen.spare_db > 0 and isinstance(self.scene.decoder, Decoder):  # pruning needs a linear decoder
+            chosen = chosen._prune(model, measure)
+        scene = chosen.scene
+        if model.coded is None:  # else each time a file is coded again it would get more cells to march
+            scene = reduce_slots(scene, measure, SLOTS_SHARE * mse)
+            scene = optimise_occupancy(scene, model.flip_errors, measure, mse) if grids else scene
+        own_multiple = 0
+        if model.coded is not None and model.coded.motion is not None:
+            own_multiple = round(model.coded.motion.step / FINEST_STEP)
+        coarser = coarsen_motion(scene, model.curvature.motion if grids else None, measure, mse, own_multiple)
         if coarser is not scene:
-            kept = replace(kept, coded=None)
-        return replace(kept, scene=coarser, bits=choose_decoder_bits(coarser, measure, DECODER_SHARE * error))
+            chosen = replace(chosen, coded=None)
+        return replace(chosen, scene=coarser, bits=choose_decoder_bits(coarser, measure, DECODER_SHARE * mse))
+
+    def _prune(self, model: Model, measure: Measure) -> "Selection":
+        pruned = prune(self.scene, model.validation.rays, lambda scene: measure(scene).psnr, self.spare_db)
+        if self.coded is not None and not pruned.removed_any:
+            return replace(self, pruned=pruned)
+        return replace(
+            self,
+            scene=pruned.scene,
+            coded=None,
+            steps=pruned.select_channels(self.steps),
+            significant=pruned.select_channels(self.significant),
+            correlation=pruned.select_channels(self.correlation, in_pairs=True),
+            pruned=pruned,
+        )
+
+
+@dataclass(frozen=True)
+class _Coder:
+    """Codes a model; arguments as for `code`."""
+
+    model: Model
+    trade: Trade
+    prune_share: float
+    tune_steps: int
+    quantise: QuantiseFunction | None
+    shown: bool
+    grids: bool
+
+    @cached_property
+    def measure(self) -> Measure:
+        return self.model.validation.measure(self.model.scene)
+
+    @cached_property
+    def uncoded_psnr(self) -> float:
+        return self.measure(self.model.scene).psnr
+
+    def select(self) -> Selection:
+        """Select what of the model is to be coded."""
+        whole = Selection.all_of(self.model)
+        if self.trade.target_bytes is None:
+            return self._reduce(whole, self.trade.loss_db(self.uncoded_psnr))
+        # What a size costs is known when it has been tried, and falls when bytes are saved elsewhere.
+        chosen, loss_db = whole, math.inf
+        for _ in range(MAX_ESTIMATES):
+            lost = max(0.0, self.uncoded_psnr - self.meet(chosen, 0, ROUGH_TOLERANCE).measured.psnr)
+            mse = (TUNED_ERROR if self.tune_steps else 1.0) * mse_of_loss(self.uncoded_psnr, lost)
+            before, loss_db = loss_db, loss_of_mse(self.uncoded_psnr, mse)
+            if loss_db >= ESTIMATE_RATIO * before:
+                break
+            chosen = self._reduce(whole, loss_db)
+        return chosen
+
+    def _reduce(self, whole: Selection, loss_db: float) -> Selection:
+        return whole.reduce(self.model, self.measure, loss_db, self.prune_share, self.grids)
+
+    def meet(self, chosen: Selection, tune_steps: int, tolerance: float) -> Attempt:
+        """Quantise a selection so that it meets the target."""
+
+        def quantise(
+            scene: Scene,
+            steps: PerPlane,
+            looked_up: np.ndarray,
+            significant: PerPlane,
+            only: Collection[PlaneKey] | None = None,
+        ) -> QuantisedScene:
+            if self.quantise is not None:
+                quantised = self.quantise(scene, steps, looked_up, significant)
+            else:
+                quantised = quantise_by_cost(scene, steps, looked_up, significant, only, chosen.correlation)
+            return replace(quantised, decoder=round_decoder(quantised.decoder, chosen.bits))
+
+        def tune(steps: PerPlane, looked_up: np.ndarray) -> QuantisedScene:
+            if self.model.coded is None:  # the steps of a file have the factors already
+                factors = step_factors(chosen.scene)
+                steps = [
+                    {name: bfloat16_ceil(step * np.float32(factors[s, name])) for name, step in scale.items()}
+                    for s, scale in enumerate(steps)
+                ]
+
+            def quantise_group(candidate: Scene, group: Sequence[PlaneKey]) -> QuantisedScene:
+                return quantise(candidate, steps, looked_up, chosen.significant, group)
+
+            return quantise_sequentially(chosen.scene, self.model.scene, quantise_group, tune_steps, self.shown)
+
+        controller = RateController(
+            chosen.scene,
+            chosen.steps,
+            chosen.significant,
+            self.measure,
+            self.uncoded_psnr,
+            chosen.coded,
+            quantise,
+            tune if tune_steps else None,
+            own_steps=self.model.coded is not None,
+        )
+        return controller.meet(self.trade, tolerance)
 
 
 def code(
@@ -170,98 +269,47 @@ def code(
     shown: bool = False,
     grids: bool = True,
 ) -> CodedModel:
-    """What of a model is needed, `kpc.encoder.rdo.prune`, in symbols as coarse or as fine as a trade asks for.
+    """Code a model so that it meets a rate-distortion target.
 
     Args:
-        prune_share: of what coding may cost, what may be spent on leaving something out.
-        tune_steps: of training that a group of planes gets to make up for others, `kpc.encoder.rdo.sequential_finetune`; 0 for none.
-        quantise: another way to choose symbols, to compare with; not tuned.
-        shown: whether progress is, where it takes long.
-        grids: whether occupancy and displacements are such as take few bits; else as they are, but for fewer slots and coarser steps.
+        model: to be coded.
+        trade: the target.
+        prune_share: share of the loss that pruning may take (`kpc.encoder.rdo.prune`).
+        tune_steps: steps of fine-tuning per group of planes (`kpc.encoder.rdo.sequential_finetune`); 0 for none.
+        quantise: another way to choose symbols, for comparison.
+        shown: whether to show the progress of fine-tuning.
+        grids: whether to choose occupancy and displacements by rate and distortion. Otherwise they are only merged into
+            fewer slots and rounded to coarser steps.
 
     Raises:
-        TrainingError: no file of this model is so small.
+        TrainingError: no file of this model is as small as the target.
     """
-    measure = model.probe.measure(model.scene)
-    whole = measure(model.scene).psnr
-
-    def met(kept: Selection, tune_steps: int, tolerance: float) -> Attempt:
-        def chosen(
-            scene: Scene,
-            steps: PerPlane,
-            reached: np.ndarray,
-            significant: PerPlane,
-            only: Collection[PlaneKey] | None = None,
-        ) -> QuantisedScene:
-            if quantise is not None:
-                quantised = quantise(scene, steps, reached, significant)
-            else:
-                quantised = quantise_by_cost(scene, steps, reached, significant, only, kept.together)
-            return replace(quantised, decoder=round_decoder(quantised.decoder, kept.bits))
-
-        def tune(steps: PerPlane, reached: np.ndarray) -> QuantisedScene:
-            if model.coded is None:  # steps of a file were spread when it was made
-                factors = step_factors(kept.scene)
-                steps = [
-                    {name: bfloat16_ceil(step * np.float32(factors[s, name])) for name, step in scale.items()}
-                    for s, scale in enumerate(steps)
-                ]
-
-            def choose(candidate: Scene, group: Sequence[PlaneKey]) -> QuantisedScene:
-                return chosen(candidate, steps, reached, kept.significant, group)
-
-            return quantise_sequentially(kept.scene, model.scene, choose, tune_steps, shown)
-
-        return meet_trade(
-            kept.scene,
-            kept.steps,
-            kept.significant,
-            measure,
-            whole,
-            trade,
-            kept.coded,
-            chosen,
-            tune if tune_steps else None,
-            own_steps=model.coded is not None,
-            tolerance=tolerance,
-        )
-
-    def needed(loss_db: float) -> Selection:
-        return every.needed(model, measure, loss_db, prune_share, grids)
-
-    every = Selection.all_of(model)
-    if trade.target_bytes is None:
-        kept = needed(trade.loss_db(whole))
-    else:  # what that costs is known when it has been tried, and less when bytes are spared elsewhere
-        kept, loss_db = every, math.inf
-        for _ in range(LOOKS):
-            lost = max(0.0, whole - met(kept, 0, ROUGH_TOLERANCE).measured.psnr)
-            before, loss_db = (
-                loss_db,
-                loss_of_mse(whole, (TUNED_ERROR if tune_steps else 1.0) * mse_of_loss(whole, lost)),
-            )
-            if loss_db >= LESS * before:
-                break
-            kept = needed(loss_db)
-    found, pruned = met(kept, tune_steps, TOLERANCE), kept.pruned
+    coder = _Coder(model, trade, prune_share, tune_steps, quantise, shown, grids)
+    chosen = coder.select()
+    found, pruned = coder.meet(chosen, tune_steps, TOLERANCE), chosen.pruned
     if trade.target_bytes is not None and found.size_bytes > trade.target_bytes:
         raise TrainingError(
-            f"{found.size_bytes:,} bytes is the least that this model takes, not {trade.target_bytes:,}; give "
+            f"{found.size_bytes:,} bytes is the smallest size of this model, more than {trade.target_bytes:,}; give "
             "another --target-size, or train anew with a smaller --preset"
         )
-    if model.coded is not None and (as_it_was := Attempt(model.coded, measure, 0.0)).size_bytes <= found.size_bytes:
-        found, pruned = as_it_was, None
+    if model.coded is not None:
+        unchanged = Attempt(model.coded, coder.measure, 0.0)
+        if unchanged.size_bytes <= found.size_bytes:
+            found, pruned = unchanged, None
     measured: Fidelity = found.measured
+    loss_db = coder.uncoded_psnr - measured.psnr
     return CodedModel(
-        found.quantised, found.data, measured.psnr, whole - measured.psnr, measured.agreement_db, pruned, kept.spare_db
+        found.quantised, found.data, measured.psnr, loss_db, measured.agreement_db, pruned, chosen.spare_db
     )
 
 
 def load(path: Path) -> Model:
-    """A finished checkpoint or a .kpc file, whichever it is.
+    """Read a finished checkpoint or a .kpc file.
 
     Raises:
-        UsageError: it is neither. TrainingError: the checkpoint cannot be used. FormatError: the file cannot be read.
+        UsageError: it is neither.
+        TrainingError: the checkpoint cannot be used.
+        FormatError: the file cannot be read.
     """
     if starts_with(path, MAGIC):
         return model_from_file(scene_io.read(path))
@@ -270,173 +318,33 @@ def load(path: Path) -> Model:
     raise UsageError(f"{path}: neither a folder of videos or images, nor a finished checkpoint, nor a .kpc file")
 
 
+def load_checkpoint(path: Path) -> Model:
+    """Read a finished checkpoint; raises as `kpc.encoder.rdo.model_checkpoint.read_checkpoint`."""
+    return Model(*read_checkpoint(path))
+
+
 def starts_with(path: Path, magic: bytes) -> bool:
-    """Whether a file is of the kind that begins so."""
+    """Return whether a file starts with some bytes."""
     with path.open("rb") as opened:
         return opened.read(len(magic)) == magic
 
 
 def model_from_file(coded: QuantisedScene) -> Model:
-    """A scene as a file holds it, to be coded again."""
+    """Return a model to code a file's scene again."""
     coded = widen_single_texels(coded)
     scene = coded.dequantise()
     return Model(scene, ValidationRays.from_cameras(scene), coded)
 
 
 def widen_single_texels(coded: QuantisedScene) -> QuantisedScene:
-    """The same pictures of planes with at least two texels along either axis, as training wants them: files may hold one, all along the axis."""
+    """Return the scene with at least two texels along both axes of every plane, as training requires; same pictures.
 
-    def widened(plane: QuantisedPlane) -> QuantisedPlane:
-        twice = [2 if size == 1 else 1 for size in plane.coded.shape]
-        symbols, known = (a.repeat(twice[0], axis=0).repeat(twice[1], axis=1) for a in (plane.symbols, plane.coded))
+    Files may hold planes of one texel along an axis, which are constant along it.
+    """
+
+    def widen(plane: QuantisedPlane) -> QuantisedPlane:
+        down, across = (2 if size == 1 else 1 for size in plane.coded.shape)
+        symbols, known = (a.repeat(down, axis=0).repeat(across, axis=1) for a in (plane.symbols, plane.coded))
         return replace(plane, symbols=symbols, coded=known)
 
-    return replace(
-        coded, scales=tuple({name: widened(plane) for name, plane in scale.items()} for scale in coded.scales)
-    )
-
-
-# --- finished checkpoints
-
-
-def save_checkpoint(path: Path, scene: Scene, probe: ValidationRays) -> None:
-    """Write all that coding asks for, as plain tensors and numbers.
-
-    Raises:
-        TrainingError: it cannot be written; what was there is left as it was.
-    """
-    kind = "hybrid" if isinstance(scene.decoder, HybridDecoder) else "explicit"
-    state = {
-        "kpc": VERSION,
-        "aabb": scene.aabb,
-        "frame_count": scene.clip.frame_count,
-        "fps": float(scene.clip.fps),
-        "scales": scene.scales,
-        "kind": kind,
-        "decoder": vars(scene.decoder),
-        "occupancy": scene.occupancy,
-        "background": scene.background,
-        "step": float(scene.step),
-        "cameras": np.array([_camera_as_numbers(camera) for camera in scene.cameras]).reshape(-1, 22),
-        "mapping": _mapping_as_numbers(scene.mapping),
-        "motion": scene.motion,
-        "names": [appearance.name for appearance in scene.appearances],
-        "codes": [appearance.code for appearance in scene.appearances],
-        "probe": vars(probe),
-    }
-    state = _changed(state, np.ndarray, lambda a: torch.from_numpy(np.ascontiguousarray(a)))
-    save_state(path, state, "name another --keep-checkpoint")
-
-
-def load_checkpoint(path: Path) -> Model:
-    """What `save_checkpoint` wrote. Nothing in it is executed, and it takes no more memory than a few times its size.
-
-    Raises:
-        TrainingError: it is something else, damaged, or breaks a rule that files must keep.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:  # what is not compressed cannot grow
-            entries = archive.infolist()
-            if any(entry.compress_type for entry in entries) or sum(e.file_size for e in entries) > path.stat().st_size:
-                raise ValueError("compressed")
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(state, dict) or state.get("kpc") != VERSION:
-            raise TrainingError(
-                f"{path}: no finished checkpoint; kpenc DATASET --keep-checkpoint writes one, --resume goes on "
-                "from one of a run"
-            )
-        state = _changed(state, torch.Tensor, _as_array)
-        scene = _scene_of(state)
-        probe = ValidationRays(**state["probe"])
-        _check(scene, probe)
-        # What no file could hold is found here, by the rules of every reader, before anything is rendered.
-        scene_io.scene_chunks(
-            quantise_scene(scene, [{name: 8.0 for name in scale} for scale in scene.scales], skip_unseen=False)
-        )
-    except (TrainingError, OSError):
-        raise
-    except FormatError as error:
-        raise TrainingError(f"{path}: not a usable checkpoint ({error})") from error
-    except Exception as error:  # what a damaged file holds may be of any kind
-        raise TrainingError(f"{path}: not a usable checkpoint ({type(error).__name__}); train anew") from error
-    return Model(scene, probe)
-
-
-def _scene_of(state: Mapping[str, Any]) -> Scene:
-    kind = {"explicit": Decoder, "hybrid": HybridDecoder}[state["kind"]]
-    return Scene(
-        state["aabb"],
-        Clip(int(state["frame_count"]), float(state["fps"])),
-        tuple(state["scales"]),
-        kind(**state["decoder"]),
-        state["occupancy"],
-        state["background"],
-        float(state["step"]),
-        tuple(_camera_of(numbers) for numbers in state["cameras"]),
-        _mapping_of(state["mapping"]),
-        state["motion"],
-        tuple(Appearance(name, code) for name, code in zip(state["names"], state["codes"], strict=True)),
-    )
-
-
-def _check(scene: Scene, probe: ValidationRays) -> None:
-    """What coding relies on beyond the rules of files."""
-    for planes in scene.scales:
-        for name, plane in planes.items():
-            if plane.dtype != np.float32 or min(plane.shape[:2]) < 2:
-                raise ValueError(name)
-    n = len(probe.times)
-    wanted = {"origins": (n, 3), "directions": (n, 3), "times": (n,), "truth": (n, 3)}
-    for name, shape in wanted.items():
-        values = getattr(probe, name)
-        if values.shape != shape or values.dtype != np.float32 or not np.isfinite(values).all() or not n:
-            raise ValueError(f"probe {name}")
-    lengths = np.linalg.norm(probe.directions, axis=1)
-    if not ((np.abs(lengths - 1) < 1e-3).all() and (probe.times >= 0).all() and (probe.times <= 1).all()):
-        raise ValueError("probe")
-    numbers = probe.appearances
-    if (numbers is None) != (not scene.appearances):
-        raise ValueError("probe appearances")
-    if numbers is not None and (numbers.shape != (n,) or numbers.min() < 0 or numbers.max() >= len(scene.appearances)):
-        raise ValueError("probe appearances")
-    if scene.motion is not None and not np.isfinite(scene.motion).all():
-        raise ValueError("motion")
-
-
-def _camera_as_numbers(camera: Camera) -> np.ndarray:
-    return np.array([camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy,
-                     *np.ravel(camera.camera_to_world)], np.float64)  # fmt: skip
-
-
-def _camera_of(numbers: np.ndarray) -> Camera:
-    width, height, fl_x, fl_y, cx, cy = map(float, numbers[:6])
-    return Camera(int(width), int(height), fl_x, fl_y, cx, cy, numbers[6:].reshape(4, 4))
-
-
-def _mapping_as_numbers(mapping: SpaceMapping | None) -> dict[str, Any] | None:
-    return None if mapping is None else {"kind": type(mapping).__name__, **vars(mapping)}
-
-
-def _mapping_of(numbers: Mapping[str, Any] | None) -> SpaceMapping | None:
-    if numbers is None:
-        return None
-    kinds: dict[str, type[SpaceMapping]] = {kind.__name__: kind for kind in (Contraction, DeviceCoordinates)}
-    return kinds[numbers["kind"]](**{name: value for name, value in numbers.items() if name != "kind"})
-
-
-def _changed(value: Any, kind: type, change: Any) -> Any:
-    """Plain data with everything of one kind in it changed; mappings become dictionaries, sequences lists."""
-    if isinstance(value, kind):
-        return change(value)
-    if isinstance(value, Mapping):
-        return {key: _changed(item, kind, change) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_changed(item, kind, change) for item in value]
-    return value
-
-
-def _as_array(tensor: torch.Tensor) -> np.ndarray:
-    """One that claims more numbers than are stored is refused."""
-    if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
-        raise ValueError("a tensor without its numbers")
-    return np.ascontiguousarray(tensor.numpy())
+    return replace(coded, scales=tuple({name: widen(plane) for name, plane in scale.items()} for scale in coded.scales))

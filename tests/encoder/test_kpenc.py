@@ -775,7 +775,7 @@ def test_the_trade_between_size_and_loss(run: Kpenc, sets: Path, tmp_path: Path)
     assert sizes[0] > usual > sizes[1] and sizes[2] <= target
     last = (tmp_path / "out.kpc").read_bytes()
     code, out, err = run(sets / "n3dv", "--resume", "--target-size", "0.3KB")
-    assert code == 1 and out == "" and "is the least that this model takes" in err.splitlines()[-1]
+    assert code == 1 and out == "" and "is the smallest size of this model" in err.splitlines()[-1]
     assert (tmp_path / "out.kpc").read_bytes() == last
     assert run(sets / "n3dv", "--resume")[0] == 0 and {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
 

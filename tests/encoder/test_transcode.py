@@ -15,7 +15,7 @@ from kpc.encoder.cli import kpenc
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import ASSUMED_MSE, ValidationRays, orbit_cameras
 from kpc.encoder.field.config import PRESETS, TrainConfig
-from kpc.encoder.rdo import codec_model, sequential_finetune
+from kpc.encoder.rdo import codec_model, model_checkpoint, sequential_finetune
 from kpc.encoder.rdo.mode_decision import requested_step
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.coding.quantise import quantise_scene
@@ -71,7 +71,7 @@ def saved(path: Path, scene: Scene) -> Path:
     rays = ValidationRays.from_cameras(scene)
     truth = SceneRenderer(scene).rgb(*rays.rays)
     numbers = np.arange(512) % len(scene.appearances) if scene.appearances else None
-    codec_model.save_checkpoint(path, scene, replace(rays, truth=truth, appearances=numbers))
+    model_checkpoint.save_checkpoint(path, scene, replace(rays, truth=truth, appearances=numbers))
     return path
 
 
@@ -113,7 +113,7 @@ def test_every_kind_of_scene_survives_a_checkpoint(tmp_path: Path, kind: str) ->
     steps = [{name: 0.01 for name in scale} for scale in scene.scales]
     back = codec_model.load(saved(tmp_path / "m.kpck", scene))
     assert scene_io.encode(quantise_scene(back.scene, steps)) == scene_io.encode(quantise_scene(scene, steps))
-    assert back.coded is None and back.probe.measure(scene)(back.scene).mse == 0
+    assert back.coded is None and back.validation.measure(scene)(back.scene).mse == 0
 
 
 def test_a_checkpoint_of_a_run_is_told_from_a_finished_one(
@@ -162,11 +162,11 @@ def changes() -> dict[str, Callable[[dict[str, Any]], object]]:
         "endless rays": lambda s: s.update(step=1e-9),
         "no frames": lambda s: s.update(frame_count=-1),
         "a wide decoder": lambda s: s["decoder"].update(w1=torch.ones(9999, 9)),
-        "rays without length": lambda s: s["probe"]["directions"].zero_(),
-        "rays of NaN": lambda s: s["probe"]["origins"].fill_(float("nan")),
-        "times out of the clip": lambda s: s["probe"]["times"].fill_(2.0),
-        "fewer colours than rays": lambda s: s["probe"].update(truth=torch.ones(3, 3)),
-        "appearances of nobody": lambda s: s["probe"].update(appearances=torch.ones(512, dtype=torch.int64)),
+        "rays without length": lambda s: s["validation_rays"]["directions"].zero_(),
+        "rays of NaN": lambda s: s["validation_rays"]["origins"].fill_(float("nan")),
+        "times out of the clip": lambda s: s["validation_rays"]["times"].fill_(2.0),
+        "fewer colours than rays": lambda s: s["validation_rays"].update(truth=torch.ones(3, 3)),
+        "appearances of nobody": lambda s: s["validation_rays"].update(appearances=torch.ones(512, dtype=torch.int64)),
         "an unknown mapping": lambda s: s.update(mapping={"kind": "Path"}),
         "a camera without focal length": lambda s: s["cameras"].zero_(),
         "a string for a number": lambda s: s.update(step="long"),

@@ -314,7 +314,7 @@ def _evaluate_on(views: ValidationRays | None) -> None:
 def _source(path: Path) -> tuple[Model, Fidelity, Measure]:
     """Return the uncoded scene, its fidelity, and the function that measures others."""
     source = codec_model.load(path)
-    measure = (_views or source.probe).measure(source.scene)
+    measure = (_views or source.validation).measure(source.scene)
     return source, measure(source.scene), measure
 
 
