@@ -149,8 +149,8 @@ def test_numbers_in_the_text_are_those_of_the_package():
     assert f"-{scene.LOG_DENSITY_LIMIT:.0f}, {scene.LOG_DENSITY_LIMIT:.0f}" in section("9.5")
     assert f"clamp(a, 0, {scene.ACTIVATION_LIMIT:.0f})" in section("9.5")
     assert f"T < 1/{1 / scene.TERMINATION:.0f}" in section("9.6")
-    assert f"(2 - 1/{space.FAR:.0f}) linear_range" in section("9.6")
-    assert f"farther than {space.FAR:.0f} linear_range" in section("9.7")
+    assert f"(2 - 1/{space.FAR:.0f}) uniform_distance" in section("9.6")
+    assert f"farther than {space.FAR:.0f} uniform_distance" in section("9.7")
     assert f"d_z <= {space.MIN_FORWARD:.4f}" in section("9.8")
     assert f"min(s / reach, {1 - space.MIN_DISPARITY})" in section("9.8")
     models = "(32768, 0)", "/ (5 * model.count + 8)", "count + 1, 120"

@@ -19,7 +19,7 @@ def render_ray(scene, origin, direction, time, appearance=None):
     extent = max(b - a for a, b in zip(low, high))
     s_start, s_end = box_interval(origin, direction, low, high)
     if mapping == CONTRACTION:
-        s_start, s_end = 0.0, (2 - 1 / 256) * scene["linear_range"]
+        s_start, s_end = 0.0, (2 - 1 / 256) * scene["uniform_distance"]
 
     embedding = scene["appearances"][appearance] if appearance else [0.0] * scene["hidden"]
     view = view_terms(scene, direction, embedding)
@@ -32,15 +32,15 @@ def render_ray(scene, origin, direction, time, appearance=None):
             break
         k += 1
         r, length = s, scene["ray_step"]
-        if mapping == CONTRACTION and s > scene["linear_range"]:
-            r = scene["linear_range"] / (2 - s / scene["linear_range"])
+        if mapping == CONTRACTION and s > scene["uniform_distance"]:
+            r = scene["uniform_distance"] / (2 - s / scene["uniform_distance"])
         p = [o + r * d for o, d in zip(origin, direction)]
         u = [(a - b) / (c - b) for a, b, c in zip(p, low, high)]
         if mapping == CONTRACTION:
             centred = [2 * a - 1 for a in u]
             q = max(1.0, *map(abs, centred))
             u = [0.5 + a * (2 - 1 / q) / (4 * q) for a in centred]
-            length *= (max(1.0, r / scene["linear_range"]) / q) ** 2
+            length *= (max(1.0, r / scene["uniform_distance"]) / q) ** 2
         i, j, m = (clamp(math.floor(a * n), 0, n - 1) for a, n in zip(u, (nx, ny, nz)))
         if not scene["occupancy"][((slot * nz + m) * ny + j) * nx + i]:
             continue

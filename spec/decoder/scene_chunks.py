@@ -55,11 +55,11 @@ def decode_warp(chunk, scene):  # section 6.2
     (mapping,) = chunk.unpack("I")
     require(mapping in (CONTRACTION, NDC), "invalid mapping")
     if mapping == CONTRACTION:
-        (linear_range,) = chunk.unpack("d")
-        require(1 / BOX_LIMIT <= linear_range <= BOX_LIMIT, "invalid linear range")
-        require(2 * linear_range / scene["ray_step"] <= SAMPLE_LIMIT, "invalid linear range")
+        (uniform_distance,) = chunk.unpack("d")
+        require(1 / BOX_LIMIT <= uniform_distance <= BOX_LIMIT, "invalid uniform distance")
+        require(2 * uniform_distance / scene["ray_step"] <= SAMPLE_LIMIT, "invalid uniform distance")
         chunk.finish()
-        return {"mapping": mapping, "linear_range": linear_range}
+        return {"mapping": mapping, "uniform_distance": uniform_distance}
     *pose, near, baseline = chunk.unpack("12ddd")
     chunk.finish()
     require(all(1 / BOX_LIMIT <= a <= BOX_LIMIT for a in (near, baseline)), "invalid near or baseline")
