@@ -61,7 +61,7 @@ class TimePlanePanel:
             return bottom - imgui.get_window_height()
 
     def _update(self, planes: list[tuple[str, int]]) -> moderngl.Texture:
-        """Return the texture, made anew if another plane is chosen or more of it has arrived."""
+        """Return the texture, updated if another plane is chosen or more of it has arrived."""
         wanted = self.number, self.state.stream.version
         is_stale = wanted != self._shown and clock.monotonic() - self._made_at > REFRESH_S
         if self._texture is None or is_stale or (self._shown or (-1,))[0] != self.number:

@@ -301,9 +301,9 @@ class Stream:
 
     def _run(self) -> None:
         try:
-            held: list[int] = []
-            while (step := self._next(held)) is not None:
-                position, held = step
+            announced: list[int] = []  # chunks that the source fetches together
+            while (step := self._next(announced)) is not None:
+                position, announced = step
                 try:
                     piece = self._fetched(position)
                 except InterruptedRead:
@@ -322,7 +322,7 @@ class Stream:
             self._bug = error
             self.arrived()
 
-    def _next(self, held: list[int]) -> tuple[int, list[int]] | None:
+    def _next(self, announced: list[int]) -> tuple[int, list[int]] | None:
         """Wait for a segment to fetch; return its position and the chunks that the source holds, None once closed."""
         with self._change:
             while not self._closed:
@@ -336,10 +336,12 @@ class Stream:
             position = int(wanted[0])
             self._requested[position], self._fetching = True, position
         number = int(self.parts.numbers[position])
-        if number not in held:
-            held = adjacent_runs(self._reader.index, map(int, self.parts.numbers[wanted[:RUN_CHUNKS]]), RUN_BYTES)[0]
-            announce(self._reader, held)
-        return position, held
+        if number not in announced:
+            announced = adjacent_runs(self._reader.index, map(int, self.parts.numbers[wanted[:RUN_CHUNKS]]), RUN_BYTES)[
+                0
+            ]
+            announce(self._reader, announced)
+        return position, announced
 
     def _is_full(self, position: int) -> bool:
         """Whether the window's thread must take over or drop segments first."""

@@ -33,13 +33,13 @@ def path_of(
 
 @settings(max_examples=50, deadline=None)
 @given(hnp.arrays(float, 4, elements=st.floats(-1, 1)).filter(lambda q: np.linalg.norm(q) > 1e-3))
-def test_quaternions_and_rotations_are_each_others_inverse(q: np.ndarray) -> None:
+def test_quaternions_and_rotations_are_inverse_to_each_other(q: np.ndarray) -> None:
     rotation = rotation_of(q)
     assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12) and np.linalg.det(rotation) == pytest.approx(1)
     assert rotation_of(quaternion_of(rotation)) == pytest.approx(rotation, abs=1e-9)
 
 
-def test_half_a_turn_has_a_quaternion_too() -> None:
+def test_rotations_by_180_degrees_have_a_quaternion() -> None:
     for axis in range(3):
         turn = -np.eye(3)
         turn[axis, axis] = 1
@@ -48,16 +48,16 @@ def test_half_a_turn_has_a_quaternion_too() -> None:
 
 def test_passes_every_keyframe_exactly() -> None:
     path = path_of()
-    for shot in path.keyframes:
-        camera, time = path.at(shot.at_s)
-        assert camera.camera_to_world == pytest.approx(shot.camera.camera_to_world, abs=1e-9)
+    for keyframe in path.keyframes:
+        camera, time = path.at(keyframe.at_s)
+        assert camera.camera_to_world == pytest.approx(keyframe.camera.camera_to_world, abs=1e-9)
         assert (camera.fl_x, camera.fl_y, camera.cx, camera.cy, time) == pytest.approx(
-            (shot.camera.fl_x, shot.camera.fl_y, shot.camera.cx, shot.camera.cy, shot.time)
+            (keyframe.camera.fl_x, keyframe.camera.fl_y, keyframe.camera.cx, keyframe.camera.cy, keyframe.time)
         )
     assert path.at(-1.0)[1] == 0.0 and path.at(99.0)[1] == pytest.approx(0.9)
 
 
-def test_goes_smoothly_and_turns_no_way_round() -> None:
+def test_the_path_is_smooth_and_takes_the_shorter_rotation() -> None:
     path, step = path_of(), 1e-3
     cameras = [path.at(s)[0] for s in np.arange(0, 5, step)]
     eyes = np.stack([camera.camera_to_world[:3, 3] for camera in cameras])
@@ -73,7 +73,7 @@ def test_goes_smoothly_and_turns_no_way_round() -> None:
     assert turned < 1.15 * sum(direct)
 
 
-def test_the_clip_stands_still_between_equal_times_and_never_runs_back() -> None:
+def test_time_is_constant_between_equal_times_and_never_decreases() -> None:
     times = [path_of().at(s)[1] for s in np.arange(0, 5, 0.01)]
     assert np.diff(times).min() >= -1e-12 and set(np.round(times[100:400], 9)) == {0.2}
 
@@ -85,18 +85,18 @@ def test_an_earlier_time_is_reached_through_the_end_of_the_clip() -> None:
     assert ((times >= 0) & (times <= 1)).all()
 
 
-def test_one_keyframe_is_a_still() -> None:
+def test_a_path_of_one_keyframe_does_not_move() -> None:
     path = CameraPath().with_keyframe(VIEWS[1], 0.3)
     assert path.at(7.0) == (VIEWS[1], 0.3) and len(path.views(30)) == 1 and path.start_s == path.end_s == 0.0
 
 
-def test_keyframes_come_and_go() -> None:
+def test_keyframes_are_added_removed_and_spaced() -> None:
     path = CameraPath()
     for view in VIEWS:
         path = path.with_keyframe(view, 0.5)
-    assert [shot.at_s for shot in path.keyframes] == [0, GAP_S, 2 * GAP_S, 3 * GAP_S]
-    assert [shot.at_s for shot in path.without(1).keyframes] == [0, 2 * GAP_S, 3 * GAP_S]
-    assert [shot.at_s for shot in path.spaced(2, 0.5).keyframes] == [0, GAP_S, GAP_S + 0.5, 2 * GAP_S + 0.5]
+    assert [keyframe.at_s for keyframe in path.keyframes] == [0, GAP_S, 2 * GAP_S, 3 * GAP_S]
+    assert [keyframe.at_s for keyframe in path.without(1).keyframes] == [0, 2 * GAP_S, 3 * GAP_S]
+    assert [keyframe.at_s for keyframe in path.spaced(2, 0.5).keyframes] == [0, GAP_S, GAP_S + 0.5, 2 * GAP_S + 0.5]
     assert path.without(0).at(0.0)[0].camera_to_world == pytest.approx(VIEWS[1].camera_to_world)
 
 
@@ -113,9 +113,7 @@ def test_keyframes_come_and_go() -> None:
     ),
     st.lists(st.floats(0, 1), min_size=1, max_size=8),
 )
-def test_whatever_the_keyframes_every_camera_is_one(
-    keys: list[tuple[np.ndarray, float, float]], shares: list[float]
-) -> None:
+def test_every_interpolated_camera_is_valid(keys: list[tuple[np.ndarray, float, float]], shares: list[float]) -> None:
     path = CameraPath()
     for quaternion, time, gap in keys:
         pose = np.eye(4)
@@ -128,12 +126,12 @@ def test_whatever_the_keyframes_every_camera_is_one(
 
 
 def test_frames_of_a_video_are_evenly_spaced_and_include_both_ends() -> None:
-    shots = path_of().views(10)
-    assert len(shots) == 51 and shots[10].time == pytest.approx(0.2) and shots[-1].time == pytest.approx(0.9)
-    assert shots[0].camera.camera_to_world == pytest.approx(VIEWS[0].camera_to_world, abs=1e-9)
+    views = path_of().views(10)
+    assert len(views) == 51 and views[10].time == pytest.approx(0.2) and views[-1].time == pytest.approx(0.9)
+    assert views[0].camera.camera_to_world == pytest.approx(VIEWS[0].camera_to_world, abs=1e-9)
 
 
-def test_a_path_is_kept_in_a_camera_file(tmp_path: Path) -> None:
+def test_a_path_survives_saving_and_loading(tmp_path: Path) -> None:
     path = path_of()
     path.save(tmp_path / "path.json")
     got = CameraPath.load(tmp_path / "path.json")
@@ -145,13 +143,13 @@ def test_a_path_is_kept_in_a_camera_file(tmp_path: Path) -> None:
         assert np.array_equal(one.camera.camera_to_world, other.camera.camera_to_world)
 
 
-def test_views_without_seconds_are_evenly_apart(tmp_path: Path) -> None:
+def test_views_without_times_are_evenly_spaced(tmp_path: Path) -> None:
     save_views(tmp_path / "c.json", [View(view, 0.1, "a.png") for view in VIEWS])
     assert "at" not in json.loads((tmp_path / "c.json").read_text())["frames"][0]
     assert CameraPath.load(tmp_path / "c.json").end_s == 3 * GAP_S
 
 
-def test_keyframes_of_another_size_see_the_same() -> None:
+def test_keyframes_are_resized_to_the_first() -> None:
     path = CameraPath((View(VIEWS[0], 0, "a", 0.0), View(VIEWS[1].resized(96, 72), 0, "b", 1.0)))
     assert path.at(1.0)[0].fl_x == pytest.approx(VIEWS[1].fl_x) and path.at(1.0)[0].width == 48
 
@@ -170,9 +168,7 @@ MIRRORED = np.diag([-1.0, 1, 1, 1])
     ([np.full((4, 4), np.nan)], [0.0], "NaN"),
     ([np.eye(4)], ["soon"], "frame 0"),
 ])  # fmt: skip
-def test_a_path_that_leads_nowhere_is_refused(
-    tmp_path: Path, poses: list[np.ndarray], ats: list[float], words: str
-) -> None:
+def test_an_invalid_path_is_refused(tmp_path: Path, poses: list[np.ndarray], ats: list[float], words: str) -> None:
     frames = [{"transform_matrix": pose.tolist(), "at": at} for pose, at in zip(poses, ats, strict=False)]
     (tmp_path / "bad.json").write_text(json.dumps({"w": 4, "h": 4, "fl_x": 4, "frames": frames}))
     with pytest.raises(DatasetError, match=words) as caught:
@@ -188,20 +184,20 @@ def test_a_path_that_leads_nowhere_is_refused(
     ("[]", "frame 0"),
     ("\udcff", "not JSON"),
 ])  # fmt: skip
-def test_a_camera_file_of_another_kind_is_refused(tmp_path: Path, text: str, words: str) -> None:
+def test_an_invalid_camera_file_is_refused(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "bad.json").write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(DatasetError, match=words):
         load_views(tmp_path / "bad.json")
 
 
-def test_a_camera_file_without_end_is_not_read_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_camera_file_that_is_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kpc.format.scene.cameras.MAX_FILE_BYTES", 1 << 10)
     (tmp_path / "big.json").write_text(" " * 2000)
     with pytest.raises(DatasetError, match="larger"):
         load_views(tmp_path / "big.json")
 
 
-def test_a_camera_with_nan_is_none() -> None:
+def test_a_camera_with_nan_is_refused() -> None:
     pose = np.eye(4)
     pose[1, 3] = np.nan
     with pytest.raises(DatasetError, match="NaN"):

@@ -18,13 +18,13 @@ def opening() -> View:
 
 
 def project(view: View, point: np.ndarray) -> tuple[float, float]:
-    """Where a point is in the picture, in heights of it, from its middle, upwards."""
+    """Return a point in the picture, from its centre to the right and upwards, in heights of the picture."""
     camera = view.camera(480, 360)
     x, y, z = camera.camera_to_world[:3, :3].T @ (point - camera.camera_to_world[:3, 3])
     return x / -z * camera.fl_x / 360, y / -z * camera.fl_y / 360
 
 
-def test_opens_on_exactly_what_the_camera_sees() -> None:
+def test_a_view_of_a_camera_is_that_camera() -> None:
     for camera in SCENE.cameras:
         got = View.of(RIG, camera).camera(camera.width, camera.height)
         assert got.camera_to_world == pytest.approx(camera.camera_to_world, abs=1e-12)
@@ -33,7 +33,7 @@ def test_opens_on_exactly_what_the_camera_sees() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(st.floats(-4, 4), st.floats(-4, 4)), max_size=12))
-def test_orbiting_keeps_focus_distance_and_right_way_up(drags: list[tuple[float, float]]) -> None:
+def test_orbiting_keeps_focus_and_distance_and_stays_upright(drags: list[tuple[float, float]]) -> None:
     view = opening()
     for drag in drags:
         view = view.orbit(*drag)
@@ -43,7 +43,7 @@ def test_orbiting_keeps_focus_distance_and_right_way_up(drags: list[tuple[float,
     assert project(view, view.focus) == pytest.approx((0.0, 0.0), abs=1e-9)
 
 
-def test_orbiting_drags_the_near_side_along() -> None:
+def test_orbiting_moves_the_near_side_with_the_pointer() -> None:
     view = opening()
     near = view.focus + 0.3 * view.axes[:, 2]
     right = project(view.orbit(0.1, 0.0), near)
@@ -91,14 +91,14 @@ def test_stepping_goes_to_whole_frames_and_pauses() -> None:
     assert playback.time == 1.0
 
 
-def test_a_still_scene_has_nothing_to_play() -> None:
+def test_a_static_clip_does_not_play() -> None:
     playback = Playback(Clip(1, 10.0))
     playback.advance(5.0)
     playback.step(1)
     assert playback.time == 0.0
 
 
-def test_speeds() -> None:
+def test_speeds_are_limited_to_the_list() -> None:
     playback = Playback(Clip(11, 10.0))
     for _ in range(10):
         playback.change_speed(1)
@@ -107,7 +107,7 @@ def test_speeds() -> None:
     assert playback.speed == SPEEDS[-2]
 
 
-def test_appearances_follow_one_another_smoothly_and_end_where_they_began() -> None:
+def test_appearances_are_blended_and_cycle() -> None:
     scene = with_appearances(tiny_scene())
     codes = [np.zeros(16, np.float32), *(appearance.code for appearance in scene.appearances)]
     appearance = AppearanceSelection(scene)
@@ -132,14 +132,14 @@ def test_appearances_follow_one_another_smoothly_and_end_where_they_began() -> N
     np.testing.assert_array_equal(appearance.code, half_way)
 
 
-def test_a_scene_of_one_appearance_knows_no_other() -> None:
+def test_a_scene_without_appearances_has_only_the_average() -> None:
     appearance = AppearanceSelection(tiny_scene())
     appearance.next()
     appearance.advance(1.0)
     assert appearance.code is None and appearance.number == 0 and appearance.names == ("average",)
 
 
-def test_where_a_clip_will_be_is_where_it_comes_to() -> None:
+def test_after_gives_the_position_that_advance_reaches() -> None:
     playback = Playback(Clip(31, 10.0), time=0.25, speed=2.0)
     later = playback.after(0.5)
     assert playback.time == 0.25 and later.time == pytest.approx(0.25 + 1 / 3) == pytest.approx(

@@ -1,4 +1,4 @@
-"""Which library windows are made with, and that all take it from one place."""
+"""Which glfw library is used, and that only one module imports it."""
 
 import ast
 from pathlib import Path
@@ -23,13 +23,13 @@ LIBRARY = Path(glfw.__file__).with_name("wayland") / "libglfw.so"
         ({"WAYLAND_DISPLAY": "wayland-0", "PYGLFW_LIBRARY_VARIANT": "x11"}, False),
     ],
 )
-def test_wayland_is_for_where_there_is_no_x_server_or_who_asks(environment: dict[str, str], is_wanted: bool) -> None:
+def test_wayland_is_used_without_an_x_server_or_on_request(environment: dict[str, str], is_wanted: bool) -> None:
     assert wayland_library("linux", environment) == (LIBRARY if is_wanted and LIBRARY.is_file() else None)
     assert wayland_library("darwin", environment) is None and wayland_library("win32", environment) is None
 
 
-def test_windows_are_made_from_one_place() -> None:
-    """Whoever imports glfw before imgui-bundle takes the wrong library, or none that loads."""
+def test_only_one_module_imports_the_window_libraries() -> None:
+    """If glfw is imported before imgui-bundle, it may be the wrong library, or imgui-bundle may fail to load."""
     for folder in ("player", "tools"):
         for file in sorted((ROOT / folder).rglob("*.py")):
             found = {module.split(".")[0] for module in imports(file)} & {"glfw", "imgui_bundle"}

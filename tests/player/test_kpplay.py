@@ -104,10 +104,10 @@ def kpplay(
 
 
 def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> None:
-    shot = tmp_path / "shot.png"
-    done = kpplay(scene_file, "--size", "400x300", "--frames", 5, "--screenshot", shot, display=display)
+    screenshot = tmp_path / "screenshot.png"
+    done = kpplay(scene_file, "--size", "400x300", "--frames", 5, "--screenshot", screenshot, display=display)
     assert done.returncode == 0 and done.stdout == "" and "Traceback" not in done.stderr, done.stderr
-    picture = read_image(shot).astype(int)
+    picture = read_image(screenshot).astype(int)
     assert picture.shape == (300, 400, 3)
     background = np.rint(tiny_scene(4).background * 255)
     assert np.abs(picture[:20, -20:] - background).max() <= 1  # the corner is empty
@@ -119,24 +119,24 @@ def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> No
 def test_plays_without_an_x_server(
     scene_file: Path, wayland: dict[str, str], session: dict[str, str], tmp_path: Path
 ) -> None:
-    shot = tmp_path / "shot.png"
+    screenshot = tmp_path / "screenshot.png"
     done = kpplay(
-        scene_file, "--size", "300x200", "--frames", 20, "--screenshot", shot, variables={**wayland, **session}
+        scene_file, "--size", "300x200", "--frames", 20, "--screenshot", screenshot, variables={**wayland, **session}
     )
     assert done.returncode == 0 and done.stdout == "" and "Traceback" not in done.stderr, done.stderr
-    picture = read_image(shot).astype(int)
+    picture = read_image(screenshot).astype(int)
     assert picture.shape == (400, 600, 3)  # what the compositor counts
     assert picture[24:200, 24:200].mean() < 180  # the HUD
 
 
 def test_plays_from_a_server(scene_file: Path, display: str, tmp_path: Path) -> None:
-    shot = tmp_path / "shot.png"
+    screenshot = tmp_path / "screenshot.png"
     with serving(scene_file.parent) as url:
-        options = ["--size", "400x300", "--memory", "50MB", "--frames", 3, "--screenshot", shot]
+        options = ["--size", "400x300", "--memory", "50MB", "--frames", 3, "--screenshot", screenshot]
         done = kpplay(f"{url}/tiny.kpc", *options, display=display)
     assert done.returncode == 0 and done.stdout == done.stderr == "", done.stderr
     background = np.rint(tiny_scene(4).background * 255)
-    assert np.abs(read_image(shot).astype(int)[150:170, 260:280] - background).max() > 20
+    assert np.abs(read_image(screenshot).astype(int)[150:170, 260:280] - background).max() > 20
 
 
 def test_a_failing_server_is_reported_in_the_window(scene_file: Path, display: str, tmp_path: Path) -> None:
@@ -151,13 +151,15 @@ def test_a_failing_server_is_reported_in_the_window(scene_file: Path, display: s
             self.headers.replace_header("Range", f"bytes={first}-{min(last, first + 1999)}")
             super().do_GET()
 
-    shots = [tmp_path / "whole.png", tmp_path / "failed.png"]
-    for handler, shot in zip((Handler, Failing), shots, strict=False):
+    pictures = [tmp_path / "whole.png", tmp_path / "failed.png"]
+    for handler, screenshot in zip((Handler, Failing), pictures, strict=True):
         with serving(scene_file.parent, handler=handler) as url:
-            done = kpplay(f"{url}/tiny.kpc", "--size", "400x300", "--frames", 2, "--screenshot", shot, display=display)
+            done = kpplay(
+                f"{url}/tiny.kpc", "--size", "400x300", "--frames", 2, "--screenshot", screenshot, display=display
+            )
         assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     whole, failed = (
-        read_image(shot).astype(int)[22:38, 250:390] for shot in shots
+        read_image(screenshot).astype(int)[22:38, 250:390] for screenshot in pictures
     )  # where the message is, right of the HUD
     assert failed.max() > 200 > 100 > failed.min() and np.abs(whole - failed).max() > 100
 

@@ -31,7 +31,7 @@ def test_every_field_is_checked() -> None:
     "loop": [1, "yes", None],
     "text_size": [0, 99, float("nan"), "x"],
 }.items())  # fmt: skip
-def test_a_wrong_value_counts_as_not_there(tmp_path: Path, name: str, values: list[object]) -> None:
+def test_an_invalid_value_is_replaced_by_its_default(tmp_path: Path, name: str, values: list[object]) -> None:
     path = tmp_path / "player.json"
     save(MINE, path)
     for value in values:
@@ -44,7 +44,7 @@ def test_a_wrong_value_counts_as_not_there(tmp_path: Path, name: str, values: li
 @pytest.mark.parametrize(
     "content", [b"", b"\xff\xfe", b"[]", b"null", b"[" * 60_000, b'{"a": 1}', b" " * (2 * MAX_BYTES)]
 )
-def test_another_file_is_none(tmp_path: Path, content: bytes) -> None:
+def test_other_files_give_the_defaults(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "player.json").write_bytes(content)
     assert load(tmp_path / "player.json") == Preferences()
 
@@ -59,7 +59,7 @@ def test_another_file_is_none(tmp_path: Path, content: bytes) -> None:
         ),
     )
 )
-def test_whatever_it_says_the_player_starts(tmp_path: Path, found: dict[str, object]) -> None:
+def test_any_content_is_accepted(tmp_path: Path, found: dict[str, object]) -> None:
     (tmp_path / "player.json").write_text(json.dumps(found))
     got = load(tmp_path / "player.json")
     assert {name: getattr(got, name) for name in _IS_VALID if name not in found} == {
@@ -67,13 +67,13 @@ def test_whatever_it_says_the_player_starts(tmp_path: Path, found: dict[str, obj
     }
 
 
-def test_no_file_a_folder_and_a_pipe_are_no_preferences(tmp_path: Path) -> None:
+def test_a_missing_file_a_folder_and_a_pipe_give_the_defaults(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "none.json", tmp_path, tmp_path / "pipe"):
         assert load(path) == Preferences()
 
 
-def test_lies_in_the_folder_the_platform_has_for_it(tmp_path: Path) -> None:
+def test_the_file_is_in_the_platforms_settings_folder(tmp_path: Path) -> None:
     """In a process of its own: the platform is asked once."""
     program = "from kpc.player.app.preferences import preferences_path; print(preferences_path())"
     env = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path), "APPDATA": str(tmp_path), "HOME": str(tmp_path)}

@@ -18,7 +18,7 @@ def listed(scene: PartialScene, order: np.ndarray) -> list[tuple[int, bool, int]
     return [(int(scene.scales[i]), bool(scene.moves[i]), scene.entry(int(scene.numbers[i])).row_start) for i in order]
 
 
-def test_the_first_coarse_picture_comes_first_then_finer_ones_then_what_is_ahead(scene: PartialScene) -> None:
+def test_the_coarse_picture_comes_first_then_finer_ones_then_segments_ahead(scene: PartialScene) -> None:
     order = listed(scene, fetch_order(scene, Playhead(0.5)))
     now = [(False, 0)] * 3 + [(True, 8)] * 3 + [(True, 10)] * 3  # row 9.5 lies between two segments
     coarse, fine, rest = order[:9], order[9:18], order[18:]
@@ -27,7 +27,7 @@ def test_the_first_coarse_picture_comes_first_then_finer_ones_then_what_is_ahead
     assert all(a <= b for a, b in pairwise(ahead)) and all(moves for _, moves, _ in rest)
 
 
-def test_while_it_plays_what_comes_soon_precedes_a_finer_scale(scene: PartialScene) -> None:
+def test_urgent_segments_precede_a_finer_scale_while_playing(scene: PartialScene) -> None:
     paused, playing = (fetch_order(scene, Playhead(0.5, rate)) for rate in (0.0, 0.3))
     finer = [
         next(k for k, (scale, moves, _) in enumerate(listed(scene, order)) if scale == 1) for order in (paused, playing)
@@ -37,13 +37,13 @@ def test_while_it_plays_what_comes_soon_precedes_a_finer_scale(scene: PartialSce
     assert max(soon) >= 14 and min(soon) >= 8
 
 
-def test_what_the_picture_shown_needs_precedes_all_else(scene: PartialScene) -> None:
+def test_segments_of_the_scales_that_are_shown_come_first(scene: PartialScene) -> None:
     order = listed(scene, fetch_order(scene, Playhead(0.5, 0.3), shown=2))
     moving = [place for place in order if place[1]]
     assert moving[:12] == [(scale, True, row) for scale in (0, 1) for row in (8, 8, 8, 10, 10, 10)]
 
 
-def test_behind_the_playhead_comes_around_again_or_last(scene: PartialScene) -> None:
+def test_segments_behind_the_playhead_follow_after_the_loop_or_last(scene: PartialScene) -> None:
     first = [
         k for k in range(len(scene.numbers)) if scene.moves[k] and scene.entry(int(scene.numbers[k])).row_start == 0
     ]
@@ -55,13 +55,13 @@ def test_behind_the_playhead_comes_around_again_or_last(scene: PartialScene) -> 
     assert (loop[before] > loop[first].max()).all() and (once[before] < once[first].min()).all()
 
 
-def test_the_least_room_is_what_some_time_needs(scene: PartialScene) -> None:
+def test_min_segment_bytes_is_the_maximum_over_time(scene: PartialScene) -> None:
     needs = [int(scene.sizes[scene.moves & scene.is_needed(t, t)].sum()) for t in np.linspace(0, 1, 2000)]
     assert min_segment_bytes(scene) == max(needs)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.33, 0.5, 0.98, 1.0])
-def test_what_fits_is_what_comes_next_and_what_is_needed_always_fits(scene: PartialScene, time: float) -> None:
+def test_the_nearest_segments_are_kept_and_those_needed_now_always_fit(scene: PartialScene, time: float) -> None:
     least, every = min_segment_bytes(scene), int(scene.sizes[scene.moves].sum())
     assert 0 < least < every
     for room in (least, 2 * least, every):
@@ -72,7 +72,7 @@ def test_what_fits_is_what_comes_next_and_what_is_needed_always_fits(scene: Part
         assert held.all() if room == every else distance[held].max() <= distance[~held].min() + 1e-9
 
 
-def test_nothing_moves_in_a_static_scene() -> None:
+def test_a_static_scene_has_no_segments_of_time_planes() -> None:
     still = opened(tiny_scene(4, dynamic=False))[0]
     assert min_segment_bytes(still) == 0 and segments_to_keep(still, Playhead(), 0).all()
     assert sorted(fetch_order(still, Playhead())) == list(range(6))

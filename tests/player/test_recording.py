@@ -1,4 +1,4 @@
-"""Videos in the making: what is put in comes out, and nobody waits."""
+"""Videos that are being written: their frames, and that no call blocks."""
 
 import time as clock
 from pathlib import Path
@@ -49,7 +49,7 @@ def test_a_full_queue_refuses_at_once(tmp_path: Path, monkeypatch: pytest.Monkey
     assert video.is_over
 
 
-def test_what_is_given_up_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_abandoned_video_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video = Recording(tmp_path / "a.mp4", 10, (40, 30))
     video.take(frame(9))
     monkeypatch.setattr(video, "end", lambda: None)  # as if frames waited still
@@ -57,7 +57,7 @@ def test_what_is_given_up_leaves_no_file(tmp_path: Path, monkeypatch: pytest.Mon
     assert video.is_over and "given up" in str(video.failure) and list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_missing_folder_is_reported(tmp_path: Path) -> None:
     video = Recording(tmp_path / "nowhere" / "a.mp4", 10, (40, 30))
     video.take(frame(9))
     video.end()
@@ -65,18 +65,18 @@ def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
     assert "nowhere" in str(video.failure)
 
 
-def test_a_video_without_frames_is_told(tmp_path: Path) -> None:
+def test_a_video_without_frames_is_reported(tmp_path: Path) -> None:
     video = Recording(tmp_path / "a.mp4", 10, (40, 30))
     video.end()
     wait_for(video)
     assert "no frames" in str(video.failure)
 
 
-@pytest.mark.parametrize("turn_s", [1 / 200, 1 / 60, 1 / 30, 1 / 7])
-def test_a_recording_lasts_as_long_as_what_it_shows(turn_s: float) -> None:
+@pytest.mark.parametrize("frame_s", [1 / 200, 1 / 60, 1 / 30, 1 / 7])
+def test_a_recording_has_the_right_duration(frame_s: float) -> None:
     taken = 0
-    for elapsed in np.arange(0, 4, turn_s):
+    for elapsed in np.arange(0, 4, frame_s):
         due = frames_due(float(elapsed), 30, taken)
-        assert due <= 30 * turn_s + 2
+        assert due <= 30 * frame_s + 2
         taken += due
         assert abs(taken / 30 - elapsed) <= 1 / 30 + 1e-9

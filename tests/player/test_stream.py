@@ -1,4 +1,4 @@
-"""Scenes played while they arrive: from memory, and over good and bad lines from a real server on this machine."""
+"""Playback of scenes while they arrive, from memory and over good and bad connections to a local server."""
 
 import gc
 import threading
@@ -29,7 +29,7 @@ from scenes import VARIANTS, tiny_scene
 
 import kpc
 
-PATIENCE_S = 20.0
+TIMEOUT_S = 20.0
 SIZE = (48, 36)
 
 
@@ -41,7 +41,7 @@ def _fast(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def watched() -> Iterator[Callable[..., Stream]]:
-    """Opens streams, and closes them in the end."""
+    """Return a function that opens streams; they are closed after the test."""
     opened: list[Stream] = []
 
     def open_stream(source: object, **options: object) -> Stream:
@@ -51,13 +51,13 @@ def watched() -> Iterator[Callable[..., Stream]]:
     yield open_stream
     for stream in opened:
         stream.close()
-        stream._thread.join(PATIENCE_S)
+        stream._thread.join(TIMEOUT_S)
         assert not stream._thread.is_alive()
 
 
 def until(condition: Callable[[], object], stream: Stream, renderer: Renderer) -> None:
-    """Frames without pictures, until something has come about."""
-    end = clock.monotonic() + PATIENCE_S
+    """Call `upload` as frames would, until a condition holds."""
+    end = clock.monotonic() + TIMEOUT_S
     while not condition():
         assert clock.monotonic() < end, stream.message
         stream.upload(renderer)
@@ -74,7 +74,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("folded", [False, True])
 @pytest.mark.parametrize("space", [*VARIANTS, "baked"])
-def test_once_all_is_there_it_is_the_same_picture(
+def test_a_scene_that_has_arrived_gives_the_same_picture_as_one_that_was_loaded(
     space: str, folded: bool, watched: Callable[..., Stream], tmp_path: Path
 ) -> None:
     scene, quality = (
@@ -93,7 +93,7 @@ def test_once_all_is_there_it_is_the_same_picture(
         for source in (str(tmp_path / "scene.kpc"), f"{url}/scene.kpc"):
             stream = watched(source)
             renderer = Renderer(gl.context(), stream.scene, quality)
-            picture(renderer, whole, 0.3)  # whatever is there
+            picture(renderer, whole, 0.3)  # with what has arrived
             until(lambda stream=stream: stream.is_settled, stream, renderer)
             assert stream.loaded_fraction == 1 and stream.can_show(0.3) and stream.message is None
             pictures = sum(24 * target.seen.width * target.seen.height for target in renderer._targets.values())
@@ -110,9 +110,7 @@ def test_a_static_scene_streams_too(watched: Callable[..., Stream]) -> None:
     assert np.array_equal(picture(renderer, whole, 0.0), picture(Renderer(gl.context(), whole), whole, 0.0))
 
 
-def test_the_coarse_picture_is_there_long_before_the_rest_and_gets_finer(
-    watched: Callable[..., Stream], tmp_path: Path
-) -> None:
+def test_a_coarse_picture_arrives_early_and_is_refined(watched: Callable[..., Stream], tmp_path: Path) -> None:
     data = coded(tiny_scene(4, time=10, scales=3, resolution=(96, 80, 64)))
     (tmp_path / "scene.kpc").write_bytes(data)
     whole, found = kpc.load(data), []
@@ -134,14 +132,14 @@ def long_scene() -> bytes:
 
 
 def test_a_long_clip_plays_in_little_memory(watched: Callable[..., Stream], tmp_path: Path) -> None:
-    """What is behind the playhead goes, what is ahead is fetched, and every picture is the right one."""
+    """Segments behind the playhead are dropped, those ahead are fetched, and every picture is right."""
     data = long_scene()
     (tmp_path / "scene.kpc").write_bytes(data)
     whole = kpc.load(data)
     wanted = Renderer(gl.context(), whole)
     with serving(tmp_path) as url:
-        probe = watched(f"{url}/scene.kpc")
-        fixed, all_of_it = probe.fixed_bytes, int(probe.parts.sizes[probe.parts.moves].sum())
+        unlimited = watched(f"{url}/scene.kpc")
+        fixed, all_of_it = unlimited.fixed_bytes, int(unlimited.parts.sizes[unlimited.parts.moves].sum())
         room = all_of_it // 5
         stream = watched(f"{url}/scene.kpc", memory=fixed + room)
         renderer, most = Renderer(gl.context(), stream.scene), 0
@@ -158,18 +156,18 @@ def test_a_long_clip_plays_in_little_memory(watched: Callable[..., Stream], tmp_
                 if int(60 * time) % 7 == turn:
                     assert np.array_equal(picture(renderer, whole, float(time)), picture(wanted, whole, float(time)))
         assert most > room / 3 and not stream._loaded.all()
-        assert stream.source.received_bytes > 1.2 * len(data)  # type: ignore[attr-defined]  # evicted, and fetched again the second time
+        assert stream.source.received_bytes > 1.2 * len(data)  # type: ignore[attr-defined]  # dropped, and fetched again the second time
 
 
-def test_too_little_memory_is_told_before_any_plane_is_fetched() -> None:
+def test_too_little_memory_is_reported_before_a_plane_is_fetched() -> None:
     data = long_scene()
     with pytest.raises(BudgetError, match=r"playing takes [\d,]+ bytes, more than --memory 3,000,000"):
         Stream(open_source(data), memory=3_000_000)
     assert "fetching" not in [thread.name for thread in threading.enumerate()]
 
 
-class Noting(Handler):
-    """Notes the first byte of every range that is asked for."""
+class RecordingHandler(Handler):
+    """Records the first byte of every range that is requested."""
 
     asked: ClassVar[list[int]] = []
 
@@ -178,25 +176,25 @@ class Noting(Handler):
         super().do_GET()
 
 
-def test_a_jump_is_served_before_all_that_lies_between(
+def test_segments_after_a_jump_are_fetched_before_those_in_between(
     watched: Callable[..., Stream], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "RUN_BYTES", 2048)
     data = long_scene()
     (tmp_path / "scene.kpc").write_bytes(data)
-    Noting.asked.clear()
-    with serving(tmp_path, link=Link(rate=40_000, delay_s=0.002), handler=Noting) as url:
+    RecordingHandler.asked.clear()
+    with serving(tmp_path, link=Link(rate=40_000, delay_s=0.002), handler=RecordingHandler) as url:
         stream = watched(f"{url}/scene.kpc")
         renderer = Renderer(gl.context(), stream.scene)
         until(lambda: stream.complete_scales == 2 and stream.can_show(0.0), stream, renderer)
-        before = len(Noting.asked)
+        before = len(RecordingHandler.asked)
         stream.set_playhead(Playhead(0.9))
         assert not stream.can_show(0.9)
         until(lambda: stream.can_show(0.9), stream, renderer)
         assert stream.loaded_fraction < 0.9
         late = [e.offset for e in Reader(data).index if e.kind == "PLNE" and 104 <= e.row_start <= 108]
-        since = Noting.asked[before:]
-        assert any(offset in late for offset in since[:3])  # what was under way may end first
+        since = RecordingHandler.asked[before:]
+        assert any(offset in late for offset in since[:3])  # the request that was under way may finish first
 
 
 def test_a_jump_does_not_wait_for_the_end_of_a_large_chunk(watched: Callable[..., Stream], tmp_path: Path) -> None:
@@ -225,19 +223,19 @@ def test_a_jump_does_not_wait_for_the_end_of_a_large_chunk(watched: Callable[...
         until(lambda: stream.is_settled, stream, renderer)
         whole = kpc.load(data)
         assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
-        assert stream.received < 1.05 * len(data)  # what came before the jump was not for nothing
+        assert stream.received < 1.05 * len(data)  # what arrived before the jump is not fetched again
 
 
-def test_a_player_that_stalls_goes_on_by_itself(watched: Callable[..., Stream], tmp_path: Path) -> None:
+def test_a_stalled_player_continues(watched: Callable[..., Stream], tmp_path: Path) -> None:
     (tmp_path / "scene.kpc").write_bytes(long_scene())
     release = threading.Event()
 
     class Halting(Handler):
-        """Sends what makes up the first picture, then nothing, until it is let go on."""
+        """Sends the first picture, then nothing until `release` is set."""
 
         def send(self, file: IO[bytes], count: int) -> None:
             if file.tell() > 30_000:
-                release.wait(PATIENCE_S)
+                release.wait(TIMEOUT_S)
             super().send(file, count)
 
     with serving(tmp_path, handler=Halting) as url:
@@ -257,7 +255,7 @@ def test_a_player_that_stalls_goes_on_by_itself(watched: Callable[..., Stream], 
         assert stream.message is None
 
 
-def test_the_window_waits_for_nothing_while_the_line_is_dead(
+def test_the_window_does_not_wait_for_a_server_that_does_not_answer(
     watched: Callable[..., Stream], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(http, "SILENCE_S", 0.3)
@@ -268,7 +266,7 @@ def test_the_window_waits_for_nothing_while_the_line_is_dead(
         def send(self, file: IO[bytes], count: int) -> None:
             if file.tell() >= 4096 and not release.is_set():
                 silent.set()
-                release.wait(PATIENCE_S)
+                release.wait(TIMEOUT_S)
                 self.close_connection = True
             else:
                 super().send(file, count)
@@ -276,10 +274,10 @@ def test_the_window_waits_for_nothing_while_the_line_is_dead(
     with serving(tmp_path, handler=Dying) as url:
         opened: list[Stream] = []
         thread = threading.Thread(target=lambda: opened.append(watched(f"{url}/scene.kpc")))
-        thread.start()  # what there can be no picture without is waited for
-        silent.wait(PATIENCE_S)
+        thread.start()  # the constructor waits for everything but planes
+        silent.wait(TIMEOUT_S)
         release.set()
-        thread.join(PATIENCE_S)
+        thread.join(TIMEOUT_S)
         stream = opened[0]
         renderer = Renderer(gl.context(), stream.scene)
         until(lambda: stream.can_show(0.0), stream, renderer)
@@ -293,12 +291,10 @@ def test_the_window_waits_for_nothing_while_the_line_is_dead(
             _ = stream.message, stream.loaded_fraction, stream.bytes_per_s
             slowest = max(slowest, clock.monotonic() - started)
         release.set()
-    assert slowest < 0.25  # a request would have waited for longer
+    assert slowest < 0.25  # a request would have taken longer
 
 
-def test_a_line_that_breaks_in_mid_chunk_is_told_and_taken_up_again(
-    watched: Callable[..., Stream], tmp_path: Path
-) -> None:
+def test_a_broken_connection_is_reported_and_resumed(watched: Callable[..., Stream], tmp_path: Path) -> None:
     data = long_scene()
     (tmp_path / "scene.kpc").write_bytes(data)
     whole = kpc.load(data)
@@ -309,21 +305,21 @@ def test_a_line_that_breaks_in_mid_chunk_is_told_and_taken_up_again(
             self.close_connection = self.close_connection or count > 3000
 
     with serving(tmp_path, handler=Breaking) as url:
-        stream, said = watched(f"{url}/scene.kpc"), []
+        stream, messages = watched(f"{url}/scene.kpc"), []
         renderer = Renderer(gl.context(), stream.scene)
 
         def settled() -> bool:
-            said.append(stream.message)
+            messages.append(stream.message)
             return stream.is_settled
 
         until(settled, stream, renderer)
-        assert any("trying again" in (message or "") for message in said)
+        assert any("trying again" in (message or "") for message in messages)
         stream.can_show(0.5)
         assert stream.message is None
         assert np.array_equal(picture(renderer, whole, 0.5), picture(Renderer(gl.context(), whole), whole, 0.5))
 
 
-def test_a_server_without_ranges_plays_from_the_beginning_on(
+def test_a_server_without_ranges_is_played_while_it_arrives(
     watched: Callable[..., Stream], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = coded(tiny_scene(4, time=10, scales=3, resolution=(96, 80, 64)))
@@ -346,7 +342,7 @@ def test_a_server_without_ranges_plays_from_the_beginning_on(
     assert "not support range requests" in capsys.readouterr().err
 
 
-def test_a_file_that_changes_is_told_and_what_is_there_still_plays(
+def test_a_file_that_changes_is_reported_and_what_has_arrived_plays(
     watched: Callable[..., Stream], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "RUN_BYTES", 4096)
@@ -373,7 +369,7 @@ def test_a_file_that_changes_is_told_and_what_is_there_still_plays(
 
 def flipping(times: int, at: int) -> type[Handler]:
     class Flipping(Handler):
-        """Damages one byte, so many times."""
+        """Damages one byte, `times` times."""
 
         left = times
 
@@ -388,9 +384,7 @@ def flipping(times: int, at: int) -> type[Handler]:
     return Flipping
 
 
-def test_a_damaged_chunk_is_fetched_a_second_time_and_not_a_third(
-    watched: Callable[..., Stream], tmp_path: Path
-) -> None:
+def test_a_damaged_chunk_is_fetched_twice_at_most(watched: Callable[..., Stream], tmp_path: Path) -> None:
     (tmp_path / "scene.kpc").write_bytes(long_scene())
     of_a_plane = Reader(long_scene()).index[-1].offset
     for times, words in ((1, None), (2, "is damaged")):
@@ -401,7 +395,7 @@ def test_a_damaged_chunk_is_fetched_a_second_time_and_not_a_third(
             assert (stream.failure is None) if words is None else words in (stream.failure or "")
 
 
-def test_a_damaged_file_on_a_disk_is_told(watched: Callable[..., Stream]) -> None:
+def test_a_damaged_local_file_is_reported(watched: Callable[..., Stream]) -> None:
     data = bytearray(long_scene())
     data[-10] ^= 1
     stream = watched(bytes(data))
@@ -410,7 +404,9 @@ def test_a_damaged_file_on_a_disk_is_told(watched: Callable[..., Stream]) -> Non
     assert "is damaged" in (stream.failure or "")
 
 
-def test_a_bug_in_the_thread_is_no_silence(watched: Callable[..., Stream], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unexpected_errors_of_the_thread_are_raised(
+    watched: Callable[..., Stream], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "dequantised", lambda *arguments: 1 / 0)
     stream = watched(long_scene())
     renderer = Renderer(gl.context(), stream.scene)
@@ -418,18 +414,18 @@ def test_a_bug_in_the_thread_is_no_silence(watched: Callable[..., Stream], monke
         until(lambda: False, stream, renderer)
 
 
-def test_closing_does_not_wait_for_a_slow_line(tmp_path: Path) -> None:
+def test_closing_does_not_wait_for_a_slow_connection(tmp_path: Path) -> None:
     (tmp_path / "scene.kpc").write_bytes(long_scene())
     with serving(tmp_path, link=Link(rate=20_000)) as url:
         stream = Stream(open_source(f"{url}/scene.kpc"))
         started = clock.monotonic()
         stream.close()
         assert clock.monotonic() - started < 1.5
-        stream._thread.join(PATIENCE_S)
+        stream._thread.join(TIMEOUT_S)
         assert not stream._thread.is_alive()
 
 
-def test_a_large_plane_goes_up_over_several_frames(watched: Callable[..., Stream]) -> None:
+def test_a_large_plane_is_uploaded_over_several_frames(watched: Callable[..., Stream]) -> None:
     data = coded(tiny_scene(4, time=10, scales=2, resolution=(96, 80, 64)))
     stream, whole = watched(data), kpc.load(data)
     renderer, written = Renderer(gl.context(), stream.scene), []
@@ -440,7 +436,7 @@ def test_a_large_plane_goes_up_over_several_frames(watched: Callable[..., Stream
         put(scale, plane, texels, first)
 
     renderer.put = noted  # type: ignore[method-assign]
-    end = clock.monotonic() + PATIENCE_S
+    end = clock.monotonic() + TIMEOUT_S
     while not stream.is_settled and clock.monotonic() < end:
         written.clear()
         stream.upload(renderer, max_bytes=20_000)
@@ -465,14 +461,14 @@ MAKERS = (
 
 
 @pytest.mark.parametrize("folded", [False, True])
-def test_steady_playback_makes_nothing_on_the_card_and_keeps_memory_flat(
+def test_playback_allocates_nothing_on_the_card_and_no_memory(
     folded: bool, watched: Callable[..., Stream], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Even while segments come and go."""
+    """Also while segments are fetched and dropped."""
     data = long_scene()
-    probe = watched(data)
-    room = int(probe.parts.sizes[probe.parts.moves].sum()) // 4
-    stream = watched(data, memory=probe.fixed_bytes + room)
+    unlimited = watched(data)
+    room = int(unlimited.parts.sizes[unlimited.parts.moves].sum()) // 4
+    stream = watched(data, memory=unlimited.fixed_bytes + room)
     ctx = gl.context()
     renderer, screen = Renderer(ctx, stream.scene, Quality(folded=folded)), ctx.simple_framebuffer(SIZE, 4)
     camera = stream.scene.cameras[0].resized(*SIZE)
@@ -497,9 +493,12 @@ def test_steady_playback_makes_nothing_on_the_card_and_keeps_memory_flat(
         gc.collect()
         grown = tracemalloc.get_traced_memory()[0] - before
     finally:
-        for each in (probe, stream):  # no kernel may allocate meanwhile: CPython's issue 128679, a crash before 3.14
+        for each in (
+            unlimited,
+            stream,
+        ):  # no kernel may allocate meanwhile: CPython's issue 128679, a crash before 3.14
             each.close()
-            each._thread.join(PATIENCE_S)
+            each._thread.join(TIMEOUT_S)
         tracemalloc.stop()
     assert not made
-    assert grown < room + 100_000  # segments that happen to be there; a row of texels kept a frame would be 1.6 MB
+    assert grown < room + 100_000  # segments; keeping a row of texels per frame would take 1.6 MB

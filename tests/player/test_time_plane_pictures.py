@@ -10,7 +10,7 @@ from scenes import tiny_scene
 
 @pytest.mark.parametrize("channels", [1, 2, 8])
 @pytest.mark.parametrize("plane", ["xt", "yt", "zt"])
-def test_what_stands_still_is_grey_and_what_moves_is_not(plane: str, channels: int) -> None:
+def test_static_texels_are_grey_and_moving_ones_are_not(plane: str, channels: int) -> None:
     scene = tiny_scene(4, channels=channels)
     values = scene.scales[1][plane]
     values[:, 0] = 0.3  # constant, if not 1
@@ -24,24 +24,24 @@ def test_what_stands_still_is_grey_and_what_moves_is_not(plane: str, channels: i
     assert picture.min() < 60 and picture.max() > 195  # the range is used
 
 
-def test_a_plane_that_says_nothing_is_grey() -> None:
+def test_a_constant_plane_is_grey() -> None:
     scene = tiny_scene(4)
     scene.scales[0]["xt"][:] = 1
     assert (time_plane_picture(scene, "xt", 0) == 128).all()
 
 
-def test_many_instants_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_planes_are_subsampled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time_plane_pictures, "MAX_INSTANTS", 5)
     scene = tiny_scene(4, time=40)
     assert time_plane_picture(scene, "zt", 1).shape == (scene.scales[1]["zt"].shape[1], 5, 3)
 
 
-def test_static_scenes_have_none() -> None:
+def test_static_scenes_have_no_time_planes() -> None:
     assert time_planes(tiny_scene(4, dynamic=False)) == []
     assert ("yt", 1) in time_planes(tiny_scene(4)) and len(time_planes(tiny_scene(4))) == 6
 
 
-def test_what_has_not_arrived_is_grey() -> None:
+def test_segments_that_have_not_arrived_are_grey() -> None:
     scene = tiny_scene(4)
     data = encode(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]))
     part = PartialScene(SceneReader(data, in_parts=True))
@@ -50,7 +50,7 @@ def test_what_has_not_arrived_is_grey() -> None:
     assert (time_plane_picture(part.scene, "xt", 1) != 128).any()
 
 
-def test_the_part_that_moves_is_found_with_a_margin() -> None:
+def test_the_moving_part_is_found_with_a_margin() -> None:
     picture = np.full((40, 9, 3), 128, np.uint8)
     assert moving_part(picture) == (0.0, 1.0)
     picture[10:20, 4, 1] = 200

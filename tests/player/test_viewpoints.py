@@ -22,14 +22,14 @@ RING = [(3 * math.cos(a), 3 * math.sin(a), 1.0) for a in np.linspace(0, 2 * math
 WALL = [(x, -4.0, z) for x in (-0.8, 0.0, 0.8) for z in (0.4, 0.9)]
 
 
-def test_focus_and_up_are_what_the_cameras_share() -> None:
+def test_focus_and_up_follow_from_the_cameras() -> None:
     for eyes in (RING, WALL):
         rig = Rig.of(scene_of(eyes))
         assert rig.focus == pytest.approx(np.zeros(3), abs=1e-6)
         assert rig.up @ UP > math.cos(math.radians(0.5 if eyes is RING else 12))
 
 
-def test_a_ring_gives_a_full_circle_that_starts_at_the_first_camera() -> None:
+def test_surrounding_cameras_give_a_full_circle_from_the_first_camera() -> None:
     scene = scene_of(RING)
     path = orbit(scene, 36)
     eyes = np.stack([camera.camera_to_world[:3, 3] for camera in path])
@@ -40,7 +40,7 @@ def test_a_ring_gives_a_full_circle_that_starts_at_the_first_camera() -> None:
     assert abs(azimuth[-1] - azimuth[0]) == pytest.approx(2 * math.pi * 35 / 36)
 
 
-def test_a_wall_of_cameras_gives_an_ellipse_between_them() -> None:
+def test_cameras_on_one_side_give_an_ellipse_between_them() -> None:
     scene = scene_of(WALL)
     eyes = np.stack([camera.camera_to_world[:3, 3] for camera in orbit(scene, 40)])
     assert np.abs(eyes[:, 0]).max() < 0.8 and np.ptp(eyes[:, 0]) > 0.8
@@ -49,7 +49,7 @@ def test_a_wall_of_cameras_gives_an_ellipse_between_them() -> None:
 
 
 @pytest.mark.parametrize("eyes", [RING, WALL, WALL[:1], [], [(0.0, 0.0, 3.0)], [(0.3, 0.1, 0.2)]])
-def test_every_path_looks_at_the_focus_with_up_upwards(eyes: list[tuple[float, float, float]]) -> None:
+def test_every_path_looks_at_the_focus_and_is_upright(eyes: list[tuple[float, float, float]]) -> None:
     scene = scene_of(eyes)
     rig = Rig.of(scene)
     for camera in orbit(scene, 9):
@@ -61,7 +61,7 @@ def test_every_path_looks_at_the_focus_with_up_upwards(eyes: list[tuple[float, f
         assert pose[:3, 1] @ rig.up > -1e-9
 
 
-def test_parallel_cameras_look_at_the_middle_of_the_box() -> None:
+def test_parallel_cameras_focus_on_the_centre_of_the_box() -> None:
     pose = look_at(np.array([0.0, 0.0, 4.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
     moved = pose.copy()
     moved[0, 3] += 0.5
@@ -70,7 +70,7 @@ def test_parallel_cameras_look_at_the_middle_of_the_box() -> None:
     assert rig.focus[2] == pytest.approx(tiny_scene(0).aabb[:, 2].mean(), abs=1e-6)
 
 
-def test_rings_are_told_from_arcs() -> None:
+def test_surrounding_cameras_are_recognised() -> None:
     assert surround_focus(np.radians([0.0, 100.0, -110.0]))
     assert not surround_focus(np.radians([0.0, 60.0, -60.0]))
     assert not surround_focus(np.array([0.0]))
@@ -85,7 +85,7 @@ def test_fitting_keeps_the_vertical_field_of_view() -> None:
     assert fit_camera(camera, 64, 48) == camera
 
 
-def test_presets_stay_where_something_was_seen() -> None:
+def test_presets_stay_within_the_filmed_angles() -> None:
     around, ahead = presets(scene_of(RING)), presets(scene_of(WALL))
     assert list(around) == ["front", "right", "back", "left", "above", "near", "far"]
     eyes = {name: camera.camera_to_world[:3, 3] for name, camera in around.items()}
