@@ -14,7 +14,7 @@ import moderngl
 import numpy as np
 import pytest
 from kpc.format.common.errors import BudgetError
-from kpc.format.container import http
+from kpc.format.container import http, http_client
 from kpc.format.container.container import Reader, open_source
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.corner_grid import CornerGrid
@@ -258,7 +258,7 @@ def test_a_stalled_player_continues(watched: Callable[..., Stream], tmp_path: Pa
 def test_the_window_does_not_wait_for_a_server_that_does_not_answer(
     watched: Callable[..., Stream], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(http, "SILENCE_S", 0.3)
+    monkeypatch.setattr(http_client, "READ_TIMEOUT_S", 0.3)
     (tmp_path / "scene.kpc").write_bytes(long_scene())
     release, silent = threading.Event(), threading.Event()
 
@@ -407,7 +407,7 @@ def test_a_damaged_local_file_is_reported(watched: Callable[..., Stream]) -> Non
 def test_unexpected_errors_of_the_thread_are_raised(
     watched: Callable[..., Stream], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "dequantised", lambda *arguments: 1 / 0)
+    monkeypatch.setattr(module, "dequantise_symbols", lambda *arguments: 1 / 0)
     stream = watched(long_scene())
     renderer = Renderer(gl.context(), stream.scene)
     with pytest.raises(ZeroDivisionError):
