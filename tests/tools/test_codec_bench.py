@@ -244,9 +244,12 @@ def test_separate_processes(scene_file: Path) -> None:
 
 def test_errors_are_one_line(few: None, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "bad").write_bytes(b"nonsense")
-    for words in (["codec", str(tmp_path / "bad")], ["codec", str(tmp_path / "none.kpc")],
-                  ["codec", str(scene_file), "--dataset", str(tmp_path / "no")],
-                  ["codec", str(scene_file), "--dataset", ".", "--dataset", "."]):  # fmt: skip
+    for words in (
+        ["codec", str(tmp_path / "bad")],
+        ["codec", str(tmp_path / "none.kpc")],
+        ["codec", str(scene_file), "--dataset", str(tmp_path / "no")],
+        ["codec", str(scene_file), "--dataset", ".", "--dataset", "."],
+    ):
         assert kpbench.main(words) in (1, 2)
         output = capsys.readouterr()
         assert (

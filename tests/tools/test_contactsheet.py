@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from kpc.format.common.media import read_image, write_image
 from kpc.tools.cli import contactsheet
+from kpc.tools.cli.depth_images import NO_SURFACE
 from PIL import Image
 
 
@@ -15,13 +16,16 @@ def fill(folder: Path, names: list[str], level: int, size: tuple[int, int] = (40
 
 
 def test_truth_rendered_and_depth_stand_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    truth, drawn = fill(tmp_path / "gt", ["a", "b", "c", "d"], 100), fill(tmp_path / "out", ["a", "b", "c", "z"], 110)
+    truth, rendered = (
+        fill(tmp_path / "gt", ["a", "b", "c", "d"], 100),
+        fill(tmp_path / "out", ["a", "b", "c", "z"], 110),
+    )
     for name in "abc":
         depth = np.linspace(1000, 2000, 40 * 60).reshape(40, 60).astype(np.uint16)
-        depth[0] = contactsheet.NOTHING
-        Image.fromarray(depth).save(drawn / f"{name}_depth.png")
+        depth[0] = NO_SURFACE
+        Image.fromarray(depth).save(rendered / f"{name}_depth.png")
     out = tmp_path / "sheet.png"
-    assert contactsheet.main([str(truth), str(drawn), "-o", str(out), "--rows", "2"]) == 0
+    assert contactsheet.main([str(truth), str(rendered), "-o", str(out), "--rows", "2"]) == 0
     assert capsys.readouterr().out == f"{out}: mean PSNR 28.13 dB over 3 pictures\n"  # 20 log10(255 / 10)
     page, gap, step = read_image(out), contactsheet.GAP, 40 + contactsheet.CAPTION
     assert page.shape == (2 * step + gap, gap + 3 * (60 + gap), 3)
@@ -40,8 +44,12 @@ def test_truth_rendered_and_depth_stand_side_by_side(tmp_path: Path, capsys: pyt
         lambda root: root / "out",
     ],
 )
-def test_what_does_not_match_is_one_line(make, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    truth, drawn = fill(tmp_path / "gt", ["a"], 0), make(tmp_path)
-    assert contactsheet.main([str(truth), str(drawn), "-o", str(tmp_path / "sheet.png")]) in (1, 2)
-    said = capsys.readouterr().err
-    assert said.startswith(f"contactsheet: {drawn}") and said.count("\n") == 1 and not (tmp_path / "sheet.png").exists()
+def test_folders_that_do_not_match_are_one_line(make, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth, rendered = fill(tmp_path / "gt", ["a"], 0), make(tmp_path)
+    assert contactsheet.main([str(truth), str(rendered), "-o", str(tmp_path / "sheet.png")]) in (1, 2)
+    error = capsys.readouterr().err
+    assert (
+        error.startswith(f"contactsheet: {rendered}")
+        and error.count("\n") == 1
+        and not (tmp_path / "sheet.png").exists()
+    )

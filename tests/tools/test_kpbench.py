@@ -21,8 +21,17 @@ from scenes import tiny_scene
 
 import kpc
 
-SMALL = replace(PRESETS["draft"], resolutions=(8, 16), samples_across=32, cells_across=12, rays=256, samples=8192, warmup=5,
-                occupancy_start=8, occupancy_every=4)  # fmt: skip
+SMALL = replace(
+    PRESETS["draft"],
+    resolutions=(8, 16),
+    samples_across=32,
+    cells_across=12,
+    rays=256,
+    samples=8192,
+    warmup=5,
+    occupancy_start=8,
+    occupancy_every=4,
+)
 
 
 GROUPS = str(Path(__file__).parents[2] / "spec" / "vectors" / "valid" / "groups.kpc")
@@ -30,34 +39,59 @@ GROUPS = str(Path(__file__).parents[2] / "spec" / "vectors" / "valid" / "groups.
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch, one_thread: None, few_rays: None) -> None:
-    """In this process, with little to do. What would go to one of its own and come back is pickled, as it would be."""
+    """Run in this process with little to do; jobs and results are pickled as for a separate process."""
 
-    def alone(work: Callable[[Any], Any], job: Any) -> Any:
+    def isolated(work: Callable[[Any], Any], job: Any) -> Any:
         work, job = pickle.loads(pickle.dumps((work, job)))
         return pickle.loads(pickle.dumps(work(job)))
 
-    monkeypatch.setattr(harness, "isolated", alone)
+    monkeypatch.setattr(harness, "isolated", isolated)
     monkeypatch.setitem(PRESETS, "draft", SMALL)
 
 
 def tiny_file(path: Path, dynamic: bool) -> Path:
     scene = tiny_scene(1, dynamic=dynamic)
-    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), path)
     return path
 
 
 def test_encode_records_every_repeat(here: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_n3dv(tmp_path / "tiny", frames=2)
-    command = ["encode", str(tmp_path / "tiny"), "--preset", "draft", "--steps", "3", "--repeats", "2", "--seed", "5",
-               "--test-views", "1", "--box=-1,-1,-1,1,1,1", "--keep-scenes", str(tmp_path / "kept"), "--psnr", "3dB"]  # fmt: skip
+    command = [
+        "encode",
+        str(tmp_path / "tiny"),
+        "--preset",
+        "draft",
+        "--steps",
+        "3",
+        "--repeats",
+        "2",
+        "--seed",
+        "5",
+        "--test-views",
+        "1",
+        "--box=-1,-1,-1,1,1,1",
+        "--keep-scenes",
+        str(tmp_path / "kept"),
+        "--psnr",
+        "3dB",
+    ]
     assert kpbench.main(command) == 0
-    said = capsys.readouterr()
-    (record,) = json.loads(said.out)
+    output = capsys.readouterr()
+    (record,) = json.loads(output.out)
     assert record["kind"] == "encode" and record["name"] == "tiny" and record["renderer"] == "cpu"
     assert record["command"] == shlex.join(["kpbench", *command]) and record["seed"] == 5
     assert record["data_sha256"] == data_hash(tmp_path / "tiny")
-    assert record["settings"] == {"preset": "draft", "steps": 3, "time_budget_s": None, "downscale": 1, "test_views": 1,
-                                  "space": "auto", "box": [-1, -1, -1, 1, 1, 1], "psnr_db": 3.0}  # fmt: skip
+    assert record["settings"] == {
+        "preset": "draft",
+        "steps": 3,
+        "time_budget_s": None,
+        "downscale": 1,
+        "test_views": 1,
+        "space": "auto",
+        "box": [-1, -1, -1, 1, 1, 1],
+        "psnr_db": 3.0,
+    }
     assert all(run["trade"] == "psnr_db" for run in record["repeats"]) and "--psnr 3" in tables.markdown([record])
     assert [run["seed"] for run in record["repeats"]] == [5, 6]
     for run in record["repeats"]:
@@ -66,10 +100,10 @@ def test_encode_records_every_repeat(here: None, tmp_path: Path, capsys: pytest.
         assert run["test_pictures"] == 1 and run["test_psnr"] > 3 and run["peak_memory_bytes"] > 1 << 26
     names = [f"tiny-draft-{seed}.{kind}" for seed in (5, 6) for kind in ("kpc", "kpck")]
     assert sorted(p.name for p in (tmp_path / "kept").iterdir()) == names
-    assert "PSNR dB" in said.err and tables.markdown([record])
+    assert "PSNR dB" in output.err and tables.markdown([record])
 
 
-def test_step_sets_training_beside_plain_pytorch_and_the_machine(
+def test_step_compares_with_plain_pytorch_and_the_machine(
     here: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(profile, "STEPS", 1)
@@ -93,13 +127,24 @@ def test_step_sets_training_beside_plain_pytorch_and_the_machine(
     assert "plain PyTorch" in capsys.readouterr().err and "speedup" in tables.markdown([record])
 
 
-def test_curve_encodes_anew_for_each_time(here: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_curve_encodes_once_per_duration(here: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_n3dv(tmp_path / "tiny", frames=2)
     out = tmp_path / "curve.json"
-    command = ["curve", str(tmp_path / "tiny"), "--preset", "draft", "--minutes", "0.002,0.02",
-               "--box=-1,-1,-1,1,1,1", "--out", str(out), "--keep-scenes", str(tmp_path / "kept")]  # fmt: skip
+    command = [
+        "curve",
+        str(tmp_path / "tiny"),
+        "--preset",
+        "draft",
+        "--minutes",
+        "0.002,0.02",
+        "--box=-1,-1,-1,1,1,1",
+        "--out",
+        str(out),
+        "--keep-scenes",
+        str(tmp_path / "kept"),
+    ]
     assert kpbench.main(command) == 0
-    said = capsys.readouterr()
+    output = capsys.readouterr()
     records = results.load([out])
     assert [record["settings"]["time_budget_s"] for record in records] == pytest.approx([0.12, 1.2])
     for record in records:
@@ -110,7 +155,7 @@ def test_curve_encodes_anew_for_each_time(here: None, tmp_path: Path, capsys: py
         assert run["size_bytes"] == (tmp_path / "kept" / run["file"]).stat().st_size
     assert len(list((tmp_path / "kept").glob("*.kpc"))) == 2
     assert records[0]["repeats"][0]["steps"] < records[1]["repeats"][0]["steps"]
-    assert said.out == "" and "training" in said.err and "against time" in tables.markdown(records)
+    assert output.out == "" and "training" in output.err and "against time" in tables.markdown(records)
     assert plot.main([str(out), "-o", str(tmp_path / "curve.svg")]) == 0
     assert "held-out PSNR, dB" in (tmp_path / "curve.svg").read_text()
 
@@ -118,7 +163,7 @@ def test_curve_encodes_anew_for_each_time(here: None, tmp_path: Path, capsys: py
 def test_ablate_changes_one_thing_at_a_time(
     here: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # After three steps no channel is worth anything yet: keep them all.
+    # After three steps no channel contributes anything yet: keep them all.
     monkeypatch.setitem(PRESETS, "draft", replace(SMALL, prune_share=0.0))
     for name in set(ABLATIONS) - {"baseline", "half the channels", "planes summed", "no motion grid"}:
         monkeypatch.delitem(ABLATIONS, name)
@@ -136,20 +181,20 @@ def test_ablate_changes_one_thing_at_a_time(
         str(out),
     ]
     assert kpbench.main(command) == 0
-    records = results.load([out])  # there is no motion grid to leave out
+    records = results.load([out])  # this scene has no motion grid to leave out
     assert [record["settings"]["ablation"] for record in records] == [
         "baseline",
         "half the channels",
         "planes summed",
     ]
     whole, half, added = (record["repeats"][0] for record in records)
-    assert added["test_psnr"] > 5 and "size_bytes" not in added  # no file can hold it
+    assert added["test_psnr"] > 5 and "size_bytes" not in added  # the format cannot hold summed planes
     assert whole["parameters"] > 1.8 * half["parameters"] and whole["steps"] == half["steps"] == 3
     assert "variant" in capsys.readouterr().err and "half the channels" in tables.markdown(records)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ablate.json", "tiny"]
 
 
-def test_every_ablation_changes_something_somewhere() -> None:
+def test_every_ablation_affects_some_config() -> None:
     plain = PRESETS["balanced"]
     lone, unequal = plain.for_single_object(), replace(plain, appearance="image")
     assert set(effective_ablations(plain)) | set(effective_ablations(lone)) | set(effective_ablations(unequal)) == set(
@@ -166,12 +211,12 @@ def test_player_measures_every_quality(tmp_path: Path, capsys: pytest.CaptureFix
     moving, still = tiny_file(tmp_path / "moving.kpc", True), tiny_file(tmp_path / "still.kpc", False)
     out = tmp_path / "out.json"
     assert kpbench.main(["player", str(moving), str(still), "--size", "48x36", "--frames", "4", "--out", str(out)]) == 0
-    said = capsys.readouterr()
+    output = capsys.readouterr()
     records = results.load([out])
-    assert said.out == "" and "within 1/255" in said.err and f"{DEFAULT} (default)" in said.err
+    assert output.out == "" and "within 1/255" in output.err and f"{DEFAULT} (default)" in output.err
     assert [(r["name"], r["settings"]["quality"]) for r in records] == [
         (name, quality) for name in ("moving", "still") for quality in LEVELS
-    ]  # fmt: skip
+    ]
     for record in records:
         (run,) = record["repeats"]
         assert len(run["frame_ms"]) == 4 and min(run["frame_ms"]) <= run["frame_ms_median"] <= run["frame_ms_p95"]
@@ -196,7 +241,7 @@ def test_player_measures_every_quality(tmp_path: Path, capsys: pytest.CaptureFix
     assert "milliseconds per frame" in (tmp_path / "player.svg").read_text()
 
 
-def test_stream_measures_how_soon_scenes_are_seen(
+def test_stream_measures_loading_and_seeking(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gl.context()
@@ -208,9 +253,9 @@ def test_stream_measures_how_soon_scenes_are_seen(
     assert "first picture ms" in capsys.readouterr().err and "| still | " in tables.markdown([second])
     for record in (first, second):
         (run,) = record["repeats"]
-        for place in ("disk", "network"):
+        for source in ("disk", "network"):
             stages = ("open", "first_picture", "full_detail", "complete")
-            open_ms, first_ms, finest_ms, all_ms = (run[f"{place}_{stage}_ms"] for stage in stages)
+            open_ms, first_ms, finest_ms, all_ms = (run[f"{source}_{stage}_ms"] for stage in stages)
             assert 0 < open_ms < first_ms < finest_ms <= all_ms
         assert 0 < run["network_first_picture_bytes"] <= run["size_bytes"]
         sizes, quality = ([prefix[key] for prefix in record["prefixes"]] for key in ("bytes", "psnr"))
@@ -219,18 +264,18 @@ def test_stream_measures_how_soon_scenes_are_seen(
     assert "seek_ms" not in second["repeats"][0]
 
 
-def test_what_was_measured_survives_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_records_before_a_failure_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gl.context()
     good, bad = tiny_file(tmp_path / "good.kpc", False), tmp_path / "bad.kpc"
     bad.write_bytes(b"nonsense")
     assert kpbench.main(["player", str(good), str(bad), "--size", "8x6", "--frames", "1"]) == 1
-    said = capsys.readouterr()
-    assert [record["name"] for record in json.loads(said.out)] == ["good"] * len(LEVELS)
-    assert said.err.splitlines()[-1].startswith(f"kpbench: {bad}: ")
+    output = capsys.readouterr()
+    assert [record["name"] for record in json.loads(output.out)] == ["good"] * len(LEVELS)
+    assert output.err.splitlines()[-1].startswith(f"kpbench: {bad}: ")
 
 
 @pytest.mark.parametrize("minutes", ["", "0", "-1", "nan", "inf", "1,,2", "soon"])
-def test_senseless_minutes_are_refused(minutes: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_minutes_are_refused(minutes: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         kpbench.main(["curve", ".", f"--minutes={minutes}"])
     assert "--minutes" in capsys.readouterr().err
@@ -247,16 +292,17 @@ def test_senseless_minutes_are_refused(minutes: str, capsys: pytest.CaptureFixtu
         ["player", GROUPS],
     ],
 )
-def test_errors_are_one_line(command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                             capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+def test_errors_are_one_line(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert kpbench.main(command) in (1, 2)
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith("kpbench: ") and said.err.count("\n") == 1
+    output = capsys.readouterr()
+    assert output.out == "" and output.err.startswith("kpbench: ") and output.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("option", ["--box=1,1,1,0,0,0", "--box=nan,0,0,1,1,1", "--time-budget=soon", "--repeats=0"])
-def test_senseless_options_are_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_options_are_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         kpbench.main(["encode", ".", option])
     assert option.split("=")[0] in capsys.readouterr().err

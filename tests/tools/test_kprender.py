@@ -18,6 +18,7 @@ from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
 from kpc.player.gl import offscreen
 from kpc.tools.cli import kprender
+from kpc.tools.cli.depth_images import NO_SURFACE
 from PIL import Image
 from scenes import tiny_scene, with_appearances, with_contraction
 
@@ -28,7 +29,7 @@ import kpc
 def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scene") / "tiny.kpc"
     scene = tiny_scene(4)
-    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), path)
     return path
 
 
@@ -39,8 +40,8 @@ def run(capsys: pytest.CaptureFixture[str]) -> Iterator[object]:
             code = kprender.main([str(a) for a in arguments])
         except SystemExit as error:  # argparse
             code = int(error.code or 0)
-        said = capsys.readouterr()
-        return code, said.out, said.err
+        output = capsys.readouterr()
+        return code, output.out, output.err
 
     yield call
 
@@ -65,8 +66,8 @@ def test_pictures_from_a_camera_file(run, scene_file: Path, tmp_path: Path, back
         gl.context()
     listed = cameras_json(tmp_path / "cameras.json", ["a/one.png", "two.jpg"])
     out = tmp_path / "new" / "out"
-    code, said, _ = run(scene_file, "--cameras", listed, "-o", out, "--backend", backend)
-    assert code == 0 and said.startswith(f"{out}: 2 pictures, 48x36")
+    code, printed, _ = run(scene_file, "--cameras", listed, "-o", out, "--backend", backend)
+    assert code == 0 and printed.startswith(f"{out}: 2 pictures, 48x36")
     assert sorted(p.name for p in out.iterdir()) == ["one.png", "two.png"]
     scene = kpc.load(scene_file)
     for n, name in enumerate(("one.png", "two.png")):
@@ -114,17 +115,17 @@ def test_depth_beside_a_png(run, scene_file: Path, tmp_path: Path) -> None:
     wanted = reference.render(scene, scene.cameras[0], 0.4).depth
     with Image.open(tmp_path / "x_depth.png") as image:
         unit, levels = float(image.text["depth_unit"]), np.asarray(image)
-    assert np.array_equal(levels == kprender.NOTHING, np.isinf(wanted))
-    seen = np.isfinite(wanted)
-    assert np.abs(levels[seen] * unit - wanted[seen]).max() <= unit / 2 * 1.01
+    assert np.array_equal(levels == NO_SURFACE, np.isinf(wanted))
+    hit = np.isfinite(wanted)
+    assert np.abs(levels[hit] * unit - wanted[hit]).max() <= unit / 2 * 1.01
 
 
-def test_depth_in_contracted_space_reaches_far_and_says_where_it_stops(run, tmp_path: Path) -> None:
+def test_depth_in_contracted_space_is_clipped(run, tmp_path: Path) -> None:
     path, camera = tmp_path / "around.kpc", tmp_path / "c.json"
     scene = with_contraction(tiny_scene(4))
-    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales], skip_unseen=False), path)
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales], skip_unseen=False), path)
     pose = scene.cameras[0].camera_to_world.copy()
-    pose[:3, 3] = [0.1, 0.05, 1.4]  # in the open, the wall behind it all
+    pose[:3, 3] = [0.1, 0.05, 1.4]  # in free space, with the wall far behind
     camera.write_text(
         json.dumps(
             {
@@ -143,11 +144,11 @@ def test_depth_in_contracted_space_reaches_far_and_says_where_it_stops(run, tmp_
     wanted = reference.render(scene, load_views(camera)[0].camera, 0.4).depth
     with Image.open(tmp_path / "a_depth.png") as image:
         unit, levels = float(image.text["depth_unit"]), np.asarray(image)
-    there = np.isfinite(wanted)
-    limit = kprender.FARTHEST_EVEN * scene.mapping.uniform_distance
-    assert wanted[there].max() > 2 * scene.mapping.uniform_distance and unit == pytest.approx(limit / 65534)
-    np.testing.assert_allclose(levels[there] * unit, np.minimum(wanted, limit)[there], atol=0.51 * unit)
-    assert (levels[~there] == kprender.NOTHING).all()
+    hit = np.isfinite(wanted)
+    limit = kprender.CONTRACTED_DEPTH_RANGE * scene.mapping.uniform_distance
+    assert wanted[hit].max() > 2 * scene.mapping.uniform_distance and unit == pytest.approx(limit / 65534)
+    np.testing.assert_allclose(levels[hit] * unit, np.minimum(wanted, limit)[hit], atol=0.51 * unit)
+    assert (levels[~hit] == NO_SURFACE).all()
     assert run(path, "--cameras", camera, "--backend", "reference", "--depth", "-o", tmp_path / "a.mp4")[0] == 0
     (frame,) = read_video(tmp_path / "a.mp4")
     grey = 255 * (1 - scene.mapping.parameter(wanted) / (2 * scene.mapping.uniform_distance))
@@ -157,41 +158,41 @@ def test_depth_in_contracted_space_reaches_far_and_says_where_it_stops(run, tmp_
 @pytest.mark.parametrize("depth", [False, True])
 def test_an_orbit_becomes_a_video(run, scene_file: Path, tmp_path: Path, depth: bool) -> None:
     out = tmp_path / "orbit.mp4"
-    code, said, _ = run(
+    code, printed, _ = run(
         scene_file, "--orbit", 7, "--size", "64x48", "--backend", "reference", "-o", out, *["--depth"] * depth
     )
-    assert code == 0 and "7 frames at 10 fps" in said
+    assert code == 0 and "7 frames at 10 fps" in printed
     frames = list(read_video(out))
     assert len(frames) == 7 and frames[0].shape == (48, 64, 3)
-    assert np.abs(frames[0].astype(int) - frames[3]).mean() > 1  # it moves
+    assert np.abs(frames[0].astype(int) - frames[3]).mean() > 1  # the camera moves
 
 
 def test_a_path_becomes_a_video_and_its_keyframes_pictures(run, scene_file: Path, tmp_path: Path) -> None:
     path = CameraPath()
-    for time, camera in zip((0.0, 0.4, 0.9), (*tiny_scene(4).cameras, tiny_scene(4).cameras[0])):
+    for time, camera in zip((0.0, 0.4, 0.9), (*tiny_scene(4).cameras, tiny_scene(4).cameras[0]), strict=True):
         path = path.with_keyframe(camera, time, 0.5)
     path.save(tmp_path / "path.json")
-    code, said, _ = run(
+    code, printed, _ = run(
         scene_file, "--path", tmp_path / "path.json", "--backend", "reference", "-o", tmp_path / "a.mp4", "--fps", 6
     )
-    assert code == 0 and "7 frames at 6 fps, 48x36" in said
+    assert code == 0 and "7 frames at 6 fps, 48x36" in printed
     frames = list(read_video(tmp_path / "a.mp4"))
-    code, said, _ = run(
+    code, printed, _ = run(
         scene_file, "--cameras", tmp_path / "path.json", "--backend", "reference", "-o", tmp_path / "keys"
     )
-    assert code == 0 and "3 pictures" in said
+    assert code == 0 and "3 pictures" in printed
     for number, frame in enumerate((frames[0], frames[3], frames[6])):
         key = read_image(tmp_path / "keys" / f"{number:04d}.png")
-        assert np.abs(frame.astype(float) - key).mean() < 6  # but for H.264's losses
+        assert np.abs(frame.astype(float) - key).mean() < 6  # up to the losses of H.264
     assert np.abs(frames[0].astype(int) - frames[3]).mean() > 6
 
 
 def test_the_clip_from_the_first_camera(run, scene_file: Path, tmp_path: Path) -> None:
-    code, said, _ = run(scene_file, "--backend", "reference", "-o", tmp_path / "clip.mp4", "--fps", 5)
-    assert code == 0 and "11 frames at 5 fps" in said
+    code, printed, _ = run(scene_file, "--backend", "reference", "-o", tmp_path / "clip.mp4", "--fps", 5)
+    assert code == 0 and "11 frames at 5 fps" in printed
 
 
-def test_quality_is_a_rung_of_the_ladder(run, scene_file: Path, tmp_path: Path) -> None:
+def test_quality_levels(run, scene_file: Path, tmp_path: Path) -> None:
     gl.context()
     pictures = {}
     for name in ("reference", "finer", "fastest"):
@@ -214,7 +215,7 @@ def test_static_and_dynamic_only(run, scene_file: Path, tmp_path: Path) -> None:
     assert np.abs(difference - pictures["--dynamic-only"]).max() <= 1
 
 
-def test_the_dynamic_map_is_grey_and_of_one_colour_by_either_backend(run, scene_file: Path, tmp_path: Path) -> None:
+def test_the_dynamic_map_is_the_same_from_both_backends(run, scene_file: Path, tmp_path: Path) -> None:
     gl.context()
     pictures = []
     for backend in ("gl", "reference"):
@@ -232,7 +233,7 @@ def test_the_dynamic_map_is_grey_and_of_one_colour_by_either_backend(run, scene_
 def varied_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("appearances") / "varied.kpc"
     scene = with_appearances(tiny_scene(4), ("dawn.jpg", "5:00 pm", "a/b.jpg", "x:y:0.5"))
-    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), path)
     return path
 
 
@@ -247,7 +248,7 @@ def varied_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("x:y:0.5:dawn.jpg:0.75", 3, 0, 0.75),
     ],
 )
-def test_appearances_by_name_and_between_two(
+def test_appearances_by_name_and_interpolated(
     run, varied_file: Path, tmp_path: Path, backend: str, text: str, one: int, other: int, share: float
 ) -> None:
     if backend == "gl":
@@ -275,14 +276,14 @@ def test_appearances_by_name_and_between_two(
         ("dawn.jpg:a/b.jpg:x", "not a share"),
     ],
 )
-def test_appearances_that_are_not_there(
+def test_unknown_appearances_are_refused(
     run, varied_file: Path, scene_file: Path, tmp_path: Path, text: str, words: str
 ) -> None:
     arguments = ("--appearance", text, "--time", 0, "--backend", "reference", "-o", tmp_path / "x.png")
     code, _, complaint = run(varied_file, *arguments)
     assert code == 2 and words in complaint and complaint.count("\n") == 1
     code, _, complaint = run(scene_file, *arguments)
-    assert code == 2 and ("none" in complaint or words == "not a share") and not (tmp_path / "x.png").exists()
+    assert code == 2 and ("no appearances" in complaint or words == "not a share") and not (tmp_path / "x.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -300,7 +301,7 @@ def test_appearances_that_are_not_there(
         (["{scene}", "--path", "x", "--orbit", "2", "-o", "{dir}"], 2, "not allowed"),
         (["{scene}", "--orbit", "2", "-o", "{text}/inside"], 1, "text.kpc"),
         (["{scene}", "--orbit", "2", "-o", "{dir}/no/such/a.mp4"], 1, "no/such"),
-        (["{scene}", "--orbit", "2", "-o", "{dir}/a.png"], 2, "2 pictures do not go into one"),
+        (["{scene}", "--orbit", "2", "-o", "{dir}/a.png"], 2, "2 pictures do not go into one file"),
         (["{scene}", "--orbit", "0", "-o", "{dir}"], 2, "--orbit"),
         (["{scene}", "--orbit", "x", "-o", "{dir}"], 2, "--orbit"),
         (["{scene}", "--time", "1.5", "-o", "{dir}"], 2, "--time"),
@@ -332,8 +333,8 @@ def test_bad_input_is_one_line(
         "empty": tmp_path / "empty.json",
         "nan": tmp_path / "nan.json",
     }
-    got, said, complaint = run(*[a.format(**names) for a in arguments], "--backend", "reference")
-    assert got == code and said == "" and words in complaint
+    got, printed, complaint = run(*[a.format(**names) for a in arguments], "--backend", "reference")
+    assert got == code and printed == "" and words in complaint
     assert "Traceback" not in complaint
     last = [line for line in complaint.splitlines() if line.startswith("kprender:")]
     assert len(last) >= 1 and words in last[-1]

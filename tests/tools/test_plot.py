@@ -1,4 +1,4 @@
-"""The plot shows what the records say."""
+"""Plots of benchmark records."""
 
 import json
 from pathlib import Path
@@ -13,15 +13,21 @@ MACHINE = {"cpu": "Test CPU", "cores": 2, "memory_bytes": 8 << 30, "os": "Linux"
 
 def record(name: str, seconds: float, psnrs: list[float | None], **changes: object) -> Record:
     runs = [
-        dict(test_psnr=psnr, test_ssim=None if psnr is None else psnr / 40, size_bytes=1000 * seconds, train_s=seconds + k,
-             encode_s=2 * seconds, steps=100)
+        {
+            "test_psnr": psnr,
+            "test_ssim": None if psnr is None else psnr / 40,
+            "size_bytes": 1000 * seconds,
+            "train_s": seconds + k,
+            "encode_s": 2 * seconds,
+            "steps": 100,
+        }
         for k, psnr in enumerate(psnrs)
-    ]  # fmt: skip
-    made: Record = dict(kind="curve", name=name, commit="0" * 40, command="kpbench curve", renderer="cpu")
-    return made | dict(machine=MACHINE, settings={"preset": "fast"}, repeats=runs) | changes
+    ]
+    made: Record = {"kind": "curve", "name": name, "commit": "0" * 40, "command": "kpbench curve", "renderer": "cpu"}
+    return made | {"machine": MACHINE, "settings": {"preset": "fast"}, "repeats": runs} | changes
 
 
-def test_a_line_a_dataset_through_medians_in_the_order_of_time_and_a_dot_a_repeat() -> None:
+def test_a_line_per_dataset_through_medians_and_a_dot_per_repeat() -> None:
     records = [record("a", 600, [30.0]), record("b", 60, [22.5]), record("a", 60, [20.0, 28.0, 21.0])]
     figure = plot.curves(records)
     assert [axes.get_title() for axes in figure.axes] == ["held-out PSNR, dB", "held-out SSIM", "file, KB"]
@@ -40,14 +46,14 @@ def test_a_line_a_dataset_through_medians_in_the_order_of_time_and_a_dot_a_repea
     assert psnr.get_xscale() == "log"
 
 
-def test_what_was_not_measured_is_left_out() -> None:
+def test_values_that_were_not_measured_are_left_out() -> None:
     figure = plot.curves([record("a", 60, [None]), record("a", 120, [None])])
     assert [axes.get_title() for axes in figure.axes] == ["file, KB"]
     figure = plot.curves([record("a", 60, [None]), record("a", 120, [21.0])])
     assert [len(axes.lines[0].get_xydata()) for axes in figure.axes] == [1, 1, 2]
 
 
-def test_the_same_records_give_the_same_svg_which_holds_its_text(tmp_path: Path) -> None:
+def test_the_svg_is_reproducible_and_keeps_its_text(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text(json.dumps([record("<b>&", 60, [20.0]), record("<b>&", 1200, [20.5])]))
     for name in ("one.svg", "two.svg"):
         assert plot.main([str(tmp_path / "x.json"), "-o", str(tmp_path / name)]) == 0
@@ -56,14 +62,14 @@ def test_the_same_records_give_the_same_svg_which_holds_its_text(tmp_path: Path)
     assert "held-out PSNR, dB" in text and "&lt;b&gt;&amp;, fast" in text and ">20</text>" in text
 
 
-@pytest.mark.parametrize("ending, magic", [("png", b"\x89PNG"), ("PDF", b"%PDF")])
-def test_other_kinds_by_the_ending(tmp_path: Path, ending: str, magic: bytes) -> None:
+@pytest.mark.parametrize("suffix, magic", [("png", b"\x89PNG"), ("PDF", b"%PDF")])
+def test_other_formats_by_suffix(tmp_path: Path, suffix: str, magic: bytes) -> None:
     (tmp_path / "x.json").write_text(json.dumps([record("a", 60, [20.0])]))
-    assert plot.main([str(tmp_path / "x.json"), "-o", str(tmp_path / f"x.{ending}")]) == 0
-    assert (tmp_path / f"x.{ending}").read_bytes().startswith(magic)
+    assert plot.main([str(tmp_path / "x.json"), "-o", str(tmp_path / f"x.{suffix}")]) == 0
+    assert (tmp_path / f"x.{suffix}").read_bytes().startswith(magic)
 
 
-def test_an_unknown_ending_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_suffix_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "x.json").write_text(json.dumps([record("a", 60, [20.0])]))
     assert plot.main([str(tmp_path / "x.json"), "-o", str(tmp_path / "x.gif")]) == 2
     assert "x.gif: plots are .svg, .png, .pdf" in capsys.readouterr().err
@@ -75,8 +81,8 @@ def test_other_records_are_refused_in_one_line(tmp_path: Path, capsys: pytest.Ca
     for content in ("[]", "{}", json.dumps([record("a", 60, [20.0]) | {"repeats": []}]), json.dumps([without_time])):
         (tmp_path / "x.json").write_text(content)
         assert plot.main([str(tmp_path / "x.json"), "-o", str(tmp_path / "x.svg")]) == 1
-        said = capsys.readouterr()
-        assert said.out == "" and said.err.startswith("plot: ") and said.err.count("\n") == 1
+        output = capsys.readouterr()
+        assert output.out == "" and output.err.startswith("plot: ") and output.err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["x.json"]
     with pytest.raises(FormatError):
         plot.curves([record("a", 60, [20.0], kind="encode")])

@@ -10,7 +10,7 @@ from kpc.tools.bench import provenance
 import kpc
 
 
-def test_the_hash_of_a_folder_is_of_names_and_contents(tmp_path: Path) -> None:
+def test_the_hash_of_a_folder_covers_names_and_contents(tmp_path: Path) -> None:
     def write(folder: str, files: dict[str, str]) -> str:
         for name, text in files.items():
             (tmp_path / folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ def test_the_commit_is_that_of_a_checkout_that_tracks_the_package(
     source.write_text("")
     monkeypatch.setattr(kpc, "__file__", str(source))
     for name in [name for name in os.environ if name.startswith("GIT_")]:
-        monkeypatch.delenv(name)  # a test run from a git hook
+        monkeypatch.delenv(name)  # set when tests run from a git hook
     assert provenance.commit() == "unknown"
     git("init", "-q")
     git("commit", "-q", "--allow-empty", "-m", "empty")
@@ -62,7 +62,7 @@ def test_the_commit_is_that_of_a_checkout_that_tracks_the_package(
     assert provenance.commit() == git("rev-parse", "HEAD") + "+dirty"
 
 
-def test_machine_and_versions_say_something() -> None:
+def test_machine_and_versions() -> None:
     machine = provenance.machine()
     assert machine["cpu"] and machine["os"] and machine["cores"] >= 1 and machine["memory_bytes"] > 1 << 28
     assert {"kpc", "numpy", "moderngl"} <= set(provenance.versions())

@@ -10,27 +10,44 @@ MACHINE = {"cpu": "Test CPU", "cores": 2, "memory_bytes": 8 << 30, "os": "Linux"
 
 
 def encode_record(name: str, psnrs: list[float | None], **changes: object) -> Record:
-    run: Record = dict(
-        test_ssim=0.9, size_bytes=345678, bits_per_parameter=1.25, identity_share=None, coding_loss_db=0.1
-    )
-    run |= dict(train_s=100.0, encode_s=120.0, rays_per_s=23456.0, peak_memory_bytes=9e8)
-    record: Record = dict(
-        kind="encode", name=name, commit="0123456789abcdef", command=f"kpbench encode {name}", renderer="cpu"
-    )
-    record |= dict(machine=MACHINE, settings={"preset": "fast"}, repeats=[run | {"test_psnr": psnr} for psnr in psnrs])
+    run: Record = {
+        "test_ssim": 0.9,
+        "size_bytes": 345678,
+        "bits_per_parameter": 1.25,
+        "identity_share": None,
+        "coding_loss_db": 0.1,
+    }
+    run |= {"train_s": 100.0, "encode_s": 120.0, "rays_per_s": 23456.0, "peak_memory_bytes": 9e8}
+    record: Record = {
+        "kind": "encode",
+        "name": name,
+        "commit": "0123456789abcdef",
+        "command": f"kpbench encode {name}",
+        "renderer": "cpu",
+    }
+    record |= {
+        "machine": MACHINE,
+        "settings": {"preset": "fast"},
+        "repeats": [run | {"test_psnr": psnr} for psnr in psnrs],
+    }
     return record | changes
 
 
-def test_a_cell_is_the_median_of_the_repeats_that_have_it() -> None:
+def test_cells_are_medians_of_the_repeats_that_have_a_value() -> None:
     record = encode_record("room", [30.0, None, 32.0, 33.0])
     assert median(record, "test_psnr") == 32.0
     assert median(record, "identity_share") is None
     head, row = tables.cells("encode", [record])
-    assert dict(zip(head, row))["PSNR dB"] == "32.00" and dict(zip(head, row))["identity"] == "-"
-    assert dict(zip(head, row))["file KB"] == "346" and dict(zip(head, row))["rays/s"] == "23,456"
+    assert (
+        dict(zip(head, row, strict=True))["PSNR dB"] == "32.00" and dict(zip(head, row, strict=True))["identity"] == "-"
+    )
+    assert (
+        dict(zip(head, row, strict=True))["file KB"] == "346"
+        and dict(zip(head, row, strict=True))["rays/s"] == "23,456"
+    )
 
 
-def test_tables_are_split_by_machine_and_say_where_they_come_from() -> None:
+def test_tables_are_split_by_machine_and_state_their_origin() -> None:
     other = encode_record("liam", [28.0], machine=MACHINE | {"cores": 64}, commit="f" * 40 + "+dirty")
     text = tables.markdown([encode_record("room", [30.0, 31.0]), other, encode_record("fox", [20.0, 21.0])])
     first, second = text.split("**Encoding**")[1:]
@@ -42,13 +59,20 @@ def test_tables_are_split_by_machine_and_say_where_they_come_from() -> None:
 def player_records(name: str, size: str = "320x240", renderer: str = "llvmpipe") -> list[Record]:
     accuracy = dict.fromkeys(("samples_per_ray", "psnr_min", "psnr_moving", "within_one_level"), 0.5) | {"psnr": 41.6}
     return [
-        encode_record(name, [30.0], kind="player", accuracy=accuracy, renderer=renderer, repeats=[{"fps": 31.4}],
-                      settings={"quality": quality, "default_quality": "balanced", "size": size})
+        encode_record(
+            name,
+            [30.0],
+            kind="player",
+            accuracy=accuracy,
+            renderer=renderer,
+            repeats=[{"fps": 31.4}],
+            settings={"quality": quality, "default_quality": "balanced", "size": size},
+        )
         for quality in ("fast", "balanced", "fine", "reference")
-    ]  # fmt: skip
+    ]
 
 
-def test_documents_show_only_the_default_quality_and_the_reference() -> None:
+def test_documents_show_only_default_and_reference_quality() -> None:
     each = [*player_records("room"), encode_record("liam", [1.0])]
     document = "".join(f"<!-- {kind}: begin -->\n<!-- {kind}: end -->\n" for kind in ("player", "encode"))
     every, few = tables.markdown(each), results.with_tables(document, each)
@@ -56,20 +80,24 @@ def test_documents_show_only_the_default_quality_and_the_reference() -> None:
     assert "| balanced (default) |" in few and "| reference |" in few
 
 
-def test_at_a_glance_each_scene_that_a_processor_plays_is_beside_its_encoding() -> None:
-    scene, asked = (
+def test_the_summary_joins_encodings_with_their_software_playback() -> None:
+    encoding, with_target = (
         encode_record("room", [30.0]),
         encode_record("room", [20.0], settings={"preset": "fast", "psnr_db": 20.0}),
     )
-    played = [player_records("room-fast", "640x480"), player_records("room-fast"), player_records("room-fast", "640x480", "NVIDIA"),
-              player_records("fox-fast", "640x480")]  # fmt: skip
-    head, _, *rows = tables.glance([scene, asked, *(record for records in played for record in records)]).splitlines()
+    played = [
+        player_records("room-fast", "640x480"),
+        player_records("room-fast"),
+        player_records("room-fast", "640x480", "NVIDIA"),
+        player_records("fox-fast", "640x480"),
+    ]
+    head, _, *rows = tables.glance(
+        [encoding, with_target, *(record for records in played for record in records)]
+    ).splitlines()
     assert rows == ["| room | fast | 30.00 | 0.900 | 346 | 2 | 2 | 31 | 42 |"] and head.count("|") == rows[0].count("|")
 
 
-def test_what_is_between_a_documents_markers_is_rewritten_and_nothing_else(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_only_text_between_markers_is_rewritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     readme, tables, records = tmp_path / "README.md", tmp_path / "tables.md", tmp_path / "a.json"
     before, after = "before\n\n<!-- glance: begin; a word -->", "<!-- glance: end -->\n\nafter\n"
     readme.write_text(f"{before}\nold\n{after}")
@@ -87,7 +115,7 @@ def test_what_is_between_a_documents_markers_is_rewritten_and_nothing_else(
     )
 
 
-def test_records_without_a_place_are_named_and_nothing_is_written(
+def test_records_without_markers_are_reported_and_nothing_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     document, records = tmp_path / "a.md", tmp_path / "a.json"
@@ -99,16 +127,24 @@ def test_records_without_a_place_are_named_and_nothing_is_written(
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1]", '[{"kind": "other"}]', '[{"kind": "encode"}]'])
-def test_other_files_are_refused_by_name(tmp_path: Path, text: str) -> None:
+def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(text)
     with pytest.raises(FormatError, match=r"a\.json: not records of kpbench"):
         results.load([path])
 
 
-@pytest.mark.parametrize("text", ["nothing", "<!-- encode: end --><!-- encode: begin -->", "<!-- encode: begin -->",
-                                  "<!-- encode: begin --><!-- encode: end -->" * 2, "<!-- other: begin --><!-- other: end -->"])  # fmt: skip
-def test_documents_without_a_pair_of_markers_a_name_are_refused(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize(
+    "text",
+    [
+        "nothing",
+        "<!-- encode: end --><!-- encode: begin -->",
+        "<!-- encode: begin -->",
+        "<!-- encode: begin --><!-- encode: end -->" * 2,
+        "<!-- other: begin --><!-- other: end -->",
+    ],
+)
+def test_documents_without_paired_markers_are_refused(tmp_path: Path, text: str) -> None:
     document = tmp_path / "a.md"
     document.write_text(text)
     with pytest.raises(FormatError, match="needs lines such as"):
@@ -116,7 +152,7 @@ def test_documents_without_a_pair_of_markers_a_name_are_refused(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("document", ["README.md", "docs/benchmarks.md"])
-def test_committed_records_make_the_tables_of_the_documents(document: str) -> None:
+def test_committed_records_give_the_tables_of_the_documents(document: str) -> None:
     root = Path(__file__).parents[2]
     text = (root / document).read_text()
     assert results.with_tables(text, results.load(sorted((root / "docs" / "bench").glob("*.json")))) == text

@@ -32,10 +32,17 @@ def get(url: str, path: str, **headers: str) -> tuple[http.client.HTTPResponse, 
 
 @pytest.mark.parametrize(
     ("wanted", "status", "span"),
-    [("bytes=0-99", 206, (0, 100)), ("bytes=100-", 206, (100, 10240)), ("bytes=10000-99999", 206, (10000, 10240)),
-     ("bytes=10240-", 416, (0, 0)), ("bytes=5-4", 416, (0, 0)), ("bytes=-5", 200, (0, 10240)), ("bytes=0-1,3-4", 200, (0, 10240)),
-     ("lines=0-1", 200, (0, 10240))],
-)  # fmt: skip
+    [
+        ("bytes=0-99", 206, (0, 100)),
+        ("bytes=100-", 206, (100, 10240)),
+        ("bytes=10000-99999", 206, (10000, 10240)),
+        ("bytes=10240-", 416, (0, 0)),
+        ("bytes=5-4", 416, (0, 0)),
+        ("bytes=-5", 200, (0, 10240)),
+        ("bytes=0-1,3-4", 200, (0, 10240)),
+        ("lines=0-1", 200, (0, 10240)),
+    ],
+)
 def test_ranges(folder: Path, wanted: str, status: int, span: tuple[int, int]) -> None:
     with serving(folder) as url:
         response, body = get(url, "/scene.kpc", Range=wanted)
@@ -44,7 +51,7 @@ def test_ranges(folder: Path, wanted: str, status: int, span: tuple[int, int]) -
             assert response.headers["Content-Range"] == f"bytes {span[0]}-{span[1] - 1}/10240"
 
 
-def test_a_range_of_another_file_is_the_whole(folder: Path) -> None:
+def test_a_changed_file_is_sent_whole(folder: Path) -> None:
     with serving(folder) as url:
         response, _ = get(url, "/scene.kpc", Range="bytes=0-9")
         etag = response.headers["ETag"]
@@ -61,14 +68,14 @@ def test_nothing_outside_the_folder_is_served(folder: Path) -> None:
             assert response.status == 404 and b"secret" not in body.replace(b"/secret", b"")
 
 
-def test_a_slow_line_is_slow(folder: Path) -> None:
+def test_a_slow_link_is_slow(folder: Path) -> None:
     with serving(folder, link=Link(rate=50_000, delay_s=0.05)) as url:
         started = clock.monotonic()
         assert get(url, "/scene.kpc")[1] == DATA
         assert 0.2 < clock.monotonic() - started
 
 
-def test_the_command_says_the_addresses(folder: Path) -> None:
+def test_the_command_prints_addresses(folder: Path) -> None:
     command = [
         sys.executable,
         "-m",
@@ -91,7 +98,7 @@ def test_the_command_says_the_addresses(folder: Path) -> None:
 @pytest.mark.parametrize(
     "arguments", [["nowhere"], [".", "--port", "70000"], [".", "--rate", "fast"], [".", "--delay", "1s"]]
 )
-def test_wrong_options_are_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_options_are_reported(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     try:
         code = serve.main(arguments)
     except SystemExit as error:

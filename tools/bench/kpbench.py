@@ -63,6 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "kpbench", description="Measure encoding or playing; write JSON to stdout or --out, and a table to stderr."
     )
+    cli.add_version_option(parser)
     kinds = parser.add_subparsers(
         dest="kind", required=True, metavar="encode|curve|ablate|step|groups|player|stream|window|steady|codec|entropy"
     )

@@ -1,5 +1,7 @@
-"""What this machine can do at most, measured: the limits that a training step is held against (a roofline model,
-https://doi.org/10.1145/1498765.1498785)."""
+"""Measure the limits of the machine to which a training step and a frame are compared.
+
+This is the roofline model (Williams et al., https://doi.org/10.1145/1498765.1498785).
+"""
 
 import time
 from collections.abc import Callable
@@ -11,23 +13,24 @@ import numpy as np
 from kpc.player.gl.shader import build, build_compute
 from numba import njit, prange
 
+# Bytes of three arrays per thread that fit into a second-level cache, and of three arrays that fit into no cache.
 CACHED_BYTES = 1 << 20
-"""Of three arrays together for each thread: what fits a second-level cache."""
 MEMORY_BYTES = 1 << 29
-"""Of three arrays together: what fits no cache."""
-REPEATS = 5
-"""The best of so many counts: a limit is what can be reached, and other processes only take away from it."""
 
+# The best of this many runs counts, since other processes can only lower it.
+REPEATS = 5
+
+# Degree of the polynomials that measure arithmetic throughput, and the fast-math flags of the kernels.
 _DEGREE = 32
-_fast = {"nsz", "arcp", "contract", "afn"}
+_FAST_MATH = {"nsz", "arcp", "contract", "afn"}
 
 
 @dataclass(frozen=True)
 class Limits:
-    """By all threads of numba together, float32.
+    """Limits of all threads of numba together, in float32.
 
     Attributes:
-        gflops: multiplications and additions, fused and in registers, 1e9/s.
+        gflops: fused multiplications and additions in registers, counted separately, 1e9/s.
         cache_gb_s: bytes read and written within each core's own cache, 1e9/s.
         memory_gb_s: bytes read and written in memory, 1e9/s.
     """
@@ -38,7 +41,7 @@ class Limits:
 
 
 def measure() -> Limits:
-    """Measure for a few seconds."""
+    """Measure the limits; this takes a few seconds."""
     threads = numba.get_num_threads()
     x = np.linspace(-1, 1, 1024 * threads, dtype=np.float32).reshape(threads, -1)
     rounds = 2000
@@ -55,14 +58,20 @@ def measure() -> Limits:
     return Limits(flops / 1e9, cached / 1e9, memory / 1e9)
 
 
+# `texel_rate`: look-ups per pixel, and the sides of the texture that is read and of the picture that is drawn.
 LOOK_UPS, TEXTURE_SIDE, PICTURE_SIDE = 64, 512, 1024
-"""Of `texel_rate`: look-ups a pixel, and sides of what is read and of what is drawn."""
+
+# Pictures are drawn for at least this long per measurement.
 SHORTEST_S = 0.05
 
 
 def texel_rate(ctx: moderngl.Context, compute: bool, dtype: str) -> float:
-    """Look-ups a second, at most: filtered, of four channels of `dtype` ("f4" or "f2"), by neighbours that read side by side, in a compute
-    or else a fragment shader. (A card need not let all its units draw: of an H100's, few do.)"""
+    """Return the peak rate per second of bilinear look-ups of four channels, neighbours by neighbouring pixels.
+
+    Args:
+        compute: whether a compute or a fragment shader reads; a data-centre GPU has few units for the latter.
+        dtype: "f4" or "f2".
+    """
     texels = (
         np.random.default_rng(0)
         .random(4 * TEXTURE_SIDE**2, np.float32)
@@ -70,15 +79,15 @@ def texel_rate(ctx: moderngl.Context, compute: bool, dtype: str) -> float:
     )
     texture = ctx.texture((TEXTURE_SIDE, TEXTURE_SIDE), 4, texels.tobytes(), dtype=dtype)
     texture.filter = moderngl.LINEAR, moderngl.LINEAR
-    seen = ctx.texture((PICTURE_SIDE, PICTURE_SIDE), 4, dtype="f4")
-    target = ctx.framebuffer([seen])
+    drawn = ctx.texture((PICTURE_SIDE, PICTURE_SIDE), 4, dtype="f4")
+    target = ctx.framebuffer([drawn])
     defines = {"LOOK_UPS": LOOK_UPS, "COMPUTE": int(compute)}
     program = (build_compute if compute else build)(ctx, "texels.glsl", defines)
     program["side"] = float(TEXTURE_SIDE)
     vertices = None if isinstance(program, moderngl.ComputeShader) else ctx.vertex_array(program, [])
     target.use()
     texture.use(0)
-    seen.bind_to_image(0, read=False)
+    drawn.bind_to_image(0, read=False)
 
     def draw(times: int) -> None:
         for _ in range(times):
@@ -90,15 +99,15 @@ def texel_rate(ctx: moderngl.Context, compute: bool, dtype: str) -> float:
 
     times = max(1, round(SHORTEST_S / _best(lambda: draw(1))))
     rate = times * LOOK_UPS * PICTURE_SIDE**2 / _best(lambda: draw(times))
-    ctx.detect_framebuffer(0).use()  # moderngl would bind again what it knows as bound, though it is gone
-    for thing in (vertices, program, target, seen, texture):
-        if thing is not None:
-            thing.release()
+    ctx.detect_framebuffer(0).use()  # otherwise moderngl would bind the released framebuffer again
+    for resource in (vertices, program, target, drawn, texture):
+        if resource is not None:
+            resource.release()
     return rate
 
 
 def _best(run: Callable[[], None]) -> float:
-    """Seconds of the fastest run, once compiled."""
+    """Return the seconds of the fastest run, after one that compiles."""
     run()
     seconds = []
     for _ in range(REPEATS):
@@ -108,9 +117,9 @@ def _best(run: Callable[[], None]) -> float:
     return min(seconds)
 
 
-@njit(parallel=True, fastmath=_fast, cache=True)
+@njit(parallel=True, fastmath=_FAST_MATH, cache=True)
 def _polynomials(x: np.ndarray, rounds: int) -> None:
-    """Each row to its polynomial of degree 32, by Horner's rule, over and over; the fixed point 0.5 keeps it finite."""
+    """Evaluate polynomials of degree 32 by Horner's rule, repeatedly; the fixed point 0.5 keeps values finite."""
     for row in prange(x.shape[0]):
         values = x[row]
         for _ in range(rounds):
@@ -122,9 +131,9 @@ def _polynomials(x: np.ndarray, rounds: int) -> None:
                 values[i] = y
 
 
-@njit(parallel=True, fastmath=_fast, cache=True)
+@njit(parallel=True, fastmath=_FAST_MATH, cache=True)
 def _triads(a: np.ndarray, b: np.ndarray, c: np.ndarray, rounds: int) -> None:
-    """a = b + factor c, row by row (STREAM's triad)."""
+    """Compute a = b + factor c row by row, the triad of the STREAM benchmark."""
     for row in prange(a.shape[0]):
         out, one, other = a[row], b[row], c[row]
         for k in range(rounds):

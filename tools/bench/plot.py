@@ -214,6 +214,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser("plot", description="Draw records of kpbench curve, codec, groups or player.")
+    cli.add_version_option(parser)
     parser.add_argument("records", type=Path, nargs="+", help="files that kpbench --out wrote")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .svg, .png or .pdf file to write")
     options = parser.parse_args(argv)

@@ -1,4 +1,4 @@
-"""Where a measurement comes from: code, machine, software, data."""
+"""The origin of a measurement: code, machine, software and data."""
 
 import hashlib
 import importlib.metadata
@@ -11,13 +11,17 @@ from pathlib import Path
 
 import kpc
 
+# Bytes hashed at a time.
 BLOCK = 1 << 20
 
 
 def commit() -> str:
-    """The git commit of the checkout that `kpc` was imported from, "+dirty" if changed since; "unknown" without one."""
+    """Return the git commit of the checkout that `kpc` was imported from.
+
+    It ends with "+dirty" if tracked files have changed since, and is "unknown" without a checkout.
+    """
     source = Path(kpc.__file__).resolve()
-    # An installed copy, too, may lie in a folder of some checkout; only a tracked file is part of it.
+    # An installed copy may lie in a folder of another checkout, which then does not track it.
     tracked = _git(source.parent, "ls-files", "--error-unmatch", source.name)
     head = _git(source.parent, "rev-parse", "HEAD") if tracked else None
     if not head:
@@ -26,7 +30,7 @@ def commit() -> str:
 
 
 def machine() -> dict[str, str | int]:
-    """Processor, cores this process may use, memory in bytes, operating system, Python."""
+    """Return processor, cores available to this process, memory in bytes, operating system and Python version."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return {
         "cpu": _cpu(),
@@ -38,20 +42,23 @@ def machine() -> dict[str, str | int]:
 
 
 def versions() -> dict[str, str]:
-    """Installed versions of kpc and of everything it asks for, extras included."""
+    """Return the installed versions of kpc and its dependencies, including those of its extras."""
     wanted = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in importlib.metadata.requires("kpc") or ()]
     found = {}
     for name in ["kpc", *sorted(wanted, key=str.lower)]:
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            continue  # an extra that is not installed
+            continue  # part of an extra that is not installed
     return found
 
 
 def data_hash(path: Path) -> str:
-    """SHA-256, in hex, of a file; or of a folder: of each file in it, by sorted relative name, the name (UTF-8), NUL,
-    the length (8 bytes, little endian), the content. Hidden files and folders are left out."""
+    """Return the SHA-256 of a file or folder as hexadecimal digits.
+
+    For a folder, the hash covers its files in the order of their relative names, each as name (UTF-8), NUL, length (8
+    bytes, little endian) and content. Hidden files and folders are ignored.
+    """
     digest = hashlib.sha256()
     if path.is_file():
         _feed(digest, path)
@@ -72,7 +79,7 @@ def _feed(digest: "hashlib._Hash", path: Path) -> None:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """What git says, or None where there is no git, no checkout or an error."""
+    """Return the output of git, or None if it fails or is not installed."""
     try:
         done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=False)
     except OSError:
@@ -81,6 +88,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def _cpu() -> str:
+    """Return the name of the processor."""
     try:
         found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     except OSError:

@@ -79,6 +79,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser("results", description="Write benchmark records as Markdown tables.")
+    cli.add_version_option(parser)
     parser.add_argument("records", type=Path, nargs="+", help="files that kpbench --out wrote")
     parser.add_argument(
         "--into",

@@ -1,4 +1,4 @@
-"""A contact sheet: truth, rendered, depth, row by row.
+"""contactsheet: put rendered pictures beside the true ones, with PSNR and depth.
 
 kprender scene.kpc --cameras gt/cameras.json --depth -o rendered
 python -m kpc.tools.cli.contactsheet gt rendered -o sheet.png
@@ -14,35 +14,37 @@ from kpc.format.common import cli
 from kpc.format.common.errors import MediaError, UsageError
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.media import IMAGE_SUFFIXES, read_image, write_image
+from kpc.tools.cli.depth_images import NO_SURFACE, read_depth_levels
 from PIL import Image, ImageDraw, ImageFont
 
+# Space between pictures, and height of a caption, in pixels.
 GAP = 6
 CAPTION = 22
+
+# Colours of the page and of the captions.
 PAPER, INK = (250, 250, 248), (40, 40, 40)
-NOTHING = 65535
-"""In a depth PNG of kprender: no surface."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A true picture and the same view rendered, uint8 (H, W, 3); its depth, uint16 (H, W), where kprender wrote it."""
+    """A true picture and the same view rendered, and its depth where kprender wrote it."""
 
     name: str
-    truth: np.ndarray
-    rendered: np.ndarray
-    depth: np.ndarray | None
+    truth: np.ndarray  # (H, W, 3) uint8
+    rendered: np.ndarray  # (H, W, 3) uint8
+    depth: np.ndarray | None  # (H, W) uint16 levels of a depth PNG
 
     @property
     def psnr(self) -> float:
-        """dB, on 8-bit values; 100 at most."""
+        """PSNR in dB of the 8-bit values, at most 100."""
         return psnr(self.truth / 255, self.rendered / 255)
 
 
 def pairs(truth: Path, rendered: Path) -> list[Pair]:
-    """The pictures of `rendered` that `truth` holds under the same name, whatever their suffixes.
+    """Pair the pictures of two folders by name, regardless of their suffixes.
 
     Raises:
-        MediaError: there are none, one is damaged, or a pair differs in size.
+        MediaError: there is no pair, a picture is damaged, or the sizes of a pair differ.
     """
     true_files = {p.stem: p for p in sorted(truth.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES}
     found = []
@@ -53,50 +55,55 @@ def pairs(truth: Path, rendered: Path) -> list[Pair]:
         if wanted.shape != given.shape:
             sizes = f"is {_size(given)}, {true_files[file.stem]} is {_size(wanted)}"
             raise MediaError(f"{file}: {sizes}; render without --size")
-        found.append(Pair(file.stem, wanted, given, _depth(file.with_name(f"{file.stem}_depth.png"))))
+        found.append(Pair(file.stem, wanted, given, _depth_levels(file)))
     if not found:
         raise MediaError(f"{rendered}: no picture has the name of one in {truth}; render with --cameras of {truth}")
     return found
 
 
 def sheet(rows: list[Pair], labels: dict[str, float]) -> np.ndarray:
-    """Truth, rendered and depth beside each other, a row for each pair, names and dB below; uint8 (H, W, 3).
+    """Return a page (H, W, 3) uint8 with a row for each pair: truth, rendered and depth, with captions below.
 
     Args:
+        rows: the pairs to show; depth is shown if all of them have one.
         labels: PSNR in dB by name.
     """
     with_depth = all(pair.depth is not None for pair in rows)
     heads = ["truth", "rendered"] + ["depth"] * with_depth
     width, height = max(p.truth.shape[1] for p in rows), max(p.truth.shape[0] for p in rows)
-    columns, step = len(heads), height + CAPTION
-    page = Image.new("RGB", (GAP + columns * (width + GAP), len(rows) * step + GAP), PAPER)
+    step = height + CAPTION
+    page = Image.new("RGB", (GAP + len(heads) * (width + GAP), len(rows) * step + GAP), PAPER)
     draw, font = ImageDraw.Draw(page), ImageFont.load_default(13)
-    for y, pair in zip(range(GAP, page.height, step), rows):
-        pictures = [pair.truth, pair.rendered] + ([_grey(pair.depth)] if with_depth and pair.depth is not None else [])
+    for number, pair in enumerate(rows):
+        y = GAP + number * step
+        pictures = [pair.truth, pair.rendered]
+        if with_depth and pair.depth is not None:
+            pictures.append(_grey(pair.depth))
         captions = [f"{pair.name}  {heads[0]}", f"{heads[1]}  {labels[pair.name]:.1f} dB", *heads[2:]]
-        for x, picture, caption in zip(range(GAP, page.width, width + GAP), pictures, captions):
+        for column, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
+            x = GAP + column * (width + GAP)
             page.paste(Image.fromarray(picture), (x, y))
             draw.text((x, y + picture.shape[0] + 1), caption, INK, font)
     return np.asarray(page)
 
 
 def _on_white(picture: np.ndarray) -> np.ndarray:
+    """Composite a picture with alpha over white."""
     if picture.shape[2] == 3:
         return picture
     alpha = picture[..., 3:] / 255
     return np.rint(picture[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
 
 
-def _depth(file: Path) -> np.ndarray | None:
-    if not file.is_file():
-        return None
-    with Image.open(file) as image:
-        return np.asarray(image).astype(np.uint16)
+def _depth_levels(picture: Path) -> np.ndarray | None:
+    """Return the depth that kprender wrote beside a picture; None if there is none."""
+    file = picture.with_name(f"{picture.stem}_depth.png")
+    return read_depth_levels(file) if file.is_file() else None
 
 
 def _grey(depth: np.ndarray) -> np.ndarray:
-    """Near is light, far is dark, nothing is black; stretched to what this picture holds."""
-    there = depth != NOTHING
+    """Show depth in grey, stretched to the range of the picture: near is light, far is dark, no surface is black."""
+    there = depth != NO_SURFACE
     if not there.any():
         return np.zeros((*depth.shape, 3), np.uint8)
     near, far = np.percentile(depth[there], (1, 99))
@@ -109,15 +116,19 @@ def _size(picture: np.ndarray) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
     return cli.run(_command, "contactsheet", argv)
 
 
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser("contactsheet", description="Put rendered pictures beside the true ones.")
+    cli.add_version_option(parser)
     parser.add_argument("truth", type=Path, help="folder of true pictures")
-    parser.add_argument("rendered", type=Path, help="folder that kprender --cameras wrote, with --depth or without")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
-    parser.add_argument("--rows", type=int, default=4, help="at most, evenly spaced (default: 4)")
+    parser.add_argument("rendered", type=Path, help="folder that kprender --cameras wrote, with or without --depth")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="PNG", help="the picture to write")
+    parser.add_argument(
+        "--rows", type=int, default=4, help="number of rows at most, evenly spaced over all pairs (default: 4)"
+    )
     options = parser.parse_args(argv)
     for folder in (options.truth, options.rendered):
         if not folder.is_dir():

@@ -1,9 +1,9 @@
-"""serve: a small web server with byte ranges, to try streaming with; as slow as you like.
+"""serve: a small web server with byte ranges and an adjustable rate and latency, to try streaming.
 
-python -m kpc.tools.cli.serve FOLDER
-python -m kpc.tools.cli.serve FOLDER --port 9000 --rate 10Mbit --delay 40ms
+    python -m kpc.tools.cli.serve FOLDER
+    python -m kpc.tools.cli.serve FOLDER --port 9000 --rate 10Mbit --delay 40ms
 
-It serves one folder to this machine alone, and is no server for the world: any static host is better at that.
+It serves one folder to this machine only. To publish scenes, use any static file host that supports byte ranges.
 """
 
 import argparse
@@ -24,15 +24,16 @@ from typing import IO, ClassVar
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 
-PIECE_BYTES = 4096
-"""Sent at a time where the rate is limited."""
+# Bytes sent at a time: few where the rate is limited, so that it is even.
+LIMITED_PIECE_BYTES, PIECE_BYTES = 4096, 1 << 20
 
 
 class Link:
-    """A connection to the world that all requests share: so many bytes a second, each answer so much later.
+    """A network link of limited rate that all requests share.
 
     Attributes:
-        rate: bytes a second; infinity does not wait. delay_s: before every answer.
+        rate: bytes per second; infinity does not wait.
+        delay_s: seconds before every response.
     """
 
     def __init__(self, rate: float = float("inf"), delay_s: float = 0.0) -> None:
@@ -40,7 +41,7 @@ class Link:
         self._free, self._lock = 0.0, threading.Lock()
 
     def wait(self, count: int) -> None:
-        """Until so many more bytes are through."""
+        """Wait until `count` more bytes have passed."""
         with self._lock:
             self._free = max(self._free, clock.monotonic()) + count / self.rate
             until = self._free
@@ -48,18 +49,19 @@ class Link:
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Python's own, and byte ranges: one a request, and If-Range."""
+    """Python's file handler with byte ranges: one range per request, and If-Range."""
 
     protocol_version = "HTTP/1.1"
     link: ClassVar[Link] = Link()
     timeout = 60
-    disable_nagle_algorithm = True  # else a short body waits for the answer to its header
+    disable_nagle_algorithm = True  # otherwise a short body waits until its header is acknowledged
 
     def __init__(self, *args: object, link: Link | None = None, **kwargs: object) -> None:
         self.shared = link or self.link
         super().__init__(*args, **kwargs)  # type: ignore[arg-type]
 
     def do_GET(self) -> None:
+        """Answer a request after the delay of the link."""
         clock.sleep(self.shared.delay_s)
         path = Path(self.translate_path(self.path))
         if path.is_dir():
@@ -72,7 +74,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
             self.send_error(HTTPStatus.NOT_FOUND)
 
     def answer(self, file: IO[bytes], stat: os.stat_result) -> None:
-        """The file, or the range of it that is asked for."""
+        """Send a file, or the requested range of it."""
         size, etag = stat.st_size, self.etag(stat)
         wanted = re.fullmatch(r"bytes=(\d{1,18})-(\d{0,18})", self.headers.get("Range", ""))
         if wanted is not None and self.headers.get("If-Range", etag) == etag:
@@ -98,34 +100,36 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         self.send(file, last + 1 - first)
 
     def etag(self, stat: os.stat_result) -> str:
+        """Return a tag that changes with the file."""
         return f'"{stat.st_mtime_ns:x}-{stat.st_size:x}"'
 
     def send(self, file: IO[bytes], count: int) -> None:
-        """The body, no faster than the line."""
-        most = PIECE_BYTES if self.shared.rate < float("inf") else 1 << 20
+        """Send `count` bytes, no faster than the link."""
+        most = LIMITED_PIECE_BYTES if self.shared.rate < float("inf") else PIECE_BYTES
         while count and (piece := file.read(min(most, count))):
             self.shared.wait(len(piece))
             try:
                 self.wfile.write(piece)
-            except OSError:  # the reader has gone
+            except OSError:  # the client has disconnected
                 self.close_connection = True
                 return
             count -= len(piece)
 
     def end_headers(self) -> None:
-        self.send_header("Access-Control-Allow-Origin", "*")  # so that players in a browser may read it
+        """Send the headers that let players in a browser read the file, and end the headers."""
+        self.send_header("Access-Control-Allow-Origin", "*")
         self.send_header("Access-Control-Expose-Headers", "Content-Range, ETag, Accept-Ranges")
         super().end_headers()
 
     def log_message(self, format: str, *args: object) -> None:
-        """Nothing: a player asks often."""
+        """Log nothing, since a player sends many requests."""
 
 
 class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A reader that hangs up is nothing to talk about."""
+        """Report nothing if a client has disconnected."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
@@ -134,7 +138,11 @@ class _Server(http.server.ThreadingHTTPServer):
 def serving(
     folder: Path, *, port: int = 0, link: Link | None = None, handler: type[Handler] = Handler
 ) -> Iterator[str]:
-    """Serve a folder to this machine while the context lasts; gives the URL of the folder, without a slash at its end."""
+    """Serve a folder to this machine while the context lasts.
+
+    Yields:
+        The URL of the folder, without a slash at its end.
+    """
     server = _Server(("127.0.0.1", port), partial(handler, directory=str(folder), link=link))
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
     thread.start()
@@ -147,40 +155,48 @@ def serving(
 
 
 def main(argv: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
     return cli.run(_command, "serve", argv)
 
 
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser("serve", description="Serve a folder to this machine by HTTP, with byte ranges.")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--port", type=int, default=8000, help="default: %(default)s")
+    cli.add_version_option(parser)
+    parser.add_argument("folder", type=Path, help="the folder to serve")
+    parser.add_argument("--port", type=int, default=8000, help="TCP port (default: %(default)s)")
     parser.add_argument(
-        "--rate", type=_rate, default=float("inf"), metavar="10Mbit", help="bits a second, all requests together"
+        "--rate",
+        type=_rate,
+        default=float("inf"),
+        metavar="10Mbit",
+        help="bits per second of all requests together (default: unlimited)",
     )
-    parser.add_argument("--delay", type=_delay, default=0.0, metavar="40ms", help="before every answer")
+    parser.add_argument(
+        "--delay", type=_delay, default=0.0, metavar="40ms", help="delay before every response (default: none)"
+    )
     options = parser.parse_args(argv)
     if not options.folder.is_dir():
         raise UsageError(f"{options.folder}: no such folder")
     if not 0 <= options.port < 65536:
-        raise UsageError(f"--port {options.port} is none")
+        raise UsageError(f"--port {options.port} is not a port number")
     with serving(options.folder, port=options.port, link=Link(options.rate, options.delay)) as url:
         for path in sorted(options.folder.glob("*.kpc")):
             print(f"{url}/{path.name}", flush=True)
-        print(f"serve: {options.folder} at {url}; Ctrl-C ends it", file=sys.stderr)
+        print(f"serve: {options.folder} at {url}; press Ctrl-C to stop", file=sys.stderr)
         threading.Event().wait()
 
 
 def _rate(text: str) -> float:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([kKM]?)bit", text)
     if match is None or float(match[1]) == 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is no rate; write 10Mbit")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a rate; write for example 10Mbit")
     return float(match[1]) * {"": 1, "k": 1e3, "K": 1e3, "M": 1e6}[match[2]] / 8
 
 
 def _delay(text: str) -> float:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)ms", text)
     if match is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is no delay; write 40ms")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a delay; write for example 40ms")
     return float(match[1]) / 1e3
 
 

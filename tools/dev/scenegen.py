@@ -221,6 +221,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "scenegen", description="Write the generated default scene: posed videos and ground truth."
     )
+    cli.add_version_option(parser)
     parser.add_argument("folder", metavar="DIR", help="the folder to write; it is made if need be")
     parser.add_argument(
         "--seed", type=int, default=default.seed, help="seed of textures and camera jitter (default %(default)s)"
