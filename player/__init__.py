@@ -1,0 +1,1 @@
+"""The player: drawing, streaming and the window."""

@@ -1,0 +1,1 @@
+"""Playback of scenes while they arrive."""
