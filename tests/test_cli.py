@@ -1,4 +1,4 @@
-"""What commands raise becomes an exit code and a line, or goes on as a bug."""
+"""Exceptions of commands become an exit code and one line, or are bugs with a traceback."""
 
 import errno
 import importlib
@@ -17,21 +17,33 @@ def raising(error: BaseException, cause: BaseException | None = None) -> Callabl
     return command
 
 
-@pytest.mark.parametrize("error, cause, code, line", [
-    (FormatError("a.kpc: cut\noff"), None, 1, "a.kpc: cut off"), (UsageError("no such option"), None, 2, "no such option"),
-    (OSError(errno.ENOENT, "nothing there", "b.kpc"), None, 1, "b.kpc: nothing there"), (OSError(errno.ENOSPC, "full"), None, 1, "full"),
-    (KeyboardInterrupt(), None, 130, "interrupted"), (SystemError("compiled"), KeyboardInterrupt(), 130, "interrupted"),
-])  # fmt: skip
-def test_what_a_user_can_mend_is_one_line(
+@pytest.mark.parametrize(
+    "error, cause, code, line",
+    [
+        (FormatError("a.kpc: cut\noff"), None, 1, "a.kpc: cut off"),
+        (UsageError("no such option"), None, 2, "no such option"),
+        (OSError(errno.ENOENT, "nothing there", "b.kpc"), None, 1, "b.kpc: nothing there"),
+        (OSError(errno.ENOSPC, "full"), None, 1, "full"),
+        (KeyboardInterrupt(), None, 130, "interrupted"),
+        (SystemError("compiled"), KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_errors_that_users_can_fix_are_one_line(
     error: BaseException, cause: BaseException | None, code: int, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(raising(error, cause), "kpx", []) == code
     assert capsys.readouterr() == ("", f"kpx: {line}\n")
 
 
-@pytest.mark.parametrize("error, cause", [
-    (SystemError("compiled"), None), (SystemError("compiled"), ValueError()), (ValueError("x"), None), (OSError(errno.EIO, "x"), None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "error, cause",
+    [
+        (SystemError("compiled"), None),
+        (SystemError("compiled"), ValueError()),
+        (ValueError("x"), None),
+        (OSError(errno.EIO, "x"), None),
+    ],
+)
 def test_bugs_keep_their_traceback(error: Exception, cause: Exception | None) -> None:
     with pytest.raises(type(error)):
         cli.run(raising(error, cause), "kpx", [])
@@ -39,9 +51,15 @@ def test_bugs_keep_their_traceback(error: Exception, cause: Exception | None) ->
 
 @pytest.mark.parametrize(
     "module",
-    ["encoder.cli.kpenc", "player.app.kpplay", "tools.cli.kprender", "tools.cli.kpinfo", "tools.cli.kpjoin",
-     "tools.bench.kpbench"],
-)  # fmt: skip
+    [
+        "encoder.cli.kpenc",
+        "player.app.kpplay",
+        "tools.cli.kprender",
+        "tools.cli.kpinfo",
+        "tools.cli.kpjoin",
+        "tools.bench.kpbench",
+    ],
+)
 def test_every_command_prints_its_version(module: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
         importlib.import_module(f"kpc.{module}").main(["--version"])

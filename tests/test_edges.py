@@ -1,4 +1,4 @@
-"""Numbers at the edges of what a file can hold: they come back as near as their steps promise, through the whole file."""
+"""Values at the limits of what a file can store survive writing and reading within half a quantisation step."""
 
 import tracemalloc
 from dataclasses import replace
@@ -15,10 +15,10 @@ from scenes import tiny_scene
 
 
 def quantised(scene: Scene, step: float) -> QuantisedScene:
-    return quantise_scene(scene, [{name: step for name in scale} for scale in scene.scales], skip_unseen=False)
+    return quantise_scene(scene, [dict.fromkeys(scale, step) for scale in scene.scales], skip_unseen=False)
 
 
-def assert_comes_back(before: QuantisedScene, segment_rows: int = 16) -> QuantisedScene:
+def assert_round_trip(before: QuantisedScene, segment_rows: int = 16) -> QuantisedScene:
     after = read(encode(before, segment_rows=segment_rows))
     for planes, found in zip(before.scales, after.scales, strict=True):
         for name, plane in planes.items():
@@ -27,10 +27,10 @@ def assert_comes_back(before: QuantisedScene, segment_rows: int = 16) -> Quantis
     return after
 
 
-def painted(scene: Scene, value: np.ndarray | float) -> Scene:
-    """All of its space planes of one value, or of one for each texel."""
+def with_space_planes(scene: Scene, value: np.ndarray | float) -> Scene:
+    """Return the scene with all space planes set to one value, or to one value per texel."""
 
-    def paint(name: str, plane: np.ndarray) -> np.ndarray:
+    def plane_of(name: str, plane: np.ndarray) -> np.ndarray:
         return (
             np.full_like(plane, value) if np.isscalar(value) else np.broadcast_to(value, plane.shape).astype(np.float32)
         )
@@ -38,22 +38,22 @@ def painted(scene: Scene, value: np.ndarray | float) -> Scene:
     return replace(
         scene,
         scales=tuple(
-            {name: paint(name, plane) if name in SPACE_PLANES else plane for name, plane in scale.items()}
+            {name: plane_of(name, plane) if name in SPACE_PLANES else plane for name, plane in scale.items()}
             for scale in scene.scales
         ),
     )
 
 
 @pytest.mark.parametrize("exponent", range(-20, 5, 4))
-def test_steps_from_a_millionth_to_sixteen(exponent):
-    """Of values that span all 255 steps, every one is at most half a step off, and what float32 adds to it."""
+def test_quantisation_steps_from_a_millionth_to_sixteen(exponent):
+    """Values that span 240 steps err by at most half a step, plus the rounding of float32."""
     step = 2.0**exponent
     rng = np.random.default_rng(0)
-    scene = painted(
+    scene = with_space_planes(
         tiny_scene(scales=1, channels=2, resolution=(6, 6, 6), dynamic=False),
         step * rng.uniform(-120, 120, (6, 6, 2)) / (4 if exponent == 4 else 1),
     )
-    found = assert_comes_back(quantised(scene, step)).dequantise()
+    found = assert_round_trip(quantised(scene, step)).dequantise()
     for name, plane in scene.scales[0].items():
         error = np.abs(found.scales[0][name].astype(np.float64) - plane)
         assert error.max() <= step / 2 + 4 * np.spacing(np.float32(128 * step))
@@ -61,8 +61,8 @@ def test_steps_from_a_millionth_to_sixteen(exponent):
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -1.0, 1e-30, 1000.0])
 def test_constant_planes(value):
-    scene = painted(tiny_scene(scales=1, channels=2, resolution=(9, 7, 5)), value)
-    found = assert_comes_back(quantised(scene, 0.01)).dequantise()
+    scene = with_space_planes(tiny_scene(scales=1, channels=2, resolution=(9, 7, 5)), value)
+    found = assert_round_trip(quantised(scene, 0.01)).dequantise()
     for name in SPACE_PLANES:
         assert np.abs(found.scales[0][name] - np.float32(value)).max() <= 0.005 + np.spacing(np.float32(abs(value)))
 
@@ -73,18 +73,18 @@ def test_symbols_at_their_limits():
     limits = np.where(np.random.default_rng(0).random(plane.symbols.shape) < 0.5, SYMBOL_MIN, SYMBOL_MAX).astype(
         np.int8
     )
-    assert_comes_back(replace(before, scales=({**before.scales[0], "xy": replace(plane, symbols=limits)},)))
+    assert_round_trip(replace(before, scales=({**before.scales[0], "xy": replace(plane, symbols=limits)},)))
 
 
 @pytest.mark.parametrize("time", [1, 10_000])
-def test_one_row_in_time_and_ten_thousand(time):
-    assert_comes_back(
+def test_time_planes_of_one_and_of_ten_thousand_rows(time):
+    assert_round_trip(
         quantised(tiny_scene(scales=1, channels=1, resolution=(2, 2, 2), time=time), 0.01), segment_rows=500
     )
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 2, 2), (2, 2048, 1), (2048, 2, 1), (2048, 2048, 1)])
-def test_sizes_of_planes(shape):
+def test_planes_of_extreme_sizes(shape):
     y, x, m = np.ogrid[: shape[0], : shape[1], : shape[2]]
     symbols = ((x * y // 97 + 3 * m + x) % 251 - 125).astype(np.int8)
     coded = np.ones(shape[:2], bool)
@@ -94,35 +94,37 @@ def test_sizes_of_planes(shape):
     assert np.array_equal(found, symbols) and np.array_equal(where, coded)
 
 
-def of_bits(bits: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Signed numbers of so many bits, the least and the largest among them."""
+def random_integers(bits: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Return signed integers of `bits` bits, including the smallest and the largest."""
     found = np.random.default_rng(bits).integers(-(1 << bits - 1), 1 << bits - 1, shape)
     found.flat[:2] = -(1 << bits - 1), (1 << bits - 1) - 1
     return found
 
 
 @pytest.mark.parametrize("bits", range(1, 9))
-def test_planes_of_so_many_bits(bits):
+def test_planes_with_symbols_of_every_width(bits):
     before = quantised(tiny_scene(scales=1, channels=2, resolution=(12, 12, 12)), 0.01)
     planes = {
-        name: replace(plane, symbols=of_bits(bits, plane.symbols.shape).astype(np.int8), coded=plane.coded | True)
+        name: replace(
+            plane, symbols=random_integers(bits, plane.symbols.shape).astype(np.int8), coded=plane.coded | True
+        )
         for name, plane in before.scales[0].items()
     }
-    assert_comes_back(replace(before, scales=(planes,)))
+    assert_round_trip(replace(before, scales=(planes,)))
 
 
 @pytest.mark.parametrize("bits", range(1, 17))
-def test_motion_of_so_many_bits(bits):
+def test_motion_with_symbols_of_every_width(bits):
     before = replace(
         quantised(tiny_scene(scales=1, channels=1, resolution=(2, 2, 2)), 0.01),
-        motion=QuantisedMotion(of_bits(bits, (3, 4, 3, 2, 3)).astype(np.int16), 0.5**15),
+        motion=QuantisedMotion(random_integers(bits, (3, 4, 3, 2, 3)).astype(np.int16), 0.5**15),
     )
-    found = assert_comes_back(before).motion
+    found = assert_round_trip(before).motion
     assert np.array_equal(found.symbols, before.motion.symbols) and found.step == before.motion.step
 
 
 def test_a_file_of_four_million_texels():
-    """Read within the memory that the reader is allowed, one byte less of which it refuses."""
+    """It is read within the memory budget, and refused with one byte less."""
     side = 2048
     y, x = np.ogrid[:side, :side]
     planes = {
@@ -147,6 +149,6 @@ def test_a_file_of_four_million_texels():
     finally:
         tracemalloc.stop()
     assert all(np.array_equal(found.scales[0][name].symbols, plane.symbols) for name, plane in planes.items())
-    assert peak < 7 * values  # symbols and coded texels twice, two bytes a texel of the channel before, the file
+    assert peak < 7 * values  # symbols and coded texels twice, 2 bytes per texel of the previous channel, the file
     with pytest.raises(BudgetError):
         read(data, memory_budget=5 * values - 1)

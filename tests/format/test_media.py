@@ -1,4 +1,4 @@
-"""Videos with every combination of colour tags decode to the colours they were made from; damage is a MediaError."""
+"""Videos with all colour tags decode to their original colours; damaged files raise MediaError."""
 
 import os
 import subprocess
@@ -22,25 +22,27 @@ from PIL import Image
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
+# Kr and Kb of ITU-R BT.601 and BT.709.
 LUMA = {"bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722)}
-"""Kr, Kb (ITU-R BT.601 and BT.709)."""
 
+# Side of a patch of uniform colour, pixels.
 PATCH = 16
 
 
 def patches(rng: np.random.Generator) -> np.ndarray:
-    """8 x 4 patches of flat colour, uint8 (64, 128, 3): subsampled chroma keeps flat ones but for the seams."""
+    """Return 8 x 4 patches of uniform colour, uint8 (64, 128, 3), which chroma subsampling keeps away from edges."""
     colours = rng.integers(0, 256, (4, 8, 3), dtype=np.uint8)
     colours[0, :5] = [(0, 0, 0), (255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255)]
     return colours.repeat(PATCH, 0).repeat(PATCH, 1)
 
 
-def middles(frame: np.ndarray) -> np.ndarray:
+def centres(frame: np.ndarray) -> np.ndarray:
+    """Return the colours at the centres of the patches."""
     return frame[PATCH // 2 :: PATCH, PATCH // 2 :: PATCH].astype(float)
 
 
 def yuv(rgb: np.ndarray, matrix: str, full: bool, bits: int, subsampled: bool) -> bytes:
-    """The recommendations' own equations: planar Y'CbCr of one frame."""
+    """Return planar Y'CbCr of one frame by the equations of the recommendations."""
     kr, kb = LUMA[matrix]
     r, g, b = np.moveaxis(rgb / 255.0, -1, 0)
     y = kr * r + (1 - kr - kb) * g + kb * b
@@ -50,31 +52,21 @@ def yuv(rgb: np.ndarray, matrix: str, full: bool, bits: int, subsampled: bool) -
     chroma = [half + c * (top if full else 224 * 2 ** (bits - 8)) for c in (cb, cr)]
     if subsampled:
         chroma = [c[::2, ::2] for c in chroma]
-    kind = np.dtype("<u2") if bits > 8 else np.dtype("u1")
-    return b"".join(np.clip(np.rint(p), 0, top).astype(kind).tobytes() for p in (luma, *chroma))
+    dtype = np.dtype("<u2") if bits > 8 else np.dtype("u1")
+    return b"".join(np.clip(np.rint(p), 0, top).astype(dtype).tobytes() for p in (luma, *chroma))
 
 
 def encode(
     path: Path, raw: bytes, pix_fmt: str, *, matrix: str | None, full: bool | None, codec: str = "ffv1", frames: int = 1
 ) -> None:
-    """A lossless video of raw planes, tagged as told and not converted."""
+    """Write a lossless video of raw planes with the given tags, without conversion."""
     tags = [f"colorspace={'smpte170m' if matrix == 'bt601' else matrix}"] if matrix else []
     tags += [f"range={'pc' if full else 'tv'}"] if full is not None else []
     command = [
         ffmpeg_binary(),
-        "-v",
-        "error",
-        "-y",
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
+        *"-v error -y -f rawvideo -pix_fmt".split(),
         pix_fmt,
-        "-s",
-        "128x64",
-        "-r",
-        "10",
-        "-i",
-        "pipe:",
+        *"-s 128x64 -r 10 -i pipe:".split(),
     ]
     command += ["-vf", "setparams=" + ":".join(tags)] if tags else []
     command += ["-color_range", "pc" if full else "tv"] if full is not None else []
@@ -83,13 +75,16 @@ def encode(
 
 
 def tolerance(matrix: str, full: bool, bits: int) -> float:
-    """Half a step of each of Y, Cb, Cr carried through the inverse matrix to the channel that feels it most, half a
-    level for rounding the result, and one for the fixed-point arithmetic of swscale."""
+    """Return the largest error of a decoded channel, in 8-bit levels.
+
+    It is half a step of each of Y, Cb and Cr through the inverse matrix to the channel with the largest coefficients,
+    half a level for rounding the result, and one level for the fixed-point arithmetic of swscale.
+    """
     kr, kb = LUMA[matrix]
-    fine = 2 ** (bits - 8)
+    steps_per_level = 2 ** (bits - 8)
     luma, chroma = (1.0, 1.0) if full else (255 / 219, 255 / 224)
     green = 2 * (kb * (1 - kb) + kr * (1 - kr)) / (1 - kr - kb)
-    return 0.5 / fine * (luma + chroma * max(2 * (1 - kb), 2 * (1 - kr), green)) + 1.5
+    return 0.5 / steps_per_level * (luma + chroma * max(2 * (1 - kb), 2 * (1 - kr), green)) + 1.5
 
 
 @pytest.mark.parametrize("matrix", ["bt601", "bt709"])
@@ -103,25 +98,18 @@ def test_tags_are_honoured(tmp_path: Path, matrix: str, full: bool, pix_fmt: str
     info = probe(path)
     assert (info.matrix, info.full_range, info.pix_fmt, info.width, info.height) == (matrix, full, pix_fmt, 128, 64)
     (frame,) = read_video(path)
-    assert np.abs(middles(frame) - middles(rgb)).max() <= tolerance(matrix, full, bits)
+    assert np.abs(centres(frame) - centres(rgb)).max() <= tolerance(matrix, full, bits)
 
 
 @pytest.mark.parametrize("matrix, full", [("bt601", True), ("bt709", False), ("bt601", False), ("bt709", True)])
 def test_tags_of_h264_are_honoured(tmp_path: Path, matrix: str, full: bool) -> None:
     rgb = patches(np.random.default_rng(2))
-    encode(
-        tmp_path / "x.mp4",
-        yuv(rgb, matrix, full, 8, True),
-        "yuv420p",
-        matrix=matrix,
-        full=full,
-        codec="libx264",
-        frames=3,
-    )
+    raw = yuv(rgb, matrix, full, 8, True)
+    encode(tmp_path / "x.mp4", raw, "yuv420p", matrix=matrix, full=full, codec="libx264", frames=3)
     frames = list(read_video(tmp_path / "x.mp4"))
     assert len(frames) == 3
     for frame in frames:
-        assert np.abs(middles(frame) - middles(rgb)).max() <= tolerance(matrix, full, 8)
+        assert np.abs(centres(frame) - centres(rgb)).max() <= tolerance(matrix, full, 8)
 
 
 def test_untagged_small_video_is_limited_bt601(tmp_path: Path) -> None:
@@ -130,7 +118,7 @@ def test_untagged_small_video_is_limited_bt601(tmp_path: Path) -> None:
     info = probe(tmp_path / "x.mkv")
     assert (info.matrix, info.full_range) == ("bt601", False)
     (frame,) = read_video(tmp_path / "x.mkv")
-    assert np.abs(middles(frame) - middles(rgb)).max() <= tolerance("bt601", False, 8)
+    assert np.abs(centres(frame) - centres(rgb)).max() <= tolerance("bt601", False, 8)
 
 
 @pytest.mark.parametrize(
@@ -147,30 +135,17 @@ def test_untagged_small_video_is_limited_bt601(tmp_path: Path) -> None:
         ("rgb24", "", 100, "rgb"),
     ],
 )
-def test_matrix_from_ffmpegs_words(pix_fmt: str, tags: str, height: int, matrix: str) -> None:
+def test_matrix_from_the_log_of_ffmpeg(pix_fmt: str, tags: str, height: int, matrix: str) -> None:
     assert media._matrix(pix_fmt, tags, height) == matrix
 
 
 def test_hdr_is_refused(tmp_path: Path) -> None:
     raw = yuv(patches(np.random.default_rng(3)), "bt709", False, 10, True)
-    command = [
-        ffmpeg_binary(),
-        "-v",
-        "error",
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "yuv420p10le",
-        "-s",
-        "128x64",
-        "-i",
-        "pipe:",
-        "-vf",
-        "setparams=color_trc=smpte2084:colorspace=bt2020nc:color_primaries=bt2020",
-        "-c:v",
-        "ffv1",
-        str(tmp_path / "x.mkv"),
-    ]
+    options = (
+        "-v error -f rawvideo -pix_fmt yuv420p10le -s 128x64 -i pipe: -c:v ffv1 "
+        "-vf setparams=color_trc=smpte2084:colorspace=bt2020nc:color_primaries=bt2020"
+    )
+    command = [ffmpeg_binary(), *options.split(), str(tmp_path / "x.mkv")]
     subprocess.run(command, input=raw, check=True, capture_output=True)
     with pytest.raises(MediaError, match="HDR"):
         probe(tmp_path / "x.mkv")
@@ -180,19 +155,9 @@ def test_display_rotation_is_applied(tmp_path: Path) -> None:
     rgb = np.zeros((32, 64, 3), np.uint8)
     rgb[:, :16] = 255
     write_video(tmp_path / "x.mp4", [rgb] * 2, 10, crf=1)
-    turn = [
-        ffmpeg_binary(),
-        "-v",
-        "error",
-        "-display_rotation",
-        "90",
-        "-i",
-        str(tmp_path / "x.mp4"),
-        "-c",
-        "copy",
-        str(tmp_path / "y.mp4"),
-    ]
-    if subprocess.run(turn, check=False, capture_output=True).returncode != 0:
+    rotate = [ffmpeg_binary(), *"-v error -display_rotation 90 -i".split(), str(tmp_path / "x.mp4")]
+    rotate += ["-c", "copy", str(tmp_path / "y.mp4")]
+    if subprocess.run(rotate, check=False, capture_output=True).returncode != 0:
         pytest.skip("this ffmpeg cannot write a rotation")
     info = probe(tmp_path / "y.mp4")
     assert (info.width, info.height) == (32, 64)
@@ -222,8 +187,8 @@ def test_frame_rate(rest: str, fps: float) -> None:
 
 
 @pytest.mark.parametrize("fps", [7.0, 15.0, 29.97, 120.0])
-def test_written_video_comes_back_frame_by_frame(tmp_path: Path, fps: float) -> None:
-    """Each frame has its own grey; a frame dropped or doubled on the way would show."""
+def test_written_videos_have_the_same_frames(tmp_path: Path, fps: float) -> None:
+    """Every frame has its own grey level, so a dropped or repeated frame would be noticed."""
     greys = np.arange(20, 240, 20)
     frames = [np.full((32, 48, 3), g, np.uint8) for g in greys]
     assert write_video(tmp_path / "x.mp4", frames, fps, crf=1) == len(frames)
@@ -235,7 +200,7 @@ def test_written_video_comes_back_frame_by_frame(tmp_path: Path, fps: float) -> 
     assert len(list(read_video(tmp_path / "x.mp4", limit=4))) == 4
 
 
-def test_odd_sizes_are_padded_where_chroma_needs_it(tmp_path: Path) -> None:
+def test_odd_sizes_are_padded_for_subsampled_chroma(tmp_path: Path) -> None:
     frame = np.full((15, 21, 3), 90, np.uint8)
     write_video(tmp_path / "even.mp4", [frame], 10)
     write_video(tmp_path / "odd.mp4", [frame], 10, pix_fmt="yuv444p")
@@ -263,7 +228,7 @@ def test_damaged_videos_are_media_errors(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_missing_video_and_pipe_are_refused(tmp_path: Path) -> None:
+def test_missing_videos_and_pipes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MediaError, match="no such file"):
         probe(tmp_path / "none.mp4")
     os.mkfifo(tmp_path / "pipe.mp4")
@@ -322,7 +287,7 @@ def test_exif_orientation_is_not_applied(tmp_path: Path) -> None:
     assert read_image(tmp_path / "x.jpg").shape == (8, 12, 3)
 
 
-def test_exr_goes_through_the_srgb_curve(tmp_path: Path) -> None:
+def test_exr_is_converted_by_the_srgb_curve(tmp_path: Path) -> None:
     linear = np.random.default_rng(0).uniform(-0.2, 1.4, (5, 6, 3)).astype(np.float32)
     alpha = np.linspace(0, 1, 30, dtype=np.float32).reshape(5, 6)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -335,7 +300,7 @@ def test_exr_goes_through_the_srgb_curve(tmp_path: Path) -> None:
     expected = np.rint(255 * srgb_from_linear(linear))
     np.testing.assert_array_equal(read_image(tmp_path / "x.exr"), expected)
     straight = read_image(tmp_path / "a.exr")
-    assert np.abs(straight[..., :3] - np.where(alpha[..., None] > 0, expected, 0)).max() <= 1  # float32 there and back
+    assert np.abs(straight[..., :3] - np.where(alpha[..., None] > 0, expected, 0)).max() <= 1  # float32 rounding
     np.testing.assert_array_equal(straight[..., 3], np.rint(255 * alpha))
     assert media.image_size(tmp_path / "x.exr") == (6, 5, False)
     assert media.image_size(tmp_path / "a.exr") == (6, 5, True)
@@ -373,14 +338,14 @@ def test_image_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied", "x.png")
 
-    monkeypatch.setattr(media.Image, "open", refuse)  # root may read everything, so the refusal is played
+    monkeypatch.setattr(media.Image, "open", refuse)  # root may read everything, so the refusal is simulated
     with pytest.raises(MediaError, match="no permission"):
         read_image(tmp_path / "x.png")
 
 
 @pytest.mark.skipif(not (DATA / "room").is_dir(), reason="shared/data is not here")
 @pytest.mark.parametrize("name, psnr_db", [("room", 39.28), ("liam", 42.39)])
-def test_real_videos_decode_as_their_readme_says(name: str, psnr_db: float) -> None:
+def test_real_videos_decode_with_the_psnr_of_their_readme(name: str, psnr_db: float) -> None:
     errors = []
     for k, frame in enumerate(read_video(DATA / name / "cam00.mp4")):
         truth = DATA / name / "gt" / f"cam00_f{k:03d}.png"

@@ -1,4 +1,4 @@
-"""Displacements: the formula point by point, in numpy and PyTorch; rounding; what is reached through them."""
+"""The motion grid: displacement in numpy and PyTorch against the formula, quantisation, and reached cells."""
 
 import numpy as np
 import pytest
@@ -21,8 +21,8 @@ from kpc.format.scene.motion import (
 RNG = np.random.default_rng(0)
 
 
-def by_hand(u: np.ndarray, time: float, offsets: np.ndarray) -> np.ndarray:
-    """u + sum over nodes of the product of hat functions, clamped; float64."""
+def displace_reference(u: np.ndarray, time: float, offsets: np.ndarray) -> np.ndarray:
+    """Return u + the sum over nodes of products of hat functions, clamped, in float64."""
     rows, nz, ny, nx, _ = offsets.shape
 
     def hats(x: float, size: int) -> np.ndarray:
@@ -33,40 +33,39 @@ def by_hand(u: np.ndarray, time: float, offsets: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("most", [0.05, 2.0])
-def test_moved_is_the_formula_in_numpy_and_pytorch(most: float) -> None:
+def test_displacement_equals_the_formula_in_numpy_and_pytorch(most: float) -> None:
     offsets = RNG.uniform(-most, most, (5, 3, 2, 4, 3)).astype(np.float32)
     u = RNG.random((300, 3), np.float32)
     u[:8] = list(np.ndindex(2, 2, 2))
     times = RNG.random(300, np.float32)
-    times[:3] = 0, 1, 0.25  # on rows, too
-    wanted = np.array([by_hand(*a, offsets) for a in zip(u.astype(np.float64), times, strict=True)])
+    times[:3] = 0, 1, 0.25  # also exactly on rows
+    wanted = np.array([displace_reference(*a, offsets) for a in zip(u.astype(np.float64), times, strict=True)])
     ours = np.array([displace(p, sample_linear(offsets, float(t))) for p, t in zip(u, times, strict=True)])
     np.testing.assert_allclose(ours, wanted, atol=1e-6 * (1 + most))
     theirs = field.displace(*map(torch.from_numpy, (u, times, offsets))).numpy()
     np.testing.assert_allclose(theirs, wanted, atol=1e-6 * (1 + most))
-    assert (np.mean((wanted == 0) | (wanted == 1)) > 0.2) == (
-        most > 1
-    )  # what leaves the planes is kept at their border
+    clamped = np.mean((wanted == 0) | (wanted == 1))
+    assert clamped > 0.2 if most > 1 else clamped < 0.2
 
 
-def test_pytorch_has_the_gradient_of_finite_differences() -> None:
+def test_the_gradient_in_pytorch_matches_finite_differences() -> None:
     points, times = torch.rand(20, 3, dtype=torch.float64) * 0.6 + 0.2, torch.rand(20, dtype=torch.float64)
     motion = (0.1 * torch.randn(3, 2, 3, 2, 3, dtype=torch.float64)).requires_grad_()
     assert torch.autograd.gradcheck(lambda motion: field.displace(points, times, motion), (motion,))
 
 
 @pytest.mark.parametrize("most", [1e-9, 0.1, 3.0, DISPLACEMENT_LIMIT / 2])
-def test_rounding(most: float) -> None:
+def test_quantisation_error_is_at_most_half_a_step(most: float) -> None:
     offsets = RNG.uniform(-most, most, (3, 2, 2, 2, 3)).astype(np.float32)
     offsets[0, 0, 0, 0] = most, -most, 0
     rounded = quantise_motion(offsets)
     assert rounded.step == FINEST_STEP or most > 32767 * FINEST_STEP
-    # Half a step, and the rounding of the product to float32.
+    # Half a step, plus the rounding of the product to float32.
     assert np.abs(rounded.dequantise() - offsets).max() <= rounded.step / 2 + most * 2.0**-23
 
 
 @pytest.mark.parametrize("multiple", [1, 3, 16])
-def test_multiples_of_several_steps_are_stored_as_such(multiple: int) -> None:
+def test_multiples_of_several_steps_get_a_coarser_step(multiple: int) -> None:
     offsets = np.random.default_rng(0).integers(-30, 30, (2, 3, 2, 2, 3)).astype(np.float32) * np.float32(
         multiple * FINEST_STEP
     )
@@ -75,7 +74,7 @@ def test_multiples_of_several_steps_are_stored_as_such(multiple: int) -> None:
     np.testing.assert_array_equal(rounded.dequantise(), offsets)
 
 
-def test_all_that_a_file_can_hold_can_be_stored_anew() -> None:
+def test_the_widest_stored_grid_can_be_quantised_again() -> None:
     widest = QuantisedMotion(np.resize(np.int16([-32768, 32767, 0]), (2, 2, 2, 2, 3)), DISPLACEMENT_LIMIT / 32768)
     again = quantise_motion(widest.dequantise())
     assert again.step == widest.step
@@ -83,7 +82,7 @@ def test_all_that_a_file_can_hold_can_be_stored_anew() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, np.nextafter(np.float32(-DISPLACEMENT_LIMIT), np.float32(-np.inf))])
-def test_what_no_file_can_store(value: float) -> None:
+def test_displacements_beyond_the_limit_are_refused(value: float) -> None:
     offsets = np.zeros((2, 2, 2, 2, 3), np.float32)
     offsets[1, 1, 0, 1, 2] = value
     with pytest.raises(FormatError, match="motion"):
@@ -92,24 +91,24 @@ def test_what_no_file_can_store(value: float) -> None:
 
 @given(seed=st.integers(0, 2**32 - 1), stretch=st.floats(0, 0.9))
 @settings(max_examples=30, deadline=None)
-def test_no_place_that_is_reached_is_missed(seed: int, stretch: float) -> None:
-    """As long as neighbouring points part by no more than their distance."""
+def test_no_reached_cell_is_missed(seed: int, stretch: float) -> None:
+    """As long as the displacement stretches distances by less than 2."""
     rng = np.random.default_rng(seed)
     nodes = rng.integers(2, 5, 4)
     offsets = rng.uniform(-1, 1, (*nodes, 3)).astype(np.float32)
-    offsets *= np.float32(stretch / (6 * max(nodes[1:])))  # no slope beyond `stretch`, summed over three axes
-    offsets += rng.uniform(-0.3, 0.3, (nodes[0], 1, 1, 1, 3)).astype(np.float32)  # all of it moves, as fast as it likes
+    offsets *= np.float32(stretch / (6 * max(nodes[1:])))  # the slopes over three axes sum to at most `stretch`
+    offsets += rng.uniform(-0.3, 0.3, (nodes[0], 1, 1, 1, 3)).astype(np.float32)  # plus any common motion
     occupancy = rng.random(rng.integers(1, 9, 4)) < 0.1
     reached = reached_cells(occupancy, offsets)
     slots, shape = len(occupancy), np.array(occupancy.shape[1:])
     for slot, *cell in np.argwhere(occupancy):
         for _ in range(5):
             u, time = ((cell + rng.random(3)) / shape)[::-1], (slot + rng.random()) / slots
-            place = displace(u.astype(np.float32), sample_linear(offsets, time))
-            assert reached[slot][tuple(np.minimum((place[::-1] * shape).astype(int), shape - 1))]
+            reached_u = displace(u.astype(np.float32), sample_linear(offsets, time))
+            assert reached[slot][tuple(np.minimum((reached_u[::-1] * shape).astype(int), shape - 1))]
 
 
-def test_nothing_occupied_reaches_nothing_and_no_motion_stays_close() -> None:
+def test_reached_cells_of_an_empty_grid_and_without_motion() -> None:
     still = np.zeros((2, 2, 2, 2, 3), np.float32)
     assert not reached_cells(np.zeros((2, 4, 5, 6), bool), still).any()
     occupancy = np.zeros((1, 8, 8, 8), bool)

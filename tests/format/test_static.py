@@ -1,4 +1,4 @@
-"""What of a scene is static: the cells, their share, and the picture that shows it."""
+"""Static and constant cells, their fractions, and the motion map."""
 
 import json
 from dataclasses import replace
@@ -18,42 +18,40 @@ from scenes import VARIANTS, tiny_scene
 
 
 def still(scene: Scene) -> Scene:
-    """The same with time planes that are 1, and an occupancy that stays as it is in its first slot."""
+    """Return the scene with time planes of 1 and the occupancy of its first slot throughout."""
     scales = tuple(
         {name: np.ones_like(p) if name in TIME_PLANES else p for name, p in scale.items()} for scale in scene.scales
     )
     return replace(scene, scales=scales, occupancy=np.repeat(scene.occupancy[:1], len(scene.occupancy), axis=0))
 
 
-def wavering(scene: Scene, plane: str, rows: slice, columns: slice, factor: float = 0.5) -> Scene:
-    """The same with some texels of the finest time plane of that name multiplied."""
+def with_changed_texels(scene: Scene, plane: str, rows: slice, columns: slice, factor: float = 0.5) -> Scene:
+    """Return the scene with some texels of its finest time plane `plane` multiplied by `factor`."""
     values = scene.scales[-1][plane].copy()
     values[rows, columns] *= factor
     return replace(scene, scales=(*scene.scales[:-1], {**scene.scales[-1], plane: values}))
 
 
 def box_of_cells(time: int = 9) -> Scene:
-    """Nine texels along every axis, all cells occupied: 8 x 8 x 8 in four slots."""
+    """Return a scene with nine texels per axis and 8 x 8 x 8 cells in four slots, all occupied."""
     return replace(still(tiny_scene(resolution=(9, 9, 9), time=time)), occupancy=np.ones((4, 8, 8, 8), bool))
 
 
 @pytest.mark.parametrize("plane, axis", [("xt", 2), ("yt", 1), ("zt", 0)])
-def test_a_texel_moves_the_slab_of_cells_that_read_it(plane: str, axis: int) -> None:
-    scene = wavering(
-        box_of_cells(), plane, slice(4, 5), slice(6, 7)
-    )  # at 1/2 over the clip, reads from 3/8 to 5/8 touch it
+def test_a_changed_texel_makes_the_cells_that_read_it_dynamic(plane: str, axis: int) -> None:
+    # The texel is at time 1/2 and read from 3/8 to 5/8.
+    scene = with_changed_texels(box_of_cells(), plane, slice(4, 5), slice(6, 7))
     moving = np.zeros((4, 8, 8, 8), bool)
-    np.moveaxis(moving, axis + 1, 1)[1:3, 4:8] = (
-        True  # between 5/8 and 7/8, closed: cells 4 and 7 touch it at their edges
-    )
+    # Along the axis it is read from 5/8 to 7/8, both included: cells 4 and 7 meet that range at their edges.
+    np.moveaxis(moving, axis + 1, 1)[1:3, 4:8] = True
     assert np.array_equal(static_cells(scene), ~moving)
     assert static_fraction(scene) == 0.75 and constant_fraction(scene) == 0.5
     assert np.array_equal(constant_cells(scene), ~moving.any(axis=0))
 
 
-def test_kpinfo_tells_the_shares(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = wavering(box_of_cells(), "xt", slice(4, 5), slice(6, 7))
-    write(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
+def test_kpinfo_prints_the_fractions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = with_changed_texels(box_of_cells(), "xt", slice(4, 5), slice(6, 7))
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]), tmp_path / "scene.kpc")
     assert kpinfo.main([str(tmp_path / "scene.kpc"), "--json"]) == 0
     shares = json.loads(capsys.readouterr().out)["static"]
     assert shares["identity_share"] == 0.75 and shares["unchanging_share"] == 0.5 <= shares["motionless_share"] <= 1
@@ -62,13 +60,13 @@ def test_kpinfo_tells_the_shares(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "75.0% of the occupied space-time is identity; 50.0% of the occupied space never changes" in page
 
 
-def test_what_is_constant_but_not_one_never_changes_and_yet_is_not_static() -> None:
-    scene = wavering(box_of_cells(), "yt", slice(None), slice(None))
+def test_planes_constant_in_time_but_not_one_are_constant_and_not_static() -> None:
+    scene = with_changed_texels(box_of_cells(), "yt", slice(None), slice(None))
     assert static_fraction(scene) == 0 and constant_fraction(scene) == 1
 
 
-def test_only_occupied_cells_count_and_one_that_comes_and_goes_changes() -> None:
-    scene = wavering(box_of_cells(), "xt", slice(None), slice(6, 7))
+def test_fractions_count_occupied_cells_and_changing_occupancy_is_not_constant() -> None:
+    scene = with_changed_texels(box_of_cells(), "xt", slice(None), slice(6, 7))
     occupancy = np.zeros((4, 8, 8, 8), bool)
     occupancy[:, 0, 0, :4] = True
     assert (
@@ -87,11 +85,11 @@ def test_scenes_without_time_planes_are_static() -> None:
     assert static_fraction(scene) == constant_fraction(scene) == motionless_share(scene) == 1
 
 
-def test_in_static_cells_features_are_those_of_the_static_scene() -> None:
-    """By definition, at random places and times in them."""
+def test_features_in_static_cells_are_those_of_the_static_scene() -> None:
+    """At random positions and times within the cells."""
     scene, rng = tiny_scene(), np.random.default_rng(1)
     motion = np.zeros((3, 2, 2, 4, 3), np.float32)
-    motion[:, :, :, 3] = rng.uniform(-0.2, 0.2, (3, 2, 2, 3))  # displaces what is farther than 2/3 along x
+    motion[:, :, :, 3] = rng.uniform(-0.2, 0.2, (3, 2, 2, 3))  # displaces everything beyond 2/3 along x
     scene = replace(scene, motion=motion)
     cells = np.argwhere(static_cells(scene))
     slots, *shape = scene.occupancy.shape
@@ -104,8 +102,8 @@ def test_in_static_cells_features_are_those_of_the_static_scene() -> None:
             assert np.array_equal(reference.features(scene, full, u), reference.features(scene, static, u))
 
 
-def test_cells_and_texels_touch_as_the_encoder_has_it() -> None:
-    """`needed_texels` tells which texels a cell needs, `cells_reading` which cells a texel serves."""
+def test_cells_reading_is_the_inverse_of_needed_texels() -> None:
+    """`needed_texels` returns the texels that a cell reads, `cells_reading` the cells that read a texel."""
     for texels, cells in [(1, 5), (2, 3), (5, 8), (8, 5), (9, 8), (17, 17), (30, 4)]:
         for cell in range(cells):
             occupancy = np.zeros((1, 1, 1, cells), bool)
@@ -119,7 +117,7 @@ def test_cells_and_texels_touch_as_the_encoder_has_it() -> None:
 def test_displaced_cells_are_not_static() -> None:
     scene = box_of_cells()
     motion = np.zeros((3, 3, 3, 5, 3), np.float32)
-    motion[1, 0, 0, 0] = 0.01  # the node in the corner; its support reaches to 1/4 along x, 1/2 along y and z
+    motion[1, 0, 0, 0] = 0.01  # the corner node, whose support reaches 1/4 along x and 1/2 along y and z
     moving = np.zeros((8, 8, 8), bool)
     moving[:5, :5, :3] = True
     assert np.array_equal(constant_cells(replace(scene, motion=motion)), ~moving)
@@ -127,7 +125,7 @@ def test_displaced_cells_are_not_static() -> None:
 
 
 @pytest.mark.parametrize("space", VARIANTS)
-def test_the_map_is_grey_where_nothing_moves(space: str) -> None:
+def test_the_motion_map_is_grey_where_nothing_moves(space: str) -> None:
     scene = VARIANTS[space](tiny_scene())
     still_scene = replace(still(scene), motion=None if scene.motion is None else np.zeros_like(scene.motion))
     camera = scene.cameras[0]
@@ -139,18 +137,18 @@ def test_the_map_is_grey_where_nothing_moves(space: str) -> None:
     assert motionless_share(still_scene) == 1 > motionless_share(scene)
 
 
-def test_a_share_is_that_of_cells_evenly_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_motionless_share_samples_cells_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(motion_map, "CELLS_AT_ONCE", 7)
     cells = np.random.default_rng(0).uniform(size=100) < 0.4
     indices = np.flatnonzero(cells)
     assert np.array_equal(motion_map._spread(cells, 1000), indices)
-    some = motion_map._spread(cells, 10)
-    assert len(some) == 10 and some[0] == indices[0] and some[-1] == indices[-1] and cells[some].all()
+    spread = motion_map._spread(cells, 10)
+    assert len(spread) == 10 and spread[0] == indices[0] and spread[-1] == indices[-1] and cells[spread].all()
     assert len(motion_map._spread(np.zeros(20, bool), 10)) == 0
 
 
-def test_the_map_colours_what_moves_while_it_is_there() -> None:
-    """A scene whose right half goes out in the second half of the clip: red at the start, and nowhere to be seen at the end."""
+def test_the_motion_map_colours_what_moves_while_it_exists() -> None:
+    """The right half of a scene disappears in the second half of the clip: it is red before, and not shown after."""
     scene = still(tiny_scene(time=9))
     occupancy = scene.occupancy[:1].repeat(2, axis=0)
     occupancy[1, :, :, 6:] = False
@@ -158,10 +156,10 @@ def test_the_map_colours_what_moves_while_it_is_there() -> None:
     rendering = reference.render(scene, camera, 0.2)
     red = np.ptp(motion_colours(scene, camera, 0.2, rendering).rgb, axis=2) > 0.1
     origins, directions = camera.rays()
-    sure = (rendering.opacity > 0.99).reshape(-1)
-    x = (origins + np.where(sure, rendering.depth.reshape(-1), 0)[:, None] * directions)[sure, 0]
+    opaque = (rendering.opacity > 0.99).reshape(-1)
+    x = (origins + np.where(opaque, rendering.depth.reshape(-1), 0)[:, None] * directions)[opaque, 0]
     right = x > scene.aabb[:, 0].mean()
     assert right.any() and not right.all()
-    assert red.reshape(-1)[sure][right].mean() > 0.8 and not red.reshape(-1)[sure][~right].any()
+    assert red.reshape(-1)[opaque][right].mean() > 0.8 and not red.reshape(-1)[opaque][~right].any()
     late = motion_colours(scene, camera, 0.8, reference.render(scene, camera, 0.8))
     assert np.ptp(late.rgb, axis=2).max() < 0.1
