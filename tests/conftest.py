@@ -1,4 +1,4 @@
-"""Tests work on tiny arrays: on a busy machine threads wait for each other far longer than they compute."""
+"""Fixtures and settings that all tests share."""
 
 import os
 from typing import TYPE_CHECKING
@@ -8,12 +8,13 @@ import pytest
 if TYPE_CHECKING:
     from kpc.encoder.datasets import Dataset
 
+# Tests work on tiny arrays, for which threads cost more time in synchronisation than they save.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 @pytest.fixture
 def one_thread():
-    """The fused kernels on one thread."""
+    """Run the fused kernels on one thread."""
     import numba
 
     before = numba.get_num_threads()
@@ -24,14 +25,14 @@ def one_thread():
 
 @pytest.fixture
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures and planes are judged by a few rays, as many as tiny scenes need."""
+    """Evaluate on few validation rays, which suffice for tiny scenes."""
     monkeypatch.setattr("kpc.encoder.evaluation.validation_rays.VALIDATION_RAYS", 512)
     monkeypatch.setattr("kpc.encoder.rdo.curvature.RAYS", 1 << 13)
 
 
 @pytest.fixture(scope="session")
 def moving(tmp_path_factory: pytest.TempPathFactory) -> "Dataset":
-    """A moving object with alpha, seen once an instant."""
+    """Return a monocular dataset of a moving object with alpha."""
     import datasets as make
     from kpc.encoder.datasets import load_dataset
 

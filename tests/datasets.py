@@ -1,4 +1,4 @@
-"""Tiny datasets in each layout, for tests: a shaded sphere seen from a few cameras, a few frames long."""
+"""Tiny datasets in every layout, for tests: a shaded sphere seen by a few cameras over a few frames."""
 
 import json
 import struct
@@ -10,11 +10,12 @@ import numpy as np
 from kpc.format.common.media import write_image, write_video
 from kpc.format.scene.cameras import Camera
 
+# Frame rate of the videos.
 FPS = 8.0
 
 
 def look_at(eye: tuple[float, float, float], width: int = 32, height: int = 24) -> Camera:
-    """A camera that looks at the origin, z up, 45 degrees wide or so."""
+    """Return a camera that looks at the origin, with z up and about 45 degrees of horizontal view."""
     back = np.asarray(eye, float) / np.linalg.norm(eye)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -24,12 +25,13 @@ def look_at(eye: tuple[float, float, float], width: int = 32, height: int = 24) 
 
 
 def ring(count: int, **size: int) -> list[Camera]:
+    """Return cameras on an arc around the origin."""
     angles = np.linspace(-0.5, 0.5, count)
     return [look_at((3 * np.sin(a), -3 * np.cos(a), 0.8), **size) for a in angles]
 
 
 def picture(camera: Camera, time: float = 0.0, alpha: bool = False) -> np.ndarray:
-    """uint8 (height, width, 3 or 4): a sphere whose radius grows with time, on a shaded ground or on nothing."""
+    """Render a sphere whose radius grows with time, on a shaded or transparent background, as uint8 (H, W, 3 or 4)."""
     origins, directions = camera.rays()
     along = -(origins * directions).sum(1)
     beside = np.linalg.norm(origins + directions * along[:, None], axis=1)
@@ -40,7 +42,7 @@ def picture(camera: Camera, time: float = 0.0, alpha: bool = False) -> np.ndarra
 
 
 def poses_bounds(cameras: list[Camera], near: float = 1.0, far: float = 6.0) -> np.ndarray:
-    """LLFF rows: [down right backwards centre | (h w f)], near, far."""
+    """Return the rows of an LLFF file: [down right backwards centre | (h w f)], near, far."""
     rows = []
     for c in cameras:
         right, up, back, centre = c.camera_to_world[:3].T
@@ -49,6 +51,7 @@ def poses_bounds(cameras: list[Camera], near: float = 1.0, far: float = 6.0) -> 
 
 
 def write_n3dv(folder: Path, cameras: int = 3, frames: int = 4, **size: int) -> list[Camera]:
+    """Write synchronised videos in the layout of Neural 3D Video."""
     folder.mkdir(parents=True, exist_ok=True)
     rig = ring(cameras, **size)
     for k, camera in enumerate(rig):
@@ -59,6 +62,7 @@ def write_n3dv(folder: Path, cameras: int = 3, frames: int = 4, **size: int) -> 
 
 
 def write_llff(folder: Path, images: int = 9) -> list[Camera]:
+    """Write images in the layout of LLFF."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     rig = ring(images)
     for k, camera in enumerate(rig):
@@ -68,6 +72,7 @@ def write_llff(folder: Path, images: int = 9) -> list[Camera]:
 
 
 def write_blender(folder: Path, dynamic: bool = True, alpha: bool = True) -> None:
+    """Write images in the layout of NeRF-synthetic, or of D-NeRF if dynamic."""
     for split, count in (("train", 5), ("val", 2), ("test", 3)):
         (folder / split).mkdir(parents=True, exist_ok=True)
         frames = []
@@ -88,7 +93,7 @@ def write_blender(folder: Path, dynamic: bool = True, alpha: bool = True) -> Non
 
 
 def write_nerfstudio(folder: Path, images: int = 10, times: list[float] | None = None, **document: Any) -> list[Camera]:
-    """`document` adds to or replaces keys of transforms.json."""
+    """Write images in the layout of nerfstudio; `document` adds or replaces keys of transforms.json."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     rig = ring(images)
     frames = []
@@ -104,7 +109,7 @@ def write_nerfstudio(folder: Path, images: int = 10, times: list[float] | None =
 
 
 def write_unbounded(folder: Path, images: int = 40) -> list[Camera]:
-    """A ball of radius 0.7 before a sky without end, from all around and several heights. Every eighth image tests."""
+    """Write images of a ball of radius 0.7 under an infinitely distant sky, from all around and several heights."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     rig, frames = [], []
     for k in range(images):
@@ -113,9 +118,9 @@ def write_unbounded(folder: Path, images: int = 40) -> list[Camera]:
         origins, directions = rig[-1].rays()
         along = -(origins * directions).sum(1)
         beside = np.linalg.norm(origins + directions * along[:, None], axis=1)
-        met = origins + directions * (along - np.sqrt(np.maximum(0.49 - beside**2, 0)))[:, None]
+        hit = origins + directions * (along - np.sqrt(np.maximum(0.49 - beside**2, 0)))[:, None]
         sky = 128 + 100 * np.sin(6 * directions @ np.array([[1, 0.3, 0], [0, 1, 0.5], [0.6, -0.8, 1]]))
-        pixels = np.where(beside[:, None] < 0.7, 128 + 170 * met, sky)
+        pixels = np.where(beside[:, None] < 0.7, 128 + 170 * hit, sky)
         write_image(folder / "images" / f"{k:04d}.png", np.rint(pixels).astype(np.uint8).reshape(30, 40, 3))
         frames.append({"file_path": f"images/{k:04d}.png", "transform_matrix": rig[-1].camera_to_world.tolist()})
     c = rig[0]
@@ -125,8 +130,12 @@ def write_unbounded(folder: Path, images: int = 40) -> list[Camera]:
 
 
 def write_varying_exposure(folder: Path, images: int = 32, own_lens: bool = True, unequal: bool = True) -> list[Camera]:
-    """A patterned ball of radius 0.7 on nothing, from all around; each image has an exposure and a white balance of its own where
-    `unequal`, drawn from a fixed seed, and a lens of its own where `own_lens`. Every eighth image tests."""
+    """Write images of a patterned ball of radius 0.7 on a transparent background, from all around.
+
+    Args:
+        unequal: whether each image has an exposure and white balance of its own, from a fixed seed.
+        own_lens: whether each image has a focal length of its own.
+    """
     (folder / "images").mkdir(parents=True, exist_ok=True)
     rng, rig, frames = np.random.default_rng(11), [], []
     for k in range(images):
@@ -138,8 +147,8 @@ def write_varying_exposure(folder: Path, images: int = 32, own_lens: bool = True
         origins, directions = rig[-1].rays()
         along = -(origins * directions).sum(1)
         beside = np.linalg.norm(origins + directions * along[:, None], axis=1)
-        met = origins + directions * (along - np.sqrt(np.maximum(0.49 - beside**2, 0)))[:, None]
-        pattern = 150 + 100 * np.sin(5 * met @ np.array([[1, 0.3, 0], [0, 1, 0.5], [0.6, -0.8, 1]]))
+        hit = origins + directions * (along - np.sqrt(np.maximum(0.49 - beside**2, 0)))[:, None]
+        pattern = 150 + 100 * np.sin(5 * hit @ np.array([[1, 0.3, 0], [0, 1, 0.5], [0.6, -0.8, 1]]))
         pixels = np.concatenate([gain * pattern, 255.0 * (beside < 0.7)[:, None]], axis=1)
         write_image(folder / "images" / f"{k:04d}.png", np.rint(pixels).astype(np.uint8).reshape(32, 32, 4))
         frames.append(
@@ -151,11 +160,12 @@ def write_varying_exposure(folder: Path, images: int = 32, own_lens: bool = True
     return rig
 
 
+# Camera models by name, with their numbers in binary files.
 COLMAP_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """w x y z of a (3, 3) rotation: the eigenvector of Bar-Itzhack's symmetric matrix (2000) for its largest eigenvalue."""
+    """Return w x y z of a (3, 3) rotation by the method of Bar-Itzhack (2000)."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     matrix = np.array(
         [
@@ -169,21 +179,22 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def colmap_pose(camera_to_world: np.ndarray) -> tuple[float, ...]:
-    """Quaternion and translation of x_camera = R x_world + t, y down and z forward, from an OpenGL pose."""
+    """Convert an OpenGL pose into quaternion and translation of x_camera = R x_world + t, y down and z forward."""
     rotation = (camera_to_world[:3, :3] * [1, -1, -1]).T
     return (*quaternion(rotation).tolist(), *(-rotation @ camera_to_world[:3, 3]).tolist())
 
 
+# Number, model, width, height and parameters.
 ColmapCamera = tuple[int, str, int, int, Sequence[float]]
-"""Number, model, width, height and parameters."""
 
+# Number, quaternion and translation, number of the camera, name, and number of points observed.
 ColmapImage = tuple[int, Sequence[float], int, str, int]
-"""Number, quaternion and translation, number of the camera, name, and how many points it sees."""
 
 
 def write_colmap_model(
     folder: Path, cameras: Sequence[ColmapCamera], images: Sequence[ColmapImage], binary: bool = True
 ) -> None:
+    """Write the files of a COLMAP model, binary or text."""
     folder.mkdir(parents=True, exist_ok=True)
     if not binary:
         lines = ["# Camera list", *(f"{n} {model} {w} {h} {_words(params)}" for n, model, w, h, params in cameras)]
@@ -207,7 +218,12 @@ def write_colmap_model(
 def write_colmap(
     folder: Path, images: int = 10, binary: bool = True, model: str = "PINHOLE", lens: Sequence[float] = ()
 ) -> list[Camera]:
-    """`lens`: what `model` has beyond focal length and centre. Images are numbered against their order."""
+    """Write images and their COLMAP model, with images numbered in reverse order.
+
+    Args:
+        model: COLMAP's camera model.
+        lens: its parameters after focal length and principal point.
+    """
     (folder / "images").mkdir(parents=True, exist_ok=True)
     rig = ring(images)
     for k, camera in enumerate(rig):
@@ -225,13 +241,13 @@ def _words(numbers: Sequence[float]) -> str:
 
 
 def write_mask(file: Path, usable: np.ndarray) -> None:
-    """8-bit grey, 255 where an (H, W) bool says usable."""
+    """Write a mask as an 8-bit grey image, 255 where the (H, W) bool array is set."""
     file.parent.mkdir(parents=True, exist_ok=True)
     write_image(file, np.where(usable, 255, 0).astype(np.uint8))
 
 
 def edit_json(file: Path, change: Any) -> None:
-    """Load, let `change(document)` alter it in place, save."""
+    """Load a JSON file, let `change` modify the document in place, and save it."""
     document = json.loads(file.read_text())
     change(document)
     file.write_text(json.dumps(document))

@@ -1,4 +1,4 @@
-"""The fused kernels and their float64 twin on the same scene and rays, for tests that hold them together."""
+"""Gradients of the fused kernels and of the float64 reference, for the tests that compare them."""
 
 from dataclasses import replace
 
@@ -12,6 +12,7 @@ from kpc.format.scene.scene import Scene
 from scenes import tiny_scene, with_contraction, with_motion
 from torch import Tensor
 
+# Whether the scene is dynamic, is contracted, and has a motion grid.
 FIELD_KINDS = [
     (True, False, False),
     (True, False, True),
@@ -20,14 +21,13 @@ FIELD_KINDS = [
     (True, True, True),
     (False, True, False),
 ]
-"""Whether it moves, lies in contracted space, has a motion grid."""
 
 
 def translucent_scene(dynamic: bool = True, contracted: bool = False, moved: bool = False) -> Scene:
-    """Every step absorbs a tenth or more: no sample before termination is so faint that it gets no colour."""
+    """Return a scene in which every step absorbs at least a tenth, so that no sample is too faint to be shaded."""
     scene = tiny_scene(dynamic=dynamic, time=6)
     weight = scene.decoder.density_weight
-    # Before the cameras' even distance, steps outside the box count for less: 1 / r^2, a tenth.
+    # Within the uniform distance, steps outside the box have a density scale of 1 / r^2, about a tenth.
     bias = 4.5 if contracted else 2.0
     scene = replace(scene, decoder=replace(scene.decoder, density_weight=np.abs(weight) / 16, density_bias=bias))
     scene = with_contraction(scene) if contracted else scene
@@ -35,22 +35,23 @@ def translucent_scene(dynamic: bool = True, contracted: bool = False, moved: boo
 
 
 def random_rays(scene: Scene, count: int, seed: int = 0) -> Rays:
-    """Rays through random pixels of the scene's cameras at random times, and one exactly along each axis."""
+    """Return rays through random pixels of the scene's cameras at random times, the last three along the axes."""
     rng = np.random.default_rng(seed)
-    origins, directions = (np.concatenate(a) for a in zip(*(c.rays() for c in scene.cameras)))
+    origins, directions = (np.concatenate(a) for a in zip(*(c.rays() for c in scene.cameras), strict=True))
     chosen = rng.choice(len(origins), count - 3, replace=False)
-    centre = scene.aabb.mean(0) + 0.03  # not on the faces of cells
+    centre = scene.aabb.mean(0) + 0.03  # away from the faces of cells
     origins = np.concatenate([origins[chosen], centre - 3 * np.eye(3)])
     directions = np.concatenate([directions[chosen], np.eye(3)])
     arrays = (origins, directions, rng.random(count), rng.random(count), rng.random((count, 3)))
     return Rays.from_arrays(*arrays)
 
 
+# Weight of the distortion loss in these tests, large enough to matter beside the colour loss.
 DISTORTION = 0.3
-"""Weight of the distortion loss in these tests: large enough to count beside the colours."""
 
 
 def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int = 2) -> dict[str, np.ndarray]:
+    """Return the gradients of the fused kernels, summed over workers, with the errors and sample counts of rays."""
     field = Field.from_scene(scene)
     layout, n = field.layout, len(targets)
     grad = np.zeros((workers, layout.size), np.float32)
@@ -99,7 +100,7 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
 
 
 def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict[str, np.ndarray]:
-    """The same by autograd through `render_reference`, in float64."""
+    """Return the same gradients by autograd through `render_reference`, in float64."""
     field = Field.from_scene(scene).double()
     rays = rays.map(torch.Tensor.double)
     basis = field.basis(rays.directions).detach().requires_grad_()
@@ -112,7 +113,7 @@ def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict
     (squared.mean() + DISTORTION * distortion).backward()
     peaks = torch.zeros(scene.occupancy.shape[1:], dtype=torch.float64)
     peaks.index_put_(tuple(cells.T), torch.zeros(len(cells), dtype=torch.float64))
-    for cell, weight in zip(cells.tolist(), weights.tolist()):
+    for cell, weight in zip(cells.tolist(), weights.tolist(), strict=True):
         peaks[tuple(cell)] = max(float(peaks[tuple(cell)]), weight)
     return {
         "theta": field.theta.grad.numpy(),
@@ -126,7 +127,7 @@ def reference_gradients(scene: Scene, rays: Rays, targets: torch.Tensor) -> dict
 
 
 class FieldFunction(torch.nn.Module):
-    """Makes a function of a field's parameters out of one that uses the field."""
+    """A function of a field as a module, for `torch.func.functional_call` to turn into one of its parameters."""
 
     def __init__(self, field: Field, call: object) -> None:
         super().__init__()
@@ -134,7 +135,7 @@ class FieldFunction(torch.nn.Module):
 
 
 def bilinear(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """A plane (rows, columns, M) as `Field.features` reads it, u (N,) along its columns, v along its rows: (N, M)."""
+    """Sample a plane (rows, columns, M) as `Field.features` does, at u (N,) along columns and v along rows: (N, M)."""
     rows, columns, M = plane.shape
     corners, shares = bilinear_corners(u, v, torch.tensor(columns), torch.tensor(rows))
     (values,) = WeightedRowSum.apply(plane.reshape(-1, M), corners[None], shares[None])

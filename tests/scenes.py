@@ -1,4 +1,4 @@
-"""Small scenes for tests: every feature of a real one, in a few kilobytes."""
+"""Small scenes for tests, with every feature of real ones in a few kilobytes."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,17 +19,23 @@ def tiny_scene(
     resolution: tuple[int, int, int] = (24, 20, 16),
     time: int = 6,
 ) -> Scene:
-    """A scene of smooth random planes in a box of unequal edges, seen by two cameras.
+    """Return a scene of smooth random planes in a box of unequal edges, with two cameras.
 
     Args:
-        resolution: (Nx, Ny, Nz) of the finest scale; each coarser one halves it.
-        time: rows of every time plane. Time planes are exactly 1 outside one bump, so that most of them is identity.
+        seed: of the random numbers.
+        dynamic: whether it has time planes, which are 1 outside the middle third of their columns.
+        scales: number of scales.
+        channels: per scale.
+        resolution: (Nx, Ny, Nz) of the finest scale; each coarser scale halves it.
+        time: rows of every time plane.
     """
     rng = np.random.default_rng(seed)
     aabb = np.array([[-1.0, -0.8, -0.6], [1.2, 0.9, 0.7]], np.float32)
     levels = []
     for scale in range(scales):
-        size = {axis: max(2, n >> (scales - 1 - scale)) for axis, n in zip("xyz", resolution)} | {"t": time}
+        size = {axis: max(2, n >> (scales - 1 - scale)) for axis, n in zip("xyz", resolution, strict=True)} | {
+            "t": time
+        }
         planes = {}
         for name in SPACE_PLANES + (TIME_PLANES if dynamic else ()):
             shape = (size[name[1]], size[name[0]], channels)
@@ -59,35 +65,37 @@ def tiny_scene(
 
 
 def with_contraction(scene: Scene) -> Scene:
-    """A scene in contracted space: what was in its box, now small in the middle, and a wall all around, out to infinity.
+    """Return the scene in contracted space, surrounded by a wall that extends to infinity.
 
-    Its even steps end within the wall's nearer part, so that samples of both kinds count.
+    Uniform steps end within the near part of the wall, so that samples of both kinds contribute.
     """
     slots = len(scene.occupancy)
     occupancy = np.zeros((slots, 16, 20, 24), bool)
     occupancy[:, 4:12, 5:15, 6:18] = scene.occupancy
     shell = np.ones(occupancy.shape[1:], bool)
     shell[2:-1, 2:-2, 1:-3] = False
-    shell[2:6, 3:7, 18] = True  # something in the open, too
+    shell[2:6, 3:7, 18] = True  # a separate object outside the box
     return replace(scene, occupancy=occupancy | shell, mapping=Contraction(5.0), step=0.08)
 
 
 def with_motion(scene: Scene, seed: int = 5, most: float = 0.06) -> Scene:
-    """A dynamic scene whose places wander: random displacements of up to `most` at 3 x 2 x 4 nodes, in as many rows as it has."""
+    """Return a dynamic scene with a random motion grid of 3 x 2 x 4 nodes and displacements of up to `most`."""
     shape = len(scene.scales[0]["xt"]), 3, 2, 4, 3
     return replace(scene, motion=np.random.default_rng(seed).uniform(-most, most, shape).astype(np.float32))
 
 
 def in_device_coordinates(scene: Scene) -> Scene:
-    """A scene in device coordinates of a camera between its cameras and before them, so that some rays begin behind its near
-    plane and some beyond. It reaches to a depth of 50."""
+    """Return the scene in device coordinates, up to a depth of 50.
+
+    Their camera lies between the scene's cameras and in front of them, so rays start on both sides of its near plane.
+    """
     frame = look_at((0.3, 0.9, 2.1), (0.1, 0.05, 0.05), 1, 1, 1.0).camera_to_world[:3]
     aabb = np.array([[-0.8, -0.7, 0.1], [0.9, 0.6, 2 * (1 / 0.8 - 1 / 50)]], np.float32)
     return replace(scene, mapping=DeviceCoordinates(frame, 0.8, 2.0), aabb=aabb)
 
 
 def with_hybrid_decoder(scene: Scene, seed: int = 6, width: int = 6, hidden: int = 7) -> Scene:
-    """A scene with a hybrid decoder, of widths that fill no vectors of four, about as dense as before."""
+    """Return the scene with a random hybrid decoder, whose widths are not multiples of four."""
     rng = np.random.default_rng(seed)
     F = scene.decoder.w2.shape[1]
     shapes = HybridDecoder.shapes(F, width, hidden)
@@ -100,32 +108,36 @@ def with_hybrid_decoder(scene: Scene, seed: int = 6, width: int = 6, hidden: int
 def with_appearances(
     scene: Scene, names: tuple[str, ...] = ("dawn.jpg", "noon.jpg", "dusk.jpg"), seed: int = 7
 ) -> Scene:
-    """A scene whose pictures disagree about its colours: an appearance of each name, their codes random, of mean 0."""
+    """Return the scene with an appearance for each name, with random codes of mean 0."""
     codes = np.random.default_rng(seed).normal(0, 1, (len(names), len(scene.decoder.b1)))
     codes = (codes - codes.mean(0)).astype(np.float32)
     return replace(scene, appearances=tuple(Appearance(name, code) for name, code in zip(names, codes, strict=True)))
 
 
 def view_independent(scene: Scene) -> Scene:
-    """Its colours the same from all sides."""
+    """Return the scene with view-independent colour."""
     return replace(scene, decoder=replace(scene.decoder, w2=0 * scene.decoder.w2))
 
 
 def unequal_scales() -> Scene:
-    """Scales of other channels, rows of time and sizes; the first is the finer one along y."""
+    """Return a scene whose scales differ in channels, time rows and size; the first is the finer one along y."""
     coarse, fine = (
         tiny_scene(1, channels=13, resolution=(12, 44, 10), time=4),
         tiny_scene(2, channels=19, resolution=(23, 20, 15), time=7),
     )
     scales = coarse.scales[-1], fine.scales[-1]
     rng, features = np.random.default_rng(3), 32
-    decoder = replace(fine.decoder, density_weight=rng.normal(0, 0.8, features).astype(np.float32),
-                      w2=np.zeros((3, features, 16), np.float32), b2=rng.normal(0, 0.4, (3, features)).astype(np.float32))  # fmt: skip
+    decoder = replace(
+        fine.decoder,
+        density_weight=rng.normal(0, 0.8, features).astype(np.float32),
+        w2=np.zeros((3, features, 16), np.float32),
+        b2=rng.normal(0, 0.4, (3, features)).astype(np.float32),
+    )
     return replace(fine, scales=scales, decoder=decoder)
 
 
 def one_texel_deep() -> Scene:
-    """Of one texel along z."""
+    """Return a view-independent scene with one texel along z."""
     scene = tiny_scene(5, scales=1, channels=30, resolution=(9, 20, 2))
     planes = {
         name: plane[:1] if name in ("xz", "yz") else plane[:, :1] if name == "zt" else plane
@@ -135,7 +147,10 @@ def one_texel_deep() -> Scene:
 
 
 def linear_per_cell(scene: Scene) -> Scene:
-    """Of one scale, in which one plane varies, and rows of time planes are the same all along their axes: so that a grid holds all there is."""
+    """Make the field linear between corners, in place: only "xy" varies in space, the time planes do not.
+
+    A grid of values at texel corners then represents it exactly.
+    """
     for name in ("xz", "yz"):
         scene.scales[0][name][:] = 1.0
     for name in ("xt", "yt", "zt"):
@@ -143,6 +158,7 @@ def linear_per_cell(scene: Scene) -> Scene:
     return scene
 
 
+# The box with an explicit decoder, and every alternative to it.
 VARIANTS: dict[str, Callable[[Scene], Scene]] = {
     "box": lambda scene: scene,
     "contracted": with_contraction,
@@ -150,18 +166,17 @@ VARIANTS: dict[str, Callable[[Scene], Scene]] = {
     "ndc": in_device_coordinates,
     "hybrid": with_hybrid_decoder,
 }
-"""What there is besides a plain box and the explicit decoder."""
 
 
 def without_planes(scene: Scene) -> Scene:
-    """A scene of whose planes nothing is there yet: all are 1."""
+    """Return the scene with all planes 1, as before any of them has been received."""
     return replace(
         scene, scales=tuple({name: np.ones_like(plane) for name, plane in scale.items()} for scale in scene.scales)
     )
 
 
 def stream_planes(renderer: Renderer, early: Scene, scene: Scene) -> None:
-    """Have planes arrive, as they do while a scene streams: space planes are put row by row, time planes change in place."""
+    """Fill in planes as streaming does: upload space planes in parts, and change those of time in `early` in place."""
     for number, scale in enumerate(scene.scales):
         for name in SPACE_PLANES:
             renderer.put(number, name, Layout.texels(scale[name][3:]), 3)
@@ -174,7 +189,7 @@ def stream_planes(renderer: Renderer, early: Scene, scene: Scene) -> None:
 def look_at(
     eye: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int, focal: float
 ) -> Camera:
-    """A camera at `eye` that looks at `target`, +y up."""
+    """Return a camera at `eye` that looks at `target`, with +y up."""
     back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
     right = np.cross([0.0, 1.0, 0.0], back)
     right /= np.linalg.norm(right)
@@ -184,7 +199,7 @@ def look_at(
 
 
 def _smooth(rng: np.random.Generator, rows: int, columns: int, channels: int) -> np.ndarray:
-    """Random knots, 5 an axis, drawn from [0.3, 1.5] and joined bilinearly."""
+    """Interpolate 5 x 5 random knots from [0.3, 1.5] bilinearly."""
     knots = rng.uniform(0.3, 1.5, (5, 5, channels))
     return np.einsum("rk,cl,klm->rcm", _hats(rows), _hats(columns), knots).astype(np.float32)
 
@@ -195,7 +210,7 @@ def _hats(size: int) -> np.ndarray:
 
 
 def _bump(rng: np.random.Generator, rows: int, columns: int, channels: int) -> np.ndarray:
-    """Exactly 1, but for the middle third of the columns, which wave in time."""
+    """Return a time plane of 1, except for the middle third of its columns, which oscillate in time."""
     amplitude = rng.uniform(-0.5, 0.5, channels)
     phase = rng.uniform(0.0, 2.0 * np.pi, channels)
     t = np.linspace(0.0, 1.0, rows)[:, None, None]
@@ -205,7 +220,7 @@ def _bump(rng: np.random.Generator, rows: int, columns: int, channels: int) -> n
 
 
 def _blob(slots: int, nz: int, ny: int, nx: int) -> np.ndarray:
-    """An ellipsoid that drifts along x from slot to slot."""
+    """Return the occupancy of an ellipsoid that moves along x from slot to slot."""
     z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n - 0.5 for n in (nz, ny, nx)), indexing="ij")
     centres = np.linspace(-0.1, 0.1, slots) if slots > 1 else [0.0]
     return np.stack([(x - c) ** 2 + y**2 + z**2 < 0.42**2 for c in centres])
