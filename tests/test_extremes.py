@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from gradients import backpropagate, random_rays, reference_gradients, translucent_scene
-from kpc.encoder.cli.kpenc import to_scene
+from kpc.encoder.cli.encode_scene import to_scene
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate
 from kpc.encoder.field import kernels

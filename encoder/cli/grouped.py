@@ -1,9 +1,10 @@
-"""A long clip in groups (`kpc.format.container.groups`): which frames each holds, and how one begins where the one before ended.
+"""A long clip in groups (`kpc.format.container.groups`): the frames of each group, and its start from the one before.
 
-Space planes are coded for each group anew. As differences from those of the group before, at equal steps, they take 1.4 times as
-many bytes (default scene, second group after 600 steps): training moves all of them a little, by about as much as they vary.
+The planes of each group are coded anew; why differences from the group before do not pay, and the figures behind the
+constants: docs/design/rate-distortion.md, "Groups of a long clip".
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -17,26 +18,18 @@ from kpc.format.container.container import ENTRY, HEADER
 from kpc.format.container.groups import Span
 from kpc.format.scene.scene import TIME_PLANES, Clip, Scene
 
+# Frames that a group holds beyond those that it shows, at either end where there are more. So two groups share four
+# frames, of which the player mixes the inner two.
 OVERLAP = 2
-"""Frames that a group holds beyond those it shows, at either end where there are more: so four are shared, and the inner two of them mixed
-(`kpc.format.container.groups`). The error of the default scene over 90 frames in 128x96 pixels (`draft`, 800 steps) changes by 0.027 from one
-frame to the next where a group takes over at once, 0.012 and 0.016 before and after; by 0.014, 0.015 and 0.017 where two are mixed."""
-
-LATER_STEPS = 0.5
-"""Steps of a group that begins where another ended, of those of one that begins anew. Held-out PSNR of the three groups named
-below with 800 steps of `fast` for the first: 27.2, 30.8, 32.9 dB with 1, 27.2, 29.0, 31.1 dB with 0.5; with 2,400 and 0.25 it is 36.0,
-31.5, 33.9 dB, which falls off where they join. Five frames before and after the first join of the run named above, it is 31.0 and 31.5 dB
-with 0.5, 31.0 and 32.9 dB with 1."""
-
-MIN_FRAMES = 8
-"""Of a group."""
+LATER_STEPS = 0.5  # training steps of a group that starts where another ended, as a share of those of the first
+MIN_FRAMES = 8  # of a group
 
 
 def split_into_spans(clip: Clip, group_s: float) -> tuple[Span, ...]:
-    """The frames of as few groups as show at most `group_s` seconds each, all about equally many.
+    """Split a clip into as few groups as show at most `group_s` seconds each, all about equally long.
 
     Raises:
-        UsageError: those are too few frames to make a scene of.
+        UsageError: those are too few frames for a group.
     """
     frames = int(group_s * clip.fps + 1e-6)
     if frames < MIN_FRAMES:
@@ -47,14 +40,14 @@ def split_into_spans(clip: Clip, group_s: float) -> tuple[Span, ...]:
     count = -(-clip.frame_count // frames)
     ends = [number * clip.frame_count // count for number in range(count + 1)]
     spans = []
-    for shown_from, shown_to in zip(ends, ends[1:]):
+    for shown_from, shown_to in itertools.pairwise(ends):
         first, last = max(shown_from - OVERLAP, 0), min(shown_to - 1 + OVERLAP, clip.frame_count - 1)
         spans.append(Span(first, last - first + 1))
     return tuple(spans)
 
 
 def options_of_group(options: Options, number: int, spans: Sequence[Span]) -> Options:
-    """What a group gets of a file's size, as much as it has of the frames, and of the time for training: LATER counts there."""
+    """Return the options of one group: its share of the file's size by frames, and of the training time by steps."""
     frames = np.array([span.count for span in spans], float)
     effort = frames * np.where(np.arange(len(spans)), LATER_STEPS, 1.0)
     trade, budget_s = options.trade, options.time_budget_s
@@ -67,11 +60,10 @@ def options_of_group(options: Options, number: int, spans: Sequence[Span]) -> Op
 
 
 def initialise_from(field: Field, before: Scene) -> None:
-    """Let a field begin where a scene of the same layout, but for its rows in time, ended: space planes and decoder as they are
-    there, what changes as it is in its last row, all the time.
+    """Initialise a field from the end of a scene of the same layout, but for its rows in time.
 
-    Of the default scene over 90 frames, in three groups of 800 steps of `fast` each, the second and third have 30.8 and 32.9 dB so,
-    and 26.7 and 29.1 dB begun anew.
+    Space planes and decoder are copied; time planes and motion take the scene's last row at all times. Appearance
+    embeddings are copied where there are as many.
     """
     earlier = Field.from_scene(before)
     with torch.no_grad():
@@ -81,8 +73,6 @@ def initialise_from(field: Field, before: Scene) -> None:
         if field.motion is not None and earlier.motion is not None:
             field.motion[:] = earlier.motion[-1:]
         for name, value in earlier.named_parameters():
-            mine = getattr(field, name)
-            if (
-                name not in ("theta", "motion") and mine.shape == value.shape
-            ):  # codes of other pictures may be more or fewer
-                mine[:] = value
+            own = getattr(field, name)
+            if name not in ("theta", "motion") and own.shape == value.shape:
+                own[:] = value

@@ -1,24 +1,38 @@
-"""What kpenc can be told, and how its command line says it."""
+"""Options of kpenc, and their command line."""
 
 import argparse
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from kpc.encoder.datasets import Dataset
-from kpc.encoder.evaluation.ablations import ABLATIONS
+from kpc.encoder.evaluation.ablations import ABLATIONS, BASELINE
 from kpc.encoder.field.appearances import choose_appearance
-from kpc.encoder.field.config import APPEARANCES, PRESETS, PROGRESSIVE_SCALE_DROPOUT, TrainConfig
+from kpc.encoder.field.config import APPEARANCES, PRESETS, PROGRESSIVE, TrainConfig
 from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, Trade
 from kpc.format.common import cli
 
-CODING = {"source", "output", "max_loss", "target_size", "quality", "lam", "psnr", "tune_steps", "json"}
-"""Options that mean something where nothing is trained."""
+# Options that apply where nothing is trained.
+TRANSCODE_OPTIONS = {
+    "source",
+    "output",
+    "max_loss",
+    "target_size",
+    "quality",
+    "lam",
+    "psnr",
+    "tune_steps",
+    "json",
+}
 
 
 @dataclass(frozen=True)
 class Options:
-    """What one run of kpenc is told; the fields are the command line's options."""
+    """Options of one run of kpenc; the fields are the options of the command line.
+
+    Attributes:
+        ablation: one of `kpc.encoder.evaluation.ablations`; not an option of the command line.
+    """
 
     source: Path
     output: Path
@@ -41,109 +55,141 @@ class Options:
     max_test_pictures: int | None = None
     group_s: float | None = None
     only: int | None = None
-    trade: Trade = Trade()
+    trade: Trade = field(default_factory=Trade)
     keep_checkpoint: Path | None = None
     tune_steps: int | None = None
-    ablation: str = "baseline"
-    """Of `kpc.encoder.evaluation.ablations`; no option of the command line."""
+    ablation: str = BASELINE
 
     @property
     def work_dir(self) -> Path:
         return self.work or self.output.with_name(self.output.name + ".work")
 
     def config(self, dataset: Dataset) -> TrainConfig:
+        """Return the configuration of training on a dataset."""
         config = PRESETS[self.preset]
-        if config.adapts_to_object and dataset.has_alpha and dataset.is_monocular:
-            config = config.for_single_object()
+        if config.adapts and dataset.has_alpha and dataset.one_view_at_a_time:
+            config = config.for_lone_object()
         appearance, _ = self.appearance_of(dataset)
         config = replace(
             config,
             hybrid=self.decoder == "hybrid",
             proposals=self.sampling == "proposals",
             seed=self.seed,
-            scale_dropout=PROGRESSIVE_SCALE_DROPOUT if self.progressive else config.scale_dropout,
+            scale_dropout=PROGRESSIVE if self.progressive else config.scale_dropout,
             steps=self.steps or config.steps,
             tune_steps=config.tune_steps if self.tune_steps is None else self.tune_steps,
             appearance=appearance,
-            view_dependent=config.view_dependent or appearance != "none",
-        )  # codes act through the direction MLP
+            view_dependent=config.view_dependent or appearance != "none",  # embeddings act through the direction MLP
+        )
         return ABLATIONS[self.ablation](config)
 
     def appearance_of(self, dataset: Dataset) -> tuple[str, str]:
-        """What is to have an appearance, as `TrainConfig.appearance`, and why, in words for the log."""
+        """Return what has an appearance embedding (`TrainConfig.appearance`), and the reason, for the log."""
         if self.appearance != "auto":
-            return self.appearance, "as told"
+            return self.appearance, "as given"
         kind, why = choose_appearance(dataset)
         return kind, f"{why}; --appearance overrides"
 
 
 def parse(argv: list[str]) -> tuple[Options, bool, bool]:
-    """The options, whether only to plan (--dry-run), and whether to answer in JSON; argparse exits on anything else."""
+    """Parse a command line; argparse exits where it is wrong.
+
+    Returns:
+        The options, whether only to plan (--dry-run), and whether to print JSON.
+    """
     parser = argparse.ArgumentParser(
         "kpenc",
-        description="A folder of posed videos or images becomes a .kpc file. A finished checkpoint, or a .kpc file, is "
-        "coded anew, without pictures and without training: name it, -o, and one of the trades.",
+        description="Encode a folder of posed videos or images as a .kpc file. Given a finished checkpoint or a .kpc "
+        "file instead, code it anew, without pictures and without training.",
     )
     cli.add_version_option(parser)
     parser.add_argument(
         "source",
         type=Path,
-        help="folder: videos or images, and poses_bounds.npy, transforms*.json or sparse/0; "
+        help="folder with videos or images, and poses_bounds.npy, transforms*.json or sparse/0; "
         "or a finished checkpoint, or a .kpc file",
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="the .kpc file to write")
+    _add_training_options(parser)
+    _add_dataset_options(parser)
+    _add_run_options(parser)
+    _add_coding_options(parser)
+    given = parser.parse_args(_join_box(argv))
+    _check(parser, given)
+    return _options_from(given), given.dry_run, given.json
+
+
+def _add_training_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--preset", choices=sorted(PRESETS), default="balanced", help="how much to spend (default: balanced)"
+        "--preset",
+        choices=sorted(PRESETS),
+        default=Options.preset,
+        help="effort of training and size of the model (default: %(default)s)",
     )
     parser.add_argument(
         "--decoder",
         choices=("explicit", "hybrid"),
-        default="explicit",
-        help="hybrid: two small MLPs for each sample; slower to train and to play (default: explicit)",
+        default=Options.decoder,
+        help="hybrid: two small MLPs per sample; slower to train and to play (default: %(default)s)",
     )
     parser.add_argument(
         "--sampling",
         choices=("grid", "proposals"),
-        default="grid",
-        help="where to look on a ray while training: where an occupancy grid is set, or where two small fields "
-        "say; what is written is marched through the grid either way (default: grid)",
+        default=Options.sampling,
+        help="where to place samples on rays while training: in the cells of an occupancy grid, or by two small "
+        "proposal fields; players use the occupancy grid either way (default: %(default)s)",
     )
     parser.add_argument(
         "--progressive",
         action="store_true",
-        help="train the coarse scales to make a picture alone, for scenes that are seen while they arrive; costs "
-        "some 0.4 dB of the whole",
+        help="train the coarse scales to make a picture of their own, for scenes that are shown while they are "
+        "downloaded; costs about 0.4 dB of the whole",
     )
-    parser.add_argument("--steps", type=_positive, help="optimiser steps instead of the preset's")
+    steps = ", ".join(f"{name} {config.steps:,}" for name, config in sorted(PRESETS.items()))
+    parser.add_argument("--steps", type=_positive, help=f"optimiser steps (default, by preset: {steps})")
     parser.add_argument(
         "--time-budget", type=cli.duration_s, metavar="10m", help="train for so long instead of a number of steps"
     )
-    parser.add_argument("--seed", type=_seed, default=0, help="of everything random (default: 0)")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--seed", type=_seed, default=Options.seed, help="of all random numbers (default: %(default)s)")
     parser.add_argument(
-        "--downscale", type=_positive, default=1, help="average blocks of N x N pixels first (default: 1)"
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        default=Options.device,
+        help="where to train; auto: on a GPU if there is one (default: %(default)s)",
+    )
+
+
+def _add_dataset_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--downscale",
+        type=_positive,
+        default=Options.downscale,
+        help="average blocks of N x N pixels first (default: %(default)s)",
     )
     parser.add_argument("--holdout", metavar="NAME", help="camera or file to test on, or 'none'")
     parser.add_argument(
         "--space",
         choices=("auto", "box", "contracted", "ndc"),
-        default="auto",
+        default=Options.space,
         help="box: nothing lies outside it; contracted: the surroundings are held, too; ndc: device coordinates, "
-        "for cameras that face one way (default: auto)",
+        "for cameras that face one way (default: %(default)s)",
     )
     parser.add_argument(
         "--box",
         type=cli.box_corners,
         metavar="x0,y0,z0,x1,y1,z1",
-        help="corners of the scene, or of its undistorted part, taken as they are, instead of those found",
+        help="corners of the scene, or of its part that is not contracted, instead of those found",
     )
     parser.add_argument(
         "--appearance",
         choices=("auto", *APPEARANCES),
-        default="auto",
-        help="learn beside the scene how each camera, or each image, shows its colours: unequal exposure, white "
-        "balance, weather (default: auto, image for photographs by many lenses, else none)",
+        default=Options.appearance,
+        help="learn an appearance embedding for each camera or each image: unequal exposure, white balance, weather; "
+        "auto: image for photographs by many lenses, else none (default: %(default)s)",
     )
+
+
+def _add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--work", type=Path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)")
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
@@ -152,21 +198,28 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
         "--keep-checkpoint",
         type=Path,
         metavar="MODEL.kpck",
-        help="write the finished checkpoint there, too: all that coding anew takes",
+        help="also write the finished checkpoint there; kpenc codes it anew without training",
     )
     parser.add_argument(
         "--group",
         type=cli.duration_s,
         metavar="10s",
         help="code a long clip in groups that show at most so long each, one after the other: encoding and playing "
-        "take the memory of one; steps are those of the first group",
+        "take the memory of one; --steps are those of the first group",
     )
     parser.add_argument(
         "--only",
-        type=_number,
+        type=_non_negative,
         metavar="N",
-        help="of --group: code group N alone, from 0 on; kpjoin makes a clip of them",
+        help="with --group: code only group N, counted from 0; kpjoin joins groups to a clip",
     )
+    parser.add_argument(
+        "--dry-run", action="store_true", help="only print what would be done, and how much time and memory it takes"
+    )
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
+
+
+def _add_coding_options(parser: argparse.ArgumentParser) -> None:
     trade = parser.add_mutually_exclusive_group()
     trade.add_argument(
         "--max-loss",
@@ -185,67 +238,68 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
         "--lam",
         type=_lam,
         metavar="LAM",
-        help="the file of least D + LAM R: D the mean squared difference from the uncoded pictures, in squares of "
-        "8-bit levels, R bits per parameter",
+        help="the file of least Lagrangian cost D + LAM R: D the mean squared difference from the uncoded pictures on "
+        "the 8-bit scale, R the bits per parameter",
     )
     trade.add_argument(
         "--psnr",
         type=cli.decibels,
         metavar="30dB",
-        help="the smallest file that has at least this PSNR on training views: what is simple takes less",
+        help="the smallest file of at least this PSNR on training views",
     )
+    tune_steps = ", ".join(f"{name} {config.tune_steps}" for name, config in sorted(PRESETS.items()))
     parser.add_argument(
         "--tune-steps",
-        type=_number,
+        type=_non_negative,
         metavar="N",
-        help="training steps that a group of planes gets to make up for the errors of those that are coded: files "
-        "are a tenth smaller with 100, and take a minute or two longer (default: 0 for draft, else 100); "
-        "fewer after short training",
+        help="steps of fine-tuning after each group of planes is coded, in which the others learn to compensate its "
+        "errors: files are about a tenth smaller, and take a minute or two longer (default, by preset: "
+        f"{tune_steps}; {TrainConfig().tune_steps} where nothing is trained; fewer after short training)",
     )
-    parser.add_argument(
-        "--dry-run", action="store_true", help="only say what would be done, how long it would take and how much memory"
-    )
-    parser.add_argument("--json", action="store_true", help="print the results as JSON")
-    a = parser.parse_args(_box_joined(argv))
-    if a.source.is_file():
-        for name, value in vars(a).items():
-            if name not in CODING and value != parser.get_default(name):
+
+
+def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    if given.source.is_file():
+        for name, value in vars(given).items():
+            if name not in TRANSCODE_OPTIONS and value != parser.get_default(name):
                 parser.error(
-                    f"--{name.replace('_', '-')}: {a.source} is trained already, it can only be coded anew; drop it"
+                    f"--{name.replace('_', '-')}: {given.source} is trained already and can only be coded anew; drop it"
                 )
-    options = Options(
-        a.source,
-        a.output,
-        a.preset,
-        a.decoder,
-        a.sampling,
-        a.progressive,
-        a.steps,
-        a.time_budget,
-        a.seed,
-        a.device,
-        a.downscale,
-        a.holdout,
-        a.space,
-        a.box,
-        a.appearance,
-        a.work,
-        a.keep,
-        a.resume,
-        a.test_views,
-        a.group,
-        a.only,
-        Trade(a.max_loss, a.target_size, a.quality, a.lam, a.psnr),
-        a.keep_checkpoint,
-        a.tune_steps,
-    )
-    if a.only is not None and a.group is None:
-        parser.error("--only names a group; say how long they are with --group 10s")
-    if a.keep_checkpoint is not None and a.group is not None and a.only is None:
+    if given.only is not None and given.group is None:
+        parser.error("--only names a group; give the length of groups with --group 10s")
+    if given.keep_checkpoint is not None and given.group is not None and given.only is None:
         parser.error("--keep-checkpoint holds a single scene; with --group give --only N, too")
-    if a.dry_run and a.resume:
-        parser.error("--dry-run tells what a whole run takes; drop --resume")
-    return options, a.dry_run, a.json
+    if given.dry_run and given.resume:
+        parser.error("--dry-run estimates a whole run; drop --resume")
+
+
+def _options_from(given: argparse.Namespace) -> Options:
+    return Options(
+        source=given.source,
+        output=given.output,
+        preset=given.preset,
+        decoder=given.decoder,
+        sampling=given.sampling,
+        progressive=given.progressive,
+        steps=given.steps,
+        time_budget_s=given.time_budget,
+        seed=given.seed,
+        device=given.device,
+        downscale=given.downscale,
+        holdout=given.holdout,
+        space=given.space,
+        box=given.box,
+        appearance=given.appearance,
+        work=given.work,
+        keep=given.keep,
+        resume=given.resume,
+        max_test_pictures=given.test_views,
+        group_s=given.group,
+        only=given.only,
+        trade=Trade(given.max_loss, given.target_size, given.quality, given.lam, given.psnr),
+        keep_checkpoint=given.keep_checkpoint,
+        tune_steps=given.tune_steps,
+    )
 
 
 def _positive(text: str) -> int:
@@ -255,7 +309,7 @@ def _positive(text: str) -> int:
     return value
 
 
-def _number(text: str) -> int:
+def _non_negative(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 on")
     return int(text)
@@ -286,8 +340,8 @@ def _seed(text: str) -> int:
     return value
 
 
-def _box_joined(argv: list[str]) -> list[str]:
-    """`--box -1,...` as `--box=-1,...`: argparse would take a value that starts with a minus for an option."""
+def _join_box(argv: list[str]) -> list[str]:
+    """Turn `--box -1,...` into `--box=-1,...`, since argparse takes a value that starts with a minus for an option."""
     joined: list[str] = []
     for word in argv:
         if joined and joined[-1] == "--box":

@@ -1,4 +1,4 @@
-"""A finished checkpoint, or a .kpc file, coded anew: no pictures, no training."""
+"""Coding a finished checkpoint or a .kpc file anew, without pictures and without training."""
 
 import os
 import time
@@ -16,23 +16,29 @@ from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.container import groups, scene_io
 from kpc.format.container.container import MAGIC
 
-JUDGED_BY = ("training views", "views of its own, taken to be right to 30 dB")
-"""What losses are measured on: those of a checkpoint, and those of a file."""
+# What losses are measured on, of a checkpoint and of a .kpc file.
+JUDGED_BY = ("training views", "views of its own, assumed to be right to 30 dB")
 
 
 def transcode(options: Options) -> dict[str, Any]:
-    """Write the .kpc file that `options.trade` asks for; what came of it, as a dictionary that JSON can hold.
+    """Code the source anew so that it meets `options.trade`, and write the file.
+
+    Returns:
+        What was measured, as a dictionary that JSON can hold.
 
     Raises:
-        UsageError, TrainingError, FormatError: the source cannot be used (`kpc.encoder.rdo.codec_model.load`), or takes more than it may.
+        UsageError, TrainingError, FormatError: the source cannot be used (`kpc.encoder.rdo.codec_model.load`), or the
+            target is too small.
     """
     started = time.monotonic()
     check_outputs(options)
     is_coded = codec_model.starts_with(options.source, MAGIC)
     if is_coded and options.trade.psnr_db is not None:
-        raise UsageError(f"--psnr: {options.source} does not know what was filmed; give its checkpoint, or --quality")
+        raise UsageError(
+            f"--psnr: {options.source} holds no filmed pictures to compare with; give its checkpoint, or --quality"
+        )
     if is_coded and not (clip := groups.Groups(options.source)).is_single:
-        return _recode_groups(options, clip) | {"encode_s": time.monotonic() - started}
+        return _transcode_groups(options, clip) | {"encode_s": time.monotonic() - started}
     source = codec_model.load(options.source)
     coded = codec_model.code(source, options.trade, TrainConfig().prune_share, _tune_steps(options), shown=True)
     size = scene_io.save(coded.data, options.output)
@@ -47,8 +53,8 @@ def _tune_steps(options: Options) -> int:
     return TrainConfig().tune_steps if options.tune_steps is None else options.tune_steps
 
 
-def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
-    """Each group by itself; the coded ones are in memory together."""
+def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
+    """Code each group on its own. All coded groups are in memory together."""
     spans, parts, found = source.timeline.spans, [], []
     for number, span in enumerate(spans):
         trade = options_of_group(options, number, spans).trade
@@ -70,7 +76,7 @@ def _recode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
 def combine_figures(
     found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size: int, trade: Trade
 ) -> dict[str, Any]:
-    """`coding_figures` of a clip whose groups have those found: sums, and means over frames."""
+    """Combine the `coding_figures` of groups: sums, and means over frames."""
     frames, parameters = [span.count for span in spans], sum(one["parameters"] for one in found)
     means = {}
     for key in ("validation_psnr", "validation_loss_db", "agreement_db", "identity_share"):
@@ -78,13 +84,18 @@ def combine_figures(
         means[key] = sum(value * count for value, count in known) / sum(count for _, count in known) if known else None
     name, value = trade.bound
     return {
-        "trade": name, "asked": value, "judged_by": found[0]["judged_by"], **means, "size_bytes": size, "parameters": parameters,
+        "trade": name,
+        "asked": value,
+        "judged_by": found[0]["judged_by"],
+        **means,
+        "size_bytes": size,
+        "parameters": parameters,
         "bits_per_parameter": 8 * size / parameters,
-    }  # fmt: skip
+    }
 
 
 def coding_figures(coded: codec_model.CodedModel, size: int, trade: Trade, judged_by: str) -> dict[str, Any]:
-    """What is said of every file that is written."""
+    """Return the figures that are reported for every file."""
     name, value = trade.bound
     return {
         "trade": name,
@@ -101,27 +112,36 @@ def coding_figures(coded: codec_model.CodedModel, size: int, trade: Trade, judge
 
 
 def describe_outcome(result: dict[str, Any]) -> str:
-    """In words, what was asked for and what that gave."""
+    """Describe the target, and what was reached, in words."""
     name, asked = result["trade"], result["asked"]
-    said = {"max_loss_db": f"at most {asked:g} dB of loss", "target_bytes": f"at most {asked:,.0f} bytes",
-            "quality": f"quality {asked:g}", "lam": f"lam {asked:g}", "psnr_db": f"at least {asked:g} dB"}[name]  # fmt: skip
-    lost = f"{result['validation_loss_db']:.3f} dB of loss on {result['judged_by']}"
-    at = f"{result['validation_psnr']:.2f} dB, " if name == "psnr_db" else ""
+    target = {
+        "max_loss_db": f"at most {asked:g} dB of loss",
+        "target_bytes": f"at most {asked:,.0f} bytes",
+        "quality": f"quality {asked:g}",
+        "lam": f"lam {asked:g}",
+        "psnr_db": f"at least {asked:g} dB",
+    }[name]
+    loss = f"{result['validation_loss_db']:.3f} dB of loss on {result['judged_by']}"
+    psnr = f"{result['validation_psnr']:.2f} dB, " if name == "psnr_db" else ""
     return (
-        f"asked for {said}; reached {result['size_bytes']:,} bytes, {at}{lost}, "
+        f"asked for {target}; reached {result['size_bytes']:,} bytes, {psnr}{loss}, "
         f"{result['agreement_db']:.1f} dB against the uncoded pictures"
     )
 
 
 def check_outputs(options: Options) -> None:
-    """Find out before hours of training whether the files can be written after them."""
+    """Check before training, which may take hours, that the output files can be written.
+
+    Raises:
+        UsageError, TrainingError: one cannot.
+    """
     if options.output.exists() and options.source.is_file() and options.output.samefile(options.source):
-        raise UsageError(f"{options.output}: is what is to be coded; write elsewhere with -o")
+        raise UsageError(f"{options.output}: is the source, too; write elsewhere with -o")
     for output in filter(None, (options.output, options.keep_checkpoint)):
-        _check_place(output)
+        _check_writable(output)
 
 
-def _check_place(output: Path) -> None:
+def _check_writable(output: Path) -> None:
     if output.is_dir():
         raise UsageError(f"{output}: is a folder; name a file such as {output / 'scene.kpc'}")
     if not output.parent.is_dir():

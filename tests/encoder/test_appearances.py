@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gradients import random_rays, translucent_scene
-from kpc.encoder.cli import kpenc
+from kpc.encoder.cli import encode_scene
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim
 from kpc.encoder.evaluation.validation_rays import ValidationRays
@@ -231,7 +231,10 @@ def test_codes_come_back_from_the_file(with_codes: Trainer) -> None:
 
 def test_held_out_right_halves_gain(unequal: Dataset, with_codes: Trainer) -> None:
     """Measured: 18.5 dB without, 24.8 dB with; and 18.9 and 24.7 dB with another seed."""
-    without, quality = SceneRenderer(kpenc.to_scene(trained(unequal))), evaluate(kpenc.to_scene(with_codes), unequal)
+    without, quality = (
+        SceneRenderer(encode_scene.to_scene(trained(unequal))),
+        evaluate(encode_scene.to_scene(with_codes), unequal),
+    )
     numbers = np.flatnonzero(unequal.pictures.is_test)
     plain = np.mean(
         [psnr(np.clip(without.picture(unequal, n, 16), 0, 1), ground_truth(unequal, n)[:, 16:]) for n in numbers]
@@ -292,7 +295,7 @@ def test_a_fitted_code_shows_what_it_was_fitted_to(contracted: bool, decoder: st
 
 
 def test_codings_are_judged_with_the_codes_of_the_rays(with_codes: Trainer) -> None:
-    scene = kpenc.to_scene(with_codes)
+    scene = encode_scene.to_scene(with_codes)
     measure = ValidationRays.from_training_views(with_codes.sampler, with_codes.background).measure(scene)
     turned = tuple(
         replace(a, code=b.code) for a, b in zip(scene.appearances, scene.appearances[1:] + scene.appearances[:1])

@@ -44,7 +44,7 @@ def test_it_extrapolates_from_the_steps_it_watched(moving: Dataset, monkeypatch:
         inner(*args, interrupted=ticking)  # type: ignore[arg-type]
 
     monkeypatch.setattr(run, "run", slow)
-    found = module.estimate(run, probe_rays=100, tested=3, spent_s=2.0, time_budget_s=None)
+    found = module.estimate(run, validation_rays=100, test_pictures=3, spent_s=2.0, time_budget_s=None)
     assert run.step == watched
     assert found.train_s == pytest.approx(5 + 3 * watched // 2 + 1.0 * (CONFIG.steps - watched // 2), abs=3)
     assert 2 < found.rest_s < 60 and found.memory_bytes > 16 * run.field.theta.numel()
@@ -55,8 +55,8 @@ def test_tuning_is_counted(moving: Dataset) -> None:
     found = []
     for tune_steps in (0, 100):
         run = Trainer(moving, replace(CONFIG, steps=1250, tune_steps=tune_steps), BOX, "cpu")
-        found.append(module.estimate(run, probe_rays=100, tested=0, spent_s=0.0, time_budget_s=None).rest_s)
-    trained = module.TUNED * 2.5 * 100 * module.RAYS / run.rays_per_second
+        found.append(module.estimate(run, validation_rays=100, test_pictures=0, spent_s=0.0, time_budget_s=None).rest_s)
+    trained = module.TUNED_CODINGS * 2.5 * 100 * module.RAYS / run.rays_per_second
     assert found[1] - found[0] == pytest.approx(trained, rel=0.5)
 
 
@@ -76,7 +76,7 @@ def test_steps_with_the_coarsest_scale_alone_are_counted_apart(
         inner(*args, interrupted=ticking)  # type: ignore[arg-type]
 
     monkeypatch.setattr(run, "run", slow)
-    found = module.estimate(run, probe_rays=100, tested=0, spent_s=0.0, time_budget_s=None)
+    found = module.estimate(run, validation_rays=100, test_pictures=0, spent_s=0.0, time_budget_s=None)
     assert run.step > watched and found.train_s == pytest.approx(0.3 * 400 * 1.0 + 0.7 * 400 * 4.0, rel=0.03)
 
 

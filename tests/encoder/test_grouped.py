@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from kpc.encoder.cli import kpenc
+from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
 from kpc.encoder.cli.estimate import Estimate
 from kpc.encoder.cli.grouped import LATER_STEPS, OVERLAP, initialise_from, options_of_group, split_into_spans
 from kpc.encoder.cli.options import Options
@@ -111,9 +112,9 @@ def test_a_field_begins_as_the_last_row_of_another():
 def test_what_goes_on_begins_with_all_scales(tmp_path):
     make.write_blender(tmp_path / "set")
     options = Options(tmp_path / "set", tmp_path / "out.kpc", preset="draft", box=((-1, -1, -1), (1, 1, 1)))
-    setting = kpenc._setting(options)
-    first = kpenc._trainer(options, setting)
-    later = kpenc._trainer(options, replace(setting, before=first.scene()))
+    setting = prepare_setting(options)
+    first = prepare_trainer(options, setting)
+    later = prepare_trainer(options, replace(setting, before=first.scene()))
     assert first.config.coarse_until > 0 and later.config == replace(first.config, coarse_until=0.0)
     assert torch.equal(later.field.density, first.field.density)
 
@@ -209,7 +210,7 @@ def test_an_interrupted_run_goes_on_at_its_group_to_the_same_file(videos, tmp_pa
     assert encode(videos, output, "--resume", "--seed", "5") == 1 and "other settings" in capsys.readouterr().err
     assert encode(videos, output, "--resume") == 0
     err = capsys.readouterr().err
-    assert "group-0000.kpc: is there already" in err and "resumed at step 4" in err
+    assert "group-0000.kpc: is finished already" in err and "resumed at step 4" in err
     assert output.read_bytes() == (tmp_path / "whole.kpc").read_bytes()
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from kpc.encoder.cli import kpenc
+from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.datasets import pixel_cache
 from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.training.train import Trainer
@@ -157,8 +158,8 @@ def test_the_hybrid_decoder(run: Kpenc, sets: Path, tmp_path: Path, name: str) -
 
 def test_what_is_printed(run: Kpenc, sets: Path) -> None:
     code, out, err = run(sets / "blender")
-    assert code == 0 and "read where a motion grid of 11x11x11 nodes leads" in err
-    assert "colour: the same from all sides, as trained; channels: " in err
+    assert code == 0 and "displaced by a motion grid of 11x11x11 nodes" in err
+    assert "colour: view-independent, as trained; channels per scale: " in err
     assert "time: 2 rows, one for 4 of 5 frames (the preset's" in err
     assert all(
         words in out
@@ -221,7 +222,7 @@ def test_options(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     assert (result["steps"], result["seed"], result["device"]) == (9, 3, "cpu")
     assert result["box"] == [[-1, -1, -0.5], [1, 1, 0.5]]
     assert "16x12" in err and "0 held out" in err
-    assert (tmp_path / "w" / kpenc.CHECKPOINT).is_file() and any((tmp_path / "w").glob("pixels-*.bin"))
+    assert (tmp_path / "w" / CHECKPOINT).is_file() and any((tmp_path / "w").glob("pixels-*.bin"))
     code, out, _ = run(sets / "n3dv", "--holdout", "cam02", "--test-views", "2", "--steps", "1")
     assert code == 0 and "over 2 pictures" in out
     code, out, _ = run(sets / "n3dv", "--holdout", "none", "--steps", "1")
@@ -257,7 +258,7 @@ def test_what_is_left_out_is_said_and_missing_from_the_file(
     counts = [scale["xy"].symbols.shape[2] for scale in scene.scales]
     assert code == 0 and json.loads(out)["coding_loss_db"] <= 1
     assert (
-        ("colour: the same from all sides, direction is worth" in err)
+        ("colour: view-independent, view dependence would gain" in err)
         == (share > 0)
         == (scene.decoder.w1.shape == (1, 9))
     )
@@ -361,8 +362,8 @@ def test_resume_with_other_settings(run: Kpenc, sets: Path, tmp_path: Path) -> N
     kept = (tmp_path / "out.kpc").read_bytes()
     for options, words in ((("--seed", "7"), "other settings"), (("--holdout", "none"), "other pictures")):
         code, _, err = run(sets / "n3dv", "--steps", "3", "--resume", "--box", "-1,-1,-1,1,1,1", *options)
-        assert code == 1 and words in err.splitlines()[-1] and kpenc.CHECKPOINT in err
-    (tmp_path / "out.kpc.work" / kpenc.CHECKPOINT).write_bytes(b"damaged")
+        assert code == 1 and words in err.splitlines()[-1] and CHECKPOINT in err
+    (tmp_path / "out.kpc.work" / CHECKPOINT).write_bytes(b"damaged")
     code, _, err = run(sets / "n3dv", "--steps", "3", "--resume")
     assert code == 1 and "delete it" in err and "Traceback" not in err
     assert (tmp_path / "out.kpc").read_bytes() == kept
@@ -376,7 +377,7 @@ def test_a_killed_process_resumes(sets: Path, tmp_path: Path, run: Kpenc) -> Non
         "import functools; from kpc.encoder.training.train import Trainer\n"
         "Trainer.run = functools.partialmethod(Trainer.run, checkpoint_every_s=0.2)",
     )
-    checkpoint = tmp_path / "out.kpc.work" / kpenc.CHECKPOINT
+    checkpoint = tmp_path / "out.kpc.work" / CHECKPOINT
     deadline = time.monotonic() + 60
     while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -487,7 +488,7 @@ def test_space_is_chosen_said_and_overridden(run: Kpenc, sets: Path, tmp_path: P
     assert result["space"] == found and (scene.mapping is not None) == (found == "contracted")
     assert ("all around it" in err) == (found == "contracted")
     assert ("space: contracted beyond" if found == "contracted" else "space: a box") in err
-    assert ("nothing bounds what the cameras see" if space == "auto" else "as told") in err
+    assert ("nothing bounds what the cameras see" if space == "auto" else "as given") in err
 
 
 @pytest.mark.parametrize("name, why", [("n3dv", "near and far are known"), ("blender", "have alpha")])
@@ -503,7 +504,7 @@ def test_appearances_are_chosen_said_and_overridden(
     run: Kpenc, sets: Path, tmp_path: Path, asked: str, names: str
 ) -> None:
     code, out, err = run(sets / "unequal", "--appearance", asked, "--steps", "60", "--test-views", "1")
-    assert code == 0 and ("28 of 28 pictures have a lens" if asked == "auto" else "as told") in err
+    assert code == 0 and ("28 of 28 pictures have a lens" if asked == "auto" else "as given") in err
     assert ("appearance: none" if names == "none" else f"appearance: a code for each {names} (") in err
     assert ("right halves, each in an appearance fitted to its left half" in out) == (names != "none")
     scene = scene_io.read(tmp_path / "out.kpc")
@@ -519,7 +520,7 @@ def test_appearances_in_numbers_and_in_the_plan(run: Kpenc, sets: Path) -> None:
     assert code == 0 and (result["appearance"], result["appearances"], result["test_pictures"]) == ("image", 28, 1)
     assert 5 < result["test_psnr"] < 60
     code, out, err = run(sets / "unequal", "--dry-run", "--json")
-    assert code == 0 and "appearance: a code for each image" in err and json.loads(out)["rest_s"] > 0
+    assert code == 0 and "appearance: an embedding for each image" in err and json.loads(out)["rest_s"] > 0
     code, out, err = run(sets / "n3dv", "--json", "--steps", "2")
     assert code == 0 and json.loads(out)["appearance"] == "none" and "appearance: none (a clip, filmed as one" in err
     code, out, err = run(sets / "n3dv", "--json", "--steps", "2", "--holdout", "none", "--appearance", "camera")
@@ -553,7 +554,7 @@ def test_device_coordinates_for_cameras_that_face_one_way(run: Kpenc, sets: Path
     code, out, err = run(sets / "n3dv", "--json", "--space", "ndc")
     scene = scene_io.read(tmp_path / "out.kpc")
     assert code == 0 and json.loads(out)["space"] == "ndc" and isinstance(scene.mapping, DeviceCoordinates)
-    assert "space: device coordinates of a rig that faces one way (as told)" in err and "baseline" in err
+    assert "space: device coordinates of a rig that faces one way (as given)" in err and "baseline" in err
     assert scene.aabb[1, 2] < scene.mapping.baseline / scene.mapping.near
     # The sphere at the origin is within, and what is seen of it lies about there.
     assert (scene.dequantise().bounds[0] < 0).all() and (scene.dequantise().bounds[1] > 0).all()
@@ -661,7 +662,7 @@ def test_disk_full_at_a_checkpoint(run: Kpenc, sets: Path, tmp_path: Path, monke
 
     monkeypatch.setattr(torch, "save", full)
     code, _, err = run(sets / "n3dv", "--steps", "2")
-    said = [line for line in err.splitlines() if kpenc.CHECKPOINT in line]
+    said = [line for line in err.splitlines() if CHECKPOINT in line]
     assert code == 0 and len(said) == 1 and "free space" in said[0] and "Traceback" not in err
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
 
@@ -676,7 +677,7 @@ def test_disk_full_as_an_interrupted_run_saves(
     _signal_at_step(monkeypatch, 3, signal.SIGINT)
     code, _, err = run(sets / "n3dv")
     last = err.splitlines()[-1]
-    assert code == 1 and kpenc.CHECKPOINT in last and "No space left" in last and "free space" in last
+    assert code == 1 and CHECKPOINT in last and "No space left" in last and "free space" in last
 
 
 def test_disk_full_as_the_file_is_written(

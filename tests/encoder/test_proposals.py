@@ -4,7 +4,7 @@ import datasets as make
 import numpy as np
 import pytest
 import torch
-from kpc.encoder.cli import kpenc
+from kpc.encoder.cli import encode_scene
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import evaluate
 from kpc.encoder.field.config import TrainConfig
@@ -96,7 +96,7 @@ def surrounded(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def test_training_learns_a_scene_and_where_to_look(surrounded: Dataset) -> None:
     mapping = Contraction(4.0)
     run = Trainer(surrounded, CONFIG, BOX, "cpu", mapping=mapping)
-    before, reports = evaluate(kpenc.to_scene(run), surrounded), []
+    before, reports = evaluate(encode_scene.to_scene(run), surrounded), []
     batch, _ = run.sampler.draw(np.random.default_rng(5), 512, run.background)
 
     def found() -> float:
@@ -111,7 +111,7 @@ def test_training_learns_a_scene_and_where_to_look(surrounded: Dataset) -> None:
 
     spread = found()
     run.run(reports.append)
-    after = evaluate(kpenc.to_scene(run), surrounded)
+    after = evaluate(encode_scene.to_scene(run), surrounded)
     assert before is not None and after is not None and after.psnr > before.psnr + 4, (before, after)
     assert found() < 0.5 * spread
     assert run.grid.occupied.mean() < 0.9  # the grid that the file gets has formed meanwhile

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 import torch
-from kpc.encoder.cli.kpenc import to_scene
+from kpc.encoder.cli.encode_scene import to_scene
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import evaluate
 from kpc.encoder.field.bounds import find_box, fit_contraction

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from kpc.encoder.cli import kpenc
+from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import ASSUMED_MSE, ValidationRays, orbit_cameras
 from kpc.encoder.field.config import PRESETS, TrainConfig
@@ -122,7 +123,7 @@ def test_a_checkpoint_of_a_run_is_told_from_a_finished_one(
     monkeypatch.setitem(PRESETS, "draft", TINY)
     make.write_n3dv(tmp_path / "set", cameras=4)
     kpenc_says(tmp_path / "set", tmp_path / "out.kpc", "--preset", "draft", "--keep", "--steps", "2")
-    said = refused(tmp_path / "out.kpc.work" / kpenc.CHECKPOINT)
+    said = refused(tmp_path / "out.kpc.work" / CHECKPOINT)
     assert "no finished checkpoint" in said and "--keep-checkpoint" in said
 
 
@@ -258,7 +259,7 @@ def test_options_of_training_mean_nothing_here(
 def test_a_source_is_never_overwritten(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = scene_file.read_bytes()
     assert kpenc.main([str(scene_file), "-o", str(scene_file), "--quality", "10"]) == 2
-    assert "is what is to be coded" in capsys.readouterr().err and scene_file.read_bytes() == before
+    assert "is the source, too" in capsys.readouterr().err and scene_file.read_bytes() == before
 
 
 def test_what_is_printed(scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

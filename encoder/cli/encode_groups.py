@@ -1,0 +1,163 @@
+"""Encode a long clip in groups: each as a scene, one after the other, and all of them as one file.
+
+Finished groups are kept in the work folder, with what was measured of them, so that an interrupted encode can be
+resumed.
+"""
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from kpc.encoder.cli.encode_scene import encode_scene
+from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group, split_into_spans
+from kpc.encoder.cli.options import Options
+from kpc.encoder.cli.prepare import Setting, prepare_setting, trim_with_progress
+from kpc.encoder.cli.report import log
+from kpc.encoder.cli.transcode import combine_figures
+from kpc.encoder.cli.work_folder import clear_work_folder
+from kpc.encoder.rdo.codec_model import load_checkpoint
+from kpc.format.common import cli
+from kpc.format.common.errors import TrainingError, UsageError
+from kpc.format.container import groups, scene_io
+from kpc.format.scene.space import Contraction
+
+# Figures that are reported for each group.
+GROUP_FIGURES = ("size_bytes", "test_psnr", "steps", "train_s", "peak_memory_bytes")
+
+
+def encode_groups(options: Options) -> dict[str, Any]:
+    """Encode all groups of a clip, or the one that `options.only` names; return what was measured."""
+    started = time.monotonic()
+    setting = prepare_setting(options)
+    work, spans = options.work_dir, split_into_spans(setting.dataset.clip, float(options.group_s or 0))
+    numbers = range(len(spans)) if options.only is None else [options.only]
+    if numbers[-1] >= len(spans):
+        raise UsageError(f"--only {numbers[-1]}: the clip has {len(spans)} groups, numbered from 0")
+    first = group_path(work, numbers[0])
+    if options.resume and first.with_suffix(".json").exists():
+        setting = replace(setting, aabb=scene_io.SceneReader(first).head.aabb, is_final=True)
+    elif not setting.is_final:
+        setting = _trim_for_groups(setting, options, spans)
+    found: list[dict[str, Any]] = []
+    for number in numbers:
+        span, path = spans[number], group_path(work, number)
+        log(f"group {number} of {len(spans)}: frames {span.start} to {span.last}")
+        group_options = replace(
+            options_of_group(options, number, spans),
+            output=path,
+            work=path.with_suffix(""),
+            keep_checkpoint=options.keep_checkpoint or path.with_suffix(".kpck"),
+        )
+        if options.resume and path.with_suffix(".json").exists():
+            found.append(_read_finished(path, group_options))
+        else:
+            before = None if number == numbers[0] else group_path(work, number - 1).with_suffix(".kpck")
+            found.append(_encode_group(group_options, setting_of_span(setting, span), before))
+    size = _join([groups.GroupInput.of(group_path(work, number), spans[number].start) for number in numbers], options)
+    if not options.keep:
+        clear_work_folder(work)
+    return _combine(found, [spans[number] for number in numbers], size, options) | {
+        "encode_s": time.monotonic() - started
+    }
+
+
+def group_path(work: Path, number: int) -> Path:
+    """Return the path of a finished group in the work folder."""
+    return work / f"group-{number:04d}.kpc"
+
+
+def setting_of_span(setting: Setting, span: groups.Span) -> Setting:
+    """Return the setting for the frames of one group."""
+    return replace(setting, dataset=setting.dataset.frame_range(span.start, span.last))
+
+
+def _trim_for_groups(setting: Setting, options: Options, spans: Sequence[groups.Span]) -> Setting:
+    """Trim the box that all groups share, on no more frames than one group has."""
+    dataset = setting.dataset.subsample_frames(max(span.count for span in spans))
+    budget_s = options_of_group(options, 0, spans).time_budget_s
+    assert not isinstance(setting.mapping, Contraction)
+    aabb, _ = trim_with_progress(dataset, options.config(dataset), setting.aabb, budget_s, setting.mapping)
+    return replace(setting, aabb=aabb, is_final=True)
+
+
+def _encode_group(options: Options, setting: Setting, before: Path | None) -> dict[str, Any]:
+    """Encode a group, starting from the checkpoint of the one before, and write what was measured beside its file.
+
+    A group counts as finished when that file exists.
+    """
+    if before is None:
+        found = encode_scene(options, setting)
+    else:
+        log(f"it starts where the one before ended, and takes {LATER_STEPS:.0%} of its steps")
+        shorter = replace(options, steps=math.ceil(LATER_STEPS * options.config(setting.dataset).steps))
+        found = encode_scene(shorter, replace(setting, before=load_checkpoint(before).scene))
+    with cli.atomic_write(options.output.with_suffix(".json")) as temporary:
+        temporary.write_text(json.dumps({"options": _fingerprint(options), "found": found}))
+    if before is not None:
+        before.unlink()
+    return found
+
+
+def _read_finished(path: Path, options: Options) -> dict[str, Any]:
+    """Return what was measured of a finished group.
+
+    Raises:
+        TrainingError: it was encoded with other options, or its figures cannot be read.
+    """
+    try:
+        kept = json.loads(path.with_suffix(".json").read_text())
+        if kept["options"] != _fingerprint(options):
+            raise TrainingError(f"{path}: belongs to a run with other settings; give the same ones or drop --resume")
+        found: dict[str, Any] = kept["found"]
+    except (OSError, ValueError, KeyError) as error:
+        raise TrainingError(f"{path}: its figures cannot be read; delete it to have the group encoded anew") from error
+    log(f"{path}: is finished already")
+    return found
+
+
+def _fingerprint(options: Options) -> str:
+    """Return all options that the result depends on, as text."""
+    return repr(replace(options, resume=False, keep=False))
+
+
+def _join(parts: Sequence[groups.GroupInput], options: Options) -> int:
+    try:
+        return groups.write(parts, options.output)
+    except OSError as error:
+        kept = f"or give another -o with --work {options.work_dir} --resume to keep what is done"
+        raise TrainingError(f"{options.output}: {error.strerror}; make room there, {kept}") from error
+
+
+def _combine(
+    found: Sequence[dict[str, Any]], spans: Sequence[groups.Span], size: int, options: Options
+) -> dict[str, Any]:
+    """Combine the figures of all groups: sums, means over frames or pictures, and those of each group."""
+
+    def mean(name: str, weights: Sequence[float]) -> float | None:
+        values = [one[name] for one in found]
+        return None if None in values or not sum(weights) else float(np.average(values, weights=weights))
+
+    pictures = [one["test_pictures"] for one in found]
+    return (
+        found[0]
+        | combine_figures(found, spans, size, options.trade)
+        | {
+            "file": str(options.output),
+            "test_psnr": mean("test_psnr", pictures),
+            "test_ssim": mean("test_ssim", pictures),
+            "test_pictures": sum(pictures),
+            "coding_loss_db": mean("coding_loss_db", [span.count for span in spans]),
+            **{key: sum(one[key] for one in found) for key in ("steps", "train_s")},
+            "rays_per_s": mean("rays_per_s", [one["train_s"] for one in found]),
+            "peak_memory_bytes": found[-1]["peak_memory_bytes"],
+            "groups": [
+                {"frames": [span.start, span.last]} | {key: one[key] for key in GROUP_FIGURES}
+                for one, span in zip(found, spans, strict=True)
+            ],
+        }
+    )

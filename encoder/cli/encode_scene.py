@@ -1,0 +1,173 @@
+"""Encode one scene: train, code, write the file, and measure it on held-out pictures."""
+
+import contextlib
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from kpc.encoder.cli.options import Options
+from kpc.encoder.cli.prepare import Setting, prepare_trainer
+from kpc.encoder.cli.report import SPACES, describe_occupancy, describe_pruning, log, show_progress
+from kpc.encoder.cli.transcode import coding_figures
+from kpc.encoder.cli.work_folder import CHECKPOINT, clear_work_folder, save_scene
+from kpc.encoder.datasets import Dataset
+from kpc.encoder.evaluation.evaluate import Quality, evaluate
+from kpc.encoder.evaluation.validation_rays import ValidationRays
+from kpc.encoder.field.occupancy_grid import merge_slots
+from kpc.encoder.rdo.codec_model import CodedModel, Model, code
+from kpc.encoder.rdo.model_checkpoint import save_checkpoint
+from kpc.encoder.rdo.sequential_finetune import steps_per_group
+from kpc.encoder.training.train import Trainer
+from kpc.format.common.memory import peak_memory_bytes
+from kpc.format.common.progress import Progress
+from kpc.format.container import scene_io
+from kpc.format.scene.scene import Scene
+
+MAX_CAMERAS = 32  # cameras of the dataset that the file holds
+MAX_SLOTS = 8  # time slots of the occupancy, before they are merged
+
+
+def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
+    """Train on a dataset and write the file; return what was measured."""
+    started = time.monotonic()
+    trainer = prepare_trainer(options, setting)
+    dataset, work, checkpoint = trainer.dataset, options.work_dir, options.work_dir / CHECKPOINT
+    try:
+        _train(trainer, checkpoint, options.time_budget_s)
+    except KeyboardInterrupt:
+        trainer.save(checkpoint)
+        if not _wants_partial(trainer, checkpoint, may_ask=options.group_s is None):
+            raise
+
+    if trainer.config.summed:
+        return _evaluate_unwritable(trainer, options, started)
+    scene = to_scene(trainer)
+    coded = _code(trainer, scene, options)
+    size = save_scene(coded.data, options.output, work)
+    decoded = scene_io.read(options.output).dequantise()
+    test, uncoded = (evaluate(one, dataset, most=options.max_test_pictures) for one in (decoded, scene))
+    if not options.keep:
+        clear_work_folder(work)
+    return {
+        "file": str(options.output),
+        "layout": dataset.layout,
+        "dynamic": dataset.is_dynamic,
+        "preset": options.preset,
+        "seed": options.seed,
+        "device": str(trainer.device),
+        "box": trainer.aabb.tolist(),
+        "space": SPACES[type(trainer.mapping)][0],
+        "appearance": trainer.config.appearance,
+        "appearances": len(trainer.names),
+        **_test_figures(test),
+        "coding_loss_db": uncoded.psnr - test.psnr if test and uncoded else coded.loss_db,
+        **coding_figures(coded, size, options.trade, "training views"),
+        "steps": trainer.step,
+        "train_s": trainer.elapsed_s,
+        "encode_s": time.monotonic() - started,
+        "rays_per_s": trainer.rays_per_second,
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+
+
+def _test_figures(test: Quality | None) -> dict[str, Any]:
+    return {
+        "test_psnr": test and test.psnr,
+        "test_ssim": test and test.ssim,
+        "test_pictures": test.pictures if test else 0,
+    }
+
+
+def _code(trainer: Trainer, scene: Scene, options: Options) -> CodedModel:
+    """Code a trained scene, and keep its finished checkpoint where asked for."""
+    tune_steps = options.tune_steps
+    if tune_steps is None:
+        tune_steps = steps_per_group(trainer.step, scene, trainer.config.tune_steps)
+    log(describe_occupancy(scene))
+    tuning = f"fine-tuning by {tune_steps} steps per group of planes, " if tune_steps else ""
+    log(f"writing: choosing quantisation steps, {tuning}rendering held-out views")
+    validation = ValidationRays.from_training_views(trainer.sampler, trainer.background)
+    if options.keep_checkpoint is not None:
+        save_checkpoint(options.keep_checkpoint, scene, validation)
+    coded = code(Model(scene, validation), options.trade, trainer.config.prune_share, tune_steps, shown=True)
+    if coded.pruned is not None:
+        log(describe_pruning(scene, coded.pruned, coded.spare_db))
+    return coded
+
+
+def _evaluate_unwritable(trainer: Trainer, options: Options, started: float) -> dict[str, Any]:
+    """Return what was measured on a model that no file can hold; fewer figures than `encode_scene` returns."""
+    test = evaluate(to_scene(trainer), trainer.dataset, most=options.max_test_pictures, field=trainer.field)
+    if not options.keep:
+        clear_work_folder(options.work_dir)
+    return {
+        "file": str(options.output),
+        "device": str(trainer.device),
+        "seed": options.seed,
+        "steps": trainer.step,
+        **_test_figures(test),
+        "train_s": trainer.elapsed_s,
+        "encode_s": time.monotonic() - started,
+    }
+
+
+def to_scene(trainer: Trainer) -> Scene:
+    """Return the trained field with its final occupancy and a selection of the cameras, the most central first."""
+    dataset = trainer.dataset
+    slots = min(MAX_SLOTS, dataset.clip.frame_count) if dataset.is_dynamic else 1
+    occupancy = merge_slots(
+        trainer.grid.sample_slots(trainer.density_at, np.random.default_rng(trainer.config.seed), slots)
+    )
+    return replace(trainer.scene(occupancy), cameras=tuple(dataset.camera(p) for p in _select_cameras(dataset)))
+
+
+def _select_cameras(dataset: Dataset) -> list[int]:
+    """Return pictures of distinct cameras, at most MAX_CAMERAS, the one nearest to their mean position first."""
+    _, first = np.unique(dataset.pictures.camera, return_index=True)
+    first = np.sort(first)
+    if len(first) > MAX_CAMERAS:
+        first = first[np.linspace(0, len(first) - 1, MAX_CAMERAS).round().astype(int)]
+    centres = dataset.pictures.camera_to_world[first, :3, 3]
+    central = int(np.argmin(np.linalg.norm(centres - centres.mean(0), axis=1)))
+    return [int(first[central])] + [int(p) for i, p in enumerate(first) if i != central]
+
+
+def _train(trainer: Trainer, checkpoint: Path, time_budget_s: float | None) -> None:
+    """Train to the end, or until Ctrl-C, which waits for the current step."""
+    requests: list[int] = []
+    with Progress("train", total=1000, unit="‰") as progress, handle_signals(lambda number, _: requests.append(number)):
+        trainer.run(
+            lambda report: show_progress(progress, report),
+            checkpoint,
+            time_budget_s=time_budget_s,
+            interrupted=lambda: bool(requests),
+        )
+
+
+def _wants_partial(trainer: Trainer, checkpoint: Path, may_ask: bool) -> bool:
+    """After Ctrl-C, log how to resume; on a terminal, ask whether to write the scene as trained so far."""
+    log(f"stopped at step {trainer.step}; {checkpoint} is kept, go on with --resume")
+    if not may_ask or not (sys.stdin.isatty() and sys.stderr.isatty()) or trainer.step < 2:
+        return False
+    print("write the scene as trained so far? [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+@contextlib.contextmanager
+def handle_signals(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Send Ctrl-C and SIGTERM alike to `handler`, unless they are ignored. Has an effect in the main thread only."""
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is not signal.SIG_IGN]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)

@@ -1,0 +1,160 @@
+"""Preparation of an encode: decode the dataset, find the space that it fills, lay out the model, resume a run."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from kpc.encoder.cli.grouped import initialise_from
+from kpc.encoder.cli.options import Options
+from kpc.encoder.cli.report import SPACES, describe_model, describe_time_rows, log, show_progress
+from kpc.encoder.cli.transcode import check_outputs
+from kpc.encoder.cli.work_folder import CHECKPOINT, choose_device, make_work_folder, remove_if_empty
+from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.field.bounds import (
+    find_box,
+    find_contraction_box,
+    fit_contraction,
+    fit_device_coordinates,
+    is_unbounded,
+    visible_cells,
+)
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.field.occupancy_grid import grid_shape
+from kpc.encoder.training.temporal_resolution import fit_frames_per_row
+from kpc.encoder.training.tight_bounds import trim_box
+from kpc.encoder.training.train import Trainer, load_checkpoint_box
+from kpc.format.common.errors import DatasetError, UsageError
+from kpc.format.common.progress import Progress
+from kpc.format.container import scene_io
+from kpc.format.scene.scene import Scene
+from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A dataset to be encoded, and the space that it fills.
+
+    Attributes:
+        dataset: decoded.
+        aabb: (2, 3) float32, the box of the planes.
+        mapping: how space beyond the box is held; None for a box with nothing outside it.
+        is_final: whether the box is not to be trimmed any more.
+        before: the scene to start from, whose last picture is about the first of this dataset; None to start afresh.
+    """
+
+    dataset: Dataset
+    aabb: np.ndarray
+    mapping: SpaceMapping | None
+    is_final: bool
+    before: Scene | None = None
+
+
+def prepare_setting(options: Options) -> Setting:
+    """Decode the dataset and find the space that it fills.
+
+    Raises:
+        DatasetError, MediaError: the dataset cannot be used.
+        UsageError, TrainingError: the outputs cannot be written, or the options contradict each other.
+    """
+    check_outputs(options)
+    choose_device(options.device)
+    make_work_folder(options.work_dir)
+    try:
+        dataset = load_dataset(options.source, options.work_dir, holdout=options.holdout, downscale=options.downscale)
+        aabb, mapping, why = _find_space(dataset, options)
+    except BaseException:
+        remove_if_empty(options.work_dir)
+        raise
+    log(dataset.describe())
+    log(f"space: {SPACES[type(mapping)][1]} ({why})")
+    return Setting(dataset, aabb, mapping, options.box is not None or isinstance(mapping, Contraction))
+
+
+def prepare_trainer(options: Options, setting: Setting) -> Trainer:
+    """Lay out the model, trim the box, and resume an interrupted run: return a trainer ready for the next step."""
+    device, checkpoint = choose_device(options.device), options.work_dir / CHECKPOINT
+    make_work_folder(options.work_dir)
+    dataset, aabb, mapping = setting.dataset, setting.aabb, setting.mapping
+    appearance, why = options.appearance_of(dataset)
+    log(f"appearance: {'none' if appearance == 'none' else f'an embedding for each {appearance}'} ({why})")
+    config, resolution = fit_frames_per_row(options.config(dataset), dataset)
+    if dataset.is_dynamic:
+        log(describe_time_rows(config, dataset, resolution))
+    if setting.before is not None:
+        config = replace(config, coarse_until=0.0)  # the scene before has all scales
+    resumes, survey_s = options.resume and checkpoint.exists(), 0.0
+    if not setting.is_final:
+        if resumes:
+            aabb = load_checkpoint_box(checkpoint)
+        else:
+            assert not isinstance(mapping, Contraction)
+            aabb, survey_s = trim_with_progress(dataset, config, aabb, options.time_budget_s, mapping)
+    trainer = Trainer(dataset, config, aabb, device, elapsed_s=survey_s, mapping=mapping)
+    log(describe_model(trainer))
+    if resumes:
+        trainer.resume(checkpoint)
+    elif setting.before is not None:
+        initialise_from(trainer.field, setting.before)
+    if options.resume:
+        log(f"resumed at step {trainer.step}" if trainer.step else f"{checkpoint}: no checkpoint yet; starting afresh")
+    return trainer
+
+
+def trim_with_progress(
+    dataset: Dataset,
+    config: TrainConfig,
+    aabb: np.ndarray,
+    time_budget_s: float | None,
+    mapping: DeviceCoordinates | None,
+) -> tuple[np.ndarray, float]:
+    """Trim the box to what is occupied, showing progress; return the box and the seconds that took."""
+    with Progress("survey", total=1000, unit="‰") as progress:
+        return trim_box(
+            dataset,
+            config,
+            aabb,
+            lambda report: show_progress(progress, report),
+            time_budget_s=time_budget_s,
+            mapping=mapping,
+        )
+
+
+def _find_space(dataset: Dataset, options: Options) -> tuple[np.ndarray, SpaceMapping | None, str]:
+    """Find the box, the mapping of space beyond it, and the reason for both, within what a file can hold."""
+    unbounded, why = is_unbounded(dataset.pictures, dataset.has_alpha)
+    space = options.space if options.space != "auto" else "contracted" if unbounded else "box"
+    if space == "ndc" and options.box is not None:
+        raise UsageError(
+            "--box is in world units, device coordinates have a box of their own: drop --box or --space ndc"
+        )
+    mapping: SpaceMapping | None = None
+    try:
+        if space == "ndc":
+            mapping, aabb = fit_device_coordinates(dataset.pictures)
+        elif options.box is not None:
+            aabb = np.array(options.box, np.float32).reshape(2, 3)
+        elif space == "contracted":
+            aabb = find_contraction_box(dataset.pictures)
+        else:
+            aabb = find_box(dataset.pictures, dataset.has_alpha)
+    except DatasetError as error:
+        raise DatasetError(f"{options.source}: {error}") from error
+    if space == "contracted":
+        mapping = fit_contraction(dataset.pictures, aabb)
+    _check_space(dataset, options, aabb, mapping)
+    return aabb, mapping, f"{why}; --space overrides" if options.space == "auto" else "as given"
+
+
+def _check_space(dataset: Dataset, options: Options, aabb: np.ndarray, mapping: SpaceMapping | None) -> None:
+    another = "give another with --box x0,y0,z0,x1,y1,z1"
+    if not (np.abs(aabb) <= scene_io.BOX_LIMIT).all() or not (aabb[1] - aabb[0] >= 1 / scene_io.BOX_LIMIT).all():
+        raise DatasetError(
+            f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; {another}"
+        )
+    samples_per_unit = options.config(dataset).samples_across / (aabb[1] - aabb[0]).max()
+    if isinstance(mapping, Contraction) and mapping.uniform_distance * samples_per_unit > scene_io.SAMPLE_LIMIT:
+        raise DatasetError(
+            f"{options.source}: the box is too small for cameras that lie {mapping.uniform_distance:.4g} from its far "
+            "side; give a larger one with --box x0,y0,z0,x1,y1,z1, or --space box"
+        )
+    if not visible_cells(dataset.pictures, aabb, grid_shape(aabb, 64), mapping).any():
+        raise DatasetError(f"{options.source}: the box lies outside every camera's view; {another}")

@@ -1,0 +1,150 @@
+"""What kpenc prints: log lines on stderr while it runs, and the results on stdout."""
+
+import json
+import math
+import sys
+from dataclasses import asdict
+from typing import Any
+
+from kpc.encoder.cli.estimate import Estimate
+from kpc.encoder.cli.options import Options
+from kpc.encoder.cli.transcode import describe_outcome
+from kpc.encoder.datasets import Dataset
+from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.field.field import time_rows
+from kpc.encoder.rdo.prune import Pruned
+from kpc.encoder.training.temporal_resolution import TimeResolution
+from kpc.encoder.training.train import Report, Trainer
+from kpc.format.common.progress import Progress
+from kpc.format.scene.scene import Scene
+from kpc.format.scene.space import FAR, Contraction, DeviceCoordinates
+
+# How --space names a mapping of space, and how the log describes it.
+SPACES = {
+    type(None): ("box", "a box, nothing outside it"),
+    Contraction: ("contracted", "contracted beyond a box"),
+    DeviceCoordinates: ("ndc", "device coordinates of a rig that faces one way"),
+}
+
+
+def log(text: str) -> None:
+    """Print a line on stderr."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def show_progress(progress: Progress, report: Report) -> None:
+    """Show step, training PSNR and speed; the bar counts per mille of the work."""
+    progress.note(
+        f"step {report.step}, psnr {report.psnr:.2f}, {report.rays_per_second:,.0f} rays/s, "
+        f"{report.samples_per_ray:.1f} samples/ray, {report.occupied:.1%} occupied"
+    )
+    progress.advance(1000 * min(report.fraction, 1.0) - progress.done)
+
+
+def describe_model(trainer: Trainer) -> str:
+    """Describe the box, the planes and the decoder that are trained."""
+    layout, (lo, hi) = trainer.field.layout, trainer.aabb
+    corners = " to ".join(" ".join(f"{v:.4g}" for v in corner) for corner in (lo, hi))
+    planes = ", ".join("x".join(str(n) for n in row if n) for row in layout.resolution)
+    beyond, mapping = "", trainer.mapping
+    if isinstance(mapping, Contraction):
+        uniform = mapping.uniform_distance
+        beyond = f" and all around it, uniform steps up to {uniform:.4g}, rays to {FAR * uniform:.4g}"
+    elif mapping is not None:
+        beyond = f" of device coordinates, near {mapping.near:.4g}, baseline {mapping.baseline:.4g}"
+    motion = ""
+    if trainer.field.motion is not None:
+        nodes = "x".join(str(n) for n in trainer.field.motion.shape[3:0:-1])
+        motion = f", displaced by a motion grid of {nodes} nodes"
+    decoder = "hybrid" if trainer.config.hybrid else "explicit"
+    return (
+        f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} "
+        f"channels, {layout.size / 1e6:.2f} M parameters{motion}; {decoder} decoder; on {trainer.device}"
+    )
+
+
+def describe_time_rows(config: TrainConfig, dataset: Dataset, found: TimeResolution | None) -> str:
+    """Describe the temporal resolution of the planes, and why it was chosen."""
+    rows = time_rows(dataset.clip.frame_count, config.frames_per_row)
+    text = f"time: {rows} rows, one for {config.frames_per_row:g} of {dataset.clip.frame_count} frames"
+    if found is None:
+        return f"{text} (the preset's; it is measured where cameras stand still)"
+    wider = "" if math.isnan(found.next_error) else f", with the next fewer rows {found.next_error:.3f}"
+    return (
+        f"{text} (linear interpolation between rows leaves an error of {found.error:.3f} of the full range in the "
+        f"{found.changing:.1%} of the pixels that change{wider}; {config.time_tolerance:g} allowed; noise "
+        f"{found.noise:.3f})"
+    )
+
+
+def describe_occupancy(scene: Scene) -> str:
+    """Describe the share of occupied cells, and the number of time slots."""
+    text, slots = f"occupied: {scene.occupancy.mean():.1%} of all cells", len(scene.occupancy)
+    if slots > 1:
+        return f"{text} at a time, in {slots} time slots; {scene.occupancy.any(0).mean():.1%} at any time"
+    return f"{text}, one time slot for the whole clip" if scene.is_dynamic else text
+
+
+def describe_pruning(scene: Scene, pruned: Pruned, spare_db: float) -> str:
+    """Describe what was pruned of a scene, and what it costs or would cost."""
+    gain, counts = pruned.view_gain_db, [scale["xy"].shape[2] for scale in scene.scales]
+    text = "colour: view-independent, as trained"
+    if gain is not None and gain > spare_db:
+        text = f"colour: view-dependent, which gains {gain:.3f} dB"
+    elif gain is not None:
+        text = f"colour: view-independent, view dependence would gain {gain:.3f} dB"
+    kept = " + ".join(f"{len(kept)} of {count}" for kept, count in zip(pruned.kept, counts, strict=True))
+    more = "" if math.isinf(pruned.next_loss_db) else f", {pruned.next_loss_db:.3f} dB with one fewer"
+    return f"{text}; channels per scale: {kept}; costs {pruned.loss_db:.3f} dB{more} ({spare_db:.3f} allowed)"
+
+
+def print_result(result: dict[str, Any], options: Options, as_json: bool) -> None:
+    """Print the result of an encode, or of a transcode where the source is a file."""
+    if as_json:
+        print(json.dumps(result, indent=1))
+    elif options.source.is_file():
+        rate = f"{result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}"
+        print(f"{options.output}: {rate}; {describe_outcome(result)}")
+    else:
+        _print_encode(result, options)
+
+
+def _print_encode(result: dict[str, Any], options: Options) -> None:
+    quality, tested = "no view held out", result["test_psnr"] is not None
+    if tested:
+        quality = (
+            f"held-out PSNR {result['test_psnr']:.2f} dB, SSIM {result['test_ssim']:.4f} "
+            f"over {result['test_pictures']} pictures"
+        )
+        if result["appearances"]:
+            quality += ", right halves, each in an appearance fitted to its left half"
+    print(f"{options.output}: {quality} (rendered from the decoded file)")
+    print(
+        f"{result['size_bytes']:,} bytes, {result['bits_per_parameter']:.2f} bits per parameter of "
+        f"{result['parameters']:,}; coding loss {result['coding_loss_db']:.3f} dB" + (" on held-out views" * tested)
+    )
+    print(describe_outcome(result))
+    if result["identity_share"] is not None:
+        print(f"time-plane texels exactly at identity: {result['identity_share']:.1%}")
+    if len(result.get("groups", [])) > 1:
+        print(f"{len(result['groups'])} groups: " + ", ".join(_describe_group(group) for group in result["groups"]))
+    print(
+        f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps)"
+    )
+
+
+def _describe_group(group: dict[str, Any]) -> str:
+    quality = "" if group["test_psnr"] is None else f", {group['test_psnr']:.2f} dB"
+    return f"{group['size_bytes']:,} bytes{quality}"
+
+
+def print_estimate(expected: Estimate, options: Options, as_json: bool) -> None:
+    """Print what an encode would take."""
+    if as_json:
+        print(json.dumps(asdict(expected), indent=1))
+        return
+    total = expected.train_s + expected.rest_s
+    print(
+        f"{options.output} would take {total:.0f} s, of which training {expected.train_s:.0f} s, and "
+        f"{expected.memory_bytes / 1e6:.0f} MB of memory; decoded pixels wait in {options.work_dir}"
+    )

@@ -1,0 +1,64 @@
+"""The work folder of an encode, where decoded pixels and the checkpoint are kept, and the device to train on."""
+
+import contextlib
+from pathlib import Path
+
+import torch
+from kpc.format.common.errors import TrainingError, UsageError
+from kpc.format.container import scene_io
+
+CHECKPOINT = "checkpoint.kpck"
+
+
+def make_work_folder(work: Path) -> None:
+    """Create the work folder.
+
+    Raises:
+        TrainingError: it cannot be created.
+    """
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrainingError(f"{work}: {error.strerror}; name another folder for decoded pixels with --work") from error
+
+
+def clear_work_folder(work: Path) -> None:
+    """Remove what kpenc has put into the work folder, and the folder if nothing else is in it."""
+    of_groups = ("group-*.kpc", "group-*.json", "group-*.kpck")
+    for pattern in ("pixels-*.bin", "pixels-*.json", *of_groups, CHECKPOINT, f".{Path(CHECKPOINT).stem}.*"):
+        for leftover in work.glob(pattern):
+            leftover.unlink(missing_ok=True)
+    remove_if_empty(work)
+
+
+def remove_if_empty(work: Path) -> None:
+    with contextlib.suppress(OSError):
+        work.rmdir()
+
+
+def save_scene(data: bytes, output: Path, work: Path) -> int:
+    """Write an encoded file and return its size in bytes.
+
+    Raises:
+        TrainingError: it cannot be written; the message says how to keep what was trained.
+    """
+    try:
+        return scene_io.save(data, output)
+    except OSError as error:
+        kept = f", or give another -o with --work {work} --resume to keep what is trained"
+        raise TrainingError(f"{output}: {error.strerror}; make room there{kept}") from error
+
+
+def choose_device(name: str) -> str:
+    """Return "cpu" or "cuda" for "auto", "cpu" or "cuda".
+
+    Raises:
+        UsageError: "cuda" was asked for, and there is none.
+    """
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UsageError(
+            "--device cuda: this PyTorch sees no CUDA device; use --device cpu, or install a CUDA build of PyTorch"
+        )
+    return name
