@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 from kpc.encoder.cli import kpenc
-from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
 from kpc.encoder.cli.estimate import Estimate
 from kpc.encoder.cli.grouped import LATER_STEPS, OVERLAP, initialise_from, options_of_group, split_into_spans
 from kpc.encoder.cli.options import Options
+from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.field.field import Field, Layout
