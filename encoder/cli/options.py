@@ -8,7 +8,7 @@ from pathlib import Path
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.ablations import ABLATIONS, BASELINE
 from kpc.encoder.field.appearances import choose_appearance
-from kpc.encoder.field.config import APPEARANCES, PRESETS, PROGRESSIVE, TrainConfig
+from kpc.encoder.field.config import APPEARANCES, PRESETS, PROGRESSIVE_SCALE_DROPOUT, TrainConfig
 from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, Trade
 from kpc.format.common import cli
 
@@ -67,15 +67,15 @@ class Options:
     def config(self, dataset: Dataset) -> TrainConfig:
         """Return the configuration of training on a dataset."""
         config = PRESETS[self.preset]
-        if config.adapts and dataset.has_alpha and dataset.one_view_at_a_time:
-            config = config.for_lone_object()
+        if config.adapts_to_object and dataset.has_alpha and dataset.is_monocular:
+            config = config.for_single_object()
         appearance, _ = self.appearance_of(dataset)
         config = replace(
             config,
             hybrid=self.decoder == "hybrid",
             proposals=self.sampling == "proposals",
             seed=self.seed,
-            scale_dropout=PROGRESSIVE if self.progressive else config.scale_dropout,
+            scale_dropout=PROGRESSIVE_SCALE_DROPOUT if self.progressive else config.scale_dropout,
             steps=self.steps or config.steps,
             tune_steps=config.tune_steps if self.tune_steps is None else self.tune_steps,
             appearance=appearance,
