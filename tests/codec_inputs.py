@@ -3,7 +3,7 @@
 import numpy as np
 from kpc.format.coding.predictive import DEPENDENT, PredictionWeights, trellis_transition
 from kpc.format.coding.transform import OFFSET_COUNT, TransformBlocks, coded_blocks
-from kpc.tools.vectors.specvectors import walked
+from kpc.tools.vectors.scenes import walked
 
 PLANE_PATTERNS = {
     "noise": lambda rng, shape: rng.integers(-128, 128, shape),

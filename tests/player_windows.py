@@ -7,7 +7,7 @@ import numpy as np
 from kpc.format.common.errors import DisplayError
 from kpc.format.common.media import read_image
 from kpc.format.container import groups
-from kpc.format.container.container import open_source
+from kpc.format.container.sources import open_source
 from kpc.player.app import kpplay
 from kpc.player.app import player as player_module
 from kpc.player.app import window as window_module

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from kpc.format.common.errors import DisplayError
 from kpc.format.common.media import read_video
-from kpc.format.container.container import open_source
+from kpc.format.container.sources import open_source
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.desktop import glfw, imgui
 from kpc.player.app.input import KEY_BINDINGS

@@ -24,7 +24,7 @@ from kpc.encoder.training.tight_bounds import trim_box
 from kpc.encoder.training.train import Trainer, load_checkpoint_box
 from kpc.format.common.errors import DatasetError, UsageError
 from kpc.format.common.progress import Progress
-from kpc.format.container import scene_io
+from kpc.format.container import scene_layout
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
 
@@ -146,12 +146,15 @@ def _find_space(dataset: Dataset, options: Options) -> tuple[np.ndarray, SpaceMa
 
 def _check_space(dataset: Dataset, options: Options, aabb: np.ndarray, mapping: SpaceMapping | None) -> None:
     another = "give another with --box x0,y0,z0,x1,y1,z1"
-    if not (np.abs(aabb) <= scene_io.BOX_LIMIT).all() or not (aabb[1] - aabb[0] >= 1 / scene_io.BOX_LIMIT).all():
+    if (
+        not (np.abs(aabb) <= scene_layout.BOX_LIMIT).all()
+        or not (aabb[1] - aabb[0] >= 1 / scene_layout.BOX_LIMIT).all()
+    ):
         raise DatasetError(
             f"{options.source}: a box from {aabb[0].tolist()} to {aabb[1].tolist()} is too large or too thin; {another}"
         )
     samples_per_unit = options.config(dataset).samples_across / (aabb[1] - aabb[0]).max()
-    if isinstance(mapping, Contraction) and mapping.uniform_distance * samples_per_unit > scene_io.SAMPLE_LIMIT:
+    if isinstance(mapping, Contraction) and mapping.uniform_distance * samples_per_unit > scene_layout.SAMPLE_LIMIT:
         raise DatasetError(
             f"{options.source}: the box is too small for cameras that lie {mapping.uniform_distance:.4g} from its far "
             "side; give a larger one with --box x0,y0,z0,x1,y1,z1, or --space box"

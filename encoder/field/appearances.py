@@ -14,7 +14,7 @@ from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.render import Rays, march_scene, shade
 from kpc.format.common.errors import UsageError
-from kpc.format.container.scene_io import APPEARANCE_LIMIT, is_valid_name
+from kpc.format.container.scene_layout import APPEARANCE_LIMIT, is_valid_name
 from kpc.format.scene.scene import Scene
 from torch import Tensor
 

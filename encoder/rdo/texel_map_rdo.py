@@ -1,6 +1,6 @@
 """Which texels of a time plane are told, where a map says so: those that are worth what it takes to tell them, and to tell where they are.
 
-A texel that is not told is 1. Whether one is told costs bits too (`kpc.format.coding.predictive.code_map`), few where it is as those around it, many
+A texel that is not told is 1. Whether one is told costs bits too (`kpc.format.coding.texel_map.code_map`), few where it is as those around it, many
 where it is alone. So those are sought that make least of
 
     sum of channels * (worth * (how far it is from 1)^2 in the mean over channels) over texels that are not told
@@ -11,7 +11,7 @@ map before had them.
 """
 
 import numpy as np
-from kpc.format.coding.predictive import MAP_CONTEXTS
+from kpc.format.coding.texel_map import MAP_CONTEXTS
 from kpc.format.common.jit import compiled, inlined
 
 IDENTITY_TOLERANCE = 0.6
@@ -61,7 +61,7 @@ def _contexts(told):
 
 @inlined
 def map_context(told, y, x):
-    """Of `kpc.format.coding.predictive.code_map`: which of the two texels to the left, of five above and of three above those are told."""
+    """Of `kpc.format.coding.texel_map.code_map`: which of the two texels to the left, of five above and of three above those are told."""
     W = told.shape[1]
     context = 0
     for left in range(1, 3):

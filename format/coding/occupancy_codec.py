@@ -1,12 +1,13 @@
-"""Occupancy under codec 2: every cell told in a context of cells already told, around it and one slot before (spec, section 8).
+"""OCCUPANCY, the codec of occupancy grids: each cell is coded in a context of coded cells (spec/kpc-format.md, "OCCUPANCY").
 
-A cell is most often as its neighbours are, and as it was. Which of these agree says how likely it is occupied.
+The context is made of cells around it and of the slot before: where these agree, the cell is most often as they are.
 """
 
 import numpy as np
 from kpc.format.coding.rans import check_end, code_bit_adaptive, encode_trace, new_models, open_stream
 from kpc.format.common.jit import compiled
 
+# (slot, z, y, x) from a cell to those of its context, the most significant bit first. `code_cells` reads them row by row.
 NEIGHBOURS = np.array(
     [
         (0, 0, 0, -1),
@@ -22,66 +23,68 @@ NEIGHBOURS = np.array(
         (-1, -1, 0, 0),
     ]
 )
-"""(slot, z, y, x) from a cell to those that make its context, the most significant bit first. `walk` has them row by row."""
 CONTEXTS = 1 << len(NEIGHBOURS)
 
 
 def encode_occupancy(occupancy: np.ndarray) -> bytes:
-    """Code (slots, Nz, Ny, Nx) bool."""
+    """Encode (slots, Nz, Ny, Nx) bool."""
     cells = np.array(occupancy, np.uint8, order="C")
     trace = np.empty(cells.size, np.int16)
-    walk(cells, 0, 0, None, trace)
+    code_cells(cells, 0, 0, None, trace)
     return encode_trace(trace)
 
 
 def decode_occupancy(body: bytes, shape: tuple[int, ...]) -> np.ndarray:
-    """Undo `encode_occupancy`: bool of that shape.
+    """Undo `encode_occupancy`: return bool of that shape.
 
     Raises:
-        FormatError: the body is cut or too long.
+        FormatError: the body is cut off or too long.
     """
     state, words = open_stream(body, "occupancy")
     cells = np.zeros(shape, np.uint8)
-    state, at = walk(cells, state, 0, words, None)
-    check_end(state, at, words, "occupancy")
+    state, position = code_cells(cells, state, 0, words, None)
+    check_end(state, position, words, "occupancy")
     return cells.view(bool)
 
 
 @compiled()
-def walk(cells, state, at, words, trace):
-    """Code (slots, Nz, Ny, Nx) uint8 `cells` of 0 and 1, or decode into them: (state, at). The rest as `kpc.format.coding.rans.code_bit`."""
+def code_cells(cells, state, position, words, trace):
+    """Code (slots, Nz, Ny, Nx) uint8 `cells` of 0 and 1: (state, position), as of `kpc.format.coding.rans`."""
     S, Z, Y, X = cells.shape
-    table, nowhere = new_models(CONTEXTS), np.zeros(X, np.uint8)
+    models, outside = new_models(CONTEXTS), np.zeros(X, np.uint8)
     for s in range(S):
         for z in range(Z):
             for y in range(Y):
+                # Rows of the context, named by their offsets in y (n: -1, s: +1), z (b: -1, f: +1) and slot (p: -1).
                 here = cells[s, z, y]
-                north = cells[s, z, y - 1] if y > 0 else nowhere
-                back = cells[s, z - 1, y] if z > 0 else nowhere
-                below = cells[s, z - 1, y + 1] if z > 0 and y + 1 < Y else nowhere
-                before = cells[s - 1, z, y] if s > 0 else nowhere
-                front = cells[s - 1, z + 1, y] if s > 0 and z + 1 < Z else nowhere
-                above = cells[s - 1, z, y - 1] if s > 0 and y > 0 else nowhere
-                behind = cells[s - 1, z - 1, y] if s > 0 and z > 0 else nowhere
+                n = cells[s, z, y - 1] if y > 0 else outside
+                b = cells[s, z - 1, y] if z > 0 else outside
+                bs = cells[s, z - 1, y + 1] if z > 0 and y + 1 < Y else outside
+                p = cells[s - 1, z, y] if s > 0 else outside
+                pf = cells[s - 1, z + 1, y] if s > 0 and z + 1 < Z else outside
+                pn = cells[s - 1, z, y - 1] if s > 0 and y > 0 else outside
+                pb = cells[s - 1, z - 1, y] if s > 0 and z > 0 else outside
                 left, past = 0, 0
                 for x in range(X):
-                    corners = 2 * int(north[x + 1]) + int(back[x + 1]) if x + 1 < X else 0
-                    now = int(before[x])
+                    corners = 2 * int(n[x + 1]) + int(b[x + 1]) if x + 1 < X else 0
+                    now = int(p[x])
                     context = (
                         left << 10
-                        | int(north[x]) << 9
-                        | int(back[x]) << 8
-                        | int(below[x]) << 7
+                        | int(n[x]) << 9
+                        | int(b[x]) << 8
+                        | int(bs[x]) << 7
                         | corners << 5
                         | now << 4
                         | past << 3
-                        | int(front[x]) << 2
-                        | int(above[x]) << 1
-                        | int(behind[x])
+                        | int(pf[x]) << 2
+                        | int(pn[x]) << 1
+                        | int(pb[x])
                     )
-                    left, state, at = code_bit_adaptive(int(here[x]), table, context, state, at, words, trace)
+                    left, state, position = code_bit_adaptive(
+                        int(here[x]), models, context, state, position, words, trace
+                    )
                     here[x] = left
                     past = now
-                if words is not None and at > words.size:
-                    return state, at
-    return state, at
+                if words is not None and position > words.size:
+                    return state, position
+    return state, position

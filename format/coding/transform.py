@@ -1,112 +1,99 @@
-"""Plane segments as blocks of cosines: the other way to tell one under codec 2, and codec 3 (spec, section 6, "Blocks").
+"""TRANSFORM, a codec of plane segments: DCT blocks with prediction from the borders of their neighbours.
 
-    N (1 byte) | flags (1 byte) | quantiser (1 byte) | rANS words: of the map, of how fine blocks are, then of levels, channel by channel
+    side N (1 byte) | flags (1 byte) | step (1 byte) | rANS words: of the map, of step offsets, then of levels, channel by channel
 
-Where little is told of each symbol, predictions from what was told before hold mostly the errors of that. There it is better to tell
-what is slow in a plane and what is quick apart: each block of N x N texels of a channel is a sum of cosines, whose factors, the *levels*,
-are told in contexts of those of higher frequency, of the blocks to the left and above, and of the channel before. The means of
-blocks are foreseen from their neighbours. Where errors are worth more, a block is told more finely. What a decoder makes of levels are
-symbols, like any other: all in integers, 32 bits hold them.
+(spec/kpc-format.md, "TRANSFORM".) Where a symbol takes few bits, predictions from coded neighbours mostly carry their errors on. There
+it is better to separate low from high frequencies: each block of N x N texels of a channel is a sum of cosines, whose quantised
+coefficients, the *levels*, are coded in contexts of higher frequencies, of the blocks to the left and above, and of the channel
+before. A decoder turns levels into symbols like any others. All arithmetic is on integers of 32 bits.
 
-Under codec 3 blocks go on from the *borders* of those to the left and above: what lies next to a block there is about what lies within it. So its mean is foreseen,
-and the sign of each level that would make the step across the border smaller is the likelier one (Clare, Henry and Jung, JCTVC-A114, 2010, of
-video). Of shelf_hand, blocks take 4 % fewer bytes at 33 dB of agreement and 6 at 43, ends told in other contexts included.
+Blocks are predicted from the *borders* of their neighbours: the mean from the texels next to the block, and the sign of each level from
+which sign makes the step across the border smaller (Clare, Henry and Jung, JCTVC-A114, 2010). This saves 4 % at 33 dB and 6 % at
+43 dB of agreement (shelf_hand), the contexts of ends included.
 
-Naming, throughout this module
-    side        N, of a block
-    level       the factor of a cosine, in quantisers; i down, j across are how quick it is
-    diagonal    i + j; of a block those before its `end` are told, the quickest first
-    step_offsets    of a block, in all channels: one more, and quantisers are sqrt(2) smaller
-    mean        the level that does not change in a block, i = j = 0, in 1 / PARTS of a symbol; told as it differs from what is foreseen
-    rest        (2, N), along the left side of a block and along its upper one: by how much what lies across the border exceeds what a block has so far
-                been told to be there, in 1 / PARTS of a symbol
-    table       counters of `kpc.format.coding.rans`
-    state at words trace    of `kpc.format.coding.rans.code_bit`
+Names in this module
+    side        N, of a block: 4, 8 or 16
+    level       a quantised coefficient; i counts frequencies down, j across
+    diagonal    i + j; the diagonals before the `end` of a block are coded, highest frequency first
+    step offset of a block, in all channels: one more makes the quantisation steps sqrt(2) finer
+    mean        the coefficient of i = j = 0, in 1/UNITS_PER_SYMBOL; coded as its difference from the prediction
+    gap         (2, N), along the left and along the upper side of a block: by how much the texels across the border exceed what the
+                block is so far known to be there, in 1/UNITS_PER_SYMBOL
+    state position words trace      of `kpc.format.coding.rans`
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from kpc.format.coding.predictive import LATTICE_BIT, MAP, THIRD, code_map, initial_map, known_flags, map_mode
 from kpc.format.coding.rans import (
     SCALE,
     check_end,
     code_bit,
     code_bit_adaptive,
-    code_signed,
     code_unsigned,
     encode_trace,
     log_class,
     new_models,
     open_stream,
 )
+from kpc.format.coding.texel_map import MAP_CODED, MAP_IMPLIED, code_map, initial_map, map_mode
 from kpc.format.common.errors import FormatError
 from kpc.format.common.jit import compiled, inlined
 
 SIDES = (4, 8, 16)
-BLOCKS = 3
-"""In the place of a lattice, `kpc.format.coding.predictive`, in the flags."""
-HEAD = 3
-"""Bytes before the words."""
+HEAD = 3  # bytes before the words
 
+# Cosines: 128 sqrt(2) cos(pi k / 32), and what stands in their place for the mean.
 COSINES = np.rint(128 * np.sqrt(2) * np.cos(np.pi * np.arange(17) / 32)).astype(np.int64)
-"""128 sqrt(2) cos(pi k / 32)."""
-MEAN = 128
-"""In their place for the mean."""
-UNITS_PER_SYMBOL = 8
-"""Of a symbol, in which quantisers are told."""
+MEAN_COSINE = 128
+UNITS_PER_SYMBOL = 8  # quantisation steps are in eighths of a symbol
 COEFFICIENT_MIN, COEFFICIENT_MAX = -(1 << 15), (1 << 15) - 1
-COARSER_BITS = 6
-"""Of `frequency_weights` and FINER."""
+WEIGHT_BITS = 6  # fractional bits of `frequency_weights` and OFFSET_SCALES
 OFFSET_COUNT, DEFAULT_OFFSET = 8, 3
-FINER = np.rint((1 << COARSER_BITS) * 2.0 ** ((DEFAULT_OFFSET - np.arange(OFFSET_COUNT)) / 2)).astype(np.int64)
-"""Quantisers by step_offsets, in 1 / 64 of what the segment says."""
+# Quantisation step by step offset, in 1/64 of that of the segment: 64 sqrt(2)^(3 - offset).
+OFFSET_SCALES = np.rint((1 << WEIGHT_BITS) * 2.0 ** ((DEFAULT_OFFSET - np.arange(OFFSET_COUNT)) / 2)).astype(np.int64)
 
+# Contexts of a level: how large the levels around it are, and its frequency, the mean last.
 MAGNITUDE_CONTEXTS, FREQUENCY_CLASSES = 16, 9
-"""Contexts: how large levels are around; how quick it is, the mean last."""
-UNARY, ESCAPES = 5, 12
-"""Magnitudes of 1 to UNARY take a decision each; of larger ones the number of bits, up to ESCAPES, comes first."""
+UNARY, ESCAPES = 5, 12  # of `code_unsigned`, for magnitudes
 MODELS_PER_CONTEXT = 1 + UNARY + ESCAPES
-LARGEST = UNARY + (2 << ESCAPES) - 1
-"""Magnitude that can be told."""
-LIKELY = np.array(
+LARGEST = UNARY + (2 << ESCAPES) - 1  # magnitude that can be coded
+MAX_DECISIONS = 2 + UNARY + 2 * ESCAPES  # bits that a level takes in a trace, at most
+
+# Initial probabilities of level models, out of 256, by magnitude context: that there is a level, that it is more than 1,
+# that it is more than 2 to UNARY; the same of means, in any context; and the number of uses that this counts for.
+INITIAL_PROBABILITIES = np.array(
     [
         [27, 66, 61, 86, 79, 96, 118, 143, 168, 190, 206, 220, 230, 238, 243, 248],
         [19, 26, 24, 37, 37, 48, 67, 90, 120, 151, 179, 201, 217, 229, 235, 244],
         [110, 100, 90, 86, 82, 80, 87, 98, 117, 135, 160, 184, 204, 220, 230, 243],
     ]
 )
-"""What counters begin with, of 256, by how large levels are around: that there is one, that it is more than 1, than any more up to UNARY."""
-KNOWN = 8
-"""Decisions that this counts for."""
-LIKELY_MEANS = np.array([243, 210, 220])
-"""The same of means, whatever is around."""
-END_CONTEXTS, END_UNARY, END_ESCAPES = 10, 2, 4
-"""Contexts of ends: what those around are. One more than an end is told as `kpc.format.coding.rans.code_unsigned` tells it."""
-END_DECISIONS = END_UNARY + END_ESCAPES
-PLAIN_ENDS, PLAIN_END_UNARY = 8, 6
-"""The same without borders, where an end is told as it differs from those around, as `kpc.format.coding.rans.code_signed` tells it."""
-PLAIN_END_DECISIONS = 2 + 2 * (PLAIN_END_UNARY + END_ESCAPES)
-MOST_END_DECISIONS = 2 + PLAIN_END_UNARY + 2 * END_ESCAPES
+INITIAL_MEAN_PROBABILITIES = np.array([243, 210, 220])
+INITIAL_USES = 8
+
+END_CONTEXTS, END_UNARY, END_ESCAPES = 10, 2, 4  # contexts of ends; an end plus 1 is coded by `code_unsigned`
+MODELS_PER_END = END_UNARY + END_ESCAPES
+MAX_END_DECISIONS = END_UNARY + 2 * END_ESCAPES
+
+# Initial probabilities of sign models, out of 256, that the sign is the likelier one, by how much likelier it is.
 SIGN_PROBABILITIES = np.array(
     [134, 135, 138, 141, 152, 159, 164, 170, 178, 184, 190, 197, 205, 212, 218, 224, 229, 234, 239, 244]
 )
-"""What counters of signs begin with, of 256, by how much likelier one is than the other: that it is that one."""
-SURENESS = 11
-"""The context of a sign that halves, to its square, what is missing of a step of the quantiser of means."""
-LARGEST_REST = (1 << 12) - 1
-MAX_DECISIONS = 2 + UNARY + 2 * ESCAPES
-"""That a level takes."""
+SIGN_CENTRE = (
+    11  # the context in which the likelier sign halves the squared step across the border, at the step of means
+)
+GAP_LIMIT = (1 << 12) - 1
 
 
 @dataclass(frozen=True, eq=False)
 class TransformBlocks:
-    """What a segment tells.
+    """The content of a segment.
 
     Attributes:
-        levels: (M, blocks down, blocks across, N, N) int64; of blocks without a coded texel nothing is told.
-        step_offsets: (blocks down, blocks across) int64, 0 to FINENESSES - 1.
-        quantiser: 1 to 255, of USUAL step_offsets, in 1 / PARTS of a symbol.
+        levels: (M, blocks down, blocks across, N, N) int64; those of blocks without a coded texel are ignored.
+        step_offsets: (blocks down, blocks across) int64, 0 to OFFSET_COUNT - 1.
+        quantiser: quantisation step at DEFAULT_OFFSET, 1 to 255, in 1/UNITS_PER_SYMBOL of a symbol.
     """
 
     levels: np.ndarray
@@ -115,153 +102,153 @@ class TransformBlocks:
 
 
 def dct_basis(side: int) -> np.ndarray:
-    """(N, N) int64: of each frequency, a row, what it is at each texel, in 1 / (128 sqrt(N)) of orthonormal cosines."""
+    """Return (N, N) int64: row i is the cosine of frequency i at each texel, 128 sqrt(N) times the orthonormal one."""
     k = 16 // side * np.outer(np.arange(side), 2 * np.arange(side) + 1) % 64
     k = np.minimum(k, 64 - k)
     rows = np.where(k <= 16, COSINES[np.minimum(k, 16)], -COSINES[np.minimum(32 - np.minimum(k, 32), 16)])
-    rows[0] = MEAN
+    rows[0] = MEAN_COSINE
     return rows
 
 
 def frequency_weights(side: int) -> np.ndarray:
-    """(N,) int64: how much coarser each frequency is told along an axis, in 1 / 64. Look-ups, which lie between texels, see less of quick
-    errors: (1 + cos(pi k / N) / 2)^(-1/2), as errors of neighbours count together by a quarter (`kpc.encoder.rdo.distortion`)."""
-    return np.rint((1 << COARSER_BITS) / np.sqrt(1 + 0.5 * np.cos(np.pi * np.arange(side) / side))).astype(np.int64)
+    """Return (N,) int64: by how much coarser each frequency is quantised along an axis, in 1/64.
+
+    (1 + cos(pi k / N) / 2)^(-1/2): bilinear look-ups between texels see less of errors of high frequency, since those of neighbours
+    count together by a quarter (`kpc.encoder.rdo.distortion`).
+    """
+    return np.rint((1 << WEIGHT_BITS) / np.sqrt(1 + 0.5 * np.cos(np.pi * np.arange(side) / side))).astype(np.int64)
 
 
 def step_table(side: int, quantiser: int) -> np.ndarray:
-    """(FINENESSES, N, N) int64: of each level, in 1 / PARTS of a symbol."""
-    along = frequency_weights(side)
-    bits = 3 * COARSER_BITS
-    return np.maximum(quantiser * FINER[:, None, None] * np.outer(along, along) + (1 << bits - 1) >> bits, 1)
+    """Return (OFFSET_COUNT, N, N) int64: the quantisation step of each level, in 1/UNITS_PER_SYMBOL of a symbol."""
+    along, bits = frequency_weights(side), 3 * WEIGHT_BITS
+    scales = quantiser * OFFSET_SCALES[:, None, None] * np.outer(along, along)
+    return np.maximum(scales + (1 << bits - 1) >> bits, 1)
 
 
 def largest_side(rows: int, columns: int) -> int:
-    """Of blocks of a segment: so that padding does not make much more of it than it is."""
+    """Return the largest side of blocks that a segment may have, so that padding does not make it much larger."""
     return max((side for side in SIDES if side <= 2 * min(rows, columns)), default=SIDES[0])
 
 
 def coded_blocks(coded: np.ndarray, side: int) -> np.ndarray:
-    """(blocks down, blocks across) bool: those with any coded texel."""
+    """Return (blocks down, blocks across) bool: the blocks with any coded texel."""
     rows, columns = coded.shape
     padded = np.pad(coded, ((0, -rows % side), (0, -columns % side)))
     return padded.reshape(-(-rows // side), side, -1, side).any((1, 3))
 
 
-def encode_blocks(
-    blocks: TransformBlocks, coded: np.ndarray, implied: np.ndarray | None = None, borders: bool = True
-) -> bytes:
-    """Code a segment whose (H, W) `coded` texels are those. `implied`: the map that needs not be told. `borders`: whether blocks go on from
-    them; codec 2 has neither."""
+def encode_blocks(blocks: TransformBlocks, coded: np.ndarray, implied: np.ndarray | None = None) -> bytes:
+    """Encode a segment.
+
+    Args:
+        coded: (H, W) bool, the coded texels.
+        implied: (H, W) bool, the map that the occupancy implies; None where it is not known.
+    """
     levels, coded = np.ascontiguousarray(blocks.levels), np.array(coded, order="C")
     side, busy = levels.shape[-1], coded_blocks(coded, levels.shape[-1])
-    trace, at = (
-        np.empty(
-            coded.size + busy.size * (3 + MOST_END_DECISIONS * len(levels)) + levels.size * MAX_DECISIONS, np.int16
-        ),
-        0,
-    )
-    flags = map_mode(coded, implied)
-    if flags & MAP:
-        _, at = code_map(coded, 0, at, None, trace)
-    step_offsets, finer = np.array(blocks.step_offsets, np.int64), step_table(side, blocks.quantiser)
-    _, at = code_offsets(step_offsets, busy, 0, at, None, trace)
-    _, at = code_levels(levels, step_offsets, busy, finer, borders, 0, at, None, trace, None, dct_basis(side), coded)
-    return bytes([side, flags | BLOCKS << LATTICE_BIT | THIRD * borders, blocks.quantiser]) + encode_trace(trace[:at])
-
-
-def holds_blocks(body: bytes) -> bool:
-    """Whether a segment under codec 2 or 3 is told in blocks, else symbol by symbol."""
-    return len(body) > 1 and known_flags(body[1]) and body[1] >> LATTICE_BIT & 3 == BLOCKS
+    decisions = coded.size + busy.size * (3 + MAX_END_DECISIONS * len(levels)) + levels.size * MAX_DECISIONS
+    trace, position, mode = np.empty(decisions, np.int16), 0, map_mode(coded, implied)
+    if mode == MAP_CODED:
+        _, position = code_map(coded, 0, position, None, trace)
+    offsets, steps = np.array(blocks.step_offsets, np.int64), step_table(side, blocks.quantiser)
+    _, position = code_offsets(offsets, busy, 0, position, None, trace)
+    _, position = code_levels(levels, offsets, busy, steps, 0, position, None, trace, None, dct_basis(side), coded)
+    return bytes([side, mode, blocks.quantiser]) + encode_trace(trace[:position])
 
 
 def decode_blocks(
     body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What `encode_blocks` coded: (rows, columns, channels) int8 symbols, and (rows, columns) bool, the coded texels.
+    """Decode what `encode_blocks` made.
+
+    Returns:
+        (rows, columns, channels) int8 symbols and (rows, columns) bool, the coded texels.
 
     Raises:
-        FormatError: the body is cut, too long, or says what only a damaged one would.
+        FormatError: the body is cut off, too long or damaged.
     """
-    symbols, coded, _ = _decoded(body, rows, columns, channels, implied, None)
+    symbols, coded, _ = _decode(body, rows, columns, channels, implied, None)
     return symbols, coded
 
 
 def decode_levels(
     body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None
 ) -> TransformBlocks:
-    """What `encode_blocks` was given, of a body that `decode_blocks` decodes; levels of blocks without a coded texel are 0."""
+    """Return what `encode_blocks` was given, of a body that `decode_blocks` decodes; 0 for levels that are not coded."""
     side = body[0]
     levels = np.zeros((channels, *coded_blocks(np.zeros((rows, columns), bool), side).shape, side, side), np.int64)
-    _, _, step_offsets = _decoded(body, rows, columns, channels, implied, levels)
+    _, _, step_offsets = _decode(body, rows, columns, channels, implied, levels)
     return TransformBlocks(levels, step_offsets, body[2])
 
 
-def _decoded(
+def _decode(
     body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None, levels: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Symbols, coded texels and how fine blocks are; `levels`, as of `TransformBlocks`, are filled in."""
-    if len(body) < HEAD or not holds_blocks(body) or body[0] not in SIDES or body[2] == 0:
-        raise FormatError("plane segment: unknown side of blocks, or a quantiser of 0")
-    side = body[0]
+    """Return symbols, coded texels and step offsets, and fill `levels` in."""
+    if len(body) < HEAD or body[0] not in SIDES or body[1] > MAP_IMPLIED or body[2] == 0:
+        raise FormatError("plane segment: unknown side of blocks or flag, or a step of 0")
+    side, mode = body[0], body[1]
     if side > largest_side(rows, columns):
         raise FormatError(f"plane segment: blocks of {side}, more than twice its {min(rows, columns)} rows or columns")
     state, words = open_stream(body[HEAD:], "plane segment")
-    symbols, coded, at = np.zeros((rows, columns, channels), np.int8), initial_map(body[1], rows, columns, implied), 0
-    if body[1] & MAP:
-        state, at = code_map(coded, state, at, words, None)
+    symbols, coded = np.zeros((rows, columns, channels), np.int8), initial_map(mode, rows, columns, implied)
+    position = 0
+    if mode == MAP_CODED:
+        state, position = code_map(coded, state, position, words, None)
     busy = coded_blocks(coded, side)
-    step_offsets = np.zeros(busy.shape, np.int64)
-    if at <= len(words):
-        state, at = code_offsets(step_offsets, busy, state, at, words, None)
-    if at <= len(words):
-        borders, finer = body[1] & THIRD != 0, step_table(side, body[2])
-        state, at = code_levels(
-            levels, step_offsets, busy, finer, borders, state, at, words, None, symbols, dct_basis(side), coded
+    offsets, steps = np.zeros(busy.shape, np.int64), step_table(side, body[2])
+    if position <= len(words):
+        state, position = code_offsets(offsets, busy, state, position, words, None)
+    if position <= len(words):
+        state, position = code_levels(
+            levels, offsets, busy, steps, state, position, words, None, symbols, dct_basis(side), coded
         )
-    check_end(state, at, words, "plane segment")
-    return symbols, coded, step_offsets
+    check_end(state, position, words, "plane segment")
+    return symbols, coded, offsets
 
 
-# --- the walk that encoder and decoder share
+# --- kernels that encoder and decoder share
 
 
 @compiled()
-def code_offsets(step_offsets, busy, state, at, words, trace):
-    """Code how fine blocks are that are `busy`, or decode into it: (state, at). Others are as foreseen, the mean of left and above."""
+def code_offsets(offsets, busy, state, position, words, trace):
+    """Code the step offsets of blocks that are `busy`: (state, position). Others are as predicted, the mean of left and above."""
     BY, BX = busy.shape
-    table = new_models(OFFSET_COUNT * OFFSET_COUNT)
+    models = new_models(OFFSET_COUNT * OFFSET_COUNT)
     for by in range(BY):
         for bx in range(BX):
-            left = step_offsets[by, bx - 1] if bx > 0 else step_offsets[by - 1, bx] if by > 0 else DEFAULT_OFFSET
-            above = step_offsets[by - 1, bx] if by > 0 else left
-            foreseen = left + above + 1 >> 1
-            node, place = 1, OFFSET_COUNT >> 1
+            left = offsets[by, bx - 1] if bx > 0 else offsets[by - 1, bx] if by > 0 else DEFAULT_OFFSET
+            above = offsets[by - 1, bx] if by > 0 else left
+            predicted = left + above + 1 >> 1
+            node, mask = 1, OFFSET_COUNT >> 1
             if busy[by, bx]:
-                while place:
-                    bit, state, at = code_bit_adaptive(
-                        1 if step_offsets[by, bx] & place else 0,
-                        table,
-                        foreseen * OFFSET_COUNT + node,
+                while mask:
+                    bit, state, position = code_bit_adaptive(
+                        1 if offsets[by, bx] & mask else 0,
+                        models,
+                        predicted * OFFSET_COUNT + node,
                         state,
-                        at,
+                        position,
                         words,
                         trace,
                     )
                     node = node << 1 | bit
-                    place >>= 1
-                step_offsets[by, bx] = node - OFFSET_COUNT
+                    mask >>= 1
+                offsets[by, bx] = node - OFFSET_COUNT
             else:
-                step_offsets[by, bx] = foreseen
-        if words is not None and at > words.size:
+                offsets[by, bx] = predicted
+        if words is not None and position > words.size:
             break
-    return state, at
+    return state, position
 
 
 @compiled()
-def code_levels(levels, step_offsets, busy, step_table, borders, state, at, words, trace, symbols, dct_basis, coded):
-    """Code `levels` of blocks that are `busy`, or decode what they make into `symbols`, and, where they are wanted, into `levels`: (state, at).
-    `borders`: whether blocks go on from them."""
+def code_levels(levels, offsets, busy, step_table, state, position, words, trace, symbols, dct_basis, coded):
+    """Code the levels of blocks that are `busy`: (state, position). Decoding fills `symbols` and, unless it is None, `levels`.
+
+    One function, since its state (magnitudes, ends, means and borders of the blocks around) would be the parameters of any part of it.
+    """
     BY, BX = busy.shape
     N = len(dct_basis)
     M = 0
@@ -269,200 +256,200 @@ def code_levels(levels, step_offsets, busy, step_table, borders, state, at, word
         M = len(levels)
     if symbols is not None:
         M = symbols.shape[2]
-    table, sign_table = level_counters(), sign_counters()
-    end_table = new_models(END_CONTEXTS * END_DECISIONS if borders else PLAIN_ENDS * PLAIN_END_DECISIONS)
+    models, sign_models, end_models = new_level_models(), new_sign_models(), new_models(END_CONTEXTS * MODELS_PER_END)
     size, before = empty_magnitudes(BY, BX, N), empty_magnitudes(BY, BX, N)
     end, end_before = np.zeros((BY + 1, BX + 1), np.int64), np.zeros((BY + 1, BX + 1), np.int64)
     mean = np.zeros((BY + 1, BX + 1), np.int64)
-    block, columns, rest = np.zeros((N, N), np.int64), np.zeros((N, N), np.int64), np.zeros((2, N), np.int64)
+    block, columns, gap = np.zeros((N, N), np.int64), np.zeros((N, N), np.int64), np.zeros((2, N), np.int64)
     right, bottom = np.zeros(N, np.int64), np.zeros((BX, N), np.int64)
     for m in range(M):
         for by in range(BY):
             for bx in range(BX):
-                Y, X, quantiser = by + 1, bx + 1, step_table[step_offsets[by, bx]]
+                Y, X, steps = by + 1, bx + 1, step_table[offsets[by, bx]]
                 here, left, above, past = size[Y, X], size[Y, X - 1], size[Y - 1, X], before[Y, X]
                 mean[Y, X] = predict_mean(mean, by, bx)
                 here[:], end[Y, X] = 0, 0
                 if not busy[by, bx]:
                     continue
-                beside, over = borders and bx > 0 and busy[by, bx - 1], borders and by > 0 and busy[by - 1, bx]
+                has_left, has_above = bx > 0 and busy[by, bx - 1], by > 0 and busy[by - 1, bx]
                 expected = mean[Y, X]
-                if beside or over:
-                    expected = (UNITS_PER_SYMBOL >> 1) * border_sum(right, bottom[bx], beside, over) + expected >> 1
-                foreseen = (expected + (quantiser[0, 0] >> 1)) // quantiser[0, 0]
+                if has_left or has_above:
+                    across = border_sum(right, bottom[bx], has_left, has_above)
+                    expected = (UNITS_PER_SYMBOL >> 1) * across + expected >> 1
+                predicted = (expected + (steps[0, 0] >> 1)) // steps[0, 0]
                 block[:] = 0
                 if levels is not None and words is None:
                     block[:] = levels[m, by, bx]
-                    block[0, 0] -= foreseen
-                ends = end[Y, X - 1], end[Y - 1, X], end_before[Y, X]
-                if borders:
-                    first = end_context(*ends) * END_DECISIONS
-                    last, state, at = code_unsigned(
-                        last_diagonal(block) + 1, end_table, first, END_UNARY, END_ESCAPES, state, at, words, trace
-                    )
-                    end[Y, X] = min(last - 1, 2 * N - 1)
-                else:
-                    usual = usual_end(*ends)
-                    first = plain_end_context(usual, N) * PLAIN_END_DECISIONS
-                    last, state, at = code_signed(
-                        last_diagonal(block) - usual,
-                        end_table,
-                        first,
-                        PLAIN_END_UNARY,
-                        END_ESCAPES,
-                        state,
-                        at,
-                        words,
-                        trace,
-                    )
-                    end[Y, X] = min(max(last + usual, 0), 2 * N - 1)
+                    block[0, 0] -= predicted
+                first = end_context(end[Y, X - 1], end[Y - 1, X], end_before[Y, X]) * MODELS_PER_END
+                last, state, position = code_unsigned(
+                    last_diagonal(block) + 1, end_models, first, END_UNARY, END_ESCAPES, state, position, words, trace
+                )
+                end[Y, X] = min(last - 1, 2 * N - 1)
                 for diagonal in range(end[Y, X] - 1, -1, -1):
-                    signed = not borders or diagonal == 0
                     for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1):
                         j = diagonal - i
                         first = level_context(here, left, above, past, i, j, N) * MODELS_PER_CONTEXT
-                        here[i, j], state, at = code_magnitude(abs(block[i, j]), table, first, state, at, words, trace)
+                        here[i, j], state, position = code_magnitude(
+                            abs(block[i, j]), models, first, state, position, words, trace
+                        )
                         positive = 1
-                        if signed and here[i, j]:
-                            positive, state, at = code_bit(
-                                1 if block[i, j] > 0 else 0, SCALE >> 1, state, at, words, trace
+                        if diagonal == 0 and here[i, j]:
+                            positive, state, position = code_bit(
+                                1 if block[i, j] > 0 else 0, SCALE >> 1, state, position, words, trace
                             )
                         if words is not None:
                             block[i, j] = here[i, j] if positive else -here[i, j]
-                block[0, 0] += foreseen
-                mean[Y, X] = coefficient(block[0, 0], quantiser[0, 0])
-                if borders:
-                    init_border_residual(rest, right, bottom[bx], beside, over)
-                    state, at = code_signs(
-                        block, end[Y, X], quantiser, dct_basis, rest, beside, over, sign_table, state, at, words, trace
-                    )
+                block[0, 0] += predicted
+                mean[Y, X] = coefficient(block[0, 0], steps[0, 0])
+                init_gap(gap, right, bottom[bx], has_left, has_above)
+                state, position = code_signs(
+                    block,
+                    end[Y, X],
+                    steps,
+                    dct_basis,
+                    gap,
+                    has_left,
+                    has_above,
+                    sign_models,
+                    state,
+                    position,
+                    words,
+                    trace,
+                )
                 if levels is not None and words is not None:
                     levels[m, by, bx] = block
-                if borders or symbols is not None:
-                    inverse_transform(block, quantiser, dct_basis, columns)
-                    right[:], bottom[bx] = block[:, N - 1], block[N - 1]
+                inverse_transform(block, steps, dct_basis, columns)
+                right[:], bottom[bx] = block[:, N - 1], block[N - 1]
                 if symbols is not None:
-                    for y in range(by * N, min(by * N + N, len(coded))):
-                        for x in range(bx * N, min(bx * N + N, coded.shape[1])):
-                            if coded[y, x]:
-                                symbols[y, x, m] = block[y - by * N, x - bx * N]
-            if words is not None and at > words.size:
-                return state, at
+                    store_block(block, symbols, coded, by, bx, m)
+            if words is not None and position > words.size:
+                return state, position
         size, before = before, size
         end, end_before = end_before, end
-    return state, at
+    return state, position
+
+
+@inlined
+def store_block(block, symbols, coded, by, bx, m):
+    """Copy the coded texels of a block into the symbols of channel m."""
+    N = len(block)
+    for y in range(by * N, min(by * N + N, len(coded))):
+        for x in range(bx * N, min(bx * N + N, coded.shape[1])):
+            if coded[y, x]:
+                symbols[y, x, m] = block[y - by * N, x - bx * N]
 
 
 @compiled()
-def code_signs(block, end, step_table, dct_basis, rest, beside, over, table, state, at, words, trace):
-    """Code the signs of all levels but the mean, the slowest first, or decode them, which makes `block` negative where they are: (state, at)."""
+def code_signs(block, end, steps, dct_basis, gap, has_left, has_above, models, state, position, words, trace):
+    """Code the signs of all levels but the mean, lowest frequency first: (state, position). Decoding negates levels of `block`."""
     N = len(block)
-    subtract_from_border(rest, dct_basis, 0, 0, coefficient(block[0, 0], step_table[0, 0]))
+    reduce_gap(gap, dct_basis, 0, 0, coefficient(block[0, 0], steps[0, 0]))
     for diagonal in range(1, end):
         for i in range(max(0, diagonal - N + 1), min(diagonal, N - 1) + 1):
             j = diagonal - i
             if block[i, j]:
-                size = coefficient(abs(block[i, j]), step_table[i, j])
-                pull = sign_bias(rest, dct_basis, i, j, beside, over)
+                size = coefficient(abs(block[i, j]), steps[i, j])
+                bias = sign_bias(gap, dct_basis, i, j, has_left, has_above)
                 positive = 1 if block[i, j] > 0 else 0
-                if pull == 0:
-                    positive, state, at = code_bit(positive, SCALE >> 1, state, at, words, trace)
+                if bias == 0:
+                    positive, state, position = code_bit(positive, SCALE >> 1, state, position, words, trace)
                 else:
-                    likelier = 1 if pull > 0 else 0
-                    context = sign_context(abs(pull), size, step_table[0, 0], N)
-                    agrees, state, at = code_bit_adaptive(
-                        1 if positive == likelier else 0, table, context, state, at, words, trace
+                    likelier = 1 if bias > 0 else 0
+                    context = sign_context(abs(bias), size, steps[0, 0], N)
+                    agrees, state, position = code_bit_adaptive(
+                        1 if positive == likelier else 0, models, context, state, position, words, trace
                     )
                     positive = likelier if agrees else 1 - likelier
                 if words is not None and not positive:
                     block[i, j] = -block[i, j]
-                subtract_from_border(rest, dct_basis, i, j, size if positive else -size)
-    return state, at
+                reduce_gap(gap, dct_basis, i, j, size if positive else -size)
+    return state, position
 
 
 @inlined
-def border_sum(right, bottom, beside, over):
-    """Of what lies across both borders; where there is one alone, of that twice. So the mean of a block is, by that, half as much."""
+def border_sum(right, bottom, has_left, has_above):
+    """Return the sum of the symbols across both borders; where there is only one border, twice the sum across that."""
     total = 0 * right[0]
     for k in range(len(right)):
-        total += (right if beside else bottom)[k] + (bottom if over else right)[k]
+        total += (right if has_left else bottom)[k] + (bottom if has_above else right)[k]
     return total
 
 
 @inlined
-def init_border_residual(rest, right, bottom, beside, over):
-    """Nothing is known of a block yet."""
+def init_gap(gap, right, bottom, has_left, has_above):
+    """Set the gap of a block of which nothing is known yet: the symbols across the border."""
     for k in range(len(right)):
-        rest[0, k], rest[1, k] = (
-            UNITS_PER_SYMBOL * right[k] if beside else 0,
-            UNITS_PER_SYMBOL * bottom[k] if over else 0,
-        )
+        gap[0, k] = UNITS_PER_SYMBOL * right[k] if has_left else 0
+        gap[1, k] = UNITS_PER_SYMBOL * bottom[k] if has_above else 0
 
 
 @inlined
-def subtract_from_border(rest, dct_basis, i, j, coefficient):
-    """A block is told to hold so much of a cosine."""
-    shift = 7  # 14 bits of dct_basis and log2 N, of which 7 are taken before
+def reduce_gap(gap, dct_basis, i, j, coefficient):
+    """Subtract from the gap what a coefficient contributes along the borders."""
+    shift = 7  # 14 bits of cosines and log2 N, of which 7 are taken before
     while 1 << shift - 7 < len(dct_basis):
         shift += 1
-    beside, over = dct_basis[j, 0] * coefficient + 64 >> 7, dct_basis[i, 0] * coefficient + 64 >> 7
+    left, above = dct_basis[j, 0] * coefficient + 64 >> 7, dct_basis[i, 0] * coefficient + 64 >> 7
     for k in range(len(dct_basis)):
-        rest[0, k] -= dct_basis[i, k] * beside + (1 << shift - 1) >> shift
-        rest[1, k] -= dct_basis[j, k] * over + (1 << shift - 1) >> shift
+        gap[0, k] -= dct_basis[i, k] * left + (1 << shift - 1) >> shift
+        gap[1, k] -= dct_basis[j, k] * above + (1 << shift - 1) >> shift
 
 
 @inlined
-def sign_bias(rest, dct_basis, i, j, beside, over):
-    """How much of a cosine what lies across borders asks for, in 1 / (128 N PARTS) of a symbol."""
+def sign_bias(gap, dct_basis, i, j, has_left, has_above):
+    """Return the correlation of the gap with a cosine, in 1/(128 N UNITS_PER_SYMBOL): its sign is the likelier one of the level."""
     left, above = 0, 0
     for k in range(len(dct_basis)):
-        left += min(max(rest[0, k], -LARGEST_REST), LARGEST_REST) * dct_basis[i, k]
-        above += min(max(rest[1, k], -LARGEST_REST), LARGEST_REST) * dct_basis[j, k]
-    return (dct_basis[j, 0] * (left >> 7) if beside else 0) + (dct_basis[i, 0] * (above >> 7) if over else 0)
+        left += min(max(gap[0, k], -GAP_LIMIT), GAP_LIMIT) * dct_basis[i, k]
+        above += min(max(gap[1, k], -GAP_LIMIT), GAP_LIMIT) * dct_basis[j, k]
+    return (dct_basis[j, 0] * (left >> 7) if has_left else 0) + (dct_basis[i, 0] * (above >> 7) if has_above else 0)
 
 
 @inlined
-def sign_context(pull, size, quantiser, side):
-    """How much likelier the sign is that `pull` asks for, of a cosine of that size."""
-    likelier = log_class(pull) + log_class(size) - 2 * log_class(quantiser) - log_class(side) - 14
-    return min(max(likelier + SURENESS, 0), len(SIGN_PROBABILITIES) - 1)
+def sign_context(bias, size, mean_step, side):
+    """Return the context of the sign of a coefficient of that size: how much likelier the sign of the bias is."""
+    likelier = log_class(bias) + log_class(size) - 2 * log_class(mean_step) - log_class(side) - 14
+    return min(max(likelier + SIGN_CENTRE, 0), len(SIGN_PROBABILITIES) - 1)
 
 
 @compiled()
-def sign_counters():
-    """Counters of signs that know what is likely."""
-    table = new_models(len(SIGN_PROBABILITIES))
+def new_sign_models():
+    """Return models of signs with their initial probabilities."""
+    models = new_models(len(SIGN_PROBABILITIES))
     for context in range(len(SIGN_PROBABILITIES)):
-        table[context] = SIGN_PROBABILITIES[context] << 16 | KNOWN
-    return table
+        models[context] = SIGN_PROBABILITIES[context] << 16 | INITIAL_USES
+    return models
 
 
 @compiled()
-def level_counters():
-    """Counters of levels, DECISIONS a context, that know what is likely."""
-    table = new_models(MAGNITUDE_CONTEXTS * FREQUENCY_CLASSES * MODELS_PER_CONTEXT)
+def new_level_models():
+    """Return models of levels, MODELS_PER_CONTEXT a context, with their initial probabilities."""
+    models = new_models(MAGNITUDE_CONTEXTS * FREQUENCY_CLASSES * MODELS_PER_CONTEXT)
     for context in range(MAGNITUDE_CONTEXTS * FREQUENCY_CLASSES):
         for which in range(1 + UNARY):
             rank, is_mean = min(which, 2), context % FREQUENCY_CLASSES == FREQUENCY_CLASSES - 1
-            likely = LIKELY_MEANS[rank] if is_mean else LIKELY[rank, context // FREQUENCY_CLASSES]
-            table[context * MODELS_PER_CONTEXT + which] = likely << 16 | KNOWN
-    return table
+            magnitude = context // FREQUENCY_CLASSES
+            probability = INITIAL_MEAN_PROBABILITIES[rank] if is_mean else INITIAL_PROBABILITIES[rank, magnitude]
+            models[context * MODELS_PER_CONTEXT + which] = probability << 16 | INITIAL_USES
+    return models
 
 
 @compiled()
 def empty_magnitudes(down, across, side):
-    """Magnitudes of levels as they were told, of no blocks yet: with one more above and to the left, and two frequencies beyond each."""
+    """Return int32 zeros for the magnitudes of levels of blocks: one block more above and to the left, two frequencies beyond."""
     return np.zeros((down + 1, across + 1, side + 2, side + 2), np.int32)
 
 
 @inlined
-def coefficient(level, quantiser):
-    return min(max(level * quantiser, COEFFICIENT_MIN), COEFFICIENT_MAX)
+def coefficient(level, step):
+    """Return the dequantised coefficient of a level, in 1/UNITS_PER_SYMBOL, clamped to 16 bits."""
+    return min(max(level * step, COEFFICIENT_MIN), COEFFICIENT_MAX)
 
 
 @inlined
 def predict_mean(mean, by, bx):
-    """The mean of a block by those to the left, above, and above to the left; `mean`: with one more above and to the left."""
+    """Return the median prediction of a block's mean from left, above and above left; `mean` has one more row and column before."""
     left, above = mean[by + 1, bx], mean[by, bx + 1]
     if by == 0:
         return left
@@ -473,7 +460,7 @@ def predict_mean(mean, by, bx):
 
 @compiled()
 def last_diagonal(block):
-    """One more than that of the quickest level that is not 0."""
+    """Return one more than the highest diagonal that has a level other than 0."""
     last = 0
     for i in range(len(block)):
         for j in range(len(block)):
@@ -483,63 +470,50 @@ def last_diagonal(block):
 
 
 @inlined
-def usual_end(left, above, before):
-    """What an end may be, by those to the left and above and of the channel before."""
-    return left + above + 2 * before + 2 >> 2
-
-
-@inlined
-def plain_end_context(usual, side):
-    """One of PLAIN_ENDS."""
-    return 0 if usual == 0 else 1 + (usual - 1) * (PLAIN_ENDS - 1) // (2 * side - 1)
-
-
-@inlined
 def end_context(left, above, before):
-    """One of ENDS, by ends to the left and above and of the channel before."""
+    """Return the context of an end, from those to the left, above and of the channel before."""
     return min(log_class(left + above + before), END_CONTEXTS - 1)
 
 
 @inlined
 def level_context(here, left, above, before, i, j, side):
-    """How large a level may be, by those of higher frequencies, of neighbours and of the channel before; and how quick it is."""
-    quicker = 2 * (here[i, j + 1] + here[i + 1, j]) + here[i + 1, j + 1] + here[i, j + 2] + here[i + 2, j]
+    """Return the context of a level: magnitudes of higher frequencies, of neighbours and of the channel before; its frequency."""
+    higher = 2 * (here[i, j + 1] + here[i + 1, j]) + here[i + 1, j + 1] + here[i, j + 2] + here[i + 2, j]
     beside = left[i, j] + above[i, j] + left[i, j + 1] + above[i, j + 1] + left[i + 1, j] + above[i + 1, j]
-    total = 3 * quicker + 2 * beside + 3 * before[i, j]
-    large = min(log_class(total), MAGNITUDE_CONTEXTS - 1)
-    quick = min(5 * (i + j) // side, FREQUENCY_CLASSES - 2) if i + j else FREQUENCY_CLASSES - 1
-    return large * FREQUENCY_CLASSES + quick
+    magnitude = min(log_class(3 * higher + 2 * beside + 3 * before[i, j]), MAGNITUDE_CONTEXTS - 1)
+    frequency = min(5 * (i + j) // side, FREQUENCY_CLASSES - 2) if i + j else FREQUENCY_CLASSES - 1
+    return magnitude * FREQUENCY_CLASSES + frequency
 
 
 @inlined
-def code_magnitude(size, table, first, state, at, words, trace):
-    """Code or decode the magnitude of a level by DECISIONS counters from `first` on: (size, state, at)."""
-    bit, state, at = code_bit_adaptive(1 if size else 0, table, first, state, at, words, trace)
+def code_magnitude(size, models, first, state, position, words, trace):
+    """Code the magnitude of a level with MODELS_PER_CONTEXT models from `first` on: (size, state, position)."""
+    bit, state, position = code_bit_adaptive(1 if size else 0, models, first, state, position, words, trace)
     if not bit:
-        return 0, state, at
-    return code_unsigned(size, table, first + 1, UNARY, ESCAPES, state, at, words, trace)
+        return 0, state, position
+    return code_unsigned(size, models, first + 1, UNARY, ESCAPES, state, position, words, trace)
 
 
 @compiled()
-def inverse_transform(block, step_table, dct_basis, columns):
-    """Turn levels into symbols, as far as 8 bits reach: dct_basis added up down the columns first, then along the rows."""
-    N, quickest = len(block), 0
-    shift = 10  # 14 bits of dct_basis, 3 of PARTS and log2 N, of which 7 are taken before
+def inverse_transform(block, steps, dct_basis, columns):
+    """Turn levels into symbols, clamped to 8 bits, in place: the inverse DCT down the columns first, then along the rows."""
+    N, highest = len(block), 0
+    shift = 10  # 14 bits of cosines, 3 of UNITS_PER_SYMBOL and log2 N, of which 7 are taken before
     while 1 << shift - 10 < N:
         shift += 1
     columns[:] = 0
     for i in range(N):
         for j in range(N):
             if block[i, j]:
-                quickest = max(quickest, j)
-                c = coefficient(block[i, j], step_table[i, j])
+                highest = max(highest, j)
+                c = coefficient(block[i, j], steps[i, j])
                 for y in range(N):
                     columns[y, j] += dct_basis[i, y] * c
     for y in range(N):
-        for j in range(quickest + 1):
+        for j in range(highest + 1):
             columns[y, j] = columns[y, j] + 64 >> 7
         for x in range(N):
             total = 1 << shift - 1
-            for j in range(quickest + 1):
+            for j in range(highest + 1):
                 total += dct_basis[j, x] * columns[y, j]
             block[y, x] = min(max(total >> shift, -128), 127)

@@ -1,8 +1,11 @@
-"""Memory use of this process."""
+"""Memory: use of this process, and the budget of a decoded scene."""
 
 import re
 import sys
 from pathlib import Path
+
+# Bytes that a decoded scene may take where the caller gives no budget.
+DEFAULT_BUDGET = 2 << 30
 
 
 def peak_memory_bytes() -> int:

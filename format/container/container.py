@@ -1,114 +1,76 @@
-"""The outer shape of a .kpc file: header, chunk index, chunks (spec/kpc-format.md, sections 3 and 4).
+"""The outer structure of a .kpc file: header, chunk index, chunks (spec/kpc-format.md, "Container").
 
-    header (64 bytes) | index (chunk_count entries of 40 bytes) | chunk 0 | chunk 1 | ...        little-endian, no gaps
+    header (48 bytes) | index (a zstd frame) | chunk 0 | chunk 1 | ...        little-endian, no gaps
 
-Files of version 1 hold the index as it is, those of version 2 as a zstd frame of its columns.
-Everything is covered by a CRC32C: the header by its own, the index by one in the header, a chunk by one in its entry.
-This module knows nothing of scenes: a chunk is a kind, a place in the scene, and bytes.
+A CRC32C covers everything: the header has its own, that of the index is in the header, that of a chunk in its index entry.
+This module does not know what a scene is: a chunk is a kind, a position in the scene, and bytes.
 """
 
-import io
-import os
 import struct
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import BinaryIO, Protocol, runtime_checkable
+from enum import IntEnum
 
 import google_crc32c
 import numpy as np
 import zstandard
 from kpc.format.common.errors import FormatError
+from kpc.format.container.sources import AnySource, open_source
 
 MAGIC = b"\x89KPC\r\n\x1a\n"
-PLAIN_VERSION, VERSION = 1, 2
-READABLE_VERSIONS = (0, PLAIN_VERSION, VERSION)
-"""Files of the draft, version 0, are as those of version 1 but for the number."""
-HEADER = struct.Struct("<8sHHIQIIQQIIII")
-ENTRY = struct.Struct("<4sHBBIIHHIIIQ")
-TOLD = ENTRY.size - 8
-"""Bytes of an entry that version 2 tells: all but the offset, which follows from the lengths before it."""
+VERSION = 1
+HEADER = struct.Struct("<8sHHIIIQQII")  # see `Header`; the last field is the CRC32C of those before
+ENTRY = struct.Struct("<4sHBBIIHIII")  # see `Entry`; the offset is not stored
+VERSION_STRUCT = struct.Struct("<8sHH")  # magic, version, header_length: their positions never change
 
-CODEC_RAW, CODEC_ZSTD, CODEC_SYMBOLS, CODEC_MIDPOINTS = range(4)
-CODEC_THIRD = CODEC_MIDPOINTS
-"""Of planes, which have no midpoints."""
 ZSTD_LEVEL = 19
+ZSTD_BLOCK = 1 << 17  # bytes of a block of a zstd frame, at most (RFC 8878)
 
-LEAST_CHUNK = 8
-"""Bytes that a file of version 2 has for each of its chunks, at least; in one of version 1 each takes ENTRY.size. So few bytes cannot claim
-many chunks."""
+# Bytes of file for each chunk, at least, so that a small file cannot claim many chunks.
+MIN_CHUNK_BYTES = 8
+# Bytes of index that a file may have: this and INDEX_BYTES_PER_CHUNK for each chunk.
+INDEX_BYTES, INDEX_BYTES_PER_CHUNK = 64, 40
+# Decoded bytes that a byte of file may stand for (zstd's own limit), so that a small file cannot claim a huge scene.
 EXPANSION_LIMIT = 32768
-"""Decoded bytes a byte of file may stand for (zstd's own limit): a small file cannot claim a huge scene."""
-CHUNK_LIMIT = 1 << 16
-"""Chunks a file may hold."""
-DEFAULT_BUDGET = 2 << 30
-"""Bytes a reader allows a decoded scene unless told otherwise."""
+CHUNK_LIMIT = 1 << 16  # chunks in a file
 
 
-@runtime_checkable
-class Source(Protocol):
-    """Where a file's bytes come from: a disk, memory, or HTTP range requests."""
+class Codec(IntEnum):
+    """How the stored bytes of a chunk become its raw ones.
 
-    name: str
-    size: int
+    `raw_length` is the number of symbols under PREDICTIVE and TRANSFORM, else the bytes that the content takes under RAW.
+    """
 
-    def read_at(self, offset: int, length: int) -> bytes:
-        """`length` bytes from `offset`, fewer only at the end."""
-
-    def will_read(self, offset: int, length: int) -> None:
-        """The next reads lie within these bytes, in order; a source to which each costs a journey may fetch them in one."""
-
-
-@runtime_checkable
-class RemoteSource(Source, Protocol):
-    """A source behind a network (`kpc.format.container.http.HttpSource`, which takes a while to import)."""
-
-    attempts: float
-    report: Callable[[str | None], None]
-
-    @property
-    def received_bytes(self) -> int:
-        """Bytes that came so far."""
-
-    @property
-    def has_ranges(self) -> bool:
-        """False if the server sends whole files only."""
-
-    def clone(self) -> "RemoteSource":
-        """The same file, for another thread to read at the same time."""
-
-    def interrupt(self) -> None:
-        """Something else is wanted sooner: what another thread is reading fails with InterruptedRead, as soon as may be. What came
-        of it is kept for when it is read again."""
-
-    def discard(self) -> None:
-        """Read anew what is asked for next: it came damaged."""
-
-    def close(self) -> None:
-        """Let go of the connection; what is being read fails."""
+    RAW = 0  # the content itself
+    ZSTD = 1  # one zstd frame
+    PREDICTIVE = 2  # plane segments: residuals of predictions, context-coded
+    TRANSFORM = 3  # plane segments: levels of DCT blocks, context-coded
+    MOTION = 4  # the motion grid, coarse to fine
+    OCCUPANCY = 5  # the occupancy grid
+    WEIGHTS = 6  # weights of a decoder
+    POSES = 7  # cameras
 
 
 @dataclass(frozen=True)
 class Header:
-    """The first 64 bytes.
+    """The first 48 bytes.
 
     Attributes:
         version: of the format.
-        index_length, chunk_count: of the index that follows.
-        file_length: size of the whole file, bytes.
-        value_count: numbers in all planes together, the limit a reader checks against its memory budget.
-        largest_raw: the largest raw length of any chunk, bytes.
-        index_crc: CRC32C of the index.
+        chunk_count, index_length, index_crc: number of chunks; size in bytes and CRC32C of the index.
+        file_length: size of the whole file in bytes.
+        value_count: numbers in all planes together, which a reader checks against its memory budget.
+        largest_raw: the largest raw length of any chunk.
     """
 
     version: int
-    index_length: int
     chunk_count: int
+    index_length: int
+    index_crc: int
     file_length: int
     value_count: int
     largest_raw: int
-    index_crc: int
 
 
 @dataclass(frozen=True)
@@ -117,10 +79,12 @@ class Entry:
 
     Attributes:
         kind: four letters; the first is a capital if no reader may ignore the chunk.
-        group, scale, plane, row_start, row_count: the place in the scene of a plane segment, or in the clip of a group, whose rows
+        group, scale, plane, row_start, row_count: position of a plane segment in the scene, or of a group in the clip, whose rows
             are frames (`kpc.format.container.groups`); 0 for other kinds.
-        codec: how the stored bytes become the raw ones.
-        stored_length, offset: where it lies in the file. raw_length: bytes once decoded. crc: of the stored bytes.
+        codec: a `Codec`, or a number that this reader does not know.
+        stored_length, offset: size and position in the file, in bytes.
+        raw_length: size once decoded, see `Codec`.
+        crc: CRC32C of the stored bytes.
     """
 
     kind: str
@@ -142,30 +106,34 @@ class Entry:
 
 @dataclass(frozen=True)
 class Chunk:
-    """One chunk to be written: its place and its raw bytes, cut where their statistics change.
+    """One chunk to be written.
 
-    Some have other forms besides, context-coded: `coded` makes them, by codec, which takes a while; they stand for `symbol_count` symbols
-    or bytes.
+    Attributes:
+        kind, scale, plane, row_start, row_count: as of `Entry`.
+        raw: the content under `Codec.RAW`.
+        codec, encode: another codec that the content has, and the function that encodes with it, which may take a while.
+        raw_length: the raw length under that codec; None: that of `raw`.
     """
 
     kind: str
-    parts: Sequence[bytes]
+    raw: bytes
     scale: int = 0
     plane: int = 0
     row_start: int = 0
     row_count: int = 0
-    coded: Mapping[int, Callable[[], bytes]] = field(default_factory=dict)
-    symbol_count: int = 0
+    codec: Codec = Codec.RAW
+    encode: Callable[[], bytes] | None = field(default=None, compare=False)
+    raw_length: int | None = None
 
 
-def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True, version: int = VERSION) -> bytes:
-    """Lay chunks out in the given order; each is stored in what is smallest: raw, context-coded if it can be, or as a zstd
-    frame (of planes only if they cannot).
+def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
+    """Return a file of these chunks in their order, each under the codec with which it is smallest.
+
+    Zstandard is tried for plane segments only where their own codec cannot be used: it would double the time and never be smaller.
 
     Args:
         value_count: numbers in all planes together.
-        compress: False stores every chunk raw, and the index as it is.
-        version: the newest that may be written; 1 has no other index than that.
+        compress: False stores every chunk raw, and the index without compression.
 
     Raises:
         FormatError: the result would break a limit that every reader checks.
@@ -176,33 +144,11 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True, ve
         )
     entries, bodies = [], []
     for chunk in chunks:
-        raw = b"".join(chunk.parts)
-        forms = [(raw, CODEC_RAW, len(raw))]
-        for codec, make in chunk.coded.items() if compress else ():
-            body = make()
-            if chunk.symbol_count <= len(body) * EXPANSION_LIMIT:
-                forms.append((body, codec, chunk.symbol_count))
-        if compress and (
-            chunk.kind != "PLNE" or len(forms) == 1
-        ):  # zstd would double the time, and never beats symbols of planes
-            forms += [(frame, CODEC_ZSTD, len(raw)) for frame in _zstd_frames(chunk.parts)]
-        body, codec, length = min(forms, key=lambda form: len(form[0]))
-        entries.append(
-            Entry(
-                chunk.kind,
-                0,
-                chunk.scale,
-                chunk.plane,
-                chunk.row_start,
-                chunk.row_count,
-                codec,
-                len(body),
-                length,
-                google_crc32c.value(body),
-            )
-        )
+        body, codec, raw_length = min(_encodings(chunk, compress), key=lambda encoding: len(encoding[0]))
+        position = 0, chunk.scale, chunk.plane, chunk.row_start, chunk.row_count
+        entries.append(Entry(chunk.kind, *position, codec, len(body), raw_length, google_crc32c.value(body)))
         bodies.append(body)
-    data = b"".join([header_and_index(entries, value_count, version if compress else PLAIN_VERSION), *bodies])
+    data = b"".join([header_and_index(entries, value_count, compress=compress), *bodies])
     if max(value_count, *(entry.raw_length for entry in entries)) > len(data) * EXPANSION_LIMIT:
         raise FormatError(
             f"the scene is too empty for its size: {value_count:,} values in {len(data):,} bytes; "
@@ -211,79 +157,81 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True, ve
     return data
 
 
-def header_and_index(entries: Sequence[Entry], value_count: int, version: int = PLAIN_VERSION) -> bytes:
-    """How a file begins that holds the chunks of these entries, which need not know their offsets; as one of version 1 if a later one
-    would not be smaller."""
-    index, stored = _plain_index(entries), sum(entry.stored_length for entry in entries)
-    if version == VERSION:
-        told = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(in_columns(index))
-        if len(told) < len(index) and len(told) + stored >= LEAST_CHUNK * len(entries):
-            index = told
-        else:
-            version = PLAIN_VERSION
-    file_length = HEADER.size + len(index) + stored
-    header = HEADER.pack(
-        MAGIC,
-        version,
-        0,
-        HEADER.size,
-        HEADER.size,
-        len(index),
-        len(entries),
-        file_length,
-        value_count,
-        max((entry.raw_length for entry in entries), default=0),
-        0,
-        google_crc32c.value(index),
-        0,
-    )
-    return b"".join([header[:-4], struct.pack("<I", google_crc32c.value(header[:-4])), index])
+def _encodings(chunk: Chunk, compress: bool) -> list[tuple[bytes, Codec, int]]:
+    """Return the stored bytes of a chunk under each codec that may be used, with the codec and the raw length."""
+    found = [(chunk.raw, Codec.RAW, len(chunk.raw))]
+    if compress and chunk.encode is not None:
+        body, raw_length = chunk.encode(), len(chunk.raw) if chunk.raw_length is None else chunk.raw_length
+        if raw_length <= len(body) * EXPANSION_LIMIT:
+            found.append((body, chunk.codec, raw_length))
+    if compress and (chunk.kind != "PLNE" or len(found) == 1):
+        found += [(frame, Codec.ZSTD, len(chunk.raw)) for frame in _zstd_frames(chunk.raw)]
+    return found
 
 
-def _plain_index(entries: Sequence[Entry]) -> bytes:
-    """As files of version 1 hold it."""
-    offset, parts = HEADER.size + ENTRY.size * len(entries), []
-    for e in entries:
-        parts.append(
-            ENTRY.pack(
-                e.kind.encode("ascii"),
-                e.group,
-                e.scale,
-                e.plane,
-                e.row_start,
-                e.row_count,
-                e.codec,
-                0,
-                e.stored_length,
-                e.raw_length,
-                e.crc,
-                offset,
-            )
-        )
-        offset += e.stored_length
-    return b"".join(parts)
-
-
-def in_columns(index: bytes) -> bytes:
-    """What the frame of those of version 2 holds: byte 0 of all entries of a plain index, then byte 1 of all, ..., but for offsets."""
-    return np.frombuffer(index, np.uint8).reshape(-1, ENTRY.size)[:, :TOLD].T.tobytes()
-
-
-def _zstd_frames(parts: Sequence[bytes]) -> list[bytes]:
-    """The same bytes as zstd frames of several kinds; which is smallest depends on the data.
-
-    Noise tempts the parser into short matches that cost more than they save, hence the longer minimum; a block boundary
-    after each part gives it a Huffman table of its own.
-    """
-    raw = b"".join(parts)
+def _zstd_frames(raw: bytes) -> list[bytes]:
+    """Return two zstd frames of the same bytes; in noise, short matches cost more than they save, hence one with long ones only."""
     long_matches = zstandard.ZstdCompressionParameters.from_level(ZSTD_LEVEL, source_size=len(raw), min_match=7)
-    stream = zstandard.ZstdCompressor(compression_params=long_matches).compressobj(size=len(raw))
-    blocks = [stream.compress(part) + stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for part in parts]
     return [
         zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(raw),
         zstandard.ZstdCompressor(compression_params=long_matches).compress(raw),
-        b"".join([*blocks, stream.flush()]),
     ]
+
+
+def header_and_index(entries: Sequence[Entry], value_count: int, *, compress: bool = True) -> bytes:
+    """Return the beginning of a file that holds the chunks of these entries, whose offsets are ignored.
+
+    Args:
+        compress: False makes the size of the index a function of the number of chunks alone, `stored_frame`.
+    """
+    table, stored = transposed_entries(entries), sum(entry.stored_length for entry in entries)
+    index = stored_frame(table)
+    if compress:
+        compressed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(table)
+        if len(compressed) + stored >= MIN_CHUNK_BYTES * len(entries):
+            index = min(compressed, index, key=len)
+    fields = HEADER.pack(
+        MAGIC,
+        VERSION,
+        HEADER.size,
+        len(entries),
+        len(index),
+        google_crc32c.value(index),
+        HEADER.size + len(index) + stored,
+        value_count,
+        max((entry.raw_length for entry in entries), default=0),
+        0,
+    )[:-4]
+    return b"".join([fields, struct.pack("<I", google_crc32c.value(fields)), index])
+
+
+def transposed_entries(entries: Sequence[Entry]) -> bytes:
+    """Return the content of the index: byte 0 of all entries, then byte 1 of all, and so on."""
+    rows = b"".join(
+        ENTRY.pack(
+            e.kind.encode("ascii"),
+            e.group,
+            e.scale,
+            e.plane,
+            e.row_start,
+            e.row_count,
+            e.codec,
+            e.stored_length,
+            e.raw_length,
+            e.crc,
+        )
+        for e in entries
+    )
+    return np.frombuffer(rows, np.uint8).reshape(-1, ENTRY.size).T.tobytes()
+
+
+def stored_frame(content: bytes) -> bytes:
+    """Return a zstd frame (RFC 8878) of stored blocks: its size depends on that of the content alone, and no library is needed."""
+    starts = range(0, len(content), ZSTD_BLOCK) or range(1)
+    blocks = [content[start : start + ZSTD_BLOCK] for start in starts]
+    heads = [int(number == len(blocks) - 1) | len(block) << 3 for number, block in enumerate(blocks)]
+    parts = [head.to_bytes(3, "little") + block for head, block in zip(heads, blocks, strict=True)]
+    return b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", len(content)) + b"".join(parts)
 
 
 class Reader:
@@ -292,16 +240,15 @@ class Reader:
     Opening reads the header and the index (two reads, at the very start of the file) and nothing else.
 
     Args:
-        source: a path, an http or https URL, the bytes themselves, a binary file object that can seek, or a `Source`; or a `Reader`
-            of it, whose header and index are taken over.
-        allow_partial: accept a file whose end is missing; `available` tells which chunks are there.
+        source: whatever `open_source` takes; or a `Reader`, whose header and index are taken over.
+        allow_partial: accept a file whose end is missing; `available` says which chunks are there.
 
     Attributes:
-        header, index: what the file says of itself, verified.
+        header, index: verified.
         name: of the file, for messages.
 
     Raises:
-        FormatError: not a .kpc file, of another version, damaged, or with limits its size does not bear out.
+        FormatError: not a .kpc file, a draft or another version, damaged, or claiming more than its size allows.
     """
 
     def __init__(self, source: "AnySource | Reader", *, allow_partial: bool = False):
@@ -316,94 +263,81 @@ class Reader:
 
     def _read_header(self, allow_partial: bool) -> Header:
         head = self.source.read_at(0, HEADER.size)
-        if head[: len(MAGIC)] != MAGIC[: len(head)] or not head:
-            raise FormatError(f"{self.name}: not a .kpc file")
-        if len(head) < HEADER.size:
-            raise FormatError(f"{self.name}: cut off within the header; fetch the file again")
-        (
-            _,
-            version,
-            flags,
-            header_length,
-            index_offset,
-            index_length,
-            chunk_count,
-            file_length,
-            value_count,
-            largest_raw,
-            reserved,
-            index_crc,
-            header_crc,
-        ) = HEADER.unpack(head)
-        if version not in READABLE_VERSIONS:
-            raise FormatError(f"{self.name}: format version {version}, this reader knows up to {VERSION}; update kpc")
+        self._check_version(head)
+        *fields, header_crc = HEADER.unpack(head)
         if google_crc32c.value(head[:-4]) != header_crc:
             raise FormatError(f"{self.name}: the header is damaged (its CRC32C differs); fetch the file again")
-        if flags or reserved or header_length != HEADER.size or index_offset != HEADER.size:
-            raise FormatError(f"{self.name}: the header uses reserved fields; update kpc")
-        plain = chunk_count * ENTRY.size
-        if not 0 < chunk_count <= CHUNK_LIMIT or not (
-            index_length < plain if version == VERSION else index_length == plain
+        _, version, header_length, *others = fields
+        if header_length != HEADER.size:
+            raise FormatError(f"{self.name}: the header claims {header_length} bytes, not {HEADER.size}")
+        header = Header(version, *others)
+        self._check_sizes(header, allow_partial)
+        return header
+
+    def _check_version(self, head: bytes) -> None:
+        if head[: len(MAGIC)] != MAGIC[: len(head)] or not head:
+            raise FormatError(f"{self.name}: not a .kpc file")
+        if len(head) >= VERSION_STRUCT.size:
+            _, version, header_length = VERSION_STRUCT.unpack_from(head)
+            if header_length == 0:  # in drafts a reserved field
+                raise FormatError(f"{self.name}: a draft of the format; encode it again")
+            if version != VERSION:
+                raise FormatError(f"{self.name}: format version {version}, this reader knows {VERSION}; update kpc")
+        if len(head) < HEADER.size:
+            raise FormatError(f"{self.name}: cut off within the header; fetch the file again")
+
+    def _check_sizes(self, header: Header, allow_partial: bool) -> None:
+        count, length, size = header.chunk_count, header.file_length, self.source.size
+        if (
+            not 0 < count <= CHUNK_LIMIT
+            or not 0 < header.index_length <= INDEX_BYTES + INDEX_BYTES_PER_CHUNK * count
+            or length < HEADER.size + max(header.index_length, MIN_CHUNK_BYTES * count)
         ):
-            raise FormatError(f"{self.name}: the header claims {chunk_count} chunks in {index_length} bytes of index")
-        if file_length < HEADER.size + LEAST_CHUNK * chunk_count:
-            raise FormatError(f"{self.name}: the header claims {chunk_count} chunks in a file of {file_length} bytes")
-        if file_length < HEADER.size + index_length:
-            raise FormatError(f"{self.name}: the header claims a file of {file_length} bytes, less than its index")
-        if self.source.size > file_length:
-            raise FormatError(f"{self.name}: {self.source.size - file_length} bytes follow the end of the file")
-        if self.source.size < file_length and not allow_partial:
             raise FormatError(
-                f"{self.name}: cut off at {self.source.size} of {file_length} bytes; fetch the file again"
+                f"{self.name}: the header claims {count} chunks and {header.index_length} bytes of index in a file of "
+                f"{length} bytes"
             )
-        if max(value_count, largest_raw) > file_length * EXPANSION_LIMIT:
+        if size > length:
+            raise FormatError(f"{self.name}: {size - length} bytes follow the end of the file")
+        if size < length and not allow_partial:
+            raise FormatError(f"{self.name}: cut off at {size} of {length} bytes; fetch the file again")
+        if max(header.value_count, header.largest_raw) > length * EXPANSION_LIMIT:
             raise FormatError(
-                f"{self.name}: claims {value_count:,} values and chunks of {largest_raw:,} bytes, "
-                f"more than {file_length:,} bytes can hold"
+                f"{self.name}: claims {header.value_count:,} values and chunks of {header.largest_raw:,} bytes, "
+                f"more than {length:,} bytes can hold"
             )
-        return Header(version, index_length, chunk_count, file_length, value_count, largest_raw, index_crc)
 
     def _read_index(self) -> tuple[Entry, ...]:
-        if self.source.size < HEADER.size + self.header.index_length:
+        header = self.header
+        if self.source.size < HEADER.size + header.index_length:
             raise FormatError(f"{self.name}: cut off within the chunk index; fetch the file again")
-        index = self.source.read_at(HEADER.size, self.header.index_length)
-        if google_crc32c.value(index) != self.header.index_crc:
+        index = self.source.read_at(HEADER.size, header.index_length)
+        if google_crc32c.value(index) != header.index_crc:
             raise FormatError(f"{self.name}: the chunk index is damaged (its CRC32C differs); fetch the file again")
-        entries, expected, has_offsets = [], HEADER.size + len(index), self.header.version != VERSION
-        for number, fields in enumerate(ENTRY.iter_unpack(index if has_offsets else self._out_of_columns(index))):
-            kind, group, scale, plane, row_start, row_count, codec, reserved, stored, raw, crc, offset = fields
+        table = np.frombuffer(self._decompressed(index, header.chunk_count * ENTRY.size, "chunk index"), np.uint8)
+        rows = table.reshape(ENTRY.size, -1).T.tobytes()
+        entries, offset = [], HEADER.size + len(index)
+        for number, (kind, *fields) in enumerate(ENTRY.iter_unpack(rows)):
             if not (kind.isascii() and kind.isalpha()):
                 raise FormatError(f"{self.name}: chunk {number} has a kind that is not four letters")
-            if reserved:
-                raise FormatError(f"{self.name}: chunk {number} uses reserved fields; update kpc")
-            if has_offsets and offset != expected:
-                raise FormatError(f"{self.name}: chunk {number} starts at byte {offset}, not at {expected}")
-            if raw > self.header.largest_raw:
-                raise FormatError(f"{self.name}: chunk {number} claims {raw:,} bytes, more than the header's limit")
-            entries.append(
-                Entry(
-                    kind.decode("ascii"), group, scale, plane, row_start, row_count, codec, stored, raw, crc, expected
+            entry = Entry(kind.decode("ascii"), *fields, offset)
+            if entry.raw_length > header.largest_raw:
+                raise FormatError(
+                    f"{self.name}: chunk {number} claims {entry.raw_length:,} bytes, more than the header's limit"
                 )
-            )
-            expected += stored
-        if expected != self.header.file_length:
-            raise FormatError(f"{self.name}: the chunks end at byte {expected} of {self.header.file_length}")
+            entries.append(entry)
+            offset += entry.stored_length
+        if offset != header.file_length:
+            raise FormatError(f"{self.name}: the chunks end at byte {offset} of {header.file_length}")
         return tuple(entries)
 
-    def _out_of_columns(self, index: bytes) -> bytes:
-        """The plain index of a frame of its columns, `in_columns`; with offsets of 0."""
-        columns = self._unframed(index, self.header.chunk_count * TOLD, "chunk index")
-        rows = np.zeros((self.header.chunk_count, ENTRY.size), np.uint8)
-        rows[:, :TOLD] = np.frombuffer(columns, np.uint8).reshape(TOLD, -1).T
-        return rows.tobytes()
-
     def available(self, number: int) -> bool:
-        """Whether all bytes of a chunk are there; False only in a partial file."""
+        """Return whether all bytes of a chunk are there; False only in a partial file."""
         entry = self.index[number]
         return entry.offset + entry.stored_length <= self.source.size
 
     def stored(self, number: int) -> bytes:
-        """A chunk as it lies in the file, its CRC32C verified. Several threads may ask; the source is read by one at a time."""
+        """Return a chunk as it lies in the file, its CRC32C verified. Threads may call this at the same time; they read in turn."""
         entry = self.index[number]
         with self._reading:
             body = self.source.read_at(entry.offset, entry.stored_length)
@@ -416,10 +350,10 @@ class Reader:
         return body
 
     def chunk(self, number: int, limit: int | None = None) -> bytes:
-        """The raw bytes of a chunk, verified and decoded.
+        """Return the content of a chunk under RAW or ZSTD, verified and decoded.
 
         Args:
-            limit: largest raw length the caller is ready for, bytes; checked before anything is allocated.
+            limit: largest raw length in bytes that the caller accepts; checked before anything is allocated.
         """
         entry = self.index[number]
         if limit is not None and entry.raw_length > limit:
@@ -428,10 +362,10 @@ class Reader:
                 f"most {limit:,} make sense"
             )
         body = self.stored(number)
-        if entry.codec == CODEC_RAW:
+        if entry.codec == Codec.RAW:
             raw = body
-        elif entry.codec == CODEC_ZSTD:
-            raw = self._unframed(body, entry.raw_length, f"chunk {number} ({entry.kind})")
+        elif entry.codec == Codec.ZSTD:
+            raw = self._decompressed(body, entry.raw_length, f"chunk {number} ({entry.kind})")
         else:
             raise FormatError(
                 f"{self.name}: chunk {number} ({entry.kind}) uses codec {entry.codec}, "
@@ -444,8 +378,18 @@ class Reader:
             )
         return raw
 
-    def _unframed(self, body: bytes, length: int, what: str) -> bytes:
-        """The content of the zstd frame that the bytes are, of so many bytes."""
+    def context_coded(self, number: int) -> bytes:
+        """Return a chunk under one of the codecs from PREDICTIVE on as it is stored, if it may stand for as much as it claims."""
+        entry = self.index[number]
+        if entry.raw_length > entry.stored_length * EXPANSION_LIMIT:
+            raise FormatError(
+                f"{self.name}: chunk {number} ({entry.kind}) claims a length of {entry.raw_length:,}, more than "
+                f"{entry.stored_length:,} bytes can hold"
+            )
+        return self.stored(number)
+
+    def _decompressed(self, body: bytes, length: int, what: str) -> bytes:
+        """Return the content of exactly one zstd frame, which must be `length` bytes."""
         try:
             frame = zstandard.get_frame_parameters(body)
             if frame.content_size != length or frame.dict_id:
@@ -453,65 +397,3 @@ class Reader:
             return zstandard.ZstdDecompressor().decompress(body, max_output_size=length, allow_extra_data=False)
         except zstandard.ZstdError as error:
             raise FormatError(f"{self.name}: {what} is no valid zstd frame ({error})") from error
-
-
-class _BytesSource:
-    def __init__(self, data: bytes, name: str = "<bytes>"):
-        self.data, self.name, self.size = memoryview(data), name, len(data)
-
-    def read_at(self, offset: int, length: int) -> bytes:
-        return bytes(self.data[offset : offset + length])
-
-    def will_read(self, offset: int, length: int) -> None:
-        """All bytes are at hand."""
-
-
-class _FileSource:
-    """A seekable file object; opened anew for each read when only its path is known."""
-
-    def __init__(self, path: Path | None, file: BinaryIO | None = None):
-        self.path, self.file = path, file
-        self.name = str(path if path is not None else getattr(file, "name", "<file>"))
-        if file is not None:
-            self.size = file.seek(0, io.SEEK_END)
-        else:
-            with open(self.name, "rb") as opened:  # so that an unreadable file is named here, not later
-                self.size = opened.seek(0, io.SEEK_END)
-
-    def read_at(self, offset: int, length: int) -> bytes:
-        if self.file is not None:
-            self.file.seek(offset)
-            return self.file.read(length)
-        with open(self.name, "rb") as opened:
-            opened.seek(offset)
-            return opened.read(length)
-
-    def will_read(self, offset: int, length: int) -> None:
-        """The operating system reads ahead."""
-
-
-AnySource = str | os.PathLike[str] | bytes | BinaryIO | Source
-"""What `open_source` takes."""
-
-
-def open_source(source: AnySource, *, limit: int = DEFAULT_BUDGET) -> Source:
-    """The bytes behind a path, a URL (`kpc.format.container.http`), or what else a `Reader` takes.
-
-    Args:
-        limit: bytes of memory that a file may take whose server sends it as a whole only.
-    """
-    if isinstance(source, str) and "://" in source:
-        from kpc.format.container.http import (
-            HttpSource,
-            is_url,
-        )  # only now: what it takes to speak to servers is slow to load
-
-        if is_url(source):
-            return HttpSource(source, limit=limit)
-    if isinstance(source, (str, os.PathLike)):
-        return _FileSource(Path(source))
-    if isinstance(source, (bytes, bytearray, memoryview)):
-        return _BytesSource(bytes(source))
-    if isinstance(source, Source):
-        return source
-    return _FileSource(None, source)

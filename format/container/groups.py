@@ -23,21 +23,12 @@ from functools import cached_property
 import google_crc32c
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import FormatError, UsageError
-from kpc.format.container.container import (
-    CODEC_RAW,
-    DEFAULT_BUDGET,
-    ENTRY,
-    HEADER,
-    AnySource,
-    Entry,
-    Reader,
-    RemoteSource,
-    Source,
-    header_and_index,
-    open_source,
-)
-from kpc.format.container.scene_io import FRAME_LIMIT, GROUP_KIND, SceneReader, read
+from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.container.container import ENTRY, HEADER, Codec, Entry, Reader, header_and_index, stored_frame
+from kpc.format.container.scene_io import SceneReader, read
+from kpc.format.container.scene_layout import FRAME_LIMIT, GROUP_KIND
 from kpc.format.container.slices import sliced
+from kpc.format.container.sources import AnySource, RemoteSource, Source, open_source
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Clip, Scene
 
@@ -223,7 +214,7 @@ class Groups:
             if entry.is_critical and entry.kind != GROUP_KIND:
                 raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) lies outside the groups; update kpc")
             if entry.kind == GROUP_KIND and (
-                entry.codec != CODEC_RAW
+                entry.codec != Codec.RAW
                 or entry.raw_length != entry.stored_length
                 or entry.scale
                 or entry.plane
@@ -377,15 +368,15 @@ def write(parts: Sequence[GroupInput], path: str | os.PathLike[str]) -> int:
     entries: list[Entry] = []
     with atomic_write(path) as temporary, temporary.open("wb") as opened:
         # Header and index come first but hold checksums of the groups, so they are written last.
-        opened.seek(HEADER.size + ENTRY.size * len(parts))
+        opened.seek(HEADER.size + len(stored_frame(bytes(ENTRY.size * len(parts)))))
         for number, part in enumerate(parts):
             body, span = part.source.read_at(0, part.source.size), part.span
             opened.write(body)
             crc, size = google_crc32c.value(body), len(body)
-            entries.append(Entry(GROUP_KIND, number, 0, 0, span.start, span.count, CODEC_RAW, size, size, crc))
+            entries.append(Entry(GROUP_KIND, number, 0, 0, span.start, span.count, Codec.RAW, size, size, crc))
         size_bytes = opened.tell()
         opened.seek(0)
-        opened.write(header_and_index(entries, max(part.value_count for part in parts)))
+        opened.write(header_and_index(entries, max(part.value_count for part in parts), compress=False))
     return size_bytes
 
 

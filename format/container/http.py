@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 
 import urllib3
 from kpc.format.common.errors import BudgetError, InterruptedRead, NetworkError, UnreachableError
-from kpc.format.container.container import DEFAULT_BUDGET
+from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.http_client import HttpClient, TemporaryFailure, describe_failure, is_url, printable
 
 __all__ = ["HttpSource", "is_url", "report_on_stderr"]

@@ -15,7 +15,8 @@ from typing import cast
 import numpy as np
 from kpc.format.coding.quantise import dequantise_symbols
 from kpc.format.container.container import Entry, Reader
-from kpc.format.container.scene_io import KNOWN_KINDS, PlaneHead, SceneReader
+from kpc.format.container.scene_io import SceneReader
+from kpc.format.container.scene_layout import KNOWN_KINDS, PlaneHead
 from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, Scene
 
 HAIR = 1e-6

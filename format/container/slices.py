@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from kpc.format.container.container import RemoteSource, Source
+from kpc.format.container.sources import RemoteSource, Source
 
 
 def sliced(source: Source, offset: int, length: int, name: str) -> Source:

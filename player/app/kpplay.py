@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING
 
 from kpc.format.common import cli
 from kpc.format.common.errors import ContextLostError, UsageError
-from kpc.format.container.container import DEFAULT_BUDGET, open_source
+from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.container.sources import open_source
 from kpc.player.app import preferences
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.preferences import TARGET_FPS, WINDOW_SIDES, Preferences

@@ -13,8 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from kpc.format.common.errors import KpcError
-from kpc.format.container.container import DEFAULT_BUDGET, RemoteSource, Source
+from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.groups import Groups
+from kpc.format.container.sources import RemoteSource, Source
 from kpc.format.scene.scene import Scene
 from kpc.player.gl.renderer import Renderer
 from kpc.player.streaming.prefetch import Playhead

@@ -18,9 +18,11 @@ import numpy as np
 from kpc.format.coding.quantise import dequantise_symbols
 from kpc.format.common.compiling import MONITOR, NOTICE
 from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, KpcError
-from kpc.format.container.container import DEFAULT_BUDGET, Reader, RemoteSource, Source
+from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.container.container import Reader
 from kpc.format.container.partial import PartialScene, adjacent_runs, announce
 from kpc.format.container.scene_io import SceneReader
+from kpc.format.container.sources import RemoteSource, Source
 from kpc.format.scene.scene import ALL_PLANES, Scene
 from kpc.player.atlas import Layout, TimeRows
 from kpc.player.cpu.corner_grid import CornerGrid

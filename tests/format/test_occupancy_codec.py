@@ -65,7 +65,7 @@ for occupancy in (rolling(3, 8, 9, 10), np.random.default_rng(1).random((2, 5, 1
 
 
 def test_compiled_code_and_plain_python_give_the_same_bytes():
-    assert_same_without_numba(PLAIN, "kpc.format.coding.occupancy_codec:walk")
+    assert_same_without_numba(PLAIN, "kpc.format.coding.occupancy_codec:code_cells")
 
 
 # --- damage and hostility

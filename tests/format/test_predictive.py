@@ -11,7 +11,6 @@ from kpc.format.coding import predictive as module
 from kpc.format.coding.predictive import (
     ACTIVITIES,
     DEPENDENT,
-    LATTICE_BIT,
     SCALAR,
     SET_COUNTS,
     TRELLIS,
@@ -27,6 +26,7 @@ from kpc.format.coding.predictive import (
     weights_in,
 )
 from kpc.format.coding.raw_planes import encode_raw_segment
+from kpc.format.coding.texel_map import MODE_BITS
 from kpc.format.common.errors import FormatError
 from numba import njit
 from without_numba import assert_same_without_numba
@@ -75,7 +75,7 @@ def test_symbols_on_the_trellis_come_back(paint, shape, seed, share):
     symbols = on_trellis(symbols, coded)
     assert follows_trellis(symbols, coded)
     body = encode_symbols(symbols, coded)
-    assert body[1] >> LATTICE_BIT == TRELLIS and weights_in(body) is None
+    assert body[1] >> MODE_BITS == TRELLIS and weights_in(body) is None
     assert_decodes(body, symbols, coded)
 
 
@@ -111,8 +111,8 @@ def test_around_predictions_errors_of_odd_places_are_odd_or_none(monkeypatch, fl
     """By the definition, told here once more: of segments whose weights are 0, so that what is foreseen is the mean of left and above; were
     all flat, or nothing."""
     monkeypatch.setattr(module, "FLAT_ACTIVITY", flat)
-    for name in ("code_map", "code_symbols"):
-        monkeypatch.setattr(module, name, njit(FunctionType(vars(module)[name].py_func.__code__, vars(module), name)))
+    kernel = FunctionType(module.code_symbols.py_func.__code__, vars(module), "code_symbols")
+    monkeypatch.setattr(module, "code_symbols", njit(kernel))
     v = np.random.default_rng(5).integers(-40, 40, (9, 30, 2)).astype(np.int8)
     trace = np.empty(v.size * module.MAX_DECISIONS, np.int16)
     module.code_symbols(
@@ -156,7 +156,7 @@ def test_smooth_planes_take_far_less_than_with_zstd():
     symbols, coded = textured()
     body = encode_symbols(symbols, coded)
     assert_decodes(body, symbols, coded)
-    frame = zstandard.ZstdCompressor(level=19).compress(b"".join(encode_raw_segment(symbols, coded)))
+    frame = zstandard.ZstdCompressor(level=19).compress(encode_raw_segment(symbols, coded))
     assert len(body) < 0.85 * len(frame)
 
 
@@ -242,7 +242,7 @@ def test_flipped_bits_are_refused_or_mean_something_else(small):
 
 
 @given(
-    body=st.binary(max_size=80), shape=shapes, count=st.sampled_from([0, 1, 2, 3, 4, 8, 255]), flag=st.integers(0, 6)
+    body=st.binary(max_size=80), shape=shapes, count=st.sampled_from([0, 1, 2, 3, 4, 8, 255]), flag=st.integers(0, 11)
 )
 @settings(deadline=None)
 def test_any_bytes_decode_or_are_refused(body, shape, count, flag):
@@ -272,7 +272,9 @@ def test_a_stream_that_ends_early_is_given_up_at_once():
         (lambda body: b"", "number of sets"),
         (lambda body: b"\3" + body[1:], "number of sets"),
         (lambda body: b"\0" + body[1:], "number of sets"),
-        (lambda body: body[:1] + b"\x06" + body[2:], "or flag"),
+        (lambda body: body[:1] + b"\x03" + body[2:], "or flag"),
+        (lambda body: body[:1] + b"\x0c" + body[2:], "or flag"),
+        (lambda body: body[:1] + b"\x10" + body[2:], "or flag"),
         (lambda body: body[: 2 + WEIGHT_COUNT + 3], "cut off"),
         (lambda body: body + b"\0", "cut off"),
         (lambda body: body + b"\0\0", "do not end"),

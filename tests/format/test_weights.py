@@ -78,7 +78,7 @@ def test_plain_python_codes_the_same() -> None:
         "from test_weights import encoded, some\n"
         "for seed in range(3):\n"
         "    print(encoded(some(seed, 60 * 6 ** seed)).hex())",
-        "kpc.format.coding.weights:walk",
+        "kpc.format.coding.weights:code_array",
     )
 
 

@@ -12,8 +12,9 @@ import pytest
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import BudgetError
 from kpc.format.container import groups, scene_io
-from kpc.format.container.container import Reader, open_source
+from kpc.format.container.container import Reader
 from kpc.format.container.groups import GroupInput, Groups
+from kpc.format.container.sources import open_source
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.gl.renderer import Renderer
 from kpc.player.streaming.group_playback import GroupPlayback

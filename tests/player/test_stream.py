@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from kpc.format.common.errors import BudgetError
 from kpc.format.container import http, http_client
-from kpc.format.container.container import Reader, open_source
+from kpc.format.container.container import Reader
+from kpc.format.container.sources import open_source
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.corner_grid import CornerGrid
 from kpc.player.gl.renderer import Renderer

@@ -13,7 +13,7 @@ from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
-from kpc.format.coding import predictive, rans, transform
+from kpc.format.coding import predictive, rans, texel_map, transform
 from kpc.format.coding.predictive import (
     DEPENDENT,
     MAX_DECISIONS,
@@ -199,7 +199,7 @@ CALLERS = {
 
 
 def _compiled(module: ModuleType, changes: dict[str, Any]) -> Walks:
-    names = vars(rans) | vars(module) | changes
+    names = vars(rans) | vars(texel_map) | vars(module) | changes
     for name in CALLERS[module]:
         if name not in changes:
             names[name] = njit(FunctionType(names[name].py_func.__code__, names, name))
@@ -241,9 +241,9 @@ def _told(segment: Segment) -> transform.TransformBlocks:
     return decode_levels(segment.body, rows, columns, channels, segment.implied)
 
 
-def _bytes_in_blocks(segment: Segment, walks: Walks, borders: bool) -> int:
-    """What a segment takes that is told in blocks; codec 2, without borders, tells all maps."""
-    return len(walks["encode_blocks"](_told(segment), segment.coded, segment.implied if borders else None, borders))
+def _bytes_in_blocks(segment: Segment, walks: Walks) -> int:
+    """Return the bytes of a segment under TRANSFORM."""
+    return len(walks["encode_blocks"](_told(segment), segment.coded, segment.implied))
 
 
 def _tables(trace: np.ndarray) -> float:
@@ -278,16 +278,15 @@ class OfSymbols:
 
 @dataclass(frozen=True)
 class OfBlocks:
-    """An idea of what is told in blocks: what changes in `kpc.format.coding.transform`, and whether blocks go on from borders."""
+    """An idea of what is told in blocks: what changes in `kpc.format.coding.transform`."""
 
     changes: dict[str, Any]
-    borders: bool = True
 
     def has(self, segment: Segment) -> bool:
         return segment.is_in_blocks
 
     def sized(self) -> Sized:
-        return partial(_bytes_in_blocks, walks=_compiled(transform, self.changes), borders=self.borders)
+        return partial(_bytes_in_blocks, walks=_compiled(transform, self.changes))
 
 
 class OfMaps:
@@ -314,13 +313,12 @@ LEFT_OUT: dict[str, OfSymbols | OfBlocks | OfMaps] = {
     "no fraction contexts": OfSymbols({"residual_context": _by_activity}),
     "no residuals of earlier channels": OfSymbols({"update_cross_channel": _forget}, steers=True),
     "static probability tables": OfSymbols({"code_bit_adaptive": _note}, size=_tables),
-    "transform: no boundary prediction": OfBlocks({}, borders=False),
     "transform: no sign contexts": OfBlocks({"sign_bias": _no_pull}),
     "transform: no neighbouring levels": OfBlocks({"level_context": _frequency_alone}),
     "transform: no frequency contexts": OfBlocks({"level_context": _without_frequency}),
     "transform: no earlier channel": OfBlocks({"level_context": _without_before}),
     "transform: uniform initial probabilities": OfBlocks(
-        {"level_counters": _even_levels, "sign_counters": _even_signs}
+        {"new_level_models": _even_levels, "new_sign_models": _even_signs}
     ),
 }
 """By what the tables call them."""

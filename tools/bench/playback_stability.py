@@ -12,7 +12,7 @@ from typing import Any
 import moderngl
 import numpy as np
 from kpc.format.common.memory import peak_memory_bytes
-from kpc.format.container.container import open_source
+from kpc.format.container.sources import open_source
 from kpc.player.app.desktop import glfw
 from kpc.player.app.player import Player
 from kpc.player.app.preferences import Preferences

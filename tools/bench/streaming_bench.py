@@ -17,9 +17,9 @@ import moderngl
 import numpy as np
 from kpc.format.common.errors import KpcError
 from kpc.format.common.fidelity import psnr_from_mse
-from kpc.format.container.container import open_source
 from kpc.format.container.partial import PartialScene
 from kpc.format.container.scene_io import SceneReader, encode, read
+from kpc.format.container.sources import open_source
 from kpc.format.scene.scene import TIME_PLANES, Clip
 from kpc.player.app.resolution_controller import ResolutionController
 from kpc.player.gl import offscreen

@@ -19,24 +19,18 @@ import numpy as np
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, UsageError
-from kpc.format.container.container import (
-    CODEC_MIDPOINTS,
-    CODEC_RAW,
-    CODEC_SYMBOLS,
-    CODEC_ZSTD,
-    DEFAULT_BUDGET,
-    Entry,
-    open_source,
-)
+from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.container.container import Codec, Entry
 from kpc.format.container.groups import Groups
 from kpc.format.container.scene_io import SceneReader, read
+from kpc.format.container.sources import open_source
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, HybridDecoder
 from kpc.format.scene.space import FAR, Contraction, SpaceMapping
 from kpc.format.scene.static import constant_fraction, static_fraction
 from kpc.player.cpu.motion_map import STILL, motionless_share
 
 NAMES_SHOWN = 8
-CODEC_NAMES = {CODEC_RAW: "raw", CODEC_ZSTD: "zstd", CODEC_SYMBOLS: "rANS", CODEC_MIDPOINTS: "rANS"}
+CODEC_NAMES = {codec.value: codec.name.lower() for codec in Codec}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -240,9 +234,7 @@ def _describe_chunk(entry: Entry, missing: bool, size: int) -> dict[str, Any]:
         "scale": entry.scale if is_plane else None,
         "plane": ALL_PLANES[entry.plane] if is_plane else None,
         "rows": [entry.row_start, entry.row_start + entry.row_count] if is_plane else None,
-        "codec": "packed"
-        if entry.kind == "came" and entry.codec == CODEC_SYMBOLS
-        else CODEC_NAMES.get(entry.codec, str(entry.codec)),
+        "codec": CODEC_NAMES.get(entry.codec, str(entry.codec)),
         "offset": entry.offset,
         "stored_bytes": entry.stored_length,
         "raw_bytes": entry.raw_length,
@@ -295,7 +287,7 @@ def _page(info: dict[str, Any]) -> str:
             f"  cut off     {info['missing_chunks']} of {len(info['chunks'])} chunks are missing and count as "
             "not stored"
         )
-    lines += ["", "  chunk  kind  scale  plane  rows        codec      stored         raw   share"]
+    lines += ["", "  chunk  kind  scale  plane  rows        codec           stored         raw   share"]
     for number, chunk in enumerate(info["chunks"]):
         place = (
             f"{'-':>5}  {'-':<5}  {'-':<10}"
@@ -303,11 +295,11 @@ def _page(info: dict[str, Any]) -> str:
             else f"{chunk['scale']:>5}  {chunk['plane']:<5}  {chunk['rows'][0]:>4}-{chunk['rows'][1]:<5}"
         )
         lines.append(
-            f"  {number:>5}  {chunk['kind']}  {place}  {chunk['codec']:<5}  {chunk['stored_bytes']:>10,}  "
+            f"  {number:>5}  {chunk['kind']}  {place}  {chunk['codec']:<10}  {chunk['stored_bytes']:>10,}  "
             f"{chunk['raw_bytes']:>10,}  {chunk['share']:>6.1%}" + ("  missing" if chunk["missing"] else "")
         )
     overhead = info["overhead_bytes"]
-    lines.append(f"  header and index {overhead:>37,} {'':>12} {overhead / info['size_bytes']:>6.1%}")
+    lines.append(f"  header and index {overhead:>42,} {'':>12} {overhead / info['size_bytes']:>6.1%}")
     return "\n".join(lines)
 
 

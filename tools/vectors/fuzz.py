@@ -1,10 +1,10 @@
-"""Damaged files by the million: `python -m kpc.tools.vectors.fuzz --count 1000000 --processes 2 --seed 1 -o found`.
+"""Fuzz the reader with damaged files: `python -m kpc.tools.vectors.fuzz --count 1000000 --processes 2 --seed 1 -o found`.
 
-Conformance vectors are taken apart, changed where it may hurt, and put together again with every length, offset and CRC32C right, so
-that a change reaches the code behind them. A reader must read the result or refuse it with a FormatError: anything else that is
-raised, more than HANG_S of computing and more memory than the budget are findings, which are written to -o as files. File number N of a
-seed is always the same, so that a run may be made in parts: --first 500000 --count 500000 is the second half of the one above. After a change,
---only borders,implied damages just the vectors whose names begin so.
+Conformance vectors are taken apart, mutated, and put together again with every length and CRC32C right, so that mutations reach the
+code behind those checks. A reader must read the result or refuse it with a FormatError. Anything else that is raised, more than HANG_S
+of computing and more memory than the budget are findings, which are written to -o as files. File number N of a seed is always the
+same, so that a run may be split: --first 500000 --count 500000 is the second half of the one above. `--only transform,motion` mutates
+just the vectors whose names begin so.
 """
 
 import argparse
@@ -28,27 +28,25 @@ import numpy as np
 import zstandard
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, KpcError, UsageError
-from kpc.format.container.container import CODEC_RAW, CODEC_ZSTD, ENTRY, HEADER, Entry, Reader, header_and_index
+from kpc.format.container.container import Codec, Entry, Reader, header_and_index
 from kpc.format.container.groups import Groups
 from kpc.format.container.partial import PartialScene
-from kpc.format.container.scene_io import GROUP_KIND, SceneReader, read
+from kpc.format.container.scene_io import SceneReader, read
+from kpc.format.container.scene_layout import GROUP_KIND
 from kpc.format.scene.scene import ALL_PLANES
 from kpc.tools.vectors import specvectors
+from kpc.tools.vectors.files import ENTRY_FIELDS, HEADER_FIELDS, sealed, with_entry, with_index
 
-BUDGET = 32 << 20
-"""Bytes a reader is given, small enough that what exceeds it shows."""
-SLACK = 96 << 20
-"""Bytes that Python, its threads and what was decoded before may take beside it."""
+BUDGET = 32 << 20  # memory budget of the reader in bytes, small enough that what exceeds it shows
+SLACK = 96 << 20  # bytes that Python, its threads and earlier files may take beside it
+# Seconds of processor time that count as a hang, and after which a process is ended from outside.
 HANG_S, KILL_S = 2.0, 30.0
-"""Seconds of computing that are a hang; and those after which a process is ended from outside. A clock would blame a busy machine."""
-STUCK_S = 600.0
-"""Seconds on the clock after which it is ended though it does not compute."""
-REPORT_EVERY = 200
+STUCK_S = 600.0  # seconds of wall time after which a process is ended that does not compute
+REPORT_EVERY = 200  # files
 
-LARGEST = 1 << 20
-"""Bytes of a chunk whose content is damaged before it is compressed again."""
+LARGEST = 1 << 20  # bytes of a chunk whose content is mutated before it is compressed again
+# Vectors that take 0.23 and 0.1 s to read, where the others take 4 ms on average.
 LONG = ("limits-cameras", "limits-appearances")
-"""Vectors of so many equal things that reading them takes 0.23 and 0.1 s, of the others 4 ms on average."""
 
 BITS = {1: "<B", 2: "<H", 4: "<I", 8: "<Q"}
 WHOLES = (
@@ -72,28 +70,12 @@ WHOLES = (
     1 << 50,
 )
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-30, 1e30, 3e38, float("nan"), float("inf"), -float("inf"), 5e-324, 1e300)
-HEADER_FIELDS = (
-    (0, 8),
-    (8, 2),
-    (10, 2),
-    (12, 4),
-    (16, 8),
-    (24, 4),
-    (28, 4),
-    (32, 8),
-    (40, 8),
-    (48, 4),
-    (52, 4),
-    (56, 4),
-    (60, 4),
-)
-ENTRY_FIELDS = ((0, 4), (4, 2), (6, 1), (7, 1), (8, 4), (12, 4), (16, 2), (18, 2), (20, 4), (24, 4), (28, 4), (32, 8))
 KINDS = ("SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "PLNE", "GRUP", "note", "Note")
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A chunk: its entry in the index, and its stored bytes."""
+    """A chunk: its index entry and its stored bytes."""
 
     entry: Entry
     body: bytes
@@ -101,7 +83,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Taken:
-    """A file taken apart."""
+    """A file taken apart into its chunks."""
 
     value_count: int
     pieces: tuple[Piece, ...]
@@ -119,24 +101,26 @@ class Taken:
         )
 
     def together(self) -> bytes:
-        """A file again, right in all but what the pieces say."""
+        """Return a file again, right in everything but what the chunks say."""
         entries = [
             replace(
                 e,
                 stored_length=len(body),
                 crc=google_crc32c.value(body),
-                raw_length=len(body) if e.codec == CODEC_RAW else min(e.raw_length, 0xFFFFFFFF),
+                raw_length=len(body) if e.codec == Codec.RAW else min(e.raw_length, 0xFFFFFFFF),
             )
             for e, body in ((piece.entry, piece.body) for piece in self.pieces)
         ]
-        return header_and_index(entries, self.value_count) + b"".join(piece.body for piece in self.pieces)
+        return header_and_index(entries, self.value_count, compress=False) + b"".join(
+            piece.body for piece in self.pieces
+        )
 
 
 Mutation = Callable[[random.Random, Taken, Sequence[Taken]], bytes]
 
 
 def scrambled(rng: random.Random, body: bytes) -> bytes:
-    """Up to four edits of some bytes: bits, numbers that are seldom meant, pieces gone, new or twice. Most where sizes stand."""
+    """Apply up to four edits: flipped bits, extreme numbers, bytes removed, inserted or repeated; most near the start, where sizes are."""
     out = bytearray(body)
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         at = rng.randrange(min(len(out), rng.choice((16, 64, len(out) or 1))) or 1)
@@ -168,36 +152,43 @@ def _number(rng: random.Random, size: int) -> bytes:
 
 
 def in_header(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
-    """A field of the header changed, its checksum right."""
+    """Mutate a field of the header; its checksum is right."""
     out = bytearray(taken.together())
-    at, size = rng.choice(HEADER_FIELDS)
+    at, layout = rng.choice([(0, "<Q"), *HEADER_FIELDS.values()])
+    size = struct.calcsize(layout)
     out[at : at + size] = _number(rng, size) if rng.random() < 0.7 else rng.randbytes(size)
-    struct.pack_into("<I", out, 60, google_crc32c.value(bytes(out[:60])))
+    struct.pack_into("<I", out, HEADER_FIELDS["header_crc"][0], google_crc32c.value(bytes(out[:44])))
     return bytes(out)
 
 
 def in_index(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
-    """One or two fields of entries changed, all checksums right."""
-    out = bytearray(taken.together())
+    """Mutate one or two fields of index entries; checksums of index and header are right."""
+    data = taken.together()
     for _ in range(rng.choice((1, 1, 2))):
-        (field, size), number = rng.choice(ENTRY_FIELDS), rng.randrange(len(taken.pieces))
-        at = HEADER.size + ENTRY.size * number + field
-        if field == 0:
-            out[at : at + 4] = rng.choice(KINDS).encode()
-        else:
-            before = int.from_bytes(out[at : at + size], "little")
-            nearby = (before + rng.choice((-2, -1, 1, 2)) & (1 << 8 * size) - 1).to_bytes(size, "little")
-            out[at : at + size] = nearby if rng.random() < 0.5 else _number(rng, size)
-    if rng.random() < 0.3:  # else what is too long is all that is ever seen
-        struct.pack_into("<I", out, 48, min(len(out) << 15, 0xFFFFFFFF))
-    return specvectors.resealed(bytes(out))
+        field, number = rng.choice(list(ENTRY_FIELDS)), rng.randrange(len(taken.pieces))
+        if field == "kind":
+            data = with_entry(data, number, field, rng.choice(KINDS).encode())
+            continue
+        size = struct.calcsize(ENTRY_FIELDS[field][1])
+        nearby = _field(taken, number, field) + rng.choice((-2, -1, 1, 2)) & (1 << 8 * size) - 1
+        value = nearby if rng.random() < 0.5 else int.from_bytes(_number(rng, size), "little")
+        data = with_entry(data, number, field, value)
+    if rng.random() < 0.3:  # otherwise most files are refused because a chunk is too long
+        data = data[:40] + struct.pack("<I", min(len(data) << 15, 0xFFFFFFFF)) + data[44:]
+    return sealed(data)
 
 
-def in_columns(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
-    """As `in_index`, of a file of version 2: one or two bytes of entries, the frame around them, or their number."""
+def _field(taken: Taken, number: int, field: str) -> int:
+    piece = taken.pieces[number]
+    known = {"stored_length": len(piece.body), "crc": google_crc32c.value(piece.body)}
+    return known[field] if field in known else int(getattr(piece.entry, field))
 
-    def edited(told: bytes) -> bytes:
-        out = bytearray(told)
+
+def in_frame(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
+    """Mutate one or two bytes of the index, the zstd frame around it, or the number of chunks."""
+
+    def edited(table: bytes) -> bytes:
+        out = bytearray(table)
         for _ in range(rng.choice((1, 1, 2)) if out else 0):
             at = rng.randrange(len(out))
             out[at] = rng.choice((0, 1, 255, out[at] ^ 1, rng.randrange(256)))
@@ -206,33 +197,33 @@ def in_columns(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> byt
     data = taken.together()
     match rng.randrange(4):
         case 0:
-            return specvectors.in_columns(data, frame=lambda frame: scrambled(rng, frame))
+            return with_index(data, frame=lambda frame: scrambled(rng, frame))
         case 1:
-            return specvectors.in_columns(data, count=rng.choice(WHOLES) & 0xFFFFFFFF)
+            return with_index(data, count=rng.choice(WHOLES) & 0xFFFFFFFF)
         case _:
-            return specvectors.in_columns(data, edited)
+            return with_index(data, edited)
 
 
 def in_content(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
-    """A chunk's content changed, under whatever codec it is stored; that of a group likewise in any of these ways."""
+    """Mutate the content of a chunk under its codec; that of a group in any of these ways."""
     pieces = list(taken.pieces)
     number = rng.randrange(len(pieces))
     entry, body = pieces[number].entry, pieces[number].body
     if entry.kind == GROUP_KIND and rng.random() < 0.9 and (group := _taken(body)):
         body = mutated(rng, group, others)
-    elif entry.codec == CODEC_ZSTD and rng.random() < 0.9 and (raw := _decompressed(body)) is not None:
+    elif entry.codec == Codec.ZSTD and rng.random() < 0.9 and (raw := _decompressed(body)) is not None:
         raw = scrambled(rng, raw)
         entry, body = replace(entry, raw_length=len(raw)), zstandard.ZstdCompressor(level=1).compress(raw)
     else:
         body = scrambled(rng, body)
         if rng.random() < 0.1:
-            entry = replace(entry, raw_length=rng.choice(WHOLES), codec=rng.randrange(4))
+            entry = replace(entry, raw_length=rng.choice(WHOLES), codec=rng.randrange(9))
     pieces[number] = Piece(entry, body)
     return replace(taken, pieces=tuple(pieces)).together()
 
 
 def of_chunks(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
-    """Chunks gone, twice, elsewhere, or of another file."""
+    """Remove, repeat, swap or replace chunks, also by those of another file."""
     pieces = list(taken.pieces)
     at, to = rng.randrange(len(pieces)), rng.randrange(len(pieces))
     strange = rng.choice(rng.choice(others).pieces)
@@ -252,20 +243,19 @@ def of_chunks(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> byte
 
 
 def of_bytes(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
-    """Any bytes changed, checksums left as they were; or the file cut."""
+    """Mutate any bytes, without correcting checksums; or truncate the file."""
     data = taken.together()
     return data[: rng.randrange(len(data))] if rng.random() < 0.5 else scrambled(rng, data)
 
 
 MUTATIONS: dict[str, Mutation] = {
-    "header": in_header, "index": in_index, "columns": in_columns, "content": in_content, "chunks": of_chunks, "bytes": of_bytes,
+    "header": in_header, "index": in_index, "frame": in_frame, "content": in_content, "chunks": of_chunks, "bytes": of_bytes,
 }  # fmt: skip
-SHARES = (1, 3, 1, 12, 3, 1)
-"""How often each is chosen."""
+SHARES = (1, 3, 1, 12, 3, 1)  # relative frequencies of MUTATIONS
 
 
 def mutated(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
-    """A file damaged in one way, seldom in two."""
+    """Return a file mutated once, seldom twice."""
     data = rng.choices(list(MUTATIONS.values()), SHARES)[0](rng, taken, others)
     if rng.random() < 0.15 and (again := _taken(data)):
         return mutated(rng, again, others)
@@ -273,7 +263,7 @@ def mutated(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes:
 
 
 def _taken(data: bytes) -> Taken | None:
-    """A file taken apart, if it still can be."""
+    """Take a file apart; None if that is no longer possible."""
     try:
         taken = Taken.of(data)
     except FormatError:
@@ -282,7 +272,7 @@ def _taken(data: bytes) -> Taken | None:
 
 
 def _decompressed(body: bytes) -> bytes | None:
-    """What a frame holds; None where that is no frame, or says of itself that it is more than LARGEST, which would be taken on trust."""
+    """Return the content of a zstd frame; None if it is not one or claims more than LARGEST, which the library would believe."""
     try:
         said = zstandard.get_frame_parameters(body).content_size
         if LARGEST < said < zstandard.CONTENTSIZE_ERROR:
@@ -293,20 +283,17 @@ def _decompressed(body: bytes) -> bytes | None:
 
 
 def seeds(only: str = "") -> list[Taken]:
-    """The valid conformance vectors whose names begin with one of `only`, separated by commas, taken apart, but for those that would take more time than all others together."""
+    """Return the valid conformance vectors, taken apart, whose names begin with one of `only`, separated by commas; but for LONG."""
     begins = tuple(only.split(","))
     return [
         Taken.of(data)
-        for path, data in specvectors.vectors().items()
-        if path.startswith("valid/")
-        and path.endswith(".kpc")
-        and Path(path).stem.startswith(begins)
-        and Path(path).stem not in LONG
+        for path, data in specvectors.files().items()
+        if path.startswith("valid/") and Path(path).stem.startswith(begins) and Path(path).stem not in LONG
     ]
 
 
 def examined(data: bytes, budget: int = BUDGET) -> str:
-    """Read all of a file at once, then piece by piece as one that arrives: "read", or the name of the error that refused it.
+    """Read a file at once, then in parts as it arrives; return "read" or the name of the error that refused it.
 
     Raises:
         Anything but a FormatError: a finding.
@@ -328,7 +315,7 @@ def examined(data: bytes, budget: int = BUDGET) -> str:
 
 
 def _fetch(reader: SceneReader, budget: int) -> None:
-    """Fetch segments while they are affordable, as a player does; look at a row of each, and let every other one go."""
+    """Fetch segments within the budget, as a player does, look at a row of each and drop every other one."""
     part, spent = PartialScene(reader), 0
     for number, size in zip(part.numbers, part.sizes, strict=True):
         spent += 5 * int(size)
@@ -354,12 +341,15 @@ def file_number(seed: int, number: int, starts: Sequence[Taken]) -> bytes:
 def _work(
     pipe: Connection, now: Any, seed: int, numbers: range, skipped: frozenset[int], budget: int, only: str
 ) -> None:
-    """Examine files; tell (next number, outcomes, findings) every so often. `now`: the number at hand, and since when, in
-    seconds of computing and on the clock."""
+    """Examine files and send (next number, outcomes, findings) every so often.
+
+    Args:
+        now: shared with the parent: the number of the current file, and its start in processor time and in wall time.
+    """
     warnings.simplefilter("error")
     starts = seeds(only)
     for taken in starts:
-        examined(taken.together(), budget)  # compiled, imported, allocated
+        examined(taken.together(), budget)  # compiles and imports what is needed
     _limit_memory(budget + SLACK)
     tally: Counter[str] = Counter()
     findings: list[tuple[int, str]] = []
@@ -370,7 +360,7 @@ def _work(
             now[:] = number, begun, time.monotonic()
             try:
                 tally[examined(data, budget)] += 1
-            except Exception as error:  # whatever it is, it is what is looked for
+            except Exception as error:  # any exception but a FormatError is a finding
                 tally["finding"] += 1
                 findings.append((number, f"{type(error).__name__}: {error}"))
             if time.process_time() - begun > HANG_S:
@@ -381,7 +371,7 @@ def _work(
 
 
 def _limit_memory(more_bytes: int) -> None:
-    """Let this process take so much more and then fail with MemoryError; where the system has no such limit, do nothing."""
+    """Limit the memory of this process to so much more than it has, where the system can; then it fails with MemoryError."""
     try:
         import resource
 
@@ -392,7 +382,7 @@ def _limit_memory(more_bytes: int) -> None:
 
 
 def _computed_s(pid: int) -> float:
-    """What `time.process_time` says in another process; 0 where the system does not tell."""
+    """Return the processor time of another process in seconds; 0 where the system does not report it."""
     try:
         user, system = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
         return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
@@ -409,8 +399,7 @@ def run(
     first: int = 0,
     only: str = "",
 ) -> dict[str, Any]:
-    """Examine `count` files from number `first` on, made of some `seeds`; how many were read, how many refused, and what was found, as
-    [number, what]."""
+    """Examine `count` files from number `first` on, made of `seeds(only)`; return the outcomes, and findings as [number, message]."""
     context, started, said = multiprocessing.get_context("spawn"), time.monotonic(), time.monotonic()
     tally: Counter[str] = Counter()
     findings: list[tuple[int, str]] = []
@@ -431,8 +420,8 @@ def run(
         for pipe in wait(list(jobs), timeout=1.0):
             process, now, numbers, skipped = jobs[pipe]
             try:
-                following, told, found = pipe.recv()  # type: ignore[union-attr]
-                tally += told
+                following, outcomes, found = pipe.recv()  # type: ignore[union-attr]
+                tally += outcomes
                 findings += found
                 for number, what in found:
                     say(f"file {number}: {what}")
@@ -458,7 +447,7 @@ def run(
 
 
 def keep(findings: Iterable[tuple[int, str]], seed: int, folder: Path, only: str = "") -> None:
-    """Write the files that were found."""
+    """Write the files of findings into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     starts = seeds(only)
     for number, _ in findings:
