@@ -1,3 +1,5 @@
+"""The public interface: load and render."""
+
 import subprocess
 import sys
 
@@ -12,7 +14,7 @@ import kpc
 def test_the_example_of_the_docstring(tmp_path):
     scene = tiny_scene()
     path = tmp_path / "scene.kpc"
-    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), path)
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), path)
     loaded = kpc.load(path)
     assert loaded.scales[0]["xy"].dtype == np.float32
     picture = kpc.render(loaded, loaded.cameras[0], time=0.5)
@@ -20,7 +22,7 @@ def test_the_example_of_the_docstring(tmp_path):
     assert 0.0 <= picture.rgb.min() and picture.rgb.max() <= 1.0 and picture.opacity.max() > 0.5
 
 
-def test_playing_needs_no_torch_and_reading_no_opengl():
+def test_importing_kpc_loads_neither_torch_nor_opengl():
     program = (
         "import sys, kpc, kpc.format.container.scene_io; "
         "print([m for m in ('torch', 'moderngl', 'glfw') if m in sys.modules])"

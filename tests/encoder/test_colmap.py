@@ -1,4 +1,4 @@
-"""A COLMAP model gives the cameras it was made of, in binary as in text; what is damaged is one line."""
+"""COLMAP models, binary and text, give the original cameras; damage is reported in one line."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ PINHOLE = (40.0, 41.0, 16.5, 11.5)
 def model_of(
     folder: Path, cameras: list[make.ColmapCamera], images: list[make.ColmapImage], binary: bool = True
 ) -> Path:
-    """A folder whose images are there and whose model is the one given."""
+    """Write a folder with three images and the given model."""
     shutil.rmtree(folder, ignore_errors=True)
     make.write_colmap(folder, images=3)
     shutil.rmtree(folder / "sparse")
@@ -32,12 +32,10 @@ def model_of(
 
 
 def three(*names: str, pose: tuple[float, ...] = POSE) -> list[make.ColmapImage]:
+    """Return images one unit apart, three unless named."""
     return [
         (k, (*pose[:4], pose[4] + k, *pose[5:]), 1, name, 0) for k, name in enumerate(names or ("0000", "0001", "0002"))
     ]
-
-
-# --- what it reads
 
 
 @pytest.mark.parametrize("binary", [True, False])
@@ -51,7 +49,7 @@ def three(*names: str, pose: tuple[float, ...] = POSE) -> list[make.ColmapImage]
         ("OPENCV", (0.06, -0.08, -0.001, 0.0002), (0.06, -0.08, -0.001, 0.0002)),
     ],
 )
-def test_cameras_come_back(
+def test_cameras_of_every_model_are_read(
     tmp_path: Path, binary: bool, model: str, lens: tuple[float, ...], distortion: tuple[float, ...]
 ) -> None:
     rig = make.write_colmap(tmp_path / "set", binary=binary, model=model, lens=lens)
@@ -61,9 +59,9 @@ def test_cameras_come_back(
     assert p.file == tuple(f"images/{k:04d}.png" for k in range(10))
     assert p.is_test.nonzero()[0].tolist() == [0, 8] and np.isnan(p.near).all() and np.isnan(p.far).all()
     for n, camera in enumerate(rig):
-        there = dataset.camera(n)
-        np.testing.assert_allclose(there.camera_to_world, camera.camera_to_world, atol=1e-12)
-        assert (there.fl_x, there.fl_y, there.cx, there.cy) == (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
+        found = dataset.camera(n)
+        np.testing.assert_allclose(found.camera_to_world, camera.camera_to_world, atol=1e-12)
+        assert (found.fl_x, found.fl_y, found.cx, found.cy) == (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
         np.testing.assert_array_equal(dataset.pixels.picture(n), make.picture(camera))
     np.testing.assert_array_equal(p.distortion, np.tile(distortion, (10, 1)))
     assert ("distortion" in dataset.describe()) == any(distortion) and dataset.describe().startswith(
@@ -71,8 +69,8 @@ def test_cameras_come_back(
     )
 
 
-def test_rays_pass_through_what_the_model_projects(tmp_path: Path) -> None:
-    """The projection as COLMAP's documents give it: x right, y down, z forward, the first pixel's middle at 0.5."""
+def test_rays_pass_through_points_projected_by_the_model(tmp_path: Path) -> None:
+    """Project as COLMAP documents it: x right, y down, z forward, the centre of the first pixel at 0.5."""
     lens = (0.06, -0.08, -0.001, 0.0002)
     make.write_colmap(tmp_path / "set", model="OPENCV", lens=lens)
     dataset = load(tmp_path / "set")
@@ -80,8 +78,8 @@ def test_rays_pass_through_what_the_model_projects(tmp_path: Path) -> None:
     for k in (1, 6):
         *q, tx, ty, tz = make.colmap_pose(make.ring(10)[k].camera_to_world)
         w, v = q[0], np.array(q[1:])
-        turned = points + 2 * np.cross(v, np.cross(v, points) + w * points)  # q p q*
-        x, y, z = (turned + [tx, ty, tz]).T
+        rotated = points + 2 * np.cross(v, np.cross(v, points) + w * points)  # q p q*
+        x, y, z = np.add(rotated, [tx, ty, tz]).T
         assert (z > 0).all()
         u, v = distorted(x / z, y / z, np.array([lens]))
         camera = dataset.camera(k)
@@ -92,17 +90,17 @@ def test_rays_pass_through_what_the_model_projects(tmp_path: Path) -> None:
 
 
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: 0.1 < np.linalg.norm(q)), st.floats(0.1, 9))
-def test_quaternions_of_any_length_turn_alike(q: list[float], length: float) -> None:
+def test_quaternions_of_any_length_give_the_same_rotation(q: list[float], length: float) -> None:
     pose = colmap._camera_to_world("here", (*(length * np.array(q)), 1.0, 2.0, 3.0))
     rotation = pose[:3, :3] * [1, -1, -1]
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1)
     np.testing.assert_allclose(rotation.T @ pose[:3, 3], [-1, -2, -3], atol=1e-12)
-    there = make.quaternion(rotation.T)
-    assert abs(there @ q) == pytest.approx(np.linalg.norm(q))  # q and -q are one rotation
+    found = make.quaternion(rotation.T)
+    assert abs(found @ q) == pytest.approx(np.linalg.norm(q))  # q and -q are the same rotation
 
 
-def test_binary_goes_before_text_and_sparse_0_before_sparse(tmp_path: Path) -> None:
+def test_binary_precedes_text_and_sparse_0_precedes_sparse(tmp_path: Path) -> None:
     folder = tmp_path / "set"
     rig = make.write_colmap(folder)
     (folder / "sparse" / "0" / "cameras.txt").write_text("damaged")
@@ -118,7 +116,7 @@ def test_binary_goes_before_text_and_sparse_0_before_sparse(tmp_path: Path) -> N
     fails(folder, "no dataset layout recognised", "sparse/0", "COLMAP")
 
 
-def test_exports_go_before_the_model(tmp_path: Path) -> None:
+def test_exported_layouts_precede_the_model(tmp_path: Path) -> None:
     for write, layout in ((make.write_nerfstudio, "nerfstudio"), (make.write_llff, "LLFF")):
         write(tmp_path / layout)
         make.write_colmap_model(tmp_path / layout / "sparse" / "0", [], [])
@@ -126,9 +124,9 @@ def test_exports_go_before_the_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_folders_spaces_order_and_several_cameras(tmp_path: Path, binary: bool) -> None:
+def test_subfolders_spaces_order_and_several_cameras(tmp_path: Path, binary: bool) -> None:
     names = ["b/view 10.png", "b/view 9.png", "a/view 1.png"]
-    small = (8, "SIMPLE_PINHOLE", 64, 48, (80.0, 33.0, 23.0))  # calibrated on twice the size
+    small = (8, "SIMPLE_PINHOLE", 64, 48, (80.0, 33.0, 23.0))  # calibrated at twice the size
     images = three(*names)
     images[0] = (*images[0][:2], 8, *images[0][3:])
     folder = model_of(tmp_path / "set", [(1, "PINHOLE", 32, 24, PINHOLE), small], images, binary)
@@ -142,8 +140,8 @@ def test_folders_spaces_order_and_several_cameras(tmp_path: Path, binary: bool) 
     np.testing.assert_allclose(p.camera_to_world[:, 0, 3], [-2.1, -1.1, -0.1])
 
 
-def test_text_as_it_may_be_written(tmp_path: Path) -> None:
-    """Comments and empty lines between records, points that are many or none, and no end to the last line."""
+def test_variations_of_the_text_format(tmp_path: Path) -> None:
+    """Comments and empty lines between records, many or no points, and a last line without a line break."""
     folder = model_of(tmp_path / "set", [], [], binary=False)
     (folder / "sparse/0/cameras.txt").write_text("# one\n\n#two\n  1 PINHOLE 32 24 40 41 16.5 11.5  \r\n")
     (folder / "sparse/0/images.txt").write_text(
@@ -168,9 +166,6 @@ def test_missing_images_are_named_in_one_line(tmp_path: Path, capsys: pytest.Cap
     fails(tmp_path / "set", "images.bin", "none of its 5 images exists")
 
 
-# --- faults
-
-
 @pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize(
     "camera, words",
@@ -185,7 +180,9 @@ def test_missing_images_are_named_in_one_line(tmp_path: Path, capsys: pytest.Cap
         ((2, "PINHOLE", 32, 24, PINHOLE), ("camera 1 is missing from the model",)),
     ],
 )
-def test_impossible_cameras(tmp_path: Path, binary: bool, camera: make.ColmapCamera, words: tuple[str, ...]) -> None:
+def test_invalid_cameras_are_refused(
+    tmp_path: Path, binary: bool, camera: make.ColmapCamera, words: tuple[str, ...]
+) -> None:
     fails(model_of(tmp_path / "set", [camera], three(), binary), *words)
 
 
@@ -200,14 +197,14 @@ def test_impossible_cameras(tmp_path: Path, binary: bool, camera: make.ColmapCam
         (0.9, 0.1, 0.3, 0.2, 1.7e308, 1.7e308, 1.7e308),
     ],
 )
-def test_impossible_poses(tmp_path: Path, binary: bool, pose: tuple[float, ...]) -> None:
+def test_invalid_poses_are_refused(tmp_path: Path, binary: bool, pose: tuple[float, ...]) -> None:
     images = [*three()[:2], (5, pose, 1, "0002.png", 0)]
     folder = model_of(tmp_path / "set", [(1, "PINHOLE", 32, 24, PINHOLE)], images, binary)
     fails(folder, "image 5", "pose")
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_what_is_there_twice_or_not_at_all(tmp_path: Path, binary: bool) -> None:
+def test_duplicates_and_empty_models_are_refused(tmp_path: Path, binary: bool) -> None:
     camera = (1, "PINHOLE", 32, 24, PINHOLE)
     suffix = ".bin" if binary else ".txt"
     fails(model_of(tmp_path / "set", [camera, camera], three(), binary), f"cameras{suffix}", "camera 1 is listed twice")
@@ -244,7 +241,7 @@ def test_names_must_not_leave_the_folder(tmp_path: Path, binary: bool, name: str
         ("1 PIN\x1b[2J 32 24 40 41 16 12", "camera model 'PIN\\x1b[2J' is not supported"),
     ],
 )
-def test_broken_text_of_cameras(tmp_path: Path, text: str, words: str) -> None:
+def test_malformed_text_of_cameras(tmp_path: Path, text: str, words: str) -> None:
     folder = model_of(tmp_path / "set", [], three(), binary=False)
     (folder / "sparse/0/cameras.txt").write_text(text)
     fails(folder, words)
@@ -261,14 +258,14 @@ def test_broken_text_of_cameras(tmp_path: Path, text: str, words: str) -> None:
         "# nothing\n\n",
     ],
 )
-def test_broken_text_of_images(tmp_path: Path, text: str) -> None:
+def test_malformed_text_in_images(tmp_path: Path, text: str) -> None:
     folder = model_of(tmp_path / "set", [(1, "PINHOLE", 32, 24, PINHOLE)], [], binary=False)
     (folder / "sparse/0/images.txt").write_text(text)
     fails(folder, "images.txt", "export")
 
 
-def test_absurd_counts(tmp_path: Path) -> None:
-    """Nothing is allocated for what a file only claims to hold."""
+def test_absurd_counts_are_refused(tmp_path: Path) -> None:
+    """Nothing is allocated by a count from the file."""
     folder = tmp_path / "set"
     make.write_colmap(folder, images=3)
     cameras, images = folder / "sparse/0/cameras.bin", folder / "sparse/0/images.bin"
@@ -290,15 +287,15 @@ def test_absurd_counts(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes, bytes]:
-    folder = tmp_path_factory.mktemp("whole") / "set"
+def valid_model(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes, bytes]:
+    folder = tmp_path_factory.mktemp("model") / "set"
     make.write_colmap(folder, images=4, model="OPENCV", lens=(0.1, 0.0, 0.0, 0.0))
     model = folder / "sparse" / "0"
     return folder, (model / "cameras.bin").read_bytes(), (model / "images.bin").read_bytes()
 
 
 def read_or_refuse(folder: Path, cameras: bytes, images: bytes) -> bool:
-    """Whether it is read; whatever is refused is refused in one line."""
+    """Return whether the model is read; a refusal must be one printable line."""
     (folder / "sparse/0/cameras.bin").write_bytes(cameras)
     (folder / "sparse/0/images.bin").write_bytes(images)
     try:
@@ -309,8 +306,10 @@ def read_or_refuse(folder: Path, cameras: bytes, images: bytes) -> bool:
     return True
 
 
-def test_every_truncation_is_refused(whole: tuple[Path, bytes, bytes], capsys: pytest.CaptureFixture[str]) -> None:
-    folder, cameras, images = whole
+def test_every_truncation_is_refused(
+    valid_model: tuple[Path, bytes, bytes], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, cameras, images = valid_model
     assert read_or_refuse(folder, cameras, images)
     assert not any(read_or_refuse(folder, cameras[:n], images) for n in range(len(cameras)))
     assert not any(read_or_refuse(folder, cameras, images[:n]) for n in range(len(images)))
@@ -318,41 +317,43 @@ def test_every_truncation_is_refused(whole: tuple[Path, bytes, bytes], capsys: p
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300, deadline=None)
 @given(st.booleans(), st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), min_size=1, max_size=8))
-def test_altered_bytes_end_in_a_dataset_or_in_one_line(
-    whole: tuple[Path, bytes, bytes], of_images: bool, changes: list[tuple[int, int]]
+def test_altered_bytes_give_a_dataset_or_a_one_line_error(
+    valid_model: tuple[Path, bytes, bytes], in_images: bool, changes: list[tuple[int, int]]
 ) -> None:
-    folder, cameras, images = whole
-    data = bytearray(images if of_images else cameras)
-    for place, value in changes:
-        data[place % len(data)] = value
-    read_or_refuse(folder, *((cameras, bytes(data)) if of_images else (bytes(data), images)))
+    folder, cameras, images = valid_model
+    data = bytearray(images if in_images else cameras)
+    for position, value in changes:
+        data[position % len(data)] = value
+    read_or_refuse(folder, *((cameras, bytes(data)) if in_images else (bytes(data), images)))
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=200, deadline=None)
 @given(st.booleans(), st.binary(max_size=300))
-def test_noise_ends_in_one_line(whole: tuple[Path, bytes, bytes], of_images: bool, noise: bytes) -> None:
-    folder, cameras, images = whole
-    assert not read_or_refuse(folder, *((cameras, noise) if of_images else (noise, images)))
+def test_random_bytes_give_a_one_line_error(
+    valid_model: tuple[Path, bytes, bytes], in_images: bool, noise: bytes
+) -> None:
+    folder, cameras, images = valid_model
+    assert not read_or_refuse(folder, *((cameras, noise) if in_images else (noise, images)))
 
 
-def test_names_that_are_no_text(tmp_path: Path) -> None:
-    """A name is bytes; what Python makes of them must find the file again."""
+def test_names_that_are_not_valid_text(tmp_path: Path) -> None:
+    """A name is bytes, and the string that Python decodes them to must still find the file."""
     folder = model_of(tmp_path / "set", [(1, "PINHOLE", 32, 24, PINHOLE)], three("0000.png", "0001.png", "0002.png"))
     try:
         os.rename(folder / "images" / "0001.png", os.fsencode(folder / "images") + b"/0\xff01.png")
     except OSError:
-        pytest.skip("the file system takes only text")
+        pytest.skip("the file system accepts valid text only")
     images = folder / "sparse/0/images.bin"
     images.write_bytes(images.read_bytes().replace(b"0001.png", b"0\xff01.png"))
     assert len(load(folder).pictures) == 3
 
 
-def test_the_same_rays_as_nerfstudio(tmp_path: Path) -> None:
+def test_rays_equal_those_of_nerfstudio(tmp_path: Path) -> None:
     lens = {"k1": 0.06, "k2": -0.08, "p1": -0.001, "p2": 0.0002}
     make.write_nerfstudio(tmp_path / "json", **lens)
     make.write_colmap(tmp_path / "model", model="OPENCV", lens=tuple(lens.values()))
     ours, theirs = load(tmp_path / "model", downscale=2), load(tmp_path / "json", downscale=2)
     np.testing.assert_array_equal(ours.pictures.is_test, theirs.pictures.is_test)
     for n in range(10):
-        for a, b in zip(all_rays(ours, n), all_rays(theirs, n)):
+        for a, b in zip(all_rays(ours, n), all_rays(theirs, n), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Every layout is recognised by its content and read to the cameras and pixels it is of; every fault is one line."""
+"""Every dataset layout is recognised and read correctly; every fault is reported in one line."""
 
 import errno
 import json
@@ -26,7 +26,7 @@ def load(folder: Path, **options: object) -> Dataset:
 
 
 def fails(folder: Path, *words: str, **options: object) -> None:
-    """Loading raises one line with all these words in it."""
+    """Assert that loading raises a one-line error that contains all these words."""
     with pytest.raises(KpcError) as caught:
         load(folder, **options)
     message = str(caught.value)
@@ -35,12 +35,10 @@ def fails(folder: Path, *words: str, **options: object) -> None:
 
 
 def all_rays(dataset: Dataset, picture: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rays of all pixels of a picture."""
     camera = dataset.camera(picture)
     row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
     return pixel_rays(dataset.pictures, np.full(len(row), picture), column, row)
-
-
-# --- layouts
 
 
 def test_n3dv(tmp_path: Path) -> None:
@@ -54,18 +52,17 @@ def test_n3dv(tmp_path: Path) -> None:
     np.testing.assert_array_equal(p.is_test, [True] * 4 + [False] * 8)
     assert (p.near == 1).all() and (p.far == 6).all()
     for n in range(len(p)):
-        camera, there = rig[p.camera[n]], dataset.camera(n)
-        np.testing.assert_allclose(there.camera_to_world, camera.camera_to_world, atol=1e-12)
-        assert (there.fl_x, there.fl_y, there.cx, there.cy) == (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
+        camera, found = rig[p.camera[n]], dataset.camera(n)
+        np.testing.assert_allclose(found.camera_to_world, camera.camera_to_world, atol=1e-12)
+        assert (found.fl_x, found.fl_y, found.cx, found.cy) == (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
         error = dataset.pixels.picture(n).astype(float) - make.picture(camera, float(p.time[n]))
-        assert np.abs(error).mean() < 2  # crf 1, and half a step of each of Y, Cb, Cr
-    said = dataset.describe()
-    assert all(
-        word in said for word in ("N3DV", "3 cameras", "12 pictures of 32x24", "cam00", "dynamic, 4 frames at 8 fps")
-    ), said
+        assert np.abs(error).mean() < 2  # crf 1, plus half a step of each of Y, Cb and Cr
+    description = dataset.describe()
+    for words in ("N3DV", "3 cameras", "12 pictures of 32x24", "cam00", "dynamic, 4 frames at 8 fps"):
+        assert words in description
 
 
-def test_rays_are_those_of_the_pinhole_camera(tmp_path: Path) -> None:
+def test_rays_equal_those_of_the_pinhole_camera(tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "set")
     dataset = load(tmp_path / "set")
     for n in (0, 5, 11):
@@ -86,14 +83,14 @@ def test_holdout_of_videos(tmp_path: Path, holdout: str | None, tests: set[str])
     fails(tmp_path / "set", "cam07", "cam00, cam01", holdout="cam07")
 
 
-def test_one_frame_of_each_video_is_a_static_scene(tmp_path: Path) -> None:
+def test_videos_of_one_frame_are_a_static_scene(tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "set", frames=1)
     dataset = load(tmp_path / "set")
     assert not dataset.is_dynamic and dataset.clip.duration_s == 0 and (dataset.pictures.time == 0).all()
     assert "static" in dataset.describe()
 
 
-def test_videos_in_natural_order(tmp_path: Path) -> None:
+def test_videos_are_read_in_natural_order(tmp_path: Path) -> None:
     rig = make.write_n3dv(tmp_path / "set")
     (tmp_path / "set" / "cam01.mp4").rename(tmp_path / "set" / "cam9.mp4")
     (tmp_path / "set" / "cam02.mp4").rename(tmp_path / "set" / "cam10.mp4")
@@ -104,7 +101,7 @@ def test_videos_in_natural_order(tmp_path: Path) -> None:
 
 def test_natural_order() -> None:
     names = ["", "2", "10", "a", "a0", "a1", "a01b", "a2", "a10", "a10b2", "a10b10", "a" + "9" * 5000, "b", "x\u00b21"]
-    assert sorted(reversed(names), key=natural_key) == names
+    assert sorted(names[::-1], key=natural_key) == names
 
 
 def test_llff_images(tmp_path: Path) -> None:
@@ -126,7 +123,7 @@ def test_blender(tmp_path: Path) -> None:
     camera = make.ring(5, width=20, height=20)[1]
     np.testing.assert_array_equal(dataset.pixels.picture(1), make.picture(camera, 0.25, alpha=True))
     assert dataset.camera(1).fl_x == pytest.approx(camera.fl_x)
-    assert len(load(tmp_path / "set", holdout="none").pictures) == 10  # val is trained on too
+    assert len(load(tmp_path / "set", holdout="none").pictures) == 10  # the val split, too, is trained on
 
 
 def test_blender_static_without_alpha(tmp_path: Path) -> None:
@@ -135,7 +132,7 @@ def test_blender_static_without_alpha(tmp_path: Path) -> None:
     assert not dataset.is_dynamic and not dataset.has_alpha and dataset.pixels.picture(0).shape == (20, 20, 3)
 
 
-def test_alpha_that_is_opaque_everywhere_is_none(tmp_path: Path) -> None:
+def test_fully_opaque_alpha_is_dropped(tmp_path: Path) -> None:
     rig = make.write_nerfstudio(tmp_path / "set")
     for k, camera in enumerate(rig):
         opaque = np.concatenate([make.picture(camera), np.full((24, 32, 1), 255, np.uint8)], axis=2)
@@ -170,7 +167,7 @@ def test_nerfstudio_split_time_and_depths(tmp_path: Path) -> None:
     assert p.file == (*names[:7], names[8])  # 7 and 9 are in neither list
     np.testing.assert_array_equal(p.is_test, [False] * 7 + [True])
     assert (p.near == 0.5).all() and (p.far == 4.5).all() and dataset.clip.fps == 12
-    assert dataset.clip.frame_count == 8  # 10 at this step, but no more than there are pictures
+    assert dataset.clip.frame_count == 8  # the step suggests 10, but there are only 8 pictures
 
 
 def test_frames_may_override_intrinsics(tmp_path: Path) -> None:
@@ -182,8 +179,8 @@ def test_frames_may_override_intrinsics(tmp_path: Path) -> None:
     assert len(dataset.camera_names) == 10 and dataset.pictures.camera.tolist() == list(range(10))
 
 
-def test_intrinsics_follow_the_images_size(tmp_path: Path) -> None:
-    """Calibrated on 64x48, the images are 32x24."""
+def test_intrinsics_are_scaled_to_the_size_of_the_images(tmp_path: Path) -> None:
+    """The calibration is for 64x48, the images are 32x24."""
     make.write_nerfstudio(tmp_path / "set", w=64, h=48, fl_x=80.0, fl_y=82.0, cx=33.0, cy=23.0)
     np.testing.assert_allclose(load(tmp_path / "set").pictures.intrinsics[0], [40.0, 41.0, 16.5, 11.5])
 
@@ -195,11 +192,11 @@ def test_missing_images_are_named_in_one_line(tmp_path: Path, capsys: pytest.Cap
     dataset = load(tmp_path / "set")
     (line,) = capsys.readouterr().err.splitlines()
     assert "2 of 10 frames" in line and "images/0002.png, images/0005.png" in line
-    np.testing.assert_array_equal(np.flatnonzero(dataset.pictures.is_test), [0])  # every eighth of those that exist
+    np.testing.assert_array_equal(np.flatnonzero(dataset.pictures.is_test), [0])  # every eighth of the existing ones
 
 
-def test_times_beyond_the_unit_are_scaled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    times = [12.0, 10.0, 11.0, 14.0, 13.0, 15.0, 19.0, 18.0, 17.0, 16.0]  # in no order, in frames
+def test_times_outside_the_unit_interval_are_scaled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    times = [12.0, 10.0, 11.0, 14.0, 13.0, 15.0, 19.0, 18.0, 17.0, 16.0]  # unsorted, in frames
     make.write_nerfstudio(tmp_path / "set", times=times)
     dataset = load(tmp_path / "set", holdout="none")
     np.testing.assert_allclose(dataset.pictures.time, (np.array(times) - 10) / 9, atol=1e-7)
@@ -207,7 +204,7 @@ def test_times_beyond_the_unit_are_scaled(tmp_path: Path, capsys: pytest.Capture
     assert "10 to 19; scaled" in capsys.readouterr().err
 
 
-def test_equal_times_are_a_static_scene(tmp_path: Path) -> None:
+def test_equal_times_make_a_static_scene(tmp_path: Path) -> None:
     make.write_nerfstudio(tmp_path / "set", times=[0.5] * 10)
     dataset = load(tmp_path / "set")
     assert not dataset.is_dynamic and dataset.clip.frame_count == 1
@@ -231,10 +228,7 @@ def test_fewer_frames_in_one_video(tmp_path: Path, capsys: pytest.CaptureFixture
     assert np.abs(error).mean() < 2
 
 
-# --- faults
-
-
-def test_folders_that_are_no_dataset(tmp_path: Path) -> None:
+def test_folders_that_are_not_datasets(tmp_path: Path) -> None:
     fails(tmp_path / "none", "no such directory")
     (tmp_path / "file").write_text("x")
     fails(tmp_path / "file", "not a directory")
@@ -251,11 +245,11 @@ def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(path: Path) -> None:
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "iterdir", refuse)  # root may read everything, so the refusal is played
+    monkeypatch.setattr(Path, "iterdir", refuse)  # root may read everything, so the refusal is simulated
     fails(tmp_path / "set", "no permission")
 
 
-def test_poses_that_do_not_match(tmp_path: Path) -> None:
+def test_malformed_poses_bounds(tmp_path: Path) -> None:
     folder = tmp_path / "set"
     make.write_n3dv(folder)
     good = np.load(folder / "poses_bounds.npy")
@@ -292,13 +286,13 @@ def test_poses_without_pictures(tmp_path: Path) -> None:
     fails(tmp_path / "set", "cam*.mp4")
 
 
-def test_a_video_that_is_none(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_video(tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "set")
     (tmp_path / "set" / "cam01.mp4").write_bytes(b"text")
     fails(tmp_path / "set", "cam01.mp4")
 
 
-def test_a_video_that_is_cut_off(tmp_path: Path) -> None:
+def test_a_truncated_video(tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "set")
     video = tmp_path / "set" / "cam01.mp4"
     video.write_bytes(video.read_bytes()[:-400])
@@ -307,7 +301,7 @@ def test_a_video_that_is_cut_off(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("frames", [1, 4])
-def test_a_single_camera_that_does_not_move(tmp_path: Path, frames: int) -> None:
+def test_a_single_static_camera_is_refused(tmp_path: Path, frames: int) -> None:
     make.write_n3dv(tmp_path / "set", cameras=2, frames=frames)
     fails(tmp_path / "set", "a single camera that does not move", "cam01.mp4")
     make.write_n3dv(tmp_path / "one", cameras=1, frames=frames)
@@ -387,7 +381,7 @@ def test_times_for_some_images_only(tmp_path: Path) -> None:
     fails(tmp_path / "set", "0003.png", "time")
 
 
-def test_no_image_at_all(tmp_path: Path) -> None:
+def test_no_image_exists(tmp_path: Path) -> None:
     make.write_nerfstudio(tmp_path / "set", images=3)
     shutil.rmtree(tmp_path / "set" / "images")
     fails(tmp_path / "set", "none of its 3 images")
@@ -407,15 +401,12 @@ def test_too_much_downscaling(tmp_path: Path) -> None:
     fails(tmp_path / "set", "cannot be downscaled by 0", downscale=0)
 
 
-# --- the cache
-
-
 def cache_file(tmp_path: Path) -> Path:
     (file,) = (tmp_path / "cache").glob("pixels-*.bin")
     return file
 
 
-def test_cache_is_built_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_is_built_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make.write_n3dv(tmp_path / "set")
     load(tmp_path / "set")
     before = cache_file(tmp_path).stat().st_mtime_ns
@@ -424,7 +415,7 @@ def test_cache_is_built_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert sorted(f.suffix for f in (tmp_path / "cache").iterdir()) == [".bin", ".json"]
 
 
-def test_stale_or_damaged_cache_is_rebuilt(tmp_path: Path) -> None:
+def test_a_stale_or_damaged_cache_is_rebuilt(tmp_path: Path) -> None:
     rig = make.write_nerfstudio(tmp_path / "set")
     load(tmp_path / "set")
     file = cache_file(tmp_path)
@@ -442,7 +433,9 @@ def test_stale_or_damaged_cache_is_rebuilt(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mapped_bytes", [1 << 30, 0])
-def test_reading_pixels_mapped_and_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mapped_bytes: int) -> None:
+def test_reading_pixels_with_and_without_a_memory_mapping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mapped_bytes: int
+) -> None:
     monkeypatch.setattr(pixel_cache, "MAPPED_BYTES", mapped_bytes)
     make.write_blender(tmp_path / "set")
     dataset = load(tmp_path / "set")
@@ -451,12 +444,12 @@ def test_reading_pixels_mapped_and_not(tmp_path: Path, monkeypatch: pytest.Monke
     picture = rng.integers(len(p), size=500)
     column, row = rng.integers(p.width[picture]), rng.integers(p.height[picture])
     found = dataset.pixels.read(p.offset[picture] + row.astype(np.int64) * p.width[picture] + column)
-    expected = np.stack([dataset.pixels.picture(n)[j, i] for n, j, i in zip(picture, row, column)])
+    expected = np.stack([dataset.pixels.picture(n)[j, i] for n, j, i in zip(picture, row, column, strict=True)])
     np.testing.assert_array_equal(found, expected)
 
 
-def test_large_cache_stays_out_of_memory(tmp_path: Path) -> None:
-    """3 GB, sparse: reading all over it leaves none of it resident."""
+def test_a_large_cache_does_not_become_resident(tmp_path: Path) -> None:
+    """Random reads from a sparse file of 3 GB leave none of it resident."""
     file = tmp_path / "pixels.bin"
     with open(file, "wb") as out:
         out.truncate(3_000_000_000)
@@ -471,11 +464,11 @@ def test_large_cache_stays_out_of_memory(tmp_path: Path) -> None:
 
 def resident_bytes() -> int:
     if not Path("/proc/self/statm").exists():
-        pytest.skip("the system does not tell resident memory in /proc")
+        pytest.skip("the system does not report resident memory in /proc")
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def test_cache_that_shrinks_while_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_truncated_while_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pixel_cache, "MAPPED_BYTES", 0)
     make.write_blender(tmp_path / "set")
     dataset = load(tmp_path / "set")
@@ -504,7 +497,7 @@ def test_disk_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fails(tmp_path / "set", "disk is full")
 
 
-def test_what_a_killed_build_left_is_swept(tmp_path: Path) -> None:
+def test_leftovers_of_killed_builds_are_deleted(tmp_path: Path) -> None:
     make.write_nerfstudio(tmp_path / "set", images=3)
     load(tmp_path / "set")
     file = cache_file(tmp_path)
@@ -517,19 +510,16 @@ def test_what_a_killed_build_left_is_swept(tmp_path: Path) -> None:
     assert not old.exists() and new.exists()
 
 
-def test_cache_directory_that_cannot_be_made(tmp_path: Path) -> None:
+def test_a_cache_directory_that_cannot_be_created(tmp_path: Path) -> None:
     make.write_nerfstudio(tmp_path / "set", images=3)
     (tmp_path / "cache").write_text("a file")
-    with pytest.raises(OSError) as caught:  # cli.run makes one line of it
+    with pytest.raises(OSError) as caught:  # cli.run prints it as one line
         load(tmp_path / "set")
     assert caught.value.filename is not None
 
 
-# --- pixels and rays
-
-
 @pytest.mark.parametrize("factor", [2, 3, 5])
-def test_shrinking_averages_blocks(factor: int) -> None:
+def test_downscaling_averages_blocks(factor: int) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (16, 23, 3), dtype=np.uint8)
     small = downscale_picture(picture, factor)
     h, w = 16 // factor, 23 // factor
@@ -537,7 +527,7 @@ def test_shrinking_averages_blocks(factor: int) -> None:
     assert small.shape == (h, w, 3) and np.abs(small - exact).max() <= 0.5
 
 
-def test_shrinking_weighs_colours_by_alpha() -> None:
+def test_downscaling_weights_colours_by_alpha() -> None:
     picture = np.random.default_rng(0).integers(0, 256, (8, 8, 4), dtype=np.uint8)
     picture[:2, :2, 3] = 0
     blocks = picture.reshape(4, 2, 4, 2, 4).astype(float)
@@ -552,16 +542,16 @@ def test_shrinking_weighs_colours_by_alpha() -> None:
 
 
 def test_downscaled_intrinsics_keep_directions(tmp_path: Path) -> None:
-    """A pixel of the small picture looks where the middle of its block does."""
+    """A pixel of the downscaled picture has the direction of the centre of its block."""
     make.write_nerfstudio(tmp_path / "set", images=3)
     large, small = load(tmp_path / "set"), load(tmp_path / "set", downscale=4)
     assert small.pixels.picture(0).shape == (6, 8, 3)
     _, fine = all_rays(large, 1)
     _, coarse = all_rays(small, 1)
-    corners = fine.reshape(6, 4, 8, 4, 3)[:, 1:3, :, 1:3]  # the middle four
+    corners = fine.reshape(6, 4, 8, 4, 3)[:, 1:3, :, 1:3]  # the four pixels around the centre
     middle = corners.mean((1, 3)).reshape(-1, 3)
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    # the mean of four unit vectors half a pixel off the middle errs by less than (half a pixel)^2, 1 / 76.8 squared
+    # The mean of four unit vectors half a pixel off the centre errs by less than (half a pixel)^2 = (0.5 / 38.4)^2.
     assert np.abs(middle - coarse).max() < (0.5 / 38.4) ** 2 * 2
 
 
@@ -569,7 +559,7 @@ def test_downscaled_intrinsics_keep_directions(tmp_path: Path) -> None:
 def test_undistortion_inverts_distortion(seed: int) -> None:
     rng = np.random.default_rng(seed)
     coefficients = rng.uniform(-1, 1, (40, 4)) * [0.15, 0.08, 0.01, 0.01]
-    x, y = rng.uniform(-0.7, 0.7, (2, 40))  # at 0.8 the strongest of these lenses fold over
+    x, y = rng.uniform(-0.7, 0.7, (2, 40))  # from 0.8 on the strongest of these lenses fold over
     u, v = undistort(*distorted(x, y, coefficients), coefficients)
     np.testing.assert_allclose(np.stack([u, v]), np.stack([x, y]), atol=1e-9)
 
@@ -581,15 +571,17 @@ def distorted(x: np.ndarray, y: np.ndarray, coefficients: np.ndarray) -> tuple[n
     return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
 
-def test_undistortion_beyond_the_fold_stays_finite() -> None:
+def test_undistortion_beyond_the_fold_is_finite() -> None:
     coefficients = np.tile([-0.9, 0.0, 0.0, 0.0], (50, 1))
     x = np.linspace(-3, 3, 50)
     assert np.isfinite(undistort(x, x, coefficients)).all()
 
 
-def test_distorted_rays_pass_through_the_point_they_show(tmp_path: Path) -> None:
+def test_distorted_rays_pass_through_the_projected_points(tmp_path: Path) -> None:
     coefficients = np.array([[0.06, -0.08, -0.001, 0.0002]])  # of a real lens
-    make.write_nerfstudio(tmp_path / "set", images=3, **dict(zip(("k1", "k2", "p1", "p2"), coefficients[0].tolist())))
+    make.write_nerfstudio(
+        tmp_path / "set", images=3, **dict(zip(("k1", "k2", "p1", "p2"), coefficients[0].tolist(), strict=True))
+    )
     dataset = load(tmp_path / "set")
     assert "distortion" in dataset.describe()
     camera, p = dataset.camera(1), dataset.pictures
@@ -599,10 +591,7 @@ def test_distorted_rays_pass_through_the_point_they_show(tmp_path: Path) -> None
     column, row = camera.cx + camera.fl_x * x - 0.5, camera.cy + camera.fl_y * y - 0.5
     origins, directions = pixel_rays(p, np.ones(20, int), column, row)
     along = ((points - origins) * directions).sum(1, keepdims=True)
-    assert np.abs(origins + along * directions - points).max() < 1e-5  # float32 at 4 units
-
-
-# --- real sets
+    assert np.abs(origins + along * directions - points).max() < 1e-5  # float32 at a distance of 4 units
 
 
 @pytest.mark.skipif(not (DATA / "fox").is_dir(), reason="shared/data is not here")
@@ -614,7 +603,7 @@ def test_distorted_rays_pass_through_the_point_they_show(tmp_path: Path) -> None
         ("fox", "static, distortion", 50, 7),
     ],
 )
-def test_real_sets(tmp_path: Path, name: str, words: str, pictures: int, tests: int) -> None:
+def test_real_datasets(tmp_path: Path, name: str, words: str, pictures: int, tests: int) -> None:
     dataset = load_dataset(DATA / name, tmp_path, downscale=8 if name == "fox" else 1, progress=False)
     assert words in dataset.describe()
     assert (len(dataset.pictures), int(dataset.pictures.is_test.sum())) == (pictures, tests)
