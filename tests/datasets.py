@@ -1,4 +1,4 @@
-"""Tiny datasets in every layout, for tests: a shaded sphere seen by a few cameras over a few frames."""
+"""Tiny datasets of every layout for tests: a shaded sphere seen by a few cameras over a few frames."""
 
 import json
 import struct
@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+from kpc.encoder.datasets import Dataset, load_dataset, pixel_rays
+from kpc.format.common.errors import DatasetError, KpcError, MediaError
 from kpc.format.common.media import write_image, write_video
 from kpc.format.scene.cameras import Camera
 
@@ -251,3 +254,32 @@ def edit_json(file: Path, change: Any) -> None:
     document = json.loads(file.read_text())
     change(document)
     file.write_text(json.dumps(document))
+
+
+def load(folder: Path, **options: object) -> Dataset:
+    """Load a dataset with its cache beside it."""
+    return load_dataset(folder, folder.parent / "cache", progress=False, **options)
+
+
+def fails(folder: Path, *words: str, **options: object) -> None:
+    """Assert that loading raises a one-line error that contains all these words."""
+    with pytest.raises(KpcError) as caught:
+        load(folder, **options)
+    message = str(caught.value)
+    assert isinstance(caught.value, (DatasetError, MediaError))
+    assert "\n" not in message and all(word in message for word in words), message
+
+
+def all_rays(dataset: Dataset, picture: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rays of all pixels of a picture."""
+    camera = dataset.camera(picture)
+    row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
+    return pixel_rays(dataset.pictures, np.full(len(row), picture), column, row)
+
+
+def distorted(x: np.ndarray, y: np.ndarray, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Apply OpenCV's lens distortion, with (N, 4) coefficients k1 k2 p1 p2, to (N,) normalised coordinates."""
+    k1, k2, p1, p2 = coefficients.T
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2
+    return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y

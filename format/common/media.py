@@ -74,7 +74,7 @@ def ffmpeg_binary() -> str:
         ) from error
 
 
-def probe(path: str | os.PathLike[str]) -> VideoInfo:
+def video_info(path: str | os.PathLike[str]) -> VideoInfo:
     """Return a video's size, length and colour tags. Packets are counted, not decoded.
 
     Raises:
@@ -115,7 +115,7 @@ def read_video(
 
     Args:
         path: of the video.
-        info: its properties, if `probe` has already been called.
+        info: its properties, if `video_info` has already been called.
         limit: the most frames to decode; None for all.
 
     Yields:
@@ -124,7 +124,7 @@ def read_video(
     Raises:
         MediaError: ffmpeg fails or reports an error, or the file ends inside a frame.
     """
-    info = info or probe(path)
+    info = info or video_info(path)
     rgb = info.matrix == "rgb"
     video = ffmpeg.input(_url(path))["V:0"].filter(
         "scale",

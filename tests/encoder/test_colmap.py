@@ -8,13 +8,13 @@ from pathlib import Path
 import datasets as make
 import numpy as np
 import pytest
+from datasets import all_rays, distorted, fails, load
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kpc.encoder.datasets import pixel_rays
 from kpc.encoder.datasets.layouts import colmap
 from kpc.format.common.errors import KpcError
 from kpc.format.common.media import write_image
-from test_datasets import all_rays, distorted, fails, load
 
 POSE = (1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 3.0)
 PINHOLE = (40.0, 41.0, 16.5, 11.5)

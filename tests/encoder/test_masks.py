@@ -8,6 +8,7 @@ from pathlib import Path
 import datasets as make
 import numpy as np
 import pytest
+from datasets import fails, load
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kpc.encoder.datasets import Dataset, pixel_cache
@@ -17,7 +18,6 @@ from kpc.encoder.training.sampler import RaySampler
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.media import write_image
 from scenes import tiny_scene
-from test_datasets import fails, load
 
 SIZE = (24, 32)
 

@@ -11,10 +11,10 @@ from kpc.format.common import media
 from kpc.format.common.errors import MediaError
 from kpc.format.common.media import (
     ffmpeg_binary,
-    probe,
     read_image,
     read_video,
     srgb_from_linear,
+    video_info,
     write_image,
     write_video,
 )
@@ -95,7 +95,7 @@ def test_tags_are_honoured(tmp_path: Path, matrix: str, full: bool, pix_fmt: str
     bits = 10 if "10" in pix_fmt else 8
     path = tmp_path / "tagged.mkv"
     encode(path, yuv(rgb, matrix, full, bits, "420" in pix_fmt), pix_fmt, matrix=matrix, full=full)
-    info = probe(path)
+    info = video_info(path)
     assert (info.matrix, info.full_range, info.pix_fmt, info.width, info.height) == (matrix, full, pix_fmt, 128, 64)
     (frame,) = read_video(path)
     assert np.abs(centres(frame) - centres(rgb)).max() <= tolerance(matrix, full, bits)
@@ -115,7 +115,7 @@ def test_tags_of_h264_are_honoured(tmp_path: Path, matrix: str, full: bool) -> N
 def test_untagged_small_video_is_limited_bt601(tmp_path: Path) -> None:
     rgb = patches(np.random.default_rng(3))
     encode(tmp_path / "x.mkv", yuv(rgb, "bt601", False, 8, False), "yuv444p", matrix=None, full=None)
-    info = probe(tmp_path / "x.mkv")
+    info = video_info(tmp_path / "x.mkv")
     assert (info.matrix, info.full_range) == ("bt601", False)
     (frame,) = read_video(tmp_path / "x.mkv")
     assert np.abs(centres(frame) - centres(rgb)).max() <= tolerance("bt601", False, 8)
@@ -148,7 +148,7 @@ def test_hdr_is_refused(tmp_path: Path) -> None:
     command = [ffmpeg_binary(), *options.split(), str(tmp_path / "x.mkv")]
     subprocess.run(command, input=raw, check=True, capture_output=True)
     with pytest.raises(MediaError, match="HDR"):
-        probe(tmp_path / "x.mkv")
+        video_info(tmp_path / "x.mkv")
 
 
 def test_display_rotation_is_applied(tmp_path: Path) -> None:
@@ -159,7 +159,7 @@ def test_display_rotation_is_applied(tmp_path: Path) -> None:
     rotate += ["-c", "copy", str(tmp_path / "y.mp4")]
     if subprocess.run(rotate, check=False, capture_output=True).returncode != 0:
         pytest.skip("this ffmpeg cannot write a rotation")
-    info = probe(tmp_path / "y.mp4")
+    info = video_info(tmp_path / "y.mp4")
     assert (info.width, info.height) == (32, 64)
     frame = next(read_video(tmp_path / "y.mp4"))
     assert {frame[:12].mean() > 200, frame[-12:].mean() > 200} == {True, False}
@@ -192,7 +192,7 @@ def test_written_videos_have_the_same_frames(tmp_path: Path, fps: float) -> None
     greys = np.arange(20, 240, 20)
     frames = [np.full((32, 48, 3), g, np.uint8) for g in greys]
     assert write_video(tmp_path / "x.mp4", frames, fps, crf=1) == len(frames)
-    info = probe(tmp_path / "x.mp4")
+    info = video_info(tmp_path / "x.mp4")
     assert (info.frame_count, info.matrix, info.full_range, info.pix_fmt) == (len(frames), "bt709", False, "yuv420p")
     assert info.fps == pytest.approx(fps, rel=1e-3)
     means = [frame.mean() for frame in read_video(tmp_path / "x.mp4")]
@@ -204,7 +204,7 @@ def test_odd_sizes_are_padded_for_subsampled_chroma(tmp_path: Path) -> None:
     frame = np.full((15, 21, 3), 90, np.uint8)
     write_video(tmp_path / "even.mp4", [frame], 10)
     write_video(tmp_path / "odd.mp4", [frame], 10, pix_fmt="yuv444p")
-    even, odd = probe(tmp_path / "even.mp4"), probe(tmp_path / "odd.mp4")
+    even, odd = video_info(tmp_path / "even.mp4"), video_info(tmp_path / "odd.mp4")
     assert (even.width, even.height) == (22, 16)
     assert (odd.width, odd.height) == (21, 15)
 
@@ -230,16 +230,16 @@ def test_damaged_videos_are_media_errors(tmp_path: Path) -> None:
 
 def test_missing_videos_and_pipes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MediaError, match="no such file"):
-        probe(tmp_path / "none.mp4")
+        video_info(tmp_path / "none.mp4")
     os.mkfifo(tmp_path / "pipe.mp4")
     with pytest.raises(MediaError, match="not a regular file"):
-        probe(tmp_path / "pipe.mp4")
+        video_info(tmp_path / "pipe.mp4")
 
 
 def test_names_that_look_like_options_or_urls(tmp_path: Path) -> None:
     for name in ("-y.mp4", "a:b.mp4", "50%d done.mp4", "concat:x.mp4"):
         write_video(tmp_path / name, [np.zeros((16, 16, 3), np.uint8)] * 2, 10)
-        assert probe(tmp_path / name).frame_count == 2
+        assert video_info(tmp_path / name).frame_count == 2
 
 
 def test_failed_writing_leaves_nothing(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from kpc.encoder.datasets.capture import (
     natural_key,
 )
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.media import IMAGE_SUFFIXES, VIDEO_SUFFIXES, image_size, probe
+from kpc.format.common.media import IMAGE_SUFFIXES, VIDEO_SUFFIXES, image_size, video_info
 
 POSES = "poses_bounds.npy"  # the file of poses and depth ranges
 
@@ -66,7 +66,7 @@ def _view(path: Path, number: int, file: Path, row: np.ndarray, is_test: bool) -
     pose = check_pose(where, np.stack([right, -down, backwards, centre], axis=1))
     if not 0 < near < far < np.inf:
         raise DatasetError(f"{where}: near {near:g} and far {far:g} are not 0 < near < far; calibrate anew")
-    video = probe(file) if file.suffix.lower() in VIDEO_SUFFIXES else None
+    video = video_info(file) if file.suffix.lower() in VIDEO_SUFFIXES else None
     width, height, has_alpha = (video.width, video.height, False) if video else image_size(file)
     intrinsics = fit_intrinsics(where, file, (focal, focal, w / 2, h / 2), (w, h), (width, height))
     return CapturedView(file, video, None, is_test, width, height, has_alpha, intrinsics, (0.0,) * 4, pose, near, far)
