@@ -13,6 +13,8 @@ MAX_SURROUND_GAP = math.radians(160)
 USED_FRACTION = 0.7
 # Least amplitudes of a path in azimuth and elevation, radians; those for a single camera.
 MIN_AMPLITUDES = (math.radians(2), math.radians(1))
+# The elevation of the viewpoint "above", radians, and distances of "near" and "far" over the cameras' median distance.
+ABOVE, NEAR, FAR = 1.4, 0.6, 1.6
 
 
 @dataclass(frozen=True)
@@ -106,25 +108,21 @@ def presets(scene: Scene) -> dict[str, Camera]:
     ends of the cameras' angles. "near" and "far" are always there.
     """
     rig = Rig.of(scene)
-    azimuth, elevation, distance = rig.angles()
-    far, level = float(np.median(distance)), float(elevation.mean())
+    azimuth, elevation, distances = rig.angles()
+    distance, level = float(np.median(distances)), float(elevation.mean())
     if surround_focus(azimuth):
-        sides = {
-            "front": (0.0, level),
-            "right": (0.5, level),
-            "back": (1.0, level),
-            "left": (-0.5, level),
-            "above": (0.0, 1.4),
-        }
-        positions = {name: (math.pi * turn, height, far) for name, (turn, height) in sides.items()}
+        half_turns = {"front": 0.0, "right": 0.5, "back": 1.0, "left": -0.5}
+        positions = {name: (math.pi * turn, level, distance) for name, turn in half_turns.items()}
+        positions["above"] = (0.0, ABOVE, distance)
     else:
         middle, amplitude_a, amplitude_e = _centre_and_amplitudes(azimuth, elevation)
         directions = {"middle": (0, 0), "left": (-1, 0), "right": (1, 0), "above": (0, 1), "below": (0, -1)}
         positions = {
-            name: (middle[0] + x * amplitude_a, middle[1] + y * amplitude_e, far) for name, (x, y) in directions.items()
+            name: (middle[0] + x * amplitude_a, middle[1] + y * amplitude_e, distance)
+            for name, (x, y) in directions.items()
         }
     first = next(iter(positions.values()))
-    positions |= {"near": (*first[:2], 0.6 * far), "far": (*first[:2], 1.6 * far)}
+    positions |= {"near": (*first[:2], NEAR * distance), "far": (*first[:2], FAR * distance)}
     return {name: rig.camera(*position) for name, position in positions.items()}
 
 

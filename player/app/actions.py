@@ -3,7 +3,7 @@
 from kpc.format.common.media import write_image
 from kpc.format.container.sources import open_source
 from kpc.player.app.camera_paths import CameraPath
-from kpc.player.app.controls import View
+from kpc.player.app.controls import OrbitView
 from kpc.player.app.filming import Filming
 from kpc.player.app.output_files import OutputFiles
 from kpc.player.app.preferences import TEXT_SIZES
@@ -71,7 +71,7 @@ class Actions:
     def to_camera(self, number: int) -> None:
         """Go to a camera of the scene, counted from 0."""
         self.state.camera_number = number
-        self.state.look_from(View.of(self.state.rig, self.state.rig.cameras[number]))
+        self.state.look_from(OrbitView.of(self.state.rig, self.state.rig.cameras[number]))
 
     def next_camera(self) -> None:
         """Go to the next camera of the scene."""
@@ -81,7 +81,7 @@ class Actions:
         """Go to a named viewpoint, counted from 0."""
         self.state.preset_number = number
         name, camera = list(self.state.presets.items())[number]
-        self.state.look_from(View.of(self.state.rig, camera))
+        self.state.look_from(OrbitView.of(self.state.rig, camera))
         self.state.notify(f"viewpoint: {name}")
 
     def next_preset(self) -> None:
@@ -160,7 +160,7 @@ class Actions:
     def to_path_position(self, seconds: float) -> None:
         """Go to a position on the camera path, and pause there."""
         camera, time = self.state.follower.path.at(seconds)
-        self.state.look_from(View.of(self.state.rig, camera))
+        self.state.look_from(OrbitView.of(self.state.rig, camera))
         self.state.scrub(time)
         self.state.follower.position_s = seconds
 

@@ -52,9 +52,7 @@ class CameraPath:
         for number, view in enumerate(views, 1):
             axes = view.camera.camera_to_world[:3, :3]
             if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3 or np.linalg.det(axes) < 0:
-                raise DatasetError(
-                    f"keyframe {number} of the camera path: its pose is scaled, skewed or mirrored, not rigid"
-                )
+                raise DatasetError(f"keyframe {number} of the camera path: its pose is scaled, skewed or mirrored")
         object.__setattr__(self, "keyframes", tuple(views))
 
     @staticmethod
@@ -131,6 +129,7 @@ class CameraPath:
 
     @cached_property
     def _ats(self) -> np.ndarray:
+        """(N,): the times of the keyframes, seconds."""
         return np.array([view.at_s for view in self.keyframes])
 
     @cached_property
@@ -142,16 +141,14 @@ class CameraPath:
         for before, rotation in itertools.pairwise(rotations):
             rotation *= 1.0 if before @ rotation >= 0 else -1.0  # q and -q are the same rotation: take the nearer one
         intrinsics = np.array([[np.log(c.fl_x), np.log(c.fl_y), c.cx, c.cy] for c in cameras])
-        eyes, times = (
-            np.stack([c.camera_to_world[:3, 3] for c in cameras]),
-            np.array([view.time for view in self.keyframes]),
-        )
+        eyes = np.stack([c.camera_to_world[:3, 3] for c in cameras])
+        times = np.array([view.time for view in self.keyframes])
         loops = np.concatenate([[0], np.cumsum(np.diff(times) < 0)])
         return np.concatenate([eyes, rotations, intrinsics, (times + loops)[:, None]], axis=1)
 
     @cached_property
     def _speeds(self) -> np.ndarray:
-        """(N, 12): the derivative of the values at each keyframe, per second."""
+        """(N, 12): the derivative of the values at each keyframe, per second; see the class for its sources."""
         gaps = np.diff(self._ats)[:, None]
         slopes = np.diff(self._values, axis=0) / gaps
         a, b, before, after = slopes[:-1], slopes[1:], gaps[:-1], gaps[1:]
@@ -168,4 +165,5 @@ def _hermite(ends: np.ndarray, speeds: np.ndarray, position: float) -> np.ndarra
 
 
 def _nonzero(values: np.ndarray) -> np.ndarray:
+    """Replace zeros by ones, for divisors whose quotient is not used."""
     return np.where(values == 0, 1.0, values)

@@ -21,7 +21,7 @@ AVERAGE = "average"
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class OrbitView:
     """A camera that orbits around a point.
 
     Attributes:
@@ -39,12 +39,12 @@ class View:
     up: np.ndarray
 
     @staticmethod
-    def of(rig: Rig, camera: Camera) -> "View":
+    def of(rig: Rig, camera: Camera) -> "OrbitView":
         """Return the view of a camera, orbiting around the point of its axis that is nearest to the rig's focus."""
         axes, eye = camera.camera_to_world[:3, :3], camera.camera_to_world[:3, 3]
         away = float(np.linalg.norm(rig.focus - eye))
         distance = max(float((rig.focus - eye) @ -axes[:, 2]), 0.1 * away, 1e-3)
-        return View(camera, eye - distance * axes[:, 2], distance, axes, rig.up)
+        return OrbitView(camera, eye - distance * axes[:, 2], distance, axes, rig.up)
 
     @property
     def eye(self) -> np.ndarray:
@@ -57,7 +57,7 @@ class View:
         pose[:3, :3], pose[:3, 3] = self.axes, self.eye
         return replace(fit_camera(self.lens, width, height), camera_to_world=pose)
 
-    def orbit(self, right: float, up: float) -> "View":
+    def orbit(self, right: float, up: float) -> "OrbitView":
         """Drag the scene by two angles in radians; the eye moves the other way around the focus."""
         turned = _rotation(self.up, -right) @ self.axes
         pitched = _rotation(turned[:, 0], up) @ turned
@@ -67,17 +67,17 @@ class View:
         is_upside_down = pitched[:, 1] @ self.up < 0.0 < turned[:, 1] @ self.up
         return replace(self, axes=_orthonormal(turned if is_too_steep or is_upside_down else pitched))
 
-    def pan(self, right: float, up: float) -> "View":
+    def pan(self, right: float, up: float) -> "OrbitView":
         """Drag the focus parallel to the image plane, in heights of the picture, so that it stays under the pointer."""
         height = self.distance * self.lens.height / self.lens.fl_y
         return replace(self, focus=self.focus - height * (right * self.axes[:, 0] + up * self.axes[:, 1]))
 
-    def zoom(self, notches: float) -> "View":
+    def zoom(self, notches: float) -> "OrbitView":
         """Move closer by a tenth of the distance for each notch of the wheel."""
         distance = self.distance * ZOOM_FACTOR ** np.clip(notches, -100, 100)
         return replace(self, distance=float(np.clip(distance, MIN_DISTANCE, MAX_DISTANCE)))
 
-    def fly(self, right: float, up: float, forward: float) -> "View":
+    def fly(self, right: float, up: float, forward: float) -> "OrbitView":
         """Move eye and focus along the camera's axes, world units."""
         return replace(self, focus=self.focus + self.axes @ np.array([right, up, -forward]))
 

@@ -2,7 +2,7 @@
 
 import time as clock
 
-from kpc.player.app.controls import View
+from kpc.player.app.controls import OrbitView
 from kpc.player.app.output_files import OutputFiles
 from kpc.player.app.recording import FILM_FPS, Recording, frames_due
 from kpc.player.app.scene_view import SceneView
@@ -100,7 +100,7 @@ class Filming:
         elif recording.has_room and state.stream.is_settled:
             follower.position_s = position_s
             camera, state.playback.time = follower.path.at(position_s)
-            state.view = View.of(state.rig, camera)
+            state.view = OrbitView.of(state.rig, camera)
             self.scene_view.draw_still()
             recording.take(self.scene_view.pixels())
 

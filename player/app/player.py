@@ -7,7 +7,7 @@ from pathlib import Path
 from kpc.format.common.errors import ContextLostError, DisplayError
 from kpc.format.common.media import write_image
 from kpc.player.app.actions import Actions
-from kpc.player.app.controls import View
+from kpc.player.app.controls import OrbitView
 from kpc.player.app.desktop import glfw
 from kpc.player.app.filming import Filming
 from kpc.player.app.imgui_renderer import ImGuiRenderer
@@ -55,7 +55,7 @@ class Snapshot:
     playing: bool
     speed: float
     loop: bool
-    view: View
+    view: OrbitView
     camera_number: int
     preset_number: int
     appearance: str
@@ -264,7 +264,7 @@ class Player:
         elif follower.is_active:
             position_s = follower.position_after(seconds, state.playback.loop)
             camera, time = follower.path.at(position_s)
-            playback, view = replace(playback, time=time), View.of(state.rig, camera)
+            playback, view = replace(playback, time=time), OrbitView.of(state.rig, camera)
         state.stream.set_playhead(Playhead(playback.time, state.playback.rate, state.playback.loop))
         state.stream.upload()
         state.follow_scene()

@@ -77,9 +77,8 @@ def preferences_path() -> Path:
     """Return the path of the file, in $XDG_CONFIG_HOME or ~/.config, ~/Library/Application Support, or %APPDATA%."""
     from kpc.player.app.desktop import hello_imgui
 
-    return (
-        Path(hello_imgui.ini_folder_location(hello_imgui.IniFolderType.app_user_config_folder)) / "kpc" / "player.json"
-    )
+    folder = hello_imgui.ini_folder_location(hello_imgui.IniFolderType.app_user_config_folder)
+    return Path(folder) / "kpc" / "player.json"
 
 
 def load(path: Path) -> Preferences:
@@ -106,7 +105,6 @@ def save(preferences: Preferences, path: Path) -> None:
         OSError: the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as aside:
-        aside.write_text(
-            json.dumps({name: value for name, value in asdict(preferences).items() if value is not None}, indent=1)
-        )
+    values = {name: value for name, value in asdict(preferences).items() if value is not None}
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(values, indent=1))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from kpc.format.common.errors import KpcError
 from kpc.format.scene.scene import Scene
-from kpc.player.app.controls import AppearanceSelection, Playback, View
+from kpc.player.app.controls import AppearanceSelection, OrbitView, Playback
 from kpc.player.app.path_follower import PathFollower
 from kpc.player.app.preferences import Preferences
 from kpc.player.app.quality_controller import QualityController
@@ -113,7 +113,7 @@ class PlayerState:
         self.target_fps = preferences.target_fps or (1 / quality.target_s if quality.target_s else FILM_FPS)
         self.rig, self.presets = Rig.of(self.scene), presets(self.scene)
         self.camera_number, self.preset_number = 0, -1
-        self.view = View.of(self.rig, self.rig.cameras[0])
+        self.view = OrbitView.of(self.rig, self.rig.cameras[0])
         has_duration = stream.clip.duration_s > 0
         self.playback = Playback(stream.clip, playing=has_duration, speed=preferences.speed, loop=preferences.loop)
         self.appearance = AppearanceSelection(self.scene)
@@ -154,7 +154,7 @@ class PlayerState:
             text_size=self.text_size,
         )
 
-    def look_from(self, view: View) -> None:
+    def look_from(self, view: OrbitView) -> None:
         """Move the camera at once, and stop following the camera path."""
         self.view, self.follower.is_active = view, False
 

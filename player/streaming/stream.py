@@ -339,9 +339,8 @@ class Stream:
             self._requested[position], self._fetching = True, position
         number = int(self.parts.numbers[position])
         if number not in announced:
-            announced = adjacent_runs(self._reader.index, map(int, self.parts.numbers[wanted[:RUN_CHUNKS]]), RUN_BYTES)[
-                0
-            ]
+            numbers = map(int, self.parts.numbers[wanted[:RUN_CHUNKS]])
+            announced = adjacent_runs(self._reader.index, numbers, RUN_BYTES)[0]
             announce(self._reader, announced)
         return position, announced
 
@@ -350,10 +349,8 @@ class Stream:
         if not self.parts.moves[position]:
             waiting = sum(piece.data.nbytes for piece in tuple(self._finished) if not self.parts.moves[piece.position])
             return waiting >= UPLOAD_BYTES
-        return (
-            int(self.parts.sizes[self._requested & self.parts.moves].sum() + self.parts.sizes[position])
-            > self._segment_memory
-        )
+        requested_bytes = int(self.parts.sizes[self._requested & self.parts.moves].sum())
+        return requested_bytes + int(self.parts.sizes[position]) > self._segment_memory
 
     def _fetched(self, position: int) -> Piece:
         """Fetch and decode a segment. One that arrives damaged is fetched a second time."""

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kpc.format.scene.scene import Clip
-from kpc.player.app.controls import BLEND_S, SPEEDS, AppearanceSelection, Playback, View
+from kpc.player.app.controls import BLEND_S, SPEEDS, AppearanceSelection, OrbitView, Playback
 from kpc.player.viewpoints import Rig
 from scenes import tiny_scene, with_appearances
 
@@ -13,11 +13,11 @@ SCENE = tiny_scene(0)
 RIG = Rig.of(SCENE)
 
 
-def opening() -> View:
-    return View.of(RIG, SCENE.cameras[0])
+def opening() -> OrbitView:
+    return OrbitView.of(RIG, SCENE.cameras[0])
 
 
-def project(view: View, point: np.ndarray) -> tuple[float, float]:
+def project(view: OrbitView, point: np.ndarray) -> tuple[float, float]:
     """Return a point in the picture, from its centre to the right and upwards, in heights of the picture."""
     camera = view.camera(480, 360)
     x, y, z = camera.camera_to_world[:3, :3].T @ (point - camera.camera_to_world[:3, 3])
@@ -26,7 +26,7 @@ def project(view: View, point: np.ndarray) -> tuple[float, float]:
 
 def test_a_view_of_a_camera_is_that_camera() -> None:
     for camera in SCENE.cameras:
-        got = View.of(RIG, camera).camera(camera.width, camera.height)
+        got = OrbitView.of(RIG, camera).camera(camera.width, camera.height)
         assert got.camera_to_world == pytest.approx(camera.camera_to_world, abs=1e-12)
         assert (got.fl_x, got.fl_y, got.cx, got.cy) == (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
 
