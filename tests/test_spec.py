@@ -1,255 +1,271 @@
-"""The vectors, the decoder written from the page, and the package agree."""
+"""The conformance vectors, the readable decoder and the package agree."""
 
+import dataclasses
 import hashlib
-import importlib.util
 import json
+import struct
+import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
+import zstandard
+from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common import errors
 from kpc.format.container import container, groups, scene_io
 from kpc.player.cpu import reference
 from kpc.tools.vectors import specvectors
+from kpc.tools.vectors.description import ZSTD_VERSION, described
 from scenes import VARIANTS, tiny_scene
 
 SPEC = Path(__file__).parent.parent / "spec"
-GROUPED = sorted((SPEC / "vectors" / "valid").glob("*groups*.kpc"))
-VALID = sorted(set((SPEC / "vectors" / "valid").glob("*.kpc")) - set(GROUPED))
-INVALID = sorted((SPEC / "vectors" / "invalid").glob("*.kpc"))
+sys.path.insert(0, str(SPEC))  # the readable decoder is no part of the package
 
-RAY_TOLERANCE = 1e-4  # section 16
+import decoder  # noqa: E402
+from decoder.common import crc32c  # noqa: E402
+from decoder.container import ENTRY, HEADER  # noqa: E402
+from decoder.entropy import EntropyDecoder  # noqa: E402
 
+VECTORS = SPEC / "vectors"
+MANIFEST = json.loads((VECTORS / "manifest.json").read_text())
+GROUPED = sorted(name for name, expected in MANIFEST["valid"].items() if "groups" in expected)
+VALID = sorted(set(MANIFEST["valid"]) - set(GROUPED))
+INVALID = sorted(MANIFEST["invalid"])
 
-@pytest.fixture(scope="module")
-def twin() -> ModuleType:
-    """spec/decoder.py, which knows the page but not the package."""
-    loader = importlib.util.spec_from_file_location("kpc_spec_decoder", SPEC / "decoder.py")
-    module = importlib.util.module_from_spec(loader)
-    loader.loader.exec_module(module)
-    return module
-
-
-@pytest.mark.parametrize("path", VALID, ids=lambda p: p.stem)
-def test_valid_vectors_decode_to_what_is_written(path):
-    expected = json.loads(path.with_suffix(".json").read_text())
-    found = specvectors.described(path.read_bytes(), expected["partial"])
-    assert_described(found, expected)
+RAY_TOLERANCE = 1e-4  # section 14 of the page
 
 
-@pytest.mark.parametrize("path", VALID, ids=lambda p: p.stem)
-def test_the_decoder_written_from_the_page_agrees(path, twin):
-    expected = json.loads(path.with_suffix(".json").read_text())
-    scene = twin.decode(path.read_bytes(), expected["partial"])
-    for plane in expected["planes"]:
-        assert twin.hashes(scene)[plane["scale"], plane["plane"]] == (
-            plane["symbols_sha256"],
-            plane["coded_sha256"],
-            plane["values_sha256"],
-        )
-    occupied = np.array(scene["occupancy"], np.uint8).reshape(*scene["cells"][::-1], scene["slots"])
-    occupied = np.ascontiguousarray(np.moveaxis(occupied, -1, 0))
-    assert list(occupied.shape) == expected["occupancy"]["shape"]
-    assert hashlib.sha256(occupied.tobytes()).hexdigest() == expected["occupancy"]["sha256"]
-    if "motion" in expected:
-        values = np.array(scene["motion"]["values"], "<f4")
-        assert [*scene["motion"]["size"], 3] == expected["motion"]["shape"]
-        assert hashlib.sha256(values.tobytes()).hexdigest() == expected["motion"]["sha256"]
-    else:
-        assert scene["motion"] is None
-    cameras = np.array(scene["cameras"], "<f8")
-    assert {"count": len(cameras), "sha256": hashlib.sha256(cameras.tobytes()).hexdigest()} == expected["cameras"]
-    if "appearances" in expected:
-        codes = np.array(list(scene["appearances"].values()), "<f4")
-        assert (
-            hashlib.sha256("".join(scene["appearances"]).encode()).hexdigest()
-            == expected["appearances"]["names_sha256"]
-        )
-        assert hashlib.sha256(codes.tobytes()).hexdigest() == expected["appearances"]["sha256"]
-        assert len(codes) == expected["appearances"]["count"]
-    else:
-        assert scene["appearances"] == {}
-    for ray in expected["rays"]:
-        rgb, opacity, depth = twin.render_ray(
-            scene, ray["origin"], ray["direction"], ray["time"], ray.get("appearance")
-        )
-        assert rgb == pytest.approx(ray["rgb"], abs=RAY_TOLERANCE)
-        assert opacity == pytest.approx(ray["opacity"], abs=RAY_TOLERANCE)
-        if ray["depth"] is None:
-            assert depth == float("inf")
-        else:
-            assert depth == pytest.approx(ray["depth"], abs=RAY_TOLERANCE)
+def valid_vector(name: str) -> tuple[dict, bytes]:
+    """Return the manifest's entry and the bytes of a valid vector."""
+    return MANIFEST["valid"][name], (VECTORS / "valid" / f"{name}.kpc").read_bytes()
 
 
-@pytest.mark.parametrize("path", INVALID, ids=lambda p: p.stem)
-def test_invalid_vectors_are_refused_as_is_written(path, twin):
-    expected = json.loads(path.with_suffix(".json").read_text())
-    with pytest.raises(getattr(errors, expected["error"])) as caught:
-        read_all(path)
-    assert type(caught.value).__name__ == expected["error"]
-    assert expected["message"] in str(caught.value)
-    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
-    with pytest.raises(twin.Refused):
-        if twin.groups(path.read_bytes()) is None:
-            twin.decode(path.read_bytes())
-
-
-def read_all(path: Path) -> None:
-    opened = groups.Groups(path)
-    for number in range(len(opened)):
-        scene_io.read(opened.open(number))
-
-
-@pytest.mark.parametrize("path", GROUPED, ids=lambda p: p.stem)
-def test_vectors_of_groups_hold_the_vectors_that_they_say(path, twin):
-    expected, data = json.loads(path.with_suffix(".json").read_text()), path.read_bytes()
-    opened = groups.Groups(path, allow_partial=expected["partial"])
-    theirs, scenes = twin.groups(data, expected["partial"])
-    assert (
-        [(span.start, span.count) for span in opened.timeline.spans]
-        == [place[:2] for place in theirs]
-        == [(group["row_start"], group["row_count"]) for group in expected["groups"]]
-    )
-    for number, (group, (*_, content)) in enumerate(zip(expected["groups"], theirs, strict=True)):
-        if group["scene"] is not None:
-            assert content == path.with_name(f"{group['scene']}.kpc").read_bytes()
-            assert scene_io.read(opened.open(number)).clip.frame_count == scenes[number]["frame_count"]
-    assert len(scenes) == sum(group["scene"] is not None for group in expected["groups"])
-    for moment in expected["times"]:
-        number, time_in_it = opened.timeline.at(moment["time"])
-        assert (number, twin.shown([place[:2] for place in theirs], moment["time"])[0]) == (moment["group"],) * 2
-        assert time_in_it == pytest.approx(moment["time_in_it"], abs=1e-6)
-        shares = {str(part): share for part, _, share in opened.timeline.blend_at(moment["time"])}
-        theirs_mixed = twin.mix([place[:2] for place in theirs], moment["time"])
-        assert (
-            shares
-            == pytest.approx(moment["mix"], abs=1e-6)
-            == {str(part): share for part, share in theirs_mixed.items()}
-        )
-        assert twin.shown([place[:2] for place in theirs], moment["time"])[1] == pytest.approx(time_in_it, abs=1e-9)
-
-
-def test_vectors_are_what_their_maker_makes():
-    made = specvectors.vectors()
-    on_disk = {str(p.relative_to(SPEC / "vectors")) for p in (SPEC / "vectors").rglob("*") if p.is_file()}
-    assert on_disk == set(made)
-    for name, content in made.items():
-        committed = (SPEC / "vectors" / name).read_bytes()
-        if name.startswith("valid/") and name.endswith(".json") and "groups" not in json.loads(content):
-            assert_described(json.loads(content), json.loads(committed))
-        elif name.endswith(".json") or name.startswith("invalid/") or packed_here(name):
-            assert content == committed, name
-    assert sum(len(content) for content in made.values()) < 750_000
-
-
-@pytest.mark.parametrize(
-    "name, digest",
-    {
-        "version-0": "332b031a5b8c07bb5451f6db534829b7548d34a87e6125edd11a70c80040cb42",
-        "version-0-symbols": "2836f74ea5ad19d75e12237690d2e54db6430c45b179f6d22bc2c01d78163ecd",
-        "version-0-groups": "fd15878b0953fd13abe5fe47c2137bfb160260d5ee51b422a15d62a407021845",
-    }.items(),
-)
-def test_files_of_the_draft_are_kept_as_they_were_made(name, digest):
-    data = (SPEC / "vectors" / "valid" / f"{name}.kpc").read_bytes()
-    assert hashlib.sha256(data).hexdigest() == digest
-    assert container.Reader(data).header.version == 0
-
-
-def test_a_file_may_have_so_many_chunks_and_no_more(twin, monkeypatch):
-    """No vector, for its index takes 2.6 MB: the least file, and after it chunks of nothing that nobody knows."""
-    path = SPEC / "vectors" / "valid" / "minimal.kpc"
-    reader = container.Reader(path.read_bytes())
-    known = [
-        container.Chunk(e.kind, [reader.chunk(k)], e.scale, e.plane, e.row_start, e.row_count)
-        for k, e in enumerate(reader.index)
-    ]
-    empty = [container.Chunk("note", [b""])] * (container.CHUNK_LIMIT - len(known))
-    data = container.pack([*known, *empty], reader.header.value_count, compress=False)
-    assert len(container.Reader(data).index) == 65536
-    plain = twin.hashes(twin.decode(path.read_bytes()))
-    assert twin.hashes(twin.decode(data)) == plain
-    assert scene_io.encode(scene_io.read(data)) == scene_io.encode(scene_io.read(path))
-    with pytest.raises(errors.FormatError, match="65537 chunks are more"):
-        container.pack([*known, *empty, *empty[:1]], reader.header.value_count, compress=False)
-    full = [container.Chunk("note", [bytes(8)])] * len(empty)  # as many in a file of version 2 are no smaller than this
-    data = container.pack([*known, *full], reader.header.value_count)
-    assert (
-        container.Reader(data).header.version == 2
-        and len(data) < 9 * 65536
-        and len(container.Reader(data).index) == 65536
-    )
-    assert twin.hashes(twin.decode(data)) == plain
-    assert container.Reader(container.pack([*known, *empty], reader.header.value_count)).header.version == 1
-    with monkeypatch.context() as patch:
-        patch.setattr(container, "CHUNK_LIMIT", 1 << 20)
-        more = container.pack([*known, *empty, *empty[:1]], reader.header.value_count, compress=False)
-    with pytest.raises(errors.FormatError, match="claims 65537 chunks"):
-        container.Reader(more)
-    with pytest.raises(twin.Refused):
-        twin.decode(more)
-
-
-def test_valid_vectors_cover_every_kind_under_every_codec():
-    found = {
-        (entry.kind, entry.codec)
-        for path in VALID + GROUPED
-        for entry in container.Reader(path.read_bytes(), allow_partial=True).index
-    }
-    codecs = {
-        kind: {0, 1, 2} if kind in ("PLNE", "OCCU", "MOVE", "DECO", "HYBR") else {0, 1} for kind in scene_io.KNOWN_KINDS
-    }
-    assert found >= {(kind, codec) for kind, known in codecs.items() for codec in known} | {(scene_io.GROUP_KIND, 0)}
-
-
-def test_valid_vectors_cover_every_context_and_size_of_errors(twin, monkeypatch):
-    """No error is large enough for the last three of the 66 contexts of planes."""
-    contexts, sizes, inner = set(), set(), twin.Decisions.error
-
-    def error(decisions, context, unary=4, most_bits=7):
-        found = inner(decisions, context, unary, most_bits)
-        contexts.add((most_bits, context))
-        sizes.add((most_bits, found if abs(found) <= 4 else (abs(found) - 4).bit_length() + 4, found > 0))
-        return found
-
-    monkeypatch.setattr(twin.Decisions, "error", error)
-    for path in VALID:
-        if path.stem.startswith(("symbols", "nodes", "limits-nodes")):
-            twin.decode(path.read_bytes(), partial=path.stem.endswith("prefix"))
-    assert contexts == {(7, context) for context in range(63)} | {(15, context) for context in range(20)}
-    for most in (7, 15):
-        of_each_sign = {(most, size, False) for size in range(-4, 1)} | {(most, size, True) for size in range(1, 5)}
-        escapes = {(most, 4 + bits, positive) for bits in range(1, most + 2) for positive in (False, True)}
-        assert sizes >= of_each_sign | escapes
-
-
-def packed_here(name: str) -> bool:
-    """Whether a vector's bytes do not depend on the version of zstd, or this is that version."""
-    written = json.loads((SPEC / "vectors" / name).with_suffix(".json").read_text())["zstd"]
-    return written in (None, specvectors.ZSTD_VERSION)
+def sha256(data: bytes | np.ndarray) -> str:
+    return hashlib.sha256(data if isinstance(data, bytes) else np.ascontiguousarray(data).tobytes()).hexdigest()
 
 
 def assert_described(found: dict, expected: dict) -> None:
-    """Equal but for the version of zstd; rays within their tolerance."""
-    assert {**found, "rays": 0, "zstd": 0} == {**expected, "rays": 0, "zstd": 0}
+    """Assert that two entries are equal, rays within their tolerance, whichever library packed the file."""
+    ignored = dict.fromkeys(("rays", "zstd", "sha256"))
+    assert {**found, **ignored} == {**expected, **ignored}
     for one, other in zip(found["rays"], expected["rays"], strict=True):
         for key in ("rgb", "opacity", "depth"):
             assert one[key] == pytest.approx(other[key], abs=RAY_TOLERANCE), key
 
 
-@pytest.mark.parametrize("space", VARIANTS)
-def test_the_twin_renders_a_scene_as_the_reference_does(twin, space):
-    from kpc.format.coding.quantise import quantise_scene
+@pytest.mark.parametrize("name", VALID + GROUPED)
+def test_valid_vectors_have_the_bytes_of_the_manifest(name):
+    expected, data = valid_vector(name)
+    assert sha256(data) == expected["sha256"]
 
-    scene = VARIANTS[space](tiny_scene(scales=1, channels=4, resolution=(10, 8, 6), time=4))
+
+@pytest.mark.parametrize("name", VALID)
+def test_package_decodes_valid_vectors_to_the_manifest(name):
+    expected, data = valid_vector(name)
+    assert_described(described(data, expected["partial"]), expected)
+
+
+@pytest.mark.parametrize("name", VALID)
+def test_readable_decoder_decodes_valid_vectors_to_the_manifest(name):
+    expected, data = valid_vector(name)
+    scene = decoder.decode(data, expected["partial"])
+    for key in ("frame_count", "fps", "background", "ray_step", "uniform_distance", "near", "baseline"):
+        assert scene.get(key) == expected.get(key), key
+    assert [list(corner) for corner in scene["aabb"]] == expected["aabb"]
+    assert len(expected["planes"]) == len(decoder.hashes(scene))
+    for plane in expected["planes"]:
+        hashes = plane["symbols_sha256"], plane["coded_sha256"], plane["values_sha256"]
+        assert decoder.hashes(scene)[plane["scale"], plane["plane"]] == hashes
+    assert list(scene["cells"]) == expected["occupancy"]["shape"]
+    assert sha256(bytes(scene["occupancy"])) == expected["occupancy"]["sha256"]
+    cameras = np.array(scene["cameras"], "<f8")
+    assert {"count": len(cameras), "sha256": sha256(cameras)} == expected["cameras"]
+    assert_weights(scene, expected["decoder"])
+    assert_motion_and_appearances(scene, expected)
+
+
+def assert_weights(scene: dict, expected: dict) -> None:
+    hybrid = ("v", "v_bias", "density_weight", "density_bias", "w1", "b1", "u", "w2", "b2")
+    names = hybrid if "width" in expected else [name for name in hybrid if name not in ("v", "v_bias", "u")]
+    weights = np.concatenate([np.ravel(scene[name]) for name in names]).astype("<f4")
+    assert sha256(weights) == expected["sha256"]
+    assert (scene["width"], scene["hidden"]) == (expected.get("width", 0), expected["hidden"])
+
+
+def assert_motion_and_appearances(scene: dict, expected: dict) -> None:
+    assert (scene["motion"] is None) == ("motion" not in expected)
+    if "motion" in expected:
+        assert [*scene["motion"]["size"], 3] == expected["motion"]["shape"]
+        assert sha256(np.array(scene["motion"]["displacements"], "<f4")) == expected["motion"]["sha256"]
+    embeddings = np.array(list(scene["appearances"].values()), "<f4")
+    assert len(embeddings) == expected.get("appearances", {"count": 0})["count"]
+    if "appearances" in expected:
+        assert sha256("".join(scene["appearances"]).encode()) == expected["appearances"]["names_sha256"]
+        assert sha256(embeddings) == expected["appearances"]["sha256"]
+
+
+@pytest.mark.parametrize("name", VALID)
+def test_readable_decoder_renders_the_rays_of_the_manifest(name):
+    expected, data = valid_vector(name)
+    scene = decoder.decode(data, expected["partial"])
+    for ray in expected["rays"]:
+        view = ray["origin"], ray["direction"], ray["time"], ray.get("appearance")
+        rgb, opacity, depth = decoder.render_ray(scene, *view)
+        assert rgb == pytest.approx(ray["rgb"], abs=RAY_TOLERANCE)
+        assert opacity == pytest.approx(ray["opacity"], abs=RAY_TOLERANCE)
+        assert (None if depth == float("inf") else depth) == pytest.approx(ray["depth"], abs=RAY_TOLERANCE)
+
+
+@pytest.mark.parametrize("name", INVALID)
+def test_package_refuses_invalid_vectors_as_the_manifest_says(name):
+    expected, path = MANIFEST["invalid"][name], VECTORS / "invalid" / f"{name}.kpc"
+    with pytest.raises(getattr(errors, expected["error"])) as caught:
+        opened = groups.Groups(path)
+        for number in range(len(opened)):
+            scene_io.read(opened.open(number))
+    assert type(caught.value).__name__ == expected["error"]
+    assert expected["message"] in str(caught.value)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", INVALID)
+def test_readable_decoder_refuses_invalid_vectors(name):
+    data = (VECTORS / "invalid" / f"{name}.kpc").read_bytes()
+    with pytest.raises(decoder.Refused) as caught:
+        if decoder.decode_groups(data) is None:
+            decoder.decode(data)
+    if name.startswith("draft"):
+        assert str(caught.value) == "a draft of the format; encode it again"
+
+
+@pytest.mark.parametrize("name", GROUPED)
+def test_groups_hold_the_vectors_of_the_manifest(name):
+    expected, data = valid_vector(name)
+    opened = groups.Groups(VECTORS / "valid" / f"{name}.kpc", allow_partial=expected["partial"])
+    listed, scenes = decoder.decode_groups(data, expected["partial"])
+    spans = [(group["row_start"], group["row_count"]) for group in expected["groups"]]
+    assert [(span.start, span.count) for span in opened.timeline.spans] == spans
+    assert [group[:2] for group in listed] == spans
+    for number, (group, (*_, content)) in enumerate(zip(expected["groups"], listed, strict=True)):
+        if group["scene"] is not None:
+            assert content == valid_vector(group["scene"])[1]
+            assert scene_io.read(opened.open(number)).clip.frame_count == scenes[number]["frame_count"]
+    assert len(scenes) == sum(group["scene"] is not None for group in expected["groups"])
+
+
+@pytest.mark.parametrize("name", GROUPED)
+def test_groups_are_shown_and_blended_as_the_manifest_says(name):
+    expected, _ = valid_vector(name)
+    opened = groups.Groups(VECTORS / "valid" / f"{name}.kpc", allow_partial=expected["partial"])
+    spans = [(group["row_start"], group["row_count"]) for group in expected["groups"]]
+    for moment in expected["times"]:
+        number, local_time = opened.timeline.at(moment["time"])
+        shown, shown_time = decoder.shown_group(spans, moment["time"])
+        assert number == shown == moment["group"]
+        assert local_time == pytest.approx(moment["local_time"], abs=1e-6)
+        assert shown_time == pytest.approx(local_time, abs=1e-9)
+        weights = {str(part): weight for part, _, weight in opened.timeline.blend_at(moment["time"])}
+        assert weights == pytest.approx(moment["blend"], abs=1e-6)
+        blended = {str(part): weight for part, weight in decoder.blend(spans, moment["time"]).items()}
+        assert blended == pytest.approx(moment["blend"], abs=1e-6)
+
+
+def test_vectors_on_disk_are_those_of_their_generator():
+    made = specvectors.vectors()
+    on_disk = {str(path.relative_to(VECTORS)) for path in VECTORS.rglob("*") if path.is_file()}
+    assert on_disk == set(made)
+    manifest = json.loads(made["manifest.json"])
+    assert manifest["invalid"] == MANIFEST["invalid"]
+    assert set(manifest["valid"]) == set(MANIFEST["valid"])
+    for name, found in manifest["valid"].items():
+        expected, data = valid_vector(name)
+        if "groups" in found:
+            assert {**found, "sha256": 0} == {**expected, "sha256": 0}
+        else:
+            assert_described(found, expected)
+        if expected.get("zstd") in (None, ZSTD_VERSION):
+            assert made[f"valid/{name}.kpc"] == data, name
+    for name in MANIFEST["invalid"]:
+        assert made[f"invalid/{name}.kpc"] == (VECTORS / "invalid" / f"{name}.kpc").read_bytes(), name
+    assert sum(map(len, made.values())) < 750_000
+
+
+def test_drafts_are_among_the_invalid_vectors():
+    drafts = [name for name in INVALID if name.startswith("draft")]
+    assert len(drafts) >= 3
+    assert all("encode it again" in MANIFEST["invalid"][name]["message"] for name in drafts)
+
+
+def test_valid_vectors_cover_every_kind_under_every_codec():
+    found = {
+        (chunk.kind.decode(), chunk.codec)
+        for name in VALID + GROUPED
+        for chunk in decoder.container.read_chunks(valid_vector(name)[1], True)[0]
+    }
+    known = decoder.container.CODECS.items()
+    expected = {(kind.decode(), codec) for kind, codecs in known for codec in (0, 1, *codecs)}
+    assert found >= expected | {("GRUP", 0)}
+
+
+def test_valid_vectors_cover_every_context_and_size_of_residuals(monkeypatch):
+    """No residual is large enough for the last three of the 66 contexts of planes."""
+    contexts, sizes, inner = set(), set(), EntropyDecoder.signed
+
+    def signed(decisions, context, unary, escape):
+        residual = inner(decisions, context, unary, escape)
+        contexts.add(context)
+        size = residual if abs(residual) <= 4 else (abs(residual) - 4).bit_length() + 4
+        sizes.add((context[0], size, residual > 0))
+        return residual
+
+    monkeypatch.setattr(EntropyDecoder, "signed", signed)
+    for name in VALID:
+        if name.startswith(("predictive", "motion", "limits-nodes")):
+            expected, data = valid_vector(name)
+            decoder.decode(data, expected["partial"])
+    planes = {("residual", context) for context in range(63)}
+    motion = {("motion", context) for context in range(20)}
+    assert {context for context in contexts if context[0] in ("residual", "motion")} == planes | motion
+    for name, escape in (("residual", 7), ("motion", 15)):
+        of_each_sign = {(name, size, False) for size in range(-4, 1)} | {(name, size, True) for size in range(1, 5)}
+        escapes = {(name, 4 + bits, positive) for bits in range(1, escape + 2) for positive in (False, True)}
+        assert sizes >= of_each_sign | escapes
+
+
+def file_of(chunks: list[decoder.container.Chunk], value_count: int) -> bytes:
+    """Return the file of these chunks."""
+    entries = b"".join(ENTRY.pack(*dataclasses.astuple(chunk)[:-1]) for chunk in chunks)
+    index = zstandard.ZstdCompressor().compress(b"".join(entries[byte :: ENTRY.size] for byte in range(ENTRY.size)))
+    stored = b"".join(chunk.stored for chunk in chunks)
+    sizes = len(chunks), len(index), crc32c(index), HEADER.size + len(index) + len(stored), value_count
+    largest_raw = max(chunk.raw_length for chunk in chunks)
+    header = HEADER.pack(b"\x89KPC\r\n\x1a\n", 1, HEADER.size, *sizes, largest_raw, 0)[:-4]
+    return header + struct.pack("<I", crc32c(header)) + index + stored
+
+
+def test_a_file_has_65536_chunks_at_most():
+    _, minimal = valid_vector("minimal")
+    chunks, value_count = decoder.container.read_chunks(minimal, False)
+    note = decoder.container.Chunk(b"note", 0, 0, 0, 0, 0, 0, 8, 8, crc32c(bytes(8)), bytes(8))
+    most = file_of(chunks + [note] * (65536 - len(chunks)), value_count)
+    assert len(container.Reader(most).index) == 65536
+    assert scene_io.encode(scene_io.read(most)) == scene_io.encode(scene_io.read(minimal))
+    assert decoder.hashes(decoder.decode(most)) == decoder.hashes(decoder.decode(minimal))
+    more = file_of(chunks + [note] * (65537 - len(chunks)), value_count)
+    with pytest.raises(errors.FormatError, match="65537 chunks"):
+        container.Reader(more)
+    with pytest.raises(decoder.Refused, match="number of chunks"):
+        decoder.decode(more)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_readable_decoder_renders_a_scene_as_the_reference_does(variant):
+    scene = VARIANTS[variant](tiny_scene(scales=1, channels=4, resolution=(10, 8, 6), time=4))
     data = scene_io.encode(quantise_scene(scene, [dict.fromkeys(scene.scales[0], 0.01)]))
-    decoded = scene_io.read(data).dequantise()
-    slow = twin.decode(data)
-    camera = scene.cameras[0].resized(8, 6)
-    origins, directions = camera.rays()
-    fast = reference.render_rays(decoded, origins, directions, 0.3)
+    decoded = decoder.decode(data)
+    origins, directions = scene.cameras[0].resized(8, 6).rays()
+    expected = reference.render_rays(scene_io.read(data).dequantise(), origins, directions, 0.3)
     for number, (origin, direction) in enumerate(zip(origins.tolist(), directions.tolist(), strict=True)):
-        rgb, opacity, _ = twin.render_ray(slow, origin, direction, 0.3)
-        assert np.abs(fast.rgb[number] - rgb).max() < 1 / 255
-        assert abs(fast.opacity[number] - opacity) < 1 / 255
+        rgb, opacity, _ = decoder.render_ray(decoded, origin, direction, 0.3)
+        assert np.abs(expected.rgb[number] - rgb).max() < 1 / 255
+        assert abs(expected.opacity[number] - opacity) < 1 / 255

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from kpc.format.coding import poses, rans
 from kpc.format.container import container as package_container
-from kpc.format.container import scene_io
+from kpc.format.container import scene_layout, segments
 from kpc.format.scene import scene, space
 
 SPEC = Path(__file__).parent.parent / "spec"
@@ -115,24 +115,36 @@ def test_sizes_in_the_text_are_those_of_the_tables(number, sizes):
 
 def test_structures_are_those_of_the_package():
     expected = {
-        "6.1": [scene_io.SCENE_STRUCT, scene_io.SCALE_STRUCT],
-        "6.2": [scene_io.WARP_STRUCT, scene_io.NDC_STRUCT],
-        "6.3": [scene_io.MOTION_STRUCT],
-        "6.4": [scene_io.OCCUPANCY_STRUCT],
-        "6.5": [scene_io.DECODER_STRUCT, scene_io.HYBRID_STRUCT],
-        "6.6": [scene_io.CAMERA_STRUCT],
-        "6.7": [scene_io.APPEARANCE_STRUCT],
+        "6.1": [scene_layout.SCENE_STRUCT, scene_layout.SCALE_STRUCT],
+        "6.2": [scene_layout.WARP_STRUCT, scene_layout.NDC_STRUCT],
+        "6.3": [scene_layout.MOTION_STRUCT],
+        "6.4": [scene_layout.OCCUPANCY_STRUCT],
+        "6.5": [scene_layout.DECODER_STRUCT, scene_layout.HYBRID_STRUCT],
+        "6.6": [scene_layout.CAMERA_STRUCT],
+        "6.7": [scene_layout.APPEARANCE_STRUCT],
         "8.4": [poses.HEAD],
     }
     for number, structures in expected.items():
         assert [spelled(table) for table in byte_tables(section(number))] == [spelled(one) for one in structures]
 
 
+def test_container_is_that_of_the_package():
+    assert spelled(package_container.HEADER) == spelled(container.HEADER)
+    assert spelled(package_container.ENTRY) == spelled(container.ENTRY)
+    assert [(codec.name, codec.value) for codec in package_container.Codec] == [
+        (name, int(number)) for number, name in re.findall(r"^\| (\d) \| ([A-Z]+) \|", section("4.4"), re.M)
+    ]
+    assert {kind.decode() for kind in container.CODECS} == scene_layout.KNOWN_KINDS
+    assert f"1 to {package_container.INDEX_BYTES} + {package_container.INDEX_BYTES_PER_CHUNK} x" in section("4.1")
+    assert f"48 + {package_container.MIN_CHUNK_BYTES} x chunk_count" in section("4.1")
+    assert PAGE.startswith(f"# The .kpc format, version {package_container.VERSION}\n")
+
+
 def test_limits_are_those_of_the_package():
     rows = re.findall(r"^\| ([A-Z_]+) \| (\d+) \|", section("11.1"), re.M)
     code = {
         name: int(value)
-        for module in (package_container, scene_io)
+        for module in (package_container, scene_layout)
         for name, value in vars(module).items()
         if name.endswith("_LIMIT") and name != "HEAD_LIMIT"
     }
@@ -144,7 +156,7 @@ def test_numbers_in_the_text_are_those_of_the_package():
     assert package_container.MAGIC.hex(" ").upper() in section("4.1")
     numbered = ", ".join(f"{number} `{name}`" for number, name in enumerate(scene.ALL_PLANES))
     assert numbered in section("4.2")
-    assert f"differ by less than {scene_io.FRAME_TOLERANCE:.4f}" in section("6.2")
+    assert f"differ by less than {scene_layout.FRAME_TOLERANCE:.4f}" in section("6.2")
     assert f"component[i] - {poses.NOTHING}" in section("8.4") and f"D = {poses.ROOT}^2" in section("8.4")
     assert f"-{scene.LOG_DENSITY_LIMIT:.0f}, {scene.LOG_DENSITY_LIMIT:.0f}" in section("9.5")
     assert f"clamp(a, 0, {scene.ACTIVATION_LIMIT:.0f})" in section("9.5")
@@ -192,6 +204,26 @@ def test_worked_examples_are_what_the_readable_decoder_does():
     for number, tables in (("13.2", trace.predictive_example()), ("13.3", trace.transform_example())):
         for table in tables:
             assert table in section(number)
+
+
+def test_the_package_decodes_the_worked_examples():
+    for codec, body, rows, columns in (
+        (container.PREDICTIVE, trace.PREDICTIVE_EXAMPLE, 2, 3),
+        (container.TRANSFORM, trace.TRANSFORM_EXAMPLE, 4, 8),
+    ):
+        _, expected = trace.traced_segment(codec, body, rows, columns)
+        symbols, coded = segments.decode_segment(codec, body, rows, columns, 1)
+        assert {(y, x, 0): int(symbols[y, x, 0]) for y, x in np.argwhere(coded).tolist()} == expected
+
+
+def test_the_hex_dump_is_the_minimal_vector():
+    rows = re.findall(r"^    ([0-9a-f]{4})  ((?:[0-9a-f]{2} ?)+)$", section("13.1"), re.M)
+    data = b"".join(bytes.fromhex(row) for _, row in rows)
+    assert [int(at, 16) for at, _ in rows] == list(range(0, len(data), 16))
+    assert data == (SPEC / "vectors" / "valid" / "minimal.kpc").read_bytes()
+    assert f"{len(data)} bytes" in section("13.1")
+    for entry in package_container.Reader(data).index:
+        assert f"0x{entry.offset:x}" in section("13.1")
 
 
 def test_the_trace_of_a_file_leaves_the_decoder_as_it_was():

@@ -27,13 +27,13 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
         "zstd": ZSTD_VERSION if Codec.ZSTD in codecs else None,
         "frame_count": scene.clip.frame_count,
         "fps": scene.clip.fps,
-        "step": scene.step,
+        "ray_step": scene.step,
     }
     if isinstance(scene.mapping, Contraction):
-        found["even"] = scene.mapping.uniform_distance
+        found["uniform_distance"] = scene.mapping.uniform_distance
     elif isinstance(scene.mapping, DeviceCoordinates):
         mapping = scene.mapping
-        found |= {"frame": mapping.frame.tolist(), "near": mapping.near, "baseline": mapping.baseline}
+        found |= {"reference_pose": mapping.frame.tolist(), "near": mapping.near, "baseline": mapping.baseline}
     if scene.motion:
         values = scene.motion.dequantise().astype("<f4")
         found["motion"] = {"shape": list(scene.motion.symbols.shape), "sha256": _sha256(values)}

@@ -113,8 +113,8 @@ def described(data: bytes, partial: bool, names: dict[bytes, str]) -> dict[str, 
             {
                 "time": time,
                 "group": number,
-                "time_in_it": round(time_in_it, 9),
-                "mix": {str(part): round(share, 9) for part, _, share in groups.timeline.blend_at(time)},
+                "local_time": round(time_in_it, 9),
+                "blend": {str(part): round(share, 9) for part, _, share in groups.timeline.blend_at(time)},
             }
             for time, number, time_in_it in shown
         ],
