@@ -16,7 +16,7 @@ from scenes import tiny_scene
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")]
-PAGES += sorted((ROOT / "docs").rglob("*.md"))
+PAGES += [ROOT / "samples" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 README_LINES = 150
 PICTURE_LIMIT_BYTES = 200_000
 
