@@ -1,8 +1,10 @@
-"""MOTION, the codec of motion grids: hierarchical, from the corners to what lies between (spec/kpc-format.md, "MOTION").
+"""MOTION, the codec of motion grids: hierarchical, from the corners to what lies between (spec/kpc-format.md,
+"MOTION").
 
-At first the ends of each axis are known. Then every gap between known nodes is halved, axis after axis, until none is left: a new node
-is predicted from the two nodes beside it and the two beyond those, by the cubic polynomial through all four. So rounding errors are
-averaged, where a prediction from one side alone would add them up; and nodes that do not matter can be what is predicted.
+At first the ends of each axis are known. Then every gap between known nodes is halved, axis after axis, until none is
+left: a new node is predicted from the two nodes beside it and the two beyond those, by the cubic polynomial through
+all four. So rounding errors are averaged, where a prediction from one side alone would add them up; and nodes that do
+not matter can be what is predicted.
 
 Symbols are 16-bit; r is the magnitude of a residual.
 """
@@ -29,7 +31,8 @@ class CodingPass:
     Attributes:
         axis: 0 to 3 for t, z, y, x.
         new: (n,) int64, the new positions.
-        references: (n, 4) int64, the positions that each is predicted from: two before it and two after it, the nearer in the middle.
+        references: (n, 4) int64, the positions that each is predicted from: two before it and two after it, the
+            nearer in the middle.
         weights: (n, 4) int64, of these, in 2^-WEIGHT_BITS; 0 where there is none.
         others: known positions along the three other axes, in their order.
         level: halvings to come, this one included; of the first nodes, one more than of any other.
@@ -44,7 +47,9 @@ class CodingPass:
 
 
 def coding_passes(sizes: tuple[int, ...]) -> Iterator[CodingPass]:
-    """Yield passes that code every node of a grid of four sizes, each at least 2, once and after what it is predicted from."""
+    """Yield passes that code every node of a grid of four sizes, each at least 2, once and after what it is predicted
+    from.
+    """
     known = [np.zeros(1, np.int64) for _ in sizes]
     halvings = [(size - 2).bit_length() for size in sizes]
     first = max(halvings) + 1
@@ -71,10 +76,11 @@ def coding_passes(sizes: tuple[int, ...]) -> Iterator[CodingPass]:
 
 
 def cubic_weights(middle: int, positions: list[int | None]) -> list[int]:
-    """Return the weights, in 2^-WEIGHT_BITS, of values at four positions in the polynomial through them, at a position in the middle.
+    """Return the weights, in 2^-WEIGHT_BITS, of values at four positions in the polynomial through them, at a
+    position in the middle.
 
-    Lagrange's: w_k = product of (middle - p_j) / (p_k - p_j) over the other positions p_j that there are, rounded; what is missing
-    to 1 goes to the second.
+    Lagrange's: w_k = product of (middle - p_j) / (p_k - p_j) over the other positions p_j that there are, rounded;
+    what is missing to 1 goes to the second.
     """
     weights = []
     for own in positions:
@@ -120,14 +126,16 @@ def _code_grid(
         state, position, fits = code_pass(
             values, r, one.new, one.references, one.weights, *one.others, models, state, position, words, trace
         )
-        if not fits or words is not None and position > words.size:
+        if not fits or (words is not None and position > words.size):
             break
     return state, position, fits
 
 
 @compiled()
 def code_pass(values, r, new, references, weights, first, second, third, models, state, position, words, trace):
-    """Code the nodes of a `CodingPass`, whose axis is the first of (n, ., ., ., M) `values` and `r`: (state, position, whether all fit)."""
+    """Code the nodes of a `CodingPass`, whose axis is the first of (n, ., ., ., M) `values` and `r`: (state,
+    position, whether all fit).
+    """
     for n in range(new.size):
         for i in range(first.size):
             for j in range(second.size):

@@ -1,4 +1,5 @@
-"""OCCUPANCY, the codec of occupancy grids: each cell is coded in a context of coded cells (spec/kpc-format.md, "OCCUPANCY").
+"""OCCUPANCY, the codec of occupancy grids: each cell is coded in a context of coded cells (spec/kpc-format.md,
+"OCCUPANCY").
 
 The context is made of cells around it and of the slot before: where these agree, the cell is most often as they are.
 """
@@ -7,7 +8,8 @@ import numpy as np
 from kpc.format.coding.rans import check_end, code_bit_adaptive, encode_trace, new_models, open_stream
 from kpc.format.common.jit import compiled
 
-# (slot, z, y, x) from a cell to those of its context, the most significant bit first. `code_cells` reads them row by row.
+# (slot, z, y, x) from a cell to those of its context, the most significant bit first. `code_cells` reads them row by
+# row.
 NEIGHBOURS = np.array(
     [
         (0, 0, 0, -1),

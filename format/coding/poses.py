@@ -1,9 +1,11 @@
 """POSES, the codec of cameras: position and rotation of each in 14 bytes (spec/kpc-format.md, "POSES").
 
-    count, lens count (u16) | exponent (i8) | corner (i32[3]) | lenses, 20 bytes each | rotations and positions, 7 + 7 bytes each
+    count, lens count (u16) | exponent (i8) | corner (i32[3]) | lenses, 20 bytes each | rotations and positions, 7 + 7
+    bytes each
 
-Positions are integer multiples of a power of two, from the corner of the box around all of them. A rotation is a unit quaternion
-without its largest component, which is positive and follows from the others. What this saves is in docs/design/entropy-coding.md.
+Positions are integer multiples of a power of two, from the corner of the box around all of them. A rotation is a unit
+quaternion without its largest component, which is positive and follows from the others. What this saves is in
+docs/design/entropy-coding.md.
 """
 
 import struct
@@ -20,7 +22,8 @@ LENS = struct.Struct("<HH4f")  # width, height, fl_x, fl_y, cx, cy
 # Bytes of a rotation, and of a position: three numbers of BITS; above those of a rotation, which component is left out.
 WORD = 7
 BITS = 18
-# sqrt(1/2) in a rotation: right angles are exact, and a picture of 1000 pixels is turned by about a hundredth of one at most.
+# sqrt(1/2) in a rotation: right angles are exact, and a picture of 1000 pixels is turned by about a hundredth of one
+# at most.
 ROOT = (1 << BITS - 1) - 1
 NOTHING = 1 << BITS - 1  # 0 in a rotation
 EXACT = 1 << 24  # magnitude of integers that are exact in float32

@@ -1,25 +1,29 @@
-"""PREDICTIVE, a codec of plane segments: each symbol is predicted from its neighbours, the residual is coded in contexts.
+"""PREDICTIVE, a codec of plane segments: symbols are predicted from neighbours, residuals coded in contexts.
 
-    set count (1 byte) | flags (1 byte) | weights (9 bytes a set) | rANS words: of the map, then of the residuals, channel by channel
+    set count (1 byte) | flags (1 byte) | weights (9 bytes a set) | rANS words: of the map, then of the residuals,
+    channel by channel
 
-(spec/kpc-format.md, "PREDICTIVE".) A prediction is a weighted mean of ten neighbours. The weights are the segment's own, one set for
-each class of local gradients: where a plane is flat it pays to average quantisation noise, where it is steep to extrapolate. The size
-of the residuals nearby, in this channel and in those before it, selects the context. All arithmetic is on integers.
+(spec/kpc-format.md, "PREDICTIVE".) A prediction is a weighted mean of ten neighbours. The weights are the segment's
+own, one set for each class of local gradients: where a plane is flat it pays to average quantisation noise, where it
+is steep to extrapolate. The size of the residuals nearby, in this channel and in those before it, selects the
+context. All arithmetic is on integers.
 
 A segment has one of three *quantisers*:
 
     SCALAR      any symbol may follow any other
-    TRELLIS     trellis-coded quantisation (Marcellin and Fischer, IEEE Trans. Comm. 38, 1990): along a row, the symbols before
-                determine whether the next one is even or odd
-    DEPENDENT   dependent quantisation where the neighbourhood is flat, else as TRELLIS: not the symbol but its difference from the
-                rounded prediction is even, or odd and zero (ITU-T H.266, 8.7.3; Schwarz et al., Data Compression Conference 2019)
+    TRELLIS     trellis-coded quantisation (Marcellin and Fischer, IEEE Trans. Comm. 38, 1990): along a row, the
+                symbols before determine whether the next one is even or odd
+    DEPENDENT   dependent quantisation where the neighbourhood is flat, else as TRELLIS: not the symbol but its
+                difference from the rounded prediction is even, or odd and zero (ITU-T H.266, 8.7.3; Schwarz et al.,
+                Data Compression Conference 2019)
 
-Whether symbols follow the trellis can be seen from them. Dependent ones can be coded only with the weights that they were chosen with:
-these are the side information of a plane, `PredictionWeights`.
+Whether symbols follow the trellis can be seen from them. Dependent ones can be coded only with the weights that they
+were chosen with: these are the side information of a plane, `PredictionWeights`.
 
 Names in this module
-    v r             symbols of a channel, and residuals in 1/16 symbol: rings of three rows, two columns wider on either side,
-                    so that column x is at X = x + 2; v0 r0 are the current row, v1 r1 the one above, v2 r2 the one above that
+    v r             symbols of a channel, and residuals in 1/16 symbol: rings of three rows, two columns wider on
+                    either side, so that column x is at X = x + 2; v0 r0 are the current row, v1 r1 the one above,
+                    v2 r2 the one above that
     w n nw ne ...   neighbours by compass direction; ww and nn are two texels away
     cross           residuals of the channels before, smoothed
     trellis         state of the trellis, 0 to 7; odd where the symbol, or the difference, has to be odd
@@ -42,11 +46,12 @@ FLAT_ACTIVITY = 4  # neighbourhoods whose activity is less than this are flat
 UNARY, ESCAPES = 4, 7  # of `code_signed`, for residuals
 # Models of a context: whether there is a residual, whether it is positive, and, for either sign, its magnitude.
 MODELS_PER_CONTEXT = 2 + 2 * (UNARY + ESCAPES)
-# Contexts: classes of activity, times the distance of the prediction from a whole symbol (or, if DEPENDENT, the parity of the trellis).
+# Contexts: classes of activity, times the distance of the prediction from a whole symbol (or, if DEPENDENT, the
+# parity of the trellis).
 ACTIVITIES, FRACTIONS = 22, 3
 MAX_DECISIONS = 2 + UNARY + 2 * ESCAPES  # bits that a symbol takes in a trace, at most
 
-# Of the fit of weights: iterations of reweighting, values used at most, and a ridge that keeps a flat plane solvable.
+# Fit of weights: iterations of reweighting, values used at most, and a ridge that keeps a flat plane solvable.
 REWEIGHTINGS, FIT_VALUES, RIDGE = 4, 1 << 14, 4.0
 
 INITIAL_RESIDUAL = 16  # r where nothing is known: one symbol
@@ -78,7 +83,8 @@ def encode_symbols(
     side_info: PredictionWeights | None = None,
     implied: np.ndarray | None = None,
 ) -> bytes:
-    """Encode a segment: DEPENDENT if the symbols follow their side information, else with the number of weight sets that is shortest.
+    """Encode a segment: DEPENDENT if the symbols follow their side information, else with the number of weight sets
+    that is shortest.
 
     Args:
         symbols: (H, W, M) int8, 0 where not coded.
@@ -101,7 +107,7 @@ def encode_symbols(
 def encode_with_weights(
     weights: np.ndarray, symbols: np.ndarray, coded: np.ndarray, quantiser: int, implied: np.ndarray | None = None
 ) -> bytes | None:
-    """Encode a segment with given (C, WEIGHT_COUNT) int8 weights; None where the symbols do not follow the quantiser."""
+    """Encode a segment with given (C, WEIGHT_COUNT) int8 weights; None if the symbols do not follow the quantiser."""
     followed, coded = np.array(symbols, order="C"), np.array(coded, order="C")
     trace = np.empty(coded.size + int(coded.sum()) * symbols.shape[2] * MAX_DECISIONS, np.int16)
     position, mode = 0, map_mode(coded, implied)
@@ -171,7 +177,8 @@ def _parse_head(body: bytes) -> tuple[np.ndarray, int, int]:
 def collect_neighbours(symbols: np.ndarray, coded: np.ndarray) -> np.ndarray:
     """Return (N, 2 + WEIGHT_COUNT) int16 of the N coded symbols, for `fit_weights`.
 
-    Column 0 is the gradient class; the others are twice the differences of the symbol, and of its neighbours, from the mean of w and n.
+    Column 0 is the gradient class; the others are twice the differences of the symbol, and of its neighbours, from
+    the mean of w and n.
     """
     values = int(coded.sum()) * symbols.shape[2]
     trace, neighbours = np.empty(values * MAX_DECISIONS, np.int16), np.empty((values, 2 + WEIGHT_COUNT), np.int16)
@@ -257,7 +264,9 @@ def round_prediction(predicted, quantiser, odd):
 
 @inlined
 def residual_context(active, part):
-    """Return the context of a residual: class of activity, and class of the fraction of the prediction or parity of the trellis."""
+    """Return the context of a residual: class of activity, and class of the fraction of the prediction or parity of
+    the trellis.
+    """
     return active * FRACTIONS + part
 
 
@@ -271,9 +280,11 @@ def next_trellis_state(trellis, value, residual, quantiser):
 
 @compiled()
 def code_symbols(symbols, coded, quantiser, weights, state, position, words, trace, neighbours):
-    """Code (H, W, M) symbols where `coded`: (state, position, whether all fit 8 bits). Encoding moves them onto the quantiser.
+    """Code (H, W, M) symbols where `coded`: (state, position, whether all fit 8 bits). Encoding moves them onto the
+    quantiser.
 
-    One function, since its state (rows of v and r, the neighbours to the left) would be the parameters of any part of it.
+    One function, since its state (rows of v and r, the neighbours to the left) would be the parameters of any part of
+    it.
 
     Args:
         quantiser: SCALAR, TRELLIS or DEPENDENT.
@@ -302,7 +313,7 @@ def code_symbols(symbols, coded, quantiser, weights, state, position, words, tra
                 X = x + 2
                 if not coded[y, x]:
                     ww, rww = w, rw
-                    if not (y == 0 or x > 0 and coded[y, x - 1]):
+                    if not (y == 0 or (x > 0 and coded[y, x - 1])):
                         w, rw = v1[X + 1], r1[X + 1]
                     v0[X], r0[X] = w, rw
                     continue
@@ -359,7 +370,8 @@ def collect(row, value, gradient, w, ww, v1, v2, X):
 
 @compiled()
 def tap_weights(weights):
-    """Return (C, 1 + WEIGHT_COUNT) int32, in 1/128: weights of w n nw ne ww nn and the four farther neighbours in a plain sum.
+    """Return (C, 1 + WEIGHT_COUNT) int32, in 1/128: weights of w n nw ne ww nn and the four farther neighbours in a
+    plain sum.
 
     (C, WEIGHT_COUNT) stored weights are of w - n, and of what the others exceed the mean of w and n by.
     """
@@ -373,7 +385,9 @@ def tap_weights(weights):
 
 @inlined
 def channel_shares(m):
-    """Return the weights, in quarters, of residuals in this channel and in those before it; the first channel has none before it."""
+    """Return the weights, in quarters, of residuals in this channel and in those before it; the first channel has
+    none before it.
+    """
     return (16, 0) if m == 0 else (11, 5)
 
 
@@ -405,7 +419,9 @@ def sum_above(sets, v1, v2, r1, r2, past, m, taps, steep, active_above):
 
 @inlined
 def predict(sets, classes, w, ww, nw, x, taps, steep):
-    """Return the prediction of a symbol, in 1/128, and the gradient around it, which selects the set through `classes`."""
+    """Return the prediction of a symbol, in 1/128, and the gradient around it, which selects the set through
+    `classes`.
+    """
     gradient = abs(w - nw) + abs(w - ww) + steep[x]
     c = classes[gradient] if len(sets) > 1 else 0  # whatever depends on the gradient waits long for it
     return min(max(sets[c, 0] * w + sets[c, 4] * ww + taps[c, x], -128 * 128), 127 * 128), gradient
@@ -419,14 +435,18 @@ def nearest(predicted, odd, doubled):
 
 @inlined
 def activity(active_above, rw, rww, gradient, m):
-    """Return the class of activity, one of ACTIVITIES, from residuals around and in the channels before, and from the gradient."""
+    """Return the class of activity, one of ACTIVITIES, from residuals around and in the channels before, and from the
+    gradient.
+    """
     total = (active_above + channel_shares(m)[0] * (2 * rw + rww) >> 2) + 20 * gradient
     return int(_LOGARITHMS[total + 128 >> 6])
 
 
 @inlined
 def begin_row(here, above, higher, y, unknown):
-    """Extend rows beyond the segment: to the left by the start of the row above; above row 0, from row 1 on, by row 0 itself."""
+    """Extend rows beyond the segment: to the left by the start of the row above; above row 0, from row 1 on, by row 0
+    itself.
+    """
     here[:2] = above[2] if y > 0 else unknown
     if y == 1:
         for x in range(higher.size):

@@ -4,7 +4,7 @@
 
 Both roundings are to nearest even and happen in this order: a decoder must not fuse them. An *uncoded* texel has
 symbol 0 in every channel, hence the value `offset`: exactly 1 on time planes (the multiplicative identity), a default
-of the channel on space planes (read only where nothing is seen).
+of the channel on space planes (read only where nothing is occupied).
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,24 +23,24 @@ from kpc.format.scene.space import SpaceMapping
 
 SYMBOL_MIN, SYMBOL_MAX = -128, 127
 
+# Magnitude of any plane value: float16 holds it, and with float16 weights no feature, density or colour overflows.
 VALUE_LIMIT = 2048.0
-"""Magnitude of any plane value: float16 holds it, and with float16 weights no feature, density or colour overflows."""
-HALF_BITS = 11
-"""Significant bits of a float16."""
-COARSEST_STEP = 8.0
-"""A coarser step is taken for this one; 128 of it stay within the limit."""
+HALF_BITS = 11  # significant bits of a float16
+COARSEST_STEP = 8.0  # coarser steps count as this one; 128 of it stay within the limit
+# Significant bits of focal lengths and principal points: an image of 1000 pixels is shifted by a hundredth of a pixel.
+CAMERA_BITS = 16
 
 
 @dataclass(frozen=True)
 class QuantisedPlane:
-    """One plane as integers.
+    """A plane as integers.
 
     Attributes:
         symbols: (H, W, M) int8; 0 wherever `coded` is False.
         step: (M,) float32 > 0; offset: (M,) float32, exactly 1 on time planes.
         coded: (H, W) bool, the texels whose symbols the file stores.
-        side_info: by which symbols were chosen, if by any; one that they do not follow does no harm.
-        starts: the first rows of the segments that symbols were chosen for; none: those that are usual, `kpc.format.container.segments`.
+        side_info: what the symbols were chosen with, if anything; if they do not follow it, that does no harm.
+        starts: the first rows of the segments that symbols were chosen for; empty: those of `rows_per_segment`.
     """
 
     symbols: np.ndarray
@@ -51,12 +51,12 @@ class QuantisedPlane:
     starts: tuple[int, ...] = ()
 
     def dequantise(self) -> np.ndarray:
-        """(H, W, M) float32."""
+        """Return (H, W, M) float32 values."""
         return dequantise_symbols(self.symbols, self.step, self.offset)
 
 
 def dequantise_symbols(symbols: np.ndarray, step: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """(..., M) float32 of (..., M) int8: symbol * step + offset, rounded after the product and after the sum."""
+    """Return (..., M) float32 values of (..., M) int8: symbol * step + offset, rounded after product and after sum."""
     values = symbols.astype(np.float32)
     values *= step
     values += offset
@@ -73,15 +73,18 @@ def quantise_plane(
 ) -> QuantisedPlane:
     """Round a plane to symbols: |dequantised - value| <= step / 2 (the plane's own step) at every needed texel.
 
-    Space planes (identity=False): the offset is the mean over the needed texels, to 8 significant bits, moved by as little as brings the
-    whole range into 8 bits; a step too small for the range is enlarged to range / 255. All needed texels are coded.
+    Space planes (identity=False): the offset is the mean over the needed texels, to 8 significant bits, moved
+    just so far that 8 bits hold the whole range; a step too small for the range is enlarged to range / 255. All needed
+    texels are coded.
+
     Time planes (identity=True): the offset is 1; a step too small is enlarged until [-128, 127] reaches both ends of
-    the range. Texels whose symbols all come out 0 are not coded.
+    the range. Texels whose symbols are all 0 are not coded.
 
     Steps above COARSEST_STEP count as that.
 
     Args:
-        values: (H, W, M) float32. step: (M,) or one number for all channels, > 0.
+        values: (H, W, M) float32.
+        step: (M,) or one number for all channels, > 0.
         needed: (H, W) bool; False where no occupied point projects to. Those texels are not coded. None: all needed.
         name: of the plane, for messages.
 
@@ -123,30 +126,27 @@ def quantise_plane(
 
 
 def _at_least(step: np.ndarray, bound: np.ndarray) -> np.ndarray:
-    """`step`, raised to `bound` where it falls short; rounded up, so that the bound still holds."""
+    """Return `step`, raised to `bound` where it is less; rounded up, so that the bound still holds."""
     single = bound.astype(np.float32)
     single = np.where(single < bound, np.nextafter(single, np.float32(np.inf)), single)
     return np.where(step < bound, bfloat16_ceil(single), step)
 
 
 def bfloat16_ceil(values: np.ndarray) -> np.ndarray:
-    """float32 numbers of 8 significant bits, at least as large as positive float32 ones and at most 1 / 128 larger: a file holds them in
-    little more than half the bytes."""
+    """Round positive float32 numbers up to 8 significant bits, which makes them at most 1 / 128 larger.
+
+    A file holds such numbers in little more than half the bytes."""
     return bfloat16_floor((values.view(np.uint32) + np.uint32(0xFFFF)).view(np.float32))
 
 
 def bfloat16_floor(values: np.ndarray) -> np.ndarray:
-    """float32 numbers without all but their first 8 significant bits."""
+    """Truncate float32 numbers to their first 8 significant bits."""
     return (values.view(np.uint32) & np.uint32(0xFFFF0000)).view(np.float32)
-
-
-CAMERA_BITS = 16
-"""Significant bits of focal lengths and principal points: a picture of a thousand pixels is shifted by a hundredth of one."""
 
 
 @dataclass(frozen=True)
 class QuantisedScene:
-    """A `Scene` as the file stores it: planes as symbols, decoder weights, codes and cameras rounded. Fields as in `Scene`."""
+    """A `Scene` as the file stores it: planes as symbols; weights, codes and cameras rounded. Fields as in `Scene`."""
 
     aabb: np.ndarray
     clip: Clip
@@ -161,7 +161,7 @@ class QuantisedScene:
     appearances: tuple[Appearance, ...] = field(default=())
 
     def dequantise(self) -> Scene:
-        """The scene that every decoder sees."""
+        """Return the scene that every decoder sees."""
         scales = tuple({name: plane.dequantise() for name, plane in scale.items()} for scale in self.scales)
         return Scene(
             self.aabb,
@@ -183,7 +183,7 @@ class QuantisedScene:
 
     @property
     def parameter_count(self) -> int:
-        """Numbers in the model, coded or not; the same as the dequantised scene's."""
+        """Numbers in the model, coded or not; the same as those of the dequantised scene."""
         others = 0 if self.motion is None else self.motion.symbols.size
         others += self.decoder.parameter_count + sum(appearance.code.size for appearance in self.appearances)
         return sum(p.symbols.size for scale in self.scales for p in scale.values()) + others
@@ -207,7 +207,7 @@ def quantise_scene(
     Args:
         steps: one mapping a scale, plane name -> step: (M,) or a number.
         skip_unseen: leave texels that no occupied point projects to uncoded.
-        reached: `reached_by(scene)`, where it is at hand.
+        reached: `looked_up_cells(scene)`, if the caller has it.
 
     Raises:
         FormatError: a value is NaN or infinite; the message names the scale and the plane.
@@ -246,56 +246,62 @@ def quantise_scene(
 
 
 def looked_up_cells(scene: Scene) -> np.ndarray:
-    """(slots, Nz, Ny, Nx) bool: the cells of the planes' [0, 1]^3 in which what is occupied is looked up."""
+    """Return (slots, Nz, Ny, Nx) bool: the cells of the planes' [0, 1]^3 in which occupied points are looked up."""
     occupancy = np.asarray(scene.occupancy, bool)
     return occupancy if scene.motion is None else reached_cells(occupancy, scene.motion)
 
 
 def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) -> np.ndarray:
-    """(rows, columns) bool: the texels of a plane that a bilinear read from inside an occupied cell may touch.
+    """Return (rows, columns) bool: the texels of a plane that a bilinear read inside an occupied cell may touch.
+
+    This is the map that the occupancy implies (spec/kpc-format.md, "Map").
 
     Args:
-        occupancy: (slots, Nz, Ny, Nx) bool. plane: its name, such as "xy" or "zt".
+        occupancy: (slots, Nz, Ny, Nx) bool.
+        plane: its name, such as "xy" or "zt".
     """
     return needed_rows(project_occupancy(occupancy, plane), rows, columns, range(rows))
 
 
 def project_occupancy(occupancy: np.ndarray, plane: str) -> np.ndarray:
-    """(cells down, cells across) bool: where any cell is occupied, seen along the axes that a plane does not have."""
+    """Return (cells down, cells across) bool: the occupancy projected along the axes that a plane does not have."""
     axes = {"t": 0, "z": 1, "y": 2, "x": 3}
     across, down = axes[plane[0]], axes[plane[1]]
     others = tuple(axis for axis in range(4) if axis not in (across, down))
-    seen = np.asarray(occupancy.any(axis=others))  # the kept axes stay in the order t, z, y, x
-    return seen if down < across else np.ascontiguousarray(seen.T)
+    projected = np.asarray(occupancy.any(axis=others))  # the kept axes stay in the order t, z, y, x
+    return projected if down < across else np.ascontiguousarray(projected.T)
 
 
-def needed_rows(seen: np.ndarray, rows: int, columns: int, some: range) -> np.ndarray:
-    """Some rows of `needed_texels`, by `project_occupancy`. Takes no more memory than they do, and a row of cells."""
+def needed_rows(projected: np.ndarray, rows: int, columns: int, some: range) -> np.ndarray:
+    """Return some rows of `needed_texels` from `project_occupancy`, in no more memory than these rows take."""
     needed = np.empty((len(some), columns), bool)
-    _mark_met(
-        seen,
-        _reached_from(rows, seen.shape[0])[:, some.start : some.stop],
-        _reached_from(columns, seen.shape[1]),
+    _mark_needed(
+        projected,
+        _touching_cells(rows, projected.shape[0])[:, some.start : some.stop],
+        _touching_cells(columns, projected.shape[1]),
         needed,
     )
     return needed
 
 
 @compiled()
-def _mark_met(seen, down, across, needed):
-    """Fill `needed`: whether any cell is seen from down[0] to before down[1] and from across[0] to before across[1]."""
+def _mark_needed(projected, down, across, needed):
+    """Fill `needed`: whether any cell is set from down[0] to before down[1] and from across[0] to before across[1]."""
     for row in range(needed.shape[0]):
-        met = np.zeros(seen.shape[1], np.bool_)
+        any_below = np.zeros(projected.shape[1], np.bool_)
         for cells in range(down[0, row], down[1, row]):
-            met |= seen[cells]
+            any_below |= projected[cells]
         for column in range(needed.shape[1]):
             needed[row, column] = False
             for cell in range(across[0, column], across[1, column]):
-                needed[row, column] |= met[cell]
+                needed[row, column] |= any_below[cell]
 
 
-def _reached_from(texels: int, cells: int) -> np.ndarray:
-    """(2, texels) int64: the first cell and the one after the last such that [c, c+1] / cells meets the closed support [i-1, i+1] / (texels-1)."""
+def _touching_cells(texels: int, cells: int) -> np.ndarray:
+    """Return (2, texels) int64: the first cell and the one after the last that touch the support of each texel.
+
+    Cell c spans [c, c + 1] / cells, the support of texel i is the closed interval [i - 1, i + 1] / (texels - 1).
+    """
     i, apart = np.arange(texels), texels - 1
     if apart == 0:
         return np.array([[0], [cells]])
@@ -304,10 +310,11 @@ def _reached_from(texels: int, cells: int) -> np.ndarray:
 
 
 def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) -> AnyDecoder:
-    """The decoder with its weights rounded to float16 (the density bias to float32), as float32 arrays.
+    """Return the decoder with its weights rounded to float16 (the density bias to float32), as float32 arrays.
 
     Args:
-        bits: of some of its arrays, at most HALF_BITS: the weights of each are rounded to as many places as its largest has in so many.
+        bits: for some of its arrays, at most HALF_BITS: the largest weight of the array has so many significant bits,
+            and the others are rounded to the same power of two.
 
     Raises:
         FormatError: a weight is NaN, infinite or beyond float16's 65504.
@@ -315,31 +322,31 @@ def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) ->
     if not np.isfinite(decoder.density_bias):
         raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
     shorter = {
-        name: to_half(_to_places(value, bits[name]) if bits and name in bits else value)
+        name: to_half(_to_shared_exponent(value, bits[name]) if bits and name in bits else value)
         for name, value in decoder_arrays(decoder).items()
     }
     return replace(decoder, **shorter, density_bias=float(np.float32(decoder.density_bias)))
 
 
 def decoder_arrays(decoder: AnyDecoder) -> dict[str, np.ndarray]:
-    """Its arrays: all but the density bias."""
+    """Return the arrays of a decoder: all fields but the density bias."""
     return {name: value for name, value in vars(decoder).items() if name != "density_bias"}
 
 
 def _to_bits(values: np.ndarray, bits: int) -> np.ndarray:
-    """Rounded to so many significant bits."""
+    """Round to so many significant bits."""
     mantissas, exponents = np.frexp(values)
     return np.ldexp(np.rint(np.ldexp(mantissas, bits)), exponents - bits)
 
 
-def _to_places(values: np.ndarray, bits: int) -> np.ndarray:
-    """Rounded to multiples of a power of two, of which the largest takes so many bits."""
-    place = max(int(np.frexp(np.abs(values).max())[1]) - bits, FINEST)
-    return np.ldexp(np.rint(np.ldexp(values, -place)), place)
+def _to_shared_exponent(values: np.ndarray, bits: int) -> np.ndarray:
+    """Round to multiples of a power of two, of which the largest takes so many bits."""
+    exponent = max(int(np.frexp(np.abs(values).max())[1]) - bits, FINEST)
+    return np.ldexp(np.rint(np.ldexp(values, -exponent)), exponent)
 
 
 def to_half(weights: np.ndarray, what: str = "decoder") -> np.ndarray:
-    """Numbers rounded to float16, as float32.
+    """Round numbers to float16; return them as float32.
 
     Raises:
         FormatError: one is NaN, infinite or beyond float16's 65504.
@@ -350,8 +357,9 @@ def to_half(weights: np.ndarray, what: str = "decoder") -> np.ndarray:
 
 
 def round_cameras(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-    """Cameras with focal lengths and principal points rounded to CAMERA_BITS, and poses to turns and places, `kpc.format.coding.poses`; where they
-    are more than those, to float32."""
+    """Round focal lengths and principal points to CAMERA_BITS, and poses to those of `kpc.format.coding.poses`.
+
+    Poses that are not rotations are rounded to float32."""
     lenses = tuple(_with_short_lens(camera) for camera in cameras)
     if lenses and are_rigid(lenses):
         return round_poses(lenses)

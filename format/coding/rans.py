@@ -1,8 +1,8 @@
 """Adaptive binary entropy coding with rANS, in integers (spec/kpc-format.md, "Entropy coder").
 
 An adaptive *model* estimates the probability that its bit is 1, out of 2^16, and counts how often it was used. rANS
-(arXiv:1311.2540) turns bits and their probabilities into 16-bit words. It encodes backwards, so an encoder first records every bit
-with its probability (the *trace*) and then turns the trace into words.
+(arXiv:1311.2540) turns bits and their probabilities into 16-bit words. It encodes backwards, so an encoder first
+records every bit with its probability (the *trace*) and then turns the trace into words.
 
 Encoder and decoder share one function for each syntax element. The coder's state is explicit:
 
@@ -32,7 +32,9 @@ RATES = np.array([327680 // (5 * n + 8) for n in range(ADAPTATION_LIMIT + 1)])
 
 @compiled()
 def new_models(count):
-    """Return (count,) int32 models of even probability: each the probability of a 1 out of 2^16, times 256, plus its uses."""
+    """Return (count,) int32 models of even probability: each the probability of a 1 out of 2^16, times 256, plus its
+    uses.
+    """
     return np.full(count, EVEN_PROBABILITY << 8, np.int32)
 
 
@@ -79,7 +81,8 @@ def code_bit_adaptive(bit, models, index, state, position, words, trace):
 def code_signed(value, models, first, unary, escapes, state, position, words, trace):
     """Code an integer with the 2 + 2 (unary + escapes) models from `first` on: (value, state, position).
 
-    In order: whether it is not 0; whether it is positive; its magnitude as of `code_unsigned`, with models for either sign.
+    In order: whether it is not 0; whether it is positive; its magnitude as of `code_unsigned`, with models for either
+    sign.
     """
     bit, state, position = code_bit_adaptive(1 if value != 0 else 0, models, first, state, position, words, trace)
     if not bit:
@@ -96,8 +99,9 @@ def code_signed(value, models, first, unary, escapes, state, position, words, tr
 def code_unsigned(value, models, first, unary, escapes, state, position, words, trace):
     """Code an integer from 1 on with the unary + escapes models from `first` on: (value, state, position).
 
-    Values up to `unary` take a bit each, with a model for each. Larger ones are escaped: an Exp-Golomb code of value - unary - 1, whose
-    prefix of at most `escapes` bits has a model for each bit, and whose suffix bits are of even probability.
+    Values up to `unary` take a bit each, with a model for each. Larger ones are escaped: an Exp-Golomb code of value
+    - unary - 1, whose prefix of at most `escapes` bits has a model for each bit, and whose suffix bits are of even
+    probability.
     """
     beyond, found = value - 1, 0
     while found < unary:
@@ -126,7 +130,8 @@ def code_unsigned(value, models, first, unary, escapes, state, position, words, 
 
 @inlined
 def log_class(number):
-    """Return the logarithmic class of an integer from 0 on, two classes for each doubling: 0, 1, 2, 3, 4 from 4, 5 from 6, 6 from 8 on.
+    """Return the logarithmic class of an integer from 0 on, two classes for each doubling: 0, 1, 2, 3, 4 from 4, 5
+    from 6, 6 from 8 on.
 
     With b the number of binary digits: 2 b - 2 + the second most significant digit; 0 and 1 are classes of their own.
     """
@@ -138,7 +143,9 @@ def log_class(number):
 
 @compiled()
 def trace_words(trace):
-    """Return the words that a decoder reads back as the (N,) int16 trace: (K,) uint16, the first two of which are its first state."""
+    """Return the words that a decoder reads back as the (N,) int16 trace: (K,) uint16, the first two of which are its
+    first state.
+    """
     backwards = np.empty(trace.size + 2, np.uint16)
     state, count = LOWEST_STATE, 0
     for at in range(trace.size - 1, -1, -1):

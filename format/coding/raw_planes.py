@@ -9,7 +9,8 @@ from kpc.format.common.errors import FormatError
 
 
 def encode_raw_segment(symbols: np.ndarray, coded: np.ndarray) -> bytes:
-    """Pack a plane segment: the map of its coded texels, unless all are, then the symbols of coded texels channel by channel.
+    """Pack a plane segment: the map of its coded texels, unless all are, then the symbols of coded texels channel by
+    channel.
 
     Args:
         symbols: (H, W, M) int8, 0 where not coded.

@@ -1,15 +1,17 @@
 """TRANSFORM, a codec of plane segments: DCT blocks with prediction from the borders of their neighbours.
 
-    side N (1 byte) | flags (1 byte) | step (1 byte) | rANS words: of the map, of step offsets, then of levels, channel by channel
+    side N (1 byte) | flags (1 byte) | step (1 byte) | rANS words: of the map, of step offsets, then of levels,
+    channel by channel
 
-(spec/kpc-format.md, "TRANSFORM".) Where a symbol takes few bits, predictions from coded neighbours mostly carry their errors on. There
-it is better to separate low from high frequencies: each block of N x N texels of a channel is a sum of cosines, whose quantised
-coefficients, the *levels*, are coded in contexts of higher frequencies, of the blocks to the left and above, and of the channel
-before. A decoder turns levels into symbols like any others. All arithmetic is on integers of 32 bits.
+(spec/kpc-format.md, "TRANSFORM".) Where a symbol takes few bits, predictions from coded neighbours mostly carry their
+errors on. There it is better to separate low from high frequencies: each block of N x N texels of a channel is a sum
+of cosines, whose quantised coefficients, the *levels*, are coded in contexts of higher frequencies, of the blocks to
+the left and above, and of the channel before. A decoder turns levels into symbols like any others. All arithmetic is
+on integers of 32 bits.
 
-Blocks are predicted from the *borders* of their neighbours: the mean from the texels next to the block, and the sign of each level from
-which sign makes the step across the border smaller (Clare, Henry and Jung, JCTVC-A114, 2010). This saves 4 % at 33 dB and 6 % at
-43 dB of agreement (shelf_hand), the contexts of ends included.
+Blocks are predicted from the *borders* of their neighbours: the mean from the texels next to the block, and the sign
+of each level from which sign makes the step across the border smaller (Clare, Henry and Jung, JCTVC-A114, 2010). This
+saves 4 % at 33 dB and 6 % at 43 dB of agreement (shelf_hand), the contexts of ends included.
 
 Names in this module
     side        N, of a block: 4, 8 or 16
@@ -17,7 +19,7 @@ Names in this module
     diagonal    i + j; the diagonals before the `end` of a block are coded, highest frequency first
     step offset of a block, in all channels: one more makes the quantisation steps sqrt(2) finer
     mean        the coefficient of i = j = 0, in 1/UNITS_PER_SYMBOL; coded as its difference from the prediction
-    gap         (2, N), along the left and along the upper side of a block: by how much the texels across the border exceed what the
+    gap         (2, N), along the left and upper side of a block: by how much the texels across the border exceed what
                 block is so far known to be there, in 1/UNITS_PER_SYMBOL
     state position words trace      of `kpc.format.coding.rans`
 """
@@ -60,8 +62,8 @@ MODELS_PER_CONTEXT = 1 + UNARY + ESCAPES
 LARGEST = UNARY + (2 << ESCAPES) - 1  # magnitude that can be coded
 MAX_DECISIONS = 2 + UNARY + 2 * ESCAPES  # bits that a level takes in a trace, at most
 
-# Initial probabilities of level models, out of 256, by magnitude context: that there is a level, that it is more than 1,
-# that it is more than 2 to UNARY; the same of means, in any context; and the number of uses that this counts for.
+# Initial probabilities of level models, out of 256, by magnitude context: that there is a level, that it is more than
+# 1, that it is more than 2 to UNARY; the same of means, in any context; and the number of uses that this counts for.
 INITIAL_PROBABILITIES = np.array(
     [
         [27, 66, 61, 86, 79, 96, 118, 143, 168, 190, 206, 220, 230, 238, 243, 248],
@@ -113,8 +115,8 @@ def dct_basis(side: int) -> np.ndarray:
 def frequency_weights(side: int) -> np.ndarray:
     """Return (N,) int64: by how much coarser each frequency is quantised along an axis, in 1/64.
 
-    (1 + cos(pi k / N) / 2)^(-1/2): bilinear look-ups between texels see less of errors of high frequency, since those of neighbours
-    count together by a quarter (`kpc.encoder.rdo.distortion`).
+    (1 + cos(pi k / N) / 2)^(-1/2): bilinear look-ups between texels see less of errors of high frequency, since those
+    of neighbours count together by a quarter (`kpc.encoder.rdo.distortion`).
     """
     return np.rint((1 << WEIGHT_BITS) / np.sqrt(1 + 0.5 * np.cos(np.pi * np.arange(side) / side))).astype(np.int64)
 
@@ -175,7 +177,7 @@ def decode_blocks(
 def decode_levels(
     body: bytes, rows: int, columns: int, channels: int, implied: np.ndarray | None = None
 ) -> TransformBlocks:
-    """Return what `encode_blocks` was given, of a body that `decode_blocks` decodes; 0 for levels that are not coded."""
+    """Return what `encode_blocks` was given, from what it made; levels that are not coded are 0."""
     side = body[0]
     levels = np.zeros((channels, *coded_blocks(np.zeros((rows, columns), bool), side).shape, side, side), np.int64)
     _, _, step_offsets = _decode(body, rows, columns, channels, implied, levels)
@@ -213,7 +215,9 @@ def _decode(
 
 @compiled()
 def code_offsets(offsets, busy, state, position, words, trace):
-    """Code the step offsets of blocks that are `busy`: (state, position). Others are as predicted, the mean of left and above."""
+    """Code the step offsets of blocks that are `busy`: (state, position). Others are as predicted, the mean of left
+    and above.
+    """
     BY, BX = busy.shape
     models = new_models(OFFSET_COUNT * OFFSET_COUNT)
     for by in range(BY):
@@ -245,9 +249,11 @@ def code_offsets(offsets, busy, state, position, words, trace):
 
 @compiled()
 def code_levels(levels, offsets, busy, step_table, state, position, words, trace, symbols, dct_basis, coded):
-    """Code the levels of blocks that are `busy`: (state, position). Decoding fills `symbols` and, unless it is None, `levels`.
+    """Code the levels of blocks that are `busy`: (state, position). Decoding fills `symbols` and, unless it is None,
+    `levels`.
 
-    One function, since its state (magnitudes, ends, means and borders of the blocks around) would be the parameters of any part of it.
+    One function, since its state (magnitudes, ends, means and borders of the blocks around) would be the parameters
+    of any part of it.
     """
     BY, BX = busy.shape
     N = len(dct_basis)
@@ -342,7 +348,9 @@ def store_block(block, symbols, coded, by, bx, m):
 
 @compiled()
 def code_signs(block, end, steps, dct_basis, gap, has_left, has_above, models, state, position, words, trace):
-    """Code the signs of all levels but the mean, lowest frequency first: (state, position). Decoding negates levels of `block`."""
+    """Code the signs of all levels but the mean, lowest frequency first: (state, position). Decoding negates levels
+    of `block`.
+    """
     N = len(block)
     reduce_gap(gap, dct_basis, 0, 0, coefficient(block[0, 0], steps[0, 0]))
     for diagonal in range(1, end):
@@ -398,7 +406,9 @@ def reduce_gap(gap, dct_basis, i, j, coefficient):
 
 @inlined
 def sign_bias(gap, dct_basis, i, j, has_left, has_above):
-    """Return the correlation of the gap with a cosine, in 1/(128 N UNITS_PER_SYMBOL): its sign is the likelier one of the level."""
+    """Return the correlation of the gap with a cosine, in 1/(128 N UNITS_PER_SYMBOL): its sign is the likelier one of
+    the level.
+    """
     left, above = 0, 0
     for k in range(len(dct_basis)):
         left += min(max(gap[0, k], -GAP_LIMIT), GAP_LIMIT) * dct_basis[i, k]
@@ -437,7 +447,9 @@ def new_level_models():
 
 @compiled()
 def empty_magnitudes(down, across, side):
-    """Return int32 zeros for the magnitudes of levels of blocks: one block more above and to the left, two frequencies beyond."""
+    """Return int32 zeros for the magnitudes of levels of blocks: one block more above and to the left, two
+    frequencies beyond.
+    """
     return np.zeros((down + 1, across + 1, side + 2, side + 2), np.int32)
 
 
@@ -449,7 +461,9 @@ def coefficient(level, step):
 
 @inlined
 def predict_mean(mean, by, bx):
-    """Return the median prediction of a block's mean from left, above and above left; `mean` has one more row and column before."""
+    """Return the median prediction of a block's mean from left, above and above left; `mean` has one more row and
+    column before.
+    """
     left, above = mean[by + 1, bx], mean[by, bx + 1]
     if by == 0:
         return left
@@ -477,7 +491,9 @@ def end_context(left, above, before):
 
 @inlined
 def level_context(here, left, above, before, i, j, side):
-    """Return the context of a level: magnitudes of higher frequencies, of neighbours and of the channel before; its frequency."""
+    """Return the context of a level: magnitudes of higher frequencies, of neighbours and of the channel before; its
+    frequency.
+    """
     higher = 2 * (here[i, j + 1] + here[i + 1, j]) + here[i + 1, j + 1] + here[i, j + 2] + here[i + 2, j]
     beside = left[i, j] + above[i, j] + left[i, j + 1] + above[i, j + 1] + left[i + 1, j] + above[i + 1, j]
     magnitude = min(log_class(3 * higher + 2 * beside + 3 * before[i, j]), MAGNITUDE_CONTEXTS - 1)
@@ -496,7 +512,9 @@ def code_magnitude(size, models, first, state, position, words, trace):
 
 @compiled()
 def inverse_transform(block, steps, dct_basis, columns):
-    """Turn levels into symbols, clamped to 8 bits, in place: the inverse DCT down the columns first, then along the rows."""
+    """Turn levels into symbols, clamped to 8 bits, in place: the inverse DCT down the columns first, then along the
+    rows.
+    """
     N, highest = len(block), 0
     shift = 10  # 14 bits of cosines, 3 of UNITS_PER_SYMBOL and log2 N, of which 7 are taken before
     while 1 << shift - 10 < N:

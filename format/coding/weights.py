@@ -1,7 +1,8 @@
-"""WEIGHTS, the codec of decoders' weights: integers times a power of two for each array (spec/kpc-format.md, "WEIGHTS").
+"""WEIGHTS, the codec of decoders' weights: integers times a power of two for each array (spec/kpc-format.md,
+"WEIGHTS").
 
-An integer is coded by its magnitude alone, with adaptive models for each array: neighbouring weights say next to nothing of it. What
-this saves is in docs/design/entropy-coding.md.
+An integer is coded by its magnitude alone, with adaptive models for each array: neighbouring weights say next to
+nothing of it. What this saves is in docs/design/entropy-coding.md.
 """
 
 import math

@@ -2,8 +2,8 @@
 
     header (48 bytes) | index (a zstd frame) | chunk 0 | chunk 1 | ...        little-endian, no gaps
 
-A CRC32C covers everything: the header has its own, that of the index is in the header, that of a chunk in its index entry.
-This module does not know what a scene is: a chunk is a kind, a position in the scene, and bytes.
+A CRC32C covers everything: the header has its own, that of the index is in the header, that of a chunk in its index
+entry. This module does not know what a scene is: a chunk is a kind, a position in the scene, and bytes.
 """
 
 import struct
@@ -39,7 +39,8 @@ CHUNK_LIMIT = 1 << 16  # chunks in a file
 class Codec(IntEnum):
     """How the stored bytes of a chunk become its raw ones.
 
-    `raw_length` is the number of symbols under PREDICTIVE and TRANSFORM, else the bytes that the content takes under RAW.
+    `raw_length` is the number of symbols under PREDICTIVE and TRANSFORM, else the bytes that the content takes under
+    RAW.
     """
 
     RAW = 0  # the content itself
@@ -79,8 +80,8 @@ class Entry:
 
     Attributes:
         kind: four letters; the first is a capital if no reader may ignore the chunk.
-        group, scale, plane, row_start, row_count: position of a plane segment in the scene, or of a group in the clip, whose rows
-            are frames (`kpc.format.container.groups`); 0 for other kinds.
+        group, scale, plane, row_start, row_count: position of a plane segment in the scene, or of a group in the
+            clip, whose rows are frames (`kpc.format.container.groups`); 0 for other kinds.
         codec: a `Codec`, or a number that this reader does not know.
         stored_length, offset: size and position in the file, in bytes.
         raw_length: size once decoded, see `Codec`.
@@ -111,7 +112,8 @@ class Chunk:
     Attributes:
         kind, scale, plane, row_start, row_count: as of `Entry`.
         raw: the content under `Codec.RAW`.
-        codec, encode: another codec that the content has, and the function that encodes with it, which may take a while.
+        codec, encode: another codec that the content has, and the function that encodes with it, which may take a
+            while.
         raw_length: the raw length under that codec; None: that of `raw`.
     """
 
@@ -129,7 +131,8 @@ class Chunk:
 def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
     """Return a file of these chunks in their order, each under the codec with which it is smallest.
 
-    Zstandard is tried for plane segments only where their own codec cannot be used: it would double the time and never be smaller.
+    Zstandard is tried for plane segments only where their own codec cannot be used: it would double the time and
+    never be smaller.
 
     Args:
         value_count: numbers in all planes together.
@@ -170,7 +173,9 @@ def _encodings(chunk: Chunk, compress: bool) -> list[tuple[bytes, Codec, int]]:
 
 
 def _zstd_frames(raw: bytes) -> list[bytes]:
-    """Return two zstd frames of the same bytes; in noise, short matches cost more than they save, hence one with long ones only."""
+    """Return two zstd frames of the same bytes; in noise, short matches cost more than they save, hence one with long
+    ones only.
+    """
     long_matches = zstandard.ZstdCompressionParameters.from_level(ZSTD_LEVEL, source_size=len(raw), min_match=7)
     return [
         zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(raw),
@@ -226,7 +231,9 @@ def transposed_entries(entries: Sequence[Entry]) -> bytes:
 
 
 def stored_frame(content: bytes) -> bytes:
-    """Return a zstd frame (RFC 8878) of stored blocks: its size depends on that of the content alone, and no library is needed."""
+    """Return a zstd frame (RFC 8878) of stored blocks: its size depends on that of the content alone, and no library
+    is needed.
+    """
     starts = range(0, len(content), ZSTD_BLOCK) or range(1)
     blocks = [content[start : start + ZSTD_BLOCK] for start in starts]
     heads = [int(number == len(blocks) - 1) | len(block) << 3 for number, block in enumerate(blocks)]
@@ -337,7 +344,9 @@ class Reader:
         return entry.offset + entry.stored_length <= self.source.size
 
     def stored(self, number: int) -> bytes:
-        """Return a chunk as it lies in the file, its CRC32C verified. Threads may call this at the same time; they read in turn."""
+        """Return a chunk as it lies in the file, its CRC32C verified. Threads may call this at the same time; they
+        read in turn.
+        """
         entry = self.index[number]
         with self._reading:
             body = self.source.read_at(entry.offset, entry.stored_length)
@@ -379,7 +388,9 @@ class Reader:
         return raw
 
     def context_coded(self, number: int) -> bytes:
-        """Return a chunk under one of the codecs from PREDICTIVE on as it is stored, if it may stand for as much as it claims."""
+        """Return a chunk under one of the codecs from PREDICTIVE on as it is stored, if it may stand for as much as
+        it claims.
+        """
         entry = self.index[number]
         if entry.raw_length > entry.stored_length * EXPANSION_LIMIT:
             raise FormatError(

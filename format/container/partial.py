@@ -1,11 +1,11 @@
-"""Scenes of which only some segments are there (spec/kpc-format.md, section 10): what is missing, and what it counts as.
+"""Scenes of which only some segments are in memory (spec/kpc-format.md, "Partial and streamed reading").
 
     reader = SceneReader("https://host/scene.kpc", in_parts=True)
     scene = PartialScene(reader)
     scene.fetch(scene.needed(scales=1, start=0.0, end=0.2))       nothing else is read
     kpc.render(scene.scene, scene.scene.cameras[0], time=0.1)
 
-Space planes that are not there have the value 0, rows of time that are not there 1. They take no memory.
+Missing space planes have the value 0, missing rows of time planes the value 1; neither takes memory.
 """
 
 from bisect import bisect_right
@@ -19,15 +19,15 @@ from kpc.format.container.scene_io import SceneReader
 from kpc.format.container.scene_layout import KNOWN_KINDS, PlaneHead
 from kpc.format.scene.scene import ALL_PLANES, TIME_PLANES, Scene
 
-HAIR = 1e-6
-"""Of the clip: which rows a time lies between is worked out in float32."""
+# Tolerance of times, as a share of the clip: renderers compute the rows that a time lies between in float32.
+TIME_TOLERANCE = 1e-6
 
 
 class SegmentedPlane:
-    """A time plane held as symbols, in segments, of which any may be missing.
+    """A time plane held as symbols in segments, any of which may be missing.
 
-    `plane[row]` is (columns, M) float32, and (rows, columns, M) its `shape`, so that it can stand where an array does of which
-    only single rows are looked at (`kpc.format.scene.grid.sample_linear`).
+    `plane[row]` is (columns, M) float32 and `shape` is (rows, columns, M), so that it can replace an array of which
+    single rows are read (`kpc.format.scene.grid.sample_linear`).
     """
 
     ndim = 3
@@ -53,7 +53,7 @@ class SegmentedPlane:
         )
 
     def put(self, start: int, symbols: np.ndarray) -> None:
-        """The segment that begins at row `start`: (row_count, columns, M) int8."""
+        """Put the segment that begins at row `start`: (row_count, columns, M) int8."""
         self._segments[start] = symbols
 
     def drop(self, start: int) -> None:
@@ -66,11 +66,12 @@ class PartialScene:
     Opening it reads the chunks without which there is no picture, and the cameras and appearances.
 
     Attributes:
-        scene: to be rendered like any other. Its planes change as segments come and go; time planes are `SegmentedPlane`.
-        numbers: (N,) of the PLNE chunks in the index; the other arrays are in the same order, that of the file.
-        scales: (N,) their scale; moves: (N,) bool, whether they are of a time plane.
-        since, until: (N,) the times between which they are needed, [0, 1] over the clip.
-        sizes: (N,) bytes of their symbols once decoded.
+        scene: rendered like any other. Its planes change as segments come and go; time planes are `SegmentedPlane`.
+        numbers: (N,) numbers of the PLNE chunks in the index; the other arrays are in the same order, that of the file.
+        scales: (N,) their scale.
+        moves: (N,) bool, whether they are of a time plane.
+        since, until: (N,) the times between which they are needed, in [0, 1] over the clip.
+        sizes: (N,) bytes of their decoded symbols.
     """
 
     def __init__(self, reader: SceneReader) -> None:
@@ -83,8 +84,8 @@ class PartialScene:
         rows = np.array([head.scales[entry.scale][ALL_PLANES[entry.plane]].rows for _, entry in chosen])
         first, count = (np.array([getattr(entry, name) for _, entry in chosen]) for name in ("row_start", "row_count"))
         last = np.maximum(rows - 1, 1)
-        self.since = np.where(self.moves, (first - 1) / last, -1.0) - HAIR
-        self.until = np.where(self.moves, (first + count) / last, 2.0) + HAIR
+        self.since = np.where(self.moves, (first - 1) / last, -1.0) - TIME_TOLERANCE
+        self.until = np.where(self.moves, (first + count) / last, 2.0) + TIME_TOLERANCE
         self.sizes = count * np.array([plane.columns * plane.channels for plane in map(self.head_of, self.numbers)])
         first_picture = {
             number for number, entry in enumerate(reader.index) if entry.kind in KNOWN_KINDS and entry.kind != "PLNE"
@@ -96,30 +97,45 @@ class PartialScene:
         for _, entry in chosen:
             starts.setdefault((entry.scale, ALL_PLANES[entry.plane]), []).append(entry.row_start)
         for s, scale in enumerate(head.scales):
-            self._planes.append({name: cast(np.ndarray, SegmentedPlane(plane, starts[s, name])) if name in TIME_PLANES
-                                 else _unseen(plane) for name, plane in scale.items()})  # fmt: skip
-        self.scene = Scene(head.aabb, head.clip, tuple(self._planes), reader.decoder(), reader.occupancy(), head.background,
-                           head.step, reader.cameras(), reader.mapping(), None if motion is None else motion.dequantise(),
-                           reader.appearances())  # fmt: skip
+            planes = {}
+            for name, plane in scale.items():
+                is_time = name in TIME_PLANES
+                planes[name] = (
+                    cast(np.ndarray, SegmentedPlane(plane, starts[s, name])) if is_time else _missing_plane(plane)
+                )
+            self._planes.append(planes)
+        self.scene = Scene(
+            head.aabb,
+            head.clip,
+            tuple(self._planes),
+            reader.decoder(),
+            reader.occupancy(),
+            head.background,
+            head.step,
+            reader.cameras(),
+            reader.mapping(),
+            None if motion is None else motion.dequantise(),
+            reader.appearances(),
+        )
 
     def entry(self, number: int) -> Entry:
         return self.reader.index[number]
 
     def head_of(self, number: int) -> PlaneHead:
-        """The plane that chunk `number` is of."""
+        """Return the head of the plane that chunk `number` is a segment of."""
         entry = self.entry(number)
         return self.reader.head.scales[entry.scale][ALL_PLANES[entry.plane]]
 
     def is_needed(self, start: float, end: float) -> np.ndarray:
-        """(N,) bool: which segments a time in [start, end] needs; those of space planes always."""
+        """Return (N,) bool: the segments that times in [start, end] need; those of space planes always."""
         return np.asarray((self.since < end) & (start < self.until))
 
     def needed(self, scales: int, start: float, end: float) -> list[int]:
-        """The chunks that the first `scales` scales need from `start` to `end`, [0, 1] over the clip; in the order of the file."""
+        """Return the chunks that the first `scales` scales need from time `start` to `end`, in file order."""
         return [int(number) for number in self.numbers[self.is_needed(start, end) & (self.scales < scales)]]
 
     def fetch(self, numbers: Iterable[int]) -> None:
-        """Read chunks and put them into the scene; those that lie side by side in one go."""
+        """Read chunks and put them into the scene; adjacent ones with one request."""
         for run in adjacent_runs(self.reader.index, numbers):
             announce(self.reader, run)
             for number in run:
@@ -141,14 +157,14 @@ class PartialScene:
         if name in TIME_PLANES:
             self._segmented(entry).drop(entry.row_start)
         else:
-            self._planes[entry.scale][name] = _unseen(self.head_of(number))
+            self._planes[entry.scale][name] = _missing_plane(self.head_of(number))
 
     def _segmented(self, entry: Entry) -> SegmentedPlane:
         return cast(SegmentedPlane, self._planes[entry.scale][ALL_PLANES[entry.plane]])
 
 
 def adjacent_runs(index: Sequence[Entry], numbers: Iterable[int], most_bytes: float = float("inf")) -> list[list[int]]:
-    """Chunks, in the order given, in groups that lie side by side in the file; a group of several is at most `most_bytes`."""
+    """Split chunks, in the order given, into runs that are adjacent in the file and at most `most_bytes` long."""
     found: list[list[int]] = []
     end = size = 0
     for number in numbers:
@@ -163,10 +179,10 @@ def adjacent_runs(index: Sequence[Entry], numbers: Iterable[int], most_bytes: fl
 
 
 def announce(reader: Reader, run: Sequence[int]) -> None:
-    """Tell the source that chunks will be read that lie side by side, in their order."""
+    """Announce to the source that a run of adjacent chunks will be read in order."""
     start, last = reader.index[run[0]].offset, reader.index[run[-1]]
     reader.source.will_read(start, last.offset + last.stored_length - start)
 
 
-def _unseen(plane: PlaneHead) -> np.ndarray:
+def _missing_plane(plane: PlaneHead) -> np.ndarray:
     return np.broadcast_to(np.float32(0), (plane.rows, plane.columns, plane.channels))

@@ -1,11 +1,12 @@
-"""The content of each kind of chunk, as bytes and as objects (spec/kpc-format.md, "Scene chunks" and the sections after it).
+"""The content of each kind of chunk, as bytes and as objects (spec/kpc-format.md, "Scene chunks" and the sections
+after it).
 
     SCNE  box, clip, sizes, quantisation steps and offsets of every plane     WARP  mapping of space beyond the box
     MOVE  motion grid            DECO, HYBR  weights of a decoder             OCCU  occupancy grid
     came  cameras                appe        appearances
 
-`pack_...` makes the content, `parse_...` reads and checks it. Every parser raises a FormatError if the content is too short, too long or
-breaks a rule of the format.
+`pack_...` makes the content, `parse_...` reads and checks it. Every parser raises a FormatError if the content is too
+short, too long or breaks a rule of the format.
 """
 
 import math
@@ -79,7 +80,9 @@ class PlaneHead:
 
 @dataclass(frozen=True)
 class SceneHead:
-    """The SCNE chunk: everything but the planes' symbols, the decoder, the occupancy, the cameras and the appearances."""
+    """The SCNE chunk: everything but the planes' symbols, the decoder, the occupancy, the cameras and the
+    appearances.
+    """
 
     aabb: np.ndarray  # (2, 3) float32
     clip: Clip

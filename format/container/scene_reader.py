@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TypeVar
 
 import numpy as np
@@ -74,8 +74,8 @@ def read(
 
     Args:
         memory_budget: bytes that the scene may take, its float32 planes included.
-        allow_partial: accept a file whose end is missing, as long as the chunks before the planes are there. Space planes that are
-            not there have the value 0, rows of time planes 1.
+        allow_partial: accept a file whose end is missing, as long as the chunks before the planes are there. Space
+            planes that are not there have the value 0, rows of time planes 1.
 
     Raises:
         FormatError: the file is damaged, hostile or of an unknown version.
@@ -252,12 +252,12 @@ class SceneReader(Reader):
         else:
             head, parse, shapes = DECODER_STRUCT, parse_decoder, Decoder.shapes(features, HIDDEN_LIMIT)
         if entry.codec == Codec.WEIGHTS:
-            weights: WeightsParser = lambda cursor, of: parse_coded_weights(cursor, of, entry.raw_length - head.size)
-            body = self.context_coded(number)
-            return self._parsed(lambda body: parse(Cursor(body, entry.kind), features, weights), body)
-        most = head.size + 2 * sum(map(math.prod, shapes.values()))
-        raw = self.chunk(number, most)
-        return self._parsed(lambda raw: parse(Cursor(raw, entry.kind), features, parse_half_weights), raw)
+            weights: WeightsParser = partial(parse_coded_weights, raw_length=entry.raw_length - head.size)
+            content = self.context_coded(number)
+        else:
+            weights = parse_half_weights
+            content = self.chunk(number, head.size + 2 * sum(map(math.prod, shapes.values())))
+        return self._parsed(lambda content: parse(Cursor(content, entry.kind), features, weights), content)
 
     def occupancy(self) -> np.ndarray:
         """Return the OCCU chunk: (slots, Nz, Ny, Nx) bool."""
@@ -317,7 +317,7 @@ class SceneReader(Reader):
         return self._only("HYBR" if "HYBR" in kinds else "DECO")
 
     def _afford(self, more_bytes: int, what: str) -> None:
-        """Count memory for something beside the planes against the budget, together with all that was counted before."""
+        """Count memory beside the planes against the budget, together with all that was counted before."""
         self._other_bytes[what] = more_bytes
         needed = self.planes_bytes + sum(self._other_bytes.values())
         if needed > self.memory_budget:
@@ -344,7 +344,9 @@ class SceneReader(Reader):
                 )
 
     def _check_segments(self) -> None:
-        """Check that every plane is listed whole: its segments, in order of their rows, neither overlap nor leave a gap."""
+        """Check that every plane is listed whole: its segments, in order of their rows, neither overlap nor leave a
+        gap.
+        """
         names = ALL_PLANES if self.head.is_dynamic else SPACE_PLANES
         found: dict[tuple[int, int], list[Entry]] = {
             (scale, plane): [] for scale in range(len(self.head.scales)) for plane in range(len(names))

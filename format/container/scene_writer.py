@@ -1,6 +1,7 @@
 """Writing a scene to a file: its chunks, in the order in which a player wants them.
 
-The coarsest picture of the first seconds comes first, then finer scales, then later seconds (spec/kpc-format.md, "Order").
+The coarsest picture of the first seconds comes first, then finer scales, then later seconds (spec/kpc-format.md,
+"Order").
 """
 
 import os
@@ -44,8 +45,8 @@ def write(scene: QuantisedScene, path: str | os.PathLike[str], *, segment_rows: 
     """Write a scene; return the size in bytes. On failure the file at `path` is unchanged.
 
     Args:
-        segment_rows: rows of a time plane in one segment, the unit in which a player fetches time; None: `rows_per_segment`. Planes
-            whose symbols were chosen for other segments keep those.
+        segment_rows: rows of a time plane in one segment, the unit in which a player fetches time; None:
+            `rows_per_segment`. Planes whose symbols were chosen for other segments keep those.
 
     Raises:
         FormatError: the scene breaks a rule that every reader checks; the message says which.
@@ -85,7 +86,7 @@ def scene_chunks(scene: QuantisedScene, *, segment_rows: int | None = None) -> l
 
 
 def _chunks_before_planes(scene: QuantisedScene) -> list[Chunk]:
-    """Return the chunks without which there is no picture; what they hold is checked by the parsers that readers use."""
+    """Return the chunks before the planes, their content checked by the parsers that readers use."""
     head = pack_head(scene)
     parsed = parse_head(head)
     _check_planes(scene, parsed)

@@ -1,4 +1,6 @@
-"""Plane segments under the context codecs PREDICTIVE and TRANSFORM: which codec a segment takes, and with what side information."""
+"""Plane segments under the context codecs PREDICTIVE and TRANSFORM: which codec a segment takes, and with what side
+information.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,8 +12,8 @@ from kpc.format.coding.transform import decode_blocks
 from kpc.format.common.errors import FormatError
 from kpc.format.container.container import Codec
 
-# Rows of a segment of a time plane, at least, unless the plane has fewer. Each segment starts without neighbours and with new models:
-# files of 16-row segments are 2 % (room) and 3 % (soldier) larger (docs/design/entropy-coding.md).
+# Rows of a segment of a time plane, at least, unless the plane has fewer. Each segment starts without neighbours and
+# with new models: files of 16-row segments are 2 % (room) and 3 % (soldier) larger (docs/design/entropy-coding.md).
 SEGMENT_ROWS = 32
 # Segments have a multiple of this many rows, the largest side of blocks, since blocks do not go beyond a segment.
 ROW_MULTIPLE = 16
@@ -71,7 +73,8 @@ def encode_segment(
 def choose_codec(
     symbols: np.ndarray, coded: np.ndarray, side_info: SegmentSideInfo | None, implied: np.ndarray | None
 ) -> tuple[Codec, Callable[[], bytes]]:
-    """Return the codec of a segment and a function that encodes it: TRANSFORM if its side information is of these symbols.
+    """Return the codec of a segment and a function that encodes it: TRANSFORM if its side information is of these
+    symbols.
 
     Args:
         symbols: (H, W, M) int8, 0 where not coded.

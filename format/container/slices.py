@@ -6,7 +6,7 @@ from kpc.format.container.sources import RemoteSource, Source
 
 
 def sliced(source: Source, offset: int, length: int, name: str) -> Source:
-    """`length` bytes of a source from `offset` on, fewer where it ends sooner; on a network if that is."""
+    """Return `length` bytes of a source from `offset` on as a source, remote if that is; fewer where it ends sooner."""
     return (
         RemoteSlice(source, offset, length, name)
         if isinstance(source, RemoteSource)
@@ -15,7 +15,7 @@ def sliced(source: Source, offset: int, length: int, name: str) -> Source:
 
 
 class Slice:
-    """See `sliced`."""
+    """A part of a local source, see `sliced`."""
 
     def __init__(self, source: Source, offset: int, length: int, name: str) -> None:
         self.name, self.size = name, max(min(length, source.size - offset), 0)
@@ -29,7 +29,7 @@ class Slice:
 
 
 class RemoteSlice(Slice):
-    """The same of a source behind a network, which it has to itself: what is done to the one is done to the other."""
+    """A part of a remote source that it has to itself: interrupting, discarding and closing go on to that source."""
 
     def __init__(self, source: RemoteSource, offset: int, length: int, name: str) -> None:
         super().__init__(source, offset, length, name)
@@ -56,8 +56,8 @@ class RemoteSlice(Slice):
         return self._remote.report
 
     @report.setter
-    def report(self, told: Callable[[str | None], None]) -> None:
-        self._remote.report = told
+    def report(self, function: Callable[[str | None], None]) -> None:
+        self._remote.report = function
 
     def interrupt(self) -> None:
         self._remote.interrupt()

@@ -25,7 +25,9 @@ class Source(Protocol):
         """Return `length` bytes from `offset` on; fewer only at the end."""
 
     def will_read(self, offset: int, length: int) -> None:
-        """Announce that the next reads lie within these bytes, in order, so that a remote source may fetch them with one request."""
+        """Announce that the next reads lie within these bytes, in order, so that a remote source may fetch them with
+        one request.
+        """
 
 
 @runtime_checkable
@@ -47,7 +49,9 @@ class RemoteSource(Source, Protocol):
         """Return a second source of the same file, for another thread."""
 
     def interrupt(self) -> None:
-        """Make a read in another thread fail with InterruptedRead, since other bytes are wanted sooner. What has arrived is kept."""
+        """Make a read in another thread fail with InterruptedRead, since other bytes are wanted sooner. What has
+        arrived is kept.
+        """
 
     def discard(self) -> None:
         """Drop what is cached: the next read fetches anew, since what came was damaged."""

@@ -160,7 +160,7 @@ def test_a_partial_file_gives_what_is_there():
     reader = Reader(data[:cut], allow_partial=True)
     assert [reader.available(n) for n in range(4)] == [True, True, True, False]  # the third is empty
     assert reader.chunk(0) == b"head"
-    with pytest.raises(FormatError, match="chunk 3 .long. is not there"):
+    with pytest.raises(FormatError, match=r"chunk 3 .long. is not there"):
         reader.chunk(3)
 
 

@@ -1,4 +1,4 @@
-"""Occupancy under codec 2 (spec, section 8): the same comes back, real grids shrink, and damage is refused."""
+"""OCCUPANCY: the same comes back, real grids shrink, and damage is refused."""
 
 import time
 

@@ -90,9 +90,11 @@ def test_planes_can_be_larger_than_the_budget_but_other_chunks_cannot() -> None:
 def test_a_scale_and_a_span_over_http_cost_their_bytes_and_two_requests(tmp_path: Path) -> None:
     scene = tiny_scene(4, time=64, resolution=(96, 80, 64), channels=16)
     rng = np.random.default_rng(0)
-    noisy = replace(scene, scales=tuple(
-        {name: plane + rng.normal(0, 0.1, plane.shape).astype(np.float32) for name, plane in scale.items()} for scale in scene.scales
-    ))  # fmt: skip
+    scales = [
+        {name: plane + rng.normal(0, 0.1, plane.shape).astype(np.float32) for name, plane in scale.items()}
+        for scale in scene.scales
+    ]
+    noisy = replace(scene, scales=tuple(scales))
     (tmp_path / "scene.kpc").write_bytes(coded(noisy, 8))
     with serving(tmp_path) as url:
         reader = SceneReader(f"{url}/scene.kpc", in_parts=True)
@@ -101,7 +103,8 @@ def test_a_scale_and_a_span_over_http_cost_their_bytes_and_two_requests(tmp_path
         index = reader.index
         coarse = index[partial.needed(1, 0.0, 0.05)[-1]]
         assert reader.source.size > 400_000
-        assert reader.source.received_bytes <= max(coarse.offset + coarse.stored_length, 1 << 16)  # type: ignore[attr-defined]
+        # Type: ignore[attr-defined]
+        assert reader.source.received_bytes <= max(coarse.offset + coarse.stored_length, 1 << 16)
         reader.source.close()  # type: ignore[attr-defined]
 
 

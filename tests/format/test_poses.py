@@ -37,7 +37,7 @@ def captures(draw):
     rng = np.random.default_rng(draw(st.integers(0, 1000)))
     turns = [draw(st.tuples(part, part, part, part).filter(lambda q: np.linalg.norm(q) > 0.1)) for _ in range(count)]
     lenses = [80.0] * count if draw(st.booleans()) else [80.0 + k for k in range(count)]
-    return [camera(turn, away + span * rng.standard_normal(3), lens) for turn, lens in zip(turns, lenses)]
+    return [camera(turn, away + span * rng.standard_normal(3), lens) for turn, lens in zip(turns, lenses, strict=True)]
 
 
 @given(captures())

@@ -1,3 +1,5 @@
+"""PREDICTIVE: the same comes back for every quantiser, smooth planes shrink, and damage is refused."""
+
 import time
 from types import FunctionType
 
@@ -82,9 +84,9 @@ def test_symbols_on_the_trellis_come_back(paint, shape, seed, share):
 def test_the_trellis_saves_a_bit_a_symbol():
     rng = np.random.default_rng(0)
     symbols, coded = rng.integers(-40, 40, (60, 60, 4)).astype(np.int8), np.ones((60, 60), bool)
-    steered = on_trellis(symbols, coded)
+    moved = on_trellis(symbols, coded)
     assert not follows_trellis(symbols, coded)
-    assert len(encode_symbols(steered, coded)) < len(encode_symbols(symbols, coded)) - 0.95 * symbols.size / 8
+    assert len(encode_symbols(moved, coded)) < len(encode_symbols(symbols, coded)) - 0.95 * symbols.size / 8
 
 
 @given(
@@ -95,7 +97,7 @@ def test_the_trellis_saves_a_bit_a_symbol():
     count=st.sampled_from(SET_COUNTS),
 )
 @settings(deadline=None)
-def test_symbols_around_predictions_come_back(paint, shape, seed, share, count):
+def test_dependent_symbols_come_back(paint, shape, seed, share, count):
     symbols, coded = plane_pattern(paint, shape, seed, share)
     side_info = PredictionWeights(
         np.random.default_rng(seed).integers(-128, 128, (count, WEIGHT_COUNT)).astype(np.int8)
@@ -107,9 +109,8 @@ def test_symbols_around_predictions_come_back(paint, shape, seed, share, count):
 
 
 @pytest.mark.parametrize("flat", [0, ACTIVITIES])
-def test_around_predictions_errors_of_odd_places_are_odd_or_none(monkeypatch, flat):
-    """By the definition, told here once more: of segments whose weights are 0, so that what is foreseen is the mean of left and above; were
-    all flat, or nothing."""
+def test_dependent_offsets_in_odd_states_are_odd_or_zero(monkeypatch, flat):
+    """Check the definition with weights of 0, where the prediction is the mean of left and above."""
     monkeypatch.setattr(module, "FLAT_ACTIVITY", flat)
     kernel = FunctionType(module.code_symbols.py_func.__code__, vars(module), "code_symbols")
     monkeypatch.setattr(module, "code_symbols", njit(kernel))
@@ -133,7 +134,7 @@ def test_around_predictions_errors_of_odd_places_are_odd_or_none(monkeypatch, fl
     assert odd_ones > 100 or not flat
 
 
-def test_what_leaves_its_guide_is_told_without():
+def test_symbols_that_do_not_follow_their_side_information_are_encoded_without():
     symbols, coded = textured(40, 50, 3)
     symbols //= 16
     side_info = PredictionWeights(fit_weights(collect_neighbours(symbols, coded), 1))
@@ -145,11 +146,11 @@ def test_what_leaves_its_guide_is_told_without():
 
 def test_one_symbol_off_the_trellis_is_enough_to_leave_it():
     symbols, coded = textured(9, 11, 3)
-    steered = on_trellis(symbols, coded)
+    moved = on_trellis(symbols, coded)
     y, x = np.argwhere(coded)[20]
-    steered[y, x, 1] ^= 1
-    assert not follows_trellis(steered, coded)
-    assert_decodes(encode_symbols(steered, coded), steered, coded)
+    moved[y, x, 1] ^= 1
+    assert not follows_trellis(moved, coded)
+    assert_decodes(encode_symbols(moved, coded), moved, coded)
 
 
 def test_smooth_planes_take_far_less_than_with_zstd():
@@ -174,7 +175,7 @@ def test_noise_takes_hardly_more_than_it_holds():
     assert len(encode_symbols(symbols, coded)) < 1.15 * symbols.size
 
 
-def test_what_is_not_coded_costs_its_map_and_a_map_without_surprises_little():
+def test_uncoded_texels_cost_their_map_and_a_simple_map_costs_little():
     still, nowhere = np.zeros((100, 200, 8), np.int8), np.zeros((100, 200), bool)
     assert len(encode_symbols(still, nowhere)) < 40
     assert len(encode_symbols(still, ~nowhere)) < 120
@@ -187,13 +188,16 @@ PLAIN = """
 import hashlib
 import numpy as np
 from codec_inputs import followed, on_trellis, plane_pattern, textured
-from kpc.format.coding.predictive import DEPENDENT, SCALAR, TRELLIS, PredictionWeights, decode_symbols, encode_with_weights
+from kpc.format.coding.predictive import DEPENDENT, SCALAR, TRELLIS, PredictionWeights
+from kpc.format.coding.predictive import decode_symbols, encode_with_weights
 
 smooth, coded = textured(14, 12, 3)
 weights = np.random.default_rng(3).integers(-128, 128, (4, 9)).astype(np.int8)
 for symbols, coded, lattice in (
-        (smooth, coded, SCALAR), (on_trellis(smooth, coded), coded, TRELLIS), (*plane_pattern("noise", (7, 9, 3), 1, 0.7), SCALAR),
-        (*plane_pattern("extremes", (9, 5, 2), 2, 1.0), SCALAR), (followed(smooth, coded, PredictionWeights(weights)), coded, DEPENDENT),
+        (smooth, coded, SCALAR), (on_trellis(smooth, coded), coded, TRELLIS),
+        (*plane_pattern("noise", (7, 9, 3), 1, 0.7), SCALAR),
+        (*plane_pattern("extremes", (9, 5, 2), 2, 1.0), SCALAR),
+        (followed(smooth, coded, PredictionWeights(weights)), coded, DEPENDENT),
         (followed(smooth // 30, coded, PredictionWeights(weights // 8)), coded, DEPENDENT)):
     body = encode_with_weights(weights // 8 if symbols.max() < 8 else weights, symbols, coded, lattice)
     assert np.array_equal(decode_symbols(body, *symbols.shape)[0], symbols)

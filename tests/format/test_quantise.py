@@ -87,7 +87,7 @@ def test_two_roundings_in_the_stated_order():
 def test_a_value_that_is_no_number_is_refused_by_name(bad):
     scene = tiny_scene()
     scene.scales[1]["xt"][2, 3, 4] = bad
-    steps = [{name: 0.02 for name in scale} for scale in scene.scales]
+    steps = [dict.fromkeys(scale, 0.02) for scale in scene.scales]
     with pytest.raises(FormatError, match="scale 1, plane xt: holds NaN, infinity"):
         quantise_scene(scene, steps, skip_unseen=False)
 
@@ -125,7 +125,7 @@ def test_a_plane_nobody_sees_costs_nothing():
 @pytest.mark.parametrize("dynamic", [True, False])
 def test_scene_keeps_what_is_not_a_plane_and_counts_the_same_parameters(dynamic):
     scene = tiny_scene(dynamic=dynamic)
-    quantised = quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
+    quantised = quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales])
     decoded = quantised.dequantise()
     assert decoded.parameter_count == quantised.parameter_count == scene.parameter_count
     assert decoded.is_dynamic == quantised.is_dynamic == dynamic

@@ -13,7 +13,7 @@ from kpc.format.coding.rans import (
 from kpc.format.common.jit import compiled
 
 
-def told(bits: list[int], probabilities: list[int]) -> np.ndarray:
+def encode_bits(bits: list[int], probabilities: list[int]) -> np.ndarray:
     trace = np.empty(len(bits), np.int16)
     for at, (bit, probability) in enumerate(zip(bits, probabilities, strict=True)):
         assert code_bit(bit, probability, 0, at, None, trace) == (bit, 0, at + 1)
@@ -25,7 +25,7 @@ def test_decisions_come_back_and_end_where_they_began(seed):
     rng = np.random.default_rng(seed)
     probabilities = rng.choice([1, 7, SCALE // 2, SCALE - 7, SCALE - 1], 3000).tolist()
     bits = (rng.random(3000) * SCALE < probabilities).astype(int).tolist()
-    words = told(bits, probabilities)
+    words = encode_bits(bits, probabilities)
     state, at, rest = int(words[0]) | int(words[1]) << 16, 0, words[2:]
     for bit, probability in zip(bits, probabilities, strict=True):
         found, state, at = code_bit(0, probability, state, at, rest, None)

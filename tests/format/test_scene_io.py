@@ -26,7 +26,7 @@ import kpc
 
 def quantised(step: float = 0.02, **options) -> QuantisedScene:
     scene = tiny_scene(**options)
-    return quantise_scene(scene, [{name: step for name in scale} for scale in scene.scales])
+    return quantise_scene(scene, [dict.fromkeys(scale, step) for scale in scene.scales])
 
 
 def assert_same(a: QuantisedScene, b: QuantisedScene) -> None:
@@ -88,7 +88,7 @@ def test_a_contracted_scene_comes_back_and_says_so_in_a_chunk_of_its_own():
 
 def test_device_coordinates_come_back():
     scene = in_device_coordinates(tiny_scene())
-    coded = quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
+    coded = quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales])
     back = read(encode(coded)).mapping
     assert isinstance(back, DeviceCoordinates) and np.array_equal(back.frame, scene.mapping.frame)
     assert (back.near, back.baseline) == (scene.mapping.near, scene.mapping.baseline)
@@ -111,7 +111,7 @@ def test_device_coordinates_that_make_no_sense_are_not_written(change):
     scene = in_device_coordinates(tiny_scene())
     broken = replace(scene, mapping=replace(scene.mapping, **change))
     with pytest.raises(FormatError, match="WARP"):
-        encode(quantise_scene(broken, [{name: 0.02 for name in scale} for scale in scene.scales]))
+        encode(quantise_scene(broken, [dict.fromkeys(scale, 0.02) for scale in scene.scales]))
 
 
 def test_a_prefix_without_the_mapping_shows_nothing():
@@ -119,18 +119,18 @@ def test_a_prefix_without_the_mapping_shows_nothing():
     index = Reader(data).index
     assert read(data[: index[4].offset], allow_partial=True).mapping == Contraction(2.0)
     # A writer may put it last; then what came before it is of no use.
-    from kpc.format.container.scene_io import WARP_STRUCT, scene_chunks
+    from kpc.format.container.scene_layout import WARP_STRUCT
 
     chunks = [*scene_chunks(quantised()), Chunk("WARP", WARP_STRUCT.pack(1, 2.0))]
     late = pack(chunks, Reader(data).header.value_count)
     assert read(late).mapping == Contraction(2.0)
-    with pytest.raises(FormatError, match="WARP.*is not there"):
+    with pytest.raises(FormatError, match=r"WARP.*is not there"):
         read(late[:-1], allow_partial=True)
 
 
 def test_a_motion_grid_comes_back_and_says_so_in_a_chunk_of_its_own():
     scene = with_motion(tiny_scene(), most=3.0)
-    coded = quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
+    coded = quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales])
     data = encode(coded)
     assert_same(read(data), coded)
     assert [e.kind for e in Reader(data).index][:3] == ["SCNE", "MOVE", "DECO"]
@@ -150,7 +150,7 @@ def test_a_motion_grid_counts_against_the_budget():
 
 def quantised_varied(names: tuple[str, ...] = ("dawn.jpg", "noon.jpg", "dusk.jpg")) -> QuantisedScene:
     scene = with_appearances(tiny_scene(), names)
-    return quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
+    return quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales])
 
 
 def test_appearances_come_back_and_say_so_in_a_chunk_of_their_own():
@@ -187,7 +187,7 @@ def test_rows_in_time_may_differ_from_scale_to_scale():
     assert_same(read(encode(scene, segment_rows=4)), scene)
 
 
-def test_maps_that_follow_from_occupancy_take_no_bytes():
+def test_maps_that_the_occupancy_implies_take_no_bytes():
     scene = quantised(resolution=(30, 28, 26), time=6)
     occupancy = np.zeros((1, 9, 10, 11), bool)
     occupancy[0, 2:5, 3, 4:9] = occupancy[0, 4, 2:8, 5] = True
@@ -198,12 +198,12 @@ def test_maps_that_follow_from_occupancy_take_no_bytes():
     codecs = {entry.plane: entry.codec for entry in Reader(data).index if entry.kind == "PLNE"}
     assert [codecs[plane] for plane in range(3)] == 3 * [Codec.PREDICTIVE]
 
-    # Where planes hold more than that, or less, a map is told.
+    # Where planes hold more than that, or less, a map is coded.
     other = replace(scene, occupancy=np.roll(occupancy, 1, axis=(1, 2, 3)))
-    told = encode(other)
-    assert_same(read(told), other)
-    assert {entry.codec for entry in Reader(told).index if entry.kind == "PLNE"} == {Codec.PREDICTIVE}
-    assert len(told) > len(data) + 20
+    mapped = encode(other)
+    assert_same(read(mapped), other)
+    assert {entry.codec for entry in Reader(mapped).index if entry.kind == "PLNE"} == {Codec.PREDICTIVE}
+    assert len(mapped) > len(data) + 20
 
     # A plane cannot be read by another occupancy than its own.
     occu = next(number for number, entry in enumerate(Reader(data).index) if entry.kind == "OCCU")
@@ -333,14 +333,14 @@ def test_identity_and_unseen_regions_cost_no_bits():
     for scale in still.scales:
         for name in TIME_PLANES:
             scale[name][:] = 1
-    scene = quantise_scene(still, [{name: 0.02 for name in scale} for scale in still.scales])
+    scene = quantise_scene(still, [dict.fromkeys(scale, 0.02) for scale in still.scales])
     assert scene.identity_share == 1.0
     reader = SceneReader(encode(scene, segment_rows=64))
     time = [e for e in reader.index if e.kind == "PLNE" and e.plane >= 3]
     assert sum(e.raw_length for e in time) > 600 and sum(e.stored_length for e in time) <= 6 * 24
 
     empty = replace(tiny_scene(), occupancy=np.zeros((1, 8, 8, 8), bool))
-    scene = quantise_scene(empty, [{name: 0.02 for name in scale} for scale in empty.scales])
+    scene = quantise_scene(empty, [dict.fromkeys(scale, 0.02) for scale in empty.scales])
     reader = SceneReader(encode(scene))
     assert sum(e.stored_length for e in reader.index if e.kind == "PLNE") <= 12 * 24
     assert_same(read(encode(scene)), scene)
@@ -351,7 +351,7 @@ def test_identity_and_unseen_regions_cost_no_bits():
 
 @pytest.fixture(scope="module")
 def small() -> bytes:
-    return files.encode_kinds(quantised(scales=1, channels=2, resolution=(5, 4, 3), time=3), "PLNE", "OCCU", "DECO")
+    return files.encode_kinds(quantised(scales=1, channels=2, resolution=(5, 4, 3), time=3), "PLNE", "OCCU")
 
 
 def test_every_truncation_is_refused_or_plays_when_partial_files_are_welcome(small):
@@ -387,7 +387,7 @@ def test_damage_behind_right_checksums_decodes_or_is_refused(small, seed):
 def test_the_memory_budget_is_checked_before_memory_is_taken():
     wide = tiny_scene(scales=1, channels=2, resolution=(1200, 1200, 2), dynamic=False)
     flat = {name: np.ones_like(plane) for name, plane in wide.scales[0].items()}
-    scene = quantise_scene(replace(wide, scales=(flat,)), [{name: 0.5 for name in flat}])
+    scene = quantise_scene(replace(wide, scales=(flat,)), [dict.fromkeys(flat, 0.5)])
     data = encode(scene)
     values = sum(plane.symbols.size for plane in scene.scales[0].values())
     assert len(data) < 20_000 and 5 * values > 14_000_000
@@ -507,7 +507,7 @@ def test_decoding_is_fast():
     rng = np.random.default_rng(0)
     base = tiny_scene(scales=1, channels=16, resolution=(256, 192, 128))
     noisy = {n: (p + rng.normal(0, 0.02, p.shape)).astype(np.float32) for n, p in base.scales[0].items()}
-    data = encode(quantise_scene(replace(base, scales=(noisy,)), [{name: 0.02 for name in noisy}]))
+    data = encode(quantise_scene(replace(base, scales=(noisy,)), [dict.fromkeys(noisy, 0.02)]))
     start = time.perf_counter()
     kpc.load(data)
     assert time.perf_counter() - start < 1.0

@@ -1,4 +1,4 @@
-"""Blocks of cosines, in integers: near to what cosines are, told and read back, and refused when damaged."""
+"""TRANSFORM in integers: near to exact cosines, the same comes back, and damage is refused."""
 
 import importlib
 from pathlib import Path
@@ -44,20 +44,20 @@ def twin() -> ModuleType:
     return module
 
 
-def float_symbols(told: TransformBlocks, coded: np.ndarray) -> np.ndarray:
+def float_symbols(blocks: TransformBlocks, coded: np.ndarray) -> np.ndarray:
     """What exact cosines make of levels, before they are rounded."""
-    side, k = told.levels.shape[-1], np.arange(told.levels.shape[-1])
+    side, k = blocks.levels.shape[-1], np.arange(blocks.levels.shape[-1])
     basis = np.cos(np.pi * np.outer(k, 2 * k + 1) / (2 * side)) * np.sqrt(2 / side)
     basis[0] /= np.sqrt(2)
-    factors = told.levels * step_table(side, told.quantiser)[told.step_offsets] / UNITS_PER_SYMBOL
+    factors = blocks.levels * step_table(side, blocks.quantiser)[blocks.step_offsets] / UNITS_PER_SYMBOL
     texels = basis.T @ factors @ basis
-    down, across = told.step_offsets.shape
+    down, across = blocks.step_offsets.shape
     whole = texels.transpose(1, 3, 2, 4, 0).reshape(down * side, across * side, -1)
     return np.where(coded[..., None], whole[: coded.shape[0], : coded.shape[1]], 0)
 
 
 @pytest.mark.parametrize("side", SIDES)
-def test_cosines_are_nearly_orthogonal(side: int) -> None:
+def test_the_basis_is_nearly_orthogonal(side: int) -> None:
     rows = dct_basis(side) / (128 * np.sqrt(side))
     np.testing.assert_allclose(rows @ rows.T, np.eye(side), atol=0.01)
     assert (np.diff(frequency_weights(side)) >= 0).all() and frequency_weights(side)[0] == 52  # 64 / sqrt(1.5)
@@ -65,19 +65,18 @@ def test_cosines_are_nearly_orthogonal(side: int) -> None:
 
 @pytest.mark.parametrize(("side", "rows", "columns"), SIZES)
 @pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
-def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(
-    side: int, rows: int, columns: int, share: float
-) -> None:
+def test_blocks_come_back_and_are_near_to_exact_cosines(side: int, rows: int, columns: int, share: float) -> None:
     for seed in range(4):
-        told, coded = random_blocks(side, rows, columns, share, seed)
-        symbols, where = decode_blocks(encode_blocks(told, coded), rows, columns, 3)
+        blocks, coded = random_blocks(side, rows, columns, share, seed)
+        symbols, where = decode_blocks(encode_blocks(blocks, coded), rows, columns, 3)
         np.testing.assert_array_equal(where, coded)
-        body = encode_blocks(told, coded)
+        body = encode_blocks(blocks, coded)
         assert encode_blocks(decode_levels(body, rows, columns, 3), coded) == body
-        exact = float_symbols(told, coded)
-        # A rounded cosine errs by 1 / 256 of 1 at most, in each of two sums over levels; then half a symbol, and a 1 / 16 after the first sum.
+        exact = float_symbols(blocks, coded)
+        # A rounded cosine errs by 1 / 256 of 1 at most, in each of two sums over levels; then half a symbol, and a 1
+        # / 16 after the first sum.
         side_sum = (
-            np.abs(told.levels * step_table(side, told.quantiser)[told.step_offsets] / UNITS_PER_SYMBOL)
+            np.abs(blocks.levels * step_table(side, blocks.quantiser)[blocks.step_offsets] / UNITS_PER_SYMBOL)
             .sum((3, 4))
             .max(initial=0)
         )
@@ -88,14 +87,14 @@ def test_what_is_told_is_read_back_and_is_near_to_exact_cosines(
 
 @pytest.mark.parametrize(("side", "rows", "columns"), SIZES)
 @pytest.mark.parametrize("share", [0.6, 1.0])
-def test_the_spec_s_own_decoder_agrees(twin: ModuleType, side: int, rows: int, columns: int, share: float) -> None:
+def test_the_readable_decoder_agrees(twin: ModuleType, side: int, rows: int, columns: int, share: float) -> None:
     for seed in range(3):
-        told, coded = random_blocks(side, rows, columns, share, seed + 10)
-        told.levels[0, 0, 0, -1, -1], told.levels[-1, -1, -1, 0, -1] = (
+        blocks, coded = random_blocks(side, rows, columns, share, seed + 10)
+        blocks.levels[0, 0, 0, -1, -1], blocks.levels[-1, -1, -1, 0, -1] = (
             -1,
             LARGEST,
         )  # the quickest alone, and the largest there is
-        body = encode_blocks(told, coded)
+        body = encode_blocks(blocks, coded)
         symbols, _ = decode_blocks(body, rows, columns, 3)
         content = SimpleNamespace(data=body, is_coded=True, raw_length=symbols.size, codec=Codec.TRANSFORM)
         plane = {"rows": rows, "columns": columns, "channels": 3}
@@ -121,10 +120,10 @@ def test_the_largest_side_never_makes_much_more_of_a_segment_than_it_is() -> Non
             assert padded <= 4 * rows * columns or side == 4
 
 
-def test_where_hardly_anything_changes_blocks_take_next_to_nothing() -> None:
+def test_flat_blocks_take_next_to_no_bytes() -> None:
     coded = np.ones((64, 64), bool)
     flat = TransformBlocks(np.zeros((8, 4, 4, 16, 16), np.int64), np.full((4, 4), DEFAULT_OFFSET), 64)
-    flat.levels[..., 0, 0] = 5  # foreseen from the second block on
+    flat.levels[..., 0, 0] = 5  # predicted from the second block on
     body = encode_blocks(flat, coded)
     assert len(body) < 60
     symbols, _ = decode_blocks(body, 64, 64, 8)
@@ -146,21 +145,23 @@ def test_prediction_from_borders_saves_bits_on_a_smooth_plane(monkeypatch: pytes
     assert sizes[0] < 0.95 * sizes[1]
 
 
-def test_a_map_that_is_implied_is_not_told() -> None:
-    told, coded = random_blocks(8, 37, 50, 0.6, 8)
-    body, longer = encode_blocks(told, coded, coded), encode_blocks(told, coded)
+def test_an_implied_map_takes_no_bytes() -> None:
+    blocks, coded = random_blocks(8, 37, 50, 0.6, 8)
+    body, longer = encode_blocks(blocks, coded, coded), encode_blocks(blocks, coded)
     assert len(body) < len(longer) - 100
     np.testing.assert_array_equal(decode_blocks(body, 37, 50, 3, coded)[0], decode_blocks(longer, 37, 50, 3)[0])
     assert segments.encode_segment(*decode_blocks(body, 37, 50, 3, coded), body, coded) == body
     with pytest.raises(FormatError, match="an occupancy that is not known"):
         decode_blocks(body, 37, 50, 3)
-    other = segments.encode_segment(*decode_blocks(body, 37, 50, 3, coded), body, ~coded)  # a side_info is no use then
+    other = segments.encode_segment(
+        *decode_blocks(body, 37, 50, 3, coded), body, ~coded
+    )  # such side information is useless
     assert len(other) != len(body) and decode_symbols(other, 37, 50, 3)[1].any()
 
 
-def test_a_body_is_read_to_its_end_and_no_further() -> None:
-    told, coded = random_blocks(8, 20, 20, 1.0, 5)
-    body = encode_blocks(told, coded)
+def test_truncated_and_longer_bodies_are_refused() -> None:
+    blocks, coded = random_blocks(8, 20, 20, 1.0, 5)
+    body = encode_blocks(blocks, coded)
     for cut in range(len(body)):
         with pytest.raises(FormatError, match=r"plane segment"):
             segments.decode_segment(Codec.TRANSFORM, body[:cut], 20, 20, 3)
@@ -174,21 +175,21 @@ def test_a_body_is_read_to_its_end_and_no_further() -> None:
 
 
 def test_no_body_makes_a_symbol_leave_its_eight_bits() -> None:
-    """Whatever bits say: levels, means and their sums are clamped."""
+    """Levels, means and their sums are clamped."""
     rng = np.random.default_rng(8)
     read = 0
     for _ in range(300):
-        told, coded = random_blocks(int(rng.choice(SIDES)), 17, 18, 1.0, int(rng.integers(1 << 30)))
-        told.levels[:] = rng.integers(-LARGEST // 2, LARGEST // 2, told.levels.shape)
-        body = encode_blocks(TransformBlocks(told.levels, told.step_offsets, 255), coded)
+        blocks, coded = random_blocks(int(rng.choice(SIDES)), 17, 18, 1.0, int(rng.integers(1 << 30)))
+        blocks.levels[:] = rng.integers(-LARGEST // 2, LARGEST // 2, blocks.levels.shape)
+        body = encode_blocks(TransformBlocks(blocks.levels, blocks.step_offsets, 255), coded)
         symbols, _ = decode_blocks(body, 17, 18, 3)
         read += int(symbols.min() == -128 and symbols.max() == 127)
     assert read == 300
 
 
-def test_a_guide_is_followed_only_where_symbols_are_its_own() -> None:
-    told, coded = random_blocks(8, 20, 20, 0.8, 6)
-    body = encode_blocks(told, coded)
+def test_side_information_is_used_only_for_its_own_symbols() -> None:
+    blocks, coded = random_blocks(8, 20, 20, 0.8, 6)
+    body = encode_blocks(blocks, coded)
     symbols, _ = decode_blocks(body, 20, 20, 3)
     assert (
         segments.encode_segment(symbols, coded, body) == body and segments.side_info_of(Codec.TRANSFORM, body) == body
@@ -200,9 +201,9 @@ def test_a_guide_is_followed_only_where_symbols_are_its_own() -> None:
     np.testing.assert_array_equal(segments.decode_segment(Codec.PREDICTIVE, other, 20, 20, 3)[0], moved)
 
 
-def test_guides_of_segments_are_one_of_the_plane() -> None:
-    told, coded = random_blocks(8, 20, 20, 0.8, 6)
-    body = encode_blocks(told, coded)
+def test_side_information_of_segments_is_merged() -> None:
+    blocks, coded = random_blocks(8, 20, 20, 0.8, 6)
+    body = encode_blocks(blocks, coded)
     plane = segments.merge_side_info({0: body, 20: body})
     assert (
         isinstance(plane, segments.TransformSegments)

@@ -1,4 +1,6 @@
-"""Weights of decoders under codec 2 (spec, section 7): the same comes back, in fewer bytes than float16 or zstd takes, and damage is refused."""
+"""Weights of decoders under codec 2 (spec, section 7): the same comes back, in fewer bytes than float16 or zstd
+takes, and damage is refused.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +18,8 @@ SHAPES = [(5,), (3, 4), (1,), (2, 3, 7)]
 
 def some(seed: int, largest: int = 60, power: int = -5, shapes: list[tuple[int, ...]] = SHAPES) -> list[np.ndarray]:
     rng = np.random.default_rng(seed)
-    return [(np.rint(rng.normal(0, largest / 3, shape)).clip(-largest, largest) * 2.0 ** (power - number)).astype(np.float32)
+    return [(np.rint(rng.normal(0, largest / 3, shape)).clip(-largest, largest)
+             * 2.0 ** (power - number)).astype(np.float32)
             for number, shape in enumerate(shapes)]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Damaged files: whatever is done to one, a reader reads it or refuses it."""
+"""A reader reads any damaged file or refuses it with a FormatError."""
 
 import json
 import os
@@ -42,7 +42,7 @@ def test_damage_of_every_kind_is_read_or_refused(starts, name, rng):
 
 
 def test_damage_gets_past_the_checksums(starts):
-    """Of content changed, a part is read and a part is refused by what decodes it, none by a checksum."""
+    """Mutated content is read or refused by its decoder, never by a checksum."""
     said = []
     for number in range(150):
         rng = random.Random(number)
@@ -92,7 +92,7 @@ def test_other_errors_are_found_and_work_goes_on(monkeypatch):
     sent: list = []
     monkeypatch.setattr(fuzz, "_limit_memory", lambda more: monkeypatch.setattr(fuzz, "examined", breaks))
     pipe = type("Pipe", (), {"send": staticmethod(sent.append)})
-    fuzz._work(pipe, [0.0, 0.0, 0.0], 1, range(0, 3), frozenset({1}), fuzz.BUDGET, "")
+    fuzz._work(pipe, [0.0, 0.0, 0.0], 1, range(3), frozenset({1}), fuzz.BUDGET, "")
     ((following, tally, findings),) = sent
     assert following == 3 and tally == {"finding": 2}
     assert findings == [(0, "ValueError: as it should not"), (2, "ValueError: as it should not")]

@@ -1,4 +1,6 @@
-"""What a decoder must find in a valid vector: the entries of `manifest.json` (spec/kpc-format.md, "Conformance vectors")."""
+"""What a decoder must find in a valid vector: the entries of `manifest.json` (spec/kpc-format.md, "Conformance
+vectors").
+"""
 
 import hashlib
 import itertools
@@ -19,7 +21,9 @@ ZSTD_VERSION = ".".join(map(str, zstandard.ZSTD_VERSION))
 
 
 def described(data: bytes, partial: bool) -> dict[str, Any]:
-    """Return what a decoder must find in a file: numbers, and the SHA-256 of every array in the order that the spec gives."""
+    """Return what a decoder must find in a file: numbers, and the SHA-256 of every array in the order that the spec
+    gives.
+    """
     scene = read(data, allow_partial=partial)
     codecs = {entry.codec for entry in Reader(data, allow_partial=partial).index}
     found = {
@@ -77,7 +81,7 @@ def _decoder(scene: QuantisedScene) -> dict[str, Any]:
 
 
 def _rays(scene: QuantisedScene) -> list[dict[str, Any]]:
-    """What four rays see: through the box's centre at the clip's start, across it, from inside it, and past it.
+    """Return what four rays see: through the box's centre at the clip's start, across it, from inside it, and past it.
 
     In contracted space some of it lies outside. The last ray shows the average of the appearances, if there are any.
     """

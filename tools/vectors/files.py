@@ -1,6 +1,7 @@
 """Files of the conformance vectors: chunks under a given codec, put together whether they make sense or not.
 
-The index of all vectors is a zstd frame of stored blocks, which no library has to make; so its bytes have known positions.
+The index of all vectors is a zstd frame of stored blocks, which no library has to make; so its bytes have known
+positions.
 """
 
 import struct
@@ -129,7 +130,8 @@ def predictive(
 
     Args:
         sets: number of sets of weights.
-        weights: (sets, WEIGHT_COUNT) int8; None: weights that need no floating-point fit, the largest and the smallest among them.
+        weights: (sets, WEIGHT_COUNT) int8; None: weights that need no floating-point fit, the largest and the
+            smallest among them.
         is_dependent: move the symbols so that they are DEPENDENT.
         implied: leave maps to the occupancy, where it implies them.
     """
@@ -275,7 +277,8 @@ def with_index(
     *,
     frame: Callable[[bytes], bytes] = bytes,
 ) -> bytes:
-    """Return the file with its index changed before it comes into the frame, or the frame itself, or the number of chunks.
+    """Return the file with its index changed before it comes into the frame, or the frame itself, or the number of
+    chunks.
 
     Checksums and lengths are right.
     """

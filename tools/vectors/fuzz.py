@@ -1,10 +1,11 @@
-"""Fuzz the reader with damaged files: `python -m kpc.tools.vectors.fuzz --count 1000000 --processes 2 --seed 1 -o found`.
+"""Fuzz the reader with damaged files: `python -m kpc.tools.vectors.fuzz --count 1000000 --processes 2 --seed 1 -o
+found`.
 
-Conformance vectors are taken apart, mutated, and put together again with every length and CRC32C right, so that mutations reach the
-code behind those checks. A reader must read the result or refuse it with a FormatError. Anything else that is raised, more than HANG_S
-of computing and more memory than the budget are findings, which are written to -o as files. File number N of a seed is always the
-same, so that a run may be split: --first 500000 --count 500000 is the second half of the one above. `--only transform,motion` mutates
-just the vectors whose names begin so.
+Conformance vectors are taken apart, mutated, and put together again with every length and CRC32C right, so that
+mutations reach the code behind those checks. A reader must read the result or refuse it with a FormatError. Anything
+else that is raised, more than HANG_S of computing and more memory than the budget are findings, which are written to
+-o as files. File number N of a seed is always the same, so that a run may be split: --first 500000 --count 500000 is
+the second half of the one above. `--only transform,motion` mutates just the vectors whose names begin so.
 """
 
 import argparse
@@ -120,7 +121,9 @@ Mutation = Callable[[random.Random, Taken, Sequence[Taken]], bytes]
 
 
 def scrambled(rng: random.Random, body: bytes) -> bytes:
-    """Apply up to four edits: flipped bits, extreme numbers, bytes removed, inserted or repeated; most near the start, where sizes are."""
+    """Apply up to four edits: flipped bits, extreme numbers, bytes removed, inserted or repeated; most near the
+    start, where sizes are.
+    """
     out = bytearray(body)
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         at = rng.randrange(min(len(out), rng.choice((16, 64, len(out) or 1))) or 1)
@@ -249,8 +252,13 @@ def of_bytes(rng: random.Random, taken: Taken, others: Sequence[Taken]) -> bytes
 
 
 MUTATIONS: dict[str, Mutation] = {
-    "header": in_header, "index": in_index, "frame": in_frame, "content": in_content, "chunks": of_chunks, "bytes": of_bytes,
-}  # fmt: skip
+    "header": in_header,
+    "index": in_index,
+    "frame": in_frame,
+    "content": in_content,
+    "chunks": of_chunks,
+    "bytes": of_bytes,
+}
 SHARES = (1, 3, 1, 12, 3, 1)  # relative frequencies of MUTATIONS
 
 
@@ -272,7 +280,9 @@ def _taken(data: bytes) -> Taken | None:
 
 
 def _decompressed(body: bytes) -> bytes | None:
-    """Return the content of a zstd frame; None if it is not one or claims more than LARGEST, which the library would believe."""
+    """Return the content of a zstd frame; None if it is not one or claims more than LARGEST, which the library would
+    believe.
+    """
     try:
         said = zstandard.get_frame_parameters(body).content_size
         if LARGEST < said < zstandard.CONTENTSIZE_ERROR:
@@ -283,7 +293,9 @@ def _decompressed(body: bytes) -> bytes | None:
 
 
 def seeds(only: str = "") -> list[Taken]:
-    """Return the valid conformance vectors, taken apart, whose names begin with one of `only`, separated by commas; but for LONG."""
+    """Return the valid conformance vectors, taken apart, whose names begin with one of `only`, separated by commas;
+    but for LONG.
+    """
     begins = tuple(only.split(","))
     return [
         Taken.of(data)
@@ -371,7 +383,9 @@ def _work(
 
 
 def _limit_memory(more_bytes: int) -> None:
-    """Limit the memory of this process to so much more than it has, where the system can; then it fails with MemoryError."""
+    """Limit the memory of this process to so much more than it has, where the system can; then it fails with
+    MemoryError.
+    """
     try:
         import resource
 
@@ -399,7 +413,9 @@ def run(
     first: int = 0,
     only: str = "",
 ) -> dict[str, Any]:
-    """Examine `count` files from number `first` on, made of `seeds(only)`; return the outcomes, and findings as [number, message]."""
+    """Examine `count` files from number `first` on, made of `seeds(only)`; return the outcomes, and findings as
+    [number, message].
+    """
     context, started, said = multiprocessing.get_context("spawn"), time.monotonic(), time.monotonic()
     tally: Counter[str] = Counter()
     findings: list[tuple[int, str]] = []
@@ -439,9 +455,9 @@ def run(
                 process.kill()
         if time.monotonic() - said > 30:
             said = time.monotonic()
-            say(
-                f"{sum(tally.values()):,} files, {len(findings)} findings, {sum(tally.values()) / (said - started):,.0f} files/s"
-            )
+            count_so_far = sum(tally.values())
+            rate = count_so_far / (said - started)
+            say(f"{count_so_far:,} files, {len(findings)} findings, {rate:,.0f} files/s")
     return {"first": first, "count": sum(tally.values()), "seed": seed, "processes": processes, "budget_bytes": budget,
             "seconds": time.monotonic() - started, "outcomes": dict(tally), "findings": sorted(findings)}  # fmt: skip
 
@@ -473,8 +489,14 @@ def _command(argv: list[str]) -> None:
         raise UsageError("--first must not be negative")
     if options.only and not seeds(options.only):
         raise UsageError(f"--only {options.only}: no vector's name begins so")
-    found = run(options.count, options.seed, options.processes, say=lambda text: print(text, file=sys.stderr, flush=True),
-                first=options.first, only=options.only)  # fmt: skip
+    found = run(
+        options.count,
+        options.seed,
+        options.processes,
+        say=lambda text: print(text, file=sys.stderr, flush=True),
+        first=options.first,
+        only=options.only,
+    )
     if options.output is not None and found["findings"]:
         keep(found["findings"], options.seed, options.output, options.only)
     print(json.dumps(found, indent=1))

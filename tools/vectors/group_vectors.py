@@ -40,7 +40,9 @@ def packed(
 
 
 def valid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, bool]]:
-    """Return files by name, and whether they are prefixes, made of the other vectors `scenes`; none has a chunk under ZSTD."""
+    """Return files by name, and whether they are prefixes, made of the other vectors `scenes`; none has a chunk under
+    ZSTD.
+    """
     one, other, third, still = (scenes[name] for name in SCENES)
     joined = packed([(0, 12, one), (9, 12, other), (20, 12, third), (32, 1, still)])
     return {
@@ -94,7 +96,9 @@ def invalid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, str, str]]:
 
 
 def described(data: bytes, partial: bool, names: dict[bytes, str]) -> dict[str, Any]:
-    """Return what a decoder must find, as `description.described` does; `names` are those of the vectors that are groups."""
+    """Return what a decoder must find, as `description.described` does; `names` are those of the vectors that are
+    groups.
+    """
     groups = Groups(data, allow_partial=partial)
     entries = sorted((entry for entry in groups.reader.index if entry.kind == "GRUP"), key=lambda entry: entry.group)
     shown = [(time, *groups.timeline.at(time)) for time in TIMES]

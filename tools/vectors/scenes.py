@@ -22,7 +22,7 @@ def map_planes(scene: QuantisedScene, change: PlaneFunction) -> QuantisedScene:
 
 
 def minimal_scene() -> QuantisedScene:
-    """The smallest scene worth a look: one channel, two texels an axis, a fog that is denser towards +x."""
+    """Return a minimal scene: one channel, two texels an axis, a fog that is denser towards +x."""
     planes = {
         name: QuantisedPlane(
             np.array([[[0], [4]], [[0], [4]]], np.int8),
@@ -166,7 +166,9 @@ def noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 
 def walked(symbols: np.ndarray, coded: np.ndarray, weights: np.ndarray, quantiser: int) -> bytes:
-    """Move (H, W, M) symbols in place onto a quantiser, and return the segment up to the first that leaves its 8 bits."""
+    """Move (H, W, M) symbols in place onto a quantiser, and return the segment up to the first that leaves its 8
+    bits.
+    """
     trace = np.empty(symbols.size * MAX_DECISIONS, np.int16)
     _, position, _ = code_symbols(symbols, np.ascontiguousarray(coded), quantiser, weights, 0, 0, None, trace, None)
     return bytes([len(weights), quantiser << MODE_BITS]) + weights.tobytes() + encode_trace(trace[:position])
@@ -188,7 +190,9 @@ def on_trellis(scene: QuantisedScene) -> QuantisedScene:
 
 
 def dependent(scene: QuantisedScene, weights: np.ndarray, segment_rows: int) -> QuantisedScene:
-    """Return the scene with symbols nearby, none at the ends of 8 bits, that are DEPENDENT under these weights in each segment."""
+    """Return the scene with symbols nearby, none at the ends of 8 bits, that are DEPENDENT under these weights in
+    each segment.
+    """
 
     def moved(name: str, plane: QuantisedPlane) -> QuantisedPlane:
         rows = segment_rows if name in TIME_PLANES else len(plane.symbols)
@@ -228,7 +232,9 @@ def at_rest(scene: QuantisedScene) -> QuantisedScene:
 
 
 def smooth(scene: QuantisedScene) -> QuantisedScene:
-    """Return the scene with planes that compress well however large they are: they rise and fall slowly over all 8 bits."""
+    """Return the scene with planes that compress well however large they are: they rise and fall slowly over all 8
+    bits.
+    """
 
     def slow(name: str, plane: QuantisedPlane) -> QuantisedPlane:
         index = np.arange(plane.symbols.size).reshape(plane.symbols.shape) // 32 % 512

@@ -3,8 +3,8 @@
     valid/NAME.kpc       decodes to what manifest.json says, bit by bit
     invalid/NAME.kpc     is refused; manifest.json names the kind of error and a part of its message
 
-Every file is computed from integers, so that it comes out the same everywhere; only files with chunks under ZSTD depend on the version
-of that library, and only in how they are packed (manifest.json says which version packed them).
+Every file is computed from integers, so that it comes out the same everywhere; only files with chunks under ZSTD
+depend on the version of that library, and only in how they are packed (manifest.json says which version packed them).
 """
 
 import hashlib

@@ -235,7 +235,9 @@ def _payloads(dense: QuantisedScene) -> dict[str, Vector]:
 
 
 def limits() -> dict[str, bytes]:
-    """Return files at the limits of the format, each as small as may be; none at the limit of chunks, which takes half a megabyte."""
+    """Return files at the limits of the format, each as small as may be; none at the limit of chunks, which takes
+    half a megabyte.
+    """
     plain = make_scene(dynamic=False, sizes=[(1, 2, 2, 2, 0)], cameras=1)
     moving = make_scene(dynamic=True, sizes=[(1, 2, 2, 2, 2)])
     deep = make_scene(dynamic=False, sizes=SCALE_LIMIT * [(1, 2, 1, 1, 0)])
