@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from kpc.encoder.field import kernels
-from kpc.encoder.field.field import Field, WeightedRowSum, bilinear_corners
+from kpc.encoder.field import fused, kernels
+from kpc.encoder.field.field import Field
 from kpc.encoder.field.render import Rays, render_reference
-from kpc.encoder.training.optimisers import max_samples_per_ray, motion_array
+from kpc.encoder.field.sampling import WeightedRowSum, bilinear_corners
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene, with_contraction, with_motion
 from torch import Tensor
@@ -61,32 +61,16 @@ def backpropagate(scene: Scene, rays: Rays, targets: torch.Tensor, workers: int 
     grad_motion = None if scene.motion is None else np.zeros((workers, *scene.motion.shape), np.float32)
     peaks = np.zeros((workers, *scene.occupancy.shape[1:]), np.float32)
     errors, counts = kernels.backpropagate(
-        field.theta.detach().numpy(),
-        grad,
-        layout.table,
-        layout.resolution,
+        fused.planes_of(field),
         field.density.detach().numpy(),
-        grad_density,
-        layout.channels,
-        motion_array(field),
-        grad_motion,
-        True,
-        scene.aabb,
-        kernels.even_of(scene.mapping),
-        scene.occupancy.view(np.uint8),
-        np.float32(scene.step),
-        np.float32(scene.extent),
-        rays.origins.numpy(),
-        rays.directions.numpy(),
-        rays.times.numpy(),
-        rays.jitters.numpy(),
+        fused.volume_of(scene.aabb, scene.occupancy, scene.step, scene.mapping),
+        fused.ray_batch(rays),
         basis,
-        grad_basis,
         targets.numpy(),
-        rays.backgrounds.numpy(),
-        peaks,
         np.float32(DISTORTION),
-        max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
+        kernels.Gradients(grad, grad_density, grad_basis, grad_motion, True),
+        peaks,
+        fused.max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
     )
     return {
         "theta": grad.sum(0),

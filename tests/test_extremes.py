@@ -18,7 +18,9 @@ from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate
 from kpc.encoder.field import kernels
 from kpc.encoder.field.bounds import find_box
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.field import Field, Layout, priors
+from kpc.encoder.field.field import Field, Layout
+from kpc.encoder.field.fused import planes_of
+from kpc.encoder.field.priors import plane_priors
 from kpc.encoder.field.render import Rays
 from kpc.encoder.training.optimisers import add_prior_gradients
 from kpc.encoder.training.train import Report, Trainer
@@ -82,20 +84,15 @@ def test_products_of_six_values_near_1e_minus_6_and_1e6(large: int, order: int) 
     with torch.no_grad():
         for (_, name, *_), value in zip(field.layout.planes(), values, strict=True):
             field.plane(0, name).fill_(float(value))
-    theta, layout = field.theta.detach().numpy(), field.layout
-    samples, features = np.ones(6, np.float32), np.zeros(1, np.float32)
-    corners, fractions = np.empty(6, np.int64), np.empty(4, np.float32)
-    corner = np.zeros(4, np.float32)
-    kernels._sample_planes(theta, layout.table, layout.resolution, corner, 1, corners, fractions, samples)
-    kernels._features(samples, 1, 1, features)
+    planes, layout = planes_of(field), field.layout
+    corner = np.zeros((1, 3), np.float32), np.zeros(1, np.float32)
+    features = kernels.features(planes, *corner, 1)
     exact = np.prod(values.astype(np.float32).astype(np.float64))
-    assert features[0] == pytest.approx(exact, rel=1e-6)
-    grad = np.zeros_like(theta)
-    one, scratch = np.ones(1, np.float32), np.empty(6, np.float32)
-    at = (layout.table, layout.resolution, 1, corners, fractions, samples)
-    kernels._scatter_planes(grad, *at, one, scratch, theta, None, False)
+    assert features[0, 0] == pytest.approx(exact, rel=1e-6)
+    grad = np.zeros((1, layout.size), np.float32)
+    kernels.scatter_features(planes, grad, None, *corner, np.ones((1, 1), np.float32))
     for (_, name, start, *_), value in zip(layout.planes(), values, strict=True):
-        assert grad[start] == pytest.approx(exact / float(np.float32(value)), rel=1e-5), name
+        assert grad[0, start] == pytest.approx(exact / float(np.float32(value)), rel=1e-5), name
 
 
 def fog(steps: int, optical_depth: float) -> tuple[Scene, Rays]:
@@ -148,7 +145,7 @@ def test_time_planes_at_identity_get_the_gradient_of_the_pictures() -> None:
     field = Field.from_scene(scene)
     prior, variation = np.zeros(field.layout.size, np.float32), TrainConfig().variation(1.0)
     add_prior_gradients(field, field.theta.detach().numpy(), prior, TrainConfig(), variation, 1.0)
-    sum(priors(field, TrainConfig(), variation).values()).backward()
+    sum(plane_priors(field, TrainConfig(), variation).values()).backward()
     for _, name, start, rows, columns in field.layout.planes():
         part = slice(start, start + rows * columns * field.layout.channels)
         if "t" in name:

@@ -2,15 +2,13 @@
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 import torch
 from kpc.encoder.datasets import Dataset, pixel_rays
-from kpc.encoder.field import kernels
 from kpc.encoder.field.appearances import FIT_RAYS, fit_code
 from kpc.encoder.field.field import Field
-from kpc.encoder.field.render import Rays, count_samples, march_scene, shade
-from kpc.encoder.training.optimisers import max_samples_per_ray
+from kpc.encoder.field.fused import count_samples, march_scene, render_rays
+from kpc.encoder.field.render import Rays, shade
 from kpc.format.common.fidelity import psnr
 from kpc.format.scene.scene import AnyDecoder, Decoder, Scene
 from kpc.format.scene.space import Contraction
@@ -72,30 +70,7 @@ class SceneRenderer:
     def _render_fused(
         self, o: np.ndarray, d: np.ndarray, t: np.ndarray, codes: torch.Tensor | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        scene, field, layout = self.scene, self.field, self.field.layout
-        basis = field.basis(torch.from_numpy(d), codes).numpy()
-        colours, opacities, depths, _ = kernels.render(
-            field.theta.detach().numpy(),
-            layout.table,
-            layout.resolution,
-            field.density.detach().numpy(),
-            layout.channels,
-            scene.motion,
-            scene.aabb,
-            kernels.even_of(scene.mapping),
-            scene.occupancy.view(np.uint8),
-            np.float32(scene.step),
-            np.float32(scene.extent),
-            o,
-            d,
-            t,
-            basis,
-            np.arange(len(o)),
-            scene.background,
-            max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
-            8 * numba.get_num_threads(),
-        )
-        return colours, opacities, depths
+        return render_rays(self.field, self.scene, self.batch(o, d, t), codes)
 
     def _render_composited(
         self, o: np.ndarray, d: np.ndarray, t: np.ndarray, codes: torch.Tensor | None

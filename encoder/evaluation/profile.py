@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 from kpc.encoder.field.field import Layout
-from kpc.encoder.training.optimisers import TorchOptimiser
+from kpc.encoder.training.torch_optimiser import TorchOptimiser
 from kpc.encoder.training.train import Trainer
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -50,11 +50,11 @@ def profile(trainer: Trainer) -> dict[str, Any]:
     plain = TorchOptimiser(copy.deepcopy(trainer.field), config, trainer.grid.visible.shape, trainer.mapping)
     fused_s, plain_s, parts, samples, rays = [], [], [], [], 0
     for _ in range(ROUNDS):
-        before = dict(trainer.watch.seconds)
+        before = dict(trainer.timers.seconds)
         started = trainer.elapsed_s
         trainer.run_until(trainer.step + FUSED_STEPS)
         fused_s.append((trainer.elapsed_s - started) / FUSED_STEPS)
-        parts.append({name: (s - before.get(name, 0.0)) / FUSED_STEPS for name, s in trainer.watch.seconds.items()})
+        parts.append({name: (s - before.get(name, 0.0)) / FUSED_STEPS for name, s in trainer.timers.seconds.items()})
         rays = trainer.rays_per_step
         samples.append(trainer.samples_per_ray)
         plain_s.append(_plain_step(trainer, plain, rays))

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.field import Field
-from kpc.encoder.field.render import Rays, march_scene, shade
+from kpc.encoder.field.fused import march_scene
+from kpc.encoder.field.render import Rays, shade
 from kpc.format.common.errors import UsageError
 from kpc.format.container.scene_layout import APPEARANCE_LIMIT, is_valid_name
 from kpc.format.scene.scene import Scene

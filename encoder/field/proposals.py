@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, plan_layout
-from kpc.encoder.field.render import Rays, Samples, cell_indices, fused_features, plane_coordinates, ray_spans
+from kpc.encoder.field.fused import fused_features
+from kpc.encoder.field.render import Rays, Samples, cell_indices, plane_coordinates, ray_spans
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import SpaceMapping
 from torch import Tensor, nn
@@ -68,7 +69,7 @@ class Proposals(nn.Module):
             samples = _between(rays, edges, aabb, mapping, cells)
             look_up = fused_features(field) if fused else field.features
             log_density, _ = field.decode(look_up(samples.points, rays.times[samples.ray]))
-            tau = (log_density.exp() * samples.length * samples.stretch / extent).view(len(near), -1)
+            tau = (log_density.exp() * samples.length * samples.density_scale / extent).view(len(near), -1)
             trans = torch.exp(torch.cumsum(tau, 1).neg() + tau)
             weights = trans * (1 - torch.exp(-tau))
             levels.append((edges, weights))
@@ -88,7 +89,7 @@ def _between(
 ) -> Samples:
     """A sample in the middle of each interval."""
     middle = (edges[:, 1:] + edges[:, :-1]) / 2
-    u, stretch = plane_coordinates(rays, middle, aabb, mapping)
+    u, scale = plane_coordinates(rays, middle, aabb, mapping)
     u = u.clamp(0, 1)
     ray = torch.arange(len(middle), device=middle.device)[:, None].expand_as(middle).flatten()
     return Samples(
@@ -96,7 +97,7 @@ def _between(
         u.flatten(0, 1),
         middle.flatten(),
         (edges[:, 1:] - edges[:, :-1]).flatten(),
-        stretch.flatten(),
+        scale.flatten(),
         cell_indices(u, cells).flatten(0, 1),
     )
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import Measure, ValidationRays
-from kpc.encoder.field.render import march_scene
+from kpc.encoder.field.fused import march_scene
 from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS
 from kpc.format.common.jit import compiled, inlined
 from kpc.format.scene.grid import dilate

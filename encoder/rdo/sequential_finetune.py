@@ -19,7 +19,8 @@ from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
 from kpc.encoder.rdo.distortion import PlaneKey
-from kpc.encoder.training.optimisers import FusedOptimiser, TorchOptimiser
+from kpc.encoder.training.fused_optimiser import FusedOptimiser
+from kpc.encoder.training.torch_optimiser import TorchOptimiser
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common.progress import Progress
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene

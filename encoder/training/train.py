@@ -19,18 +19,18 @@ from kpc.encoder.field.field import (
     Field,
     HybridField,
     SummedField,
-    appearance_priors,
     motion_grid_shape,
-    motion_priors,
     plan_layout,
-    priors,
 )
+from kpc.encoder.field.fused import log_densities
 from kpc.encoder.field.occupancy_grid import OccupancyGrid, grid_shape
+from kpc.encoder.field.priors import appearance_priors, motion_priors, plane_priors
 from kpc.encoder.field.proposals import Proposals
 from kpc.encoder.training.checkpoint import save_state
+from kpc.encoder.training.fused_optimiser import FusedOptimiser
 from kpc.encoder.training.importance import TileWeights, has_static_cameras
-from kpc.encoder.training.optimisers import FusedOptimiser, TorchOptimiser, log_densities
 from kpc.encoder.training.sampler import RaySampler
+from kpc.encoder.training.torch_optimiser import TorchOptimiser
 from kpc.format.common.errors import TrainingError
 from kpc.format.common.fidelity import psnr_from_mse
 from kpc.format.scene.scene import Scene
@@ -96,7 +96,7 @@ class Trainer:
             if on_cpu and proposals is None and not (config.hybrid or config.summed)
             else TorchOptimiser(self.field, config, shape, mapping, fused=on_cpu, proposals=proposals)
         )
-        self.watch = self.optimiser.watch
+        self.timers = self.optimiser.timers
         self.step = 0
         self.elapsed_s = elapsed_s
         self.samples_per_ray = float(config.samples_across)
@@ -131,7 +131,7 @@ class Trainer:
             if interrupted():
                 raise KeyboardInterrupt
             started = time.monotonic()
-            with self.watch("occupancy"):
+            with self.timers("occupancy"):
                 if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
                     self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
                 if (
@@ -142,7 +142,7 @@ class Trainer:
                     self.grid.split(self.density_at, self.slots, self.rng)
             count = self.rays_per_step
             background = None if self.dataset.has_alpha else self.background
-            with self.watch("rays"):
+            with self.timers("rays"):
                 weights = self._weights_at(fraction)
                 batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays, weights)
             rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
@@ -238,7 +238,7 @@ class Trainer:
         """Which terms of the loss hold NaN or infinity, the colours being one of them, and which parameters they come from."""
         field, config = self.field, self.config
         weighed = (
-            priors(field, config, config.variation(0.0))
+            plane_priors(field, config, config.variation(0.0))
             | motion_priors(field, config)
             | appearance_priors(field, config)
         )

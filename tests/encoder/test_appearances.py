@@ -16,9 +16,11 @@ from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field import appearances
 from kpc.encoder.field.appearances import assign_appearances, choose_appearance, fit_code
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.field import Field, appearance_priors
+from kpc.encoder.field.field import Field
+from kpc.encoder.field.priors import appearance_priors
 from kpc.encoder.field.render import render_reference
-from kpc.encoder.training.optimisers import FusedOptimiser, TorchOptimiser
+from kpc.encoder.training.fused_optimiser import FusedOptimiser
+from kpc.encoder.training.torch_optimiser import TorchOptimiser
 from kpc.encoder.training.train import Trainer
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import UsageError

@@ -7,15 +7,9 @@ import pytest
 import torch
 from gradients import bilinear
 from kpc.encoder.field.config import PRESETS, TrainConfig
-from kpc.encoder.field.field import (
-    Field,
-    Layout,
-    motion_grid_shape,
-    motion_priors,
-    plan_layout,
-    scatter_rows,
-    scatter_rows_sparse,
-)
+from kpc.encoder.field.field import Field, Layout, motion_grid_shape, plan_layout
+from kpc.encoder.field.priors import motion_priors
+from kpc.encoder.field.sampling import scatter_rows, scatter_rows_sparse
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Clip
 from kpc.player.cpu import reference

@@ -20,22 +20,20 @@ from gradients import FIELD_KINDS, FieldFunction, backpropagate, random_rays, re
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig
-from kpc.encoder.field.field import Field, Layout, priors
+from kpc.encoder.field.field import Field, Layout
+from kpc.encoder.field.fused import log_densities, max_samples_per_ray, planes_of, ray_batch, volume_of
+from kpc.encoder.field.kernels import compilation
+from kpc.encoder.field.priors import plane_priors
 from kpc.encoder.field.render import Rays, render_reference
-from kpc.encoder.training.optimisers import (
-    BETA1,
-    BETA2,
-    EPSILON,
-    add_prior_gradients,
-    log_densities,
-    max_samples_per_ray,
-)
+from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_prior_gradients
 from kpc.player.cpu import reference
 from numba.core.dispatcher import Dispatcher
 from scenes import tiny_scene, with_motion
 
 COLOUR = 1e-4
 GRADIENT = 1e-3
+
+KERNEL_MODULES = ("geometry", "planes", "marching", "backward", "points", "updates")
 
 
 @pytest.mark.parametrize("kind", FIELD_KINDS)
@@ -82,8 +80,9 @@ def test_a_machine_s_first_training_equals_its_second(tmp_path: Path) -> None:
 
     The one that compiles fastest and sums stands for all: they have its flags.
     """
-    functions = [f for f in vars(kernels).values() if isinstance(f, Dispatcher)]
-    assert len(functions) > 20 and all(f.targetoptions["fastmath"] == kernels._FASTMATH for f in functions)
+    modules = [getattr(kernels, name) for name in KERNEL_MODULES]
+    functions = [f for module in modules for f in vars(module).values() if isinstance(f, Dispatcher)]
+    assert len(functions) > 20 and all(f.targetoptions["fastmath"] == compilation.FASTMATH for f in functions)
     field, rng = Field.from_scene(tiny_scene()), np.random.default_rng(0)
     theta, density = field.theta.detach().numpy(), field.density.detach().numpy()
     places = rng.random((500, 3), np.float32), rng.random(500, np.float32)
@@ -91,7 +90,8 @@ def test_a_machine_s_first_training_equals_its_second(tmp_path: Path) -> None:
     script = (
         "import sys, numpy\nfrom kpc.encoder.field import kernels\n"
         "theta, table, resolution, density, points, times = numpy.load(sys.argv[1]).values()\n"
-        f"logs = kernels.log_densities(theta, table, resolution, density, {field.layout.channels}, None, points, times, 2)\n"
+        f"planes = kernels.PlaneSet(theta, table, resolution, {field.layout.channels}, None)\n"
+        "logs = kernels.log_densities(planes, density, points, times, 2)\n"
         "sys.stdout.buffer.write(logs.tobytes())"
     )
     command, env = (
@@ -99,7 +99,7 @@ def test_a_machine_s_first_training_equals_its_second(tmp_path: Path) -> None:
         os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")},
     )
     compiled, cached = (subprocess.run(command, env=env, check=True, stdout=subprocess.PIPE).stdout for _ in range(2))
-    assert len(list(tmp_path.glob("cache/**/kernels.log_densities-*.nbc"))) == 1
+    assert len(list(tmp_path.glob("cache/**/points.log_densities-*.nbc"))) == 1
     assert len(compiled) == 2000 and compiled == cached
 
 
@@ -155,24 +155,13 @@ def test_render_gives_opacity_depth_and_counts() -> None:
     field, camera = Field.from_scene(scene), scene.cameras[0]
     origins, directions = camera.rays()
     n = len(origins)
+    batch = Rays.from_arrays(origins, directions, np.full(n, 0.4), np.full(n, 0.5), np.tile(scene.background, (n, 1)))
     _, opacity, depth, counts = kernels.render(
-        field.theta.detach().numpy(),
-        field.layout.table,
-        field.layout.resolution,
+        planes_of(field),
         field.density.detach().numpy(),
-        field.layout.channels,
-        None,
-        scene.aabb,
-        kernels.even_of(scene.mapping),
-        scene.occupancy.view(np.uint8),
-        np.float32(scene.step),
-        np.float32(scene.extent),
-        origins,
-        directions,
-        np.full(n, 0.4, np.float32),
-        field.basis(torch.from_numpy(directions)).detach().numpy(),
-        np.arange(n),
-        scene.background,
+        volume_of(scene.aabb, scene.occupancy, scene.step, scene.mapping),
+        ray_batch(batch),
+        field.basis(batch.directions).detach().numpy(),
         max_samples_per_ray(scene.aabb, scene.step),
         4,
     )
@@ -222,7 +211,7 @@ def test_priors_are_the_gradient_of_their_twin(dynamic: bool, late: bool, alone:
     grad = np.ones(field.layout.size, np.float32)
     add_prior_gradients(field, field.theta.detach().numpy(), grad, config, variation, 4.0)
     field = field.double()
-    (4 * sum(priors(field, config, variation).values())).backward()
+    (4 * sum(plane_priors(field, config, variation).values())).backward()
     expected = field.theta.grad.numpy()
     # `grad` held 1 before: what is added is rounded to 2^-24 of that, a few times.
     np.testing.assert_allclose(grad - 1, expected, atol=8 * 2.0**-24 + 1e-6 * np.abs(expected).max())

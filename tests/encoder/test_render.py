@@ -9,17 +9,10 @@ from gradients import FIELD_KINDS, FieldFunction, bilinear, random_rays, translu
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, HybridField, Layout, SummedField
-from kpc.encoder.field.render import (
-    Rays,
-    fused_features,
-    sample_rays,
-    sample_rays_fused,
-    select_reached,
-    shade,
-    weigh_samples,
-)
+from kpc.encoder.field.fused import fused_features, max_samples_per_ray, sample_rays_fused
+from kpc.encoder.field.render import Rays, sample_rays, select_reached, shade, weigh_samples
 from kpc.encoder.training.cuda_graphs import GraphCache
-from kpc.encoder.training.optimisers import DeferredReadback, TorchOptimiser, max_samples_per_ray
+from kpc.encoder.training.torch_optimiser import DeferredReadback, TorchOptimiser
 from kpc.player.cpu import reference
 from scenes import tiny_scene, with_hybrid_decoder
 
@@ -38,7 +31,7 @@ def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bo
     assert same.mean() > 0.98 and counts[0].sum() > 403
     mine, other = same[ours.ray], same[theirs.ray]
     np.testing.assert_array_equal(ours.ray[mine], theirs.ray[other])
-    for name, tolerance in (("points", 1e-5), ("s", 1e-4), ("length", 0), ("stretch", 1e-4)):
+    for name, tolerance in (("points", 1e-5), ("s", 1e-4), ("length", 0), ("density_scale", 1e-4)):
         np.testing.assert_allclose(
             getattr(ours, name)[mine], getattr(theirs, name)[other], atol=tolerance, rtol=1e-4, err_msg=name
         )
@@ -55,7 +48,7 @@ def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(sh
     n = len(wanted.ray) - short
     assert len(wanted.ray) % 16 == 0
     found = sample_rays(*told, most=max_samples_per_ray(scene.aabb, scene.step), capacity=n + (0 if short else 500))
-    for name in ("ray", "points", "s", "length", "stretch", "cell"):
+    for name in ("ray", "points", "s", "length", "density_scale", "cell"):
         assert torch.equal(getattr(found, name)[:n], getattr(wanted, name)[:n]), name
     assert len(found.ray) == n + (0 if short else 500) and not found.length[n:].any() and short < n
     if not short:
@@ -128,7 +121,7 @@ def test_a_recorded_step_on_a_gpu_is_the_step(moved: bool, monkeypatch: pytest.M
         field = Field.from_scene(scene).cuda()
         optimiser = TorchOptimiser(field, TrainConfig(learning_rate=1e-3), scene.occupancy.shape[1:])
         losses = [optimiser.step(k, 0.0, 1.0, rays, targets, *told)[0] for k in range(60)]
-        assert bool(optimiser._recorder._recordings) == records
+        assert bool(optimiser._graphs.captured) == records
         found.append((losses[-1], field.theta.detach().cpu(), optimiser.peaks()))
     (loss, theta, peaks), (wanted_loss, wanted_theta, wanted_peaks) = found
     assert loss == pytest.approx(wanted_loss, rel=1e-3)

@@ -16,8 +16,9 @@ from kpc.encoder.field.bounds import find_box, fit_contraction
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.render import Rays
-from kpc.encoder.training.optimisers import TorchOptimiser, feature_mask
+from kpc.encoder.training.optimisers import feature_mask
 from kpc.encoder.training.sampler import RaySampler
+from kpc.encoder.training.torch_optimiser import TorchOptimiser
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.errors import TrainingError
 from kpc.format.common.fidelity import psnr

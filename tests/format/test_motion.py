@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kpc.encoder.field import field
+from kpc.encoder.field import sampling
 from kpc.format.common.errors import FormatError
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.motion import (
@@ -42,7 +42,7 @@ def test_displacement_equals_the_formula_in_numpy_and_pytorch(most: float) -> No
     wanted = np.array([displace_reference(*a, offsets) for a in zip(u.astype(np.float64), times, strict=True)])
     ours = np.array([displace(p, sample_linear(offsets, float(t))) for p, t in zip(u, times, strict=True)])
     np.testing.assert_allclose(ours, wanted, atol=1e-6 * (1 + most))
-    theirs = field.displace(*map(torch.from_numpy, (u, times, offsets))).numpy()
+    theirs = sampling.displace(*map(torch.from_numpy, (u, times, offsets))).numpy()
     np.testing.assert_allclose(theirs, wanted, atol=1e-6 * (1 + most))
     clamped = np.mean((wanted == 0) | (wanted == 1))
     assert clamped > 0.2 if most > 1 else clamped < 0.2
@@ -51,7 +51,7 @@ def test_displacement_equals_the_formula_in_numpy_and_pytorch(most: float) -> No
 def test_the_gradient_in_pytorch_matches_finite_differences() -> None:
     points, times = torch.rand(20, 3, dtype=torch.float64) * 0.6 + 0.2, torch.rand(20, dtype=torch.float64)
     motion = (0.1 * torch.randn(3, 2, 3, 2, 3, dtype=torch.float64)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda motion: field.displace(points, times, motion), (motion,))
+    assert torch.autograd.gradcheck(lambda motion: sampling.displace(points, times, motion), (motion,))
 
 
 @pytest.mark.parametrize("most", [1e-9, 0.1, 3.0, DISPLACEMENT_LIMIT / 2])

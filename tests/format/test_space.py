@@ -6,8 +6,8 @@ import gl
 import numpy as np
 import pytest
 import torch
-from kpc.encoder.field import kernels
 from kpc.encoder.field import render as in_pytorch
+from kpc.encoder.field.kernels import geometry
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import FAR, MIN_DISPARITY, Contraction, DeviceCoordinates, contract, uncontract
 from kpc.player.cpu.reference import render, sample_positions
@@ -99,12 +99,12 @@ def _torch(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndar
 
 
 def _kernels(scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
-    even, inverse = kernels.even_of(scene.mapping), 1 / (scene.aabb[1] - scene.aabb[0])
+    uniform, inverse = np.float32(scene.mapping.uniform_distance), 1 / (scene.aabb[1] - scene.aabb[0])
     t, u, stretch = np.empty_like(s), np.empty((*s.shape, 3), np.float32), np.empty_like(s)
     for ray, k in np.ndindex(s.shape):
-        t[ray, k] = kernels._distance(s[ray, k], even)
-        *u[ray, k], stretch[ray, k] = kernels._place(
-            origins[ray], directions[ray], t[ray, k], scene.aabb, inverse, even
+        t[ray, k] = geometry.ray_distance(s[ray, k], uniform)
+        *u[ray, k], stretch[ray, k] = geometry.ray_point(
+            origins[ray], directions[ray], t[ray, k], scene.aabb, inverse, uniform
         )
     return t, u, stretch
 

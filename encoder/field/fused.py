@@ -1,0 +1,152 @@
+"""The CPU kernels as functions of torch fields and rays: what stands in for `kpc.encoder.field.render` on the CPU."""
+
+from collections.abc import Callable
+
+import numba
+import numpy as np
+import torch
+from kpc.encoder.field import kernels
+from kpc.encoder.field.field import Field, Layout, SummedField
+from kpc.encoder.field.render import Rays, RayWeights, Samples, weigh_samples
+from kpc.format.scene.scene import Scene
+from kpc.format.scene.space import Contraction, SpaceMapping
+from torch import Tensor
+
+# Parts into which a batch is divided, per thread: threads that are done early take another.
+PARTS_PER_THREAD = 8
+
+
+def parts() -> int:
+    """Return the number of parts into which kernels without buffers per thread divide a batch."""
+    return PARTS_PER_THREAD * numba.get_num_threads()
+
+
+def plane_set(
+    theta: np.ndarray, layout: Layout, motion: np.ndarray | None, scales: int | None = None
+) -> kernels.PlaneSet:
+    """Return planes (n,) and motion grid as the kernels take them, with the coarsest `scales` only where given."""
+    return kernels.PlaneSet(theta, layout.table[:scales], layout.resolution[:scales], layout.channels, motion)
+
+
+def planes_of(field: Field, scales: int | None = None) -> kernels.PlaneSet:
+    """Return a field's planes and motion grid, which are not copied, as `plane_set`."""
+    motion = None if field.motion is None else field.motion.detach().numpy()
+    return plane_set(field.theta.detach().numpy(), field.layout, motion, scales)
+
+
+def volume_of(aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None) -> kernels.Volume:
+    """Return where rays take samples; aabb (2, 3) float32, occupancy (slots, Nz, Ny, Nx) bool, step in s."""
+    uniform = np.float32(mapping.uniform_distance) if isinstance(mapping, Contraction) else None
+    extent = np.max(aabb[1] - aabb[0])
+    return kernels.Volume(aabb, uniform, occupancy.view(np.uint8), np.float32(step), np.float32(extent))
+
+
+def ray_batch(rays: Rays) -> kernels.RayBatch:
+    """Return rays as the kernels take them; appearances are left out."""
+    return kernels.RayBatch(
+        *(a.numpy() for a in (rays.origins, rays.directions, rays.times, rays.jitters, rays.backgrounds))
+    )
+
+
+def max_samples_per_ray(aabb: np.ndarray, step: float, mapping: SpaceMapping | None = None) -> int:
+    """Return the most samples that a ray can take: the box's diagonal, or a whole contracted ray, in steps."""
+    longest = (
+        mapping.s_end if isinstance(mapping, Contraction) else np.linalg.norm(np.asarray(aabb[1] - aabb[0], np.float64))
+    )
+    return int(longest / step) + 2
+
+
+def render_rays(
+    field: Field, scene: Scene, rays: Rays, codes: Tensor | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Render rays of a scene whose planes and decoder `field` holds.
+
+    Args:
+        field: with the explicit decoder.
+        scene: for box, mapping, occupancy and step.
+        rays: N rays.
+        codes: (N, H) or (H,) appearance codes; None for 0.
+
+    Returns:
+        Colours (N, 3), opacities (N,) and mean depths (N,), float32.
+    """
+    basis = field.basis(rays.directions, codes).detach().numpy()
+    colours, opacities, depths, _ = kernels.render(
+        planes_of(field),
+        field.density.detach().numpy(),
+        volume_of(scene.aabb, scene.occupancy, scene.step, scene.mapping),
+        ray_batch(rays),
+        basis,
+        max_samples_per_ray(scene.aabb, scene.step, scene.mapping),
+        parts(),
+    )
+    return colours, opacities, depths
+
+
+def log_densities(field: Field, points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return the clipped log densities (N,) at u (N, 3) in [0, 1]^3 and times (N,), of the explicit decoder."""
+    density = field.density.detach().numpy()
+    at = np.asarray(points, np.float32), np.asarray(times, np.float32)
+    return kernels.log_densities(planes_of(field), density, *at, parts())
+
+
+def count_samples(
+    rays: Rays, aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None = None
+) -> np.ndarray:
+    """Return how many samples `sample_rays` finds on each ray, (N,) int64."""
+    starts = np.zeros(len(rays.times), np.int64)
+    counts: np.ndarray = kernels.collect_samples(
+        volume_of(aabb, occupancy, step, mapping), ray_batch(rays), starts, None, parts()
+    )
+    return counts
+
+
+def sample_rays_fused(
+    rays: Rays, aabb: np.ndarray, occupancy: np.ndarray, step: float, mapping: SpaceMapping | None = None
+) -> Samples:
+    """Return what `kpc.encoder.field.render.sample_rays` does, by the kernels."""
+    counts = count_samples(rays, aabb, occupancy, step, mapping)
+    ends = np.cumsum(counts)
+    n = int(ends[-1]) if len(ends) else 0
+    out = kernels.SampleArrays(
+        np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.int64)
+    )
+    volume = volume_of(aabb, occupancy, step, mapping)
+    kernels.collect_samples(volume, ray_batch(rays), ends - counts, out, parts())
+    ray = np.repeat(np.arange(len(counts)), counts)
+    arrays = ray, out.points, out.s, np.full_like(out.s, step), out.density_scale, out.cells
+    return Samples(*(torch.from_numpy(a) for a in arrays))
+
+
+def march_scene(field: Field, rays: Rays, scene: Scene) -> tuple[Samples, RayWeights]:
+    """Return the samples that rays take of a scene whose planes `field` holds, and their weights."""
+    samples = sample_rays_fused(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
+    return samples, weigh_samples(field, rays, samples, fused_features(field), scene.extent)
+
+
+class FusedFeatures(torch.autograd.Function):
+    """`Field.features` by the kernels; points and times have no gradient."""
+
+    @staticmethod
+    def forward(ctx, theta, motion, layout, points, times):  # type: ignore[no-untyped-def]
+        theta, motion, *at = (None if a is None else a.detach().numpy() for a in (theta, motion, points, times))
+        ctx.planes, ctx.at = plane_set(theta, layout, motion), at
+        return torch.from_numpy(kernels.features(ctx.planes, *at, parts()))
+
+    @staticmethod
+    def backward(ctx, g):  # type: ignore[no-untyped-def]
+        planes, workers = ctx.planes, numba.get_num_threads()
+        g_theta = np.zeros((workers, planes.theta.size), np.float32)
+        g_motion = None if planes.motion is None else np.zeros((workers, *planes.motion.shape), np.float32)
+        kernels.scatter_features(planes, g_theta, g_motion, *ctx.at, g.contiguous().numpy())
+        summed = (None if a is None else torch.from_numpy(a.sum(0)) for a in (g_theta, g_motion))
+        return *summed, None, None, None
+
+
+def fused_features(field: Field) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return a function of points (n, 3) and times (n,) that gives a CPU field's features (n, F) by the kernels."""
+    if isinstance(field, SummedField):  # the kernels multiply planes
+        return field.features
+    return lambda points, times: FusedFeatures.apply(  # type: ignore[no-any-return,no-untyped-call]
+        field.theta, field.motion, field.layout, points, times
+    )

@@ -1,0 +1,51 @@
+"""Fused CPU kernels of the K-Planes field: march, sample the planes, composite and back-propagate, ray by ray.
+
+A batch of rays is never expanded into a batch of samples. Each worker marches its rays one by one, keeps the occupied
+samples of the current ray in buffers that fit the cache, and adds gradients to a buffer of its own, so no locks are
+needed. `kpc.encoder.field.field` and `kpc.encoder.field.render` state the same mathematics in plain PyTorch; the tests
+compare the two.
+
+Symbols in shape comments
+    M   channels of a plane
+    S   scales;  F = S * M features
+    N   rays of a batch, or points
+    u   coordinates in the planes, [0, 1]^3
+    s   ray parameter: the distance along the ray, contracted where space is (`kpc.format.scene.space.Contraction`)
+
+Modules
+    compilation  how kernels are compiled
+    arguments    named tuples that kernels take
+    geometry     rays, occupancy cells, displacement by the motion grid
+    planes       bilinear sampling of planes, products over planes, and the transposes of both
+    marching     one ray through the field; rendering; lists of samples
+    backward     the gradient of a batch's loss
+    points       features and densities at given points
+    updates      Adam and the gradients of the priors
+
+Numba's on-disk cache notices a change in the file of the function that was called, not in the files of functions that
+it calls: after editing a module here, delete `__pycache__`.
+"""
+
+from kpc.encoder.field.kernels.arguments import Gradients, PlaneSet, RayBatch, SampleArrays, Volume
+from kpc.encoder.field.kernels.backward import backpropagate
+from kpc.encoder.field.kernels.marching import collect_samples, render
+from kpc.encoder.field.kernels.points import features, log_densities, scatter_features
+from kpc.encoder.field.kernels.updates import adam, add_sparse_transients, add_time_smoothness, add_variation
+
+__all__ = [
+    "Gradients",
+    "PlaneSet",
+    "RayBatch",
+    "SampleArrays",
+    "Volume",
+    "adam",
+    "add_sparse_transients",
+    "add_time_smoothness",
+    "add_variation",
+    "backpropagate",
+    "collect_samples",
+    "features",
+    "log_densities",
+    "render",
+    "scatter_features",
+]

@@ -1,0 +1,79 @@
+"""Named tuples of arrays that the kernels take.
+
+They are flat, because numba's parallel loops take no nested tuples. Where a member may be None, code that depends on it
+is in a function that takes this member as an argument: numba then compiles only the branch that applies.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class PlaneSet(NamedTuple):
+    """The planes of a field, and its motion grid."""
+
+    theta: np.ndarray  # (n,) float32, all planes one after the other, each (rows, columns, M)
+    table: np.ndarray  # (S, 6) int64, first element in theta of xy xz yz xt yt zt; -1 where there is no such plane
+    resolution: np.ndarray  # (S, 4) int64, texels along x, y, z and t
+    channels: int  # M
+    motion: np.ndarray | None  # (T, Nz, Ny, Nx, 3) float32, displacements (`kpc.format.scene.motion`); or None
+
+
+class Volume(NamedTuple):
+    """Where rays take samples. Rays in device coordinates are given as such: to the kernels their scene is a box."""
+
+    aabb: np.ndarray  # (2, 3) float32, lower and upper corner
+    uniform_distance: np.float32 | None  # of `kpc.format.scene.space.Contraction`; None where the scene ends at its box
+    occupancy: np.ndarray  # (slots, Nz, Ny, Nx) uint8
+    step: np.float32  # length of a step, in s
+    extent: np.float32  # longest edge of the box: densities are per this length
+
+
+class RayBatch(NamedTuple):
+    """Rays; sample k of a ray lies at s = near + (k + jitter) * step."""
+
+    origins: np.ndarray  # (N, 3) float32
+    directions: np.ndarray  # (N, 3) float32, unit vectors
+    times: np.ndarray  # (N,) float32 in [0, 1]
+    jitters: np.ndarray  # (N,) float32 in [0, 1)
+    backgrounds: np.ndarray  # (N, 3) float32, RGB
+
+
+class Gradients(NamedTuple):
+    """Where gradients are added: a buffer for each worker."""
+
+    theta: np.ndarray  # (workers, n) float32
+    density: np.ndarray  # (workers, F + 1) float32
+    basis: np.ndarray  # (N, 3, F) float32, of each ray; (workers, 3, F) where all rays share one basis
+    motion: np.ndarray | None  # (workers, T, Nz, Ny, Nx, 3) float32; None where there is no motion grid
+    wants_motion: bool  # whether the gradient of the motion grid is computed, which takes a fifth of the time
+
+
+class SampleArrays(NamedTuple):
+    """Samples of a batch of rays, ray by ray, as `collect_samples` writes them."""
+
+    points: np.ndarray  # (n, 3) float32, u before displacement
+    s: np.ndarray  # (n,) float32
+    density_scale: np.ndarray  # (n,) float32, `Contraction.density_scale`
+    cells: np.ndarray  # (n, 3) int64, occupancy cell in the order z, y, x
+
+
+class RayBuffers(NamedTuple):
+    """One worker's memory for the samples of the current ray; K is the most that a ray can have."""
+
+    values: np.ndarray  # (K, S * 6 * M) float32, what each plane holds at a sample; 1 for planes that do not exist
+    features: np.ndarray  # (K, F) float32
+    points: np.ndarray  # (K, 7) float32: u displaced, time, u before displacement
+    corners: np.ndarray  # (K, S * 6) int64, first element in theta of the texel below each sample
+    fractions: np.ndarray  # (K, S * 4) float32, position between texels along x, y, z, t
+    s: np.ndarray  # (K,) float32
+    log_densities: np.ndarray  # (K,) float32, clipped
+    taus: np.ndarray  # (K,) float32, optical thickness
+    weights: np.ndarray  # (K,) float32, transmittance times alpha
+    colours: np.ndarray  # (K, 3) float32
+    g_weights: np.ndarray  # (K,) float32, gradient of the distortion loss with respect to the weights
+    g_features: np.ndarray  # (F,) float32, of the current sample
+    g_values: np.ndarray  # (6 * M,) float32, of the current sample and scale
+    slopes: np.ndarray  # (3 * M,) float32, gradient with respect to u, by axis and channel
+    g_point: np.ndarray  # (3,) float32, gradient with respect to u
+    ones: np.ndarray  # (M,) float32

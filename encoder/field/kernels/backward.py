@@ -1,0 +1,153 @@
+"""The gradient of a batch's loss."""
+
+import numpy as np
+from kpc.encoder.field.kernels.arguments import Gradients
+from kpc.encoder.field.kernels.compilation import bare, inlined, parallel, plain
+from kpc.encoder.field.kernels.geometry import cell_index
+from kpc.encoder.field.kernels.marching import LIMIT, NEGLIGIBLE, march_ray, new_ray_buffers, shade_ray
+from kpc.encoder.field.kernels.planes import clear_slopes, scatter_motion, scatter_planes
+from numba import prange
+
+
+@bare
+def distortion_gradient(buffers, count, volume, factor):
+    """Set g_weights[k] = factor * d D / d w_k of `backpropagate`, from running sums of w and w s before sample k."""
+    weights, places, step, extent = buffers.weights, buffers.s, volume.step, volume.extent
+    total, total_s = np.float32(0.0), np.float32(0.0)
+    for k in range(count):
+        total += weights[k]
+        total_s += weights[k] * (places[k] - places[0]) / extent
+    before, before_s = np.float32(0.0), np.float32(0.0)
+    for k in range(count):
+        s = (places[k] - places[0]) / extent
+        apart = s * (np.float32(2.0) * before - total) + total_s - np.float32(2.0) * before_s
+        buffers.g_weights[k] = factor * (np.float32(2.0) * apart + np.float32(2.0 / 3.0) * weights[k] * step / extent)
+        before += weights[k]
+        before_s += weights[k] * s
+
+
+@inlined
+def decoder_gradient(density, basis, g_log, weight, g_rgb, feature, colour, g_features, g_density, g_basis):
+    """Set g_features (F,), and add the gradients of density and basis, of one sample.
+
+    log density = density . (features, 1);  colour_c = sigmoid(basis_c . features)
+    """
+    F = g_features.size
+    for i in range(F):
+        g_features[i] = g_log * density[i]
+        g_density[i] += g_log * feature[i]
+    g_density[F] += g_log
+    if weight > NEGLIGIBLE:
+        for c in range(3):
+            g_c = g_rgb[0] if c == 0 else (g_rgb[1] if c == 1 else g_rgb[2])
+            g_c *= weight * colour[c] * (np.float32(1.0) - colour[c])
+            for i in range(F):
+                g_features[i] += g_c * basis[c, i]
+                g_basis[c, i] += g_c * feature[i]
+
+
+@bare
+def backpropagate_ray(planes, density, basis, buffers, count, trans, g_rgb, g_background, gradients, peaks):
+    """Add the gradients of one ray after `march_ray` and `shade_ray`, from its last sample to its first.
+
+    Args:
+        planes, density, buffers: as of `march_ray`. basis: (3, F).
+        count, trans: what `march_ray` returned.
+        g_rgb: d loss / d C, three numbers.
+        g_background: trans * g_rgb . background.
+        gradients: `Gradients` of this worker and ray: (n,), (F + 1,), (3, F), (T, Nz, Ny, Nx, 3) or None.
+        peaks: (Nz, Ny, Nx), raised to the weights of the samples in each cell.
+    """
+    behind = g_background  # d loss / d C times the colour that comes from behind sample k
+    trans_after = trans  # transmittance after sample k
+    for k in range(count - 1, -1, -1):
+        weight, colour = buffers.weights[k], buffers.colours[k]
+        g_weight = g_rgb[0] * colour[0] + g_rgb[1] * colour[1] + g_rgb[2] * colour[2] + buffers.g_weights[k]
+        g_log = (trans_after * g_weight - behind) * buffers.taus[k]
+        if buffers.log_densities[k] >= LIMIT or buffers.log_densities[k] <= -LIMIT:
+            g_log = np.float32(0.0)
+        cell = cell_index(peaks, buffers.points[k, 4], buffers.points[k, 5], buffers.points[k, 6])
+        peaks[cell] = max(peaks[cell], weight)
+        behind += weight * g_weight
+        trans_after += weight
+        decoder_gradient(
+            density,
+            basis,
+            g_log,
+            weight,
+            g_rgb,
+            buffers.features[k],
+            colour,
+            buffers.g_features,
+            gradients.density,
+            gradients.basis,
+        )
+        clear_slopes(planes.motion, buffers.slopes)
+        scatter_planes(planes, gradients.theta, buffers.g_features, buffers, k, gradients.wants_motion)
+        scatter_motion(gradients.motion, buffers, k, gradients.wants_motion)
+
+
+@plain
+def row_or_none(array, row):
+    """Return array[row], or None of None."""
+    return None if array is None else array[row]
+
+
+@parallel
+def backpropagate(planes, density, volume, rays, basis, targets, distortion, gradients, peaks, capacity):
+    """Render a batch, and add the gradient of its loss.
+
+    loss = mean over rays and colour channels of (C - target)^2 + distortion * mean over rays of D
+    C = sum_k w_k c_k + trans * background
+    D = sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 d,   with s over the extent, d = step / extent
+    d D / d w_k = 2 sum_j w_j |s_k - s_j| + 2/3 w_k d
+    d C / d tau_k = trans_{k+1} c_k - sum_{j>k} w_j c_j - trans_end * background,   tau = sigma * scale * step / extent
+
+    D is the distortion loss of mip-NeRF 360 (arXiv:2111.12077, eq. 15).
+
+    Args:
+        planes: `PlaneSet`.
+        density: (F + 1,) float32, the weights of the log density and its bias.
+        volume: `Volume`.
+        rays: `RayBatch`.
+        basis: (N, 3, F) float32, the colour basis of each ray; or (1, 3, F), of all, where colour is view-independent.
+        targets: (N, 3) float32.
+        distortion: float32, weight of the distortion loss.
+        gradients: `Gradients`, added to; it has as many workers as the batch is divided among.
+        peaks: (workers, Nz, Ny, Nx) float32, raised to the largest weight that a sample in each cell has.
+        capacity: the most samples that a ray can have.
+
+    Returns:
+        Squared errors (N,) float32, summed over colour channels, and the samples that each ray took, (N,) int32.
+    """
+    N = rays.origins.shape[0]
+    workers = gradients.theta.shape[0]
+    errors = np.empty(N, np.float32)
+    counts = np.empty(N, np.int32)
+    scale = np.float32(2.0 / (3.0 * N))
+    shared = basis.shape[0] == 1
+    for worker in prange(workers):
+        buffers = new_ray_buffers(planes.table, planes.channels, capacity)
+        for i in range(worker, N, workers):
+            count, trans = march_ray(
+                planes, density, volume, rays.origins[i], rays.directions[i], rays.times[i], rays.jitters[i], buffers
+            )
+            b, background = (basis[0] if shared else basis[i]), rays.backgrounds[i]
+            red, green, blue = shade_ray(
+                buffers, count, b, trans * background[0], trans * background[1], trans * background[2]
+            )
+            e0, e1, e2 = red - targets[i, 0], green - targets[i, 1], blue - targets[i, 2]
+            errors[i] = e0 * e0 + e1 * e1 + e2 * e2
+            counts[i] = count
+            g_rgb = (scale * e0, scale * e1, scale * e2)
+            g_background = trans * (g_rgb[0] * background[0] + g_rgb[1] * background[1] + g_rgb[2] * background[2])
+            distortion_gradient(buffers, count, volume, np.float32(distortion / N))
+            own = Gradients(
+                gradients.theta[worker],
+                gradients.density[worker],
+                gradients.basis[worker] if shared else gradients.basis[i],
+                row_or_none(gradients.motion, worker),
+                gradients.wants_motion,
+            )
+            backpropagate_ray(planes, density, b, buffers, count, trans, g_rgb, g_background, own, peaks[worker])
+    return errors, counts

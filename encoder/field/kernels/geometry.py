@@ -1,0 +1,130 @@
+"""Rays, occupancy cells, and displacement by the motion grid.
+
+`uniform_distance` is that of `kpc.format.scene.space.Contraction`, or None where the scene is its box.
+"""
+
+import numpy as np
+from kpc.encoder.field.kernels.compilation import bare, inlined
+from kpc.format.scene.space import FAR
+
+
+@bare
+def box_span(origin, direction, aabb):
+    """Return the distances at which a ray enters (at least 0) and leaves the box; leaves <= enters where it misses."""
+    near, far = np.float32(0.0), np.float32(np.inf)
+    for axis in range(3):
+        d = direction[axis]
+        if d == 0.0:
+            if origin[axis] < aabb[0, axis] or origin[axis] > aabb[1, axis]:
+                return np.float32(0.0), np.float32(0.0)
+            continue
+        t0 = (aabb[0, axis] - origin[axis]) / d
+        t1 = (aabb[1, axis] - origin[axis]) / d
+        near = max(near, min(t0, t1))
+        far = min(far, max(t0, t1))
+    return near, far
+
+
+@inlined
+def ray_span(origin, direction, aabb, uniform_distance):
+    """Return the s between which a ray takes samples."""
+    if uniform_distance is None:
+        return box_span(origin, direction, aabb)
+    return np.float32(0.0), np.float32(2.0 - 1.0 / FAR) * uniform_distance
+
+
+@inlined
+def ray_distance(s, uniform_distance):
+    """Return the distance along the ray at s: `Contraction.distance`."""
+    if uniform_distance is None:
+        return s
+    return s if s <= uniform_distance else uniform_distance / (np.float32(2.0) - s / uniform_distance)
+
+
+@inlined
+def inverse_edges(aabb):
+    """Return 1 over the box's edges, as three numbers."""
+    one = np.float32(1.0)
+    return one / (aabb[1, 0] - aabb[0, 0]), one / (aabb[1, 1] - aabb[0, 1]), one / (aabb[1, 2] - aabb[0, 2])
+
+
+@inlined
+def ray_point(origin, direction, t, aabb, inverse, uniform_distance):
+    """Return u at distance t of a ray, and `Contraction.density_scale` there; `inverse` as from `inverse_edges`."""
+    u = (origin[0] + t * direction[0] - aabb[0, 0]) * inverse[0]
+    v = (origin[1] + t * direction[1] - aabb[0, 1]) * inverse[1]
+    w = (origin[2] + t * direction[2] - aabb[0, 2]) * inverse[2]
+    one = np.float32(1.0)
+    if uniform_distance is None:
+        return u, v, w, one
+    x, y, z = np.float32(2.0) * u - one, np.float32(2.0) * v - one, np.float32(2.0) * w - one
+    radius = max(max(abs(x), abs(y), abs(z)), one)
+    scale = np.float32(0.25) * (np.float32(2.0) - one / radius) / radius
+    root = max(t / uniform_distance, one) / radius
+    half = np.float32(0.5)
+    return x * scale + half, y * scale + half, z * scale + half, root * root
+
+
+@inlined
+def cell_index(grid, u, v, w):
+    """Return the index (z, y, x) of the cell of an (Nz, Ny, Nx) grid that holds a point of [0, 1]^3."""
+    nz, ny, nx = grid.shape
+    x = min(max(int(u * nx), 0), nx - 1)
+    y = min(max(int(v * ny), 0), ny - 1)
+    z = min(max(int(w * nz), 0), nz - 1)
+    return z, y, x
+
+
+@inlined
+def texel_and_fraction(u, size):
+    """Return the texel below a corner-aligned coordinate u in [0, 1], and the fraction of the way to the next."""
+    position = u * np.float32(size - 1)
+    lower = min(max(int(position), 0), max(size - 2, 0))
+    return lower, min(max(position - np.float32(lower), np.float32(0.0)), np.float32(1.0))
+
+
+@inlined
+def motion_cell(motion, u, v, w, time):
+    """Return the lower corner of the motion grid's cell around a point, and the fractions, along t, z, y, x."""
+    rows, nz, ny, nx, _ = motion.shape
+    t, ft = texel_and_fraction(time, rows)
+    z, fz = texel_and_fraction(w, nz)
+    y, fy = texel_and_fraction(v, ny)
+    x, fx = texel_and_fraction(u, nx)
+    return t, z, y, x, ft, fz, fy, fx
+
+
+@inlined
+def motion_corner(i, ft, fz, fy, fx):
+    """Return the offsets along t, z, y, x of corner i (0 to 15) of a motion cell, and its weight."""
+    dt, dz, dy, dx = i >> 3, i >> 2 & 1, i >> 1 & 1, i & 1
+    one = np.float32(1.0)
+    weight = (ft if dt else one - ft) * (fz if dz else one - fz) * (fy if dy else one - fy) * (fx if dx else one - fx)
+    return dt, dz, dy, dx, weight
+
+
+@inlined
+def displace(motion, u, v, w, time):
+    """Return u + D(u, time), `kpc.format.scene.motion.displace`; `texel_and_fraction` clamps it to [0, 1] later."""
+    if motion is None:
+        return u, v, w
+    t, z, y, x, ft, fz, fy, fx = motion_cell(motion, u, v, w, time)
+    for i in range(16):
+        dt, dz, dy, dx, weight = motion_corner(i, ft, fz, fy, fx)
+        offset = motion[t + dt, z + dz, y + dy, x + dx]
+        u += weight * offset[0]
+        v += weight * offset[1]
+        w += weight * offset[2]
+    return u, v, w
+
+
+@inlined
+def scatter_displacement(g_motion, u, v, w, time, g):
+    """Add the gradient of the motion grid, given g (3,), that of the displaced u: the transpose of `displace`."""
+    t, z, y, x, ft, fz, fy, fx = motion_cell(g_motion, u, v, w, time)
+    for i in range(16):
+        dt, dz, dy, dx, weight = motion_corner(i, ft, fz, fy, fx)
+        out = g_motion[t + dt, z + dz, y + dy, x + dx]
+        out[0] += weight * g[0]
+        out[1] += weight * g[1]
+        out[2] += weight * g[2]

@@ -1,0 +1,61 @@
+"""Features and densities at given points."""
+
+import numpy as np
+from kpc.encoder.field.kernels.compilation import parallel
+from kpc.encoder.field.kernels.marching import decode_density, new_ray_buffers
+from kpc.encoder.field.kernels.planes import (
+    clear_slopes,
+    combine_planes,
+    sample_displaced,
+    scatter_motion,
+    scatter_planes,
+)
+from numba import prange
+
+
+@parallel
+def log_densities(planes, density, points, times, workers):
+    """Return the clipped log densities at u (N, 3) in [0, 1]^3 and times (N,): (N,) float32; density as in `render`."""
+    N = points.shape[0]
+    out = np.empty(N, np.float32)
+    for worker in prange(workers):
+        buffers = new_ray_buffers(planes.table, planes.channels, 1)
+        for i in range(worker, N, workers):
+            sample_displaced(planes, points[i, 0], points[i, 1], points[i, 2], times[i], buffers, 0)
+            combine_planes(buffers.values[0], planes.table.shape[0], planes.channels, buffers.features[0])
+            out[i] = decode_density(buffers.features[0], density)
+    return out
+
+
+@parallel
+def features(planes, points, times, workers):
+    """Return `kpc.encoder.field.field.Field.features` at u (N, 3) in [0, 1]^3 and times (N,): (N, F) float32."""
+    N, S, M = points.shape[0], planes.table.shape[0], planes.channels
+    out = np.empty((N, S * M), np.float32)
+    for worker in prange(workers):
+        buffers = new_ray_buffers(planes.table, M, 1)
+        for i in range(worker * N // workers, (worker + 1) * N // workers):
+            sample_displaced(planes, points[i, 0], points[i, 1], points[i, 2], times[i], buffers, 0)
+            combine_planes(buffers.values[0], S, M, out[i])
+    return out
+
+
+@parallel
+def scatter_features(planes, g_theta, g_motion, points, times, g):
+    """Add the gradients of planes and motion grid, given g (N, F) = d loss / d `features`.
+
+    The planes are sampled once more rather than kept from the forward pass: all samples would not fit the cache.
+
+    Args:
+        g_theta: (workers, n) float32, a buffer for each worker.
+        g_motion: (workers, T, Nz, Ny, Nx, 3) float32, or None where there is no motion grid.
+    """
+    N, workers = points.shape[0], g_theta.shape[0]
+    for worker in prange(workers):
+        buffers = new_ray_buffers(planes.table, planes.channels, 1)
+        for i in range(worker * N // workers, (worker + 1) * N // workers):
+            sample_displaced(planes, points[i, 0], points[i, 1], points[i, 2], times[i], buffers, 0)
+            clear_slopes(planes.motion, buffers.slopes)
+            scatter_planes(planes, g_theta[worker], g[i], buffers, 0, True)
+            if g_motion is not None:
+                scatter_motion(g_motion[worker], buffers, 0, True)
