@@ -32,8 +32,8 @@ from torch import Tensor, nn
 
 AXES = "xyzt"
 
-# Factor on the first layer of the hybrid decoder at the start: features start at about 0.03, the product of three texels,
-# and are to span that layer's range.
+# Factor on the first layer of the hybrid decoder at the start: features start at about 0.03, the product of three
+# texels, and are to span that layer's range.
 FEATURE_GAIN = 8.0
 
 # A function of low, high and a shape that returns uniform random numbers.
@@ -119,7 +119,7 @@ class Field(nn.Module):
 
     Attributes:
         layout: where each plane lies in theta.
-        theta: (n,) the planes. Space planes start uniform in [0.1, 0.5], space-time planes at 1 (K-Planes, section 3.2).
+        theta: (n,) the planes. Space planes start uniform in [0.1, 0.5], space-time planes at 1 (K-Planes).
         motion: (T, Nz, Ny, Nx, 3) displacements, `kpc.format.scene.motion`, at first 0; or None.
         codes: (K, H) appearance codes, at first 0; or None.
         mixed: whether the layers of a decoder compute in bfloat16 with float32 sums.
@@ -128,6 +128,10 @@ class Field(nn.Module):
             on the direction only as far as the pictures ask for it.
         axes, sizes, first: constants of `features`: the axes, sizes and first texels of the planes.
     """
+
+    axes: Tensor
+    sizes: Tensor
+    first: Tensor
 
     # What a space-time plane holds where nothing changes: the identity of `combine`.
     IDENTITY = 1.0
@@ -286,7 +290,7 @@ class Field(nn.Module):
     ) -> Scene:
         """Return the field as data; the planes are copied.
 
-        The mean of the codes moves into b1: pictures with a code stay the same, and the average code is that of no code.
+        The mean of the codes moves into b1: pictures with a code stay the same, and no code is the average one.
 
         Args:
             aabb, clip, occupancy, background, step, mapping: as in `Scene`.
@@ -317,10 +321,13 @@ class Field(nn.Module):
 
     @staticmethod
     def from_scene(scene: Scene) -> "Field":
-        """The field whose planes, decoder and codes a scene holds. Its planes have at least two texels along either axis
-        (`kpc.encoder.rdo.codec_model.widen_single_texels`)."""
+        """Return a field with a scene's planes, decoder, motion grid and codes.
+
+        Raises:
+            ValueError: a plane has a single texel along an axis (see `rdo.codec_model.widen_single_texels`).
+        """
         if any(min(plane.shape[:2]) < 2 for scale in scene.scales for plane in scale.values()):
-            raise ValueError("a plane has but one texel along an axis")
+            raise ValueError("a plane has a single texel along an axis")
         shape = {name: scene.scales[0][name].shape for name in scene.scales[0]}
         resolution = []
         for scale in scene.scales:

@@ -44,11 +44,11 @@ class Rays:
     def from_arrays(*arrays: np.ndarray, appearances: np.ndarray | None = None) -> "Rays":
         """Return rays of the first five members as arrays of any float type, and of appearances (N,) int64."""
         floats = (torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays)
-        return Rays(*floats, None if appearances is None else torch.from_numpy(appearances))
+        return Rays(*floats, appearances=None if appearances is None else torch.from_numpy(appearances))
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "Rays":
         """Return rays whose members are `change` of these."""
-        return Rays(*(None if value is None else change(value) for value in vars(self).values()))
+        return Rays(**{name: None if value is None else change(value) for name, value in vars(self).items()})
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def select_reached(samples: Samples, is_reached: Tensor, capacity: int) -> Sampl
 
 
 def _first_set(is_set: Tensor, capacity: int) -> tuple[Tensor, Tensor]:
-    """Return the positions at which (n,) bool are set, (capacity,) int64, and whether there is one, (capacity,) bool."""
+    """Return where (n,) bool are set, (capacity,) int64, and which of these are more than padding, (capacity,) bool."""
     n = is_set.numel()
     number = torch.where(is_set, is_set.cumsum(0) - 1, capacity).clamp(max=capacity)
     positions = torch.full((capacity + 1,), n - 1, device=is_set.device)
@@ -204,7 +204,7 @@ def plane_coordinates(rays: Rays, s: Tensor, aabb: Tensor, mapping: SpaceMapping
 
 def cell_indices(u: Tensor, cells: tuple[int, ...]) -> Tensor:
     """Return the cells z, y, x of a grid (Nz, Ny, Nx) that hold u (..., 3): (..., 3) int64."""
-    return torch.stack([(u[..., axis] * n).long().clamp(0, n - 1) for axis, n in zip((2, 1, 0), cells)], dim=-1)
+    return torch.stack([(u[..., axis] * n).long().clamp(0, n - 1) for axis, n in zip((2, 1, 0), cells, strict=True)], dim=-1)
 
 
 def weigh_samples(

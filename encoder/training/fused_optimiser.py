@@ -129,7 +129,7 @@ class FusedOptimiser:
         )
 
     def _step_decoder(self, basis: torch.Tensor, mask: torch.Tensor, gradients: kernels.Gradients, rate: float) -> None:
-        """Step all parameters but the planes, given the gradients of basis and density with respect to masked features."""
+        """Step all parameters but the planes, given the gradients of the masked basis and density."""
         field, config = self.field, self.config
         self.decoder.zero_grad()
         g_basis = gradients.basis if config.view_dependent else gradients.basis.sum(0, keepdims=True)

@@ -28,8 +28,8 @@ from kpc.encoder.training.optimisers import (
 )
 from kpc.format.scene.space import SpaceMapping
 
-# On a GPU a step has a fixed capacity for samples, a multiple of the number in recent steps: CAPACITY when it is set. It
-# is set anew once it is below MIN_CAPACITY or above MAX_CAPACITY times that number.
+# On a GPU a step has a fixed capacity for samples: CAPACITY times the number in recent steps when it is set. It is set
+# anew once it is below MIN_CAPACITY or above MAX_CAPACITY times that number.
 CAPACITY, MIN_CAPACITY, MAX_CAPACITY = 1.125, 1.04, 1.35
 
 # Capacities are multiples of this: PyTorch reuses memory of equal sizes.
@@ -83,8 +83,8 @@ class StepPlan:
 class TorchOptimiser:
     """A step in PyTorch on any device; on the CPU with the kernels for the planes where `fused`.
 
-    On a GPU nothing in a step waits for it: shapes do not depend on what it computes, and `step` returns numbers of some
-    steps before. Steps that repeat are captured as CUDA graphs (`kpc.encoder.training.cuda_graphs`).
+    On a GPU nothing in a step waits for it: shapes do not depend on what it computes, and `step` returns numbers of
+    some steps before. Steps that repeat are captured as CUDA graphs (`kpc.encoder.training.cuda_graphs`).
 
     Attributes:
         timers: seconds spent, by part of a step.
@@ -207,7 +207,7 @@ class TorchOptimiser:
         occupancy: torch.Tensor,
         appearances: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Set all gradients and raise the peaks; return the mean squared error, and samples per ray taken and reached."""
+        """Set all gradients and raise the peaks; return the mean squared error, samples per ray taken, and reached."""
         field, config = self.field, self.config
         batch, targets = _unpack(packed, appearances)
         assert self._aabb is not None

@@ -1,6 +1,8 @@
 """How the kernels are compiled."""
 
-from numba import njit
+from functools import partial
+
+from kpc.format.common.jit import compiled
 
 # Not "reassoc": the order of sums would differ between code compiled in this process and the same code from numba's
 # cache, so that the first training run on a machine would end elsewhere than the second.
@@ -8,17 +10,18 @@ FASTMATH = {"nsz", "arcp", "contract", "afn"}
 
 # Innermost loops run over the channels of one plane. Their number is not a compile-time constant: LLVM would unroll a
 # loop of eight before it could vectorise it. They also touch few arrays, as LLVM proves only a handful distinct.
+_kernel = partial(compiled, fastmath=FASTMATH, error_model="numpy")
+
+# For functions that create or return arrays.
+plain = _kernel()
 
 # For functions that neither create nor return an array. Without numba's runtime (`_nrt=False`, which has no public
 # name) references to arrays are not counted, which is atomic and takes a sixth of a step.
-bare = njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True, _nrt=False)
+bare = _kernel(_nrt=False)
 
 # The same for functions that run many times per sample: an array is about eight arguments, and passing them costs as
 # much as the work.
-inlined = njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True, _nrt=False, forceinline=True)
-
-# For functions that create or return arrays.
-plain = njit(fastmath=FASTMATH, error_model="numpy", cache=True, nogil=True)
+inlined = _kernel(_nrt=False, forceinline=True)
 
 # For functions that Python calls and whose `prange` loops run on all of numba's threads.
-parallel = njit(fastmath=FASTMATH, error_model="numpy", cache=True, parallel=True)
+parallel = _kernel(parallel=True)
