@@ -204,7 +204,9 @@ def plane_coordinates(rays: Rays, s: Tensor, aabb: Tensor, mapping: SpaceMapping
 
 def cell_indices(u: Tensor, cells: tuple[int, ...]) -> Tensor:
     """Return the cells z, y, x of a grid (Nz, Ny, Nx) that hold u (..., 3): (..., 3) int64."""
-    return torch.stack([(u[..., axis] * n).long().clamp(0, n - 1) for axis, n in zip((2, 1, 0), cells, strict=True)], dim=-1)
+    return torch.stack(
+        [(u[..., axis] * n).long().clamp(0, n - 1) for axis, n in zip((2, 1, 0), cells, strict=True)], dim=-1
+    )
 
 
 def weigh_samples(
