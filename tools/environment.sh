@@ -1,5 +1,5 @@
-# Sourced by demo.sh and test.sh: makes .venv/ at the repository's root, or reuses it, and installs KPC there.
-# Bash 3.2, as macOS has it. PYTHON=... chooses the interpreter; pip's own settings choose where packages come from.
+# Sourced by demo.sh, test.sh and check.sh: makes or reuses .venv/ at the root of the repository and installs KPC there.
+# It runs in Bash 3.2, the version of macOS. PYTHON=... chooses the interpreter; pip's settings choose the package index.
 
 cd "$(dirname "${BASH_SOURCE[0]}")/.." || exit 1
 
@@ -19,12 +19,12 @@ make_environment() {
     "$python" -m venv .venv || fail ".venv: could not be made; is the disk full, or the folder read-only?"
 }
 
-# install_kpc EXTRAS: kpc with these extras, unless the last run installed the same.
+# install_kpc EXTRAS: install kpc with these extras, unless they are installed already.
 install_kpc() {
     local extras=$1 wanted stamp
     new_enough .venv/bin/python || make_environment
     wanted=$(cat pyproject.toml constraints.txt | cksum)
-    for stamp in .venv/.installed-*; do  # "encoder,test" holds "encoder"
+    for stamp in .venv/.installed-*; do  # "encoder,test" includes "encoder"
         case "$stamp" in *"-$extras"*) [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ] || return 0 ;; esac
     done
     echo "installing kpc[$extras] into .venv (the first time takes minutes: PyTorch is large)" >&2
@@ -33,7 +33,7 @@ install_kpc() {
     printf '%s\n' "$wanted" > ".venv/.installed-$extras"
 }
 
-# Whether OpenGL can be had; says in one line how to get it where not.
+# Succeeds if OpenGL is available; otherwise prints in one line how to install it.
 has_opengl() {
     .venv/bin/python - <<'PYTHON'
 import sys

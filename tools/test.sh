@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Makes or reuses .venv/, installs KPC with all it needs, runs the whole test suite, a process a core up to four.
-# Arguments go to pytest (`-n 0`: in one process).
+# Makes or reuses .venv/, installs KPC with everything the tests need, and runs them in one process per core, at most
+# four. Arguments go to pytest (`-n 0`: in one process).
 set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 
