@@ -105,7 +105,7 @@ def test_the_motion_map_and_kpinfo_describe_the_group_shown(clip, scenes, tmp_pa
         alone, camera = kpc.load(scenes[number]), fit_camera(kpc.load(clip).cameras[0], 24, 18)
         expected = motion_colours(alone, camera, own, reference.render(alone, camera, own)).rgb
         assert np.abs(read_image(picture) - 255 * np.clip(expected, 0, 1)).max() <= 1
-        assert (shares == {"identity_share": 1, "unchanging_share": 1, "motionless_share": 1}) == (number == 2)
+        assert (shares == {"identity_share": 1, "constant_share": 1, "motionless_share": 1}) == (number == 2)
 
 
 def test_a_scene_counts_as_a_clip_of_one_group(scenes):

@@ -54,10 +54,11 @@ def test_kpinfo_prints_the_fractions(tmp_path: Path, capsys: pytest.CaptureFixtu
     write(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]), tmp_path / "scene.kpc")
     assert kpinfo.main([str(tmp_path / "scene.kpc"), "--json"]) == 0
     shares = json.loads(capsys.readouterr().out)["static"]
-    assert shares["identity_share"] == 0.75 and shares["unchanging_share"] == 0.5 <= shares["motionless_share"] <= 1
+    assert shares["identity_share"] == 0.75 and shares["constant_share"] == 0.5 <= shares["motionless_share"] <= 1
     assert kpinfo.main([str(tmp_path / "scene.kpc")]) == 0
     page = capsys.readouterr().out
-    assert "75.0% of the occupied space-time is identity; 50.0% of the occupied space never changes" in page
+    assert "75.0% of the occupied space-time has time planes of 1" in page
+    assert "50.0% of the occupied space never changes" in page
 
 
 def test_planes_constant_in_time_but_not_one_are_constant_and_not_static() -> None:

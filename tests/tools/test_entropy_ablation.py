@@ -1,4 +1,7 @@
+"""Variants of the entropy coder: without a change they encode as the coder does, and every change has an effect."""
+
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,77 +12,98 @@ from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.scene_io import write
 from kpc.format.container.segments import encode_segment
 from kpc.tools.bench import entropy_ablation, kpbench, tables
+from kpc.tools.bench.entropy_ablation import (
+    RECORDED,
+    TABLE_BITS,
+    VARIANTS,
+    PredictiveVariant,
+    Segment,
+    TransformVariant,
+    compile_encoder,
+    encode_by_tables,
+    predictive_size,
+)
 from scenes import tiny_scene
 
 
-def in_blocks(side=8, rows=60, columns=92, share=0.7, by_occupancy=False):
-    """A segment."""
-    told, coded = random_blocks(side, rows, columns, share, seed=3)
-    implied = coded if by_occupancy else None
-    body = transform.encode_blocks(told, coded, implied)
-    values, _ = transform.decode_blocks(body, rows, columns, 3, implied)
-    return entropy_ablation.Segment(values, coded, coded if by_occupancy else ~coded, body, body)
+def transform_segment(rows: int = 60, columns: int = 92, share: float = 0.7, implied: bool = False) -> Segment:
+    blocks, coded = random_blocks(8, rows, columns, share, seed=3)
+    occupied = coded if implied else None
+    body = transform.encode_blocks(blocks, coded, occupied)
+    symbols, _ = transform.decode_blocks(body, rows, columns, 3, occupied)
+    return Segment(symbols, coded, coded if implied else ~coded, body, body)
 
 
-def test_with_nothing_changed_the_coder_is_the_coder():
-    values, coded = textured(20, 24, 3)
-    side_info = PredictionWeights(np.int8([[3, -5, 8, 0, 1, -2, 4, 0, 1]]))
-    for values, side_info in ((values, None), (followed(values, coded, side_info), side_info)):
-        for implied in (coded, ~coded):
-            body = encode_symbols(values, coded, side_info, implied)
-            segment = entropy_ablation.Segment(values, coded, implied, side_info, body)
-            assert entropy_ablation._bytes(segment, entropy_ablation._compiled(predictive, {}), SET_COUNTS) == len(body)
+def predictive_segment(side_info: PredictionWeights | None = None, implied: bool = False) -> Segment:
+    symbols, coded = textured(20, 24, 3)
+    if side_info is not None:
+        symbols = followed(symbols, coded, side_info)
+    derived = coded if implied else ~coded
+    return Segment(symbols, coded, derived, side_info, encode_segment(symbols, coded, side_info, derived))
 
 
-@pytest.mark.parametrize("by_occupancy", [False, True])
-def test_with_nothing_changed_blocks_are_as_they_were(by_occupancy):
-    segment, walks = in_blocks(by_occupancy=by_occupancy), entropy_ablation._compiled(transform, {})
-    assert entropy_ablation._bytes_in_blocks(segment, walks) == len(segment.body)
+WEIGHTS = PredictionWeights(np.int8([[3, -5, 8, 0, 1, -2, 4, 0, 1]]))
+
+
+@pytest.mark.parametrize("side_info", [None, WEIGHTS], ids=["no side information", "weights"])
+@pytest.mark.parametrize("implied", [False, True])
+def test_without_changes_symbols_take_what_the_coder_takes(side_info: PredictionWeights | None, implied: bool) -> None:
+    segment = predictive_segment(side_info, implied)
+    encode = compile_encoder(predictive, "encode_with_weights", {})
+    assert predictive_size(segment, encode, SET_COUNTS) == len(segment.body)
+
+
+@pytest.mark.parametrize("implied", [False, True])
+def test_without_changes_blocks_take_what_the_coder_takes(implied: bool) -> None:
+    segment = transform_segment(implied=implied)
+    assert TransformVariant({}).compiled()(segment) == len(segment.body)
+
+
+@pytest.mark.parametrize("name", [name for name, one in VARIANTS.items() if isinstance(one, TransformVariant)])
+def test_changes_of_the_transform_codec_have_an_effect(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(entropy_ablation, "njit", lambda function: function)  # plain Python is faster than compiling
+    segment = transform_segment(rows=60, columns=64, share=1.0)
+    assert VARIANTS[name].affects(segment)
+    assert VARIANTS[name].compiled()(segment) != len(segment.body)
 
 
 @pytest.mark.parametrize(
-    "idea",
-    [name for name, idea in entropy_ablation.LEFT_OUT.items() if isinstance(idea, entropy_ablation.OfBlocks)],
+    "name", [name for name, one in VARIANTS.items() if isinstance(one, PredictiveVariant) and one.set_counts != (1,)]
 )
-def test_what_is_left_out_of_blocks_changes_something(idea, monkeypatch):
-    monkeypatch.setattr(entropy_ablation, "njit", lambda function: function)  # as plain Python: compiling takes longer
-    segment = in_blocks(rows=60, columns=64, share=1.0)
-    assert entropy_ablation.LEFT_OUT[idea].has(segment)
-    assert entropy_ablation.LEFT_OUT[idea].sized()(segment) != len(segment.body)
+def test_changes_of_the_predictive_codec_have_an_effect(name: str) -> None:
+    segment = predictive_segment()
+    assert VARIANTS[name].affects(segment) and not VARIANTS[name].affects(transform_segment())
+    assert VARIANTS[name].compiled()(segment) != len(segment.body)
 
 
-def test_a_map_is_told_where_occupancy_does_not():
-    segment, idea = in_blocks(by_occupancy=True), entropy_ablation.LEFT_OUT["signalled significance maps"]
-    assert idea.has(segment) and not idea.has(in_blocks()) and not idea.has(in_blocks(share=1.0))
-    assert idea.sized()(segment) > len(segment.body)
-    values, coded = textured(20, 24, 3)
-    by_symbols = entropy_ablation.Segment(values, coded, coded, None, encode_segment(values, coded, None, coded))
-    assert idea.sized()(by_symbols) == len(encode_symbols(values, coded)) > len(by_symbols.body)
+def test_maps_that_follow_from_occupancy_are_coded() -> None:
+    segment, variant = transform_segment(implied=True), VARIANTS["signalled significance maps"]
+    assert variant.affects(segment)
+    assert not variant.affects(transform_segment()) and not variant.affects(transform_segment(share=1.0))
+    assert variant.compiled()(segment) > len(segment.body)
+    by_symbols = predictive_segment(implied=True)
+    expected = len(encode_symbols(by_symbols.symbols, by_symbols.coded))
+    assert variant.compiled()(by_symbols) == expected > len(by_symbols.body)
 
 
-def test_what_tables_would_take():
-    asked = np.repeat(
-        np.int16([-10000, -10001, -10002, -10003, -20000]), [50, 50, 0, 64, 1]
-    )  # 0 and 1 as often, 1 always, 0 once
-    assert (
-        entropy_ablation._tables(np.append(asked, np.int16([2048, -2048]))) * 8
-        == 100 + 3 * entropy_ablation.TABLE_BITS + 2
-    )
+def test_the_size_by_static_tables() -> None:
+    """One model sees 0 and 1 equally often, one only 1 and one a single 0; three bits have no model."""
+    decisions = RECORDED - np.repeat([0, 1, 3, 10000], [44, 44, 64, 1])
+    trace = np.append(decisions, [2048, -2048, 2048]).astype(np.int16)
+    assert len(encode_by_tables(trace)) == round((88 + 3 * TABLE_BITS + 3) / 8)
 
 
-def test_records(tmp_path, monkeypatch):
+def test_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tiny_scene(scales=1, channels=4)
-    write(quantise_scene(scene, [{name: 0.02 for name in scene.scales[0]}]), tmp_path / "tiny.kpc")
-    idea = "one set of prediction weights"
-    monkeypatch.setattr(entropy_ablation, "LEFT_OUT", {idea: entropy_ablation.LEFT_OUT[idea]})
+    write(quantise_scene(scene, [dict.fromkeys(scene.scales[0], 0.02)]), tmp_path / "tiny.kpc")
+    name = "one set of prediction weights"
+    monkeypatch.setattr(entropy_ablation, "VARIANTS", {name: VARIANTS[name]})
     out = tmp_path / "entropy.json"
     assert kpbench.main(["entropy", str(tmp_path / "tiny.kpc"), "--out", str(out)]) == 0
-    records = {record["settings"]["variant"]: record["repeats"][0] for record in json.loads(out.read_text())}
-    assert list(records) == ["baseline", "zstd", idea]
-    assert records["baseline"]["plane_bytes"] < records["zstd"]["plane_bytes"]
-    assert records["baseline"]["decode_ms"] > 0
-    assert (
-        records["baseline"]["file_bytes"] == (tmp_path / "tiny.kpc").stat().st_size
-        and records["baseline"]["read_ms"] > 0
-    )
-    assert "reading ms" in tables.markdown(json.loads(out.read_text()))
+    records = json.loads(out.read_text())
+    by_variant = {record["settings"]["variant"]: record["repeats"][0] for record in records}
+    assert list(by_variant) == ["baseline", "zstd", name]
+    baseline = by_variant["baseline"]
+    assert baseline["plane_bytes"] < by_variant["zstd"]["plane_bytes"] and baseline["decode_ms"] > 0
+    assert baseline["file_bytes"] == (tmp_path / "tiny.kpc").stat().st_size and baseline["read_ms"] > 0
+    assert "reading ms" in tables.markdown(records)

@@ -65,7 +65,7 @@ NO_GRID_RDO = "kpc, no grid RDO"
 
 # Ablations of KPC's coder, at QUALITIES, all without fine-tuning: how planes are quantised; None is the usual way. The
 # first two lack nothing else, or the rate-distortion optimisation of occupancy and motion grids. The others ignore the
-# correlation of errors between channels, and the last four one thing more each.
+# correlation of errors between channels, and the last four leave out one more part each.
 ABLATIONS: dict[str, QuantiseFunction | None] = {
     "kpc, no fine-tuning": None,
     NO_GRID_RDO: None,

@@ -91,9 +91,9 @@ def texel_rate(ctx: moderngl.Context, compute: bool, dtype: str) -> float:
 
     def draw(times: int) -> None:
         for _ in range(times):
-            if vertices is None:
+            if isinstance(program, moderngl.ComputeShader):
                 program.run(PICTURE_SIDE // 8, PICTURE_SIDE // 8)
-            else:
+            elif vertices is not None:
                 vertices.render(moderngl.TRIANGLES, vertices=3)
         ctx.finish()
 

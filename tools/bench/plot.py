@@ -65,9 +65,8 @@ def curves(records: Sequence[Record]) -> Figure:
     for axes, (key, title, unit) in zip(all_axes, panels, strict=True):
         for number, (name, line) in enumerate(lines.items()):
             dots = [(seconds / 60, value / unit) for seconds, value in _dots(line, key)]
-            medians = sorted(
-                (median(record, "train_s"), median(record, key)) for record in line if _dots([record], key)
-            )
+            measured = [record for record in line if _dots([record], key)]
+            medians = sorted((median(record, "train_s") or 0.0, median(record, key) or 0.0) for record in measured)
             axes.plot([s / 60 for s, _ in medians], [v / unit for _, v in medians], color=f"C{number}", label=name)
             if dots:
                 axes.plot(*zip(*dots, strict=True), "o", markersize=4, color=f"C{number}")
