@@ -1,13 +1,14 @@
-"""Which cells are told as occupied: so few bits as the pictures, and a renderer's time, allow.
+"""Choice of the occupied cells by rate and distortion, within what pictures and a renderer's time allow.
 
-Where density ends a grid is ragged by chance, and what is ragged takes bits (`kpc.format.coding.occupancy_codec`). A cell may be told otherwise than it is if
-that costs less than it saves: one that holds next to nothing may be marched, and then shows that; one that hardly gives any ray
-its colour may be left out. Cells are flipped one by one, over and over, where that makes less of
+The boundary of a trained occupancy is ragged by chance, and that takes bits (`kpc.format.coding.occupancy_codec`). A
+cell may be flipped if that costs less than it saves: one that holds next to nothing may be marched, and then shows
+that; one that hardly gives any ray its colour may be empty. Cells are flipped one by one, in several passes, where
+that reduces
 
-    bits of all cells + MARCHED * cells that are occupied + BITS * parameters * error / most
+    bits of all cells + MARCH_BITS * occupied cells + PLANE_BITS * parameters * error / allowed error
 
-with the error in pictures that comes of flipping them, as a share of the most that coding may bring: about what planes would take to make
-up for it. The error is found by rays of the scene's cameras, from the weight that each ray has in each cell.
+with the error in pictures that comes of flipping. The last term is about the bits with which planes would make up for
+it. The error is estimated on rays of the scene's cameras, from the weight that each ray has in each cell.
 """
 
 from dataclasses import replace
@@ -22,89 +23,101 @@ from kpc.format.common.jit import compiled, inlined
 from kpc.format.scene.grid import dilate
 from kpc.format.scene.scene import Scene
 
-MARCH_BITS = 0.5
-"""Bits that a cell less to march is worth. With 1 soldier has 2 % fewer cells to march, and 3 % more bytes to tell them."""
-PLANE_BITS = 0.15
-"""Of planes, a parameter, that make errors e times smaller: 0.12 to 0.25 for the default scene, soldier, liam and room."""
+# Figures behind these constants: docs/design/rate-distortion.md, "Occupancy".
+MARCH_BITS = 0.5  # bits that one cell less to march is worth
+PLANE_BITS = 0.15  # bits per parameter with which planes make their errors e times smaller
+# Mean squared difference of the colour in a cell from that behind it, as a share of the full range; a little more,
+# since the errors of neighbouring cells on a ray add up.
 CONTRAST = 0.1
-"""Mean squared difference in colour, as a share of the full range, between what is in a cell and what is behind it; and as neighbours on a
-ray err together, some more."""
-SHARE = 0.05
-"""Of the error that coding may bring, how much may come of this."""
-ERROR_GROWTH = 8.0
-"""How much more errors are taken to cost, where that was exceeded; and how often that is tried."""
+SHARE = 0.05  # of the allowed error that this may take
+ERROR_GROWTH = 8.0  # factor on the assumed errors for each retry, where SHARE was exceeded
 TRIES = 3
-RAYS, RAYS_A_CELL = 1 << 19, 8
-"""That look for errors, at most. With a quarter of them cells are left out that other rays need: pictures of room then err forty times as much."""
-FEWER_RAYS = 1 << 18
-"""At most, that look for what empty cells would show. Those are marched that are next to occupied ones; where they hide others, it is not known what these show."""
-RAYS_AT_ONCE = 1 << 12
+RAYS, RAYS_PER_CELL = 1 << 19, 8  # rays that errors of occupied cells are estimated on, at most
+FEWER_RAYS = 1 << 18  # rays for empty cells next to occupied ones, at most
+RAYS_PER_BATCH = 1 << 12
 PASSES = 8
-MAX_OWN_BITS = 8.0
-"""Bits more that a flipped cell itself would take, for which what it does to others is not looked at."""
+MAX_OWN_BITS = 8.0  # a flip that costs so many bits for the cell itself is not considered further
 
 
-def optimise_occupancy(scene: Scene, errors: np.ndarray, measure: Measure, most: float) -> Scene:
-    """The scene with cells of its occupancy flipped, where it pays and pictures lose no more than SHARE of `most`; else itself.
+def optimise_occupancy(scene: Scene, errors: np.ndarray, measure: Measure, mse: float) -> Scene:
+    """Flip cells of a scene's occupancy where it pays, if that adds at most SHARE of an error.
 
     Args:
-        errors: `flip_errors` of the scene, or of one whose slots this one's stand for, several each.
-        measure: of pictures, by which it is known what they lose. most: the error that coding may bring, in squares of 8-bit levels.
+        scene: whose slots may be several merged slots each of the scene that `errors` are of.
+        errors: `flip_errors` of the original scene.
+        measure: judges scenes.
+        mse: error that coding may bring, on the 8-bit scale.
+
+    Returns:
+        The scene with its new occupancy; itself where the added error is too large.
     """
-    if most <= 0:
+    if mse <= 0:
         return scene
     slots, *cells = scene.occupancy.shape
-    known, lost = (
-        measure(scene).mse,
-        PLANE_BITS * scene.parameter_count / most * errors.reshape(slots, -1, *cells).sum(1),
-    )
+    known = measure(scene).mse
+    lost = PLANE_BITS * scene.parameter_count / mse * errors.reshape(slots, -1, *cells).sum(1)
     for number in range(TRIES):
         candidate = replace(scene, occupancy=flip_cells(scene.occupancy, ERROR_GROWTH**number * lost))
-        if measure(candidate).mse - known <= SHARE * most:
+        if measure(candidate).mse - known <= SHARE * mse:
             return candidate
     return scene
 
 
-def flip_errors(scene: Scene, probe: ValidationRays, share: int = 1) -> np.ndarray:
-    """(slots, Nz, Ny, Nx) float64: mean squared error of colours, in squares of 8-bit levels, that comes of flipping a cell; 0 of those that are
-    neither occupied nor next to one. By one in `share` of the rays that it takes."""
-    wide = replace(scene, occupancy=dilate(scene.occupancy))
-    rays = RAYS_A_CELL * int(np.count_nonzero(scene.occupancy))
-    own, next_to_it = (
-        removal_errors(one, probe, min(rays, most) // share) for one, most in ((scene, RAYS), (wide, FEWER_RAYS))
+def flip_errors(scene: Scene, validation: ValidationRays, ray_divisor: int = 1) -> np.ndarray:
+    """Estimate the MSE of colours that comes of flipping each cell.
+
+    Args:
+        scene: uncoded.
+        validation: rays that are used first; random rays of the scene's cameras follow.
+        ray_divisor: use this many times fewer rays.
+
+    Returns:
+        (slots, Nz, Ny, Nx) float64, on the 8-bit scale; 0 for cells that are neither occupied nor next to such a cell.
+    """
+    dilated = replace(scene, occupancy=dilate(scene.occupancy))
+    rays = RAYS_PER_CELL * int(np.count_nonzero(scene.occupancy))
+    removing, adding = (
+        removal_errors(one, validation, min(rays, most) // ray_divisor)
+        for one, most in ((scene, RAYS), (dilated, FEWER_RAYS))
     )
-    return np.where(scene.occupancy, own, next_to_it)
+    return np.where(scene.occupancy, removing, adding)
 
 
-def removal_errors(scene: Scene, probe: ValidationRays, rays: int) -> np.ndarray:
-    """(slots, Nz, Ny, Nx) float64: mean squared error of colours, in squares of 8-bit levels, that comes of not marching a cell.
+def removal_errors(scene: Scene, validation: ValidationRays, rays: int) -> np.ndarray:
+    """Estimate the MSE of colours that comes of not marching each cell, on validation rays and `rays` random ones.
 
-    By a probe and so many random rays of the scene's cameras.
+    Returns:
+        (slots, Nz, Ny, Nx) float64, on the 8-bit scale.
     """
     renderer, slots = SceneRenderer(scene), len(scene.occupancy)
-    probe = probe.subset(np.flatnonzero(renderer.hits_occupied(*probe.rays)))
+    validation = validation.subset(np.flatnonzero(renderer.hits_occupied(*validation.rays)))
     more = ValidationRays.through_occupied(scene, rays, seed=5)
     sums = np.zeros(scene.occupancy.size)
-    for one in (probe, more):
-        for some in one.batches(RAYS_AT_ONCE):
+    for part in (validation, more):
+        for batch in part.batches(RAYS_PER_BATCH):
             with torch.no_grad():
-                samples, met = march_scene(renderer.field, renderer.batch(*some.rays), scene)
-            ray, weights = samples.ray.numpy(), met.weights.numpy().astype(np.float64)
-            slot = np.minimum((some.times * slots).astype(np.int64), slots - 1)[ray]
+                samples, composited = march_scene(renderer.field, renderer.batch(*batch.rays), scene)
+            ray, weights = samples.ray.numpy(), composited.weights.numpy().astype(np.float64)
+            slot = np.minimum((batch.times * slots).astype(np.int64), slots - 1)[ray]
             cell = np.ravel_multi_index((slot, *samples.cell.numpy().T), scene.occupancy.shape)
-            first = np.flatnonzero(
-                np.diff(cell, prepend=-1) | np.diff(ray, prepend=-1)
-            )  # of a ray's samples in one cell
+            # The first of a ray's consecutive samples in each cell; their weights are added up.
+            first = np.flatnonzero(np.diff(cell, prepend=-1) | np.diff(ray, prepend=-1))
             sums += np.bincount(cell[first], np.add.reduceat(weights, first) ** 2 if len(first) else None, sums.size)
-    error: np.ndarray = (
-        255**2 * CONTRAST * sums.reshape(scene.occupancy.shape) / max(1, len(probe.times) + len(more.times))
-    )
+    count = max(1, len(validation.times) + len(more.times))
+    error: np.ndarray = 255**2 * CONTRAST * sums.reshape(scene.occupancy.shape) / count
     return error
 
 
 def flip_cells(occupancy: np.ndarray, lost: np.ndarray) -> np.ndarray:
-    """(slots, Nz, Ny, Nx) bool `occupancy`, as it is cheapest to tell; `lost`: bits that errors of flipping a cell are worth. Cells that
-    are neither occupied nor next to one stay empty."""
+    """Return the occupancy of least cost.
+
+    Args:
+        occupancy: (slots, Nz, Ny, Nx) bool.
+        lost: of the same shape, bits that the error of flipping each cell is worth.
+
+    Returns:
+        Of the same shape; cells that are neither occupied nor next to such a cell stay empty.
+    """
     cells = np.array(occupancy, np.uint8, order="C")
     occupied = np.where(occupancy, MARCH_BITS - lost, np.where(dilate(occupancy), MARCH_BITS + lost, np.inf))
     for _ in range(PASSES):
@@ -116,7 +129,7 @@ def flip_cells(occupancy: np.ndarray, lost: np.ndarray) -> np.ndarray:
 
 @compiled()
 def count_contexts(cells, neighbours):
-    """(CONTEXTS, 2): how often a cell is empty, and how often occupied, in each context."""
+    """Count how often cells are empty, and occupied, in each context: (CONTEXTS, 2)."""
     counts = np.zeros((CONTEXTS, 2))
     for s in range(cells.shape[0]):
         for z in range(cells.shape[1]):
@@ -128,10 +141,13 @@ def count_contexts(cells, neighbours):
 
 @compiled()
 def _flip(cells, bits, occupied, neighbours):
-    """Flip cells one by one where that costs less than it saves: how many.
+    """Flip cells, one by one, where that saves bits; return how many.
 
     Args:
-        bits: (CONTEXTS, 2) of a cell that is empty, or occupied. occupied: what it costs that a cell is, besides.
+        cells: (slots, Nz, Ny, Nx) uint8, updated.
+        bits: (CONTEXTS, 2), of an empty and of an occupied cell.
+        occupied: (slots, Nz, Ny, Nx), further bits that an occupied cell costs.
+        neighbours: of the contexts.
     """
     S, Z, Y, X = cells.shape
     count = 0
@@ -148,7 +164,7 @@ def _flip(cells, bits, occupied, neighbours):
                     )
                     if not more < MAX_OWN_BITS:
                         continue
-                    for k in range(len(neighbours)):  # those in whose contexts it is
+                    for k in range(len(neighbours)):  # cells whose contexts this one is part of
                         i, j, v, u = (
                             s - neighbours[k, 0],
                             z - neighbours[k, 1],
@@ -156,8 +172,8 @@ def _flip(cells, bits, occupied, neighbours):
                             x - neighbours[k, 3],
                         )
                         if 0 <= i < S and 0 <= j < Z and 0 <= v < Y and 0 <= u < X:
-                            theirs, told = context_at(cells, i, j, v, u, neighbours), int(cells[i, j, v, u])
-                            more += bits[theirs ^ 1 << len(neighbours) - 1 - k, told] - bits[theirs, told]
+                            theirs, other = context_at(cells, i, j, v, u, neighbours), int(cells[i, j, v, u])
+                            more += bits[theirs ^ 1 << len(neighbours) - 1 - k, other] - bits[theirs, other]
                     if more < 0:
                         cells[s, z, y, x] = 1 - is_set
                         count += 1
@@ -166,7 +182,7 @@ def _flip(cells, bits, occupied, neighbours):
 
 @inlined
 def context_at(cells, s, z, y, x, neighbours):
-    """The context of a cell, as `kpc.format.coding.occupancy_codec.walk` finds it."""
+    """Return the context of a cell, as in `kpc.format.coding.occupancy_codec`."""
     S, Z, Y, X = cells.shape
     context = 0
     for k in range(len(neighbours)):

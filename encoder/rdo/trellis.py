@@ -1,27 +1,27 @@
-"""Which symbol a number becomes: trellis-coded quantisation, with an eye on what symbols cost.
+"""Trellis-coded quantisation of planes with a Lagrangian cost.
 
-Symbols lie half as far apart as plain rounding to the same number of bits would have them, but along a row only every other one may
-follow (`kpc.format.coding.predictive.trellis_transition`). A Viterbi search finds the path through a row of least
+On the trellis, symbols lie half as far apart as with uniform quantisation of the same rate, but along a row only
+every other symbol may follow (`kpc.format.coding.predictive.next_trellis_state`). A Viterbi search finds the path
+through a row of least cost J = D + lambda R (`kpc.encoder.rdo.distortion`): for each symbol it adds
 
-    u^2 + 2 u (BESIDE * sum of u of the four texels around + ACROSS * sum of u of the four at the corners + others)
-        + LAM * bits(symbol | those before it),        u = sqrt(worth) (symbol - value / step)
+    u^2 + 2 u (EDGE_COUPLING * sum of u of the four adjacent texels
+               + CORNER_COUPLING * sum of u of the four diagonal texels + cross-channel errors)
+        + LAM * bits(symbol | symbols before it),        u = sqrt(weight) (symbol - value / step)
 
-(`kpc.encoder.rdo.distortion`), each survivor with the predictions and contexts that its own symbols lead to (Marcellin and Fischer, IEEE Trans.
-Comm. 38, 1990). Bits are counted in the contexts of the coder, from what the search before chose; rows below and channels to come have the
-errors that the search before left them. So errors next to each other get opposite signs, and look-ups, which lie between texels, see less of
-them; and a channel undoes what others err. What an error is worth differs from texel to texel by orders of magnitude
-(`kpc.encoder.rdo.curvature`): where it is worth little, symbols are those that are foreseen.
+Each survivor has the predictions and contexts that its own symbols lead to (Marcellin and Fischer, IEEE Trans. Comm.
+38, 1990). The bits are those of the entropy coder's contexts, estimated from the result of the search before; rows
+below and channels to come have the errors that the search before left. So neighbouring errors get opposite signs, and
+look-ups, which interpolate between texels, see less of them; and channels compensate each other's errors.
 
-Where little more than a bit is told of a symbol (`LOW_RATE_BITS`), they follow the trellis around predictions where it is flat: what is foreseen may
-then follow everywhere, as it should where nothing else is said, and not only every other time.
+At low rates (`LOW_RATE_BITS`) the symbols follow the trellis only around predictions that are not flat: the predicted
+symbol itself may then always follow (mode DEPENDENT), not only every other time.
 
-Default scene, `fast`: at equal error of pictures of 1, 2 and 4 squared levels planes take 11 to 14 % fewer bytes than with symbols chosen
-by rate and distortion around the nearest. Errors that know of each other save 5 to 8 % more, and 14 % where steps are fine (liam,
-`balanced`, at equal error of held-out views).
+What this gains: docs/design/rate-distortion.md, "Trellis-coded quantisation".
 """
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from kpc.encoder.rdo.distortion import (
@@ -59,67 +59,63 @@ from kpc.format.coding.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, b
 from kpc.format.common.jit import compiled
 from kpc.format.container.segments import rows_per_segment
 
-LOW_RATE_BITS = 1.3
-"""Bits of a symbol below which the trellis goes around predictions. Liam and soldier, large planes alone, at equal slopes: squared errors
-plus what bits are worth are 1 % less at 1.3 bits, 8 at 0.75, 15 at 0.5 and 24 at 0.4."""
-LOW_RATE_LAM = 1.0
-"""LAM of those. What bits are worth stays what it is: steps are sqrt(LAM / THIN_LAM) of what they are on the trellis. With 0.7 it is 0 to 1 %
-less at 1.3 bits, and 3 to 5 % more at 0.5."""
+# Figures behind these constants: docs/design/rate-distortion.md, "Trellis-coded quantisation".
+LOW_RATE_BITS = 1.3  # bits per symbol below which the trellis is followed only around predictions that are not flat
+LOW_RATE_LAM = 1.0  # lambda there, in squared steps
+# How much finer the steps are there, so that a bit costs the same distortion.
 LOW_RATE_STEP_RATIO = math.sqrt(LOW_RATE_LAM / LAM)
-"""By how much steps around predictions are finer than those on the trellis at which bits are worth as much."""
-STATES = 8
-PASSES = 4
-"""Searches: the first knows but the weights of rounded symbols, not what symbols cost, nor errors of rows below. Two more make files half a
-percent smaller."""
+STATES = 8  # of the trellis
+PASSES = 4  # searches; the first does not know the bits of symbols, nor the errors of rows below
+# Sets of prediction weights. In mode DEPENDENT the file holds those of the search: one set, unless the plane has
+# MANY_SYMBOLS or more.
 PREDICTOR_SETS, MANY_SYMBOLS = 4, 1 << 17
-"""Of weights. Around predictions files hold those of the search: one set, but for so many symbols or more."""
-MAGNITUDE_BINS = 40
-"""Magnitudes of errors whose bits are told apart."""
+MAGNITUDE_BINS = 40  # magnitudes of residuals whose bits are distinguished
 
 
 def trellis_quantise(
     plane: QuantisedPlane,
-    values: np.ndarray,
-    step: np.ndarray,
-    significant: np.ndarray,
+    values: np.ndarray,  # (H, W, M) float32
+    step: np.ndarray,  # (M,)
+    significant: np.ndarray,  # (H, W, M)
     identity: bool,
-    together: np.ndarray = NO_CORRELATION,
-    thin: float = LOW_RATE_BITS,
+    correlation: np.ndarray = NO_CORRELATION,
+    low_rate_bits: float = LOW_RATE_BITS,
 ) -> QuantisedPlane:
-    """A plane that is quantised to the nearest, with other symbols, and around predictions with other steps. What was left out stays so, and
-    holds 0; and so does what is so near the identity that it is not worth telling.
+    """Requantise a plane on the trellis.
 
-    Where 8 bits are too few for (M,) `step` by a factor of two, all symbols may follow: those that the trellis allows would err more.
-    Bits are worth what they are at the steps that were asked for.
+    Texels that are not coded stay so and hold 0; so do texels of a time plane that are too close to the identity. Where
+    8 bits are too few for `step` by a factor of two, all symbols may follow each other (mode SCALAR), since the symbols
+    that the trellis permits would be too far apart. Lambda stays that of `step`.
 
     Args:
-        significant: (H, W, M), what a squared error costs in each number, relative to others of its channel; none negative.
-        together: as of `kpc.encoder.rdo.curvature.Curvature`, or ALONE.
-        thin: bits of a symbol below which it goes around predictions.
+        plane: quantised to the nearest symbols.
+        values: of the plane.
+        step: quantisation steps that were asked for.
+        significant: cost of a squared error in each value, relative to others of its channel; not negative.
+        identity: whether texels that are not coded are 1 (a time plane).
+        correlation: as in `kpc.encoder.rdo.curvature.Curvature`, or NO_CORRELATION.
+        low_rate_bits: bits per symbol below which mode DEPENDENT is used.
     """
-    lattice = TRELLIS if np.median(plane.step / step) < 2 else SCALAR
-    search = _Search(plane, values, step, significant, identity, together, lattice)
+    mode = TRELLIS if np.median(plane.step / step) < 2 else SCALAR
+    search = _Search(plane, values, step, significant, identity, correlation, mode)
     search.run(1)
-    if lattice == SCALAR or search.bits_of_a_symbol >= thin:
+    if mode == SCALAR or search.bits_per_symbol >= low_rate_bits:
         search.run(PASSES - 1)
-        return search.found()
+        return search.result()
     finer = bfloat16_ceil((step / LOW_RATE_STEP_RATIO).astype(np.float32))
-    around = quantise_plane(values, finer, identity=identity, needed=plane.coded)
-    search = _Search(around, values, finer, significant, identity, together, DEPENDENT)
+    requantised = quantise_plane(values, finer, identity=identity, needed=plane.coded)
+    search = _Search(requantised, values, finer, significant, identity, correlation, DEPENDENT)
     search.run(PASSES)
-    return search.found()
+    return search.result()
 
 
 def requested_trellis_step(plane: QuantisedPlane) -> np.ndarray:
-    """(M,) float64: for which steps `trellis_quantise` was asked when it made this plane, if it did and 8 bits were enough."""
+    """Return the steps, (M,) float64, that `trellis_quantise` was given to make this plane, where 8 bits sufficed."""
     return plane.step.astype(np.float64) * (1.0 if plane.side_info is None else LOW_RATE_STEP_RATIO)
 
 
 class _Search:
-    """Searches for the symbols of one plane, each knowing what the one before found.
-
-    Args: as of `trellis_quantise`; `lattice`: as of `kpc.format.coding.predictive`.
-    """
+    """Iterated search for the symbols of one plane; arguments as for `trellis_quantise`, and the trellis mode."""
 
     def __init__(
         self,
@@ -128,191 +124,293 @@ class _Search:
         step: np.ndarray,
         significant: np.ndarray,
         identity: bool,
-        together: np.ndarray,
-        lattice: int,
+        correlation: np.ndarray,
+        mode: int,
     ) -> None:
-        self.plane, self.identity, self.together, self.lattice = plane, identity, together, lattice
-        self._finer = LOW_RATE_STEP_RATIO if lattice == DEPENDENT else 1.0
+        self.plane, self.identity, self.correlation, self.mode = plane, identity, correlation, mode
+        self._step_ratio = LOW_RATE_STEP_RATIO if mode == DEPENDENT else 1.0
         self.rows = rows_per_segment(len(values), identity)
         coarser = plane.step / step
         self.wanted = (values.astype(np.float64) - plane.offset) / plane.step
-        known = np.ascontiguousarray(plane.coded)
-        worth = distortion_weights(significant, known)
+        coded = np.ascontiguousarray(plane.coded)
+        weight = distortion_weights(significant, coded)
         if identity:
-            known = choose_coded_texels(self.wanted / self._finer, worth, known)
-        self.known, self.worth = known, worth * np.float32(coarser**2)
-        self.symbols = np.where(known[..., None], plane.symbols, np.int8(0))
+            coded = choose_coded_texels(self.wanted / self._step_ratio, weight, coded)
+        self.coded, self.weight = coded, weight * np.float32(coarser**2)
+        self.symbols = np.where(coded[..., None], plane.symbols, np.int8(0))
         self.counts = np.zeros((2 * ACTIVITIES, MAGNITUDE_BINS))
         self.errors = np.zeros((values.shape[0] + 2, values.shape[1] + 2, values.shape[2]), np.float32)
         if identity:
-            self.errors[1:-1, 1:-1] = np.where(known[..., None], 0, np.sqrt(self.worth) * -self.wanted)
+            self.errors[1:-1, 1:-1] = np.where(coded[..., None], 0, np.sqrt(self.weight) * -self.wanted)
 
-    def run(self, times: int) -> None:
-        for _ in range(times):
-            neighbours = collect_neighbours(self.symbols, self.known)
-            self.weights = fit_weights(
-                neighbours, PREDICTOR_SETS if self.lattice != DEPENDENT or len(neighbours) >= MANY_SYMBOLS else 1
-            )
-            self.symbols, self.counts = _search(
+    def run(self, passes: int) -> None:
+        """Search `passes` times, each time with predictors and bits from the result before."""
+        for _ in range(passes):
+            neighbours = collect_neighbours(self.symbols, self.coded)
+            many = self.mode != DEPENDENT or len(neighbours) >= MANY_SYMBOLS
+            self.predictors = fit_weights(neighbours, PREDICTOR_SETS if many else 1)
+            rate_costs = LAM * self._step_ratio**2 * _residual_bits(self.counts)
+            problem = Problem(
                 self.wanted,
-                self.worth,
-                self.known,
+                self.weight,
+                self.coded,
                 self.rows,
-                self.lattice,
-                self.weights,
-                LAM * self._finer**2 * _bits(self.counts),
-                self.errors,
-                self.together,
+                self.mode,
+                self.predictors,
+                rate_costs,
+                self.correlation,
             )
+            self.symbols, self.counts = search(problem, self.errors)
 
     @property
-    def bits_of_a_symbol(self) -> float:
-        return float((self.counts * _bits(self.counts)).sum() / max(self.counts.sum(), 1))
+    def bits_per_symbol(self) -> float:
+        return float((self.counts * _residual_bits(self.counts)).sum() / max(self.counts.sum(), 1))
 
-    def found(self) -> QuantisedPlane:
-        if self.lattice == DEPENDENT:  # what is coded tells what is foreseen
-            return replace(
-                self.plane, symbols=self.symbols, coded=self.known, side_info=PredictionWeights(self.weights)
-            )
-        return replace(
-            self.plane, symbols=self.symbols, coded=self.symbols.any(axis=2) if self.identity else self.known
-        )
+    def result(self) -> QuantisedPlane:
+        """Return the plane with the symbols found."""
+        if self.mode == DEPENDENT:  # symbols depend on predictions, whose weights are part of the file
+            side_info = PredictionWeights(self.predictors)
+            return replace(self.plane, symbols=self.symbols, coded=self.coded, side_info=side_info)
+        coded = self.symbols.any(axis=2) if self.identity else self.coded
+        return replace(self.plane, symbols=self.symbols, coded=coded)
 
 
-def _bits(counts: np.ndarray) -> np.ndarray:
-    """(2 ACTIVITIES, TOLD_APART) bits of errors by their magnitude, that came so often in each context: at even places, then at odd ones. What is
-    expected doubles with every other context."""
+def _residual_bits(counts: np.ndarray) -> np.ndarray:
+    """Return the bits (2 ACTIVITIES, MAGNITUDE_BINS) of residuals by magnitude, from their counts in each context.
+
+    The first half is for even states of the trellis, the second for odd ones. The expected magnitude doubles with every
+    other activity.
+    """
     return magnitude_bits(counts, 0.04 * 2.0 ** (np.tile(np.arange(ACTIVITIES), 2) / 2 - 1.5))
 
 
-@compiled()
-def _search(
-    wanted: np.ndarray,
-    worth: np.ndarray,
-    known: np.ndarray,
-    rows: int,
-    lattice: int,
-    weights: np.ndarray,
-    price: np.ndarray,
-    errors: np.ndarray,
-    together: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, M) int8 symbols of (H, W, M) numbers in steps, whose errors are worth as much as that; 0 where nothing is `known`; and how often
-    errors came, as `_bits` counts them. Every so many `rows` a segment begins, which knows of none before. `lattice`: as of
-    `kpc.format.coding.predictive`; where any may follow, survivors differ in which of their last three are odd. `price`: of `_bits`, in squared steps.
-    `errors`: (H + 2, W + 2, M) float32, u of all texels, one row and one column of 0 around; those of known ones are found anew.
-    `together`: as of `trellis_quantise`, or ALONE.
+class Problem(NamedTuple):
+    """What a search is given.
 
-    v, r, cross and the names of neighbours as in `kpc.format.coding.predictive`; v0, r0 and errors of survivors are held by their states.
+    Attributes:
+        wanted: (H, W, M) float64, the values in steps.
+        weight: (H, W, M) float32 distortion weights.
+        coded: (H, W) bool.
+        rows: rows per segment; segments are predicted independently.
+        mode: TRELLIS, DEPENDENT or SCALAR (`kpc.format.coding.predictive`).
+        predictors: prediction weights.
+        rate_costs: (contexts, MAGNITUDE_BINS), lambda times the bits of a residual.
+        correlation: as for `trellis_quantise`.
     """
-    H, W, M = wanted.shape
-    sets, classes = tap_weights(weights), GRADIENT_CLASSES * len(weights) >> 3
-    apart = 1 if lattice == SCALAR else 2  # of symbols that may follow
-    symbols, counts = np.zeros((H, W, M), np.int8), np.zeros(price.shape)
-    v, r = np.zeros((3, W + 4), np.int32), np.zeros((3, W + 4), np.int32)
-    leaning, steep, restless = np.zeros((len(sets), W), np.int32), np.zeros(W, np.int32), np.zeros(W, np.int32)
-    cross = np.zeros((H, W), np.int16)
-    V, R = np.zeros((W + 4, STATES), np.int64), np.zeros((W + 4, STATES), np.int64)  # of the survivor that ends there
-    U = np.zeros((W + 2, STATES), np.float32)
-    cost, before = np.zeros(STATES), np.zeros(STATES)
-    came, context, missed = (
+
+    wanted: np.ndarray
+    weight: np.ndarray
+    coded: np.ndarray
+    rows: int
+    mode: int
+    predictors: np.ndarray
+    rate_costs: np.ndarray
+    correlation: np.ndarray
+
+
+class _Prediction(NamedTuple):
+    """State of the predictor; names of neighbours as in `kpc.format.coding.predictive`.
+
+    Attributes:
+        v: (3, W + 4) int32, symbols of this row and the two above, by row modulo 3.
+        r: (3, W + 4) int32, residuals of the same.
+        taps: prediction weights as integers.
+        sums: (sets, W) int32, weighted sums of the symbols above.
+        gradients: (W,) int32, of the symbols above.
+        activities: (W,) int32, of the residuals above.
+        cross: (H, W) int16, residuals of earlier channels.
+        classes: gradient classes, for the choice of the set of weights.
+    """
+
+    v: np.ndarray
+    r: np.ndarray
+    taps: np.ndarray
+    sums: np.ndarray
+    gradients: np.ndarray
+    activities: np.ndarray
+    cross: np.ndarray
+    classes: np.ndarray
+
+
+class _Survivors(NamedTuple):
+    """Paths of the Viterbi search along a row, by position and final state.
+
+    Attributes:
+        values: (W + 4, STATES) int64 symbols.
+        residuals: (W + 4, STATES) int64.
+        errors: (W + 2, STATES) float32, weighted errors u.
+        origins: (W, STATES) int64, the states that the paths come from.
+        contexts: (W, STATES) int64, entropy contexts of the residuals.
+        magnitudes: (W, STATES) int64, of the residuals, clipped to the bins.
+    """
+
+    values: np.ndarray
+    residuals: np.ndarray
+    errors: np.ndarray
+    origins: np.ndarray
+    contexts: np.ndarray
+    magnitudes: np.ndarray
+
+
+@compiled()
+def search(
+    problem: Problem,
+    errors: np.ndarray,  # (H + 2, W + 2, M) float32
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the symbols of least cost, (H, W, M) int8, row by row, and count their residuals by context and magnitude.
+
+    `errors` holds the weighted errors u of all texels with a border of 0; those of coded texels are updated.
+    """
+    H, W, M = problem.wanted.shape
+    taps = tap_weights(problem.predictors)
+    symbols, counts = np.zeros((H, W, M), np.int8), np.zeros(problem.rate_costs.shape)
+    prediction = _Prediction(
+        np.zeros((3, W + 4), np.int32),
+        np.zeros((3, W + 4), np.int32),
+        taps,
+        np.zeros((len(taps), W), np.int32),
+        np.zeros(W, np.int32),
+        np.zeros(W, np.int32),
+        np.zeros((H, W), np.int16),
+        GRADIENT_CLASSES * len(problem.predictors) >> 3,
+    )
+    survivors = _Survivors(
+        np.zeros((W + 4, STATES), np.int64),
+        np.zeros((W + 4, STATES), np.int64),
+        np.zeros((W + 2, STATES), np.float32),
         np.zeros((W, STATES), np.int64),
         np.zeros((W, STATES), np.int64),
         np.zeros((W, STATES), np.int64),
     )
+    v, r, cross = prediction.v, prediction.r, prediction.cross
     for m in range(M):
-        outside_others = cross_channel_errors(errors, together, m)
+        from_channels = cross_channel_errors(errors, problem.correlation, m)
         for y in range(H):
-            own = y % rows  # of its segment
+            row = y % problem.rows  # within its segment
             v0, v1, v2 = v[y % 3], v[(y + 2) % 3], v[(y + 1) % 3]
-            r0, r1, r2, past = r[y % 3], r[(y + 2) % 3], r[(y + 1) % 3], cross[y]
-            begin_row(v0, v1, v2, own, 0)
-            begin_row(r0, r1, r2, own, INITIAL_RESIDUAL)
-            if own > 0:
-                sum_above(sets, v1, v2, r1, r2, past, m, leaning, steep, restless)
-            for s in range(STATES):
-                V[:2, s], R[:2, s] = v0[:2], r0[:2]
-            cost[:] = np.inf
-            cost[0] = 0
-            for x in range(W):
-                X = x + 2
-                before, cost = cost, before
-                cost[:] = np.inf
-                root, here = math.sqrt(worth[y, x, m]), errors[y + 1, x + 1, m]
-                outside = (
-                    outside_others[y, x]
-                    + EDGE_COUPLING * (errors[y, x + 1, m] + errors[y + 2, x + 1, m])
-                    + CORNER_COUPLING
-                    * (errors[y, x, m] + errors[y, x + 2, m] + errors[y + 2, x, m] + errors[y + 2, x + 2, m])
+            r0, r1, r2 = r[y % 3], r[(y + 2) % 3], r[(y + 1) % 3]
+            begin_row(v0, v1, v2, row, 0)
+            begin_row(r0, r1, r2, row, INITIAL_RESIDUAL)
+            if row > 0:
+                sum_above(
+                    taps, v1, v2, r1, r2, cross[y], m, prediction.sums, prediction.gradients, prediction.activities
                 )
-                for s in range(STATES):
-                    if before[s] == np.inf:
-                        continue
-                    # left of it, of this survivor: one and, by the way that it came, two texels away
-                    w, rw = V[X - 1, s], R[X - 1, s]
-                    old = came[x - 1, s] if x else s
-                    ww, rww = V[X - 2, old], R[X - 2, old]
-                    if not known[y, x]:
-                        left = own == 0 or x > 0 and known[y, x - 1]
-                        V[X, s], R[X, s] = (w, rw) if left else (v1[X + 1], r1[X + 1])
-                        cost[s], came[x, s], U[x + 1, s] = before[s] + 2 * here * EDGE_COUPLING * U[x, s], s, here
-                        continue
-                    if own == 0:  # nothing is above but what is to the left
-                        v1[x : x + 5], v2[x : x + 5], r1[x : x + 5], r2[x : x + 5] = w, w, rw, rw
-                        sum_above(
-                            sets,
-                            v1[x:],
-                            v2[x:],
-                            r1[x:],
-                            r2[x:],
-                            past[x:],
-                            m,
-                            leaning[:, x : x + 1],
-                            steep[x : x + 1],
-                            restless[x : x + 1],
-                        )
-                    predicted, gradient = predict(sets, classes, w, ww, int(v1[X - 1]), x, leaning, steep)
-                    active, odd = activity(restless[x], rw, rww, gradient, m), s & 1 if lattice != SCALAR else 0
-                    kind = TRELLIS if lattice == DEPENDENT and active >= FLAT_ACTIVITY else lattice
-                    whole = round_prediction(predicted, kind, odd)
-                    if odd and kind == DEPENDENT:
-                        active += ACTIVITIES
-                    near = outside + EDGE_COUPLING * U[x, s]
-                    best = min(max(wanted[y, x, m] - near / root, SYMBOL_MIN), SYMBOL_MAX)  # as far as errors go
-                    away = best - whole
-                    size = int((abs(away) + (1 if odd and kind == DEPENDENT else 0)) / apart)
-                    inside = size if away > 0 else -size
-                    for error in (
-                        inside - 1,
-                        inside,
-                        inside + 1,
-                        0,
-                    ):  # those around it, the next that costs less, what is foreseen
-                        value = whole + residual_to_offset(error, kind, odd)
-                        if not SYMBOL_MIN <= value <= SYMBOL_MAX:
-                            continue
-                        size = min(abs(error), MAGNITUDE_BINS - 1)
-                        u = root * (value - wanted[y, x, m])
-                        total = before[s] + u * (u + 2 * near) + price[active, size]
-                        to = (
-                            (s << 1 | value & 1) & STATES - 1
-                            if lattice == SCALAR
-                            else next_trellis_state(s, value, error, kind)
-                        )
-                        if total < cost[to]:
-                            cost[to], came[x, to], context[x, to], missed[x, to] = total, s, active, size
-                            V[X, to], R[X, to], U[x + 1, to] = value, abs((value << 7) - predicted) >> 3, u
-            s = int(np.argmin(cost))
-            for x in range(W - 1, -1, -1):
-                v0[x + 2], r0[x + 2] = V[x + 2, s], R[x + 2, s]
-                if known[y, x]:
-                    symbols[y, x, m] = V[x + 2, s]
-                    errors[y + 1, x + 1, m] = U[x + 1, s]
-                    counts[context[x, s], missed[x, s]] += 1
-                s = came[x, s]
+            state = _search_row(problem, prediction, survivors, errors, from_channels, m, y)
+            for x in range(W - 1, -1, -1):  # trace the best path back
+                v0[x + 2], r0[x + 2] = survivors.values[x + 2, state], survivors.residuals[x + 2, state]
+                if problem.coded[y, x]:
+                    symbols[y, x, m] = survivors.values[x + 2, state]
+                    errors[y + 1, x + 1, m] = survivors.errors[x + 1, state]
+                    counts[survivors.contexts[x, state], survivors.magnitudes[x, state]] += 1
+                state = survivors.origins[x, state]
             v0[W + 2 :], r0[W + 2 :] = v0[W + 1], r0[W + 1]
-            if own > 0:
+            if row > 0:
                 update_cross_channel(cross[y - 1], r2, r1, r0, m)
-            if own == rows - 1 or y == H - 1:
-                update_cross_channel(cross[y], r1 if own > 0 else r0, r0, r0, m)
+            if row == problem.rows - 1 or y == H - 1:
+                update_cross_channel(cross[y], r1 if row > 0 else r0, r0, r0, m)
     return symbols, counts
+
+
+@compiled()
+def _search_row(
+    problem: Problem,
+    prediction: _Prediction,
+    survivors: _Survivors,
+    errors: np.ndarray,  # (H + 2, W + 2, M) float32
+    from_channels: np.ndarray,  # (H, W) float32
+    m: int,
+    y: int,
+) -> int:
+    """Find the path of least cost along a row of a channel; return its final state.
+
+    The loop body is one function because survivors, predictions and costs depend on each other symbol by symbol, and
+    calls would take most of the time.
+    """
+    wanted, weight, coded, mode, rate_costs = (
+        problem.wanted,
+        problem.weight,
+        problem.coded,
+        problem.mode,
+        problem.rate_costs,
+    )
+    V, R, U, origins = survivors.values, survivors.residuals, survivors.errors, survivors.origins
+    sums, gradients, activities = prediction.sums, prediction.gradients, prediction.activities
+    v1, v2, r1, r2 = (
+        prediction.v[(y + 2) % 3],
+        prediction.v[(y + 1) % 3],
+        prediction.r[(y + 2) % 3],
+        prediction.r[(y + 1) % 3],
+    )
+    cross, first_row = prediction.cross[y], y % problem.rows == 0
+    spacing = 1 if mode == SCALAR else 2  # of the symbols that may follow
+    cost, before = np.full(STATES, np.inf), np.full(STATES, np.inf)
+    cost[0] = 0
+    for s in range(STATES):
+        V[:2, s], R[:2, s] = prediction.v[y % 3][:2], prediction.r[y % 3][:2]
+    for x in range(coded.shape[1]):
+        X = x + 2
+        before, cost = cost, before
+        cost[:] = np.inf
+        root, here = math.sqrt(weight[y, x, m]), errors[y + 1, x + 1, m]
+        outside = (
+            from_channels[y, x]
+            + EDGE_COUPLING * (errors[y, x + 1, m] + errors[y + 2, x + 1, m])
+            + CORNER_COUPLING * (errors[y, x, m] + errors[y, x + 2, m] + errors[y + 2, x, m] + errors[y + 2, x + 2, m])
+        )
+        for s in range(STATES):
+            if before[s] == np.inf:
+                continue
+            # Symbols and residuals to the left: one texel away, and two, by the path of this survivor.
+            w, rw = V[X - 1, s], R[X - 1, s]
+            earlier = origins[x - 1, s] if x else s
+            ww, rww = V[X - 2, earlier], R[X - 2, earlier]
+            if not coded[y, x]:
+                left = first_row or (x > 0 and coded[y, x - 1])
+                V[X, s], R[X, s] = (w, rw) if left else (v1[X + 1], r1[X + 1])
+                cost[s], origins[x, s], U[x + 1, s] = before[s] + 2 * here * EDGE_COUPLING * U[x, s], s, here
+                continue
+            if first_row:  # the row above repeats the symbol to the left
+                v1[x : x + 5], v2[x : x + 5], r1[x : x + 5], r2[x : x + 5] = w, w, rw, rw
+                sum_above(
+                    prediction.taps,
+                    v1[x:],
+                    v2[x:],
+                    r1[x:],
+                    r2[x:],
+                    cross[x:],
+                    m,
+                    sums[:, x : x + 1],
+                    gradients[x : x + 1],
+                    activities[x : x + 1],
+                )
+            predicted, gradient = predict(
+                prediction.taps, prediction.classes, w, ww, int(v1[X - 1]), x, sums, gradients
+            )
+            context, odd = activity(activities[x], rw, rww, gradient, m), s & 1 if mode != SCALAR else 0
+            local_mode = TRELLIS if mode == DEPENDENT and context >= FLAT_ACTIVITY else mode
+            rounded = round_prediction(predicted, local_mode, odd)
+            if odd and local_mode == DEPENDENT:
+                context += ACTIVITIES
+            coupled = outside + EDGE_COUPLING * U[x, s]
+            best = min(max(wanted[y, x, m] - coupled / root, SYMBOL_MIN), SYMBOL_MAX)  # of least distortion
+            away = best - rounded
+            size = int((abs(away) + (1 if odd and local_mode == DEPENDENT else 0)) / spacing)
+            nearest = size if away > 0 else -size
+            for residual in (nearest - 1, nearest, nearest + 1, 0):
+                value = rounded + residual_to_offset(residual, local_mode, odd)
+                if not SYMBOL_MIN <= value <= SYMBOL_MAX:
+                    continue
+                size = min(abs(residual), MAGNITUDE_BINS - 1)
+                u = root * (value - wanted[y, x, m])
+                total = before[s] + u * (u + 2 * coupled) + rate_costs[context, size]
+                # In mode SCALAR survivors differ in the parities of their last three symbols.
+                to = (
+                    (s << 1 | value & 1) & STATES - 1
+                    if mode == SCALAR
+                    else next_trellis_state(s, value, residual, local_mode)
+                )
+                if total < cost[to]:
+                    cost[to], origins[x, to] = total, s
+                    survivors.contexts[x, to], survivors.magnitudes[x, to] = context, size
+                    V[X, to], R[X, to], U[x + 1, to] = value, abs((value << 7) - predicted) >> 3, u
+    return int(np.argmin(cost))

@@ -93,10 +93,11 @@ def test_errors_are_smaller_where_they_are_worth_more() -> None:
         error(plane, slice(32, None)) < 1.05 * error(alike, slice(32, None)) < 0.7 * error(plane, slice(0, 32))
         and size < 0.9 * as_ever
     )
-    told = search._fineness(significant, np.ones((64, 64), bool), np.ones((8, 8), bool), 8)
+    told = search._quantiser_offsets(significant, np.ones((64, 64), bool), np.ones((8, 8), bool), 8)
     assert (told[:, 4:] > told[:, :4]).all() and told.min() >= 0 and told.max() < OFFSET_COUNT
     assert (
-        search._fineness(np.ones_like(significant), np.ones((64, 64), bool), np.ones((8, 8), bool), 8) == DEFAULT_OFFSET
+        search._quantiser_offsets(np.ones_like(significant), np.ones((64, 64), bool), np.ones((8, 8), bool), 8)
+        == DEFAULT_OFFSET
     ).all()
 
 

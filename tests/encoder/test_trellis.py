@@ -54,9 +54,8 @@ def searched(
 ) -> np.ndarray:
     distortion = np.ones(wanted.shape, np.float32) if distortion is None else distortion
     errors = np.zeros((wanted.shape[0] + 2, wanted.shape[1] + 2, wanted.shape[2]), np.float32)
-    symbols, counts = trellis._search(
-        wanted, distortion, known, len(wanted), TRELLIS, NO_WEIGHTS, bits, errors, together
-    )
+    problem = trellis.Problem(wanted, distortion, known, len(wanted), TRELLIS, NO_WEIGHTS, bits, together)
+    symbols, counts = trellis.search(problem, errors)
     assert np.allclose(
         errors[1:-1, 1:-1], np.where(known[..., None], np.sqrt(distortion) * (symbols - wanted), 0), atol=1e-4
     )
@@ -289,7 +288,7 @@ def test_what_is_hardly_told_goes_around_predictions(identity: bool) -> None:
     around = trellis.trellis_quantise(rounded, values, step, alike, identity)
     assert around.side_info is not None
     np.testing.assert_allclose(trellis.requested_trellis_step(around), step, rtol=2**-7)
-    on_trellis = trellis.trellis_quantise(rounded, values, step, alike, identity, thin=0.0)
+    on_trellis = trellis.trellis_quantise(rounded, values, step, alike, identity, low_rate_bits=0.0)
     assert on_trellis.side_info is None and cost(around) < 0.92 * cost(on_trellis)
 
 
