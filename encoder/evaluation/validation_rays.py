@@ -81,8 +81,9 @@ class ValidationRays:
     def from_training_views(sampler: RaySampler, background: np.ndarray) -> "ValidationRays":
         """Draw random pixels of the training pictures."""
         batch, targets = sampler.draw(np.random.default_rng(1), VALIDATION_RAYS, background)
-        rays = (a.numpy() for a in (batch.origins, batch.directions, batch.times))
-        return ValidationRays(*rays, None if batch.appearances is None else batch.appearances.numpy(), targets.numpy())
+        origins, directions, times = (a.numpy() for a in (batch.origins, batch.directions, batch.times))
+        appearances = None if batch.appearances is None else batch.appearances.numpy()
+        return ValidationRays(origins, directions, times, appearances, targets.numpy())
 
     @staticmethod
     def from_cameras(scene: Scene, count: int | None = None, seed: int | Sequence[int] = 1) -> "ValidationRays":
@@ -112,13 +113,16 @@ class ValidationRays:
             missing -= len(parts[-1].times)
             if not missing:
                 break
-        return ValidationRays(
-            *(np.concatenate(arrays) for arrays in zip(*(part.rays for part in parts), strict=True)), None, None
+        origins, directions, times = (
+            np.concatenate(arrays) for arrays in zip(*(part.rays for part in parts), strict=True)
         )
+        return ValidationRays(origins, directions, times, None, None)
 
     def subset(self, indices: np.ndarray) -> "ValidationRays":
         """Return the rays with the given indices."""
-        return ValidationRays(*(None if a is None else a[indices] for a in (*self.rays, self.appearances, self.truth)))
+        origins, directions, times = (a[indices] for a in self.rays)
+        appearances, truth = (None if a is None else a[indices] for a in (self.appearances, self.truth))
+        return ValidationRays(origins, directions, times, appearances, truth)
 
     def batches(self, count: int) -> "Iterator[ValidationRays]":
         """Yield the rays in batches of at most `count`."""

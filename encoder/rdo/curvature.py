@@ -78,7 +78,7 @@ def estimate_curvature(scene: Scene, validation: ValidationRays, rays: int | Non
             _, composited = march_scene(field, batch_rays, scene)
             codes = renderer.codes(batch.appearances)
             colours = shade(field, batch_rays, composited, None if codes is None else torch.from_numpy(codes))
-            signs = torch.from_numpy(rng.choice(np.float32([-1, 1]), tuple(colours.shape)))
+            signs = torch.from_numpy(rng.choice(np.array([-1, 1], np.float32), tuple(colours.shape)))
             gradients = torch.autograd.grad((signs * colours).sum(), parameters)
             for scale, planes in zip(products, _by_plane(field.layout, scene, gradients[0].numpy()), strict=True):
                 for name, plane in planes.items():

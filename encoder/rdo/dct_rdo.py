@@ -120,7 +120,8 @@ def transform_quantise(
         )
         implied_here = None if implied is None else implied[own]
         bodies[start] = encode_blocks(blocks, coded_here, implied_here)
-        symbols[own], _ = decode_blocks(bodies[start], *symbols[own].shape, implied=implied_here)
+        own_rows, columns, channels = symbols[own].shape
+        symbols[own], _ = decode_blocks(bodies[start], own_rows, columns, channels, implied=implied_here)
     found = replace(finer, symbols=symbols, coded=coded, side_info=TransformSegments(bodies), starts=tuple(bodies))
     return found, sum(map(len, bodies.values()))
 

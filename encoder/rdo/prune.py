@@ -78,6 +78,7 @@ def prune(scene: Scene, rays: Rays, fidelity: Callable[[Scene], float], spare_db
         fidelity: of a scene, dB.
         spare_db: how much the fidelity may fall.
     """
+    assert isinstance(scene.decoder, Decoder)
     before = fidelity(scene)
     gain = None
     if not scene.decoder.w2.any():
@@ -89,13 +90,15 @@ def prune(scene: Scene, rays: Rays, fidelity: Callable[[Scene], float], spare_db
     loss = gain if gain is not None and gain <= spare_db else 0.0
 
     sampled, features = SurfaceFeatures.sample(scene, rays), len(scene.decoder.density_weight)
-    order = elimination_order(scene.decoder, sampled)
+    decoder = scene.decoder
+    assert isinstance(decoder, Decoder)
+    order = elimination_order(decoder, sampled)
     removable, next_loss_db = 0, math.inf
     best, too_many = scene, features
     while too_many - removable > 1:
         # Most often not even one channel can be removed, so that one is tried first.
         count = (removable + too_many) // 2 if removable or too_many < features else 1
-        candidate = replace(scene, decoder=redistribute(scene.decoder, sampled, order[:count]))
+        candidate = replace(scene, decoder=redistribute(decoder, sampled, order[:count]))
         candidate_loss = before - fidelity(candidate)
         if candidate_loss <= spare_db:
             removable, loss, best = count, candidate_loss, candidate
@@ -113,8 +116,9 @@ def make_view_independent(scene: Scene, directions: np.ndarray) -> Scene:
     decoder = scene.decoder
     b2 = decoder.b2 if not decoder.w2.any() else _basis(scene, directions).mean(0)
     F = len(decoder.density_weight)
-    zeros = [np.zeros(shape, np.float32) for shape in ((1, 9), (1,), (3, F, 1))]
-    return replace(scene, decoder=Decoder(decoder.density_weight, decoder.density_bias, *zeros, b2.astype(np.float32)))
+    w1, b1, w2 = (np.zeros(shape, np.float32) for shape in ((1, 9), (1,), (3, F, 1)))
+    plain = Decoder(decoder.density_weight, decoder.density_bias, w1, b1, w2, b2.astype(np.float32))
+    return replace(scene, decoder=plain)
 
 
 @dataclass(frozen=True)

@@ -224,7 +224,7 @@ def _nonzero_means(values: np.ndarray) -> np.ndarray:
     return flat.sum(0, dtype=np.float64) / np.maximum(np.count_nonzero(flat, axis=0), 1)
 
 
-def scaled(steps: Steps, factor: float) -> list[Mapping[str, np.ndarray]]:
+def scaled(steps: PerPlane, factor: float) -> list[Mapping[str, np.ndarray]]:
     """Return all steps times a factor, rounded up to float32 of 8 significant bits."""
     return [
         {name: bfloat16_ceil((step * factor).astype(np.float32)) for name, step in scale.items()} for scale in steps
@@ -259,7 +259,7 @@ class RateController:
     """
 
     scene: Scene
-    steps: Steps
+    steps: PerPlane
     significant: PerPlane
     measure: Measure
     uncoded_psnr: float

@@ -171,7 +171,7 @@ class _Search:
         if self.mode == DEPENDENT:  # symbols depend on predictions, whose weights are part of the file
             side_info = PredictionWeights(self.predictors)
             return replace(self.plane, symbols=self.symbols, coded=self.coded, side_info=side_info)
-        coded = self.symbols.any(axis=2) if self.identity else self.coded
+        coded = np.asarray(self.symbols.any(axis=2)) if self.identity else self.coded
         return replace(self.plane, symbols=self.symbols, coded=coded)
 
 
