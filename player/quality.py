@@ -4,8 +4,9 @@
     DEFAULT                           the level at which a player on a processor begins
     neighbouring_level(name, +1)      the name of the next finer level
 
-A `kpc.player.gl.renderer.Renderer` takes a Quality when it is made, and another one whenever its `quality` attribute is set; nothing is uploaded
-again. Measurements behind the values, and variants that were tried and left out: docs/design/drawing.md.
+A `kpc.player.gl.renderer.Renderer` takes a Quality when it is made, and another one whenever its `quality` attribute is
+set; nothing is uploaded again. Measurements behind the values, and variants that were tried and left out:
+docs/design/drawing.md.
 """
 
 from collections.abc import Collection
@@ -19,20 +20,26 @@ class Quality:
     """The settings of a picture. The default of every field is what the format says, exactly.
 
     Attributes:
-        folded: who draws. False: the exact shaders, which look up space planes and time rows at every sample. True: a graphics card marches space
-            planes into which it multiplies ("folds") the time rows once a frame; where a software driver would draw, the processor's own
-            code marches (`kpc.player.cpu.cpu_renderer`).
+        folded: who draws. False: the exact shaders, which look up space planes and time rows at every sample. True: a
+            graphics card marches space planes into which it multiplies ("folds") the time rows once a frame; where a
+            software driver would draw, the processor's own code marches (`kpc.player.cpu.cpu_renderer`).
         step: distance between samples, in steps of the scene, at least 1.
-        termination: a ray ends once its transmittance is below this. If that is more than the format's TERMINATION, the remaining
-            light is given the colour met so far.
-        resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated by a cubic.
-        rays_across: rays across a pixel, at most: as many as it spans texels of the finest scale. Their mean is the pixel's colour.
-        reprojection_tolerance: processor only. While the clip plays, a picture is predicted from the one before; blocks of 4 x 4 pixels whose
-            sample pixel differs from the prediction by more than this, of the full range, are marched again. 0: none is predicted.
-        interpolation_tolerance: processor only. A picture that is not predicted is marched at a lower resolution first and interpolated; the
-            blocks that are off the most are marched until the RMS error left is at most this, of the full range. 0: all pixels are marched.
-        culling_alpha: processor only. Rays skip occupied cells whose corners have less alpha than this at the present time. 0: none.
-        grid_termination: processor only. Scenes that `kpc.player.cpu.corner_grid` serves are marched through its grid, and their rays end once their
+        termination: a ray ends once its transmittance is below this. If that is more than the format's TERMINATION, the
+            remaining light is given the colour met so far.
+        resolution: side of the raster that is marched over that of the picture, in (0, 1]; the rest is interpolated by
+            a cubic.
+        rays_across: rays across a pixel, at most: as many as it spans texels of the finest scale. Their mean is the
+            pixel's colour.
+        reprojection_tolerance: processor only. While the clip plays, a picture is predicted from the one before; blocks
+            of 4 x 4 pixels whose sample pixel differs from the prediction by more than this, of the full range, are
+            marched again. 0: none is predicted.
+        interpolation_tolerance: processor only. A picture that is not predicted is marched at a lower resolution first
+            and interpolated; the blocks that are off the most are marched until the RMS error left is at most this, of
+            the full range. 0: all pixels are marched.
+        culling_alpha: processor only. Rays skip occupied cells whose corners have less alpha than this at the present
+            time. 0: none.
+        grid_termination: processor only. Scenes that `kpc.player.cpu.corner_grid` serves are marched through its grid,
+            and their rays end once their
             transmittance is below this. 0: the grid is not used.
     """
 
@@ -61,7 +68,7 @@ class Quality:
             raise ValueError(f"invalid quality settings: {self}")
 
 
-# Of the full range: 8-bit levels a sample pixel may be off its prediction.
+# How far a sample pixel may be off its prediction, of the full range: five 8-bit levels.
 REPROJECTION = 5 / 255
 # RMS of the interpolated pixels, 44 dB.
 INTERPOLATION = 1.6 / 255
@@ -91,6 +98,7 @@ DEFAULT = "balanced"
 
 
 def neighbouring_level(name: str, offset: int, skipped: Collection[str] = ()) -> str:
-    """Return the level `offset` places finer (negative: faster) than `name`, or the last in that direction; `skipped` levels do not count."""
+    """Return the level `offset` places finer (negative: faster) than `name`, or the last in that direction; `skipped`
+    levels do not count."""
     names = [level for level in LEVELS if level == name or level not in skipped]
     return names[min(max(names.index(name) + offset, 0), len(names) - 1)]

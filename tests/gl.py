@@ -8,7 +8,7 @@ import pytest
 from kpc.format.common.errors import DisplayError
 from kpc.player.gl import shader
 from kpc.player.gl.offscreen import open_context
-from kpc.player.gl.renderer import _volume as volume_of
+from kpc.player.gl.textures import volume_texture
 
 
 @functools.cache
@@ -49,7 +49,7 @@ def evaluate(
         texture.use(unit)
         program[f"from_{name}"] = unit
     if grid is not None:
-        volume = volume_of(ctx, grid.shape[2::-1])
+        volume = volume_texture(ctx, grid.shape[2::-1])
         volume.write(np.ascontiguousarray(grid, np.float32))
         volume.use(len(inputs))
         program["grid"] = len(inputs)

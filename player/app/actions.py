@@ -11,7 +11,7 @@ from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.scene_view import SceneView
 from kpc.player.app.state import PlayerState
 from kpc.player.cpu.reference import Part
-from kpc.player.gl.renderer import DisplayMode
+from kpc.player.gl.presentation import DisplayMode
 from kpc.player.quality import neighbouring_level
 from kpc.player.streaming.group_playback import GroupPlayback
 

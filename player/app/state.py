@@ -14,7 +14,7 @@ from kpc.player.app.preferences import Preferences
 from kpc.player.app.quality_controller import QualityController
 from kpc.player.app.recording import FILM_FPS
 from kpc.player.cpu.reference import Part
-from kpc.player.gl.renderer import DisplayMode
+from kpc.player.gl.presentation import DisplayMode
 from kpc.player.streaming.group_playback import GroupPlayback
 from kpc.player.viewpoints import Rig, presets
 

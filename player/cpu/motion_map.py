@@ -1,11 +1,12 @@
-"""What moves, and how much: the field at a place now, against the same place at other times of the clip.
+"""What moves, and how much: the field at a point now, against the same point at other times of the clip.
 
-Time planes that differ from 1 say little about what is seen to move: fitted planes differ a little nearly everywhere, and one
-that is constant but not 1 moves nothing. So the field itself is compared. A place at time t looks as
+Time planes that differ from 1 say little about visible motion: fitted planes differ a little nearly everywhere, and one
+that is constant but not 1 moves nothing. So the field itself is compared. A point at time t has
 
     q(t) = (alpha rgb, alpha)       alpha = 1 - exp(-sigma cell / extent), 0 where the occupancy grid is not set
 
-`cell` being the mean edge of a cell of the occupancy grid, and it changes at t by the mean over INSTANTS t' of max |q(t) - q(t')|.
+`cell` being the mean edge of a cell of the occupancy grid, and it changes at t by the mean over INSTANTS t' of max
+|q(t) - q(t')|.
 """
 
 from dataclasses import replace
@@ -18,33 +19,33 @@ from kpc.player.cpu import reference
 from kpc.player.cpu.reference import Rendering, SceneAtTime
 from kpc.player.viewpoints import Rig
 
+# Times that are compared with.
 INSTANTS = (np.arange(8) + 0.5) / 8
-"""Of the clip."""
+# A change up to STILL counts as none: noise of fitting and rounding. From LIVELY on a picture shows its full colour.
 STILL, LIVELY = 0.1, 0.3
-"""A change up to the one counts as none: some noise of fitting and rounding. From the other on a picture shows its full colour."""
+# Cells that a share is computed from; of more, as many, evenly spread.
 CELLS = 8192
-"""Looked at for a share; of more, as many, evenly spread."""
 CELLS_AT_ONCE = 1 << 20
 POINTS_AT_ONCE = 8192
+# Luma coefficients of BT.709.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
-"""Of BT.709."""
+# Contrast and black level of what stands still.
 MUTED = 0.6, 0.2
-"""Contrast and black of what stands still."""
 MOVING = np.array([1.0, 0.25, 0.05], np.float32)
 
 
 def motion_colours(scene: Scene, camera: Camera, time: float, rendering: Rendering) -> Rendering:
-    """A rendering of `scene` with new colours: grey where what is seen at `time` is there all over the clip, from STILL to LIVELY
-    more and more of one colour where it is not. Looked at is the place at the mean depth of each ray."""
+    """Recolour a rendering of `scene`: grey where what is visible at `time` is there all over the clip, from STILL to
+    LIVELY more and more of one colour where it is not. The point at the mean depth of each ray is compared."""
     origins, directions = camera.rays()
     seen = np.flatnonzero(rendering.opacity > 0)
     change = np.zeros(rendering.opacity.size, np.float32)
     for rays in np.split(seen, range(POINTS_AT_ONCE, len(seen), POINTS_AT_ONCE)):
         o, d = origins[rays], directions[rays]
-        u = _place(scene, o + rendering.depth.reshape(-1)[rays, None] * d)
+        u = _position(scene, o + rendering.depth.reshape(-1)[rays, None] * d)
         terms = _terms(scene, o, d)
-        others = np.stack([_looks(scene, u, terms, float(instant)) for instant in INSTANTS])
-        change[rays] = _change(_looks(scene, u, terms, time), others)
+        others = np.stack([_appearances_at(scene, u, terms, float(instant)) for instant in INSTANTS])
+        change[rays] = _change(_appearances_at(scene, u, terms, time), others)
     share = np.clip((change.reshape(rendering.opacity.shape) - STILL) / (LIVELY - STILL), 0, 1) * rendering.opacity
     grey = (rendering.rgb @ LUMINANCE)[..., None]
     muted, coloured = MUTED[0] * grey + MUTED[1], MOVING * (0.4 + 0.6 * grey)
@@ -52,8 +53,8 @@ def motion_colours(scene: Scene, camera: Camera, time: float, rendering: Renderi
 
 
 def motionless_share(scene: Scene) -> float:
-    """Of the cells that are ever occupied, the share whose middle at no instant changes by more than STILL, seen as the opening
-    camera looks; 1 where none is occupied."""
+    """Return the share of the cells that are ever occupied whose middle never changes by more than STILL, as the
+    opening camera sees it; 1 where none is occupied."""
     ever = scene.occupancy.any(axis=0)
     cells = _spread(ever.reshape(-1), CELLS)
     if not len(cells):
@@ -61,12 +62,15 @@ def motionless_share(scene: Scene) -> float:
     middles = (np.stack(np.unravel_index(cells, ever.shape)[::-1], axis=1) + 0.5) / ever.shape[::-1]
     pose = Rig.of(scene).cameras[0].camera_to_world.astype(np.float32)
     terms = _terms(scene, pose[None, :3, 3], -pose[None, :3, 2])
-    looks = np.stack([_looks(scene, middles.astype(np.float32), terms, float(instant)) for instant in INSTANTS])
+    looks = np.stack(
+        [_appearances_at(scene, middles.astype(np.float32), terms, float(instant)) for instant in INSTANTS]
+    )
     return float((np.max([_change(now, looks) for now in looks], axis=0) <= STILL).mean())
 
 
 def _spread(cells: np.ndarray, most: int) -> np.ndarray:
-    """Indices of set ones among (N,) bool, at most so many, evenly spread; in blocks, as those of all may not fit in memory."""
+    """Return indices of set cells among (N,) bool, at most so many, evenly spread; in blocks, since all of them may not
+    fit in memory."""
     count = np.count_nonzero(cells)
     wanted = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
     found, before = [np.empty(0, np.int64)], 0
@@ -79,12 +83,12 @@ def _spread(cells: np.ndarray, most: int) -> np.ndarray:
 
 
 def _change(now: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """The mean over (K, N, 4) others of max |now - other|: (N,)."""
+    """Return the mean over (K, N, 4) others of max |now - other|: (N,)."""
     return np.asarray(np.abs(others - now).max(axis=2).mean(axis=0))
 
 
-def _looks(scene: Scene, u: np.ndarray, terms: np.ndarray, time: float) -> np.ndarray:
-    """q of places (N, 3) in [0, 1]^3 at a time, given the `_terms` of as many rays or of one: (N, 4)."""
+def _appearances_at(scene: Scene, u: np.ndarray, terms: np.ndarray, time: float) -> np.ndarray:
+    """Return q of points (N, 3) in [0, 1]^3 at a time, given the `_terms` of as many rays or of one: (N, 4)."""
     moment, decoder = SceneAtTime.of(scene, time), scene.decoder
     cells = np.array(moment.occupied.shape[::-1])
     x, y, z = np.clip((u * cells).astype(np.int32), 0, cells - 1).T
@@ -96,8 +100,8 @@ def _looks(scene: Scene, u: np.ndarray, terms: np.ndarray, time: float) -> np.nd
     return np.concatenate([alpha * rgb, alpha], axis=1)
 
 
-def _place(scene: Scene, points: np.ndarray) -> np.ndarray:
-    """Where in the planes' [0, 1]^3 points of the world (N, 3) are."""
+def _position(scene: Scene, points: np.ndarray) -> np.ndarray:
+    """Return where in the planes' [0, 1]^3 points of the world (N, 3) are."""
     if isinstance(scene.mapping, Contraction):
         u = contract(points, scene.aabb)[0]
     else:
@@ -107,7 +111,7 @@ def _place(scene: Scene, points: np.ndarray) -> np.ndarray:
 
 
 def _terms(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """`kpc.player.cpu.reference.ray_terms` of rays of the world, (N, 3) and (N, 3), in the average look."""
+    """`kpc.player.cpu.reference.ray_terms` of rays of the world, (N, 3) and (N, 3), with the average appearance."""
     if isinstance(scene.mapping, DeviceCoordinates):
         directions = scene.mapping.rays(origins, directions).directions
     return reference.ray_terms(scene.decoder, directions, reference.appearance_code(scene, None))

@@ -1,12 +1,14 @@
-"""The picture a scene must give, in readable numpy: the oracle of the OpenGL renderer and its stand-in on bare servers.
+"""The reference renderer in readable numpy: the oracle of the player's renderers, and their stand-in on servers without
+OpenGL.
 
 A ray o + t d with |d| = 1 enters the box at t_near and leaves it at t_far. Its samples lie at
 
     t_k = t_near + (k + 1/2) step,   k = 0, 1, ... while t_k < t_far,
 
-and count where the occupancy grid is set. (In contracted space `kpc.format.scene.space.Contraction` says where they lie, and what
-a step counts in the next line. In device coordinates o, d and t are those of `kpc.format.scene.space.Path`, all but the depth's t.)
-With sigma per longest edge of the box ("extent"), from trans = 1 on:
+and count where the occupancy grid is set. (In contracted space `kpc.format.scene.space.Contraction` says where they
+lie, and what a step counts in the next line. In device coordinates o, d and t are those of
+`kpc.format.scene.space.Path`, all but the depth's t.) With sigma per longest edge of the box ("extent"), from trans = 1
+on:
 
     alpha = 1 - exp(-sigma step / extent)      weight = trans alpha      trans <- trans - weight
 
@@ -37,23 +39,27 @@ from kpc.format.scene.space import Contraction, DeviceCoordinates, contract
 
 RAYS_AT_ONCE = 8192
 STEPS_AT_ONCE = 16
+# A direction's component is kept at least this far from 0, so that no slab test divides by 0.
 PARALLEL = 1e-12
-"""A direction's component is kept at least this far from 0, so that no slab test divides by it."""
 
 
 class Part(Enum):
-    """What of a scene to show."""
+    """What of a scene to show.
+
+    STATIC: every time plane set to 1, every displacement to 0. DYNAMIC: |full - static|, that is, what moves, and what
+        it hides or uncovers; depth,
+    opacity and samples are the full scene's.
+    """
 
     FULL = "full"
     STATIC = "static"
-    """Every time plane set to 1, every displacement to 0."""
     DYNAMIC = "dynamic"
-    """|full - static|: what moves, and what it hides or lays bare. Depth, opacity and samples are the full scene's."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """A picture, float32, and what rays met: (H, W, ...) from `render`, (N, ...) from `render_rays`.
+    """A picture, float32, and the depth and samples of its rays: (H, W, ...) from `render`, (N, ...) from
+    `render_rays`.
 
     Attributes:
         rgb: (H, W, 3) in [0, 1].
@@ -69,8 +75,8 @@ class Rendering:
 
 
 def blend(parts: Sequence[tuple[Rendering, float]]) -> Rendering:
-    """Pictures of one camera and their shares as one: colours and opacity in these shares, depth of the one whose share is largest, samples
-    of all."""
+    """Blend pictures of one camera by their shares: colours and opacity in these shares, depth of the largest share,
+    samples of all."""
     rgb, opacity = (
         sum(np.float32(share) * getattr(part, name) for part, share in parts) for name in ("rgb", "opacity")
     )
@@ -81,7 +87,8 @@ def blend(parts: Sequence[tuple[Rendering, float]]) -> Rendering:
 def render(
     scene: Scene, camera: Camera, time: float, *, part: Part = Part.FULL, appearance: np.ndarray | None = None
 ) -> Rendering:
-    """Render `scene` as `camera` sees it at `time` in [0, 1] over the clip, and as `appearance_code` says of `appearance`."""
+    """Render `scene` as `camera` sees it at `time` in [0, 1] over the clip, and as `appearance_code` says of
+    `appearance`."""
     origins, directions = camera.rays()
     flat = render_rays(scene, origins, directions, time, part=part, appearance=appearance)
     shape = (camera.height, camera.width)
@@ -97,8 +104,8 @@ def render_rays(
     part: Part = Part.FULL,
     appearance: np.ndarray | None = None,
 ) -> Rendering:
-    """Render rays, (N, 3) float32 origins and unit directions in world coordinates. Memory does not grow with N but for
-    the result. `appearance` as in `appearance_code`."""
+    """Render rays, (N, 3) float32 origins and unit directions in world coordinates. Only the result grows with N.
+    `appearance` as in `appearance_code`."""
     if not 0.0 <= time <= 1.0:
         raise ValueError(f"time {time} lies outside [0, 1]")
     if part is Part.DYNAMIC:
@@ -117,7 +124,7 @@ def render_rays(
 
 
 def appearance_code(scene: Scene, appearance: np.ndarray | None) -> np.ndarray:
-    """The code to show a scene with, (H,) float32: 0, the average look, for None.
+    """Return the appearance code to show a scene with, (H,) float32: 0, the average appearance, for None.
 
     Raises:
         ValueError: it is not (H,), or the scene has no appearances, so that its decoder knows no codes.
@@ -161,13 +168,14 @@ class SceneAtTime:
 
 
 def occupancy_slot(scene: Scene, time: float) -> int:
-    """The slot of the occupancy grid that holds at `time`: floor(time slots), the last one at time 1."""
+    """Return the slot of the occupancy grid that holds at `time`: floor(time slots), the last one at time 1."""
     slots = len(scene.occupancy)
     return min(int(time * slots), slots - 1)
 
 
 def box_range(aabb: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays are inside the box: (t_near, t_far), (N,) each, t_near >= 0. t_far <= t_near where they miss it."""
+    """Return where rays are inside the box: (t_near, t_far), (N,) each, t_near >= 0. t_far <= t_near where they miss
+    it."""
     away = np.where(directions < 0, np.float32(-PARALLEL), np.float32(PARALLEL))
     inverse = np.float32(1) / np.where(np.abs(directions) < PARALLEL, away, directions)
     t0, t1 = (aabb[0] - origins) * inverse, (aabb[1] - origins) * inverse
@@ -175,7 +183,7 @@ def box_range(aabb: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> 
 
 
 def sample_range(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the samples of rays begin and end, (N,) each: as `box_range`; in contracted space in its s."""
+    """Return where the samples of rays begin and end, (N,) each: as `box_range`; in contracted space in its s."""
     if not isinstance(scene.mapping, Contraction):
         return box_range(scene.aabb, origins, directions)
     return np.zeros(len(origins), np.float32), np.full(len(origins), scene.mapping.s_end, np.float32)
@@ -184,7 +192,8 @@ def sample_range(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> t
 def sample_positions(
     scene: Scene, origins: np.ndarray, directions: np.ndarray, s: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Of samples at s (N, K) on N rays: distance t (N, K), place u (N, K, 3) in the planes, what a step counts (N, K)."""
+    """Return, for samples at s (N, K) on N rays, distance t (N, K), position u (N, K, 3) in the planes, and density
+    scale (N, K)."""
     if not isinstance(scene.mapping, Contraction):
         size = (scene.aabb[1] - scene.aabb[0]).astype(np.float32)
         return s, (origins[:, None] + s[..., None] * directions[:, None] - scene.aabb[0]) / size, np.ones_like(s)
@@ -208,12 +217,13 @@ def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def features(scene: Scene, moment: SceneAtTime, u: np.ndarray) -> np.ndarray:
-    """f at (N, 3) points in [0, 1]^3: (N, F), the product over planes, concatenated over scales (eq. 1 of K-Planes)."""
+    """Return f at (N, 3) points in [0, 1]^3: (N, F), the product over planes, concatenated over scales (eq. 1 of
+    K-Planes)."""
     if moment.offsets is not None:
         u = displace(u, moment.offsets)
     axis = {"x": u[:, 0], "y": u[:, 1], "z": u[:, 2]}
     out = []
-    for scale, rows in zip(scene.scales, moment.rows):
+    for scale, rows in zip(scene.scales, moment.rows, strict=True):
         product = np.ones(1, np.float32)
         for name in SPACE_PLANES:
             product = product * bilinear(scale[name], axis[name[0]], axis[name[1]])
@@ -224,7 +234,7 @@ def features(scene: Scene, moment: SceneAtTime, u: np.ndarray) -> np.ndarray:
 
 
 def density(decoder: AnyDecoder, f: np.ndarray) -> np.ndarray:
-    """sigma per longest edge of the box of features (N, F): (N,). `kpc.format.scene.scene`."""
+    """Return sigma per longest edge of the box of features (N, F): (N,). `kpc.format.scene.scene`."""
     values = activations(decoder, f) if isinstance(decoder, HybridDecoder) else f
     return np.exp(
         np.clip(values @ decoder.density_weight + decoder.density_bias, -LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)
@@ -232,31 +242,33 @@ def density(decoder: AnyDecoder, f: np.ndarray) -> np.ndarray:
 
 
 def activations(decoder: HybridDecoder, f: np.ndarray) -> np.ndarray:
-    """h of `HybridDecoder`: (N, F) -> (N, G)."""
+    """Return h of `HybridDecoder`: (N, F) -> (N, G)."""
     return np.clip(f @ decoder.v.T + decoder.v_bias, 0, ACTIVATION_LIMIT)
 
 
 def hidden_layer(decoder: AnyDecoder, directions: np.ndarray, code: np.ndarray) -> np.ndarray:
-    """w1 e(d) + b1 + code of unit directions (N, 3) and an appearance's code (H,): (N, H), constant along a ray."""
+    """Return w1 e(d) + b1 + code of unit directions (N, 3) and an appearance's code (H,): (N, H), constant along a
+    ray."""
     x, y, z = directions.T
     encoded = np.stack([x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
     return encoded @ decoder.w1.T + (decoder.b1 + code)
 
 
 def direction_basis(decoder: Decoder, directions: np.ndarray, code: np.ndarray) -> np.ndarray:
-    """basis(d) = w2 relu(hidden layer) + b2 of unit directions (N, 3): (N, 3, F)."""
+    """Return basis(d) = w2 relu(hidden layer) + b2 of unit directions (N, 3): (N, 3, F)."""
     hidden = np.maximum(hidden_layer(decoder, directions, code), 0)
     return np.einsum("cfh,nh->ncf", decoder.w2, hidden, optimize=True) + decoder.b2
 
 
 def ray_terms(decoder: AnyDecoder, directions: np.ndarray, code: np.ndarray) -> np.ndarray:
-    """What `colour` takes of unit directions (N, 3): their basis, or with a hybrid decoder their part of its hidden layer."""
+    """Return what `colour` needs of unit directions (N, 3): their basis, or with a hybrid decoder their part of its
+    hidden layer."""
     terms = hidden_layer if isinstance(decoder, HybridDecoder) else direction_basis
     return terms(decoder, directions, code).astype(np.float32)  # type: ignore[arg-type]
 
 
 def colour(decoder: AnyDecoder, f: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """rgb of features (N, F), given `ray_terms` of their rays: (N, 3). `kpc.format.scene.scene`."""
+    """Return rgb of features (N, F), given `ray_terms` of their rays: (N, 3). `kpc.format.scene.scene`."""
     if isinstance(decoder, HybridDecoder):
         hidden = np.clip(terms + activations(decoder, f) @ decoder.u.T, 0, ACTIVATION_LIMIT)
         return sigmoid(hidden @ decoder.w2.T + decoder.b2)
@@ -269,9 +281,10 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 def composite(alphas: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spend the transmittance `trans` (N,) of rays on their next samples, (N, K) alphas, front to back.
+    """Composite the next samples of rays, (N, K) alphas, front to back, from their transmittance `trans` (N,) on.
 
-    Returns (N, K) weights, (N,) what is left, and (N, K) bool: samples that were reached before the ray ended.
+    Returns:
+        (N, K) weights, (N,) remaining transmittance, and (N, K) bool: samples that were reached before the ray ended.
     """
     through = np.cumprod(np.concatenate([trans[:, None], 1 - alphas], axis=1), axis=1)
     reached = through[:, :-1] >= TERMINATION

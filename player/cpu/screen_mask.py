@@ -1,7 +1,7 @@
-"""Which blocks of a picture can show anything: those into which an occupied cell may project. Rays of the others meet nothing.
+"""Which blocks of a picture can show anything: those that an occupied cell may project to. Rays of the others meet
+nothing.
 
-A ray that meets nothing costs a graphics card little, but a processor that draws as much as a step of the march: there neighbouring
-pixels run as one, and what one of them need not do is done all the same.
+A ray that meets nothing costs a graphics card little, but the processor as much as a step of the march.
 """
 
 from dataclasses import dataclass
@@ -10,17 +10,17 @@ import numpy as np
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.grid import dilate
 
+# Occupied cells up to which each is projected; of more, eight count as one, and so on.
 MOST_CELLS = 8192
-"""Of a grid with more occupied ones, eight count as one, and so on."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScreenMask:
-    """Cubes around all that is occupied.
+    """Cubes around everything that is occupied.
 
     Attributes:
         centres: (N, 3) float64, world units.
-        reach: by how much a point of one may be off its centre along any direction.
+        reach: how far a point of a cube may be from its centre along any direction, world units.
     """
 
     centres: np.ndarray
@@ -28,21 +28,26 @@ class ScreenMask:
 
     @staticmethod
     def of(occupied: np.ndarray, aabb: np.ndarray) -> "ScreenMask":
-        """Of a (Nz, Ny, Nx) bool grid over a box. What has occupied cells all around is left out: who sees it sees them."""
+        """Make the mask of a (Nz, Ny, Nx) bool grid over a box. Cells with occupied cells all around are left out: they
+        are hidden by those."""
         cell = (aabb[1] - aabb[0]).astype(np.float64) / occupied.shape[::-1]
         while np.count_nonzero(occupied) > MOST_CELLS:
             occupied, cell = _halved(occupied), 2 * cell
-        amid = np.pad(occupied, 1)
-        shell = occupied & dilate(~amid)[1:-1, 1:-1, 1:-1]
+        around = np.pad(occupied, 1)
+        shell = occupied & dilate(~around)[1:-1, 1:-1, 1:-1]
         z, y, x = np.nonzero(shell)
         return ScreenMask(aabb[0] + cell * (np.stack([x, y, z], axis=-1) + 0.5), float(np.linalg.norm(cell) / 2))
 
     def blocks(self, camera: Camera, side: int) -> np.ndarray | None:
-        """(rows, columns) bool of blocks of `side` x `side` pixels, rows from below, the first of which begins with the lowest pixels;
-        None where the camera is so near to something that it may be all."""
-        x, y, away = ((self.centres - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]).T
-        ahead = -away > -self.reach
-        x, y, nearest, farthest = x[ahead], y[ahead], -away[ahead] - self.reach, -away[ahead] + self.reach
+        """Find the blocks of `side` x `side` pixels that a cube may project to.
+
+        Returns:
+            (rows, columns) bool, rows from below; None where the camera is so near to a cube that it may fill the
+            picture.
+        """
+        x, y, z = ((self.centres - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]).T
+        ahead = -z > -self.reach
+        x, y, nearest, farthest = x[ahead], y[ahead], -z[ahead] - self.reach, -z[ahead] + self.reach
         if not (nearest > 0.1 * self.reach).all():
             return None
         columns, rows = -(-camera.width // side), -(-camera.height // side)
@@ -56,7 +61,7 @@ class ScreenMask:
             last = np.floor((centre + focal * np.maximum(high / nearest, high / farthest)) / side)
             edges += [np.clip(first, 0, count).astype(int), np.clip(last + 1, 0, count).astype(int)]
         left, right, bottom, top = edges
-        # Each rectangle adds one at its corners or takes one away, so that sums along rows and columns count rectangles.
+        # Each rectangle adds or takes away one at its corners, so that sums along rows and columns count rectangles.
         corners = np.zeros((rows + 1, columns + 1), int)
         for row, column, sign in ((bottom, left, 1), (bottom, right, -1), (top, left, -1), (top, right, 1)):
             np.add.at(corners, (row, column), sign)
@@ -64,7 +69,7 @@ class ScreenMask:
 
 
 def _halved(occupied: np.ndarray) -> np.ndarray:
-    """At half the resolution: cells of which any of eight is occupied."""
+    """Return the grid at half the resolution: cells of which any of eight is occupied."""
     even = np.pad(occupied, [(0, n % 2) for n in occupied.shape])
     nz, ny, nx = (n // 2 for n in even.shape)
     return even.reshape(nz, 2, ny, 2, nx, 2).any((1, 3, 5))

@@ -1,7 +1,9 @@
-"""What numba has no types for, vectors, for `kpc.player.cpu.raymarch`: sums over neighbours and over channels, in LLVM's own terms.
+"""Vector operations that numba has no types for, written in LLVM's terms for `kpc.player.cpu.raymarch`: sums over grid
+nodes and over channels.
 
-Left to itself, numba makes vectors of loops alone. Four channels are too few for one: it takes them number by number, at four times the cost; and it
-sums up the vectors of a dot product one by one. LLVM makes what it is told here fit whatever vectors a processor has.
+Left to itself, numba makes vectors of loops only. Four channels are too few for a loop, which it would process number
+by number at four times the cost, and it sums up the vectors of a dot product one by one. LLVM fits the vectors asked
+for here to those that the processor has.
 """
 
 from collections.abc import Sequence
@@ -13,14 +15,15 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+# Channels of a grid node, processed at once.
 CHANNELS = 4
-"""Of a grid: all of a node's at once."""
+# Features that are stored together: as many floats as the widest processors multiply at once.
 WIDE = 16
-"""Features at once: as many floats as the widest processors multiply."""
+# Features that are processed at once: in halves of WIDE samples take 0.8 of the time, since all operands fit the
+# registers.
 NARROW = 8
-"""Of them: samples take 0.8 of the time by halves, which leave room in the registers for all that is at work."""
+# Sums are clamped to this.
 LARGEST = 1e30
-"""What sums are cut off at."""
 
 _INDEX, _LANE, _SHORT, _FLOAT = ir.IntType(64), ir.IntType(32), ir.IntType(16), ir.FloatType()
 _CONTRACT = ["contract"]
@@ -41,14 +44,20 @@ def interpolate(
     line: Any,
     column: Any,
 ) -> Any:
-    """into[line + c, column] = the sum over the eight nodes around of their weights times grid[node, c], c = 0 to 3.
+    """Interpolate a grid trilinearly: into[line + c, column] = sum over the eight nodes around of weight * grid[node,
+    c], c = 0 to 3.
 
-    `grid`, (N, 4) float32; `first`, the node before along all axes, `right`, `up`, `back` from it to the next along x, y, z, uint64; x, y, z,
-    float32 shares of the way to those; `into`, (lines, columns) float32; `line`, `column`, uint64.
+    Args:
+        grid: (N, 4) float32.
+        first: uint64, the node before the point along all axes.
+        right, up, back: uint64, distance from a node to the next along x, y, z.
+        x, y, z: float32, share of the way to the next node.
+        into: (lines, columns) float32.
+        line, column: uint64.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-        grid, first, right, up, back, x, y, z, into, line, column = arguments
+        _, first, right, up, back, x, y, z, _, line, column = arguments
         nodes, out = (
             _array(context, builder, signature, arguments, 0),
             _array(context, builder, signature, arguments, 8),
@@ -74,12 +83,17 @@ def interpolate(
 
 
 @intrinsic
-def combine(_: Any, wholes: Any, factors: Any, weights: Any, bias: Any, into: Any, row: Any) -> Any:
-    """into[row, c] = the sum over m of weights[c, m] times the product of all wholes[m] and factors[m], c = 0 to 3, to the last of them `bias`
-    added. Finite: cut off at LARGEST, 0 where it is not a number.
+def decode_corner(_: Any, wholes: Any, factors: Any, weights: Any, bias: Any, into: Any, row: Any) -> Any:
+    """Apply a linear decoder: into[row, c] = sum over m of weights[c, m] * product of all wholes[m] and factors[m], c =
+    0 to 3, plus `bias` for c = 3. The result is finite: clamped to LARGEST, 0 for NaN.
 
-    `wholes`, a tuple of (M,) int16, `factors`, of (M,) float32, `weights`, (4, M) float32, M a multiple of WIDE; `into`, (N, 4) float32; `row`,
-    uint64.
+    Args:
+        wholes: tuple of (M,) int16, M a multiple of WIDE.
+        factors: tuple of (M,) float32.
+        weights: (4, M) float32.
+        bias: float32.
+        into: (N, 4) float32.
+        row: uint64.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
@@ -122,17 +136,37 @@ def combine(_: Any, wholes: Any, factors: Any, weights: Any, bias: Any, into: An
 
 
 @intrinsic
-def weigh(
-    _: Any, planes: Any, texels: Any, ups: Any, rows: Any, starts: Any, shares: Any, weights: Any, first: Any, halves: Any, into: Any,
-    line: Any, column: Any,
-) -> Any:  # fmt: skip
-    """into[line + c, column] += the sum over m of weights[first + wide c + m] times the product of all planes and rows, c = 0 to 3, m below wide.
+def accumulate_features(
+    _: Any,
+    planes: Any,
+    texels: Any,
+    ups: Any,
+    rows: Any,
+    starts: Any,
+    shares: Any,
+    weights: Any,
+    first: Any,
+    halves: Any,
+    into: Any,
+    line: Any,
+    column: Any,
+) -> Any:
+    """Add what one group of features contributes: into[line + c, column] += sum over m < wide of weights[first + wide c
+    + m] * product of all planes and rows at a sample, interpolated, c = 0 to 3.
 
-    `halves`, (0,) or (0, NARROW), tells by its length how `wide` is what is there for each texel, NARROW or WIDE numbers, of `planes`, (N,) int16, and
-    `rows`, (N,) float32. Of the planes xy, xz and yz: `texels`, where that before a place
-    begins, the next along the first axis following it, and `ups`, how far from it the next along the second begins. Of the rows along x, y and z:
-    `starts`. `shares`, float32, of the way to the next along x, y, z. `weights`, (N,) float32; `into`, (lines, columns) float32. All places uint64; of
-    threes, tuples.
+    Args:
+        planes: (N,) int16; each texel has `wide` numbers.
+        texels: three uint64, in xy, xz, yz, where the texel before the sample begins; the next along the first axis
+            follows it.
+        ups: three uint64, distance from there to the next texel along the second axis.
+        rows: (N,) float32; each texel has `wide` numbers.
+        starts: three uint64, in the rows along x, y, z, where the texel before the sample begins.
+        shares: three float32, of the way to the next texel along x, y, z.
+        weights: (N,) float32.
+        first: uint64.
+        halves: tuple whose length, known when compiled, is wide / NARROW.
+        into: (lines, columns) float32.
+        line, column: uint64.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
@@ -190,7 +224,7 @@ def _sum(builder: Any, terms: Sequence[Any]) -> Any:
 
 
 def _sums(builder: Any, vectors: Sequence[Any], wide: int) -> Any:
-    """Of the numbers of each of four vectors, as one of four."""
+    """Return the sums of the numbers of each of four vectors, as one vector of four."""
     while wide > CHANNELS:
         wide //= 2
         halves = range(wide), range(wide, 2 * wide)

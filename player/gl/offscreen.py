@@ -9,8 +9,9 @@ REMEDY = "apt install libegl1 libgl1-mesa-dri (Debian, Ubuntu), or kprender --ba
 
 
 def open_context() -> moderngl.Context:
-    """An OpenGL context that draws to textures, of 4.3 where there is that, for compute shaders, else of 3.3: through EGL where there is
-    one, else what the system offers. (Some drivers give more than they are asked for, NVIDIA's gives just that.)
+    """Open an OpenGL context that draws to textures: 4.3 for compute shaders where there is that, else 3.3; through EGL
+    if possible, else what the system offers. (Some drivers give more than they are asked for, NVIDIA's gives exactly
+    that.)
 
     Raises:
         DisplayError: there is none; the message says how to get one.
@@ -28,5 +29,5 @@ def open_context() -> moderngl.Context:
 
 
 def describe(ctx: moderngl.Context) -> str:
-    """The renderer and its version, in one line."""
+    """Return the renderer and its version, in one line."""
     return f"{ctx.info['GL_RENDERER']}, OpenGL {ctx.info['GL_VERSION']}"

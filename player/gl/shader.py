@@ -1,7 +1,8 @@
-"""Puts GLSL files together: preamble, `#include`s, `#unroll`s, `#line`, and compiler messages that name the file they mean.
+"""Puts GLSL files together: preamble, `#include`s, `#unroll`s, `#line`, and compiler messages that name the file they
+mean.
 
-The files in `player/glsl` hold no `#version`, so that one set serves desktop OpenGL 3.3 and WebGL2. They are written in
-the subset that both understand (GLSL ES 3.00).
+The files in `player/gl/glsl` hold no `#version`, so that one set serves desktop OpenGL 3.3 and WebGL2. They are written
+in the subset that both understand (GLSL ES 3.00).
 """
 
 import contextlib
@@ -38,10 +39,10 @@ def compose(
     A `#line` gives line L of file F the number F * LINES_A_FILE + L. (The language has a second number for the file,
     but Mesa reports some complaints under the file before.)
 
-    Each file is included once. The lines from `#unroll NAME COUNT` to `#end` are written COUNT times, a number or one of
-    `defines`, with the word NAME, or ##NAME as part of a word, replaced by 0, 1, ...: compilers leave long loops as they are, and
-    where a processor draws, an array at a place that is not known beforehand costs more than all else. `defines` become macros. `written` holds files that are made for one scene, by name; the
-    others lie in `player/glsl`.
+    Each file is included once. The lines from `#unroll NAME COUNT` to `#end` are written COUNT times, a number or one
+    of `defines`, with the word NAME, or ##NAME as part of a word, replaced by 0, 1, ...: compilers do not unroll long
+    loops, and on a software driver an array at an index that is not a constant costs more than all else. `defines`
+    become macros. `written` holds files that are made for one scene, by name; the others lie in `player/gl/glsl`.
 
     Raises:
         ValueError: an included file does not exist; a count is not known; an #end is missing.
@@ -113,14 +114,14 @@ def build(
     written: Mapping[str, str] | None = None,
     vertex: str = "fullscreen.glsl",
 ) -> moderngl.Program:
-    """Compile a fragment shader that is drawn over the whole viewport, or where `vertex` says.
+    """Compile a fragment shader that is drawn over the whole viewport, or where the shader `vertex` says.
 
     Raises:
         DisplayError: the driver refuses it; the message names file, line and driver.
     """
     vertex_text, _ = compose(vertex, defines)
     text, files = compose(fragment, defines, written=written)
-    with _complaints_named(ctx, files):
+    with _errors_with_file_names(ctx, files):
         return ctx.program(vertex_shader=vertex_text, fragment_shader=text)
 
 
@@ -133,21 +134,22 @@ def build_compute(
         DisplayError: as `build`.
     """
     text, files = compose(name, defines, GL43, written)
-    with _complaints_named(ctx, files):
+    with _errors_with_file_names(ctx, files):
         return ctx.compute_shader(text)
 
 
 @contextlib.contextmanager
-def _complaints_named(ctx: moderngl.Context, files: list[str]) -> Iterator[None]:
+def _errors_with_file_names(ctx: moderngl.Context, files: list[str]) -> Iterator[None]:
     try:
         yield
     except moderngl.Error as error:
-        message, driver = first_complaint(str(error), files), ctx.info["GL_RENDERER"]
+        message, driver = first_error(str(error), files), ctx.info["GL_RENDERER"]
         raise DisplayError(f"{message} (driver: {driver}); update it, or kprender --backend reference") from error
 
 
 def constants(arrays: Mapping[str, np.ndarray]) -> str:
-    """GLSL that declares each (N, 4) float32 array as `const vec4 name[N]`, (N,) ones as float or int, to the last bit."""
+    """Return GLSL that declares each (N, 4) float32 array as `const vec4 name[N]`, (N,) ones as float or int, to the
+    last bit."""
     lines = []
     for name, array in arrays.items():
         if array.ndim == 2:
@@ -163,8 +165,8 @@ def constants(arrays: Mapping[str, np.ndarray]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def first_complaint(log: str, files: list[str]) -> str:
-    """The first message of a driver's log that names a place, as "shader file:line: message"."""
+def first_error(log: str, files: list[str]) -> str:
+    """Return the first message of a driver's log that names a line, as "shader file:line: message"."""
     for line in log.splitlines():
         where = _WHERE.search(line)
         if where is not None and int(where[1]) // LINES_A_FILE < len(files):

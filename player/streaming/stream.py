@@ -24,11 +24,8 @@ from kpc.format.container.partial import PartialScene, adjacent_runs, announce
 from kpc.format.container.scene_io import SceneReader
 from kpc.format.container.sources import RemoteSource, Source
 from kpc.format.scene.scene import ALL_PLANES, Scene
-from kpc.player.atlas import Layout, TimeRows
-from kpc.player.cpu.corner_grid import CornerGrid
-from kpc.player.cpu.occupancy_culling import OccupancyCulling
-from kpc.player.cpu.plane_sampler import PlaneSampler
-from kpc.player.gl.renderer import FOLDING_UPSAMPLING, Renderer
+from kpc.player.atlas import Layout
+from kpc.player.gl.renderer import Renderer
 from kpc.player.streaming.prefetch import Playhead, fetch_order, min_segment_bytes, segments_to_keep
 
 # The most that is fetched with one request, bytes and chunks, so that a jump of the playhead does not wait long.
@@ -231,28 +228,18 @@ class Stream:
     def fixed_bytes(self) -> int:
         """Bytes that the scene takes besides segments of time planes.
 
-        They are those of the textures; of folding, occupancy culling and ray marching on the processor; of occupancy
-        and its distances; of motion; of planes that wait to be uploaded and one that is being decoded; and of the
-        source.
+        They are those of the renderer without pictures, of occupancy and motion, of planes that wait to be uploaded and one
+        that is being decoded, and of the source.
         """
         scene, layout = self.scene, self._layout
-        texels = layout.size[0] * layout.size[1]
-        if scene.is_dynamic:
-            finer = Layout.of(scene, FOLDING_UPSAMPLING)
-            texels += (
-                2 * finer.size[0] * finer.size[1]
-                + (1 + FOLDING_UPSAMPLING) * TimeRows(scene, layout).width * layout.row_count()
-            )
-            texels += 2 * layout.size[0] * layout.size[1] if OccupancyCulling.serves(scene) else 0
-        marching = sum(kind.bytes_for(scene) for kind in (CornerGrid, PlaneSampler) if kind.serves(scene))
         largest = max(layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
-        motion = 0 if scene.motion is None else scene.motion.nbytes + 16 * int(np.prod(scene.motion.shape[1:4]))
+        motion = 0 if scene.motion is None else scene.motion.nbytes
         decoding = UPLOAD_BYTES + 4 * 16 * largest + 2 * self._reader.header.largest_raw
         whole = isinstance(self.source, RemoteSource) and not self.source.has_ranges
         source = (
             self.source.size if whole else 2 * (RUN_BYTES + max(entry.stored_length for entry in self._reader.index))
         )
-        return 16 * texels + marching + 2 * scene.occupancy.nbytes + motion + decoding + source
+        return Renderer.bytes_for(scene) + scene.occupancy.nbytes + motion + decoding + source
 
     @property
     def failure(self) -> str | None:

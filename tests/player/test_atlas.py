@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES
-from kpc.player.atlas import FARTHEST, Layout, TimeRows, decoder_arrays, empty_distances
+from kpc.player.atlas import FARTHEST, Layout, TimeRows, empty_distances
 from kpc.player.cpu import reference
+from kpc.player.gl.shader_constants import decoder_arrays
 from scenes import tiny_scene
 
 
@@ -53,7 +54,7 @@ def test_rows_are_the_time_planes_cut() -> None:
             size = scale[name].shape[1]
             u = np.linspace(0, 1, size, dtype=np.float32)
             wanted = reference.bilinear(scale[name], u, np.full_like(u, at))
-            first = layout.first_row(axis, s)
+            first = layout.first_line(axis, s)
             got = rows[first : first + layout.layers[s], :size].swapaxes(0, 1).reshape(size, -1)[:, :6]
             assert got == pytest.approx(wanted, abs=1e-6)
 

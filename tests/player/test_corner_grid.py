@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
-from kpc.player.cpu.corner_grid import MOST_CORNERS, CornerGrid, corners_of
-from kpc.player.cpu.raymarch import BAKED as CORNER_BAKED
+from kpc.player.cpu.corner_grid import MOST_CORNERS, CornerGrid, grid_shape
+from kpc.player.cpu.field_kernels import COMPUTED
 from kpc.player.cpu.reference import Part, SceneAtTime, features, render
 from kpc.player.cpu.simd import LARGEST
 from kpc.player.gl.renderer import Renderer
@@ -27,16 +27,14 @@ from scenes import (
 )
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
-FOLDED, BAKED = Quality(folded=True), Quality(folded=True, grid_termination=TERMINATION)
+FOLDED, WITH_GRID = Quality(folded=True), Quality(folded=True, grid_termination=TERMINATION)
 
 
-def baking_of(scene: Scene, camera: Camera = CAMERA, time: float = 0.0) -> CornerGrid:
-    """As it is after a picture."""
-    renderer = Renderer(gl.context(), scene, BAKED)
-    if not renderer.casts:
-        pytest.skip("a graphics card, which bakes nothing")
+def grid_of(scene: Scene, camera: Camera = CAMERA, time: float = 0.0) -> CornerGrid:
+    """The grid after a picture."""
+    renderer = Renderer(gl.context(), scene, WITH_GRID, processor=True)
     renderer.march(camera, time)
-    return renderer._kept(CornerGrid)
+    return renderer._processor._sampler(CornerGrid)
 
 
 SCENES = {
@@ -50,15 +48,15 @@ SCENES = {
 @pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
 def test_corners_hold_what_a_sample_there_finds(make) -> None:
     scene = make()
-    shape = corners_of(scene)
+    shape = grid_shape(scene)
     at = np.argwhere(np.ones(shape, bool))[:, ::-1] / np.maximum(np.array(shape[::-1]) - 1, 1)
     still, decoder = replace(scene, motion=None), scene.decoder
     weights = np.concatenate([decoder.b2, decoder.density_weight[None]]).astype(np.float64)
     for time in (0.0, 0.37, 1.0):
-        baking = baking_of(scene, time=time)
+        grid = grid_of(scene, time=time)
         wanted = features(still, SceneAtTime.of(still, time), at.astype(np.float32)) @ weights.T
         wanted[:, 3] += decoder.density_bias
-        known = (baking._known & CORNER_BAKED).any(0).reshape(-1)
+        known = (grid._known & COMPUTED).any(0).reshape(-1)
         # Each of a plane's numbers is off by half a step at most, of 32767 to the largest.
         largest = np.prod([max(np.abs(scale[name]).max() for scale in scene.scales) for name in SPACE_PLANES])
         off = (
@@ -69,7 +67,7 @@ def test_corners_hold_what_a_sample_there_finds(make) -> None:
             / 32767
             * max(np.abs(scale["xt"]).max() for scale in scene.scales) ** 3
         )
-        assert np.all(np.abs(baking.grid.reshape(-1, 4)[known] - wanted[known]) < off + 1e-4) and off.max() < 0.05
+        assert np.all(np.abs(grid.values.reshape(-1, 4)[known] - wanted[known]) < off + 1e-4) and off.max() < 0.05
         assert known.mean() > 0.05
 
 
@@ -78,8 +76,8 @@ def test_what_overflows_is_finite() -> None:
     for value in (3e38, -3e38, 1e-38):
         for name in SPACE_PLANES:
             scene.scales[1][name][:] = value
-        baking = baking_of(scene, time=0.3)
-        assert np.isfinite(baking.grid).all() and np.abs(baking.grid).max() <= LARGEST
+        grid = grid_of(scene, time=0.3)
+        assert np.isfinite(grid.values).all() and np.abs(grid.values).max() <= LARGEST
 
 
 @pytest.mark.parametrize("change", [{"step": 2.0}, {"termination": 1 / 16}, {"rays_across": 4}, {"resolution": 0.5}])
@@ -89,10 +87,12 @@ def test_qualities_mean_what_they_mean_for_planes(change: dict[str, float]) -> N
     )
     camera = look_at((4.8, 2.0, 4.4), (0.1, 0.05, 0.05), 61, 45, 60.0) if "rays_across" in change else CAMERA
     assert CornerGrid.serves(scene)
-    renderers = [Renderer(gl.context(), scene, replace(quality, **change)) for quality in (BAKED, FOLDED)]
-    renderers[1].casts = False
+    renderers = [
+        Renderer(gl.context(), scene, replace(quality, **change), processor=processor)
+        for quality, processor in ((WITH_GRID, True), (FOLDED, False))
+    ]
     if "termination" in change:
-        renderers[0].quality = replace(BAKED, grid_termination=change["termination"])
+        renderers[0].quality = replace(WITH_GRID, grid_termination=change["termination"])
     assert renderers[0].rays_across(camera) > 1 or "rays_across" not in change
     got, wanted = (renderer.render(camera, 0.6) for renderer in renderers)
     np.testing.assert_allclose(got.rgb, wanted.rgb, atol=2e-3)
@@ -103,15 +103,15 @@ def test_qualities_mean_what_they_mean_for_planes(change: dict[str, float]) -> N
 def test_pictures_are_near_those_of_the_reference(space: str) -> None:
     """Of a scene of 24 texels, smooth over six. What is exact, or static, looks up planes."""
     scene = VARIANTS[space](view_independent(tiny_scene(4, channels=16)))
-    renderer = Renderer(gl.context(), scene, BAKED)
-    assert renderer._marching_kind(moving=True) is (CornerGrid if renderer.casts else None)
+    renderer = Renderer(gl.context(), scene, WITH_GRID, processor=True)
+    assert renderer._processor._sampler_kind(renderer.quality, is_moving=True) is CornerGrid
     for time in (0.1, 0.5, 0.9):
         got, wanted = renderer.render(CAMERA, time), render(scene, CAMERA, time)
         assert -10 * np.log10(np.mean((got.rgb - wanted.rgb) ** 2)) > 40
         assert np.mean(np.abs(got.samples - wanted.samples) <= 1) > 0.95
     still = renderer.render(CAMERA, 0.9, part=Part.STATIC)
     np.testing.assert_array_equal(
-        still.rgb, Renderer(gl.context(), scene, FOLDED).render(CAMERA, 0.9, part=Part.STATIC).rgb
+        still.rgb, Renderer(gl.context(), scene, FOLDED, processor=True).render(CAMERA, 0.9, part=Part.STATIC).rgb
     )
     renderer.quality = LEVELS["reference"]
     assert renderer.drawn_by == "fragment shaders"
@@ -120,25 +120,28 @@ def test_pictures_are_near_those_of_the_reference(space: str) -> None:
 
 
 def test_what_it_takes_is_counted() -> None:
-    baking = baking_of(view_independent(tiny_scene(4, channels=16)))
-    taken = baking.grid.nbytes + baking._known.nbytes + sum(plane.nbytes for plane in baking._planes)
-    assert taken == CornerGrid.bytes_for(baking._scene) and taken + baking._room.nbytes == baking.memory_bytes
+    grid = grid_of(view_independent(tiny_scene(4, channels=16)))
+    taken = grid.values.nbytes + grid._known.nbytes + sum(plane.nbytes for plane in grid._planes)
+    assert taken == CornerGrid.bytes_for(grid._scene) == grid.memory_bytes
 
 
 def test_a_picture_hangs_on_none_before_it() -> None:
     scene = with_motion(view_independent(tiny_scene(4, channels=16)))
-    renderer = Renderer(gl.context(), scene, LEVELS["balanced"])
+    renderer = Renderer(gl.context(), scene, LEVELS["balanced"], processor=True)
     for time in (0.1, 0.11, 0.7, 0.12):
         got = renderer.render(CAMERA, time)
-    if not renderer.casts:
-        pytest.skip("a graphics card, which bakes nothing")
-    np.testing.assert_array_equal(got.rgb, Renderer(gl.context(), scene, LEVELS["balanced"]).render(CAMERA, 0.12).rgb)
+    np.testing.assert_array_equal(
+        got.rgb, Renderer(gl.context(), scene, LEVELS["balanced"], processor=True).render(CAMERA, 0.12).rgb
+    )
 
 
 def test_planes_that_arrive_later_count() -> None:
     scene = view_independent(tiny_scene(4, channels=16))
     early = without_planes(scene)
-    renderer, whole = Renderer(gl.context(), early, BAKED), Renderer(gl.context(), scene, BAKED)
+    renderer, whole = (
+        Renderer(gl.context(), early, WITH_GRID, processor=True),
+        Renderer(gl.context(), scene, WITH_GRID, processor=True),
+    )
     renderer.render(CAMERA, 0.5)
     stream_planes(renderer, early, scene)
     np.testing.assert_array_equal(renderer.render(CAMERA, 0.5).rgb, whole.render(CAMERA, 0.5).rgb)
@@ -147,7 +150,7 @@ def test_planes_that_arrive_later_count() -> None:
 def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
     assert CornerGrid.serves(view_independent(tiny_scene(channels=16)))
     fine = view_independent(tiny_scene(scales=1, channels=30, resolution=(200, 180, 120)))
-    assert np.prod(corners_of(fine)) > MOST_CORNERS
+    assert np.prod(grid_shape(fine)) > MOST_CORNERS
     mapped = [VARIANTS[space](view_independent(tiny_scene(channels=16))) for space in ("ndc", "contracted")]
     for scene in (
         *mapped,
@@ -158,5 +161,8 @@ def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
         VARIANTS["hybrid"](tiny_scene(channels=16)),
     ):
         assert not CornerGrid.serves(scene)
-        got, wanted = (Renderer(gl.context(), scene, quality).render(CAMERA, 0.5) for quality in (BAKED, FOLDED))
+        got, wanted = (
+            Renderer(gl.context(), scene, quality, processor=True).render(CAMERA, 0.5)
+            for quality in (WITH_GRID, FOLDED)
+        )
         np.testing.assert_array_equal(got.rgb, wanted.rgb)

@@ -8,9 +8,10 @@ import pytest
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
 from kpc.player.cpu.corner_grid import CornerGrid
-from kpc.player.cpu.cpu_renderer import in_steps, rehearse
+from kpc.player.cpu.field_sampler import quantised_planes, warm_up
+from kpc.player.cpu.lanes import FAST, clamped
 from kpc.player.cpu.plane_sampler import PlaneSampler
-from kpc.player.cpu.raymarch import _FAST, _within, march_blocks
+from kpc.player.cpu.raymarch import march_blocks
 from kpc.player.cpu.reference import Part, render
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LEVELS, Quality
@@ -35,18 +36,17 @@ QUALITY = {PlaneSampler: FOLDED, CornerGrid: BAKED}
 
 
 def renderer_of(scene: Scene, kind: type = PlaneSampler, quality: Quality | None = None) -> Renderer:
-    renderer = Renderer(gl.context(), scene, quality or QUALITY[kind])
-    if not renderer.casts:
-        pytest.skip("a graphics card, which marches everything")
-    assert renderer._marching_kind(scene.is_dynamic) is kind and renderer.drawn_by == "the processor itself"
+    renderer = Renderer(gl.context(), scene, quality or QUALITY[kind], processor=True)
+    assert renderer._processor._sampler_kind(renderer.quality, scene.is_dynamic) is kind
+    assert renderer.drawn_by == "the processor"
     return renderer
 
 
-@njit(**_FAST)
-def clamped(places, most):
+@njit(**FAST)
+def clamped_all(places, most):
     out = np.empty_like(places)
     for i in range(len(places)):
-        out[i] = _within(places[i], most)
+        out[i] = clamped(places[i], most)
     return out
 
 
@@ -124,7 +124,7 @@ def test_planes_of_all_sizes_are_looked_up(make) -> None:
 
 def test_what_is_no_number_is_no_place_in_an_array() -> None:
     places = np.array([np.nan, -np.inf, -1.0, 0.0, 2.5, 7.0, np.inf] * 5, np.float32)  # more than vectors hold
-    np.testing.assert_array_equal(clamped(places, np.float32(5)), np.float32([0, 0, 0, 0, 2.5, 5, 5] * 5))
+    np.testing.assert_array_equal(clamped_all(places, np.float32(5)), np.float32([0, 0, 0, 0, 2.5, 5, 5] * 5))
 
 
 @pytest.mark.parametrize("value", [3e38, -3e38, 1e-38])
@@ -149,38 +149,27 @@ def test_boxes_without_a_volume_show_the_background(edges: tuple[float, float, f
 
 def test_planes_are_as_near_as_their_steps() -> None:
     plane = np.random.default_rng(0).normal(size=(7, 9, 5)).astype(np.float32) * np.float32([1e-30, 1, 0, 1e30, 5])
-    whole, step = in_steps(plane)
+    whole, step = quantised_planes(plane)
     assert whole.dtype == np.int16 and step[2] == 0 and not whole[..., 2].any()
     assert (np.abs(whole * step - plane) <= 0.51 * step).all() and (
         np.abs(whole).max((0, 1)) == [32767, 32767, 0, 32767, 32767]
     ).all()
 
 
-@pytest.mark.parametrize("rung", ["fast", "balanced", "fine", "finer"])
-@pytest.mark.parametrize("space", ["box", "displaced", "contracted"])
-def test_rungs_are_as_near_as_by_shaders(rung: str, space: str) -> None:
-    """While the clip plays, too."""
-    scene, camera = VARIANTS[space](tiny_scene(4, channels=16)), CAMERA.resized(160, 120)
-    by_shaders, itself = Renderer(gl.context(), scene, LEVELS[rung]), renderer_of(scene, quality=LEVELS[rung])
-    by_shaders.casts = False
-    for time in (0.4, 0.41, 0.42, 0.43):
-        wanted = render(scene, camera, time).rgb
-        off = [np.mean((renderer.render(camera, time).rgb - wanted) ** 2) for renderer in (by_shaders, itself)]
-        assert off[1] < 1.3 * off[0] + 1e-6
+@pytest.mark.parametrize("variant", ["ndc", "hybrid"])
+def test_scenes_that_it_does_not_serve_are_drawn_by_shaders(variant: str) -> None:
+    scene = VARIANTS[variant](tiny_scene(4))
+    renderer = Renderer(gl.context(), scene, FOLDED, processor=True)
+    assert not PlaneSampler.serves(scene) and renderer.drawn_by.endswith("shaders")
+    error = renderer.render(CAMERA, 0.5).rgb - render(scene, CAMERA, 0.5).rgb
+    assert -10 * np.log10(np.mean(error**2)) > 60
 
 
-def test_scenes_that_it_would_not_serve_are_marched_by_shaders() -> None:
-    assert PlaneSampler.serves(tiny_scene()) and PlaneSampler.serves(tiny_scene(dynamic=False))
-    for space in ("ndc", "hybrid"):
-        scene = VARIANTS[space](tiny_scene(4))
-        renderer = Renderer(gl.context(), scene, FOLDED)
-        assert not PlaneSampler.serves(scene) and renderer.drawn_by.endswith("shaders")
-        assert np.isfinite(renderer.render(CAMERA, 0.5).rgb).all()
-    scene = tiny_scene(4)
-    renderer = Renderer(gl.context(), scene, LEVELS["reference"])
+def test_the_exact_level_is_drawn_by_shaders() -> None:
+    renderer = Renderer(gl.context(), tiny_scene(4), LEVELS["reference"], processor=True)
     assert renderer.drawn_by == "fragment shaders"
     renderer.render(CAMERA, 0.5)
-    assert not renderer._in_memory
+    assert renderer._processor.memory_bytes == 0
 
 
 def test_planes_that_arrive_later_count() -> None:
@@ -192,28 +181,24 @@ def test_planes_that_arrive_later_count() -> None:
     np.testing.assert_array_equal(renderer.render(CAMERA, 0.5).rgb, whole.render(CAMERA, 0.5).rgb)
 
 
-def test_what_it_takes_is_counted() -> None:
+def test_its_memory_is_counted() -> None:
     for make in SCENES.values():
         renderer = renderer_of(scene := make())
         before = renderer.memory_bytes
         renderer.render(CAMERA, 0.5)
-        lookup = renderer._kept(PlaneSampler)
-        taken = lookup._planes.nbytes + lookup._rows.nbytes + lookup._seen_from.nbytes
-        assert (
-            taken == PlaneSampler.bytes_for(scene)
-            or not scene.decoder.w2.any()
-            and taken < PlaneSampler.bytes_for(scene)
-        )
-        assert (
-            renderer.memory_bytes >= before + lookup.memory_bytes >= PlaneSampler.bytes_for(scene) + lookup._room.nbytes
-        )
+        sampler = renderer._processor._sampler(PlaneSampler)
+        taken = sampler._planes.nbytes + sampler._rows.nbytes + sampler._ray_weights.nbytes
+        bound = PlaneSampler.bytes_for(scene)
+        assert taken == bound or not scene.decoder.w2.any() and taken < bound
+        assert renderer.memory_bytes >= before + bound
+        assert renderer.memory_bytes - renderer.picture_bytes <= Renderer.bytes_for(scene)
 
 
 @pytest.mark.parametrize("kind", [PlaneSampler, CornerGrid])
-def test_what_is_rehearsed_is_what_pictures_need(kind: type) -> None:
+def test_what_is_warmed_up_is_what_pictures_need(kind: type) -> None:
     """Whether or not anything is displaced, colours have sides or something moves."""
     for scene in [make() for make in SCENES.values()] if kind is PlaneSampler else [unequal_scales(), one_texel_deep()]:
-        rehearse(kind, scene)
+        warm_up(kind, scene)
         before = list(march_blocks.signatures)
         for shown in (scene, with_motion(scene)) if scene.is_dynamic else (scene,):
             renderer_of(shown, kind).render(CAMERA, 0.3)

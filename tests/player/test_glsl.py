@@ -27,22 +27,13 @@ def lens() -> str:
             f"const vec3 eye = vec3({', '.join(f'{x:.9e}' for x in CAMERA.camera_to_world[:3, 3])});\n")  # fmt: skip
 
 
-def test_a_place_is_seen_where_its_ray_leaves_the_raster() -> None:
-    i, j, away = RNG.uniform(0, 64, N), RNG.uniform(0, 48, N), 10 ** RNG.uniform(-2, 4, N)
-    glsl = '#include "ray.glsl"\n' + lens()
+def test_rays_go_through_their_pixels() -> None:
+    i, j = RNG.uniform(0, 64, N), RNG.uniform(0, 48, N)
     local = np.stack([(i - CAMERA.cx) / CAMERA.fl_x, -(j - CAMERA.cy) / CAMERA.fl_y, -np.ones(N)], axis=1)
     directions = local / np.linalg.norm(local, axis=1, keepdims=True) @ CAMERA.camera_to_world[:3, :3].T
+    glsl = '#include "ray.glsl"\n' + lens()
     got = gl.evaluate(glsl, "vec4(camera_direction(a.xy, 48.0, lens, axes), 0.0)", columns(i, 48 - j))[:, :3]
     np.testing.assert_allclose(got, directions, atol=1e-6)
-    places = CAMERA.camera_to_world[:3, 3] + away[:, None] * directions
-    on = gl.evaluate(glsl, "vec4(on_raster(a.xyz, 48.0, lens, axes, eye), 0.0, 0.0)", columns(*places.T))[:, :2]
-    # A place in float32 errs by 2^-24 of its distance from the origin: seen from nearby, by as much more of a pixel.
-    error = 2.0**-22 * np.maximum(np.abs(places).max(1), 3) / away * CAMERA.fl_x + 1e-4
-    assert (np.abs(on - np.stack([i, 48 - j], axis=1)).max(1) < error + 2e-5 * 64).all()
-    behind = CAMERA.camera_to_world[:3, 3] - away[:, None] * directions
-    assert (
-        gl.evaluate(glsl, "vec4(on_raster(a.xyz, 48.0, lens, axes, eye), 0.0, 0.0)", columns(*behind.T))[:, :2] < -1e8
-    ).all()
 
 
 def test_distances_in_contracted_space() -> None:

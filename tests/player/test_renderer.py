@@ -14,7 +14,9 @@ from kpc.format.container import scene_io
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part, Rendering, render
-from kpc.player.gl.renderer import DisplayMode, Renderer
+from kpc.player.gl.folding import folded_layout
+from kpc.player.gl.presentation import DisplayMode
+from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LEVELS, Quality
 from kpc.player.viewpoints import Rig, fit_camera
 from PIL import Image
@@ -169,7 +171,9 @@ def test_scenes_without_appearances_have_no_code_in_the_shader() -> None:
     ):
         renderer = Renderer(gl.context(), scene)
         renderer.render(CAMERAS["outside"], 0.62)
-        (program,) = (program for (name, *_), (program, _) in renderer._programs.items() if name == "march.glsl")
+        (program,) = (
+            program for (name, *_), (program, _) in renderer._programs._programs.items() if name == "march.glsl"
+        )
         assert (program.get("appearance", None) is not None) == held
         if not held and scene.appearances:  # colour is the same from all sides, whatever the code
             check(
@@ -205,15 +209,16 @@ def test_one_renderer_serves_many_sizes_and_times() -> None:
     assert renderer.memory_bytes > 1000
 
 
+@pytest.mark.parametrize("processor", [False, True], ids=["shaders", "processor"])
 @pytest.mark.parametrize("space", VARIANTS)
-def test_folding_is_exact_where_nothing_moves_and_close_where_it_does(space: str) -> None:
+def test_folded_levels_are_exact_where_nothing_moves_and_close_where_it_does(space: str, processor: bool) -> None:
     still, moving = tiny_scene(6, dynamic=False), VARIANTS[space](tiny_scene(4))
     still = with_contraction(still) if space == "contracted" else still
     check(
-        Renderer(gl.context(), still, Quality(folded=True)).render(CAMERAS["outside"], 0.0),
+        Renderer(gl.context(), still, Quality(folded=True), processor=processor).render(CAMERAS["outside"], 0.0),
         render(still, CAMERAS["outside"], 0.0),
     )
-    renderer = Renderer(gl.context(), moving, FOLDED)
+    renderer = Renderer(gl.context(), moving, FOLDED, processor=processor)
     for time in (0.2, 0.7):
         got, wanted = renderer.render(CAMERAS["outside"], time), render(moving, CAMERAS["outside"], time)
         assert -10 * np.log10(np.mean((got.rgb - wanted.rgb) ** 2)) > 50
@@ -286,27 +291,11 @@ def test_a_decoder_too_large_for_a_shader_is_refused() -> None:
         Renderer(gl.context(), replace(scene, decoder=wide))
 
 
-@pytest.mark.parametrize("factor", [1.0, 1e20])  # and beyond what float32 can hold
-def test_a_processor_folds_as_shaders_do(factor: float) -> None:
-    scene = tiny_scene(4)
-    larger = [{name: np.float32(factor) * plane for name, plane in scale.items()} for scale in scene.scales]
-    planes = []
-    for in_memory in (False, True):
-        renderer = Renderer(gl.context(), replace(scene, scales=tuple(larger)), FOLDED)
-        renderer._folds_in_memory, renderer._folds_in_half, renderer.casts = in_memory, False, False
-        renderer.march(CAMERAS["outside"], 0.3)
-        planes.append(
-            np.frombuffer(renderer.march(CAMERAS["outside"], 0.7) and renderer._folded.planes.read(), np.float32)
-        )
-    assert np.array_equal(*planes) and np.abs(planes[0]).max() > min(factor / 10, 3e38)
-
-
 def test_planes_that_fit_only_unrefined_are_folded_so(monkeypatch: pytest.MonkeyPatch) -> None:
     ctx, scene = gl.context(), tiny_scene(4)
     monkeypatch.setitem(ctx.info, "GL_MAX_TEXTURE_SIZE", max(Renderer(ctx, scene).layout.size))
-    renderer = Renderer(ctx, scene, FOLDED)
-    renderer.casts = False
-    assert renderer.folded_layout is renderer.layout
+    renderer = Renderer(ctx, scene, FOLDED, processor=False)
+    assert folded_layout(renderer._textures) is renderer.layout
     error = renderer.render(CAMERAS["outside"], 0.7).rgb - render(scene, CAMERAS["outside"], 0.7).rgb
     assert -10 * np.log10(np.mean(error**2)) > 40
 

@@ -1,15 +1,16 @@
 """Blocks of a picture that can show anything."""
 
-import gl
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from kpc.format.scene.scene import Scene
+from kpc.player.cpu import cpu_renderer
 from kpc.player.cpu.reference import occupancy_slot, render
 from kpc.player.cpu.screen_mask import MOST_CELLS, ScreenMask
-from kpc.player.gl import renderer as renderer_module
-from kpc.player.gl.renderer import Renderer
-from kpc.player.quality import LEVELS
-from scenes import look_at, tiny_scene, with_hybrid_decoder, with_motion
+from kpc.player.quality import LEVELS, Quality
+from processor import draw, processor_of, psnr
+from scenes import look_at, tiny_scene, with_motion
 
 CAMERAS = {
     "near": look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 61, 43, 60.0),
@@ -80,18 +81,34 @@ def test_from_among_what_is_occupied_all_is_drawn() -> None:
     assert ScreenMask.of(filled, scene.aabb).blocks(inside, 4) is None
 
 
-@pytest.mark.parametrize("kind", ["plain", "hybrid", "displaced"])
+@pytest.mark.parametrize("kind", ["plain", "displaced"])
 @pytest.mark.parametrize("camera", ["near", "far", "beside", "away"])
-def test_pictures_are_the_same(monkeypatch: pytest.MonkeyPatch, kind: str, camera: str) -> None:
-    make = {"plain": lambda s: s, "hybrid": with_hybrid_decoder, "displaced": with_motion}[kind]
+def test_pictures_are_the_same_without_a_mask(monkeypatch: pytest.MonkeyPatch, kind: str, camera: str) -> None:
+    make = {"plain": lambda s: s, "displaced": with_motion}[kind]
     scene, view = sparse(make(tiny_scene(3)), 0.02), CAMERAS[camera]
-    for name in ("reference", "balanced"):
+    for name in ("finer", "balanced"):
         pictures = []
-        for most_covered in (renderer_module.MOST_COVERED, -1.0):
-            monkeypatch.setattr(renderer_module, "MOST_COVERED", most_covered)
-            renderer = Renderer(gl.context(), scene, LEVELS[name])
-            renderer._is_software = True
-            pictures.append([renderer.render(view, time) for time in (0.3, 0.31, 0.32, 0.7, 0.7)])
+        for most in (cpu_renderer.MOST_MASKED, -1.0):
+            monkeypatch.setattr(cpu_renderer, "MOST_MASKED", most)
+            renderer = processor_of(scene)
+            pictures.append([draw(renderer, view, time, LEVELS[name]) for time in (0.3, 0.31, 0.32, 0.7, 0.7)])
         for one, other in zip(*pictures, strict=True):
-            for field in ("rgb", "opacity", "samples", "depth"):
-                np.testing.assert_array_equal(getattr(one, field), getattr(other, field), f"{name} {field}")
+            np.testing.assert_array_equal(one, other, name)
+
+
+def test_what_was_drawn_before_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = tiny_scene(4, resolution=(33, 17, 17))
+    renderer, most = processor_of(scene), cpu_renderer.MOST_MASKED
+    coarse, predicted = (
+        Quality(folded=True, interpolation_tolerance=0.005),
+        Quality(folded=True, reprojection_tolerance=0.02),
+    )
+    for number, away in enumerate(((2.0, 1.0), (-3.0, 4.0), (0.5, -9.0), (6.0, 2.0))):
+        camera = look_at((away[0], away[1], 3.0), (0.1 * number - 0.2, 0.0, 0.0), 96, 64, 70.0)
+        for quality in (coarse, predicted, coarse):
+            for time in (0.3, 0.31):
+                monkeypatch.setattr(cpu_renderer, "MOST_MASKED", most)
+                got = draw(renderer, camera, time, quality)
+                monkeypatch.setattr(cpu_renderer, "MOST_MASKED", -1.0)
+                wanted = draw(processor_of(scene), camera, time, replace(quality, reprojection_tolerance=0.0))
+                assert psnr(got, wanted) > (60 if quality is coarse else 40)

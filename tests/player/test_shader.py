@@ -1,16 +1,13 @@
 import re
-from itertools import chain
 
 import gl
 import numpy as np
 import pytest
 from kpc.format.common.errors import DisplayError
-from kpc.player.atlas import Layout, block_arrays, decoder_arrays, decoder_shape, planes_shape
+from kpc.player.atlas import Layout
 from kpc.player.gl import shader
+from kpc.player.gl.shader_constants import block_arrays, decoder_arrays, decoder_shape, planes_shape
 from scenes import tiny_scene, with_hybrid_decoder
-
-VERTICES = {"settle.glsl": ["places.glsl"], "march.glsl": ["blocks.glsl", "squares.glsl"]}
-"""Those of fragment shaders that are not drawn all over the viewport, or not always."""
 
 
 def test_includes_come_once_and_lines_keep_their_numbers() -> None:
@@ -57,11 +54,11 @@ def test_a_missing_file_is_named() -> None:
         shader.compose("a", written={"a": '#include "nowhere.glsl"'})
 
 
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "refine.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "enlarge.glsl", "average.glsl", "nothing.glsl", "predict.glsl", "doubt.glsl", "settle.glsl",
-                                  *chain(*VERTICES.values()), "fullscreen.glsl"])  # fmt: skip
+@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "upsample_plane.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "enlarge.glsl", "average.glsl",
+                                  "fullscreen.glsl"])  # fmt: skip
 def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
     scene = tiny_scene(0)
-    defines = {**planes_shape(Layout.of(scene)), **decoder_shape(scene.decoder), "SHARED": 1}
+    defines = {**planes_shape(Layout.of(scene)), **decoder_shape(scene.decoder)}
     text, files = shader.compose(
         name, defines, written={"decoder_weights": "", "plane_blocks": ""}, preamble=shader.ES30
     )
@@ -80,7 +77,7 @@ def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
 def test_compiler_messages_name_the_file(log: str) -> None:
     assert re.match(
         r"shader march\.glsl:12: .*(undeclared|undefined)",
-        shader.first_complaint(f"\nFragment\n{log}\n", ["a.glsl", "march.glsl"]),
+        shader.first_error(f"\nFragment\n{log}\n", ["a.glsl", "march.glsl"]),
     )
 
 
@@ -109,16 +106,12 @@ def test_constants_are_exact() -> None:
     [
         "march.glsl",
         "cells.glsl",
-        "refine.glsl",
+        "upsample_plane.glsl",
         "fold.glsl",
         "present.glsl",
         "upscale.glsl",
         "enlarge.glsl",
         "average.glsl",
-        "nothing.glsl",
-        "predict.glsl",
-        "doubt.glsl",
-        "settle.glsl",
     ],
 )
 def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, rows: int, space: str) -> None:
@@ -130,9 +123,8 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     blocks = shader.constants(block_arrays(scene, layout))
-    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "DRAWN": 2, "SHARED": int(space == "box"), "PIXELS": rows + motion, "MOVED": motion, "CUBIC": motion, "VIEW": rows + 2 * motion, "COMPUTE": 0, "TILE": 64, "SQUARE": 20,
+    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "MODE": rows + 2 * motion, "COMPUTE": 0,
                "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion, "APPEARANCE": rows}  # fmt: skip
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights, "plane_blocks": blocks})
-    for where in VERTICES.get(name, ["fullscreen.glsl"]):
-        vertex, _ = shader.compose(where, defines, preamble=shader.ES30)
-        ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()
+    vertex, _ = shader.compose("fullscreen.glsl", defines, preamble=shader.ES30)
+    ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from kpc.player.cpu.simd import LARGEST, NARROW, WIDE, combine, interpolate, weigh
+from kpc.player.cpu.simd import LARGEST, NARROW, WIDE, accumulate_features, decode_corner, interpolate
 from numba import njit
 
 
@@ -26,14 +26,14 @@ def interpolated(grid, first, steps, shares, into):
 
 @njit
 def combined(wholes, factors, weights, bias, into):
-    combine(wholes, factors, weights, bias, into, np.uint64(1))
+    decode_corner(wholes, factors, weights, bias, into, np.uint64(1))
 
 
 @njit
 def weighed(planes, texels, ups, rows, starts, shares, weights, halves, into):
     for n in range(len(texels)):
         at, from_, way = texels[n], starts[n], shares[n]
-        weigh(
+        accumulate_features(
             planes, (at[0], at[1], at[2]), (ups[0], ups[1], ups[2]), rows, (from_[0], from_[1], from_[2]), (way[0], way[1], way[2]), weights,
             np.uint64(3), halves, into, np.uint64(1), np.uint64(n),
         )  # fmt: skip

@@ -1,20 +1,20 @@
-// A picture of a march with several rays across a pixel: their mean.
+// The mean of several rays across each pixel.
 
-uniform sampler2D seen_fine;
-uniform sampler2D met_fine;
-uniform int across;  // rays
+uniform sampler2D rgba_rays;
+uniform sampler2D sums_rays;
+uniform int rays_across;
 
-layout(location = 0) out vec4 seen;
-layout(location = 1) out vec4 met;
+layout(location = 0) out vec4 rgba;
+layout(location = 1) out vec4 sums;
 
 void main() {
-    ivec2 first = across * ivec2(gl_FragCoord.xy);
-    seen = met = vec4(0.0);
-    for (int i = 0; i < across * across; ++i) {
-        ivec2 at = first + ivec2(i % across, i / across);
-        seen += texelFetch(seen_fine, at, 0);
-        met += texelFetch(met_fine, at, 0);
+    ivec2 first = rays_across * ivec2(gl_FragCoord.xy);
+    rgba = sums = vec4(0.0);
+    for (int i = 0; i < rays_across * rays_across; ++i) {
+        ivec2 at = first + ivec2(i % rays_across, i / rays_across);
+        rgba += texelFetch(rgba_rays, at, 0);
+        sums += texelFetch(sums_rays, at, 0);
     }
-    seen /= float(across * across);
-    met /= float(across * across);
+    rgba /= float(rays_across * rays_across);
+    sums /= float(rays_across * rays_across);
 }

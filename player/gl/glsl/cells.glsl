@@ -1,4 +1,4 @@
-// The occupied cells themselves, as boxes with a pattern of grid lines: where a march takes samples.
+// The occupied cells, as boxes with a pattern of grid lines: where a march takes samples.
 
 #include "ray.glsl"
 #include "space.glsl"
@@ -20,14 +20,14 @@ uniform vec4 lens;
 uniform mat3 axes;
 uniform vec3 eye;
 
-layout(location = 0) out vec4 seen;
-layout(location = 1) out vec4 met;
+layout(location = 0) out vec4 rgba;
+layout(location = 1) out vec4 sums;
 
 void main() {
     Path path = path_of(eye, camera_direction(gl_FragCoord.xy, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
-    seen = vec4(background, 0.0);
-    met = vec4(0.0);
+    rgba = vec4(background, 0.0);
+    sums = vec4(0.0);
     Place place;
     if (!to_occupied(walk, cells, place)) return;
 
@@ -35,7 +35,7 @@ void main() {
     vec3 inside = place.u * cell_count;
     vec3 cell = floor(inside);
 #if CONTRACTED
-    // The way is bent: take the face that the sample is nearest to for the one through which the ray came in.
+    // The ray is curved: take the face nearest to the sample for the one through which the ray came in.
     vec3 local = abs(inside - cell - 0.5);
     vec3 face = vec3(greaterThanEqual(local, vec3(largest(local))));
 #else
@@ -50,6 +50,6 @@ void main() {
     float lit = dot(face, vec3(0.72, 0.84, 1.0));
     vec3 shade = cell * walk.edge;
     vec3 tint = mix(vec3(0.30, 0.46, 0.62), vec3(0.90, 0.74, 0.46), shade);
-    seen = vec4(tint * max(lit, 0.6) * mix(1.0, 0.6, line), 1.0);
-    met = vec4(world_distance(path, t), 1.0, 0.0, 0.0);
+    rgba = vec4(tint * max(lit, 0.6) * mix(1.0, 0.6, line), 1.0);
+    sums = vec4(world_distance(path, t), 1.0, 0.0, 0.0);
 }

@@ -1,5 +1,5 @@
-// What the decoders share. In the explicit one, log density and colour are linear in the features, and the view direction picks
-// the colour's basis; the hybrid one is a small MLP for each.
+// What the decoders share. In the explicit one, log density and colour are linear in the features, and the view
+// direction picks the colour's basis; the hybrid one is a small MLP for each.
 
 const float LOG_DENSITY_LIMIT = 20.0;  // as in kpc.format.scene.scene, as the next
 const float ACTIVATION_LIMIT = 65504.0;

@@ -1,13 +1,13 @@
-// Puts what is shown on a screen that is larger.
+// Puts a picture that is ready to be shown on a larger screen.
 
 #include "cubic.glsl"
 
 uniform sampler2D shown_small;
 uniform vec2 viewport;  // pixels
-uniform float share;    // of the picture; the rest is there already
+uniform float opacity;  // of the picture over what is there
 
 layout(location = 0) out vec4 shown;
 
 void main() {
-    shown = vec4(cubic(shown_small, gl_FragCoord.xy / viewport), share);
+    shown = vec4(cubic(shown_small, gl_FragCoord.xy / viewport), opacity);
 }

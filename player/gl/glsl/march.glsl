@@ -1,13 +1,11 @@
 // The picture of a scene; normative text and a readable twin: kpc.player.cpu.reference.
 //
-// LAYERS_n, FIRST_n: of four channels, of scale n; FEATURES: all of them; BASIS: three times as many. HIDDEN is 0 where colour is the same from all sides. HYBRID: 1 where the
-// decoder is the hybrid one, of layers of WIDTH and HIDDEN units. APPEARANCE: 1 where colours come in more than one appearance.
-// ROWS: 1 where rows of time planes are multiplied in at every sample.
-// CONTRACTED: 1 where the planes hold what lies outside the box, too. MOTION: 1 where places are displaced.
-// NDC: 1 where all this is in device coordinates. DRAWN: how many scales count. SHARED: how many, from
-// the coarsest on, are looked up once for two samples, in the middle between them; the next gives their slope.
-// PIXELS: 0 all are marched; 1 the probes (probes.glsl), as in tiles.glsl; 2 blocks in doubt (blocks.glsl).
-// COMPUTE: 1 for a compute shader (GL 4.3).
+// LAYERS_n, FIRST_n: layers of four channels of scale n, and the first among those of all; FEATURES: layers of all;
+// BASIS: three times as many. HIDDEN: hidden units of the colour's direction layer, 0 for view-independent colour.
+// HYBRID: 1 for the hybrid decoder, of layers of WIDTH and HIDDEN units. APPEARANCE: 1 where colours come in more than
+// one appearance. ROWS: 1 where time rows are multiplied in at every sample. CONTRACTED: 1 where the planes hold what
+// lies outside the box, too. MOTION: 1 where samples are displaced. NDC: 1 where all this is in normalised device
+// coordinates. COMPUTE: 1 for a compute shader (GL 4.3).
 
 #include "ray.glsl"
 #include "space.glsl"
@@ -15,10 +13,9 @@
 #include "motion.glsl"
 #include "planes.glsl"
 #include "decoder.glsl"
-#include "probes.glsl"
-#include "tiles.glsl"
-#include "decoder_weights"  // constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.atlas), as the next
-#include "plane_blocks"     // blocks, layer_widths, last_texels, layers, first_layers
+// Constants: density_weight, density_bias, w1, w2, b2, ... (kpc.player.gl.shader_constants), as the next.
+#include "decoder_weights"
+#include "plane_blocks"     // blocks, layer_widths, last_texels, first_layers
 
 const float TERMINATION = 1.0 / 1024.0;  // as in kpc.format.scene.scene
 
@@ -43,12 +40,6 @@ uniform float termination;          // a ray ends once its transmittance is less
 uniform vec4 appearance[(HIDDEN + 3) / 4];  // the code to show, padded
 #endif
 
-#if PIXELS
-uniform vec2 size;                  // of the picture
-uniform int turn;                   // of the probes
-uniform sampler2D doubts;           // a texel a block, to be marched if more than
-uniform float bearable;
-#endif
 uniform float height;
 uniform vec4 lens;
 uniform mat3 axes;
@@ -115,7 +106,8 @@ vec4 feature(vec3 u, int scale, int layer) {
 }
 
 #if HYBRID
-// A weight below which a sample's colour is not worked out but grey: 4096 of them are not off by more than half an 8-bit level.
+// A weight below which a sample's colour is not worked out but grey: 4096 of them are not off by more than half an
+// 8-bit level.
 const float NEGLIGIBLE = 4e-7;
 
 // Four numbers of v f.
@@ -136,8 +128,9 @@ vec3 shade_of(vec4 h[WIDTH / 4]) {
 #unroll i HIDDEN_4
     sum = towards[i];
 #unroll j WIDTH_4
-    sum += vec4(dot(passed_on[i * WIDTH + j], h[j]), dot(passed_on[i * WIDTH + WIDTH / 4 + j], h[j]),
-                dot(passed_on[i * WIDTH + WIDTH / 2 + j], h[j]), dot(passed_on[i * WIDTH + 3 * WIDTH / 4 + j], h[j]));
+    sum += vec4(dot(from_hidden[i * WIDTH + j], h[j]), dot(from_hidden[i * WIDTH + WIDTH / 4 + j], h[j]),
+                dot(from_hidden[i * WIDTH + WIDTH / 2 + j], h[j]),
+                dot(from_hidden[i * WIDTH + 3 * WIDTH / 4 + j], h[j]));
 #end
     sum = activated(sum);
     shade += vec3(dot(w2[i], sum), dot(w2[HIDDEN / 4 + i], sum), dot(w2[HIDDEN / 2 + i], sum));
@@ -152,7 +145,7 @@ vec4 hybrid_logits_of(vec3 u, float trans, float thickness) {
     vec4 f[FEATURES];
 #unroll scale SCALES
 #unroll layer LAYERS_##scale
-    f[FIRST_##scale + layer] = scale < DRAWN ? feature(u, scale, layer) : vec4(0.0);
+    f[FIRST_##scale + layer] = feature(u, scale, layer);
 #end
 #end
     vec4 h[WIDTH / 4];
@@ -166,41 +159,21 @@ vec4 hybrid_logits_of(vec3 u, float trans, float thickness) {
     return vec4(shade, log_density);
 }
 #else
-// What a scale adds to the logits of the colour, and in w to the log of the density.
+// The logits of the colour, and in w the log of the density.
+vec4 logits_of(vec3 u) {
+    vec4 sum = vec4(vec3(0.0), density_bias[0].x), f;
 #unroll scale SCALES
-vec4 logits_of_scale_##scale(vec3 u) {
-    vec4 sum = vec4(0.0), f;
 #unroll layer LAYERS_##scale
     f = feature(u, scale, layer);
     sum += vec4(dot(f, basis[FIRST_##scale + layer]), dot(f, basis[FEATURES + FIRST_##scale + layer]),
                 dot(f, basis[2 * FEATURES + FIRST_##scale + layer]), dot(f, density_weight[FIRST_##scale + layer]));
 #end
-    return sum;
-}
-#end
-
-// Of the scales from SHARED on.
-vec4 logits_of(vec3 u) {
-    vec4 sum = vec4(0.0);
-#unroll scale SCALES
-#if scale >= SHARED && scale < DRAWN
-    sum += logits_of_scale_##scale(u);
-#endif
-#end
-    return sum;
-}
-
-// Of those before.
-vec4 shared_logits_of(vec3 u) {
-    vec4 sum = vec4(vec3(0.0), density_bias[0].x);
-#unroll scale SHARED
-    sum += logits_of_scale_##scale(u);
 #end
     return sum;
 }
 #endif
 
-// Where in the planes to look for what is at a place.
+// The position in the planes of a sample at u: displaced where the scene has motion.
 vec3 looked_up(vec3 u) {
     u = clamp(u, 0.0, 1.0);
 #if MOTION
@@ -209,7 +182,7 @@ vec3 looked_up(vec3 u) {
     return u;
 }
 
-// What a step at a place counts for the density.
+// The thickness of a step: its length over the longest edge of the box, times the density scale of contracted space.
 float thickness_at(Walk walk, Place place) {
 #if CONTRACTED
     return tau * stretch_of(walk.start + place.t * walk.rate, place.t, even);
@@ -218,105 +191,77 @@ float thickness_at(Walk walk, Place place) {
 #endif
 }
 
-// What a ray has met so far.
-struct Met {
+// The sums of a ray so far.
+struct Sums {
     vec3 rgb;
     float trans;
     float depth;
     float samples;
 };
 
-void add_sample(inout Met sum, vec4 logits, float thickness, float distance) {
-    float weight = sum.trans * alpha_of(logits.w, thickness);
-    sum.rgb += weight * sigmoid(logits.rgb);
-    sum.depth += weight * distance;
-    sum.trans -= weight;
-    sum.samples += 1.0;
+void add_sample(inout Sums sums, vec4 logits, float thickness, float distance) {
+    float weight = sums.trans * alpha_of(logits.w, thickness);
+    sums.rgb += weight * sigmoid(logits.rgb);
+    sums.depth += weight * distance;
+    sums.trans -= weight;
+    sums.samples += 1.0;
 }
 
-// seen: rgb and opacity; met: sum of weight t, samples.
-void march(vec2 fragment, out vec4 seen, out vec4 met) {
-#if PIXELS == 1
-    fragment = probe_of(block_of(floor(fragment)), turn, size) + 0.5;
-#endif
+// rgba: colour and opacity; depth_samples: sum of weight times distance, number of samples.
+void march(vec2 fragment, out vec4 rgba, out vec4 depth_samples) {
     Path path = path_of(eye, camera_direction(fragment, height, lens, axes), frame, near, baseline);
     Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
-    Met sum = Met(vec3(0.0), 1.0, 0.0, 0.0);
+    Sums sums = Sums(vec3(0.0), 1.0, 0.0, 0.0);
     Place place;
     bool more = to_occupied(walk, cells, place);
 #if HIDDEN
     if (more) look_along(path.way);
 #endif
-#if SHARED
-    vec4 shared_before = vec4(0.0);
-    float pair_k = -1.0;
-#endif
     // Tested at its end: neighbouring rays run as one, and a test up front would cost them all one more body.
     do {
         if (more) {
             vec3 u = looked_up(place.u);
-#if SHARED
-            float next_s = sample_s(walk, walk.k + 1.0);
-            Place next = place_at(walk, next_s);
-            bool both = next_s < walk.far && free_around(cells, walk, cell_of(walk, next.u)) == 0u;
-            vec3 next_u = looked_up(next.u);
-            vec4 shared_logits = shared_logits_of(0.5 * (u + next_u));
-            // How they go on from half a sample to the next, if the pair before was the one just before.
-            vec4 slope = walk.k == pair_k ? 0.25 * (shared_logits - shared_before) : vec4(0.0);
-            slope /= 1.0 + abs(slope);  // steep ones seldom go on
-            shared_before = shared_logits;
-            vec4 next_logits = shared_logits + slope + logits_of(next_u);
-            add_sample(sum, shared_logits - slope + logits_of(u), thickness_at(walk, place), world_distance(path, place.t));
-            if (both && sum.trans >= termination) {
-                add_sample(sum, next_logits, thickness_at(walk, next), world_distance(path, next.t));
-            }
-            walk.k += 2.0;
-            pair_k = walk.k;
-#else
             float thickness = thickness_at(walk, place);
 #if HYBRID
-            vec4 logits = hybrid_logits_of(u, sum.trans, thickness);
+            vec4 logits = hybrid_logits_of(u, sums.trans, thickness);
 #else
-            vec4 logits = shared_logits_of(u) + logits_of(u);
+            vec4 logits = logits_of(u);
 #endif
-            add_sample(sum, logits, thickness, world_distance(path, place.t));
+            add_sample(sums, logits, thickness, world_distance(path, place.t));
             walk.k += 1.0;
-#endif
-            more = sum.trans >= termination;
+            more = sums.trans >= termination;
         }
         more = more && to_occupied(walk, cells, place);
     } while (more);
 
-    if (sum.trans < termination && termination > TERMINATION) {  // sooner than the format says: the rest is like what was met
-        sum.rgb /= 1.0 - sum.trans;
-        sum.depth /= 1.0 - sum.trans;
-        sum.trans = 0.0;
+    // Sooner than the format says: the remaining light gets the colour met so far.
+    if (sums.trans < termination && termination > TERMINATION) {
+        sums.rgb /= 1.0 - sums.trans;
+        sums.depth /= 1.0 - sums.trans;
+        sums.trans = 0.0;
     }
-    seen = vec4(sum.rgb + sum.trans * background, 1.0 - sum.trans);
-    met = vec4(sum.depth, sum.samples, 0.0, 0.0);
+    rgba = vec4(sums.rgb + sums.trans * background, 1.0 - sums.trans);
+    depth_samples = vec4(sums.depth, sums.samples, 0.0, 0.0);
 }
 
 #if COMPUTE
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(rgba32f) uniform writeonly image2D seen_picture;
-layout(rg32f) uniform writeonly image2D met_picture;
+layout(rgba32f) uniform writeonly image2D rgba_picture;
+layout(rg32f) uniform writeonly image2D sums_picture;
 
 void main() {
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
-    if (any(greaterThanEqual(at, imageSize(seen_picture)))) return;
-#if PIXELS == 2
-    if (textureLod(doubts, (floor(vec2(at) / BLOCK) + 0.5) / ceil(size / BLOCK), 0.0).r <= bearable) return;
-#endif
-    vec4 seen, met;
-    march(vec2(at) + 0.5, seen, met);
-    imageStore(seen_picture, at, seen);
-    imageStore(met_picture, at, met);
+    if (any(greaterThanEqual(at, imageSize(rgba_picture)))) return;
+    vec4 rgba, sums;
+    march(vec2(at) + 0.5, rgba, sums);
+    imageStore(rgba_picture, at, rgba);
+    imageStore(sums_picture, at, sums);
 }
 #else
-layout(location = 0) out vec4 seen;
-layout(location = 1) out vec4 met;
+layout(location = 0) out vec4 rgba;
+layout(location = 1) out vec4 sums;
 
 void main() {
-    march(gl_FragCoord.xy, seen, met);
+    march(gl_FragCoord.xy, rgba, sums);
 }
 #endif

@@ -4,7 +4,8 @@
 // most 255). All cells nearer than that are empty: a ray crosses a whole block of them in one step. The lattice stays.
 
 struct Walk {
-    vec3 start;    // where the ray begins, in [0, 1]^3 over the box; CONTRACTED: in half edges of the box from its middle
+    // Where the ray begins, in [0, 1]^3 over the box; CONTRACTED: in half edges of the box from its middle.
+    vec3 start;
     vec3 rate;     // the same per unit of t; no component is 0
     vec3 inverse;  // 1 / rate
     vec3 count;    // cells along x, y, z
@@ -58,8 +59,8 @@ uint free_around(usampler3D cells, Walk walk, vec3 cell) {
     return textureLod(cells, (cell + 0.5) * walk.edge, 0.0).r;
 }
 
-// How far, in t, a ray stays within the block that reaches `reach` cells from `cell` in both directions, it being at `place` in
-// that cell. In contracted space a bound from below.
+// How far, in t, a ray stays within the block that reaches `reach` cells from `cell` in both directions, it being at
+// `place` in that cell. In contracted space a bound from below.
 float way_out(Walk walk, Place place, vec3 cell, float reach) {
     vec3 ahead = vec3(greaterThan(walk.rate, vec3(0.0)));
     vec3 low = (cell + 1.0 - reach) * walk.edge, high = (cell + reach) * walk.edge;
@@ -72,8 +73,9 @@ float way_out(Walk walk, Place place, vec3 cell, float reach) {
         vec3 leave = (mix(max(low, -1.0), min(high, 1.0), ahead) - y) * walk.inverse;
         return min(leave.x, min(leave.y, leave.z));
     }
-    // |d contract / dt| <= v (4 r - 3) / r^2 <= 4/3 v, and with w_ij = y_i v_j - y_j v_i, constant along the ray, it is at
-    // most (v + 2 w) / r^2 where r > 1. Until the way is `margin` long, r is no less than at a radius of place - margin.
+    // |d contract / dt| <= v (4 r - 3) / r^2 <= 4/3 v, and with w_ij = y_i v_j - y_j v_i, constant along the ray, it is
+    // at most (v + 2 w) / r^2 where r > 1. Until the way is `margin` long, r is no less than at a radius of place -
+    // margin.
     vec3 to_faces = min(at - low, high - at);
     float margin = max(min(to_faces.x, min(to_faces.y, to_faces.z)), 0.0);
     float speed = largest(abs(walk.rate)), turn = largest(abs(cross(walk.start, walk.rate)));
@@ -87,7 +89,8 @@ float way_out(Walk walk, Place place, vec3 cell, float reach) {
 #endif
 }
 
-// Move walk.k on to the first sample, from itself on, that lies in an occupied cell, at `place`. False where there is none.
+// Move walk.k on to the first sample, from itself on, that lies in an occupied cell, at `place`. False where there is
+// none.
 bool to_occupied(inout Walk walk, usampler3D cells, out Place place) {
     bool inside;
     uint free;

@@ -1,17 +1,17 @@
-// Puts what a march gave on the screen: its colours, or one of the other things it met.
+// Puts a picture on the screen.
 //
-// VIEW: 0 colour, 1 |colour - without|, 2 depth, 3 samples.
+// MODE: 0 colour, 1 |colour - static part|, 2 depth, 3 number of samples.
 
 #include "space.glsl"
 
-uniform sampler2D seen;
-uniform sampler2D met;
-uniform sampler2D without;  // what a march of the static part has seen
+uniform sampler2D rgba;
+uniform sampler2D sums;
+uniform sampler2D static_rgba;
 uniform vec2 viewport;      // pixels
-uniform vec2 depths;        // shown from bright to dark
-uniform float even;         // CONTRACTED: how far steps are even
+uniform vec2 depths;        // shown from bright to dark, world units
+uniform float even;         // CONTRACTED: how far along a ray steps are even
 uniform float most_samples;
-uniform float share;        // of the picture; the rest is there already
+uniform float opacity;      // of the picture over what is there
 
 layout(location = 0) out vec4 shown;
 
@@ -22,16 +22,16 @@ vec3 heat(float x) {
 
 void main() {
     vec2 at = gl_FragCoord.xy / viewport;
-    vec4 colour = texture(seen, at);
+    vec4 colour = texture(rgba, at);
     vec3 rgb = colour.rgb;
-#if VIEW == 1
-    rgb = abs(rgb - texture(without, at).rgb);
-#elif VIEW == 2
-    float depth = progress_of(texture(met, at).x / max(colour.a, 1e-6), even);
+#if MODE == 1
+    rgb = abs(rgb - texture(static_rgba, at).rgb);
+#elif MODE == 2
+    float depth = progress_of(texture(sums, at).x / max(colour.a, 1e-6), even);
     float near = progress_of(depths.x, even), far = progress_of(depths.y, even);
     rgb = colour.a * heat(1.0 - clamp((depth - near) / (far - near), 0.0, 1.0));
-#elif VIEW == 3
-    rgb = heat(texture(met, at).y / most_samples);
+#elif MODE == 3
+    rgb = heat(texture(sums, at).y / most_samples);
 #endif
-    shown = vec4(rgb, share);
+    shown = vec4(rgb, opacity);
 }

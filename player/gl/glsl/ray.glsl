@@ -9,14 +9,6 @@ vec3 camera_direction(vec2 fragment, float height, vec4 lens, mat3 axes) {
     return normalize(axes * vec3((pixel.x - lens.z) / lens.x, (lens.w - pixel.y) / lens.y, -1.0));
 }
 
-// Where on the raster, in fragments, a camera at `eye` sees p; far outside if p is not before it.
-vec2 on_raster(vec3 p, float height, vec4 lens, mat3 axes, vec3 eye) {
-    vec3 local = (p - eye) * axes;
-    if (local.z > -1e-6) return vec2(-1e9);
-    vec2 pixel = lens.zw + vec2(lens.x, -lens.y) * local.xy / -local.z;
-    return vec2(pixel.x, height - pixel.y);
-}
-
 float slanted(float x) {
     return abs(x) >= PARALLEL ? x : x < 0.0 ? -PARALLEL : PARALLEL;
 }

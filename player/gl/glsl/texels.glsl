@@ -1,4 +1,5 @@
-// Nothing but look-ups: how many there can be, kpc.tools.bench.machine_limits. COMPUTE: 1 for a compute shader (GL 4.3).
+// Texture look-ups alone, to measure how many the device can do (kpc.tools.bench.machine_limits). COMPUTE: 1 for a
+// compute shader (GL 4.3).
 
 uniform sampler2D planes;
 uniform float side;  // of the texture, in texels
@@ -15,16 +16,16 @@ vec4 looked_up(vec2 at) {
 
 #if COMPUTE
 layout(local_size_x = 8, local_size_y = 8) in;
-layout(rgba32f) uniform writeonly image2D seen_picture;
+layout(rgba32f) uniform writeonly image2D rgba_picture;
 
 void main() {
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
-    imageStore(seen_picture, at, looked_up(vec2(at) + 0.5));
+    imageStore(rgba_picture, at, looked_up(vec2(at) + 0.5));
 }
 #else
-out vec4 seen;
+out vec4 rgba;
 
 void main() {
-    seen = looked_up(gl_FragCoord.xy);
+    rgba = looked_up(gl_FragCoord.xy);
 }
 #endif

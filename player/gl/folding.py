@@ -1,0 +1,106 @@
+"""Folding: once a frame, the time rows are multiplied into the space planes, so that a march looks up half as many
+texels.
+
+The product is exact at the texels that are written. Between them the product of two interpolations becomes the
+interpolation of a product, an error that falls with the square of the distance between texels; so planes and rows are
+upsampled along the row first.
+"""
+
+import moderngl
+from kpc.player.atlas import Layout
+from kpc.player.gl.programs import Programs, draw, set_uniforms
+from kpc.player.gl.targets import allocation
+from kpc.player.gl.textures import PLANES_UNIT, ROWS_UNIT, SceneTextures, plane_texture, texture_bytes
+
+# Texels of a folded plane to one of the scene's, along the folded row.
+UPSAMPLING = 2
+# The largest float16. Folded planes are float16: cards look it up at more than twice the rate of float32, and room is
+# 74 dB and soldier 80 dB from their pictures in float32.
+LARGEST_HALF = 65504.0
+
+
+def folded_layout(textures: SceneTextures) -> Layout:
+    """Return the layout of folded planes: upsampled, unless that is more than the card takes."""
+    finer = Layout.of(textures.scene, UPSAMPLING)
+    return finer if max(finer.size) <= textures.ctx.info["GL_MAX_TEXTURE_SIZE"] else textures.layout
+
+
+class FoldedPlanes:
+    """The planes of a dynamic scene at one time.
+
+    Attributes:
+        layout: of the folded planes.
+    """
+
+    def __init__(self, textures: SceneTextures, programs: Programs) -> None:
+        self._textures, self._programs = textures, programs
+        assert textures.time_rows is not None, "a static scene has nothing to fold"
+        ctx, self.layout = textures.ctx, folded_layout(textures)
+        with allocation(ctx, "the folded planes"):
+            lines, width = self.layout.line_count, self.layout.upsampling * (textures.time_rows.width - 1) + 1
+            self._upsampled = plane_texture(ctx, self.layout.size)
+            self._rows = plane_texture(ctx, (width, lines))
+            self._planes = plane_texture(ctx, self.layout.size, "f2")
+            self._upsampled.filter = self._rows.filter = moderngl.NEAREST, moderngl.NEAREST
+            self._upsample_into, self._fold_into = ctx.framebuffer([self._upsampled]), ctx.framebuffer([self._planes])
+        self._time: float | None = None
+        self._is_upsampled = False
+
+    @property
+    def memory_bytes(self) -> int:
+        return sum(texture_bytes(texture) for texture in (self._upsampled, self._rows, self._planes))
+
+    @property
+    def dtype(self) -> str:
+        return self._planes.dtype
+
+    def planes_changed(self) -> None:
+        self._time, self._is_upsampled = None, False
+
+    def time_planes_changed(self) -> None:
+        self._time = None
+
+    def at(self, time: float) -> moderngl.Texture:
+        """Return the planes at a time in [0, 1]."""
+        if not self._is_upsampled:
+            self._textures.planes.use(PLANES_UNIT)
+            self._draw_blocks("upsample_plane.glsl", self._upsample_into)
+            self._is_upsampled = True
+        if time != self._time:
+            assert self._textures.time_rows is not None
+            self._rows.write(self._textures.time_rows.at(time, self.layout.upsampling))
+            self._upsampled.use(PLANES_UNIT)
+            self._rows.use(ROWS_UNIT)
+            self._draw_blocks("fold.glsl", self._fold_into)
+            self._time = time
+        return self._planes
+
+    def _draw_blocks(self, name: str, into: moderngl.Framebuffer) -> None:
+        """Draw each plane by a shader that takes as uniforms where it lies and which rows go with it."""
+        source = self._textures.layout
+        program, vertices = self._programs.get(name, source)
+        set_uniforms(
+            program,
+            upsampled=PLANES_UNIT,
+            upsampled_texel=tuple(1 / side for side in into.size),
+            folded_rows_texel=tuple(1 / side for side in self._rows.size),
+            largest=LARGEST_HALF,
+        )
+        for block, written in zip(source.blocks, self.layout.blocks, strict=True):
+            lines = self.layout.lines(written)
+            set_uniforms(
+                program,
+                source=source.texture_rectangle(block),
+                source_width=block.width / source.size[0],
+                origin=(written.x, written.y),
+                width=written.width,
+                per_texel=(1 / max(written.width - 1, 1), 1 / max(written.height - 1, 1)),
+                along_rows=written.is_folded_along_rows,
+                line=lines.start,
+            )
+            columns = (lines.stop - lines.start) * written.width
+            draw(self._textures.ctx, into, vertices, (written.x, written.y, columns, written.height))
+
+    def release(self) -> None:
+        for resource in (self._upsample_into, self._fold_into, self._upsampled, self._rows, self._planes):
+            resource.release()
