@@ -30,9 +30,16 @@ def context() -> moderngl.Context:
 def evaluate(
     glsl: str, expression: str, *inputs: np.ndarray, grid: np.ndarray | None = None, **defines: int
 ) -> np.ndarray:
-    """(N, 4) float32: `expression`, a vec4, at each of N places, N a multiple of 256; inputs (N, 4) are called a, b, c, d there.
+    """Evaluate a GLSL expression at N points.
 
-    `glsl`: what comes before main, `#include`s for the most part. `grid`: (Nz, Ny, Nx, 4), a filtered sampler3D of that name.
+    Args:
+        glsl: what comes before main, `#include`s for the most part.
+        expression: of type vec4.
+        inputs: (N, 4) each, N a multiple of 256, called a, b, c, d in the expression.
+        grid: (Nz, Ny, Nx, 4), a filtered sampler3D of that name.
+
+    Returns:
+        (N, 4) float32.
     """
     ctx, names = context(), "abcd"[: len(inputs)]
     size = (256, len(inputs[0]) // 256)

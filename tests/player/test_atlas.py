@@ -37,10 +37,10 @@ def test_the_atlas_holds_every_plane(channels: int, scales: int) -> None:
     assert claimed.max() == 1
 
 
-def test_a_refined_layout_has_room_between_texels_along_the_folded_axis() -> None:
+def test_an_upsampled_layout_has_room_between_texels_along_the_folded_axis() -> None:
     scene = tiny_scene(0)
     coarse, fine = Layout.of(scene), Layout.of(scene, 2)
-    for a, b in zip(coarse.blocks, fine.blocks):
+    for a, b in zip(coarse.blocks, fine.blocks, strict=True):
         widened = a.plane in ("xy", "yz")  # x and y run along columns, z in xz along rows
         assert (b.width, b.height) == ((2 * a.width - 1, a.height) if widened else (a.width, 2 * a.height - 1))
 
@@ -59,7 +59,7 @@ def test_rows_are_the_time_planes_cut() -> None:
             assert got == pytest.approx(wanted, abs=1e-6)
 
 
-def test_refined_rows_are_straight_between_those_of_the_scene() -> None:
+def test_upsampled_rows_are_straight_between_those_of_the_scene() -> None:
     rows = TimeRows(scene := tiny_scene(1, channels=6), Layout.of(scene))
     whole, finer = rows.at(0.43), rows.at(0.43, 3)
     assert finer.shape == (len(whole), 3 * (rows.width - 1) + 1, 4) and np.array_equal(finer[:, ::3], whole)

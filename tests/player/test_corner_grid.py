@@ -1,4 +1,4 @@
-"""What planes come to at the corners of their texels, and pictures that a processor marches itself, against the reference."""
+"""The corner grid: its values, and pictures drawn through it, against the reference."""
 
 from dataclasses import replace
 

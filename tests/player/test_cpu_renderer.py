@@ -1,4 +1,4 @@
-"""Pictures that a processor marches itself, through a grid or by planes, against the reference."""
+"""The processor's pictures, through the corner grid or by planes, against the reference."""
 
 from dataclasses import replace
 
@@ -189,7 +189,7 @@ def test_its_memory_is_counted() -> None:
         sampler = renderer._processor._sampler(PlaneSampler)
         taken = sampler._planes.nbytes + sampler._rows.nbytes + sampler._ray_weights.nbytes
         bound = PlaneSampler.bytes_for(scene)
-        assert taken == bound or not scene.decoder.w2.any() and taken < bound
+        assert taken == bound or (not scene.decoder.w2.any() and taken < bound)
         assert renderer.memory_bytes >= before + bound
         assert renderer.memory_bytes - renderer.picture_bytes <= Renderer.bytes_for(scene)
 

@@ -16,6 +16,6 @@ def test_without_opengl_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> 
         raise Exception("libEGL not loaded")
 
     monkeypatch.setattr(moderngl, "create_context", refuse)
-    with pytest.raises(DisplayError, match="libEGL not loaded.*apt install libegl1.*--backend reference") as caught:
+    with pytest.raises(DisplayError, match=r"libEGL not loaded.*apt install libegl1.*--backend reference") as caught:
         offscreen.open_context()
     assert "\n" not in str(caught.value)

@@ -103,7 +103,7 @@ def test_rays_along_the_axes_and_from_inside() -> None:
     directions = np.array([[1, 0, 0], [0, 0, -1], [1, 0, 0], [1, 0, 0], [0, -1, 0]], np.float32)
     got = render_rays(scene, origins, directions, 0.5)
     for n in range(5):
-        rgb, _, opacity, count = plain_ray(scene, origins[n], directions[n], 0.5, False)
+        rgb, _, _, count = plain_ray(scene, origins[n], directions[n], 0.5, False)
         assert got.rgb[n] == pytest.approx(rgb, abs=2e-4) and got.samples[n] == count
     assert np.all(got.samples[:3] > 0) and np.all(got.samples[3:] == 0)
     assert np.all(np.isinf(got.depth[3:])) and np.allclose(got.rgb[3:], scene.background)
@@ -187,9 +187,9 @@ def test_appearances_by_name_and_between_two() -> None:
     np.testing.assert_allclose(
         scene.interpolate_appearance("dawn.jpg", "noon.jpg", 0.25), 0.75 * dawn + 0.25 * noon, atol=1e-6
     )
-    with pytest.raises(UsageError, match="'night.jpg'.*dawn.jpg, noon.jpg, dusk.jpg$"):
+    with pytest.raises(UsageError, match=r"'night.jpg'.*dawn.jpg, noon.jpg, dusk.jpg$"):
         scene.appearance("night.jpg")
-    with pytest.raises(UsageError, match="none.*leave it out"):
+    with pytest.raises(UsageError, match=r"none.*leave it out"):
         tiny_scene(4).appearance("noon.jpg")
     with pytest.raises(UsageError, match=r"7.jpg, \.\.\.$"):
         with_appearances(tiny_scene(4), tuple(f"{k}.jpg" for k in range(9))).appearance("noon.jpg")

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import gl
 import moderngl
@@ -304,13 +305,13 @@ def test_a_picture_too_large_for_the_card_is_refused() -> None:
     renderer = Renderer(gl.context(), tiny_scene(4))
     with pytest.raises(DisplayError, match=r"no room for a picture of 99999x2 .*smaller size"):
         renderer.render(CAMERAS["outside"].resized(99999, 2), 0.0)
-    renderer.ctx.error  # the card's own note of it is read, and with that forgotten
+    _ = renderer.ctx.error  # reading the card's error clears it
 
 
-def test_an_error_of_the_card_is_told() -> None:
+def test_an_error_of_the_card_is_reported() -> None:
     class Card:
         error = "GL_OUT_OF_MEMORY"
-        info = {"GL_RENDERER": "some card"}
+        info: ClassVar = {"GL_RENDERER": "some card"}
 
     renderer = Renderer(gl.context(), tiny_scene(4))
     renderer.ctx = Card()

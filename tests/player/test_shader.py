@@ -33,12 +33,15 @@ def test_includes_come_once_and_lines_keep_their_numbers() -> None:
 
 def test_loops_are_written_out() -> None:
     written = {
-        "a": "#unroll i TWO\nint x_##i = i;\n#unroll j N_##i  // nested\nint y_##i##j = idle + j;\n#end\n#end\nint bad;\n"
+        "a": "#unroll i TWO\nint x_##i = i;\n"
+        "#unroll j N_##i  // nested\nint y_##i##j = idle + j;\n#end\n#end\nint bad;\n"
     }
     text, _ = shader.compose("a", {"TWO": 2, "N_0": 1, "N_1": 2}, written=written)
     lines = text.splitlines()
     assert [line for line in lines if line.startswith("int")] == [
-        "int x_0 = 0;", "int y_00 = idle + 0;", "int x_1 = 1;", "int y_10 = idle + 0;", "int y_11 = idle + 1;", "int bad;",
+        "int x_0 = 0;", "int y_00 = idle + 0;",
+        "int x_1 = 1;", "int y_10 = idle + 0;", "int y_11 = idle + 1;",
+        "int bad;",
     ]  # fmt: skip
     assert (
         lines[lines.index("int bad;") - 1] == "#line 7" and lines[lines.index("int y_11 = idle + 1;") - 1] == "#line 4"
@@ -54,8 +57,10 @@ def test_a_missing_file_is_named() -> None:
         shader.compose("a", written={"a": '#include "nowhere.glsl"'})
 
 
-@pytest.mark.parametrize("name", ["march.glsl", "cells.glsl", "upsample_plane.glsl", "fold.glsl", "present.glsl", "upscale.glsl", "enlarge.glsl", "average.glsl",
-                                  "fullscreen.glsl"])  # fmt: skip
+FRAGMENTS = ("march", "cells", "upsample_plane", "fold", "present", "upscale", "enlarge", "average")
+
+
+@pytest.mark.parametrize("name", [*(f"{name}.glsl" for name in FRAGMENTS), "fullscreen.glsl"])
 def test_shader_files_leave_the_version_to_the_composer(name: str) -> None:
     scene = tiny_scene(0)
     defines = {**planes_shape(Layout.of(scene)), **decoder_shape(scene.decoder)}
@@ -101,19 +106,7 @@ def test_constants_are_exact() -> None:
 @pytest.mark.parametrize("space", ["box", "contracted", "ndc", "hybrid"])
 @pytest.mark.parametrize("rows", [0, 1])
 @pytest.mark.parametrize("motion", [0, 1])
-@pytest.mark.parametrize(
-    "name",
-    [
-        "march.glsl",
-        "cells.glsl",
-        "upsample_plane.glsl",
-        "fold.glsl",
-        "present.glsl",
-        "upscale.glsl",
-        "enlarge.glsl",
-        "average.glsl",
-    ],
-)
+@pytest.mark.parametrize("name", [f"{name}.glsl" for name in FRAGMENTS])
 def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, rows: int, space: str) -> None:
     ctx = gl.context()
     if "GL_ARB_ES3_compatibility" not in ctx.extensions:
@@ -123,8 +116,9 @@ def test_shaders_keep_to_the_subset_that_browsers_take(name: str, motion: int, r
     layout = Layout.of(scene)
     weights = shader.constants(decoder_arrays(scene.decoder, scene, layout))
     blocks = shader.constants(block_arrays(scene, layout))
-    defines = {**planes_shape(layout), **decoder_shape(scene.decoder), "ROWS": rows, "MODE": rows + 2 * motion, "COMPUTE": 0,
-               "CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc"), "MOTION": motion, "APPEARANCE": rows}  # fmt: skip
+    defines = {"ROWS": rows, "MODE": rows + 2 * motion, "MOTION": motion, "APPEARANCE": rows, "COMPUTE": 0}
+    defines |= {"CONTRACTED": int(space == "contracted"), "NDC": int(space == "ndc")}
+    defines |= {**planes_shape(layout), **decoder_shape(scene.decoder)}
     fragment, _ = shader.compose(name, defines, shader.ES30, {"decoder_weights": weights, "plane_blocks": blocks})
     vertex, _ = shader.compose("fullscreen.glsl", defines, preamble=shader.ES30)
     ctx.program(vertex_shader=vertex, fragment_shader=fragment).release()

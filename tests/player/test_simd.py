@@ -34,8 +34,9 @@ def weighed(planes, texels, ups, rows, starts, shares, weights, halves, into):
     for n in range(len(texels)):
         at, from_, way = texels[n], starts[n], shares[n]
         accumulate_features(
-            planes, (at[0], at[1], at[2]), (ups[0], ups[1], ups[2]), rows, (from_[0], from_[1], from_[2]), (way[0], way[1], way[2]), weights,
-            np.uint64(3), halves, into, np.uint64(1), np.uint64(n),
+            planes, (at[0], at[1], at[2]), (ups[0], ups[1], ups[2]),
+            rows, (from_[0], from_[1], from_[2]), (way[0], way[1], way[2]),
+            weights, np.uint64(3), halves, into, np.uint64(1), np.uint64(n),
         )  # fmt: skip
 
 
@@ -74,7 +75,7 @@ def test_products_are_summed_up(vectors: int) -> None:
     for _ in range(2):  # sums begin anew each time
         combined(wholes, factors, weights, np.float32(0.25), into)
     wanted = weights.astype(np.float64) @ np.prod([array.astype(np.float64) for array in (*wholes, *factors)], axis=0)
-    np.testing.assert_allclose(into[1], wanted + [0, 0, 0, 0.25], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(into[1], [*wanted, 0, 0, 0, 0.25], rtol=1e-4, atol=1e-4)
     assert np.isnan(into[[0, 2]]).all()
 
 

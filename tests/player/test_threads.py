@@ -26,7 +26,7 @@ def test_what_goes_wrong_in_any_part_is_raised(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(threads, "CORES", 2)
     for wrong in (0, 5):
 
-        def work(part: slice) -> None:
+        def work(part: slice, wrong: int = wrong) -> None:
             if part.start == wrong:
                 raise ValueError(threading.current_thread().name)
 
@@ -65,7 +65,7 @@ def test_what_goes_wrong_at_either_end_is_raised(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(threads, "WORKERS", 2)
     for wrong in (0, 310):
 
-        def work(worker: int, part: slice) -> None:
+        def work(worker: int, part: slice, wrong: int = wrong) -> None:
             if part.start <= wrong < part.stop:
                 raise ValueError(worker)
 
