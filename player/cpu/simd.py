@@ -47,6 +47,8 @@ def interpolate(
     """Interpolate a grid trilinearly: into[line + c, column] = sum over the eight nodes around of weight * grid[node,
     c], c = 0 to 3.
 
+    An intrinsic takes values in registers, not tuples of them, so its parameters are many.
+
     Args:
         grid: (N, 4) float32.
         first: uint64, the node before the point along all axes.
@@ -153,6 +155,9 @@ def accumulate_features(
 ) -> Any:
     """Add what one group of features contributes: into[line + c, column] += sum over m < wide of weights[first + wide c
     + m] * product of all planes and rows at a sample, interpolated, c = 0 to 3.
+
+    It is one function because it writes one sequence of instructions, and its parameters are many because an intrinsic
+    takes values in registers.
 
     Args:
         planes: (N,) int16; each texel has `wide` numbers.
