@@ -98,6 +98,17 @@ def test_references_name_sections_that_exist():
     assert {int(number) for number in re.findall(r"[ (]\[(\d+)\]", PAGE)} == set(range(1, count + 1))
 
 
+def test_sources_refer_to_sections_by_their_titles():
+    root = SPEC.parent
+    titles = {match[3] for match in HEADINGS}
+    found = set()
+    for folder in ("encoder", "format", "player", "tools", "tests"):
+        for path in (root / folder).rglob("*.py"):
+            for title in re.findall(r'kpc-format\.md,\s+"([^"]+)"', path.read_text()):
+                found.add(" ".join(title.split()))
+    assert found and found <= titles
+
+
 def test_header_and_index_tables_are_those_of_the_readable_decoder():
     assert [spelled(table) for table in byte_tables(section("4.1"))] == [spelled(container.HEADER)]
     assert [spelled(table) for table in byte_tables(section("4.2"))] == [spelled(container.ENTRY)]

@@ -1,4 +1,4 @@
-"""The content of a plane segment under codecs RAW and ZSTD (spec/kpc-format.md, "PLNE").
+"""The content of a plane segment under codecs RAW and ZSTD (spec/kpc-format.md, "RAW and ZSTD").
 
 map mode (1 byte) | map (ceil(H W / 8) bytes, if the mode is MAP_CODED) | symbols (M x coded texels bytes)
 """

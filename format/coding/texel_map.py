@@ -1,4 +1,4 @@
-"""The significance map of a plane segment: which of its texels are coded (spec/kpc-format.md, "PLNE", "Map").
+"""The significance map of a plane segment: which of its texels are coded (spec/kpc-format.md, "Texel map").
 
 All codecs of plane segments have the same map modes; RAW and ZSTD have no MAP_IMPLIED. That occupancy implies the
 maps of space planes saves 0.4 KB a file (shelf_hand, liam).

@@ -1,5 +1,5 @@
-"""Long clips: files that hold several groups, each a scene over some of the clip's frames (spec/kpc-format.md, section
-4).
+"""Long clips: files that hold several groups, each a scene over some of the clip's frames (spec/kpc-format.md,
+"Groups").
 
     GRUP chunk    a whole .kpc file: one group. Its index entry says which frames of the clip the group covers.
 

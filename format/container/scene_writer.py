@@ -1,7 +1,7 @@
 """Writing a scene to a file: its chunks, in the order in which a player wants them.
 
 The coarsest picture of the first seconds comes first, then finer scales, then later seconds (spec/kpc-format.md,
-"Order").
+"Order of chunks").
 """
 
 import os
