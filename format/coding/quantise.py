@@ -254,7 +254,7 @@ def looked_up_cells(scene: Scene) -> np.ndarray:
 def needed_texels(occupancy: np.ndarray, plane: str, rows: int, columns: int) -> np.ndarray:
     """Return (rows, columns) bool: the texels of a plane that a bilinear read inside an occupied cell may touch.
 
-    This is the map that the occupancy implies (spec/kpc-format.md, "Map").
+    This is the map that the occupancy implies (spec/kpc-format.md, "Texel map").
 
     Args:
         occupancy: (slots, Nz, Ny, Nx) bool.
