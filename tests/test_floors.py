@@ -1,4 +1,4 @@
-"""Who may import whom: format <- encoder, player <- tools; encoder and player never each other."""
+"""The layers of the packages: format below encoder and player, tools above; encoder and player are independent."""
 
 import ast
 from pathlib import Path
@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+
+# The packages that no module of a folder may import.
 FORBIDDEN = {
     "format": {
         "kpc.encoder",
@@ -21,12 +23,10 @@ FORBIDDEN = {
     "player": {"kpc.encoder", "kpc.tools", "torch"},
     "tools": set(),
 }
-VIEWERS = ("format", "player")
-"""What a viewer installs must import without the extras."""
 
 
 def imports(file: Path) -> set[str]:
-    """Every module a file imports, wherever in it, by its full name."""
+    """Return the full names of all modules that a file imports, at its top or inside functions."""
     found = set()
     for node in ast.walk(ast.parse(file.read_text(), str(file))):
         if isinstance(node, ast.Import):
@@ -41,13 +41,13 @@ def is_within(module: str, package: str) -> bool:
     return module == package or module.startswith(f"{package}.")
 
 
-@pytest.mark.parametrize("floor", FORBIDDEN)
-def test_floors_hold(floor: str) -> None:
-    files = sorted((ROOT / floor).rglob("*.py"))
+@pytest.mark.parametrize("package", FORBIDDEN)
+def test_layers_hold(package: str) -> None:
+    files = sorted((ROOT / package).rglob("*.py"))
     assert files
     for file in files:
         for module in imports(file):
-            broken = [package for package in FORBIDDEN[floor] if is_within(module, package)]
+            broken = [other for other in FORBIDDEN[package] if is_within(module, other)]
             assert not broken, f"{file.relative_to(ROOT)} imports {module}"
 
 
