@@ -61,9 +61,9 @@ class SceneRenderer:
         out = []
         for start in range(0, len(origins), RAYS_AT_ONCE):
             some = slice(start, start + RAYS_AT_ONCE)
-            batch = (np.ascontiguousarray(a[some], np.float32) for a in (origins, directions, times))
+            o, d, t = (np.ascontiguousarray(a[some], np.float32) for a in (origins, directions, times))
             with torch.no_grad():
-                out.append(draw(*batch, None if codes is None else torch.from_numpy(codes[some])))
+                out.append(draw(o, d, t, None if codes is None else torch.from_numpy(codes[some])))
         colours, opacities, depths = (np.concatenate(parts) for parts in zip(*out, strict=True))
         return colours, opacities, depths
 

@@ -207,7 +207,7 @@ def search_blocks(
     """Search for the levels of a segment; `wanted` is in quantisers."""
     H, W, M = wanted.shape
     with_texels = coded_blocks(coded, side)
-    offsets = _quantiser_offsets(weight, coded, with_texels, side)
+    offsets = quantiser_offsets(weight, coded, with_texels, side)
     frequency = frequency_weights(side) / 64
     problem = _Problem(
         wanted,
@@ -232,7 +232,7 @@ def search_blocks(
     return blocks
 
 
-def _quantiser_offsets(weight: np.ndarray, coded: np.ndarray, with_texels: np.ndarray, side: int) -> np.ndarray:
+def quantiser_offsets(weight: np.ndarray, coded: np.ndarray, with_texels: np.ndarray, side: int) -> np.ndarray:
     """Choose the quantiser offset of each block, (blocks down, blocks across) int64.
 
     The quantiser goes with the inverse fourth root of the block's mean distortion weight. With the square root, which

@@ -66,7 +66,7 @@ def quantise_by_cost(
     def search(key: PlaneKey) -> QuantisedPlane:
         s, name = key
         values = scene.scales[s][name]
-        plane = _Plane(
+        plane = Plane(
             quantised.scales[s][name],
             values,
             steps[s][name],
@@ -79,8 +79,8 @@ def quantise_by_cost(
             return plane.on_trellis()
         needed = needed_texels(looked_up, name, *values.shape[:2])
         if looked_up is scene.occupancy:
-            return _cheapest(plane, needed, needed)
-        return _cheapest(plane, needed_texels(scene.occupancy, name, *values.shape[:2]), needed)
+            return cheapest_mode(plane, needed, needed)
+        return cheapest_mode(plane, needed_texels(scene.occupancy, name, *values.shape[:2]), needed)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the searches release the GIL
         searched = dict(zip(chosen, pool.map(search, chosen), strict=True))
@@ -99,7 +99,7 @@ def requested_step(plane: QuantisedPlane) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Plane:
+class Plane:
     """A plane to be quantised; attributes as for `kpc.encoder.rdo.trellis.trellis_quantise`."""
 
     nearest: QuantisedPlane
@@ -135,7 +135,7 @@ class _Plane:
         )
 
 
-def _cheapest(plane: _Plane, implied: np.ndarray, needed: np.ndarray) -> QuantisedPlane:
+def cheapest_mode(plane: Plane, implied: np.ndarray, needed: np.ndarray) -> QuantisedPlane:
     """Return the plane in the mode of least cost.
 
     Args:
@@ -164,11 +164,11 @@ def _cheapest(plane: _Plane, implied: np.ndarray, needed: np.ndarray) -> Quantis
         on_trellis = plane.on_trellis()
         if not tried:
             return on_trellis
-        tried.append((cost(on_trellis, _coded_size(on_trellis, plane.identity, implied)), on_trellis))
+        tried.append((cost(on_trellis, coded_size(on_trellis, plane.identity, implied)), on_trellis))
     return min(tried, key=lambda one: one[0])[1]
 
 
-def _coded_size(plane: QuantisedPlane, identity: bool, implied: np.ndarray) -> int:
+def coded_size(plane: QuantisedPlane, identity: bool, implied: np.ndarray) -> int:
     """Return the size of a plane's segments in bytes."""
     rows = rows_per_segment(len(plane.symbols), identity)
     segments = [

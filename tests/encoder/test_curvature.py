@@ -30,24 +30,24 @@ def without_the_last_channels(scene: Scene) -> Scene:
     )
 
 
-def probe_of(scene: Scene, count: int) -> ValidationRays:
-    probe = ValidationRays.through_occupied(scene, count, seed=1)
-    return replace(probe, appearances=np.arange(count) % len(scene.appearances) if scene.appearances else None)
+def validation_rays_of(scene: Scene, count: int) -> ValidationRays:
+    validation = ValidationRays.through_occupied(scene, count, seed=1)
+    return replace(validation, appearances=np.arange(count) % len(scene.appearances) if scene.appearances else None)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_foretells_what_small_errors_do_to_pictures(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Independent errors of variance s^2 move the three colours of a ray by s^2 sum(h) squared, in the mean: of each plane by
-    itself, since a large sum would hide a small one."""
+def test_the_diagonal_predicts_the_effect_of_small_errors(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Independent errors of variance s^2 move the three colours of a ray by s^2 sum(h) squared, in the mean: of each
+    plane by itself, since a large sum would hide a small one."""
     scene = KINDS[kind](tiny_scene(3))
     monkeypatch.setattr(
         module, "RAYS_PER_GRADIENT", 16
     )  # so few rays: hardly any cross terms, that they need not cancel
-    probe, rng = probe_of(scene, 2000), np.random.default_rng(0)
-    h = estimate_curvature(scene, probe, 2000).diagonal
+    validation, rng = validation_rays_of(scene, 2000), np.random.default_rng(0)
+    h = estimate_curvature(scene, validation, 2000).diagonal
     renderer = SceneRenderer(scene)
-    codes = renderer.codes(probe.appearances)
-    before = renderer.rgb(*probe.rays, codes)
+    codes = renderer.codes(validation.appearances)
+    before = renderer.rgb(*validation.rays, codes)
     for s, scale in enumerate(scene.scales):
         for name, plane in scale.items():
             assert h[s][name].shape == plane.shape and h[s][name].dtype == np.float32 and (h[s][name] >= 0).all()
@@ -56,7 +56,7 @@ def test_it_foretells_what_small_errors_do_to_pictures(kind: str, monkeypatch: p
                 changed = dict(scale) | {name: plane + rng.normal(0, 1e-3, plane.shape).astype(np.float32)}
                 scales = (*scene.scales[:s], changed, *scene.scales[s + 1 :])
                 moved.append(
-                    np.square(SceneRenderer(replace(scene, scales=scales)).rgb(*probe.rays, codes) - before)
+                    np.square(SceneRenderer(replace(scene, scales=scales)).rgb(*validation.rays, codes) - before)
                     .sum(1)
                     .mean()
                 )
@@ -64,15 +64,17 @@ def test_it_foretells_what_small_errors_do_to_pictures(kind: str, monkeypatch: p
 
 
 @pytest.mark.parametrize("kind", ["box", "fewer channels"])
-def test_it_foretells_what_errors_of_two_channels_do_together(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Squared moves of colours by the same errors in both channels, less those by errors of opposite signs, are four times what goes
-    together: of the two channels of each plane for which that is most."""
+def test_the_correlation_predicts_the_effect_of_errors_in_two_channels(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Squared moves of colours by the same errors in both channels, less those by errors of opposite signs, are four
+    times what goes together: of the two channels of each plane for which that is most."""
     scene = KINDS[kind](tiny_scene(3))
     monkeypatch.setattr(module, "RAYS_PER_GRADIENT", 16)
     monkeypatch.setattr(module, "BLOCK_SIDE", 1)
-    probe, rng = probe_of(scene, 2000), np.random.default_rng(0)
-    found = estimate_curvature(scene, probe, 2000)
-    before = SceneRenderer(scene).rgb(*probe.rays)
+    validation, rng = validation_rays_of(scene, 2000), np.random.default_rng(0)
+    found = estimate_curvature(scene, validation, 2000)
+    before = SceneRenderer(scene).rgb(*validation.rays)
     for s, scale in enumerate(scene.scales):
         for name, plane in scale.items():
             roots, correlation = np.sqrt(found.diagonal[s][name]), found.correlation[s][name]
@@ -88,13 +90,13 @@ def test_it_foretells_what_errors_of_two_channels_do_together(kind: str, monkeyp
                     changed[..., m] += error
                     changed[..., n] += sign * error
                     scales = (*scene.scales[:s], dict(scale) | {name: changed}, *scene.scales[s + 1 :])
-                    colours = SceneRenderer(replace(scene, scales=scales)).rgb(*probe.rays)
+                    colours = SceneRenderer(replace(scene, scales=scales)).rgb(*validation.rays)
                     moved.append(sign * np.square(colours - before).sum(1).mean())
             assert 2 * np.mean(moved) == pytest.approx(4e-6 * products[m, n], rel=0.35), (s, name)
 
 
 @pytest.mark.parametrize("rows, columns", [(4, 6), (5, 7), (1, 1)])
-def test_products_are_summed_over_blocks(rows: int, columns: int) -> None:
+def test_channel_products_are_summed_over_blocks(rows: int, columns: int) -> None:
     plane = np.random.default_rng(0).normal(size=(rows, columns, 3)).astype(np.float32)
     sums = module._products(plane)
     assert sums.shape == (-(-rows // 2), -(-columns // 2), 3, 3)
@@ -103,42 +105,44 @@ def test_products_are_summed_over_blocks(rows: int, columns: int) -> None:
         np.testing.assert_allclose(sums[y, x], block.T @ block, rtol=1e-4, atol=1e-6)
 
 
-def test_what_no_ray_meets_costs_nothing() -> None:
+def test_values_that_no_ray_meets_cost_nothing() -> None:
     scene = tiny_scene(3)
-    h = estimate_curvature(replace(scene, occupancy=np.zeros_like(scene.occupancy)), probe_of(scene, 100), 100)
+    h = estimate_curvature(
+        replace(scene, occupancy=np.zeros_like(scene.occupancy)), validation_rays_of(scene, 100), 100
+    )
     assert all(not plane.any() for part in (h.diagonal, h.correlation) for scale in part for plane in scale.values())
 
 
-def test_what_is_seen_more_costs_more() -> None:
-    """Half of the box is empty: texels of planes along x are met on one side alone, but for neighbours."""
+def test_values_that_more_rays_meet_cost_more() -> None:
+    """Half of the box is empty, so that rays meet the texels of planes along x on one side only, and their neighbours."""
     scene = tiny_scene(3)
     occupancy = scene.occupancy.copy()
     occupancy[..., : occupancy.shape[3] // 2] = False
-    h = estimate_curvature(replace(scene, occupancy=occupancy), probe_of(scene, 500), 500).diagonal[1]
+    h = estimate_curvature(replace(scene, occupancy=occupancy), validation_rays_of(scene, 500), 500).diagonal[1]
     for name in ("xy", "xz", "xt"):
         columns = h[name].sum((0, 2))
         assert not columns[: len(columns) // 2 - 2].any() and columns[len(columns) // 2 + 2 : -4].all()
 
 
-def test_rays_beyond_those_of_the_probe_that_meet_something_are_drawn_from_the_cameras() -> None:
-    """All of a probe's rays miss: what is found comes from the others, the same ones each time."""
+def test_missing_rays_are_drawn_from_the_cameras() -> None:
+    """All validation rays miss the scene. Random rays replace them, the same each time."""
     scene = tiny_scene(3)
-    blind = replace(probe_of(scene, 64), origins=np.full((64, 3), 50, np.float32))
+    blind = replace(validation_rays_of(scene, 64), origins=np.full((64, 3), 50, np.float32))
     once, again = (estimate_curvature(scene, blind, 1000).diagonal for _ in range(2))
     assert once[0]["xy"].any()
     for name in once[1]:
         np.testing.assert_array_equal(once[1][name], again[1][name])
 
 
-def test_rays_that_pass_where_nothing_is_do_not_count() -> None:
+def test_rays_through_empty_space_do_not_count() -> None:
     scene = tiny_scene(3)
-    probe = probe_of(scene, 64)
+    validation = validation_rays_of(scene, 64)
     astray = replace(
-        probe,
-        origins=np.concatenate([probe.origins, np.full((64, 3), 50, np.float32)]),
-        directions=np.tile(probe.directions, (2, 1)),
-        times=np.tile(probe.times, 2),
+        validation,
+        origins=np.concatenate([validation.origins, np.full((64, 3), 50, np.float32)]),
+        directions=np.tile(validation.directions, (2, 1)),
+        times=np.tile(validation.times, 2),
     )
-    with_them, without = estimate_curvature(scene, astray, 64), estimate_curvature(scene, probe, 64)
+    with_them, without = estimate_curvature(scene, astray, 64), estimate_curvature(scene, validation, 64)
     for name, found in with_them.diagonal[1].items():
         assert found.any() and found.tobytes() == without.diagonal[1][name].tobytes()

@@ -130,7 +130,7 @@ def test_frames_of_a_clip_as_a_clip_of_their_own(clip):
         assert np.array_equal(some.pixels.picture(picture), clip.pixels.picture(twin))
         first = some.pictures.offset[picture : picture + 1]
         assert np.array_equal(some.pixels.read(first), clip.pixels.read(clip.pictures.offset[twin : twin + 1]))
-    with pytest.raises(DatasetError, match="no picture to train on"):
+    with pytest.raises(DatasetError, match="no training picture"):
         clip.frame_range(FRAMES + 3, FRAMES + 9)
 
 
@@ -171,7 +171,7 @@ def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
     assert 5 < result["test_psnr"] < 60 and result["test_pictures"] == FRAMES + 4 * OVERLAP
     assert (
         all(f"group {number} of 3" in err for number in range(3))
-        and err.count("begins where the one before ended") == 2
+        and err.count("starts where the one before ended") == 2
     )
     boxes = [opened.open(number).head.aabb for number in range(3)]
     assert np.array_equal(boxes[0], boxes[1]) and np.array_equal(boxes[0], boxes[2])

@@ -73,7 +73,7 @@ Kpenc = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Kpenc:
-    """Run the command on a dataset, to out.kpc unless told otherwise: exit code, stdout, stderr."""
+    """Run the command on a dataset, to out.kpc unless another output is given: exit code, stdout, stderr."""
 
     def call(source: Path, *options: str, output: Path = tmp_path / "out.kpc") -> tuple[int, str, str]:
         capsys.readouterr()
@@ -183,8 +183,8 @@ def test_rows_of_time_are_as_far_apart_as_the_motion_allows(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tolerance: float, rows: int, why: str
 ) -> None:
     """Of four frames; a run that is resumed finds the same number."""
-    told = TrainConfig(**TINY | {"time_tolerance": tolerance, "frames_per_row": 1.5})  # type: ignore[arg-type]
-    monkeypatch.setitem(PRESETS, "draft", told)
+    config = TrainConfig(**TINY | {"time_tolerance": tolerance, "frames_per_row": 1.5})  # type: ignore[arg-type]
+    monkeypatch.setitem(PRESETS, "draft", config)
     for options in (("--keep",), ("--resume",)):
         code, _, err = run(sets / "n3dv", "--steps", "2", *options)
         (said,) = [line for line in err.splitlines() if line.startswith("time: ")]
@@ -251,7 +251,7 @@ def test_masks_and_what_a_damaged_model_says(run: Kpenc, sets: Path, tmp_path: P
 def test_what_is_left_out_is_said_and_missing_from_the_file(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
 ) -> None:
-    """After 24 steps hardly anything is worth a decibel; the loss that is reported counts all that coding costs."""
+    """After 24 steps hardly anything gains a decibel; the loss that is reported counts all that coding costs."""
     monkeypatch.setitem(PRESETS, "draft", TrainConfig(**TINY | {"prune_share": share}))  # type: ignore[arg-type]
     code, out, err = run(sets / "n3dv", "--max-loss", "1dB", "--holdout", "none", "--json")
     scene = scene_io.read(tmp_path / "out.kpc")
@@ -752,7 +752,8 @@ def _failing_for(target: Path, error: BaseException) -> Callable[[Path, Path], N
 def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
     script = (
         f"import sys\n{preparation}\n"
-        "from kpc.encoder import curvature, kpenc, probe\nfrom kpc.encoder.field.config import PRESETS, TrainConfig\n"
+        "from kpc.encoder.cli import kpenc\nfrom kpc.encoder.evaluation import validation_rays\n"
+        "from kpc.encoder.rdo import curvature\nfrom kpc.encoder.field.config import PRESETS, TrainConfig\n"
         f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nvalidation_rays.VALIDATION_RAYS = 512\ncurvature.RAYS = 1 << 13\nsys.exit(kpenc.main({argv!r}))"
     )
     return subprocess.Popen(

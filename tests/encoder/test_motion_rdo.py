@@ -1,4 +1,4 @@
-"""Displacements in as few bits as pictures allow (`kpc.encoder.rdo.motion_rdo`)."""
+"""Quantisation of a motion grid (`kpc.encoder.rdo.motion_rdo`)."""
 
 import math
 
@@ -14,13 +14,13 @@ from scenes import tiny_scene, with_motion
 
 
 def errs(scene: Scene, left_out: float = 1e-3):
-    """A stand-in for pictures, that displacements far from a scene's make worse."""
+    """Stand in for rendering: errors grow with the distance from a scene's displacements."""
     return lambda candidate: Fidelity(30.0, left_out + float(np.mean((candidate.motion - scene.motion) ** 2)))
 
 
 @pytest.mark.parametrize("share", [1e9, 72.0, 12.0, 1.5])
-def test_displacements_are_as_coarse_as_their_error_may_be(share):
-    """`share`: of the square of motion.STEP; rounding errs by a twelfth of a step's own."""
+def test_displacements_are_as_coarse_as_the_error_allows(share):
+    """`share` of the square of FINEST_STEP; the error of rounding is a twelfth of the square of its step."""
     scene, most = with_motion(tiny_scene()), share * FINEST_STEP**2 / 12 / SHARE
     found = coarsen_motion(scene, np.ones(scene.motion.shape), errs(scene), most)
     symbols = found.motion / np.float32(FINEST_STEP)
@@ -32,36 +32,36 @@ def test_displacements_are_as_coarse_as_their_error_may_be(share):
 
 
 @pytest.mark.parametrize("share, expected", [(1e9, 64), (72.0, 8), (12.0, 3), (1.5, 1)])
-def test_where_no_worth_is_told_they_are_the_nearest(share, expected):
+def test_without_curvature_symbols_are_the_nearest(share, expected):
     scene = with_motion(tiny_scene())
     found = coarsen_motion(scene, None, errs(scene), share * FINEST_STEP**2 / 12 / SHARE)
     step = np.float32(expected * FINEST_STEP)
     np.testing.assert_array_equal(found.motion, np.rint(scene.motion / step) * step)
 
 
-def test_scenes_in_which_nothing_may_err_or_nothing_moves_stay():
+def test_scenes_without_motion_or_allowed_error_stay_unchanged():
     scene = with_motion(tiny_scene())
     assert coarsen_motion(scene, None, errs(scene), 0.0) is scene
     assert coarsen_motion(scene, None, lambda candidate: Fidelity(math.nan, math.nan), 1e9) is scene
     assert coarsen_motion(tiny_scene(), None, errs(scene), 1e9).motion is None
 
 
-def test_what_matters_is_near_to_what_is_wanted_and_what_does_not_takes_next_to_nothing():
+def test_important_symbols_are_exact_and_others_take_few_bits():
     wanted = swaying(16, 6, 6, 6) / 8
     rounded = np.rint(wanted).astype(np.int16)
-    worth = np.zeros(wanted.shape)
-    worth[:, :, :3] = 1.0
-    found = quantise_motion(wanted, worth)
+    curvature = np.zeros(wanted.shape)
+    curvature[:, :, :3] = 1.0
+    found = quantise_motion(wanted, curvature)
     assert np.abs(found - wanted)[:, :, :3].mean() < 1.5 * np.abs(rounded - wanted).mean()
     assert len(encode_motion(found.astype(np.int16))) < 0.75 * len(encode_motion(rounded))
 
 
-def test_noise_that_is_worth_telling_is_told_as_it_is():
+def test_important_noise_is_coded_exactly():
     wanted = np.random.default_rng(0).uniform(-3e4, 3e4, (4, 3, 3, 3, 3))
     assert np.abs(quantise_motion(wanted, np.ones(wanted.shape)) - wanted).max() < 2.5
 
 
-def test_symbols_stay_within_their_16_bits():
+def test_symbols_stay_within_16_bits():
     wanted = np.where(np.random.default_rng(0).random((5, 3, 3, 3, 3)) < 0.5, -32768.4, 32767.4)
     found = quantise_motion(wanted, np.ones(wanted.shape))
     assert found.min() >= -32768 and found.max() <= 32767

@@ -19,19 +19,19 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SCENE = tiny_scene()
 
 
-def test_contexts_are_those_of_the_coder():
-    """The same grid, coded cell by cell in the contexts that the search sees."""
+def test_contexts_match_those_of_the_coder():
+    """The grid is coded cell by cell in the contexts of the search."""
     occupancy = rolling(3, 6, 7, 8)
-    told, table, trace, at = occupancy.astype(np.uint8), new_models(CONTEXTS), np.empty(occupancy.size, np.int16), 0
-    for place in np.ndindex(told.shape):
+    cells, table, trace, at = occupancy.astype(np.uint8), new_models(CONTEXTS), np.empty(occupancy.size, np.int16), 0
+    for place in np.ndindex(cells.shape):
         _, _, at = code_bit_adaptive(
-            int(told[place]), table, occupancy_rdo.context_at(told, *place, NEIGHBOURS), 0, at, None, trace
+            int(cells[place]), table, occupancy_rdo.context_at(cells, *place, NEIGHBOURS), 0, at, None, trace
         )
     assert encode_trace(trace) == encode_occupancy(occupancy)
-    assert count_contexts(told, NEIGHBOURS).sum() == told.size
+    assert count_contexts(cells, NEIGHBOURS).sum() == cells.size
 
 
-def test_where_errors_cost_nothing_a_ragged_grid_takes_far_fewer_bytes():
+def test_a_ragged_grid_shrinks_where_errors_cost_nothing():
     occupancy = rolling()
     found = flip_cells(occupancy, np.zeros(occupancy.shape))
     assert len(encode_occupancy(found)) < 0.7 * len(encode_occupancy(occupancy))
@@ -39,7 +39,7 @@ def test_where_errors_cost_nothing_a_ragged_grid_takes_far_fewer_bytes():
     assert np.mean(found != occupancy) < 0.1
 
 
-def test_what_is_worth_its_bits_stays():
+def test_important_cells_stay():
     occupancy = rolling(2, 12, 13, 14)
     np.testing.assert_array_equal(flip_cells(occupancy, np.full(occupancy.shape, 1e6)), occupancy)
     needed = occupancy & (np.random.default_rng(0).random(occupancy.shape) < 0.3)
@@ -47,14 +47,14 @@ def test_what_is_worth_its_bits_stays():
     assert found[needed].all() and not np.array_equal(found, occupancy)
 
 
-def test_cells_that_rays_need_are_known_and_the_others_too():
-    """Of a scene with cells that hold nothing, and some that no ray passes."""
-    probe = ValidationRays.from_cameras(SCENE, 500)
-    error = removal_errors(SCENE, probe, 2000)
+def test_removal_errors_distinguish_needed_cells():
+    """The scene has cells without density, and cells that no ray passes."""
+    validation = ValidationRays.from_cameras(SCENE, 500)
+    error = removal_errors(SCENE, validation, 2000)
     assert error.shape == SCENE.occupancy.shape and (error >= 0).all() and (error[~SCENE.occupancy] == 0).all()
     assert 0 < error.max() <= 255**2 * CONTRAST
     thin = replace(SCENE, decoder=replace(SCENE.decoder, density_bias=-30.0))
-    assert removal_errors(thin, probe, 2000).max() < 1e-6 * error.max()
+    assert removal_errors(thin, validation, 2000).max() < 1e-6 * error.max()
 
 
 def judged(found: list, error: float):
@@ -68,17 +68,17 @@ def judged(found: list, error: float):
 @pytest.mark.parametrize(
     "error, tries", [(0.0, 1), (0.04, 1), (0.06, occupancy_rdo.TRIES), (math.nan, occupancy_rdo.TRIES)]
 )
-def test_a_grid_is_taken_where_pictures_hardly_lose_by_it(error, tries):
+def test_a_grid_is_accepted_where_its_error_is_small(error, tries):
     seen: list = []
     found = optimise_occupancy(SCENE, np.zeros(SCENE.occupancy.shape), judged(seen, error), 1.0)
     assert len(seen) == 1 + tries and (found is seen[1]) == (tries == 1) and (found is SCENE) == (tries != 1)
 
 
-def test_where_nothing_may_be_lost_nothing_is_looked_at():
+def test_no_allowed_error_leaves_the_scene_unchanged():
     assert optimise_occupancy(SCENE, np.zeros(SCENE.occupancy.shape), judged([], 0.0), 0.0) is SCENE
 
 
-def test_slots_that_stand_for_several_lose_what_these_do():
+def test_merged_slots_add_up_errors():
     occupancy = rolling(4, 12, 13, 14)
     merged = replace(SCENE, occupancy=occupancy.reshape(2, 2, 12, 13, 14).any(1))
     errors = np.where(occupancy & (np.random.default_rng(0).random(occupancy.shape) < 0.3), 1e6, 0.0)
@@ -86,7 +86,7 @@ def test_slots_that_stand_for_several_lose_what_these_do():
     assert found.shape == merged.occupancy.shape and found[(errors > 0).reshape(2, 2, 12, 13, 14).any(1)].all()
 
 
-def test_a_scene_without_a_cell_stays_without(monkeypatch):
+def test_an_empty_occupancy_stays_empty(monkeypatch):
     monkeypatch.setattr(occupancy_rdo, "RAYS", 100)
     monkeypatch.setattr(occupancy_rdo, "FEWER_RAYS", 100)
     empty = replace(SCENE, occupancy=np.zeros_like(SCENE.occupancy))

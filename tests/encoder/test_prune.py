@@ -243,8 +243,8 @@ def test_channels_of_unequal_number_look_the_same_in_every_renderer() -> None:
 
 def test_the_direction_stays_where_appearances_act_through_it() -> None:
     scene = with_appearances(tiny_scene())
-    probes = rays_of(scene)
-    pruned = prune(scene, probes, lambda candidate: 30.0, 1.0)  # whatever goes costs nothing
+    rays = rays_of(scene)
+    pruned = prune(scene, rays, lambda candidate: 30.0, 1.0)  # whatever goes costs nothing
     assert pruned.view_gain_db is None and pruned.scene.decoder.w2.any()
     assert pruned.scene.appearances == scene.appearances and len(pruned.scene.decoder.b1) == len(
         scene.appearances[0].code

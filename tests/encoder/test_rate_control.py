@@ -31,7 +31,7 @@ from scenes import tiny_scene
 
 
 def needed(scene: Scene) -> Scene:
-    """With every texel."""
+    """Return the scene with all cells occupied, so that every texel is looked up."""
     return replace(scene, occupancy=np.ones((1, 2, 2, 2), bool))
 
 
@@ -49,15 +49,15 @@ EQUAL, ALIKE = equal(SCENE), alike(SCENE)
 
 @pytest.fixture
 def steady(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scene whose searches end alike however its numbers are rounded, as processors round differently: with errors of 2e-7 in each number
-    eight of eight times, while those of SCENE end elsewhere in three."""
+    """A scene whose searches end alike however its numbers are rounded, as processors round differently: with errors
+    of 2e-7 in each number eight of eight times, while those of SCENE end elsewhere in three."""
     scene = needed(tiny_scene(resolution=(16, 14, 12)))
     for name, value in (("SCENE", scene), ("EQUAL", equal(scene)), ("ALIKE", alike(scene))):
         monkeypatch.setattr(f"{__name__}.{name}", value)
 
 
 def measure(scene: Scene) -> Fidelity:
-    """A stand-in for pictures: noise of 1e-3, and what the planes err."""
+    """Stand in for rendering: an MSE of 1e-3, to which the errors of the planes add."""
     pairs = zip(scene.scales, SCENE.scales)
     error = float(np.mean([np.square(ours[n] - theirs[n]).mean() for ours, theirs in pairs for n in ours]))
     return Fidelity(-10 * math.log10(1e-3 + error), 255**2 * error)
@@ -72,38 +72,38 @@ def loss(found: Attempt) -> float:
 
 
 @pytest.mark.parametrize("most", [0.02, 0.05, 0.15, 0.4, 1.0])
-def test_a_loss_is_met_from_below(most: float) -> None:
+def test_the_loss_stays_just_below_its_limit(most: float) -> None:
     assert 0.9 * most <= loss(coded(max_loss_db=most)) <= most
 
 
 @pytest.mark.parametrize("psnr", [27.0, 29.0, 29.9])
-def test_a_psnr_is_met_from_above(psnr: float) -> None:
+def test_the_psnr_stays_just_above_its_limit(psnr: float) -> None:
     assert psnr <= 30.0 - loss(coded(psnr_db=psnr)) <= psnr + 0.1 * (30.0 - psnr)
 
 
-def test_what_a_model_has_not_is_not_sought() -> None:
+def test_a_psnr_beyond_the_model_means_the_default_loss() -> None:
     assert loss(coded(psnr_db=31.0)) == loss(coded()) == loss(coded(psnr_db=30.0))
 
 
-def test_without_a_word_the_loss_is_the_default() -> None:
+def test_no_target_means_the_default_loss() -> None:
     assert Trade().bound == ("max_loss_db", 0.15) and loss(coded()) == loss(coded(max_loss_db=0.15))
 
 
 @pytest.mark.parametrize("quality", [40, 60, 75, 95])
-def test_a_quality_is_an_agreement_with_the_uncoded_scene(quality: float) -> None:
+def test_quality_sets_the_agreement_with_the_uncoded_scene(quality: float) -> None:
     found = coded(quality=quality)
     assert agreement_of(quality) <= found.measured.agreement_db <= agreement_of(quality) + 0.2
     assert mse_of_quality(quality) == pytest.approx(255**2 * 10 ** (-(20 + quality / 3) / 10))
 
 
-def test_a_better_quality_takes_more() -> None:
+def test_a_better_quality_takes_more_bytes() -> None:
     sizes = [coded(quality=quality).size_bytes for quality in (1, 50, 75, 100)]
     assert sizes == sorted(sizes) and sizes[-1] > 1.3 * sizes[0]
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_a_size_is_met_from_below(share: float) -> None:
-    """Symbols are whole numbers, and chunks few and small here: the last bytes are luck."""
+def test_the_size_stays_just_below_its_limit(share: float) -> None:
+    """The tolerance is wide because chunks are few and small here."""
     largest, smallest = (coded(max_loss_db=most).size_bytes for most in (1e-9, 1e9))
     target = int(smallest + share * (largest - smallest))
     found = coded(target_bytes=target)
@@ -111,20 +111,20 @@ def test_a_size_is_met_from_below(share: float) -> None:
     assert 0.94 * target < found.size_bytes <= target
 
 
-def test_of_a_size_that_no_file_has_the_smallest_is_found() -> None:
+def test_an_unreachable_size_gives_the_smallest_file() -> None:
     assert coded(target_bytes=10).size_bytes == coded(max_loss_db=1e9).size_bytes
 
 
 @pytest.fixture(scope="module")
 def raster() -> list[Attempt]:
-    """On a fine raster of factors, for all lam."""
+    """Attempts on a fine raster of factors, for all lambdas."""
     return [Attempt(quantise_by_cost(SCENE, scaled(EQUAL, 2.0**e)), measure, float(e)) for e in np.arange(-10, 2, 0.1)]
 
 
 @pytest.mark.parametrize("lam", [0.01, 0.3, 10.0])
-def test_lam_finds_the_least_cost(lam: float, raster: list[Attempt]) -> None:
-    """Nothing on the raster is cheaper by more than a little: the least is flat, and where 8 bits become too few for the trellis a plane
-    goes back to rounding, which makes the cost jump a little."""
+def test_lam_minimises_the_lagrangian_cost(lam: float, raster: list[Attempt]) -> None:
+    """Nothing on the raster is cheaper by more than a little: the least is flat, and where 8 bits become too few for
+    the trellis a plane goes back to rounding, which makes the cost jump a little."""
     assert coded(lam=lam).cost(lam) <= 1.06 * min(attempt.cost(lam) for attempt in raster)
 
 
@@ -133,12 +133,12 @@ def test_a_larger_lam_gives_a_smaller_file() -> None:
     assert sizes == sorted(sizes, reverse=True) and sizes[0] > sizes[-1]
 
 
-def test_where_nothing_is_good_enough_the_finest_is_taken() -> None:
+def test_an_unreachable_loss_gives_the_finest_steps() -> None:
     finest = quantise_by_cost(SCENE, scaled(EQUAL, 2.0**FINEST))
     assert scene_io.encode(coded(max_loss_db=-1.0).quantised) == scene_io.encode(finest)
 
 
-def test_a_psnr_that_is_not_a_number_does_not_pass() -> None:
+def test_nan_does_not_meet_a_target() -> None:
     seen = []
 
     def broken(scene: Scene) -> Fidelity:
@@ -149,7 +149,7 @@ def test_a_psnr_that_is_not_a_number_does_not_pass() -> None:
     assert math.isfinite(found.measured.psnr) and found.size_bytes > 0
 
 
-def test_a_file_is_never_made_finer_than_it_is() -> None:
+def test_a_file_is_never_coded_with_finer_steps() -> None:
     whole = quantise_scene(SCENE, scaled(EQUAL, 0.01))
     own = [{name: plane.step.astype(np.float64) for name, plane in scale.items()} for scale in whole.scales]
     size = len(scene_io.encode(whole))
@@ -164,7 +164,7 @@ def test_a_file_is_never_made_finer_than_it_is() -> None:
     assert 0.7 * size < smaller.size_bytes <= 0.8 * size
 
 
-def test_what_a_trade_may_cost_in_decibels() -> None:
+def test_targets_as_a_loss_in_decibels() -> None:
     assert Trade(max_loss_db=0.3).loss_db(30) == 0.3 and math.isnan(Trade(target_bytes=9).loss_db(30))
     assert Trade(psnr_db=28.5).loss_db(30) == 1.5 and Trade(psnr_db=31).loss_db(30) == 0.15
     as_much_again = 3 * (30 - 20)  # an error as large as the model's own
@@ -172,7 +172,7 @@ def test_what_a_trade_may_cost_in_decibels() -> None:
     assert Trade(lam=2 * math.log(2) * 255**2 * 1e-3).loss_db(30) == pytest.approx(10 * math.log10(2))
 
 
-def test_what_errors_cost_is_trusted_so_far() -> None:
+def test_significance_is_a_power_of_the_curvature() -> None:
     h = [{name: np.full_like(plane, 4.0**-s) for name, plane in scale.items()} for s, scale in enumerate(SCENE.scales)]
     h[1]["yt"][3, 2, 1] = 64
     significant = significance(h)
@@ -182,7 +182,7 @@ def test_what_errors_cost_is_trusted_so_far() -> None:
 
 
 def test_steps_follow_the_significance() -> None:
-    """At each step errors that rounding makes cost the same, of all that are not nothing."""
+    """Rounding errors cost the same in all channels of nonzero significance."""
 
     def of(k: int, plane: np.ndarray) -> np.ndarray:
         w = 0.5**k * np.arange(1.0, plane.shape[2] + 1) * np.linspace(0, 2, plane.shape[0])[:, None, None]
@@ -194,7 +194,7 @@ def test_steps_follow_the_significance() -> None:
             np.testing.assert_allclose(values[1:].mean((0, 1)) * steps[name] ** 2, 1, rtol=1e-5)
 
 
-def test_channels_that_no_ray_reached_get_the_coarsest_step() -> None:
+def test_channels_without_significance_get_the_coarsest_step() -> None:
     w = [{name: np.where(np.arange(plane.shape[2]) == 2, 0, 1) + np.zeros(plane.shape) for name, plane in scale.items()}
          for scale in SCENE.scales]  # fmt: skip
     for scale in relative_steps(w):
@@ -202,15 +202,15 @@ def test_channels_that_no_ray_reached_get_the_coarsest_step() -> None:
             assert step[2] == pytest.approx(MIN_SIGNIFICANCE**-0.5) and (np.delete(step, 2) == 1).all()
 
 
-def test_where_nothing_costs_anything_all_steps_are_equal() -> None:
+def test_steps_are_equal_where_nothing_has_significance() -> None:
     nothing = significance([{name: np.zeros_like(plane) for name, plane in scale.items()} for scale in SCENE.scales])
     assert len({float(step) for scale in relative_steps(nothing) for steps in scale.values() for step in steps}) == 1
     assert math.isfinite(RateController(SCENE, EQUAL, nothing, measure, 30.0).meet(Trade()).measured.psnr)
 
 
 @pytest.mark.parametrize("error, common, slots", [(1.0, 100, 1), (1.0, 50, 2), (0.1, 100, 4)])
-def test_slots_are_fewer_where_they_hold_much_the_same(error: float, common: int, slots: int) -> None:
-    """Unless pictures err by more than they may, or players would have to march too many cells: each slot has ten of its own."""
+def test_similar_slots_are_merged(error: float, common: int, slots: int) -> None:
+    """Unless the error is too large, or too many cells would be marched: each slot has ten cells of its own."""
     cells = np.zeros((4, 250), bool)
     cells[:, :common] = True
     for k in range(4):
@@ -222,8 +222,8 @@ def test_slots_are_fewer_where_they_hold_much_the_same(error: float, common: int
 
 
 @pytest.mark.parametrize("error, bits", [(0.0, None), (2.0**-24, 11), (2.0**-15, 7), (2.0**-11, 5), (1.0, 3)])
-def test_weights_of_the_decoder_have_as_few_bits_as_their_error_allows(error: float, bits: int | None) -> None:
-    """Of an array that is seen, and of the others, which are not, the fewest."""
+def test_decoder_weights_get_the_fewest_bits_that_the_error_allows(error: float, bits: int | None) -> None:
+    """One array affects pictures; all others get the fewest bits."""
     scene = tiny_scene()
 
     def measure(candidate: Scene) -> Fidelity:
@@ -242,7 +242,7 @@ def test_weights_of_the_decoder_have_as_few_bits_as_their_error_allows(error: fl
     assert measure(replace(scene, decoder=rounded)).mse <= 0.25 + error or bits is None
 
 
-def test_scaled() -> None:
+def test_scaled_steps_are_rounded_up() -> None:
     out = scaled([{"xy": np.array([1.0, 2.0, 0.1])}], 0.25)
     assert out[0]["xy"].dtype == np.float32
     np.testing.assert_array_equal(out[0]["xy"][:2], [0.25, 0.5])
@@ -250,7 +250,7 @@ def test_scaled() -> None:
 
 
 def tuned_to(factor: float, seen: list[Attempt] | None = None, power: float = 1.0, **trade: float) -> Attempt:
-    """With a stand-in for tuning: steps to some power, times a factor, at the bytes that those take."""
+    """Code with a stand-in for fine-tuning, whose errors are those of other steps at the same bytes."""
 
     def tune(steps: Steps, reached: np.ndarray) -> QuantisedScene:
         made = quantise_by_cost(
@@ -264,8 +264,8 @@ def tuned_to(factor: float, seen: list[Attempt] | None = None, power: float = 1.
 
 
 @pytest.mark.parametrize("factor", [0.6, 0.85])
-def test_what_is_tuned_meets_the_trade(steady: None, factor: float) -> None:
-    """Within 10 %, after few tries, whatever tuning brings."""
+def test_fine_tuned_codings_meet_the_target(steady: None, factor: float) -> None:
+    """Within 10 %, after few attempts, whatever fine-tuning gains."""
     for most in (0.05, 0.15, 0.4):
         seen: list[Attempt] = []
         assert 0.9 * most <= loss(tuned_to(factor, seen, max_loss_db=most)) <= most
@@ -276,7 +276,7 @@ def test_what_is_tuned_meets_the_trade(steady: None, factor: float) -> None:
 
 
 @pytest.mark.parametrize("power", [0.6, 1.6])
-def test_errors_of_what_is_tuned_may_follow_steps_less_or_more(steady: None, power: float) -> None:
+def test_errors_with_fine_tuning_may_follow_steps_less_or_more(steady: None, power: float) -> None:
     plain = coded(max_loss_db=0.15)
     seen: list[Attempt] = []
     factor = 0.7 * float(2.0**plain.exponent) ** (1 - power)
@@ -284,14 +284,14 @@ def test_errors_of_what_is_tuned_may_follow_steps_less_or_more(steady: None, pow
     assert 2 <= len(seen) <= MAX_TUNINGS
 
 
-def test_tuning_that_does_harm_is_not_taken() -> None:
+def test_harmful_fine_tuning_is_not_used() -> None:
     plain = coded(max_loss_db=0.15)
     assert tuned_to(1e-3, max_loss_db=0.15).size_bytes < 1.1 * plain.size_bytes
     assert loss(tuned_to(1e3, max_loss_db=0.15)) <= 0.15
     assert tuned_to(1e-3, lam=0.3).cost(0.3) <= coded(lam=0.3).cost(0.3)
 
 
-def test_tuning_that_breaks_leaves_what_was_found() -> None:
+def test_failed_fine_tuning_leaves_the_untuned_coding() -> None:
     def broken(scene: Scene) -> Fidelity:
         return Fidelity(math.nan, math.nan) if scene.step == 7 else measure(scene)
 

@@ -290,7 +290,7 @@ def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
         for name, plane in scene.scales[0].items()
     }
     whole = quantise_scene(
-        replace(scene, scales=(thin, scene.scales[1])), [{name: 0.01 for name in planes} for planes in scene.scales]
+        replace(scene, scales=(thin, scene.scales[1])), [dict.fromkeys(planes, 0.01) for planes in scene.scales]
     )
     with pytest.raises(ValueError, match="one texel"):
         SceneRenderer(whole.dequantise())
@@ -305,7 +305,8 @@ def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["appearances", "cells-one", "contracted", "device-coordinates", "dynamic", "hybrid-moved", "limits-large"]
+    "name",
+    ["appearances", "occupancy-one", "contracted", "device-coordinates", "dynamic", "hybrid-moved", "limits-large"],
 )
 def test_files_of_all_kinds_are_coded_again(name: str) -> None:
     source = codec_model.model_from_file(scene_io.read(VECTORS / f"{name}.kpc"))
@@ -314,7 +315,7 @@ def test_files_of_all_kinds_are_coded_again(name: str) -> None:
     assert coded.size_bytes <= len(scene_io.encode(source.coded))  # type: ignore[arg-type]
 
 
-# --- probes
+# --- validation rays
 
 
 def test_cameras_around_a_scene_without_any_see_it() -> None:
