@@ -20,8 +20,6 @@ ASSUMED_FACTOR = 1.5
 SETTLING_FRAMES = 1
 # Two consecutive frames that take this many times the target time lower the quality by several levels at once.
 MUCH_TOO_SLOW, LEVELS_AT_ONCE = 4.0, 2
-# Levels that are not chosen automatically on a graphics card: see docs/design/playback.md, "Levels a card skips".
-SKIPPED_ON_GPUS = frozenset({"fine"})
 
 
 @dataclass
@@ -37,14 +35,12 @@ class QualityController:
         chosen_level: the level the user chose; still pictures have at least this one.
         resolution: chooses the resolution where the level does not suffice.
         target_s: seconds that a frame may take; None: the level does not change automatically.
-        skipped: levels that are not chosen automatically.
         level: the level of frames while something changes.
     """
 
     chosen_level: str
     resolution: ResolutionController
     target_s: float | None = None
-    skipped: frozenset[str] = frozenset()
     level: str = field(init=False)
     _times: deque[float] = field(init=False, default_factory=lambda: deque(maxlen=UP_AFTER))  # of frames on this level
     _settling: int = field(init=False, default=0)  # frames since the last change, up to SETTLING_FRAMES
@@ -119,7 +115,7 @@ class QualityController:
 
     def _change(self, levels: int, seconds: float) -> None:
         self._previous = self.level, seconds
-        self.level = neighbouring_level(self.level, levels, self.skipped)
+        self.level = neighbouring_level(self.level, levels)
         self._restart()
 
     def _measure_factor(self, seconds: float) -> None:
@@ -127,7 +123,7 @@ class QualityController:
         if self._previous is not None:
             both = sorted((self._previous, (self.level, seconds)), key=lambda pair: LEVEL_NAMES.index(pair[0]))
             (lower, lower_s), (upper, upper_s) = both
-            if upper == neighbouring_level(lower, 1, self.skipped):
+            if upper == neighbouring_level(lower, 1):
                 self._factors[lower] = max(upper_s / max(lower_s, 1e-6), 1.0)
             self._previous = None
 
@@ -150,9 +146,7 @@ def quality_controller_for(software: bool, quality: str | None, target_fps: floa
     if software:
         controller = QualityController(quality or DEFAULT, ResolutionController.of(software))
     else:
-        controller = QualityController(
-            quality or LEVEL_NAMES[-1], ResolutionController.of(software), skipped=SKIPPED_ON_GPUS
-        )
+        controller = QualityController(quality or LEVEL_NAMES[-1], ResolutionController.of(software))
         target_fps = target_fps or (GPU_FPS if quality is None else None)
     if target_fps is not None:
         controller.hold(target_fps)
