@@ -9,7 +9,6 @@ set; nothing is uploaded again. Measurements behind the values, and variants tha
 docs/design/drawing.md.
 """
 
-from collections.abc import Collection
 from dataclasses import dataclass
 
 from kpc.format.scene.scene import TERMINATION
@@ -97,8 +96,7 @@ LEVELS: dict[str, Quality] = {
 DEFAULT = "balanced"
 
 
-def neighbouring_level(name: str, offset: int, skipped: Collection[str] = ()) -> str:
-    """Return the level `offset` places finer (negative: faster) than `name`, or the last in that direction; `skipped`
-    levels do not count."""
-    names = [level for level in LEVELS if level == name or level not in skipped]
+def neighbouring_level(name: str, offset: int) -> str:
+    """Return the level `offset` places finer (negative: faster) than `name`, or the last in that direction."""
+    names = list(LEVELS)
     return names[min(max(names.index(name) + offset, 0), len(names) - 1)]

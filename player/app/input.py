@@ -82,7 +82,7 @@ KEY_BINDINGS = (
         },
     ),
     KeyBinding("U", "hold the frame rate or the quality", {(glfw.KEY_U, NONE): Actions.toggle_target_rate}),
-    KeyBinding("F", "exact or folded time planes", {(glfw.KEY_F, NONE): Actions.toggle_exact}),
+    KeyBinding("F", "exact or fast drawing of what moves", {(glfw.KEY_F, NONE): Actions.toggle_exact}),
     KeyBinding("K", "add a keyframe to the camera path", {(glfw.KEY_K, NONE): Actions.add_keyframe}),
     KeyBinding("Backspace", "remove the last keyframe", {(glfw.KEY_BACKSPACE, NONE): Actions.remove_last_keyframe}),
     KeyBinding("J", "follow the camera path, or stop", {(glfw.KEY_J, NONE): Actions.follow_or_stop}),

@@ -143,7 +143,7 @@ class Panels:
         if state.scene.is_dynamic and LEVELS[quality.level].folded:
             label("exact")
             _, state.exact = imgui.checkbox("##exact", state.exact)
-            imgui.set_item_tooltip("Sample the time planes instead of folding them into the space planes; slower (F)")
+            imgui.set_item_tooltip("Draw what moves exactly, by sampling time planes; slower (F)")
 
     def _viewpoints(self) -> None:
         """The cameras of the scene, and the named viewpoints."""
