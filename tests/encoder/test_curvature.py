@@ -114,7 +114,7 @@ def test_values_that_no_ray_meets_cost_nothing() -> None:
 
 
 def test_values_that_more_rays_meet_cost_more() -> None:
-    """Half of the box is empty, so that rays meet the texels of planes along x on one side only, and their neighbours."""
+    """Half of the box is empty, so that rays meet the texels of planes along x on one side only."""
     scene = tiny_scene(3)
     occupancy = scene.occupancy.copy()
     occupancy[..., : occupancy.shape[3] // 2] = False

@@ -1,4 +1,4 @@
-"""A dry run says what the run would take, takes nothing from it, and leaves nothing but decoded pixels."""
+"""A dry run estimates what a run would take, and leaves nothing but decoded pixels."""
 
 import json
 from collections.abc import Callable
@@ -30,8 +30,8 @@ CONFIG = TrainConfig(
 BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
 
 
-def test_it_extrapolates_from_the_steps_it_watched(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A clock that ticks once a step: the first half of the steps at 3 s, the others at 1 s."""
+def test_training_is_extrapolated_from_the_watched_steps(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock ticks once per step: 3 s in the first half of the watched steps, 1 s in the others."""
     run = Trainer(moving, CONFIG, BOX, "cpu", elapsed_s=5.0)
     watched = module.STEPS * CONFIG.occupancy_start
     inner = run.run
@@ -50,8 +50,8 @@ def test_it_extrapolates_from_the_steps_it_watched(moving: Dataset, monkeypatch:
     assert 2 < found.rest_s < 60 and found.memory_bytes > 16 * run.field.theta.numel()
 
 
-def test_tuning_is_counted(moving: Dataset) -> None:
-    """By what a ray takes in training, and to be rendered."""
+def test_fine_tuning_is_counted(moving: Dataset) -> None:
+    """From the time of a ray in training and in rendering."""
     found = []
     for tune_steps in (0, 100):
         run = Trainer(moving, replace(CONFIG, steps=1250, tune_steps=tune_steps), BOX, "cpu")
@@ -60,10 +60,8 @@ def test_tuning_is_counted(moving: Dataset) -> None:
     assert found[1] - found[0] == pytest.approx(trained, rel=0.5)
 
 
-def test_steps_with_the_coarsest_scale_alone_are_counted_apart(
-    moving: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By the same clock: 1 s a step while it is alone, 4 s with all."""
+def test_steps_of_the_coarsest_scale_are_counted_separately(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the same clock: 1 s per step for the coarsest scale alone, 4 s for all."""
     run = Trainer(moving, replace(CONFIG, coarse_until=0.3), BOX, "cpu")
     watched = module.STEPS * CONFIG.occupancy_start
     inner = run.run
@@ -80,7 +78,7 @@ def test_steps_with_the_coarsest_scale_alone_are_counted_apart(
     assert run.step > watched and found.train_s == pytest.approx(0.3 * 400 * 1.0 + 0.7 * 400 * 4.0, rel=0.03)
 
 
-def test_a_time_budget_is_the_time(moving: Dataset) -> None:
+def test_a_time_budget_is_the_training_time(moving: Dataset) -> None:
     run = Trainer(moving, CONFIG, BOX, "cpu")
     assert module.estimate(run, 100, 0, 0.0, 600.0).train_s == 600.0
 

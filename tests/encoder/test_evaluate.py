@@ -1,4 +1,4 @@
-"""PSNR and SSIM against straightforward twins; pictures of a scene against the player's reference."""
+"""PSNR and SSIM against simple implementations; pictures of a scene against the player's reference."""
 
 import math
 from dataclasses import replace
@@ -41,7 +41,7 @@ def noise(*shape: int, seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", [(14, 16, 3), (11, 11, 3), (5, 20, 3), (1, 1, 3)])
-def test_ssim_is_its_twin(shape: tuple[int, int, int]) -> None:
+def test_ssim_matches_the_simple_implementation(shape: tuple[int, int, int]) -> None:
     a = noise(*shape)
     for b in (noise(*shape, seed=1), np.clip(a + 0.1 * noise(*shape, seed=2), 0, 1), 1 - a):
         assert ssim(a, b) == pytest.approx(plain_ssim(a, b), abs=1e-9)
@@ -53,7 +53,8 @@ def test_psnr() -> None:
     a = noise(8, 9, 3)
     b = noise(8, 9, 3, seed=1)
     assert psnr(a, b) == pytest.approx(
-        -10 * math.log10(sum((float(x) - float(y)) ** 2 for x, y in zip(a.flat, b.flat)) / a.size), abs=1e-4
+        -10 * math.log10(sum((float(x) - float(y)) ** 2 for x, y in zip(a.flat, b.flat, strict=True)) / a.size),
+        abs=1e-4,
     )
     assert psnr(a, a) == 100
     assert psnr(np.zeros((4, 4, 3), np.float32), np.full((4, 4, 3), 0.1, np.float32)) == pytest.approx(20, abs=1e-5)
@@ -67,13 +68,13 @@ def blender(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 def dim_scene() -> Scene:
-    """Every step absorbs a tenth or more, so that the kernel leaves no sample without colour."""
+    """Return a scene where every step absorbs at least a tenth, so that the kernel skips no sample."""
     scene = tiny_scene()
     weight = np.abs(scene.decoder.density_weight) / 16
     return replace(scene, decoder=replace(scene.decoder, density_weight=weight), background=np.ones(3, np.float32))
 
 
-def test_a_picture_is_what_the_players_reference_renders(blender: Dataset) -> None:
+def test_a_picture_matches_the_reference_renderer(blender: Dataset) -> None:
     scene = dim_scene()
     for number in (0, 6):
         ours = SceneRenderer(scene).picture(blender, number)
@@ -82,14 +83,14 @@ def test_a_picture_is_what_the_players_reference_renders(blender: Dataset) -> No
         assert np.mean(np.abs(ours - theirs).max(-1) > 1e-4) <= 0.005  # a ray that grazes a cell's face
 
 
-def test_true_pictures_are_on_white(blender: Dataset) -> None:
+def test_ground_truth_is_composited_on_white(blender: Dataset) -> None:
     picture, raw = ground_truth(blender, 5), blender.pixels.picture(5) / 255.0
     assert raw.shape[2] == 4
     np.testing.assert_allclose(picture, raw[..., :3] * raw[..., 3:] + 1 - raw[..., 3:], atol=1e-6)
     assert (picture[raw[..., 3] == 0] == 1).all()
 
 
-def test_true_pictures_without_alpha(tmp_path: Path) -> None:
+def test_ground_truth_without_alpha(tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "set", frames=1)
     dataset = load_dataset(tmp_path / "set", tmp_path / "cache", progress=False)
     np.testing.assert_array_equal(

@@ -1,4 +1,4 @@
-"""`kpenc --group`: which frames a group holds, how it begins, and that a run that ends goes on where it was."""
+"""`kpenc --group`: the frames of each group, its start from the one before, and resumed runs."""
 
 import json
 import os
@@ -35,8 +35,18 @@ FRAMES = 26
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    config = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
-                         occupancy_start=8, occupancy_every=4)  # fmt: skip
+    config = TrainConfig(
+        tune_steps=0,
+        resolutions=(8, 16),
+        samples_across=32,
+        cells_across=12,
+        steps=24,
+        rays=256,
+        samples=8192,
+        warmup=5,
+        occupancy_start=8,
+        occupancy_every=4,
+    )
     monkeypatch.setitem(PRESETS, "draft", config)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
@@ -71,11 +81,11 @@ def test_groups_are_about_equally_long_and_share_frames():
         assert cut[0].start == 0 and cut[-1].last == frames - 1 and max(np.bincount(shown)) <= 25
         assert np.ptp(np.bincount(shown)) <= 1
     assert split_into_spans(Clip(20, 10.0), 2.5) == (Span(0, 20),)
-    with pytest.raises(UsageError, match="at least 0.8s"):
+    with pytest.raises(UsageError, match=r"at least 0\.8s"):
         split_into_spans(Clip(100, 10.0), 0.3)
 
 
-def test_size_and_time_are_shared_out():
+def test_size_and_time_are_divided_among_groups():
     spans = split_into_spans(Clip(100, 10.0), 2.5)
     options = Options(Path("a"), Path("b"), time_budget_s=100.0, trade=Trade(target_bytes=100_000))
     shares = [options_of_group(options, number, spans) for number in range(4)]
@@ -88,7 +98,7 @@ def test_size_and_time_are_shared_out():
     assert plain.trade == Trade(quality=50) and plain.time_budget_s is None
 
 
-def test_a_field_begins_as_the_last_row_of_another():
+def test_a_field_starts_from_the_last_row_of_another():
     def field(rows: int, seed: int) -> Field:
         layout = Layout.of(np.array([[5, 4, 3, rows]]), 2)
         made = Field(layout, 4, torch.Generator().manual_seed(seed), (rows, 2, 2, 2))
@@ -109,7 +119,7 @@ def test_a_field_begins_as_the_last_row_of_another():
     assert later.theta.requires_grad and later.theta.is_leaf
 
 
-def test_what_goes_on_begins_with_all_scales(tmp_path):
+def test_later_groups_start_with_all_scales(tmp_path):
     make.write_blender(tmp_path / "set")
     options = Options(tmp_path / "set", tmp_path / "out.kpc", preset="draft", box=((-1, -1, -1), (1, 1, 1)))
     setting = prepare_setting(options)
@@ -119,7 +129,7 @@ def test_what_goes_on_begins_with_all_scales(tmp_path):
     assert torch.equal(later.field.density, first.field.density)
 
 
-def test_frames_of_a_clip_as_a_clip_of_their_own(clip):
+def test_a_range_of_frames_is_a_dataset(clip):
     some = clip.frame_range(7, 19)
     assert some.clip == Clip(13, clip.clip.fps) and len(some.pictures) == 3 * 13 and some.is_dynamic
     assert np.allclose(np.unique(some.pictures.time), np.arange(13) / 12, atol=1e-6)
@@ -184,7 +194,7 @@ def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
     assert np.mean([frame["psnr"] for frame in found["frames"]]) == pytest.approx(result["test_psnr"], abs=0.5)
 
 
-def test_an_interrupted_run_goes_on_at_its_group_to_the_same_file(videos, tmp_path, monkeypatch, capsys):
+def test_an_interrupted_run_resumes_in_its_group_to_the_same_file(videos, tmp_path, monkeypatch, capsys):
     assert encode(videos, tmp_path / "whole.kpc") == 0
     begun: list[Trainer] = []
     make_trainer = Trainer.__init__
@@ -214,7 +224,7 @@ def test_an_interrupted_run_goes_on_at_its_group_to_the_same_file(videos, tmp_pa
     assert output.read_bytes() == (tmp_path / "whole.kpc").read_bytes()
 
 
-def test_a_clip_in_groups_is_coded_again_group_by_group(videos, tmp_path, capsys):
+def test_a_clip_is_coded_anew_group_by_group(videos, tmp_path, capsys):
     assert encode(videos, tmp_path / "long.kpc", "--steps", "8") == 0
     capsys.readouterr()
     assert (
@@ -242,7 +252,7 @@ def test_a_clip_in_groups_is_coded_again_group_by_group(videos, tmp_path, capsys
     assert result["parameters"] == sum(scene_io.read(after.open(number)).parameter_count for number in range(3))
 
 
-def test_groups_that_are_coded_apart_are_joined(videos, tmp_path, capsys):
+def test_separately_coded_groups_are_joined(videos, tmp_path, capsys):
     parts = [tmp_path / f"part{number}.kpc" for number in range(3)]
     for number, part in enumerate(parts):
         assert encode(videos, part, "--only", str(number), "--keep-checkpoint", str(part.with_suffix(".kpck"))) == 0
@@ -258,7 +268,7 @@ def test_groups_that_are_coded_apart_are_joined(videos, tmp_path, capsys):
     (["--only", "3"], "has 3 groups"), (["--group", "0.2s"], "too few for a group"),
     (["--keep-checkpoint", "x.kpck"], "single scene"),
 ])  # fmt: skip
-def test_what_makes_no_sense_is_refused(videos, tmp_path, capsys, options, complaint):
+def test_invalid_options_are_refused(videos, tmp_path, capsys, options, complaint):
     try:
         code = encode(videos, tmp_path / "long.kpc", *options)
     except SystemExit as ended:

@@ -1,4 +1,4 @@
-"""The whole command: a folder becomes a file; whatever is wrong is one line, and harms nothing."""
+"""The whole command: a folder becomes a file; every error is one line and leaves other files alone."""
 
 import builtins
 import errno
@@ -28,23 +28,23 @@ from kpc.format.scene.scene import HybridDecoder
 from kpc.format.scene.space import DeviceCoordinates
 
 pytestmark = pytest.mark.usefixtures("one_thread", "few_rays", "tiny", "heeded_signals")
-TINY = dict(
-    tune_steps=0,
-    resolutions=(8, 16),
-    samples_across=32,
-    cells_across=12,
-    steps=24,
-    rays=256,
-    samples=8192,
-    warmup=5,
-    occupancy_start=8,
-    occupancy_every=4,
-)
+TINY = {
+    "tune_steps": 0,
+    "resolutions": (8, 16),
+    "samples_across": 32,
+    "cells_across": 12,
+    "steps": 24,
+    "rays": 256,
+    "samples": 8192,
+    "warmup": 5,
+    "occupancy_start": 8,
+    "occupancy_every": 4,
+}
 
 
 @pytest.fixture
 def heeded_signals() -> Iterator[None]:
-    """kpenc leaves a signal alone that its parent ignores; what runs these tests may ignore Ctrl-C, as nohup in scripts does."""
+    """Restore the default of Ctrl-C, which the parent of these tests may ignore: kpenc leaves ignored signals alone."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -93,7 +93,7 @@ def fails(
     code: int = 1,
     lines: int = 1,
 ) -> None:
-    """One line with all these words, the exit code, and nothing left; an output file that was there stays as it was."""
+    """Check for one line of error with all these words, the exit code, no files left, and an unchanged output file."""
     output = output or tmp_path / "out.kpc"
     there = output.is_dir() or output.exists()
     if not there and output.parent.is_dir():
@@ -156,7 +156,7 @@ def test_the_hybrid_decoder(run: Kpenc, sets: Path, tmp_path: Path, name: str) -
     assert 5 < json.loads(out)["test_psnr"] < 60
 
 
-def test_what_is_printed(run: Kpenc, sets: Path) -> None:
+def test_the_result_is_printed(run: Kpenc, sets: Path) -> None:
     code, out, err = run(sets / "blender")
     assert code == 0 and "displaced by a motion grid of 11x11x11 nodes" in err
     assert "colour: view-independent, as trained; channels per scale: " in err
@@ -179,10 +179,10 @@ def test_what_is_printed(run: Kpenc, sets: Path) -> None:
 @pytest.mark.parametrize(
     "tolerance, rows, why", [(1.0, 2, "1 allowed"), (1e-4, 4, "0.0001 allowed"), (0.0, 3, "the preset's")]
 )
-def test_rows_of_time_are_as_far_apart_as_the_motion_allows(
+def test_time_rows_are_as_far_apart_as_motion_allows(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tolerance: float, rows: int, why: str
 ) -> None:
-    """Of four frames; a run that is resumed finds the same number."""
+    """Of four frames; a resumed run finds the same number of rows."""
     config = TrainConfig(**TINY | {"time_tolerance": tolerance, "frames_per_row": 1.5})  # type: ignore[arg-type]
     monkeypatch.setitem(PRESETS, "draft", config)
     for options in (("--keep",), ("--resume",)):
@@ -229,7 +229,7 @@ def test_options(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     assert code == 0 and "no view held out" in out
 
 
-def test_masks_and_what_a_damaged_model_says(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+def test_masks_and_the_error_for_a_damaged_model(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     code, _, err = run(sets / "colmap", "--steps", "2", "--keep")
     assert code == 0 and "distortion, masks (17.2% ignored)" in err
     assert len(list((tmp_path / "out.kpc.work").glob("pixels-*-masks.bin"))) == 1
@@ -248,7 +248,7 @@ def test_masks_and_what_a_damaged_model_says(run: Kpenc, sets: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("share", [1.0, 0.0])
-def test_what_is_left_out_is_said_and_missing_from_the_file(
+def test_pruning_is_logged_and_reduces_the_file(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
 ) -> None:
     """After 24 steps hardly anything gains a decibel; the loss that is reported counts all that coding costs."""
@@ -280,7 +280,7 @@ def test_a_seed_gives_the_same_bytes(run: Kpenc, sets: Path, tmp_path: Path) -> 
     assert written[0] == written[1] != written[2]
 
 
-def test_the_work_folder_keeps_what_is_not_ours(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+def test_the_work_folder_keeps_foreign_files(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years of work")
     assert run(sets / "blender", "--work", str(tmp_path / "mine"), "--steps", "2")[0] == 0
@@ -329,7 +329,7 @@ def test_termination_is_like_ctrl_c(run: Kpenc, sets: Path, tmp_path: Path, monk
 
 
 @pytest.mark.parametrize("answer, code", [("y\n", 0), ("\n", 130)])
-def test_on_a_terminal_ctrl_c_offers_what_there_is(
+def test_on_a_terminal_ctrl_c_offers_the_partial_scene(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, code: int
 ) -> None:
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
@@ -352,7 +352,7 @@ def test_interrupted_while_writing(run: Kpenc, sets: Path, tmp_path: Path, monke
     assert run(sets / "blender", "--steps", "2", "--resume")[0] == 0
 
 
-def test_resume_without_a_checkpoint_starts_afresh_and_says_so(run: Kpenc, sets: Path) -> None:
+def test_resume_without_a_checkpoint_starts_afresh(run: Kpenc, sets: Path) -> None:
     code, _, err = run(sets / "blender", "--steps", "2", "--resume")
     assert code == 0 and "starting afresh" in err
 
@@ -422,11 +422,11 @@ def test_an_unreadable_video(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     fails(run, tmp_path, folder, "cam02.mp4")
 
 
-def test_frame_counts_that_differ_are_said(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+def test_different_frame_counts_are_logged(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     folder, other = copied(sets, tmp_path), tmp_path / "short"
     make.write_n3dv(other, cameras=4, frames=3)
     shutil.copy(other / "cam02.mp4", folder / "cam02.mp4")
-    code, out, err = run(folder, "--steps", "2")
+    code, _, err = run(folder, "--steps", "2")
     assert code == 0 and "cam02.mp4" in err and "first 3" in err and (tmp_path / "out.kpc").exists()
 
 
@@ -481,7 +481,7 @@ def test_cameras_without_a_common_point(run: Kpenc, sets: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("space, found", [("auto", "contracted"), ("box", "box"), ("contracted", "contracted")])
-def test_space_is_chosen_said_and_overridden(run: Kpenc, sets: Path, tmp_path: Path, space: str, found: str) -> None:
+def test_space_is_chosen_logged_and_overridden(run: Kpenc, sets: Path, tmp_path: Path, space: str, found: str) -> None:
     code, out, err = run(sets / "colmap", "--json", "--space", space)
     assert code == 0
     result, scene = json.loads(out), scene_io.read(tmp_path / "out.kpc")
@@ -492,7 +492,7 @@ def test_space_is_chosen_said_and_overridden(run: Kpenc, sets: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("name, why", [("n3dv", "near and far are known"), ("blender", "have alpha")])
-def test_space_is_a_box_where_something_bounds_it(run: Kpenc, sets: Path, name: str, why: str) -> None:
+def test_bounded_scenes_get_a_box(run: Kpenc, sets: Path, name: str, why: str) -> None:
     code, out, err = run(sets / name, "--json", "--steps", "2")
     assert code == 0 and json.loads(out)["space"] == "box" and why in err
 
@@ -500,7 +500,7 @@ def test_space_is_a_box_where_something_bounds_it(run: Kpenc, sets: Path, name: 
 @pytest.mark.parametrize(
     "asked, names", [("auto", "image"), ("image", "image"), ("camera", "camera"), ("none", "none")]
 )
-def test_appearances_are_chosen_said_and_overridden(
+def test_appearances_are_chosen_logged_and_overridden(
     run: Kpenc, sets: Path, tmp_path: Path, asked: str, names: str
 ) -> None:
     code, out, err = run(sets / "unequal", "--appearance", asked, "--steps", "60", "--test-views", "1")
@@ -514,7 +514,7 @@ def test_appearances_are_chosen_said_and_overridden(
     assert names == "none" or np.abs([appearance.code for appearance in scene.appearances]).max() > 0.01
 
 
-def test_appearances_in_numbers_and_in_the_plan(run: Kpenc, sets: Path) -> None:
+def test_appearances_in_results_and_estimates(run: Kpenc, sets: Path) -> None:
     code, out, _ = run(sets / "unequal", "--json", "--test-views", "1")
     result = json.loads(out)
     assert code == 0 and (result["appearance"], result["appearances"], result["test_pictures"]) == ("image", 28, 1)
@@ -527,9 +527,7 @@ def test_appearances_in_numbers_and_in_the_plan(run: Kpenc, sets: Path) -> None:
     assert code == 0 and (json.loads(out)["appearances"], json.loads(out)["test_psnr"]) == (4, None)
 
 
-def test_a_lone_object_gets_colour_by_direction_where_appearances_are_asked_for(
-    run: Kpenc, sets: Path, tmp_path: Path
-) -> None:
+def test_a_single_object_gets_view_dependence_with_appearances(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     for options, directed in (((), False), (("--appearance", "image"), True)):
         assert run(sets / "blender", "--test-views", "1", *options)[0] == 0
         scene = scene_io.read(tmp_path / "out.kpc")
@@ -566,14 +564,14 @@ def test_rigs_that_have_no_device_coordinates(run: Kpenc, sets: Path, tmp_path: 
     assert code == 2 and "--box" in err
 
 
-def test_a_box_in_contracted_space_is_taken_as_it_is(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+def test_a_given_box_of_contracted_space_is_not_changed(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     code, out, _ = run(sets / "n3dv", "--json", "--space", "contracted", "--box", "-1,-1,-1,1,1,0.5")
     scene = scene_io.read(tmp_path / "out.kpc")
     assert code == 0 and json.loads(out)["box"] == scene.aabb.tolist() == [[-1, -1, -1], [1, 1, 0.5]]
     assert scene.mapping is not None and scene.mapping.uniform_distance > 3  # the cameras' distance
 
 
-def test_a_box_where_nothing_is(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+def test_a_box_outside_all_views(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     fails(run, tmp_path, sets / "n3dv", "outside every camera's view", "--box", options=("--box", "90,90,90,91,91,91"))
     fails(run, tmp_path, sets / "n3dv", "too large or too thin", "--box", options=("--box", "0,0,0,1,1,1e12"))
     fails(run, tmp_path, sets / "n3dv", "too large or too thin", "--box", options=("--box", "1e8,0,0,100000001,1,1"))
@@ -598,7 +596,7 @@ def test_no_permission(run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pyte
         fails(run, tmp_path, sets / "n3dv", str(tmp_path), "no permission", "-o")
 
 
-def test_outputs_that_cannot_be(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+def test_outputs_that_cannot_be_written(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     fails(run, tmp_path, sets / "n3dv", str(tmp_path / "no"), "make it first", output=tmp_path / "no" / "x.kpc", code=2)
     (tmp_path / "folder").mkdir()
     fails(run, tmp_path, sets / "n3dv", str(tmp_path / "folder"), "is a folder", output=tmp_path / "folder", code=2)
@@ -626,7 +624,7 @@ def test_outputs_that_cannot_be(run: Kpenc, sets: Path, tmp_path: Path) -> None:
         ("--nonsense",),
     ],
 )
-def test_options_that_make_no_sense(
+def test_invalid_options_are_refused(
     run: Kpenc, sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...]
 ) -> None:
     with pytest.raises(SystemExit) as stopped:
@@ -654,7 +652,7 @@ def test_disk_full_while_decoding(run: Kpenc, sets: Path, tmp_path: Path, monkey
 
 
 def test_disk_full_at_a_checkpoint(run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Said in one line; the run goes on and the scene, which is far smaller, may well find room."""
+    """One line is logged and the run goes on, since the much smaller scene may still fit."""
 
     def full(_: object, path: Path) -> None:
         Path(path).write_bytes(b"half")
@@ -754,7 +752,8 @@ def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
         f"import sys\n{preparation}\n"
         "from kpc.encoder.cli import kpenc\nfrom kpc.encoder.evaluation import validation_rays\n"
         "from kpc.encoder.rdo import curvature\nfrom kpc.encoder.field.config import PRESETS, TrainConfig\n"
-        f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nvalidation_rays.VALIDATION_RAYS = 512\ncurvature.RAYS = 1 << 13\nsys.exit(kpenc.main({argv!r}))"
+        f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nvalidation_rays.VALIDATION_RAYS = 512\n"
+        f"curvature.RAYS = 1 << 13\nsys.exit(kpenc.main({argv!r}))"
     )
     return subprocess.Popen(
         [sys.executable, "-c", script],
@@ -765,8 +764,8 @@ def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
     )
 
 
-def test_the_trade_between_size_and_loss(run: Kpenc, sets: Path, tmp_path: Path) -> None:
-    """Coded again from the checkpoint that --keep leaves, without a step of training."""
+def test_rate_distortion_targets(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+    """The kept checkpoint is coded anew, without a step of training."""
     _, out, _ = run(sets / "n3dv", "--keep", "--json")
     usual = json.loads(out)["size_bytes"]
     sizes, target = [], int(0.95 * usual)
@@ -792,7 +791,7 @@ def test_the_trade_between_size_and_loss(run: Kpenc, sets: Path, tmp_path: Path)
         (("--target-size", "2MB", "--max-loss", "1dB"), "not allowed"),
     ],
 )
-def test_a_trade_that_makes_no_sense(
+def test_invalid_targets_are_refused(
     words: tuple[str, ...], named: str, sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="2"):

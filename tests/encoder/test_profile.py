@@ -1,4 +1,4 @@
-"""The profile of a training step: its parts make the whole, and its count of work is that of the formulas."""
+"""The profile of a training step: its parts add up, and the count of work follows the formulas."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from test_train import BOX, CONFIG
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_the_parts_make_the_step(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_parts_add_up_to_the_step(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(profile, "STEPS", 2)
     monkeypatch.setattr(profile, "FUSED_STEPS", 10)
     trainer = Trainer(moving, replace(CONFIG, steps=1000), BOX, "cpu")
@@ -30,13 +30,13 @@ def test_the_parts_make_the_step(moving: Dataset, monkeypatch: pytest.MonkeyPatc
     assert found["kernel_gflops"] > 0 and found["kernel_gb_s"] > 0
 
 
-def test_a_run_that_ends_before_is_not_profiled(moving: Dataset) -> None:
+def test_too_short_a_run_is_refused(moving: Dataset) -> None:
     with pytest.raises(ValueError, match="60 steps"):
         profile.profile(Trainer(moving, CONFIG, BOX, "cpu"))
 
 
 def test_work_of_a_sample() -> None:
-    """Two scales of four channels: 6 planes of 4 taps each way, a multiplication and an addition a tap and channel."""
+    """Two scales of four channels: 6 planes of 4 taps in either direction, a multiply-add per tap and channel."""
     layout = Layout.of(np.array([[4, 4, 4, 2], [8, 8, 8, 2]]), 4)
     flops, bytes_ = profile.least_work(layout, 10)
     assert bytes_ == 10 * 2 * 6 * 4 * (4 * 4) * 3  # read, then read and written back
@@ -64,7 +64,7 @@ def test_traffic_is_what_operations_read_and_write() -> None:
     with profile.Traffic() as traffic:
         x + x[:1]  # the row once
         assert traffic.bytes == 4 * (5000 + 50 + 5000)
-        x.T
+        _ = x.T
         assert traffic.bytes == 4 * (5000 + 50 + 5000)
         traffic.bytes = 0
         table.index_select(0, rows)  # of the table 60 rows

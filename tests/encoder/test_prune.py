@@ -1,4 +1,4 @@
-"""What a scene can do without goes, what it needs stays, and the bill is right."""
+"""Pruning (`kpc.encoder.rdo.prune`): redundant channels go, needed ones stay, and the reported loss is right."""
 
 import math
 from dataclasses import replace
@@ -31,13 +31,15 @@ Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def rays_of(scene: Scene) -> Rays:
-    origins, directions = (np.concatenate(parts) for parts in zip(*(camera.rays() for camera in scene.cameras)))
+    origins, directions = (
+        np.concatenate(parts) for parts in zip(*(camera.rays() for camera in scene.cameras), strict=True)
+    )
     times = np.random.default_rng(4).random(len(origins), np.float32)
     return origins.astype(np.float32), directions.astype(np.float32), times
 
 
 class Fidelity:
-    """PSNR of a scene to what another shows, with a little noise; counts how often it is asked."""
+    """PSNR of a scene against another's pictures with a little noise; counts its calls."""
 
     def __init__(self, truth: Scene, rays: Rays) -> None:
         self.rays, self.asked = rays, 0
@@ -50,7 +52,7 @@ class Fidelity:
 
 
 def redundant(scene: Scene, channel: int = 2) -> Scene:
-    """The scene with a copy of one channel of its finest scale in place of another, and at half of the size: it says the same."""
+    """Return the scene with a channel of its finest scale replaced by half of another one, which makes it redundant."""
     finest = {name: plane.copy() for name, plane in scene.scales[-1].items()}
     for name, plane in finest.items():
         plane[..., channel] = plane[..., channel + 1] * (0.5 if name == "xy" else 1)
@@ -58,7 +60,7 @@ def redundant(scene: Scene, channel: int = 2) -> Scene:
 
 
 def mute(scene: Scene, features: list[int]) -> Scene:
-    """The scene with a decoder that does not listen to some features."""
+    """Return the scene with decoder weights of 0 for some features."""
     d = scene.decoder
     weights = [a.copy() for a in (d.density_weight, d.w2, d.b2)]
     for a in (weights[0], weights[1].swapaxes(0, 1), weights[2].T):
@@ -71,7 +73,7 @@ def directed(scene: Scene, strength: float) -> Scene:
 
 
 @pytest.mark.parametrize("kind", ["static", *(space for space in VARIANTS if space != "hybrid")])
-def test_a_channel_that_says_nothing_new_goes_at_no_cost(kind: str) -> None:
+def test_a_redundant_channel_is_removed_without_loss(kind: str) -> None:
     scene = redundant(VARIANTS.get(kind, lambda scene: scene)(tiny_scene(dynamic=kind != "static")))
     rays = rays_of(scene)
     if kind == "ndc":
@@ -84,7 +86,7 @@ def test_a_channel_that_says_nothing_new_goes_at_no_cost(kind: str) -> None:
     np.testing.assert_allclose(SceneRenderer(pruned.scene).rgb(*rays), before, atol=0.01)
 
 
-def test_what_is_needed_stays_bit_for_bit() -> None:
+def test_needed_channels_stay_unchanged() -> None:
     scene = tiny_scene()
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), 1e-4)
     assert (
@@ -95,17 +97,18 @@ def test_what_is_needed_stays_bit_for_bit() -> None:
     )
     for ours, theirs in zip(pruned.scene.scales, scene.scales, strict=True):
         assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
-    assert all(np.array_equal(a, b) for a, b in zip(vars(pruned.scene.decoder).values(), vars(scene.decoder).values()))
+    decoders = zip(vars(pruned.scene.decoder).values(), vars(scene.decoder).values(), strict=True)
+    assert all(np.array_equal(a, b) for a, b in decoders)
 
 
-def test_a_scale_that_nothing_listens_to_is_left_out() -> None:
+def test_an_unused_scale_is_removed() -> None:
     scene = mute(tiny_scene(scales=3), [*range(8, 16), 20])
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), 1e-4)
     assert [len(kept) for kept in pruned.kept] == [8, 0, 7] and len(pruned.scene.scales) == 2
     assert pruned.scene.scales[1]["xy"].shape == (20, 24, 7) and pruned.scene.decoder.b2.shape == (3, 15)
 
 
-def test_one_channel_always_stays() -> None:
+def test_one_channel_is_always_kept() -> None:
     scene = tiny_scene()
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), 1e3)
     assert (
@@ -116,7 +119,7 @@ def test_one_channel_always_stays() -> None:
 
 
 @pytest.mark.parametrize("spare", [0.0, 0.3, 2.0])
-def test_the_bill_is_what_pictures_show(spare: float) -> None:
+def test_the_reported_loss_is_that_of_pictures(spare: float) -> None:
     scene = tiny_scene()
     fidelity = Fidelity(scene, rays_of(scene))
     before = fidelity(scene)
@@ -127,7 +130,7 @@ def test_the_bill_is_what_pictures_show(spare: float) -> None:
     assert before - fidelity(pruned.scene) == pytest.approx(pruned.loss_db, abs=1e-3)
 
 
-def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
+def test_pruning_and_quantisation_together_stay_within_the_limit() -> None:
     scene = redundant(directed(tiny_scene(scales=3, resolution=(48, 40, 32)), 0.03))
     rays = rays_of(scene)
     numbers = [{name: np.arange(1.0, 9.0) for name in scale} for scale in scene.scales]
@@ -139,14 +142,15 @@ def test_pruned_and_quantised_stay_within_the_bound_together() -> None:
     pairs = [{name: np.arange(64.0).reshape(1, 1, 8, 8) for name in scale} for scale in scene.scales]
     for found in coded.pruned.select_channels(pairs, in_pairs=True)[1].values():
         np.testing.assert_array_equal(found[0, 0], 8.0 * kept[:, None] + kept)
-    # So small a scene's loss leaps by a quarter from one step to the next: how near it comes depends on the processor's rounding.
+    # So small a scene's loss leaps by a quarter from one step to the next: how near it comes depends on the
+    # processor's rounding.
     assert (SPARE + 0.15) / 2 < coded.loss_db <= 0.15 and coded.size_bytes == len(scene_io.encode(coded.scene))
     fidelity = Fidelity(scene, rays)
     assert fidelity(scene) - fidelity(coded.scene.dequantise()) == pytest.approx(coded.loss_db, abs=1e-3)
 
 
-def test_of_a_size_what_may_be_left_out_is_a_share_of_what_it_costs() -> None:
-    """Not of what it would cost if nothing were."""
+def test_for_a_target_size_pruning_takes_a_share_of_its_loss() -> None:
+    """The loss is that with pruning, not that of the unpruned model."""
     scene = redundant(directed(tiny_scene(scales=3, resolution=(48, 40, 32)), 0.03))
     rays = rays_of(scene)
     model = Model(scene, ValidationRays(*rays, None, Fidelity(scene, rays).truth))
@@ -155,21 +159,21 @@ def test_of_a_size_what_may_be_left_out_is_a_share_of_what_it_costs() -> None:
 
 
 @pytest.mark.parametrize("strength, goes", [(0.02, True), (3.0, False)])
-def test_direction_goes_where_it_is_worth_little(strength: float, goes: bool) -> None:
+def test_view_dependence_is_removed_where_it_gains_little(strength: float, goes: bool) -> None:
     scene = directed(tiny_scene(), strength)
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), SPARE)
     assert pruned.view_gain_db is not None and (pruned.view_gain_db <= SPARE) == goes
     assert pruned.scene.decoder.w2.any() != goes
 
 
-def test_colour_that_never_depended_on_direction_costs_no_weights() -> None:
+def test_view_independent_colour_has_no_direction_weights() -> None:
     scene = directed(tiny_scene(), 0.0)
     pruned = prune(scene, rays_of(scene), Fidelity(scene, rays_of(scene)), SPARE)
     assert pruned.view_gain_db is None and pruned.scene.decoder.w1.shape == (1, 9)
     np.testing.assert_array_equal(make_view_independent(scene, rays_of(scene)[1]).decoder.b2, scene.decoder.b2)
 
 
-def test_the_mean_basis_is_that_over_the_rays() -> None:
+def test_the_mean_basis_is_over_the_directions_of_rays() -> None:
     scene = tiny_scene()
     directions = rays_of(scene)[1]
     plain = make_view_independent(scene, directions)
@@ -180,11 +184,11 @@ def test_the_mean_basis_is_that_over_the_rays() -> None:
     np.testing.assert_allclose(seen, np.stack([expected] * 3), atol=1e-5)
 
 
-def test_one_colour_takes_next_to_nothing_in_the_file() -> None:
-    """The decoder's chunk without the MLP: 7 numbers a feature, 10 zeros and a head."""
+def test_view_independent_colour_takes_few_bytes() -> None:
+    """The decoder's chunk then has 7 values per feature, 10 zeros and a head."""
     scene = tiny_scene()
     plain = make_view_independent(scene, rays_of(scene)[1])
-    steps = [{name: 0.05 for name in scale} for scale in scene.scales]
+    steps = [dict.fromkeys(scale, 0.05) for scale in scene.scales]
     stored = []
     for each in (scene, plain):
         reader = scene_io.SceneReader(scene_io.encode(quantise_scene(each, steps)))
@@ -193,8 +197,8 @@ def test_one_colour_takes_next_to_nothing_in_the_file() -> None:
     assert stored[1][0] == 8 + 2 * (7 * 16 + 10) < 0.15 * stored[0][0] and stored[1][1] <= stored[1][0]
 
 
-def test_passing_on_is_least_squares() -> None:
-    """What colour and density lose is the least that any share of the others can leave."""
+def test_redistribution_is_least_squares() -> None:
+    """No other shares leave a smaller error of colour and density."""
     scene = tiny_scene()
     seen, gone = SurfaceFeatures.sample(scene, rays_of(scene)), np.array([3, 9])
     left = np.setdiff1d(np.arange(16), gone)
@@ -213,8 +217,8 @@ def test_passing_on_is_least_squares() -> None:
     assert not after.density_weight[gone].any() and not after.b2[:, gone].any() and not after.w2[:, gone].any()
 
 
-def test_the_order_is_that_of_what_a_linear_map_loses() -> None:
-    """Independent features of equal size: what is listened to least goes first; an equal twin goes before all."""
+def test_elimination_order_follows_the_loss_of_a_linear_map() -> None:
+    """Of independent features of equal size the one of least weight goes first; a duplicate goes before all."""
     rng = np.random.default_rng(3)
     features = rng.normal(size=(4096, 5))
     features[:, 4] = features[:, 3]
@@ -225,8 +229,8 @@ def test_the_order_is_that_of_what_a_linear_map_loses() -> None:
     assert order[0] in (3, 4) and order[1:].tolist() == [1, 0, 2]
 
 
-def test_channels_of_unequal_number_look_the_same_in_every_renderer() -> None:
-    """Encoder, its reference, and what is read back from a file."""
+def test_all_renderers_agree_on_unequal_numbers_of_channels() -> None:
+    """The encoder's renderer, the reference, and the scene as read from a file."""
     scene = keep_channels(tiny_scene(), (np.array([0, 5, 6]), np.arange(8)))
     camera = scene.cameras[0]
     origins, directions = camera.rays()
@@ -236,12 +240,12 @@ def test_channels_of_unequal_number_look_the_same_in_every_renderer() -> None:
     assert np.quantile(np.abs(ours - theirs), 0.99) < 2 / 255
     even = pad_channels(scene)
     np.testing.assert_allclose(reference.render(even, camera, 0.5).rgb.reshape(-1, 3), theirs, atol=1e-5)
-    quantised = quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales])
+    quantised = quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales])
     again = scene_io.read(scene_io.encode(quantised)).dequantise()
     assert [scale["xy"].shape[2] for scale in again.scales] == [3, 8] and again.parameter_count == scene.parameter_count
 
 
-def test_the_direction_stays_where_appearances_act_through_it() -> None:
+def test_the_direction_mlp_stays_where_appearances_use_it() -> None:
     scene = with_appearances(tiny_scene())
     rays = rays_of(scene)
     pruned = prune(scene, rays, lambda candidate: 30.0, 1.0)  # whatever goes costs nothing
@@ -252,11 +256,11 @@ def test_the_direction_stays_where_appearances_act_through_it() -> None:
 
 
 @pytest.mark.parametrize("quality", [10, 20, 99])
-def test_a_file_that_something_is_left_out_of_is_coded_between_its_own_steps_and_much_coarser_ones(
+def test_a_pruned_file_is_coded_with_its_own_steps_or_coarser_ones(
     quality: float,
 ) -> None:
     scene = redundant(tiny_scene(scales=3, resolution=(48, 40, 32)))
-    own = quantise_scene(scene, [{name: 0.004 for name in planes} for planes in scene.scales])
+    own = quantise_scene(scene, [dict.fromkeys(planes, 0.004) for planes in scene.scales])
     coded = code(model_from_file(own), Trade(quality=quality), 0.25, 0)
     assert coded.pruned is not None and coded.pruned.removed_any
     assert coded.size_bytes < len(scene_io.encode(own))

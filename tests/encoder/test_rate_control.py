@@ -58,7 +58,7 @@ def steady(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def measure(scene: Scene) -> Fidelity:
     """Stand in for rendering: an MSE of 1e-3, to which the errors of the planes add."""
-    pairs = zip(scene.scales, SCENE.scales)
+    pairs = zip(scene.scales, SCENE.scales, strict=True)
     error = float(np.mean([np.square(ours[n] - theirs[n]).mean() for ours, theirs in pairs for n in ours]))
     return Fidelity(-10 * math.log10(1e-3 + error), 255**2 * error)
 

@@ -18,7 +18,7 @@ class Attempt:
 
 
 def rough(noise: list[float]) -> tuple[Attempt | None, list[Attempt]]:
-    """Search among fine-tuned attempts whose errors grow with the power 1.2 of steps, times `noise`; also return them all."""
+    """Search among attempts whose errors grow with the power 1.2 of steps, times `noise`; also return them."""
     tried = [Attempt(e, 0.85 * 2 ** (1.2 * (e + 7))) for e in (-7.0, -6.0)]
     seen: list[Attempt] = []
 
@@ -135,5 +135,5 @@ def test_noisy_values_end_a_search(seed: int) -> None:
 
 def test_minimise_finds_the_least_cost() -> None:
     for least in (-12.9, -7.3, 1.8):
-        found = minimise(-13.0, 2.0, lambda e: Attempt(e, abs(e - least)), lambda one: one.error)
+        found = minimise(-13.0, 2.0, lambda e, least=least: Attempt(e, abs(e - least)), lambda one: one.error)
         assert found.error <= COST_OCTAVES

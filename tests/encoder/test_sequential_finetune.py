@@ -1,4 +1,4 @@
-"""Tuning: what is coded later makes up for what was coded before."""
+"""Sequential fine-tuning (`kpc.encoder.rdo.sequential_finetune`): planes compensate errors of those coded before."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -43,7 +43,7 @@ def error(scene: Scene, quantised: QuantisedScene) -> float:
     return ValidationRays.from_cameras(scene, 4096, seed=77).measure(scene)(quantised.dequantise()).mse
 
 
-def test_every_plane_has_its_turn_the_finest_first() -> None:
+def test_every_plane_is_coded_once_the_finest_first() -> None:
     scene = tiny_scene(scales=3)
     groups = coding_order(scene)
     assert [{s for s, _ in group} for group in groups] == [{s} for s in (2, 2, 2, 1, 1, 1, 0, 0, 0, 2, 1, 0)]
@@ -53,7 +53,7 @@ def test_every_plane_has_its_turn_the_finest_first() -> None:
     assert coding_order(tiny_scene(dynamic=False, scales=1)) == [[(0, "xy")], [(0, "xz")], [(0, "yz")]]
 
 
-def test_what_is_coded_first_is_coded_most_coarsely() -> None:
+def test_planes_coded_first_have_the_coarsest_steps() -> None:
     scene = tiny_scene(scales=2)
     factors = step_factors(scene)
     in_order = [factors[plane] for group in coding_order(scene) for plane in group]
@@ -62,14 +62,14 @@ def test_what_is_coded_first_is_coded_most_coarsely() -> None:
 
 
 @pytest.mark.parametrize("make", [tiny_scene, partial(tiny_scene, dynamic=False), lambda: with_motion(tiny_scene())])
-def test_pictures_come_nearer_to_those_of_the_whole(make: Callable[[], Scene]) -> None:
+def test_fine_tuning_reduces_the_error_of_pictures(make: Callable[[], Scene]) -> None:
     scene = make()
     plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 60)
     assert error(scene, better) < 0.96 * error(scene, plain)
     assert scene_io.read(scene_io.encode(better)).parameter_count == plain.parameter_count
 
 
-def test_what_is_coded_first_is_coded_as_it_was_and_nothing_but_planes_and_decoder_changes() -> None:
+def test_the_first_group_is_not_fine_tuned_and_only_planes_and_decoder_change() -> None:
     scene = with_motion(tiny_scene())
     plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 20)
     assert np.array_equal(better.scales[-1]["xy"].symbols, plain.scales[-1]["xy"].symbols)
@@ -83,7 +83,7 @@ def test_what_is_coded_first_is_coded_as_it_was_and_nothing_but_planes_and_decod
     assert not np.array_equal(better.decoder.w2, plain.decoder.w2)  # type: ignore[union-attr]
 
 
-def test_after_short_training_steps_are_few() -> None:
+def test_steps_are_few_after_short_training() -> None:
     scene = tiny_scene(scales=2)
     assert [steps_per_group(trained, scene, 100) for trained in (0, 40, 1500, 3750, 30_000)] == [0, 1, 40, 100, 100]
     assert steps_per_group(30_000, scene, 0) == 0
@@ -91,7 +91,7 @@ def test_after_short_training_steps_are_few() -> None:
 
 
 @pytest.mark.parametrize("steps", [0, 1])
-def test_few_steps_or_none_are_no_mishap(steps: int) -> None:
+def test_few_steps_or_none_work(steps: int) -> None:
     scene = tiny_scene()
     planes = code_sequentially(
         scene, scene, lambda candidate, group: {(s, name): candidate.scales[s][name] for s, name in group}, steps
@@ -100,7 +100,7 @@ def test_few_steps_or_none_are_no_mishap(steps: int) -> None:
     assert (planes.scales[0]["xt"].tobytes() == scene.scales[0]["xt"].tobytes()) == (steps == 0)
 
 
-def test_where_nothing_is_nothing_is_learnt() -> None:
+def test_an_empty_scene_is_not_fine_tuned() -> None:
     scene = tiny_scene()
     scene = replace(scene, occupancy=np.zeros_like(scene.occupancy))
     plain, same = choose(scene), quantise_sequentially(scene, scene, choose, 5)
@@ -108,9 +108,7 @@ def test_where_nothing_is_nothing_is_learnt() -> None:
         assert all(np.array_equal(plane.symbols, same.scales[s][name].symbols) for name, plane in scale.items())
 
 
-def test_progress_is_shown_where_it_is_wanted(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_progress_is_shown_on_request(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("kpc.format.common.progress.LINE_EVERY_S", 0.0)
     scene = tiny_scene(scales=1, dynamic=False)
     quantise_sequentially(scene, scene, choose, 4)
@@ -120,24 +118,24 @@ def test_progress_is_shown_where_it_is_wanted(
     assert out == "" and err.splitlines()[-1].startswith("tune: 10/10 step, 0 s left")
 
 
-def test_it_comes_out_the_same_each_time() -> None:
+def test_results_are_reproducible() -> None:
     scene = tiny_scene()
     assert scene_io.encode(quantise_sequentially(scene, scene, choose, 5)) == scene_io.encode(
         quantise_sequentially(scene, scene, choose, 5)
     )
 
 
-def test_a_look_that_is_the_same_from_everywhere_stays_so() -> None:
+def test_view_independent_colour_stays_so() -> None:
     scene = tiny_scene()
     scene = replace(scene, decoder=replace(scene.decoder, w2=np.zeros_like(scene.decoder.w2)))  # type: ignore[arg-type]
     assert not quantise_sequentially(scene, scene, choose, 5).decoder.w2.any()
 
 
-def test_scales_of_unequal_width_and_appearances_and_the_hybrid_decoder() -> None:
+def test_unequal_scales_appearances_and_the_hybrid_decoder() -> None:
     whole = tiny_scene()
-    narrow = replace(whole, scales=({name: plane[..., :5] for name, plane in whole.scales[0].items()}, whole.scales[1]),
-                     decoder=unpad_decoder(replace(whole, scales=({n: p[..., :5] for n, p in whole.scales[0].items()}, whole.scales[1])),
-                                        whole.decoder))  # fmt: skip
+    scales = ({name: plane[..., :5] for name, plane in whole.scales[0].items()}, whole.scales[1])
+    narrow = replace(whole, scales=scales)
+    narrow = replace(narrow, decoder=unpad_decoder(narrow, whole.decoder))
     assert unpad_decoder(narrow, pad_channels(narrow).decoder).w2.tobytes() == narrow.decoder.w2.tobytes()
     for scene in (narrow, with_appearances(whole), with_hybrid_decoder(whole)):
         plain, better = choose(scene), quantise_sequentially(scene, scene, choose, 40)

@@ -1,4 +1,4 @@
-"""Finished checkpoints and files are coded anew: no pictures, no training, and nothing hostile gets through."""
+"""Coding finished checkpoints and files anew, without pictures and training; hostile ones are refused."""
 
 import json
 import zipfile
@@ -27,8 +27,18 @@ from kpc.player.cpu import reference
 from scenes import VARIANTS, tiny_scene, with_appearances
 
 pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
-TINY = TrainConfig(tune_steps=0, resolutions=(8, 16), samples_across=32, cells_across=12, steps=24, rays=256, samples=8192, warmup=5,
-                   occupancy_start=8, occupancy_every=4)  # fmt: skip
+TINY = TrainConfig(
+    tune_steps=0,
+    resolutions=(8, 16),
+    samples_across=32,
+    cells_across=12,
+    steps=24,
+    rays=256,
+    samples=8192,
+    warmup=5,
+    occupancy_start=8,
+    occupancy_every=4,
+)
 
 VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "valid"
 Kpenc = Callable[..., dict[str, Any]]
@@ -41,7 +51,7 @@ def short_tuning(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def kpenc_says(capsys: pytest.CaptureFixture[str]) -> Kpenc:
-    """What kpenc --json says of a source and an output."""
+    """Run kpenc --json on a source; return its result."""
 
     def call(source: Path, output: Path, *options: str) -> dict[str, Any]:
         capsys.readouterr()
@@ -54,7 +64,7 @@ def kpenc_says(capsys: pytest.CaptureFixture[str]) -> Kpenc:
 
 @pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
-    """The one line that kpenc says of a source that it cannot use, after which nothing is left."""
+    """Run kpenc on a source that it cannot use; return its one line of error, after which no file is left."""
 
     def call(source: Path, *options: str, code: int = 1) -> str:
         capsys.readouterr()
@@ -68,7 +78,7 @@ def refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[...,
 
 
 def saved(path: Path, scene: Scene) -> Path:
-    """A finished checkpoint of a scene."""
+    """Write a finished checkpoint of a scene."""
     rays = ValidationRays.from_cameras(scene)
     truth = SceneRenderer(scene).rgb(*rays.rays)
     numbers = np.arange(512) % len(scene.appearances) if scene.appearances else None
@@ -111,13 +121,13 @@ def test_every_kind_of_scene_survives_a_checkpoint(tmp_path: Path, kind: str) ->
     others = {"still": lambda scene: tiny_scene(2, dynamic=False), "appearances": with_appearances,
               "no cameras": lambda scene: replace(scene, cameras=())}  # fmt: skip
     scene = (VARIANTS | others)[kind](tiny_scene(2))
-    steps = [{name: 0.01 for name in scale} for scale in scene.scales]
+    steps = [dict.fromkeys(scale, 0.01) for scale in scene.scales]
     back = codec_model.load(saved(tmp_path / "m.kpck", scene))
     assert scene_io.encode(quantise_scene(back.scene, steps)) == scene_io.encode(quantise_scene(scene, steps))
     assert back.coded is None and back.validation.measure(scene)(back.scene).mse == 0
 
 
-def test_a_checkpoint_of_a_run_is_told_from_a_finished_one(
+def test_a_checkpoint_of_a_run_is_not_a_finished_one(
     tmp_path: Path, kpenc_says: Kpenc, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(PRESETS, "draft", TINY)
@@ -127,7 +137,7 @@ def test_a_checkpoint_of_a_run_is_told_from_a_finished_one(
     assert "no finished checkpoint" in said and "--keep-checkpoint" in said
 
 
-def test_damaged_checkpoints_are_refused_in_a_line(tmp_path: Path, refused: Callable[..., str]) -> None:
+def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path, refused: Callable[..., str]) -> None:
     good, bad = saved(tmp_path / "good.kpck", tiny_scene(2)), tmp_path / "bad.kpck"
     whole = good.read_bytes()
     for content in (
@@ -176,7 +186,7 @@ def changes() -> dict[str, Callable[[dict[str, Any]], object]]:
 
 
 @pytest.mark.parametrize("what", changes())
-def test_hostile_checkpoints_are_refused_in_a_line(tmp_path: Path, refused: Callable[..., str], what: str) -> None:
+def test_hostile_checkpoints_are_refused_in_one_line(tmp_path: Path, refused: Callable[..., str], what: str) -> None:
     path = saved(tmp_path / "m.kpck", tiny_scene(2))
     state = torch.load(path, weights_only=True)
     changes()[what](state)
@@ -190,7 +200,7 @@ def test_a_checkpoint_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest
         raise RuntimeError("unexpected pos 704 vs 598\nmore")
 
     monkeypatch.setattr(torch, "save", full)
-    with pytest.raises(TrainingError, match="m.kpck: the checkpoint cannot be written .*--keep-checkpoint"):
+    with pytest.raises(TrainingError, match=r"m\.kpck: the checkpoint cannot be written .*--keep-checkpoint"):
         saved(tmp_path / "m.kpck", tiny_scene(2))
     assert not any(tmp_path.iterdir())
 
@@ -202,7 +212,7 @@ def test_a_checkpoint_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest
 def scene_file(tmp_path: Path) -> Path:
     scene = tiny_scene(3)
     scene_io.write(
-        quantise_scene(scene, [{name: 0.002 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc"
+        quantise_scene(scene, [dict.fromkeys(scale, 0.002) for scale in scene.scales]), tmp_path / "scene.kpc"
     )
     return tmp_path / "scene.kpc"
 
@@ -219,25 +229,27 @@ def test_a_file_becomes_smaller(scene_file: Path, tmp_path: Path, kpenc_says: Kp
     assert result["validation_loss_db"] == pytest.approx(lost) and "30 dB" in result["judged_by"]
 
 
-def test_a_file_keeps_its_symbols_where_they_are_wanted(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
+def test_a_file_keeps_its_symbols_at_a_loose_target(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
     kpenc_says(scene_file, tmp_path / "same.kpc", "--target-size", "1MB")
     assert (tmp_path / "same.kpc").read_bytes() == scene_file.read_bytes()
 
 
-def test_a_file_does_not_know_what_was_filmed(scene_file: Path, refused: Callable[..., str]) -> None:
+def test_a_file_cannot_be_coded_to_a_psnr(scene_file: Path, refused: Callable[..., str]) -> None:
     assert "checkpoint" in refused(scene_file, "--psnr", "30dB", code=2)
 
 
-def test_the_ratio_of_steps_stays(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
+def test_relative_steps_are_kept(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:
     kpenc_says(scene_file, tmp_path / "smaller.kpc", "--max-loss", "0.02dB")
-    steps = [[requested_step(plane) / requested_step(scene.scales[0]["xy"])[0] for scale in scene.scales for plane in scale.values()]
-             for scene in (scene_io.read(scene_file), scene_io.read(tmp_path / "smaller.kpc"))]  # fmt: skip
+    steps = [
+        [requested_step(p) / requested_step(scene.scales[0]["xy"])[0] for scale in scene.scales for p in scale.values()]
+        for scene in (scene_io.read(scene_file), scene_io.read(tmp_path / "smaller.kpc"))
+    ]
     np.testing.assert_allclose(
         np.concatenate(steps[0]), np.concatenate(steps[1]), rtol=2**-6
     )  # each to 8 significant bits
 
 
-def test_damaged_files_are_refused_in_a_line(scene_file: Path, refused: Callable[..., str]) -> None:
+def test_damaged_files_are_refused_in_one_line(scene_file: Path, refused: Callable[..., str]) -> None:
     whole = bytearray(scene_file.read_bytes())
     whole[-3] ^= 1
     scene_file.write_bytes(whole)
@@ -247,9 +259,7 @@ def test_damaged_files_are_refused_in_a_line(scene_file: Path, refused: Callable
 # --- the command line
 
 
-def test_options_of_training_mean_nothing_here(
-    scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_of_training_are_refused(scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words in (["--steps", "3"], ["--preset", "fast"], ["--resume"], ["--dry-run"], ["--keep-checkpoint", "m.kpck"]):
         with pytest.raises(SystemExit, match="2"):
             kpenc.main([str(scene_file), "-o", str(tmp_path / "x.kpc"), *words])
@@ -262,7 +272,7 @@ def test_a_source_is_never_overwritten(scene_file: Path, capsys: pytest.CaptureF
     assert "is the source, too" in capsys.readouterr().err and scene_file.read_bytes() == before
 
 
-def test_what_is_printed(scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_result_is_printed(scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert kpenc.main([str(scene_file), "-o", str(tmp_path / "x.kpc"), "--lam", "3"]) == 0
     out, _ = capsys.readouterr()
     assert out.count("\n") == 1 and all(
@@ -270,9 +280,18 @@ def test_what_is_printed(scene_file: Path, tmp_path: Path, capsys: pytest.Captur
     )
 
 
-@pytest.mark.parametrize("words", [["--quality", "0"], ["--quality", "101"], ["--quality", "nan"], ["--lam", "-1"], ["--lam", "x"],
-                                   ["--quality", "5", "--lam", "1"]])  # fmt: skip
-def test_a_trade_that_makes_no_sense(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--quality", "0"],
+        ["--quality", "101"],
+        ["--quality", "nan"],
+        ["--lam", "-1"],
+        ["--lam", "x"],
+        ["--quality", "5", "--lam", "1"],
+    ],
+)
+def test_invalid_targets_are_refused(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         kpenc.main([str(tmp_path), "-o", str(tmp_path / "x.kpc"), *words])
     assert words[0] in capsys.readouterr().err
@@ -283,7 +302,7 @@ def test_a_trade_that_makes_no_sense(words: list[str], tmp_path: Path, capsys: p
 
 @pytest.mark.parametrize("axis", ["x", "y", "z", "t"])
 def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
-    """They hold the same all along the axis, and so do two."""
+    """A plane of one texel along an axis is constant along it, and so is one of two equal texels."""
     scene = tiny_scene()
     thin = {
         name: plane[: 1 if axis == name[1] else None, : 1 if axis == name[0] else None]
@@ -318,7 +337,7 @@ def test_files_of_all_kinds_are_coded_again(name: str) -> None:
 # --- validation rays
 
 
-def test_cameras_around_a_scene_without_any_see_it() -> None:
+def test_orbit_cameras_see_the_whole_scene() -> None:
     scene = replace(tiny_scene(4), cameras=())
     corners = np.stack(np.meshgrid(*scene.bounds.T), -1).reshape(-1, 3)
     for camera in orbit_cameras(scene):
@@ -330,7 +349,7 @@ def test_cameras_around_a_scene_without_any_see_it() -> None:
         )
 
 
-def test_a_probe_of_surfaces_meets_them_from_all_cameras() -> None:
+def test_rays_through_occupied_cells_come_from_all_cameras() -> None:
     scene = tiny_scene(4)
     rays, others = (ValidationRays.through_occupied(scene, 2000, seed) for seed in (1, 2))
     assert len(rays.times) == 2000 and SceneRenderer(scene).hits_occupied(*rays.rays).all()
@@ -340,7 +359,7 @@ def test_a_probe_of_surfaces_meets_them_from_all_cameras() -> None:
     assert not np.array_equal(rays.times, others.times)
 
 
-def test_a_probe_of_surfaces_has_what_there_is() -> None:
+def test_fewer_rays_where_few_pass_through_occupied_cells() -> None:
     scene = tiny_scene(4)
     nothing = replace(scene, occupancy=np.zeros_like(scene.occupancy))
     assert ValidationRays.through_occupied(nothing, 100, seed=1).origins.shape == (0, 3)
@@ -350,7 +369,7 @@ def test_a_probe_of_surfaces_has_what_there_is() -> None:
     assert 0 < len(few.times) < 100
 
 
-def test_a_probe_of_cameras_goes_through_their_pixels() -> None:
+def test_rays_of_cameras_go_through_their_pixels() -> None:
     scene = tiny_scene(4)
     rays = ValidationRays.from_cameras(scene)
     assert rays.truth is None and len(rays.times) == 512 and 0 <= rays.times.min() < rays.times.max() < 1

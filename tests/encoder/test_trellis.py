@@ -196,8 +196,10 @@ def test_errors_are_larger_where_weights_are_small() -> None:
 
 def test_weights_are_relative_to_the_channel() -> None:
     scene = noisy()
-    faint = [{name: np.full(plane.shape, 2.0 ** -np.arange(plane.shape[2]), np.float32) for name, plane in scale.items()}
-             for scale in scene.scales]  # fmt: skip
+    faint = [
+        {name: np.full(p.shape, 2.0 ** -np.arange(p.shape[2]), np.float32) for name, p in scale.items()}
+        for scale in scene.scales
+    ]
     assert scene_io.encode(trellis_quantised(scene, 0.05, faint)) == scene_io.encode(trellis_quantised(scene, 0.05))
 
 
