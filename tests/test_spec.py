@@ -21,7 +21,8 @@ from scenes import VARIANTS, tiny_scene
 SPEC = Path(__file__).parent.parent / "spec"
 sys.path.insert(0, str(SPEC))  # the readable decoder is no part of the package
 
-import decoder  # noqa: E402
+import decoder.__main__  # noqa: E402
+import decoder.trace  # noqa: E402
 from decoder.common import crc32c  # noqa: E402
 from decoder.container import ENTRY, HEADER  # noqa: E402
 from decoder.entropy import EntropyDecoder  # noqa: E402
@@ -230,6 +231,19 @@ def test_valid_vectors_cover_every_context_and_size_of_residuals(monkeypatch):
         of_each_sign = {(name, size, False) for size in range(-4, 1)} | {(name, size, True) for size in range(1, 5)}
         escapes = {(name, 4 + bits, positive) for bits in range(1, escape + 2) for positive in (False, True)}
         assert sizes >= of_each_sign | escapes
+
+
+def test_commands_of_the_readable_decoder_print_hashes_and_decisions(capsys):
+    path = str(VECTORS / "valid" / "predictive.kpc")
+    decoder.__main__.main(path)
+    expected, data = valid_vector("predictive")
+    printed = capsys.readouterr().out
+    assert all(plane["symbols_sha256"] in printed for plane in expected["planes"])
+    chunks, _ = decoder.container.read_chunks(data, False)
+    number = next(number for number, chunk in enumerate(chunks) if chunk.codec == decoder.container.PREDICTIVE)
+    decoder.trace.main([path, str(number)])
+    rows = capsys.readouterr().out.splitlines()
+    assert rows[0].startswith("| number | model |") and rows[-1].endswith("| 10000 |")
 
 
 def file_of(chunks: list[decoder.container.Chunk], value_count: int) -> bytes:
