@@ -165,7 +165,7 @@ def holdout_flags(path: Path, names: Sequence[str], holdout: str | None, default
     if not any(chosen):
         shown = ", ".join(Path(name).stem for name in names[:4])
         raise DatasetError(
-            f"{path}: nothing is named {holdout!r} to hold out; there are {shown}{' ...' if len(names) > 4 else ''}"
+            f"{path}: no file is named {holdout!r}; give --holdout one of {shown}{' ...' if len(names) > 4 else ''}"
         )
     return chosen
 

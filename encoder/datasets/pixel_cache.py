@@ -50,9 +50,8 @@ class Tile:
 class PixelCache:
     """A flat file of uint8 pixels, picture after picture, row by row.
 
-    Random reads from a memory mapping bring in whole pages, up to 2 MB for three bytes where the kernel uses large
-    folios, and all of them count as resident. Files larger than MAPPED_BYTES are therefore read with pread, which keeps
-    nothing in the process: about 1 us per pixel instead of 0.1.
+    Small files are mapped into memory; large ones are read with pread, so that they do not become resident
+    (docs/design/datasets.md).
 
     Args:
         path: of the file.

@@ -49,7 +49,7 @@ class CompilationMonitor(event.Listener):
         return self._depth > 0 and self._spent + time.monotonic() - self._begun >= NOTICE_AFTER_S
 
 
-# Monitors this process, from the import of `kpc.format.coding.rans` on.
+# Monitors this process, from the import of `kpc.format.common.jit` on.
 MONITOR = CompilationMonitor()
 
 
