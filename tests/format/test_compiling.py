@@ -81,7 +81,7 @@ def test_a_player_waiting_for_compilation_shows_the_notice(monkeypatch: pytest.M
 
     stream = Stream.__new__(Stream)
     stream._failure = stream._trouble = None
-    monkeypatch.setattr(Stream, "rate", 2000.0)
+    monkeypatch.setattr(Stream, "bytes_per_s", 2000.0)
     for stalled, compiles, wanted in (
         (True, True, NOTICE),
         (True, False, "loading, 2 KB/s"),
