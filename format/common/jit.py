@@ -1,5 +1,4 @@
-"""Compilation of kernels with numba: `@compiled()` for functions that Python calls, `@inlined` for those that kernels
-call.
+"""Compilation of kernels with numba: `@compiled()` for functions that Python calls, `@inlined` for their helpers.
 
 With NUMBA_DISABLE_JIT=1 the same functions run as plain Python.
 """
@@ -14,23 +13,24 @@ compiling.register()
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator: numba's `njit`, which releases the GIL and caches machine code on disk where there is a
-    folder for it.
+    """Return numba's `njit` as a decorator, with the GIL released and machine code cached on disk.
 
-    Numba caches in the package's folder or else in the user's; where it can write to neither, each process compiles
-    anew.
+    Numba caches in the package's folder, or else in the user's cache folder. If it can write to neither, each process
+    compiles anew.
+
+    Args:
+        options: further options of `njit`.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return njit(cache=True, nogil=True, **options)(function)
-        except RuntimeError:  # numba found no folder that it can write to
+        except RuntimeError:  # numba found no writable cache folder
             return njit(nogil=True, **options)(function)
 
     return decorate
 
 
-# Compiles a function into its callers without reference counts. Only for functions that create and return no array:
-# counting at every call would take a decoder three quarters of its time, and numba has no public option that leaves
-# it out.
+# Compiles a function into its callers without reference counting, which takes a decoder three quarters of its time.
+# Only for functions that neither create nor return arrays. Numba has no public option for it.
 inlined = compiled(forceinline=True, _nrt=False)
