@@ -1,7 +1,8 @@
-"""Appearances: which pictures share a code, what it is called, and which code a picture has that was not trained on.
+"""Appearance embeddings: which pictures share a code, its name, and the code of a picture that was not trained on.
 
-Pictures of one scene may disagree about its colours. Each appearance is a code that shifts the hidden layer of the direction MLP
-(`kpc.format.scene.scene.Decoder`): it reaches colours alone, never geometry (K-Planes, arXiv:2301.10241, section 3.3).
+Pictures of one scene may disagree about its colours. An appearance is a code that is added to the hidden layer of the
+direction MLP (`kpc.format.scene.scene.Decoder`): it changes colours, never geometry (K-Planes, arXiv:2301.10241,
+section 3.3).
 """
 
 from collections.abc import Sequence
@@ -19,20 +20,21 @@ from kpc.format.container.scene_layout import APPEARANCE_LIMIT, is_valid_name
 from kpc.format.scene.scene import Scene
 from torch import Tensor
 
+# Rays of a picture by which its code is fitted.
 FIT_RAYS = 1024
-"""Of a picture, that tell its code."""
+
+# Steps and learning rate of Adam (measured: docs/design/training.md).
 FIT_STEPS = 100
 FIT_RATE = 0.05
-"""Of Adam. The ball of `TrainConfig.appearance_learning_rate` has 25.4 dB with 0.02, 25.5 with 0.05 and 0.1, and 25.6 after 300
-steps."""
+
+# Samples of a smaller weight are left out of the fit.
 FIT_MIN_WEIGHT = 1e-3
-"""Samples of a smaller weight have no say."""
 
 
 def choose_appearance(dataset: Dataset) -> tuple[str, str]:
-    """Whether every training picture has an appearance of its own ("image") or none has ("none"), and why, in words for the log.
+    """Return whether each training picture gets an appearance ("image") or none does ("none"), and the reason.
 
-    They have where they are a photo collection: nothing moves, and most of them have a lens or size that no other has.
+    They get one in a photo collection: nothing moves, and most pictures have a lens or size that no other has.
     """
     pictures = dataset.pictures
     if dataset.is_dynamic:
@@ -49,11 +51,16 @@ def choose_appearance(dataset: Dataset) -> tuple[str, str]:
 
 
 def assign_appearances(dataset: Dataset, kind: str) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The appearance of each picture, (P,) int64, -1 where it has none because it is held out or `kind` is "none"; and the names,
-    all different. With "camera", pictures of one camera share theirs; with "image", none do.
+    """Assign appearances to the training pictures.
+
+    Args:
+        kind: "image": one for each picture; "camera": one for each camera; "none".
+
+    Returns:
+        The appearance of each picture, (P,) int64, -1 for none (held-out pictures, too); and their distinct names.
 
     Raises:
-        UsageError: they are more than a file holds.
+        UsageError: there are more than a file holds.
     """
     pictures = dataset.pictures
     numbers, train = np.full(len(pictures), -1, np.int64), np.flatnonzero(~pictures.is_test)
@@ -76,17 +83,17 @@ def assign_appearances(dataset: Dataset, kind: str) -> tuple[np.ndarray, tuple[s
 
 
 def _counted(files: list[str]) -> list[str]:
-    """A video's frames told apart: "cam00.mp4#0", "cam00.mp4#1", ..."""
-    seen: dict[str, int] = {}
+    """Number the frames of each video: "cam00.mp4#0", "cam00.mp4#1", ..."""
+    last: dict[str, int] = {}
     out = []
     for file in files:
-        seen[file] = seen.get(file, -1) + 1
-        out.append(f"{file}#{seen[file]}")
+        last[file] = last.get(file, -1) + 1
+        out.append(f"{file}#{last[file]}")
     return out
 
 
 def _storable(names: Sequence[str]) -> tuple[str, ...]:
-    """The names, but a number where a file cannot hold one (`kpc.format.container.scene_io.is_valid_name`) or has it already."""
+    """Return the names, with numbers for those that a file cannot hold or that occur before."""
     out: dict[str, None] = {}
     for number, name in enumerate(names):
         while not is_valid_name(name) or name in out:
@@ -96,19 +103,24 @@ def _storable(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def fit_code(scene: Scene, field: Field, rays: Rays, targets: Tensor) -> np.ndarray:
-    """The code with which a scene shows rays most nearly as (N, 3) `targets`: (H,) float32, from 0 by FIT_STEPS steps of Adam on
-    the mean squared error, all else frozen. The same rays give the same code. `field`: `Field.from_scene(scene)`.
+    """Fit the code with which a scene shows rays most nearly in given colours: 0, then FIT_STEPS steps of Adam.
+
+    Args:
+        field: `Field.from_scene(scene)`, which is not changed. rays: N rays. targets: (N, 3) colours in [0, 1].
+
+    Returns:
+        (H,) float32; the same rays give the same code.
     """
     code = torch.zeros(len(scene.decoder.b1), requires_grad=True)
     if not len(targets):
         return code.detach().numpy()
     with torch.no_grad():
-        _, met = march_scene(field, rays, scene)
-        seen = met.weights > FIT_MIN_WEIGHT
-        met = replace(met, ray=met.ray[seen], latent=met.latent[seen], weights=met.weights[seen])
+        _, weighed = march_scene(field, rays, scene)
+        kept = weighed.weights > FIT_MIN_WEIGHT
+        weighed = replace(weighed, **{name: getattr(weighed, name)[kept] for name in ("ray", "latent", "weights")})
     optimiser = torch.optim.Adam([code], lr=FIT_RATE)
     for _ in range(FIT_STEPS):
         optimiser.zero_grad()
-        (shade(field, rays, met, code) - targets).square().mean().backward()
+        (shade(field, rays, weighed, code) - targets).square().mean().backward()
         optimiser.step()
     return code.detach().numpy()

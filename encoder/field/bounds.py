@@ -1,4 +1,4 @@
-"""Where the scene is: its axis-aligned box, and which parts of it the cameras see."""
+"""The extent of a scene: its axis-aligned box, its space mapping, and the cells that the cameras see."""
 
 import numpy as np
 from kpc.encoder.datasets import Pictures
@@ -6,23 +6,23 @@ from kpc.format.common.errors import DatasetError
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping, uncontract
 from numba import njit, prange
 
+# Radius around a camera in which nothing is, as a share of its distance to the point that all cameras look at.
 CLEARANCE = 0.3
-"""Share of a camera's distance to the scene's middle, around it, where nothing is."""
 
+# Half the edge of a contracted scene's box, as a share of the cameras' distance from the point that they look at
+# (measured: docs/design/training.md).
 CONTRACTION_BOX = 0.5
-"""Half the edge of a contracted scene's box over the cameras' distance from what they look at. Held-out PSNR of fox at a
-quarter of its size after 1,500 steps of `fast`: 26.2 dB with 1, 27.3 with 0.5, 27.1 with 0.35."""
 
 
 def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
-    """The (2, 3) float32 box the scene lies in.
+    """Return the (2, 3) float32 box that the scene lies in.
 
-    * Near and far known: the bounds of all frustums between them.
-    * Cameras that look at a common point: a cube around it, as large as the widest view contains (pictures with alpha,
-      an object on its own), or out to twice the cameras' distance (a subject in its surroundings).
+    * Where near and far are known: the bounds of all frustums between them.
+    * Where cameras look at a common point: a cube around it, as large as the widest view contains (pictures with alpha:
+      a single object), or out to twice the cameras' distance (a subject in surroundings).
 
     Raises:
-        DatasetError: neither holds.
+        DatasetError: neither is the case.
     """
     cameras = _distinct_cameras(pictures)
     if _near_and_far_known(pictures, cameras):
@@ -46,12 +46,9 @@ def find_box(pictures: Pictures, has_alpha: bool) -> np.ndarray:
 
 
 def is_unbounded(pictures: Pictures, has_alpha: bool) -> tuple[bool, str]:
-    """Whether the pictures show more than a box can hold, and why, in words for the log.
+    """Return whether the pictures show more than a box can hold, and the reason for the log.
 
-    They do, but where
-
-    * they have alpha: what was filmed is an object on its own;
-    * every camera's near and far are known: they bound what it sees.
+    They do unless they have alpha, as of a single object, or near and far of every camera are known.
     """
     if has_alpha:
         return False, "the pictures have alpha: an object on its own"
@@ -61,13 +58,13 @@ def is_unbounded(pictures: Pictures, has_alpha: bool) -> tuple[bool, str]:
 
 
 def find_contraction_box(pictures: Pictures) -> np.ndarray:
-    """The (2, 3) float32 box of a contracted scene, a cube.
+    """Return the (2, 3) float32 box of a contracted scene, a cube.
 
-    * Cameras that look at a common point: around it, out to INNER of their median distance.
-    * Others: around their mean position, out to twice the farthest of them.
+    * Where cameras look at a common point: around it, out to CONTRACTION_BOX times their median distance.
+    * Elsewhere: around their mean position, out to twice the distance of the farthest.
 
     Raises:
-        DatasetError: all cameras are in one place.
+        DatasetError: all cameras have the same position.
     """
     cameras = _distinct_cameras(pictures)
     eyes, focus = pictures.camera_to_world[cameras, :3, 3], _focus(pictures, cameras)
@@ -77,27 +74,27 @@ def find_contraction_box(pictures: Pictures) -> np.ndarray:
         centre = eyes.mean(0)
         half = 2 * np.max(np.linalg.norm(eyes - centre, axis=1))
     if not half > 0:
-        raise DatasetError("all cameras are in one place; give --box x0,y0,z0,x1,y1,z1")
+        raise DatasetError("all cameras have the same position; give --box x0,y0,z0,x1,y1,z1")
     return np.stack([centre - half, centre + half]).astype(np.float32)
 
 
 def fit_contraction(pictures: Pictures, aabb: np.ndarray) -> Contraction:
-    """The contraction around a box whose even steps reach its farthest corner from nine cameras of ten."""
+    """Return the contraction whose uniform steps reach the box's farthest corner from 90 % of the cameras."""
     eyes = pictures.camera_to_world[_distinct_cameras(pictures), :3, 3]
     corners = np.abs(eyes - aabb.mean(0)) + (aabb[1] - aabb[0]) / 2
     return Contraction(float(np.quantile(np.linalg.norm(corners, axis=1), 0.9)))
 
 
 def fit_device_coordinates(pictures: Pictures) -> tuple[DeviceCoordinates, np.ndarray]:
-    """Device coordinates for a rig that faces one way, and the (2, 3) float32 box there of all that lies between near and far.
+    """Return device coordinates for a forward-facing rig, and the (2, 3) float32 box there of all frustums.
 
-    They are those of a camera that looks as all cameras look on average, from the middle of the rig as far forward as the
-    foremost. The baseline is twice the distance of the outermost camera from the middle; near is the least depth of any
-    camera's near plane.
+    They are those of a camera with the mean orientation of all, in the middle of the rig and as far forward as the
+    foremost camera. The baseline is twice the distance of the outermost camera from the middle; near is the least depth
+    of a near plane's corner.
 
     Raises:
-        DatasetError: a camera's near or far is not known, or the cameras do not face one way: what one of them sees from near on
-            lies less than a tenth of that depth before the foremost camera.
+        DatasetError: near or far of a camera are not known; or the cameras do not face one way, so that a corner of a
+            near plane is nearer to the foremost camera's plane than a tenth of the median near.
     """
     cameras = _distinct_cameras(pictures)
     if not _near_and_far_known(pictures, cameras):
@@ -115,8 +112,8 @@ def fit_device_coordinates(pictures: Pictures) -> tuple[DeviceCoordinates, np.nd
     if not (near > typical / 10 and baseline > 0):
         raise DatasetError("the cameras do not face one way; try --space box or contracted")
     mapping = DeviceCoordinates(np.stack([right, np.cross(back, right), back, eye], axis=1), near, baseline)
-    places = mapping.to_device(corners)
-    return mapping, np.stack([places.min(0), places.max(0)]).astype(np.float32)
+    coordinates = mapping.to_device(corners)
+    return mapping, np.stack([coordinates.min(0), coordinates.max(0)]).astype(np.float32)
 
 
 def visible_cells(
@@ -126,11 +123,15 @@ def visible_cells(
     mapping: SpaceMapping | None = None,
     at_least: int = 2,
 ) -> np.ndarray:
-    """Cells of an (Nz, Ny, Nx) grid over what the planes cover whose centre at least so many distinct cameras see: bool.
+    """Return the cells of an (Nz, Ny, Nx) grid over the planes whose centre enough cameras see, (Nz, Ny, Nx) bool.
 
-    What a single camera sees cannot be placed in depth; leaving it empty keeps floaters from growing in front of lenses.
-    Where fewer cameras than that exist, all of them must see a cell. Nothing is within CLEAR of the way from a camera to the
-    point all of them look at, in any direction: a camera that moves would else carry each of its pictures before it.
+    The depth of what a single camera sees is unknown; leaving such cells empty keeps floaters from growing in front of
+    lenses. For the same reason cells within CLEARANCE of a camera are never visible: a moving camera could otherwise
+    carry each of its pictures along.
+
+    Args:
+        shape: Nz, Ny, Nx.
+        at_least: distinct cameras that must see a cell; all of them if there are fewer.
     """
     nz, ny, nx = shape
     low, edges = (np.zeros(3), np.ones(3)) if isinstance(mapping, Contraction) else (aabb[0], aabb[1] - aabb[0])
@@ -154,8 +155,12 @@ def visible_cells(
 
 @njit(parallel=True, cache=True)
 def _views(points, poses, intrinsics, sizes, near, clear):
-    """How many cameras see each of (N, 3) points at a depth beyond `near` (C,), and whether it is nearer than `clear` (C,) to
-    any: (N,) int32 and (N,) bool. `poses` (C, 3, 4) are camera-to-world."""
+    """Return how many cameras see each point, (N,) int32, and whether any is closer than its clearance, (N,) bool.
+
+    Args:
+        points: (N, 3) world coordinates. poses: (C, 3, 4), camera-to-world. intrinsics: (C, 4), fx fy cx cy.
+        sizes: (C, 2), width and height. near: (C,), the least depth at which a camera sees. clear: (C,), clearances.
+    """
     count, blocked = np.zeros(len(points), np.int32), np.zeros(len(points), np.bool_)
     for n in prange(len(points)):
         for c in range(len(poses)):
@@ -170,13 +175,13 @@ def _views(points, poses, intrinsics, sizes, near, clear):
             i = cx + fx * (x * pose[0, 0] + y * pose[1, 0] + z * pose[2, 0]) / depth
             j = cy - fy * (x * pose[0, 1] + y * pose[1, 1] + z * pose[2, 1]) / depth
             width, height = sizes[c]
-            margin = 0.02 * width  # a cell whose centre is just outside still shows an edge
+            margin = 0.02 * width  # part of a cell whose centre is just outside is visible
             count[n] += -margin < i < width + margin and -margin < j < height + margin
     return count, blocked
 
 
 def _distinct_cameras(pictures: Pictures) -> np.ndarray:
-    """One training picture for each distinct pose."""
+    """Return one training picture for each distinct pose."""
     train = np.flatnonzero(~pictures.is_test)
     poses = np.round(pictures.camera_to_world[train].reshape(len(train), 16), 9)
     _, first = np.unique(poses, axis=0, return_index=True)
@@ -184,11 +189,12 @@ def _distinct_cameras(pictures: Pictures) -> np.ndarray:
 
 
 def _near_and_far_known(pictures: Pictures, cameras: np.ndarray) -> bool:
+    """Return whether near and far of all cameras are known."""
     return bool(np.all(np.isfinite(pictures.near[cameras])) and np.all(np.isfinite(pictures.far[cameras])))
 
 
 def _frustum(pictures: Pictures, p: int) -> np.ndarray:
-    """The eight corners of a picture's view between near and far, world coordinates."""
+    """Return the eight corners of a picture's frustum between near and far, (8, 3) world coordinates."""
     fx, fy, cx, cy = pictures.intrinsics[p]
     w, h = pictures.width[p], pictures.height[p]
     local = np.array(
@@ -204,7 +210,7 @@ def _frustum(pictures: Pictures, p: int) -> np.ndarray:
 
 
 def _focus(pictures: Pictures, cameras: np.ndarray) -> np.ndarray | None:
-    """What the cameras look at: the point of least squared distance to all optical axes.
+    """Return the point that the cameras look at, of least squared distance to all optical axes, (3,).
 
     None where the axes are parallel, or the point lies behind more than a tenth of the cameras.
     """

@@ -1,8 +1,9 @@
-"""Proposal sampling: where on a ray to look, learnt by two small fields beside the one that is to be had.
+"""Proposal sampling: two small fields learn where along a ray to take samples.
 
-mip-NeRF 360 (arXiv:2111.12077, section 3.1), with K-Planes for the proposals (arXiv:2301.10241, section 3.4). For scenes in which
-an occupancy grid does not serve: where something is nearly everywhere, or far too fine for its cells. The proposals are of use in
-training alone: what is stored and played is marched through the grid that has formed meanwhile.
+mip-NeRF 360 (arXiv:2111.12077, section 3.1), with K-Planes as proposal networks (arXiv:2301.10241, section 3.4). It is
+for scenes in which an occupancy grid does not help, because most cells hold something or because details are much finer
+than cells. Proposals serve in training only: the stored scene is marched through the occupancy grid that was formed
+meanwhile.
 """
 
 from dataclasses import replace
@@ -17,21 +18,22 @@ from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import SpaceMapping
 from torch import Tensor, nn
 
+# Added to each weight before resampling, so that no part of a ray is given up for good.
 WEIGHT_PADDING = 0.01
-"""Added to each weight before samples are drawn by them, so that no part of a ray is given up for good."""
 
+# Scale, in steps, of the annealing of weights from uniform to those of the proposals, which know nothing at first.
 ANNEAL_STEPS = 500
-"""Steps over which the weights come into force, from all being equal; before, they are the weights of fields that know nothing."""
 
+# N rays in K intervals: edges (N, K + 1), s rising along each ray, and weights (N, K).
 ProposalLevel = tuple[Tensor, Tensor]
-"""Of N rays cut into K intervals: edges (N, K + 1), s rising along each ray, and weights (N, K)."""
 
 
 class Proposals(nn.Module):
-    """Two fields with a density and no colour, one scale each.
+    """Two fields of one scale each, with a density and no colour.
 
     Attributes:
         fields: coarse, then fine.
+        counts: samples per ray, of both and of the main field.
     """
 
     def __init__(self, config: TrainConfig, aabb: np.ndarray, clip: Clip, is_dynamic: bool) -> None:
@@ -53,41 +55,42 @@ class Proposals(nn.Module):
         step: int,
         fused: bool,
     ) -> tuple[Samples, Tensor, list[ProposalLevel]]:
-        """Samples for the field that is to be had, as many on every ray; their edges (N, K + 1); what each proposal made of them.
+        """Return samples for the main field, K on each ray; their edges (N, K + 1); and what each proposal found.
 
         Args:
-            cells: (Nz, Ny, Nx) of the occupancy grid. step: number of the training step. fused: whether the kernels look the
-                planes up.
+            rays: N rays. aabb: (2, 3). cells: (Nz, Ny, Nx) of the occupancy grid.
+            step: number of the training step, for annealing.
+            fused: whether the kernels sample the planes.
         """
         near, far = ray_spans(rays, aabb, mapping)
         extent = (aabb[1] - aabb[0]).max()
-        force = min(1.0, 10 * step / (9 * step + ANNEAL_STEPS))  # mip-NeRF 360's schedule: fast at first
-        edges = _evenly(near, far, self.counts[0], rays.jitters)
+        exponent = min(1.0, 10 * step / (9 * step + ANNEAL_STEPS))  # mip-NeRF 360's schedule: fast at first
+        edges = _uniform_edges(near, far, self.counts[0], rays.jitters)
         levels: list[ProposalLevel] = []
         for field, count in zip(self.fields, self.counts[1:], strict=True):
             assert isinstance(field, Field)
-            samples = _between(rays, edges, aabb, mapping, cells)
-            look_up = fused_features(field) if fused else field.features
-            log_density, _ = field.decode(look_up(samples.points, rays.times[samples.ray]))
+            samples = _midpoints(rays, edges, aabb, mapping, cells)
+            features = fused_features(field) if fused else field.features
+            log_density, _ = field.decode(features(samples.points, rays.times[samples.ray]))
             tau = (log_density.exp() * samples.length * samples.density_scale / extent).view(len(near), -1)
             trans = torch.exp(torch.cumsum(tau, 1).neg() + tau)
             weights = trans * (1 - torch.exp(-tau))
             levels.append((edges, weights))
-            edges = resample_edges(edges, weights.detach() ** force, count, rays.jitters)
-        return _between(rays, edges, aabb, mapping, cells), edges, levels
+            edges = resample_edges(edges, weights.detach() ** exponent, count, rays.jitters)
+        return _midpoints(rays, edges, aabb, mapping, cells), edges, levels
 
 
-def _evenly(near: Tensor, far: Tensor, count: int, jitters: Tensor) -> Tensor:
-    """Edges (N, count + 1) of equal intervals from near to far (N,), the inner ones moved by up to half an interval."""
+def _uniform_edges(near: Tensor, far: Tensor, count: int, jitters: Tensor) -> Tensor:
+    """Return edges (N, count + 1) of equal intervals from near to far (N,), inner ones jittered by half an interval."""
     at = torch.arange(count + 1, device=near.device, dtype=near.dtype) / count
     moved = at + (jitters[:, None] - 0.5) / count * ((at > 0) & (at < 1))
     return near[:, None] + moved * (far - near).clamp(min=0)[:, None]
 
 
-def _between(
+def _midpoints(
     rays: Rays, edges: Tensor, aabb: Tensor, mapping: SpaceMapping | None, cells: tuple[int, int, int]
 ) -> Samples:
-    """A sample in the middle of each interval."""
+    """Return samples in the middle of each interval of edges (N, K + 1)."""
     middle = (edges[:, 1:] + edges[:, :-1]) / 2
     u, scale = plane_coordinates(rays, middle, aabb, mapping)
     u = u.clamp(0, 1)
@@ -103,9 +106,9 @@ def _between(
 
 
 def resample_edges(edges: Tensor, weights: Tensor, count: int, jitters: Tensor) -> Tensor:
-    """Edges (N, count + 1) of new intervals that all hold as much of the weights (N, K) between edges (N, K + 1).
+    """Return edges (N, count + 1) of intervals with equal shares of weights (N, K) between edges (N, K + 1).
 
-    The inverse of the cumulative weights, read at even steps moved by jitters (N,) in [0, 1); no gradient.
+    It is the inverse of the cumulative weights at uniform steps, jittered by (N,) in [0, 1). There is no gradient.
     """
     with torch.no_grad():
         padded = weights + WEIGHT_PADDING / weights.shape[1]
@@ -120,15 +123,18 @@ def resample_edges(edges: Tensor, weights: Tensor, count: int, jitters: Tensor) 
 
 
 def histogram_loss(edges: Tensor, weights: Tensor, level: ProposalLevel) -> Tensor:
-    """How far a proposal underrates what was found, arXiv:2111.12077, eq. 13; the gradient is for the proposal alone.
+    """Return by how much a proposal underestimateds weights (mip-NeRF 360, arXiv:2111.12077, eq. 13).
 
-    mean over rays of sum_i max(0, w_i - bound_i)^2 / w_i, where bound_i is the sum of the proposal's weights in all its intervals
-    that meet interval i of `edges` (N, K + 1), with `weights` (N, K).
+    mean over rays of sum_i max(0, w_i - bound_i)^2 / w_i, where bound_i is the sum of the proposal's weights in all its
+    intervals that overlap interval i. Only the proposal gets a gradient.
+
+    Args:
+        edges: (N, K + 1). weights: (N, K), of the main field. level: of the proposal.
     """
-    proposed, estimate = level
+    proposed, estimated = level
     edges, weights = edges.detach(), weights.detach()
-    cumulative = torch.nn.functional.pad(torch.cumsum(estimate, 1), (1, 0))
-    last = estimate.shape[1]
+    cumulative = torch.nn.functional.pad(torch.cumsum(estimated, 1), (1, 0))
+    last = estimated.shape[1]
     first = (torch.searchsorted(proposed.contiguous(), edges[:, :-1].contiguous(), right=True) - 1).clamp(0, last - 1)
     beyond = torch.searchsorted(proposed.contiguous(), edges[:, 1:].contiguous()).clamp(1, last)
     bound = torch.gather(cumulative, 1, torch.maximum(beyond, first + 1)) - torch.gather(cumulative, 1, first)

@@ -1,4 +1,4 @@
-"""Checkpoints on a disk: of a run that goes on, `kpc.encoder.training.train`, and of a finished model, `kpc.encoder.rdo.codec_model`."""
+"""Writing of checkpoints: of a run in progress (`train`) and of a finished model (`kpc.encoder.rdo.codec_model`)."""
 
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,11 @@ from kpc.format.common.errors import TrainingError
 
 
 def save_state(path: Path, state: dict[str, Any], remedy: str) -> None:
-    """Write plain tensors and numbers, which are read again without unpickling code.
+    """Write plain tensors and numbers, which can be read without unpickling code.
 
     Raises:
-        TrainingError: it cannot be written, with the `remedy` besides free space; what was there is left as it was.
+        TrainingError: the file cannot be written; `remedy` is what the message suggests besides freeing space. A file
+            that was there is left unchanged.
     """
     try:
         with atomic_write(path) as aside:

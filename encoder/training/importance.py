@@ -1,7 +1,7 @@
-"""Which pixels are drawn more often than others: those that change, as far as cameras that stand still can tell.
+"""Importance sampling by temporal difference: pixels that change are drawn more often, with static cameras.
 
-Importance sampling by temporal difference, IST: DyNeRF (arXiv:2103.02597), K-Planes (arXiv:2301.10241, section 3.4). The loss
-becomes the mean over what is drawn; nothing is weighed back, as in both papers: that would undo the purpose.
+IST of DyNeRF (arXiv:2103.02597); K-Planes (arXiv:2301.10241, section 3.4). The loss becomes the mean over the drawn
+pixels; as in both papers it is not reweighted, which would undo the purpose.
 """
 
 from collections.abc import Iterator
@@ -10,31 +10,37 @@ from functools import reduce
 import numpy as np
 from kpc.encoder.datasets import Dataset
 
+# Pixels along the side of a tile; all pixels of a tile have the same probability.
 SMALLEST_TILE = 8
-"""Pixels along the side of a tile; all in one have the same chance."""
 
+# Tiles, of a byte each, are doubled in width until there are no more than this, which bounds the memory of long clips.
 MOST_TILES = 1 << 25
-"""Tiles are made twice as wide until there are no more than this, a byte each: a long clip takes no more memory than that."""
 
+# Pictures before and after that a picture is compared with (K-Planes: 25).
 WINDOW = 25
-"""Pictures before and after that one is compared with (K-Planes: 25 frames either way)."""
 
+# Bytes of pixels that are processed at a time while weights are computed: about what the cache holds.
 BAND_BYTES = 1 << 21
-"""Of pixels at a time while weights are computed, whatever the length of the clip: what a processor's cache holds."""
 
+# Tiles with a common running sum: 8 bytes of memory per block, and 64 bytes to read for every pixel drawn.
 _BLOCK = 64
-"""Tiles that are counted together: 8 bytes of memory each, and 64 bytes to read for every pixel drawn."""
 
 
 class TileWeights:
-    """A weight for each square tile of each training picture; draws usable pixels with a chance in proportion to it.
+    """A weight for each square tile of each training picture; draws usable pixels with probability proportional to it.
 
-    The weight of a pixel is its largest difference in any channel, as a share of the full range, from the same pixel in the
-    pictures of the same camera up to WINDOW before and after, but at least `floor`. Colours count as far as they are opaque.
-    A tile has the mean over its usable pixels, in 8 bits and at least 1, so it is drawn as often as they would be one by one;
-    0 without any.
+    The weight of a pixel is its largest absolute difference in any channel, as a share of the full range, from the same
+    pixel in pictures of the same camera up to WINDOW before and after, but at least `floor`. Colours are premultiplied
+    by alpha. A tile has the mean over its usable pixels, in 8 bits and at least 1; or 0 without usable pixels.
 
-    Memory: 1 byte a tile, and 8 a block of 64; so 0.018 bytes a pixel, and 36 MiB at most.
+    It takes a byte per tile and 8 per block of 64 tiles: 0.018 bytes per pixel, and 36 MiB at most.
+
+    Attributes:
+        train: (P,) int64, the training pictures.
+        tile: pixels along the side of a tile.
+        across: (P,) int64, tiles along a row of each picture.
+        ends: (P,) int64, tiles of all pictures up to and including each.
+        weights: uint8, row by row, picture by picture, zero-padded to whole blocks.
     """
 
     def __init__(self, dataset: Dataset, floor: float) -> None:
@@ -49,21 +55,22 @@ class TileWeights:
             self.tile *= 2
         self.across = -(-pictures.width[self.train] // self.tile)
         self.ends = np.cumsum(tiles)
-        """(P,) int64, tiles of all pictures up to each, itself included."""
         self.weights = np.zeros(-(-int(self.ends[-1]) // _BLOCK) * _BLOCK, np.uint8)
-        """Row by row, picture by picture, filled up with 0 to whole blocks."""
         starts = self.ends - tiles
         for numbers in group_by_camera(dataset):
             for some, row, weights in _tile_weights(dataset, numbers, floor, self.tile):
-                place = np.searchsorted(self.train, some)
-                first = starts[place] + row // self.tile * self.across[place]
+                picture = np.searchsorted(self.train, some)
+                first = starts[picture] + row // self.tile * self.across[picture]
                 self.weights[first[:, None] + np.arange(weights[0].size)] = weights.reshape(len(some), -1)
         self._block_ends = np.cumsum(self.weights.reshape(-1, _BLOCK).sum(1, dtype=np.int64))
 
     def draw(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """`count` usable training pixels: numbers of their pictures, rows and columns, all (count,) int64.
+        """Draw `count` usable training pixels.
 
-        What falls on a pixel that is masked out or beyond the picture's edge is drawn again.
+        Pixels that are masked out or beyond the picture's edge are drawn again.
+
+        Returns:
+            Numbers of the pictures, rows and columns, (count,) int64 each.
         """
         found: list[np.ndarray] = []
         missing = count
@@ -75,23 +82,24 @@ class TileWeights:
         return picture, row, column
 
     def _draw_any(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """As `draw`, with pixels that are not there or not usable: (3, count) int64."""
+        """Draw as `draw` does, including pixels that do not exist or are not usable: (3, count) int64."""
         mass = rng.integers(self._block_ends[-1], size=count)
         block = np.searchsorted(self._block_ends, mass, side="right")
-        up_to = np.cumsum(self.weights.reshape(-1, _BLOCK)[block], axis=1, dtype=np.int64)
-        inside = mass - (self._block_ends[block] - up_to[:, -1])
-        tile = block * _BLOCK + (up_to <= inside[:, None]).sum(1)
-        place = np.searchsorted(self.ends, tile, side="right")
-        down, along = np.divmod(tile - np.where(place > 0, self.ends[place - 1], 0), self.across[place])
-        below, beside = np.divmod(rng.integers(self.tile * self.tile, size=count), self.tile)
-        return np.stack([self.train[place], self.tile * down + below, self.tile * along + beside])
+        running = np.cumsum(self.weights.reshape(-1, _BLOCK)[block], axis=1, dtype=np.int64)
+        inside = mass - (self._block_ends[block] - running[:, -1])
+        tile = block * _BLOCK + (running <= inside[:, None]).sum(1)
+        picture = np.searchsorted(self.ends, tile, side="right")
+        tile_row, tile_column = np.divmod(tile - np.where(picture > 0, self.ends[picture - 1], 0), self.across[picture])
+        row, column = np.divmod(rng.integers(self.tile * self.tile, size=count), self.tile)
+        return np.stack([self.train[picture], self.tile * tile_row + row, self.tile * tile_column + column])
 
     def _tiles(self) -> np.ndarray:
-        """How many of the present size each training picture has: (P,) int64."""
+        """Return how many tiles of the current size each training picture has, (P,) int64."""
         width, height = self.dataset.pictures.width[self.train], self.dataset.pictures.height[self.train]
         return (-(-width // self.tile)).astype(np.int64) * -(-height // self.tile)
 
     def _usable(self, picture: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Return whether pixels exist and are usable, (count,) bool."""
         pictures = self.dataset.pictures
         usable: np.ndarray = (row < pictures.height[picture]) & (column < pictures.width[picture])
         there = np.flatnonzero(usable)
@@ -101,12 +109,12 @@ class TileWeights:
 
 
 def has_static_cameras(dataset: Dataset) -> bool:
-    """Whether every training camera of a moving scene has several pictures, so that one can be compared with another."""
+    """Return whether every training camera of a moving scene has several pictures, which can then be compared."""
     return dataset.is_dynamic and all(len(numbers) > 1 for numbers in group_by_camera(dataset))
 
 
 def group_by_camera(dataset: Dataset) -> list[np.ndarray]:
-    """The training pictures of one pose, lens and size in the order of their times, for each there is."""
+    """Return the training pictures of each camera and picture size, in the order of their times."""
     pictures = dataset.pictures
     train = np.flatnonzero(~pictures.is_test)
     train = train[np.argsort(pictures.time[train], kind="stable")]
@@ -118,8 +126,12 @@ def group_by_camera(dataset: Dataset) -> list[np.ndarray]:
 def _tile_weights(
     dataset: Dataset, numbers: np.ndarray, floor: float, tile: int
 ) -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
-    """For (K,) pictures of one camera, part by part: some of them, a row of pixels, and the uint8 weights of their tiles from
-    that row on, (pictures, rows of tiles, tiles across)."""
+    """Compute the tile weights of the pictures `numbers` (K,) of one camera, part by part.
+
+    Yields:
+        Some of the pictures, the first row of pixels, and their weights from that row on, (pictures, tile rows, tile
+        columns) uint8.
+    """
     pictures, pixels = dataset.pictures, dataset.pixels
     width, height = int(pictures.width[numbers[0]]), int(pictures.height[numbers[0]])
     rows = max(1, BAND_BYTES // (4 * WINDOW * tile * width * pixels.channels)) * tile
@@ -135,32 +147,37 @@ def _tile_weights(
 
 
 def max_temporal_difference(pictures: np.ndarray, radius: int) -> np.ndarray:
-    """The largest |a - b| over channels and over the pictures b up to `radius` before and after each picture a.
+    """Return the largest |a - b| over channels and over the pictures b up to `radius` before and after each picture a.
 
-    (K, H, W, C) uint8 to (K, H, W) uint8.
+    Args:
+        pictures: (K, H, W, C) uint8.
+
+    Returns:
+        (K, H, W) uint8.
     """
     above = _running(np.maximum, pictures, radius) - pictures
     below = pictures - _running(np.minimum, pictures, radius)
-    return reduce(
-        np.maximum, np.moveaxis(np.maximum(above, below), 3, 0)
-    )  # max(axis=3) takes four times as long in all
+    return reduce(np.maximum, np.moveaxis(np.maximum(above, below), 3, 0))  # max(axis=3) takes four times as long
 
 
 def _running(extreme: np.ufunc, values: np.ndarray, radius: int) -> np.ndarray:
-    """Maximum or minimum over 2 radius + 1 neighbours along the first axis, fewer at its ends.
+    """Return the maximum or minimum over 2 radius + 1 neighbours along the first axis, fewer at its ends.
 
-    Spans double in length until two of them, laid over one another, make the whole.
+    Windows double in length until two of them, overlapping, cover the whole.
     """
     length = 2 * radius + 1
     ends = ((radius, radius),) + ((0, 0),) * (values.ndim - 1)
-    spans, span = np.pad(values, ends, mode="edge"), 1  # an end lies within the window of all it is added to
+    spans, span = (
+        np.pad(values, ends, mode="edge"),
+        1,
+    )  # an end lies within the window of all pictures that it is added to
     while 2 * span <= length:
         spans, span = extreme(spans[:-span], spans[span:]), 2 * span
     return extreme(spans[: len(values)], spans[length - span : length - span + len(values)])
 
 
 def premultiply_alpha(picture: np.ndarray) -> np.ndarray:
-    """Straight alpha multiplied in: what is transparent has no colour that could change."""
+    """Return a picture (H, W, 3 or 4) uint8 with premultiplied alpha: colours that are transparent do not count."""
     if picture.shape[2] == 3:
         return picture
     alpha = picture[..., 3:].astype(np.uint16)
@@ -168,11 +185,11 @@ def premultiply_alpha(picture: np.ndarray) -> np.ndarray:
 
 
 def _tile_means(values: np.ndarray, usable: np.ndarray, tile: int) -> np.ndarray:
-    """(K, H, W) uint8 to the rounded means over the usable pixels of each tile, at least 1; 0 where there are none."""
+    """Return the rounded means of (K, H, W) uint8 over the usable pixels of each tile: at least 1, or 0 without any."""
     count, height, width = values.shape
     tall, wide = -(-height // tile), -(-width // tile)
     sums = np.zeros((2, count, tall, wide), np.uint32)
-    for total, kind in zip(sums, (values * usable, usable)):
+    for total, kind in zip(sums, (values * usable, usable), strict=True):
         padded = np.pad(kind.view(np.uint8), ((0, 0), (0, tall * tile - height), (0, wide * tile - width)))
         for j, i in np.ndindex(tile, tile):
             total += padded[:, j::tile, i::tile]

@@ -1,4 +1,4 @@
-"""Which rays a training step takes: pixels of the training pictures, drawn, and their rays."""
+"""Draws the rays of a training step: random pixels of the training pictures."""
 
 import math
 
@@ -11,20 +11,20 @@ from kpc.format.scene.space import SpaceMapping
 
 
 class RaySampler:
-    """Draws usable pixels of the training pictures, each as likely as any other unless told otherwise, and makes their rays.
+    """Draws usable pixels of the training pictures, uniformly or by weights, and makes their rays.
 
     Attributes:
-        frames: (P, 4) int64, columns from and to, rows from and to, of what is not transparent in each training picture;
+        frames: (P, 4) int64, columns from and to and rows from and to around the opaque part of each training picture;
             None without alpha, and with masks, which need not agree with it.
     """
 
+    # Margin around the opaque part, as a share of a picture's longer side: an outline is learnt from both of its sides.
     MARGIN = 0.03
-    """Of a picture's longer side, about what is not transparent: the outline wants to be learnt from both sides."""
 
     def __init__(
         self, dataset: Dataset, mapping: SpaceMapping | None = None, appearances: np.ndarray | None = None
     ) -> None:
-        """`appearances`: (P,) int64, of each picture, as `appearances.number_pictures` has them; None where there are none."""
+        """`appearances`: (P,) int64 as from `assign_appearances`, or None where there are none."""
         self.dataset, self.mapping, self.appearances = dataset, mapping, appearances
         self.train = np.flatnonzero(~dataset.pictures.is_test)
         self.ends = np.cumsum(dataset.usable_counts[self.train])
@@ -42,9 +42,16 @@ class RaySampler:
         object_rays: float = 0.0,
         weights: TileWeights | None = None,
     ) -> tuple[Rays, torch.Tensor]:
-        """`count` rays and the (count, 3) colours they should have, over one background or one drawn for each ray.
+        """Draw rays.
 
-        `object_rays` is the share of them that is drawn from `frames`, where there are any; the others go by `weights`.
+        Args:
+            count: N, number of rays.
+            background: (3,) RGB, or None for a random one for each ray.
+            object_rays: share of the rays that are drawn from `frames`, where there are any.
+            weights: by which the others are drawn; None for uniform.
+
+        Returns:
+            The rays, and the colours (N, 3) that they should have.
         """
         pictures = self.dataset.pictures
         within = 0 if self.frames is None or not self.frame_ends[-1] else round(object_rays * count)
@@ -60,7 +67,7 @@ class RaySampler:
             below, beside = np.divmod(rank, right - left)
             picture = np.concatenate([self.train[which], picture])
             row, column = np.concatenate([top + below, row]), np.concatenate([left + beside, column])
-        # Rays of one instant read the same rows of the space-time planes: side by side, they find them in the cache.
+        # Rays of one time read the same rows of the space-time planes, which then stay in the cache.
         order = np.argsort(pictures.time[picture], kind="stable")
         picture, row, column = picture[order], row[order], column[order]
         inside = row * pictures.width[picture] + column
@@ -79,6 +86,7 @@ class RaySampler:
         return batch, torch.from_numpy(targets)
 
     def _frame(self, alpha: np.ndarray) -> tuple[int, int, int, int]:
+        """Return the row of `frames` of a picture with alpha (H, W)."""
         rows, columns = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))
         if not len(rows):
             return 0, 0, 0, 0
@@ -92,7 +100,7 @@ class RaySampler:
 
 
 def _pick(rng: np.random.Generator, ends: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """`count` of the ends[-1] pixels of several ranges laid end to end: which range each is in, and its number there."""
+    """Draw `count` numbers below ends[-1]: which of several consecutive ranges each is in, and its rank there."""
     pixel = rng.integers(ends[-1], size=count)
     which = np.searchsorted(ends, pixel, side="right")
     return which, pixel - np.where(which > 0, ends[which - 1], 0)

@@ -1,8 +1,8 @@
-"""How finely a scene has to be divided in time, found from its pictures before anything is trained.
+"""How many time rows a scene needs, found from its pictures before training.
 
-Where a camera stands still, each pixel is a signal in time. Between rows of a space-time plane the model knows straight lines;
-what straight lines between rows so far apart cannot follow, the model cannot either, so rows nearer to each other are only
-needed where that is much. (With a motion grid they need not follow: it leads along what moves.)
+With a static camera each pixel is a signal over time. Between rows of a space-time plane the model interpolates
+linearly; what linear interpolation between rows cannot follow, the model cannot either. So rows are only as close as
+the interpolation error requires. (With a motion grid they need not be, as it follows what moves.)
 """
 
 from collections.abc import Iterator
@@ -14,34 +14,33 @@ from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows
 from kpc.encoder.training.importance import group_by_camera, has_static_cameras, premultiply_alpha
 
+# The most cameras that are measured, spans of the clip for each, and pictures in a span.
 CAMERAS, SPANS, SPAN = 6, 3, 240
-"""At most so many cameras are looked at, each over so many spans of the clip of so many pictures at most."""
 
+# Rows of pixels of a picture that are measured.
 LINES = 24
-"""Rows of pixels of a picture that are looked at."""
 
+# Pixels of a camera's span that are measured, counted in every picture: 6 MB of float32. More only takes longer.
 VALUES = 1 << 19
-"""Pixels of a camera's span, counted in every picture, that are looked at: 6 MB of float32. More only take longer."""
 
-SEEN_OFTEN = 0.5
-"""Share of the clip's frames that every camera must show; else what lies between its pictures is not known."""
+# The least share of the clip's frames that every camera must show; else the signal between its pictures is unknown.
+MIN_COVERAGE = 0.5
 
+# Standard deviation over time from which on a pixel counts as changing: as a share of the full range, and in standard
+# deviations of the noise.
 CHANGING = 0.03
-"""Standard deviation over time, as a share of the full range, from which on a pixel counts as changing."""
-
 NOISE_FACTOR = 3.0
-"""That, in standard deviations of the noise, too."""
 
 
 @dataclass(frozen=True)
 class TimeResolution:
-    """What was measured on pixels that change.
+    """What was measured on changing pixels. Errors and noise are shares of the full range.
 
     Attributes:
-        frames_per_row: the widest spacing within the tolerance, frames.
-        error, next_error: root mean squared error that straight lines between rows leave with it, and with the next wider spacing
-            (NaN where there is none), as a share of the full range, without what noise alone would leave.
-        noise: standard deviation of a still pixel's noise, as a share of the full range.
+        frames_per_row: the widest spacing of rows within the tolerance, in frames.
+        error: root mean square interpolation error with it, without what noise alone would leave.
+        next_error: the same with the next wider spacing; NaN where there is none.
+        noise: standard deviation of the noise of still pixels.
         changing: share of the pixels that change.
     """
 
@@ -53,10 +52,10 @@ class TimeResolution:
 
 
 def fit_frames_per_row(config: TrainConfig, dataset: Dataset) -> tuple[TrainConfig, TimeResolution | None]:
-    """A config whose `frames_per_row` is what the pictures ask for, and what was measured.
+    """Return a configuration whose `frames_per_row` follows from the pictures, and what was measured.
 
-    The config as it is and None where the pictures cannot tell: cameras that move, a motion grid, or `time_tolerance` 0. Follows
-    from the dataset and the config alone, so a run that is resumed finds the same.
+    The configuration is unchanged, and the second None, where pictures cannot show it: with moving cameras, a motion
+    grid, or `time_tolerance` 0. The result depends on dataset and configuration only.
     """
     if not config.time_tolerance or config.motion_cells or not has_static_cameras(dataset):
         return config, None
@@ -65,24 +64,26 @@ def fit_frames_per_row(config: TrainConfig, dataset: Dataset) -> tuple[TrainConf
 
 
 def measure_time_resolution(dataset: Dataset, tolerance: float) -> TimeResolution | None:
-    """The widest spacing of rows, in frames, whose error is at most `tolerance` (a share of the full range).
+    """Find the widest spacing of rows whose interpolation error is at most `tolerance`, a share of the full range.
 
-    For n colours y over time of a pixel and the hat functions H of the rows, least squares leave |y - H H^+ y|^2, of which noise of
-    variance s^2 alone makes s^2 (n - rank H). Its excess over that is averaged over the pixels that change. s^2 is a sixth
-    of the mean squared second difference, the median over the tenth of the pixels that change least. None where a camera shows
-    too few of the clip's frames.
+    For the n colours y of a pixel over time and the hat functions H of the rows, least squares leave |y - H H^+ y|^2,
+    of which noise of variance s^2 alone makes s^2 (n - rank H). The excess over that is averaged over changing pixels.
+    s^2 is a sixth of the mean squared second difference, the median over the tenth of the pixels that change least.
 
-    Memory: VALUES pixels at a time, whatever the length of the clip.
+    It takes the memory of VALUES pixels, whatever the length of the clip.
+
+    Returns:
+        None where a camera shows less than MIN_COVERAGE of the clip's frames.
     """
     frame_count = dataset.clip.frame_count
     cameras = group_by_camera(dataset)
-    if min(len(numbers) for numbers in cameras) < SEEN_OFTEN * frame_count:
+    if min(len(numbers) for numbers in cameras) < MIN_COVERAGE * frame_count:
         return None
     spacings = _spacings(frame_count)
     bases: dict[tuple[bytes, int], np.ndarray] = {}
     excess, values, changing, pixels, noises = np.zeros(len(spacings)), 0, 0, 0, []
     for times, colours in _spans(dataset, cameras):
-        n, count, channels = colours.shape
+        n, count, _ = colours.shape
         colours -= colours.mean(0)
         variance = np.square(colours).mean((0, 2), dtype=np.float64)
         noise = _noise(colours, variance)
@@ -98,7 +99,7 @@ def measure_time_resolution(dataset: Dataset, tolerance: float) -> TimeResolutio
         values, changing, pixels = values + signal.size, changing + int(moves.sum()), pixels + count
         noises.append(noise)
     errors = np.sqrt(np.maximum(excess, 0) / max(values, 1))
-    # A row for every frame leaves nothing, whatever rounding says.
+    # A row for every frame leaves no error but for rounding.
     within = next((k for k, error in enumerate(errors) if k and error > tolerance), len(spacings)) - 1
     beyond = float(errors[within + 1]) if within + 1 < len(spacings) else float("nan")
     return TimeResolution(
@@ -107,14 +108,14 @@ def measure_time_resolution(dataset: Dataset, tolerance: float) -> TimeResolutio
 
 
 def _spacings(frame_count: int) -> list[int]:
-    """1, 2, 3, 4, 6, 8, 12, ... frames, as long as a wider one saves a row."""
+    """Return spacings 1, 2, 3, 4, 6, 8, 12, ... in frames, as long as a wider one saves a row."""
     powers = sorted({m << k for m in (1, 3) for k in range(frame_count.bit_length())})
     rows = [time_rows(frame_count, spacing) for spacing in powers]
     return [spacing for k, spacing in enumerate(powers) if k == 0 or rows[k] < rows[k - 1]]
 
 
 def _basis(times: np.ndarray, rows: int) -> np.ndarray:
-    """Orthonormal columns (n, rank) that span what `rows` rows can say at (n,) times in [0, 1]."""
+    """Return orthonormal columns (n, rank) that span the linear interpolations of rows at times (n,) in [0, 1]."""
     position = times.astype(np.float64) * (rows - 1)
     hats = np.maximum(0, 1 - np.abs(position[:, None] - np.arange(rows)))
     u, s, _ = np.linalg.svd(hats, full_matrices=False)
@@ -122,7 +123,7 @@ def _basis(times: np.ndarray, rows: int) -> np.ndarray:
 
 
 def _noise(colours: np.ndarray, variance: np.ndarray) -> float:
-    """Variance of the noise of (n, pixels, channels) colours in time; 0 where there are too few to tell."""
+    """Return the variance of the noise of colours (n, pixels, channels) over time; 0 with fewer than 3 pictures."""
     if len(colours) < 3:
         return 0.0
     stillest = np.argsort(variance, kind="stable")[: max(1, len(variance) // 10)]
@@ -131,7 +132,7 @@ def _noise(colours: np.ndarray, variance: np.ndarray) -> float:
 
 
 def _spans(dataset: Dataset, cameras: list[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Times (n,) and float32 colours (n, pixels, channels) in [0, 1] of spans of the clip, cameras and lines chosen evenly."""
+    """Yield times (n,) and float32 colours (n, pixels, channels) in [0, 1] of evenly chosen spans and lines."""
     pictures, pixels = dataset.pictures, dataset.pixels
     for camera in _evenly(len(cameras), CAMERAS):
         numbers = cameras[camera]
@@ -155,6 +156,6 @@ def _spans(dataset: Dataset, cameras: list[np.ndarray]) -> Iterator[tuple[np.nda
 
 
 def _evenly(count: int, most: int) -> np.ndarray:
-    """`most` of `count` numbers from 0 on, or all of them, the middles of as many equal parts."""
+    """Return `most` of the numbers below `count`, the middles of as many equal parts; or all if they are fewer."""
     most = min(count, most)
     return ((np.arange(most) + 0.5) * count / most).astype(np.int64) if most else np.zeros(0, np.int64)

@@ -1,4 +1,4 @@
-"""A short first pass that finds where in the box the scene is, so that no texel is spent on the rest."""
+"""A short first training pass that finds the part of the box that the scene fills, so that no texel is wasted."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,18 +10,18 @@ from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.scene.space import DeviceCoordinates
 
-MOST_STEPS = 300
-LEAST_STEPS = 100
-"""What a shorter pass finds is not to be believed."""
+# Steps of the pass. What fewer than MIN_STEPS find is not reliable.
+MAX_STEPS = 300
+MIN_STEPS = 100
 
+# Training rays whose mean depths are measured.
 RAYS = 1 << 17
-"""Training rays whose mean depths make the survey."""
 
+# Share of the surface points that each of the six sides of the box may cut off, before MARGIN is added.
 OUTLIERS = 1e-3
-"""Share of the surfaces that the box may leave out at each of its six sides, before MARGIN is added."""
 
+# Margin on every side, as a share of the longest edge: the coarse field is blurred, and few rays show fast motion.
 MARGIN = 0.04
-"""Of the longest edge, added on every side: the survey is blurred, and what moves fast was seen by few rays."""
 
 
 def trim_box(
@@ -33,17 +33,20 @@ def trim_box(
     time_budget_s: float | None = None,
     mapping: DeviceCoordinates | None = None,
 ) -> tuple[np.ndarray, float]:
-    """The part of a (2, 3) box that holds what the pictures show, and the seconds it took to find out.
+    """Find the part of a box (2, 3) that holds what the pictures show.
 
-    A coarse field is trained on the CPU for a tenth of `config.steps`, or of the time budget where given, but for at most MOST_STEPS.
-    The box then goes from the OUTLIERS quantile to the 1 - OUTLIERS quantile of the points where rays end in something, and
-    MARGIN further; never beyond `aabb`. After fewer than LEAST_STEPS, or where nearly all rays end in nothing, it is `aabb`.
+    A coarse field is trained on the CPU for a tenth of `config.steps`, or of the time budget where given, but for at
+    most MAX_STEPS. The result spans the OUTLIERS to 1 - OUTLIERS quantiles of the points where rays hit a surface, and
+    MARGIN more, within `aabb`. It is `aabb` after fewer than MIN_STEPS, or where less than 1 % of the rays hit one.
+
+    Returns:
+        The box, and the seconds that this took.
 
     Raises:
         TrainingError: as `Trainer.run`.
     """
-    steps = min(MOST_STEPS, config.steps // 10)
-    if time_budget_s is None and steps < LEAST_STEPS:
+    steps = min(MAX_STEPS, config.steps // 10)
+    if time_budget_s is None and steps < MIN_STEPS:
         return aabb, 0.0
     coarse = replace(
         config,
@@ -60,16 +63,16 @@ def trim_box(
         occupancy_start=64,
     )
     trainer = Trainer(dataset, coarse, aabb, "cpu", mapping=mapping)
-    trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10, most_steps=MOST_STEPS)
-    if trainer.step < LEAST_STEPS:
+    trainer.run(report, time_budget_s=time_budget_s and time_budget_s / 10, most_steps=MAX_STEPS)
+    if trainer.step < MIN_STEPS:
         return aabb, trainer.elapsed_s
     rays, _ = trainer.sampler.draw(np.random.default_rng(config.seed), RAYS, trainer.background)
     origins, directions, times = (a.numpy() for a in (rays.origins, rays.directions, rays.times))
     _, opacities, depths = SceneRenderer(trainer.scene()).render(origins, directions, times)
-    ends = (origins + depths[:, None] * directions)[opacities > 0.5]
-    if len(ends) < RAYS // 100:
+    surfaces = (origins + depths[:, None] * directions)[opacities > 0.5]
+    if len(surfaces) < RAYS // 100:
         return aabb, trainer.elapsed_s
-    corners = np.quantile(ends, (OUTLIERS, 1 - OUTLIERS), axis=0)
+    corners = np.quantile(surfaces, (OUTLIERS, 1 - OUTLIERS), axis=0)
     margin = MARGIN * (corners[1] - corners[0]).max()
     trimmed = np.stack([np.maximum(aabb[0], corners[0] - margin), np.minimum(aabb[1], corners[1] + margin)])
     return trimmed.astype(np.float32), trainer.elapsed_s

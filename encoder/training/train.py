@@ -39,7 +39,14 @@ from kpc.format.scene.space import Contraction, SpaceMapping
 
 @dataclass(frozen=True)
 class Report:
-    """How training stands after a step."""
+    """The state of training after a step.
+
+    Attributes:
+        step: steps done. fraction: of the run, in [0, 1]. elapsed_s: seconds of training.
+        psnr: of the rays since the last report, dB.
+        rays_per_second, samples_per_ray: recent means.
+        occupied: share of the cells that are occupied.
+    """
 
     step: int
     fraction: float
@@ -51,9 +58,17 @@ class Report:
 
 
 class Trainer:
-    """One run: a dataset, a field, the optimiser's state. `run` trains to the end or until told to stop.
+    """A training run: a dataset, a field, and the state of optimiser and occupancy grid.
 
-    `elapsed_s` counts the seconds of training, those spent before, on a survey, included.
+    Attributes:
+        field: being trained.
+        grid: the occupancy grid.
+        step: steps done.
+        elapsed_s: seconds of training, including those spent before on finding the box.
+        timers: seconds by part of a step.
+        names: of the appearances.
+        slots: time slots of the occupancy grid.
+        extent: longest edge of the box. step_length: of rays, in s.
     """
 
     def __init__(
@@ -68,9 +83,8 @@ class Trainer:
         self.dataset, self.config, self.device, self.mapping = dataset, config, torch.device(device), mapping
         self.aabb = np.asarray(aabb, np.float32)
         self.extent = float(np.max(self.aabb[1] - self.aabb[0]))
-        steps_across = config.samples_across / (
-            2 if isinstance(mapping, Contraction) else 1
-        )  # a box is half of contracted space
+        # The box is half of contracted space.
+        steps_across = config.samples_across / (2 if isinstance(mapping, Contraction) else 1)
         self.step_length = self.extent / steps_across
         self.rng = np.random.default_rng(config.seed)
         layout = plan_layout(config, self.aabb, dataset.clip, dataset.is_dynamic)
@@ -101,10 +115,10 @@ class Trainer:
         self.elapsed_s = elapsed_s
         self.samples_per_ray = float(config.samples_across)
         self.sampler = RaySampler(dataset, mapping, appearances if self.names else None)
-        # Objects with alpha are shown on white. Elsewhere what the box leaves open is grey: the least wrong guess.
+        # Objects with alpha are shown on white; elsewhere an unknown background is grey, the guess of least error.
         self.background = np.full(3, 1.0 if dataset.has_alpha else 0.5, np.float32)
         self._weights: TileWeights | None = None
-        self._can_weigh = has_static_cameras(dataset)
+        self._has_weights = has_static_cameras(dataset)
         self._steady_rays, self._steady_s = 0, 0.0
 
     def run(
@@ -117,13 +131,18 @@ class Trainer:
         checkpoint_every_s: float = 60.0,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Train until `config.steps`, or for `time_budget_s` seconds of training where given, and `most_steps` at most then.
+        """Train until `config.steps`, or for `time_budget_s` seconds and at most `most_steps` steps.
 
-        A checkpoint that cannot be written on the way is said on stderr and tried again: it is no reason to stop.
+        A checkpoint that cannot be written on the way is reported on stderr and does not stop training.
+
+        Args:
+            report: called twice a second at most.
+            checkpoint: file to write every `checkpoint_every_s` seconds and at the end.
+            interrupted: called between steps.
 
         Raises:
             TrainingError: the loss is not finite.
-            KeyboardInterrupt: `interrupted()`, asked between steps, was true.
+            KeyboardInterrupt: `interrupted()` returned True.
         """
         config = self.config
         saved, error, drawn, since = time.monotonic(), 0.0, 0, time.monotonic()
@@ -131,36 +150,7 @@ class Trainer:
             if interrupted():
                 raise KeyboardInterrupt
             started = time.monotonic()
-            with self.timers("occupancy"):
-                if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
-                    self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
-                if (
-                    self.slots > 1
-                    and self.step >= 4 * config.occupancy_start
-                    and self.step % config.occupancy_split_every == 0
-                ):
-                    self.grid.split(self.density_at, self.slots, self.rng)
-            count = self.rays_per_step
-            background = None if self.dataset.has_alpha else self.background
-            with self.timers("rays"):
-                weights = self._weights_at(fraction)
-                batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays, weights)
-            rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
-            squared_error, samples = self.optimiser.step(
-                self.step,
-                fraction,
-                rate,
-                batch,
-                targets,
-                self.aabb,
-                self.grid.active,
-                self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1),
-                self.extent,
-            )
-            if not math.isfinite(squared_error):
-                raise TrainingError(f"step {self.step}: {self._not_finite()}; try another --seed or --preset")
-            self.samples_per_ray += 0.1 * (samples - self.samples_per_ray)
-            self.step += 1
+            squared_error, count = self._step(fraction)
             error, drawn = error + squared_error * count, drawn + count
             now = time.monotonic()
             self.elapsed_s += now - started
@@ -186,35 +176,71 @@ class Trainer:
         if checkpoint is not None:
             self._try_to_save(checkpoint)
 
+    def _step(self, fraction: float) -> tuple[float, int]:
+        """Do one step at a fraction of the run; return its mean squared error and its number of rays."""
+        config = self.config
+        with self.timers("occupancy"):
+            self._update_grid()
+        count = self.rays_per_step
+        background = None if self.dataset.has_alpha else self.background
+        with self.timers("rays"):
+            weights = self._weights_at(fraction)
+            batch, targets = self.sampler.draw(self.rng, count, background, config.object_rays, weights)
+        rate = min(1.0, (self.step + 1) / config.warmup) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * fraction)))
+        squared_error, samples = self.optimiser.step(
+            self.step,
+            fraction,
+            rate,
+            batch,
+            targets,
+            self.aabb,
+            self.grid.active,
+            self.step_length * (config.warmup_stride if self.step < config.occupancy_start else 1),
+            self.extent,
+        )
+        if not math.isfinite(squared_error):
+            raise TrainingError(f"step {self.step}: {self._not_finite()}; try another --seed or --preset")
+        self.samples_per_ray += 0.1 * (samples - self.samples_per_ray)
+        self.step += 1
+        return squared_error, count
+
+    def _update_grid(self) -> None:
+        """Update the occupancy grid where it is due at this step."""
+        config = self.config
+        if self.step >= config.occupancy_start and self.step % config.occupancy_every == 0:
+            self.grid.update(self.density_at, self.optimiser.peaks(), self.rng)
+        if self.slots > 1 and self.step >= 4 * config.occupancy_start and self.step % config.occupancy_split_every == 0:
+            self.grid.split(self.density_at, self.slots, self.rng)
+
     def run_until(self, step: int, watch: Callable[[], None] = lambda: None) -> None:
-        """Train as `run` does, without a report, but only to a step on the way; `watch` is called before each.
+        """Train as `run` does, without reports, until a step of the run is reached; `watch` is called before each step.
 
         Raises:
             As `run`.
         """
 
-        def there() -> bool:
+        def is_reached() -> bool:
             watch()
             return self.step >= step
 
         try:
-            self.run(lambda report: None, interrupted=there)
+            self.run(lambda report: None, interrupted=is_reached)
         except KeyboardInterrupt:
-            if self.step < step:  # the user's
+            if self.step < step:  # interrupted by the user
                 raise
 
     @property
     def rays_per_step(self) -> int:
-        """As many as keep a step's samples within bounds, now."""
+        """Rays in the next step: as many as keep the number of samples within `config.samples`."""
         return int(np.clip(self.config.samples / max(self.samples_per_ray, 1e-3), 256, self.config.rays))
 
     @property
     def rays_per_second(self) -> float:
-        """Rays trained in a second, all that a step takes included, once the occupancy grid has formed."""
+        """Mean rays per second of training since the occupancy grid has formed."""
         return self._steady_rays / self._steady_s if self._steady_s else 0.0
 
     def scene(self, occupancy: np.ndarray | None = None) -> Scene:
-        """The field as it stands, with an occupancy (slots, Nz, Ny, Nx), or with that of training; the planes are copied."""
+        """Return the field as a scene; planes are copied. `occupancy`: (slots, Nz, Ny, Nx), or that of training."""
         if occupancy is None:
             occupancy = self.grid.active
         return self.field.to_scene(
@@ -222,27 +248,28 @@ class Trainer:
         )
 
     def _weights_at(self, fraction: float) -> TileWeights | None:
-        """What decides which rays are drawn at this share of the run; it follows from the dataset, so no checkpoint holds it."""
-        if fraction < self.config.temporal_start or not self._can_weigh:
+        """Return the weights by which rays are drawn at a fraction of the run; None for uniform drawing."""
+        if fraction < self.config.temporal_start or not self._has_weights:
             return None
         if self._weights is None:
             self._weights = TileWeights(self.dataset, self.config.temporal_floor)
         return self._weights
 
     def _fraction(self, time_budget_s: float | None, most_steps: int | None) -> float:
+        """Return the fraction of the run that is done."""
         if time_budget_s is None:
             return self.step / self.config.steps
         return max(self.elapsed_s / time_budget_s, self.step / most_steps if most_steps else 0.0)
 
     def _not_finite(self) -> str:
-        """Which terms of the loss hold NaN or infinity, the colours being one of them, and which parameters they come from."""
+        """Return a message that names the terms of the loss and the parameters that are not finite."""
         field, config = self.field, self.config
-        weighed = (
+        weighted = (
             plane_priors(field, config, config.variation(0.0))
             | motion_priors(field, config)
             | appearance_priors(field, config)
         )
-        terms = ["colour"] + [name for name, value in weighed.items() if not torch.isfinite(value)]
+        terms = ["colour"] + [name for name, value in weighted.items() if not torch.isfinite(value)]
         planes = [
             f"{name} at scale {s}"
             for s, name, *_ in self.field.layout.planes()
@@ -255,23 +282,22 @@ class Trainer:
         return f"the loss is not finite ({', '.join(terms)})" + (f", nor are all values of {found}" if found else "")
 
     def density_at(self, points: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Log densities at (N, 3) points in [0, 1]^3 and (N,) times."""
+        """Return log densities (N,) at points (N, 3) in [0, 1]^3 and times (N,)."""
         if isinstance(self.optimiser, FusedOptimiser):
             return log_densities(self.field, points, times)
         out = []
         with torch.no_grad():
-            for p, t in zip(
-                np.array_split(points, len(points) // 2**18 + 1), np.array_split(times, len(times) // 2**18 + 1)
-            ):
+            parts = len(points) // 2**18 + 1
+            for p, t in zip(np.array_split(points, parts), np.array_split(times, parts), strict=True):
                 features = self.optimiser.features(*(torch.from_numpy(np.float32(a)).to(self.device) for a in (p, t)))
                 out.append(self.field.decode(features)[0].cpu().numpy())
         return np.concatenate(out)
 
     def save(self, path: Path) -> None:
-        """Write everything a later `resume` needs. The file is plain tensors and numbers; it is read without unpickling code.
+        """Write all that `resume` needs, as plain tensors and numbers that are read without unpickling code.
 
         Raises:
-            TrainingError: it cannot be written; an earlier checkpoint is left as it was.
+            TrainingError: the file cannot be written; an earlier checkpoint is left unchanged.
         """
         state = {
             "config": asdict(self.config),
@@ -295,10 +321,10 @@ class Trainer:
             print(f"{error}; training goes on", file=sys.stderr, flush=True)
 
     def resume(self, path: Path) -> None:
-        """Go on from a checkpoint of the same dataset and config, to bitwise the same end.
+        """Continue from a checkpoint of the same dataset and configuration, to bitwise the same result.
 
         Raises:
-            TrainingError: it cannot be read, or belongs to another run.
+            TrainingError: the checkpoint cannot be read, or belongs to another run.
         """
         try:
             state = _load(path, self.device)
@@ -321,15 +347,15 @@ class Trainer:
             self.samples_per_ray = state["samples_per_ray"]
         except TrainingError:
             raise
-        except Exception as error:  # what a damaged file holds may be of any kind
+        except Exception as error:  # a damaged file may raise anything
             raise _unusable(path, error) from error
 
 
 def load_checkpoint_box(path: Path) -> np.ndarray:
-    """The (2, 3) box of the run that wrote a checkpoint.
+    """Return the (2, 3) box of the run that wrote a checkpoint.
 
     Raises:
-        TrainingError: it cannot be read.
+        TrainingError: the checkpoint cannot be read.
     """
     try:
         aabb = _load(path, torch.device("cpu"))["aabb"].numpy()
@@ -350,7 +376,7 @@ def _unusable(path: Path, error: Exception) -> TrainingError:
 
 
 def _comparable(config: dict[str, Any]) -> dict[str, Any]:
-    """A config without what may differ between a run and its continuation."""
+    """Return a configuration without what may differ between a run and its continuation."""
     return {
         key: tuple(value) if isinstance(value, list) else value
         for key, value in config.items()
@@ -359,7 +385,7 @@ def _comparable(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fingerprint(dataset: Dataset) -> str:
-    """Of what the rays of a training run depend on, the checksums of pixels and masks included."""
+    """Return a hash of all that the rays of a run depend on, including checksums of pixels and masks."""
     digest = hashlib.sha256(repr([(tile.offset, tile.crc32c) for tile in dataset.pixels.tiles]).encode())
     p = dataset.pictures
     for array in (p.time, p.is_test, p.width, p.height, p.intrinsics, p.distortion, p.camera_to_world):

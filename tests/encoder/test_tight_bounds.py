@@ -8,7 +8,7 @@ import pytest
 from kpc.encoder.cli.options import Options
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import PRESETS, TrainConfig
-from kpc.encoder.training.tight_bounds import MOST_STEPS, trim_box
+from kpc.encoder.training.tight_bounds import MAX_STEPS, trim_box
 
 CONFIG = TrainConfig(steps=1500, rays=256, samples=12288, warmup=5)
 LARGE = np.array([[-3, -3, -3], [3, 3, 3]], np.float32)
@@ -31,9 +31,9 @@ def test_a_run_too_short_to_survey_keeps_its_box(moving: Dataset) -> None:
 
 def test_time_to_spare_does_not_go_into_the_survey(moving: Dataset) -> None:
     steps: list[int] = []
-    long = replace(CONFIG, steps=10 * MOST_STEPS)
+    long = replace(CONFIG, steps=10 * MAX_STEPS)
     box, seconds = trim_box(moving, long, LARGE, lambda report: steps.append(report.step), time_budget_s=1e5)
-    assert steps[-1] <= MOST_STEPS and seconds < 1e4
+    assert steps[-1] <= MAX_STEPS and seconds < 1e4
     assert np.array_equal(box, trim_box(moving, long, LARGE, lambda report: None)[0])
 
 

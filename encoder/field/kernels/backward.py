@@ -12,18 +12,18 @@ from numba import prange
 @bare
 def distortion_gradient(buffers, count, volume, factor):
     """Set g_weights[k] = factor * d D / d w_k of `backpropagate`, from running sums of w and w s before sample k."""
-    weights, places, step, extent = buffers.weights, buffers.s, volume.step, volume.extent
+    weights, s, step, extent = buffers.weights, buffers.s, volume.step, volume.extent
     total, total_s = np.float32(0.0), np.float32(0.0)
     for k in range(count):
         total += weights[k]
-        total_s += weights[k] * (places[k] - places[0]) / extent
+        total_s += weights[k] * (s[k] - s[0]) / extent
     before, before_s = np.float32(0.0), np.float32(0.0)
     for k in range(count):
-        s = (places[k] - places[0]) / extent
-        apart = s * (np.float32(2.0) * before - total) + total_s - np.float32(2.0) * before_s
+        along = (s[k] - s[0]) / extent
+        apart = along * (np.float32(2.0) * before - total) + total_s - np.float32(2.0) * before_s
         buffers.g_weights[k] = factor * (np.float32(2.0) * apart + np.float32(2.0 / 3.0) * weights[k] * step / extent)
         before += weights[k]
-        before_s += weights[k] * s
+        before_s += weights[k] * along
 
 
 @inlined
