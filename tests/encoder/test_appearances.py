@@ -1,6 +1,7 @@
-"""Appearances in training: who has one, that colours alone depend on it, and what held-out pictures gain."""
+"""Appearances in training: which pictures have one, that only colours depend on it, and what held-out pictures gain."""
 
 import copy
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,9 +73,7 @@ def with_codes(unequal: Dataset) -> Trainer:
 # --- who has one
 
 
-def test_photographs_by_many_lenses_have_appearances_and_nothing_else_has(
-    unequal: Dataset, rig: Dataset, tmp_path: Path
-) -> None:
+def test_only_photo_collections_get_appearances(unequal: Dataset, rig: Dataset, tmp_path: Path) -> None:
     assert choose_appearance(unequal) == ("image", "photographs: 28 of 28 pictures have a lens or size of their own")
     assert choose_appearance(rig) == ("none", "a clip, filmed as one")
     make.write_varying_exposure(tmp_path / "set", images=9, own_lens=False)
@@ -87,7 +86,7 @@ def test_photographs_by_many_lenses_have_appearances_and_nothing_else_has(
         assert choose_appearance(replace(one_lens, pictures=replace(pictures, width=width)))[0] == kind
 
 
-def test_each_image_or_each_camera_has_its_own(rig: Dataset, unequal: Dataset) -> None:
+def test_each_image_or_each_camera_has_an_appearance(rig: Dataset, unequal: Dataset) -> None:
     held_out = rig.pictures.is_test
     assert held_out.sum() == 3 and rig.camera_names == ("cam00", "cam01", "cam02")
     numbers, names = assign_appearances(rig, "camera")
@@ -102,7 +101,7 @@ def test_each_image_or_each_camera_has_its_own(rig: Dataset, unequal: Dataset) -
     assert names[:2] == ("0001.png", "0002.png") and numbers[:3].tolist() == [-1, 0, 1]
 
 
-def test_names_that_clash_or_that_no_file_can_hold_give_way(unequal: Dataset) -> None:
+def test_names_that_clash_or_that_no_file_can_hold_are_replaced(unequal: Dataset) -> None:
     files = ("a/1.jpg", "b/1.jpg", "c/x\ny.jpg", "d/" + "z" * 300, "e/\ud800.jpg", "#4")
     some = replace(unequal.pictures, file=files + unequal.pictures.file[6:], is_test=np.arange(32) >= 6)
     dataset = replace(unequal, pictures=some)
@@ -112,7 +111,7 @@ def test_names_that_clash_or_that_no_file_can_hold_give_way(unequal: Dataset) ->
     assert assign_appearances(stems, "camera")[1][:3] == ("a/1.jpg", "b/1.jpg", "#2")
 
 
-def test_more_than_a_file_holds_are_refused(unequal: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_appearances_than_a_file_holds_are_refused(unequal: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(appearances, "APPEARANCE_LIMIT", 27)
     with pytest.raises(UsageError, match="28 appearances, a file holds 27; give --appearance camera"):
         assign_appearances(unequal, "image")
@@ -135,14 +134,14 @@ def test_rays_carry_the_appearance_of_their_picture(unequal: Dataset, object_ray
 # --- gradients
 
 
-@pytest.mark.parametrize("way", ["fused", "plain", "hybrid"])
-def test_gradients_are_those_of_autograd_in_double_precision(way: str) -> None:
-    scene = with_appearances(with_hybrid_decoder(translucent_scene()) if way == "hybrid" else translucent_scene())
+@pytest.mark.parametrize("kind", ["fused", "plain", "hybrid"])
+def test_gradients_equal_those_of_autograd_in_double_precision(kind: str) -> None:
+    scene = with_appearances(with_hybrid_decoder(translucent_scene()) if kind == "hybrid" else translucent_scene())
     rays = replace(random_rays(scene, 160), appearances=torch.from_numpy(np.random.default_rng(3).integers(0, 3, 160)))
     targets = torch.from_numpy(np.random.default_rng(1).random((160, 3), np.float32))
     config = replace(CONFIG, appearance="image", appearance_decay=0.05, regularise_every=1000)
     field = Field.from_scene(scene)
-    optimiser = (FusedOptimiser if way == "fused" else TorchOptimiser)(field, config, scene.occupancy.shape[1:])
+    optimiser = (FusedOptimiser if kind == "fused" else TorchOptimiser)(field, config, scene.occupancy.shape[1:])
     twin = copy.deepcopy(field).double()
     optimiser.step(1, 0.0, 0.0, rays, targets, scene.aabb, scene.occupancy, scene.step, scene.extent)  # at a rate of 0
 
@@ -179,10 +178,10 @@ def test_the_prior_is_the_mean_square_and_pulls_each_code_to_0() -> None:
     assert appearance_priors(Field.from_scene(tiny_scene()), config) == {}
 
 
-# --- what they change, and what not
+# --- what appearances change
 
 
-def test_codes_start_at_0_and_colour_alone_depends_on_them(unequal: Dataset, with_codes: Trainer) -> None:
+def test_codes_start_at_0_and_affect_only_colour(unequal: Dataset, with_codes: Trainer) -> None:
     fresh = Trainer(unequal, replace(CONFIG, appearance="image"), BOX, "cpu")
     assert fresh.field.codes is not None and fresh.field.codes.shape == (28, 16) and not fresh.field.codes.any()
     scene = with_codes.scene()
@@ -191,13 +190,13 @@ def test_codes_start_at_0_and_colour_alone_depends_on_them(unequal: Dataset, wit
     times = np.zeros(len(origins), np.float32)
     looks = [renderer.render(origins, directions, times, renderer.codes(np.full(len(origins), k))) for k in (0, 5)]
     looks.append(renderer.render(origins, directions, times))
-    assert all(np.abs(one[0] - other[0]).max() > 0.05 for one, other in zip(looks, looks[1:]))
-    for one, other in zip(looks, looks[1:]):
+    assert all(np.abs(one[0] - other[0]).max() > 0.05 for one, other in itertools.pairwise(looks))
+    for one, other in itertools.pairwise(looks):
         np.testing.assert_array_equal(one[1], other[1])
         np.testing.assert_array_equal(one[2], other[2])
 
 
-def test_the_average_look_is_the_mean_of_the_codes(with_codes: Trainer) -> None:
+def test_the_average_appearance_is_the_mean_of_the_codes(with_codes: Trainer) -> None:
     field, scene = with_codes.field, with_codes.scene()
     assert field.codes is not None and field.codes.mean(0).abs().max().item() > 1e-2
     codes = np.stack([appearance.code for appearance in scene.appearances])
@@ -210,11 +209,9 @@ def test_the_average_look_is_the_mean_of_the_codes(with_codes: Trainer) -> None:
         np.testing.assert_allclose(ours, field.hidden(directions, raw).detach().numpy(), atol=1e-5)
 
 
-def test_codes_come_back_from_the_file(with_codes: Trainer) -> None:
+def test_codes_survive_a_file(with_codes: Trainer) -> None:
     scene = with_codes.scene()
-    decoded = read(
-        encode(quantise_scene(scene, [{name: 0.02 for name in scale} for scale in scene.scales]))
-    ).dequantise()
+    decoded = read(encode(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]))).dequantise()
     assert [a.name for a in decoded.appearances] == [a.name for a in scene.appearances] == [*with_codes.names]
     back = Field.from_scene(decoded)
     assert back.codes is not None
@@ -231,7 +228,7 @@ def test_codes_come_back_from_the_file(with_codes: Trainer) -> None:
 # --- held-out pictures
 
 
-def test_held_out_right_halves_gain(unequal: Dataset, with_codes: Trainer) -> None:
+def test_appearances_improve_held_out_right_halves(unequal: Dataset, with_codes: Trainer) -> None:
     """Measured: 18.5 dB without, 24.8 dB with; and 18.9 and 24.7 dB with another seed."""
     without, quality = (
         SceneRenderer(encode_scene.to_scene(trained(unequal))),
@@ -244,7 +241,9 @@ def test_held_out_right_halves_gain(unequal: Dataset, with_codes: Trainer) -> No
     assert quality is not None and quality.pictures == 4 and quality.psnr > plain + 4, (quality, plain)
 
 
-def test_the_left_half_tells_the_code_and_the_right_half_is_scored(unequal: Dataset, with_codes: Trainer) -> None:
+def test_the_code_is_fitted_on_the_left_half_and_the_right_half_is_scored(
+    unequal: Dataset, with_codes: Trainer
+) -> None:
     scene = with_codes.scene()
     renderer, number = SceneRenderer(scene), 8
     code = renderer.fit_left_half(unequal, number)
@@ -267,8 +266,8 @@ def test_the_left_half_tells_the_code_and_the_right_half_is_scored(unequal: Data
     )
 
 
-def test_masks_count_in_halves(tmp_path: Path, with_codes: Trainer) -> None:
-    """A picture whose right half is ignored is not scored; one whose left half is, shows the average."""
+def test_masks_apply_to_both_halves(tmp_path: Path, with_codes: Trainer) -> None:
+    """A picture whose right half is masked is not scored; one whose left half is shows the average appearance."""
     make.write_varying_exposure(tmp_path / "set")
     for k, usable in ((0, np.arange(32) < 16), (8, np.arange(32) >= 16)):
         make.write_mask(tmp_path / f"set/masks/{k:04d}.png", np.broadcast_to(usable, (32, 32)))
@@ -280,7 +279,7 @@ def test_masks_count_in_halves(tmp_path: Path, with_codes: Trainer) -> None:
 
 
 @pytest.mark.parametrize(("contracted", "decoder"), [(False, "explicit"), (True, "explicit"), (False, "hybrid")])
-def test_a_fitted_code_shows_what_it_was_fitted_to(contracted: bool, decoder: str) -> None:
+def test_a_fitted_code_reproduces_its_target(contracted: bool, decoder: str) -> None:
     scene = translucent_scene(contracted=contracted)
     scene = with_appearances(with_hybrid_decoder(scene) if decoder == "hybrid" else scene)
     wanted = scene.appearance("dusk.jpg") / 2
@@ -296,11 +295,12 @@ def test_a_fitted_code_shows_what_it_was_fitted_to(contracted: bool, decoder: st
     assert not fit_code(scene, renderer.field, rays.map(lambda a: a[:0]), torch.zeros(0, 3)).any()
 
 
-def test_codings_are_judged_with_the_codes_of_the_rays(with_codes: Trainer) -> None:
+def test_coding_loss_is_measured_with_the_codes_of_the_rays(with_codes: Trainer) -> None:
     scene = encode_scene.to_scene(with_codes)
     measure = ValidationRays.from_training_views(with_codes.sampler, with_codes.background).measure(scene)
     turned = tuple(
-        replace(a, code=b.code) for a, b in zip(scene.appearances, scene.appearances[1:] + scene.appearances[:1])
+        replace(a, code=b.code)
+        for a, b in zip(scene.appearances, scene.appearances[1:] + scene.appearances[:1], strict=True)
     )
     judged = measure(replace(scene, appearances=turned))
     assert measure(scene).psnr > 25 > judged.psnr + 3 and measure(scene).mse == 0 < judged.mse

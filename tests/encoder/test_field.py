@@ -1,5 +1,6 @@
 """The field: where its planes lie, how they are sampled, and that a scene goes in and comes out unchanged."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,7 @@ def test_layout_is_gapless_and_in_order() -> None:
     assert layout.is_dynamic and layout.features == 10
     end = 0
     for s, name, start, rows, columns in layout.planes():
-        axes = dict(zip("xyzt", layout.resolution[s]))
+        axes = dict(zip("xyzt", layout.resolution[s], strict=True))
         assert start == end and (rows, columns) == (axes[name[1]], axes[name[0]])
         end += rows * columns * 5
     assert end == layout.size
@@ -56,7 +57,7 @@ def test_time_planes_start_as_the_identity_and_a_seed_repeats() -> None:
     for name in ALL_PLANES:
         plane = one.plane(0, name)
         assert bool((plane == 1).all()) == (name in TIME_PLANES)
-    for parameter, same, different in zip(one.parameters(), two.parameters(), other.parameters()):
+    for parameter, same, different in zip(one.parameters(), two.parameters(), other.parameters(), strict=True):
         assert torch.equal(parameter, same)
         assert parameter is one.b1 or parameter is one.w2 or not torch.equal(parameter, different)
 
@@ -68,7 +69,7 @@ def test_scene_to_field_and_back(kind: str) -> None:
     scene = with_motion(scene) if kind == "displaced" else scene
     back = Field.from_scene(scene).to_scene(scene.aabb, scene.clip, scene.occupancy, scene.background, scene.step)
     assert back.parameter_count == scene.parameter_count and back.is_dynamic == dynamic
-    for ours, theirs in zip(back.scales, scene.scales):
+    for ours, theirs in zip(back.scales, scene.scales, strict=True):
         assert set(ours) == set(theirs)
         for name in theirs:
             np.testing.assert_array_equal(ours[name], theirs[name])
@@ -78,7 +79,7 @@ def test_scene_to_field_and_back(kind: str) -> None:
         np.testing.assert_array_equal(getattr(back, name), getattr(scene, name))
 
 
-def test_the_motion_grid_starts_at_rest_with_cells_as_near_to_cubes_as_may_be() -> None:
+def test_the_motion_grid_starts_at_zero_with_nearly_cubic_cells() -> None:
     box, clip, config = (
         np.array([[0, 0, 0], [1.2, 0.5, 2.4]]),
         Clip(30, 30.0),
@@ -92,13 +93,13 @@ def test_the_motion_grid_starts_at_rest_with_cells_as_near_to_cubes_as_may_be() 
     assert motion_grid_shape(config, box, plan_layout(config, box, clip, is_dynamic=False)) is None
 
 
-def test_motion_priors_do_not_mind_even_motion_and_measure_the_rest() -> None:
+def test_motion_priors_ignore_uniform_motion_and_measure_the_rest() -> None:
     config = replace(PRESETS["draft"], motion_smoothness_time=3.0, motion_smoothness_space=0.5)
     field = Field(Layout.of(np.array([[3, 3, 3, 5]]), 2), 4, motion_shape=(5, 4, 3, 3))
     t, z, y, x = torch.meshgrid(*(torch.arange(float(n)) for n in (5, 4, 3, 3)), indexing="ij")
-    even = torch.stack([2 * t - x, 0.5 * z + y, x + y + z - t], -1)
+    uniform = torch.stack([2 * t - x, 0.5 * z + y, x + y + z - t], -1)
     with torch.no_grad():
-        field.motion.copy_(even)
+        field.motion.copy_(uniform)
     assert all(value.item() < 1e-9 for value in motion_priors(field, config).values())
     with torch.no_grad():
         field.motion[2, 1, 1, 1, 0] += 1.0  # in time 1 - 2 1; the same along z, but along y and x one difference each
@@ -117,7 +118,7 @@ def test_the_scene_is_a_copy() -> None:
     np.testing.assert_array_equal(scene.scales[0]["xy"], kept)
 
 
-def test_bilinear_at_texels_between_them_and_on_the_border() -> None:
+def test_bilinear_sampling_at_texels_between_them_and_on_the_border() -> None:
     plane = torch.arange(12, dtype=torch.float64).reshape(3, 4, 1)  # value = 4 row + column
     u = torch.tensor([0, 1 / 3, 1, 1, 0.5, 1 / 6], dtype=torch.float64)
     v = torch.tensor([0, 0.5, 1, 0, 0.5, 0.25], dtype=torch.float64)
@@ -125,13 +126,13 @@ def test_bilinear_at_texels_between_them_and_on_the_border() -> None:
     torch.testing.assert_close(bilinear(plane, u, v)[:, 0], expected, rtol=0, atol=1e-12)
 
 
-def test_bilinear_clamps_beyond_the_border() -> None:
+def test_bilinear_sampling_clamps_beyond_the_border() -> None:
     plane = torch.arange(12, dtype=torch.float64).reshape(3, 4, 1)
     u, v = torch.tensor([-0.2, 1.2], dtype=torch.float64), torch.tensor([-1.0, 7.0], dtype=torch.float64)
     torch.testing.assert_close(bilinear(plane, u, v)[:, 0], torch.tensor([0, 11], dtype=torch.float64))
 
 
-def test_bilinear_is_the_players() -> None:
+def test_bilinear_sampling_equals_the_players() -> None:
     rng = np.random.default_rng(0)
     for rows, columns in ((2, 2), (5, 9)):
         plane, u, v = rng.random((rows, columns, 3), np.float32), rng.random(64, np.float32), rng.random(64, np.float32)
@@ -173,7 +174,7 @@ def test_features_multiply_planes_and_concatenate_scales() -> None:
         {"appearance": "image", "view_dependent": False},
     ],
 )
-def test_a_config_that_makes_no_sense_is_refused(change: dict[str, object]) -> None:
+def test_an_invalid_config_is_refused(change: dict[str, object]) -> None:
     with pytest.raises(UsageError, match=next(iter(change))):
         TrainConfig(**change)  # type: ignore[arg-type]
 
@@ -181,7 +182,7 @@ def test_a_config_that_makes_no_sense_is_refused(change: dict[str, object]) -> N
 def test_presets_grow() -> None:
     names = ("draft", "fast", "balanced", "best")
     assert set(names) == set(PRESETS) - {"paper"}
-    for smaller, larger in zip(names, names[1:]):
+    for smaller, larger in itertools.pairwise(names):
         assert PRESETS[smaller].steps < PRESETS[larger].steps
         assert max(PRESETS[smaller].resolutions) < max(PRESETS[larger].resolutions)
 
@@ -196,7 +197,7 @@ def test_colours_are_those_of_the_basis() -> None:
     torch.testing.assert_close(field.colours(latent, field.ray_terms(directions), ray), wanted)
 
 
-def test_what_is_gathered_by_row_is_what_is_scattered() -> None:
+def test_sparse_and_dense_scattering_agree() -> None:
     values, rows, shares = torch.randn(500, 8), torch.randint(0, 60, (500, 4)), torch.rand(500, 4)
     rows[rows == 7] = 8  # to one goes nothing
     torch.testing.assert_close(scatter_rows_sparse(values, rows, shares, 60), scatter_rows(values, rows, shares, 60))

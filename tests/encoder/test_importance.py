@@ -1,4 +1,4 @@
-"""Pixels that change are drawn as much more often as they change more, and no other pixel is ever drawn."""
+"""Pixels are drawn in proportion to their change over time, and no other pixel is ever drawn."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,32 +20,33 @@ def load(folder: Path, **options: object) -> Dataset:
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """Three cameras, six frames; 36 x 20 is no multiple of a tile."""
+    """Return a clip of three cameras and six frames; 36 x 20 pixels are no multiple of a tile."""
     folder = tmp_path_factory.mktemp("rig")
     make.write_n3dv(folder / "set", frames=6, width=36, height=20)
     return load(folder)
 
 
 def write_stills(folder: Path, sizes: list[tuple[int, int]], times: int = 4, masked: bool = False) -> None:
-    """Images of cameras that stand still, of one size each, in the nerfstudio layout; random pixels."""
+    """Write images of static cameras, each of one size, in the nerfstudio layout, with random pixels."""
     rng = np.random.default_rng(5)
     (folder / "images").mkdir(parents=True)
     frames = []
-    for k, ((width, height), camera) in enumerate(zip(sizes, make.ring(len(sizes)))):
+    for k, ((width, height), camera) in enumerate(zip(sizes, make.ring(len(sizes)), strict=True)):
         for t in range(times):
             name = f"images/{k}_{t}.png"
             write_image(folder / name, rng.integers(256, size=(height, width, 3), dtype=np.uint8))
             if masked:
                 make.write_mask(folder / f"masks/{k}_{t}.png", rng.random((height, width)) < 0.4)
-            frames.append({"file_path": name, "transform_matrix": camera.camera_to_world.tolist(), "time": t / (times - 1),
-                           "w": width, "h": height, "fl_x": 40, "fl_y": 40, "cx": width / 2, "cy": height / 2})  # fmt: skip
+            lens = {"w": width, "h": height, "fl_x": 40, "fl_y": 40, "cx": width / 2, "cy": height / 2}
+            pose = {"transform_matrix": camera.camera_to_world.tolist(), "time": t / (times - 1)}
+            frames.append({"file_path": name, **pose, **lens})
     (folder / "transforms.json").write_text(make.json.dumps({"test_filenames": [], "frames": frames}))
 
 
 def chances(
     dataset: Dataset, floor: float, window: int = importance.WINDOW, side: int = SMALLEST_TILE
 ) -> dict[int, np.ndarray]:
-    """By the definition: for each training picture the chance of each pixel to be drawn, (height, width)."""
+    """Return, by definition, the probability of each pixel of each training picture, (height, width)."""
     pictures, found = dataset.pictures, {}
     train = np.flatnonzero(~pictures.is_test)
     for number in train:
@@ -91,22 +92,22 @@ def test_draws_follow_the_weights(rig: Dataset) -> None:
     assert_drawn_as_stated(rig, expected)
 
 
-def test_uniform_draws_would_be_noticed(rig: Dataset) -> None:
+def test_uniform_draws_fail_the_test_of_weights(rig: Dataset) -> None:
     flat = {number: np.full(chance.shape, 1 / 12 / chance.size) for number, chance in chances(rig, FLOOR).items()}
     with pytest.raises(AssertionError):
         assert_drawn_as_stated(rig, flat)
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_pictures_of_other_sizes_and_masks_are_honoured(tmp_path: Path, masked: bool) -> None:
+def test_weights_respect_picture_sizes_and_masks(tmp_path: Path, masked: bool) -> None:
     write_stills(tmp_path / "set", [(33, 17), (16, 8), (7, 5)], masked=masked)
     dataset = load(tmp_path)
     assert has_static_cameras(dataset) and (dataset.masks is not None) == masked
     assert_drawn_as_stated(dataset, chances(dataset, FLOOR))
 
 
-def test_the_window_ends_and_the_memory_too(rig: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the least of both, a clip takes many passes over bands of few rows; the weights stay what they should be."""
+def test_window_and_memory_bounds_do_not_change_weights(rig: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the smallest of both, weights take many passes over bands of few rows and stay the same."""
     monkeypatch.setattr(importance, "WINDOW", 1)
     whole = TileWeights(rig, FLOOR)
     monkeypatch.setattr(importance, "BAND_BYTES", 1)
@@ -144,7 +145,7 @@ def test_a_long_clip_takes_larger_tiles_instead_of_more_memory(rig: Dataset, mon
 
 
 @pytest.mark.parametrize("radius", [0, 1, 2, 25])
-def test_largest_change_is_that_over_the_window(radius: int) -> None:
+def test_max_temporal_difference_is_over_the_window(radius: int) -> None:
     pictures = np.random.default_rng(radius).integers(256, size=(9, 3, 4, 3), dtype=np.uint8)
     wide = pictures.astype(int)
     expected = [
@@ -153,7 +154,7 @@ def test_largest_change_is_that_over_the_window(radius: int) -> None:
     np.testing.assert_array_equal(max_temporal_difference(pictures, radius), expected)
 
 
-def test_colours_that_are_transparent_do_not_change(tmp_path: Path) -> None:
+def test_transparent_colours_do_not_count_as_change(tmp_path: Path) -> None:
     write_stills(tmp_path / "set", [(16, 8), (16, 8)])
     for image in (tmp_path / "set/images").iterdir():
         pixels = np.random.default_rng(0).integers(256, size=(8, 16, 4), dtype=np.uint8)
@@ -165,7 +166,7 @@ def test_colours_that_are_transparent_do_not_change(tmp_path: Path) -> None:
     assert (left == round(255 * FLOOR)).all() and (right == 255).all()
 
 
-def test_only_cameras_that_stand_still_can_tell(rig: Dataset, moving: Dataset, tmp_path: Path) -> None:
+def test_static_cameras_are_recognised(rig: Dataset, moving: Dataset, tmp_path: Path) -> None:
     assert has_static_cameras(rig) and not has_static_cameras(moving)
     assert not has_static_cameras(replace(rig, is_dynamic=False))
     write_stills(tmp_path / "set", [(16, 8), (16, 8)], times=3)

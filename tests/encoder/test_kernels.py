@@ -1,9 +1,9 @@
-"""The fused kernels meet their readable twins: `kpc.encoder.field.field` in float64, torch.optim.Adam, the numpy renderer.
+"""The fused kernels agree with their references: the PyTorch field in float64, torch.optim.Adam, the numpy renderer.
 
-Tolerances. Float32 places a sample at 4 units from the eye to 2^-22 or so, 5e-7 of the box; planes of 24 texels that
-change by 1 a texel turn that into 1e-5 of a feature, and six factors, 16 features and a march of 60 samples into some
-1e-4 at worst.
-Colours must agree to 1e-4, a fortieth of an 8-bit level; a gradient to 1e-3 of the largest element of its array.
+Tolerances. In float32 a sample 4 units from the camera is placed to about 2^-22, 5e-7 of the box. In planes of 24
+texels whose values change by 1 per texel that is 1e-5 of a feature; with six factors, 16 features and 60 samples it
+becomes 1e-4 at worst. Colours must agree to 1e-4, a fortieth of an 8-bit level; gradients to 1e-3 of the largest
+element of their array.
 """
 
 import math
@@ -37,7 +37,7 @@ KERNEL_MODULES = ("geometry", "planes", "marching", "backward", "points", "updat
 
 
 @pytest.mark.parametrize("kind", FIELD_KINDS)
-def test_backpropagate_is_autograd_through_the_reference(kind: tuple[bool, bool, bool]) -> None:
+def test_backpropagate_equals_autograd_through_the_reference(kind: tuple[bool, bool, bool]) -> None:
     scene = translucent_scene(*kind)
     rays = random_rays(scene, 403)
     targets = torch.rand(403, 3, generator=torch.Generator().manual_seed(1))
@@ -51,8 +51,8 @@ def test_backpropagate_is_autograd_through_the_reference(kind: tuple[bool, bool,
         np.testing.assert_allclose(ours[name], theirs[name], atol=GRADIENT * largest, err_msg=name)
 
 
-def test_backpropagate_gives_faint_samples_no_colour_and_hardly_errs() -> None:
-    """A sample of weight below 1e-4 gets no colour: off by less than that, `max_samples_per_ray` times at most."""
+def test_the_error_of_faint_samples_without_colour_is_bounded() -> None:
+    """Samples of weight below 1e-4 have no colour: the error is at most that times `max_samples_per_ray`."""
     scene = tiny_scene()
     rays = random_rays(scene, 203)
     targets = torch.rand(203, 3, generator=torch.Generator().manual_seed(1))
@@ -64,7 +64,7 @@ def test_backpropagate_gives_faint_samples_no_colour_and_hardly_errs() -> None:
         assert difference < colour, (name, difference)
 
 
-def test_workers_share_the_rays_and_change_nothing_but_rounding() -> None:
+def test_the_number_of_workers_changes_only_rounding() -> None:
     scene = translucent_scene()
     rays, targets = random_rays(scene, 103), torch.zeros(103, 3)
     one, three = backpropagate(scene, rays, targets, workers=1), backpropagate(scene, rays, targets, workers=3)
@@ -75,18 +75,18 @@ def test_workers_share_the_rays_and_change_nothing_but_rounding() -> None:
     np.testing.assert_allclose(one["theta"], three["theta"], atol=1e-5 * np.abs(one["theta"]).max())
 
 
-def test_a_machine_s_first_training_equals_its_second(tmp_path: Path) -> None:
-    """The first process compiles a kernel, the second finds it in numba's cache; sums in any order would differ between them.
+def test_compiled_and_cached_kernels_give_equal_results(tmp_path: Path) -> None:
+    """The first process compiles a kernel, the second loads it from numba's cache; reordered sums would differ.
 
-    The one that compiles fastest and sums stands for all: they have its flags.
+    The kernel that compiles fastest and has a sum stands for all, as they are compiled with the same flags.
     """
     modules = [getattr(kernels, name) for name in KERNEL_MODULES]
     functions = [f for module in modules for f in vars(module).values() if isinstance(f, Dispatcher)]
     assert len(functions) > 20 and all(f.targetoptions["fastmath"] == compilation.FASTMATH for f in functions)
     field, rng = Field.from_scene(tiny_scene()), np.random.default_rng(0)
     theta, density = field.theta.detach().numpy(), field.density.detach().numpy()
-    places = rng.random((500, 3), np.float32), rng.random(500, np.float32)
-    np.savez(tmp_path / "in.npz", theta, field.layout.table, field.layout.resolution, density, *places)
+    at = rng.random((500, 3), np.float32), rng.random(500, np.float32)
+    np.savez(tmp_path / "in.npz", theta, field.layout.table, field.layout.resolution, density, *at)
     script = (
         "import sys, numpy\nfrom kpc.encoder.field import kernels\n"
         "theta, table, resolution, density, points, times = numpy.load(sys.argv[1]).values()\n"
@@ -111,7 +111,7 @@ def test_rays_that_miss_the_box_show_the_background() -> None:
     assert not ours["counts"].any() and not ours["errors"].any() and not ours["theta"].any() and not ours["basis"].any()
 
 
-def test_the_reference_has_the_gradient_of_finite_differences() -> None:
+def test_the_reference_gradient_matches_finite_differences() -> None:
     generator = torch.Generator().manual_seed(3)
     field = Field(Layout.of(np.array([[3, 3, 2, 2]]), 2), 2, generator).double()
     aabb = torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]], dtype=torch.float64)
@@ -137,7 +137,7 @@ def test_the_reference_has_the_gradient_of_finite_differences() -> None:
 
 
 @pytest.mark.parametrize("kind", FIELD_KINDS)
-def test_render_is_the_players_reference(kind: tuple[bool, bool, bool]) -> None:
+def test_render_equals_the_players_reference(kind: tuple[bool, bool, bool]) -> None:
     scene = translucent_scene(*kind)
     renderer = SceneRenderer(scene)
     for time in (0.0, 0.3, 0.5, 1.0):
@@ -150,7 +150,7 @@ def test_render_is_the_players_reference(kind: tuple[bool, bool, bool]) -> None:
             assert np.abs(ours - theirs.rgb).max() < 0.3
 
 
-def test_render_gives_opacity_depth_and_counts() -> None:
+def test_render_returns_opacity_depth_and_counts() -> None:
     scene = translucent_scene()
     field, camera = Field.from_scene(scene), scene.cameras[0]
     origins, directions = camera.rays()
@@ -166,10 +166,10 @@ def test_render_gives_opacity_depth_and_counts() -> None:
         4,
     )
     theirs = reference.render_rays(scene, origins, directions, 0.4)
-    seen = theirs.opacity > 0.05
-    assert 0.1 < seen.mean() < 0.9
+    hit = theirs.opacity > 0.05
+    assert 0.1 < hit.mean() < 0.9
     assert np.mean(np.abs(opacity - theirs.opacity) > COLOUR) < 0.002
-    assert np.mean(np.abs(depth - theirs.depth)[seen] > 4 * COLOUR) < 0.002  # depth reaches 4 units
+    assert np.mean(np.abs(depth - theirs.depth)[hit] > 4 * COLOUR) < 0.002  # depth reaches 4 units
     assert np.mean(counts != theirs.samples) < 0.002
 
 
@@ -180,9 +180,9 @@ def test_log_densities(moved: bool) -> None:
     rng = np.random.default_rng(0)
     points, times = rng.random((500, 3), np.float32), rng.random(500, np.float32)
     points[:4], times[:4] = [[0, 0, 0], [1, 1, 1], [0, 1, 0], [1, 0, 1]], [0, 1, 1, 0]
-    twin = field.double()
-    features = twin.features(torch.from_numpy(points).double(), torch.from_numpy(times).double())
-    expected = twin.decode(features)[0].detach().numpy()
+    reference_field = field.double()
+    features = reference_field.features(torch.from_numpy(points).double(), torch.from_numpy(times).double())
+    expected = reference_field.decode(features)[0].detach().numpy()
     np.testing.assert_allclose(log_densities(Field.from_scene(scene), points, times), expected, atol=COLOUR)
 
 
@@ -193,13 +193,13 @@ def test_log_densities_are_clipped() -> None:
         assert (log_densities(field, np.full((3, 3), 0.5), np.zeros(3)) == limit).all()
 
 
-WEIGHTS = dict(space_variation=0.3, transient_variation=0.4, time_smoothness=0.7, sparse_transients=0.2)
+WEIGHTS = {"space_variation": 0.3, "transient_variation": 0.4, "time_smoothness": 0.7, "sparse_transients": 0.2}
 
 
 @pytest.mark.parametrize("alone", [None, *WEIGHTS])
 @pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize("dynamic", [True, False])
-def test_priors_are_the_gradient_of_their_twin(dynamic: bool, late: bool, alone: str | None) -> None:
+def test_prior_kernels_have_the_gradient_of_the_torch_priors(dynamic: bool, late: bool, alone: str | None) -> None:
     """All of them together, and each on its own."""
     field = Field.from_scene(tiny_scene(dynamic=dynamic))
     with torch.no_grad():
@@ -217,29 +217,29 @@ def test_priors_are_the_gradient_of_their_twin(dynamic: bool, late: bool, alone:
     np.testing.assert_allclose(grad - 1, expected, atol=8 * 2.0**-24 + 1e-6 * np.abs(expected).max())
 
 
-def test_adam_is_pytorchs() -> None:
+def test_adam_equals_pytorchs() -> None:
     n, workers = 40_000, 3
     rng = np.random.default_rng(0)
     theta = rng.normal(size=n).astype(np.float32)
-    twin = torch.nn.Parameter(torch.from_numpy(theta.copy()).double())
-    optimiser = torch.optim.Adam([twin], lr=1.0, betas=(BETA1, BETA2), eps=EPSILON)
+    parameter = torch.nn.Parameter(torch.from_numpy(theta.copy()).double())
+    optimiser = torch.optim.Adam([parameter], lr=1.0, betas=(BETA1, BETA2), eps=EPSILON)
     mean, square = np.zeros(n, np.float32), np.zeros(n, np.float32)
     for number in range(1, 6):
         rate = 0.05 / number
         grad = rng.normal(size=(workers, n)).astype(np.float32)
         grad[:, :100] = 0  # never reached: 0 / eps must not move them
-        twin.grad = torch.from_numpy(grad.sum(0, dtype=np.float64))
+        parameter.grad = torch.from_numpy(grad.sum(0, dtype=np.float64))
         optimiser.param_groups[0]["lr"] = rate
         optimiser.step()
         kernels.adam(theta, grad, mean, square, rate, BETA1, BETA2, EPSILON, number)
         assert not grad.any()
     # Five steps of at most 0.05, each rounded to 1e-5 of itself or so; where gradients cancel, a little worse.
-    expected = twin.detach().numpy()
+    expected = parameter.detach().numpy()
     assert (theta[:100] == expected[:100].astype(np.float32)).all()
     np.testing.assert_allclose(theta, expected, atol=1e-5)
-    np.testing.assert_allclose(square, optimiser.state[twin]["exp_avg_sq"].numpy(), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(square, optimiser.state[parameter]["exp_avg_sq"].numpy(), rtol=1e-4, atol=1e-9)
 
 
-def test_sample_capacity_is_never_reached() -> None:
+def test_max_samples_per_ray_exceeds_the_diagonal() -> None:
     aabb = np.array([[0, 0, 0], [1, 2, 3]], np.float32)
     assert max_samples_per_ray(aabb, 0.1) >= math.sqrt(14) / 0.1 + 1

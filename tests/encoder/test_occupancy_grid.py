@@ -1,4 +1,4 @@
-"""The occupancy grid: what it keeps, what it empties, and what is stored of it."""
+"""The occupancy grid: which cells it keeps, which it empties, and what is stored of it."""
 
 import numpy as np
 from kpc.encoder.field.occupancy_grid import MERGE_TOLERANCE, OccupancyGrid, grid_shape, merge_slots
@@ -12,12 +12,12 @@ def ball(points: np.ndarray, times: np.ndarray, centre: float = 0.5) -> np.ndarr
 
 
 def moving(points: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """In the lower half of x during the first half of the clip, in the upper half during the second."""
+    """Return density in the lower half of x during the first half of the clip, in the upper half after that."""
     return np.where((points[:, 0] < 0.5) == (times < 0.5), 5.0, -5.0).astype(np.float32)
 
 
-def grid(seen: np.ndarray | None = None) -> OccupancyGrid:
-    return OccupancyGrid(np.ones(SHAPE, bool) if seen is None else seen, threshold=0.0)
+def grid(visible: np.ndarray | None = None) -> OccupancyGrid:
+    return OccupancyGrid(np.ones(SHAPE, bool) if visible is None else visible, threshold=0.0)
 
 
 def settled(g: OccupancyGrid, density: object, peaks: np.ndarray, updates: int = 200) -> OccupancyGrid:
@@ -27,7 +27,7 @@ def settled(g: OccupancyGrid, density: object, peaks: np.ndarray, updates: int =
     return g
 
 
-def test_cells_are_cubes_as_nearly_as_may_be() -> None:
+def test_cells_are_nearly_cubes() -> None:
     assert grid_shape(np.array([[0, 0, 0], [4, 2, 1]], np.float32), 96) == (24, 48, 96)
     assert grid_shape(np.array([[0, 0, 0], [1, 1, 1e-9]], np.float32), 10) == (1, 10, 10)
 
@@ -50,12 +50,12 @@ def test_dilation_along_time_too() -> None:
     assert dilate(one, SPACE_TIME_AXES).sum() == 81
 
 
-def test_all_that_is_seen_is_occupied_at_first() -> None:
-    seen = np.random.default_rng(0).random(SHAPE) < 0.5
-    np.testing.assert_array_equal(grid(seen).occupied, seen)
+def test_all_visible_cells_are_occupied_at_first() -> None:
+    visible = np.random.default_rng(0).random(SHAPE) < 0.5
+    np.testing.assert_array_equal(grid(visible).occupied, visible)
 
 
-def test_it_settles_on_where_density_is() -> None:
+def test_the_grid_converges_to_where_density_is() -> None:
     g = settled(grid(), ball, np.ones(SHAPE, np.float32))
     z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n for n in SHAPE), indexing="ij")
     centre = ball(np.stack([x, y, z], -1).reshape(-1, 3), np.zeros(z.size)).reshape(SHAPE) > 0
@@ -68,45 +68,45 @@ def corner(points: np.ndarray, times: np.ndarray) -> np.ndarray:
     return np.where((points < 0.2).all(1), 5.0, -5.0).astype(np.float32)
 
 
-def test_density_that_vanishes_is_forgotten() -> None:
+def test_cells_whose_density_vanishes_are_emptied() -> None:
     g = settled(grid(), lambda p, t: np.maximum(ball(p, t), corner(p, t)), np.ones(SHAPE, np.float32))
     assert g.occupied[3, 2, 4] and g.occupied[0, 0, 0]
     settled(g, corner, np.ones(SHAPE, np.float32), updates=201)  # 10 units of 0.05
     assert g.occupied[0, 0, 0] and not g.occupied[3, 2, 4]
 
 
-def test_density_that_appears_is_found() -> None:
+def test_cells_whose_density_appears_are_occupied() -> None:
     g = settled(grid(), corner, np.ones(SHAPE, np.float32), updates=5)
     assert not g.occupied[3, 2, 4]
     settled(g, ball, np.ones(SHAPE, np.float32))
     assert g.occupied[3, 2, 4]
 
 
-def test_while_all_is_thin_the_thicker_half_stays() -> None:
-    """Everything below the threshold of 0: emptying it all would leave nothing to learn from."""
+def test_while_density_is_low_everywhere_the_denser_half_stays() -> None:
+    """Density is below the threshold of 0 everywhere, but an empty grid could not be trained."""
     g = settled(
         grid(), lambda p, t: np.where(p[:, 0] < 0.5, -1.0, -3.0).astype(np.float32), np.ones(SHAPE, np.float32), 3
     )
     assert g.occupied[:, :, :4].all() and not g.occupied[:, :, 4:].any()
 
 
-def test_what_gives_no_ray_colour_is_emptied() -> None:
-    """Density everywhere, weights in one cell only: that cell and its neighbours stay."""
+def test_cells_that_contribute_to_no_ray_are_emptied() -> None:
+    """Density is everywhere, but only one cell has weights: that cell and its neighbours stay."""
     peaks = np.zeros(SHAPE, np.float32)
     peaks[3, 2, 4] = 0.5
     g = settled(grid(), lambda p, t: np.full(len(p), 5.0, np.float32), peaks)
     assert g.occupied.sum() == 27 and g.occupied[2:5, 1:4, 3:6].all()
 
 
-def test_cells_that_are_not_seen_stay_empty() -> None:
-    seen = np.ones(SHAPE, bool)
-    seen[:, :, :4] = False
-    g = settled(grid(seen), lambda p, t: np.full(len(p), 5.0, np.float32), np.ones(SHAPE, np.float32), updates=20)
-    np.testing.assert_array_equal(g.occupied, seen)
-    assert not g.sample_slots(ball, np.random.default_rng(0), 3)[:, ~seen].any()
+def test_cells_that_are_not_visible_stay_empty() -> None:
+    visible = np.ones(SHAPE, bool)
+    visible[:, :, :4] = False
+    g = settled(grid(visible), lambda p, t: np.full(len(p), 5.0, np.float32), np.ones(SHAPE, np.float32), updates=20)
+    np.testing.assert_array_equal(g.occupied, visible)
+    assert not g.sample_slots(ball, np.random.default_rng(0), 3)[:, ~visible].any()
 
 
-def test_over_time_follows_what_moves() -> None:
+def test_time_slots_follow_what_moves() -> None:
     g = settled(grid(), moving, np.ones(SHAPE, np.float32))
     assert g.occupied.all()
     slots = g.sample_slots(moving, np.random.default_rng(0), 4)
@@ -115,8 +115,8 @@ def test_over_time_follows_what_moves() -> None:
         assert (slots[slot, :, :, :4] == first_half).all() and (slots[slot, :, :, 4:] != first_half).all()
 
 
-def test_a_split_grid_is_marched_where_density_is_or_was_close_by() -> None:
-    """Of what moves at half time, the slots beside it hold both places; what no slot holds is not marched at all."""
+def test_a_split_grid_is_active_where_density_is_close_in_space_and_time() -> None:
+    """Density moves at half time: the slots beside that hold both positions; cells without density are inactive."""
     g = settled(grid(), moving, np.ones(SHAPE, np.float32))
     np.testing.assert_array_equal(g.active, g.occupied[None])
     g.split(moving, 6, np.random.default_rng(0))
@@ -134,7 +134,7 @@ def test_an_update_empties_cells_in_every_slot() -> None:
     assert not g.active[:, 3, 2, 4].any()
 
 
-def test_while_all_is_thin_a_split_leaves_the_thicker_half() -> None:
+def test_while_density_is_low_everywhere_a_split_leaves_the_denser_half() -> None:
     def thin(points: np.ndarray, times: np.ndarray) -> np.ndarray:
         return np.where(points[:, 0] < 0.5, -1.0, -3.0).astype(np.float32)
 
@@ -144,23 +144,23 @@ def test_while_all_is_thin_a_split_leaves_the_thicker_half() -> None:
     assert g.sample_slots(thin, np.random.default_rng(0), 2)[..., :4].all()
 
 
-def test_points_lie_in_their_cells_and_times_in_their_slot() -> None:
-    seen = np.zeros(SHAPE, bool)
-    seen[1, 4, 6] = True
+def test_sampled_points_lie_in_their_cells_and_times_in_their_slot() -> None:
+    visible = np.zeros(SHAPE, bool)
+    visible[1, 4, 6] = True
     asked: list[tuple[np.ndarray, np.ndarray]] = []
 
     def density(points: np.ndarray, times: np.ndarray) -> np.ndarray:
         asked.append((points, times))
         return np.full(len(points), 5.0, np.float32)
 
-    grid(seen).sample_slots(density, np.random.default_rng(0), 2, samples=8)
+    grid(visible).sample_slots(density, np.random.default_rng(0), 2, samples=8)
     points = np.concatenate([p for p, _ in asked])
     np.testing.assert_array_equal(np.floor(points * [8, 5, 6]), np.tile([6, 4, 1], (16, 1)))
     times = np.concatenate([t for _, t in asked])
     assert (times[:8] <= 0.5).all() and (times[8:] >= 0.5).all()
 
 
-def test_state_goes_into_another_grid() -> None:
+def test_a_grids_state_restores_another_grid() -> None:
     one, two = settled(grid(), moving, np.ones(SHAPE, np.float32), updates=7), grid()
     one.split(moving, 4, np.random.default_rng(0))
     two.load(one.state())
@@ -170,7 +170,7 @@ def test_state_goes_into_another_grid() -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
-def test_slots_are_as_few_as_what_moves_allows() -> None:
+def test_slots_are_merged_as_far_as_motion_allows() -> None:
     rng = np.random.default_rng(4)
     still = np.broadcast_to(rng.random((1, 9, 8, 7)) < 0.3, (8, 9, 8, 7)).copy()
     noisy = still & ((rng.random(still.shape) < 0.99) | (np.arange(8) == 3)[:, None, None, None])
@@ -179,8 +179,8 @@ def test_slots_are_as_few_as_what_moves_allows() -> None:
     turning = np.zeros_like(still)
     for slot in range(8):
         turning[slot, slot] = True
-    for before, slots in ((still, 1), (noisy, 1), (halves, 2), (turning, 8), (still[:5], 1), (turning[:5], 5), (still[:1], 1),
-                          (np.zeros_like(still), 1)):  # fmt: skip
+    whole = ((still, 1), (noisy, 1), (halves, 2), (turning, 8))
+    for before, slots in (*whole, (still[:5], 1), (turning[:5], 5), (still[:1], 1), (np.zeros_like(still), 1)):
         after = merge_slots(before)
         assert len(after) == slots and after.dtype == bool and after.mean() <= (1 + MERGE_TOLERANCE) * before.mean()
         whole = np.repeat(after, len(before) // slots, axis=0)

@@ -1,4 +1,4 @@
-"""Proposal sampling: new intervals hold even shares, the loss is its equation, and training puts samples where surfaces are."""
+"""Proposal sampling: equal shares after resampling, the histogram loss, and samples at surfaces after training."""
 
 import datasets as make
 import numpy as np
@@ -38,10 +38,10 @@ def intervals(rays: int, count: int, seed: int) -> tuple[torch.Tensor, torch.Ten
     return edges, weights / weights.sum(1, keepdim=True)
 
 
-def test_new_intervals_hold_even_shares_of_the_weights() -> None:
+def test_resampled_intervals_hold_equal_shares_of_the_weights() -> None:
     edges, weights = intervals(20, 30, 0)
     new = resample_edges(edges, weights, 12, torch.full((20,), 0.5))
-    for e, w, n in zip(edges.numpy(), weights.numpy(), new.numpy()):
+    for e, w, n in zip(edges.numpy(), weights.numpy(), new.numpy(), strict=True):
         padded = w + WEIGHT_PADDING / 30
         cumulative = np.append(0, np.cumsum(padded / padded.sum()))
         np.testing.assert_allclose(np.interp(n, e, cumulative), np.linspace(0, 1, 13), atol=1e-4)
@@ -55,16 +55,16 @@ def test_jitter_keeps_edges_in_order_and_within(jitter: float) -> None:
     assert (new.diff(dim=1) >= 0).all() and (new >= edges[:, :1]).all() and (new <= edges[:, -1:]).all()
 
 
-def test_rays_without_weight_or_length_get_even_or_no_intervals() -> None:
+def test_rays_without_weight_get_uniform_and_rays_without_length_empty_intervals() -> None:
     edges = torch.stack([torch.linspace(1, 2, 9), torch.full((9,), 3.0)])
     new = resample_edges(edges, torch.zeros(2, 8), 4, torch.full((2,), 0.5))
     assert torch.allclose(new[0], torch.linspace(1, 2, 5)) and torch.equal(new[1], torch.full((5,), 3.0))
 
 
-def test_the_histogram_loss_is_its_equation() -> None:
+def test_the_histogram_loss_follows_its_equation() -> None:
     (edges, weights), (proposed, estimate) = intervals(8, 10, 2), intervals(8, 14, 3)
     expected = 0.0
-    for e, w, p, v in zip(*(a.double().numpy() for a in (edges, weights, proposed, estimate))):
+    for e, w, p, v in zip(*(a.double().numpy() for a in (edges, weights, proposed, estimate)), strict=True):
         for i in range(10):
             bound = sum(v[j] for j in range(14) if p[j] < e[i + 1] and p[j + 1] > e[i])
             expected += max(0.0, w[i] - bound) ** 2 / (w[i] + 1e-7)
@@ -72,7 +72,7 @@ def test_the_histogram_loss_is_its_equation() -> None:
     assert expected > 0
 
 
-def test_the_histogram_loss_moves_the_proposal_alone_and_none_that_bounds_what_was_found() -> None:
+def test_the_histogram_loss_trains_only_proposals_that_underestimate() -> None:
     (edges, weights), (proposed, estimate) = intervals(8, 10, 2), intervals(8, 14, 3)
     weights.requires_grad_()
     estimate.requires_grad_()
@@ -93,14 +93,14 @@ def surrounded(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return load_dataset(folder / "set", folder / "cache", progress=False)
 
 
-def test_training_learns_a_scene_and_where_to_look(surrounded: Dataset) -> None:
+def test_training_learns_a_scene_and_where_to_sample(surrounded: Dataset) -> None:
     mapping = Contraction(4.0)
     run = Trainer(surrounded, CONFIG, BOX, "cpu", mapping=mapping)
     before, reports = evaluate(encode_scene.to_scene(run), surrounded), []
     batch, _ = run.sampler.draw(np.random.default_rng(5), 512, run.background)
 
     def found() -> float:
-        """Share of the light that the field's samples on those rays have met."""
+        """Return the share of the rays' light that is absorbed at the field's samples."""
         optimiser = run.optimiser
         with torch.no_grad():
             samples, *_ = optimiser.proposals.sample(

@@ -1,4 +1,4 @@
-"""Rendering in PyTorch: the parts that the kernels stand in for, and the hybrid decoder, whose gradients only PyTorch has."""
+"""Rendering in PyTorch: the parts that kernels replace, and the hybrid decoder, whose gradients only PyTorch has."""
 
 from dataclasses import replace
 
@@ -18,14 +18,14 @@ from scenes import tiny_scene, with_hybrid_decoder
 
 
 @pytest.mark.parametrize("kind", FIELD_KINDS)
-def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bool]) -> None:
+def test_fused_samples_equal_those_of_pytorch(kind: tuple[bool, bool, bool]) -> None:
     scene = translucent_scene(*kind)
     rays = random_rays(scene, 403)
     ours = sample_rays_fused(rays, scene.aabb, scene.occupancy, scene.step, scene.mapping)
     theirs = sample_rays(
         rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step, scene.mapping
     )
-    # A sample within rounding of a cell's face may count here and not there: rays of as many samples have the same ones.
+    # A sample within rounding of a cell's face may count in one only: rays with equal counts have equal samples.
     counts = [np.bincount(samples.ray.numpy(), minlength=403) for samples in (ours, theirs)]
     same = counts[0] == counts[1]
     assert same.mean() > 0.98 and counts[0].sum() > 403
@@ -39,15 +39,17 @@ def test_collected_samples_are_those_of_plain_pytorch(kind: tuple[bool, bool, bo
 
 
 @pytest.mark.parametrize("short", [0, 300])
-def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(short: int) -> None:
+def test_samples_of_fixed_capacity_are_the_same_and_padding_changes_nothing(short: int) -> None:
     scene = translucent_scene()
-    # So many rays that all samples fill vectors of 16: what is left over of one rounds otherwise, on one thread.
+    # The number of rays is such that samples fill vectors of 16: remainders are rounded differently on one thread.
     rays, field = random_rays(scene, 112), Field.from_scene(scene)
-    told = rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step
-    wanted = sample_rays(*told)
+    arguments = rays, torch.from_numpy(scene.aabb), torch.from_numpy(scene.occupancy), scene.step
+    wanted = sample_rays(*arguments)
     n = len(wanted.ray) - short
     assert len(wanted.ray) % 16 == 0
-    found = sample_rays(*told, most=max_samples_per_ray(scene.aabb, scene.step), capacity=n + (0 if short else 500))
+    found = sample_rays(
+        *arguments, most=max_samples_per_ray(scene.aabb, scene.step), capacity=n + (0 if short else 500)
+    )
     for name in ("ray", "points", "s", "length", "density_scale", "cell"):
         assert torch.equal(getattr(found, name)[:n], getattr(wanted, name)[:n]), name
     assert len(found.ray) == n + (0 if short else 500) and not found.length[n:].any() and short < n
@@ -59,9 +61,10 @@ def test_samples_of_fixed_shape_are_the_same_and_the_left_over_change_nothing(sh
         assert torch.isclose(one.distortion, two.distortion, rtol=1e-5)
 
 
-def test_mixed_precision_is_float32_within_its_bound() -> None:
-    """The layers' inputs and weights err by 2^-9 of themselves, bfloat16's half step, a number of them summed in float32: less than
-    1 % of a colour's range; so do gradients, against the largest of their kind.
+def test_mixed_precision_is_within_its_bound_of_float32() -> None:
+    """Inputs and weights of layers have a relative error of 2^-9, half a step of bfloat16, and sums are in float32.
+
+    Colours then differ by less than 1 % of the range, and gradients by less than 1 % of the largest of their kind.
     """
     scene = with_hybrid_decoder(translucent_scene())
     rays = random_rays(scene, 203)
@@ -80,7 +83,7 @@ def test_mixed_precision_is_float32_within_its_bound() -> None:
         assert (gradient - gradients[True][name]).abs().max() < 0.03 * gradient.abs().max(), name
 
 
-def test_gradients_are_added_up_in_float32() -> None:
+def test_gradients_are_summed_in_float32() -> None:
     """A thousand of 1/4096 after one of 1: a float16 sum would stay at 1."""
     plane = torch.ones(2, 2, 1, requires_grad=True)
     u = torch.zeros(1001)
@@ -92,17 +95,17 @@ def test_gradients_are_added_up_in_float32() -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("hybrid_decoder", [False, True])
-def test_a_step_on_a_gpu_waits_for_nothing(hybrid_decoder: bool) -> None:
+def test_a_step_on_a_gpu_never_synchronises(hybrid_decoder: bool) -> None:
     scene = with_hybrid_decoder(translucent_scene()) if hybrid_decoder else translucent_scene()
     field = Field.from_scene(scene).cuda()
     config = TrainConfig(hybrid=hybrid_decoder)
     optimiser = TorchOptimiser(field, config, scene.occupancy.shape[1:])
     rays, targets = random_rays(scene, 203), torch.rand(203, 3)
-    told = scene.aabb, scene.occupancy, scene.step, scene.extent
-    losses = [optimiser.step(k, 0.0, 0.1, rays, targets, *told)[0] for k in range(DeferredReadback.LATE + 2)]
+    arguments = scene.aabb, scene.occupancy, scene.step, scene.extent
+    losses = [optimiser.step(k, 0.0, 0.1, rays, targets, *arguments)[0] for k in range(DeferredReadback.LATE + 2)]
     torch.cuda.set_sync_debug_mode("error")
     try:
-        losses += [optimiser.step(k, 0.0, 0.1, rays, targets, *told)[0] for k in range(20)]
+        losses += [optimiser.step(k, 0.0, 0.1, rays, targets, *arguments)[0] for k in range(20)]
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert losses[-1] < losses[0]
@@ -110,17 +113,17 @@ def test_a_step_on_a_gpu_waits_for_nothing(hybrid_decoder: bool) -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("moved", [False, True])
-def test_a_recorded_step_on_a_gpu_is_the_step(moved: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_captured_step_on_a_gpu_equals_an_eager_one(moved: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = translucent_scene(True, False, moved)
     rays, targets = random_rays(scene, 203), torch.rand(203, 3)
-    told = scene.aabb, scene.occupancy, scene.step, scene.extent
+    arguments = scene.aabb, scene.occupancy, scene.step, scene.extent
     found = []
     for records in (True, False):
         if not records:
             monkeypatch.setattr(GraphCache, "run", lambda self, key, inputs, work: work(*inputs))
         field = Field.from_scene(scene).cuda()
         optimiser = TorchOptimiser(field, TrainConfig(learning_rate=1e-3), scene.occupancy.shape[1:])
-        losses = [optimiser.step(k, 0.0, 1.0, rays, targets, *told)[0] for k in range(60)]
+        losses = [optimiser.step(k, 0.0, 1.0, rays, targets, *arguments)[0] for k in range(60)]
         assert bool(optimiser._graphs.captured) == records
         found.append((losses[-1], field.theta.detach().cpu(), optimiser.peaks()))
     (loss, theta, peaks), (wanted_loss, wanted_theta, wanted_peaks) = found
@@ -130,7 +133,7 @@ def test_a_recorded_step_on_a_gpu_is_the_step(moved: bool, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_samples_that_are_not_reached_take_no_part(moved: bool) -> None:
+def test_samples_that_are_not_reached_contribute_nothing(moved: bool) -> None:
     scene = translucent_scene(True, False, moved)
     rays, field = random_rays(scene, 203), Field.from_scene(scene).double()
     rays = rays.map(torch.Tensor.double)
@@ -144,33 +147,33 @@ def test_samples_that_are_not_reached_take_no_part(moved: bool) -> None:
     for room in (count, count + 100):
         some = select_reached(samples, whole.reached, room)
         assert len(some.ray) == room and (some.ray.diff() >= 0).all()
-        met = weigh_samples(field, rays, some, field.features, scene.extent)
-        found = shade(field, rays, met)
+        weighed = weigh_samples(field, rays, some, field.features, scene.extent)
+        found = shade(field, rays, weighed)
         torch.testing.assert_close(found, shown)
-        torch.testing.assert_close(met.distortion, whole.distortion)
+        torch.testing.assert_close(weighed.distortion, whole.distortion)
         found.square().sum().backward()
         torch.testing.assert_close(field.theta.grad, wanted)
         field.theta.grad = None
 
 
-def test_rays_that_meet_nothing_have_no_samples() -> None:
+def test_rays_through_empty_space_have_no_samples() -> None:
     scene = translucent_scene()
     rays = random_rays(scene, 13)
     away = replace(rays, origins=rays.origins + 100)
     samples = sample_rays_fused(away, scene.aabb, scene.occupancy, scene.step)
     assert len(samples.ray) == 0
     field = Field.from_scene(with_hybrid_decoder(scene))
-    met = weigh_samples(field, away, samples, fused_features(field), scene.extent)
+    weighed = weigh_samples(field, away, samples, fused_features(field), scene.extent)
     assert (
-        torch.equal(shade(field, away, met), away.backgrounds)
-        and not met.opacity.any()
-        and float(met.distortion.detach()) == 0
+        torch.equal(shade(field, away, weighed), away.backgrounds)
+        and not weighed.opacity.any()
+        and float(weighed.distortion.detach()) == 0
     )
 
 
 @pytest.mark.parametrize("moved", [False, True])
 @pytest.mark.parametrize("dynamic", [False, True])
-def test_fused_features_are_plain_ones_with_their_gradient(dynamic: bool, moved: bool) -> None:
+def test_fused_features_equal_those_of_pytorch_with_their_gradient(dynamic: bool, moved: bool) -> None:
     scene = translucent_scene(dynamic, False, moved and dynamic)
     ours, theirs = Field.from_scene(scene), Field.from_scene(scene).double()
     generator = torch.Generator().manual_seed(0)
@@ -185,7 +188,7 @@ def test_fused_features_are_plain_ones_with_their_gradient(dynamic: bool, moved:
         np.testing.assert_allclose(mine, other, atol=1e-3 * float(other.abs().max()), err_msg=name)
 
 
-def test_the_hybrid_decoder_has_the_gradient_of_finite_differences() -> None:
+def test_the_hybrid_decoders_gradient_matches_finite_differences() -> None:
     generator = torch.Generator().manual_seed(3)
     field = HybridField(Layout.of(np.array([[3, 3, 2, 2]]), 2), 3, generator).double()
     aabb = torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]], dtype=torch.float64)
@@ -196,22 +199,22 @@ def test_the_hybrid_decoder_has_the_gradient_of_finite_differences() -> None:
     parameters = dict(field.named_parameters())
 
     def rendered() -> tuple[torch.Tensor, torch.Tensor]:
-        met = weigh_samples(field, rays, samples, field.features, 2.0)
-        return shade(field, rays, met), met.distortion
+        weighed = weigh_samples(field, rays, samples, field.features, 2.0)
+        return shade(field, rays, weighed), weighed.distortion
 
-    def met(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        changed = {f"field.{name}": value for name, value in zip(parameters, values)}
+    def rendered_by_parameters(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        changed = {f"field.{name}": value for name, value in zip(parameters, values, strict=True)}
         return torch.func.functional_call(FieldFunction(field, rendered), changed, ())  # type: ignore[no-any-return]
 
     values = tuple(p.detach().clone().requires_grad_() for p in parameters.values())
-    assert torch.autograd.gradcheck(met, values)
-    rgb, _ = met(*values)
-    for name, gradient in zip(parameters, torch.autograd.grad(rgb.square().sum(), values)):
+    assert torch.autograd.gradcheck(rendered_by_parameters, values)
+    rgb, _ = rendered_by_parameters(*values)
+    for name, gradient in zip(parameters, torch.autograd.grad(rgb.square().sum(), values), strict=True):
         assert gradient.abs().max() > 0, name
 
 
 @pytest.mark.parametrize("kind", FIELD_KINDS)
-def test_pictures_of_a_hybrid_scene_are_the_reference_s(kind: tuple[bool, bool, bool]) -> None:
+def test_pictures_of_a_hybrid_scene_equal_the_references(kind: tuple[bool, bool, bool]) -> None:
     scene = with_hybrid_decoder(translucent_scene(*kind))
     renderer = SceneRenderer(scene)
     for camera in scene.cameras:
@@ -226,7 +229,7 @@ def test_pictures_of_a_hybrid_scene_are_the_reference_s(kind: tuple[bool, bool, 
         assert np.mean(np.abs(depth[there] - theirs.depth[there]) > 0.01) < 0.01
 
 
-def test_a_hybrid_field_is_its_scene_again() -> None:
+def test_a_hybrid_field_converts_to_a_scene_and_back() -> None:
     scene = with_hybrid_decoder(tiny_scene())
     field = Field.from_scene(scene)
     assert isinstance(field, HybridField)
@@ -234,7 +237,7 @@ def test_a_hybrid_field_is_its_scene_again() -> None:
         np.testing.assert_array_equal(weights, getattr(scene.decoder, name), err_msg=name)
 
 
-def test_added_planes_are_their_sum() -> None:
+def test_a_summed_field_adds_its_planes() -> None:
     field = SummedField(Layout.of(np.array([[4, 3, 2, 3]]), 2), 2, torch.Generator().manual_seed(0))
     assert not field.plane(0, "xt").any() and field.plane(0, "xy").all()
     points, times = torch.rand(9, 3), torch.rand(9)

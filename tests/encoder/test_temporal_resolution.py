@@ -1,4 +1,4 @@
-"""How far apart rows of time may lie follows from how fast the pictures change, and from nothing else."""
+"""The spacing of time rows follows from how fast the pictures change, and from nothing else."""
 
 import math
 from collections.abc import Callable
@@ -15,15 +15,15 @@ from kpc.encoder.training import temporal_resolution
 from kpc.encoder.training.temporal_resolution import fit_frames_per_row, measure_time_resolution
 from kpc.format.common.media import write_image
 
+# The last frame is 48 after the first: a spacing r that divides 48 has 48 / r + 1 rows, which can match a clip exactly.
 FRAMES = 49
-"""48 frames between the first and the last: with spacing r there are 48 / r + 1 rows where r divides it, so clips can be exact."""
 
+# A function of frame numbers (n,) to colours in [0, 1].
 Signal = Callable[[np.ndarray], np.ndarray]
-"""Of frame numbers (n,), in [0, 1]."""
 
 
 def film(folder: Path, signal: Signal, noise: float = 0.0, moving: float = 0.5, masked: bool = False) -> Dataset:
-    """Two cameras; the left part of each picture follows `signal`, the rest stands still. `masked`: the rest alone is used."""
+    """Write two cameras whose pictures follow `signal` in their left part, which is ignored if `masked`."""
     rng = np.random.default_rng(2)
     (folder / "set/images").mkdir(parents=True)
     frames = []
@@ -61,7 +61,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Callable[[float], Dataset
 
 
 def by_definition(dataset: Dataset, spacing: int) -> float:
-    """Of all pixels that change: what the best straight lines between rows miss, pixel by pixel, by numpy's least squares."""
+    """Return the error of linear interpolation on all changing pixels, by numpy's least squares for each."""
     rows, pictures = time_rows(dataset.clip.frame_count, spacing), dataset.pictures
     squares, values = 0.0, 0
     for camera in np.unique(pictures.camera):
@@ -77,7 +77,7 @@ def by_definition(dataset: Dataset, spacing: int) -> float:
     return math.sqrt(squares / values)
 
 
-def test_errors_are_those_of_least_squares(clips: Callable[[float], Dataset]) -> None:
+def test_interpolation_errors_equal_least_squares(clips: Callable[[float], Dataset]) -> None:
     for period in (8, 24):
         found = measure_time_resolution(clips(period), 0.05)
         assert found is not None and found.error <= 0.05 < found.next_error
@@ -89,7 +89,7 @@ def test_errors_are_those_of_least_squares(clips: Callable[[float], Dataset]) ->
         assert found.changing == pytest.approx(0.5) and found.noise < 1e-3
 
 
-def test_slow_things_need_fewer_rows(clips: Callable[[float], Dataset]) -> None:
+def test_slow_motion_needs_fewer_rows(clips: Callable[[float], Dataset]) -> None:
     chosen = []
     for period in (3, 12, 24, 96):
         found = measure_time_resolution(clips(period), 0.02)
@@ -98,14 +98,14 @@ def test_slow_things_need_fewer_rows(clips: Callable[[float], Dataset]) -> None:
     assert chosen == sorted(chosen) and chosen[0] == 1 and len(set(chosen)) == 4 and chosen[-1] >= 12
 
 
-def test_what_changes_evenly_needs_its_ends_only(tmp_path: Path) -> None:
+def test_linear_change_needs_two_rows(tmp_path: Path) -> None:
     dataset = film(tmp_path, lambda t: t / (FRAMES - 1))
     found = measure_time_resolution(dataset, 0.02)
     assert found is not None and time_rows(FRAMES, found.frames_per_row) == 2 and math.isnan(found.next_error)
 
 
-def test_noise_asks_for_no_rows_and_hides_no_motion(tmp_path: Path) -> None:
-    """Noise of 0.04, as much as the tolerance: by itself it would ask for rows that are not needed."""
+def test_noise_adds_no_rows_and_hides_no_motion(tmp_path: Path) -> None:
+    """Noise of 0.04 is near the tolerance: by itself it would require more rows."""
     for name, period in (("slow", 48), ("fast", 6)):
         (tmp_path / name).mkdir()
         clean = measure_time_resolution(film(tmp_path / name / "clean", wave(period)), 0.04)
@@ -121,14 +121,16 @@ def test_a_scene_that_hardly_changes_has_two_rows(tmp_path: Path) -> None:
     assert found is not None and found.changing == 0 and time_rows(FRAMES, found.frames_per_row) == 2
 
 
-def test_only_pixels_that_masks_leave_count(tmp_path: Path) -> None:
+def test_masked_pixels_do_not_count(tmp_path: Path) -> None:
     dataset = film(tmp_path, wave(5), masked=True)
     found = measure_time_resolution(dataset, 0.02)
     assert found is not None and found.changing == 0
 
 
-def test_bounded_work_finds_the_same(clips: Callable[[float], Dataset], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few pixels, few lines, three short spans of a clip that is the same everywhere; never more values at a time than stated."""
+def test_smaller_samples_give_the_same_result(
+    clips: Callable[[float], Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Few pixels, few lines and three short spans of a uniform clip suffice; no more values are read than stated."""
     whole = measure_time_resolution(clips(8), 0.05)
     for name, value in (("VALUES", 1600), ("LINES", 5), ("SPAN", 16), ("CAMERAS", 1)):
         monkeypatch.setattr(temporal_resolution, name, value)
@@ -140,7 +142,7 @@ def test_bounded_work_finds_the_same(clips: Callable[[float], Dataset], monkeypa
     assert some.frames_per_row == whole.frames_per_row and some.error == pytest.approx(whole.error, abs=0.01)
 
 
-def test_the_config_gets_what_was_measured(clips: Callable[[float], Dataset], moving: Dataset) -> None:
+def test_the_config_takes_the_measured_spacing(clips: Callable[[float], Dataset], moving: Dataset) -> None:
     config = TrainConfig(time_tolerance=0.02)
     fitted, found = fit_frames_per_row(config, clips(24))
     assert found is not None and fitted == replace(config, frames_per_row=found.frames_per_row) != config
@@ -153,8 +155,8 @@ def test_the_config_gets_what_was_measured(clips: Callable[[float], Dataset], mo
         assert fit_frames_per_row(other, dataset) == (other, None)
 
 
-def test_cameras_that_show_little_of_the_clip_cannot_tell(clips: Callable[[float], Dataset]) -> None:
-    """Between the frames that a camera does not show anything may have happened."""
+def test_cameras_that_show_little_of_the_clip_are_not_measured(clips: Callable[[float], Dataset]) -> None:
+    """Anything may have happened between the frames that a camera shows."""
     pictures = clips(8).pictures
     seldom = replace(pictures, is_test=(pictures.camera == 1) & (np.arange(len(pictures)) % 3 > 0))
     assert (

@@ -1,4 +1,4 @@
-"""The survey finds the object in a box that is far too large, and leaves alone what it cannot judge."""
+"""The first pass finds the object in a much too large box, and leaves the box alone where it cannot judge."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,21 +15,21 @@ LARGE = np.array([[-3, -3, -3], [3, 3, 3]], np.float32)
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_a_large_box_is_cut_down_to_the_object(moving: Dataset) -> None:
+def test_a_large_box_is_trimmed_to_the_object(moving: Dataset) -> None:
     box, seconds = trim_box(moving, CONFIG, LARGE, lambda report: None)
     assert seconds > 0 and box.dtype == np.float32 and (box[0] < box[1]).all()
     assert (box[0] >= LARGE[0]).all() and (box[1] <= LARGE[1]).all()
     assert np.prod(box[1] - box[0]) < 0.5 * np.prod(LARGE[1] - LARGE[0])
 
 
-def test_a_run_too_short_to_survey_keeps_its_box(moving: Dataset) -> None:
+def test_a_short_run_keeps_its_box(moving: Dataset) -> None:
     box, seconds = trim_box(moving, replace(CONFIG, steps=900), LARGE, lambda report: None)
     assert box is LARGE and seconds == 0
     box, _ = trim_box(moving, CONFIG, LARGE, lambda report: None, time_budget_s=1e-3)
     assert box is LARGE
 
 
-def test_time_to_spare_does_not_go_into_the_survey(moving: Dataset) -> None:
+def test_trimming_takes_a_bounded_part_of_the_time(moving: Dataset) -> None:
     steps: list[int] = []
     long = replace(CONFIG, steps=10 * MAX_STEPS)
     box, seconds = trim_box(moving, long, LARGE, lambda report: steps.append(report.step), time_budget_s=1e5)
@@ -37,7 +37,7 @@ def test_time_to_spare_does_not_go_into_the_survey(moving: Dataset) -> None:
     assert np.array_equal(box, trim_box(moving, long, LARGE, lambda report: None)[0])
 
 
-def test_a_lone_object_seen_once_gets_a_model_of_its_own(moving: Dataset, tmp_path: Path) -> None:
+def test_a_single_object_in_monocular_video_gets_an_adapted_config(moving: Dataset, tmp_path: Path) -> None:
     options = Options(tmp_path, tmp_path / "out.kpc", preset="balanced", steps=7, seed=3)
     plain, lone = PRESETS["balanced"], options.config(moving)
     assert (lone.channels, lone.resolutions, lone.view_dependent, lone.steps, lone.seed) == (32, (32, 128), False, 7, 3)
