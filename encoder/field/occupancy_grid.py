@@ -29,9 +29,8 @@ def merge_slots(occupancy: np.ndarray, more: float = MERGE_TOLERANCE) -> np.ndar
     alone (measured: docs/design/training.md).
     """
     slots, *cells = occupancy.shape
-    merged = (
-        occupancy.reshape(count, slots // count, *cells).any(1) for count in range(1, slots + 1) if slots % count == 0
-    )
+    counts = (count for count in range(1, slots + 1) if slots % count == 0)
+    merged = (np.asarray(occupancy.reshape(count, slots // count, *cells).any(1)) for count in counts)
     return next(grid for grid in merged if grid.mean() <= (1 + more) * occupancy.mean())
 
 

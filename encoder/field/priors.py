@@ -49,10 +49,10 @@ def motion_priors(field: Field, config: TrainConfig) -> dict[str, Tensor]:
     if field.motion is None:
         return {}
     n = field.motion.numel()
-    in_time, *in_space = (field.motion.diff(n=2, dim=dim).square().sum() / n for dim in range(4))
+    in_time, along_z, along_y, along_x = (field.motion.diff(n=2, dim=dim).square().sum() / n for dim in range(4))
     return {
         "motion_smoothness_time": config.motion_smoothness_time * in_time,
-        "motion_smoothness_space": config.motion_smoothness_space * sum(in_space),
+        "motion_smoothness_space": config.motion_smoothness_space * (along_z + along_y + along_x),
     }
 
 

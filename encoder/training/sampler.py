@@ -61,7 +61,7 @@ class RaySampler:
             which, rank = _pick(rng, self.ends, count - within)
             picture = self.train[which]
             row, column = np.divmod(self.dataset.nth_usable(picture, rank), pictures.width[picture])
-        if within:
+        if within and self.frames is not None:
             which, rank = _pick(rng, self.frame_ends, within)
             left, right, top, _ = self.frames[which].T
             below, beside = np.divmod(rank, right - left)

@@ -106,6 +106,7 @@ class TorchOptimiser:
         self.device = field.theta.device
         self._on_gpu = self.device.type != "cpu"
         self._captures = self._on_gpu and proposals is None
+        self._cells = cells
         self._peaks = torch.zeros(cells, device=self.device)
         self._readback = DeferredReadback(self.device)
         self._taken_per_ray = self._reached_per_ray = math.inf
@@ -216,7 +217,7 @@ class TorchOptimiser:
             samples = self._sample(plan, batch, occupancy)
         else:
             samples, edges, levels = self.proposals.sample(
-                batch, self._aabb, self.mapping, tuple(self._peaks.shape), plan.number, self.fused
+                batch, self._aabb, self.mapping, self._cells, plan.number, self.fused
             )
         taken = (samples.length > 0).sum()
         if plan.capacities is not None and self.proposals is None:
@@ -238,7 +239,7 @@ class TorchOptimiser:
         loss.backward()  # type: ignore[no-untyped-call]
         if field.motion is not None and not plan.moving:
             field.motion.grad = None
-        _, ny, nx = self._peaks.shape
+        _, ny, nx = self._cells
         flat = (samples.cell[:, 0] * ny + samples.cell[:, 1]) * nx + samples.cell[:, 2]
         self._peaks.view(-1).scatter_reduce_(0, flat, weighed.weights.detach(), "amax")
         counts = torch.stack([taken, (weighed.reached & (samples.length > 0)).sum()]) / len(targets)
