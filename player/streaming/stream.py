@@ -228,8 +228,8 @@ class Stream:
     def fixed_bytes(self) -> int:
         """Bytes that the scene takes besides segments of time planes.
 
-        They are those of the renderer without pictures, of occupancy and motion, of planes that wait to be uploaded and one
-        that is being decoded, and of the source.
+        They are those of the renderer without pictures, of occupancy and motion, of planes that wait to be uploaded and
+        one that is being decoded, and of the source.
         """
         scene, layout = self.scene, self._layout
         largest = max(layout.layers[block.scale] * block.width * block.height for block in layout.blocks)
