@@ -110,13 +110,21 @@ class FieldSampler(ABC):
         """
         scene = self._scene
         settings = march_settings(scene, stride, termination)
-        view, even = view_of(scene, camera), even_distance(scene)
+        view, uniform_distance = view_of(scene, camera), uniform_distance_of(scene)
         occupancy = Occupancy(free.reshape(-1), free.shape[::-1])
         blocks = np.ascontiguousarray(blocks, np.int64)
 
         def work(worker: int, part: slice) -> None:
             march_blocks(
-                blocks[part], side, view, settings, even, occupancy, self._motion, *self._arrays(worker), picture
+                blocks[part],
+                side,
+                view,
+                settings,
+                uniform_distance,
+                occupancy,
+                self._motion,
+                *self._arrays(worker),
+                picture,
             )
 
         from_both_ends(work, len(blocks), PIXELS_AT_ONCE // side**2)
@@ -128,7 +136,7 @@ def warm_up(kind: type[FieldSampler], scene: Scene) -> None:
     camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))
     picture = Picture.empty((1, 1))
     march_blocks(
-        np.zeros((0, 2), np.int64), 1, view_of(scene, camera), march_settings(scene, 1.0, 0.5), even_distance(scene),
+        np.zeros((0, 2), np.int64), 1, view_of(scene, camera), march_settings(scene, 1.0, 0.5), uniform_distance_of(scene),
         Occupancy(np.zeros(1, np.uint8), (1, 1, 1)), _no_motion(), *kind.dummy_arrays(scene), picture,
     )  # fmt: skip
 
@@ -155,8 +163,8 @@ def march_settings(scene: Scene, stride: float, termination: float) -> March:
     return March(np.float32(stride), np.float32(stride / scene.extent), np.float32(termination), background)
 
 
-def even_distance(scene: Scene) -> np.float32 | None:
-    """Return how far along a ray steps are even in contracted space; None elsewhere."""
+def uniform_distance_of(scene: Scene) -> np.float32 | None:
+    """Return how far along a ray samples are evenly spaced in contracted space; None elsewhere."""
     return np.float32(scene.mapping.uniform_distance) if isinstance(scene.mapping, Contraction) else None
 
 

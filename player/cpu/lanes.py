@@ -19,11 +19,11 @@ CORNERS = 8
 
 # Rows of `Lanes.rays`; the first KEPT belong to the ray, as in march.glsl with FAR in t; the others to the sample it is
 # at in this round.
-RATE_X, RATE_Y, RATE_Z, NEAR, FAR, STEP, TRANS, RED, GREEN, BLUE, DEPTH, SAMPLES, T, X, Y, Z, STRETCH = range(17)
+RATE_X, RATE_Y, RATE_Z, NEAR, FAR, STEP, TRANS, RED, GREEN, BLUE, DEPTH, SAMPLES, T, X, Y, Z, DENSITY_SCALE = range(17)
 KEPT = SAMPLES + 1
 # Rows of `Lanes.samples`: position in [0, 1]^3, share of the way to the next grid node, density factor of the step, and
 # four values.
-POSITION_X, POSITION_Y, POSITION_Z, FRACTION_X, FRACTION_Y, FRACTION_Z, STEP_STRETCH, VALUES = range(8)
+POSITION_X, POSITION_Y, POSITION_Z, FRACTION_X, FRACTION_Y, FRACTION_Z, STEP_SCALE, VALUES = range(8)
 LOGIT_RED, LOGIT_GREEN, LOGIT_BLUE, LOG_DENSITY = range(VALUES, VALUES + 4)
 
 F, I, U = np.float32, np.int32, np.uint64  # noqa: E741, the kernels' names of their types
@@ -53,7 +53,7 @@ class Lanes(NamedTuple):
 def new_lanes():
     """Make lanes without rays."""
     return Lanes(
-        np.zeros((STRETCH + 1, LANES), np.float32),
+        np.zeros((DENSITY_SCALE + 1, LANES), np.float32),
         np.zeros((LOG_DENSITY + 1, LANES), np.float32),
         np.empty(LANES, np.int32),
         np.empty(LANES, np.int32),

@@ -18,6 +18,7 @@ from kpc.player.cpu.field_kernels import displace, sample_corner_grid, sample_pl
 from kpc.player.cpu.lanes import (
     BLUE,
     CORNERS,
+    DENSITY_SCALE,
     DEPTH,
     FAR,
     FAST,
@@ -39,8 +40,7 @@ from kpc.player.cpu.lanes import (
     RED,
     SAMPLES,
     STEP,
-    STEP_STRETCH,
-    STRETCH,
+    STEP_SCALE,
     TRANS,
     ZERO,
     F,
@@ -62,7 +62,7 @@ DONE = -1
 
 HALF, TWO, FOUR, TINY = F(0.5), F(2), F(4), F(1e-30)
 EPSILON, ALMOST, FARTHEST, LIMIT, END = F(PARALLEL), F(1e-3), F(1e6), F(LOG_DENSITY_LIMIT), F(TERMINATION)
-# Where a ray in contracted space ends, in s over the contraction's even distance.
+# Where a ray in contracted space ends, in s over the contraction's uniform distance.
 LAST = F(2 - 1 / space.FAR)
 LOG2_E, MOST_DOUBLINGS = F(1 / math.log(2)), 126
 # Taylor series of 2^x.
@@ -98,13 +98,13 @@ class Occupancy(NamedTuple):
 
 
 @compiled(**FAST)
-def march_blocks(blocks, side, view, march, even, occupancy, motion, corners, planes, picture):
+def march_blocks(blocks, side, view, march, uniform_distance, occupancy, motion, corners, planes, picture):
     """March the pixels of blocks into a picture.
 
     Args:
         blocks: (N, 2) int64, row and column of each block, in blocks of `side` x `side` pixels, rows from below.
         view, march, occupancy: a View, a March, an Occupancy.
-        even: in contracted space, how far along a ray steps are even, float32; else None.
+        uniform_distance: in contracted space, how far along a ray samples are evenly spaced, float32; else None.
         motion: a Grid of displacements; without nodes where nothing is displaced.
         corners: CornerGridArrays, or None.
         planes: PlaneArrays, or None; one of the two is None.
@@ -113,7 +113,7 @@ def march_blocks(blocks, side, view, march, even, occupancy, motion, corners, pl
     # Made here, not in a function: the compiler then knows that these arrays do not overlap, which saves 6 % to 15 % of
     # the time.
     lanes = Lanes(
-        np.zeros((STRETCH + 1, LANES), np.float32),
+        np.zeros((DENSITY_SCALE + 1, LANES), np.float32),
         np.zeros((LOG_DENSITY + 1, LANES), np.float32),
         np.empty(LANES, np.int32),
         np.empty(LANES, np.int32),
@@ -130,14 +130,14 @@ def march_blocks(blocks, side, view, march, even, occupancy, motion, corners, pl
     taken, count = np.int64(0), np.int64(0)
     while taken < len(blocks) or count > 0:
         while taken < len(blocks) and count + side * side <= LANES:
-            count = _start_rays(blocks[taken], side, view, even, count, lanes)
+            count = _start_rays(blocks[taken], side, view, uniform_distance, count, lanes)
             taken += 1
-        _locate_samples(count, view.start, even, march.stride, occupancy, lanes)
-        if even is None:
+        _locate_samples(count, view.start, uniform_distance, march.stride, occupancy, lanes)
+        if uniform_distance is None:
             _skip_empty(count, march.stride, occupancy.size, lanes)
         else:
-            _skip_empty_contracted(count, view.start, even, march.stride, occupancy.size, lanes)
-        found = _collect_samples(count, even, lanes)
+            _skip_empty_contracted(count, view.start, uniform_distance, march.stride, occupancy.size, lanes)
+        found = _collect_samples(count, uniform_distance, lanes)
         if found > 0:
             if len(motion.nodes) > 0:
                 displace(found, motion, lanes)
@@ -145,7 +145,7 @@ def march_blocks(blocks, side, view, march, even, occupancy, motion, corners, pl
                 sample_corner_grid(found, corners, lanes)
             if planes is not None:
                 sample_planes(found, view.box, planes, lanes)
-            _shade(found, even, march.tau, lanes)
+            _shade(found, uniform_distance, march.tau, lanes)
             _composite(found, march.termination, lanes)
         count = _finish_rays(count, march, view.size, lanes, picture)
 
@@ -174,19 +174,19 @@ def _largest(x, y, z):
 
 
 @kernel_part
-def _distance(s, even):
+def _distance(s, uniform_distance):
     """Return t of s, `distance_of` of space.glsl."""
-    return s if s <= even else even / (TWO - s / even)
+    return s if s <= uniform_distance else uniform_distance / (TWO - s / uniform_distance)
 
 
 @kernel_part
-def _progress(t, even):
-    """Return s of t, `progress_of` of space.glsl."""
-    return t if t <= even else even * (TWO - even / t)
+def _parameter(t, uniform_distance):
+    """Return s of t, `parameter_of` of space.glsl."""
+    return t if t <= uniform_distance else uniform_distance * (TWO - uniform_distance / t)
 
 
 @kernel_part
-def _start_rays(block, side, view, even, count, lanes):
+def _start_rays(block, side, view, uniform_distance, count, lanes):
     """Add the rays of a block to the `count` that are under way; return how many there are then."""
     rays, pixel = lanes.rays, lanes.pixel
     lens, axes, start, box = view.lens, view.axes, view.start, view.box
@@ -208,8 +208,8 @@ def _start_rays(block, side, view, even, count, lanes):
         rays[RATE_X, i], rays[RATE_Y, i], rays[RATE_Z, i] = x, y, z
         rays[STEP, i], rays[TRANS, i] = ZERO, ONE
         rays[RED, i], rays[GREEN, i], rays[BLUE, i], rays[DEPTH, i], rays[SAMPLES, i] = ZERO, ZERO, ZERO, ZERO, ZERO
-        if even is not None:
-            rays[NEAR, i], rays[FAR, i] = ZERO, _distance(LAST * even, even)
+        if uniform_distance is not None:
+            rays[NEAR, i], rays[FAR, i] = ZERO, _distance(LAST * uniform_distance, uniform_distance)
             continue
         x_low, y_low, z_low = -start[0] / x, -start[1] / y, -start[2] / z
         x_high, y_high, z_high = (ONE - start[0]) / x, (ONE - start[1]) / y, (ONE - start[2]) / z
@@ -219,21 +219,21 @@ def _start_rays(block, side, view, even, count, lanes):
 
 
 @kernel_part
-def _locate_samples(count, start, even, stride, occupancy, lanes):
+def _locate_samples(count, start, uniform_distance, stride, occupancy, lanes):
     """Find where next samples lie, and the distance of their cells to the nearest occupied one."""
     rays, cell, free = lanes.rays, lanes.cell, lanes.free
     nx, ny, nz = occupancy.size
     for i in range(whole_vectors(count)):
         t = rays[NEAR, i] + (rays[STEP, i] + HALF) * stride
-        if even is not None:
-            t = _distance(min(t, LAST * even), even)
+        if uniform_distance is not None:
+            t = _distance(min(t, LAST * uniform_distance), uniform_distance)
         x, y, z = start[0] + t * rays[RATE_X, i], start[1] + t * rays[RATE_Y, i], start[2] + t * rays[RATE_Z, i]
-        if even is not None:
+        if uniform_distance is not None:
             radius = max(_largest(x, y, z), ONE)
             shrunk = F(0.25) * (TWO - ONE / radius) / radius
             x, y, z = x * shrunk + HALF, y * shrunk + HALF, z * shrunk + HALF
-            stretch = max(t / even, ONE) / radius
-            rays[STRETCH, i] = stretch * stretch
+            scale = max(t / uniform_distance, ONE) / radius
+            rays[DENSITY_SCALE, i] = scale * scale
         rays[T, i], rays[X, i], rays[Y, i], rays[Z, i] = t, x, y, z
         row = I(clamped(z * F(nz), F(nz - 1))) * I(ny) + I(clamped(y * F(ny), F(ny - 1)))
         cell[i] = row * I(nx) + I(clamped(x * F(nx), F(nx - 1)))
@@ -278,7 +278,7 @@ def _skip_empty(count, stride, cells, lanes):
 
 
 @kernel_part
-def _skip_empty_contracted(count, start, even, stride, cells, lanes):
+def _skip_empty_contracted(count, start, uniform_distance, stride, cells, lanes):
     """Advance rays as `_skip_empty` does, by the lower bound that `way_out` of occupancy.glsl derives."""
     rays, free = lanes.rays, lanes.free
     nx, ny, nz = cells
@@ -305,13 +305,15 @@ def _skip_empty_contracted(count, start, even, stride, cells, lanes):
         closer = min(bound, (speed + TWO * turn) * (TWO - nearest) * (TWO - nearest))
         curved = margin / max(closer if nearest > ONE else bound, TINY)
         way = straight if _largest(x, y, z) < ONE else curved
-        steps = min((_progress(t + way, even) - _progress(t, even)) / stride - ALMOST, FARTHEST)
+        steps = min(
+            (_parameter(t + way, uniform_distance) - _parameter(t, uniform_distance)) / stride - ALMOST, FARTHEST
+        )
         further = rays[STEP, i] + F(max(I(steps), I(0))) + ONE
         rays[STEP, i] = further if free[i] > 0 else rays[STEP, i]
 
 
 @kernel_part
-def _collect_samples(count, even, lanes):
+def _collect_samples(count, uniform_distance, lanes):
     """Collect the rays that take a sample and return their number; mark those beyond the box as finished."""
     rays, samples, free, ray_of = lanes.rays, lanes.samples, lanes.free, lanes.ray_of
     found = U(0)
@@ -324,19 +326,19 @@ def _collect_samples(count, even, lanes):
             rays[Y, i],
             rays[Z, i],
         )
-        if even is not None:
-            samples[STEP_STRETCH, found] = rays[STRETCH, i]
+        if uniform_distance is not None:
+            samples[STEP_SCALE, found] = rays[DENSITY_SCALE, i]
         found += U(inside & ~is_free)  # a branch would often be mispredicted
     return found
 
 
 @kernel_part
-def _shade(found, even, tau, lanes):
+def _shade(found, uniform_distance, tau, lanes):
     """Turn logits and log densities into colours and alphas."""
     samples = lanes.samples
     for j in range(whole_vectors(found)):
         density = _exp(min(max(samples[LOG_DENSITY, j], -LIMIT), LIMIT))
-        thickness = tau if even is None else tau * samples[STEP_STRETCH, j]
+        thickness = tau if uniform_distance is None else tau * samples[STEP_SCALE, j]
         samples[LOG_DENSITY, j] = ONE - _exp(-density * thickness)
         samples[LOGIT_RED, j] = ONE / (ONE + _exp(-samples[LOGIT_RED, j]))
         samples[LOGIT_GREEN, j] = ONE / (ONE + _exp(-samples[LOGIT_GREEN, j]))

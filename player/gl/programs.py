@@ -88,7 +88,7 @@ class Programs:
             box_low=tuple(scene.aabb[0]),
             box_high=tuple(scene.aabb[1]),
             background=tuple(scene.background),
-            even=scene.mapping.uniform_distance if isinstance(scene.mapping, Contraction) else 0.0,
+            uniform_distance=scene.mapping.uniform_distance if isinstance(scene.mapping, Contraction) else 0.0,
             **_device_uniforms(scene.mapping),
         )
         entry = self._programs[key] = program, vertices

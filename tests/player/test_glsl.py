@@ -43,13 +43,13 @@ def test_distances_in_contracted_space() -> None:
     t = gl.evaluate(glsl, "vec4(distance_of(a.x, 5.0))", columns(s), CONTRACTED=1)[:, 0]
     # Near the end t is even / (2 - s / even), which multiplies an error of s by (t / even)^2.
     np.testing.assert_allclose(t, mapping.distance(s), rtol=1e-4)
-    back = gl.evaluate(glsl, "vec4(progress_of(a.x, 5.0))", columns(t), CONTRACTED=1)[:, 0]
+    back = gl.evaluate(glsl, "vec4(parameter_of(a.x, 5.0))", columns(t), CONTRACTED=1)[:, 0]
     np.testing.assert_allclose(back, mapping.parameter(t.astype(np.float64)), rtol=1e-6)
     y = RNG.normal(size=(N, 3)) * 10 ** RNG.uniform(-1, 3, (N, 1))
     u = gl.evaluate(glsl, "vec4(contracted(a.xyz), 0.0)", columns(*y.T), CONTRACTED=1)[:, :3]
     wanted, radius = contract(y, np.array([[-1.0, -1, -1], [1, 1, 1]]))
     np.testing.assert_allclose(u, 4 * wanted - 2, atol=1e-6)
-    stretch = gl.evaluate(glsl, "vec4(stretch_of(a.xyz, b.x, 5.0))", columns(*y.T), columns(t), CONTRACTED=1)[:, 0]
+    stretch = gl.evaluate(glsl, "vec4(density_scale(a.xyz, b.x, 5.0))", columns(*y.T), columns(t), CONTRACTED=1)[:, 0]
     np.testing.assert_allclose(stretch, mapping.density_scale(t.astype(np.float64), radius), rtol=1e-5)
 
 
@@ -122,7 +122,7 @@ def test_places_are_moved(nodes: tuple[int, int, int]) -> None:
     u, offsets = rng.random((N, 3), np.float32), rng.uniform(-0.3, 0.3, (*nodes, 3)).astype(np.float32)
     grid = np.concatenate([offsets, np.zeros((*nodes, 1))], axis=-1)
     counts = "vec3({}.0, {}.0, {}.0)".format(*nodes[::-1])
-    got = gl.evaluate('#include "motion.glsl"\n', f"vec4(moved(grid, {counts}, a.xyz), 0.0)", columns(*u.T), grid=grid)[
-        :, :3
-    ]
+    got = gl.evaluate(
+        '#include "motion.glsl"\n', f"vec4(displaced(grid, {counts}, a.xyz), 0.0)", columns(*u.T), grid=grid
+    )[:, :3]
     np.testing.assert_allclose(got, displace(u, offsets), atol=2e-6)

@@ -9,7 +9,7 @@ uniform vec3 cell_count;
 uniform vec3 box_low;
 uniform vec3 box_high;
 uniform float stride;
-uniform float even;
+uniform float uniform_distance;
 uniform vec3 background;
 uniform mat4x3 frame;
 uniform float near;
@@ -25,14 +25,14 @@ layout(location = 1) out vec4 sums;
 
 void main() {
     Path path = path_of(eye, camera_direction(gl_FragCoord.xy, height, lens, axes), frame, near, baseline);
-    Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
+    Walk walk = walk_of(path.origin, path.direction, box_low, box_high, cell_count, stride, uniform_distance);
     rgba = vec4(background, 0.0);
     sums = vec4(0.0);
-    Place place;
-    if (!to_occupied(walk, cells, place)) return;
+    SamplePoint point;
+    if (!to_occupied(walk, cells, point)) return;
 
-    float t = place.t;
-    vec3 inside = place.u * cell_count;
+    float t = point.t;
+    vec3 inside = point.u * cell_count;
     vec3 cell = floor(inside);
 #if CONTRACTED
     // The ray is curved: take the face nearest to the sample for the one through which the ray came in.

@@ -30,7 +30,7 @@ uniform vec3 box_low;
 uniform vec3 box_high;
 uniform vec3 background;
 uniform float stride;
-uniform float even;                 // CONTRACTED: how far steps are even
+uniform float uniform_distance;                 // CONTRACTED: how far along a ray samples are evenly spaced
 uniform mat4x3 frame;               // NDC: of its camera
 uniform float near;                 // NDC
 uniform float baseline;             // NDC
@@ -174,18 +174,18 @@ vec4 logits_of(vec3 u) {
 #endif
 
 // The position in the planes of a sample at u: displaced where the scene has motion.
-vec3 looked_up(vec3 u) {
+vec3 plane_position(vec3 u) {
     u = clamp(u, 0.0, 1.0);
 #if MOTION
-    u = moved(motion, nodes, u);
+    u = displaced(motion, nodes, u);
 #endif
     return u;
 }
 
 // The thickness of a step: its length over the longest edge of the box, times the density scale of contracted space.
-float thickness_at(Walk walk, Place place) {
+float thickness_at(Walk walk, SamplePoint point) {
 #if CONTRACTED
-    return tau * stretch_of(walk.start + place.t * walk.rate, place.t, even);
+    return tau * density_scale(walk.start + point.t * walk.rate, point.t, uniform_distance);
 #else
     return tau;
 #endif
@@ -210,28 +210,28 @@ void add_sample(inout Sums sums, vec4 logits, float thickness, float distance) {
 // rgba: colour and opacity; depth_samples: sum of weight times distance, number of samples.
 void march(vec2 fragment, out vec4 rgba, out vec4 depth_samples) {
     Path path = path_of(eye, camera_direction(fragment, height, lens, axes), frame, near, baseline);
-    Walk walk = walk_of(path.begin, path.way, box_low, box_high, cell_count, stride, even);
+    Walk walk = walk_of(path.origin, path.direction, box_low, box_high, cell_count, stride, uniform_distance);
     Sums sums = Sums(vec3(0.0), 1.0, 0.0, 0.0);
-    Place place;
-    bool more = to_occupied(walk, cells, place);
+    SamplePoint point;
+    bool more = to_occupied(walk, cells, point);
 #if HIDDEN
-    if (more) look_along(path.way);
+    if (more) look_along(path.direction);
 #endif
     // Tested at its end: neighbouring rays run as one, and a test up front would cost them all one more body.
     do {
         if (more) {
-            vec3 u = looked_up(place.u);
-            float thickness = thickness_at(walk, place);
+            vec3 u = plane_position(point.u);
+            float thickness = thickness_at(walk, point);
 #if HYBRID
             vec4 logits = hybrid_logits_of(u, sums.trans, thickness);
 #else
             vec4 logits = logits_of(u);
 #endif
-            add_sample(sums, logits, thickness, world_distance(path, place.t));
+            add_sample(sums, logits, thickness, world_distance(path, point.t));
             walk.k += 1.0;
             more = sums.trans >= termination;
         }
-        more = more && to_occupied(walk, cells, place);
+        more = more && to_occupied(walk, cells, point);
     } while (more);
 
     // Sooner than the format says: the remaining light gets the colour met so far.

@@ -13,27 +13,29 @@ struct Walk {
     float near;    // in s
     float far;
     float stride;
-    float even;
+    float uniform_distance;
     float k;       // the sample it is at, or the next to look at
 };
 
 // Where the sample at s lies.
-struct Place {
+struct SamplePoint {
     float t;       // along the ray
     vec3 u;        // in [0, 1]^3 over what the planes cover
 };
 
-Walk walk_of(vec3 eye, vec3 d, vec3 low, vec3 high, vec3 count, float stride, float even) {
+Walk walk_of(vec3 eye, vec3 d, vec3 low, vec3 high, vec3 count, float stride, float uniform_distance) {
 #if CONTRACTED
     vec3 half_edges = 0.5 * (high - low);
     vec3 rate = slanted(d) / half_edges;
     vec3 start = (eye - low) / half_edges - 1.0;
-    return Walk(start, rate, 1.0 / rate, count, 1.0 / count, 0.0, (2.0 - 1.0 / FAR) * even, stride, even, 0.0);
+    float far = (2.0 - 1.0 / FAR) * uniform_distance;
+    return Walk(start, rate, 1.0 / rate, count, 1.0 / count, 0.0, far, stride, uniform_distance, 0.0);
 #else
     vec2 range = box_range(eye, d, low, high);
     vec3 box = high - low;
     vec3 rate = slanted(d) / box;
-    return Walk((eye - low) / box, rate, 1.0 / rate, count, 1.0 / count, range.x, range.y, stride, even, 0.0);
+    vec3 start = (eye - low) / box;
+    return Walk(start, rate, 1.0 / rate, count, 1.0 / count, range.x, range.y, stride, uniform_distance, 0.0);
 #endif
 }
 
@@ -41,13 +43,13 @@ float sample_s(Walk walk, float k) {
     return walk.near + (k + 0.5) * walk.stride;
 }
 
-Place place_at(Walk walk, float s) {
-    float t = distance_of(s, walk.even);
+SamplePoint point_at(Walk walk, float s) {
+    float t = distance_of(s, walk.uniform_distance);
     vec3 p = walk.start + t * walk.rate;
 #if CONTRACTED
     p = 0.25 * contracted(p) + 0.5;
 #endif
-    return Place(t, p);
+    return SamplePoint(t, p);
 }
 
 vec3 cell_of(Walk walk, vec3 u) {
@@ -60,21 +62,21 @@ uint free_around(usampler3D cells, Walk walk, vec3 cell) {
 }
 
 // How far, in t, a ray stays within the block that reaches `reach` cells from `cell` in both directions, it being at
-// `place` in that cell. In contracted space a bound from below.
-float way_out(Walk walk, Place place, vec3 cell, float reach) {
+// `point` in that cell. In contracted space a bound from below.
+float way_out(Walk walk, SamplePoint point, vec3 cell, float reach) {
     vec3 ahead = vec3(greaterThan(walk.rate, vec3(0.0)));
     vec3 low = (cell + 1.0 - reach) * walk.edge, high = (cell + reach) * walk.edge;
 #if CONTRACTED
     low = 4.0 * low - 2.0;
     high = 4.0 * high - 2.0;
-    vec3 at = 4.0 * place.u - 2.0, y = walk.start + place.t * walk.rate;
+    vec3 at = 4.0 * point.u - 2.0, y = walk.start + point.t * walk.rate;
     float radius = largest(abs(y));
-    if (radius < 1.0) {  // the way is straight as far as the box reaches
+    if (radius < 1.0) {  // the contracted ray is straight as far as the box reaches
         vec3 leave = (mix(max(low, -1.0), min(high, 1.0), ahead) - y) * walk.inverse;
         return min(leave.x, min(leave.y, leave.z));
     }
     // |d contract / dt| <= v (4 r - 3) / r^2 <= 4/3 v, and with w_ij = y_i v_j - y_j v_i, constant along the ray, it is
-    // at most (v + 2 w) / r^2 where r > 1. Until the way is `margin` long, r is no less than at a radius of place -
+    // at most (v + 2 w) / r^2 where r > 1. Until the way is `margin` long, r is no less than at a radius of point -
     // margin.
     vec3 to_faces = min(at - low, high - at);
     float margin = max(min(to_faces.x, min(to_faces.y, to_faces.z)), 0.0);
@@ -82,27 +84,28 @@ float way_out(Walk walk, Place place, vec3 cell, float reach) {
     float nearest = largest(abs(at)) - margin;
     float bound = 4.0 / 3.0 * speed;
     if (nearest > 1.0) bound = min(bound, (speed + 2.0 * turn) * (2.0 - nearest) * (2.0 - nearest));
-    return margin / max(bound, 1e-30);  // 0 where rounding puts a place at infinity
+    return margin / max(bound, 1e-30);  // 0 where rounding puts a point at infinity
 #else
-    vec3 leave = (mix(low, high, ahead) - place.u) * walk.inverse;
+    vec3 leave = (mix(low, high, ahead) - point.u) * walk.inverse;
     return min(leave.x, min(leave.y, leave.z));
 #endif
 }
 
-// Move walk.k on to the first sample, from itself on, that lies in an occupied cell, at `place`. False where there is
+// Move walk.k on to the first sample, from itself on, that lies in an occupied cell, at `point`. False where there is
 // none.
-bool to_occupied(inout Walk walk, usampler3D cells, out Place place) {
+bool to_occupied(inout Walk walk, usampler3D cells, out SamplePoint point) {
     bool inside;
     uint free;
     do {
         float s = sample_s(walk, walk.k);
-        place = place_at(walk, s);
+        point = point_at(walk, s);
         inside = s < walk.far;
-        vec3 cell = cell_of(walk, place.u);
+        vec3 cell = cell_of(walk, point.u);
         free = inside ? free_around(cells, walk, cell) : 0u;
         if (free > 0u) {
-            float free_t = way_out(walk, place, cell, float(free));
-            float free_s = progress_of(place.t + free_t, walk.even) - progress_of(place.t, walk.even);
+            float free_t = way_out(walk, point, cell, float(free));
+            float until_s = parameter_of(point.t + free_t, walk.uniform_distance);
+            float free_s = until_s - parameter_of(point.t, walk.uniform_distance);
             // A hair less than the way out: landing one sample early costs a look-up, one late would lose a sample.
             walk.k += max(1.0, floor(free_s / walk.stride - 1e-3) + 1.0);
         }

@@ -9,7 +9,7 @@ uniform sampler2D sums;
 uniform sampler2D static_rgba;
 uniform vec2 viewport;      // pixels
 uniform vec2 depths;        // shown from bright to dark, world units
-uniform float even;         // CONTRACTED: how far along a ray steps are even
+uniform float uniform_distance;         // CONTRACTED: how far along a ray samples are evenly spaced
 uniform float most_samples;
 uniform float opacity;      // of the picture over what is there
 
@@ -27,8 +27,8 @@ void main() {
 #if MODE == 1
     rgb = abs(rgb - texture(static_rgba, at).rgb);
 #elif MODE == 2
-    float depth = progress_of(texture(sums, at).x / max(colour.a, 1e-6), even);
-    float near = progress_of(depths.x, even), far = progress_of(depths.y, even);
+    float depth = parameter_of(texture(sums, at).x / max(colour.a, 1e-6), uniform_distance);
+    float near = parameter_of(depths.x, uniform_distance), far = parameter_of(depths.y, uniform_distance);
     rgb = colour.a * heat(1.0 - clamp((depth - near) / (far - near), 0.0, 1.0));
 #elif MODE == 3
     rgb = heat(texture(sums, at).y / most_samples);

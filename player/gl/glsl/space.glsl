@@ -1,7 +1,8 @@
-// Where a ray's samples lie, and where in the planes; normative text and readable twin: kpc.format.scene.space.
+// Where a ray's samples lie, in the world and in the planes; normative text and readable twin: kpc.format.scene.space.
 //
-// CONTRACTED: 1 where the planes hold what lies outside the box, too. `y` is a place in half edges of the box from its
-// middle; `even` is how far along a ray the steps are even. NDC: 1 where box and rays are in device coordinates.
+// CONTRACTED: 1 where the planes hold what lies outside the box, too. `y` is a point in half edges of the box from its
+// middle; `uniform_distance` is how far along a ray samples are evenly spaced. NDC: 1 where box and rays are in device
+// coordinates.
 
 const float FAR = 256.0;  // as in kpc.format.scene.space
 const float FORWARD = 1e-4;
@@ -12,18 +13,18 @@ float largest(vec3 v) {
 }
 
 // The distance t along a ray of a sample at s.
-float distance_of(float s, float even) {
+float distance_of(float s, float uniform_distance) {
 #if CONTRACTED
-    return s <= even ? s : even / (2.0 - s / even);
+    return s <= uniform_distance ? s : uniform_distance / (2.0 - s / uniform_distance);
 #else
     return s;
 #endif
 }
 
 // s of t.
-float progress_of(float t, float even) {
+float parameter_of(float t, float uniform_distance) {
 #if CONTRACTED
-    return t <= even ? t : even * (2.0 - even / t);
+    return t <= uniform_distance ? t : uniform_distance * (2.0 - uniform_distance / t);
 #else
     return t;
 #endif
@@ -35,19 +36,19 @@ vec3 contracted(vec3 y) {
     return y * ((2.0 - 1.0 / radius) / radius);
 }
 
-// What a step at y, t along its ray, counts for the density.
-float stretch_of(vec3 y, float t, float even) {
-    float stretch = max(t / even, 1.0) / max(largest(abs(y)), 1.0);
-    return stretch * stretch;
+// The density scale of a step at y, t along its ray.
+float density_scale(vec3 y, float t, float uniform_distance) {
+    float scale = max(t / uniform_distance, 1.0) / max(largest(abs(y)), 1.0);
+    return scale * scale;
 }
 
-// A ray as it is marched: begin + s way. In the world, unless NDC.
+// A ray as it is marched: origin + s direction. In the world, unless NDC; then as kpc.format.scene.space.DeviceRays.
 struct Path {
-    vec3 begin;
-    vec3 way;
-    float reach;  // NDC: s at which it is infinitely far
-    float start;  // distance in the world at s = 0
-    float pace;   // how fast that grows there, times reach
+    vec3 origin;
+    vec3 direction;
+    float s_infinity;  // NDC: s at which it is infinitely far
+    float t_start;     // NDC: distance in the world at s = 0
+    float t_scale;     // NDC: dt/ds there, times s_infinity
 };
 
 // frame: the right, up and backward axes of the camera that stands for all, and where it is.
@@ -56,22 +57,23 @@ Path path_of(vec3 o, vec3 d, mat4x3 frame, float near, float baseline) {
     vec3 p = transpose(mat3(frame)) * (o - frame[3]);
     vec3 v = transpose(mat3(frame)) * d;
     if (v.z > -FORWARD) return Path(vec3(0.0, 0.0, -1.0), vec3(0.0, 0.0, -1.0), 1.0, 0.0, 0.0);
-    float start = max((near + p.z) / -v.z, 0.0);
-    p += start * v;
-    vec3 begin = vec3(p.xy, baseline) / -p.z;
-    vec3 way = vec3(v.xy / -v.z - begin.xy, begin.z);
-    float reach = length(way);
-    return Path(vec3(begin.xy, baseline / near - begin.z), way / reach, reach, start, p.z / v.z);
+    float t_start = max((near + p.z) / -v.z, 0.0);
+    p += t_start * v;
+    vec3 origin = vec3(p.xy, baseline) / -p.z;
+    vec3 direction = vec3(v.xy / -v.z - origin.xy, origin.z);
+    float s_infinity = length(direction);
+    origin.z = baseline / near - origin.z;
+    return Path(origin, direction / s_infinity, s_infinity, t_start, p.z / v.z);
 #else
     return Path(o, d, 0.0, 0.0, 0.0);
 #endif
 }
 
-// The distance in the world of what lies `t` along the path.
+// The distance in the world of the point at t along a path.
 float world_distance(Path path, float t) {
 #if NDC
-    float share = min(t / path.reach, 1.0 - LEAST_DISPARITY);
-    return path.start + path.pace * (share / (1.0 - share));
+    float share = min(t / path.s_infinity, 1.0 - LEAST_DISPARITY);
+    return path.t_start + path.t_scale * (share / (1.0 - share));
 #else
     return t;
 #endif
