@@ -46,7 +46,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
-def test_corners_hold_what_a_sample_there_finds(make) -> None:
+def test_corners_hold_the_field_at_their_positions(make) -> None:
     scene = make()
     shape = grid_shape(scene)
     at = np.argwhere(np.ones(shape, bool))[:, ::-1] / np.maximum(np.array(shape[::-1]) - 1, 1)
@@ -71,7 +71,7 @@ def test_corners_hold_what_a_sample_there_finds(make) -> None:
         assert known.mean() > 0.05
 
 
-def test_what_overflows_is_finite() -> None:
+def test_values_that_overflow_are_clamped() -> None:
     scene = view_independent(tiny_scene(4, channels=16))
     for value in (3e38, -3e38, 1e-38):
         for name in SPACE_PLANES:
@@ -81,7 +81,7 @@ def test_what_overflows_is_finite() -> None:
 
 
 @pytest.mark.parametrize("change", [{"step": 2.0}, {"termination": 1 / 16}, {"rays_across": 4}, {"resolution": 0.5}])
-def test_qualities_mean_what_they_mean_for_planes(change: dict[str, float]) -> None:
+def test_quality_settings_have_the_same_effect_as_with_planes(change: dict[str, float]) -> None:
     scene = with_motion(
         linear_per_cell(view_independent(tiny_scene(4, scales=1, channels=32, resolution=(90, 80, 70))))
     )
@@ -119,13 +119,13 @@ def test_pictures_are_near_those_of_the_reference(space: str) -> None:
     np.testing.assert_array_equal(exact.rgb, Renderer(gl.context(), scene, LEVELS["reference"]).render(CAMERA, 0.9).rgb)
 
 
-def test_what_it_takes_is_counted() -> None:
+def test_its_memory_is_counted() -> None:
     grid = grid_of(view_independent(tiny_scene(4, channels=16)))
     taken = grid.values.nbytes + grid._known.nbytes + sum(plane.nbytes for plane in grid._planes)
     assert taken == CornerGrid.bytes_for(grid._scene) == grid.memory_bytes
 
 
-def test_a_picture_hangs_on_none_before_it() -> None:
+def test_a_picture_does_not_depend_on_the_ones_before() -> None:
     scene = with_motion(view_independent(tiny_scene(4, channels=16)))
     renderer = Renderer(gl.context(), scene, LEVELS["balanced"], processor=True)
     for time in (0.1, 0.11, 0.7, 0.12):
@@ -135,7 +135,7 @@ def test_a_picture_hangs_on_none_before_it() -> None:
     )
 
 
-def test_planes_that_arrive_later_count() -> None:
+def test_planes_that_arrive_later_are_drawn() -> None:
     scene = view_independent(tiny_scene(4, channels=16))
     early = without_planes(scene)
     renderer, whole = (
@@ -147,7 +147,7 @@ def test_planes_that_arrive_later_count() -> None:
     np.testing.assert_array_equal(renderer.render(CAMERA, 0.5).rgb, whole.render(CAMERA, 0.5).rgb)
 
 
-def test_scenes_that_it_would_not_serve_are_looked_up_in_planes() -> None:
+def test_scenes_that_it_does_not_serve_are_sampled_by_planes() -> None:
     assert CornerGrid.serves(view_independent(tiny_scene(channels=16)))
     fine = view_independent(tiny_scene(scales=1, channels=30, resolution=(200, 180, 120)))
     assert np.prod(grid_shape(fine)) > MOST_CORNERS

@@ -31,8 +31,8 @@ from scenes import (
 )
 
 CAMERA = look_at((2.4, 1.0, 2.2), (0.1, 0.05, 0.05), 64, 48, 70.0)
-FOLDED, BAKED = Quality(folded=True), Quality(folded=True, grid_termination=TERMINATION)
-QUALITY = {PlaneSampler: FOLDED, CornerGrid: BAKED}
+FOLDED, WITH_GRID = Quality(folded=True), Quality(folded=True, grid_termination=TERMINATION)
+QUALITY = {PlaneSampler: FOLDED, CornerGrid: WITH_GRID}
 
 
 def renderer_of(scene: Scene, kind: type = PlaneSampler, quality: Quality | None = None) -> Renderer:
@@ -122,13 +122,13 @@ def test_planes_of_all_sizes_are_looked_up(make) -> None:
         assert np.abs(renderer.render(CAMERA, 1.0).rgb - got.rgb).max() > 0.05
 
 
-def test_what_is_no_number_is_no_place_in_an_array() -> None:
+def test_nan_is_no_index_into_an_array() -> None:
     places = np.array([np.nan, -np.inf, -1.0, 0.0, 2.5, 7.0, np.inf] * 5, np.float32)  # more than vectors hold
     np.testing.assert_array_equal(clamped_all(places, np.float32(5)), np.float32([0, 0, 0, 0, 2.5, 5, 5] * 5))
 
 
 @pytest.mark.parametrize("value", [3e38, -3e38, 1e-38])
-def test_what_overflows_is_no_crash(value: float) -> None:
+def test_planes_that_overflow_do_not_crash(value: float) -> None:
     scene = tiny_scene(4)
     for name in SPACE_PLANES:
         scene.scales[1][name][:] = value
@@ -147,7 +147,7 @@ def test_boxes_without_a_volume_show_the_background(edges: tuple[float, float, f
         assert np.isfinite(got.rgb).all() and np.abs(got.rgb - scene.background).max() < 0.02
 
 
-def test_planes_are_as_near_as_their_steps() -> None:
+def test_quantised_planes_are_off_by_half_a_step() -> None:
     plane = np.random.default_rng(0).normal(size=(7, 9, 5)).astype(np.float32) * np.float32([1e-30, 1, 0, 1e30, 5])
     whole, step = quantised_planes(plane)
     assert whole.dtype == np.int16 and step[2] == 0 and not whole[..., 2].any()
@@ -172,7 +172,7 @@ def test_the_exact_level_is_drawn_by_shaders() -> None:
     assert renderer._processor.memory_bytes == 0
 
 
-def test_planes_that_arrive_later_count() -> None:
+def test_planes_that_arrive_later_are_drawn() -> None:
     scene = with_motion(tiny_scene(4))
     early = without_planes(scene)
     renderer, whole = renderer_of(early), renderer_of(scene)
@@ -195,7 +195,7 @@ def test_its_memory_is_counted() -> None:
 
 
 @pytest.mark.parametrize("kind", [PlaneSampler, CornerGrid])
-def test_what_is_warmed_up_is_what_pictures_need(kind: type) -> None:
+def test_no_picture_compiles_anything_after_warming_up(kind: type) -> None:
     """Whether or not anything is displaced, colours have sides or something moves."""
     for scene in [make() for make in SCENES.values()] if kind is PlaneSampler else [unequal_scales(), one_texel_deep()]:
         warm_up(kind, scene)

@@ -64,13 +64,13 @@ def test_densities_from_1e_minus_10_to_1e10(tau: float) -> None:
     assert alpha.min() >= 0 and alpha.max() <= 1
 
 
-def test_colours() -> None:
+def test_the_sigmoid_is_that_of_the_reference() -> None:
     x = RNG.normal(size=(N, 3)) * 10 ** RNG.uniform(-3, 3, (N, 1))
     got = gl.evaluate('#include "decoder.glsl"', "vec4(sigmoid(a.xyz), 0.0)", columns(*x.T))[:, :3]
     np.testing.assert_allclose(got, sigmoid(x.astype(np.float32).astype(np.float64)), atol=2e-6)
 
 
-def test_walking_finds_the_cells_that_the_reference_finds() -> None:
+def test_positions_are_in_the_same_cells_as_in_the_reference() -> None:
     """Cells of places, on the faces between them only may they differ; what they hold."""
     count = np.array([12, 10, 8])
     u = RNG.uniform(-0.1, 1.1, (N, 3))
@@ -102,7 +102,7 @@ def cubic(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     )
 
 
-def test_colours_between_pixels() -> None:
+def test_colours_between_pixels_follow_the_cubic() -> None:
     x, y, picture = (
         RNG.uniform(-0.01, 1.01, N).astype(np.float32),
         RNG.random(N, np.float32),
@@ -117,7 +117,7 @@ def test_colours_between_pixels() -> None:
 
 
 @pytest.mark.parametrize("nodes", [(4, 3, 5), (2, 2, 2)])
-def test_places_are_moved(nodes: tuple[int, int, int]) -> None:
+def test_positions_are_displaced(nodes: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(9)
     u, offsets = rng.random((N, 3), np.float32), rng.uniform(-0.3, 0.3, (*nodes, 3)).astype(np.float32)
     grid = np.concatenate([offsets, np.zeros((*nodes, 1))], axis=-1)

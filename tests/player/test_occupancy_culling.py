@@ -73,7 +73,7 @@ def test_a_cell_is_empty_whose_corners_are() -> None:
             assert empty.any() or limit < 0.03
 
 
-def test_nothing_is_empty_where_no_density_is_less() -> None:
+def test_nothing_is_culled_below_the_least_density() -> None:
     scene = moving()
     scene = replace(scene, decoder=replace(scene.decoder, density_bias=-100.0))
     assert not culling_at(scene, 0.0)[0].empty(0, 1e-12).any()
@@ -101,7 +101,7 @@ def test_rays_skip_what_is_empty_and_pictures_stay(variant: str) -> None:
     assert np.mean(renderer.render(CAMERA, 0.9).samples == render(scene, CAMERA, 0.9).samples) > 0.99
 
 
-def test_planes_that_arrive_later_count() -> None:
+def test_planes_that_arrive_later_are_drawn() -> None:
     scene = moving()
     early = without_planes(scene)
     quality = replace(FOLDED, culling_alpha=1 / 100)
@@ -116,7 +116,7 @@ def test_planes_that_arrive_later_count() -> None:
     np.testing.assert_array_equal(got.rgb, wanted.rgb)
 
 
-def test_scenes_that_it_would_not_serve_keep_their_cells() -> None:
+def test_scenes_that_it_does_not_serve_keep_their_cells() -> None:
     assert OccupancyCulling.serves(moving())
     one_slot = replace(moving(), occupancy=moving().occupancy[:1])
     fine = moving(resolution=(40, 20, 16))  # more than two texels a cell

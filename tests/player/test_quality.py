@@ -130,7 +130,7 @@ def test_what_was_drawn_from_far_away_is_whole_from_near(level: str, processor: 
     assert np.abs(shown[0] - shown[1]).max() <= 1 and np.ptp(shown[0]) > 50
 
 
-def test_steady_playback_makes_nothing_new() -> None:
+def test_steady_playback_allocates_and_compiles_nothing() -> None:
     ctx, scene = gl.context(), tiny_scene(4)
     screen, renderer = ctx.simple_framebuffer((64, 48), 4), Renderer(ctx, scene, LEVELS[DEFAULT])
     for n in range(12):

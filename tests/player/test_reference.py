@@ -109,7 +109,7 @@ def test_rays_along_the_axes_and_from_inside() -> None:
     assert np.all(np.isinf(got.depth[3:])) and np.allclose(got.rgb[3:], scene.background)
 
 
-def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_size_of_blocks_of_rays_does_not_change_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tiny_scene(2)
     whole = render(scene, scene.cameras[1], 0.25)
     monkeypatch.setattr(reference, "RAYS_AT_ONCE", 77)
@@ -141,7 +141,7 @@ def test_bilinear_and_linear_meet_texels_at_corners() -> None:
     assert reference.sample_linear(plane[0], np.float32(0.5)) == pytest.approx((plane[0, 2] + plane[0, 3]) / 2)
 
 
-def test_compositing_spends_what_there_is() -> None:
+def test_weights_and_remaining_transmittance_sum_to_the_transmittance() -> None:
     alphas = np.array([[0.5, 0.0, 0.999, 0.5, 0.5], [0.1, 0.2, 0.0, 0.0, 0.3]], np.float32)
     weights, trans, reached = reference.composite(alphas, np.array([1.0, 0.5], np.float32))
     assert weights.sum(axis=1) + trans == pytest.approx([1.0, 0.5], abs=1e-6)
@@ -170,7 +170,7 @@ def test_an_appearance_is_a_change_of_the_hidden_bias_and_of_colour_alone(part: 
     np.testing.assert_array_equal(zero.rgb, average.rgb)
 
 
-def test_codes_that_no_decoder_knows_are_refused() -> None:
+def test_codes_that_do_not_fit_the_decoder_are_refused() -> None:
     scene = with_appearances(tiny_scene(4))
     with pytest.raises(ValueError, match="shape"):
         render(scene, scene.cameras[0], 0.3, appearance=np.zeros(15, np.float32))

@@ -54,7 +54,7 @@ def check(got: Rendering, wanted: Rendering) -> None:
     assert np.mean(np.abs(got.depth[solid] - wanted.depth[solid]) < 2e-3) >= 0.999 if solid.any() else True
 
 
-def undirected(scene: Scene) -> Scene:
+def view_independent(scene: Scene) -> Scene:
     return replace(scene, decoder=replace(scene.decoder, w2=np.zeros_like(scene.decoder.w2)))
 
 
@@ -80,7 +80,7 @@ def test_gives_the_reference_picture(view: str, part: Part, space: str) -> None:
         with_contraction(tiny_scene(6, dynamic=False)),
         replace(with_contraction(tiny_scene(9)), occupancy=np.zeros((2, 300, 2, 3), bool)),
         with_motion(with_contraction(tiny_scene(6)), most=0.5),
-        undirected(tiny_scene(6)),
+        view_independent(tiny_scene(6)),
         keep_channels(tiny_scene(4, scales=3), (np.array([1, 4, 6]), np.array([0]), np.arange(8))),
     ],
     ids=[
@@ -137,7 +137,7 @@ def test_appearances_of_a_hybrid_scene_are_those_of_the_reference() -> None:
 
 
 @pytest.mark.parametrize("part", Part)
-def test_an_appearance_comes_to_the_screen(part: Part) -> None:
+def test_an_appearance_is_shown_on_the_screen(part: Part) -> None:
     ctx, scene = gl.context(), with_appearances(tiny_scene(4))
     screen, renderer, camera = ctx.framebuffer([ctx.texture((64, 48), 4)]), Renderer(ctx, scene), CAMERAS["outside"]
     for code in (None, scene.appearance("dusk.jpg")):
@@ -147,7 +147,7 @@ def test_an_appearance_comes_to_the_screen(part: Part) -> None:
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5])
-def test_a_share_of_a_picture_goes_over_what_is_there(share: float) -> None:
+def test_a_picture_is_blended_over_the_screen_by_its_opacity(share: float) -> None:
     ctx, one, other = gl.context(), tiny_scene(4), tiny_scene(5)
     screen, camera = ctx.framebuffer([ctx.texture((64, 48), 4)]), CAMERAS["outside"]
     pictures = []
@@ -168,7 +168,7 @@ def test_scenes_without_appearances_have_no_code_in_the_shader() -> None:
     for scene, held in (
         (tiny_scene(4), False),
         (with_appearances(tiny_scene(4)), True),
-        (with_appearances(undirected(tiny_scene(4))), False),
+        (with_appearances(view_independent(tiny_scene(4))), False),
     ):
         renderer = Renderer(gl.context(), scene)
         renderer.render(CAMERAS["outside"], 0.62)
@@ -176,7 +176,7 @@ def test_scenes_without_appearances_have_no_code_in_the_shader() -> None:
             program for (name, *_), (program, _) in renderer._programs._programs.items() if name == "march.glsl"
         )
         assert (program.get("appearance", None) is not None) == held
-        if not held and scene.appearances:  # colour is the same from all sides, whatever the code
+        if not held and scene.appearances:  # view-independent colour, whatever the code
             check(
                 renderer.render(CAMERAS["outside"], 0.62, appearance=scene.appearance("dawn.jpg")),
                 render(scene, CAMERAS["outside"], 0.62, appearance=scene.appearance("dawn.jpg")),
@@ -233,7 +233,7 @@ def test_folded_levels_are_exact_where_nothing_moves_and_close_where_it_does(spa
 
 
 @pytest.mark.parametrize("space", VARIANTS)
-def test_shows_every_look_and_part_on_a_screen_of_another_size(space: str) -> None:
+def test_every_display_mode_and_part_is_shown_on_a_screen_of_another_size(space: str) -> None:
     ctx, scene = gl.context(), VARIANTS[space](tiny_scene(4))
     screen = ctx.framebuffer([ctx.texture((70, 50), 4)])
     renderer, pictures = Renderer(ctx, scene), {}
@@ -292,7 +292,7 @@ def test_a_decoder_too_large_for_a_shader_is_refused() -> None:
         Renderer(gl.context(), replace(scene, decoder=wide))
 
 
-def test_planes_that_fit_only_unrefined_are_folded_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planes_that_fit_only_without_upsampling_are_folded_so(monkeypatch: pytest.MonkeyPatch) -> None:
     ctx, scene = gl.context(), tiny_scene(4)
     monkeypatch.setitem(ctx.info, "GL_MAX_TEXTURE_SIZE", max(Renderer(ctx, scene).layout.size))
     renderer = Renderer(ctx, scene, FOLDED, processor=False)
@@ -325,7 +325,7 @@ TOO_LARGE = {"limits-axes": "texture of 16384x16391", "limits-hybrid": "weights"
 
 
 @pytest.mark.parametrize("name", WHOLE)
-def test_conformance_files_are_drawn_at_every_quality(name: str) -> None:
+def test_conformance_files_are_drawn_at_every_level(name: str) -> None:
     """Planes of one texel or thousands, one row of time or many: whatever a file may hold."""
     scene = scene_io.read(VECTORS / f"{name}.kpc").dequantise()
     if name == "limits-axes" and gl.context().info["GL_MAX_TEXTURE_SIZE"] > 16384:
@@ -344,7 +344,7 @@ def test_conformance_files_are_drawn_at_every_quality(name: str) -> None:
     renderer.release()
 
 
-def test_a_small_picture_is_enlarged_by_more_than_straight_lines() -> None:
+def test_a_small_picture_is_enlarged_by_a_cubic() -> None:
     """A screen of four times the pixels shows what the cubic makes of the small picture."""
     ctx, scene, camera = gl.context(), tiny_scene(4), CAMERAS["outside"]
     renderer, screens = Renderer(ctx, scene), {}

@@ -67,7 +67,7 @@ def test_nothing_occupied_covers_nothing() -> None:
     assert blocks is not None and not blocks.any()
 
 
-def test_from_among_what_is_occupied_all_is_drawn() -> None:
+def test_a_camera_within_occupied_cells_has_no_mask() -> None:
     scene = tiny_scene(3)
     inside = look_at((0.1, 0.05, 0.05), (1.0, 0.0, 0.0), 32, 24, 30.0)
     assert (
@@ -96,7 +96,7 @@ def test_pictures_are_the_same_without_a_mask(monkeypatch: pytest.MonkeyPatch, k
             np.testing.assert_array_equal(one, other, name)
 
 
-def test_what_was_drawn_before_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_earlier_pictures_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tiny_scene(4, resolution=(33, 17, 17))
     renderer, most = processor_of(scene), cpu_renderer.MOST_MASKED
     coarse, predicted = (

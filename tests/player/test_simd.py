@@ -41,7 +41,7 @@ def weighed(planes, texels, ups, rows, starts, shares, weights, halves, into):
 
 
 @pytest.mark.parametrize("shape", [(4, 5, 3), (2, 2, 2), (3, 1, 1)])
-def test_neighbours_are_weighted_as_they_should(shape: tuple[int, int, int]) -> None:
+def test_grids_are_interpolated_trilinearly(shape: tuple[int, int, int]) -> None:
     """Against the sum over all nodes of products of hat functions; along an axis of one node there is no next."""
     rng, count = np.random.default_rng(0), 500
     values = rng.normal(size=(*shape, 4)).astype(np.float32)
@@ -67,7 +67,7 @@ def test_neighbours_are_weighted_as_they_should(shape: tuple[int, int, int]) -> 
 
 
 @pytest.mark.parametrize("vectors", [1, 2, 3, 5])
-def test_products_are_summed_up(vectors: int) -> None:
+def test_corners_are_decoded_from_products(vectors: int) -> None:
     rng, count = np.random.default_rng(vectors), WIDE * vectors
     wholes = tuple(rng.integers(-32767, 32768, count).astype(np.int16) for _ in range(3))
     factors = tuple(rng.normal(size=count).astype(np.float32) for _ in range(2))
@@ -80,7 +80,7 @@ def test_products_are_summed_up(vectors: int) -> None:
 
 
 @pytest.mark.parametrize("halves", [(0,), (0, NARROW)])
-def test_samples_of_planes_are_products_of_what_is_between_texels(halves: tuple[int, ...]) -> None:
+def test_features_are_products_of_interpolated_planes_and_rows(halves: tuple[int, ...]) -> None:
     """Of planes of other sizes, which lie one after the other, and of rows."""
     wide = NARROW * len(halves)
     rng, count, (nx, ny, nz) = np.random.default_rng(4), 300, (5, 3, 4)

@@ -9,7 +9,7 @@ from kpc.player.cpu.threads import from_both_ends, share_out
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 1000])
 @pytest.mark.parametrize("among", [1, 2, 3, 8])
-def test_all_is_done_once(count: int, among: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_part_is_done_once(count: int, among: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "CORES", among)
     done, parts = [0] * count, []
 
@@ -22,7 +22,7 @@ def test_all_is_done_once(count: int, among: int, monkeypatch: pytest.MonkeyPatc
     assert done == [1] * count and len(parts) == min(among, count)
 
 
-def test_what_goes_wrong_in_any_part_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_in_any_part_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "CORES", 2)
     for wrong in (0, 5):
 
@@ -36,7 +36,7 @@ def test_what_goes_wrong_in_any_part_is_raised(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 1000])
 @pytest.mark.parametrize("among", [1, 2, 3, 8])
-def test_from_both_ends_all_is_done_once_in_parts_of_some_size(
+def test_from_both_ends_every_part_is_done_once_and_is_large_enough(
     count: int, among: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(threads, "WORKERS", among)
@@ -61,7 +61,7 @@ def test_workers_meet_in_the_middle(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not taken[0] or not taken[1] or max(taken[0]) < min(taken[1])
 
 
-def test_what_goes_wrong_at_either_end_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_at_either_end_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "WORKERS", 2)
     for wrong in (0, 310):
 
