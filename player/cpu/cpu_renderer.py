@@ -17,7 +17,7 @@ from kpc.player.cpu.coarse_to_fine import FACTOR, blocks_over, interpolation_err
 from kpc.player.cpu.corner_grid import CornerGrid
 from kpc.player.cpu.field_sampler import FieldSampler, warm_up
 from kpc.player.cpu.occupancy_culling import OccupancyCulling
-from kpc.player.cpu.picture import BLOCK, Picture
+from kpc.player.cpu.picture import BLOCK, Picture, Rectangle, union
 from kpc.player.cpu.plane_sampler import PlaneSampler
 from kpc.player.cpu.reference import occupancy_slot
 from kpc.player.cpu.reprojection import edge_blocks, mismatched_blocks, predict, sample_pixels
@@ -56,6 +56,7 @@ class Drawn:
         turn: of its sample pixels.
         marched: share of the pixels that the last picture without prediction took.
         unpredicted: how many pictures from here on are to be drawn without prediction.
+        content: of the picture; outside it shows the background.
     """
 
     camera: Camera
@@ -67,6 +68,7 @@ class Drawn:
     turn: int = 0
     marched: float = 1.0
     unpredicted: int = 0
+    content: Rectangle = (0, 0, 0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +94,9 @@ class ProcessorRenderer:
         scene: the scene; time planes are read from it.
         layout: of the atlas.
         read_atlas: returns the space planes, a (height, width, 4) float32 atlas, when they are needed.
+
+    Attributes:
+        content: of the last picture; outside this rectangle it shows the background.
     """
 
     def __init__(self, scene: Scene, layout: Layout, read_atlas: Callable[[], np.ndarray]) -> None:
@@ -109,6 +114,7 @@ class ProcessorRenderer:
         self._pictures: dict[tuple[bool, tuple[int, int], int], Picture] = {}
         self._drawn: dict[tuple[bool, tuple[int, int]], Drawn] = {}
         self._count = 0
+        self.content: Rectangle = (0, 0, 0, 0)
 
     @staticmethod
     def serves(scene: Scene) -> bool:
@@ -175,11 +181,12 @@ class ProcessorRenderer:
             sampler.march(view, free, blocks, side, stride, termination, picture)
 
         frame = Frame(march, is_moving, slot, 0.0 if kind is CornerGrid else quality.interpolation_tolerance)
+        self.content = self._content(slot, camera)
         if kind is CornerGrid or not quality.reprojection_tolerance:
             picture = self._picture(*key, FULL)
             self._draw_unpredicted(frame, camera, picture)
             return picture
-        drawn = Drawn(camera, time, code.tobytes(), quality, self._count)
+        drawn = Drawn(camera, time, code.tobytes(), quality, self._count, content=self.content)
         return self._draw_predicted(frame, drawn, last)
 
     # --- whole pictures
@@ -254,6 +261,8 @@ class ProcessorRenderer:
             unpredicted = 0 if self._seconds_between(drawn, last) > JUMP_S else UNPREDICTED_PICTURES
             self._drawn[key] = replace(drawn, marched=marched, unpredicted=unpredicted)
             return picture
+        self.content = (0, 0, *size) if has_moved else union(last.content, drawn.content)
+        drawn = replace(drawn, content=self.content)
         picture.rgba[rows, columns], picture.sums[rows, columns] = sampled
         self._clear_blocks(picture, np.argwhere(mismatched & ~is_shown))
         frame.march(camera, np.argwhere(mismatched & is_shown), BLOCK, picture)
@@ -339,6 +348,19 @@ class ProcessorRenderer:
             blocks = self._masks[slot].blocks(camera, BLOCK)
             self._masked = key, None if blocks is None or blocks.mean() > MOST_MASKED else blocks
         return self._masked[1]
+
+    def _content(self, slot: int, camera: Camera) -> Rectangle:
+        """Return the rectangle outside which a picture shows the background: that of its mask, and as far as
+        interpolation reaches."""
+        blocks = self._masked_blocks(slot, camera)
+        if blocks is None:
+            return 0, 0, camera.width, camera.height
+        if not blocks.any():
+            return 0, 0, 0, 0
+        rows, columns = np.flatnonzero(blocks.any(1)), np.flatnonzero(blocks.any(0))
+        left, bottom = (max(BLOCK * (int(first) - 1), 0) for first in (columns[0], rows[0]))
+        right, top = min(BLOCK * (int(columns[-1]) + 2), camera.width), min(BLOCK * (int(rows[-1]) + 2), camera.height)
+        return left, bottom, right, top
 
     def _picture(self, is_moving: bool, size: tuple[int, int], role: int) -> Picture:
         """Return a picture in memory; the last used are kept."""

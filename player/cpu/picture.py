@@ -22,6 +22,19 @@ class Picture(NamedTuple):
         return Picture(np.zeros((height, width, 4), np.float32), np.zeros((height, width, 2), np.float32))
 
 
+# Left, bottom, right and top of a part of a picture, pixels, rows from below; right and top are exclusive.
+Rectangle = tuple[int, int, int, int]
+
+
+def union(one: Rectangle, other: Rectangle) -> Rectangle:
+    """Return the smallest rectangle that holds both; an empty one holds nothing."""
+    parts = [part for part in (one, other) if part[0] < part[2] and part[1] < part[3]]
+    if not parts:
+        return 0, 0, 0, 0
+    left, bottom, right, top = zip(*parts, strict=True)
+    return min(left), min(bottom), max(right), max(top)
+
+
 @kernel_part
 def interpolate_pixel(picture, x, y, out):
     """Interpolate a (H, W, C) picture bilinearly at a point of its raster, to (C,); beyond its edges all is as at

@@ -1,5 +1,6 @@
 """Bringing pictures to their size and to the screen."""
 
+import math
 from enum import Enum
 
 import moderngl
@@ -26,6 +27,7 @@ class Presentation:
 
     def __init__(self, textures: SceneTextures, programs: Programs) -> None:
         self._ctx, self._layout, self._programs = textures.ctx, textures.layout, programs
+        self._background = tuple(map(float, textures.scene.background))
         self._canvas: Canvas | None = None
 
     @property
@@ -39,7 +41,7 @@ class Presentation:
         marched.rgba.use(RGBA_UNIT)
         marched.sums.use(SUMS_UNIT)
         draw(self._ctx, target.framebuffer, vertices)
-        return target
+        return target.mark_drawn()
 
     def enlarge(self, marched: Target, target: Target) -> Target:
         """Interpolate a picture to a larger target: colours by a cubic, the rest bilinearly."""
@@ -48,7 +50,7 @@ class Presentation:
         marched.rgba.use(RGBA_UNIT)
         marched.sums.use(SUMS_UNIT)
         draw(self._ctx, target.framebuffer, vertices)
-        return target
+        return target.mark_drawn()
 
     def show(
         self, screen: moderngl.Framebuffer, picture: Target, static: Target | None, mode: DisplayMode,
@@ -81,12 +83,34 @@ class Presentation:
         picture.rgba.use(RGBA_UNIT)
         picture.sums.use(SUMS_UNIT)
         (static or picture).rgba.use(STATIC_UNIT)
-        draw(self._ctx, into, vertices, blend=not canvas and opacity < 1)
+        is_partial = shown == DisplayMode.COLOUR.value and opacity == 1 and not picture.is_full
+        self._draw(into, vertices, picture, is_partial, blend=not canvas and opacity < 1)
         if canvas:
             enlarge, vertices = self._programs.get("enlarge.glsl", self._layout)
             set_uniforms(enlarge, shown_small=RGBA_UNIT, viewport=tuple(map(float, screen.size)), opacity=opacity)
             canvas.shown.use(RGBA_UNIT)
-            draw(self._ctx, screen, vertices, blend=opacity < 1)
+            self._draw(screen, vertices, picture, is_partial, blend=opacity < 1)
+
+    def _draw(
+        self,
+        screen: moderngl.Framebuffer,
+        vertices: moderngl.VertexArray | None,
+        picture: Target,
+        is_partial: bool,
+        blend: bool,
+    ) -> None:
+        """Draw over a screen; if `is_partial`, only where the picture has content, and the background elsewhere."""
+        scissor = None
+        if is_partial:
+            screen.scissor = None
+            screen.clear(*self._background, 1.0)
+            across, up = (side / of for side, of in zip(screen.size, picture.rgba.size, strict=True))
+            left, bottom, right, top = picture.content
+            # Interpolation reaches two pixels of the picture.
+            left, bottom = math.floor((left - 2) * across), math.floor((bottom - 2) * up)
+            right, top = math.ceil((right + 2) * across), math.ceil((top + 2) * up)
+            scissor = left, bottom, right - left, top - bottom
+        draw(self._ctx, screen, vertices, blend=blend, scissor=scissor)
 
     def _canvas_of(self, size: tuple[int, int]) -> Canvas:
         """Return a canvas of a size; the last one is kept."""

@@ -112,8 +112,9 @@ def draw(
     vertices: moderngl.VertexArray | None,
     viewport: tuple[int, int, int, int] | None = None,
     blend: bool = False,
+    scissor: tuple[int, int, int, int] | None = None,
 ) -> None:
-    """Draw over all of a framebuffer, or a viewport of it; `blend` with what is there, by alpha."""
+    """Draw over all of a framebuffer, or a viewport of it within a scissor; `blend` with what is there, by alpha."""
     assert vertices is not None, "compute shaders are run, not drawn"
     ctx.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
     if blend:
@@ -121,8 +122,9 @@ def draw(
         ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
     framebuffer.use()
     framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
-    framebuffer.scissor = None
+    framebuffer.scissor = scissor
     vertices.render(moderngl.TRIANGLES, vertices=3)
+    framebuffer.scissor = None  # or it would bound the next clear
 
 
 def set_uniforms(program: AnyProgram, **values: Any) -> None:

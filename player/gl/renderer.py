@@ -221,10 +221,15 @@ class Renderer:
         if mode is DisplayMode.OCCUPANCY:
             picture, static = self._draw_occupancy(camera, time), None
         else:
-            shown = Part.STATIC if part is Part.STATIC else Part.FULL
-            picture, static = self.march(camera, time, part=shown, appearance=appearance, keep_small=True), None
+            shown, with_sums = Part.STATIC if part is Part.STATIC else Part.FULL, mode is not DisplayMode.COLOUR
+            picture, static = (
+                self.march(camera, time, part=shown, appearance=appearance, keep_small=True, with_sums=with_sums),
+                None,
+            )
             if part is Part.DYNAMIC and mode is DisplayMode.COLOUR:
-                static = self.march(camera, time, part=Part.STATIC, appearance=appearance, keep_small=True)
+                static = self.march(
+                    camera, time, part=Part.STATIC, appearance=appearance, keep_small=True, with_sums=with_sums
+                )
         self._presentation.show(screen, picture, static, mode, depths, most_samples, opacity)
 
     def march(
@@ -235,12 +240,14 @@ class Renderer:
         part: Part = Part.FULL,
         appearance: np.ndarray | None = None,
         keep_small: bool = False,
+        with_sums: bool = True,
     ) -> Target:
         """Draw a picture of the camera's size on the card.
 
         Args:
             part: FULL or STATIC.
             keep_small: leave the picture smaller where the quality level has a lower resolution.
+            with_sums: also bring `Target.sums` to the card, which only display modes besides COLOUR need.
 
         Returns:
             the picture, valid until the next one of the same part and size.
@@ -260,11 +267,13 @@ class Renderer:
         processor = self._drawing_processor()
         if processor is not None:
             is_moving = part is Part.FULL and self.scene.is_dynamic
-            target.write(processor.draw(raster, time, self.quality, code, is_moving=is_moving))
+            picture = processor.draw(raster, time, self.quality, code, is_moving=is_moving)
+            target.write(picture, processor.content, with_sums)
         else:
             self._shaders.draw(
                 target, raster, time, self.quality, code, is_moving=part is Part.FULL, compute=self.compute
             )
+            target.mark_drawn()
         if rays_across > 1:
             return self._presentation.average(target, self._target(part, size), rays_across)
         if target.rgba.size != size and not keep_small:
@@ -274,7 +283,7 @@ class Renderer:
     def _draw_occupancy(self, camera: Camera, time: float) -> Target:
         target = self._target(Part.STATIC, (camera.width, camera.height))
         self._shaders.draw_occupancy(target, camera, time, self.quality)
-        return target
+        return target.mark_drawn()
 
     def is_compute_faster(self, camera: Camera, time: float) -> bool:
         """Draw a picture by fragment and by compute shaders, a few times each, and compare the best of their times."""
@@ -286,6 +295,7 @@ class Renderer:
                 self.ctx.finish()
                 started = clock.perf_counter()
                 self._shaders.draw(target, camera, time, self.quality, code, is_moving=True, compute=compute)
+                target.mark_drawn()
                 self.ctx.finish()
                 took.append(clock.perf_counter() - started)
             seconds[compute] = min(took[1:])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import moderngl
 import numpy as np
 from kpc.format.common.errors import DisplayError
-from kpc.player.cpu.picture import Picture
+from kpc.player.cpu.picture import Picture, Rectangle, union
 from kpc.player.cpu.reference import Rendering
 
 
@@ -31,6 +31,8 @@ class Target:
     rgba: moderngl.Texture
     sums: moderngl.Texture
     framebuffer: moderngl.Framebuffer
+    content: Rectangle  # outside this rectangle `rgba` shows the background
+    sums_content: Rectangle  # outside this rectangle `sums` is 0
 
     @staticmethod
     def of(ctx: moderngl.Context, size: tuple[int, int]) -> "Target":
@@ -38,16 +40,31 @@ class Target:
             rgba, sums = ctx.texture(size, 4, dtype="f4"), ctx.texture(size, 2, dtype="f4")
             for texture in (rgba, sums):
                 texture.repeat_x = texture.repeat_y = False
-            return Target(rgba, sums, ctx.framebuffer([rgba, sums]))
+            return Target(rgba, sums, ctx.framebuffer([rgba, sums]), (0, 0, *size), (0, 0, *size))
 
     @property
     def memory_bytes(self) -> int:
         return 24 * self.rgba.width * self.rgba.height
 
-    def write(self, picture: Picture) -> None:
-        """Upload a picture of the same size."""
-        self.rgba.write(picture.rgba)
-        self.sums.write(picture.sums)
+    @property
+    def is_full(self) -> bool:
+        """Whether all of it may show something."""
+        return self.content == (0, 0, *self.rgba.size)
+
+    def write(self, picture: Picture, content: Rectangle, with_sums: bool) -> None:
+        """Upload a picture of the same size that shows the background outside `content`; its sums only if they are
+        needed."""
+        _upload(self.rgba, picture.rgba, union(self.content, content))
+        self.content = content
+        self.sums_content = union(self.sums_content, content)
+        if with_sums:
+            _upload(self.sums, picture.sums, self.sums_content)
+            self.sums_content = content
+
+    def mark_drawn(self) -> "Target":
+        """Note that shaders have drawn all of it."""
+        self.content = self.sums_content = (0, 0, *self.rgba.size)
+        return self
 
     def read(self) -> Rendering:
         """Read a finished picture, the top row first."""
@@ -61,6 +78,13 @@ class Target:
     def release(self) -> None:
         for resource in (self.framebuffer, self.rgba, self.sums):
             resource.release()
+
+
+def _upload(texture: moderngl.Texture, array: np.ndarray, part: Rectangle) -> None:
+    """Write a part of a picture to its texture."""
+    left, bottom, right, top = part
+    if left < right and bottom < top:
+        texture.write(np.ascontiguousarray(array[bottom:top, left:right]), (left, bottom, right - left, top - bottom))
 
 
 @dataclass

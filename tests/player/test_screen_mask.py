@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import gl
 import numpy as np
 import pytest
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import cpu_renderer
 from kpc.player.cpu.reference import occupancy_slot, render
 from kpc.player.cpu.screen_mask import MOST_CELLS, ScreenMask
+from kpc.player.gl.presentation import DisplayMode
+from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LEVELS, Quality
 from processor import draw, processor_of, psnr
 from scenes import look_at, tiny_scene, with_motion
@@ -112,3 +115,21 @@ def test_earlier_pictures_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) 
                 monkeypatch.setattr(cpu_renderer, "MOST_MASKED", -1.0)
                 wanted = draw(processor_of(scene), camera, time, replace(quality, reprojection_tolerance=0.0))
                 assert psnr(got, wanted) > (60 if quality is coarse else 40)
+
+
+@pytest.mark.parametrize("size", [(96, 64), (201, 97)])
+def test_a_screen_shows_nothing_of_earlier_pictures(monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]) -> None:
+    """Only the part with content is uploaded and drawn: after other cameras, and at once, the screen is the same."""
+    scene, ctx, shown = tiny_scene(4, resolution=(33, 17, 17)), gl.context(), []
+    cameras = [look_at((x, 1.0, 3.0), (0.3, 0.2, 0.0), 96, 64, 70.0) for x in (9.0, -2.0, 30.0, 4.0)]
+    for mode in (DisplayMode.COLOUR, DisplayMode.DEPTH):
+        for most, seen in ((cpu_renderer.MOST_MASKED, cameras), (-1.0, cameras[-1:])):
+            monkeypatch.setattr(cpu_renderer, "MOST_MASKED", most)
+            renderer, screen = Renderer(ctx, scene, LEVELS["balanced"], processor=True), ctx.simple_framebuffer(size, 4)
+            for camera in seen:
+                renderer.show(screen, camera, 0.3)
+            renderer.show(screen, cameras[-1], 0.3, mode=mode, depths=(2.0, 6.0))
+            shown.append(np.frombuffer(screen.read(), np.uint8).astype(int))
+            monkeypatch.undo()
+    for one, other in (shown[:2], shown[2:]):
+        assert np.abs(one - other).max() <= 1 and len(np.unique(one)) > 50
