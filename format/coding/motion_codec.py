@@ -42,7 +42,7 @@ class CodingPass:
     new: np.ndarray
     references: np.ndarray
     weights: np.ndarray
-    others: tuple[np.ndarray, np.ndarray, np.ndarray]
+    others: tuple[np.ndarray, ...]
     level: int
 
 

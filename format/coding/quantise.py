@@ -9,6 +9,7 @@ of the channel on space planes (read only where nothing is occupied).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from kpc.format.coding.poses import are_rigid, round_poses
@@ -321,7 +322,7 @@ def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) ->
     """
     if not np.isfinite(decoder.density_bias):
         raise FormatError("decoder: the density bias is NaN or infinite, which no file can store")
-    shorter = {
+    shorter: dict[str, Any] = {
         name: to_half(_to_shared_exponent(value, bits[name]) if bits and name in bits else value)
         for name, value in decoder_arrays(decoder).items()
     }

@@ -137,7 +137,7 @@ def coded_blocks(coded: np.ndarray, side: int) -> np.ndarray:
     """Return (blocks down, blocks across) bool: the blocks with any coded texel."""
     rows, columns = coded.shape
     padded = np.pad(coded, ((0, -rows % side), (0, -columns % side)))
-    return padded.reshape(-(-rows // side), side, -1, side).any((1, 3))
+    return np.asarray(padded.reshape(-(-rows // side), side, -1, side).any((1, 3)))
 
 
 def encode_blocks(blocks: TransformBlocks, coded: np.ndarray, implied: np.ndarray | None = None) -> bytes:

@@ -16,7 +16,7 @@ import google_crc32c
 import numpy as np
 import zstandard
 from kpc.format.common.errors import FormatError
-from kpc.format.container.sources import AnySource, open_source
+from kpc.format.container.sources import AnySource, Source, open_source
 
 MAGIC = b"\x89KPC\r\n\x1a\n"
 VERSION = 1
@@ -258,6 +258,11 @@ class Reader:
         FormatError: not a .kpc file, a draft or another version, damaged, or claiming more than its size allows.
     """
 
+    source: Source
+    name: str
+    header: Header
+    index: tuple[Entry, ...]
+
     def __init__(self, source: "AnySource | Reader", *, allow_partial: bool = False):
         self._reading = threading.Lock()
         if isinstance(source, Reader):
@@ -324,10 +329,12 @@ class Reader:
         table = np.frombuffer(self._decompressed(index, header.chunk_count * ENTRY.size, "chunk index"), np.uint8)
         rows = table.reshape(ENTRY.size, -1).T.tobytes()
         entries, offset = [], HEADER.size + len(index)
-        for number, (kind, *fields) in enumerate(ENTRY.iter_unpack(rows)):
+        for number, fields in enumerate(ENTRY.iter_unpack(rows)):
+            kind, group, scale, plane, row_start, row_count, codec, stored, raw, crc = fields
             if not (kind.isascii() and kind.isalpha()):
                 raise FormatError(f"{self.name}: chunk {number} has a kind that is not four letters")
-            entry = Entry(kind.decode("ascii"), *fields, offset)
+            name = kind.decode("ascii")
+            entry = Entry(name, group, scale, plane, row_start, row_count, codec, stored, raw, crc, offset)
             if entry.raw_length > header.largest_raw:
                 raise FormatError(
                     f"{self.name}: chunk {number} claims {entry.raw_length:,} bytes, more than the header's limit"

@@ -91,7 +91,8 @@ def choose_codec(
 def _decodes_to(body: bytes, symbols: np.ndarray, coded: np.ndarray, implied: np.ndarray | None) -> bool:
     """Return whether blocks decode to just these symbols."""
     try:
-        found, where = decode_blocks(body, *symbols.shape, implied=implied)
+        rows, columns, channels = symbols.shape
+        found, where = decode_blocks(body, rows, columns, channels, implied)
     except FormatError:  # the occupancy has changed since they were encoded
         return False
     return np.array_equal(found, symbols) and np.array_equal(where, coded)

@@ -26,7 +26,7 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
     """
     scene = read(data, allow_partial=partial)
     codecs = {entry.codec for entry in Reader(data, allow_partial=partial).index}
-    found = {
+    found: dict[str, Any] = {
         "partial": partial,
         "zstd": ZSTD_VERSION if Codec.ZSTD in codecs else None,
         "frame_count": scene.clip.frame_count,
@@ -96,7 +96,7 @@ def _rays(scene: QuantisedScene) -> list[dict[str, Any]]:
     for origin, direction, time, look in zip(origins, directions, (0.0, 0.375, 0.8125, 1.0), appearances, strict=True):
         with np.errstate(over="ignore"):  # a vector may saturate colours
             seen = reference.render_rays(
-                scene.dequantise(), origin[None], direction[None], time, appearance=look and look.code
+                scene.dequantise(), origin[None], direction[None], time, appearance=None if look is None else look.code
             )
         depth = float(seen.depth[0])
         rays.append(

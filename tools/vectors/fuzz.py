@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import google_crc32c
 import numpy as np
@@ -436,7 +436,7 @@ def run(
         for pipe in wait(list(jobs), timeout=1.0):
             process, now, numbers, skipped = jobs[pipe]
             try:
-                following, outcomes, found = pipe.recv()  # type: ignore[union-attr]
+                following, outcomes, found = cast(Connection, pipe).recv()
                 tally += outcomes
                 findings += found
                 for number, what in found:

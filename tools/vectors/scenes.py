@@ -116,9 +116,9 @@ def extreme_decoder(decoder: Decoder) -> Decoder:
     """With the largest and the smallest numbers that codec 2 has, and an array of zeros."""
     return replace(
         decoder,
-        density_weight=np.float32([-65504, 65504, 32][: len(decoder.density_weight)]),
+        density_weight=np.array([-65504, 65504, 32][: len(decoder.density_weight)], np.float32),
         w1=0 * decoder.w1,
-        b1=np.float32([1, -2, 2048]) * np.float32(0.5**24),
+        b1=np.array([1, -2, 2048], np.float32) * np.float32(0.5**24),
         w2=noise(decoder.w2.shape, 83) * np.float32(16),
         b2=noise(decoder.b2.shape, 84) * np.float32(0.5**20),
     )

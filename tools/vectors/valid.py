@@ -221,6 +221,7 @@ def _payloads(dense: QuantisedScene) -> dict[str, Vector]:
     near = poses(-24, (-5, 1 << 24, -7), 3 * [(0, 3, 4, 5)], [(1, 0, 2), (0, 9, 0), (4, 4, 0)], lenses=3)
     least = poses(-126, (-(1 << 31), 0, (1 << 31) - 1), [(3, 0, 0, 0)], [((1 << BITS) - 1, 1, 0)])
     weights = encode_kinds(dense, "DECO")
+    assert isinstance(dense.decoder, Decoder)
     return {
         "weights": (weights, False),
         "weights-prefix": prefix(weights, 4),
@@ -248,14 +249,14 @@ def limits() -> dict[str, bytes]:
     rows = make_scene(dynamic=True, sizes=[(1, 1, 2, 1, AXIS_LIMIT)])
     pose = np.diag([1.0, 1, 1, 1])
     names = [chr(0x4E00 + k) for k in range(APPEARANCE_LIMIT)]
-    steps = np.float32(
-        [16, 8, 0.5**20, 0.5**149, 0.5**126]
+    steps = np.array(
+        [16, 8, 0.5**20, 0.5**149, 0.5**126], np.float32
     )  # the last two: the least number above 0, the least that is normal
     wide = {
         name: QuantisedPlane(
-            np.tile(np.int8([[[-128], [127], [1]]]), (1, 1, 5)),
+            np.tile(np.array([[[-128], [127], [1]]], np.int8), (1, 1, 5)),
             steps,
-            np.float32([0, -1024, 1, 0, 0.5**126]),
+            np.array([0, -1024, 1, 0, 0.5**126], np.float32),
             np.ones((1, 3), bool),
         )
         for name in SPACE_PLANES[:2]
@@ -264,13 +265,13 @@ def limits() -> dict[str, bytes]:
     decoder = make_scene(dynamic=False, sizes=[(5, 1, 1, 1, 0)]).decoder
     far = replace(
         plain,
-        aabb=np.float32([[-BOX_LIMIT] * 3, [BOX_LIMIT] * 3]),
+        aabb=np.array([[-BOX_LIMIT] * 3, [BOX_LIMIT] * 3], np.float32),
         clip=Clip(FRAME_LIMIT, 5e-324),
         scales=(wide,),
         decoder=decoder,
         step=2.0**32 / SAMPLE_LIMIT,
         occupancy=np.zeros((1, 1, 1, 1), bool),
-        background=np.float32([0, 1, 1]),
+        background=np.array([0, 1, 1], np.float32),
         cameras=(
             Camera(
                 65535,
@@ -286,7 +287,7 @@ def limits() -> dict[str, bytes]:
     )
     near = replace(
         plain,
-        aabb=np.float32([[0, 0, 0], [1 / BOX_LIMIT] * 3]),
+        aabb=np.array([[0, 0, 0], [1 / BOX_LIMIT] * 3], np.float32),
         step=2.0**-33,
         clip=Clip(1, 1.7e308),
         occupancy=far.occupancy,
@@ -311,7 +312,9 @@ def limits() -> dict[str, bytes]:
         "limits-motion": small(
             replace(
                 moving,
-                motion=QuantisedMotion(np.resize(np.int16([-32768, 32767, 0]), (AXIS_LIMIT, 2, 2, 2, 3)), 1 / 32),
+                motion=QuantisedMotion(
+                    np.resize(np.array([-32768, 32767, 0], np.int16), (AXIS_LIMIT, 2, 2, 2, 3)), 1 / 32
+                ),
             )
         ),
         "limits-nodes": encode_kinds(replace(moving, motion=smooth_motion(2, 2, 2, MOTION_LIMIT)), "OCCU", "MOVE"),
