@@ -70,7 +70,7 @@ def estimate_curvature(scene: Scene, validation: ValidationRays, rays: int | Non
     parameters = [field.theta] if field.motion is None else [field.theta, field.motion]
     squares = [torch.zeros_like(one) for one in parameters]
     products = [
-        {name: _channel_products(np.zeros_like(plane)) for name, plane in scale.items()} for scale in scene.scales
+        {name: channel_products(np.zeros_like(plane)) for name, plane in scale.items()} for scale in scene.scales
     ]
     for part in (validation, more):
         for batch in part.batches(RAYS_PER_GRADIENT):
@@ -82,7 +82,7 @@ def estimate_curvature(scene: Scene, validation: ValidationRays, rays: int | Non
             gradients = torch.autograd.grad((signs * colours).sum(), parameters)
             for scale, planes in zip(products, _by_plane(field.layout, scene, gradients[0].numpy()), strict=True):
                 for name, plane in planes.items():
-                    scale[name] += _channel_products(plane)
+                    scale[name] += channel_products(plane)
             for total, gradient in zip(squares, gradients, strict=True):
                 total += gradient.square_()
     count = max(1, len(validation.times) + len(more.times))
@@ -104,7 +104,7 @@ def _by_plane(layout: Layout, scene: Scene, values: np.ndarray) -> list[dict[str
     return planes
 
 
-def _channel_products(plane: np.ndarray) -> np.ndarray:
+def channel_products(plane: np.ndarray) -> np.ndarray:
     """Sum the products of two channels over each block: (H, W, M) to (blocks down, blocks across, M, M)."""
     rows, columns, M = plane.shape
     down = -(-rows // BLOCK_SIDE)

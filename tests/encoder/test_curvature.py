@@ -98,7 +98,7 @@ def test_the_correlation_predicts_the_effect_of_errors_in_two_channels(
 @pytest.mark.parametrize("rows, columns", [(4, 6), (5, 7), (1, 1)])
 def test_channel_products_are_summed_over_blocks(rows: int, columns: int) -> None:
     plane = np.random.default_rng(0).normal(size=(rows, columns, 3)).astype(np.float32)
-    sums = module._products(plane)
+    sums = module.channel_products(plane)
     assert sums.shape == (-(-rows // 2), -(-columns // 2), 3, 3)
     for y, x in np.ndindex(sums.shape[:2]):
         block = plane[2 * y : 2 * y + 2, 2 * x : 2 * x + 2].reshape(-1, 3)

@@ -28,7 +28,7 @@ def test_displacements_are_as_coarse_as_the_error_allows(share):
     np.testing.assert_array_equal(symbols, np.rint(symbols))
     assert errs(scene)(found).mse - 1e-3 <= share * FINEST_STEP**2 / 12
     assert math.sqrt(share) / 3 < multiple <= MAX_MULTIPLE or share > 1e6
-    assert coarsen_motion(found, np.ones(scene.motion.shape), errs(found), most, own=MAX_MULTIPLE) is found
+    assert coarsen_motion(found, np.ones(scene.motion.shape), errs(found), most, own_multiple=MAX_MULTIPLE) is found
 
 
 @pytest.mark.parametrize("share, expected", [(1e9, 64), (72.0, 8), (12.0, 3), (1.5, 1)])
