@@ -112,6 +112,8 @@ class ProcessorRenderer:
         # The last blocks of a screen mask, and the view that they are for.
         self._masked: tuple[object, np.ndarray | None] | None = None
         self._pictures: dict[tuple[bool, tuple[int, int], int], Picture] = {}
+        # By the id of a picture's rgba, the rectangle outside which it is the background; unknown: nowhere.
+        self._contents: dict[int, Rectangle] = {}
         self._drawn: dict[tuple[bool, tuple[int, int]], Drawn] = {}
         self._count = 0
         self.content: Rectangle = (0, 0, 0, 0)
@@ -203,8 +205,9 @@ class ProcessorRenderer:
         blocks = self._masked_blocks(frame.slot, camera)
         if blocks is None:
             blocks = np.ones((-(-camera.height // BLOCK), -(-camera.width // BLOCK)), bool)
+            self._contents.pop(id(picture.rgba), None)
         else:
-            self._clear(picture)
+            self._clear(picture, self._content(frame.slot, camera))
         frame.march(camera, np.argwhere(blocks), BLOCK, picture)
         return float(blocks.mean())
 
@@ -226,6 +229,7 @@ class ProcessorRenderer:
         marched = self._draw_coarse_to_fine(frame, coarser, coarse, FACTOR * texels, allowed_there)
         blocks = blocks_over(interpolation_errors(coarse.rgba, size), allowed - allowed_there)
         upsample(coarse, picture)
+        self._contents.pop(id(picture.rgba), None)
         frame.march(camera, np.argwhere(blocks), BLOCK, picture)
         return marched / FACTOR**2 + float(blocks.mean())
 
@@ -247,6 +251,7 @@ class ProcessorRenderer:
         picture = self._picture(*key, role)
         if has_moved:
             predict(self._picture(*key, last.role), last.camera, picture, camera)
+            self._contents.pop(id(picture.rgba), None)
         is_shown = self._masked_blocks(frame.slot, camera)
         rows, columns = sample_pixels(drawn.turn, size)
         if is_shown is None:
@@ -263,6 +268,8 @@ class ProcessorRenderer:
             return picture
         self.content = (0, 0, *size) if has_moved else union(last.content, drawn.content)
         drawn = replace(drawn, content=self.content)
+        if id(picture.rgba) in self._contents:
+            self._contents[id(picture.rgba)] = union(self._contents[id(picture.rgba)], self.content)
         picture.rgba[rows, columns], picture.sums[rows, columns] = sampled
         self._clear_blocks(picture, np.argwhere(mismatched & ~is_shown))
         frame.march(camera, np.argwhere(mismatched & is_shown), BLOCK, picture)
@@ -369,13 +376,17 @@ class ProcessorRenderer:
         self._pictures[key] = picture = Picture.empty(size) if picture is None else picture
         if len(self._pictures) > PICTURES_KEPT:
             dropped = next(iter(self._pictures))
-            self._pictures.pop(dropped)
+            self._contents.pop(id(self._pictures.pop(dropped).rgba), None)
             self._drawn.pop(dropped[:2], None)
         return picture
 
-    def _clear(self, picture: Picture) -> None:
-        """Fill a picture with the background."""
-        picture.rgba[:], picture.sums[:] = (*self.scene.background, 0.0), 0.0
+    def _clear(self, picture: Picture, content: Rectangle) -> None:
+        """Fill a picture with the background, where it is not, to be drawn within `content` then."""
+        height, width = picture.rgba.shape[:2]
+        left, bottom, right, top = union(self._contents.get(id(picture.rgba), (0, 0, width, height)), content)
+        picture.rgba[bottom:top, left:right] = (*self.scene.background, 0.0)
+        picture.sums[bottom:top, left:right] = 0.0
+        self._contents[id(picture.rgba)] = content
 
     def _clear_blocks(self, picture: Picture, blocks: np.ndarray) -> None:
         for row, column in BLOCK * blocks:

@@ -136,8 +136,8 @@ def warm_up(kind: type[FieldSampler], scene: Scene) -> None:
     camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))
     picture = Picture.empty((1, 1))
     march_blocks(
-        np.zeros((0, 2), np.int64), 1, view_of(scene, camera), march_settings(scene, 1.0, 0.5), uniform_distance_of(scene),
-        Occupancy(np.zeros(1, np.uint8), (1, 1, 1)), _no_motion(), *kind.dummy_arrays(scene), picture,
+        np.zeros((0, 2), np.int64), 1, view_of(scene, camera), march_settings(scene, 1.0, 0.5),
+        uniform_distance_of(scene), Occupancy(np.zeros(1, np.uint8), (1, 1, 1)), _no_motion(), *kind.dummy_arrays(scene), picture,
     )  # fmt: skip
 
 
