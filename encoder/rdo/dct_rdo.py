@@ -2,8 +2,7 @@
 
 For each block in turn those levels are sought, one after the other, that minimise J = D + lambda R:
 
-    sum over coded texels of weight * (symbol - wanted)^2, in squared quantisers, times the error weight of the
-    frequency
+    sum over coded texels of weight * (symbol - wanted)^2 * error weight of the frequency, in squared quantisers
         + TRANSFORM_LAM * bits(level | levels before it)
 
 with the distortion weights of `kpc.encoder.rdo.distortion`; what is wanted is moved so as to compensate the errors of
@@ -14,7 +13,8 @@ search keeps the error that all levels of a block make together, and chooses eac
 are those of the entropy coder's contexts, estimated from the result of the search before; the first search starts
 from the transform of the plane itself, with texels that are not needed filled in from around.
 
-When transform blocks pay: docs/design/rate-distortion.md, "Transform blocks".
+When transform blocks pay: docs/design/rate-distortion.md, "Transform blocks". The file is longer than others because
+the search and its kernels share one state.
 """
 
 import math

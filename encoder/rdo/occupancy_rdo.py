@@ -24,7 +24,7 @@ from kpc.format.scene.grid import dilate
 from kpc.format.scene.scene import Scene
 
 # Figures behind these constants: docs/design/rate-distortion.md, "Occupancy".
-MARCH_BITS = 0.5  # bits that one cell less to march is worth
+MARCH_BITS = 0.5  # bits that may be spent to have one cell less to march
 PLANE_BITS = 0.15  # bits per parameter with which planes make their errors e times smaller
 # Mean squared difference of the colour in a cell from that behind it, as a share of the full range; a little more,
 # since the errors of neighbouring cells on a ray add up.
@@ -113,7 +113,7 @@ def flip_cells(occupancy: np.ndarray, lost: np.ndarray) -> np.ndarray:
 
     Args:
         occupancy: (slots, Nz, Ny, Nx) bool.
-        lost: of the same shape, bits that the error of flipping each cell is worth.
+        lost: of the same shape, cost of flipping each cell, in bits.
 
     Returns:
         Of the same shape; cells that are neither occupied nor next to such a cell stay empty.
