@@ -43,12 +43,14 @@ class Rays:
     @staticmethod
     def from_arrays(*arrays: np.ndarray, appearances: np.ndarray | None = None) -> "Rays":
         """Return rays of the first five members as arrays of any float type, and of appearances (N,) int64."""
-        floats = (torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays)
-        return Rays(*floats, appearances=None if appearances is None else torch.from_numpy(appearances))
+        floats = [torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays]
+        return Rays(*floats, None if appearances is None else torch.from_numpy(appearances))  # type: ignore[call-arg]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "Rays":
         """Return rays whose members are `change` of these."""
-        return Rays(**{name: None if value is None else change(value) for name, value in vars(self).items()})
+        floats = (self.origins, self.directions, self.times, self.jitters, self.backgrounds)
+        appearances = None if self.appearances is None else change(self.appearances)
+        return Rays(*map(change, floats), appearances)  # type: ignore[call-arg]
 
 
 @dataclass(frozen=True)
