@@ -135,6 +135,8 @@ def _code_grid(
 def code_pass(values, r, new, references, weights, first, second, third, models, state, position, words, trace):
     """Code the nodes of a `CodingPass`, whose axis is the first of (n, ., ., ., M) `values` and `r`: (state,
     position, whether all fit).
+
+    Its parameters are many because numba takes no dataclass such as `CodingPass`.
     """
     for n in range(new.size):
         for i in range(first.size):

@@ -7,7 +7,8 @@
 errors on. There it is better to separate low from high frequencies: each block of N x N texels of a channel is a sum
 of cosines, whose quantised coefficients, the *levels*, are coded in contexts of higher frequencies, of the blocks to
 the left and above, and of the channel before. A decoder turns levels into symbols like any others. All arithmetic is
-on integers of 32 bits.
+on integers of 32 bits. The codec is one module because encoder and decoder share its kernels, which are compiled into
+each other.
 
 Blocks are predicted from the *borders* of their neighbours: the mean from the texels next to the block, and the sign
 of each level from which sign makes the step across the border smaller (Clare, Henry and Jung, JCTVC-A114, 2010). This
@@ -350,6 +351,8 @@ def store_block(block, symbols, coded, by, bx, m):
 def code_signs(block, end, steps, dct_basis, gap, has_left, has_above, models, state, position, words, trace):
     """Code the signs of all levels but the mean, lowest frequency first: (state, position). Decoding negates levels
     of `block`.
+
+    Its parameters are many because it is a part of `code_levels`, whose state it shares.
     """
     N = len(block)
     reduce_gap(gap, dct_basis, 0, 0, coefficient(block[0, 0], steps[0, 0]))

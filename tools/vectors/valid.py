@@ -249,50 +249,6 @@ def limits() -> dict[str, bytes]:
     rows = make_scene(dynamic=True, sizes=[(1, 1, 2, 1, AXIS_LIMIT)])
     pose = np.diag([1.0, 1, 1, 1])
     names = [chr(0x4E00 + k) for k in range(APPEARANCE_LIMIT)]
-    steps = np.array(
-        [16, 8, 0.5**20, 0.5**149, 0.5**126], np.float32
-    )  # the last two: the least number above 0, the least that is normal
-    wide = {
-        name: QuantisedPlane(
-            np.tile(np.array([[[-128], [127], [1]]], np.int8), (1, 1, 5)),
-            steps,
-            np.array([0, -1024, 1, 0, 0.5**126], np.float32),
-            np.ones((1, 3), bool),
-        )
-        for name in SPACE_PLANES[:2]
-    }
-    wide["yz"] = replace(wide["xy"], symbols=wide["xy"].symbols[:, :1], coded=np.ones((1, 1), bool))
-    decoder = make_scene(dynamic=False, sizes=[(5, 1, 1, 1, 0)]).decoder
-    far = replace(
-        plain,
-        aabb=np.array([[-BOX_LIMIT] * 3, [BOX_LIMIT] * 3], np.float32),
-        clip=Clip(FRAME_LIMIT, 5e-324),
-        scales=(wide,),
-        decoder=decoder,
-        step=2.0**32 / SAMPLE_LIMIT,
-        occupancy=np.zeros((1, 1, 1, 1), bool),
-        background=np.array([0, 1, 1], np.float32),
-        cameras=(
-            Camera(
-                65535,
-                65535,
-                BOX_LIMIT,
-                BOX_LIMIT,
-                -BOX_LIMIT,
-                BOX_LIMIT,
-                pose + np.pad([[BOX_LIMIT]], ((0, 3), (3, 0))),
-            ),
-        ),
-        appearances=make_appearances("n" * NAME_LIMIT, "é" * (NAME_LIMIT // 2)),
-    )
-    near = replace(
-        plain,
-        aabb=np.array([[0, 0, 0], [1 / BOX_LIMIT] * 3], np.float32),
-        step=2.0**-33,
-        clip=Clip(1, 1.7e308),
-        occupancy=far.occupancy,
-        mapping=Contraction(1 / BOX_LIMIT),
-    )
     periodic = noise((97,), 71) / np.float32(64)
 
     def repeated(shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
@@ -337,6 +293,58 @@ def limits() -> dict[str, bytes]:
         "limits-appearances": small(
             replace(plain, appearances=tuple(Appearance(name, np.zeros(3, np.float32)) for name in names))
         ),
-        "limits-large": small(far),
-        "limits-small": small(near),
+        "limits-large": small(_large_values(plain)),
+        "limits-small": small(_small_values(plain)),
     }
+
+
+def _large_values(plain: QuantisedScene) -> QuantisedScene:
+    """Return a scene whose numbers are as large as the format allows."""
+    steps = np.array(
+        [16, 8, 0.5**20, 0.5**149, 0.5**126], np.float32
+    )  # the last two: the least number above 0, the least that is normal
+    wide = {
+        name: QuantisedPlane(
+            np.tile(np.array([[[-128], [127], [1]]], np.int8), (1, 1, 5)),
+            steps,
+            np.array([0, -1024, 1, 0, 0.5**126], np.float32),
+            np.ones((1, 3), bool),
+        )
+        for name in SPACE_PLANES[:2]
+    }
+    wide["yz"] = replace(wide["xy"], symbols=wide["xy"].symbols[:, :1], coded=np.ones((1, 1), bool))
+    decoder = make_scene(dynamic=False, sizes=[(5, 1, 1, 1, 0)]).decoder
+    return replace(
+        plain,
+        aabb=np.array([[-BOX_LIMIT] * 3, [BOX_LIMIT] * 3], np.float32),
+        clip=Clip(FRAME_LIMIT, 5e-324),
+        scales=(wide,),
+        decoder=decoder,
+        step=2.0**32 / SAMPLE_LIMIT,
+        occupancy=np.zeros((1, 1, 1, 1), bool),
+        background=np.array([0, 1, 1], np.float32),
+        cameras=(
+            Camera(
+                65535,
+                65535,
+                BOX_LIMIT,
+                BOX_LIMIT,
+                -BOX_LIMIT,
+                BOX_LIMIT,
+                np.eye(4) + np.pad([[BOX_LIMIT]], ((0, 3), (3, 0))),
+            ),
+        ),
+        appearances=make_appearances("n" * NAME_LIMIT, "é" * (NAME_LIMIT // 2)),
+    )
+
+
+def _small_values(plain: QuantisedScene) -> QuantisedScene:
+    """Return a scene whose numbers are as small as the format allows."""
+    return replace(
+        plain,
+        aabb=np.array([[0, 0, 0], [1 / BOX_LIMIT] * 3], np.float32),
+        step=2.0**-33,
+        clip=Clip(1, 1.7e308),
+        occupancy=np.zeros((1, 1, 1, 1), bool),
+        mapping=Contraction(1 / BOX_LIMIT),
+    )
