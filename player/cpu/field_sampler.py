@@ -135,10 +135,10 @@ def warm_up(kind: type[FieldSampler], scene: Scene) -> None:
     of one pixel."""
     camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))
     picture = Picture.empty((1, 1))
-    march_blocks(
-        np.zeros((0, 2), np.int64), 1, view_of(scene, camera), march_settings(scene, 1.0, 0.5),
-        uniform_distance_of(scene), Occupancy(np.zeros(1, np.uint8), (1, 1, 1)), _no_motion(), *kind.dummy_arrays(scene), picture,
-    )  # fmt: skip
+    view, settings, even = view_of(scene, camera), march_settings(scene, 1.0, 0.5), uniform_distance_of(scene)
+    occupancy, no_blocks = Occupancy(np.zeros(1, np.uint8), (1, 1, 1)), np.zeros((0, 2), np.int64)
+    arrays = kind.dummy_arrays(scene)
+    march_blocks(no_blocks, 1, view, settings, even, occupancy, _no_motion(), *arrays, picture)
 
 
 def view_of(scene: Scene, camera: Camera) -> View:
