@@ -326,7 +326,8 @@ def round_decoder(decoder: AnyDecoder, bits: Mapping[str, int] | None = None) ->
         name: to_half(_to_shared_exponent(value, bits[name]) if bits and name in bits else value)
         for name, value in decoder_arrays(decoder).items()
     }
-    return replace(decoder, **shorter, density_bias=float(np.float32(decoder.density_bias)))
+    density_bias = float(np.float32(decoder.density_bias))
+    return replace(decoder, density_bias=density_bias, **shorter)  # type: ignore[arg-type]
 
 
 def decoder_arrays(decoder: AnyDecoder) -> dict[str, np.ndarray]:

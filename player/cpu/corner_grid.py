@@ -113,7 +113,7 @@ class CornerGrid(FieldSampler):
         scales, kept, rows = self._scene.scales, self._corner_rows, []
         self._corner_rows = {}
         taps = {
-            count: texel_and_fraction(np.float32(time), count)
+            count: texel_and_fraction(np.asarray(time, np.float32), count)
             for count in {len(scale[TIME_PLANES[0]]) for scale in scales}
         }
         for name in TIME_PLANES:

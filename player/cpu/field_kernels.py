@@ -53,8 +53,8 @@ class CornerGridArrays(NamedTuple):
 
     grid: Grid  # values; those of corners that are not COMPUTED are stale
     known: np.ndarray  # (Nz * Ny * Nx,) uint8, flags of each corner
-    planes: tuple[np.ndarray, np.ndarray, np.ndarray]  # xy, xz, yz at corners, (rows * columns, M) int16
-    rows: tuple[np.ndarray, np.ndarray, np.ndarray]  # time rows along x, y, z at corners, (N, M) float32
+    planes: tuple[np.ndarray, ...]  # xy, xz, yz at corners, (rows * columns, M) int16
+    rows: tuple[np.ndarray, ...]  # time rows along x, y, z at corners, (N, M) float32
     weights: np.ndarray  # (4, M) float32, times the quantisation steps of the planes
     bias: np.float32  # of the log density
 

@@ -71,7 +71,7 @@ def motionless_share(scene: Scene) -> float:
 def _spread(cells: np.ndarray, most: int) -> np.ndarray:
     """Return indices of set cells among (N,) bool, at most so many, evenly spread; in blocks, since all of them may not
     fit in memory."""
-    count = np.count_nonzero(cells)
+    count = int(np.count_nonzero(cells))
     wanted = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
     found, before = [np.empty(0, np.int64)], 0
     for start in range(0, len(cells), CELLS_AT_ONCE):

@@ -100,8 +100,10 @@ class PlaneSampler(FieldSampler):
         `out`."""
         _, planes = self._arrays(0)
         assert planes is not None
-        no_hidden = {"w1": planes.w1[:0], "b1": planes.b1[:0], "w2": planes.w2[:0], "ray_weights": planes.weights[None]}
-        log_densities_at(positions, self._motion, planes._replace(**no_hidden), out)
+        density_only = planes._replace(
+            w1=planes.w1[:0], b1=planes.b1[:0], w2=planes.w2[:0], ray_weights=planes.weights[None]
+        )
+        log_densities_at(positions, self._motion, density_only, out)
 
     @staticmethod
     def dummy_arrays(scene: Scene) -> FieldArrays:

@@ -81,7 +81,7 @@ def blend(parts: Sequence[tuple[Rendering, float]]) -> Rendering:
         sum(np.float32(share) * getattr(part, name) for part, share in parts) for name in ("rgb", "opacity")
     )
     largest, _ = max(parts, key=lambda part: part[1])
-    return Rendering(rgb, largest.depth, opacity, sum(part.samples for part, _ in parts))
+    return Rendering(rgb, largest.depth, opacity, np.asarray(np.sum([part.samples for part, _ in parts], axis=0)))
 
 
 def render(

@@ -72,4 +72,4 @@ def _halved(occupied: np.ndarray) -> np.ndarray:
     """Return the grid at half the resolution: cells of which any of eight is occupied."""
     even = np.pad(occupied, [(0, n % 2) for n in occupied.shape])
     nz, ny, nx = (n // 2 for n in even.shape)
-    return even.reshape(nz, 2, ny, 2, nx, 2).any((1, 3, 5))
+    return np.asarray(even.reshape(nz, 2, ny, 2, nx, 2).any((1, 3, 5)))

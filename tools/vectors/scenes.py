@@ -10,7 +10,16 @@ from kpc.format.coding.rans import encode_trace
 from kpc.format.coding.texel_map import MODE_BITS
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.motion import QuantisedMotion
-from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder
+from kpc.format.scene.scene import (
+    ALL_PLANES,
+    SPACE_PLANES,
+    TIME_PLANES,
+    AnyDecoder,
+    Appearance,
+    Clip,
+    Decoder,
+    HybridDecoder,
+)
 
 PlaneFunction = Callable[[str, QuantisedPlane], QuantisedPlane]
 
@@ -112,8 +121,9 @@ def hybrid_decoder(features: int, width: int, hidden: int) -> HybridDecoder:
     )
 
 
-def extreme_decoder(decoder: Decoder) -> Decoder:
-    """With the largest and the smallest numbers that codec 2 has, and an array of zeros."""
+def extreme_decoder(decoder: AnyDecoder) -> Decoder:
+    """Return an explicit decoder with the largest and the smallest numbers of the WEIGHTS codec, and an array of zeros."""
+    assert isinstance(decoder, Decoder)
     return replace(
         decoder,
         density_weight=np.array([-65504, 65504, 32][: len(decoder.density_weight)], np.float32),
