@@ -40,7 +40,7 @@ def test_python_examples_run(example: str, tmp_path: Path, monkeypatch: pytest.M
     if "offscreen" in example:
         gl.context()
     scene = tiny_scene()
-    write(quantise_scene(scene, [{name: 0.01 for name in scale} for scale in scene.scales]), tmp_path / "scene.kpc")
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), tmp_path / "scene.kpc")
     monkeypatch.chdir(tmp_path)
     exec(compile(example, "python.md", "exec"), {"__name__": "example"})
     if "still.png" in example:

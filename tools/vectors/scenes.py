@@ -122,7 +122,7 @@ def hybrid_decoder(features: int, width: int, hidden: int) -> HybridDecoder:
 
 
 def extreme_decoder(decoder: AnyDecoder) -> Decoder:
-    """Return an explicit decoder with the largest and the smallest numbers of the WEIGHTS codec, and an array of zeros."""
+    """Return an explicit decoder with the extreme numbers of the WEIGHTS codec, and an array of zeros."""
     assert isinstance(decoder, Decoder)
     return replace(
         decoder,
