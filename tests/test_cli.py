@@ -65,3 +65,10 @@ def test_every_command_prints_its_version(module: str, capsys: pytest.CaptureFix
         importlib.import_module(f"kpc.{module}").main(["--version"])
     assert exit_.value.code == 0
     assert capsys.readouterr().out == f"{module.rpartition('.')[2]} {importlib.metadata.version('kpc')}\n"
+
+
+@pytest.mark.parametrize(
+    "text, count", [("300000", 300_000), ("300KB", 300_000), ("2mb", 2_000_000), ("1.5M", 1_500_000)]
+)
+def test_sizes(text: str, count: int) -> None:
+    assert cli.byte_count(text) == count

@@ -15,6 +15,8 @@ from the transform of the plane itself, with texels that are not needed filled i
 
 When transform blocks pay: docs/design/rate-distortion.md, "Transform blocks". The file is longer than others because
 the search and its kernels share one state.
+
+The search is one module because its kernels are compiled into each other.
 """
 
 import math

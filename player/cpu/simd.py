@@ -47,7 +47,7 @@ def interpolate(
     """Interpolate a grid trilinearly: into[line + c, column] = sum over the eight nodes around of weight * grid[node,
     c], c = 0 to 3.
 
-    An intrinsic takes values in registers, not tuples of them, so its parameters are many.
+    Its parameters are many because an intrinsic takes values in registers, not tuples of them.
 
     Args:
         grid: (N, 4) float32.

@@ -21,7 +21,7 @@ KINDS: dict[str, Callable[[Scene], Scene]] = VARIANTS | {
 
 
 def without_the_last_channels(scene: Scene) -> Scene:
-    """Of the coarsest scale, whose features come first."""
+    """The features of the coarsest scale come first."""
     left = np.delete(np.arange(16), [6, 7])
     d = scene.decoder
     decoder = replace(d, density_weight=d.density_weight[left], w2=d.w2[:, left], b2=d.b2[:, left])

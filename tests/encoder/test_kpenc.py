@@ -182,7 +182,7 @@ def test_the_result_is_printed(run: Kpenc, sets: Path) -> None:
 def test_time_rows_are_as_far_apart_as_motion_allows(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tolerance: float, rows: int, why: str
 ) -> None:
-    """Of four frames; a resumed run finds the same number of rows."""
+    """There are four frames; a resumed run finds the same number of rows."""
     config = TrainConfig(**TINY | {"time_tolerance": tolerance, "frames_per_row": 1.5})  # type: ignore[arg-type]
     monkeypatch.setitem(PRESETS, "draft", config)
     for options in (("--keep",), ("--resume",)):
@@ -797,10 +797,3 @@ def test_invalid_targets_are_refused(
     with pytest.raises(SystemExit, match="2"):
         kpenc.main([str(sets / "n3dv"), "-o", str(tmp_path / "out.kpc"), *words])
     assert named in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "text, count", [("300000", 300_000), ("300KB", 300_000), ("2mb", 2_000_000), ("1.5M", 1_500_000)]
-)
-def test_sizes(text: str, count: int) -> None:
-    assert cli.byte_count(text) == count

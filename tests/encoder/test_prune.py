@@ -218,7 +218,7 @@ def test_redistribution_is_least_squares() -> None:
 
 
 def test_elimination_order_follows_the_loss_of_a_linear_map() -> None:
-    """Of independent features of equal size the one of least weight goes first; a duplicate goes before all."""
+    """The independent feature of least weight goes first if all are of equal size; a duplicate goes before all."""
     rng = np.random.default_rng(3)
     features = rng.normal(size=(4096, 5))
     features[:, 4] = features[:, 3]

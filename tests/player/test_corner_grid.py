@@ -101,7 +101,7 @@ def test_quality_settings_have_the_same_effect_as_with_planes(change: dict[str, 
 
 @pytest.mark.parametrize("space", ["box", "displaced"])
 def test_pictures_are_near_those_of_the_reference(space: str) -> None:
-    """Of a scene of 24 texels, smooth over six. What is exact, or static, looks up planes."""
+    """The scene has 24 texels and is smooth over six; exact and static pictures look up planes."""
     scene = VARIANTS[space](view_independent(tiny_scene(4, channels=16)))
     renderer = Renderer(gl.context(), scene, WITH_GRID, processor=True)
     assert renderer._processor._sampler_kind(renderer.quality, is_moving=True) is CornerGrid

@@ -81,7 +81,7 @@ def test_corners_are_decoded_from_products(vectors: int) -> None:
 
 @pytest.mark.parametrize("halves", [(0,), (0, NARROW)])
 def test_features_are_products_of_interpolated_planes_and_rows(halves: tuple[int, ...]) -> None:
-    """Of planes of other sizes, which lie one after the other, and of rows."""
+    """Planes of different sizes lie one after the other; rows are read, too."""
     wide = NARROW * len(halves)
     rng, count, (nx, ny, nz) = np.random.default_rng(4), 300, (5, 3, 4)
     planes = [rng.integers(-32767, 32768, (*shape, wide)).astype(np.int16) for shape in ((ny, nx), (nz, nx), (nz, ny))]

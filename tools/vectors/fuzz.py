@@ -6,6 +6,8 @@ mutations reach the code behind those checks. A reader must read the result or r
 else that is raised, more than HANG_S of computing and more memory than the budget are findings, which are written to
 -o as files. File number N of a seed is always the same, so that a run may be split: --first 500000 --count 500000 is
 the second half of the one above. `--only transform,motion` mutates just the vectors whose names begin so.
+
+The mutations and the processes that try them are one module because neither is used elsewhere.
 """
 
 import argparse
