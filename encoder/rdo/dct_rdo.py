@@ -13,10 +13,9 @@ search keeps the error that all levels of a block make together, and chooses eac
 are those of the entropy coder's contexts, estimated from the result of the search before; the first search starts
 from the transform of the plane itself, with texels that are not needed filled in from around.
 
-When transform blocks pay: docs/design/rate-distortion.md, "Transform blocks". The file is longer than others because
-the search and its kernels share one state.
+When transform blocks pay: docs/design/rate-distortion.md, "Transform blocks".
 
-The search is one module because its kernels are compiled into each other.
+It is one module because the search and its kernels share one state.
 """
 
 import math
