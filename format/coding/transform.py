@@ -23,6 +23,8 @@ Names in this module
     gap         (2, N), along the left and upper side of a block: by how much the texels across the border exceed what
                 block is so far known to be there, in 1/UNITS_PER_SYMBOL
     state position words trace      of `kpc.format.coding.rans`
+
+The kernels have more than ten parameters, and the module more than 500 lines, since numba inlines what one module defines.
 """
 
 from dataclasses import dataclass

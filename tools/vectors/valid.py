@@ -236,8 +236,9 @@ def _payloads(dense: QuantisedScene) -> dict[str, Vector]:
 
 
 def limits() -> dict[str, bytes]:
-    """Return files at the limits of the format, each as small as may be; none at the limit of chunks, which takes
-    half a megabyte.
+    """Return files at the limits of the format, each as small as may be; none at the limit of chunks, which takes 0.5 MB.
+
+    One function, since it is a table of files.
     """
     plain = make_scene(dynamic=False, sizes=[(1, 2, 2, 2, 0)], cameras=1)
     moving = make_scene(dynamic=True, sizes=[(1, 2, 2, 2, 2)])
