@@ -24,7 +24,8 @@ Names in this module
                 block is so far known to be there, in 1/UNITS_PER_SYMBOL
     state position words trace      of `kpc.format.coding.rans`
 
-The kernels have more than ten parameters, and the module more than 500 lines, since numba inlines what one module defines.
+Kernels have more than ten parameters and the module more than 500 lines, since numba keeps
+their state in registers only as scalars.
 """
 
 from dataclasses import dataclass

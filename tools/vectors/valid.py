@@ -236,7 +236,7 @@ def _payloads(dense: QuantisedScene) -> dict[str, Vector]:
 
 
 def limits() -> dict[str, bytes]:
-    """Return files at the limits of the format, each as small as may be; none at the limit of chunks, which takes 0.5 MB.
+    """Return files at the limits of the format, each as small as may be; none at the limit of chunks.
 
     One function, since it is a table of files.
     """
