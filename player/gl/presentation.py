@@ -102,8 +102,9 @@ class Presentation:
         """Draw over a screen; if `is_partial`, only where the picture has content, and the background elsewhere."""
         scissor = None
         if is_partial:
-            screen.scissor = None
-            screen.clear(*self._background, 1.0)
+            screen.scissor = None  # type: ignore[assignment]
+            red, green, blue = self._background
+            screen.clear(red, green, blue, 1.0)
             across, up = (side / of for side, of in zip(screen.size, picture.rgba.size, strict=True))
             left, bottom, right, top = picture.content
             # Interpolation reaches two pixels of the picture.

@@ -119,12 +119,13 @@ def draw(
     ctx.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
     if blend:
         ctx.enable(moderngl.BLEND)
-        ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
+        factors = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
+        ctx.blend_func = factors  # type: ignore[assignment]
     framebuffer.use()
     framebuffer.viewport = viewport or (0, 0, *framebuffer.size)
-    framebuffer.scissor = scissor
+    framebuffer.scissor = scissor  # type: ignore[assignment]
     vertices.render(moderngl.TRIANGLES, vertices=3)
-    framebuffer.scissor = None  # or it would bound the next clear
+    framebuffer.scissor = None  # type: ignore[assignment]  # or it would bound the next clear
 
 
 def set_uniforms(program: AnyProgram, **values: Any) -> None:
