@@ -8,6 +8,7 @@ planes are not in it: at one time each of them is a row along x, y or z (`TimeRo
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.format.scene.grid import dilate, sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Scene
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, Scene
 from kpc.format.scene.space import DeviceCoordinates

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 

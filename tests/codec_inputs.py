@@ -1,6 +1,7 @@
 """Inputs for the tests of the codecs: planes of symbols, transform blocks, motion grids and occupancy grids."""
 
 import numpy as np
+
 from kpc.format.coding.predictive import DEPENDENT, PredictionWeights, trellis_transition
 from kpc.format.coding.transform import OFFSET_COUNT, TransformBlocks, coded_blocks
 from kpc.tools.vectors.scenes import walked

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from kpc.encoder.datasets import Dataset, load_dataset, pixel_rays
 from kpc.format.common.errors import DatasetError, KpcError, MediaError
 from kpc.format.common.media import write_image, write_video

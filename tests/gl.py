@@ -5,6 +5,7 @@ import functools
 import moderngl
 import numpy as np
 import pytest
+
 from kpc.format.common.errors import DisplayError
 from kpc.player.gl import shader
 from kpc.player.gl.offscreen import open_context

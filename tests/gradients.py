@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
+
 from kpc.encoder.field import fused, kernels
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.render import Rays, render_reference
 from kpc.encoder.field.sampling import WeightedRowSum, bilinear_corners
 from kpc.format.scene.scene import Scene
 from scenes import tiny_scene, with_contraction, with_motion
-from torch import Tensor
 
 # Whether the scene is dynamic, is contracted, and has a motion grid.
 FIELD_KINDS = [

@@ -1,11 +1,10 @@
 """Small scenes in files, and scenes that are read from them segment by segment."""
 
+import kpc
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.partial import PartialScene
 from kpc.format.container.scene_io import SceneReader, encode
 from kpc.format.scene.scene import Scene
-
-import kpc
 
 
 def coded(scene: Scene, segment_rows: int = 3) -> bytes:

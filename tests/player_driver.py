@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
+
 from kpc.player.app.desktop import glfw
 from kpc.player.app.player import Player
 

@@ -4,6 +4,8 @@ import shutil
 from collections.abc import Callable
 
 import numpy as np
+from pytest import approx, raises
+
 from kpc.format.common.errors import DisplayError
 from kpc.format.common.media import read_image
 from kpc.format.container import groups
@@ -20,7 +22,6 @@ from kpc.player.app.window import Window
 from kpc.player.quality import DEFAULT, neighbouring_level
 from kpc.player.streaming.group_playback import GroupPlayback
 from player_driver import frames_until, press, replaced
-from pytest import approx, raises
 
 
 def opening_asks_for_older_opengl() -> None:

@@ -6,6 +6,8 @@ import time
 from pathlib import Path
 
 import numpy as np
+from pytest import approx, raises
+
 from kpc.format.common.errors import DisplayError
 from kpc.format.common.media import read_video
 from kpc.format.container.sources import open_source
@@ -28,7 +30,6 @@ from player_windows import (
     reset_of_the_graphics_card,
     settings_are_saved,
 )
-from pytest import approx, raises
 
 LEFT, RIGHT = 0, 1  # buttons of the mouse
 

@@ -1,6 +1,7 @@
 """The processor's renderer for tests, without OpenGL."""
 
 import numpy as np
+
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.atlas import Layout

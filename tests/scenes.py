@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates

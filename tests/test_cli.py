@@ -6,6 +6,7 @@ import importlib.metadata
 from collections.abc import Callable
 
 import pytest
+
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, UsageError
 

@@ -6,8 +6,9 @@ import shlex
 import tomllib
 from pathlib import Path
 
-import gl
 import pytest
+
+import gl
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.media import read_image
 from kpc.format.container.scene_io import write

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from kpc.format.coding.predictive import SCALAR, WEIGHT_COUNT, decode_symbols, encode_with_weights
 from kpc.format.coding.quantise import SYMBOL_MAX, SYMBOL_MIN, QuantisedPlane, QuantisedScene, quantise_scene
 from kpc.format.common.errors import BudgetError

@@ -7,10 +7,11 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
 import torch
+
+import datasets as make
 from gradients import backpropagate, random_rays, reference_gradients, translucent_scene
 from kpc.encoder.cli.encode_scene import to_scene
 from kpc.encoder.datasets import Dataset, load_dataset

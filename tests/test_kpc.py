@@ -4,11 +4,11 @@ import subprocess
 import sys
 
 import numpy as np
+
+import kpc
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.scene_io import write
 from scenes import tiny_scene
-
-import kpc
 
 
 def test_the_example_of_the_docstring(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common import errors
 from kpc.format.container import container, groups, scene_io

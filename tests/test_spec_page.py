@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from kpc.format.coding import poses, rans
 from kpc.format.container import container as package_container
 from kpc.format.container import scene_layout, segments

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from kpc.encoder.cli.encode_scene import encode_scene
 from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group, split_into_spans
 from kpc.encoder.cli.options import Options

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import Setting, prepare_trainer
 from kpc.encoder.cli.report import SPACES, describe_occupancy, describe_pruning, log, show_progress

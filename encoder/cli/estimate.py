@@ -4,6 +4,7 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.rdo.curvature import RAYS as CURVATURE_RAYS

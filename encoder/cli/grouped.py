@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+
 from kpc.encoder.cli.options import Options
 from kpc.encoder.field.field import Field
 from kpc.encoder.rdo.rate_control import Trade

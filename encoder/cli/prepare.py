@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from kpc.encoder.cli.grouped import initialise_from
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.report import SPACES, describe_model, describe_time_rows, log, show_progress

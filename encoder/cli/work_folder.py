@@ -4,6 +4,7 @@ import contextlib
 from pathlib import Path
 
 import torch
+
 from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.container import scene_io
 

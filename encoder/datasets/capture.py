@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import IMAGE_SUFFIXES, VideoInfo, image_size
 

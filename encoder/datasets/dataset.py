@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+
 from kpc.encoder.datasets.masks import Masks
 from kpc.encoder.datasets.pixel_cache import PixelCache
 from kpc.format.common.errors import DatasetError

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+
 from kpc.encoder.datasets.capture import Capture, CapturedView
 from kpc.encoder.datasets.dataset import Dataset, Pictures
 from kpc.encoder.datasets.layouts import blender, colmap, llff, nerfstudio

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+
 from kpc.encoder.datasets.capture import CapturedView, file_exists, first_names
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.format.common.errors import DatasetError

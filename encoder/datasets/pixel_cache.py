@@ -15,6 +15,7 @@ from typing import Any
 
 import google_crc32c
 import numpy as np
+
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError
 

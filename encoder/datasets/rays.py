@@ -1,6 +1,7 @@
 """Rays through pixels of posed cameras, with OpenCV's lens distortion."""
 
 import numpy as np
+
 from kpc.encoder.datasets.dataset import Pictures
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.space import DeviceCoordinates, SpaceMapping

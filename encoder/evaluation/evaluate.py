@@ -4,6 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch.nn.functional import conv2d
+
 from kpc.encoder.datasets import Dataset, pixel_rays
 from kpc.encoder.field.appearances import FIT_RAYS, fit_code
 from kpc.encoder.field.field import Field
@@ -12,7 +14,6 @@ from kpc.encoder.field.render import Rays, shade
 from kpc.format.common.fidelity import psnr
 from kpc.format.scene.scene import AnyDecoder, Decoder, Scene
 from kpc.format.scene.space import Contraction
-from torch.nn.functional import conv2d
 
 WHITE = np.ones(3, np.float32)
 RAYS_AT_ONCE = 1 << 16  # bounds the memory of rendering

@@ -14,11 +14,12 @@ from functools import partial
 from typing import Any
 
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
 from kpc.encoder.field.field import Layout
 from kpc.encoder.training.torch_optimiser import TorchOptimiser
 from kpc.encoder.training.train import Trainer
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 # Steps before the profile, in multiples of the first step with an occupancy grid: by then the grid has formed and has
 # been split in time.

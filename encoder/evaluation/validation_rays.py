@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.encoder.datasets import camera_rays
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.training.sampler import RaySampler

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
+
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import march_scene
@@ -18,7 +20,6 @@ from kpc.encoder.field.render import Rays, shade
 from kpc.format.common.errors import UsageError
 from kpc.format.container.scene_layout import APPEARANCE_LIMIT, is_valid_name
 from kpc.format.scene.scene import Scene
-from torch import Tensor
 
 # Rays of a picture by which its code is fitted.
 FIT_RAYS = 1024

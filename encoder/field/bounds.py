@@ -1,10 +1,11 @@
 """The extent of a scene: its axis-aligned box, its space mapping, and the cells that the cameras see."""
 
 import numpy as np
+from numba import njit, prange
+
 from kpc.encoder.datasets import Pictures
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping, uncontract
-from numba import njit, prange
 
 # Radius around a camera in which nothing is, as a share of its distance to the point that all cameras look at.
 CLEARANCE = 0.3

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor, nn
+
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.occupancy_grid import grid_shape
 from kpc.encoder.field.sampling import WeightedRowSum, bilinear_corners, displace
@@ -28,7 +30,6 @@ from kpc.format.scene.scene import (
     Scene,
 )
 from kpc.format.scene.space import SpaceMapping
-from torch import Tensor, nn
 
 AXES = "xyzt"
 

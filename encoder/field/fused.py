@@ -5,12 +5,13 @@ from collections.abc import Callable
 import numba
 import numpy as np
 import torch
+from torch import Tensor
+
 from kpc.encoder.field import kernels
 from kpc.encoder.field.field import Field, Layout, SummedField
 from kpc.encoder.field.render import Rays, RayWeights, Samples, weigh_samples
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, SpaceMapping
-from torch import Tensor
 
 # Parts into which a batch is divided, per thread: threads that are done early take another.
 PARTS_PER_THREAD = 8

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+
 from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 
 # Share of cells by which merging time slots may raise the mean occupancy.

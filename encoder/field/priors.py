@@ -4,9 +4,10 @@
 """
 
 import torch
+from torch import Tensor
+
 from kpc.encoder.field.config import TrainConfig, Variation
 from kpc.encoder.field.field import Field
-from torch import Tensor
 
 
 def plane_priors(field: Field, config: TrainConfig, variation: Variation) -> dict[str, Tensor]:

@@ -10,13 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor, nn
+
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, plan_layout
 from kpc.encoder.field.fused import fused_features
 from kpc.encoder.field.render import Rays, Samples, cell_indices, plane_coordinates, ray_spans
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import SpaceMapping
-from torch import Tensor, nn
 
 # Added to each weight before resampling, so that no part of a ray is given up for good.
 WEIGHT_PADDING = 0.01

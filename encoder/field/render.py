@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
+
 from kpc.encoder.field.field import Field
 from kpc.format.scene.scene import TERMINATION
 from kpc.format.scene.space import Contraction, SpaceMapping
-from torch import Tensor
 
 # Optical thickness of a sample beyond which more makes no difference to what lies behind it: exp(-50) is 2e-22.
 OPAQUE_TAU = 50.0

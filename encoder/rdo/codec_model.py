@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+
 from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, ValidationRays
 from kpc.encoder.rdo.curvature import Curvature, PerPlane, estimate_curvature
 from kpc.encoder.rdo.distortion import PlaneKey

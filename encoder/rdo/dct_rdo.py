@@ -23,6 +23,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+
 from kpc.encoder.rdo.curvature import BLOCK_SIDE
 from kpc.encoder.rdo.distortion import LAM, cross_channel_errors, distortion_weights, magnitude_bits
 from kpc.encoder.rdo.texel_map_rdo import choose_coded_texels

@@ -16,6 +16,7 @@ R is in bits, and lambda is LAM.
 """
 
 import numpy as np
+
 from kpc.encoder.rdo.curvature import BLOCK_SIDE
 from kpc.format.common.jit import compiled
 

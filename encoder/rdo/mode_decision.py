@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from kpc.encoder.rdo.curvature import PerPlane
 from kpc.encoder.rdo.dct_rdo import requested_transform_step, transform_quantise
 from kpc.encoder.rdo.distortion import NO_CORRELATION, PlaneKey, distortion_weights, total_distortion

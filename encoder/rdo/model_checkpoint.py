@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.training.checkpoint import save_state
 from kpc.format.coding.quantise import quantise_scene

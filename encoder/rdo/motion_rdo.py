@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+
 from kpc.encoder.evaluation.validation_rays import Measure
 from kpc.encoder.rdo.distortion import EDGE_COUPLING, magnitude_bits
 from kpc.format.coding.motion_codec import CONTEXTS, coding_passes, interpolate, neighbour_residuals, residual_context

@@ -15,6 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import Measure, ValidationRays
 from kpc.encoder.field.fused import march_scene

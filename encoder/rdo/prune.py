@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field import render
 from kpc.encoder.field.field import Field, Layout

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+
 from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, mse_of_psnr
 from kpc.encoder.field.occupancy_grid import merge_slots
 from kpc.encoder.rdo.curvature import PerPlane

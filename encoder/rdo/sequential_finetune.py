@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+
 from kpc.encoder.evaluation.evaluate import SceneRenderer, pad_channels, unpad_decoder
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.config import TrainConfig

@@ -12,6 +12,7 @@ bits estimated from the map of the pass before.
 """
 
 import numpy as np
+
 from kpc.format.coding.texel_map import MAP_CONTEXTS
 from kpc.format.common.jit import compiled, inlined
 

@@ -24,6 +24,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+
 from kpc.encoder.rdo.distortion import (
     CORNER_COUPLING,
     EDGE_COUPLING,

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import TrainingError
 

@@ -5,6 +5,7 @@ from typing import Any
 import numba
 import numpy as np
 import torch
+
 from kpc.encoder.field import fused, kernels
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from functools import reduce
 
 import numpy as np
+
 from kpc.encoder.datasets import Dataset
 
 # Pixels along the side of a tile; all pixels of a tile have the same probability.

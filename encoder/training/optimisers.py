@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
+
 from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig, Variation
 from kpc.encoder.field.field import Field

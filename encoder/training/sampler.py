@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import torch
+
 from kpc.encoder.datasets import Dataset, pixel_rays
 from kpc.encoder.field.render import Rays
 from kpc.encoder.training.importance import TileWeights

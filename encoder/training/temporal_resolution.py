@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field.config import TrainConfig

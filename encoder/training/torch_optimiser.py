@@ -10,6 +10,7 @@ from typing import Any
 import numba
 import numpy as np
 import torch
+
 from kpc.encoder.field.config import TrainConfig, Variation
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import fused_features, max_samples_per_ray, sample_rays_fused

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.appearances import assign_appearances
 from kpc.encoder.field.bounds import visible_cells

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.format.coding.rans import check_end, code_signed, encode_trace, log_class, new_models, open_stream
 from kpc.format.common.errors import FormatError
 from kpc.format.common.jit import compiled, inlined

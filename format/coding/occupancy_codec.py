@@ -5,6 +5,7 @@ The context is made of cells around it and of the slot before: where these agree
 """
 
 import numpy as np
+
 from kpc.format.coding.rans import check_end, code_bit_adaptive, encode_trace, new_models, open_stream
 from kpc.format.common.jit import compiled
 

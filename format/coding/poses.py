@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+
 from kpc.format.common.errors import FormatError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rotations import quaternion_of

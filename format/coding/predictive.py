@@ -33,6 +33,7 @@ Names in this module
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.format.coding.rans import check_end, code_signed, encode_trace, new_models, open_stream
 from kpc.format.coding.texel_map import MAP_CODED, MAP_IMPLIED, MODE_BITS, code_map, initial_map, map_mode
 from kpc.format.common.errors import FormatError

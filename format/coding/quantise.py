@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+
 from kpc.format.coding.poses import are_rigid, round_poses
 from kpc.format.coding.weights import FINEST
 from kpc.format.common.errors import FormatError

@@ -15,6 +15,7 @@ A decoder that runs out of words reads zeros, and `position` goes on beyond the 
 """
 
 import numpy as np
+
 from kpc.format.common.errors import FormatError
 from kpc.format.common.jit import compiled, inlined
 

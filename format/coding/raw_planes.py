@@ -4,6 +4,7 @@ map mode (1 byte) | map (ceil(H W / 8) bytes, if the mode is MAP_CODED) | symbol
 """
 
 import numpy as np
+
 from kpc.format.coding.texel_map import MAP_ALL, MAP_CODED
 from kpc.format.common.errors import FormatError
 

@@ -5,6 +5,7 @@ maps of space planes saves 0.4 KB a file (shelf_hand, liam).
 """
 
 import numpy as np
+
 from kpc.format.coding.rans import code_bit_adaptive, new_models
 from kpc.format.common.errors import FormatError
 from kpc.format.common.jit import compiled

@@ -31,6 +31,7 @@ their state in registers only as scalars.
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.format.coding.rans import (
     SCALE,
     check_end,

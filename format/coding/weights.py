@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+
 from kpc.format.coding.rans import check_end, code_signed, encode_trace, new_models, open_stream
 from kpc.format.common.errors import FormatError
 from kpc.format.common.jit import compiled

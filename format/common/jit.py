@@ -6,8 +6,9 @@ With NUMBA_DISABLE_JIT=1 the same functions run as plain Python.
 from collections.abc import Callable
 from typing import Any
 
-from kpc.format.common import compiling
 from numba import njit
+
+from kpc.format.common import compiling
 
 compiling.register()
 

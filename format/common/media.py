@@ -23,9 +23,10 @@ import ffmpeg
 import imageio_ffmpeg
 import numpy as np
 import OpenEXR
+from PIL import Image, UnidentifiedImageError
+
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import MediaError
-from PIL import Image, UnidentifiedImageError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")

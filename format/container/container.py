@@ -15,6 +15,7 @@ from enum import IntEnum
 import google_crc32c
 import numpy as np
 import zstandard
+
 from kpc.format.common.errors import FormatError
 from kpc.format.container.sources import AnySource, Source, open_source
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import google_crc32c
+
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import FormatError, UsageError
 from kpc.format.common.memory import DEFAULT_BUDGET

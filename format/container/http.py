@@ -21,6 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import urllib3
+
 from kpc.format.common.errors import BudgetError, InterruptedRead, NetworkError, UnreachableError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.http_client import HttpClient, TemporaryFailure, describe_failure, is_url, printable

@@ -5,6 +5,7 @@ import urllib.request
 from urllib.parse import urljoin, urlsplit, urlunsplit
 
 import urllib3
+
 from kpc.format.common.errors import NetworkError
 
 SCHEMES = ("http", "https")

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from typing import cast
 
 import numpy as np
+
 from kpc.format.coding.quantise import dequantise_symbols
 from kpc.format.container.container import Entry, Reader
 from kpc.format.container.scene_io import SceneReader

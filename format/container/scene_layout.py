@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
 from kpc.format.coding.motion_codec import decode_motion
 from kpc.format.coding.occupancy_codec import decode_occupancy
 from kpc.format.coding.poses import decode_poses

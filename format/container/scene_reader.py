@@ -9,6 +9,7 @@ from functools import cached_property, partial
 from typing import TypeVar
 
 import numpy as np
+
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_rows, project_occupancy
 from kpc.format.coding.raw_planes import decode_raw_segment
 from kpc.format.common.errors import BudgetError, FormatError

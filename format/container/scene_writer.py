@@ -9,6 +9,7 @@ import struct
 from itertools import pairwise
 
 import numpy as np
+
 from kpc.format.coding.motion_codec import encode_motion
 from kpc.format.coding.occupancy_codec import encode_occupancy
 from kpc.format.coding.poses import encode_poses

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+
 from kpc.format.coding.predictive import PredictionWeights, decode_symbols, encode_symbols, needs_occupancy, weights_in
 from kpc.format.coding.transform import decode_blocks
 from kpc.format.common.errors import FormatError

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError
 

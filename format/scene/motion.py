@@ -13,6 +13,7 @@ a small texture.
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.format.common.errors import FormatError
 from kpc.format.scene.grid import sample_linear, texel_and_fraction
 

@@ -24,6 +24,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.space import DeviceCoordinates, SpaceMapping

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+
 from kpc.format.scene.scene import TIME_PLANES, Scene
 
 

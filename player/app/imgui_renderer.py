@@ -4,6 +4,7 @@ import ctypes
 
 import moderngl
 import numpy as np
+
 from kpc.player.app.desktop import imgui
 from kpc.player.app.widgets import ACCENT
 from kpc.player.gl import shader

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+
 from kpc.player.app.actions import Actions
 from kpc.player.app.desktop import glfw, imgui
 from kpc.player.app.state import PlayerState

@@ -3,6 +3,7 @@
 import time as clock
 
 import numpy as np
+
 from kpc.format.scene.scene import HybridDecoder
 from kpc.player.app.actions import DISPLAY_MODE_NAMES, PART_NAMES, Actions
 from kpc.player.app.controls import SPEEDS

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+
 from kpc.format.common.errors import KpcError
 from kpc.format.common.media import write_video
 

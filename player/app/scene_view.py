@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import moderngl
 import numpy as np
+
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.app.controls import AppearanceSelection

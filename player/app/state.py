@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.format.common.errors import KpcError
 from kpc.format.scene.scene import Scene
 from kpc.player.app.controls import AppearanceSelection, OrbitView, Playback

@@ -3,6 +3,7 @@
 import time as clock
 
 import moderngl
+
 from kpc.player.app.desktop import imgui
 from kpc.player.app.imgui_renderer import ImGuiRenderer
 from kpc.player.app.state import PlayerState

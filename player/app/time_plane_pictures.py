@@ -1,6 +1,7 @@
 """Pictures of time planes: what moves makes waves along the time axis, what is static is grey."""
 
 import numpy as np
+
 from kpc.format.scene.scene import TIME_PLANES, Scene
 
 # Instants in a picture; longer planes are subsampled evenly.

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import moderngl
+
 from kpc.format.common.errors import ContextLostError, DisplayError
 from kpc.player.app.desktop import glfw, imgui
 

@@ -6,6 +6,7 @@ eight. For a parabola that is exact between its pixels; for an edge it is not, b
 """
 
 import numpy as np
+
 from kpc.format.coding.rans import compiled
 from kpc.player.cpu.lanes import FAST, F
 from kpc.player.cpu.picture import BLOCK, Picture, interpolate_pixel

@@ -9,6 +9,7 @@ needs them. Figures: docs/design/drawing.md.
 import math
 
 import numpy as np
+
 from kpc.format.scene.grid import sample_linear, texel_and_fraction
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.player.atlas import Layout, pad_to_multiple

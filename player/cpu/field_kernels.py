@@ -8,6 +8,7 @@ A sample of planes takes about 60 ns of a core (room, two scales of 16 channels,
 from typing import NamedTuple
 
 import numpy as np
+
 from kpc.format.coding.rans import compiled
 from kpc.player.cpu.lanes import (
     CORNERS,

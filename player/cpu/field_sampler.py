@@ -5,6 +5,7 @@ import math
 from abc import ABC, abstractmethod
 
 import numpy as np
+
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import Scene

@@ -8,6 +8,7 @@ instructions.
 from typing import Any, NamedTuple
 
 import numpy as np
+
 from kpc.format.coding.rans import compiled
 from kpc.player.cpu.simd import WIDE
 

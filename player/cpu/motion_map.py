@@ -12,6 +12,7 @@ that is constant but not 1 moves nothing. So the field itself is compared. A poi
 from dataclasses import replace
 
 import numpy as np
+
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, contract

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, Decoder, Scene
 from kpc.format.scene.space import Contraction
 from kpc.player.cpu.plane_sampler import PlaneSampler

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+
 from kpc.player.cpu.lanes import F, I, kernel_part
 
 # Pixels a side of the blocks that a picture is divided into.

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES, Decoder, Scene
 from kpc.format.scene.space import DeviceCoordinates

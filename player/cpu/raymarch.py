@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+
 from kpc.format.coding.rans import compiled
 from kpc.format.scene import space
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.grid import sample_linear, texel_and_fraction
 from kpc.format.scene.motion import displace

@@ -8,6 +8,7 @@ marched whole.
 from typing import NamedTuple
 
 import numpy as np
+
 from kpc.format.coding.rans import compiled
 from kpc.format.scene.cameras import Camera
 from kpc.player.cpu.lanes import FAST, F, I, kernel_part

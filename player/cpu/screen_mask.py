@@ -7,6 +7,7 @@ A ray that meets nothing costs a graphics card little, but the processor as much
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.grid import dilate
 

@@ -7,6 +7,7 @@ upsampled along the row first.
 """
 
 import moderngl
+
 from kpc.player.atlas import Layout
 from kpc.player.gl.programs import Programs, draw, set_uniforms
 from kpc.player.gl.targets import allocation

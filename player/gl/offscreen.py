@@ -3,6 +3,7 @@
 from typing import Any
 
 import moderngl
+
 from kpc.format.common.errors import DisplayError
 
 REMEDY = "apt install libegl1 libgl1-mesa-dri (Debian, Ubuntu), or kprender --backend reference"

@@ -4,6 +4,7 @@ import math
 from enum import Enum
 
 import moderngl
+
 from kpc.player.gl.programs import RGBA_UNIT, STATIC_UNIT, SUMS_UNIT, Programs, draw, set_uniforms
 from kpc.player.gl.targets import Canvas, Target
 from kpc.player.gl.textures import SceneTextures

@@ -3,6 +3,7 @@
 from typing import Any
 
 import moderngl
+
 from kpc.format.common.errors import DisplayError
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
 from kpc.player.atlas import Layout

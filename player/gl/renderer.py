@@ -13,6 +13,7 @@ import time as clock
 
 import moderngl
 import numpy as np
+
 from kpc.format.common.errors import DisplayError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene

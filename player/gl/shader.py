@@ -12,6 +12,7 @@ from importlib import resources
 
 import moderngl
 import numpy as np
+
 from kpc.format.common.errors import DisplayError
 
 GL33 = "#version 330 core"

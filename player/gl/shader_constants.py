@@ -2,6 +2,7 @@
 planes lie."""
 
 import numpy as np
+
 from kpc.format.scene.scene import AnyDecoder, HybridDecoder, Scene
 from kpc.player.atlas import Layout, pad_to_multiple
 

@@ -2,6 +2,7 @@
 
 import moderngl
 import numpy as np
+
 from kpc.format.scene.cameras import Camera
 from kpc.player.atlas import pad_to_multiple
 from kpc.player.gl.folding import FoldedPlanes

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import moderngl
 import numpy as np
+
 from kpc.format.common.errors import DisplayError
 from kpc.player.cpu.picture import Picture, Rectangle, union
 from kpc.player.cpu.reference import Rendering

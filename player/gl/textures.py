@@ -6,6 +6,7 @@ from typing import Any
 
 import moderngl
 import numpy as np
+
 from kpc.format.common.errors import DisplayError
 from kpc.format.scene.grid import sample_linear
 from kpc.format.scene.scene import SPACE_PLANES, Scene

@@ -14,6 +14,7 @@ Memory is given to the segments that the playhead reaches first; those behind it
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.format.container.partial import PartialScene
 
 # Segments that will be needed within so many seconds are fetched before a finer scale.

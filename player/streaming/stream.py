@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.format.coding.quantise import dequantise_symbols
 from kpc.format.common.compiling import MONITOR, NOTICE
 from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, KpcError

@@ -5,10 +5,11 @@ import itertools
 from dataclasses import replace
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
 import torch
+
+import datasets as make
 from gradients import random_rays, translucent_scene
 from kpc.encoder.cli import encode_scene
 from kpc.encoder.datasets import Dataset, load_dataset

@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
-import datasets as make
 import numpy as np
 import pytest
+
+import datasets as make
 from kpc.encoder.datasets import Pictures
 from kpc.encoder.field.bounds import (
     CLEARANCE,

@@ -5,12 +5,13 @@ import shutil
 import struct
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
-from datasets import all_rays, distorted, fails, load
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+import datasets as make
+from datasets import all_rays, distorted, fails, load
 from kpc.encoder.datasets import pixel_rays
 from kpc.encoder.datasets.layouts import colmap
 from kpc.format.common.errors import KpcError

@@ -5,9 +5,10 @@ import random
 import shutil
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
+
+import datasets as make
 from datasets import fails, load
 from kpc.encoder.datasets import load_dataset
 from kpc.encoder.datasets.capture import natural_key

@@ -5,9 +5,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
+
+import datasets as make
 from kpc.encoder.cli import estimate as module
 from kpc.encoder.cli import kpenc
 from kpc.encoder.datasets import Dataset

@@ -4,9 +4,10 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
+
+import datasets as make
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim
 from kpc.format.common.fidelity import psnr

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
 from gradients import bilinear
 from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.field.field import Field, Layout, motion_grid_shape, plan_layout

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
 import torch
+
+import datasets as make
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.estimate import Estimate
 from kpc.encoder.cli.grouped import LATER_STEPS, OVERLAP, initialise_from, options_of_group, split_into_spans

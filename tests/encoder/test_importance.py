@@ -3,9 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
+
+import datasets as make
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.training import importance
 from kpc.encoder.training.importance import SMALLEST_TILE, TileWeights, has_static_cameras, max_temporal_difference

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numba.core.dispatcher import Dispatcher
+
 from gradients import FIELD_KINDS, FieldFunction, backpropagate, random_rays, reference_gradients, translucent_scene
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field import kernels
@@ -27,7 +29,6 @@ from kpc.encoder.field.priors import plane_priors
 from kpc.encoder.field.render import Rays, render_reference
 from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_prior_gradients
 from kpc.player.cpu import reference
-from numba.core.dispatcher import Dispatcher
 from scenes import tiny_scene, with_motion
 
 COLOUR = 1e-4

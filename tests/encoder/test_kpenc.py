@@ -13,10 +13,11 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
 import torch
+
+import datasets as make
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.datasets import pixel_cache

@@ -5,12 +5,13 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
-from datasets import fails, load
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+import datasets as make
+from datasets import fails, load
 from kpc.encoder.datasets import Dataset, pixel_cache
 from kpc.encoder.datasets.masks import BLOCK
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim

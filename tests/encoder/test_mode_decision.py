@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_trellis import waves
+
 from kpc.encoder.rdo import dct_rdo, mode_decision
 from kpc.encoder.rdo.distortion import NO_CORRELATION, total_distortion
 from kpc.encoder.rdo.mode_decision import quantise_by_cost, requested_step
@@ -14,7 +16,6 @@ from kpc.format.coding.transform import DEFAULT_OFFSET, OFFSET_COUNT
 from kpc.format.container import scene_io
 from kpc.format.container.segments import TransformSegments
 from scenes import tiny_scene
-from test_trellis import waves
 
 
 def in_blocks(

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from codec_inputs import swaying
 from kpc.encoder.evaluation.validation_rays import Fidelity
 from kpc.encoder.rdo.motion_rdo import MAX_MULTIPLE, SHARE, coarsen_motion, quantise_motion

@@ -1,6 +1,7 @@
 """The occupancy grid: which cells it keeps, which it empties, and what is stored of it."""
 
 import numpy as np
+
 from kpc.encoder.field.occupancy_grid import MERGE_TOLERANCE, OccupancyGrid, grid_shape, merge_slots
 from kpc.format.scene.grid import SPACE_TIME_AXES, dilate
 

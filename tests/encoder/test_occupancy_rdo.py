@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from codec_inputs import rolling
 from kpc.encoder.evaluation.validation_rays import Fidelity, ValidationRays
 from kpc.encoder.rdo import occupancy_rdo

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.training.optimisers import feature_mask
 from kpc.format.scene.space import Contraction

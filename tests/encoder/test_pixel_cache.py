@@ -6,9 +6,10 @@ import os
 import shutil
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
+
+import datasets as make
 from datasets import fails, load
 from kpc.encoder.datasets import PixelCache, pixel_cache
 from kpc.format.common.errors import DatasetError

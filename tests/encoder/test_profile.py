@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from test_train import BOX, CONFIG
+
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation import profile
 from kpc.encoder.field.field import Layout
 from kpc.encoder.training.train import Trainer
 from kpc.tools.bench import machine_limits
-from test_train import BOX, CONFIG
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -1,9 +1,10 @@
 """Proposal sampling: equal shares after resampling, the histogram loss, and samples at surfaces after training."""
 
-import datasets as make
 import numpy as np
 import pytest
 import torch
+
+import datasets as make
 from kpc.encoder.cli import encode_scene
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import evaluate

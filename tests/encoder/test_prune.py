@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from kpc.encoder.evaluation.evaluate import SceneRenderer, pad_channels
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.rdo.codec_model import Model, code, model_from_file

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from kpc.encoder.evaluation.validation_rays import Fidelity
 from kpc.encoder.rdo.mode_decision import quantise_by_cost
 from kpc.encoder.rdo.rate_control import (

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+
 from kpc.encoder.rdo.rate_search import COST_OCTAVES, MAX_ATTEMPTS, MAX_TUNINGS, find_limit, find_tuned_limit, minimise
 
 

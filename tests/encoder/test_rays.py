@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
-import datasets as make
 import numpy as np
-from datasets import all_rays, distorted, load
 from hypothesis import given
 from hypothesis import strategies as st
+
+import datasets as make
+from datasets import all_rays, distorted, load
 from kpc.encoder.datasets import pixel_rays
 from kpc.encoder.datasets.rays import undistort
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.render import Rays
 from kpc.encoder.training.sampler import RaySampler

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+
 from kpc.encoder.evaluation.evaluate import pad_channels, unpad_decoder
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.rdo import sequential_finetune

@@ -5,9 +5,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import datasets as make
 import numpy as np
 import pytest
+
+import datasets as make
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from kpc.encoder.cli.options import Options
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import PRESETS, TrainConfig

@@ -5,11 +5,12 @@ import itertools
 from dataclasses import replace
 from pathlib import Path
 
-import datasets as make
 import numba
 import numpy as np
 import pytest
 import torch
+
+import datasets as make
 from kpc.encoder.cli.encode_scene import to_scene
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.evaluation.evaluate import evaluate

@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import datasets as make
 import numpy as np
 import pytest
 import torch
+
+import datasets as make
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.evaluation.evaluate import SceneRenderer

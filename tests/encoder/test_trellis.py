@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from kpc.encoder.rdo import distortion, trellis
 from kpc.encoder.rdo.distortion import NO_CORRELATION
 from kpc.encoder.rdo.mode_decision import quantise_by_cost

@@ -4,10 +4,11 @@ import io
 import sys
 
 import pytest
-from kpc.format.common import compiling
-from kpc.format.common.compiling import MONITOR, NOTICE, NOTICE_AFTER_S, CompilationMonitor
 from numba import njit
 from numba.core import event
+
+from kpc.format.common import compiling
+from kpc.format.common.compiling import MONITOR, NOTICE, NOTICE_AFTER_S, CompilationMonitor
 
 
 class Terminal(io.StringIO):

@@ -6,6 +6,7 @@ import google_crc32c
 import numpy as np
 import pytest
 import zstandard
+
 from kpc.format.common.errors import FormatError
 from kpc.format.container.container import ENTRY, EXPANSION_LIMIT, HEADER, Chunk, Codec, Reader, pack, stored_frame
 

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
+
+import kpc
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import BudgetError, FormatError, UsageError
 from kpc.format.common.media import read_image
@@ -18,10 +21,7 @@ from kpc.player.cpu.motion_map import motion_colours
 from kpc.player.viewpoints import fit_camera, orbit
 from kpc.tools.cli import kpinfo, kpjoin, kprender
 from kpc.tools.cli.serve import Handler, serving
-from PIL import Image
 from scenes import tiny_scene, with_appearances
-
-import kpc
 
 
 def coded(scene: Scene) -> bytes:

@@ -8,6 +8,8 @@ from typing import IO, ClassVar
 
 import numpy as np
 import pytest
+
+import kpc
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import BudgetError, FormatError, InterruptedRead, NetworkError, UnreachableError
 from kpc.format.container import http, http_client
@@ -16,8 +18,6 @@ from kpc.format.container.scene_io import SceneReader, write
 from kpc.format.container.sources import RemoteSource, Source
 from kpc.tools.cli.serve import Handler, Link, serving
 from scenes import tiny_scene
-
-import kpc
 
 DATA = np.random.default_rng(0).integers(0, 256, 400_000, np.uint8).tobytes()
 

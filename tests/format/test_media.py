@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
+
 from kpc.format.common import media
 from kpc.format.common.errors import MediaError
 from kpc.format.common.media import (
@@ -18,7 +20,6 @@ from kpc.format.common.media import (
     write_image,
     write_video,
 )
-from PIL import Image
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from kpc.encoder.field import sampling
 from kpc.format.common.errors import FormatError
 from kpc.format.scene.grid import sample_linear

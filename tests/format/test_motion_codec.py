@@ -6,9 +6,10 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import zstandard
-from codec_inputs import GRID_PATTERNS, drifting, grid_pattern, swaying
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from codec_inputs import GRID_PATTERNS, drifting, grid_pattern, swaying
 from kpc.format.coding.motion_codec import WEIGHT_BITS, coding_passes, cubic_weights, decode_motion, encode_motion
 from kpc.format.common.errors import FormatError
 from without_numba import assert_same_without_numba

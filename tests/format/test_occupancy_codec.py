@@ -5,9 +5,10 @@ import time
 import numpy as np
 import pytest
 import zstandard
-from codec_inputs import rolling
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from codec_inputs import rolling
 from kpc.format.coding.occupancy_codec import decode_occupancy, encode_occupancy
 from kpc.format.common.errors import FormatError
 from without_numba import assert_same_without_numba

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from kpc.format.common.errors import BudgetError
 from kpc.format.container.container import Reader
 from kpc.format.container.partial import PartialScene, SegmentedPlane, adjacent_runs

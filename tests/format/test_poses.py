@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kpc.format.coding.poses import are_rigid, decode_poses, encode_poses, round_poses
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.rotations import rotation_of

@@ -6,9 +6,11 @@ from types import FunctionType
 import numpy as np
 import pytest
 import zstandard
-from codec_inputs import PLANE_PATTERNS, followed, on_trellis, plane_pattern, textured
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
+
+from codec_inputs import PLANE_PATTERNS, followed, on_trellis, plane_pattern, textured
 from kpc.format.coding import predictive as module
 from kpc.format.coding.predictive import (
     ACTIVITIES,
@@ -30,7 +32,6 @@ from kpc.format.coding.predictive import (
 from kpc.format.coding.raw_planes import encode_raw_segment
 from kpc.format.coding.texel_map import MODE_BITS
 from kpc.format.common.errors import FormatError
-from numba import njit
 from without_numba import assert_same_without_numba
 
 shapes = st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 5))

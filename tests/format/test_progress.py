@@ -4,6 +4,7 @@ import io
 import sys
 
 import pytest
+
 from kpc.format.common import progress as module
 from kpc.format.common.progress import Progress, progress
 

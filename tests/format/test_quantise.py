@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kpc.format.coding.quantise import (
     VALUE_LIMIT,
     QuantisedPlane,

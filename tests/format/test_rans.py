@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from kpc.format.coding.rans import (
     ADAPTATION_LIMIT,
     EVEN_PROBABILITY,

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kpc.format.coding.raw_planes import decode_raw_segment, encode_raw_segment
 from kpc.format.common.errors import FormatError
 

@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from codec_inputs import drifting, rolling, swaying
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+import kpc
+from codec_inputs import drifting, rolling, swaying
 from kpc.format.coding.quantise import QuantisedScene, quantise_scene
 from kpc.format.common.errors import BudgetError, FormatError
 from kpc.format.container.container import HEADER, Chunk, Codec, Reader, pack
@@ -20,8 +22,6 @@ from kpc.format.scene.space import Contraction, DeviceCoordinates
 from kpc.tools.vectors import files
 from kpc.tools.vectors.scenes import with_occupancy
 from scenes import in_device_coordinates, tiny_scene, with_appearances, with_motion
-
-import kpc
 
 
 def quantised(step: float = 0.02, **options) -> QuantisedScene:

@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
-import gl
 import numpy as np
 import pytest
 import torch
+
+import gl
 from kpc.encoder.field import render as in_pytorch
 from kpc.encoder.field.kernels import geometry
 from kpc.format.scene.scene import Scene

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from kpc.format.coding.quantise import needed_texels, quantise_scene
 from kpc.format.container.scene_io import write
 from kpc.format.scene.scene import TIME_PLANES, Scene

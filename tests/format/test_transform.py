@@ -6,6 +6,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+
 from codec_inputs import random_blocks
 from kpc.format.coding.predictive import WEIGHT_COUNT, PredictionWeights, decode_symbols, encode_symbols
 from kpc.format.coding.transform import (

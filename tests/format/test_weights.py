@@ -7,6 +7,7 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from kpc.format.coding.quantise import decoder_arrays, round_decoder
 from kpc.format.coding.weights import COARSEST, FINEST, LARGEST, decode_weights, encode_weights
 from kpc.format.common.errors import FormatError

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+
 from kpc.format.scene.scene import SPACE_PLANES, TIME_PLANES
 from kpc.player.atlas import FARTHEST, Layout, TimeRows, empty_distances
 from kpc.player.cpu import reference

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.cameras import Camera, View, load_views, save_views
 from kpc.format.scene.rotations import quaternion_of, rotation_of

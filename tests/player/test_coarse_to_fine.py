@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+
 from kpc.player.cpu.coarse_to_fine import blocks_over, interpolation_errors, upsample
 from kpc.player.cpu.field_sampler import FieldSampler
 from kpc.player.cpu.picture import BLOCK, Picture

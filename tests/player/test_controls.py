@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from kpc.format.scene.scene import Clip
 from kpc.player.app.controls import BLEND_S, SPEEDS, AppearanceSelection, OrbitView, Playback
 from kpc.player.viewpoints import Rig

@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
-import gl
 import numpy as np
 import pytest
+
+import gl
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
 from kpc.player.cpu.corner_grid import MOST_CORNERS, CornerGrid, grid_shape

@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
-import gl
 import numpy as np
 import pytest
+from numba import njit
+
+import gl
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, Scene
 from kpc.player.cpu.corner_grid import CornerGrid
@@ -15,7 +17,6 @@ from kpc.player.cpu.raymarch import march_blocks
 from kpc.player.cpu.reference import Part, render
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LEVELS, Quality
-from numba import njit
 from scenes import (
     VARIANTS,
     linear_per_cell,

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import glfw
 import pytest
+
 from kpc.player.app.desktop import wayland_library
 from test_floors import ROOT, imports
 

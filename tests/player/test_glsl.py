@@ -1,8 +1,9 @@
 """Functions of the shaders, each against its twin in numpy, in float64, on 65,536 random inputs."""
 
-import gl
 import numpy as np
 import pytest
+
+import gl
 from kpc.format.scene.motion import displace
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT
 from kpc.format.scene.space import Contraction, contract

@@ -6,9 +6,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import gl
 import numpy as np
 import pytest
+
+import gl
+import kpc
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import BudgetError
 from kpc.format.container import groups, scene_io
@@ -21,8 +23,6 @@ from kpc.player.streaming.group_playback import GroupPlayback
 from kpc.player.streaming.prefetch import Playhead
 from kpc.tools.cli.serve import serving
 from scenes import tiny_scene
-
-import kpc
 
 TIMEOUT_S = 10.0
 RATE = 0.2  # fraction of the clip per second

@@ -10,6 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
+
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.media import read_image
 from kpc.format.container.scene_io import write

@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
-import gl
 import numpy as np
 import pytest
+
+import gl
 from kpc.format.scene.scene import Scene
 from kpc.player.atlas import Layout
 from kpc.player.cpu.occupancy_culling import OccupancyCulling

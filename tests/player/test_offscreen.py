@@ -1,6 +1,7 @@
-import gl
 import moderngl
 import pytest
+
+import gl
 from kpc.format.common.errors import DisplayError
 from kpc.player.gl import offscreen
 

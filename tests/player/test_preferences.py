@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
 from kpc.player.app.preferences import _IS_VALID, MAX_BYTES, Preferences, load, preferences_path, save
 
 MINE = Preferences((800, 600), "fine", 30.0, 0.5, False, False, True, True, 1.5)

@@ -2,6 +2,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+
 from kpc.format.container.partial import PartialScene
 from kpc.player.streaming.prefetch import Playhead, distances_ahead, fetch_order, min_segment_bytes, segments_to_keep
 from partial_scenes import opened

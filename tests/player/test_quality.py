@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
-import gl
 import numpy as np
 import pytest
+
+import gl
 from kpc.format.scene.scene import SPACE_PLANES, TERMINATION, TIME_PLANES, Scene
 from kpc.player.cpu.cpu_renderer import ProcessorRenderer
 from kpc.player.cpu.reference import box_range, render

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+
 from kpc.player.app.quality_controller import (
     LEVEL_NAMES,
     TOO_SLOW,

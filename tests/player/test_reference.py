@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, TERMINATION, Scene

@@ -5,10 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
-import gl
 import moderngl
 import numpy as np
 import pytest
+from PIL import Image
+from test_glsl import cubic
+
+import gl
 from kpc.encoder.rdo.prune import keep_channels
 from kpc.format.common.errors import DisplayError
 from kpc.format.container import scene_io
@@ -20,9 +23,7 @@ from kpc.player.gl.presentation import DisplayMode
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LEVELS, Quality
 from kpc.player.viewpoints import Rig, fit_camera
-from PIL import Image
 from scenes import VARIANTS, look_at, tiny_scene, with_appearances, with_contraction, with_hybrid_decoder, with_motion
-from test_glsl import cubic
 
 CENTRE = (0.1, 0.05, 0.05)
 CAMERAS = {

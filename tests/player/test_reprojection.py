@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from kpc.format.scene.cameras import Camera
 from kpc.player.cpu import cpu_renderer as module
 from kpc.player.cpu.cpu_renderer import LATEST, UNPREDICTED_PICTURES, ProcessorRenderer

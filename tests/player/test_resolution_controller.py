@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+
 from kpc.player.app.resolution_controller import ResolutionController
 
 

@@ -1,8 +1,9 @@
 import re
 
-import gl
 import numpy as np
 import pytest
+
+import gl
 from kpc.format.common.errors import DisplayError
 from kpc.player.atlas import Layout
 from kpc.player.gl import shader

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from kpc.player.cpu.simd import LARGEST, NARROW, WIDE, accumulate_features, decode_corner, interpolate
 from numba import njit
+
+from kpc.player.cpu.simd import LARGEST, NARROW, WIDE, accumulate_features, decode_corner, interpolate
 
 
 @njit

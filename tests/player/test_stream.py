@@ -9,10 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, ClassVar
 
-import gl
 import moderngl
 import numpy as np
 import pytest
+
+import gl
+import kpc
 from kpc.format.common.errors import BudgetError
 from kpc.format.container import http, http_client
 from kpc.format.container.container import Reader
@@ -27,8 +29,6 @@ from kpc.player.streaming.stream import Stream
 from kpc.tools.cli.serve import Handler, Link, serving
 from partial_scenes import coded
 from scenes import VARIANTS, tiny_scene
-
-import kpc
 
 TIMEOUT_S = 20.0
 SIZE = (48, 36)

@@ -3,6 +3,7 @@
 import threading
 
 import pytest
+
 from kpc.player.cpu import threads
 from kpc.player.cpu.threads import from_both_ends, share_out
 

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.partial import PartialScene
 from kpc.format.container.scene_io import SceneReader, encode

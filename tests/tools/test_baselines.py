@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
+
 from kpc.format.coding.quantise import looked_up_cells, needed_texels
 from kpc.format.common.errors import MediaError
 from kpc.format.scene.scene import TIME_PLANES

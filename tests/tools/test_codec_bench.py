@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
 from datasets import write_n3dv
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container import scene_io

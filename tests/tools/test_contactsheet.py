@@ -2,10 +2,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
+
 from kpc.format.common.media import read_image, write_image
 from kpc.tools.cli import contactsheet
 from kpc.tools.cli.depth_images import NO_SURFACE
-from PIL import Image
 
 
 def fill(folder: Path, names: list[str], level: int, size: tuple[int, int] = (40, 60)) -> Path:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from codec_inputs import followed, random_blocks, textured
 from kpc.format.coding import predictive, transform
 from kpc.format.coding.predictive import SET_COUNTS, PredictionWeights, encode_symbols

@@ -9,6 +9,7 @@ import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
 from kpc.format.common.errors import FormatError
 from kpc.format.container.scene_io import read
 from kpc.tools.vectors import fuzz

@@ -6,8 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gl
 import pytest
+
+import gl
+import kpc
 from datasets import write_n3dv
 from kpc.encoder.evaluation import profile
 from kpc.encoder.evaluation.ablations import ABLATIONS, effective_ablations
@@ -18,8 +20,6 @@ from kpc.player.quality import DEFAULT, LEVELS
 from kpc.tools.bench import harness, kpbench, machine_limits, plot, results, tables
 from kpc.tools.bench.provenance import data_hash
 from scenes import tiny_scene
-
-import kpc
 
 SMALL = replace(
     PRESETS["draft"],

@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container.container import Reader
 from kpc.format.container.scene_io import write

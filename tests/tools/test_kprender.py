@@ -5,10 +5,13 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import gl
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
+
+import gl
+import kpc
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import DisplayError
 from kpc.format.common.media import read_image, read_video
@@ -19,10 +22,7 @@ from kpc.player.cpu import reference
 from kpc.player.gl import offscreen
 from kpc.tools.cli import kprender
 from kpc.tools.cli.depth_images import NO_SURFACE
-from PIL import Image
 from scenes import tiny_scene, with_appearances, with_contraction
-
-import kpc
 
 
 @pytest.fixture(scope="module")

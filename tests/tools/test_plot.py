@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+
 from kpc.format.common.errors import FormatError
 from kpc.tools.bench import plot
 from kpc.tools.bench.records import Record

@@ -4,10 +4,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from kpc.format.common.memory import peak_memory_bytes
-from kpc.tools.bench import provenance
 
 import kpc
+from kpc.format.common.memory import peak_memory_bytes
+from kpc.tools.bench import provenance
 
 
 def test_the_hash_of_a_folder_covers_names_and_contents(tmp_path: Path) -> None:

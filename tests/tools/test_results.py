@@ -2,6 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
+
 from kpc.format.common.errors import FormatError
 from kpc.tools.bench import results, tables
 from kpc.tools.bench.records import Record, median

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from kpc.encoder.datasets import load_dataset, pixel_rays
 from kpc.format.common.media import read_image
 from kpc.format.scene.cameras import Camera, load_views

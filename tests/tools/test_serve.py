@@ -6,6 +6,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+
 from kpc.tools.cli import serve
 from kpc.tools.cli.serve import Link, serving
 

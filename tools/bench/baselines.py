@@ -17,11 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import zstandard
+from PIL import Image, features
+
 from kpc.format.coding.quantise import looked_up_cells, needed_texels
 from kpc.format.common.errors import MediaError
 from kpc.format.common.media import ffmpeg_binary
 from kpc.format.scene.scene import TIME_PLANES, Scene
-from PIL import Image, features
 
 # Planes (H, W, M) by name for each scale, as in `Scene.scales`, and their shapes.
 Planes = Sequence[Mapping[str, np.ndarray]]

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from kpc.encoder.datasets import Dataset, load_dataset, pixel_rays
 from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, ValidationRays
 from kpc.encoder.field.config import TrainConfig

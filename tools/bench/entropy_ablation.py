@@ -14,13 +14,14 @@ from types import FunctionType, ModuleType
 from typing import Any, Protocol
 
 import numpy as np
+from numba import njit
+
 from kpc.format.coding import predictive, rans, texel_map, transform
 from kpc.format.coding.quantise import needed_texels
 from kpc.format.container.container import Chunk, Codec, pack
 from kpc.format.container.scene_io import SceneReader, read, scene_chunks
 from kpc.format.container.segments import SegmentSideInfo, encode_segment, side_info_at
 from kpc.format.scene.scene import ALL_PLANES
-from numba import njit
 
 # Decodings of which the median time counts, after one that warms up.
 DECODINGS = 5

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.evaluate import SceneRenderer, ground_truth
 from kpc.encoder.rdo.codec_model import widen_single_texels

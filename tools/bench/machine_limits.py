@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import moderngl
 import numba
 import numpy as np
-from kpc.player.gl.shader import build, build_compute
 from numba import njit, prange
+
+from kpc.player.gl.shader import build, build_compute
 
 # Bytes of three arrays per thread that fit into a second-level cache, and of three arrays that fit into no cache.
 CACHED_BYTES = 1 << 20

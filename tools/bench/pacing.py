@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from kpc.format.common.fidelity import psnr
 from kpc.player.app.desktop import glfw
 from kpc.player.app.preferences import Preferences

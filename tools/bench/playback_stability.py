@@ -11,6 +11,7 @@ from typing import Any
 
 import moderngl
 import numpy as np
+
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.container.sources import open_source
 from kpc.player.app.desktop import glfw

@@ -8,6 +8,7 @@ from typing import Any
 
 import moderngl
 import numpy as np
+
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.container import scene_io

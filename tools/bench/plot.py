@@ -15,15 +15,16 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from matplotlib import rcParams
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, UsageError
 from kpc.tools.bench import results
 from kpc.tools.bench.records import Record, median
 from kpc.tools.bench.tables import is_ours
-from matplotlib import rcParams
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 # Panels of the training plot: the key of a repeat, the title, and the unit of the axis.
 PANELS = (("test_psnr", "held-out PSNR, dB", 1.0), ("test_ssim", "held-out SSIM", 1.0), ("size_bytes", "file, KB", 1e3))

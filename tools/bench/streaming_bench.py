@@ -15,6 +15,7 @@ from typing import Any
 
 import moderngl
 import numpy as np
+
 from kpc.format.common.errors import KpcError
 from kpc.format.common.fidelity import psnr_from_mse
 from kpc.format.container.partial import PartialScene

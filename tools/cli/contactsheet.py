@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
 from kpc.format.common import cli
 from kpc.format.common.errors import MediaError, UsageError
 from kpc.format.common.fidelity import psnr
 from kpc.format.common.media import IMAGE_SUFFIXES, read_image, write_image
 from kpc.tools.cli.depth_images import NO_SURFACE, read_depth_levels
-from PIL import Image, ImageDraw, ImageFont
 
 # Space between pictures, and height of a caption, in pixels.
 GAP = 6

@@ -7,8 +7,9 @@ hits nothing.
 from pathlib import Path
 
 import numpy as np
-from kpc.format.common import cli
 from PIL import Image, PngImagePlugin
+
+from kpc.format.common import cli
 
 NO_SURFACE = 65535
 

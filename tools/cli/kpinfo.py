@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, UsageError

@@ -24,6 +24,8 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
+
+import kpc
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.common.media import write_image, write_video
@@ -39,8 +41,6 @@ from kpc.player.cpu.reference import Part, Rendering
 from kpc.player.quality import LEVELS
 from kpc.player.viewpoints import Rig, fit_camera, orbit
 from kpc.tools.cli.depth_images import NO_SURFACE, write_depth
-
-import kpc
 
 Render = Callable[[Camera, float], Rendering]
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
+
 from kpc.tools.dev.scene_geometry import (
     BALL,
     BEAD,

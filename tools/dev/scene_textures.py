@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+
 from kpc.tools.dev.scene_geometry import (
     BACK_WALL,
     BALL,

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.common.media import srgb_from_linear, write_image, write_video

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import zstandard
+
 from kpc.format.coding.quantise import QuantisedScene
 from kpc.format.container.container import Codec, Reader
 from kpc.format.container.scene_io import read

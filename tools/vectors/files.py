@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import google_crc32c
 import numpy as np
 import zstandard
+
 from kpc.format.coding.poses import BITS, LENS, NOTHING, WORD
 from kpc.format.coding.poses import HEAD as POSES_HEAD
 from kpc.format.coding.predictive import (

@@ -29,6 +29,7 @@ from typing import Any, cast
 import google_crc32c
 import numpy as np
 import zstandard
+
 from kpc.format.common import cli
 from kpc.format.common.errors import FormatError, KpcError, UsageError
 from kpc.format.container.container import Codec, Entry, Reader, header_and_index

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import google_crc32c
+
 from kpc.format.container.container import Entry, Reader, header_and_index
 from kpc.format.container.groups import Groups
 from kpc.tools.vectors.files import HEADER_FIELDS, sealed, with_entry

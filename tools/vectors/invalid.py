@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+
 from kpc.format.coding.motion_codec import encode_motion
 from kpc.format.coding.occupancy_codec import encode_occupancy
 from kpc.format.coding.poses import HEAD as POSES_HEAD

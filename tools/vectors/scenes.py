@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+
 from kpc.format.coding.predictive import DEPENDENT, MAX_DECISIONS, PredictionWeights, code_symbols, trellis_transition
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_texels
 from kpc.format.coding.rans import encode_trace

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+
 from kpc.format.coding.poses import BITS, NOTHING, ROOT
 from kpc.format.coding.predictive import WEIGHT_COUNT
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene

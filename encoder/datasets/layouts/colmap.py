@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import BinaryIO, TextIO
 
 import numpy as np
+
 from kpc.encoder.datasets.capture import (
     HOLD_OUT_EVERY,
     Capture,

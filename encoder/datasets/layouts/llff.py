@@ -9,6 +9,7 @@ Source: https://github.com/Fyusion/LLFF
 from pathlib import Path
 
 import numpy as np
+
 from kpc.encoder.datasets.capture import (
     HOLD_OUT_EVERY,
     Capture,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from kpc.encoder.datasets.capture import CapturedView, image_view
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import image_size

@@ -1,12 +1,13 @@
 """The gradient of a batch's loss."""
 
 import numpy as np
+from numba import prange
+
 from kpc.encoder.field.kernels.arguments import Gradients
 from kpc.encoder.field.kernels.compilation import bare, inlined, parallel, plain
 from kpc.encoder.field.kernels.geometry import cell_index
 from kpc.encoder.field.kernels.marching import LIMIT, NEGLIGIBLE, march_ray, new_ray_buffers, shade_ray
 from kpc.encoder.field.kernels.planes import clear_slopes, scatter_motion, scatter_planes
-from numba import prange
 
 
 @bare

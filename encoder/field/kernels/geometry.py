@@ -4,6 +4,7 @@
 """
 
 import numpy as np
+
 from kpc.encoder.field.kernels.compilation import bare, inlined
 from kpc.format.scene.space import FAR
 

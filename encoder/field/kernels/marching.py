@@ -3,12 +3,13 @@
 import math
 
 import numpy as np
+from numba import prange
+
 from kpc.encoder.field.kernels.arguments import RayBuffers
 from kpc.encoder.field.kernels.compilation import bare, inlined, parallel, plain
 from kpc.encoder.field.kernels.geometry import cell_index, inverse_edges, ray_distance, ray_point, ray_span
 from kpc.encoder.field.kernels.planes import combine_planes, dot, sample_displaced
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
-from numba import prange
 
 LIMIT = np.float32(LOG_DENSITY_LIMIT)
 END_TRANSMITTANCE = np.float32(TERMINATION)

@@ -1,6 +1,7 @@
 """Sampling of planes at a point, the product over planes, and the transposes of both."""
 
 import numpy as np
+
 from kpc.encoder.field.kernels.compilation import inlined
 from kpc.encoder.field.kernels.geometry import displace, scatter_displacement, texel_and_fraction
 

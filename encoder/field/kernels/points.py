@@ -1,6 +1,8 @@
 """Features and densities at given points."""
 
 import numpy as np
+from numba import prange
+
 from kpc.encoder.field.kernels.compilation import parallel
 from kpc.encoder.field.kernels.marching import decode_density, new_ray_buffers
 from kpc.encoder.field.kernels.planes import (
@@ -10,7 +12,6 @@ from kpc.encoder.field.kernels.planes import (
     scatter_motion,
     scatter_planes,
 )
-from numba import prange
 
 
 @parallel

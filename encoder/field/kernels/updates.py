@@ -3,8 +3,9 @@
 import math
 
 import numpy as np
-from kpc.encoder.field.kernels.compilation import inlined, parallel
 from numba import prange
+
+from kpc.encoder.field.kernels.compilation import inlined, parallel
 
 # Means of Adam below this are set to 0: texels that no ray visits would decay into denormal numbers, which take some
 # hundred times as long to compute with.
