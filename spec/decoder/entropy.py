@@ -68,7 +68,7 @@ class EntropyDecoder:
         """Decode an integer with the models of a context."""
         if not self.adaptive((context, "nonzero")):
             return 0
-        if self.adaptive((context, "positive")):
+        if self.adaptive((context, "is_positive")):
             return self.positive(lambda k: self.adaptive((context, "above", k)), unary, escape)
         return -self.positive(lambda k: self.adaptive((context, "below", k)), unary, escape)
 

@@ -11,9 +11,9 @@ from .entropy import EntropyDecoder, log_class
 
 def decode_motion(content):
     chunk = ByteReader(content.data)
-    nt, nz, ny, nx, step = chunk.unpack("4Hf")
+    nt, nz, ny, nx, motion_step = chunk.unpack("4Hf")
     require(2 <= nt <= 16384 and all(2 <= n <= 256 for n in (nz, ny, nx)), "invalid size of the motion grid")
-    require(step > 0 and 32768 * step <= 1024, "invalid step of the motion grid")
+    require(motion_step > 0 and 32768 * motion_step <= 1024, "invalid step of the motion grid")
     count = 3 * nt * nz * ny * nx
     if content.is_coded:
         require(content.raw_length == 12 + 2 * count, "invalid raw length")
@@ -21,16 +21,16 @@ def decode_motion(content):
     else:
         symbols = chunk.unpack(f"{count}h")
         chunk.finish()
-    return {"size": (nt, nz, ny, nx), "displacements": [f32(symbol * step) for symbol in symbols]}
+    return {"size": (nt, nz, ny, nx), "displacements": [f32(symbol * motion_step) for symbol in symbols]}
 
 
 def decode_motion_symbols(chunk, sizes):
     """Return the symbols of the MOTION codec, row-major; sizes: nodes along t, z, y, x."""
     decisions = EntropyDecoder(chunk)
-    v, mag = {}, {}  # by (t, z, y, x, component)
+    symbol, residual = {}, {}  # by (t, z, y, x, component)
     decoded = [[0] for _ in sizes]  # positions along each axis that are decoded
 
-    def decode_pass(axis, new, references, weights):
+    def decode_pass(axis, new, ref, tap):
         """Decode the nodes at position `new` of an axis, predicted from up to four reference positions."""
         others = [decoded[a] for a in range(4) if a != axis]
         for at in itertools.product(*others):
@@ -45,15 +45,15 @@ def decode_motion_symbols(chunk, sizes):
                     moved = (*at[:a], others[a][index - 1], *at[a + 1 :])
                     previous.append((*moved[:axis], new, *moved[axis:]))
             for component in range(3):
-                used = [(k, (*node(references[k]), component)) for k in range(4) if weights[k]]
-                prediction = clamp(sum(weights[k] * v[i] for k, i in used) + 32 >> 6, -32768, 32767)
-                activity = sum(mag[i] * (2 if k in (1, 2) else 1) for k, i in used)
-                activity += 3 * sum(mag[(*node(new), c)] for c in range(component))
-                activity += sum(mag[(*i, c)] for i in previous for c in range(3))
-                residual = decisions.signed(("motion", min(log_class(activity), 19)), unary=4, escape=15)
-                require(-32768 <= prediction + residual <= 32767, "a symbol exceeds 16 bits")
-                v[(*node(new), component)] = prediction + residual
-                mag[(*node(new), component)] = abs(residual)
+                used = [(k, (*node(ref[k]), component)) for k in range(4) if tap[k]]
+                prediction = clamp(sum(tap[k] * symbol[i] for k, i in used) + 32 >> 6, -32768, 32767)
+                activity = sum(abs(residual[i]) * (2 if k in (1, 2) else 1) for k, i in used)
+                activity += 3 * sum(abs(residual[*node(new), c]) for c in range(component))
+                activity += sum(abs(residual[*i, c]) for i in previous for c in range(3))
+                decoded_residual = decisions.signed(("motion", min(log_class(activity), 19)), unary=4, escape=15)
+                require(-32768 <= prediction + decoded_residual <= 32767, "a symbol exceeds 16 bits")
+                here = *node(new), component
+                symbol[here], residual[here] = prediction + decoded_residual, decoded_residual
 
     decode_pass(0, 0, [None] * 4, [0] * 4)
     for axis, n in enumerate(sizes):
@@ -65,7 +65,7 @@ def decode_motion_symbols(chunk, sizes):
             if halvings[axis] >= halving:
                 halve(decoded, axis, decode_pass)
     decisions.finish()
-    return [v[i] for i in itertools.product(*map(range, sizes), range(3))]
+    return [symbol[i] for i in itertools.product(*map(range, sizes), range(3))]
 
 
 def halve(decoded, axis, decode_pass):
@@ -75,23 +75,23 @@ def halve(decoded, axis, decode_pass):
     for index in range(len(old) - 1):
         if old[index + 1] - old[index] > 1:
             new = old[index] + old[index + 1] >> 1
-            references = [old[i] if 0 <= i < len(old) else None for i in range(index - 1, index + 3)]
-            decode_pass(axis, new, references, interpolation_weights(new, references))
+            ref = [old[i] if 0 <= i < len(old) else None for i in range(index - 1, index + 3)]
+            decode_pass(axis, new, ref, interpolation_taps(new, ref))
             middles.append(new)
     decoded[axis] = sorted(old + middles)
 
 
-def interpolation_weights(new, references):
-    """Return the weights of cubic interpolation, in 1/64."""
-    weights = [0] * 4
-    for k, s_k in enumerate(references):
-        if s_k is not None:
-            others = [s_j for s_j in references if s_j is not None and s_j != s_k]
-            A = 64 * math.prod(new - s_j for s_j in others)
-            B = math.prod(s_k - s_j for s_j in others)
-            weights[k] = (2 * A + B) // (2 * B)
-    weights[1] += 64 - sum(weights)
-    return weights
+def interpolation_taps(new, ref):
+    """Return the factors of cubic interpolation, in 1/64."""
+    tap = [0] * 4
+    for k in range(4):
+        if ref[k] is not None:
+            others = [position for j, position in enumerate(ref) if position is not None and j != k]
+            A = 64 * math.prod(new - position for position in others)
+            B = math.prod(ref[k] - position for position in others)
+            tap[k] = (2 * A + B) // (2 * B)
+    tap[1] += 64 - sum(tap)
+    return tap
 
 
 # --- 6.4 OCCU, 8.2 OCCUPANCY
@@ -212,11 +212,14 @@ def decode_cameras(content):
 
 
 def decode_poses(chunk):
-    count, lens_count, e, *corner = chunk.unpack("HHb3i")
-    require(1 <= count <= 4096 and lens_count in (1, count) and -126 <= e <= 30, "invalid number of cameras or lenses")
+    camera_count, lens_count, e, *corner = chunk.unpack("HHb3i")
+    require(
+        1 <= camera_count <= 4096 and lens_count in (1, camera_count) and -126 <= e <= 30,
+        "invalid number of cameras or lenses",
+    )
     lenses = [chunk.unpack("HH4f") for _ in range(lens_count)]
     cameras = []
-    for number in range(count):
+    for number in range(camera_count):
         rotation, position = (int.from_bytes(chunk.take(7), "little") for _ in range(2))
         require(position >> 54 == 0, "invalid position of a camera")
         left_out = rotation >> 54
@@ -244,9 +247,11 @@ def decode_poses(chunk):
 
 def decode_appearances(chunk, expected_hidden):
     """Return {name: embedding}."""
-    count, hidden = chunk.unpack("HH")
-    require(1 <= count <= 16384 and hidden == expected_hidden, "invalid number of appearances or of hidden units")
-    embeddings = [chunk.unpack(f"{hidden}e") for _ in range(count)]
+    appearance_count, hidden = chunk.unpack("HH")
+    require(
+        1 <= appearance_count <= 16384 and hidden == expected_hidden, "invalid number of appearances or of hidden units"
+    )
+    embeddings = [chunk.unpack(f"{hidden}e") for _ in range(appearance_count)]
     require(all(math.isfinite(a) for embedding in embeddings for a in embedding), "an embedding is not finite")
     appearances = {}
     for embedding in embeddings:

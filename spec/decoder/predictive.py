@@ -7,27 +7,27 @@ from .entropy import log_class
 
 SCALAR, TRELLIS, DEPENDENT = range(3)  # quantisers
 UNARY, ESCAPE = 4, 7  # binarisation of a residual
-START = 0, 16  # (v, dev) to the left of the first row
+START = 0, 16  # (padded, dev) to the left of the first row
 FAR_NEIGHBOURS = [(1, 1), (1, -1), (0, 2), (2, 0), (1, 2), (2, 1), (2, -1), (1, -2)]  # nw ne ww nn nww nnw nne nee
 
 
 class Channel:
-    """v (the symbols) and dev (the deviations) of one channel, with their padding."""
+    """padded (the symbols) and dev (the deviations) of one channel, at all positions where they are defined."""
 
     def __init__(self, W):
-        self.W, self.known = W, {}  # (v, dev) by (y, x)
+        self.W, self.known = W, {}  # (padded, dev) by (y, x)
 
-    def padded(self, y, x):
-        """Return (v, dev) at (y, x), x from -2 to W + 1."""
+    def at(self, y, x):
+        """Return (padded, dev) at (y, x), x from -2 to W + 1."""
         if x < 0:
             return self.known[y - 1, 0] if y > 0 else START
         return self.known[y, min(x, self.W - 1)]
 
     def neighbour(self, y, x, up, back):
-        """Return (v, dev) of the neighbour (y - up, x - back) of the texel (y, x)."""
+        """Return (padded, dev) of the neighbour (y - up, x - back) of the texel (y, x)."""
         if y == 0 and up > 0:
-            return self.padded(0, x - 1)
-        return self.padded(max(y - up, 0), x - back)
+            return self.at(0, x - 1)
+        return self.at(max(y - up, 0), x - back)
 
 
 class Prediction(NamedTuple):
@@ -61,11 +61,11 @@ def decode_symbols(decisions, coded, H, W, M, quantiser, weights):
                 residual = decisions.signed(("residual", here.context), UNARY, ESCAPE)
                 if here.remainder < 0:
                     residual = -residual
-                v = reconstruct(here, residual, parity)
-                require(-128 <= v <= 127, "a symbol exceeds 8 bits")
-                symbols[y, x, c] = v
-                channel.known[y, x] = v, abs(128 * v - predicted.prediction) >> 3
-                branch = residual % 2 if here.rule == DEPENDENT else v % 4 >> 1
+                symbol = reconstruct(here, residual, parity)
+                require(-128 <= symbol <= 127, "a symbol exceeds 8 bits")
+                symbols[y, x, c] = symbol
+                channel.known[y, x] = symbol, abs(128 * symbol - predicted.prediction) >> 3
+                branch = residual % 2 if here.rule == DEPENDENT else symbol % 4 >> 1
                 trellis_state = trellis_state >> 1 ^ 5 * parity ^ 2 * branch
         update_cross(cross, channel, H, W, c)
     return symbols
@@ -109,7 +109,7 @@ def update_cross(cross, channel, H, W, c):
     for y in range(H):
         for x in range(W):
             smooth = sum(
-                (2 - abs(i)) * (2 - abs(j)) * channel.padded(clamp(y + i, 0, H - 1), x + j)[1]
+                (2 - abs(i)) * (2 - abs(j)) * channel.at(clamp(y + i, 0, H - 1), x + j)[1]
                 for i in (-1, 0, 1)
                 for j in (-1, 0, 1)
             )

@@ -22,7 +22,7 @@ def implied_map(scene, name, rows, columns, row_start, row_count):
     """Return the map of a segment of the plane of that name, which has so many rows and columns."""
     K, nz, ny, nx = scene["cells"]
     cell_count = {"x": nx, "y": ny, "z": nz, "t": K}
-    occupied = set()  # (row_cell, column_cell): cells along the row axis and the column axis of the plane
+    occupied = set()  # (a, b): projected cells, a along the axis of the plane's rows, b along that of its columns
     for number, bit in enumerate(scene["occupancy"]):
         if bit:
             cell = {
@@ -38,9 +38,9 @@ def implied_map(scene, name, rows, columns, row_start, row_count):
         return (texel + 1) * count >= cell * (size - 1) and (texel - 1) * count <= (cell + 1) * (size - 1)
 
     coded = {(y, x): 0 for y in range(row_count) for x in range(columns)}
-    for row_cell, column_cell in occupied:
-        across = [x for x in range(columns) if touches(x, columns, column_cell, cell_count[name[0]])]
+    for a, b in occupied:
+        across = [x for x in range(columns) if touches(x, columns, b, cell_count[name[0]])]
         for y in range(row_count):
-            if touches(row_start + y, rows, row_cell, cell_count[name[1]]):
+            if touches(row_start + y, rows, a, cell_count[name[1]]):
                 coded |= {(y, x): 1 for x in across}
     return coded

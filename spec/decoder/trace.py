@@ -113,10 +113,10 @@ def predictive_example():
     tracing, symbols = traced_segment(PREDICTIVE, PREDICTIVE_EXAMPLE, 2, 3)
     names = "predict", "round_prediction", "reconstruct"
     rows = []
-    for (y, x, _), predicted, here, v in zip(symbols, *(tracing.results[name] for name in names)):
-        dev = abs(128 * v - predicted.prediction) >> 3
-        residual = (v - here.rounded) * (-1 if here.remainder < 0 else 1)  # as it is coded
-        numbers = here.rounded, here.remainder, here.context, residual, v, dev
+    for (y, x, _), predicted, here, symbol in zip(symbols, *(tracing.results[name] for name in names)):
+        dev = abs(128 * symbol - predicted.prediction) >> 3
+        residual = (symbol - here.rounded) * (-1 if here.remainder < 0 else 1)  # as it is coded
+        numbers = here.rounded, here.remainder, here.context, residual, symbol, dev
         rows.append((f"({y}, {x})", *predicted, *numbers))
     titles = [
         "texel",
@@ -127,7 +127,7 @@ def predictive_example():
         "remainder",
         "context",
         "signed",
-        "v",
+        "symbol",
         "dev",
     ]
     return decision_table(tracing.decoders[0].steps), table(titles, rows)

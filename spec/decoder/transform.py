@@ -87,12 +87,12 @@ def decode_symbols(decisions, coded, H, W, M, N, base_step):
             level[0, 0] = level.get((0, 0), 0) + dc_prediction
             coefficient = decode_signs(decisions, level, qstep, block_end, left_edge, top_edge, N)
             dc[by, bx] = coefficient[0, 0]
-            v = inverse_transform(coefficient, N)
-            right_edge[by, bx], bottom_edge[by, bx] = [row[-1] for row in v], v[-1]
+            output = inverse_transform(coefficient, N)
+            right_edge[by, bx], bottom_edge[by, bx] = [row[-1] for row in output], output[-1]
             for y in range(N):
                 for x in range(N):
                     if coded.get((by * N + y, bx * N + x)):
-                        symbols[by * N + y, bx * N + x, c] = v[y][x]
+                        symbols[by * N + y, bx * N + x, c] = output[y][x]
     return symbols
 
 
@@ -149,8 +149,8 @@ def decode_magnitude(decisions, magnitude_class, frequency_class):
 
 def decode_signs(decisions, level, qstep, end, left_edge, top_edge, N):
     """Return {(i, j): coefficient}, which the boundary residuals of the block help to sign."""
-    left_residual = [8 * v for v in left_edge or [0] * N]
-    top_residual = [8 * v for v in top_edge or [0] * N]
+    left_residual = [8 * a for a in left_edge or [0] * N]
+    top_residual = [8 * a for a in top_edge or [0] * N]
     shift = 7 + LOG2[N]
 
     def subtract(i, j, a):
@@ -183,7 +183,7 @@ def decode_signs(decisions, level, qstep, end, left_edge, top_edge, N):
 
 
 def inverse_transform(coefficient, N):
-    """Return the symbols v[y][x] of a block."""
+    """Return the symbols output[y][x] of a block."""
     rows = range(N)
     column = [[sum(basis(N, i, y) * coefficient.get((i, j), 0) for i in rows) + 64 >> 7 for j in rows] for y in rows]
     shift = 10 + LOG2[N]
