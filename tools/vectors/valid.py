@@ -117,7 +117,18 @@ def _scenes(dynamic: QuantisedScene, dense: QuantisedScene) -> dict[str, Vector]
         "zstd": (encode(replace(varied, mapping=contracted.mapping, motion=moved.motion), store=zstd), False),
         "zstd-hybrid": (encode(hybrid, store=zstd), False),
         "time-empty": (encode(at_rest(dynamic), segment_rows=4), False),
+        "inexact-steps": (encode(_inexact_steps()), False),
     }
+
+
+def _inexact_steps() -> QuantisedScene:
+    """Return a scene whose values differ if a fused multiply-add computes them."""
+    scene = painted(noise)
+    planes = {
+        name: replace(plane, step=np.full(3, 0.1, np.float32), offset=np.full(3, 0.3, np.float32))
+        for name, plane in scene.scales[0].items()
+    }
+    return replace(scene, scales=(planes,))
 
 
 def _planes(dynamic: QuantisedScene) -> dict[str, Vector]:
