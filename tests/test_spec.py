@@ -172,6 +172,20 @@ def test_groups_are_shown_and_blended_as_the_manifest_says(name):
         assert blended == pytest.approx(moment["blend"], abs=1e-6)
 
 
+@pytest.mark.parametrize("held_bytes", [0, 20, 60])  # of group 1: nothing, a part of its header, a part of its index
+def test_a_clip_cut_off_at_the_head_of_a_group_keeps_the_groups_before_it(held_bytes):
+    expected, data = valid_vector("groups")
+    start = container.Reader(data).index[1].offset
+    data = data[: start + held_bytes]
+    opened = groups.Groups(data, allow_partial=True)
+    assert [opened.available(number) for number in range(len(opened))] == [True, False, False, False]
+    assert scene_io.read(opened.open(0)).clip.frame_count == expected["groups"][0]["row_count"]
+    with pytest.raises(errors.FormatError):
+        opened.open(1)
+    listed, scenes = decoder.decode_groups(data, True)
+    assert len(listed) == 4 and len(scenes) == 1
+
+
 def test_vectors_on_disk_are_those_of_their_generator():
     made = specvectors.vectors()
     on_disk = {str(path.relative_to(VECTORS)) for path in VECTORS.rglob("*") if path.is_file()}
