@@ -38,8 +38,7 @@ class Quality:
         culling_alpha: processor only. Rays skip occupied cells whose corners have less alpha than this at the present
             time. 0: none.
         grid_termination: processor only. Scenes that `kpc.player.cpu.corner_grid` serves are marched through its grid,
-            and their rays end once their
-            transmittance is below this. 0: the grid is not used.
+            and their rays end once their transmittance is below this. 0: the grid is not used.
     """
 
     folded: bool = False

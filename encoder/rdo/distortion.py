@@ -7,10 +7,10 @@ of its channel (`distortion_weights`), the distortion of pictures is
     D = sum of u (u + EDGE_COUPLING * sum of u of the four adjacent texels
                     + CORNER_COUPLING * sum of u of the four diagonal texels + cross)
 
-    cross = c + EDGE_COUPLING * sum of c of the four adjacent texels + CORNER_COUPLING * sum of c of the four diagonal
-    ones c = CHANNEL_COUPLING * sum over the other channels of a texel of their u times their correlation with this
-    channel
-        (`kpc.encoder.rdo.curvature`)
+    cross = c + EDGE_COUPLING * sum of c of the four adjacent texels
+              + CORNER_COUPLING * sum of c of the four diagonal texels
+    c     = CHANNEL_COUPLING * sum over the other channels of a texel of their u, times their correlation with this
+            channel (`kpc.encoder.rdo.curvature`)
 
 R is in bits, and lambda is LAM.
 """
