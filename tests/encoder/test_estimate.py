@@ -48,7 +48,7 @@ def test_training_is_extrapolated_from_the_watched_steps(moving: Dataset, monkey
     found = module.estimate(run, validation_rays=100, test_pictures=3, spent_s=2.0, time_budget_s=None)
     assert run.step == watched
     assert found.train_s == pytest.approx(5 + 3 * watched // 2 + 1.0 * (CONFIG.steps - watched // 2), abs=3)
-    assert 2 < found.rest_s < 60 and found.memory_bytes > 16 * run.field.theta.numel()
+    assert found.rest_s > 2 and found.memory_bytes > 16 * run.field.theta.numel()
 
 
 def test_fine_tuning_is_counted(moving: Dataset) -> None:

@@ -401,8 +401,8 @@ def copied(sets: Path, tmp_path: Path, name: str = "n3dv") -> Path:
 
 def test_no_dataset(run: Kpenc, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    fails(run, tmp_path, tmp_path / "empty", str(tmp_path / "empty"), "empty directory; name a folder")
-    fails(run, tmp_path, tmp_path / "none", str(tmp_path / "none"), "no such directory; name a folder")
+    fails(run, tmp_path, tmp_path / "empty", str(tmp_path / "empty"), "empty directory; give a folder")
+    fails(run, tmp_path, tmp_path / "none", str(tmp_path / "none"), "no such directory; give a folder")
     assert not (tmp_path / "out.kpc.work").exists()
     (tmp_path / "empty" / "notes.txt").write_text("")
     fails(run, tmp_path, tmp_path / "empty", "no dataset layout recognised", "poses_bounds.npy")
@@ -506,7 +506,7 @@ def test_appearances_are_chosen_logged_and_overridden(
 ) -> None:
     code, out, err = run(sets / "unequal", "--appearance", asked, "--steps", "60", "--test-views", "1")
     assert code == 0 and ("28 of 28 pictures have a lens" if asked == "auto" else "as given") in err
-    assert ("appearance: none" if names == "none" else f"appearance: a code for each {names} (") in err
+    assert ("appearance: none" if names == "none" else f"appearance: an embedding for each {names} (") in err
     assert ("right halves, each in an appearance fitted to its left half" in out) == (names != "none")
     scene = scene_io.read(tmp_path / "out.kpc")
     found = [appearance.name for appearance in scene.appearances]

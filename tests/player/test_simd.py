@@ -76,7 +76,7 @@ def test_corners_are_decoded_from_products(vectors: int) -> None:
     for _ in range(2):  # sums begin anew each time
         combined(wholes, factors, weights, np.float32(0.25), into)
     wanted = weights.astype(np.float64) @ np.prod([array.astype(np.float64) for array in (*wholes, *factors)], axis=0)
-    np.testing.assert_allclose(into[1], [*wanted, 0, 0, 0, 0.25], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(into[1], wanted + np.array([0, 0, 0, 0.25]), rtol=1e-4, atol=1e-4)
     assert np.isnan(into[[0, 2]]).all()
 
 
