@@ -1,15 +1,21 @@
 """The encoder: from posed pictures to a .kpc file. Needs PyTorch (the extra `kpc[encoder]`), which viewers do not."""
 
+import importlib.metadata
 import sys
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run `kpenc`; where only the viewer is installed, print how to install the encoder and return 1."""
+    arguments = sys.argv[1:] if argv is None else argv
+    if "--version" in arguments:  # known without the encoder, too
+        print(f"kpenc {importlib.metadata.version('kpc')}")
+        return 0
     try:
         from kpc.encoder.cli import kpenc
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        print(f'kpenc: needs {error.name}, which is not installed; pip install "kpc[encoder]"', file=sys.stderr)
+        remedy = 'in a checkout of KPC, pip install ".[encoder]"'
+        print(f"kpenc: needs {error.name}, which is not installed; {remedy}", file=sys.stderr)
         return 1
     return kpenc.main(argv)

@@ -112,7 +112,13 @@ def test_nobody_needs_what_tests_and_benches_do(module: str) -> None:
 def test_encoding_without_torch_is_one_line(call: str, code: int, tmp_path: Path) -> None:
     program = f"{WITHOUT_TORCH}\nimport {call} as c; sys.exit(c.main(['encode', {str(tmp_path)!r}]))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == code and done.stderr.count("\n") == 1 and 'pip install "kpc[encoder]"' in done.stderr
+    assert done.returncode == code and done.stderr.count("\n") == 1 and 'pip install ".[encoder]"' in done.stderr
+
+
+def test_the_encoder_has_a_version_without_torch() -> None:
+    program = f"{WITHOUT_TORCH}\nimport kpc.encoder as c; sys.exit(c.main(['--version']))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0 and re.fullmatch(r"kpenc \d+\.\d+\.\d+\n", done.stdout)
 
 
 def test_scripts_are_sound_shell() -> None:

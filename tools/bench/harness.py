@@ -72,7 +72,8 @@ def encoder() -> ModuleType:
     try:
         from kpc.encoder.cli import kpenc  # needs torch
     except ModuleNotFoundError as error:
-        raise UsageError(f'encode needs {error.name}, which is not installed; pip install "kpc[encoder]"') from error
+        remedy = 'in a checkout of KPC, pip install ".[encoder]"'
+        raise UsageError(f"encode needs {error.name}, which is not installed; {remedy}") from error
     return kpenc
 
 

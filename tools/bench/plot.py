@@ -7,7 +7,7 @@
 
 Records of `kpbench curve` give quality and size against training time, those of `codec` rate against distortion, those
 of `groups` the PSNR of each frame, those of `player` accuracy against frame time. The suffix of the output chooses SVG,
-PNG or PDF. Needs `pip install kpc[bench]`.
+PNG or PDF. Needs the extra `bench`: `pip install ".[bench]"` in a checkout.
 """
 
 import argparse
