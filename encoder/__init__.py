@@ -1,14 +1,15 @@
 """The encoder: from posed pictures to a .kpc file. Needs PyTorch (the extra `kpc[encoder]`), which viewers do not."""
 
-import importlib.metadata
 import sys
+
+from kpc.format.common.version import VERSION
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run `kpenc`; where only the viewer is installed, print how to install the encoder and return 1."""
     arguments = sys.argv[1:] if argv is None else argv
     if "--version" in arguments:  # known without the encoder, too
-        print(f"kpenc {importlib.metadata.version('kpc')}")
+        print(f"kpenc {VERSION}")
         return 0
     try:
         from kpc.encoder.cli import kpenc

@@ -22,6 +22,19 @@ CONFIG = TrainConfig(
     occupancy_start=16,
     occupancy_every=8,
 )
+# A still shorter run, of commands that train and code.
+TINY = TrainConfig(
+    tune_steps=0,
+    resolutions=(8, 16),
+    samples_across=32,
+    cells_across=12,
+    steps=24,
+    rays=256,
+    samples=8192,
+    warmup=5,
+    occupancy_start=8,
+    occupancy_every=4,
+)
 BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
 
 

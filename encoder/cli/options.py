@@ -1,7 +1,6 @@
 """Options of kpenc, and their command line."""
 
 import argparse
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -316,21 +315,11 @@ def _non_negative(text: str) -> int:
 
 
 def _quality(text: str) -> float:
-    return _number_within(text, 1, 100)
+    return cli.number_within(text, 1, 100)
 
 
 def _lam(text: str) -> float:
-    return _number_within(text, 1e-4, 1e6)
-
-
-def _number_within(text: str, low: float, high: float) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number from {low:g} to {high:g}")
-    return value
+    return cli.number_within(text, 1e-4, 1e6)
 
 
 def _seed(text: str) -> int:

@@ -3,7 +3,7 @@
 import argparse
 import contextlib
 import errno
-import importlib.metadata
+import functools
 import math
 import os
 import sys
@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from kpc.format.common.errors import KpcError, UsageError
+from kpc.format.common.version import VERSION
 
 
 def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None = None) -> int:
@@ -50,7 +51,7 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
 
 def add_version_option(parser: argparse.ArgumentParser) -> None:
     """Give a command's parser `--version`, which prints the version of KPC and exits."""
-    parser.add_argument("--version", action="version", version=f"%(prog)s {importlib.metadata.version('kpc')}")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
@@ -102,16 +103,18 @@ def duration_s(text: str) -> float:
 def frame_rate(low: float, high: float) -> Callable[[str], float]:
     """Return a parser of frame rates from `low` to `high` frames per second."""
 
-    def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a frame rate from {low:g} to {high:g}")
-        return value
+    return functools.partial(number_within, low=low, high=high, name="a frame rate")
 
-    return parse
+
+def number_within(text: str, low: float, high: float, name: str = "a number") -> float:
+    """Parse a number from `low` to `high`; the error calls it `name`."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {name} from {low:g} to {high:g}")
+    return value
 
 
 def decibels(text: str) -> float:

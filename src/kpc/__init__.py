@@ -7,10 +7,10 @@ picture = kpc.render(scene, scene.cameras[0], time=0.5).rgb     # (H, W, 3) floa
 """
 
 import os
-from importlib import metadata
 from typing import TYPE_CHECKING, BinaryIO
 
 from kpc.format.common.errors import KpcError
+from kpc.format.common.version import VERSION
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 
@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Camera", "KpcError", "Scene", "__version__", "load", "render"]
 
-try:
-    __version__ = metadata.version("kpc")
-except metadata.PackageNotFoundError:  # run from a source tree that is not installed
-    __version__ = "0+unknown"
+__version__ = VERSION
 
 
 def load(path: "str | os.PathLike[str] | bytes | BinaryIO", memory_budget: int = 2 << 30) -> "Scene | GroupedScene":

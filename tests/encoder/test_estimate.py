@@ -5,30 +5,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import datasets as make
 from kpc.encoder.cli import estimate as module
 from kpc.encoder.cli import kpenc
 from kpc.encoder.datasets import Dataset
-from kpc.encoder.field.config import PRESETS, TrainConfig
+from kpc.encoder.field.config import PRESETS
 from kpc.encoder.training.train import Trainer
+from training_runs import BOX, TINY
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-CONFIG = TrainConfig(
-    resolutions=(8, 16),
-    samples_across=32,
-    cells_across=12,
-    steps=400,
-    rays=256,
-    samples=8192,
-    warmup=5,
-    occupancy_start=8,
-    occupancy_every=4,
-    tune_steps=0,
-)
-BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
+CONFIG = replace(TINY, steps=400)
 
 
 def test_training_is_extrapolated_from_the_watched_steps(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:

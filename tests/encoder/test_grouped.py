@@ -18,7 +18,7 @@ from kpc.encoder.cli.grouped import LATER_STEPS, OVERLAP, initialise_from, optio
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.field.config import PRESETS, TrainConfig
+from kpc.encoder.field.config import PRESETS
 from kpc.encoder.field.field import Field, Layout
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.encoder.training.train import Trainer
@@ -29,6 +29,7 @@ from kpc.format.container.groups import Groups, Span, Timeline
 from kpc.format.scene.scene import Clip
 from kpc.tools.bench import group_joins
 from kpc.tools.cli import kpjoin
+from training_runs import TINY
 
 pytestmark = pytest.mark.usefixtures("one_thread", "few_rays", "tiny")
 FRAMES = 26
@@ -36,19 +37,7 @@ FRAMES = 26
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    config = TrainConfig(
-        tune_steps=0,
-        resolutions=(8, 16),
-        samples_across=32,
-        cells_across=12,
-        steps=24,
-        rays=256,
-        samples=8192,
-        warmup=5,
-        occupancy_start=8,
-        occupancy_every=4,
-    )
-    monkeypatch.setitem(PRESETS, "draft", config)
+    monkeypatch.setitem(PRESETS, "draft", TINY)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

@@ -26,20 +26,9 @@ from kpc.format.container import scene_io
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
 from scenes import VARIANTS, tiny_scene, with_appearances
+from training_runs import TINY
 
 pytestmark = pytest.mark.usefixtures("one_thread", "few_rays")
-TINY = TrainConfig(
-    tune_steps=0,
-    resolutions=(8, 16),
-    samples_across=32,
-    cells_across=12,
-    steps=24,
-    rays=256,
-    samples=8192,
-    warmup=5,
-    occupancy_start=8,
-    occupancy_every=4,
-)
 
 VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "valid"
 Kpenc = Callable[..., dict[str, Any]]
