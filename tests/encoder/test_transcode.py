@@ -301,7 +301,7 @@ def test_planes_of_one_texel_are_coded_again(axis: str) -> None:
     whole = quantise_scene(
         replace(scene, scales=(thin, scene.scales[1])), [dict.fromkeys(planes, 0.01) for planes in scene.scales]
     )
-    with pytest.raises(ValueError, match="one texel"):
+    with pytest.raises(ValueError, match="single texel"):
         SceneRenderer(whole.dequantise())
     source = codec_model.model_from_file(whole)
     camera = scene.cameras[0]
