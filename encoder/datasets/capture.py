@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.media import IMAGE_SUFFIXES, VideoInfo, image_size
+from kpc.format.common.media import VideoInfo, image_size
+from kpc.format.common.media_files import IMAGE_SUFFIXES
 
 # Where neither the dataset nor the user names test images, every eighth is one, as in LLFF (arXiv:1905.00889).
 HOLD_OUT_EVERY = 8

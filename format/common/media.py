@@ -28,9 +28,6 @@ from PIL import Image, UnidentifiedImageError
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import MediaError
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
-
 # Options of ffmpeg's scale filter for an exact colour conversion.
 _SCALE_FLAGS = "bicubic+accurate_rnd+full_chroma_int+full_chroma_inp"
 

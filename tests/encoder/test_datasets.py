@@ -405,3 +405,14 @@ def test_real_datasets(tmp_path: Path, name: str, words: str, pictures: int, tes
     dataset = load_dataset(DATA / name, tmp_path, downscale=8 if name == "fox" else 1, progress=False)
     assert words in dataset.describe()
     assert (len(dataset.pictures), int(dataset.pictures.is_test.sum())) == (pictures, tests)
+
+
+def test_files_that_systems_leave_are_no_pictures(tmp_path: Path) -> None:
+    """AppleDouble files have the suffix of the picture that they belong to, and are listed with it."""
+    make.write_llff(tmp_path / "llff")
+    for name in ("._view0.png", ".view1.png.Xa1b", "Thumbs.db", "desktop.ini", ".DS_Store"):
+        (tmp_path / "llff/images" / name).write_bytes(bytes.fromhex("0005160700020000") + b"Mac OS X" + bytes(50))
+    assert len(load(tmp_path / "llff").pictures) == 9
+    make.write_n3dv(tmp_path / "n3dv")
+    (tmp_path / "n3dv/._cam00.mp4").write_bytes(bytes(70))
+    assert load(tmp_path / "n3dv").pictures.is_test.sum() == 4

@@ -15,7 +15,8 @@ from PIL import Image, ImageDraw, ImageFont
 from kpc.format.common import cli
 from kpc.format.common.errors import MediaError, UsageError
 from kpc.format.common.fidelity import psnr
-from kpc.format.common.media import IMAGE_SUFFIXES, read_image, write_image
+from kpc.format.common.media import read_image, write_image
+from kpc.format.common.media_files import is_image
 from kpc.tools.cli.depth_images import NO_SURFACE, read_depth_levels
 
 # Space between pictures, and height of a caption, in pixels.
@@ -47,7 +48,7 @@ def pairs(truth: Path, rendered: Path) -> list[Pair]:
     Raises:
         MediaError: there is no pair, a picture is damaged, or the sizes of a pair differ.
     """
-    true_files = {p.stem: p for p in sorted(truth.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES}
+    true_files = {p.stem: p for p in sorted(truth.iterdir()) if is_image(p)}
     found = []
     for file in sorted(rendered.glob("*.png")):
         if file.stem not in true_files:

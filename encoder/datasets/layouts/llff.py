@@ -20,7 +20,8 @@ from kpc.encoder.datasets.capture import (
     natural_key,
 )
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.media import IMAGE_SUFFIXES, VIDEO_SUFFIXES, image_size, video_info
+from kpc.format.common.media import image_size, video_info
+from kpc.format.common.media_files import is_image, is_video
 
 POSES = "poses_bounds.npy"  # the file of poses and depth ranges
 
@@ -39,25 +40,25 @@ def read(path: Path, holdout: str | None) -> Capture:
         DatasetError: there are not as many poses as files, or a pose, focal length or depth range is invalid.
         MediaError: a file cannot be read.
     """
-    videos = [f for f in path.iterdir() if f.suffix.lower() in VIDEO_SUFFIXES]
+    videos = [f for f in path.iterdir() if is_video(f)]
     files = [f for f in videos if f.name.lower().startswith("cam")] or videos
-    is_video = bool(files)
+    has_videos = bool(files)
     if not files and (path / "images").is_dir():
-        files = [f for f in (path / "images").iterdir() if f.suffix.lower() in IMAGE_SUFFIXES]
+        files = [f for f in (path / "images").iterdir() if is_image(f)]
     if not files:
         raise DatasetError(f"{path}: has {POSES}, but neither cam*.mp4 nor images/; copy the videos or images there")
     files.sort(key=lambda file: natural_key(file.name))
     rows = _read_poses(path / POSES)
-    kind = "videos" if is_video else "images"
+    kind = "videos" if has_videos else "images"
     if len(rows) != len(files):
         raise DatasetError(
             f"{path / POSES}: {len(rows)} poses for {len(files)} {kind}; remove those that do not belong together"
         )
-    default = [k == 0 if is_video else k % HOLD_OUT_EVERY == 0 for k in range(len(files))]
+    default = [k == 0 if has_videos else k % HOLD_OUT_EVERY == 0 for k in range(len(files))]
     tests = holdout_flags(path, [str(f.relative_to(path)) for f in files], holdout, default)
     views = tuple(_view(path, number, *item) for number, item in enumerate(zip(files, rows, tests, strict=True)))
     fps = views[0].video.fps if views[0].video else None
-    return Capture("N3DV" if is_video else "LLFF", views, fps)
+    return Capture("N3DV" if has_videos else "LLFF", views, fps)
 
 
 def _view(path: Path, number: int, file: Path, row: np.ndarray, is_test: bool) -> CapturedView:
@@ -67,7 +68,7 @@ def _view(path: Path, number: int, file: Path, row: np.ndarray, is_test: bool) -
     pose = check_pose(where, np.stack([right, -down, backwards, centre], axis=1))
     if not 0 < near < far < np.inf:
         raise DatasetError(f"{where}: near {near:g} and far {far:g} are not 0 < near < far; calibrate anew")
-    video = video_info(file) if file.suffix.lower() in VIDEO_SUFFIXES else None
+    video = video_info(file) if is_video(file) else None
     width, height, has_alpha = (video.width, video.height, False) if video else image_size(file)
     intrinsics = fit_intrinsics(where, file, (focal, focal, w / 2, h / 2), (w, h), (width, height))
     return CapturedView(file, video, None, is_test, width, height, has_alpha, intrinsics, (0.0,) * 4, pose, near, far)
