@@ -88,6 +88,20 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
+def output_file(*suffixes: str) -> Callable[[str], Path]:
+    """Return a parser of names of files to write that end in one of these suffixes, in capital letters or not.
+
+    Writers choose the kind of a file by its suffix, so any other name would promise what is not written.
+    """
+
+    def parse(text: str) -> Path:
+        if text.endswith(tuple(filter(None, (os.sep, os.altsep)))) or Path(text).suffix.lower() not in suffixes:
+            raise argparse.ArgumentTypeError(f"{text!r} does not end in {' or '.join(suffixes)}")
+        return Path(text)
+
+    return parse
+
+
 def duration_s(text: str) -> float:
     """Parse a duration such as "90", "90s", "10m" or "1.5h" into seconds."""
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:], None)

@@ -15,6 +15,7 @@ import numpy as np
 
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError
+from kpc.format.scene.camera_documents import rewritten
 
 # The largest `cameras.json` that is read, in bytes: enough for more than a hundred thousand frames.
 MAX_FILE_BYTES = 1 << 26
@@ -99,7 +100,7 @@ def load_views(path: str | os.PathLike[str]) -> list[View]:
 
     The document has the intrinsics `w h fl_x fl_y cx cy` and a list `frames`. Each frame has a `transform_matrix` and
     may have `time`, `file`, `at` (keyframes of a camera path, seconds) and intrinsics that replace those of the
-    document.
+    document. Files of nerfstudio are read, too; see `kpc.format.scene.camera_documents`.
 
     Raises:
         DatasetError: the file is too large or not JSON, or a key is missing or malformed; the message names the frame.
@@ -116,6 +117,7 @@ def load_views(path: str | os.PathLike[str]) -> list[View]:
         raise DatasetError(f"{path}: not JSON ({error}); write it anew") from error
     views: list[View] = []
     try:
+        document = rewritten(document)
         for number, frame in enumerate(document["frames"]):
             views.append(_parse_view({**document, **frame}, number))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:

@@ -47,8 +47,6 @@ def _command(argv: list[str]) -> None:
     options = _parser().parse_args(argv)
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames} is not positive")
-    if options.screenshot is not None and Path(options.screenshot).suffix.lower() != ".png":
-        raise UsageError(f"--screenshot {options.screenshot} is not a .png file")
     if not Path(options.folder).is_dir():
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), options.folder)
     path = None if options.path is None else CameraPath.load(options.path)
@@ -109,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--frames", type=int, metavar="N", help="exit after N frames; settings are neither read nor saved"
     )
-    parser.add_argument("--screenshot", metavar="PNG", help="save the window at the end")
+    parser.add_argument("--screenshot", type=cli.output_file(".png"), metavar="PNG", help="save the window at the end")
     return parser
 
 
@@ -145,7 +143,7 @@ def _play(
             try:
                 player.run(options.frames)
                 if options.screenshot is not None and player.successor is None:
-                    player.screenshot(Path(options.screenshot))
+                    player.screenshot(options.screenshot)
             except ContextLostError:
                 resets, interrupted = resets + 1, player
                 if resets > MAX_RESETS:

@@ -27,7 +27,9 @@ def test_truth_rendered_and_depth_stand_side_by_side(tmp_path: Path, capsys: pyt
         Image.fromarray(depth).save(rendered / f"{name}_depth.png")
     out = tmp_path / "sheet.png"
     assert contactsheet.main([str(truth), str(rendered), "-o", str(out), "--rows", "2"]) == 0
-    assert capsys.readouterr().out == f"{out}: mean PSNR 28.13 dB over 3 pictures\n"  # 20 log10(255 / 10)
+    printed = capsys.readouterr()
+    assert printed.out == f"{out}: mean PSNR 28.13 dB over 3 pictures\n"  # 20 log10(255 / 10)
+    assert printed.err == f"contactsheet: {rendered / 'z.png'} and 1 others: no partner of that name, left out\n"
     page, gap, step = read_image(out), contactsheet.GAP, 40 + contactsheet.CAPTION
     assert page.shape == (2 * step + gap, gap + 3 * (60 + gap), 3)
     for row in (gap, gap + step):
@@ -37,12 +39,28 @@ def test_truth_rendered_and_depth_stand_side_by_side(tmp_path: Path, capsys: pyt
         assert (grey[0] == 0).all() and (np.diff(grey[1:].ravel()) <= 0).all() and grey[1, 0] > 4 * grey[-1, -1] > 0
 
 
+def ambiguous(folder: Path) -> Path:
+    fill(folder, ["a"], 0)
+    write_image(folder / "a.jpg", np.zeros((40, 60, 3), np.uint8))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["sheet", "sheet.webp", "sheet.gif", "sheet.mp4", "sheet.png/"])
+def test_a_sheet_is_a_png_or_jpeg(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    folder = fill(tmp_path / "gt", ["a"], 0)
+    with pytest.raises(SystemExit) as error:
+        contactsheet.main([str(folder), str(folder), "-o", f"{tmp_path}/{name}"])
+    assert error.value.code == 2 and "does not end in .png or .jpg" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["gt"]
+
+
 @pytest.mark.parametrize(
     "make",
     [
         lambda root: fill(root / "out", ["other"], 0),
         lambda root: fill(root / "out", ["a"], 0, (20, 30)),
         lambda root: root / "out",
+        lambda root: ambiguous(root / "out"),
     ],
 )
 def test_folders_that_do_not_match_are_one_line(make, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

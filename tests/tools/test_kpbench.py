@@ -281,6 +281,13 @@ def test_invalid_minutes_are_refused(minutes: str, capsys: pytest.CaptureFixture
     assert "--minutes" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["x", "x.csv", "x.svg", "x.json/"])
+def test_records_are_json(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as error:
+        kpbench.main(["player", "x.kpc", "--out", name])
+    assert error.value.code == 2 and f"{name!r} does not end in .json" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "command",
     [
@@ -288,7 +295,7 @@ def test_invalid_minutes_are_refused(minutes: str, capsys: pytest.CaptureFixture
         ["curve", "missing"],
         ["ablate", "missing"],
         ["player", "missing.kpc"],
-        ["player", "x.kpc", "--out", "no/x"],
+        ["player", "x.kpc", "--out", "no/x.json"],
         ["player", GROUPS],
     ],
 )

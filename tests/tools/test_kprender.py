@@ -97,6 +97,84 @@ def test_names_from_a_camera_file_stay_in_the_directory(run, scene_file: Path, t
     assert {"out/escape.png", "out/passwd.png", "out/win.png", "out/x.png"} <= found
 
 
+def test_a_name_with_a_slash_or_without_suffix_is_a_folder(run, scene_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "take.3").mkdir()
+    for number, name in enumerate(("plain", "slash.png/", "film.mp4/", "take.3")):
+        words = ["--orbit", 2, "--size", "8x6", "--backend", "reference", *["--format", "jpg"] * (number % 2)]
+        assert run(scene_file, *words, "-o", f"{tmp_path}/{name}")[0] == 0
+        suffix = ("png", "jpg")[number % 2]
+        assert sorted(p.name for p in (tmp_path / name).iterdir()) == [f"0000.{suffix}", f"0001.{suffix}"]
+
+
+@pytest.mark.parametrize(
+    ("name", "beginning"), [("x.JPG", b"\xff\xd8"), ("x.jpeg", b"\xff\xd8"), ("x.mkv", b"\x1a\x45\xdf\xa3")]
+)
+def test_files_are_what_their_names_say(run, scene_file: Path, tmp_path: Path, name: str, beginning: bytes) -> None:
+    words = ["--time", 0.4, "--size", "16x12", "--backend", "reference"]
+    assert run(scene_file, *words, "-o", tmp_path / name)[0] == 0
+    assert (tmp_path / name).read_bytes().startswith(beginning)
+
+
+def test_names_and_poses_of_nerfstudio(run, scene_file: Path, tmp_path: Path) -> None:
+    """Frames keep the names of `file_path`, also one without a suffix; equal names are reported."""
+    listed = cameras_json(tmp_path / "transforms.json", ["images/0007.png", "./train/r_0.5", "b/0007.png"])
+    document = json.loads(listed.read_text())
+    for frame in document["frames"]:
+        frame["file_path"] = frame.pop("file")
+        del frame["time"]
+    listed.write_text(json.dumps(document))
+    words = ["--cameras", listed, "--size", "8x6", "--backend", "reference", "-o", tmp_path / "out"]
+    code, _, notes = run(scene_file, *words)
+    assert code == 0 and "1 pictures get other names" in notes and "beginning of the clip" in notes
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["0007.png", "0007_0002.png", "r_0.5.png"]
+
+
+@pytest.mark.parametrize(("fps", "at_s"), [(12, (0.0, 1.0, 2.0)), (1.5, (0.0, 2 / 3, 4 / 3))])
+def test_the_camera_path_of_nerfstudio(run, scene_file: Path, tmp_path: Path, fps: float, at_s: tuple[float]) -> None:
+    """Three poses are keyframes over `seconds`, or the frames of a film if `fps` says so."""
+    cameras = [*tiny_scene(4).cameras, tiny_scene(4).cameras[0]]
+    fov = float(np.degrees(2 * np.arctan(18 / 55)))
+    poses = [{"camera_to_world": c.camera_to_world.ravel().tolist(), "fov": fov, "aspect": 4 / 3} for c in cameras]
+    shared = {"camera_type": "perspective", "render_height": 36, "render_width": 48, "fps": fps, "seconds": 2.0}
+    file = tmp_path / "camera_path.json"
+    file.write_text(json.dumps({**shared, "camera_path": poses}))
+    views = load_views(file)
+    assert [view.at_s for view in views] == pytest.approx(at_s)
+    assert [view.time for view in views] == [0.0, 0.5, 1.0]
+    for view, camera in zip(views, cameras, strict=True):
+        np.testing.assert_array_equal(view.camera.camera_to_world, camera.camera_to_world)
+        intrinsics = [view.camera.fl_x, view.camera.fl_y, view.camera.cx, view.camera.cy]
+        assert intrinsics == pytest.approx([55, 55, 24, 18])
+    words = ["--size", "8x6", "--backend", "reference", "--fps", 3]
+    code, printed, _ = run(scene_file, "--path", file, *words, "-o", tmp_path / "path.mp4")
+    assert code == 0 and f"{round(3 * at_s[-1]) + 1} frames" in printed
+    code, printed, _ = run(scene_file, "--cameras", file, *words, "-o", tmp_path / "views")
+    assert code == 0 and len(list((tmp_path / "views").iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"camera_type": "fisheye"}, "no pinhole"),
+        ({"camera_type": "equirectangular"}, "no pinhole"),
+        ({"render_width": None}, "malformed"),
+        ({"camera_path": [{"camera_to_world": [1, 0, 0], "fov": 50}]}, "pose has shape"),
+        ({"camera_path": [{"camera_to_world": np.eye(4).tolist(), "fov": 180}]}, "outside (0, 180)"),
+        ({"camera_path": [{"camera_to_world": np.eye(4).tolist()}]}, "'fov'"),
+        ({"camera_path": []}, "no frames"),
+        ({"camera_path": {}}, "no frames"),
+    ],
+)
+def test_camera_paths_that_are_none(run, scene_file: Path, tmp_path: Path, change: dict, words: str) -> None:
+    shared = {"render_height": 36, "render_width": 48, "seconds": 2.0}
+    poses = [{"camera_to_world": np.eye(4).tolist(), "fov": 50}]
+    file = tmp_path / "camera_path.json"
+    file.write_text(json.dumps({**shared, "camera_path": poses, **change}))
+    for option in ("--cameras", "--path"):
+        code, _, complaint = run(scene_file, option, file, "--backend", "reference", "-o", tmp_path / "out")
+        assert code == 1 and words in complaint and complaint.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
 def test_exr_holds_linear_colour_and_depth(run, scene_file: Path, tmp_path: Path) -> None:
     code, _, _ = run(scene_file, "--time", 0.4, "--backend", "reference", "-o", tmp_path / "x.exr")
     assert code == 0
@@ -310,6 +388,12 @@ def test_unknown_appearances_are_refused(
         (["{scene}", "--fps", "-1", "-o", "{dir}"], 2, "--fps"),
         (["{scene}", "--orbit", "2", "--cameras", "x", "-o", "{dir}"], 2, "not allowed"),
         (["{scene}"], 2, "--output"),
+        *(
+            (["{scene}", "--time", "0", "-o", f"{{dir}}/x{suffix}"], 2, f"{suffix} is not written")
+            for suffix in (".gif", ".webp", ".tiff", ".avi", ".MXF", ".v2")
+        ),
+        (["{scene}", "--time", "0", "--format", "exr", "-o", "{dir}/x.png"], 2, "contradicts .png"),
+        (["{scene}", "--time", "0", "--format", "png", "-o", "{dir}/x.mp4"], 2, "contradicts .mp4"),
     ],
 )
 def test_bad_input_is_one_line(

@@ -70,7 +70,9 @@ def _parser() -> argparse.ArgumentParser:
     for module in (encoding_commands, playing_commands, coding_commands):
         module.add_parsers(kinds)
     for kind in kinds.choices.values():
-        kind.add_argument("--out", type=Path, metavar="FILE", help="write the records here instead of to stdout")
+        kind.add_argument(
+            "--out", type=cli.output_file(".json"), metavar="JSON", help="write the records here instead of to stdout"
+        )
     return parser
 
 

@@ -23,6 +23,9 @@ from kpc.tools.cli.depth_images import NO_SURFACE, read_depth_levels
 GAP = 6
 CAPTION = 22
 
+# Suffixes of the sheet.
+SHEET_SUFFIXES = (".png", ".jpg", ".jpeg")
+
 # Colours of the page and of the captions.
 PAPER, INK = (250, 250, 248), (40, 40, 40)
 
@@ -42,24 +45,42 @@ class Pair:
         return psnr(self.truth / 255, self.rendered / 255)
 
 
-def pairs(truth: Path, rendered: Path) -> list[Pair]:
-    """Pair the pictures of two folders by name, regardless of their suffixes.
+def pairs(truth: Path, rendered: Path) -> tuple[list[Pair], list[Path]]:
+    """Pair the pictures of two folders by name, regardless of their suffixes. Nothing is paired by order.
+
+    Returns:
+        The pairs, and the pictures that have no partner.
 
     Raises:
-        MediaError: there is no pair, a picture is damaged, or the sizes of a pair differ.
+        MediaError: there is no pair, two pictures of a folder differ in their suffixes alone, a picture is damaged, or
+            the sizes of a pair differ.
     """
-    true_files = {p.stem: p for p in sorted(truth.iterdir()) if is_image(p)}
+    true_files, files = _by_stem(truth), _by_stem(rendered)
+    depths = {f"{stem}_depth" for stem in files}
+    files = {stem: file for stem, file in files.items() if stem not in depths}
     found = []
-    for file in sorted(rendered.glob("*.png")):
-        if file.stem not in true_files:
+    for stem, file in files.items():
+        if stem not in true_files:
             continue
-        wanted, given = _on_white(read_image(true_files[file.stem])), _on_white(read_image(file))
+        wanted, given = _on_white(read_image(true_files[stem])), _on_white(read_image(file))
         if wanted.shape != given.shape:
-            sizes = f"is {_size(given)}, {true_files[file.stem]} is {_size(wanted)}"
+            sizes = f"is {_size(given)}, {true_files[stem]} is {_size(wanted)}"
             raise MediaError(f"{file}: {sizes}; render without --size")
-        found.append(Pair(file.stem, wanted, given, _depth_levels(file)))
+        found.append(Pair(stem, wanted, given, _depth_levels(file)))
     if not found:
         raise MediaError(f"{rendered}: no picture has the name of one in {truth}; render with --cameras of {truth}")
+    alone = [file for stem, file in files.items() if stem not in true_files]
+    return found, alone + [file for stem, file in true_files.items() if stem not in files]
+
+
+def _by_stem(folder: Path) -> dict[str, Path]:
+    """Return the pictures of a folder by their names without suffix."""
+    found: dict[str, Path] = {}
+    for file in sorted(folder.iterdir()):
+        if not is_image(file):
+            continue
+        if (other := found.setdefault(file.stem, file)) != file:
+            raise MediaError(f"{file}: {other.name} has the same name; which one is meant? Move one elsewhere")
     return found
 
 
@@ -127,7 +148,14 @@ def _command(argv: list[str]) -> None:
     cli.add_version_option(parser)
     parser.add_argument("truth", type=Path, help="folder of true pictures")
     parser.add_argument("rendered", type=Path, help="folder that kprender --cameras wrote, with or without --depth")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="PNG", help="the picture to write")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=cli.output_file(*SHEET_SUFFIXES),
+        required=True,
+        metavar="PNG",
+        help="the .png or .jpg to write",
+    )
     parser.add_argument(
         "--rows", type=int, default=4, help="number of rows at most, evenly spaced over all pairs (default: 4)"
     )
@@ -137,7 +165,10 @@ def _command(argv: list[str]) -> None:
             raise UsageError(f"{folder}: no such folder")
     if options.rows < 1:
         raise UsageError(f"--rows {options.rows} is not positive")
-    found = pairs(options.truth, options.rendered)
+    found, alone = pairs(options.truth, options.rendered)
+    if alone:
+        others = f" and {len(alone) - 1} others" if len(alone) > 1 else ""
+        print(f"contactsheet: {alone[0]}{others}: no partner of that name, left out", file=sys.stderr)
     quality = {pair.name: pair.psnr for pair in found}
     chosen = sorted({round(k) for k in np.linspace(0, len(found) - 1, min(options.rows, len(found)))})
     write_image(options.output, sheet([found[k] for k in chosen], quality))

@@ -28,7 +28,9 @@ def _command(argv: list[str]) -> None:
     )
     cli.add_version_option(parser)
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE", help=".kpc files")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the .kpc file to write")
+    parser.add_argument(
+        "-o", "--output", type=cli.output_file(".kpc"), required=True, metavar="FILE", help="the .kpc file to write"
+    )
     options = parser.parse_args(argv)
     if len(options.scenes) < 2:
         raise UsageError(f"{options.scenes[0]}: a single file cannot be joined; give two or more")

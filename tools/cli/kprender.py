@@ -18,7 +18,7 @@ import os
 import re
 import sys
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,11 +41,9 @@ from kpc.player.cpu.reference import Part, Rendering
 from kpc.player.quality import LEVELS
 from kpc.player.viewpoints import Rig, fit_camera, orbit
 from kpc.tools.cli.depth_images import NO_SURFACE, write_depth
+from kpc.tools.rendering.outputs import FILM_SUFFIXES, PICTURE_FORMATS, PICTURE_SUFFIXES, Output
 
 Render = Callable[[Camera, float], Rendering]
-
-# Suffixes of --output that name a file; anything else is a directory.
-FILE_SUFFIXES = (".mp4", ".png", ".exr")
 
 # Limits of --fps, of a side of a picture, and of the number of pictures.
 MIN_FPS, MAX_FPS = 0.001, 240.0
@@ -64,21 +62,20 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     options = _parser().parse_args(argv)
-    out = Path(options.output)
-    if out.suffix.lower() in FILE_SUFFIXES and not out.absolute().parent.is_dir():
+    output = Output.of(options.output, options.format)
+    out = output.path
+    if not output.is_folder and not out.absolute().parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(out.absolute().parent))
     loaded = kpc.load(options.scene)
     scene, _ = loaded.at(0.0)  # the first group of a long clip has the cameras and bounds of all
-    views = _views(scene, loaded.clip, options)
-    if out.suffix.lower() in (".png", ".exr") and len(views) != 1:
-        raise UsageError(
-            f"-o {out}: {len(views)} pictures do not go into one file; give a directory, an .mp4 or --time"
-        )
+    views = _views(scene, loaded.clip, options, output)
+    if not output.is_film and not output.is_folder and len(views) != 1:
+        raise UsageError(f"-o {out}: {len(views)} pictures do not go into one file; give a folder, an .mp4 or --time")
     render, renderer = _backend(loaded, options)
-    print(f"kprender: {renderer}", file=sys.stderr)
+    _say(renderer)
 
     started = clock.monotonic()
-    if out.suffix.lower() == ".mp4":
+    if output.is_film:
         pixels = _depth_pixels(scene, views) if options.depth else _colour_pixels
         fps = _fps(loaded.clip, options)
         renderings = (render(view.camera, view.time) for view in progress(views, out.name, unit="frame"))
@@ -86,12 +83,20 @@ def _command(argv: list[str]) -> None:
         what = f"{out}: {len(views)} frames at {fps:g} fps"
     else:
         depth_unit = _max_depth(scene, views) / (NO_SURFACE - 1) if options.depth else None
-        paths = _paths(out, views, options.format)
+        paths, renamed = output.picture_paths(views)
+        if renamed:
+            _say(f"{options.cameras}: {renamed} pictures get other names, for theirs are taken or no plain file names")
+        if output.is_folder:
+            out.mkdir(parents=True, exist_ok=True)
         for view, path in zip(progress(views, "render", unit="picture"), paths, strict=True):
             _write(path, render(view.camera, view.time), depth_unit)
         what = f"{out}: {len(views)} picture{'s' * (len(views) != 1)}"
     elapsed = clock.monotonic() - started
     print(f"{what}, {views[0].camera.width}x{views[0].camera.height}, in {elapsed:.1f} s")
+
+
+def _say(text: str) -> None:
+    print(f"kprender: {text}", file=sys.stderr)
 
 
 # --- options
@@ -110,13 +115,14 @@ def _parser() -> argparse.ArgumentParser:
         "--output",
         required=True,
         metavar="DIR|FILE",
-        help="a directory for pictures, or an .mp4; for a single picture also a .png or .exr",
+        help="a folder for pictures (a name without suffix, or with / at its end), "
+        f"a film ({' '.join(FILM_SUFFIXES)}), or a single picture ({' '.join(PICTURE_SUFFIXES)})",
     )
     parser.add_argument(
         "--format",
-        choices=("png", "exr"),
-        default="png",
-        help="format of pictures in a directory: 8-bit PNG, or EXR with linear colour and depth (default: %(default)s)",
+        choices=PICTURE_FORMATS,
+        help="format of pictures in a folder: 8-bit PNG or JPEG, or EXR with linear colour and depth (default: "
+        f"{PICTURE_FORMATS[0]})",
     )
     parser.add_argument(
         "--fps",
@@ -258,10 +264,12 @@ def _fps(clip: Clip, options: argparse.Namespace) -> float:
 # --- views
 
 
-def _views(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[View]:
+def _views(scene: Scene, clip: Clip, options: argparse.Namespace, output: Output) -> list[View]:
     """Return the views to render: a camera, a time and a name each."""
     if options.cameras is not None:
         views = load_views(options.cameras)
+        if options.time is None and clip.frame_count > 1 and not any(view.time for view in views):
+            _say(f"{options.cameras}: all views are at the beginning of the clip; --time chooses another time")
     elif options.path is not None:
         views = _path_views(clip, options)
     else:
@@ -277,7 +285,7 @@ def _views(scene: Scene, clip: Clip, options: argparse.Namespace) -> list[View]:
         views = [replace(view, time=options.time) for view in views]
     if options.size is not None:
         views = [replace(view, camera=fit_camera(view.camera, *options.size)) for view in views]
-    elif options.cameras is not None and Path(options.output).suffix.lower() == ".mp4":
+    elif options.cameras is not None and output.is_film:
         size = views[0].camera.width, views[0].camera.height
         views = [replace(view, camera=fit_camera(view.camera, *size)) for view in views]
     return views
@@ -342,24 +350,6 @@ def _displayed(scene: Scene, camera: Camera, time: float, picture: Rendering, op
 
 
 # --- files
-
-
-def _paths(out: Path, views: list[View], suffix: str) -> Iterator[Path]:
-    """Yield the path of each picture.
-
-    Camera files may come from anywhere: only the last part of their names is used, and none twice.
-    """
-    if out.suffix.lower() in (".png", ".exr"):
-        yield out
-        return
-    out.mkdir(parents=True, exist_ok=True)
-    used: set[str] = set()
-    for number, view in enumerate(views):
-        stem = re.sub(r"[^\w.+-]", "_", re.split(r"[/\\]", view.file)[-1].rsplit(".", 1)[0])[:120].lstrip(".")
-        if not stem or stem in used:
-            stem = f"{number:04d}" if not stem else f"{stem}_{number:04d}"
-        used.add(stem)
-        yield out / f"{stem}.{suffix}"
 
 
 def _write(path: Path, rendering: Rendering, depth_unit: float | None) -> None:

@@ -1,0 +1,84 @@
+"""What the name of kprender's output stands for: a film, a picture, or a folder of pictures."""
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from kpc.format.common.errors import UsageError
+from kpc.format.scene.cameras import View
+
+FILM_SUFFIXES = (".mp4", ".mkv")
+PICTURE_FORMATS = ("png", "jpg", "exr")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
+
+# Suffixes of pictures and films, which are no part of a view's name.
+MEDIA_SUFFIX = re.compile(
+    r"\.(png|jpe?g|exr|webp|tiff?|bmp|gif|avif|heic|hdr|dpx|tga|mp4|m4v|mov|mkv|webm|avi|mxf|ts|y4m)", re.IGNORECASE
+)
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where pictures go.
+
+    Attributes:
+        path: of the file or folder.
+        suffix: of the film or of every picture, in small letters, with its dot.
+        is_film, is_folder: what it is; a single picture is neither.
+    """
+
+    path: Path
+    suffix: str
+    is_film: bool = False
+    is_folder: bool = False
+
+    @staticmethod
+    def of(text: str, picture_format: str | None) -> "Output":
+        """Return the output that a name and --format ask for.
+
+        A name without suffix, with a slash at its end, or of a folder that exists is a folder.
+
+        Args:
+            text: the name.
+            picture_format: one of PICTURE_FORMATS; None if it was not asked for.
+
+        Raises:
+            UsageError: nothing of that kind can be written, or name and format contradict each other.
+        """
+        path, suffix = Path(text), Path(text).suffix.lower()
+        has_slash = text.endswith(tuple(filter(None, (os.sep, os.altsep))))
+        if not suffix or has_slash or (path.is_dir() and not MEDIA_SUFFIX.fullmatch(suffix)):
+            return Output(path, f".{picture_format or PICTURE_FORMATS[0]}", is_folder=True)
+        if suffix not in FILM_SUFFIXES + PICTURE_SUFFIXES:
+            raise UsageError(
+                f"-o {text}: {path.suffix} is not written; give a film ({', '.join(FILM_SUFFIXES)}), a picture "
+                f"({', '.join(PICTURE_SUFFIXES)}), or a folder: a name without suffix or with / at its end"
+            )
+        if picture_format is not None and suffix.replace("jpeg", "jpg") != f".{picture_format}":
+            raise UsageError(
+                f"-o {text}: --format {picture_format} contradicts {suffix}; leave --format out, or give a folder or a "
+                f".{picture_format}"
+            )
+        return Output(path, suffix, is_film=suffix in FILM_SUFFIXES)
+
+    def picture_paths(self, views: Sequence[View]) -> tuple[list[Path], int]:
+        """Return the path of each view's picture, and how many could not keep their names.
+
+        Camera files may come from anywhere: only the last part of their names is used, and none twice.
+        """
+        if not self.is_folder:
+            return [self.path], 0
+        paths, used, renamed = [], set[str](), 0
+        for number, view in enumerate(views):
+            name = re.split(r"[/\\]", view.file)[-1]
+            ending = re.search(r"\.[^.]*$", name)
+            bare = name[: ending.start()] if ending and MEDIA_SUFFIX.fullmatch(ending[0]) else name
+            stem = re.sub(r"[^\w.+-]", "_", bare)[:120].lstrip(".")
+            if not stem or stem in used:
+                stem = f"{number:04d}" if not stem else f"{stem}_{number:04d}"
+            used.add(stem)
+            renamed += stem != bare
+            paths.append(self.path / f"{stem}{self.suffix}")
+        return paths, renamed
