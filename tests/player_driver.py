@@ -12,7 +12,7 @@ from kpc.player.app.player import Player
 PATIENCE_S = 20.0
 
 
-def press(player: Player, *keys: int) -> None:
+def press(player: Player, *keys: int | str) -> None:
     for key in keys:
         player.press(key)
 

@@ -53,7 +53,7 @@ def groups_of_a_clip(window: Window, scene_file: str) -> None:
     player = Player(window, stream, Preferences())
     press(player, glfw.KEY_SPACE)
     player.state.appearance.select(2)
-    press(player, glfw.KEY_MINUS)
+    press(player, "-")
     level, times = player.snapshot().level, []
     for key, number in ((glfw.KEY_END, 1), (glfw.KEY_LEFT, 1), (glfw.KEY_HOME, 0)):
         player.press(key)
@@ -135,7 +135,7 @@ def settings_are_saved(scene_file: str) -> None:
     def run(player: Player, frames: int | None = None) -> None:
         player.frame()
         settings.append(player.preferences())
-        press(player, glfw.KEY_MINUS, glfw.KEY_G)
+        press(player, "-", "g")
 
     with replaced(Player, run=run):
         assert kpplay.main([scene_file, "--size", "300x200"]) == 0

@@ -46,7 +46,7 @@ def main(scene_file: str) -> None:
     keys_of_what_is_shown(player)
     keys_and_drags_of_the_camera(player)
     keys_of_quality_and_panels(player)
-    player.press(glfw.KEY_J)
+    player.press("j")
     assert player.snapshot().notice_is_error and not player.snapshot().follows_path  # there is no path yet
     camera_path(player)
     videos(player)
@@ -83,30 +83,30 @@ def keys_of_the_clip(player: Player) -> None:
     assert player.snapshot().time == approx(0.1)
     press(player, glfw.KEY_END)
     assert player.snapshot().time == 1.0
-    press(player, glfw.KEY_RIGHT_BRACKET, glfw.KEY_L)
+    press(player, "]", "l")
     assert player.snapshot().speed == 2.0 and not player.snapshot().loop
 
 
 def keys_of_what_is_shown(player: Player) -> None:
-    modes = {glfw.KEY_2: "depth", glfw.KEY_3: "samples", glfw.KEY_4: "occupancy", glfw.KEY_1: "colour"}
+    modes = {"2": "depth", "3": "samples", "4": "occupancy", "1": "colour"}
     for key, mode in modes.items():
         press(player, key)
         assert player.snapshot().display_mode == mode
     for part in ("static", "dynamic", "full"):
-        press(player, glfw.KEY_C)
+        press(player, "c")
         assert player.snapshot().part == part
     for folds in (False, True):
-        press(player, glfw.KEY_F)
+        press(player, "f")
         player.scene_view.draw("fine")
         assert player.snapshot().folds is folds
 
     average, appearance = exact_picture(player), player.state.appearance
     for name in ("dawn.jpg", "noon.jpg", "dusk.jpg"):
-        press(player, glfw.KEY_V)
+        press(player, "v")
         assert player.snapshot().appearance == name
     appearance.advance(1.0)
     assert np.abs(exact_picture(player) - average).max() > 10
-    press(player, glfw.KEY_V)
+    press(player, "v")
     appearance.advance(1.0)
     assert np.abs(exact_picture(player) - average).max() <= 1  # a value between two levels may be rounded to either
 
@@ -122,23 +122,23 @@ def keys_and_drags_of_the_camera(player: Player) -> None:
     player.window.scroll(0, 2)
     player.frame()
     assert player.snapshot().view.distance == approx(0.81 * before.distance)
-    press(player, glfw.KEY_N)
+    press(player, "n")
     assert player.snapshot().camera_number == 1
-    press(player, glfw.KEY_R)
+    press(player, "r")
     assert player.snapshot().view.eye == approx(before.eye)
-    press(player, glfw.KEY_B)
+    press(player, "b")
     assert player.snapshot().preset_number == 0 and player.snapshot().view.eye != approx(before.eye)
 
 
 def keys_of_quality_and_panels(player: Player) -> None:
     level = player.snapshot().level
-    press(player, glfw.KEY_MINUS)
+    press(player, "-")
     assert player.snapshot().level == neighbouring_level(level, -1) and level == DEFAULT
-    press(player, glfw.KEY_EQUAL)
+    press(player, "=")
     assert player.snapshot().level == level
-    press(player, glfw.KEY_U)
+    press(player, "u")
     assert player.snapshot().target_s == approx(1 / FILM_FPS)
-    press(player, glfw.KEY_U, glfw.KEY_T, glfw.KEY_G)
+    press(player, "u", "t", "g")
     assert player.snapshot().target_s is None and player.snapshot().panels == {"controls", "planes", "graphs"}
     player.state.quality.choose(level)  # the level that U chose depends on the machine
     text_size = player.state.text_size
@@ -150,16 +150,16 @@ def camera_path(player: Player) -> None:
     """Add two keyframes, follow the path between them, and save it."""
     state = player.state
     state.playback.seek(0.2)
-    press(player, glfw.KEY_R, glfw.KEY_K)
+    press(player, "r", "k")
     first = player.snapshot().view.eye
     state.playback.seek(0.6)
-    press(player, glfw.KEY_N, glfw.KEY_K, glfw.KEY_K, glfw.KEY_BACKSPACE)
+    press(player, "n", "k", "k", glfw.KEY_BACKSPACE)
     second, path = player.snapshot().view.eye, state.follower.path
     assert [keyframe.time for keyframe in path.keyframes] == approx([0.2, 0.6])
     assert path.end_s == 2.0 and "path" in player.snapshot().panels
     state.follower.path = path.spaced(1, 0.2)
 
-    player.press(glfw.KEY_J, seconds=0.0)
+    player.press("j", seconds=0.0)
     assert player.snapshot().follows_path
     player.frame(seconds=0.06)
     between = player.snapshot()
@@ -179,13 +179,13 @@ def videos(player: Player) -> None:
     """Record the camera path, the window, and a window whose size changes."""
     second = player.snapshot().view.eye
     for modifiers in (glfw.MOD_SHIFT, 0):
-        player.press(glfw.KEY_O, modifiers)
+        player.press("o", modifiers)
         recording = player.filming.recording
         assert recording is not None
         if not modifiers:
             time.sleep(0.2)
             player.frame()
-            press(player, glfw.KEY_O)
+            press(player, "o")
         frames_until(player, lambda: not player.snapshot().films)
         end = player.snapshot()
         assert str(recording.path) in end.notice and not end.notice_is_error, end.notice
@@ -197,7 +197,7 @@ def videos(player: Player) -> None:
             assert 3 <= len(frames) <= 20
         assert frames[0].shape == (*end.canvas[::-1], 3)
 
-    press(player, glfw.KEY_O)
+    press(player, "o")
     glfw.set_window_size(player.window.handle, 420, 330)
     time.sleep(0.05)
     frames_until(player, lambda: not player.snapshot().films)
@@ -223,7 +223,7 @@ def files_cannot_be_written(player: Player) -> None:
     """An error is shown, and the player continues."""
     Path("nowhere").touch()
     with replaced(player.files, folder=Path("nowhere")):
-        press(player, glfw.KEY_P)
+        press(player, "p")
     assert player.snapshot().notice_is_error and "nowhere" in player.snapshot().notice, player.snapshot().notice
 
 
@@ -353,7 +353,7 @@ def dropped_files(player: Player, scene_file: Path) -> None:
 
 def resized_and_closed(player: Player) -> None:
     window = player.window
-    press(player, glfw.KEY_H, glfw.KEY_P)
+    press(player, "h", "p")
     glfw.set_window_size(window.handle, 200, 260)
     time.sleep(0.05)
     glfw.poll_events()
@@ -364,7 +364,7 @@ def resized_and_closed(player: Player) -> None:
     settings = player.preferences()
     assert settings == Preferences((200, 260), DEFAULT, None, 2.0, False, False, True, True, player.state.text_size)
     player.run()
-    press(player, glfw.KEY_O)
+    press(player, "o")
     recording = player.filming.recording
     player.run(1)
     player.frame()

@@ -1,4 +1,4 @@
-"""Keys, pointer and dropped files. The table of keys is data: the list on the screen and README.md are made from it."""
+"""Keys, pointer and dropped files. The list on the screen and docs/playing.md are made from the table of keys."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -7,6 +7,7 @@ import numpy as np
 
 from kpc.player.app.actions import Actions
 from kpc.player.app.desktop import glfw, imgui
+from kpc.player.app.keyboard import KeyPress, flying_keys, label, nearest_at_hand
 from kpc.player.app.state import PlayerState
 from kpc.player.app.window import Window
 
@@ -16,116 +17,125 @@ CROSSING_S, SHIFT_FACTOR = 4.0, 4.0
 # The camera flies no farther than in so many seconds at once, however long a frame took.
 MAX_FLY_S = 0.1
 
-NONE, SHIFT, CTRL = 0, glfw.MOD_SHIFT, glfw.MOD_CONTROL
-
 
 @dataclass(frozen=True)
 class KeyBinding:
     """A line of the list of keys.
 
     Attributes:
-        keys: as the user reads them.
+        keys: as the user reads them on a US keyboard.
         help: what they do.
-        actions: by (glfw key, modifier) what to call; empty for what `Input` handles while it is held.
+        actions: by shortcut what to call; empty for what `Input` handles while it is held. A shortcut is a character or
+            a name of `keyboard.KEY_NAMES`, with "Ctrl+" or "Shift+" before it.
+        elsewhere: other keys for the same, which some keyboards have without Shift and AltGr where they lack `keys`.
     """
 
     keys: str
     help: str
-    actions: Mapping[tuple[int, int], Callable[[Actions], None]] = field(default_factory=dict)
+    actions: Mapping[str, Callable[[Actions], None]] = field(default_factory=dict)
+    elsewhere: tuple[str, ...] = ()
+
+    def keys_here(self) -> str:
+        """Return the keys as the user reads them on this keyboard."""
+        if self.keys == FLYING:
+            left, right, down, up, backward, forward = (label(key) for key in flying_keys(_ACTIONS))
+            return f"{forward} {left} {backward} {right}, {down} {up}"
+        return nearest_at_hand((self.keys, *self.elsewhere))
 
 
+def _slower(do: Actions) -> None:
+    do.change_speed(-1)
+
+
+def _faster(do: Actions) -> None:
+    do.change_speed(1)
+
+
+def _coarser(do: Actions) -> None:
+    do.change_quality(-1)
+
+
+def _finer(do: Actions) -> None:
+    do.change_quality(1)
+
+
+def _smaller_text(do: Actions) -> None:
+    do.change_text_size(-1)
+
+
+def _larger_text(do: Actions) -> None:
+    do.change_text_size(1)
+
+
+FLYING = "W A S D, Q E"
 KEY_BINDINGS = (
     KeyBinding("Drag", "orbit around the scene"),
     KeyBinding("Right drag, Shift+drag", "pan"),
     KeyBinding("Wheel", "zoom"),
-    KeyBinding("W A S D, Q E", "fly; four times as fast with Shift"),
-    KeyBinding("Space", "play or pause", {(glfw.KEY_SPACE, NONE): Actions.play_or_pause}),
+    KeyBinding(FLYING, "fly; four times as fast with Shift"),
+    KeyBinding("Space", "play or pause", {"Space": Actions.play_or_pause}),
     KeyBinding(
-        "Left, Right",
-        "one frame back or forward",
-        {(glfw.KEY_LEFT, NONE): lambda do: do.step(-1), (glfw.KEY_RIGHT, NONE): lambda do: do.step(1)},
+        "Left, Right", "one frame back or forward", {"Left": lambda do: do.step(-1), "Right": lambda do: do.step(1)}
     ),
     KeyBinding(
-        "Home, End",
-        "go to the start or the end",
-        {(glfw.KEY_HOME, NONE): lambda do: do.seek(0.0), (glfw.KEY_END, NONE): lambda do: do.seek(1.0)},
+        "Home, End", "go to the start or the end", {"Home": lambda do: do.seek(0.0), "End": lambda do: do.seek(1.0)}
     ),
     KeyBinding(
         "[  ]",
         "play slower or faster",
-        {
-            (glfw.KEY_LEFT_BRACKET, NONE): lambda do: do.change_speed(-1),
-            (glfw.KEY_RIGHT_BRACKET, NONE): lambda do: do.change_speed(1),
-        },
+        {"[": _slower, "]": _faster, ",": _slower, ".": _faster},
+        elsewhere=(",  .",),
     ),
-    KeyBinding("L", "loop on or off", {(glfw.KEY_L, NONE): Actions.toggle_loop}),
-    KeyBinding("R", "back to the first camera", {(glfw.KEY_R, NONE): lambda do: do.to_camera(0)}),
-    KeyBinding("N", "next camera of the scene", {(glfw.KEY_N, NONE): Actions.next_camera}),
-    KeyBinding("B", "next viewpoint", {(glfw.KEY_B, NONE): Actions.next_preset}),
-    KeyBinding("V", "next appearance, if the scene has several", {(glfw.KEY_V, NONE): Actions.next_appearance}),
+    KeyBinding("L", "loop on or off", {"l": Actions.toggle_loop}),
+    KeyBinding("R", "back to the first camera", {"r": lambda do: do.to_camera(0)}),
+    KeyBinding("N", "next camera of the scene", {"n": Actions.next_camera}),
+    KeyBinding("B", "next viewpoint", {"b": Actions.next_preset}),
+    KeyBinding("V", "next appearance, if the scene has several", {"v": Actions.next_appearance}),
     KeyBinding(
         "1 2 3 4",
         "show colour, depth, samples per ray, occupancy",
         {
-            (glfw.KEY_1, NONE): lambda do: do.show_mode(0),
-            (glfw.KEY_2, NONE): lambda do: do.show_mode(1),
-            (glfw.KEY_3, NONE): lambda do: do.show_mode(2),
-            (glfw.KEY_4, NONE): lambda do: do.show_mode(3),
+            "1": lambda do: do.show_mode(0),
+            "2": lambda do: do.show_mode(1),
+            "3": lambda do: do.show_mode(2),
+            "4": lambda do: do.show_mode(3),
         },
     ),
-    KeyBinding("C", "show everything, the static part, the dynamic part", {(glfw.KEY_C, NONE): Actions.next_part}),
+    KeyBinding("C", "show everything, the static part, the dynamic part", {"c": Actions.next_part}),
+    KeyBinding("-  =", "lower or higher quality", {"-": _coarser, "=": _finer, "+": _finer}, elsewhere=("-  +",)),
+    KeyBinding("U", "hold the frame rate or the quality", {"u": Actions.toggle_target_rate}),
+    KeyBinding("F", "exact or fast drawing of what moves", {"f": Actions.toggle_exact}),
+    KeyBinding("K", "add a keyframe to the camera path", {"k": Actions.add_keyframe}),
+    KeyBinding("Backspace", "remove the last keyframe", {"Backspace": Actions.remove_last_keyframe}),
+    KeyBinding("J", "follow the camera path, or stop", {"j": Actions.follow_or_stop}),
+    KeyBinding("Ctrl+S", "save the camera path", {"Ctrl+s": Actions.save_path}),
+    KeyBinding("P", "save a screenshot", {"p": Actions.save_picture}),
+    KeyBinding("O", "record the window, or stop", {"o": lambda do: do.start_or_stop_filming(along_path=False)}),
     KeyBinding(
-        "-  =",
-        "lower or higher quality",
-        {
-            (glfw.KEY_MINUS, NONE): lambda do: do.change_quality(-1),
-            (glfw.KEY_EQUAL, NONE): lambda do: do.change_quality(1),
-        },
+        "Shift+O", "record the camera path, or stop", {"Shift+o": lambda do: do.start_or_stop_filming(along_path=True)}
     ),
-    KeyBinding("U", "hold the frame rate or the quality", {(glfw.KEY_U, NONE): Actions.toggle_target_rate}),
-    KeyBinding("F", "exact or fast drawing of what moves", {(glfw.KEY_F, NONE): Actions.toggle_exact}),
-    KeyBinding("K", "add a keyframe to the camera path", {(glfw.KEY_K, NONE): Actions.add_keyframe}),
-    KeyBinding("Backspace", "remove the last keyframe", {(glfw.KEY_BACKSPACE, NONE): Actions.remove_last_keyframe}),
-    KeyBinding("J", "follow the camera path, or stop", {(glfw.KEY_J, NONE): Actions.follow_or_stop}),
-    KeyBinding("Ctrl+S", "save the camera path", {(glfw.KEY_S, CTRL): Actions.save_path}),
-    KeyBinding("P", "save a screenshot", {(glfw.KEY_P, NONE): Actions.save_picture}),
+    KeyBinding("T", "show the time planes", {"t": lambda do: do.toggle_panel("planes")}),
+    KeyBinding("G", "show the frame times", {"g": lambda do: do.toggle_panel("graphs")}),
     KeyBinding(
-        "O",
-        "record the window, or stop",
-        {(glfw.KEY_O, NONE): lambda do: do.start_or_stop_filming(along_path=False)},
-    ),
-    KeyBinding(
-        "Shift+O",
-        "record the camera path, or stop",
-        {(glfw.KEY_O, SHIFT): lambda do: do.start_or_stop_filming(along_path=True)},
-    ),
-    KeyBinding("T", "show the time planes", {(glfw.KEY_T, NONE): lambda do: do.toggle_panel("planes")}),
-    KeyBinding("G", "show the frame times", {(glfw.KEY_G, NONE): lambda do: do.toggle_panel("graphs")}),
-    KeyBinding(
-        "Ctrl+-, Ctrl+=",
+        "Ctrl+-  Ctrl+=",
         "smaller or larger text",
-        {
-            (glfw.KEY_MINUS, CTRL): lambda do: do.change_text_size(-1),
-            (glfw.KEY_EQUAL, CTRL): lambda do: do.change_text_size(1),
-        },
+        {"Ctrl+-": _smaller_text, "Ctrl+=": _larger_text, "Ctrl++": _larger_text},
+        elsewhere=("Ctrl+-  Ctrl++",),
     ),
-    KeyBinding("Tab", "show or hide the controls", {(glfw.KEY_TAB, NONE): lambda do: do.toggle_panel("controls")}),
-    KeyBinding("H", "show this list", {(glfw.KEY_H, NONE): lambda do: do.toggle_panel("keys")}),
-    KeyBinding("Esc", "quit", {(glfw.KEY_ESCAPE, NONE): Actions.quit}),
+    KeyBinding("Tab", "show or hide the controls", {"Tab": lambda do: do.toggle_panel("controls")}),
+    KeyBinding("H", "show this list", {"h": lambda do: do.toggle_panel("keys")}),
+    KeyBinding("Esc", "quit", {"Esc": Actions.quit}),
 )
 _ACTIONS = {shortcut: action for binding in KEY_BINDINGS for shortcut, action in binding.actions.items()}
 
 
-def press(actions: Actions, key: int, modifiers: int = NONE) -> None:
-    """Do what a key is bound to. With Ctrl only shortcuts with Ctrl count; Shift is ignored where it changes nothing.
-
-    Args:
-        actions: what can be done.
-        key, modifiers: as in a glfw key event.
-    """
-    wanted = (CTRL,) if modifiers & CTRL else (SHIFT, NONE) if modifiers & SHIFT else (NONE,)
-    for modifier in wanted:
-        if (action := _ACTIONS.get((key, modifier))) is not None:
+def press(actions: Actions, pressed: KeyPress) -> None:
+    """Do what a key or a character is bound to. With Ctrl only shortcuts with Ctrl count; Shift is ignored where it
+    changes nothing. Without Ctrl, a key whose character is bound acts through that character, which follows it."""
+    if pressed.key is not None and pressed.character in _ACTIONS and not pressed.modifiers & glfw.MOD_CONTROL:
+        return
+    for shortcut in pressed.shortcuts():
+        if (action := _ACTIONS.get(shortcut)) is not None:
             action(actions)
             return
 
@@ -144,8 +154,8 @@ class Input:
         """
         self._move_pointer()
         self._fly(min(seconds, MAX_FLY_S))
-        for key, modifiers in self.window.take_keys():
-            press(self.actions, key, modifiers)
+        for pressed in self.window.take_keys():
+            press(self.actions, pressed)
         for file in self.window.take_dropped_files():
             self.actions.open(file)
 
@@ -169,14 +179,12 @@ class Input:
             state.look_from(state.view.zoom(io.mouse_wheel))
 
     def _fly(self, seconds: float) -> None:
-        """Move the camera while W, A, S, D, Q or E are held."""
+        """Move the camera while one of `keyboard.flying_keys` is held."""
         is_held = self.window.is_held
         if is_held(glfw.KEY_LEFT_CONTROL, glfw.KEY_RIGHT_CONTROL):
             return  # Ctrl+S saves
-        right, up, forward = (
-            is_held(plus) - is_held(minus)
-            for plus, minus in ((glfw.KEY_D, glfw.KEY_A), (glfw.KEY_E, glfw.KEY_Q), (glfw.KEY_W, glfw.KEY_S))
-        )
+        held = [is_held(key) for key in flying_keys(_ACTIONS)]
+        right, up, forward = (plus - minus for minus, plus in zip(held[::2], held[1::2], strict=True))
         if right or up or forward:
             factor = SHIFT_FACTOR if is_held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT) else 1.0
             distance = factor * seconds * self.state.scene.extent / CROSSING_S

@@ -128,7 +128,7 @@ class Panels:
         )
         if changed and wanted != number:
             quality.choose(LEVEL_NAMES[wanted])
-        imgui.set_item_tooltip("From fastest to exact (keys - and =)")
+        imgui.set_item_tooltip("From fastest to exact (key - and = or +)")
         label("hold")
         holds = quality.target_s is not None
         changed, holds = imgui.checkbox("##hold", holds)
@@ -232,7 +232,7 @@ class Panels:
                 for binding in KEY_BINDINGS:
                     imgui.table_next_row()
                     imgui.table_next_column()
-                    imgui.text(binding.keys)
+                    imgui.text(binding.keys_here())
                     imgui.table_next_column()
                     imgui.text_disabled(binding.help)
                 imgui.end_table()

@@ -206,9 +206,12 @@ class Player:
 
     # --- for tests
 
-    def press(self, key: int, modifiers: int = 0, seconds: float | None = None) -> None:
-        """Press a key, and show a frame; see `Window.press_key` and `frame`."""
-        self.window.press_key(key, modifiers)
+    def press(self, key: int | str, modifiers: int = 0, seconds: float | None = None) -> None:
+        """Press a key or type a character, and show a frame; see `Window.press_key` and `frame`."""
+        if isinstance(key, str):
+            self.window.type_character(key, modifiers)
+        else:
+            self.window.press_key(key, modifiers)
         self.frame(seconds)
 
     def present_panels(self) -> None:

@@ -8,6 +8,7 @@ import moderngl
 
 from kpc.format.common.errors import ContextLostError, DisplayError
 from kpc.player.app.desktop import glfw, imgui
+from kpc.player.app.keyboard import KeyPress, key_name
 
 # What error messages recommend where no window can be opened.
 REMEDY = "render pictures or a video with kprender instead"
@@ -48,9 +49,11 @@ class Window:
         )
         self._reset_status = reset_status_query()
         self.io: imgui.IO | None = None
-        self._keys: list[tuple[int, int]] = []
+        self._keys: list[KeyPress] = []
+        self._modifiers = 0
         self._dropped: list[str] = []
         glfw.set_key_callback(self.handle, self._key_event)
+        glfw.set_char_callback(self.handle, lambda window, code: self.type_character(chr(code), self._modifiers))
         glfw.set_cursor_pos_callback(self.handle, lambda window, x, y: self.move_pointer(x, y))
         glfw.set_mouse_button_callback(
             self.handle, lambda window, button, action, mods: self.press_button(button, action == glfw.PRESS)
@@ -60,9 +63,14 @@ class Window:
 
     # --- events, as the system sends them or as a test does
 
-    def press_key(self, key: int, modifiers: int = 0) -> None:
+    def press_key(self, key: int, modifiers: int = 0, scancode: int = 0) -> None:
         """Keep a key for `take_keys`."""
-        self._keys.append((key, modifiers))
+        self._keys.append(KeyPress(key, key_name(key, scancode), modifiers))
+        self._modifiers = modifiers
+
+    def type_character(self, character: str, modifiers: int = 0) -> None:
+        """Keep a character for `take_keys`. glfw tells of it after the key that types it."""
+        self._keys.append(KeyPress(None, character, modifiers))
 
     def move_pointer(self, x: float, y: float) -> None:
         """Move the pointer to a position in screen units."""
@@ -83,8 +91,8 @@ class Window:
         """Keep files for `take_dropped_files`."""
         self._dropped += paths
 
-    def take_keys(self) -> list[tuple[int, int]]:
-        """Return (key, modifiers) of all keys pressed since the last call."""
+    def take_keys(self) -> list[KeyPress]:
+        """Return all keys pressed and characters typed since the last call."""
         keys, self._keys = self._keys, []
         return keys
 
@@ -196,7 +204,7 @@ class Window:
 
     def _key_event(self, window: object, key: int, scancode: int, action: int, modifiers: int) -> None:
         if action in (glfw.PRESS, glfw.REPEAT):
-            self.press_key(key, modifiers)
+            self.press_key(key, modifiers, scancode)
 
 
 def reset_status_query() -> Callable[[], int]:

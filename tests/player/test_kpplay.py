@@ -16,6 +16,7 @@ from kpc.format.common.media import read_image
 from kpc.format.container.scene_io import write
 from kpc.tools.cli.serve import Handler, serving
 from scenes import tiny_scene, with_appearances
+from x_server import x_server
 
 
 @pytest.fixture(scope="module")
@@ -32,27 +33,8 @@ def display() -> Iterator[str]:
     if os.environ.get("DISPLAY"):
         yield os.environ["DISPLAY"]
         return
-    if shutil.which("Xvfb") is None:
-        pytest.skip("no display and no Xvfb (Debian: apt install xvfb)")
-    reader, writer = os.pipe()
-    server = (
-        subprocess.Popen(  # without -noreset it starts over when its last client leaves, and refuses the next meanwhile
-            ["Xvfb", "-noreset", "-displayfd", str(writer), "-screen", "0", "1024x768x24"],
-            pass_fds=[writer],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-    )
-    os.close(writer)
-    with os.fdopen(reader) as output:
-        number = output.readline().strip()
-    try:
-        if not number:
-            pytest.skip("Xvfb does not start")
-        yield f":{number}"
-    finally:
-        server.terminate()
-        server.wait()
+    with x_server() as name:
+        yield name
 
 
 @pytest.fixture(scope="module")
@@ -227,6 +209,8 @@ def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
         (["{scene}", "--size", "7x7"], 2, "--size"),
         (["{scene}", "--frames", "0"], 2, "--frames"),
         (["{scene}", "--screenshot", "x.bmp"], 2, "x.bmp"),
+        (["{scene}", "--screenshot", "x.jpg"], 2, "x.jpg"),
+        (["{scene}", "--screenshot", "x.png/"], 2, "x.png/"),
         (["{scene}", "--folder", "nowhere"], 1, "nowhere"),
         (["{scene}", "--path", "nowhere.json"], 1, "nowhere.json"),
         (["{scene}", "--path", "{scene}"], 1, "tiny.kpc"),
