@@ -7,16 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kpc.format.common.errors import UsageError
+from kpc.format.common.media_files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from kpc.format.scene.cameras import View
 
 FILM_SUFFIXES = (".mp4", ".mkv")
 PICTURE_FORMATS = ("png", "jpg", "exr")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
-
-# Suffixes of pictures and films, which are no part of a view's name.
-MEDIA_SUFFIX = re.compile(
-    r"\.(png|jpe?g|exr|webp|tiff?|bmp|gif|avif|heic|hdr|dpx|tga|mp4|m4v|mov|mkv|webm|avi|mxf|ts|y4m)", re.IGNORECASE
-)
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,7 @@ class Output:
         """
         path, suffix = Path(text), Path(text).suffix.lower()
         has_slash = text.endswith(tuple(filter(None, (os.sep, os.altsep))))
-        if not suffix or has_slash or (path.is_dir() and not MEDIA_SUFFIX.fullmatch(suffix)):
+        if not suffix or has_slash or (path.is_dir() and not _is_of_media(text)):
             return Output(path, f".{picture_format or PICTURE_FORMATS[0]}", is_folder=True)
         if suffix not in FILM_SUFFIXES + PICTURE_SUFFIXES:
             raise UsageError(
@@ -73,8 +69,7 @@ class Output:
         paths, used, renamed = [], set[str](), 0
         for number, view in enumerate(views):
             name = re.split(r"[/\\]", view.file)[-1]
-            ending = re.search(r"\.[^.]*$", name)
-            bare = name[: ending.start()] if ending and MEDIA_SUFFIX.fullmatch(ending[0]) else name
+            bare = name.rsplit(".", 1)[0] if _is_of_media(name) else name
             stem = re.sub(r"[^\w.+-]", "_", bare)[:120].lstrip(".")
             if not stem or stem in used:
                 stem = f"{number:04d}" if not stem else f"{stem}_{number:04d}"
@@ -82,3 +77,8 @@ class Output:
             renamed += stem != bare
             paths.append(self.path / f"{stem}{self.suffix}")
         return paths, renamed
+
+
+def _is_of_media(name: str) -> bool:
+    """Return whether a name ends in the suffix of a picture or film; another ending is part of the name."""
+    return Path(name).suffix.lower() in IMAGE_SUFFIXES + VIDEO_SUFFIXES
