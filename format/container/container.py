@@ -17,7 +17,7 @@ import numpy as np
 import zstandard
 
 from kpc.format.common.errors import FormatError
-from kpc.format.container.sources import AnySource, Source, open_source
+from kpc.format.container.sources import AnySource, RemoteSource, Source, open_source
 
 MAGIC = b"\x89KPC\r\n\x1a\n"
 VERSION = 1
@@ -361,9 +361,11 @@ class Reader:
         if len(body) != entry.stored_length:
             raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is not there; fetch the file again")
         if google_crc32c.value(body) != entry.crc:
-            raise FormatError(
-                f"{self.name}: chunk {number} ({entry.kind}) is damaged (its CRC32C differs); fetch the file again"
+            is_remote = isinstance(self.source, RemoteSource)
+            remedy = (
+                "open it again, since it may have been replaced on the server" if is_remote else "fetch the file again"
             )
+            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is damaged (its CRC32C differs); {remedy}")
         return body
 
     def chunk(self, number: int, limit: int | None = None) -> bytes:

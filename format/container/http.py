@@ -13,7 +13,6 @@ urllib3 does what lies below: connection reuse, TLS, proxies and time-outs.
 import contextlib
 import copy
 import random
-import re
 import sys
 import threading
 import time as clock
@@ -24,7 +23,9 @@ import urllib3
 
 from kpc.format.common.errors import BudgetError, InterruptedRead, NetworkError, UnreachableError
 from kpc.format.common.memory import DEFAULT_BUDGET
-from kpc.format.container.http_client import HttpClient, TemporaryFailure, describe_failure, is_url, printable
+from kpc.format.container.http_address import is_url, printable
+from kpc.format.container.http_client import HttpClient, TemporaryFailure, describe_failure
+from kpc.format.container.http_headers import length_of, range_of, retry_after, validator_of
 
 __all__ = ["HttpSource", "is_url", "report_on_stderr"]
 
@@ -36,6 +37,13 @@ PIECE_BYTES = 1 << 16
 
 # Bytes of a long response that are kept behind the current position.
 KEPT_BYTES = 1 << 26
+
+# Bytes of the beginning of a file by which it is recognised where its ETag or date differs, as between the nodes of a
+# server. They hold the header of a .kpc file and so the checksum of its index, which holds those of all chunks.
+BEGINNING_BYTES = 512
+
+# The most bytes before the ones requested that a response may begin with.
+MAX_SKIPPED_BYTES = 1 << 22
 
 # Requests that may fail in a row without a single new byte.
 MAX_ATTEMPTS = 5
@@ -138,6 +146,7 @@ class HttpSource:
         self._limit, self.report, self._closed = limit, report, threading.Event()
         self._size: int | None = None
         self._validator: tuple[str, str] | None = None
+        self._beginning = b""
         self._reading, self._retrying = threading.Lock(), False
         self._interruption = threading.Event()
         self._parked: _Download | None = None  # the last unfinished download that was left for another
@@ -145,6 +154,8 @@ class HttpSource:
         self._fetch(1)
         assert self._size is not None
         self.size: int = self._size
+        self._fetch(min(BEGINNING_BYTES, self.size))
+        self._beginning = bytes(self._download.data[:BEGINNING_BYTES])
 
     def read_at(self, offset: int, length: int) -> bytes:
         """Return `length` bytes from `offset`, fewer only at the end of the file; wait until they are there."""
@@ -182,7 +193,8 @@ class HttpSource:
         other = copy.copy(self)
         other._client, other._reading = self._client.clone(), threading.Lock()
         other._closed, other._interruption = threading.Event(), threading.Event()
-        other._download, other._parked, other._retrying, other.received_bytes = _Download(0, 0), None, False, 0
+        other._parked, other._retrying, other.received_bytes = None, False, 0
+        other._download = _Download(0, 0 if self.has_ranges else self.size)
         return other
 
     def interrupt(self) -> None:
@@ -196,7 +208,7 @@ class HttpSource:
     def discard(self) -> None:
         """Drop everything received: it came damaged and has to be requested again."""
         self._download.close_response()
-        self._download, self._parked = (_Download(0, 0) if self.has_ranges else _Download(0, self.size)), None
+        self._download, self._parked = _Download(0, 0 if self.has_ranges else self.size), None
 
     def close(self) -> None:
         """Close the connection. A read in progress fails with UnreachableError."""
@@ -273,16 +285,31 @@ class HttpSource:
 
     def _open_response(self, download: _Download) -> None:
         """Request the missing part of a download and check the response."""
+        response = self._request(download, f"bytes={download.reached}-{download.stop - 1}" if self.has_ranges else None)
+        if response.status == 416 and self._size is None:
+            response = self._request_less(download, response)
+        if response.status == 206 and self.has_ranges:
+            self._accept_range(download, response)
+        elif response.status == 200:
+            self._accept_whole(download, response)
+        elif response.status == 416 and self._size is not None and range_of(response)[2] != self._size:
+            raise self._changed(download)
+        else:
+            raise self._error(download, self._client.refusal(response))
+
+    def _request(self, download: _Download, wanted: str | None) -> urllib3.BaseHTTPResponse:
+        """Send a request with a Range header, or without one if `wanted` is None."""
         headers = {"Accept-Encoding": "identity", "User-Agent": "kpc"}
-        if self.has_ranges:
-            headers["Range"] = f"bytes={download.reached}-{download.stop - 1}"
+        if wanted is not None:
+            headers["Range"] = wanted
             if self._validator is not None:
                 headers["If-Range"] = self._validator[1]
+        download.close_response()
         response = self._client.get(headers)
         download.response, download.waited_s, download.received_bytes = response, 0.0, 0
         if response.status in TEMPORARY_STATUS:
             raise TemporaryFailure(
-                f"the server answers {response.status} {response.reason}", pause_s=_retry_after(response)
+                f"the server answers {response.status} {response.reason}", pause_s=retry_after(response)
             )
         encoding = response.headers.get("Content-Encoding", "identity")
         if response.status in (200, 206) and encoding != "identity":
@@ -290,65 +317,122 @@ class HttpSource:
                 download,
                 f"the server sends it compressed ({encoding[:40]}), which ranges do not allow; switch that off there",
             )
-        if response.status == 206 and self.has_ranges:
-            self._accept_range(download, response)
-        elif response.status == 200:
-            self._accept_whole(download, response)
-        elif response.status == 416 and self._size is not None:
-            raise self._error(download, "changed on the server while it was read; open it again")
-        elif response.status == 416:
+        return response
+
+    def _request_less(self, download: _Download, refused: urllib3.BaseHTTPResponse) -> urllib3.BaseHTTPResponse:
+        """Repeat the first request, since some servers refuse a range that goes beyond the end of a small file: ask for
+        what there is, or for the whole file if the server does not say how much that is.
+        """
+        size = range_of(refused)[2]
+        if size == 0:
             raise self._error(download, "is empty; upload the file again")
-        else:
-            raise self._error(download, f"the server answers {response.status} {response.reason}; check the address")
+        if size is not None and size < download.stop:
+            response = self._request(download, f"bytes=0-{size - 1}")
+            if response.status != 416:
+                return response
+        return self._request(download, None)
 
     def _accept_range(self, download: _Download, response: urllib3.BaseHTTPResponse) -> None:
-        """Check a 206 response, which holds the range that was requested or a first part of it."""
-        content_range = response.headers.get("Content-Range", "")
-        match = re.fullmatch(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18})", content_range.strip())
-        if match is None:
-            raise self._error(
-                download, f"the server does not say which bytes it sends (Content-Range: {content_range[:60]!r})"
-            )
-        first, last, size = map(int, match.groups())
-        if first != download.reached or not first <= last < size:
-            raise self._error(download, f"the server sends bytes {first}-{last}/{size}, not from {download.reached} on")
+        """Check a 206 response, which holds the range that was requested, a first part of it, or more."""
+        first, last, size = range_of(response)
+        said = response.headers.get("Content-Range", "")[:60]
+        if first is None or last is None:
+            raise self._error(download, f"the server does not say which bytes it sends (Content-Range: {said!r})")
+        if size is None and self._size is None:
+            response = self._request(download, "bytes=0-")  # the last byte of which is the last of the file
+            first, last, size = range_of(response)
+            size = last + 1 if size is None and last is not None else size
+            if response.status != 206 or first != 0 or last is None or size is None:
+                raise self._error(download, f"the server does not say how long the file is (Content-Range: {said!r})")
+        size = self._size if size is None else size
+        assert size is not None
+        if self._size not in (None, size):
+            raise self._changed(download)
+        if not first <= download.reached <= last or not first < size or first + (length_of(response) or 0) > size:
+            raise self._error(download, f"the server sends {said!r}, not the bytes from {download.reached} on")
         if self._size is None:
-            self._size, self._validator = size, _validator(response)
+            self._size, self._validator = size, validator_of(response)
             download.stop = min(download.stop, size)
-        elif size != self._size or not self._is_same(response):
-            raise self._error(download, "changed on the server while it was read; open it again")
+        elif not self._is_same(response):
+            self._compare_beginning(download)
+            self._open_response(download)
+            return
+        self._skip(download, first)
         download.response_stop = min(last + 1, download.stop)
 
     def _accept_whole(self, download: _Download, response: urllib3.BaseHTTPResponse) -> None:
-        """Check a 200 response, the whole file: the server has no ranges, or If-Range found the file changed."""
-        length = response.headers.get("Content-Length")
-        size = int(length) if length is not None and re.fullmatch(r"\d{1,18}", length) else None
-        first_time = self._size is None
-        if not first_time and (self.has_ranges or size not in (self._size, None) or not self._is_same(response)):
-            raise self._error(download, "changed on the server while it was read; open it again")
-        if first_time:
-            if (size or 0) > self._limit:
-                download.close_response()
-                raise BudgetError(
-                    f"{self.name}: the server does not support range requests, and the whole file of "
-                    f"{size:,} bytes is more than the budget of {self._limit:,} bytes; download it first"
-                )
-            if self.has_ranges:
-                self.report(f"{self.name}: the server does not support range requests, so the whole file is downloaded")
-                self.report(None)
-            self.has_ranges, self._validator = False, _validator(response)
-            if size is None:
-                size = self._read_to_end(download)
-            if size == 0:
-                raise self._error(download, "is empty; upload the file again")
-            self._size = download.stop = size
+        """Check a 200 response, the whole file: the server has no ranges, or takes the file for another one."""
+        size = length_of(response)
+        if self._size is None:
+            self._accept_first_whole(download, response, size)
+        elif size not in (self._size, None):
+            raise self._changed(download)
+        elif self.has_ranges and not self._is_same(response):
+            self._compare_beginning(download)
+            self._open_response(download)
+            return
         else:
-            left = download.reached  # What has been received comes once more and is skipped.
-            while left and (piece := self._read_piece(download, left)):
-                left -= len(piece)
-            if left:
-                raise TemporaryFailure(f"the connection breaks off before byte {download.reached} of {self._size}")
+            self._skip(download, 0)
         download.response_stop = download.stop
+
+    def _accept_first_whole(self, download: _Download, response: urllib3.BaseHTTPResponse, size: int | None) -> None:
+        """Take over a file of a server without range requests, on opening."""
+        if (size or 0) > self._limit:
+            download.close_response()
+            raise BudgetError(
+                f"{self.name}: the server does not support range requests, and the whole file of "
+                f"{size:,} bytes is more than the budget of {self._limit:,} bytes; download it first"
+            )
+        if self.has_ranges:
+            self.report(f"{self.name}: the server does not support range requests, so the whole file is downloaded")
+            self.report(None)
+        self.has_ranges, self._validator = False, validator_of(response)
+        if size is None:
+            size = self._read_to_end(download)
+        if size == 0:
+            raise self._error(download, "is empty; upload the file again")
+        self._size = download.stop = size
+
+    def _skip(self, download: _Download, position: int) -> None:
+        """Read a response that begins at `position` up to where the download continues. What it repeats must be the
+        same as before.
+        """
+        if self.has_ranges and download.reached - position > MAX_SKIPPED_BYTES:
+            raise TemporaryFailure("the server sends much more of the file than was requested")
+        while position < download.reached:
+            piece = self._read_piece(download, download.reached - position)
+            if not piece:
+                raise TemporaryFailure(f"the connection breaks off before byte {download.reached} of {self._size}")
+            begin, position = position, position + len(piece)
+            held = download.data[max(begin - download.start, 0) : max(position - download.start, 0)]
+            if not piece.endswith(held):
+                raise self._changed(download)
+            download.check_rate()
+
+    def _compare_beginning(self, download: _Download) -> None:
+        """Find out whether the file is still the one that was opened, although its ETag or date differs.
+
+        Some servers have several nodes with different ETags for one file. If the beginning is the same, ETags and dates
+        count no more, and the checksums of chunks tell whether the file is replaced.
+
+        Raises:
+            NetworkError: the file has changed.
+        """
+        download.close_response()
+        validator, self._validator = self._validator, None
+        beginning = _Download(0, len(self._beginning))
+        try:
+            while beginning.reached < beginning.stop:
+                if beginning.response is None:
+                    self._open_response(beginning)
+                self._receive(beginning, beginning.stop)
+            if beginning.data != self._beginning:
+                raise self._changed(beginning)
+        except BaseException:
+            self._validator = validator
+            raise
+        finally:
+            beginning.close_response()
 
     def _read_to_end(self, download: _Download) -> int:
         """Receive a whole file whose response lacks a length, and return its size; it must not exceed the limit."""
@@ -373,20 +457,9 @@ class HttpSource:
             or response.headers.get(self._validator[0], self._validator[1]) == self._validator[1]
         )
 
+    def _changed(self, download: _Download) -> NetworkError:
+        return self._error(download, "changed on the server while it was read; open it again")
+
     def _error(self, download: _Download, message: str) -> NetworkError:
         download.close_response()
         return NetworkError(f"{self.name}: {printable(message)}")
-
-
-def _validator(response: urllib3.BaseHTTPResponse) -> tuple[str, str] | None:
-    """Return the header that identifies this version of a file, and its value: a strong ETag, else the date."""
-    etag, date = response.headers.get("ETag"), response.headers.get("Last-Modified")
-    if etag is not None and re.fullmatch(r'"[\x21\x23-\x7e]{0,200}"', etag):
-        return "ETag", etag
-    return ("Last-Modified", date) if date is not None and re.fullmatch(r"[\x20-\x7e]{1,64}", date) else None
-
-
-def _retry_after(response: urllib3.BaseHTTPResponse) -> float:
-    """Return the pause in seconds that a server asks for, at most 30."""
-    value = response.headers.get("Retry-After", "")
-    return min(float(value), 30.0) if re.fullmatch(r"\d{1,9}", value) else 0.0
