@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from kpc.format.common import cli
 from kpc.format.common.errors import ContextLostError, UsageError
 from kpc.format.common.memory import DEFAULT_BUDGET
-from kpc.format.container.sources import open_source
+from kpc.format.container.sources import RemoteSource, open_source
 from kpc.player.app import preferences
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.preferences import TARGET_FPS, WINDOW_SIDES, Preferences
@@ -156,7 +156,10 @@ def _play(
                 window.close()
                 stream.close()
                 window = Window("kpplay", settings.size or _default_size(stream))
-                stream = GroupPlayback(open_source(stream.source.name, limit=options.memory), memory=options.memory)
+                # A remote source alone knows its address; the name lacks what is secret.
+                source = stream.source
+                source = source.clone() if isinstance(source, RemoteSource) else open_source(source.name)
+                stream = GroupPlayback(source, memory=options.memory)
             elif player.successor is not None:
                 stream.close()
                 stream = player.successor
