@@ -7,7 +7,7 @@ import numpy as np
 from pytest import approx, raises
 
 from kpc.format.common.errors import DisplayError
-from kpc.format.common.media import read_image
+from kpc.format.common.images import read_image
 from kpc.format.container import groups
 from kpc.format.container.sources import open_source
 from kpc.player.app import kpplay

@@ -26,7 +26,7 @@ from kpc.encoder.field.render import Rays
 from kpc.encoder.training.optimisers import add_prior_gradients
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.media import write_image
+from kpc.format.common.images import write_image
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION, Scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")

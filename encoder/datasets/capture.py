@@ -5,6 +5,7 @@ import math
 import os
 import re
 import sys
+import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.media import VideoInfo, image_size
+from kpc.format.common.images import image_info
+from kpc.format.common.media import VideoInfo
 from kpc.format.common.media_files import IMAGE_SUFFIXES
 
 # Where neither the dataset nor the user names test images, every eighth is one, as in LLFF (arXiv:1905.00889).
@@ -28,11 +30,13 @@ class CapturedView:
         video: properties of the video.
         time: as given by the dataset, in any unit; None for videos and where it gives none.
         is_test: whether it is held out from training.
-        width, height, has_alpha: of the file, before downscaling.
+        width, height, has_alpha: of the picture, before downscaling.
         intrinsics: fl_x fl_y cx cy in pixels of that size.
         distortion: k1 k2 p1 p2 of OpenCV's lens model.
         camera_to_world: (4, 4) float64, OpenGL convention.
         near, far: depth range along the optical axis, NaN if unknown.
+        orientation: of an image, EXIF's number from 1 (as stored) to 8.
+        upright: whether that orientation is applied.
     """
 
     file: Path
@@ -47,6 +51,8 @@ class CapturedView:
     camera_to_world: np.ndarray
     near: float = math.nan
     far: float = math.nan
+    orientation: int = 1
+    upright: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,11 +83,38 @@ def image_view(
     near: float,
     far: float,
 ) -> CapturedView:
-    """Return the view of an image. `declared` is the image size of the calibration; None if it is the image's own."""
-    width, height, has_alpha = image_size(file)
-    intrinsics = fit_intrinsics(where, file, intrinsics, declared or (width, height), (width, height))
-    pose = check_pose(where, camera_to_world)
-    return CapturedView(file, None, time, is_test, width, height, has_alpha, intrinsics, distortion, pose, near, far)
+    """Return the view of an image.
+
+    An EXIF orientation is applied only if the image then has the aspect ratio of the calibration, and not as stored.
+
+    Args:
+        file: the image.
+        where: the calibration's file and entry, for messages.
+        declared: the image size of the calibration; None if it is that of the image as stored.
+        time, is_test, intrinsics, distortion, camera_to_world, near, far: as in `CapturedView`, but `intrinsics` for
+            the declared size, and `camera_to_world` not yet checked.
+    """
+    info = image_info(file)
+    width, height = info.width, info.height
+    upright = declared is not None and _fits(declared, info.displayed_size) and not _fits(declared, (width, height))
+    if upright:
+        width, height = info.displayed_size
+    return CapturedView(
+        file,
+        None,
+        time,
+        is_test,
+        width,
+        height,
+        info.has_alpha,
+        fit_intrinsics(where, file, intrinsics, declared or (width, height), (width, height)),
+        distortion,
+        check_pose(where, camera_to_world),
+        near,
+        far,
+        info.orientation,
+        upright,
+    )
 
 
 def fit_intrinsics(
@@ -109,12 +142,17 @@ def fit_intrinsics(
     if not (declared[0] >= 1 and declared[1] >= 1):
         raise DatasetError(f"{where}: picture size {declared[0]:g}x{declared[1]:g} is empty; correct the calibration")
     sx, sy = actual[0] / declared[0], actual[1] / declared[1]
-    if abs(declared[0] * sy - actual[0]) > 1 + 0.01 * actual[0]:
+    if not _fits(declared, actual):
         raise DatasetError(
             f"{file}: is {actual[0]}x{actual[1]}, but {where} is for {declared[0]:g}x{declared[1]:g}, another aspect "
             "ratio; undo the crop or correct the size there"
         )
     return fl_x * sx, fl_y * sy, cx * sx, cy * sy
+
+
+def _fits(declared: tuple[float, float], actual: tuple[int, int]) -> bool:
+    """Return whether two sizes have the same aspect ratio, within 1 % and a pixel of rounding."""
+    return declared[1] > 0 and abs(declared[0] * actual[1] / declared[1] - actual[0]) <= 1 + 0.01 * actual[0]
 
 
 def check_pose(where: str, pose: np.ndarray) -> np.ndarray:
@@ -189,11 +227,36 @@ def find_image(root: Path, file: Path, name: str) -> Path | None:
     relative = os.path.normpath(name.replace("\\", "/"))
     if os.path.isabs(relative) or relative.split(os.sep)[0] in (os.curdir, os.pardir) or "\0" in relative:
         raise DatasetError(f"{file}: {name!r} leads out of {root} or is no file name; make it relative to that folder")
-    bare = root / relative
-    for candidate in (bare, *(bare.with_name(bare.name + suffix) for suffix in (*IMAGE_SUFFIXES, ".JPG", ".PNG"))):
-        if candidate.suffix.lower() in IMAGE_SUFFIXES and file_exists(candidate):
-            return candidate
+    unreadable = None
+    # Macs decompose accented letters (NFD), other systems do not.
+    for form in dict.fromkeys(
+        (relative, unicodedata.normalize("NFC", relative), unicodedata.normalize("NFD", relative))
+    ):
+        bare, suffix = root / form, Path(form).suffix
+        is_image = suffix.lower() in IMAGE_SUFFIXES
+        if is_image and file_exists(bare):
+            return bare
+        found = (_in_any_case(bare.with_suffix(""), suffix) if is_image else None) or with_image_suffix(bare)
+        if found is not None:
+            return found
+        if file_exists(bare):
+            unreadable = suffix
+    if unreadable is not None:
+        kind = f"of the suffix {printable(unreadable)}" if unreadable else "without a suffix"
+        raise DatasetError(
+            f"{file}: {printable(name)} exists, but images {kind} are not read; convert it to PNG, TIFF or JPEG"
+        )
     return None
+
+
+def with_image_suffix(bare: Path) -> Path | None:
+    """Return the image whose name is `bare` and a suffix in any case; None if there is none."""
+    return next(filter(None, (_in_any_case(bare, suffix) for suffix in IMAGE_SUFFIXES)), None)
+
+
+def _in_any_case(bare: Path, suffix: str) -> Path | None:
+    candidates = (bare.with_name(bare.name + case) for case in (suffix.lower(), suffix.upper(), suffix.title()))
+    return next(filter(file_exists, candidates), None)
 
 
 def file_exists(path: Path) -> bool:
@@ -219,6 +282,24 @@ def report_missing(file: Path, missing: list[str], total: int) -> None:
     if missing:
         print(
             f"{file}: {len(missing)} of {total} frames have no image and are skipped: {first_names(missing)}",
+            file=sys.stderr,
+        )
+
+
+def report_orientations(root: Path, views: Iterable[CapturedView]) -> None:
+    """Print one line about images that are turned by their EXIF orientation, and one about those that are not."""
+    turned = [view.file.name for view in views if view.orientation != 1 and view.upright]
+    stored = [view.file.name for view in views if view.orientation != 1 and not view.upright]
+    if turned:
+        print(
+            f"{root}: {len(turned)} images are turned by their EXIF orientation, since the calibration is for that "
+            f"size: {first_names(turned)}",
+            file=sys.stderr,
+        )
+    if stored:
+        print(
+            f"{root}: {len(stored)} images have an EXIF orientation, but are used as stored, since the calibration "
+            f"does not ask for another size; if it is for turned images, turn the files: {first_names(stored)}",
             file=sys.stderr,
         )
 

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import Capture, CapturedView
+from kpc.encoder.datasets.capture import Capture, CapturedView, report_orientations
 from kpc.encoder.datasets.dataset import Dataset, Pictures
 from kpc.encoder.datasets.layouts import blender, colmap, llff, nerfstudio
 from kpc.encoder.datasets.masks import FOLDER, find_masks, load_masks
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.format.common.errors import DatasetError, MediaError
-from kpc.format.common.media import read_image, read_video
+from kpc.format.common.images import read_image
+from kpc.format.common.media import read_video
 from kpc.format.common.progress import Progress
 from kpc.format.scene.scene import Clip
 
@@ -55,6 +56,7 @@ def load_dataset(
     try:
         capture = _recognise(root, holdout)
         _check(root, capture, downscale)
+        report_orientations(root, capture.views)
         return _load(root, capture, find_masks(root, capture.views), Path(cache_dir), downscale, progress)
     except PermissionError as error:
         raise DatasetError(
@@ -197,7 +199,7 @@ def _cached_pixels(
 ) -> PixelCache:
     """Open the cache of decoded pictures if it is up to date, else build it."""
     sources = [
-        (view.file.relative_to(root).as_posix(), view.file.stat().st_size, view.file.stat().st_mtime_ns)
+        (view.file.relative_to(root).as_posix(), view.file.stat().st_size, view.file.stat().st_mtime_ns, view.upright)
         for view in views
     ]
     fingerprint = fingerprint_of(sources, frame_count, downscale)
@@ -223,7 +225,7 @@ def _cached_pixels(
 def _decoded(view: CapturedView, frame_count: int) -> Iterator[np.ndarray]:
     """Yield the image of a view, or the first `frame_count` frames of its video."""
     if view.video is None:
-        yield read_image(view.file)
+        yield read_image(view.file, upright=view.upright)
         return
     count = 0
     for picture in read_video(view.file, view.video, frame_count):

@@ -1,6 +1,7 @@
 """Masks of images: which pixels may be used for training and testing. They are cached as bits beside the pixel cache.
 
-The mask of `images/x/name.jpg` is `masks/x/name.jpg.png` (as in COLMAP) or `masks/x/name.png`; 0 means ignored.
+The mask of `images/x/name.jpg` is `masks/x/name.jpg.png` (as in COLMAP) or `masks/x/name.png`, or has the suffix of
+another image format; black (0) means ignored, as does transparent.
 """
 
 import copy
@@ -10,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import CapturedView, file_exists, first_names
+from kpc.encoder.datasets.capture import CapturedView, first_names, with_image_suffix
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.media import image_size, read_image
+from kpc.format.common.images import image_info, read_mask
 from kpc.format.common.progress import Progress
 
 # The folder of masks within a dataset.
@@ -101,11 +102,13 @@ def find_masks(root: Path, views: Sequence[CapturedView]) -> list[Path | None]:
         return [None] * len(views)
     masks = [None if view.video else _find(folder, view.file.relative_to(root)) for view in views]
     for view, mask in zip(views, masks, strict=True):
-        if mask is not None and (size := image_size(mask)[:2]) != (view.width, view.height):
-            raise DatasetError(
-                f"{mask}: is {size[0]}x{size[1]}, but {view.file.name} is {view.width}x{view.height}; "
-                "make the mask anew at that size"
-            )
+        if mask is not None:
+            info, size = image_info(mask), (view.width, view.height)
+            if size not in ((info.width, info.height), info.displayed_size):
+                raise DatasetError(
+                    f"{mask}: is {info.width}x{info.height}, but {view.file.name} is {view.width}x{view.height}; "
+                    "make the mask anew at that size"
+                )
     unmasked = [view.file.name for view, mask in zip(views, masks, strict=True) if mask is None and not view.video]
     if unmasked:
         total = sum(not view.video for view in views)
@@ -143,8 +146,8 @@ def load_masks(
         with Progress(f"masks of {root.name}", len(views), "mask", shown=progress) as bar:
 
             def packed() -> Iterator[np.ndarray]:
-                for mask, size in zip(masks, sizes, strict=True):
-                    yield _packed(mask, size, downscale)
+                for mask, view in zip(masks, views, strict=True):
+                    yield _packed(mask, view, downscale)
                     bar.advance()
 
             bits = build_cache(file, fingerprint, packed(), BLOCK // 8, size_bytes)
@@ -153,10 +156,7 @@ def load_masks(
 
 def _find(folder: Path, image: Path) -> Path | None:
     inside = Path(*image.parts[1:]) if image.parts[0] == "images" else image
-    for candidate in (folder / f"{inside}.png", (folder / inside).with_suffix(".png")):
-        if file_exists(candidate):
-            return candidate
-    return None
+    return with_image_suffix(folder / inside) or with_image_suffix((folder / inside).with_suffix(""))
 
 
 def _source(root: Path, mask: Path | None) -> tuple[str, int, int] | None:
@@ -167,12 +167,17 @@ def _source(root: Path, mask: Path | None) -> tuple[str, int, int] | None:
     return mask.relative_to(root).as_posix(), stat.st_size, stat.st_mtime_ns
 
 
-def _packed(mask: Path | None, size: tuple[int, int], downscale: int) -> np.ndarray:
+def _packed(mask: Path | None, view: CapturedView, downscale: int) -> np.ndarray:
     """Return the bits of one mask, (1, blocks, BLOCK / 8) uint8; all set if there is no mask."""
-    width, height = size
+    width, height = view.width // downscale, view.height // downscale
     usable = np.ones((height, width), bool)
     if mask is not None:
-        large = read_image(mask)[: height * downscale, : width * downscale, 0] != 0
-        usable = large.reshape(height, downscale, width, downscale).all(axis=(1, 3))
+        info = image_info(mask)
+        large = read_mask(mask, upright=(info.width, info.height) != (view.width, view.height))
+        usable = (
+            large[: height * downscale, : width * downscale]
+            .reshape(height, downscale, width, downscale)
+            .all(axis=(1, 3))
+        )
     blocks = -(-width * height // BLOCK)
     return np.packbits(np.pad(usable.ravel(), (0, blocks * BLOCK - width * height))).reshape(1, blocks, BLOCK // 8)

@@ -1,4 +1,4 @@
-"""Reading and writing of videos (through ffmpeg) and images (through Pillow and OpenEXR).
+"""Reading and writing of videos, through ffmpeg.
 
 Colour: `read_video` returns R'G'B' in [0, 255] and honours the file's tags for matrix, range and chroma layout. Where
 tags are missing it does as players do: limited range, BT.601 below 720 lines and BT.709 from there on. HDR transfer
@@ -13,7 +13,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,11 +21,10 @@ from typing import IO
 import ffmpeg
 import imageio_ffmpeg
 import numpy as np
-import OpenEXR
-from PIL import Image, UnidentifiedImageError
 
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import MediaError
+from kpc.format.common.media_files import require_file
 
 # Options of ffmpeg's scale filter for an exact colour conversion.
 _SCALE_FLAGS = "bicubic+accurate_rnd+full_chroma_int+full_chroma_inp"
@@ -78,7 +76,7 @@ def video_info(path: str | os.PathLike[str]) -> VideoInfo:
     Raises:
         MediaError: the file is missing, damaged, not a video, or HDR.
     """
-    _require_file(path)
+    require_file(path)
     stream = ffmpeg.input(_url(path)).output("pipe:", format="null", codec="copy", map="0:V:0")
     command = stream.global_args("-nostdin", "-hide_banner", "-nostats", "-progress", "pipe:1").compile(
         cmd=ffmpeg_binary()
@@ -215,57 +213,6 @@ def write_video(
     return count
 
 
-def image_size(path: str | os.PathLike[str]) -> tuple[int, int, bool]:
-    """Return width, height and whether there is an alpha channel, from an image's header.
-
-    Raises:
-        MediaError: as `read_image`.
-    """
-    with _image_errors(path):
-        if _is_exr(path):
-            with OpenEXR.File(os.fspath(path), header_only=True) as exr:
-                header = exr.header()
-                low, high = header["dataWindow"]
-                names = {channel.name for channel in header["channels"]}
-            return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1), "A" in names
-        with Image.open(path) as image:
-            return image.width, image.height, image.has_transparency_data
-
-
-def read_image(path: str | os.PathLike[str]) -> np.ndarray:
-    """Read a PNG, JPEG or EXR image.
-
-    An EXIF orientation is not applied, since poses and intrinsics refer to the pixels as stored. An EXR holds linear
-    light with associated alpha: colours are divided by alpha, clipped to [0, 1] and converted by the sRGB curve.
-
-    Returns:
-        (height, width, 3) uint8, or 4 channels with straight alpha if the file has alpha.
-
-    Raises:
-        MediaError: the file is missing, damaged or of another format.
-    """
-    with _image_errors(path):
-        if _is_exr(path):
-            return _read_exr(path)
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
-
-
-def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> None:
-    """Write a (height, width, 3 or 4) uint8 image as PNG or JPEG, chosen by the suffix."""
-    with atomic_write(path) as temporary:
-        Image.fromarray(pixels).save(temporary, quality=95)  # the quality concerns JPEG only
-
-
-def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
-    """Apply the sRGB transfer curve (IEC 61966-2-1) to values, which are clipped to [0, 1]; NaN counts as 0.
-
-    12.92 x  where x <= 0.0031308,  1.055 x^(1/2.4) - 0.055  elsewhere
-    """
-    clipped = np.clip(np.nan_to_num(linear), 0.0, 1.0)
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * np.power(clipped, 1 / 2.4) - 0.055)
-
-
 # The line of ffmpeg's log that describes a video stream.
 _STREAM = re.compile(
     r"Stream #0:\d+[^\n]*?: Video: (?P<codec>[^\n]*?), (?P<pix_fmt>[a-z][a-z0-9_]*)(?:\((?P<tags>[^)\n]*)\))?"
@@ -310,55 +257,6 @@ def _matrix(pix_fmt: str, tags: str, height: int) -> str:
         if name.startswith("bt2020"):
             return "bt2020"
     return "bt601" if height < 720 else "bt709"
-
-
-def _read_exr(path: str | os.PathLike[str]) -> np.ndarray:
-    with OpenEXR.File(os.fspath(path), separate_channels=True) as exr:
-        channels = exr.channels()
-        names = ["R", "G", "B"] if "R" in channels else ["Y", "Y", "Y"]
-        rgb = np.stack([np.asarray(channels[name].pixels, np.float32) for name in names], axis=-1)
-        alpha = np.asarray(channels["A"].pixels, np.float32)[..., None] if "A" in channels else None
-    if alpha is None:
-        return np.rint(srgb_from_linear(rgb) * 255).astype(np.uint8)
-    alpha = np.clip(np.nan_to_num(alpha), 0, 1)
-    straight = np.divide(rgb, alpha, out=np.zeros_like(rgb), where=alpha > 0)
-    return np.rint(np.concatenate([srgb_from_linear(straight), alpha], axis=-1) * 255).astype(np.uint8)
-
-
-@contextlib.contextmanager
-def _image_errors(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn what Pillow and OpenEXR raise about `path` into a MediaError."""
-    _require_file(path)
-    try:
-        with warnings.catch_warnings(action="ignore"):  # Pillow warns of large images
-            yield
-    except PermissionError as error:
-        raise MediaError(f"{path}: no permission to read it; chmod it or run as its owner") from error
-    except (
-        UnidentifiedImageError,
-        Image.DecompressionBombError,
-        OSError,
-        SyntaxError,
-        ValueError,
-        KeyError,
-        RuntimeError,
-        TypeError,
-    ) as error:
-        raise MediaError(f"{path}: not an image that can be read ({error}); export or copy it anew") from error
-
-
-def _is_exr(path: str | os.PathLike[str]) -> bool:
-    return Path(path).suffix.lower() == ".exr"
-
-
-def _require_file(path: str | os.PathLike[str]) -> None:
-    """Refuse what is not a regular file: a pipe or device would make a reader wait forever."""
-    if not Path(path).is_file():
-        raise MediaError(
-            f"{path}: no such file; check the path"
-            if not Path(path).exists()
-            else f"{path}: not a regular file; copy it to one"
-        )
 
 
 def _url(path: str | os.PathLike[str]) -> str:

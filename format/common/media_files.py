@@ -1,7 +1,9 @@
 """Which files are images or videos, judged by their names alone."""
 
 import os
-from pathlib import PurePath
+from pathlib import Path, PurePath
+
+from kpc.format.common.errors import MediaError
 
 # Suffixes of still images, most frequent first: those of the formats that `images.py` decodes.
 IMAGE_SUFFIXES = (
@@ -35,3 +37,17 @@ def is_hidden(path: str | os.PathLike[str]) -> bool:
     """Return whether a name is that of a hidden or system file, such as ._0001.png, .DS_Store or Thumbs.db."""
     name = PurePath(path).name
     return name.startswith(".") or name.lower() in _SYSTEM_FILES
+
+
+def require_file(path: str | os.PathLike[str]) -> None:
+    """Refuse what is not a regular file: a pipe or device would make a reader wait forever.
+
+    Raises:
+        MediaError: there is no such file, or it is not a regular one.
+    """
+    if not Path(path).is_file():
+        raise MediaError(
+            f"{path}: no such file; check the path"
+            if not Path(path).exists()
+            else f"{path}: not a regular file; copy it to one"
+        )

@@ -1,6 +1,6 @@
 """What keys and panels can make a player do."""
 
-from kpc.format.common.media import write_image
+from kpc.format.common.images import write_image
 from kpc.format.container.sources import open_source
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.controls import OrbitView

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from kpc.format.common.errors import ContextLostError, DisplayError
-from kpc.format.common.media import write_image
+from kpc.format.common.images import write_image
 from kpc.player.app.actions import Actions
 from kpc.player.app.controls import OrbitView
 from kpc.player.app.desktop import glfw

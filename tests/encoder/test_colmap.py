@@ -15,7 +15,7 @@ from datasets import all_rays, distorted, fails, load
 from kpc.encoder.datasets import pixel_rays
 from kpc.encoder.datasets.layouts import colmap
 from kpc.format.common.errors import KpcError
-from kpc.format.common.media import write_image
+from kpc.format.common.images import write_image
 
 POSE = (1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 3.0)
 PINHOLE = (40.0, 41.0, 16.5, 11.5)

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import datasets as make
 from datasets import fails, load
 from kpc.encoder.datasets import load_dataset
 from kpc.encoder.datasets.capture import natural_key
 from kpc.encoder.datasets.loading import downscale_picture
-from kpc.format.common.media import write_image, write_video
+from kpc.format.common.images import write_image
+from kpc.format.common.media import write_video
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -416,3 +418,101 @@ def test_files_that_systems_leave_are_no_pictures(tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "n3dv")
     (tmp_path / "n3dv/._cam00.mp4").write_bytes(bytes(70))
     assert load(tmp_path / "n3dv").pictures.is_test.sum() == 4
+
+
+def test_sixteen_bit_grey(tmp_path: Path) -> None:
+    """Every sample counts by its high byte; Pillow's own conversion would make all of them white."""
+    rig = make.write_nerfstudio(tmp_path / "set", images=4)
+    grey = [make.picture(camera)[..., 0] for camera in rig]
+    for k, levels in enumerate(grey):
+        Image.fromarray(levels.astype(np.uint16) * 256 + 77).save(tmp_path / f"set/images/{k:04d}.png")
+    dataset = load(tmp_path / "set")
+    for k, levels in enumerate(grey):
+        np.testing.assert_array_equal(dataset.pixels.picture(k), np.repeat(levels[..., None], 3, axis=2))
+
+
+@pytest.mark.parametrize("listed", [".webp", ".WEBP", ""])
+@pytest.mark.parametrize("suffix", [".webp", ".TIFF", ".Bmp"])
+def test_pictures_of_any_suffix(tmp_path: Path, suffix: str, listed: str) -> None:
+    """The list may write the suffix in another case, or leave it out."""
+    rig = make.write_nerfstudio(tmp_path / "set", images=3)
+    for k in range(3):
+        file = tmp_path / f"set/images/{k:04d}.png"
+        Image.open(file).save(file.with_suffix(suffix), quality=95)
+        file.unlink()
+    name = {".webp": suffix.lower(), ".WEBP": suffix.upper()}.get(listed, "")
+    make.edit_json(
+        tmp_path / "set/transforms.json",
+        lambda d: [f.update(file_path=f["file_path"].replace(".png", name)) for f in d["frames"]],
+    )
+    dataset = load(tmp_path / "set")
+    assert np.abs(dataset.pixels.picture(2).astype(int) - make.picture(rig[2])).mean() < 3
+
+
+@pytest.mark.parametrize("suffix, words", [(".nef", "images of the suffix .nef"), ("", "images without a suffix")])
+def test_files_that_exist_are_not_said_to_be_missing(tmp_path: Path, suffix: str, words: str) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    (tmp_path / "set/images/0001.png").rename(tmp_path / f"set/images/0001{suffix}")
+    make.edit_json(tmp_path / "set/transforms.json", lambda d: d["frames"][1].update(file_path=f"images/0001{suffix}"))
+    fails(tmp_path / "set", f"images/0001{suffix} exists", words, "convert it to PNG")
+
+
+def test_names_of_accented_letters(tmp_path: Path) -> None:
+    """Macs decompose them, so that a list and the names in an archive may differ."""
+    make.write_nerfstudio(tmp_path / "set", images=3)
+    (tmp_path / "set/images/0001.png").rename(tmp_path / "set/images/cafe\u0301.png")
+    make.edit_json(tmp_path / "set/transforms.json", lambda d: d["frames"][1].update(file_path="images/caf\u00e9.png"))
+    assert len(load(tmp_path / "set").pictures) == 3
+
+
+@pytest.mark.parametrize(
+    "declared, upright, words",
+    [
+        ((24, 32), True, "are turned by their EXIF orientation"),
+        ((32, 24), False, "are used as stored"),
+        (None, False, "are used as stored"),
+    ],
+)
+def test_exif_orientation(
+    tmp_path: Path, declared: tuple[int, int] | None, upright: bool, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Images are turned only if the calibration is for the turned size; masks of either size fit then."""
+    rig = make.write_nerfstudio(tmp_path / "set", images=3)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter turn clockwise shows it upright
+    usable = np.arange(24 * 32).reshape(24, 32) % 5 > 0
+    for k in range(2):
+        file = tmp_path / f"set/images/{k:04d}.png"
+        Image.open(file).save(file, exif=exif)
+    make.write_mask(tmp_path / "set/masks/0000.png", np.rot90(usable, -1) if upright else usable)
+    Image.fromarray(usable).save(tmp_path / "set/masks/0001.png", exif=exif)
+    Image.open(tmp_path / "set/images/0002.png").rotate(-90 * upright, expand=True).save(
+        tmp_path / "set/images/0002.png"
+    )
+
+    def declare(document: dict[str, object]) -> None:
+        if declared is None:
+            del document["w"], document["h"]
+        else:
+            document["w"], document["h"] = declared
+
+    make.edit_json(tmp_path / "set/transforms.json", declare)
+    dataset = load(tmp_path / "set")
+    lines = [line for line in capsys.readouterr().err.splitlines() if "EXIF" in line]
+    assert len(lines) == 1 and "2 images" in lines[0] and words in lines[0]
+    for k in range(2):
+        expected = make.picture(rig[k])
+        np.testing.assert_array_equal(dataset.pixels.picture(k), np.rot90(expected, -1) if upright else expected)
+        np.testing.assert_array_equal(dataset.usable(k), np.rot90(usable, -1) if upright else usable)
+
+
+def test_exif_orientation_of_llff(tmp_path: Path) -> None:
+    """The size in poses_bounds.npy decides in the same way."""
+    make.write_llff(tmp_path / "set", images=3)
+    exif = Image.Exif()
+    exif[0x0112] = 8
+    for k in range(3):
+        file = tmp_path / f"set/images/view{k}.png"
+        Image.open(file).rotate(-90, expand=True).save(file, exif=exif)
+    dataset = load(tmp_path / "set")
+    assert dataset.pictures.width.tolist() == [32] * 3

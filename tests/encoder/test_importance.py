@@ -10,7 +10,7 @@ import datasets as make
 from kpc.encoder.datasets import Dataset, load_dataset
 from kpc.encoder.training import importance
 from kpc.encoder.training.importance import SMALLEST_TILE, TileWeights, has_static_cameras, max_temporal_difference
-from kpc.format.common.media import write_image
+from kpc.format.common.images import write_image
 
 FLOOR = 0.1
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 import datasets as make
 from datasets import fails, load
@@ -17,7 +18,7 @@ from kpc.encoder.datasets.masks import BLOCK
 from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim
 from kpc.encoder.training.sampler import RaySampler
 from kpc.format.common.fidelity import psnr
-from kpc.format.common.media import write_image
+from kpc.format.common.images import write_image
 from scenes import tiny_scene
 
 SIZE = (24, 32)
@@ -113,18 +114,20 @@ def test_images_without_a_mask_are_listed(tmp_path: Path, capsys: pytest.Capture
     assert f"masks ({share:.1%} ignored)" in description
 
 
-def test_only_zero_is_ignored(tmp_path: Path) -> None:
-    """Any other grey level is usable; of colour only the first channel matters, and alpha never."""
+def test_only_black_and_transparent_is_ignored(tmp_path: Path) -> None:
+    """Any other grey level is usable, and so is any other colour."""
     folder = masked(tmp_path / "set", {})
     (folder / "masks").mkdir()
     grey = np.arange(24 * 32, dtype=np.uint8).reshape(SIZE)
     write_image(folder / "masks/0001.png", grey)
-    colour = np.stack([grey, 255 - grey, 255 - grey, 255 - grey], axis=2)
-    write_image(folder / "masks/0002.png", colour[..., :3])
-    write_image(folder / "masks/0003.png", colour)
+    blue = np.stack([0 * grey, 0 * grey, grey, np.where(grey == 7, 0, 255).astype(np.uint8)], axis=2)
+    write_image(folder / "masks/0002.png", blue[..., :3])
+    write_image(folder / "masks/0003.png", blue)
+    Image.fromarray(grey.astype(np.uint16)).save(folder / "masks/0004.png.TIF")
     dataset = load(folder)
-    for k in (1, 2, 3):
+    for k in (1, 2, 4):
         np.testing.assert_array_equal(dataset.usable(k), grey != 0)
+    np.testing.assert_array_equal(dataset.usable(3), (grey != 0) & (grey != 7))
 
 
 def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import datasets as make
 from datasets import fails, load
 from kpc.encoder.datasets import PixelCache, pixel_cache
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.media import write_image
+from kpc.format.common.images import write_image
 
 
 def cache_file(tmp_path: Path) -> Path:

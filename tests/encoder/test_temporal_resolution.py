@@ -14,7 +14,7 @@ from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import time_rows
 from kpc.encoder.training import temporal_resolution
 from kpc.encoder.training.temporal_resolution import fit_frames_per_row, measure_time_resolution
-from kpc.format.common.media import write_image
+from kpc.format.common.images import write_image
 
 # The last frame is 48 after the first: a spacing r that divides 48 has 48 / r + 1 rows, which can match a clip exactly.
 FRAMES = 49

@@ -19,7 +19,7 @@ from kpc.encoder.training.sampler import RaySampler
 from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.errors import TrainingError
 from kpc.format.common.fidelity import psnr
-from kpc.format.common.media import read_image, write_image
+from kpc.format.common.images import read_image, write_image
 from kpc.format.scene.scene import SPACE_PLANES
 from kpc.format.scene.space import Contraction
 from training_runs import BOX, CONFIG, ignore, torch_twin, trained, trainer

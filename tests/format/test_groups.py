@@ -11,7 +11,7 @@ from PIL import Image
 import kpc
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import BudgetError, FormatError, UsageError
-from kpc.format.common.media import read_image
+from kpc.format.common.images import read_image
 from kpc.format.container import groups, scene_io
 from kpc.format.container.container import Reader
 from kpc.format.container.groups import GroupedScene, GroupInput, Groups, Span, Timeline

@@ -5,21 +5,12 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 import pytest
-from PIL import Image
 
 from kpc.format.common import media
 from kpc.format.common.errors import MediaError
-from kpc.format.common.media import (
-    ffmpeg_binary,
-    read_image,
-    read_video,
-    srgb_from_linear,
-    video_info,
-    write_image,
-    write_video,
-)
+from kpc.format.common.images import read_image
+from kpc.format.common.media import ffmpeg_binary, read_video, video_info, write_video
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -263,85 +254,6 @@ def test_no_ffmpeg_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(MediaError, match="install ffmpeg"):
         ffmpeg_binary()
     ffmpeg_binary.cache_clear()
-
-
-@pytest.mark.parametrize("mode, channels", [("RGB", 3), ("RGBA", 4), ("L", 3), ("LA", 4), ("P", 3)])
-def test_png_modes(tmp_path: Path, mode: str, channels: int) -> None:
-    Image.new(mode, (5, 4), 7).save(tmp_path / "x.png")
-    assert read_image(tmp_path / "x.png").shape == (4, 5, channels)
-    assert media.image_size(tmp_path / "x.png") == (5, 4, channels == 4)
-
-
-def test_images_round_trip(tmp_path: Path) -> None:
-    pixels = np.random.default_rng(0).integers(0, 256, (6, 7, 4), dtype=np.uint8)
-    write_image(tmp_path / "x.png", pixels)
-    np.testing.assert_array_equal(read_image(tmp_path / "x.png"), pixels)
-    flat = np.full((8, 8, 3), (200, 100, 50), np.uint8)
-    write_image(tmp_path / "x.jpg", flat)
-    assert np.abs(read_image(tmp_path / "x.jpg").astype(int) - flat).max() <= 2  # half a step of each of Y, Cb, Cr
-
-
-def test_exif_orientation_is_not_applied(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 6  # a quarter turn
-    Image.new("RGB", (12, 8)).save(tmp_path / "x.jpg", exif=exif)
-    assert read_image(tmp_path / "x.jpg").shape == (8, 12, 3)
-
-
-def test_exr_is_converted_by_the_srgb_curve(tmp_path: Path) -> None:
-    linear = np.random.default_rng(0).uniform(-0.2, 1.4, (5, 6, 3)).astype(np.float32)
-    alpha = np.linspace(0, 1, 30, dtype=np.float32).reshape(5, 6)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {"RGB": OpenEXR.Channel(linear.copy())}) as exr:
-        exr.write(str(tmp_path / "x.exr"))
-    with OpenEXR.File(
-        header, {"RGBA": OpenEXR.Channel(np.concatenate([linear * alpha[..., None], alpha[..., None]], axis=2))}
-    ) as exr:
-        exr.write(str(tmp_path / "a.exr"))
-    expected = np.rint(255 * srgb_from_linear(linear))
-    np.testing.assert_array_equal(read_image(tmp_path / "x.exr"), expected)
-    straight = read_image(tmp_path / "a.exr")
-    assert np.abs(straight[..., :3] - np.where(alpha[..., None] > 0, expected, 0)).max() <= 1  # float32 rounding
-    np.testing.assert_array_equal(straight[..., 3], np.rint(255 * alpha))
-    assert media.image_size(tmp_path / "x.exr") == (6, 5, False)
-    assert media.image_size(tmp_path / "a.exr") == (6, 5, True)
-
-
-def test_srgb_curve_at_known_points() -> None:
-    np.testing.assert_allclose(
-        srgb_from_linear(np.array([-1, 0, 0.0031308, 0.2140411, 1, 5, np.nan])),
-        [0, 0, 0.0404499, 0.5, 1, 1, 0],
-        atol=1e-6,
-    )
-
-
-@pytest.mark.parametrize("name", ["x.png", "x.jpg", "x.exr"])
-def test_damaged_images_are_media_errors(tmp_path: Path, name: str) -> None:
-    with pytest.raises(MediaError, match="no such file"):
-        read_image(tmp_path / name)
-    if name == "x.exr":
-        with OpenEXR.File(
-            {"type": OpenEXR.scanlineimage}, {"RGB": OpenEXR.Channel(np.ones((40, 40, 3), np.float32))}
-        ) as exr:
-            exr.write(str(tmp_path / name))
-    else:
-        write_image(tmp_path / name, np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8))
-    data = (tmp_path / name).read_bytes()
-    for damaged in (b"", b"nonsense", data[: len(data) // 2]):
-        (tmp_path / name).write_bytes(damaged)
-        with pytest.raises(MediaError, match=name):
-            read_image(tmp_path / name)
-
-
-def test_image_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_image(tmp_path / "x.png", np.zeros((4, 4, 3), np.uint8))
-
-    def refuse(*_: object) -> None:
-        raise PermissionError(13, "Permission denied", "x.png")
-
-    monkeypatch.setattr(media.Image, "open", refuse)  # root may read everything, so the refusal is simulated
-    with pytest.raises(MediaError, match="no permission"):
-        read_image(tmp_path / "x.png")
 
 
 @pytest.mark.skipif(not (DATA / "room").is_dir(), reason="shared/data is not here")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from kpc.format.coding.quantise import quantise_scene
-from kpc.format.common.media import read_image
+from kpc.format.common.images import read_image
 from kpc.format.container.scene_io import write
 from kpc.tools.cli.serve import Handler, serving
 from scenes import tiny_scene, with_appearances

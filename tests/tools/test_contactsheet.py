@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kpc.format.common.media import read_image, write_image
+from kpc.format.common.images import read_image, write_image
 from kpc.tools.cli import contactsheet
 from kpc.tools.cli.depth_images import NO_SURFACE
 

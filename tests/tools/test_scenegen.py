@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kpc.encoder.datasets import load_dataset, pixel_rays
-from kpc.format.common.media import read_image
+from kpc.format.common.images import read_image
 from kpc.format.scene.cameras import Camera, load_views
 from kpc.tools.dev import scene_geometry, scenegen
 from kpc.tools.dev.scene_geometry import BALL, BEAD, CONTENTS, RING, moving_objects

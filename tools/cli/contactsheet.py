@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from kpc.format.common import cli
 from kpc.format.common.errors import MediaError, UsageError
 from kpc.format.common.fidelity import psnr
-from kpc.format.common.media import read_image, write_image
+from kpc.format.common.images import read_image, write_image
 from kpc.format.common.media_files import is_image
 from kpc.tools.cli.depth_images import NO_SURFACE, read_depth_levels
 

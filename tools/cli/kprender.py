@@ -28,7 +28,8 @@ import OpenEXR
 import kpc
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
-from kpc.format.common.media import write_image, write_video
+from kpc.format.common.images import write_image
+from kpc.format.common.media import write_video
 from kpc.format.common.progress import progress
 from kpc.format.container.groups import GroupedScene
 from kpc.format.scene.cameras import Camera, View, load_views

@@ -17,10 +17,11 @@ from kpc.encoder.datasets.capture import (
     check_pose,
     fit_intrinsics,
     holdout_flags,
+    image_view,
     natural_key,
 )
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.media import image_size, video_info
+from kpc.format.common.media import video_info
 from kpc.format.common.media_files import is_image, is_video
 
 POSES = "poses_bounds.npy"  # the file of poses and depth ranges
@@ -68,10 +69,24 @@ def _view(path: Path, number: int, file: Path, row: np.ndarray, is_test: bool) -
     pose = check_pose(where, np.stack([right, -down, backwards, centre], axis=1))
     if not 0 < near < far < np.inf:
         raise DatasetError(f"{where}: near {near:g} and far {far:g} are not 0 < near < far; calibrate anew")
-    video = video_info(file) if is_video(file) else None
-    width, height, has_alpha = (video.width, video.height, False) if video else image_size(file)
-    intrinsics = fit_intrinsics(where, file, (focal, focal, w / 2, h / 2), (w, h), (width, height))
-    return CapturedView(file, video, None, is_test, width, height, has_alpha, intrinsics, (0.0,) * 4, pose, near, far)
+    intrinsics, no_distortion = (focal, focal, w / 2, h / 2), (0.0,) * 4
+    if not is_video(file):
+        return image_view(
+            file,
+            where=where,
+            time=None,
+            is_test=is_test,
+            declared=(w, h),
+            intrinsics=intrinsics,
+            distortion=no_distortion,
+            camera_to_world=pose,
+            near=near,
+            far=far,
+        )
+    video = video_info(file)
+    size = video.width, video.height
+    intrinsics = fit_intrinsics(where, file, intrinsics, (w, h), size)
+    return CapturedView(file, video, None, is_test, *size, False, intrinsics, no_distortion, pose, near, far)
 
 
 def _read_poses(file: Path) -> np.ndarray:

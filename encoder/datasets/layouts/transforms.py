@@ -12,7 +12,7 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import CapturedView, image_view
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.media import image_size
+from kpc.format.common.images import image_info
 
 # Camera models of nerfstudio that are not a pinhole with k1 k2 p1 p2.
 _UNSUPPORTED = {
@@ -65,7 +65,11 @@ def frame_view(file: Path, number: int, document: dict[str, Any], image: Path, i
     if any(_number(where, keys, k, 0.0) != 0 for k in ("k3", "k4", "k5", "k6")):
         raise DatasetError(f"{where}: distortion beyond k1 k2 p1 p2 is not supported; undistort the images")
     declared = (_number(where, keys, "w"), _number(where, keys, "h")) if "w" in keys and "h" in keys else None
-    width, height = declared or image_size(image)[:2]
+    if declared is None:
+        info = image_info(image)
+        width, height = float(info.width), float(info.height)
+    else:
+        width, height = declared
     fl_x = _focal(where, keys, width)
     intrinsics = (
         fl_x,
