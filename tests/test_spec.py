@@ -13,7 +13,7 @@ import zstandard
 
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common import errors
-from kpc.format.container import container, groups, scene_io
+from kpc.format.container import container, groups, metadata_chunk, scene_io
 from kpc.player.cpu import reference
 from kpc.tools.vectors import specvectors
 from kpc.tools.vectors.description import ZSTD_VERSION, described
@@ -84,6 +84,7 @@ def test_readable_decoder_decodes_valid_vectors_to_the_manifest(name):
     assert {"count": len(cameras), "sha256": sha256(cameras)} == expected["cameras"]
     assert_weights(scene, expected["decoder"])
     assert_motion_and_appearances(scene, expected)
+    assert scene["metadata"] == expected.get("metadata", {})
 
 
 def assert_weights(scene: dict, expected: dict) -> None:
@@ -153,6 +154,7 @@ def test_groups_hold_the_vectors_of_the_manifest(name):
             assert content == valid_vector(group["scene"])[1]
             assert scene_io.read(opened.open(number)).clip.frame_count == scenes[number]["frame_count"]
     assert len(scenes) == sum(group["scene"] is not None for group in expected["groups"])
+    assert opened.metadata().document == expected.get("metadata", {})
 
 
 @pytest.mark.parametrize("name", GROUPED)
@@ -204,6 +206,10 @@ def test_vectors_on_disk_are_those_of_their_generator():
     for name in MANIFEST["invalid"]:
         assert made[f"invalid/{name}.kpc"] == (VECTORS / "invalid" / f"{name}.kpc").read_bytes(), name
     assert sum(map(len, made.values())) < 750_000
+
+
+def test_schema_of_metadata_is_that_of_the_package():
+    assert json.loads((SPEC / "meta.schema.json").read_text()) == metadata_chunk.SCHEMA
 
 
 def test_drafts_are_among_the_invalid_vectors():

@@ -10,7 +10,7 @@ import pytest
 
 from kpc.format.coding import poses, rans
 from kpc.format.container import container as package_container
-from kpc.format.container import scene_layout, segments
+from kpc.format.container import metadata_chunk, scene_layout, segments
 from kpc.format.scene import scene, space
 
 SPEC = Path(__file__).parent.parent / "spec"
@@ -156,7 +156,7 @@ def test_limits_are_those_of_the_package():
     rows = re.findall(r"^\| ([A-Z_]+) \| (\d+) \|", section("11.1"), re.M)
     code = {
         name: int(value)
-        for module in (package_container, scene_layout)
+        for module in (package_container, scene_layout, metadata_chunk)
         for name, value in vars(module).items()
         if name.endswith("_LIMIT") and name != "HEAD_LIMIT"
     }

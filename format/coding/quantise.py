@@ -19,6 +19,7 @@ from kpc.format.common.errors import FormatError
 from kpc.format.common.jit import compiled
 from kpc.format.container.segments import PlaneSideInfo
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.motion import QuantisedMotion, quantise_motion, reached_cells
 from kpc.format.scene.scene import TIME_PLANES, AnyDecoder, Appearance, Clip, Scene
 from kpc.format.scene.space import SpaceMapping
@@ -161,6 +162,7 @@ class QuantisedScene:
     mapping: SpaceMapping | None = None
     motion: QuantisedMotion | None = None
     appearances: tuple[Appearance, ...] = field(default=())
+    metadata: Metadata = field(default_factory=Metadata)
 
     def dequantise(self) -> Scene:
         """Return the scene that every decoder sees."""
@@ -177,6 +179,7 @@ class QuantisedScene:
             self.mapping,
             None if self.motion is None else self.motion.dequantise(),
             self.appearances,
+            self.metadata,
         )
 
     @property
@@ -244,6 +247,7 @@ def quantise_scene(
         scene.mapping,
         None if scene.motion is None else quantise_motion(scene.motion),
         tuple(Appearance(appearance.name, to_half(appearance.code, "appearances")) for appearance in scene.appearances),
+        scene.metadata,
     )
 
 

@@ -26,11 +26,13 @@ from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import FormatError, UsageError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.container import ENTRY, HEADER, Codec, Entry, Reader, header_and_index, stored_frame
+from kpc.format.container.metadata_chunk import META_LIMIT, pack_metadata, parse_metadata
 from kpc.format.container.scene_io import SceneReader, read
 from kpc.format.container.scene_layout import FRAME_LIMIT, GROUP_KIND
 from kpc.format.container.slices import sliced
 from kpc.format.container.sources import AnySource, RemoteSource, Source, open_source
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.metadata import Metadata, merged
 from kpc.format.scene.scene import Clip, Scene
 
 
@@ -159,6 +161,7 @@ class Groups:
                 self.reader.source = open_source(source.read_at(0, source.size))
             spans = self._spans()
             self._first = self._opened(0, self._slice(0, self.reader.source))
+        self._beside = None if self.is_single else self._metadata_beside()
         self.timeline = Timeline(spans, self._first.head.clip.fps)
         self._check(0, self._first)
 
@@ -207,6 +210,23 @@ class Groups:
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras of the first group, which stand for all."""
         return self._first.cameras()
+
+    def metadata(self) -> Metadata:
+        """Return the metadata beside the groups, which are those of the clip; without any, those of the first group."""
+        return self._first.metadata() if self._beside is None else self._beside
+
+    def _metadata_beside(self) -> Metadata | None:
+        """Return the metadata beside the groups; None if there are none, or not yet."""
+        found = [number for number, entry in enumerate(self.reader.index) if entry.kind == "meta"]
+        if len(found) > 1:
+            raise FormatError(f"{self.name}: holds {len(found)} meta chunks, not one")
+        if not found or not self.reader.available(found[0]):
+            return None
+        content = self.reader.chunk(found[0], META_LIMIT)
+        try:
+            return parse_metadata(content)
+        except FormatError as error:
+            raise FormatError(f"{self.name}: {error}") from error
 
     def _spans(self) -> tuple[Span, ...]:
         """Sort the groups by number and return their frames, after checking them."""
@@ -263,6 +283,7 @@ class GroupedScene:
     Attributes:
         clip: the time axis of the whole clip.
         cameras: some of the cameras that the first group was captured with.
+        metadata: of the clip.
         timeline: which group is shown when.
     """
 
@@ -270,6 +291,7 @@ class GroupedScene:
         self._groups = groups
         self._held: dict[int, Scene] = {}
         self.timeline, self.clip, self.cameras = groups.timeline, groups.clip, groups.cameras()
+        self.metadata = groups.metadata()
 
     def at(self, time: float) -> tuple[Scene, float]:
         """Return the scene shown at `time` in [0, 1] over the clip, and the time in it; read it if it is not held.
@@ -295,7 +317,7 @@ class GroupedScene:
         self._held = {held: scene for held, scene in self._held.items() if held in wanted}
         if number not in self._held:
             scene = read(self._groups.open(number)).dequantise()
-            self._held[number] = replace(scene, cameras=scene.cameras or self.cameras)
+            self._held[number] = replace(scene, cameras=scene.cameras or self.cameras, metadata=self.metadata)
         return self._held[number]
 
 
@@ -314,19 +336,22 @@ class GroupInput:
         span: the frames of the clip that it covers.
         fps: frames per second.
         value_count: number of values in its planes, from its header.
+        metadata: of the file that it was part of.
     """
 
     source: Source
     span: Span
     fps: float
     value_count: int
+    metadata: Metadata
 
     @staticmethod
-    def of(source: AnySource, start: int) -> "GroupInput":
-        """Open a scene file that covers the frames from `start` on."""
+    def of(source: AnySource, start: int, metadata: Metadata | None = None) -> "GroupInput":
+        """Open a scene file that covers the frames from `start` on; its own metadata stand for None."""
         scene = SceneReader(source, in_parts=True)
         clip = scene.head.clip
-        return GroupInput(scene.source, Span(start, clip.frame_count), clip.fps, scene.header.value_count)
+        found = scene.metadata() if metadata is None else metadata
+        return GroupInput(scene.source, Span(start, clip.frame_count), clip.fps, scene.header.value_count, found)
 
 
 def group_inputs(files: Sequence[AnySource]) -> list[GroupInput]:
@@ -343,15 +368,21 @@ def group_inputs(files: Sequence[AnySource]) -> list[GroupInput]:
             parts.append(GroupInput.of(groups.reader.source, parts[-1].span.last + 1 if parts else 0))
         else:
             parts += [
-                GroupInput.of(groups.source_of(number), span.start) for number, span in enumerate(groups.timeline.spans)
+                GroupInput.of(groups.source_of(number), span.start, groups.metadata())
+                for number, span in enumerate(groups.timeline.spans)
             ]
     return parts
 
 
-def write(parts: Sequence[GroupInput], path: str | os.PathLike[str]) -> int:
+def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: Metadata | None = None) -> int:
     """Write a clip in groups and return its size in bytes.
 
     One group is in memory at a time. On failure an existing file at `path` is left unchanged.
+
+    Args:
+        parts: the groups, in order.
+        path: of the file.
+        metadata: of the clip; None for what the parts agree on.
 
     Raises:
         UsageError: the parts do not make up a clip.
@@ -366,10 +397,16 @@ def write(parts: Sequence[GroupInput], path: str | os.PathLike[str]) -> int:
             f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; "
             "encode both at one rate"
         )
+    metadata = merged([part.metadata for part in parts]) if metadata is None else metadata
+    beside = [pack_metadata(metadata)] if metadata else []
     entries: list[Entry] = []
     with atomic_write(path) as temporary, temporary.open("wb") as opened:
         # Header and index come first but hold checksums of the groups, so they are written last.
-        opened.seek(HEADER.size + len(stored_frame(bytes(ENTRY.size * len(parts)))))
+        opened.seek(HEADER.size + len(stored_frame(bytes(ENTRY.size * (len(parts) + len(beside))))))
+        for body in beside:  # before the groups, so that it comes with the first request
+            opened.write(body)
+            crc, size = google_crc32c.value(body), len(body)
+            entries.append(Entry("meta", 0, 0, 0, 0, 0, Codec.RAW, size, size, crc))
         for number, part in enumerate(parts):
             body, span = part.source.read_at(0, part.source.size), part.span
             opened.write(body)

@@ -64,7 +64,7 @@ class SegmentedPlane:
 class PartialScene:
     """A scene with the segments that have been put into it.
 
-    Opening it reads the chunks without which there is no picture, and the cameras and appearances.
+    Opening it reads the chunks without which there is no picture, the cameras, the appearances and the metadata.
 
     Attributes:
         scene: rendered like any other. Its planes change as segments come and go; time planes are `SegmentedPlane`.
@@ -117,6 +117,7 @@ class PartialScene:
             reader.mapping(),
             None if motion is None else motion.dequantise(),
             reader.appearances(),
+            reader.metadata(),
         )
 
     def entry(self, number: int) -> Entry:

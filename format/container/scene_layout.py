@@ -3,7 +3,7 @@ after it).
 
     SCNE  box, clip, sizes, quantisation steps and offsets of every plane     WARP  mapping of space beyond the box
     MOVE  motion grid            DECO, HYBR  weights of a decoder             OCCU  occupancy grid
-    came  cameras                appe        appearances
+    came  cameras                appe        appearances                  meta  metadata (`metadata_chunk`)
 
 `pack_...` makes the content, `parse_...` reads and checks it. Every parser raises a FormatError if the content is too
 short, too long or breaks a rule of the format.
@@ -23,7 +23,7 @@ from kpc.format.coding.poses import decode_poses
 from kpc.format.coding.quantise import VALUE_LIMIT, QuantisedScene
 from kpc.format.coding.weights import decode_weights
 from kpc.format.common.errors import DatasetError, FormatError
-from kpc.format.scene.cameras import Camera
+from kpc.format.scene.cameras import Camera, has_unit_axes
 from kpc.format.scene.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, Appearance, Clip, Decoder, HybridDecoder
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
@@ -57,7 +57,7 @@ FRAME_TOLERANCE = 1e-4  # of the products of the axes of a frame, which should b
 BOX_LIMIT = 1 << 30
 
 GROUP_KIND = "GRUP"  # a scene's file in a file of several, `kpc.format.container.groups`
-KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "PLNE"})
+KNOWN_KINDS = frozenset({"SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "meta", "PLNE"})
 HEAD_LIMIT = SCENE_STRUCT.size + SCALE_LIMIT * (SCALE_STRUCT.size + 9 * 4 * CHANNEL_LIMIT)  # bytes of SCNE, at most
 
 
@@ -434,8 +434,7 @@ def _make_camera(number: int, numbers: tuple[Any, ...]) -> Camera:
     """Return the camera of the fields of CAMERA_STRUCT."""
     width, height, fl_x, fl_y, cx, cy, *pose = numbers
     matrix = np.vstack([np.reshape(pose, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
-    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
-    if max(map(abs, (fl_x, fl_y, cx, cy, *pose))) > BOX_LIMIT or lengths.min() < 0.5 or lengths.max() > 2.0:
+    if max(map(abs, (fl_x, fl_y, cx, cy, *pose))) > BOX_LIMIT or not has_unit_axes(matrix):
         raise FormatError(f"came: camera {number} lies absurdly far, or its axes are not of length 1")
     try:
         return Camera(width, height, fl_x, fl_y, cx, cy, matrix)

@@ -15,6 +15,7 @@ from kpc.format.coding.raw_planes import decode_raw_segment
 from kpc.format.common.errors import BudgetError, FormatError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.container import Codec, Entry, Reader
+from kpc.format.container.metadata_chunk import META_LIMIT, parse_metadata
 from kpc.format.container.scene_layout import (
     APPEARANCE_LIMIT,
     APPEARANCE_STRUCT,
@@ -53,6 +54,7 @@ from kpc.format.container.segments import (
 )
 from kpc.format.container.sources import AnySource, open_source
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.motion import QuantisedMotion
 from kpc.format.scene.scene import (
     ALL_PLANES,
@@ -101,6 +103,7 @@ def read(
         reader.mapping(),
         reader.motion(),
         reader.appearances(),
+        reader.metadata(),
     )
 
 
@@ -300,6 +303,13 @@ class SceneReader(Reader):
         most = APPEARANCE_STRUCT.size + APPEARANCE_LIMIT * (2 * hidden + 1 + NAME_LIMIT)
         self._afford(4 * self.index[number].raw_length, "its appearances")  # stored bytes, float32 codes and names
         return self._parsed(lambda raw: parse_appearances(raw, hidden), self.chunk(number, most))
+
+    def metadata(self) -> Metadata:
+        """Return the metadata; none if the file has (or has yet) no such chunk."""
+        number = self._at_most_one("meta")
+        if number is None or not self.available(number):
+            return Metadata()
+        return self._parsed(parse_metadata, self.chunk(number, META_LIMIT))
 
     def _only(self, kind: str) -> int:
         """Return the number of the one chunk of a kind."""

@@ -19,6 +19,7 @@ from kpc.format.coding.weights import encode_weights
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import FormatError
 from kpc.format.container.container import Chunk, Codec, pack
+from kpc.format.container.metadata_chunk import pack_metadata
 from kpc.format.container.scene_layout import (
     MOTION_STRUCT,
     OCCUPANCY_STRUCT,
@@ -105,6 +106,8 @@ def _chunks_before_planes(scene: QuantisedScene) -> list[Chunk]:
         appe = pack_appearances(scene.appearances, len(scene.decoder.b1))
         parse_appearances(appe, len(scene.decoder.b1))
         chunks.append(Chunk("appe", appe))
+    if scene.metadata:
+        chunks.append(Chunk("meta", pack_metadata(scene.metadata)))
     return chunks
 
 

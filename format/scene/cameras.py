@@ -78,6 +78,12 @@ class Camera:
         return np.ascontiguousarray(origins, np.float32), directions.astype(np.float32)
 
 
+def has_unit_axes(pose: np.ndarray) -> bool:
+    """Return whether the axes of a pose, (4, 4), are of about the length 1, as files must have them; or NaN."""
+    lengths = np.linalg.norm(pose[:3, :3], axis=0)
+    return not bool(lengths.min() < 0.5 or lengths.max() > 2.0)
+
+
 @dataclass(frozen=True)
 class View:
     """One frame of `cameras.json`: a camera, a time, and the image file that belongs to it.

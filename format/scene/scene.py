@@ -27,6 +27,7 @@ import numpy as np
 
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.space import DeviceCoordinates, SpaceMapping
 
 SPACE_PLANES = ("xy", "xz", "yz")
@@ -183,6 +184,7 @@ class Scene:
         motion: (T, Nz, Ny, Nx, 3) float32, the motion grid: displacements in edges of the box (with a mapping: of the
             region that the planes cover); see `kpc.format.scene.motion`. None without motion, and in static scenes.
         appearances: embeddings with unique names; empty if all images agree in colour.
+        metadata: what the file says of itself.
     """
 
     aabb: np.ndarray
@@ -196,6 +198,7 @@ class Scene:
     mapping: SpaceMapping | None = None
     motion: np.ndarray | None = None
     appearances: tuple[Appearance, ...] = field(default=())
+    metadata: Metadata = field(default_factory=Metadata)
 
     def at(self, time: float) -> "tuple[Scene, float]":
         """Return the scene shown at `time` and the time in it: itself and `time`.

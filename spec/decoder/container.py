@@ -18,6 +18,7 @@ CODECS = {  # beside RAW and ZSTD
     b"SCNE": (),
     b"WARP": (),
     b"appe": (),
+    b"meta": (),
 }
 HEADER, ENTRY = struct.Struct("<8sHHIIIQQII"), struct.Struct("<4sHBBIIHIII")
 EXPANSION_LIMIT = 32768
@@ -115,20 +116,20 @@ def scene_contents(data, is_prefix):  # sections 4.3 and 4.4
         require(chunk.codec in (RAW, ZSTD, *CODECS[chunk.kind]), "unknown codec")
         require(chunk.codec != RAW or chunk.raw_length == chunk.stored_length, "invalid raw length")
         require(chunk.codec <= ZSTD or chunk.raw_length <= EXPANSION_LIMIT * chunk.stored_length, "invalid raw length")
-        content = None
-        if chunk.is_whole:
-            require(crc32c(chunk.stored) == chunk.crc, "a chunk is damaged")
-            is_frame = chunk.codec == ZSTD
-            stored = decompress(chunk.stored, chunk.raw_length) if is_frame else chunk.stored
-            content = Content(chunk.codec, chunk.raw_length, stored)
-        contents.append((chunk, content))
+        contents.append((chunk, plain_content(chunk) if chunk.is_whole else None))
     return contents, value_count
 
 
+def plain_content(chunk):
+    require(crc32c(chunk.stored) == chunk.crc, "a chunk is damaged")
+    stored = decompress(chunk.stored, chunk.raw_length) if chunk.codec == ZSTD else chunk.stored
+    return Content(chunk.codec, chunk.raw_length, stored)
+
+
 def group_chunks(data, is_prefix=False):  # section 4.7
-    """Return (the GRUP chunks by rising number, value_count); an empty list for a file that is a scene."""
+    """Return (the GRUP chunks by rising number, the meta chunks beside them, value_count); no chunks of a scene."""
     chunks, value_count = read_chunks(data, is_prefix)
-    groups = {}
+    groups, beside = {}, []
     if any(chunk.kind == b"GRUP" for chunk in chunks):
         for chunk in chunks:
             require(chunk.kind == b"GRUP" or not chunk.is_critical, "a critical chunk lies beside groups")
@@ -137,5 +138,8 @@ def group_chunks(data, is_prefix=False):  # section 4.7
                 require(chunk.scale == chunk.plane == 0 and chunk.row_count > 0, "invalid fields of a group")
                 require(chunk.group not in groups, "invalid number of a group")
                 groups[chunk.group] = chunk
+            elif chunk.kind == b"meta":
+                require(chunk.codec in (RAW, ZSTD), "unknown codec")
+                beside.append(chunk)
     require(sorted(groups) == list(range(len(groups))), "invalid numbers of groups")
-    return [groups[number] for number in range(len(groups))], value_count
+    return [groups[number] for number in range(len(groups))], beside, value_count

@@ -1,7 +1,8 @@
 """Section 4.7: clips in groups."""
 
 from .common import clamp, require
-from .container import group_chunks
+from .container import group_chunks, plain_content
+from .metadata import decode_metadata
 from .scene import decode
 
 
@@ -9,9 +10,13 @@ def decode_groups(data, is_prefix=False):
     """Return (groups, scenes): [(row_start, row_count, the file of the group)], and the scenes of those that are whole.
 
     None for a file that is a scene."""
-    chunks, value_count = group_chunks(data, is_prefix)
+    chunks, beside, value_count = group_chunks(data, is_prefix)
     if not chunks:
         return None
+    require(len(beside) <= 1, "there are two meta chunks")
+    for chunk in beside:
+        if chunk.is_whole:
+            decode_metadata(plain_content(chunk).data)
     first = [chunk.row_start for chunk in chunks]
     last = [chunk.row_start + chunk.row_count - 1 for chunk in chunks]
     for g in range(len(chunks) - 1):

@@ -5,6 +5,7 @@ import struct
 
 from .common import PLANES, ByteReader, require
 from .container import scene_contents
+from .metadata import decode_metadata
 from .payloads import (
     decode_appearances,
     decode_cameras,
@@ -16,7 +17,7 @@ from .payloads import (
 from .planes import decode_segment, dequantise
 from .scene_chunks import decode_scne, decode_warp
 
-SINGLE_KINDS = "SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe"
+SINGLE_KINDS = "SCNE", "WARP", "MOVE", "DECO", "HYBR", "OCCU", "came", "appe", "meta"
 
 
 def decode(data, is_prefix=False):
@@ -39,7 +40,8 @@ def decode(data, is_prefix=False):
     planes = [plane for scale in scene["scales"] for plane in scale.values()]
     require(sum(p["rows"] * p["columns"] * p["channels"] for p in planes) == value_count, "invalid value count")
     feature_count = sum(scale["xy"]["channels"] for scale in scene["scales"])
-    scene |= {"value_count": value_count, "mapping": 0, "motion": None, "cameras": [], "appearances": {}}
+    scene |= {"value_count": value_count, "mapping": 0, "motion": None}
+    scene |= {"cameras": [], "appearances": {}, "metadata": {}}
     if "WARP" in single:
         scene |= decode_warp(ByteReader(single["WARP"].data), scene)
     if "MOVE" in single:
@@ -54,6 +56,8 @@ def decode(data, is_prefix=False):
         scene["cameras"] = decode_cameras(single["came"])
     if single.get("appe") is not None:
         scene["appearances"] = decode_appearances(ByteReader(single["appe"].data), scene["hidden"])
+    if single.get("meta") is not None:
+        scene["metadata"] = decode_metadata(single["meta"].data)
     decode_planes(scene, segments)
     return scene
 

@@ -42,6 +42,8 @@ def described(data: bytes, partial: bool) -> dict[str, Any]:
     if scene.motion:
         values = scene.motion.dequantise().astype("<f4")
         found["motion"] = {"shape": list(scene.motion.symbols.shape), "sha256": _sha256(values)}
+    if scene.metadata:
+        found["metadata"] = scene.metadata.document
     if scene.appearances:
         names = [np.frombuffer(one.name.encode(), np.uint8) for one in scene.appearances]
         codes = [one.code.astype("<f4") for one in scene.appearances]

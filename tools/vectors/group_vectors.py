@@ -9,6 +9,7 @@ import google_crc32c
 from kpc.format.container.container import Entry, Reader, header_and_index
 from kpc.format.container.groups import Groups
 from kpc.tools.vectors.files import HEADER_FIELDS, sealed, with_entry
+from kpc.tools.vectors.metadata_vectors import MINIMAL
 
 TIMES = (0.0, 0.125, 0.3, 0.31, 0.32, 0.5, 0.6875, 1.0)
 
@@ -49,6 +50,7 @@ def valid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, bool]]:
     return {
         "groups": (joined, False),
         "groups-apart": (packed([(7, 12, one), (19, 12, third)], beside=[NOTE]), False),
+        "groups-metadata": (packed([(0, 12, third)], beside=[NOTE, ("meta", MINIMAL)]), False),
         "groups-one": (packed([(40, 12, third)]), False),
         "groups-prefix": (joined[: Reader(joined).index[1].offset + len(other) // 2], True),
     }
@@ -80,6 +82,8 @@ def invalid(scenes: dict[str, bytes]) -> dict[str, tuple[bytes, str, str]]:
         "groups-rate": (packed([(0, 1, still), (1, 1, scenes[SLOWER])]), broken, "not 1 at"),
         "groups-values": (packed([(0, 12, third), (9, 12, other)], value_count=7), broken, "more than the header's 7"),
         "groups-beside": (packed([(0, 12, third)], beside=[("SCNE", b"")]), broken, "lies outside the groups"),
+        "groups-metadata-twice": (packed([(0, 12, third)], beside=2 * [("meta", MINIMAL)]), broken, "2 meta chunks"),
+        "groups-metadata-array": (packed([(0, 12, third)], beside=[("meta", b"[]")]), broken, "is no object"),
         "groups-in-groups": (packed([(0, 21, good)]), broken, "a clip in groups"),
         "groups-no-file": (
             packed([(0, 12, third), (9, 12, other)])[: -len(other)] + bytes(len(other)),
@@ -103,9 +107,11 @@ def described(data: bytes, partial: bool, names: dict[bytes, str]) -> dict[str, 
     groups = Groups(data, allow_partial=partial)
     entries = sorted((entry for entry in groups.reader.index if entry.kind == "GRUP"), key=lambda entry: entry.group)
     shown = [(time, *groups.timeline.at(time)) for time in TIMES]
+    has_metadata = any(entry.kind == "meta" for entry in groups.reader.index)
     return {
         "partial": partial,
         "zstd": None,
+        **({"metadata": groups.metadata().document} if has_metadata else {}),
         "groups": [
             {
                 "row_start": entry.row_start,

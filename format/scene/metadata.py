@@ -1,0 +1,189 @@
+"""What a file says of itself: title and author, how to look at the scene, and how it was made.
+
+All of it is optional. A file holds it as a JSON object (spec/kpc-format.md, "meta: metadata"), whose members are
+checked by `kpc.format.container.metadata_chunk`; members that this version does not know are kept.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from kpc.format.scene.cameras import Camera
+
+
+@dataclass(frozen=True)
+class ViewLimits:
+    """From where, and how near, a scene holds.
+
+    A position has an azimuth, an elevation and a distance around the focus. Seen from the focus, azimuth 0 is the
+    horizontal part of `forward`; it grows towards `cross(up, forward)`, which is to the right of a viewer who looks at
+    the focus.
+
+    Attributes:
+        focus: (3,) the point that viewers look at, world coordinates.
+        forward: (3,) unit vector from the focus to a viewer at azimuth 0.
+        up: (3,) unit vector, perpendicular to `forward`.
+        azimuth, elevation: least and largest, radians; an azimuth of a full turn has no bounds.
+        distance: least and largest, world units.
+        reach: how far from the focus the point may lie that a viewer looks at, world units.
+    """
+
+    focus: np.ndarray
+    forward: np.ndarray
+    up: np.ndarray
+    azimuth: tuple[float, float]
+    elevation: tuple[float, float]
+    distance: tuple[float, float]
+    reach: float
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What a viewer shows first.
+
+    Attributes:
+        camera: the view.
+        time: in [0, 1] over the clip.
+    """
+
+    camera: Camera
+    time: float
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """The metadata of a file; see the module.
+
+    Attributes:
+        document: the JSON object, as dictionaries, lists, strings, numbers and booleans.
+    """
+
+    document: Mapping[str, Any] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.document)
+
+    @property
+    def title(self) -> str:
+        """The title; empty if there is none."""
+        return str(self.document.get("title", ""))
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """The names of the scene's cameras, in their order; empty if they are not known."""
+        return tuple(self.document.get("camera_names", ()))
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """How the file was made; empty if that is not known."""
+        return self.document.get("provenance", {})
+
+    @property
+    def up(self) -> np.ndarray | None:
+        """The direction that is up in the world, (3,) unit vector; None if it is not known."""
+        return _unit(self.document["up"]) if "up" in self.document else None
+
+    @property
+    def opening(self) -> Opening | None:
+        """What a viewer shows first; None if that is not known.
+
+        Raises:
+            DatasetError: the camera cannot be.
+        """
+        if "opening" not in self.document:
+            return None
+        opening = self.document["opening"]
+        return Opening(camera_from(opening["camera"]), float(opening["time"]))
+
+    @property
+    def view_limits(self) -> ViewLimits | None:
+        """From where the scene holds; None if that is not known."""
+        up = self.up
+        if "view_limits" not in self.document or up is None:
+            return None
+        limits = self.document["view_limits"]
+        forward = np.array(limits["forward"], float)
+        (azimuth, elevation), (near, far) = np.radians([limits["azimuth"], limits["elevation"]]), limits["distance"]
+        return ViewLimits(
+            np.array(limits["focus"], float),
+            _unit(forward - forward @ up * up),
+            up,
+            (float(azimuth[0]), float(azimuth[1])),
+            (float(elevation[0]), float(elevation[1])),
+            (float(near), float(far)),
+            float(limits["reach"]),
+        )
+
+    def with_members(self, **members: Any) -> "Metadata":
+        """Return the metadata with some members of the object replaced, and without those that are None."""
+        changed = {**self.document, **members}
+        return Metadata({name: value for name, value in changed.items() if value is not None})
+
+    def with_provenance(self, **members: Any) -> "Metadata":
+        """Return the metadata with some members of its provenance replaced, and without those that are None."""
+        changed = {name: value for name, value in {**self.provenance, **members}.items() if value is not None}
+        return self.with_members(provenance=changed or None)
+
+
+def merged(parts: "list[Metadata]") -> Metadata:
+    """Return the members that all parts agree on, of those that have them; of a clip joined from these parts."""
+    return Metadata(_agreed([part.document for part in parts]))
+
+
+def _agreed(documents: "list[Mapping[str, Any]]") -> dict[str, Any]:
+    names = dict.fromkeys(name for document in documents for name in document)
+    found = {}
+    for name in names:
+        values = [document[name] for document in documents if name in document]
+        if name == "provenance":
+            found[name] = _agreed(values)
+        elif all(value == values[0] for value in values):
+            found[name] = values[0]
+    return {name: value for name, value in found.items() if value != {}}
+
+
+def camera_document(camera: Camera) -> dict[str, Any]:
+    """Return a camera as the JSON object of the metadata holds it; numbers have seven digits."""
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "focal": rounded([camera.fl_x, camera.fl_y]),
+        "centre": rounded([camera.cx, camera.cy]),
+        "pose": rounded(np.ravel(camera.camera_to_world[:3])),
+    }
+
+
+def camera_from(document: Mapping[str, Any]) -> Camera:
+    """Return the camera that an object of the metadata describes.
+
+    Raises:
+        DatasetError: it cannot be.
+    """
+    pose = np.vstack([np.reshape(np.array(document["pose"], float), (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+    return Camera(int(document["width"]), int(document["height"]), *map(float, document["focal"]),
+                  *map(float, document["centre"]), pose)  # fmt: skip
+
+
+def limits_document(limits: ViewLimits) -> dict[str, Any]:
+    """Return view limits as the JSON object of the metadata holds them; `up` is a member of its own there."""
+    return {
+        "focus": rounded(limits.focus),
+        "forward": rounded(limits.forward),
+        "azimuth": rounded(np.degrees(limits.azimuth)),
+        "elevation": rounded(np.degrees(limits.elevation)),
+        "distance": rounded(limits.distance),
+        "reach": rounded([limits.reach])[0],
+    }
+
+
+def rounded(numbers: "Any") -> list[float]:
+    """Return numbers rounded to seven significant digits, whole ones as integers."""
+    found = (float(f"{float(number):.7g}") for number in numbers)
+    return [int(number) if number.is_integer() and abs(number) < 1e15 else number for number in found]
+
+
+def _unit(vector: Any) -> np.ndarray:
+    array = np.array(vector, float)
+    return np.asarray(array / np.linalg.norm(array))
