@@ -22,6 +22,19 @@ HOLD_OUT_EVERY = 8
 
 
 @dataclass(frozen=True)
+class MaskFile:
+    """An image that says which pixels of another are ignored: those that are 0, or those that are not.
+
+    Attributes:
+        path: of the image.
+        marks_ignored: whether other values than 0 are ignored, as in the `dynamic_mask_*.png` of instant-ngp.
+    """
+
+    path: Path
+    marks_ignored: bool = False
+
+
+@dataclass(frozen=True)
 class CapturedView:
     """One file of a dataset, with the camera that captured it.
 
@@ -37,6 +50,7 @@ class CapturedView:
         near, far: depth range along the optical axis, NaN if unknown.
         orientation: of an image, EXIF's number from 1 (as stored) to 8.
         upright: whether that orientation is applied.
+        mask: the mask that the dataset's own files name; None if they name none.
     """
 
     file: Path
@@ -53,6 +67,7 @@ class CapturedView:
     far: float = math.nan
     orientation: int = 1
     upright: bool = False
+    mask: MaskFile | None = None
 
 
 @dataclass(frozen=True)
@@ -63,11 +78,15 @@ class Capture:
         layout: name of the layout.
         views: all files that are used.
         fps: frames per second; None if the dataset does not give it.
+        found: all images, or videos, in the folders that the layout reads.
+        left_out: those of them that are not used for a reason that the layout has reported.
     """
 
     layout: str
     views: tuple[CapturedView, ...]
     fps: float | None
+    found: tuple[Path, ...]
+    left_out: tuple[Path, ...] = ()
 
 
 def image_view(
@@ -216,7 +235,7 @@ def find_image(root: Path, file: Path, name: str) -> Path | None:
     Args:
         root: the folder of images.
         file: the file that lists the name, for messages.
-        name: as listed.
+        name: as listed; an absolute path inside `root` counts as relative to it, and a backslash as a slash.
 
     Returns:
         The image's path, or None if it does not exist.
@@ -225,6 +244,8 @@ def find_image(root: Path, file: Path, name: str) -> Path | None:
         DatasetError: the name leads out of `root`. (Symbolic links inside it may: whoever put them there meant it.)
     """
     relative = os.path.normpath(name.replace("\\", "/"))
+    for folder in (os.path.abspath(root), os.path.realpath(root)):
+        relative = relative.removeprefix(folder + os.sep)
     if os.path.isabs(relative) or relative.split(os.sep)[0] in (os.curdir, os.pardir) or "\0" in relative:
         raise DatasetError(f"{file}: {name!r} leads out of {root} or is no file name; make it relative to that folder")
     unreadable = None
@@ -269,15 +290,21 @@ def file_exists(path: Path) -> bool:
         raise
 
 
-def report_missing(file: Path, missing: list[str], total: int) -> None:
+def report_missing(file: Path, folder: Path, missing: list[str], total: int) -> None:
     """Print one line about all frames whose image does not exist.
+
+    Args:
+        file: the file that lists the images.
+        folder: the folder to which their names are relative.
+        missing: names of those that do not exist.
+        total: how many are listed.
 
     Raises:
         DatasetError: none of the images exists.
     """
     if len(missing) == total:
         raise DatasetError(
-            f"{file}: none of its {total} images exists ({printable(missing[0])} ...); copy them beside it"
+            f"{file}: none of its {total} images exists ({printable(missing[0])} ...); copy them to {folder}"
         )
     if missing:
         print(

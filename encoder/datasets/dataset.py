@@ -11,6 +11,9 @@ from kpc.format.common.errors import DatasetError
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Clip
 
+# Pixels whose sides differ by less than this share are square; for others the ratio of focal lengths is shown.
+SQUARE_PIXELS = 0.01
+
 # Tolerance in frames for assigning a picture to a frame, since times are float32.
 SAME_FRAME = 1e-2
 
@@ -68,6 +71,7 @@ class Dataset:
         has_alpha: whether pixels have a fourth channel, straight alpha.
         camera_names: by the numbers in `pictures.camera`.
         masks: which pixels may be used; None if all may.
+        left_out: how many images or videos in the folders that were read are not used.
     """
 
     layout: str
@@ -79,6 +83,7 @@ class Dataset:
     has_alpha: bool
     camera_names: tuple[str, ...]
     masks: Masks | None = None
+    left_out: int = 0
 
     @property
     def is_monocular(self) -> bool:
@@ -134,6 +139,8 @@ class Dataset:
             f"{_count(len(p), 'picture')} of {size}",
             f"{int(p.is_test.sum())} held out{self._held_out()}",
         ]
+        if self.left_out:
+            parts.append(f"{_count(self.left_out, 'file')} left out")
         if self.is_dynamic:
             clip = self.clip
             frames = _count(clip.frame_count, "frame")
@@ -144,6 +151,9 @@ class Dataset:
             parts.append("static")
         if self.has_alpha:
             parts.append("alpha")
+        aspect = p.intrinsics[:, 1] / p.intrinsics[:, 0]
+        if np.abs(aspect - 1).max() > SQUARE_PIXELS:
+            parts.append(f"fl_y / fl_x {aspect[np.abs(aspect - 1).argmax()]:.4g}")
         if p.distortion.any():
             parts.append("distortion")
         if self.masks is not None:

@@ -5,14 +5,16 @@ import math
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import Capture, CapturedView, report_orientations
+from kpc.encoder.datasets.capture import Capture, CapturedView, MaskFile, report_orientations
 from kpc.encoder.datasets.dataset import Dataset, Pictures
 from kpc.encoder.datasets.layouts import blender, colmap, llff, nerfstudio
-from kpc.encoder.datasets.masks import FOLDER, find_masks, load_masks
+from kpc.encoder.datasets.left_out import count_left_out
+from kpc.encoder.datasets.masks import find_masks, load_masks
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.format.common.errors import DatasetError, MediaError
 from kpc.format.common.images import read_image
@@ -57,7 +59,10 @@ def load_dataset(
         capture = _recognise(root, holdout)
         _check(root, capture, downscale)
         report_orientations(root, capture.views)
-        return _load(root, capture, find_masks(root, capture.views), Path(cache_dir), downscale, progress)
+        masks = find_masks(root, capture.views)
+        left_out = count_left_out(root, capture, [mask.path for mask in masks if mask])
+        dataset = _load(root, capture, masks, Path(cache_dir), downscale, progress)
+        return replace(dataset, left_out=left_out)
     except PermissionError as error:
         raise DatasetError(
             f"{error.filename or root}: no permission to read it; change its permissions or run as its owner"
@@ -71,9 +76,13 @@ def _recognise(root: Path, holdout: str | None) -> Capture:
         raise DatasetError(f"{root}: {problem}; give a folder of posed videos or images")
     if not any(root.iterdir()):
         raise DatasetError(f"{root}: empty directory; give a folder of posed videos or images")
-    for layout in LAYOUTS:
-        if layout.recognise(root):
-            return layout.read(root, holdout)
+    layouts = [layout for layout in LAYOUTS if layout.recognise(root)]
+    if layouts:
+        capture = layouts[0].read(root, holdout)
+        if len(layouts) > 1:
+            others = ", ".join(layout.NAME for layout in layouts[1:])
+            print(f"{root}: read as {capture.layout}; what is there in the layout of {others} is not", file=sys.stderr)
+        return capture
     raise DatasetError(
         f"{root}: no dataset layout recognised; it needs one of: poses_bounds.npy (N3DV, LLFF), transforms_train.json "
         "(Blender, D-NeRF), transforms.json (nerfstudio, instant-ngp), sparse/0 with cameras and images (COLMAP)"
@@ -101,7 +110,7 @@ def _check(root: Path, capture: Capture, downscale: int) -> None:
 
 
 def _load(
-    root: Path, capture: Capture, mask_files: list[Path | None], cache_dir: Path, downscale: int, progress: bool
+    root: Path, capture: Capture, mask_files: list[MaskFile | None], cache_dir: Path, downscale: int, progress: bool
 ) -> Dataset:
     views, frame_count = capture.views, _common_frames(root, capture.views)
     lengths = [frame_count if view.video else 1 for view in views]
@@ -133,7 +142,7 @@ def _load(
     names = tuple(Path(files[p]).stem for p in first)
     if masks is not None and not masks.counts[~pictures.is_test].any():
         raise DatasetError(
-            f"{root / FOLDER}: 0 means ignored, and that is every pixel to train on; invert the masks or move them away"
+            f"{root}: its masks ignore every pixel to train on (0 means ignored); invert the masks or remove them"
         )
     is_dynamic = clip.frame_count > 1
     return Dataset(capture.layout, root, pictures, cache, clip, is_dynamic, cache.channels == 4, names, masks)

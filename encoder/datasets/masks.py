@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import CapturedView, first_names, with_image_suffix
+from kpc.encoder.datasets.capture import CapturedView, MaskFile, first_names, with_image_suffix
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info, read_mask
@@ -90,37 +90,41 @@ class Masks:
         return (block - first) * BLOCK + byte * 8 + _NTH[value, rank]
 
 
-def find_masks(root: Path, views: Sequence[CapturedView]) -> list[Path | None]:
+def find_masks(root: Path, views: Sequence[CapturedView]) -> list[MaskFile | None]:
     """Find the mask of each view; None for videos and for images without one.
 
     Raises:
-        DatasetError: a mask differs in size from its image.
+        DatasetError: a mask differs in size from its image, or an image has two masks.
         MediaError: a mask cannot be read.
     """
     folder = root / FOLDER
-    if not folder.is_dir():
-        return [None] * len(views)
-    masks = [None if view.video else _find(folder, view.file.relative_to(root)) for view in views]
+    masks = [None if view.video else _find(root, folder, view) for view in views]
     for view, mask in zip(views, masks, strict=True):
         if mask is not None:
-            info, size = image_info(mask), (view.width, view.height)
+            info, size = image_info(mask.path), (view.width, view.height)
             if size not in ((info.width, info.height), info.displayed_size):
                 raise DatasetError(
-                    f"{mask}: is {info.width}x{info.height}, but {view.file.name} is {view.width}x{view.height}; "
+                    f"{mask.path}: is {info.width}x{info.height}, but {view.file.name} is {view.width}x{view.height}; "
                     "make the mask anew at that size"
                 )
     unmasked = [view.file.name for view, mask in zip(views, masks, strict=True) if mask is None and not view.video]
-    if unmasked:
+    if unmasked and (any(masks) or folder.is_dir()):
         total = sum(not view.video for view in views)
         print(
-            f"{folder}: {len(unmasked)} of {total} images have no mask and are used entirely: {first_names(unmasked)}",
+            f"{folder if folder.is_dir() else root}: {len(unmasked)} of {total} images have no mask and are used "
+            f"entirely: {first_names(unmasked)}",
             file=sys.stderr,
         )
     return masks
 
 
 def load_masks(
-    root: Path, views: Sequence[CapturedView], masks: Sequence[Path | None], file: Path, downscale: int, progress: bool
+    root: Path,
+    views: Sequence[CapturedView],
+    masks: Sequence[MaskFile | None],
+    file: Path,
+    downscale: int,
+    progress: bool,
 ) -> Masks | None:
     """Read the masks, or open their cache; return None if there are none.
 
@@ -154,30 +158,34 @@ def load_masks(
     return Masks(bits, sizes)
 
 
-def _find(folder: Path, image: Path) -> Path | None:
+def _find(root: Path, folder: Path, view: CapturedView) -> MaskFile | None:
+    """Return the mask of an image: the one that the dataset's own files name, or the one in the folder of masks."""
+    image = view.file.relative_to(root)
     inside = Path(*image.parts[1:]) if image.parts[0] == "images" else image
-    return with_image_suffix(folder / inside) or with_image_suffix((folder / inside).with_suffix(""))
+    beside = with_image_suffix(folder / inside) or with_image_suffix((folder / inside).with_suffix(""))
+    if view.mask is None:
+        return None if beside is None else MaskFile(beside)
+    if beside is not None and not beside.samefile(view.mask.path):
+        raise DatasetError(f"{view.file}: has two masks, {beside} and {view.mask.path}; remove one")
+    return view.mask
 
 
-def _source(root: Path, mask: Path | None) -> tuple[str, int, int] | None:
-    """Return what identifies the content of a mask: name, size and time of modification."""
+def _source(root: Path, mask: MaskFile | None) -> tuple[str, int, int, bool] | None:
+    """Return what identifies the content of a mask: name, size, time of modification, and which values it ignores."""
     if mask is None:
         return None
-    stat = mask.stat()
-    return mask.relative_to(root).as_posix(), stat.st_size, stat.st_mtime_ns
+    stat = mask.path.stat()
+    return mask.path.relative_to(root).as_posix(), stat.st_size, stat.st_mtime_ns, mask.marks_ignored
 
 
-def _packed(mask: Path | None, view: CapturedView, downscale: int) -> np.ndarray:
+def _packed(mask: MaskFile | None, view: CapturedView, downscale: int) -> np.ndarray:
     """Return the bits of one mask, (1, blocks, BLOCK / 8) uint8; all set if there is no mask."""
     width, height = view.width // downscale, view.height // downscale
     usable = np.ones((height, width), bool)
     if mask is not None:
-        info = image_info(mask)
-        large = read_mask(mask, upright=(info.width, info.height) != (view.width, view.height))
-        usable = (
-            large[: height * downscale, : width * downscale]
-            .reshape(height, downscale, width, downscale)
-            .all(axis=(1, 3))
-        )
+        info = image_info(mask.path)
+        marked = read_mask(mask.path, upright=(info.width, info.height) != (view.width, view.height))
+        large = (marked != mask.marks_ignored)[: height * downscale, : width * downscale]
+        usable = large.reshape(height, downscale, width, downscale).all(axis=(1, 3))
     blocks = -(-width * height // BLOCK)
     return np.packbits(np.pad(usable.ravel(), (0, blocks * BLOCK - width * height))).reshape(1, blocks, BLOCK // 8)

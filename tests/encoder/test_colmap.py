@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import datasets as make
 from datasets import all_rays, distorted, fails, load
 from kpc.encoder.datasets import pixel_rays
-from kpc.encoder.datasets.layouts import colmap
+from kpc.encoder.datasets.layouts import colmap, colmap_model
 from kpc.format.common.errors import KpcError
 from kpc.format.common.images import write_image
 
@@ -92,7 +92,7 @@ def test_rays_pass_through_points_projected_by_the_model(tmp_path: Path) -> None
 
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: 0.1 < np.linalg.norm(q)), st.floats(0.1, 9))
 def test_quaternions_of_any_length_give_the_same_rotation(q: list[float], length: float) -> None:
-    pose = colmap._camera_to_world("here", (*(length * np.array(q)), 1.0, 2.0, 3.0))
+    pose = colmap_model._camera_to_world("here", (*(length * np.array(q)), 1.0, 2.0, 3.0))
     rotation = pose[:3, :3] * [1, -1, -1]
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1)

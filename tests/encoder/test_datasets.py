@@ -59,15 +59,6 @@ def test_videos_of_one_frame_are_a_static_scene(tmp_path: Path) -> None:
     assert "static" in dataset.describe()
 
 
-def test_videos_are_read_in_natural_order(tmp_path: Path) -> None:
-    rig = make.write_n3dv(tmp_path / "set")
-    (tmp_path / "set" / "cam01.mp4").rename(tmp_path / "set" / "cam9.mp4")
-    (tmp_path / "set" / "cam02.mp4").rename(tmp_path / "set" / "cam10.mp4")
-    dataset = load(tmp_path / "set")
-    assert dataset.camera_names == ("cam00", "cam9", "cam10")
-    np.testing.assert_allclose(dataset.camera(8).camera_to_world, rig[2].camera_to_world)
-
-
 def test_natural_order() -> None:
     names = ["", "2", "10", "a", "a0", "a1", "a01b", "a2", "a10", "a10b2", "a10b10", "a" + "9" * 5000, "b", "x\u00b21"]
     shuffled = random.Random(0).sample(names, len(names))

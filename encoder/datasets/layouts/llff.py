@@ -1,6 +1,6 @@
 """The layouts of LLFF and Neural 3D Video: `poses_bounds.npy` beside `images/` or beside `cam*.mp4`.
 
-Row n of `poses_bounds.npy` belongs to the n-th file in natural order. Its first 15 numbers are a 3x5 matrix by rows,
+Row n of `poses_bounds.npy` belongs to the n-th file (`row_order.py`). Its first 15 numbers are a 3x5 matrix by rows,
 with the columns [down right backwards centre | (h w f)]; near and far depth follow.
 
 Source: https://github.com/Fyusion/LLFF
@@ -18,13 +18,18 @@ from kpc.encoder.datasets.capture import (
     fit_intrinsics,
     holdout_flags,
     image_view,
-    natural_key,
 )
+from kpc.encoder.datasets.layouts.row_order import in_row_order
+from kpc.encoder.datasets.left_out import media_in
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media import video_info
 from kpc.format.common.media_files import is_image, is_video
 
 POSES = "poses_bounds.npy"  # the file of poses and depth ranges
+
+
+# The layout's name in messages; with videos it is that of Neural 3D Video.
+NAME = "LLFF"
 
 
 def recognise(path: Path) -> bool:
@@ -41,32 +46,37 @@ def read(path: Path, holdout: str | None) -> Capture:
         DatasetError: there are not as many poses as files, or a pose, focal length or depth range is invalid.
         MediaError: a file cannot be read.
     """
-    videos = [f for f in path.iterdir() if is_video(f)]
-    files = [f for f in videos if f.name.lower().startswith("cam")] or videos
-    has_videos = bool(files)
+    found = [file for file in media_in(path) if is_video(file)]
+    files = [file for file in found if file.name.lower().startswith("cam")] or found
+    layout = "N3DV" if files else NAME
     if not files and (path / "images").is_dir():
-        files = [f for f in (path / "images").iterdir() if is_image(f)]
+        found = media_in(path / "images")
+        files = [file for file in found if is_image(file)]
     if not files:
         raise DatasetError(f"{path}: has {POSES}, but neither cam*.mp4 nor images/; copy the videos or images there")
-    files.sort(key=lambda file: natural_key(file.name))
     rows = _read_poses(path / POSES)
-    kind = "videos" if has_videos else "images"
+    kind = "videos" if layout == "N3DV" else "images"
     if len(rows) != len(files):
         raise DatasetError(
             f"{path / POSES}: {len(rows)} poses for {len(files)} {kind}; remove those that do not belong together"
         )
-    default = [k == 0 if has_videos else k % HOLD_OUT_EVERY == 0 for k in range(len(files))]
+    poses = np.stack([_pose(f"{path / POSES} row {number}", row) for number, row in enumerate(rows)])
+    files = in_row_order(path / POSES, files, poses[:, :3, 3], -poses[:, :3, 2])
+    default = [k == 0 if layout == "N3DV" else k % HOLD_OUT_EVERY == 0 for k in range(len(files))]
     tests = holdout_flags(path, [str(f.relative_to(path)) for f in files], holdout, default)
-    views = tuple(_view(path, number, *item) for number, item in enumerate(zip(files, rows, tests, strict=True)))
-    fps = views[0].video.fps if views[0].video else None
-    return Capture("N3DV" if has_videos else "LLFF", views, fps)
+    items = enumerate(zip(files, rows, poses, tests, strict=True))
+    views = tuple(_view(f"{path / POSES} row {number}", *item) for number, item in items)
+    return Capture(layout, views, views[0].video.fps if views[0].video else None, tuple(found))
 
 
-def _view(path: Path, number: int, file: Path, row: np.ndarray, is_test: bool) -> CapturedView:
-    where = f"{path / POSES} row {number}"
-    down, right, backwards, centre, (h, w, focal) = row[:15].reshape(3, 5).T
-    near, far = row[15:]
-    pose = check_pose(where, np.stack([right, -down, backwards, centre], axis=1))
+def _pose(where: str, row: np.ndarray) -> np.ndarray:
+    """Return the pose of a row, (4, 4) float64 in the OpenGL convention."""
+    down, right, backwards, centre = row[:15].reshape(3, 5).T[:4]
+    return check_pose(where, np.stack([right, -down, backwards, centre], axis=1))
+
+
+def _view(where: str, file: Path, row: np.ndarray, pose: np.ndarray, is_test: bool) -> CapturedView:
+    (h, w, focal), (near, far) = row[[4, 9, 14]], row[15:]
     if not 0 < near < far < np.inf:
         raise DatasetError(f"{where}: near {near:g} and far {far:g} are not 0 < near < far; calibrate anew")
     intrinsics, no_distortion = (focal, focal, w / 2, h / 2), (0.0,) * 4

@@ -3,13 +3,15 @@
 Source: https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
-import os
 from pathlib import Path
-from typing import Any
 
-from kpc.encoder.datasets.capture import HOLD_OUT_EVERY, Capture, find_image, holdout_flags, natural_key, report_missing
+from kpc.encoder.datasets.capture import Capture, find_image, holdout_flags, natural_key, report_missing
+from kpc.encoder.datasets.layouts.splits import split_of
 from kpc.encoder.datasets.layouts.transforms import frame_rate, frame_view, load_transforms
-from kpc.format.common.errors import DatasetError
+from kpc.encoder.datasets.left_out import media_in
+
+# The layout's name in messages.
+NAME = "nerfstudio"
 
 
 def recognise(path: Path) -> bool:
@@ -18,39 +20,29 @@ def recognise(path: Path) -> bool:
 
 
 def read(path: Path, holdout: str | None) -> Capture:
-    """Read the folder. Test pictures are `test_filenames` (or `val_filenames`), else every eighth existing image.
+    """Read the folder. Test pictures are what the document lists, else every eighth existing image (`split_of`).
+
+    With `holdout`, the document's lists are ignored, and all other pictures are trained on.
 
     Raises:
         DatasetError, MediaError: the JSON or an image cannot be used.
     """
     file = path / "transforms.json"
     document = load_transforms(file)
-    frames = sorted(enumerate(document["frames"]), key=lambda item: natural_key(item[1]["file_path"]))
-    found = [(number, find_image(path, file, frame["file_path"])) for number, frame in frames]
-    report_missing(file, [document["frames"][n]["file_path"] for n, image in found if image is None], len(found))
+    found = [(number, find_image(path, file, frame["file_path"])) for number, frame in enumerate(document["frames"])]
+    missing = [document["frames"][number]["file_path"] for number, image in found if image is None]
+    report_missing(file, path, missing, len(found))
     existing = [(number, image) for number, image in found if image is not None]
-    names = [os.path.normpath(document["frames"][n]["file_path"]) for n, _ in existing]
-    train, test = _listed(file, document, "train_filenames"), _listed(file, document, "test_filenames")
-    if test is None:
-        test = _listed(file, document, "val_filenames")
-    if train is None and test is None:
-        default = [k % HOLD_OUT_EVERY == 0 for k in range(len(existing))]
-    else:
-        default = [name in test if test is not None else name not in (train or ()) for name in names]
-    tests = holdout_flags(path, [str(image.relative_to(path)) for _, image in existing], holdout, default)
+    existing.sort(key=lambda item: natural_key(item[1].relative_to(path).as_posix()))
+    images = [image for _, image in existing]
+    split = split_of(path, file, document, images, missing) if holdout is None else ["train"] * len(images)
+    default = [part == "test" for part in split]
+    tests = holdout_flags(path, [str(image.relative_to(path)) for image in images], holdout, default)
     views = tuple(
-        frame_view(file, number, document, image, is_test)
-        for (number, image), name, is_test in zip(existing, names, tests, strict=True)
-        if is_test or train is None or name in train or holdout is not None
+        frame_view(path, file, number, document, image, is_test)
+        for (number, image), part, is_test in zip(existing, split, tests, strict=True)
+        if part is not None
     )
-    return Capture("nerfstudio", views, frame_rate(file, document))
-
-
-def _listed(file: Path, document: dict[str, Any], key: str) -> frozenset[str] | None:
-    """Return a list of file names in the document, normalised; None if the key is absent."""
-    names = document.get(key)
-    if names is None:
-        return None
-    if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-        raise DatasetError(f"{file}: {key} is not a list of names; export it anew")
-    return frozenset(os.path.normpath(name) for name in names)
+    left_out = tuple(image for image, part in zip(images, split, strict=True) if part is None)
+    in_folders = tuple(media for folder in sorted({image.parent for image in images}) for media in media_in(folder))
+    return Capture(NAME, views, frame_rate(file, document), in_folders, left_out)

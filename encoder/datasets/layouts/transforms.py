@@ -1,53 +1,57 @@
 """Reading of `transforms*.json`, common to the layouts of Blender and nerfstudio.
 
-The document describes a camera and lists frames, which may override it.
+The document describes a camera and lists frames, which may override it. `transforms_keys.py` has all its keys.
 """
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import CapturedView, image_view
+from kpc.encoder.datasets.capture import CapturedView, MaskFile, file_exists, find_image, image_view, printable
+from kpc.encoder.datasets.layouts.camera_models import HIGHER_ORDERS, check_higher_orders, understood_model
+from kpc.encoder.datasets.layouts.transforms_keys import check_keys
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
 
-# Camera models of nerfstudio that are not a pinhole with k1 k2 p1 p2.
-_UNSUPPORTED = {
-    "OPENCV_FISHEYE",
-    "EQUIRECTANGULAR",
-    "OMNIDIRECTIONALSTEREO_L",
-    "OMNIDIRECTIONALSTEREO_R",
-    "FISHEYE624",
-    "ORTHOPHOTO",
-}
+# Keys that say the same in other words: a frame that has one of them overrides all of the document.
+_SAME = (("fl_x", "camera_angle_x", "x_fov"), ("fl_y", "camera_angle_y", "y_fov"))
+
+# Coefficients of distortion, by themselves and in the order of nerfstudio's list `distortion_params`.
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", *HIGHER_ORDERS)
+_DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def load_transforms(file: Path) -> dict[str, Any]:
-    """Read the document and check that it has a list `frames` of objects with `file_path` and `transform_matrix`.
+    """Read the document and check its keys, and that it lists frames with `file_path` and `transform_matrix`.
 
     Raises:
-        DatasetError: it is not JSON or lacks those.
+        DatasetError: it is not JSON, lacks those, or a key is refused.
     """
     try:
-        document = json.loads(file.read_text())
+        document = json.loads(file.read_text(encoding="utf-8-sig"), object_pairs_hook=_without_repetition)
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{file}: not JSON ({error}); export it anew") from error
+        raise DatasetError(f"{file}: not JSON ({printable(str(error))}); export it anew") from error
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not frames:
         raise DatasetError(f"{file}: lists no frames; export it anew")
     for number, frame in enumerate(frames):
         if not (isinstance(frame, dict) and isinstance(frame.get("file_path"), str) and "transform_matrix" in frame):
             raise DatasetError(f"{file}: frame {number} lacks file_path or transform_matrix; export it anew")
+    check_keys(file, document)
     return document
 
 
-def frame_view(file: Path, number: int, document: dict[str, Any], image: Path, is_test: bool) -> CapturedView:
+def frame_view(
+    root: Path, file: Path, number: int, document: dict[str, Any], image: Path, is_test: bool
+) -> CapturedView:
     """Return the view of a frame, whose keys override those of the document.
 
     Args:
+        root: the dataset's folder.
         file: the document's path, for messages.
         number: of the frame.
         document: from `load_transforms`.
@@ -58,42 +62,40 @@ def frame_view(file: Path, number: int, document: dict[str, Any], image: Path, i
         DatasetError: a number is missing or malformed, or the camera is not a pinhole with at most k1 k2 p1 p2.
     """
     where = f"{file} frame {number}"
-    keys = {**{k: v for k, v in document.items() if k != "frames"}, **document["frames"][number]}
-    if keys.get("camera_model") in _UNSUPPORTED or keys.get("is_fisheye"):
-        model = keys.get("camera_model", "fisheye")
-        raise DatasetError(f"{where}: camera model {model} is not supported; undistort the images to a pinhole")
-    if any(_number(where, keys, k, 0.0) != 0 for k in ("k3", "k4", "k5", "k6")):
-        raise DatasetError(f"{where}: distortion beyond k1 k2 p1 p2 is not supported; undistort the images")
-    declared = (_number(where, keys, "w"), _number(where, keys, "h")) if "w" in keys and "h" in keys else None
+    keys = _merged(document, document["frames"][number])
+    if ("w" in keys) != ("h" in keys):
+        raise DatasetError(f"{where}: has only one of w and h; add the other or export anew")
+    _check_rays(where, keys, image)
+    declared = (_number(where, keys, "w"), _number(where, keys, "h")) if "w" in keys else None
     if declared is None:
         info = image_info(image)
         width, height = float(info.width), float(info.height)
     else:
         width, height = declared
-    fl_x = _focal(where, keys, width)
+    fl_x, fl_y = _focals(where, keys, width, height)
     intrinsics = (
         fl_x,
-        _number(where, keys, "fl_y", fl_x),
+        fl_y,
         _number(where, keys, "cx", width / 2),
         _number(where, keys, "cy", height / 2),
     )
-    k1, k2, p1, p2 = (_number(where, keys, k, 0.0) for k in ("k1", "k2", "p1", "p2"))
     try:
         pose = np.array(keys["transform_matrix"], np.float64)
     except (TypeError, ValueError) as error:
         raise DatasetError(f"{where}: transform_matrix is not 4x4 numbers; export it anew") from error
-    return image_view(
+    view = image_view(
         image,
         where=where,
         is_test=is_test,
         declared=declared,
         intrinsics=intrinsics,
-        distortion=(k1, k2, p1, p2),
+        distortion=_distortion(where, keys),
         camera_to_world=pose,
         time=_number(where, keys, "time") if keys.get("time") is not None else None,
         near=_number(where, keys, "near", math.nan),
         far=_number(where, keys, "far", math.nan),
     )
+    return replace(view, mask=_mask(root, file, where, keys, image))
 
 
 def frame_rate(file: Path, document: dict[str, Any]) -> float | None:
@@ -106,14 +108,85 @@ def frame_rate(file: Path, document: dict[str, Any]) -> float | None:
     return fps
 
 
-def _focal(where: str, keys: dict[str, Any], width: float) -> float:
-    """Return fl_x in pixels, from that key or from the horizontal angle of view: width / 2 / tan(angle / 2)."""
-    if "fl_x" in keys or "camera_angle_x" not in keys:
-        return _number(where, keys, "fl_x")
-    angle = _number(where, keys, "camera_angle_x")
-    if not 0 < angle < math.pi:
-        raise DatasetError(f"{where}: camera_angle_x {angle:g} does not lie between 0 and pi; correct the calibration")
-    return width / 2 / math.tan(angle / 2)
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object as a dictionary; raise ValueError if a key is there twice."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"the key {twice!r} is there twice in one object")
+    return found
+
+
+def _merged(document: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys that hold for a frame: its own, and those of the document that it does not override."""
+    overridden = {"frames", *(key for same in _SAME if any(k in frame for k in same) for key in same)}
+    if "distortion_params" in frame:
+        overridden.update(_COEFFICIENTS)
+    elif any(k in frame for k in _COEFFICIENTS):
+        overridden.add("distortion_params")
+    return {**{key: value for key, value in document.items() if key not in overridden}, **frame}
+
+
+def _focals(where: str, keys: dict[str, Any], width: float, height: float) -> tuple[float, float]:
+    """Return fl_x and fl_y in pixels; an axis without one takes that of the other."""
+    fl_x, fl_y = _focal(where, keys, "x", width), _focal(where, keys, "y", height)
+    fl_x = fl_y if fl_x is None else fl_x
+    if fl_x is None:
+        raise DatasetError(f"{where}: fl_x is missing, and so is camera_angle_x; add it or export anew")
+    return fl_x, fl_x if fl_y is None else fl_y
+
+
+def _focal(where: str, keys: dict[str, Any], axis: str, size: float) -> float | None:
+    """Return fl_x or fl_y in pixels, from that key or an angle of view: size / 2 / tan(angle / 2); None without them.
+
+    As in instant-ngp, `camera_angle_*` is in radians and `*_fov` in degrees.
+    """
+    if f"fl_{axis}" in keys:
+        return _number(where, keys, f"fl_{axis}")
+    for key, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.pi / 180)):
+        if key in keys:
+            angle = _number(where, keys, key) * unit
+            if not 0 < angle < math.pi:
+                raise DatasetError(f"{where}: {key} {angle / unit:g} is no angle of view; correct the calibration")
+            return size / 2 / math.tan(angle / 2)
+    return None
+
+
+def _distortion(where: str, keys: dict[str, Any]) -> tuple[float, float, float, float]:
+    """Return k1 k2 p1 p2 of a camera whose model is understood."""
+    for key in ("camera_model", "camera_type"):
+        if keys.get(key) is not None:
+            understood_model(where, printable(str(keys[key])))
+    if "distortion_params" in keys:
+        values = keys["distortion_params"]
+        if not (isinstance(values, list) and len(values) == len(_DISTORTION_PARAMS)):
+            raise DatasetError(f"{where}: distortion_params is not {len(_DISTORTION_PARAMS)} numbers; export it anew")
+        keys = dict(zip(_DISTORTION_PARAMS, values, strict=True))
+    check_higher_orders(where, {k: _number(where, keys, k, 0.0) for k in HIGHER_ORDERS})
+    k1, k2, p1, p2 = (_number(where, keys, k, 0.0) for k in ("k1", "k2", "p1", "p2"))
+    return k1, k2, p1, p2
+
+
+def _check_rays(where: str, keys: dict[str, Any], image: Path) -> None:
+    """Refuse an image beside which instant-ngp finds a file of its rays, which then replace the camera."""
+    rays = image.with_name(f"rays_{image.stem}.dat")
+    if keys.get("enable_ray_loading", True) and file_exists(rays):
+        raise DatasetError(f"{where}: {rays} replaces the camera, which is not supported; undistort the images")
+
+
+def _mask(root: Path, file: Path, where: str, keys: dict[str, Any], image: Path) -> MaskFile | None:
+    """Return the mask that `mask_path` names, or instant-ngp's `dynamic_mask_NAME.png` beside the image."""
+    name = keys.get("mask_path") or None
+    dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")
+    if name is None:
+        return MaskFile(dynamic, marks_ignored=True) if file_exists(dynamic) else None
+    mask = find_image(root, file, name) if isinstance(name, str) else None
+    if mask is None:
+        raise DatasetError(f"{where}: mask_path {printable(str(name))} is no image in {root}; copy it there")
+    if file_exists(dynamic):
+        raise DatasetError(f"{where}: has two masks, {mask} and {dynamic}; remove one")
+    return MaskFile(mask)
 
 
 def _number(where: str, keys: dict[str, Any], key: str, default: float | None = None) -> float:

@@ -1,0 +1,59 @@
+"""The camera models of COLMAP and nerfstudio, by name: those that are understood, with their parameters.
+
+Understood is a pinhole with at most OpenCV's lens model k1 k2 p1 p2; whatever is not in `PARAMETERS` is refused.
+
+Sources: https://colmap.github.io/cameras.html, https://docs.nerf.studio/quickstart/data_conventions.html
+"""
+
+from kpc.format.common.errors import DatasetError
+
+# The understood models, with COLMAP's parameters in order; nerfstudio's files name the parameters themselves.
+PARAMETERS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",  # k3 to k6 must be 0
+}
+
+# Other names of understood models, in documents whose keys name the parameters.
+OTHER_NAMES = {"PERSPECTIVE": "PINHOLE"}
+
+# Coefficients of distortion that are not understood: they must be 0.
+HIGHER_ORDERS = ("k3", "k4", "k5", "k6")
+
+# COLMAP's numbers of models in binary files, so that messages can name those that are refused.
+COLMAP_NUMBERS = dict(
+    enumerate(
+        "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV SIMPLE_RADIAL_FISHEYE "
+        "RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE SIMPLE_DIVISION DIVISION SIMPLE_FISHEYE FISHEYE "
+        "EUCM EQUIRECTANGULAR".split()
+    )
+)
+
+
+def understood_model(where: str, name: str) -> str:
+    """Return the name of an understood camera model as `PARAMETERS` has it, whatever its case.
+
+    Args:
+        where: the calibration's file and entry, for messages.
+        name: as the file has it, in printable form.
+
+    Raises:
+        DatasetError: the model is not understood.
+    """
+    model = OTHER_NAMES.get(name.upper(), name.upper())
+    if model not in PARAMETERS:
+        raise DatasetError(f"{where}: camera model {name} is not supported; undistort the images to a pinhole")
+    return model
+
+
+def check_higher_orders(where: str, distortion: dict[str, float]) -> None:
+    """Refuse distortion of higher order than k1 k2 p1 p2.
+
+    Raises:
+        DatasetError: k3, k4, k5 or k6 is not 0.
+    """
+    if any(distortion.get(name, 0.0) != 0 for name in HIGHER_ORDERS):
+        raise DatasetError(f"{where}: distortion beyond k1 k2 p1 p2 is not supported; undistort the images")

@@ -1,0 +1,101 @@
+"""Which file belongs to which row of a table of poses that names none.
+
+LLFF writes the rows in the plain order of names, and whoever reads them sorts names alike: cam1, cam10, cam2. Tables
+made by hand may be in natural order: cam1, cam2, cam10. Where the two differ, the pictures decide
+(docs/design/datasets.md).
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from kpc.encoder.datasets.capture import natural_key
+from kpc.format.common.errors import MediaError
+from kpc.format.common.images import read_image
+from kpc.format.common.media import read_video
+from kpc.format.common.media_files import is_video
+
+# At most so many files are compared, evenly spread, as pictures of this size.
+COMPARED_FILES = 64
+THUMBNAIL = (16, 12)
+
+# Each picture is compared with those of this many nearest cameras.
+NEIGHBOURS = 2
+
+# Natural order is taken if neighbours then differ by less than this share of what they differ by in plain order.
+CLEARLY_LESS = 0.95
+
+
+def in_row_order(table: Path, files: Sequence[Path], centres: np.ndarray, directions: np.ndarray) -> list[Path]:
+    """Return the files in the order of the rows, and say in one line if it had to be decided.
+
+    Args:
+        table: the file of poses, for messages.
+        files: images or videos, as many as there are rows.
+        centres: (N, 3) position of the camera in each row.
+        directions: (N, 3) its viewing direction, a unit vector.
+
+    Raises:
+        MediaError: a file cannot be read.
+    """
+    plain = sorted(files, key=lambda file: os.fsencode(file.name))
+    natural = sorted(files, key=lambda file: natural_key(file.name))
+    if plain == natural:
+        return plain
+    chosen = [plain[n] for n in np.linspace(0, len(plain) - 1, min(len(plain), COMPARED_FILES)).astype(int)]
+    pictures = np.stack([_thumbnail(file) for file in chosen])
+    cost = {}
+    for name, order in (("plain", plain), ("natural", natural)):
+        row_of = {file: n for n, file in enumerate(order)}
+        rows = [row_of[file] for file in chosen]
+        cost[name] = neighbour_difference(centres[rows], directions[rows], pictures)
+    is_natural = cost["natural"] < CLEARLY_LESS * cost["plain"]
+    order, other = (natural, plain) if is_natural else (plain, natural)
+    row = next(n for n, (file, another) in enumerate(zip(order, other, strict=True)) if file != another)
+    why = (
+        "natural order of names, by which neighbouring cameras see more alike" if is_natural else "plain order of names"
+    )
+    print(
+        f"{table}: rows belong to files in the {why}: row {row} to {order[row].name}, not to {other[row].name}; if "
+        "not, rename the files so that their order is that of the rows",
+        file=sys.stderr,
+    )
+    return order
+
+
+def neighbour_difference(centres: np.ndarray, directions: np.ndarray, pictures: np.ndarray) -> float:
+    """Return the mean difference between each picture and those of its nearest cameras.
+
+    The distance of two cameras is that of their centres plus that of their directions, each in units of its mean
+    distance from the mean.
+
+    Args:
+        centres, directions: (N, 3).
+        pictures: (N, ...) float.
+    """
+    flat = pictures.reshape(len(pictures), -1)
+    spread = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()
+    turn = np.linalg.norm(directions - directions.mean(axis=0), axis=1).mean()
+    total = 0.0
+    for n in range(len(flat)):
+        distance = np.linalg.norm(centres - centres[n], axis=1) / max(spread, 1e-9)
+        distance += np.linalg.norm(directions - directions[n], axis=1) / max(turn, 1e-9)
+        distance[n] = np.inf
+        nearest = np.argsort(distance, kind="stable")[:NEIGHBOURS]
+        total += float(np.sqrt(((flat[nearest] - flat[n]) ** 2).mean(axis=1)).mean())
+    return total / len(flat)
+
+
+def _thumbnail(file: Path) -> np.ndarray:
+    """Return an image, or the first frame of a video, on white and reduced to THUMBNAIL, (12, 16, 3) float64."""
+    picture = next(read_video(file, limit=1), None) if is_video(file) else read_image(file)
+    if picture is None:
+        raise MediaError(f"{file}: no frame of it can be decoded; encode or copy it anew")
+    image = Image.fromarray(picture)
+    if image.mode == "RGBA":
+        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
+    return np.asarray(image.convert("RGB").resize(THUMBNAIL, Image.Resampling.BOX), np.float64)

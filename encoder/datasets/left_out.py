@@ -1,0 +1,40 @@
+"""Which images and videos of a dataset's folder are not used, so that it can be said."""
+
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from kpc.encoder.datasets.capture import Capture, first_names
+from kpc.format.common.media_files import is_hidden, is_image, is_video
+
+
+def media_in(folder: Path, *, recursive: bool = False) -> list[Path]:
+    """Return the images and videos in a folder; hidden and system files and folders do not count."""
+    found = folder.rglob("*") if recursive else folder.iterdir()
+    return [
+        file
+        for file in found
+        if (is_image(file) or is_video(file))
+        and not any(map(is_hidden, file.relative_to(folder).parts))
+        and file.is_file()
+    ]
+
+
+def count_left_out(root: Path, capture: Capture, masks: Iterable[Path]) -> int:
+    """Return how many files a layout found but does not use, and name those for which it has not given a reason.
+
+    Args:
+        root: the dataset's folder.
+        capture: what the layout read.
+        masks: the masks of its images, which count as used.
+    """
+    used = {view.file for view in capture.views}
+    left_out = {*capture.found, *capture.left_out} - used - set(masks)
+    unnamed = sorted(file.relative_to(root).as_posix() for file in left_out - set(capture.left_out))
+    if unnamed:
+        print(
+            f"{root}: {len(unnamed)} of {len(used | left_out)} files found belong to no camera and are left out: "
+            f"{first_names(unnamed)}",
+            file=sys.stderr,
+        )
+    return len(left_out)
