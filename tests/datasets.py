@@ -11,8 +11,8 @@ import pytest
 
 from kpc.encoder.datasets import Dataset, load_dataset, pixel_rays
 from kpc.format.common.errors import DatasetError, KpcError, MediaError
+from kpc.format.common.films import write_video
 from kpc.format.common.images import write_image
-from kpc.format.common.media import write_video
 from kpc.format.scene.cameras import Camera
 
 # Frame rate of the videos.

@@ -1,33 +1,24 @@
-"""Reading and writing of videos, through ffmpeg.
+"""Reading of videos, through ffmpeg.
 
 Colour: `read_video` returns R'G'B' in [0, 255] and honours the file's tags for matrix, range and chroma layout. Where
 tags are missing it does as players do: limited range, BT.601 below 720 lines and BT.709 from there on. HDR transfer
 curves (PQ, HLG) are refused, since they would be shown wrong.
 """
 
-import contextlib
 import functools
-import itertools
 import os
 import re
-import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import IO
 
 import ffmpeg
-import imageio_ffmpeg
 import numpy as np
 
-from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import MediaError
+from kpc.format.common.films import SCALE_FLAGS, ffmpeg_binary, file_url, main_error, read_log
 from kpc.format.common.media_files import require_file
-
-# Options of ffmpeg's scale filter for an exact colour conversion.
-_SCALE_FLAGS = "bicubic+accurate_rnd+full_chroma_int+full_chroma_inp"
 
 
 @dataclass(frozen=True)
@@ -52,24 +43,6 @@ class VideoInfo:
     full_range: bool
 
 
-@functools.cache
-def ffmpeg_binary() -> str:
-    """Return the ffmpeg to run: the one on PATH, else the one that the package imageio-ffmpeg brings.
-
-    Raises:
-        MediaError: there is none.
-    """
-    found = shutil.which("ffmpeg")
-    if found:
-        return found
-    try:
-        return str(imageio_ffmpeg.get_ffmpeg_exe())
-    except RuntimeError as error:
-        raise MediaError(
-            "ffmpeg: no binary on PATH nor in imageio-ffmpeg; install ffmpeg (Debian: apt install ffmpeg)"
-        ) from error
-
-
 def video_info(path: str | os.PathLike[str]) -> VideoInfo:
     """Return a video's size, length and colour tags. Packets are counted, not decoded.
 
@@ -77,7 +50,7 @@ def video_info(path: str | os.PathLike[str]) -> VideoInfo:
         MediaError: the file is missing, damaged, not a video, or HDR.
     """
     require_file(path)
-    stream = ffmpeg.input(_url(path)).output("pipe:", format="null", codec="copy", map="0:V:0")
+    stream = ffmpeg.input(file_url(path)).output("pipe:", format="null", codec="copy", map="0:V:0")
     command = stream.global_args("-nostdin", "-hide_banner", "-nostats", "-progress", "pipe:1").compile(
         cmd=ffmpeg_binary()
     )
@@ -86,7 +59,7 @@ def video_info(path: str | os.PathLike[str]) -> VideoInfo:
     found = _STREAM.search(log)
     counts = re.findall(r"^frame=\s*(\d+)", done.stdout.decode(errors="replace"), re.MULTILINE)
     if done.returncode != 0 or found is None or not counts or int(counts[-1]) == 0:
-        raise MediaError(f"{path}: not a video ffmpeg can read ({_main_error(log)}); encode or copy it anew")
+        raise MediaError(f"{path}: not a video ffmpeg can read ({main_error(log)}); encode or copy it anew")
     pix_fmt, tags, width, height = found["pix_fmt"], found["tags"] or "", int(found["width"]), int(found["height"])
     if re.search(r"smpte2084|arib-std-b67", tags):
         raise MediaError(f"{path}: HDR video ({tags}); tone-map it to BT.709 first")
@@ -122,11 +95,11 @@ def read_video(
     """
     info = info or video_info(path)
     rgb = info.matrix == "rgb"
-    video = ffmpeg.input(_url(path))["V:0"].filter(
+    video = ffmpeg.input(file_url(path))["V:0"].filter(
         "scale",
         info.width,
         info.height,
-        flags=_SCALE_FLAGS,
+        flags=SCALE_FLAGS,
         out_range="full",
         **({} if rgb else {"in_color_matrix": info.matrix, "in_range": "full" if info.full_range else "limited"}),
     )
@@ -147,70 +120,9 @@ def read_video(
             process.kill()
             process.stdout.close()
             process.wait()
-        message = _read_log(log)
+        message = read_log(log)
     if code != 0 or message or data:
-        raise MediaError(f"{path}: does not decode ({_main_error(message)}); encode or copy it anew")
-
-
-def write_video(
-    path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float, *, crf: int = 18, pix_fmt: str = "yuv420p"
-) -> int:
-    """Encode frames as H.264, tagged BT.709 limited range, and return the number of frames written.
-
-    Where `pix_fmt` subsamples chroma, an odd size is made even by repeating the last row or column.
-
-    Args:
-        path: of the video; its suffix chooses the container.
-        frames: (height, width, 3) uint8 R'G'B'.
-        fps: frames per second.
-        crf: constant rate factor of x264, from 0 (lossless) to 51.
-        pix_fmt: ffmpeg's name of the pixel format.
-
-    Raises:
-        MediaError: there are no frames, frames differ in size, or ffmpeg fails.
-    """
-    frames = iter(frames)
-    first = next(frames, None)
-    if first is None:
-        raise MediaError(f"{path}: no frames to write")
-    height, width = first.shape[:2]
-    even = 1 if pix_fmt.startswith("yuv444") else 2
-    pad = ((0, -height % even), (0, -width % even), (0, 0))
-    raw = ffmpeg.input(
-        "pipe:", format="rawvideo", pix_fmt="rgb24", framerate=fps, video_size=(width + pad[1][1], height + pad[0][1])
-    )
-    scaled = raw.filter("scale", flags=_SCALE_FLAGS, out_color_matrix="bt709", out_range="limited")
-    tags = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709", "color_range": "tv"}
-    count = 0
-    with atomic_write(path) as temporary, tempfile.TemporaryFile() as log:
-        stream = scaled.output(
-            _url(temporary), vcodec="libx264", crf=crf, pix_fmt=pix_fmt, movflags="+faststart", **tags
-        )
-        command = stream.global_args("-v", "error", "-y").compile(cmd=ffmpeg_binary())
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
-        assert process.stdin is not None
-        try:
-            for frame in itertools.chain([first], frames):
-                if frame.shape != first.shape or frame.dtype != np.uint8:
-                    raise MediaError(
-                        f"{path}: frame {count} is {frame.dtype} {frame.shape}, the first uint8 {first.shape}"
-                    )
-                process.stdin.write(np.pad(frame, pad, mode="edge").tobytes())
-                count += 1
-            process.stdin.close()
-            code = process.wait()
-        except BrokenPipeError:
-            code = process.wait() or 1
-        finally:
-            process.kill()
-            process.wait()
-            with contextlib.suppress(BrokenPipeError):
-                process.stdin.close()
-        if code != 0:
-            raise MediaError(
-                f"{path}: ffmpeg cannot write it ({_main_error(_read_log(log))}); it needs libx264 and disk space"
-            )
-    return count
+        raise MediaError(f"{path}: does not decode ({main_error(message)}); encode or copy it anew")
 
 
 # The line of ffmpeg's log that describes a video stream.
@@ -257,22 +169,3 @@ def _matrix(pix_fmt: str, tags: str, height: int) -> str:
         if name.startswith("bt2020"):
             return "bt2020"
     return "bt601" if height < 720 else "bt709"
-
-
-def _url(path: str | os.PathLike[str]) -> str:
-    """Return a URL that ffmpeg takes for a local file, whatever characters the path contains."""
-    return f"file:{Path(path).absolute()}"
-
-
-def _read_log(log: IO[bytes]) -> str:
-    log.seek(0)
-    return log.read().decode(errors="replace").strip()
-
-
-def _main_error(log: str) -> str:
-    """Return the line of ffmpeg's log that most likely names the error, without its prefix."""
-    lines = [line.strip() for line in log.splitlines() if line.strip()]
-    errors = [
-        line for line in lines if re.search(r"error|invalid|denied|no such|not found|partial|corrupt|fail", line, re.I)
-    ]
-    return re.sub(r"^\[[^]]*\]\s*", "", (errors or lines or ["it ends early"])[0])[:160]

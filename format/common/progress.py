@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar on a terminal, a line every ten seconds elsewhere."""
+"""Progress on stderr: a bar on a terminal; elsewhere a line after a second, and then every ten seconds."""
 
 import sys
 import time
@@ -10,8 +10,8 @@ from tqdm import tqdm
 
 T = TypeVar("T")
 
-# Seconds between two lines where stderr is not a terminal.
-LINE_EVERY_S = 10.0
+# Seconds before the first line, and between any two, where stderr is not a terminal.
+FIRST_LINE_S, LINE_EVERY_S = 1.0, 10.0
 
 
 class Progress:
@@ -31,7 +31,7 @@ class Progress:
     def __init__(self, label: str, total: float | None = None, unit: str = "", *, shown: bool = True) -> None:
         self.label, self.total, self.unit, self.shown = label, total, unit, shown
         self.done, self.text = 0.0, ""
-        self.reported_at = time.monotonic()
+        self.reported_at = time.monotonic() + FIRST_LINE_S - LINE_EVERY_S
         # Units done and the time at the first call of `advance`. The remaining time is estimated from there on, since
         # before it kernels are compiled and caches filled.
         self.first: tuple[float, float] | None = None

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from kpc.format.common.errors import KpcError
-from kpc.format.common.media import write_video
+from kpc.format.common.films import write_video
 
 # Frames per second of all videos.
 FILM_FPS = 30.0
@@ -21,7 +21,7 @@ class _AbandonedError(Exception):
 
 
 class Recording:
-    """A video that is being written; see `kpc.format.common.media.write_video`. The file appears when it is complete.
+    """A video that is being written; see `kpc.format.common.films.write_video`. The file appears when it is complete.
 
     Attributes:
         path: of the file, absolute.

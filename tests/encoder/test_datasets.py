@@ -14,8 +14,8 @@ from datasets import fails, load
 from kpc.encoder.datasets import load_dataset
 from kpc.encoder.datasets.capture import natural_key
 from kpc.encoder.datasets.loading import downscale_picture
+from kpc.format.common.films import write_video
 from kpc.format.common.images import write_image
-from kpc.format.common.media import write_video
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

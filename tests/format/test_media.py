@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kpc.format.common import media
+from kpc.format.common import films, media
 from kpc.format.common.errors import MediaError
+from kpc.format.common.films import ffmpeg_binary, write_video
 from kpc.format.common.images import read_image
-from kpc.format.common.media import ffmpeg_binary, read_video, video_info, write_video
+from kpc.format.common.media import read_video, video_info
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -248,8 +249,8 @@ def test_no_ffmpeg_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     def none() -> str:
         raise RuntimeError("none")
 
-    monkeypatch.setattr(media.shutil, "which", lambda name: None)
-    monkeypatch.setattr(media.imageio_ffmpeg, "get_ffmpeg_exe", none)
+    monkeypatch.setattr(films.shutil, "which", lambda name: None)
+    monkeypatch.setattr(films.imageio_ffmpeg, "get_ffmpeg_exe", none)
     ffmpeg_binary.cache_clear()
     with pytest.raises(MediaError, match="install ffmpeg"):
         ffmpeg_binary()

@@ -21,7 +21,7 @@ from PIL import Image, features
 
 from kpc.format.coding.quantise import looked_up_cells, needed_texels
 from kpc.format.common.errors import MediaError
-from kpc.format.common.media import ffmpeg_binary
+from kpc.format.common.films import ffmpeg_binary
 from kpc.format.scene.scene import TIME_PLANES, Scene
 
 # Planes (H, W, M) by name for each scale, as in `Scene.scales`, and their shapes.

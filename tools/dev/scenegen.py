@@ -25,8 +25,8 @@ import numpy as np
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
+from kpc.format.common.films import write_video
 from kpc.format.common.images import srgb_from_linear, write_image
-from kpc.format.common.media import write_video
 from kpc.format.common.progress import progress
 from kpc.format.scene.cameras import Camera
 from kpc.tools.dev.processes import end_with_parent

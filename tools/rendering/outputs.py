@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kpc.format.common.errors import UsageError
+from kpc.format.common.films import DEFAULT_CODECS
 from kpc.format.common.media_files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from kpc.format.scene.cameras import View
 
-FILM_SUFFIXES = (".mp4", ".mkv")
+FILM_SUFFIXES = tuple(DEFAULT_CODECS)
 PICTURE_FORMATS = ("png", "jpg", "exr")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 
@@ -59,16 +59,16 @@ class Output:
             )
         return Output(path, suffix, is_film=suffix in FILM_SUFFIXES)
 
-    def picture_paths(self, views: Sequence[View]) -> tuple[list[Path], int]:
-        """Return the path of each view's picture, and how many could not keep their names.
+    def picture_paths(self, names: Sequence[str]) -> tuple[list[Path], int]:
+        """Return the path of each picture, and how many could not keep their names.
 
         Camera files may come from anywhere: only the last part of their names is used, and none twice.
         """
         if not self.is_folder:
             return [self.path], 0
         paths, used, renamed = [], set[str](), 0
-        for number, view in enumerate(views):
-            name = re.split(r"[/\\]", view.file)[-1]
+        for number, whole_name in enumerate(names):
+            name = re.split(r"[/\\]", whole_name)[-1]
             bare = name.rsplit(".", 1)[0] if _is_of_media(name) else name
             stem = re.sub(r"[^\w.+-]", "_", bare)[:120].lstrip(".")
             if not stem or stem in used:

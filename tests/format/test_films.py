@@ -1,0 +1,103 @@
+"""Films have the codec, bits, alpha and colour tags that are asked for, and all their frames."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kpc.format.common.errors import UsageError
+from kpc.format.common.films import CODECS, DEFAULT_CODECS, FilmFormat, write_film
+
+av = pytest.importorskip("av")
+
+WIDTH, HEIGHT = 65, 65  # SVT-AV1 takes no less than 64
+NAMES = {"h264": "h264", "hevc": "hevc", "prores": "prores", "vp9": "vp9", "av1": "av1"}
+BT709, LIMITED = 1, 1
+
+
+def pictures(bits: int, with_alpha: bool) -> list[np.ndarray]:
+    """Three grey pictures of which the right half is transparent."""
+    kind = np.uint8 if bits == 8 else np.uint16
+    found = []
+    for level in (0.2, 0.5, 0.8):
+        picture = np.full((HEIGHT, WIDTH, 3 + with_alpha), level * np.iinfo(kind).max).astype(kind)
+        if with_alpha:
+            picture[..., 3] = np.where(np.arange(WIDTH) < WIDTH // 2, np.iinfo(kind).max, 0)
+        found.append(picture)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec", "bits", "alpha"),
+    [
+        *((DEFAULT, None, None, False) for DEFAULT in DEFAULT_CODECS),
+        (".mov", None, None, True),
+        (".webm", None, None, True),
+        (".mp4", "hevc", 10, False),
+        (".mp4", "av1", 10, False),
+        (".mov", "h264", 10, False),
+        (".mkv", "vp9", 10, False),
+    ],
+)
+def test_films_are_what_was_asked_for(
+    tmp_path: Path, suffix: str, codec: str | None, bits: int | None, alpha: bool
+) -> None:
+    film = FilmFormat.of(suffix, codec, bits=bits, alpha=alpha)
+    assert film.bits == (bits or film.bits) and film.has_alpha == alpha
+    path = tmp_path / f"x{suffix}"
+    assert write_film(path, pictures(film.bits, alpha), 12.5, film) == 3
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        assert context.codec.canonical_name == (codec or DEFAULT_CODECS[suffix]) and stream.average_rate == 12.5
+        assert (context.width, context.height) == film.padded(WIDTH, HEIGHT)
+        tags = context.color_primaries, context.color_trc, context.colorspace, context.color_range
+        assert tags == (BT709, BT709, BT709, LIMITED)
+        if codec is None and suffix == ".webm" and alpha:  # FFmpeg's own decoder leaves the alpha out
+            decoder = av.CodecContext.create("libvpx-vp9", "r")
+            frames = [frame for packet in container.demux(stream) for frame in decoder.decode(packet)]
+        else:
+            frames = list(container.decode(stream))
+    assert len(frames) == 3
+    assert frames[0].format.components[0].bits >= film.bits
+    for frame, level in zip(frames, (0.2, 0.5, 0.8), strict=True):
+        rgba = frame.to_ndarray(format="rgba").astype(int)
+        assert abs(int(rgba[20, 20, 1]) - 255 * level) <= 3
+        assert rgba[20, 20, 3] == 255 and rgba[20, 50, 3] == (0 if alpha else 255)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "words", "message"),
+    [
+        (".mp4", {"codec": "prores"}, "it holds h264, hevc, av1; prores goes into .mov, .mkv"),
+        (".webm", {"codec": "h264"}, "it holds vp9, av1"),
+        (".mp4", {"alpha": True}, "films with alpha are prores (.mov, .mkv), vp9 (.webm, .mkv)"),
+        (".webm", {"alpha": True, "bits": 10}, "vp9 with alpha has 8 bits, not 10"),
+        (".mov", {"bits": 8}, "prores has 10 bits, not 8"),
+        (".mov", {"crf": 10}, "its quality is fixed"),
+        (".mp4", {"crf": 52}, "0 to 51; not 52"),
+    ],
+)
+def test_films_that_do_not_exist_are_refused(suffix: str, words: dict, message: str) -> None:
+    with pytest.raises(UsageError) as error:
+        FilmFormat.of(suffix, **words)
+    assert message in str(error.value)
+
+
+def test_a_lower_rate_factor_makes_a_larger_file(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    for name, codec in CODECS.items():
+        if codec.crf is None:
+            continue
+        sizes = []
+        for crf in (codec.crf[0] + 10, codec.crf[1] - 5):
+            path = tmp_path / f"{name}{crf}{codec.suffixes[0]}"
+            write_film(path, [noise] * 2, 10, FilmFormat.of(path.suffix, name, crf=crf))
+            sizes.append(path.stat().st_size)
+        assert sizes[0] > 1.5 * sizes[1], name
+
+
+def test_sizes_are_padded_only_as_chroma_needs() -> None:
+    assert FilmFormat.of(".mp4").padded(33, 17) == (34, 18)
+    assert FilmFormat.of(".mov").padded(33, 17) == (34, 17)
+    assert FilmFormat.of(".mov", alpha=True).padded(33, 17) == (33, 17)

@@ -1,0 +1,225 @@
+"""Times, alpha, exposure and interruption of what kprender writes."""
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import kpc
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common.images import read_image
+from kpc.format.container.scene_io import write
+from kpc.player.app.camera_paths import CameraPath
+from kpc.player.cpu import reference
+from kpc.tools.cli import kprender
+from kpc.tools.rendering import content
+from scenes import tiny_scene
+
+SIZE = ("--size", "16x12", "--backend", "reference")
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clip of 11 frames at 10 frames per second."""
+    path = tmp_path_factory.mktemp("scene") / "tiny.kpc"
+    scene = tiny_scene(4)
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), path)
+    return path
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    def call(*arguments: object) -> tuple[int, str, str]:
+        try:
+            code = kprender.main([str(a) for a in arguments])
+        except SystemExit as error:  # argparse
+            code = int(error.code or 0)
+        output = capsys.readouterr()
+        return code, output.out, output.err
+
+    return call
+
+
+@pytest.fixture
+def times(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The times of all pictures that are rendered, seconds."""
+    seen: list[float] = []
+    render = reference.render
+
+    def record(scene: object, camera: object, time: float, **words: object) -> object:
+        seen.append(time * 1.0)  # the clip lasts a second
+        return render(scene, camera, time, **words)
+
+    monkeypatch.setattr(reference, "render", record)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("words", "numbers", "fps"),
+    [
+        ([], range(11), 10),
+        (["--fps", 20], range(22), 20),
+        (["--fps", 5], range(6), 5),
+        (["--from", 0.3, "--to", 0.6], range(3, 6), 10),
+        (["--from", 0.35], range(4, 11), 10),
+        (["--fps", 20, "--from", 0.3, "--to", 0.5], range(6, 10), 20),
+        (["--frames", "2-4"], range(2, 5), 10),
+        (["--frames", "7"], range(7, 8), 10),
+        (["--fps", 20, "--frames", "20-21"], range(20, 22), 20),
+        (["--step", 3], range(0, 11, 3), 10),
+        (["--orbit", 8, "--frames", "2-5"], range(2, 6), 10),
+    ],
+)
+def test_time_is_continuous(
+    run: Run, scene_file: Path, tmp_path: Path, times: list[float], words: list, numbers: range, fps: float
+) -> None:
+    """Frame n is at n / fps seconds and keeps its number as its name, whichever are rendered."""
+    code, _, complaint = run(scene_file, *words, *SIZE, "-o", tmp_path / "out")
+    assert code == 0, complaint
+    assert sorted(p.stem for p in (tmp_path / "out").iterdir()) == [f"{number:04d}" for number in numbers]
+    last = 7 if "--orbit" in words else fps
+    assert times == pytest.approx([min(number / last, 1.0) for number in numbers])
+
+
+@pytest.mark.parametrize(
+    ("words", "frames", "rate"),
+    [(["--fps", 20], 22, "20"), (["--step", 2], 6, "5"), (["--from", 0.5, "--fps", 30], 18, "30")],
+)
+def test_films_last_as_long_as_the_clip(
+    run: Run, scene_file: Path, tmp_path: Path, words: list, frames: int, rate: str
+) -> None:
+    code, printed, _ = run(scene_file, *words, *SIZE, "-o", tmp_path / "x.mkv")
+    assert code == 0 and f"{frames} frames at {rate} fps" in printed
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--from", 2], "no frame lies"),
+        (["--to", 2], "all lasts 1.1 s"),
+        (["--from", 0.5, "--to", 0.4], "no frame lies"),
+        (["--frames", "5-11"], "the last frame is 10"),
+        (["--frames", "4-2"], "range of frames"),
+        (["--step", 0], "--step"),
+        (["--shutter", 1.5], "--shutter"),
+        (["--samples", 17], "--samples"),
+        (["--background", "greenish"], "no colour"),
+        (["--camera", 2], "cameras 0 to 1"),
+        (["--crf", 10], "is for films"),
+        (["--codec", "h264"], "is for films"),
+        (["--background", "transparent", "--format", "jpg"], "no alpha"),
+        (["--background", "transparent", "--dynamic-map"], "opaque"),
+        (["-o", "x.mp4", "--background", "transparent"], "films with alpha are prores (.mov, .mkv)"),
+        (["-o", "x.mp4", "--codec", "vp9"], "it holds h264, hevc, av1"),
+        (["-o", "x.mp4", "--resume"], "cannot be resumed"),
+        (["-o", "x.png", "--size", "9000x10", "--samples", 2, "--time", 0], "more than 16384"),
+    ],
+)
+def test_what_cannot_be_rendered_is_a_usage_error(
+    run: Run, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, printed, complaint = run(scene_file, *SIZE, "-o", "out", *words)
+    assert code == 2 and printed == "" and message in complaint and not list(tmp_path.iterdir())
+
+
+def test_a_fixed_camera_needs_no_path(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    scene = kpc.load(scene_file)
+    path = CameraPath().with_keyframe(scene.cameras[1], 0.0)
+    path.save(tmp_path / "one.json")
+    words = ["--frames", "4", "--backend", "reference"]
+    assert run(scene_file, *words, "--camera", 1, "-o", tmp_path / "a")[0] == 0
+    assert run(scene_file, *words, "--camera", tmp_path / "one.json", "-o", tmp_path / "b")[0] == 0
+    wanted = reference.render(scene, scene.cameras[1], 0.4).rgb
+    for folder in "ab":
+        assert np.abs(read_image(tmp_path / folder / "0004.png") / 255 - wanted).max() < 1 / 255
+    path.with_keyframe(scene.cameras[0], 0.5).save(tmp_path / "two.json")
+    code, _, complaint = run(scene_file, *words, "--camera", tmp_path / "two.json", "-o", tmp_path / "c")
+    assert code == 2 and "lists 2 views" in complaint
+
+
+def test_png_holds_straight_alpha(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    words = ["--time", 0.4, "--backend", "reference", "--background", "transparent", "-o", tmp_path / "x.png"]
+    assert run(scene_file, *words)[0] == 0
+    scene, pixels = kpc.load(scene_file), read_image(tmp_path / "x.png") / 255
+    wanted = reference.render(scene, scene.cameras[0], 0.4)
+    assert np.abs(pixels[..., 3] - wanted.opacity).max() < 1 / 255
+    over = pixels[..., :3] * pixels[..., 3:] + scene.background * (1 - pixels[..., 3:])
+    assert np.abs(over - wanted.rgb).max() < 1.5 / 255
+
+
+@pytest.mark.parametrize("is_transparent", [False, True])
+def test_samples_and_instants_are_averaged_in_linear_light(is_transparent: bool) -> None:
+    """A white, opaque sample beside a black or an empty one is half the light."""
+    camera = tiny_scene(4).cameras[0].resized(2, 1)
+
+    def render(camera: object, time: float) -> reference.Rendering:
+        checks = np.indices((camera.height, camera.width)).sum(0) % 2 == 0
+        white = checks if camera.width > 2 else np.full_like(checks, time < 0.5)
+        rgb = np.repeat(white[..., None], 3, axis=2).astype(np.float32)
+        opacity = white.astype(np.float32) if is_transparent else np.ones_like(rgb[..., 0])
+        return reference.Rendering(rgb, np.where(white, 1, 5).astype(np.float32), opacity, np.ones(white.shape, int))
+
+    half = 1.0 * 0.5 if is_transparent else 1.055 * 0.5 ** (1 / 2.4) - 0.055
+    for instants, samples in (([(camera, 0.0)], 2), ([(camera, 0.0), (camera, 1.0)], 1)):
+        picture = content.mean_picture(render, instants, samples, is_transparent)
+        assert picture.rgb == pytest.approx(half, abs=1e-6) and picture.rgb.shape == (1, 2, 3)
+        assert picture.opacity == pytest.approx(0.5 if is_transparent else 1.0)
+        assert set(picture.depth.ravel()) <= {1.0, 5.0}  # no depth between two surfaces
+
+
+def test_the_shutter_opens_around_the_frame(run: Run, scene_file: Path, tmp_path: Path, times: list[float]) -> None:
+    words = ["--frames", "5", "--shutter", 0.5, *SIZE]
+    assert run(scene_file, *words, "-o", tmp_path / "x.png")[0] == 0
+    assert len(times) == 8 and np.mean(times) == pytest.approx(0.5)
+    assert max(times) - min(times) == pytest.approx(0.05 * 7 / 8)
+
+
+def test_resuming_skips_whole_pictures_of_this_size(
+    run: Run, scene_file: Path, tmp_path: Path, times: list[float]
+) -> None:
+    out = tmp_path / "out"
+    words = [scene_file, "--frames", "0-5", "--depth", *SIZE, "--resume", "-o", out]
+    assert run(*words)[0] == 0 and len(times) == 6
+    whole = (out / "0001.png").read_bytes()
+    (out / "0001.png").write_bytes(whole[:-20])  # cut off while it was copied
+    (out / "0002.png").unlink()
+    (out / "0003_depth.png").unlink()
+    (out / "0004.png").write_bytes((out / "0004_depth.png").read_bytes()[:0])
+    times.clear()
+    code, printed, _ = run(*words)
+    assert code == 0 and "6 pictures (2 were there)" in printed
+    assert times == pytest.approx([0.1, 0.2, 0.3, 0.4]) and (out / "0001.png").read_bytes() == whole
+    times.clear()
+    assert run(*words[:-1], out, "--size", "12x9")[0] == 0 and len(times) == 6  # another size
+
+
+@pytest.mark.parametrize("name", ["out", "x.mkv", "x.webm"])
+def test_ctrl_c_leaves_whole_frames_only(
+    run: Run, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    render, calls = reference.render, itertools.count()
+
+    def interrupt(*arguments: object, **words: object) -> object:
+        if next(calls) == 4:
+            raise KeyboardInterrupt
+        return render(*arguments, **words)
+
+    monkeypatch.setattr(reference, "render", interrupt)
+    code, _, complaint = run(scene_file, *SIZE, "-o", tmp_path / name)
+    assert code == 130 and complaint.endswith("kprender: interrupted\n")
+    left = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
+    assert left == ([f"out/{number:04d}.png" for number in range(4)] if name == "out" else [])
+    for file in left:
+        assert read_image(tmp_path / file).shape == (12, 16, 3)
+
+
+def test_an_odd_size_is_padded_and_said(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    words = [scene_file, "--frames", "0-1", "--size", "33x17", "--backend", "reference"]
+    code, printed, notes = run(*words, "-o", tmp_path / "x.mp4")
+    assert code == 0 and "padded to 34x18" in printed and "needs even sides" in notes
+    code, printed, notes = run(*words, "-o", tmp_path / "x.mov", "--background", "transparent")
+    assert code == 0 and "(padded" not in printed and "33x17" in printed

@@ -1,0 +1,148 @@
+"""What pictures show: the scene by one of two renderers, its background, what moves, and the mean of many samples."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kpc.format.common.errors import UsageError
+from kpc.format.common.images import srgb_from_linear
+from kpc.format.container.groups import GroupedScene
+from kpc.format.scene.cameras import Camera
+from kpc.format.scene.scene import Scene
+from kpc.player.cpu import reference
+from kpc.player.cpu.motion_map import motion_colours
+from kpc.player.cpu.reference import Rendering
+from kpc.player.quality import LEVELS
+
+# Renders a camera's picture at a time in [0, 1] over the clip.
+Render = Callable[[Camera, float], Rendering]
+# Draws a scene, one of those needed at a time of the clip, at a time of its own.
+Draw = Callable[[Scene, Camera, float, Sequence[Scene]], Rendering]
+
+
+def renderer_of(loaded: Scene | GroupedScene, options: argparse.Namespace) -> tuple[Render, str]:
+    """Return a function that renders a picture over the background of the options, and the name of the renderer.
+
+    With a transparent background colours are multiplied by opacity.
+    """
+    appearance_of(loaded.at(0.0)[0], options.appearance)  # reports an unknown name at once
+    draw, name = _reference_drawing(options) if options.backend == "reference" else _gl_drawing(options)
+
+    def render(camera: Camera, time: float) -> Rendering:
+        parts, pictures = loaded.blend_at(time), []
+        for scene, local_time, share in parts:
+            picture = draw(scene, camera, local_time, [one for one, *_ in parts])
+            if options.dynamic_map:
+                picture = motion_colours(scene, camera, local_time, picture)
+            elif options.background is not None:
+                uncovered = (1 - picture.opacity)[..., None]
+                picture = replace(picture, rgb=picture.rgb + uncovered * (options.background - scene.background))
+            pictures.append((picture, share))
+        return reference.blend(pictures)
+
+    return render, name
+
+
+def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
+    from kpc.player.gl import offscreen  # here, since the reference backend works without moderngl
+    from kpc.player.gl.renderer import Renderer
+
+    ctx = offscreen.open_context()
+    renderers: list[Renderer] = []
+
+    def draw(scene: Scene, camera: Camera, time: float, needed: Sequence[Scene]) -> Rendering:
+        for unused in [one for one in renderers if all(one.scene is not other for other in needed)]:
+            unused.release()
+            renderers.remove(unused)
+        renderer = next((one for one in renderers if one.scene is scene), None)
+        if renderer is None:
+            renderers.append(renderer := Renderer(ctx, scene, LEVELS[options.quality]))
+        appearance = appearance_of(scene, options.appearance)
+        return renderer.render(camera, time, part=options.part, appearance=appearance)
+
+    return draw, offscreen.describe(ctx)
+
+
+def _reference_drawing(options: argparse.Namespace) -> tuple[Draw, str]:
+    def draw(scene: Scene, camera: Camera, time: float, needed: Sequence[Scene]) -> Rendering:
+        appearance = appearance_of(scene, options.appearance)
+        return reference.render(scene, camera, time, part=options.part, appearance=appearance)
+
+    return draw, "reference renderer (numpy)"
+
+
+def mean_picture(
+    render: Render, instants: Sequence[tuple[Camera, float]], samples: int, is_transparent: bool
+) -> Rendering:
+    """Render a picture as the mean, in linear light, of several instants and of several samples a pixel.
+
+    Depth is not averaged, which would invent surfaces between near and far ones: it is that of one sample, at the
+    middle of the pixel or beside it, and of the middle instant.
+
+    Args:
+        render: renders one instant.
+        instants: cameras and times.
+        samples: along each side of a pixel.
+        is_transparent: whether colours are multiplied by opacity.
+    """
+    if len(instants) == 1 and samples == 1:
+        return render(*instants[0])
+    light: list[np.ndarray] = []
+    opacity: list[np.ndarray] = []
+    middle, total = None, 0
+    for number, (camera, time) in enumerate(instants):
+        width, height = camera.width * samples, camera.height * samples
+        fine = render(camera.resized(width, height) if samples > 1 else camera, time)
+        cells = camera.height, samples, camera.width, samples
+        light.append(linear_colours(fine, is_transparent).reshape(*cells, 3).mean(axis=(1, 3)))
+        opacity.append(fine.opacity.reshape(cells).mean(axis=(1, 3)))
+        total = total + fine.samples.reshape(cells).sum(axis=(1, 3))
+        if number == len(instants) // 2:
+            middle = fine.depth[samples // 2 :: samples, samples // 2 :: samples]
+    assert middle is not None
+    mean, mean_opacity = np.mean(light, axis=0), np.mean(opacity, axis=0)
+    covered = np.maximum(mean_opacity, 1e-12)[..., None] if is_transparent else 1.0
+    rgb = srgb_from_linear(mean / covered) * (mean_opacity[..., None] if is_transparent else 1.0)
+    return Rendering(rgb.astype(np.float32), middle, mean_opacity.astype(np.float32), np.asarray(total))
+
+
+def straight_colours(picture: Rendering) -> np.ndarray:
+    """Divide colours that are multiplied by opacity by it, (H, W, 3) in [0, 1]; 0 where nothing is."""
+    opacity = picture.opacity[..., None]
+    divided = np.divide(picture.rgb, opacity, out=np.zeros_like(picture.rgb), where=opacity > 1e-6)
+    return np.clip(divided, 0, 1)
+
+
+def linear_colours(picture: Rendering, is_transparent: bool) -> np.ndarray:
+    """Return colours in linear light by the inverse sRGB curve, (H, W, 3) float64; multiplied by opacity if the
+    picture's are."""
+    rgb = np.clip(straight_colours(picture) if is_transparent else picture.rgb, 0, 1).astype(np.float64)
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return linear * picture.opacity[..., None] if is_transparent else linear
+
+
+def appearance_of(scene: Scene, text: str | None) -> np.ndarray | None:
+    """Return the embedding that --appearance asks for; None, the average, without the option.
+
+    The text is NAME, or ONE:OTHER:SHARE for a linear interpolation; names themselves may contain colons.
+
+    Raises:
+        UsageError: the scene has no appearance of that name, or the share lies outside [0, 1].
+    """
+    if text is None:
+        return None
+    names = {appearance.name for appearance in scene.appearances}
+    pair, _, share = text.rpartition(":")
+    if text in names or ":" not in pair:
+        return scene.appearance(text)
+    try:
+        weight = float(share)
+    except ValueError:
+        weight = -1.0
+    if not 0.0 <= weight <= 1.0:
+        raise UsageError(f"--appearance {text}: {share!r} is not a share in [0, 1]; give NAME or NAME:NAME:SHARE")
+    colons = [k for k, letter in enumerate(pair) if letter == ":"]
+    split = next((k for k in colons if names.issuperset({pair[:k], pair[k + 1 :]})), colons[0])
+    return scene.interpolate_appearance(pair[:split], pair[split + 1 :], weight)

@@ -1,0 +1,181 @@
+"""The frames to render: which cameras, which times, and what they are called.
+
+Time is continuous: frame n of a film is at n / fps seconds, whatever the rate of the clip. A frame of a clip lasts 1 /
+(its rate), the last one, too; so a clip of 30 frames at 30 fps fills one second at any rate.
+"""
+
+import argparse
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kpc.format.common.errors import UsageError
+from kpc.format.scene.cameras import Camera, View, load_views
+from kpc.format.scene.scene import Clip, Scene
+from kpc.player.app.camera_paths import CameraPath
+from kpc.player.viewpoints import Rig, fit_camera, orbit
+
+# Limits of --fps and of the number of pictures.
+MIN_FPS, MAX_FPS = 0.001, 240.0
+MAX_PICTURES = 100_000
+# Instants at which a frame with an open shutter is rendered.
+SHUTTER_INSTANTS = 8
+# Frames by which a time may miss a frame and still mean it: rounding of seconds that were typed.
+SLACK = 1e-3
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """All frames that cameras and clip give, of which a range is rendered.
+
+    Attributes:
+        count: number of frames.
+        fps: frames per second.
+        at: the camera and the clip's time in [0, 1] at a frame, which need not be whole.
+        names: of the frames; None to name them by their numbers.
+    """
+
+    count: int
+    fps: float
+    at: Callable[[float], tuple[Camera, float]]
+    names: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Shots:
+    """The frames to render.
+
+    Attributes:
+        timeline: all frames.
+        numbers: of those to render.
+        fps: frames per second of a film of them, which plays as fast as the clip.
+        shutter: the part of a frame's time for which the shutter is open, 0 for an instant.
+    """
+
+    timeline: Timeline
+    numbers: range
+    fps: float
+    shutter: float
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def name(self, number: int) -> str:
+        """Return what a frame is called."""
+        return f"{number:04d}" if self.timeline.names is None else self.timeline.names[number]
+
+    def camera(self, number: int) -> Camera:
+        """Return the camera of a frame."""
+        return self.timeline.at(number)[0]
+
+    def time(self, number: int) -> float:
+        """Return the clip's time of a frame, in [0, 1]."""
+        return self.timeline.at(number)[1]
+
+    def instants(self, number: int) -> list[tuple[Camera, float]]:
+        """Return the cameras and times whose mean a frame is: one, or several evenly over the time that the shutter is
+        open, the middle of which is the frame's."""
+        if self.shutter == 0:
+            return [self.timeline.at(number)]
+        steps = (np.arange(SHUTTER_INSTANTS) + 0.5) / SHUTTER_INSTANTS - 0.5
+        return [self.timeline.at(number + self.shutter * float(step)) for step in steps]
+
+
+def shots_of(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bool) -> Shots:
+    """Return the frames that the options of `kpc.tools.rendering.options` ask for.
+
+    Raises:
+        DatasetError: a camera file cannot be used.
+        UsageError: there are no such frames, or too many.
+    """
+    timeline = _timeline(scene, clip, options, is_film)
+    if timeline.count > MAX_PICTURES:
+        raise UsageError(f"{timeline.count} pictures are more than {MAX_PICTURES}; choose a lower --fps")
+    first, last, fps = 0, timeline.count - 1, timeline.fps
+    if options.frames is not None:
+        first, last = options.frames
+        if last >= timeline.count:
+            raise UsageError(f"--frames {first}-{last}: the last frame is {timeline.count - 1}")
+    if options.start_s is not None or options.end_s is not None:
+        start_s, end_s = options.start_s or 0.0, options.end_s
+        if end_s is not None and end_s * fps > timeline.count + SLACK:
+            raise UsageError(f"--to {end_s:g}: all lasts {timeline.count / fps:g} s")
+        first = math.ceil(start_s * fps - SLACK)
+        last = last if end_s is None else math.ceil(end_s * fps - SLACK) - 1
+        if not first <= last < timeline.count:
+            raise UsageError(
+                f"no frame lies from --from {start_s:g} up to --to {(last + 1) / fps:g} s; swap or widen them"
+            )
+    return Shots(timeline, range(first, last + 1, options.step), fps / options.step, options.shutter)
+
+
+def _timeline(scene: Scene, clip: Clip, options: argparse.Namespace, is_film: bool) -> Timeline:
+    fps = float(options.fps or min(max(clip.fps, 1.0), MAX_FPS))
+    # What a frame adds to the clip's time, as a fraction: exact where the rate is the clip's.
+    clip_frames, last_frame = clip.fps / fps, max(clip.frame_count - 1, 1)
+    fixed_time: float | None = options.time
+
+    def fitted(camera: Camera) -> Camera:
+        return camera if options.size is None else fit_camera(camera, *options.size)
+
+    if options.path is not None:
+        path = CameraPath.load(options.path)
+        duration_s = path.end_s - path.start_s
+        if duration_s * fps >= MAX_PICTURES:
+            raise UsageError(
+                f"--path {options.path}: {duration_s:g} s at {fps:g} fps are more than {MAX_PICTURES} pictures"
+            )
+
+        def along(frame: float) -> tuple[Camera, float]:
+            camera, time = path.at(path.start_s + frame / fps)
+            return fitted(camera), time if fixed_time is None else fixed_time
+
+        return Timeline(int(duration_s * fps + 1e-6) + 1, fps, along)
+
+    if options.cameras is not None or options.orbit is not None:
+        views = load_views(options.cameras) if options.cameras is not None else _orbit(scene, options)
+        if options.size is None and is_film:  # all frames of a film have one size
+            first = views[0].camera
+            views = [View(fit_camera(v.camera, first.width, first.height), v.time, v.file) for v in views]
+
+        def nearest(frame: float) -> tuple[Camera, float]:
+            number = min(max(round(frame), 0), len(views) - 1)
+            time = views[number].time if fixed_time is None else fixed_time
+            return fitted(views[number].camera), _clamped(time + (frame - number) * clip_frames / last_frame)
+
+        names = tuple(view.file for view in views) if options.cameras is not None else None
+        return Timeline(len(views), fps, nearest, names)
+
+    camera = fitted(_camera(scene, options))
+    if fixed_time is not None:
+        return Timeline(1, fps, lambda frame: (camera, _clamped(fixed_time + frame * clip_frames / last_frame)))
+    count = math.ceil(clip.frame_count / clip_frames - SLACK) if clip.frame_count > 1 else 1
+    return Timeline(count, fps, lambda frame: (camera, _clamped(frame * clip_frames / last_frame)))
+
+
+def _clamped(time: float) -> float:
+    return min(max(time, 0.0), 1.0)
+
+
+def _orbit(scene: Scene, options: argparse.Namespace) -> list[View]:
+    cameras = orbit(scene, options.orbit)
+    times = np.linspace(0.0, 1.0, len(cameras))
+    return [View(camera, float(time), "") for camera, time in zip(cameras, times, strict=True)]
+
+
+def _camera(scene: Scene, options: argparse.Namespace) -> Camera:
+    """Return the fixed camera that --camera names: a number among the scene's, or a file that lists one view."""
+    if options.camera is None:
+        return Rig.of(scene).cameras[0]
+    if options.camera.isdecimal():
+        cameras = Rig.of(scene).cameras
+        if int(options.camera) >= len(cameras):
+            raise UsageError(f"--camera {options.camera}: the scene has the cameras 0 to {len(cameras) - 1}")
+        return cameras[int(options.camera)]
+    views = load_views(Path(options.camera))
+    if len(views) != 1:
+        raise UsageError(f"--camera {options.camera}: lists {len(views)} views, not one; --cameras renders each")
+    return views[0].camera
