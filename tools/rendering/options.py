@@ -219,10 +219,11 @@ def _colour(text: str) -> np.ndarray | str:
     """Return a colour, (3,) float32 in [0, 1], or "transparent"."""
     if text == "transparent":
         return text
+    refusal = argparse.ArgumentTypeError(f"{text!r} is no colour like white or #00ff00, nor transparent")
     try:
         colour = ImageColor.getrgb(text)
     except ValueError:
-        colour = ()
+        raise refusal from None
     if len(colour) != 3:
-        raise argparse.ArgumentTypeError(f"{text!r} is no colour like white or #00ff00, nor transparent")
+        raise refusal
     return np.array(colour, np.float32) / 255
