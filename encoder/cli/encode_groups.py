@@ -29,6 +29,8 @@ from kpc.format.scene.space import Contraction
 
 # Figures that are reported for each group.
 GROUP_FIGURES = ("size_bytes", "test_psnr", "steps", "train_s", "peak_memory_bytes")
+# Figures that are summed over all groups.
+SUMMED_FIGURES = ("test_pictures", "held_out_pictures", "steps", "train_s")
 
 
 def encode_groups(options: Options) -> dict[str, Any]:
@@ -151,9 +153,8 @@ def _combine(
             "file": str(options.output),
             "test_psnr": mean("test_psnr", pictures),
             "test_ssim": mean("test_ssim", pictures),
-            "test_pictures": sum(pictures),
             "coding_loss_db": mean("coding_loss_db", [span.count for span in spans]),
-            **{key: sum(one[key] for one in found) for key in ("steps", "train_s")},
+            **{key: sum(one[key] for one in found) for key in SUMMED_FIGURES},
             "rays_per_s": mean("rays_per_s", [one["train_s"] for one in found]),
             "peak_memory_bytes": found[-1]["peak_memory_bytes"],
             "groups": [

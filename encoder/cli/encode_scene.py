@@ -18,7 +18,8 @@ from kpc.encoder.cli.report import SPACES, describe_occupancy, describe_pruning,
 from kpc.encoder.cli.transcode import coding_figures
 from kpc.encoder.cli.work_folder import CHECKPOINT, clear_work_folder, save_scene
 from kpc.encoder.datasets import Dataset
-from kpc.encoder.evaluation.evaluate import Quality, evaluate
+from kpc.encoder.evaluation.evaluate import Quality, SceneRenderer, evaluate
+from kpc.encoder.evaluation.testing_time import affordable_pictures, picture_seconds
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.occupancy_grid import merge_slots
 from kpc.encoder.rdo.codec_model import CodedModel, Model, code
@@ -52,7 +53,9 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     coded = _code(trainer, scene, options)
     size = save_scene(coded.data, options.output, work)
     decoded = scene_io.read(options.output).dequantise()
-    test, uncoded = (evaluate(one, dataset, most=options.max_test_pictures) for one in (decoded, scene))
+    most = _most_tested(options, SceneRenderer(decoded), trainer)
+    test = evaluate(decoded, dataset, most=most, label="testing the coded file")
+    uncoded = evaluate(scene, dataset, most=most, label="testing the model")
     if not options.keep:
         clear_work_folder(work)
     return {
@@ -66,7 +69,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         "space": SPACES[type(trainer.mapping)][0],
         "appearance": trainer.config.appearance,
         "appearances": len(trainer.names),
-        **_test_figures(test),
+        **_test_figures(test, dataset),
         "coding_loss_db": uncoded.psnr - test.psnr if test and uncoded else coded.loss_db,
         **coding_figures(coded, size, options.trade, "training views"),
         "steps": trainer.step,
@@ -77,11 +80,23 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     }
 
 
-def _test_figures(test: Quality | None) -> dict[str, Any]:
+def _most_tested(options: Options, renderer: SceneRenderer, trainer: Trainer) -> int:
+    """Return the most held-out pictures to test; log where the training time limits them."""
+    if options.test_views is not None:
+        return options.test_views
+    most = affordable_pictures(trainer.elapsed_s, picture_seconds(renderer, trainer.dataset))
+    total = int(trainer.dataset.pictures.is_test.sum())
+    if most < total:
+        log(f"testing {most} of {total} held-out pictures, to save time; --test-views all tests them all")
+    return most
+
+
+def _test_figures(test: Quality | None, dataset: Dataset) -> dict[str, Any]:
     return {
         "test_psnr": test and test.psnr,
         "test_ssim": test and test.ssim,
         "test_pictures": test.pictures if test else 0,
+        "held_out_pictures": int(dataset.pictures.is_test.sum()),
     }
 
 
@@ -104,7 +119,9 @@ def _code(trainer: Trainer, scene: Scene, options: Options) -> CodedModel:
 
 def _evaluate_unwritable(trainer: Trainer, options: Options, started: float) -> dict[str, Any]:
     """Return what was measured on a model that no file can hold; fewer figures than `encode_scene` returns."""
-    test = evaluate(to_scene(trainer), trainer.dataset, most=options.max_test_pictures, field=trainer.field)
+    scene = to_scene(trainer)
+    most = _most_tested(options, SceneRenderer(scene, trainer.field), trainer)
+    test = evaluate(scene, trainer.dataset, most=most, field=trainer.field, label="testing the model")
     if not options.keep:
         clear_work_folder(options.work_dir)
     return {
@@ -112,7 +129,7 @@ def _evaluate_unwritable(trainer: Trainer, options: Options, started: float) -> 
         "device": str(trainer.device),
         "seed": options.seed,
         "steps": trainer.step,
-        **_test_figures(test),
+        **_test_figures(test, trainer.dataset),
         "train_s": trainer.elapsed_s,
         "encode_s": time.monotonic() - started,
     }

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kpc.encoder.evaluation.evaluate import SceneRenderer
+from kpc.encoder.evaluation.testing_time import TIMED_RAYS, affordable_pictures, picture_seconds, ray_seconds
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.rdo.curvature import RAYS as CURVATURE_RAYS
 from kpc.encoder.rdo.curvature import estimate_curvature
@@ -29,19 +30,25 @@ class Estimate:
 
     Attributes:
         train_s: seconds of training.
-        rest_s: seconds of all that comes before and after.
+        test_s: seconds of testing on held-out pictures.
+        rest_s: seconds of all else that comes before and after.
         memory_bytes: peak memory.
+        test_pictures: held-out pictures that are tested.
+        held_out_pictures: all held-out pictures.
     """
 
     train_s: float
+    test_s: float
     rest_s: float
     memory_bytes: int
+    test_pictures: int
+    held_out_pictures: int
 
 
 def estimate(
     trainer: Trainer,
     validation_rays: int,
-    test_pictures: int,
+    test_views: int | None,
     spent_s: float,
     time_budget_s: float | None,
     tune_steps: int | None = None,
@@ -51,7 +58,7 @@ def estimate(
     Args:
         trainer: ready for the first step.
         validation_rays: rays on which each attempt at a quantisation is judged.
-        test_pictures: held-out pictures that will be rendered.
+        test_views: as in `Options`.
         spent_s: seconds since the command started, without a survey: they will be spent again.
         time_budget_s: of training; None for `TrainConfig.steps` steps.
         tune_steps: steps of fine-tuning per group of planes; None for as many as the length of training permits.
@@ -61,10 +68,8 @@ def estimate(
     """
     config = trainer.config
     train_s, step_s = _estimate_training(trainer, time_budget_s)
-    pixels = trainer.dataset.pictures.width.astype(np.int64) * trainer.dataset.pictures.height
     renderings = RENDERINGS + (max_renderings(trainer.field.layout.features) if config.prunes else 0)
-    rendered = (renderings + 1) * validation_rays + 2 * test_pictures * float(pixels.mean())
-    fit_s = 2 * test_pictures * _time_appearance_fit(trainer) if trainer.names and test_pictures else 0.0
+    rendered = (renderings + 1) * validation_rays
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()
     scene = trainer.scene()
     coding_s, ray_s = _time_coding(scene), _time_ray(trainer)
@@ -77,7 +82,11 @@ def estimate(
     if steps := total_steps(scene, tune_steps):
         trained_ray_s = 1 / trainer.rays_per_second if trainer.rays_per_second else 3 * ray_s
         all_coding_s += TUNED_CODINGS * (coding_s + steps * RAYS * (trained_ray_s + ray_s))
-    return Estimate(train_s, spent_s + rendered * ray_s + all_coding_s + fit_s, memory)
+    picture_s = picture_seconds(SceneRenderer(scene), trainer.dataset)
+    held_out = int(trainer.dataset.pictures.is_test.sum())
+    tested = min(held_out, affordable_pictures(train_s, picture_s) if test_views is None else test_views)
+    rest_s = spent_s + rendered * ray_s + all_coding_s
+    return Estimate(train_s, tested * picture_s, rest_s, memory, tested, held_out)
 
 
 def _estimate_training(trainer: Trainer, time_budget_s: float | None) -> tuple[float, float]:
@@ -121,20 +130,9 @@ def _time_curvature(scene: Scene) -> float:
     return 16 * (time.perf_counter() - started)
 
 
-def _time_appearance_fit(trainer: Trainer) -> float:
-    """Return the seconds of fitting the appearance of a held-out picture."""
-    renderer, held_out = SceneRenderer(trainer.scene()), np.flatnonzero(trainer.dataset.pictures.is_test)
-    started = time.perf_counter()
-    renderer.fit_left_half(trainer.dataset, int(held_out[0]))
-    return time.perf_counter() - started
-
-
-def _time_ray(trainer: Trainer, count: int = 1 << 14) -> float:
+def _time_ray(trainer: Trainer) -> float:
     """Return the seconds of rendering a ray."""
-    batch, _ = trainer.sampler.draw(np.random.default_rng(0), count, trainer.background)
-    renderer = SceneRenderer(trainer.scene())
-    rays = [a.numpy() for a in (batch.origins, batch.directions, batch.times)]
-    renderer.rgb(*(a[:16] for a in rays))  # compiles
-    started = time.perf_counter()
-    renderer.rgb(*rays)
-    return (time.perf_counter() - started) / count
+    batch, _ = trainer.sampler.draw(np.random.default_rng(0), TIMED_RAYS, trainer.background)
+    return ray_seconds(
+        SceneRenderer(trainer.scene()), *(a.numpy() for a in (batch.origins, batch.directions, batch.times))
+    )

@@ -1,5 +1,6 @@
 """`kpenc`: encode a folder of posed videos or images as a .kpc file, or code a trained model anew."""
 
+import contextlib
 import signal
 import sys
 import time
@@ -10,18 +11,18 @@ from kpc.encoder.cli.encode_groups import encode_groups, setting_of_span
 from kpc.encoder.cli.encode_scene import encode_scene, handle_signals
 from kpc.encoder.cli.estimate import Estimate, estimate
 from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group, split_into_spans
-from kpc.encoder.cli.options import Options, parse
+from kpc.encoder.cli.options import ALL_VIEWS, Options, parse
 from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
 from kpc.encoder.cli.report import print_estimate, print_result
 from kpc.encoder.cli.transcode import transcode
-from kpc.encoder.cli.work_folder import make_work_folder
+from kpc.encoder.cli.work_folder import leaving_nothing, make_work_folder
 from kpc.encoder.datasets import load_dataset
 from kpc.encoder.evaluation.ablations import effective_ablations
 from kpc.encoder.evaluation.profile import profile
 from kpc.encoder.evaluation.validation_rays import VALIDATION_RAYS
 from kpc.format.common import cli
 
-__all__ = ["Options", "ablations", "dry_run", "encode", "main", "profile_steps"]
+__all__ = ["ALL_VIEWS", "Options", "ablations", "dry_run", "encode", "main", "profile_steps"]
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -57,26 +58,40 @@ def encode(options: Options) -> dict[str, Any]:
 def dry_run(options: Options) -> Estimate:
     """Do what `encode` does up to the first few hundred steps, and estimate the rest.
 
-    Nothing is written but decoded pixels, which are kept in the work folder for the run itself. Raises as `encode`.
+    Nothing is left in the work folder that was not there before; with `options.keep`, decoded pixels are. Raises as
+    `encode`.
     """
+    with contextlib.nullcontext() if options.keep else leaving_nothing(options.work_dir):
+        return _dry_run(options)
+
+
+def _dry_run(options: Options) -> Estimate:
     started = time.monotonic()
     setting = prepare_setting(options)
-    group_count = 1.0  # in units of the first group
+    groups, effort = 1, 1.0  # effort: in units of the first group
     if options.group_s is not None:
         spans, number = split_into_spans(setting.dataset.clip, options.group_s), options.only or 0
-        group_count = 1 if options.only is not None else 1 + LATER_STEPS * (len(spans) - 1)
+        groups = 1 if options.only is not None else len(spans)
+        effort = 1 + LATER_STEPS * (groups - 1)
         options, setting = options_of_group(options, number, spans), setting_of_span(setting, spans[number])
     trainer = prepare_trainer(options, setting)
-    test_pictures = int(trainer.dataset.pictures.is_test.sum())
     found = estimate(
         trainer,
         VALIDATION_RAYS,
-        min(test_pictures, options.max_test_pictures or test_pictures),
+        options.test_views,
         time.monotonic() - started - trainer.elapsed_s,
         options.time_budget_s,
         options.tune_steps,
     )
-    return replace(found, train_s=group_count * found.train_s, rest_s=group_count * found.rest_s)
+    tested = effort if options.test_views is None else groups
+    return replace(
+        found,
+        train_s=effort * found.train_s,
+        test_s=tested * found.test_s,
+        rest_s=effort * found.rest_s,
+        test_pictures=round(tested * found.test_pictures),
+        held_out_pictures=groups * found.held_out_pictures,
+    )
 
 
 def profile_steps(options: Options) -> dict[str, Any]:

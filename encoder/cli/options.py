@@ -1,15 +1,20 @@
 """Options of kpenc, and their command line."""
 
 import argparse
+import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.ablations import ABLATIONS, BASELINE
+from kpc.encoder.evaluation.testing_time import FEWEST_PICTURES
 from kpc.encoder.field.appearances import choose_appearance
 from kpc.encoder.field.config import APPEARANCES, PRESETS, PROGRESSIVE_SCALE_DROPOUT, TrainConfig
 from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, Trade
 from kpc.format.common import cli
+
+# `Options.test_views` for all held-out pictures.
+ALL_VIEWS = sys.maxsize
 
 # Options that apply where nothing is trained.
 TRANSCODE_OPTIONS = {
@@ -30,6 +35,8 @@ class Options:
     """Options of one run of kpenc; the fields are the options of the command line.
 
     Attributes:
+        test_views: the most held-out pictures that are tested; None for as many as a share of the training time permits
+            (`kpc.encoder.evaluation.testing_time`), ALL_VIEWS for all.
         ablation: one of `kpc.encoder.evaluation.ablations`; not an option of the command line.
     """
 
@@ -51,7 +58,7 @@ class Options:
     work: Path | None = None
     keep: bool = False
     resume: bool = False
-    max_test_pictures: int | None = None
+    test_views: int | None = None
     group_s: float | None = None
     only: int | None = None
     trade: Trade = field(default_factory=Trade)
@@ -108,12 +115,14 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
         help="folder with videos or images, and poses_bounds.npy, transforms*.json or sparse/0; "
         "or a finished checkpoint, or a .kpc file",
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, help="the .kpc file to write")
+    parser.add_argument("-o", "--output", type=Path, help="the .kpc file to write")
     _add_training_options(parser)
     _add_dataset_options(parser)
     _add_run_options(parser)
     _add_coding_options(parser)
     given = parser.parse_args(_join_box(argv))
+    if given.output is None and given.dry_run:
+        given.output = Path(given.source.resolve().name + ".kpc")
     _check(parser, given)
     return _options_from(given), given.dry_run, given.json
 
@@ -192,7 +201,13 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--work", type=Path, help="folder for decoded pixels and the checkpoint (default: OUTPUT.work)")
     parser.add_argument("--keep", action="store_true", help="keep that folder when done")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint of an interrupted run")
-    parser.add_argument("--test-views", type=_positive, metavar="N", help="test on at most N held-out pictures")
+    parser.add_argument(
+        "--test-views",
+        type=test_views,
+        metavar="N|all",
+        help="test on at most N held-out pictures, or on all (default: as many as a tenth of the training time "
+        f"permits, at least {FEWEST_PICTURES})",
+    )
     parser.add_argument(
         "--keep-checkpoint",
         type=Path,
@@ -213,7 +228,9 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
         help="with --group: code only group N, counted from 0; kpjoin joins groups to a clip",
     )
     parser.add_argument(
-        "--dry-run", action="store_true", help="only print what would be done, and how much time and memory it takes"
+        "--dry-run",
+        action="store_true",
+        help="only print what would be done, and how much time and memory it takes; needs no -o and leaves nothing",
     )
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
 
@@ -258,6 +275,8 @@ def _add_coding_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    if given.output is None:
+        parser.error("-o names the file to write; give for example -o scene.kpc")
     if given.source.is_file():
         for name, value in vars(given).items():
             if name not in TRANSCODE_OPTIONS and value != parser.get_default(name):
@@ -292,7 +311,7 @@ def _options_from(given: argparse.Namespace) -> Options:
         work=given.work,
         keep=given.keep,
         resume=given.resume,
-        max_test_pictures=given.test_views,
+        test_views=given.test_views,
         group_s=given.group,
         only=given.only,
         trade=Trade(given.max_loss, given.target_size, given.quality, given.lam, given.psnr),
@@ -306,6 +325,11 @@ def _positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
+
+
+def test_views(text: str) -> int:
+    """Parse the most held-out pictures to test: a positive number, or "all"."""
+    return ALL_VIEWS if text == "all" else _positive(text)
 
 
 def _non_negative(text: str) -> int:

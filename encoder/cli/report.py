@@ -114,7 +114,7 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
     if tested:
         quality = (
             f"held-out PSNR {result['test_psnr']:.2f} dB, SSIM {result['test_ssim']:.4f} "
-            f"over {result['test_pictures']} pictures"
+            f"over {result['test_pictures']} of {result['held_out_pictures']} pictures"
         )
         if result["appearances"]:
             quality += ", right halves, each in an appearance fitted to its left half"
@@ -143,8 +143,9 @@ def print_estimate(expected: Estimate, options: Options, as_json: bool) -> None:
     if as_json:
         print(json.dumps(asdict(expected), indent=1))
         return
-    total = expected.train_s + expected.rest_s
+    total = expected.train_s + expected.test_s + expected.rest_s
     print(
-        f"{options.output} would take {total:.0f} s, of which training {expected.train_s:.0f} s, and "
-        f"{expected.memory_bytes / 1e6:.0f} MB of memory; decoded pixels wait in {options.work_dir}"
+        f"would take {total:.0f} s, of which training {expected.train_s:.0f} s and testing {expected.test_pictures} of "
+        f"{expected.held_out_pictures} held-out pictures {expected.test_s:.0f} s; {expected.memory_bytes / 1e6:.0f} MB "
+        "of memory"
     )

@@ -1,6 +1,7 @@
 """The work folder of an encode, where decoded pixels and the checkpoint are kept, and the device to train on."""
 
 import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -30,6 +31,18 @@ def clear_work_folder(work: Path) -> None:
         for leftover in work.glob(pattern):
             leftover.unlink(missing_ok=True)
     remove_if_empty(work)
+
+
+@contextlib.contextmanager
+def leaving_nothing(work: Path) -> Iterator[None]:
+    """Remove at the end, also after an error, what was put into the work folder meanwhile."""
+    before = set(work.glob("*"))
+    try:
+        yield
+    finally:
+        for leftover in set(work.glob("*")) - before:
+            leftover.unlink(missing_ok=True)
+        remove_if_empty(work)
 
 
 def remove_if_empty(work: Path) -> None:

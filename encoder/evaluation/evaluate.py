@@ -6,12 +6,13 @@ import numpy as np
 import torch
 from torch.nn.functional import conv2d
 
-from kpc.encoder.datasets import Dataset, pixel_rays
+from kpc.encoder.datasets import Dataset, Pictures, pixel_rays
 from kpc.encoder.field.appearances import FIT_RAYS, fit_code
 from kpc.encoder.field.field import Field
 from kpc.encoder.field.fused import count_samples, march_scene, render_rays
 from kpc.encoder.field.render import Rays, shade
 from kpc.format.common.fidelity import psnr
+from kpc.format.common.progress import progress
 from kpc.format.scene.scene import AnyDecoder, Decoder, Scene
 from kpc.format.scene.space import Contraction
 
@@ -176,7 +177,14 @@ class Quality:
     pictures: int
 
 
-def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None, field: Field | None = None) -> Quality | None:
+def evaluate(
+    scene: Scene,
+    dataset: Dataset,
+    *,
+    most: int | None = None,
+    field: Field | None = None,
+    label: str | None = None,
+) -> Quality | None:
     """Return the mean PSNR and SSIM over held-out pictures; None where none are held out.
 
     Pictures with alpha are composited on white, the background that such scenes are stored with. Masked pixels do not
@@ -189,21 +197,21 @@ def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None, field: 
     Args:
         scene: to be rendered.
         dataset: with its held-out pictures.
-        most: at most this many pictures, evenly spaced.
+        most: at most this many pictures, chosen by `spread_evenly`.
         field: as for `SceneRenderer`.
+        label: name of the task, to show progress; None to show nothing.
     """
-    held_out = np.flatnonzero(dataset.pictures.is_test)
-    first = {int(number): _middle(dataset, int(number)) if scene.appearances else 0 for number in held_out}
-    if dataset.masks is not None:
-        held_out = held_out[[bool(_centres(dataset.usable(n)[:, start:]).any()) for n, start in first.items()]]
+    held_out = testable_pictures(dataset, right_halves=bool(scene.appearances))
     if len(held_out) == 0:
         return None
-    if most is not None and len(held_out) > most:
-        held_out = held_out[np.linspace(0, len(held_out) - 1, most).round().astype(int)]
+    if most is not None:
+        held_out = spread_evenly(dataset.pictures, held_out, most)
     renderer = SceneRenderer(scene, field)
     scores = []
-    for number in map(int, held_out):
-        start, code = first[number], renderer.fit_left_half(dataset, number) if scene.appearances else None
+    for number in progress(held_out.tolist(), label or "", unit="pictures", shown=label is not None):
+        start, code = 0, None
+        if scene.appearances:
+            start, code = _middle(dataset, number), renderer.fit_left_half(dataset, number)
         picture = np.clip(renderer.picture(dataset, number, start, code), 0, 1)
         truth = ground_truth(dataset, number)[:, start:]
         if dataset.masks is None:
@@ -213,6 +221,47 @@ def evaluate(scene: Scene, dataset: Dataset, *, most: int | None = None, field: 
             scores.append((psnr(picture[usable], truth[usable]), ssim(picture, truth, usable)))
     mean_psnr, mean_ssim = np.mean(scores, axis=0)
     return Quality(float(mean_psnr), float(mean_ssim), len(scores))
+
+
+def testable_pictures(dataset: Dataset, right_halves: bool) -> np.ndarray:
+    """Return the numbers of the held-out pictures that can be scored: those whose mask leaves a window of SSIM.
+
+    Args:
+        dataset: with its held-out pictures.
+        right_halves: whether only the right half of each picture is scored.
+    """
+    held_out = np.flatnonzero(dataset.pictures.is_test)
+    if dataset.masks is None:
+        return held_out
+    starts = [_middle(dataset, number) if right_halves else 0 for number in held_out.tolist()]
+    usable = [
+        bool(_centres(dataset.usable(n)[:, start:]).any()) for n, start in zip(held_out.tolist(), starts, strict=True)
+    ]
+    return held_out[np.array(usable, bool)]
+
+
+def spread_evenly(pictures: Pictures, numbers: np.ndarray, count: int) -> np.ndarray:
+    """Choose at most `count` of some pictures, spread evenly over cameras and time; the choice is deterministic.
+
+    Each camera gets its share of the pictures. Its own are evenly spaced in time, shifted from camera to camera, so
+    that one picture each of several cameras shows different times.
+
+    Args:
+        pictures: of the dataset.
+        numbers: of the pictures to choose from.
+        count: at least 1.
+    """
+    if count >= len(numbers):
+        return numbers
+    ordered = numbers[np.lexsort((pictures.time[numbers], pictures.camera[numbers]))]
+    _, sizes = np.unique(pictures.camera[ordered], return_counts=True)
+    ends = np.cumsum(sizes)
+    shares = np.diff((ends * count + len(ordered) // 2) // len(ordered), prepend=0)
+    chosen = []
+    for k, (end, size, share) in enumerate(zip(ends, sizes, shares, strict=True)):
+        places = (np.arange(share) + (k + 0.5) / len(ends)) * size / max(share, 1)
+        chosen.append(ordered[end - size + places.astype(int)])
+    return np.concatenate(chosen)
 
 
 def _middle(dataset: Dataset, number: int) -> int:

@@ -1,4 +1,4 @@
-"""A dry run estimates what a run would take, and leaves nothing but decoded pixels."""
+"""A dry run estimates what a run would take, and leaves nothing."""
 
 import json
 from collections.abc import Callable
@@ -10,6 +10,7 @@ import pytest
 import datasets as make
 from kpc.encoder.cli import estimate as module
 from kpc.encoder.cli import kpenc
+from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.config import PRESETS
 from kpc.encoder.training.train import Trainer
@@ -33,9 +34,10 @@ def test_training_is_extrapolated_from_the_watched_steps(moving: Dataset, monkey
         inner(*args, interrupted=ticking)  # type: ignore[arg-type]
 
     monkeypatch.setattr(run, "run", slow)
-    found = module.estimate(run, validation_rays=100, test_pictures=3, spent_s=2.0, time_budget_s=None)
+    found = module.estimate(run, validation_rays=100, test_views=3, spent_s=2.0, time_budget_s=None)
     assert run.step == watched
     assert found.train_s == pytest.approx(5 + 3 * watched // 2 + 1.0 * (CONFIG.steps - watched // 2), abs=3)
+    assert (found.test_pictures, found.held_out_pictures) == (3, 3) and found.test_s > 0
     assert found.rest_s > 2 and found.memory_bytes > 16 * run.field.theta.numel()
 
 
@@ -44,7 +46,7 @@ def test_fine_tuning_is_counted(moving: Dataset) -> None:
     found = []
     for tune_steps in (0, 100):
         run = Trainer(moving, replace(CONFIG, steps=1250, tune_steps=tune_steps), BOX, "cpu")
-        found.append(module.estimate(run, validation_rays=100, test_pictures=0, spent_s=0.0, time_budget_s=None).rest_s)
+        found.append(module.estimate(run, validation_rays=100, test_views=0, spent_s=0.0, time_budget_s=None).rest_s)
     trained = module.TUNED_CODINGS * 2.5 * 100 * module.RAYS / run.rays_per_second
     assert found[1] - found[0] == pytest.approx(trained, rel=0.5)
 
@@ -63,29 +65,37 @@ def test_steps_of_the_coarsest_scale_are_counted_separately(moving: Dataset, mon
         inner(*args, interrupted=ticking)  # type: ignore[arg-type]
 
     monkeypatch.setattr(run, "run", slow)
-    found = module.estimate(run, validation_rays=100, test_pictures=0, spent_s=0.0, time_budget_s=None)
+    found = module.estimate(run, validation_rays=100, test_views=0, spent_s=0.0, time_budget_s=None)
     assert run.step > watched and found.train_s == pytest.approx(0.3 * 400 * 1.0 + 0.7 * 400 * 4.0, rel=0.03)
 
 
 def test_a_time_budget_is_the_training_time(moving: Dataset) -> None:
     run = Trainer(moving, CONFIG, BOX, "cpu")
-    assert module.estimate(run, 100, 0, 0.0, 600.0).train_s == 600.0
+    found = module.estimate(run, 100, None, 0.0, 600.0)
+    assert found.train_s == 600.0 and found.test_pictures == found.held_out_pictures
 
 
-def test_a_dry_run_writes_no_scene(
+def test_a_dry_run_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(PRESETS, "draft", CONFIG)
     make.write_blender(tmp_path / "set")
-    words = [str(tmp_path / "set"), "-o", str(tmp_path / "out.kpc"), "--preset", "draft", "--steps", "30"]
-    assert kpenc.main([*words, "--dry-run"]) == 0
-    out, err = capsys.readouterr()
-    assert "would take" in out and "MB of memory" in out and "planes" in err
-    assert {p.name for p in tmp_path.iterdir()} == {"set", "out.kpc.work"}
-    assert {p.suffix for p in (tmp_path / "out.kpc.work").iterdir()} == {".bin", ".json"}
-    assert kpenc.main([*words, "--dry-run", "--json"]) == 0
-    assert set(json.loads(capsys.readouterr().out)) == {"train_s", "rest_s", "memory_bytes"}
-    with pytest.raises(SystemExit, match="2"):
-        kpenc.main([*words, "--dry-run", "--resume"])
+    monkeypatch.chdir(tmp_path)
+    words = ["set", "--preset", "draft", "--steps", "30", "--dry-run"]
     assert kpenc.main(words) == 0
-    assert {p.name for p in tmp_path.iterdir()} == {"set", "out.kpc"}
+    out, err = capsys.readouterr()
+    assert "would take" in out and "3 of 3 held-out pictures" in out and "MB of memory" in out and "planes" in err
+    assert {p.name for p in tmp_path.iterdir()} == {"set"}
+    work = tmp_path / "set.kpc.work"
+    work.mkdir()
+    (work / CHECKPOINT).touch()  # of an interrupted run
+    assert kpenc.main([*words, "--json"]) == 0
+    names = {"train_s", "test_s", "rest_s", "memory_bytes", "test_pictures", "held_out_pictures"}
+    assert set(json.loads(capsys.readouterr().out)) == names
+    assert [p.name for p in work.iterdir()] == [CHECKPOINT]
+    assert kpenc.main([*words, "-o", "out.kpc", "--keep"]) == 0
+    assert {p.suffix for p in (tmp_path / "out.kpc.work").iterdir()} == {".bin", ".json"}
+    with pytest.raises(SystemExit, match="2"):
+        kpenc.main([*words, "--resume"])
+    with pytest.raises(SystemExit, match="2"):
+        kpenc.main(words[:-1])  # only a dry run needs no -o

@@ -9,7 +9,8 @@ import pytest
 
 import datasets as make
 from kpc.encoder.datasets import Dataset, load_dataset
-from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, ssim
+from kpc.encoder.evaluation.evaluate import SceneRenderer, evaluate, ground_truth, spread_evenly, ssim
+from kpc.encoder.evaluation.testing_time import FEWEST_PICTURES, affordable_pictures, picture_seconds
 from kpc.format.common.fidelity import psnr
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
@@ -114,3 +115,30 @@ def test_evaluate_is_the_mean_over_held_out_pictures(blender: Dataset) -> None:
     two = evaluate(scene, blender, most=2)
     assert two is not None and two.pictures == 2
     assert two.psnr == pytest.approx(np.mean([psnr(*pairs[0]), psnr(*pairs[2])]))
+
+
+def test_pictures_are_spread_over_cameras_and_time(blender: Dataset) -> None:
+    """3 cameras of 20 frames, in any order: 8 of 60 pictures, at distinct and evenly spaced times for each camera."""
+    camera, time = np.divmod(np.random.default_rng(0).permutation(60), 20)
+    pictures = replace(blender.pictures, camera=camera, time=time.astype(np.float32))
+    chosen = spread_evenly(pictures, np.arange(60), 8)
+    assert len(set(chosen.tolist())) == 8 and sorted(np.bincount(camera[chosen])) == [2, 3, 3]
+    for k in range(3):
+        times = np.sort(time[chosen[camera[chosen] == k]])
+        assert (np.abs(np.diff(times) - 20 / len(times)) < 1).all()
+    one_each = spread_evenly(pictures, np.arange(60), 3)
+    assert sorted(camera[one_each]) == [0, 1, 2] and sorted(time[one_each]) == [3, 10, 16]
+    subset = np.arange(7, 50)
+    np.testing.assert_array_equal(spread_evenly(pictures, subset, 43), subset)
+    for count in range(1, 43):
+        chosen = spread_evenly(pictures, subset, count)
+        assert len(set(chosen.tolist())) == count and np.isin(chosen, subset).all()
+
+
+def test_testing_takes_a_tenth_of_the_training_time(blender: Dataset) -> None:
+    assert affordable_pictures(train_s=2515, picture_s=56) == 4
+    assert affordable_pictures(train_s=10000, picture_s=10) == 100
+    assert affordable_pictures(train_s=1, picture_s=10) == affordable_pictures(1, 1e9) == FEWEST_PICTURES
+    without = replace(blender, pictures=replace(blender.pictures, is_test=np.zeros(len(blender.pictures), bool)))
+    renderer = SceneRenderer(dim_scene())
+    assert picture_seconds(renderer, blender) > 0 == picture_seconds(renderer, without)

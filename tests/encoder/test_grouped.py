@@ -160,7 +160,7 @@ def test_masks_of_some_pictures(tmp_path):
 
 def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
     output = tmp_path / "long.kpc"
-    assert encode(videos, output, "--json") == 0
+    assert encode(videos, output, "--json", "--test-views", "all") == 0
     out, err = capsys.readouterr()
     result, opened = json.loads(out), Groups(output)
     assert opened.timeline.spans == split_into_spans(Clip(FRAMES, 8.0), 1.2) and len(opened) == 3
@@ -168,7 +168,8 @@ def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
         [span.start, span.last] for span in opened.timeline.spans
     ]
     assert result["steps"] == 24 * (1 + 2 * LATER_STEPS) and result["size_bytes"] == output.stat().st_size
-    assert 5 < result["test_psnr"] < 60 and result["test_pictures"] == FRAMES + 4 * OVERLAP
+    assert 5 < result["test_psnr"] < 60
+    assert result["test_pictures"] == result["held_out_pictures"] == FRAMES + 4 * OVERLAP
     assert (
         all(f"group {number} of 3" in err for number in range(3))
         and err.count("starts where the one before ended") == 2

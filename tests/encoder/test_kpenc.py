@@ -3,6 +3,7 @@
 import builtins
 import errno
 import json
+import math
 import os
 import shutil
 import signal
@@ -198,7 +199,7 @@ def test_time_rows_are_as_far_apart_as_motion_allows(
     assert "resumed at step 2" in err
 
 
-def test_options(run: Kpenc, sets: Path, tmp_path: Path) -> None:
+def test_options(run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code, out, err = run(
         sets / "n3dv",
         "--json",
@@ -225,7 +226,11 @@ def test_options(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     assert "16x12" in err and "0 held out" in err
     assert (tmp_path / "w" / CHECKPOINT).is_file() and any((tmp_path / "w").glob("pixels-*.bin"))
     code, out, _ = run(sets / "n3dv", "--holdout", "cam02", "--test-views", "2", "--steps", "1")
-    assert code == 0 and "over 2 pictures" in out
+    assert code == 0 and "over 2 of 4 pictures" in out
+    monkeypatch.setattr("kpc.encoder.evaluation.testing_time.FEWEST_PICTURES", 3)
+    monkeypatch.setattr("kpc.encoder.cli.encode_scene.picture_seconds", lambda *_: math.inf)
+    code, out, err = run(sets / "n3dv", "--holdout", "cam02", "--steps", "1")
+    assert code == 0 and "testing 3 of 4 held-out pictures" in err and "over 3 of 4 pictures" in out
     code, out, _ = run(sets / "n3dv", "--holdout", "none", "--steps", "1")
     assert code == 0 and "no view held out" in out
 

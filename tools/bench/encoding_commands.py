@@ -76,7 +76,7 @@ def add_parsers(kinds: Any) -> None:
     for parser in (encode, curve, ablate, groups):
         parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train")
         parser.add_argument(
-            "--test-views", type=harness.positive, metavar="N", help="test on at most N held-out pictures"
+            "--test-views", type=harness.positive, metavar="N", help="test on at most N held-out pictures, not on all"
         )
         parser.add_argument(
             "--keep-scenes", type=Path, metavar="DIR", help="keep the .kpc files, and the .kpck files for `codec`, here"
@@ -152,7 +152,6 @@ def _encodings(kind: str, options: argparse.Namespace, origin: Record, runs: Seq
                 job = replace(
                     _job(options, source, seed, kept / f"{label}{suffix}.kpc", work),
                     steps=options.steps,
-                    max_test_pictures=options.test_views,
                     keep_checkpoint=kept / f"{label}{suffix}.kpck" if options.keep_scenes else None,
                     **changes,
                 )
@@ -209,7 +208,6 @@ def _groups(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
             job = replace(
                 _job(options, source, options.seed, output, work),
                 steps=options.steps,
-                max_test_pictures=options.test_views,
                 group_s=options.group,
                 keep=True,
             )
@@ -229,7 +227,8 @@ def _groups(options: argparse.Namespace, origin: Record) -> Iterator[Record]:
 
 def _job(options: argparse.Namespace, source: Path, seed: int, output: Path, work: Path) -> Any:
     """Return the `kpenc.Options` that all subcommands have in common."""
-    job = harness.encoder().Options(
+    kpenc = harness.encoder()
+    job = kpenc.Options(
         source=source,
         output=output,
         preset=options.preset,
@@ -239,6 +238,7 @@ def _job(options: argparse.Namespace, source: Path, seed: int, output: Path, wor
         space=options.space,
         box=options.box,
         work=work,
+        test_views=getattr(options, "test_views", None) or kpenc.ALL_VIEWS,
     )
     return replace(job, trade=replace(job.trade, psnr_db=options.psnr))
 
