@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,26 +23,15 @@ import datasets as make
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.work_folder import CHECKPOINT
 from kpc.encoder.datasets import pixel_cache
-from kpc.encoder.field.config import PRESETS, TrainConfig
+from kpc.encoder.field.config import PRESETS
 from kpc.encoder.training.train import Trainer
 from kpc.format.common import cli
 from kpc.format.container import scene_io
 from kpc.format.scene.scene import HybridDecoder
 from kpc.format.scene.space import DeviceCoordinates
+from training_runs import TINY
 
 pytestmark = pytest.mark.usefixtures("one_thread", "few_rays", "tiny", "heeded_signals")
-TINY = {
-    "tune_steps": 0,
-    "resolutions": (8, 16),
-    "samples_across": 32,
-    "cells_across": 12,
-    "steps": 24,
-    "rays": 256,
-    "samples": 8192,
-    "warmup": 5,
-    "occupancy_start": 8,
-    "occupancy_every": 4,
-}
 
 
 @pytest.fixture
@@ -54,7 +44,7 @@ def heeded_signals() -> Iterator[None]:
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PRESETS, "draft", TrainConfig(**TINY))  # type: ignore[arg-type]
+    monkeypatch.setitem(PRESETS, "draft", TINY)
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +175,7 @@ def test_time_rows_are_as_far_apart_as_motion_allows(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tolerance: float, rows: int, why: str
 ) -> None:
     """There are four frames; a resumed run finds the same number of rows."""
-    config = TrainConfig(**TINY | {"time_tolerance": tolerance, "frames_per_row": 1.5})  # type: ignore[arg-type]
+    config = replace(TINY, time_tolerance=tolerance, frames_per_row=1.5)
     monkeypatch.setitem(PRESETS, "draft", config)
     for options in (("--keep",), ("--resume",)):
         code, _, err = run(sets / "n3dv", "--steps", "2", *options)
@@ -258,7 +248,7 @@ def test_pruning_is_logged_and_reduces_the_file(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
 ) -> None:
     """After 24 steps hardly anything gains a decibel; the loss that is reported counts all that coding costs."""
-    monkeypatch.setitem(PRESETS, "draft", TrainConfig(**TINY | {"prune_share": share}))  # type: ignore[arg-type]
+    monkeypatch.setitem(PRESETS, "draft", replace(TINY, prune_share=share))
     code, out, err = run(sets / "n3dv", "--max-loss", "1dB", "--holdout", "none", "--json")
     scene = scene_io.read(tmp_path / "out.kpc")
     counts = [scale["xy"].symbols.shape[2] for scale in scene.scales]
@@ -758,7 +748,7 @@ def _subprocess(argv: list[str], preparation: str) -> subprocess.Popen[str]:
         f"import sys\n{preparation}\n"
         "from kpc.encoder.cli import kpenc\nfrom kpc.encoder.evaluation import validation_rays\n"
         "from kpc.encoder.rdo import curvature\nfrom kpc.encoder.field.config import PRESETS, TrainConfig\n"
-        f"PRESETS['draft'] = TrainConfig(**{TINY!r})\nvalidation_rays.VALIDATION_RAYS = 512\n"
+        f"PRESETS['draft'] = {TINY!r}\nvalidation_rays.VALIDATION_RAYS = 512\n"
         f"curvature.RAYS = 1 << 13\nsys.exit(kpenc.main({argv!r}))"
     )
     return subprocess.Popen(
