@@ -213,6 +213,12 @@ def test_more_that_is_refused(tmp_path: Path) -> None:
     fails(folder, "not JSON", "'fl_x' is there twice")
 
 
+def test_two_frames_of_one_image_are_refused(tmp_path: Path) -> None:
+    """Two poses of one picture contradict each other, and one of them would be held out, the other trained on."""
+    folder = nerfstudio(tmp_path / "set", lambda d: d["frames"][7].update(file_path="images\\0003"))
+    fails(folder, "frames 3 and 7 have the same image", "remove one")
+
+
 def test_keys_without_effect_are_named_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = nerfstudio(tmp_path / "set", each(colmap_im_id=1, depth_file_path="d", weather="fair"))
     make.edit_json(folder / "transforms.json", without(aabb_scale=16, applied_transform=[], ligth="on"))
@@ -390,7 +396,7 @@ def test_other_videos_pictures_and_splits_are_counted(tmp_path: Path, capsys: py
 
     make.write_blender(tmp_path / "blender")
     assert "2 files left out" in load(tmp_path / "blender").describe()
-    assert "transforms_val.json: its 2 pictures are left out" in said(capsys)
+    assert "transforms_val.json: 2 pictures are left out" in said(capsys)
     assert "left out" not in load(tmp_path / "blender", holdout="none").describe()
 
 

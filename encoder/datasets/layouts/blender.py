@@ -6,9 +6,10 @@ Sources: https://github.com/bmild/nerf, https://github.com/albertpumarola/D-NeRF
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from kpc.encoder.datasets.capture import Capture, CapturedView, find_image, holdout_flags, report_missing
-from kpc.encoder.datasets.layouts.transforms import frame_rate, frame_view, load_transforms
+from kpc.encoder.datasets.capture import Capture, CapturedView, find_image, holdout_flags
+from kpc.encoder.datasets.layouts.transforms import find_images, frame_rate, frame_view, load_transforms
 from kpc.encoder.datasets.left_out import media_in
 
 # The layout's name in messages.
@@ -28,27 +29,26 @@ def read(path: Path, holdout: str | None) -> Capture:
     """
     splits = [s for s in ("train", "test", "val") if (path / f"transforms_{s}.json").is_file()]
     views: list[CapturedView] = []
-    found: list[Path] = []
     left_out: tuple[Path, ...] = ()
     fps = None
     for split in splits:
         file = path / f"transforms_{split}.json"
         document = load_transforms(file)
-        names = [frame["file_path"] for frame in document["frames"]]
-        images = [find_image(path, file, name) for name in names]
-        existing = {image for image in images if image}
-        found += (media for folder in sorted({image.parent for image in existing}) for media in media_in(folder))
         if split == "val" and "test" in splits and holdout is None:
-            left_out = tuple(existing)
-            print(
-                f"{file}: its {len(left_out)} pictures are left out, since the test split is held out", file=sys.stderr
-            )
+            left_out = _existing(path, file, document)
+            print(f"{file}: {len(left_out)} pictures are left out, since the test split is held out", file=sys.stderr)
             continue
-        report_missing(
-            file, path, [name for name, image in zip(names, images, strict=True) if image is None], len(names)
-        )
-        views += [frame_view(path, file, n, document, im, split != "train") for n, im in enumerate(images) if im]
+        images = find_images(path, file, document)
+        views += [frame_view(path, file, n, document, image, split != "train") for n, image in images.items()]
         fps = fps or frame_rate(file, document)
+    folders = sorted({file.parent for file in (*left_out, *(view.file for view in views))})
+    found = tuple(media for folder in folders for media in media_in(folder))
     tests = holdout_flags(path, [str(v.file.relative_to(path)) for v in views], holdout, [v.is_test for v in views])
     used = tuple(replace(view, is_test=is_test) for view, is_test in zip(views, tests, strict=True))
-    return Capture(NAME, used, fps, tuple(found), left_out)
+    return Capture(NAME, used, fps, found, left_out)
+
+
+def _existing(root: Path, file: Path, document: dict[str, Any]) -> tuple[Path, ...]:
+    """Return the existing images of a split that is left out."""
+    images = (find_image(root, file, frame["file_path"]) for frame in document["frames"])
+    return tuple(image for image in images if image is not None)

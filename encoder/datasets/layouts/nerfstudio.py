@@ -5,9 +5,9 @@ Source: https://docs.nerf.studio/quickstart/data_conventions.html
 
 from pathlib import Path
 
-from kpc.encoder.datasets.capture import Capture, find_image, holdout_flags, natural_key, report_missing
+from kpc.encoder.datasets.capture import Capture, holdout_flags, natural_key
 from kpc.encoder.datasets.layouts.splits import split_of
-from kpc.encoder.datasets.layouts.transforms import frame_rate, frame_view, load_transforms
+from kpc.encoder.datasets.layouts.transforms import find_images, frame_rate, frame_view, load_transforms
 from kpc.encoder.datasets.left_out import media_in
 
 # The layout's name in messages.
@@ -29,11 +29,9 @@ def read(path: Path, holdout: str | None) -> Capture:
     """
     file = path / "transforms.json"
     document = load_transforms(file)
-    found = [(number, find_image(path, file, frame["file_path"])) for number, frame in enumerate(document["frames"])]
-    missing = [document["frames"][number]["file_path"] for number, image in found if image is None]
-    report_missing(file, path, missing, len(found))
-    existing = [(number, image) for number, image in found if image is not None]
-    existing.sort(key=lambda item: natural_key(item[1].relative_to(path).as_posix()))
+    found = find_images(path, file, document)
+    missing = [frame["file_path"] for number, frame in enumerate(document["frames"]) if number not in found]
+    existing = sorted(found.items(), key=lambda item: natural_key(item[1].relative_to(path).as_posix()))
     images = [image for _, image in existing]
     split = split_of(path, file, document, images, missing) if holdout is None else ["train"] * len(images)
     default = [part == "test" for part in split]

@@ -11,7 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import CapturedView, MaskFile, file_exists, find_image, image_view, printable
+from kpc.encoder.datasets.capture import (
+    CapturedView,
+    MaskFile,
+    file_exists,
+    find_image,
+    image_view,
+    printable,
+    report_missing,
+)
 from kpc.encoder.datasets.layouts.camera_models import HIGHER_ORDERS, check_higher_orders, understood_model
 from kpc.encoder.datasets.layouts.transforms_keys import check_keys
 from kpc.format.common.errors import DatasetError
@@ -43,6 +51,23 @@ def load_transforms(file: Path) -> dict[str, Any]:
             raise DatasetError(f"{file}: frame {number} lacks file_path or transform_matrix; export it anew")
     check_keys(file, document)
     return document
+
+
+def find_images(root: Path, file: Path, document: dict[str, Any]) -> dict[int, Path]:
+    """Return the existing images by the numbers of their frames, and name the missing ones in one line.
+
+    Raises:
+        DatasetError: none of the images exists, one leads out of the folder, or two frames have the same.
+    """
+    names = [frame["file_path"] for frame in document["frames"]]
+    found = {number: image for number, name in enumerate(names) if (image := find_image(root, file, name))}
+    report_missing(file, root, [name for number, name in enumerate(names) if number not in found], len(names))
+    frame_of: dict[Path, int] = {}
+    for number, image in found.items():
+        if frame_of.setdefault(image, number) != number:
+            both = f"frames {frame_of[image]} and {number}"
+            raise DatasetError(f"{file}: {both} have the same image, {printable(names[number])}; remove one")
+    return found
 
 
 def frame_view(
