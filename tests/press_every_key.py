@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from pytest import approx, raises
 
+from kpc.encoder.datasets.video import read_video
 from kpc.format.common.errors import DisplayError
-from kpc.format.common.media import read_video
 from kpc.format.container.sources import open_source
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.desktop import glfw, imgui

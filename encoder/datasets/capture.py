@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from kpc.encoder.datasets.video import VideoInfo
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
-from kpc.format.common.media import VideoInfo
 from kpc.format.common.media_files import IMAGE_SUFFIXES
 
 # Where neither the dataset nor the user names test images, every eighth is one, as in LLFF (arXiv:1905.00889).

@@ -17,6 +17,8 @@ SQUARE_PIXELS = 0.01
 # Tolerance in frames for assigning a picture to a frame, since times are float32.
 SAME_FRAME = 1e-2
 
+SAME_INSTANT = 0.5 + SAME_FRAME  # frames by which pictures of one instant may differ
+
 
 @dataclass(frozen=True)
 class Pictures:
@@ -87,9 +89,14 @@ class Dataset:
 
     @property
     def is_monocular(self) -> bool:
-        """Whether no two training pictures of a dynamic scene show the same instant."""
-        times = self.pictures.time[~self.pictures.is_test]
-        return self.is_dynamic and len(np.unique(times)) == len(times)
+        """Whether most training pictures of a dynamic scene are the only one of their instant, to within half a frame.
+
+        Cameras that are not synchronised show each instant at slightly different times.
+        """
+        frames = np.sort(self.pictures.time[~self.pictures.is_test].astype(np.float64)) * (self.clip.frame_count - 1)
+        steps = np.pad(np.diff(frames), 1, constant_values=np.inf)
+        nearest = np.minimum(steps[:-1], steps[1:])  # distance to the nearest other picture
+        return self.is_dynamic and 2 * int((nearest <= SAME_INSTANT).sum()) < len(frames)
 
     def frame_range(self, first: int, last: int) -> "Dataset":
         """Return the frames `first` to `last` (inclusive) of the clip as a clip of their own.

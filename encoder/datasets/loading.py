@@ -10,15 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from kpc.encoder.datasets.capture import Capture, CapturedView, MaskFile, report_orientations
+from kpc.encoder.datasets.capture import Capture, CapturedView, MaskFile, first_names, report_orientations
 from kpc.encoder.datasets.dataset import Dataset, Pictures
 from kpc.encoder.datasets.layouts import blender, colmap, llff, nerfstudio
 from kpc.encoder.datasets.left_out import count_left_out
 from kpc.encoder.datasets.masks import find_masks, load_masks
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
-from kpc.format.common.errors import DatasetError, MediaError
+from kpc.encoder.datasets.timeline import align
+from kpc.encoder.datasets.video import VideoInfo, read_video
+from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import read_image
-from kpc.format.common.media import read_video
 from kpc.format.common.progress import Progress
 from kpc.format.scene.scene import Clip
 
@@ -112,14 +113,12 @@ def _check(root: Path, capture: Capture, downscale: int) -> None:
 def _load(
     root: Path, capture: Capture, mask_files: list[MaskFile | None], cache_dir: Path, downscale: int, progress: bool
 ) -> Dataset:
-    views, frame_count = capture.views, _common_frames(root, capture.views)
-    lengths = [frame_count if view.video else 1 for view in views]
-    view_of = np.repeat(np.arange(len(views)), lengths)  # the view of each picture
-    frame = np.concatenate([np.arange(n) for n in lengths])
+    views = capture.views
+    frames, times, clip = _times(root, capture)
+    view_of = np.repeat(np.arange(len(views)), [len(some) for some in frames])  # the view of each picture
     key = hashlib.sha256(f"{root.resolve()} {downscale}".encode()).hexdigest()[:12]
-    cache = _cached_pixels(root, views, frame_count, cache_dir / f"pixels-{key}.bin", downscale, progress)
+    cache = _cached_pixels(root, views, frames, cache_dir / f"pixels-{key}.bin", downscale, progress)
     masks = load_masks(root, views, mask_files, cache_dir / f"pixels-{key}-masks.bin", downscale, progress)
-    times, clip = _times(root, capture, view_of, frame, frame_count)
     intrinsics = np.array([v.intrinsics for v in views])[view_of] / downscale
     distortion = np.array([v.distortion for v in views])[view_of]
     poses = np.stack([v.camera_to_world for v in views])[view_of]
@@ -148,36 +147,21 @@ def _load(
     return Dataset(capture.layout, root, pictures, cache, clip, is_dynamic, cache.channels == 4, names, masks)
 
 
-def _common_frames(root: Path, views: tuple[CapturedView, ...]) -> int:
-    """Return the number of frames that all videos have, at least; 1 without videos."""
-    videos = {view.file.name: view.video for view in views if view.video}
-    rates = {round(video.fps, 3) for video in videos.values()}
-    if len(rates) > 1:
-        raise DatasetError(f"{root}: videos run at {min(rates):g} to {max(rates):g} fps; convert them to the same rate")
-    counts = {name: video.frame_count for name, video in videos.items()}
-    fewest, most = min(counts.values(), default=1), max(counts.values(), default=1)
-    if fewest < most:
-        short = min(counts, key=lambda name: counts[name])
-        print(
-            f"{root}: videos have {fewest} ({short}) to {most} frames; the first {fewest} of each are used",
-            file=sys.stderr,
-        )
-    return fewest
+def _times(root: Path, capture: Capture) -> tuple[tuple[range, ...], np.ndarray, Clip]:
+    """Return the frames of each view that are used, the time of each of these pictures in [0, 1], and the clip.
 
-
-def _times(
-    root: Path, capture: Capture, view_of: np.ndarray, frame: np.ndarray, frame_count: int
-) -> tuple[np.ndarray, Clip]:
-    """Return the time of each picture in [0, 1], and the clip.
-
-    For videos the time is frame / (frames - 1). For images it is the dataset's if all are within [0, 1], else shifted
+    Videos are aligned by `timeline.align`. The time of an image is the dataset's if all are within [0, 1], else shifted
     and scaled to [0, 1]; the frame count of their clip follows from the median step between times of training images.
     """
-    if capture.views[0].video:
-        return frame / max(frame_count - 1, 1), Clip(frame_count, float(capture.fps or ASSUMED_FPS))
+    videos = {view.file.name: view.video for view in capture.views if view.video}
+    if videos:
+        _report_notes(root, videos)
+        timeline = align(root, videos)
+        return timeline.frames, np.concatenate(timeline.times), timeline.clip
+    still = (range(1),) * len(capture.views)
     given = [view.time for view in capture.views]
     if all(time is None for time in given):
-        return np.zeros(len(view_of)), Clip(1, ASSUMED_FPS)
+        return still, np.zeros(len(given)), Clip(1, ASSUMED_FPS)
     if any(time is None or not math.isfinite(time) for time in given):
         number = next(k for k, time in enumerate(given) if time is None or not math.isfinite(time))
         name = capture.views[number].file.name
@@ -191,7 +175,14 @@ def _times(
         times = (times - low) / (high - low) if high > low else np.zeros_like(times)
     steps = np.diff(np.unique(np.round(times[[not view.is_test for view in capture.views]], 6)))
     count = min(1 + round(1 / float(np.median(steps))), len(times)) if len(steps) else 1
-    return times, Clip(count, float(capture.fps or ASSUMED_FPS))
+    return still, times, Clip(count, float(capture.fps or ASSUMED_FPS))
+
+
+def _report_notes(root: Path, videos: dict[str, VideoInfo]) -> None:
+    """Print one line for each thing that a user should know about how videos are read."""
+    for note in dict.fromkeys(note for video in videos.values() for note in video.notes):
+        names = [name for name, video in videos.items() if note in video.notes]
+        print(f"{root}: {first_names(names)}: {note}", file=sys.stderr)
 
 
 def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -204,46 +195,39 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cached_pixels(
-    root: Path, views: tuple[CapturedView, ...], frame_count: int, file: Path, downscale: int, progress: bool
+    root: Path, views: tuple[CapturedView, ...], frames: tuple[range, ...], file: Path, downscale: int, progress: bool
 ) -> PixelCache:
-    """Open the cache of decoded pictures if it is up to date, else build it."""
+    """Open the cache of decoded pictures if it is up to date, else build it from the given frames of each view."""
     sources = [
         (view.file.relative_to(root).as_posix(), view.file.stat().st_size, view.file.stat().st_mtime_ns, view.upright)
         for view in views
     ]
-    fingerprint = fingerprint_of(sources, frame_count, downscale)
+    fingerprint = fingerprint_of(sources, [(some.start, some.stop) for some in frames], downscale)
     cache = open_cache(file, fingerprint)
     if cache is not None:
         return cache
-    total = sum(frame_count if view.video else 1 for view in views)
     channels = 4 if any(view.has_alpha for view in views) else 3
     pixels = sum(
-        (view.width // downscale) * (view.height // downscale) * (frame_count if view.video else 1) for view in views
+        (view.width // downscale) * (view.height // downscale) * len(some)
+        for view, some in zip(views, frames, strict=True)
     )
-    with Progress(f"decoding {root.name}", total, "picture", shown=progress) as bar:
+    with Progress(f"decoding {root.name}", sum(map(len, frames)), "picture", shown=progress) as bar:
 
         def pictures() -> Iterator[np.ndarray]:
-            for view in views:
-                for picture in _decoded(view, frame_count):
+            for view, some in zip(views, frames, strict=True):
+                for picture in _decoded(view, some):
                     yield downscale_picture(picture, downscale)
                     bar.advance()
 
         return build_cache(file, fingerprint, pictures(), channels, pixels * channels)
 
 
-def _decoded(view: CapturedView, frame_count: int) -> Iterator[np.ndarray]:
-    """Yield the image of a view, or the first `frame_count` frames of its video."""
+def _decoded(view: CapturedView, frames: range) -> Iterator[np.ndarray]:
+    """Yield the image of a view, or the given frames of its video."""
     if view.video is None:
         yield read_image(view.file, upright=view.upright)
-        return
-    count = 0
-    for picture in read_video(view.file, view.video, frame_count):
-        yield picture
-        count += 1
-    if count != frame_count:
-        raise MediaError(
-            f"{view.file}: only {count} of its {view.video.frame_count} frames can be decoded; encode or copy it anew"
-        )
+    else:
+        yield from read_video(view.file, view.video, frames.start, frames.stop)
 
 
 def downscale_picture(picture: np.ndarray, factor: int) -> np.ndarray:

@@ -20,7 +20,7 @@ from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError
 
 # Part of every fingerprint: caches of another version are rebuilt.
-CACHE_VERSION = 3
+CACHE_VERSION = 4
 
 # Caches up to this size are mapped into memory and may become resident entirely; larger ones are read pixel by pixel.
 MAPPED_BYTES = 1 << 30

@@ -257,8 +257,8 @@ def test_a_truncated_video(tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "set")
     video = tmp_path / "set" / "cam01.mp4"
     video.write_bytes(video.read_bytes()[:-400])
-    fails(tmp_path / "set", "cam01.mp4")
-    assert not list((tmp_path / "cache").iterdir())
+    fails(tmp_path / "set", "cam01.mp4", "of its 4 frames decode")
+    assert not list((tmp_path / "cache").glob("*"))
 
 
 @pytest.mark.parametrize("frames", [1, 4])
@@ -268,12 +268,6 @@ def test_a_single_static_camera_is_refused(tmp_path: Path, frames: int) -> None:
     make.write_n3dv(tmp_path / "one", cameras=1, frames=frames)
     fails(tmp_path / "one", "every picture is held out")
     fails(tmp_path / "one", "a single camera that does not move", holdout="none")
-
-
-def test_videos_at_different_rates(tmp_path: Path) -> None:
-    rig = make.write_n3dv(tmp_path / "set")
-    write_video(tmp_path / "set" / "cam01.mp4", [make.picture(rig[1])] * 4, 25, pix_fmt="yuv444p")
-    fails(tmp_path / "set", "8 to 25 fps")
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,15 @@
 
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
-from kpc.format.common.errors import UsageError
-from kpc.format.common.films import CODECS, DEFAULT_CODECS, FilmFormat, write_film
-
-av = pytest.importorskip("av")
+from kpc.encoder.datasets.video import read_video, video_info
+from kpc.format.common import films
+from kpc.format.common.errors import MediaError, UsageError
+from kpc.format.common.films import CODECS, DEFAULT_CODECS, FilmFormat, ffmpeg_binary, write_film, write_video
+from videos import colour_tolerance
 
 WIDTH, HEIGHT = 65, 65  # SVT-AV1 takes no less than 64
 NAMES = {"h264": "h264", "hevc": "hevc", "prores": "prores", "vp9": "vp9", "av1": "av1"}
@@ -101,3 +103,54 @@ def test_sizes_are_padded_only_as_chroma_needs() -> None:
     assert FilmFormat.of(".mp4").padded(33, 17) == (34, 18)
     assert FilmFormat.of(".mov").padded(33, 17) == (34, 17)
     assert FilmFormat.of(".mov", alpha=True).padded(33, 17) == (33, 17)
+
+
+@pytest.mark.parametrize("fps", [7.0, 15.0, 29.97, 120.0])
+def test_written_videos_have_the_same_frames(tmp_path: Path, fps: float) -> None:
+    """Every frame has its own grey level, so a dropped or repeated frame would be noticed."""
+    greys = np.arange(20, 240, 20)
+    frames = [np.full((32, 48, 3), g, np.uint8) for g in greys]
+    assert write_video(tmp_path / "x.mp4", frames, fps, crf=1) == len(frames)
+    info = video_info(tmp_path / "x.mp4")
+    assert (info.frame_count, info.matrix, info.full_range, info.pix_fmt) == (len(frames), "bt709", False, "yuv420p")
+    assert info.fps == pytest.approx(fps, rel=1e-3)
+    means = [frame.mean() for frame in read_video(tmp_path / "x.mp4")]
+    assert np.abs(np.array(means) - greys).max() <= colour_tolerance("bt709", False, 8)
+    assert len(list(read_video(tmp_path / "x.mp4", stop=4))) == 4
+
+
+def test_odd_sizes_are_padded_for_subsampled_chroma(tmp_path: Path) -> None:
+    frame = np.full((15, 21, 3), 90, np.uint8)
+    write_video(tmp_path / "even.mp4", [frame], 10)
+    write_video(tmp_path / "odd.mp4", [frame], 10, pix_fmt="yuv444p")
+    even, odd = video_info(tmp_path / "even.mp4"), video_info(tmp_path / "odd.mp4")
+    assert (even.width, even.height) == (22, 16)
+    assert (odd.width, odd.height) == (21, 15)
+
+
+def test_names_that_look_like_options_or_urls(tmp_path: Path) -> None:
+    for name in ("-y.mp4", "a:b.mp4", "50%d done.mp4", "concat:x.mp4"):
+        write_video(tmp_path / name, [np.zeros((16, 16, 3), np.uint8)] * 2, 10)
+        assert video_info(tmp_path / name).frame_count == 2
+
+
+def test_failed_writing_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(MediaError, match="no frames"):
+        write_video(tmp_path / "x.mp4", [], 10)
+    with pytest.raises(MediaError, match="frame 1"):
+        write_video(tmp_path / "x.mp4", [np.zeros((16, 16, 3), np.uint8), np.zeros((8, 16, 3), np.uint8)], 10)
+    with pytest.raises(MediaError, match="cannot write"):
+        write_video(tmp_path / "x.mp4", [np.zeros((16, 16, 3), np.uint8)] * 5, 10, pix_fmt="no_such_format")
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_ffmpeg_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> str:
+        raise RuntimeError("none")
+
+    monkeypatch.setattr(films.shutil, "which", lambda name: None)
+    monkeypatch.setattr(films.imageio_ffmpeg, "get_ffmpeg_exe", none)
+    ffmpeg_binary.cache_clear()
+    with pytest.raises(MediaError, match="install ffmpeg"):
+        ffmpeg_binary()
+    ffmpeg_binary.cache_clear()

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kpc.format.common.media import read_video
+from kpc.encoder.datasets.video import read_video
 from kpc.player.app import recording
 from kpc.player.app.recording import Recording, frames_due
 

@@ -67,7 +67,7 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
     """
     groups = Groups(scene)
     timeline, first = groups.timeline, groups.timeline.spans[0].start
-    blending: dict[tuple[int, int], np.ndarray] = {}  # by frame and camera: the earlier group's picture
+    blending: dict[int, np.ndarray] = {}  # by picture: how the earlier group renders it
     last_error: dict[int, np.ndarray] = {}  # by camera
     found: list[Frame] = []
     agreements: list[list[float]] = [[] for _ in timeline.spans]
@@ -77,15 +77,16 @@ def measure(scene: Path, dataset: Dataset) -> dict[str, Any]:
         frames = np.rint(some.pictures.time * (span.count - 1)).astype(int) + span.start - first  # of each picture
         for picture in sorted(map(int, np.flatnonzero(some.pictures.is_test)), key=lambda p: int(frames[p])):
             frame, camera = int(frames[picture]), int(some.pictures.camera[picture])
+            same = int(some.pictures.offset[picture])  # in every group
             shares = {part: share for part, _, share in timeline.blend_at(_time(groups, frame))}
             if number not in shares:
                 continue
             rendered = np.clip(renderer.picture(some, picture), 0, 1)
             if number < max(shares):
-                blending[frame, camera] = rendered
+                blending[same] = rendered
                 continue
             if number > min(shares):
-                earlier = blending.pop((frame, camera))
+                earlier = blending.pop(same)
                 agreements[number].append(psnr(earlier, rendered))
                 rendered = (1 - shares[number]) * earlier + shares[number] * rendered
             error = rendered - ground_truth(some, picture)

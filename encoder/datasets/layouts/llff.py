@@ -21,11 +21,13 @@ from kpc.encoder.datasets.capture import (
 )
 from kpc.encoder.datasets.layouts.row_order import in_row_order
 from kpc.encoder.datasets.left_out import media_in
+from kpc.encoder.datasets.video import VideoInfo, video_info
 from kpc.format.common.errors import DatasetError
-from kpc.format.common.media import video_info
 from kpc.format.common.media_files import is_image, is_video
 
 POSES = "poses_bounds.npy"  # the file of poses and depth ranges
+
+NEARLY_SQUARE = 5e-3  # pixels of a video whose aspect differs from 1 by no more are taken as square
 
 
 # The layout's name in messages; with videos it is that of Neural 3D Video.
@@ -66,7 +68,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     tests = holdout_flags(path, [str(f.relative_to(path)) for f in files], holdout, default)
     items = enumerate(zip(files, rows, poses, tests, strict=True))
     views = tuple(_view(f"{path / POSES} row {number}", *item) for number, item in items)
-    return Capture(layout, views, views[0].video.fps if views[0].video else None, tuple(found))
+    return Capture(layout, views, None, tuple(found))
 
 
 def _pose(where: str, row: np.ndarray) -> np.ndarray:
@@ -95,8 +97,30 @@ def _view(where: str, file: Path, row: np.ndarray, pose: np.ndarray, is_test: bo
         )
     video = video_info(file)
     size = video.width, video.height
-    intrinsics = fit_intrinsics(where, file, intrinsics, (w, h), size)
-    return CapturedView(file, video, None, is_test, *size, False, intrinsics, no_distortion, pose, near, far)
+    if abs(video.pixel_aspect - 1) > NEARLY_SQUARE:
+        intrinsics = _fit_stretched(where, file, video, intrinsics, (w, h))
+    else:
+        intrinsics = fit_intrinsics(where, file, intrinsics, (w, h), size)
+    return CapturedView(file, video, None, is_test, *size, video.has_alpha, intrinsics, no_distortion, pose, near, far)
+
+
+def _fit_stretched(
+    where: str,
+    file: Path,
+    video: VideoInfo,
+    intrinsics: tuple[float, float, float, float],
+    declared: tuple[float, float],
+) -> tuple[float, float, float, float]:
+    """Return `fit_intrinsics` for a video whose pixels are not square; a single focal length is for square ones."""
+    shown = round(video.width * video.pixel_aspect), video.height
+    if abs(declared[0] * shown[1] / declared[1] - shown[0]) > 1 + 0.01 * shown[0]:
+        raise DatasetError(
+            f"{file}: its pixels are not square (width {video.pixel_aspect:.4g} of the height), and {where} gives one "
+            f"focal length for {declared[0]:g}x{declared[1]:g}; scale it to {shown[0]}x{shown[1]} and calibrate"
+        )
+    fl_x, fl_y, cx, cy = fit_intrinsics(where, file, intrinsics, declared, shown)
+    across = video.width / shown[0]
+    return fl_x * across, fl_y, cx * across, cy
 
 
 def _read_poses(file: Path) -> np.ndarray:

@@ -14,9 +14,8 @@ import numpy as np
 from PIL import Image
 
 from kpc.encoder.datasets.capture import natural_key
-from kpc.format.common.errors import MediaError
+from kpc.encoder.datasets.video import read_video
 from kpc.format.common.images import read_image
-from kpc.format.common.media import read_video
 from kpc.format.common.media_files import is_video
 
 # At most so many files are compared, evenly spread, as pictures of this size.
@@ -92,9 +91,7 @@ def neighbour_difference(centres: np.ndarray, directions: np.ndarray, pictures: 
 
 def _thumbnail(file: Path) -> np.ndarray:
     """Return an image, or the first frame of a video, on white and reduced to THUMBNAIL, (12, 16, 3) float64."""
-    picture = next(read_video(file, limit=1), None) if is_video(file) else read_image(file)
-    if picture is None:
-        raise MediaError(f"{file}: no frame of it can be decoded; encode or copy it anew")
+    picture = next(read_video(file, stop=1)) if is_video(file) else read_image(file)
     image = Image.fromarray(picture)
     if image.mode == "RGBA":
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
