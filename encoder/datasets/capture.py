@@ -16,6 +16,7 @@ from kpc.encoder.datasets.video import VideoInfo
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
 from kpc.format.common.media_files import IMAGE_SUFFIXES
+from kpc.format.scene.camera_checks import check_depths, check_lens, check_pose
 
 # Where neither the dataset nor the user names test images, every eighth is one, as in LLFF (arXiv:1905.00889).
 HOLD_OUT_EVERY = 8
@@ -111,13 +112,16 @@ def image_view(
         where: the calibration's file and entry, for messages.
         declared: the image size of the calibration; None if it is that of the image as stored.
         time, is_test, intrinsics, distortion, camera_to_world, near, far: as in `CapturedView`, but `intrinsics` for
-            the declared size, and `camera_to_world` not yet checked.
+            the declared size, and none of them checked.
     """
     info = image_info(file)
     width, height = info.width, info.height
     upright = declared is not None and _fits(declared, info.displayed_size) and not _fits(declared, (width, height))
     if upright:
         width, height = info.displayed_size
+    intrinsics = fit_intrinsics(where, file, intrinsics, declared or (width, height), (width, height))
+    check_lens(where, (width, height), intrinsics, distortion)
+    check_depths(where, near, far)
     return CapturedView(
         file,
         None,
@@ -126,7 +130,7 @@ def image_view(
         width,
         height,
         info.has_alpha,
-        fit_intrinsics(where, file, intrinsics, declared or (width, height), (width, height)),
+        intrinsics,
         distortion,
         check_pose(where, camera_to_world),
         near,
@@ -152,14 +156,11 @@ def fit_intrinsics(
         declared, actual: width and height.
 
     Raises:
-        DatasetError: the focal length is not positive, or the aspect ratios differ by more than 1 % and a pixel of
-            rounding: then the image was cropped, and it is unknown where.
+        DatasetError: the intrinsics are not those of a camera, or the aspect ratios differ by more than 1 % and a pixel
+            of rounding: then the image was cropped, and it is unknown where.
     """
+    check_lens(where, declared, intrinsics)
     fl_x, fl_y, cx, cy = intrinsics
-    if not (all(map(math.isfinite, intrinsics)) and fl_x > 0 and fl_y > 0):
-        raise DatasetError(f"{where}: focal length {fl_x:g} x {fl_y:g} must be positive; correct the calibration")
-    if not (declared[0] >= 1 and declared[1] >= 1):
-        raise DatasetError(f"{where}: picture size {declared[0]:g}x{declared[1]:g} is empty; correct the calibration")
     sx, sy = actual[0] / declared[0], actual[1] / declared[1]
     if not _fits(declared, actual):
         raise DatasetError(
@@ -172,26 +173,6 @@ def fit_intrinsics(
 def _fits(declared: tuple[float, float], actual: tuple[int, int]) -> bool:
     """Return whether two sizes have the same aspect ratio, within 1 % and a pixel of rounding."""
     return declared[1] > 0 and abs(declared[0] * actual[1] / declared[1] - actual[0]) <= 1 + 0.01 * actual[0]
-
-
-def check_pose(where: str, pose: np.ndarray) -> np.ndarray:
-    """Return a pose as (4, 4) float64 with its axes normalised.
-
-    Raises:
-        DatasetError: the pose is not 3x4 or 4x4, holds NaN or infinity, or its axes are not orthogonal and
-            right-handed.
-    """
-    if pose.shape not in ((3, 4), (4, 4)):
-        raise DatasetError(f"{where}: pose has shape {pose.shape}, not 4x4; export it anew")
-    if not np.isfinite(pose).all():
-        raise DatasetError(f"{where}: pose holds NaN or infinity; remove the camera or calibrate it anew")
-    lengths = np.linalg.norm(pose[:3, :3], axis=0)
-    axes = pose[:3, :3] / np.where(lengths > 0, lengths, 1)
-    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-2 or np.linalg.det(axes) < 0:
-        raise DatasetError(f"{where}: pose is not a rotation and a translation; calibrate the camera anew")
-    checked = np.eye(4)
-    checked[:3, :3], checked[:3, 3] = axes, pose[:3, 3]
-    return checked
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:

@@ -3,8 +3,15 @@
 import numpy as np
 
 from kpc.encoder.datasets.dataset import Pictures
+from kpc.format.scene.camera_checks import distort
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.space import DeviceCoordinates, SpaceMapping
+
+# How to invert distortion: Newton steps at most; the share of its distance from the principal point by which a weak
+# lens moves a point; parts of the way from there in which a strong lens is followed.
+MOST_STEPS = 40
+WEAK = 0.2
+STAGES = 16
 
 
 def pixel_rays(
@@ -60,12 +67,12 @@ def _rays_through(
 
 
 def undistort(x: np.ndarray, y: np.ndarray, distortion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Invert OpenCV's lens distortion by Newton's method.
+    """Invert OpenCV's lens distortion (`camera_checks.distort`) by Newton's method.
 
-    x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2)
-    y_d = y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y
-
-    Far outside the calibrated image the model may fold over. There the result is finite but meaningless.
+    A weak lens starts at the distorted point. A strong one could lead from there beyond a fold, so that its points are
+    followed from the principal point outwards, in STAGES parts of the way. Ends where no step is longer than 1e-10,
+    after MOST_STEPS at the latest. Within the picture the model is one-to-one (`check_lens`); far outside it may fold
+    over, and there the result is finite but meaningless.
 
     Args:
         x, y: (N,) distorted coordinates, normalised by focal length and principal point, y down.
@@ -74,22 +81,29 @@ def undistort(x: np.ndarray, y: np.ndarray, distortion: np.ndarray) -> tuple[np.
     Returns:
         The undistorted coordinates, (N,) each.
     """
-    k1, k2, p1, p2 = distortion.T
+    coefficients = tuple(distortion.T)
+    moved_x, moved_y, _ = distort(x, y, coefficients)
     u, v = x, y
-    for _ in range(12):
-        r2 = u * u + v * v
-        radial = 1 + r2 * (k1 + r2 * k2)
-        slope = 2 * (k1 + 2 * k2 * r2)
-        residual_x = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u) - x
-        residual_y = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v - y
-        xx = radial + u * u * slope + 2 * p1 * v + 6 * p2 * u
-        yy = radial + v * v * slope + 6 * p1 * v + 2 * p2 * u
-        xy = u * v * slope + 2 * p1 * u + 2 * p2 * v
-        determinant = xx * yy - xy * xy
-        determinant = np.where(np.abs(determinant) < 1e-6, 1e-6, determinant)
-        step_u = np.clip((yy * residual_x - xy * residual_y) / determinant, -1, 1)
-        step_v = np.clip((xx * residual_y - xy * residual_x) / determinant, -1, 1)
-        u, v = u - step_u, v - step_v
-        if max(np.abs(step_u).max(initial=0), np.abs(step_v).max(initial=0)) < 1e-10:
+    if (np.hypot(moved_x - x, moved_y - y) > WEAK * np.hypot(x, y)).any():
+        u, v = np.zeros_like(x), np.zeros_like(y)
+        for stage in range(1, STAGES):
+            for _ in range(2):
+                u, v, _ = _newton_step(u, v, x * stage / STAGES, y * stage / STAGES, coefficients)
+    for _ in range(MOST_STEPS):
+        u, v, length = _newton_step(u, v, x, y, coefficients)
+        if length < 1e-10:
             break
     return u, v
+
+
+def _newton_step(
+    u: np.ndarray, v: np.ndarray, x: np.ndarray, y: np.ndarray, coefficients: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return undistorted coordinates after a step towards those of x and y, and the longest step along an axis."""
+    distorted_x, distorted_y, (xx, yy, xy) = distort(u, v, coefficients)
+    residual_x, residual_y = distorted_x - x, distorted_y - y
+    determinant = xx * yy - xy * xy
+    determinant = np.where(np.abs(determinant) < 1e-6, 1e-6, determinant)
+    step_u = np.clip((yy * residual_x - xy * residual_y) / determinant, -1, 1)
+    step_v = np.clip((xx * residual_y - xy * residual_x) / determinant, -1, 1)
+    return u - step_u, v - step_v, max(np.abs(step_u).max(initial=0), np.abs(step_v).max(initial=0))

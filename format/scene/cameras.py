@@ -15,13 +15,14 @@ import numpy as np
 
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import DatasetError
+from kpc.format.scene.camera_checks import check_lens, check_pinhole, number_of, pose_of
 from kpc.format.scene.camera_documents import rewritten
 
 # The largest `cameras.json` that is read, in bytes: enough for more than a hundred thousand frames.
 MAX_FILE_BYTES = 1 << 26
 
 # The largest image side that `cameras.json` may name, in pixels.
-MAX_SIDE = 1 << 16
+MAX_SIDE = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,8 @@ def load_views(path: str | os.PathLike[str]) -> list[View]:
     document. Files of nerfstudio are read, too; see `kpc.format.scene.camera_documents`.
 
     Raises:
-        DatasetError: the file is too large or not JSON, or a key is missing or malformed; the message names the frame.
+        DatasetError: the file is too large or not JSON, a key is missing or malformed, or a camera is none that can be
+            rendered (`camera_checks`); the message names the frame.
     """
     with open(path, "rb") as file:
         content = file.read(MAX_FILE_BYTES + 1)
@@ -121,33 +123,35 @@ def load_views(path: str | os.PathLike[str]) -> list[View]:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: not JSON ({error}); write it anew") from error
-    views: list[View] = []
-    try:
-        document = rewritten(document)
-        for number, frame in enumerate(document["frames"]):
-            views.append(_parse_view({**document, **frame}, number))
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise DatasetError(f"{path}: frame {len(views)}: missing or malformed {error}; correct the file") from error
-    except DatasetError as error:
-        raise DatasetError(f"{path}: frame {len(views)}: {error}") from error
+    document = rewritten(str(path), document)
+    views = [_parse_view(f"{path} frame {n}", {**document, **frame}, n) for n, frame in enumerate(document["frames"])]
     if not views:
         raise DatasetError(f"{path}: lists no frames; add some")
     return views
 
 
-def _parse_view(frame: Mapping[str, Any], number: int) -> View:
-    w, h = int(frame["w"]), int(frame["h"])
+def _parse_view(where: str, frame: Mapping[str, Any], number: int) -> View:
+    check_pinhole(where, frame)
+    w, h = number_of(where, frame, "w"), number_of(where, frame, "h")
+    if not (w == int(w) and h == int(h)):
+        raise DatasetError(f"{where}: picture size {w:g}x{h:g} is not of whole pixels; correct the file")
     if max(w, h) > MAX_SIDE:
-        raise DatasetError(f"an image of {w}x{h} is too large; at most {MAX_SIDE} pixels a side are allowed")
-    camera = Camera(
-        w, h, float(frame["fl_x"]), float(frame.get("fl_y", frame["fl_x"])),
-        float(frame.get("cx", w / 2)), float(frame.get("cy", h / 2)),
-        np.array(frame["transform_matrix"], np.float64),
-    )  # fmt: skip
-    time = float(frame.get("time", 0.0))
+        raise DatasetError(
+            f"{where}: an image of {w:g}x{h:g} is too large; at most {MAX_SIDE} pixels a side are allowed"
+        )
+    fl_x = number_of(where, frame, "fl_x")
+    intrinsics = (
+        fl_x,
+        number_of(where, frame, "fl_y", fl_x),
+        number_of(where, frame, "cx", w / 2),
+        number_of(where, frame, "cy", h / 2),
+    )
+    check_lens(where, (w, h), intrinsics)
+    camera = Camera(int(w), int(h), *intrinsics, pose_of(where, frame))
+    time = number_of(where, frame, "time", 0.0)
     if not 0.0 <= time <= 1.0:
-        raise DatasetError(f"time {time} lies outside [0, 1]")
-    at_s = None if frame.get("at") is None else float(frame["at"])
+        raise DatasetError(f"{where}: time {time:g} lies outside [0, 1]; correct the file")
+    at_s = None if frame.get("at") is None else number_of(where, frame, "at")
     return View(camera, time, str(frame.get("file", f"{number:04d}.png")), at_s)
 
 

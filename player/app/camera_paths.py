@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from kpc.format.common.errors import DatasetError
+from kpc.format.scene.camera_checks import check_pose
 from kpc.format.scene.cameras import Camera, View, load_views, save_views
 from kpc.format.scene.rotations import quaternion_of, rotation_of
 
@@ -51,9 +52,7 @@ class CameraPath:
                 raise DatasetError(f"keyframe {len(views) + 1} of the camera path is at {at_s:g} s, which {reason}")
             views.append(replace(view, at_s=at_s))
         for number, view in enumerate(views, 1):
-            axes = view.camera.camera_to_world[:3, :3]
-            if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3 or np.linalg.det(axes) < 0:
-                raise DatasetError(f"keyframe {number} of the camera path: its pose is scaled, skewed or mirrored")
+            check_pose(f"keyframe {number} of the camera path", view.camera.camera_to_world)
         object.__setattr__(self, "keyframes", tuple(views))
 
     @staticmethod

@@ -229,7 +229,7 @@ def test_malformed_poses_bounds(tmp_path: Path) -> None:
     fails(with_poses(good.astype(complex)), "N x 17")
     fails(changed(1, 3, np.nan), "row 1", "NaN")
     fails(changed(2, 14, 0.0), "row 2", "focal length")
-    fails(changed(2, 14, np.nan), "row 2", "focal length")
+    fails(changed(2, 14, np.nan), "row 2", "fl_x")
     fails(changed(0, 4, 0.0), "row 0", "empty")
     fails(changed(0, 0, 9.0), "row 0", "not a rotation")
     fails(changed(1, 15, -1.0), "row 1", "near")
@@ -333,7 +333,7 @@ def test_times_for_some_images_only(tmp_path: Path) -> None:
     make.edit_json(tmp_path / "set" / "transforms.json", lambda d: d["frames"][3].pop("time"))
     fails(tmp_path / "set", "0003.png", "time")
     make.edit_json(tmp_path / "set" / "transforms.json", lambda d: d["frames"][3].update(time=float("nan")))
-    fails(tmp_path / "set", "0003.png", "time")
+    fails(tmp_path / "set", "frame 3", "time is NaN")
 
 
 def test_no_image_exists(tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ import pytest
 import datasets as make
 from datasets import fails, load
 from kpc.encoder.datasets.capture import natural_key
-from kpc.encoder.datasets.layouts.camera_models import COLMAP_NUMBERS, PARAMETERS
 from kpc.encoder.datasets.layouts.transforms_keys import INFORMATION, READ, REFUSED, WITHOUT_EFFECT
 from kpc.format.common.images import write_image
+from kpc.format.scene.camera_models import COLMAP_NUMBERS, PARAMETERS
 
 ENCODING = Path(__file__).resolve().parents[2] / "docs" / "encoding.md"
 USABLE = np.indices((24, 32))[1] >= 12

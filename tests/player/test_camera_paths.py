@@ -162,10 +162,10 @@ MIRRORED = np.diag([-1.0, 1, 1, 1])
     ([np.eye(4), np.eye(4)], [1.0, 1.0], "keyframe 2"),
     ([np.eye(4), np.eye(4)], [2.0, 1.0], "does not follow"),
     ([np.eye(4)], [-1.0], "keyframe 1"),
-    ([np.eye(4)], [math.nan], "keyframe 1"),
+    ([np.eye(4)], [math.nan], "at is NaN"),
     ([np.eye(4), np.eye(4)], [0.0, 1e9], "keyframe 2"),
     ([np.eye(4), MIRRORED], [0.0, 1.0], "mirrored"),
-    ([2 * np.eye(4)], [0.0], "scaled"),
+    ([np.diag([2.0, 2, 2, 1])], [0.0], "scaled"),
     ([np.full((4, 4), np.nan)], [0.0], "NaN"),
     ([np.eye(4)], ["soon"], "frame 0"),
 ])  # fmt: skip
@@ -181,8 +181,8 @@ def test_an_invalid_path_is_refused(tmp_path: Path, poses: list[np.ndarray], ats
     ("[" * 100_000, "not JSON"),
     ('{"w": Infinity, "h": 1, "fl_x": 1, "frames": [{}]}', "frame 0"),
     ('{"w": 1e9, "h": 1, "fl_x": 1, "frames": [{"transform_matrix": 0}]}', "too large"),
-    ('{"frames": {"a": 1}}', "frame 0"),
-    ("[]", "frame 0"),
+    ('{"frames": {"a": 1}}', "list of frames"),
+    ("[]", "list of frames"),
     ("\udcff", "not JSON"),
 ])  # fmt: skip
 def test_an_invalid_camera_file_is_refused(tmp_path: Path, text: str, words: str) -> None:

@@ -159,12 +159,12 @@ def test_the_camera_path_of_nerfstudio(run, scene_file: Path, tmp_path: Path, fp
     [
         ({"camera_type": "fisheye"}, "no pinhole"),
         ({"camera_type": "equirectangular"}, "no pinhole"),
-        ({"render_width": None}, "malformed"),
-        ({"camera_path": [{"camera_to_world": [1, 0, 0], "fov": 50}]}, "pose has shape"),
+        ({"render_width": None}, "w is missing"),
+        ({"camera_path": [{"camera_to_world": [1, 0, 0], "fov": 50}]}, "not 4x4 numbers"),
         ({"camera_path": [{"camera_to_world": np.eye(4).tolist(), "fov": 180}]}, "outside (0, 180)"),
-        ({"camera_path": [{"camera_to_world": np.eye(4).tolist()}]}, "'fov'"),
+        ({"camera_path": [{"camera_to_world": np.eye(4).tolist()}]}, "fov is missing"),
         ({"camera_path": []}, "no frames"),
-        ({"camera_path": {}}, "no frames"),
+        ({"camera_path": {}}, "list of frames"),
     ],
 )
 def test_camera_paths_that_are_none(run, scene_file: Path, tmp_path: Path, change: dict, words: str) -> None:

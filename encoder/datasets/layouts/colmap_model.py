@@ -18,13 +18,14 @@ from typing import BinaryIO
 import numpy as np
 
 from kpc.encoder.datasets.capture import printable
-from kpc.encoder.datasets.layouts.camera_models import (
+from kpc.format.common.errors import DatasetError
+from kpc.format.scene.camera_checks import DISTORTION_KEYS, check_lens
+from kpc.format.scene.camera_models import (
     COLMAP_NUMBERS,
     PARAMETERS,
     check_higher_orders,
     understood_model,
 )
-from kpc.format.common.errors import DatasetError
 from kpc.format.scene.rotations import rotation_of
 
 # The longest image name in bytes; no file system takes longer ones.
@@ -87,14 +88,11 @@ def _camera(where: str, model: str, size: tuple[int, int], params: tuple[float, 
     value = dict(zip(names, params, strict=True))
     fl_x = value["f"] if "f" in value else value["fx"]
     fl_y = value.get("fy", fl_x)
-    if not (fl_x > 0 and fl_y > 0 and min(size) > 0):
-        raise DatasetError(
-            f"{where}: focal length {fl_x:g} x {fl_y:g} and size {size[0]}x{size[1]} must be positive; "
-            "calibrate it anew"
-        )
     check_higher_orders(where, value)
-    k1, k2, p1, p2 = (value.get(name, 0.0) for name in ("k1", "k2", "p1", "p2"))
-    return ModelCamera((float(size[0]), float(size[1])), (fl_x, fl_y, value["cx"], value["cy"]), (k1, k2, p1, p2))
+    k1, k2, p1, p2 = (value.get(name, 0.0) for name in DISTORTION_KEYS)
+    camera = ModelCamera((float(size[0]), float(size[1])), (fl_x, fl_y, value["cx"], value["cy"]), (k1, k2, p1, p2))
+    check_lens(where, camera.size, camera.intrinsics, camera.distortion)
+    return camera
 
 
 def read_images(file: Path) -> list[ModelImage]:

@@ -14,7 +14,6 @@ from kpc.encoder.datasets.capture import (
     HOLD_OUT_EVERY,
     Capture,
     CapturedView,
-    check_pose,
     fit_intrinsics,
     holdout_flags,
     image_view,
@@ -24,6 +23,7 @@ from kpc.encoder.datasets.left_out import media_in
 from kpc.encoder.datasets.video import VideoInfo, video_info
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.media_files import is_image, is_video
+from kpc.format.scene.camera_checks import check_depths, check_pose
 
 POSES = "poses_bounds.npy"  # the file of poses and depth ranges
 
@@ -79,8 +79,9 @@ def _pose(where: str, row: np.ndarray) -> np.ndarray:
 
 def _view(where: str, file: Path, row: np.ndarray, pose: np.ndarray, is_test: bool) -> CapturedView:
     (h, w, focal), (near, far) = row[[4, 9, 14]], row[15:]
-    if not 0 < near < far < np.inf:
-        raise DatasetError(f"{where}: near {near:g} and far {far:g} are not 0 < near < far; calibrate anew")
+    if np.isnan(row[15:]).any():
+        raise DatasetError(f"{where}: near or far is NaN; calibrate anew")
+    check_depths(where, near, far)
     intrinsics, no_distortion = (focal, focal, w / 2, h / 2), (0.0,) * 4
     if not is_video(file):
         return image_view(

@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from kpc.encoder.datasets.capture import (
     CapturedView,
     MaskFile,
@@ -20,16 +18,17 @@ from kpc.encoder.datasets.capture import (
     printable,
     report_missing,
 )
-from kpc.encoder.datasets.layouts.camera_models import HIGHER_ORDERS, check_higher_orders, understood_model
 from kpc.encoder.datasets.layouts.transforms_keys import check_keys
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
+from kpc.format.scene.camera_checks import DISTORTION_KEYS, number_of, pose_of
+from kpc.format.scene.camera_models import HIGHER_ORDERS, check_higher_orders, understood_model
 
 # Keys that say the same in other words: a frame that has one of them overrides all of the document.
 _SAME = (("fl_x", "camera_angle_x", "x_fov"), ("fl_y", "camera_angle_y", "y_fov"))
 
 # Coefficients of distortion, by themselves and in the order of nerfstudio's list `distortion_params`.
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", *HIGHER_ORDERS)
+_COEFFICIENTS = (*DISTORTION_KEYS, *HIGHER_ORDERS)
 _DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
@@ -91,7 +90,7 @@ def frame_view(
     if ("w" in keys) != ("h" in keys):
         raise DatasetError(f"{where}: has only one of w and h; add the other or export anew")
     _check_rays(where, keys, image)
-    declared = (_number(where, keys, "w"), _number(where, keys, "h")) if "w" in keys else None
+    declared = (number_of(where, keys, "w"), number_of(where, keys, "h")) if "w" in keys else None
     if declared is None:
         info = image_info(image)
         width, height = float(info.width), float(info.height)
@@ -101,13 +100,9 @@ def frame_view(
     intrinsics = (
         fl_x,
         fl_y,
-        _number(where, keys, "cx", width / 2),
-        _number(where, keys, "cy", height / 2),
+        number_of(where, keys, "cx", width / 2),
+        number_of(where, keys, "cy", height / 2),
     )
-    try:
-        pose = np.array(keys["transform_matrix"], np.float64)
-    except (TypeError, ValueError) as error:
-        raise DatasetError(f"{where}: transform_matrix is not 4x4 numbers; export it anew") from error
     view = image_view(
         image,
         where=where,
@@ -115,10 +110,10 @@ def frame_view(
         declared=declared,
         intrinsics=intrinsics,
         distortion=_distortion(where, keys),
-        camera_to_world=pose,
-        time=_number(where, keys, "time") if keys.get("time") is not None else None,
-        near=_number(where, keys, "near", math.nan),
-        far=_number(where, keys, "far", math.nan),
+        camera_to_world=pose_of(where, keys),
+        time=number_of(where, keys, "time") if keys.get("time") is not None else None,
+        near=number_of(where, keys, "near", math.nan),
+        far=number_of(where, keys, "far", math.nan),
     )
     return replace(view, mask=_mask(root, file, where, keys, image))
 
@@ -127,8 +122,8 @@ def frame_rate(file: Path, document: dict[str, Any]) -> float | None:
     """Return the frame rate from the key `fps`, an extension of KPC; None if it is absent."""
     if document.get("fps") is None:
         return None
-    fps = _number(str(file), document, "fps")
-    if not (math.isfinite(fps) and fps > 0):
+    fps = number_of(str(file), document, "fps")
+    if not fps > 0:
         raise DatasetError(f"{file}: fps {fps:g} must be a positive number; correct it")
     return fps
 
@@ -168,11 +163,11 @@ def _focal(where: str, keys: dict[str, Any], axis: str, size: float) -> float | 
     As in instant-ngp, `camera_angle_*` is in radians and `*_fov` in degrees.
     """
     if f"fl_{axis}" in keys:
-        return _number(where, keys, f"fl_{axis}")
+        return number_of(where, keys, f"fl_{axis}")
     for key, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.pi / 180)):
         if key in keys:
-            angle = _number(where, keys, key) * unit
-            if not 0 < angle < math.pi:
+            angle = number_of(where, keys, key) * unit
+            if not 1e-9 < angle < math.pi:
                 raise DatasetError(f"{where}: {key} {angle / unit:g} is no angle of view; correct the calibration")
             return size / 2 / math.tan(angle / 2)
     return None
@@ -188,8 +183,8 @@ def _distortion(where: str, keys: dict[str, Any]) -> tuple[float, float, float, 
         if not (isinstance(values, list) and len(values) == len(_DISTORTION_PARAMS)):
             raise DatasetError(f"{where}: distortion_params is not {len(_DISTORTION_PARAMS)} numbers; export it anew")
         keys = dict(zip(_DISTORTION_PARAMS, values, strict=True))
-    check_higher_orders(where, {k: _number(where, keys, k, 0.0) for k in HIGHER_ORDERS})
-    k1, k2, p1, p2 = (_number(where, keys, k, 0.0) for k in ("k1", "k2", "p1", "p2"))
+    check_higher_orders(where, {k: number_of(where, keys, k, 0.0) for k in HIGHER_ORDERS})
+    k1, k2, p1, p2 = (number_of(where, keys, k, 0.0) for k in DISTORTION_KEYS)
     return k1, k2, p1, p2
 
 
@@ -212,15 +207,3 @@ def _mask(root: Path, file: Path, where: str, keys: dict[str, Any], image: Path)
     if file_exists(dynamic):
         raise DatasetError(f"{where}: has two masks, {mask} and {dynamic}; remove one")
     return MaskFile(mask)
-
-
-def _number(where: str, keys: dict[str, Any], key: str, default: float | None = None) -> float:
-    """Return a number of the document, or its default.
-
-    Raises:
-        DatasetError: it is missing without a default, or not a number.
-    """
-    value = keys.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise DatasetError(f"{where}: {key} is {'missing' if value is None else 'not a number'}; add it or export anew")
-    return float(value)

@@ -13,6 +13,7 @@ from typing import Any
 
 from kpc.encoder.datasets.capture import first_names
 from kpc.format.common.errors import DatasetError
+from kpc.format.scene.camera_models import NO_PINHOLE_KEYS
 
 # Keys that are read.
 READ = frozenset(
@@ -44,10 +45,7 @@ INFORMATION = frozenset(("colmap_im_id", "rotation", "sharpness"))
 # Keys by which the camera is no pinhole or the pose means something else, by remedy. They are refused unless their
 # value is 0, false, null or empty.
 REFUSED = {
-    "undistort the images to a pinhole": (
-        *("is_fisheye", "fisheye", "fisheye_crop_radius", "latlong", "equirectangular", "orthographic"),
-        *(f"ftheta_p{n}" for n in range(5)),
-    ),
+    "undistort the images to a pinhole": NO_PINHOLE_KEYS,
     "export the poses as nerfstudio has them": ("from_na", "from_mitsuba", "normal_mts_args"),
 }
 

@@ -23,6 +23,12 @@ OTHER_NAMES = {"PERSPECTIVE": "PINHOLE"}
 # Coefficients of distortion that are not understood: they must be 0.
 HIGHER_ORDERS = ("k3", "k4", "k5", "k6")
 
+# Keys of documents by which a camera is no pinhole, unless their value is 0, false, null or empty.
+NO_PINHOLE_KEYS = (
+    *("is_fisheye", "fisheye", "fisheye_crop_radius", "latlong", "equirectangular", "orthographic"),
+    *(f"ftheta_p{n}" for n in range(5)),
+)
+
 # COLMAP's numbers of models in binary files, so that messages can name those that are refused.
 COLMAP_NUMBERS = dict(
     enumerate(
