@@ -1,6 +1,5 @@
 """What kpenc prints: log lines on stderr while it runs, and the results on stdout."""
 
-import json
 import math
 import sys
 from dataclasses import asdict
@@ -15,6 +14,7 @@ from kpc.encoder.field.field import time_rows
 from kpc.encoder.rdo.prune import Pruned
 from kpc.encoder.training.temporal_resolution import TimeResolution
 from kpc.encoder.training.train import Report, Trainer
+from kpc.format.common.cli import print_json
 from kpc.format.common.progress import Progress
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import FAR, Contraction, DeviceCoordinates
@@ -101,7 +101,7 @@ def describe_pruning(scene: Scene, pruned: Pruned, spare_db: float) -> str:
 def print_result(result: dict[str, Any], options: Options, as_json: bool) -> None:
     """Print the result of an encode, or of a transcode where the source is a file."""
     if as_json:
-        print(json.dumps(result, indent=1))
+        print_json(result)
     elif options.source.is_file():
         rate = f"{result['bits_per_parameter']:.2f} bits per parameter of {result['parameters']:,}"
         print(f"{options.output}: {rate}; {describe_outcome(result)}")
@@ -141,7 +141,7 @@ def _describe_group(group: dict[str, Any]) -> str:
 def print_estimate(expected: Estimate, options: Options, as_json: bool) -> None:
     """Print what an encode would take."""
     if as_json:
-        print(json.dumps(asdict(expected), indent=1))
+        print_json(asdict(expected))
         return
     total = expected.train_s + expected.test_s + expected.rest_s
     print(

@@ -224,7 +224,12 @@ def find_image(root: Path, file: Path, name: str) -> Path | None:
     Raises:
         DatasetError: the name leads out of `root`. (Symbolic links inside it may: whoever put them there meant it.)
     """
-    relative = os.path.normpath(name.replace("\\", "/"))
+    try:
+        # Documents hold UTF-8; what Python takes a name for depends on the system's encoding.
+        stored = os.fsdecode(name.encode("utf-8", "surrogateescape"))
+    except UnicodeEncodeError:
+        return None
+    relative = os.path.normpath(stored.replace("\\", "/"))
     for folder in (os.path.abspath(root), os.path.realpath(root)):
         relative = relative.removeprefix(folder + os.sep)
     if os.path.isabs(relative) or relative.split(os.sep)[0] in (os.curdir, os.pardir) or "\0" in relative:

@@ -21,6 +21,7 @@ from kpc.encoder.datasets.video import VideoInfo, read_video
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import read_image
 from kpc.format.common.progress import Progress
+from kpc.format.common.text import valid_unicode
 from kpc.format.scene.scene import Clip
 
 # The first layout that recognises a folder reads it: formats to which a COLMAP model is exported precede COLMAP's own.
@@ -116,13 +117,13 @@ def _load(
     views = capture.views
     frames, times, clip = _times(root, capture)
     view_of = np.repeat(np.arange(len(views)), [len(some) for some in frames])  # the view of each picture
-    key = hashlib.sha256(f"{root.resolve()} {downscale}".encode()).hexdigest()[:12]
+    key = hashlib.sha256(os.fsencode(f"{root.resolve()} {downscale}")).hexdigest()[:12]
     cache = _cached_pixels(root, views, frames, cache_dir / f"pixels-{key}.bin", downscale, progress)
     masks = load_masks(root, views, mask_files, cache_dir / f"pixels-{key}-masks.bin", downscale, progress)
     intrinsics = np.array([v.intrinsics for v in views])[view_of] / downscale
     distortion = np.array([v.distortion for v in views])[view_of]
     poses = np.stack([v.camera_to_world for v in views])[view_of]
-    files = tuple(views[v].file.relative_to(root).as_posix() for v in view_of)
+    files = tuple(valid_unicode(views[v].file.relative_to(root).as_posix()) for v in view_of)
     camera, first = _distinct(np.concatenate([poses.reshape(-1, 16), intrinsics, distortion], axis=1))
     pictures = Pictures(
         file=files,

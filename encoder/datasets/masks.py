@@ -181,7 +181,7 @@ def _source(root: Path, mask: MaskFile | None) -> tuple[str, int, int, bool] | N
 def _packed(mask: MaskFile | None, view: CapturedView, downscale: int) -> np.ndarray:
     """Return the bits of one mask, (1, blocks, BLOCK / 8) uint8; all set if there is no mask."""
     width, height = view.width // downscale, view.height // downscale
-    usable = np.ones((height, width), bool)
+    usable: np.ndarray = np.ones((height, width), bool)
     if mask is not None:
         info = image_info(mask.path)
         marked = read_mask(mask.path, upright=(info.width, info.height) != (view.width, view.height))

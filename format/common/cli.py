@@ -4,14 +4,18 @@ import argparse
 import contextlib
 import errno
 import functools
+import io
+import json
 import math
 import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from kpc.format.common.errors import KpcError, UsageError
+from kpc.format.common.text import valid_unicode
 from kpc.format.common.version import VERSION
 
 
@@ -27,6 +31,9 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         0 for success; 1 for a KpcError, or an error of the operating system that names a file or a full disk; 2 for a
         usage error; 130 after Ctrl-C. Any other exception is a bug and is raised with its traceback.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # names may hold what the terminal's encoding lacks
     try:
         command(sys.argv[1:] if argv is None else argv)
     except UsageError as error:
@@ -52,6 +59,12 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
 def add_version_option(parser: argparse.ArgumentParser) -> None:
     """Give a command's parser `--version`, which prints the version of KPC and exits."""
     parser.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON, in ASCII characters and with valid Unicode in its strings, on stdout."""
+    text = valid_unicode(json.dumps(value, ensure_ascii=False))
+    print(json.dumps(json.loads(text), indent=1))
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -78,7 +79,7 @@ def _opened(path: str | os.PathLike[str], **options: bool) -> Iterator[OpenEXR.F
         yield exr
 
 
-def _size(path: str | os.PathLike[str], header: dict[str, object]) -> tuple[int, int]:
+def _size(path: str | os.PathLike[str], header: dict[str, Any]) -> tuple[int, int]:
     """Return width and height of the display window, after a check of what no conversion is known for."""
     colours = header.get("chromaticities")
     if colours is not None and not np.allclose(np.ravel(colours), _BT709, atol=2e-3):

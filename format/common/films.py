@@ -23,6 +23,7 @@ import numpy as np
 
 from kpc.format.common.cli import atomic_write
 from kpc.format.common.errors import MediaError, UsageError
+from kpc.format.common.text import valid_unicode
 
 # Options of ffmpeg's scale filter for an exact colour conversion.
 SCALE_FLAGS = "bicubic+accurate_rnd+full_chroma_int+full_chroma_inp"
@@ -256,9 +257,18 @@ def ffmpeg_binary() -> str:
         ) from error
 
 
+class _Url(str):
+    """A URL whose `str()`, which ffmpeg-python hashes, is valid Unicode; ffmpeg gets the bytes of the file's name."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        return valid_unicode(super().__str__())
+
+
 def file_url(path: str | os.PathLike[str]) -> str:
     """Return a URL that ffmpeg takes for a local file, whatever characters the path contains."""
-    return f"file:{Path(path).absolute()}"
+    return _Url(f"file:{Path(path).absolute()}")
 
 
 def read_log(log: IO[bytes]) -> str:

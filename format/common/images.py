@@ -183,7 +183,7 @@ def _formats(with_tga: bool) -> tuple[str, ...]:
 def _refusal(path: str | os.PathLike[str], image: Image.Image) -> str | None:
     """Return what about an image would be misread, and what to do; None if all is known."""
     tags = getattr(image, "tag_v2", {})  # of TIFF
-    deep_colour = len(tags.get(_BITS, ())) > 1 and max(tags.get(_BITS)) > 8
+    deep_colour = len(tags.get(_BITS, ())) > 1 and max(tags[_BITS]) > 8
     if image.format not in ("MPO", "HEIF") and _picture_count(image) > 1:  # phones put previews behind the first
         return "holds several pictures; save the one that is meant as a PNG"
     if tags.get(_SUBFILE_TYPE, 0) & 1:
@@ -237,7 +237,8 @@ def _foreign_colours(path: str | os.PathLike[str]) -> str | None:
 
 def _raw_mode(image: Image.Image) -> str:
     """Return how Pillow unpacks the pixels, for example "RGB;16B"."""
-    arguments = image.tile[0].args if isinstance(getattr(image, "tile", None), list) and image.tile else ""
+    tiles = getattr(image, "tile", None)
+    arguments = tiles[0].args if tiles else ""
     return str(arguments[0] if isinstance(arguments, tuple) else arguments)
 
 
@@ -256,11 +257,10 @@ def _has_alpha(image: Image.Image) -> bool:
 
 def _alpha(image: Image.Image) -> np.ndarray:
     """Return straight alpha, (H, W) uint8."""
-    key = image.info.get("transparency")
     if image.mode in ("1", "L", "RGB") or image.mode.startswith("I"):  # one level or colour is transparent
         raw = _raw_mode(image)
         scale = 255 if image.mode == "1" else {"L;2": 85, "L;4": 17}.get(raw, 1)
-        same = np.asarray(image) == np.multiply(key, scale)
+        same = np.asarray(image) == np.multiply(image.info["transparency"], scale)
         return np.where(same.all(axis=-1) if image.mode == "RGB" else same, 0, 255).astype(np.uint8)
     straight = image.convert("LA") if image.mode == "La" else image
     return np.asarray(straight.convert("RGBA").getchannel("A"))

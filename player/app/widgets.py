@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
+from kpc.format.common.text import valid_unicode
 from kpc.player.app.desktop import imgui
 
 # Colours of what is active, and of errors.
@@ -82,7 +83,7 @@ def message(
         imgui.push_text_wrap_pos(MESSAGE_SHARE * (across[1] - across[0]))
         if colour is not None:
             imgui.push_style_color(imgui.Col_.text, colour)
-        imgui.text(text)
+        imgui.text(valid_unicode(text))
         if colour is not None:
             imgui.pop_style_color()
         imgui.pop_text_wrap_pos()

@@ -7,6 +7,7 @@ from typing import Any
 import moderngl
 
 from kpc.format.common.errors import ContextLostError, DisplayError
+from kpc.format.common.text import valid_unicode
 from kpc.player.app.desktop import glfw, imgui
 from kpc.player.app.keyboard import KeyPress, key_name
 
@@ -146,7 +147,7 @@ class Window:
 
     def set_title(self, title: str) -> None:
         """Change the title."""
-        glfw.set_window_title(self.handle, title)
+        glfw.set_window_title(self.handle, valid_unicode(title))
 
     def check(self) -> None:
         """Raise a ContextLostError if the graphics card was reset, which loses everything on it."""
@@ -181,7 +182,7 @@ class Window:
         }
         for hint, value in hints.items():
             glfw.window_hint(hint, value)
-        return glfw.create_window(*size, title, None, None)
+        return glfw.create_window(*size, valid_unicode(title), None, None)
 
     def _make_context(self) -> moderngl.Context:
         failures = []

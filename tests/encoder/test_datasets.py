@@ -1,8 +1,10 @@
 """Every dataset layout is recognised and read correctly; every fault is reported in one line."""
 
 import errno
+import os
 import random
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -501,3 +503,51 @@ def test_exif_orientation_of_llff(tmp_path: Path) -> None:
         Image.open(file).rotate(-90, expand=True).save(file, exif=exif)
     dataset = load(tmp_path / "set")
     assert dataset.pictures.width.tolist() == [32] * 3
+
+
+def not_utf8(folder: Path, name: bytes = b"caf\xe9") -> Path:
+    """Rename a file or folder to a name that is not UTF-8, as old archives unpack; skip where the disk has none."""
+    renamed = Path(os.fsdecode(os.fsencode(folder.parent) + b"/" + name))
+    try:
+        folder.rename(renamed)
+    except OSError:
+        pytest.skip("this file system holds Unicode names only")
+    return renamed
+
+
+@pytest.mark.parametrize("write", [make.write_n3dv, make.write_llff, make.write_blender, make.write_colmap])
+def test_folders_of_names_that_are_not_utf8(tmp_path: Path, write: Callable[[Path], object]) -> None:
+    write(tmp_path / "set")
+    dataset = load(not_utf8(tmp_path / "set"))
+    assert len(dataset.pictures) == len(load(dataset.path).pictures)  # the second from the cache
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_pictures_of_names_that_are_not_utf8(tmp_path: Path, binary: bool) -> None:
+    """They are found by their bytes, and called by names with replaced letters."""
+    make.write_colmap(tmp_path / "set", images=3, binary=binary)
+    not_utf8(tmp_path / "set/images/0001.png", b"\xe91.png")
+    file = tmp_path / f"set/sparse/0/images.{'bin' if binary else 'txt'}"
+    file.write_bytes(file.read_bytes().replace(b"0001.png", b"\xe91.png"))
+    dataset = load(tmp_path / "set")
+    assert "images/\ufffd1.png" in dataset.pictures.file and "\ufffd1" in dataset.camera_names
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_byte_order_marks(tmp_path: Path, encoding: str) -> None:
+    make.write_nerfstudio(tmp_path / "nerfstudio", images=3)
+    make.write_colmap(tmp_path / "colmap", images=3, binary=False)
+    folder = tmp_path / "colmap/sparse/0"
+    for file in (tmp_path / "nerfstudio/transforms.json", folder / "cameras.txt", folder / "images.txt"):
+        file.write_text(file.read_text(), encoding=encoding)
+    assert len(load(tmp_path / "nerfstudio").pictures) == len(load(tmp_path / "colmap").pictures) == 3
+
+
+def test_lists_in_the_encoding_of_the_names(tmp_path: Path) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=4)
+    not_utf8(tmp_path / "set/images/0001.png", b"\xe91.png")
+    file = tmp_path / "set/transforms.json"
+    file.write_bytes(file.read_bytes().replace(b"0001.png", b"\xe91.png"))
+    assert len(load(tmp_path / "set").pictures) == 4
+    file.write_bytes(file.read_bytes().replace(b"\xe91.png", rb"\ud8001.png"))  # no name of a file, but valid JSON
+    assert len(load(tmp_path / "set").pictures) == 3

@@ -10,7 +10,6 @@ Without --verify, a file whose end is missing is described as far as it goes.
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -57,12 +56,12 @@ def _command(argv: list[str]) -> None:
             verify(groups.open(number))
     if options.group is None and not groups.is_single:
         overview = describe_groups(groups) | {"verified": options.verify}
-        print(json.dumps(overview, indent=2) if options.json else _groups_page(overview))
+        cli.print_json(overview) if options.json else print(_groups_page(overview))
         return
     reader = groups.open(options.group or 0)
     info = describe(reader, read(reader, memory_budget=options.memory_budget, allow_partial=True))
     info["verified"] = options.verify
-    print(json.dumps(info, indent=2) if options.json else _page(info))
+    cli.print_json(info) if options.json else print(_page(info))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -19,6 +19,7 @@ import numpy as np
 
 from kpc.encoder.datasets.capture import printable
 from kpc.format.common.errors import DatasetError
+from kpc.format.common.text import open_text
 from kpc.format.scene.camera_checks import DISTORTION_KEYS, check_lens
 from kpc.format.scene.camera_models import (
     COLMAP_NUMBERS,
@@ -203,12 +204,12 @@ def _name(stream: BinaryIO) -> str:
         if len(name) == MAX_NAME_BYTES:
             raise ValueError(f"a name of more than {MAX_NAME_BYTES} bytes")
         name += byte
-    return os.fsdecode(bytes(name))
+    return name.decode("utf-8", "surrogateescape")
 
 
 def _text_lines(file: Path) -> Iterator[str]:
     """Yield the lines of a text file that are no comments, stripped."""
-    with open(file, encoding="utf-8-sig", errors="surrogateescape") as lines:
+    with open_text(file) as lines:
         yield from (line.strip() for line in lines if not line.lstrip().startswith("#"))
 
 

@@ -21,6 +21,7 @@ from kpc.encoder.datasets.capture import (
 from kpc.encoder.datasets.layouts.transforms_keys import check_keys
 from kpc.format.common.errors import DatasetError
 from kpc.format.common.images import image_info
+from kpc.format.common.text import open_text
 from kpc.format.scene.camera_checks import DISTORTION_KEYS, number_of, pose_of
 from kpc.format.scene.camera_models import HIGHER_ORDERS, check_higher_orders, understood_model
 
@@ -39,7 +40,8 @@ def load_transforms(file: Path) -> dict[str, Any]:
         DatasetError: it is not JSON, lacks those, or a key is refused.
     """
     try:
-        document = json.loads(file.read_text(encoding="utf-8-sig"), object_pairs_hook=_without_repetition)
+        with open_text(file) as text:
+            document = json.load(text, object_pairs_hook=_without_repetition)
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{file}: not JSON ({printable(str(error))}); export it anew") from error
     frames = document.get("frames") if isinstance(document, dict) else None

@@ -1,0 +1,35 @@
+"""Text in files of unknown encoding, and names that are not valid Unicode.
+
+Names of files are bytes on Linux, in whatever encoding their maker used. Python stands for bytes that are not UTF-8 by
+surrogates (PEP 383): with them a file is found, but they can be neither printed nor stored in a UTF-8 document.
+"""
+
+import codecs
+import os
+import re
+from pathlib import Path
+from typing import TextIO
+
+# Byte order marks and their encodings; that of UTF-32 begins as that of UTF-16 does.
+_BYTE_ORDER_MARKS = (
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
+
+
+def open_text(path: str | os.PathLike[str]) -> TextIO:
+    """Open a text in UTF-8, with or without a byte order mark, or in UTF-16 or UTF-32 with one.
+
+    Bytes that are not UTF-8 become surrogates, so that names in a list are those of the files.
+    """
+    with open(path, "rb") as file:
+        head = file.read(4)
+    encoding = next((name for mark, name in _BYTE_ORDER_MARKS if head.startswith(mark)), "utf-8-sig")
+    return Path(path).open(encoding=encoding, errors="surrogateescape")
+
+
+def valid_unicode(text: str | os.PathLike[str]) -> str:
+    """Return text with a replacement character (U+FFFD) for each surrogate."""
+    return re.sub("[\ud800-\udfff]", "\ufffd", os.fspath(text))

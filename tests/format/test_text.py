@@ -1,0 +1,51 @@
+"""Texts with byte order marks are read; names that are not Unicode are printed with replaced letters."""
+
+import io
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from kpc.format.common import cli
+from kpc.format.common.text import open_text, valid_unicode
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32"])
+def test_byte_order_marks(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "x.txt").write_text("café €\n", encoding=encoding)
+    with open_text(tmp_path / "x.txt") as file:
+        assert file.read() == "café €\n"
+
+
+def test_other_encodings_keep_their_bytes(tmp_path: Path) -> None:
+    (tmp_path / "x.txt").write_bytes(b"caf\xe9\n")
+    with open_text(tmp_path / "x.txt") as file:
+        assert os.fsencode(file.read()) == b"caf\xe9\n"
+
+
+def test_valid_unicode() -> None:
+    assert valid_unicode("a\udce9b\ud800 é 😀") == "a\ufffdb\ufffd é 😀"
+    assert valid_unicode(Path("caf\udce9")) == "caf\ufffd"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_terminals_of_any_encoding(monkeypatch: pytest.MonkeyPatch, encoding: str) -> None:
+    streams = [io.TextIOWrapper(io.BytesIO(), encoding=encoding) for _ in range(2)]
+    monkeypatch.setattr(sys, "stdout", streams[0])
+    monkeypatch.setattr(sys, "stderr", streams[1])
+
+    def command(argv: list[str]) -> None:
+        print("caf\udce9 \u20ac")
+        cli.print_json({"caf\udce9": ["é", 1, None, "\\ud800"]})
+        raise cli.UsageError("caf\udce9 \u20ac")
+
+    assert cli.run(command, "kpx", []) == 2
+    for stream in streams:
+        stream.flush()
+    out, err = (stream.buffer.getvalue().decode(encoding) for stream in streams)
+    euro = "\u20ac" if encoding == "utf-8" else "?"
+    first, rest = out.split("\n", 1)
+    assert first == f"caf? {euro}" and err == f"kpx: caf? {euro}\n"
+    assert json.loads(rest) == {"caf\ufffd": ["é", 1, None, "\\ud800"]}
