@@ -10,6 +10,7 @@ from kpc.encoder.cli.report import SPACES, describe_model, describe_time_rows, l
 from kpc.encoder.cli.transcode import check_outputs
 from kpc.encoder.cli.work_folder import CHECKPOINT, choose_device, make_work_folder, remove_if_empty
 from kpc.encoder.datasets import Dataset, load_dataset
+from kpc.encoder.datasets.plausibility import doubts
 from kpc.encoder.field.bounds import (
     find_box,
     find_contraction_box,
@@ -66,6 +67,8 @@ def prepare_setting(options: Options) -> Setting:
         remove_if_empty(options.work_dir)
         raise
     log(dataset.describe())
+    for doubt in doubts(dataset):
+        log(f"warning: {doubt}")
     log(f"space: {SPACES[type(mapping)][1]} ({why})")
     return Setting(dataset, aabb, mapping, options.box is not None or isinstance(mapping, Contraction))
 

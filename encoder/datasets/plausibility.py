@@ -1,0 +1,107 @@
+"""Signs that a dataset is not what its owner thinks, from a cheap look at its pictures and cameras.
+
+Each is reported in one line before training; none is an error, since each has a harmless explanation, too.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from kpc.encoder.datasets.capture import first_names
+from kpc.encoder.datasets.dataset import Dataset
+
+# Pictures that are looked at, evenly spread over all of them, and rows of each.
+PICTURES, ROWS = 256, 8
+
+# Pictures of one colour are verified by reading all of their pixels; only so many of them.
+VERIFIED = 8
+
+# A picture is of one colour if no channel varies by more than this many of its 255 levels.
+FLAT = 2
+
+
+def doubts(dataset: Dataset) -> Iterator[str]:
+    """Yield a line for each sign that the result will mean less than it seems; none for good data.
+
+    Reads at most PICTURES times ROWS rows and VERIFIED whole pictures, one at a time. Equal pictures are found by the
+    checksums of the cache.
+    """
+    yield from _flat_pictures(dataset)
+    yield from _equal_pictures(dataset)
+    yield from _cameras(dataset)
+
+
+def _flat_pictures(dataset: Dataset) -> Iterator[str]:
+    """Doubt pictures of one colour, or without anything opaque."""
+    count = len(dataset.pictures)
+    looked_at = np.unique(np.linspace(0, count - 1, min(count, PICTURES)).round().astype(int))
+    flat = [int(n) for n in looked_at if _is_flat(dataset, n, ROWS)]
+    if not flat or not all(_is_flat(dataset, n) for n in flat[:VERIFIED]):
+        return
+    is_empty = dataset.has_alpha and not dataset.pixels.picture(flat[0])[..., 3].any()
+    meaning = "show nothing (they are transparent)" if is_empty else "are of one colour"
+    names = first_names(list(dict.fromkeys(dataset.pictures.file[n] for n in flat)))
+    share = "all" if len(flat) == len(looked_at) else f"{len(flat)} of {len(looked_at)}"
+    yield f"{share} pictures looked at {meaning}: {names}; check these files"
+
+
+def _is_flat(dataset: Dataset, number: int, rows: int | None = None) -> bool:
+    """Return whether a picture, or `rows` of its rows, is of one colour; what is fully transparent does not count."""
+    height = int(dataset.pictures.height[number])
+    if rows is None or rows >= height:
+        pixels = dataset.pixels.picture(number)
+    else:
+        tops = np.linspace(0, height - 1, rows).astype(int)
+        pixels = np.concatenate([dataset.pixels.picture(number, top, top + 1) for top in tops.tolist()])
+    if dataset.has_alpha:
+        if not pixels[..., 3].any():
+            return True
+        pixels = np.where(pixels[..., 3:] > 0, pixels, pixels[pixels[..., 3] > 0][0])
+    return bool(np.ptp(pixels.reshape(-1, pixels.shape[2]), axis=0).max() <= FLAT)
+
+
+def _equal_pictures(dataset: Dataset) -> Iterator[str]:
+    """Doubt test pictures that are training pictures, and cameras in different places that show the same."""
+    pictures, by_content = dataset.pictures, {}
+    for number, tile in enumerate(dataset.pixels.tiles):
+        by_content.setdefault((tile.crc32c, tile.width, tile.height), []).append(number)
+    equal = [numbers for numbers in by_content.values() if len(numbers) > 1]
+    trained = [n for numbers in equal if not pictures.is_test[numbers].all() for n in numbers if pictures.is_test[n]]
+    trained = [n for n in trained if not _is_flat(dataset, n, ROWS)]
+    if trained:
+        names = first_names(list(dict.fromkeys(pictures.file[n] for n in trained)))
+        yield (
+            f"{len(trained)} of {int(pictures.is_test.sum())} test pictures are also trained on: {names}; what is "
+            "measured on them means nothing"
+        )
+    train = [[n for n in numbers if not pictures.is_test[n]] for numbers in equal]
+    pairs: dict[tuple[int, int], int] = {}
+    for numbers in train:
+        cameras = sorted(set(pictures.camera[numbers].tolist()))
+        if len(cameras) > 1 and not _is_flat(dataset, numbers[0], ROWS):
+            pairs.setdefault((cameras[0], cameras[1]), numbers[0])
+    if pairs:
+        names = [" and ".join(dataset.camera_names[c] for c in pair) for pair in pairs]
+        yield f"cameras in different places show the same picture: {first_names(names)}; check these files"
+
+
+def _cameras(dataset: Dataset) -> Iterator[str]:
+    """Doubt cameras that coincide, look past their picture, or lack the depth range that others have."""
+    p = dataset.pictures
+    _, first, count = np.unique(
+        np.stack([p.camera.astype(np.float64), p.time], axis=1), axis=0, return_index=True, return_counts=True
+    )
+    if (count > 1).any():
+        names = first_names([p.file[n] for n in sorted(first[count > 1])])
+        yield f"several pictures of the same time have the same pose: {names}; check the calibration"
+    size = np.stack([p.width, p.height], axis=1)
+    outside = ((p.intrinsics[:, 2:] < 0) | (p.intrinsics[:, 2:] > size)).any(axis=1)
+    if outside.any():
+        names = first_names(list(dict.fromkeys(p.file[n] for n in np.flatnonzero(outside))))
+        yield f"the principal point lies outside of {int(outside.sum())} pictures: {names}; check cx and cy"
+    known = np.isfinite(p.near) & np.isfinite(p.far)
+    if known.any() and not known.all():
+        yield (
+            f"near and far are known for {int(known.sum())} of {len(p)} pictures only, so the box does not follow from "
+            "them; give them for all or none"
+        )
