@@ -156,6 +156,17 @@ def test_focal_lengths_and_angles(tmp_path: Path, keys: dict[str, float], fl_x: 
     assert ("fl_y / fl_x" in dataset.describe()) == (fl_x != fl_y)
 
 
+def test_angles_that_contradict_focal_lengths_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As Blender exports them: its vertical angle belongs to the sensor, not to the picture."""
+    angles = {"camera_angle_x": 2 * math.atan(16 / 38.4), "camera_angle_y": 0.5}
+    p = load(nerfstudio(tmp_path / "set", without(**angles))).pictures
+    assert p.intrinsics[0, :2].tolist() == [38.4, 38.4]
+    assert "fl_y is 38.4, but 46.9958 by camera_angle_y; fl_y is used" in said(capsys)
+    # Pictures that were reduced after the calibration, without a word in the document.
+    load(nerfstudio(tmp_path / "set", without("w", "h", "fl_y", "cx", "cy", fl_x=76.8, x_fov=45.2397)))
+    assert "fl_x is 76.8, but 38.4 by x_fov" in said(capsys)
+
+
 def test_a_frame_overrides_the_document_in_other_words(tmp_path: Path) -> None:
     def change(document: dict[str, Any]) -> None:
         document.update(k1=0.2, k2=0.1)

@@ -9,7 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from kpc.encoder.datasets.capture import Capture, CapturedView, find_image, holdout_flags
-from kpc.encoder.datasets.layouts.transforms import find_images, frame_rate, frame_view, load_transforms
+from kpc.encoder.datasets.layouts.transforms import (
+    find_images,
+    frame_rate,
+    frame_view,
+    load_transforms,
+    report_contradictions,
+)
 from kpc.encoder.datasets.left_out import media_in
 
 # The layout's name in messages.
@@ -39,6 +45,7 @@ def read(path: Path, holdout: str | None) -> Capture:
             print(f"{file}: {len(left_out)} pictures are left out, since the test split is held out", file=sys.stderr)
             continue
         images = find_images(path, file, document)
+        report_contradictions(file, document, next(iter(images.values())))
         views += [frame_view(path, file, n, document, image, split != "train") for n, image in images.items()]
         fps = fps or frame_rate(file, document)
     folders = sorted({file.parent for file in (*left_out, *(view.file for view in views))})

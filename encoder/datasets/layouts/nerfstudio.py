@@ -7,7 +7,13 @@ from pathlib import Path
 
 from kpc.encoder.datasets.capture import Capture, holdout_flags, natural_key
 from kpc.encoder.datasets.layouts.splits import split_of
-from kpc.encoder.datasets.layouts.transforms import find_images, frame_rate, frame_view, load_transforms
+from kpc.encoder.datasets.layouts.transforms import (
+    find_images,
+    frame_rate,
+    frame_view,
+    load_transforms,
+    report_contradictions,
+)
 from kpc.encoder.datasets.left_out import media_in
 
 # The layout's name in messages.
@@ -32,6 +38,7 @@ def read(path: Path, holdout: str | None) -> Capture:
     found = find_images(path, file, document)
     missing = [frame["file_path"] for number, frame in enumerate(document["frames"]) if number not in found]
     existing = sorted(found.items(), key=lambda item: natural_key(item[1].relative_to(path).as_posix()))
+    report_contradictions(file, document, existing[0][1])
     images = [image for _, image in existing]
     split = split_of(path, file, document, images, missing) if holdout is None else ["train"] * len(images)
     default = [part == "test" for part in split]

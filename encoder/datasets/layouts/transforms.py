@@ -5,6 +5,8 @@ The document describes a camera and lists frames, which may override it. `transf
 
 import json
 import math
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,9 @@ from kpc.format.common.images import image_info
 from kpc.format.common.text import open_text
 from kpc.format.scene.camera_checks import DISTORTION_KEYS, number_of, pose_of
 from kpc.format.scene.camera_models import HIGHER_ORDERS, check_higher_orders, understood_model
+
+# Focal lengths that differ by less than this share are the same.
+SAME_FOCAL = 0.02
 
 # Keys that say the same in other words: a frame that has one of them overrides all of the document.
 _SAME = (("fl_x", "camera_angle_x", "x_fov"), ("fl_y", "camera_angle_y", "y_fov"))
@@ -120,6 +125,22 @@ def frame_view(
     return replace(view, mask=_mask(root, file, where, keys, image))
 
 
+def report_contradictions(file: Path, document: dict[str, Any], image: Path) -> None:
+    """Say in one line if a document's angle of view gives another focal length than fl_x or fl_y, which is then used.
+
+    Args:
+        file: the document's path, for messages.
+        document: from `load_transforms`.
+        image: one of its images; its size counts if the document has none.
+    """
+    info = image_info(image)
+    for axis, side, size in (("x", "w", info.width), ("y", "h", info.height)):
+        focal = number_of(str(file), document, f"fl_{axis}", math.nan)
+        for key, other in _focals_of_angles(str(file), document, axis, number_of(str(file), document, side, size)):
+            if abs(other - focal) > SAME_FOCAL * focal:
+                print(f"{file}: fl_{axis} is {focal:g}, but {other:g} by {key}; fl_{axis} is used", file=sys.stderr)
+
+
 def frame_rate(file: Path, document: dict[str, Any]) -> float | None:
     """Return the frame rate from the key `fps`, an extension of KPC; None if it is absent."""
     if document.get("fps") is None:
@@ -160,19 +181,23 @@ def _focals(where: str, keys: dict[str, Any], width: float, height: float) -> tu
 
 
 def _focal(where: str, keys: dict[str, Any], axis: str, size: float) -> float | None:
-    """Return fl_x or fl_y in pixels, from that key or an angle of view: size / 2 / tan(angle / 2); None without them.
+    """Return fl_x or fl_y in pixels, from that key or an angle of view; None without them."""
+    if f"fl_{axis}" in keys:
+        return number_of(where, keys, f"fl_{axis}")
+    return next((focal for _, focal in _focals_of_angles(where, keys, axis, size)), None)
+
+
+def _focals_of_angles(where: str, keys: dict[str, Any], axis: str, size: float) -> Iterator[tuple[str, float]]:
+    """Yield the keys that give an angle of view, and the focal length in pixels: size / 2 / tan(angle / 2).
 
     As in instant-ngp, `camera_angle_*` is in radians and `*_fov` in degrees.
     """
-    if f"fl_{axis}" in keys:
-        return number_of(where, keys, f"fl_{axis}")
     for key, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.pi / 180)):
-        if key in keys:
+        if keys.get(key) is not None:
             angle = number_of(where, keys, key) * unit
             if not 1e-9 < angle < math.pi:
                 raise DatasetError(f"{where}: {key} {angle / unit:g} is no angle of view; correct the calibration")
-            return size / 2 / math.tan(angle / 2)
-    return None
+            yield key, size / 2 / math.tan(angle / 2)
 
 
 def _distortion(where: str, keys: dict[str, Any]) -> tuple[float, float, float, float]:
