@@ -55,7 +55,10 @@ def read(path: Path, holdout: str | None) -> Capture:
         found = media_in(path / "images")
         files = [file for file in found if is_image(file)]
     if not files:
-        raise DatasetError(f"{path}: has {POSES}, but neither cam*.mp4 nor images/; copy the videos or images there")
+        raise DatasetError(
+            f"{path}: has {POSES}, but neither cam*.mp4 nor, in images/, any image that is read, such as PNG or JPEG; "
+            "copy the videos or images there, or convert them"
+        )
     rows = _read_poses(path / POSES)
     kind = "videos" if layout == "N3DV" else "images"
     if len(rows) != len(files):
