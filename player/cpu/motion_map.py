@@ -9,48 +9,21 @@ that is constant but not 1 moves nothing. So the field itself is compared. A poi
 |q(t) - q(t')|.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
-from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
-from kpc.format.scene.space import Contraction, DeviceCoordinates, contract
+from kpc.format.scene.space import Contraction, DeviceCoordinates
 from kpc.player.cpu import reference
-from kpc.player.cpu.reference import Rendering, SceneAtTime
+from kpc.player.cpu.reference import SceneAtTime
 from kpc.player.viewpoints import Rig
 
 # Times that are compared with.
 INSTANTS = (np.arange(8) + 0.5) / 8
-# A change up to STILL counts as none: noise of fitting and rounding. From LIVELY on a picture shows its full colour.
-STILL, LIVELY = 0.1, 0.3
+# A change up to STILL counts as none: noise of fitting and rounding.
+STILL = 0.1
 # Cells that a share is computed from; of more, as many, evenly spread.
 CELLS = 8192
 CELLS_AT_ONCE = 1 << 20
-POINTS_AT_ONCE = 8192
-# Luma coefficients of BT.709.
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
-# Contrast and black level of what stands still.
-MUTED = 0.6, 0.2
-MOVING = np.array([1.0, 0.25, 0.05], np.float32)
-
-
-def motion_colours(scene: Scene, camera: Camera, time: float, rendering: Rendering) -> Rendering:
-    """Recolour a rendering of `scene`: grey where what is visible at `time` is there all over the clip, from STILL to
-    LIVELY more and more of one colour where it is not. The point at the mean depth of each ray is compared."""
-    origins, directions = camera.rays()
-    seen = np.flatnonzero(rendering.opacity > 0)
-    change = np.zeros(rendering.opacity.size, np.float32)
-    for rays in np.split(seen, range(POINTS_AT_ONCE, len(seen), POINTS_AT_ONCE)):
-        o, d = origins[rays], directions[rays]
-        u = _position(scene, o + rendering.depth.reshape(-1)[rays, None] * d)
-        terms = _terms(scene, o, d)
-        others = np.stack([_appearances_at(scene, u, terms, float(instant)) for instant in INSTANTS])
-        change[rays] = _change(_appearances_at(scene, u, terms, time), others)
-    share = np.clip((change.reshape(rendering.opacity.shape) - STILL) / (LIVELY - STILL), 0, 1) * rendering.opacity
-    grey = (rendering.rgb @ LUMINANCE)[..., None]
-    muted, coloured = MUTED[0] * grey + MUTED[1], MOVING * (0.4 + 0.6 * grey)
-    return replace(rendering, rgb=(muted + share[..., None] * (coloured - muted)).astype(np.float32))
 
 
 def motionless_share(scene: Scene) -> float:
@@ -99,16 +72,6 @@ def _appearances_at(scene: Scene, u: np.ndarray, terms: np.ndarray, time: float)
     alpha = np.where(moment.occupied[z, y, x], alpha, 0)[:, None]
     rgb = reference.colour(decoder, f, terms)
     return np.concatenate([alpha * rgb, alpha], axis=1)
-
-
-def _position(scene: Scene, points: np.ndarray) -> np.ndarray:
-    """Return where in the planes' [0, 1]^3 points of the world (N, 3) are."""
-    if isinstance(scene.mapping, Contraction):
-        u = contract(points, scene.aabb)[0]
-    else:
-        inside = scene.mapping.to_device(points) if isinstance(scene.mapping, DeviceCoordinates) else points
-        u = (inside - scene.aabb[0]) / (scene.aabb[1] - scene.aabb[0])
-    return np.clip(u, 0, 1).astype(np.float32)
 
 
 def _terms(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

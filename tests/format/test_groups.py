@@ -17,10 +17,10 @@ from kpc.format.container.container import Reader
 from kpc.format.container.groups import GroupedScene, GroupInput, Groups, Span, Timeline
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.cpu import reference
-from kpc.player.cpu.motion_map import motion_colours
 from kpc.player.viewpoints import fit_camera, orbit
 from kpc.tools.cli import kpinfo, kpjoin, kprender
 from kpc.tools.cli.serve import Handler, serving
+from kpc.tools.rendering.clean_plate import CleanPlates, matte, motion_colours
 from scenes import tiny_scene, with_appearances
 
 
@@ -103,7 +103,9 @@ def test_the_motion_map_and_kpinfo_describe_the_group_shown(clip, scenes, tmp_pa
         assert kpinfo.main([str(clip), "--group", str(number), "--json"]) == 0
         shares = json.loads(capsys.readouterr().out)["static"]
         alone, camera = kpc.load(scenes[number]), fit_camera(kpc.load(clip).cameras[0], 24, 18)
-        expected = motion_colours(alone, camera, own, reference.render(alone, camera, own)).rgb
+        plate = CleanPlates(reference.render).of(alone, camera)
+        shown = reference.render(alone, camera, own)
+        expected = motion_colours(shown, matte(shown, plate)).rgb
         assert np.abs(read_image(picture) - 255 * np.clip(expected, 0, 1)).max() <= 1
         assert (shares == {"identity_share": 1, "constant_share": 1, "motionless_share": 1}) == (number == 2)
 

@@ -12,7 +12,7 @@ from kpc.format.container.scene_io import write
 from kpc.format.scene.scene import TIME_PLANES, Scene
 from kpc.format.scene.static import cells_reading, constant_cells, constant_fraction, static_cells, static_fraction
 from kpc.player.cpu import motion_map, reference
-from kpc.player.cpu.motion_map import motion_colours, motionless_share
+from kpc.player.cpu.motion_map import motionless_share
 from kpc.player.cpu.reference import SceneAtTime
 from kpc.tools.cli import kpinfo
 from scenes import VARIANTS, tiny_scene
@@ -127,15 +127,9 @@ def test_displaced_cells_are_not_static() -> None:
 
 
 @pytest.mark.parametrize("space", VARIANTS)
-def test_the_motion_map_is_grey_where_nothing_moves(space: str) -> None:
+def test_a_scene_that_does_not_move_is_motionless(space: str) -> None:
     scene = VARIANTS[space](tiny_scene())
     still_scene = replace(still(scene), motion=None if scene.motion is None else np.zeros_like(scene.motion))
-    camera = scene.cameras[0]
-    for shown, colourful in ((still_scene, False), (scene, True)):
-        rendering = reference.render(shown, camera, 0.4)
-        picture = motion_colours(shown, camera, 0.4, rendering)
-        assert picture.depth is rendering.depth and picture.rgb.shape == rendering.rgb.shape
-        assert (np.ptp(picture.rgb, axis=2).max() > 0.2) == colourful
     assert motionless_share(still_scene) == 1 > motionless_share(scene)
 
 
@@ -147,21 +141,3 @@ def test_the_motionless_share_samples_cells_evenly(monkeypatch: pytest.MonkeyPat
     spread = motion_map._spread(cells, 10)
     assert len(spread) == 10 and spread[0] == indices[0] and spread[-1] == indices[-1] and cells[spread].all()
     assert len(motion_map._spread(np.zeros(20, bool), 10)) == 0
-
-
-def test_the_motion_map_colours_what_moves_while_it_exists() -> None:
-    """The right half of a scene disappears in the second half of the clip: it is red before, and not shown after."""
-    scene = still(tiny_scene(time=9))
-    occupancy = scene.occupancy[:1].repeat(2, axis=0)
-    occupancy[1, :, :, 6:] = False
-    scene, camera = replace(scene, occupancy=occupancy), scene.cameras[0]
-    rendering = reference.render(scene, camera, 0.2)
-    red = np.ptp(motion_colours(scene, camera, 0.2, rendering).rgb, axis=2) > 0.1
-    origins, directions = camera.rays()
-    opaque = (rendering.opacity > 0.99).reshape(-1)
-    x = (origins + np.where(opaque, rendering.depth.reshape(-1), 0)[:, None] * directions)[opaque, 0]
-    right = x > scene.aabb[:, 0].mean()
-    assert right.any() and not right.all()
-    assert red.reshape(-1)[opaque][right].mean() > 0.8 and not red.reshape(-1)[opaque][~right].any()
-    late = motion_colours(scene, camera, 0.8, reference.render(scene, camera, 0.8))
-    assert np.ptp(late.rgb, axis=2).max() < 0.1

@@ -7,7 +7,8 @@
     kprender scene.kpc --time 0.5 --size 960x720 -o still.png
     kprender scene.kpc --from 2 --to 4 --fps 60 -o slow.mov   two seconds of the clip as ProRes
     kprender scene.kpc --background transparent -o cut.webm   with alpha
-    kprender scene.kpc --dynamic-map -o moves.mp4             moving content in colour, static content in grey
+    kprender scene.kpc --static-only --time 0 -o plate.png    without what moves
+    kprender scene.kpc --dynamic-only --background transparent -o moves.mov
     kprender scene.kpc --appearance dawn.jpg:dusk.jpg:0.3 -o clip.mp4
 
 The player saves files for --cameras and --path.
@@ -59,7 +60,9 @@ def _command(argv: list[str]) -> None:
     _say(renderer)
 
     def picture(number: int) -> Rendering:
-        return mean_picture(render, shots.instants(number), options.samples, is_transparent)
+        # a matte is opacity, of which the mean is taken as it is
+        has_opacity = is_transparent or options.content == "matte"
+        return mean_picture(render, shots.instants(number), options.samples, has_opacity)
 
     started = clock.monotonic()
     if film is not None:
@@ -89,14 +92,20 @@ def _film_format(output: Output, options: argparse.Namespace) -> FilmFormat | No
 
 
 def _resolve_background(output: Output, options: argparse.Namespace) -> bool:
-    """Set the background to black where it is transparent, and return whether it is."""
-    is_drawing = options.dynamic_map or options.part is not Part.FULL or (options.depth and output.is_film)
+    """Set the background to black where it is transparent, and return whether it is.
+
+    A matte is shown by opacity; it has no background.
+    """
+    is_drawing = (options.depth and output.is_film) or options.content in ("map", "matte")
+    is_drawing |= options.part is not Part.FULL
+    if options.content == "matte" and output.suffix == ".exr":
+        raise UsageError(f"-o {options.output}: the matte is the channel A of --dynamic-only; or give .png")
+    if is_drawing and options.background is not None:
+        raise UsageError("--background: depth films, --dynamic-map, --matte and --diagnose have none; leave it out")
     if options.background is None and output.suffix == ".exr" and not is_drawing:
         options.background = "transparent"
     if not isinstance(options.background, str):
         return False
-    if is_drawing:
-        raise UsageError("--background transparent: depth films, --dynamic-map and --diagnose are opaque")
     if output.suffix in (".jpg", ".jpeg"):
         raise UsageError(f"-o {options.output}: JPEG has no alpha; give .png or .exr, or a background colour")
     options.background = np.zeros(3, np.float32)

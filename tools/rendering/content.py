@@ -12,12 +12,14 @@ from kpc.format.container.groups import GroupedScene
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
-from kpc.player.cpu.motion_map import motion_colours
 from kpc.player.cpu.reference import Rendering
 from kpc.player.quality import LEVELS
+from kpc.tools.rendering.clean_plate import CleanPlates, matte, motion_colours
 
 # Renders a camera's picture at a time in [0, 1] over the clip.
 Render = Callable[[Camera, float], Rendering]
+# Contents that are drawn over black, not over the scene's background.
+BLACK_BEHIND = ("moving", "matte")
 # Draws a scene, one of those needed at a time of the clip, at a time of its own.
 Draw = Callable[[Scene, Camera, float, Sequence[Scene]], Rendering]
 
@@ -29,20 +31,37 @@ def renderer_of(loaded: Scene | GroupedScene, options: argparse.Namespace) -> tu
     """
     appearance_of(loaded.at(0.0)[0], options.appearance)  # reports an unknown name at once
     draw, name = _reference_drawing(options) if options.backend == "reference" else _gl_drawing(options)
+    needed: list[Scene] = []
+    plates = CleanPlates(lambda scene, camera, time: draw(scene, camera, time, needed))
 
     def render(camera: Camera, time: float) -> Rendering:
         parts, pictures = loaded.blend_at(time), []
+        needed[:] = [scene for scene, *_ in parts]
         for scene, local_time, share in parts:
-            picture = draw(scene, camera, local_time, [one for one, *_ in parts])
-            if options.dynamic_map:
-                picture = motion_colours(scene, camera, local_time, picture)
-            elif options.background is not None:
+            if options.content == "plate":
+                picture = plates.of(scene, camera)
+            else:
+                picture = draw(scene, camera, local_time, needed)
+                if options.content is not None:
+                    picture = _what_moves(scene, picture, matte(picture, plates.of(scene, camera)), options.content)
+            if options.background is not None:
                 uncovered = (1 - picture.opacity)[..., None]
-                picture = replace(picture, rgb=picture.rgb + uncovered * (options.background - scene.background))
+                behind = np.zeros(3, np.float32) if options.content in BLACK_BEHIND else scene.background
+                picture = replace(picture, rgb=picture.rgb + uncovered * (options.background - behind))
             pictures.append((picture, share))
         return reference.blend(pictures)
 
     return render, name
+
+
+def _what_moves(scene: Scene, picture: Rendering, share: np.ndarray, content: str) -> Rendering:
+    """Show of a picture what moves, given how much of each pixel does: as a map, a matte, or cut out over black."""
+    if content == "map":
+        return motion_colours(picture, share)
+    if content == "matte":
+        return replace(picture, rgb=np.repeat(share[..., None], 3, axis=2), opacity=share)
+    covering = picture.rgb - (1 - picture.opacity)[..., None] * scene.background
+    return replace(picture, rgb=share[..., None] * covering, opacity=share * picture.opacity)
 
 
 def _gl_drawing(options: argparse.Namespace) -> tuple[Draw, str]:

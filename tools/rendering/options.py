@@ -133,11 +133,13 @@ def _add_content(group: argparse._ArgumentGroup) -> None:
         "contains depth as channel Z",
     )
     part = group.add_mutually_exclusive_group()
-    part.add_argument(
-        "--dynamic-map",
-        action="store_true",
-        help="colour for content that differs from that at other times, grey for the rest",
-    )
+    for option, content, text in (
+        ("--static-only", "plate", "the clean plate: what is seen when what moves is gone"),
+        ("--dynamic-only", "moving", "what moves and its shadow, cut out, over black or --background"),
+        ("--matte", "matte", "how much of each pixel moves, white on black"),
+        ("--dynamic-map", "map", "what moves in colour, all else in grey"),
+    ):
+        part.add_argument(option, action="store_const", const=content, dest="content", help=text)
     part.add_argument(
         "--diagnose",
         dest="part",
