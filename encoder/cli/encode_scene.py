@@ -35,6 +35,10 @@ MAX_CAMERAS = 32  # cameras of the dataset that the file holds
 MAX_SLOTS = 8  # time slots of the occupancy, before they are merged
 
 
+class Abandoned(KeyboardInterrupt):
+    """The user pressed Ctrl-C again within a training step, whose half-made changes are not worth saving."""
+
+
 def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     """Train on a dataset and write the file; return what was measured."""
     started = time.monotonic()
@@ -42,6 +46,8 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     dataset, work, checkpoint = trainer.dataset, options.work_dir, options.work_dir / CHECKPOINT
     try:
         _train(trainer, checkpoint, options.time_budget_s)
+    except Abandoned:
+        raise
     except KeyboardInterrupt:
         trainer.save(checkpoint)
         if not _wants_partial(trainer, checkpoint, may_ask=options.group_s is None):
@@ -157,9 +163,20 @@ def _select_cameras(dataset: Dataset) -> list[int]:
 
 
 def _train(trainer: Trainer, checkpoint: Path, time_budget_s: float | None) -> None:
-    """Train to the end, or until Ctrl-C, which waits for the current step."""
+    """Train to the end, or until Ctrl-C, which waits for the current step.
+
+    Raises:
+        Abandoned: a second Ctrl-C came before the step's end.
+        KeyboardInterrupt: the step has ended after a Ctrl-C.
+    """
     requests: list[int] = []
-    with Progress("train", total=1000, unit="‰") as progress, handle_signals(lambda number, _: requests.append(number)):
+
+    def note(number: int, _: Any) -> None:
+        if requests:
+            raise Abandoned
+        requests.append(number)
+
+    with Progress("train", total=1000, unit="‰") as progress, handle_signals(note):
         trainer.run(
             lambda report: show_progress(progress, report),
             checkpoint,

@@ -23,11 +23,12 @@ from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.field import kernels
 from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.field.field import Field, Layout
-from kpc.encoder.field.fused import log_densities, max_samples_per_ray, planes_of, ray_batch, volume_of
+from kpc.encoder.field.fused import count_samples, log_densities, max_samples_per_ray, planes_of, ray_batch, volume_of
 from kpc.encoder.field.kernels import compilation
 from kpc.encoder.field.priors import plane_priors
 from kpc.encoder.field.render import Rays, render_reference
 from kpc.encoder.training.optimisers import BETA1, BETA2, EPSILON, add_prior_gradients
+from kpc.format.container.scene_layout import SAMPLE_LIMIT
 from kpc.player.cpu import reference
 from scenes import tiny_scene, with_motion
 
@@ -110,6 +111,19 @@ def test_rays_that_miss_the_box_show_the_background() -> None:
     away = replace(rays, origins=rays.origins + 100)
     ours = backpropagate(scene, away, away.backgrounds)
     assert not ours["counts"].any() and not ours["errors"].any() and not ours["theta"].any() and not ours["basis"].any()
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_marching_ends_on_rays_that_are_none(contracted: bool) -> None:
+    """Directions of 0 and NaN leave no box, and in a step that is too small s no longer grows."""
+    scene = translucent_scene(contracted=contracted)
+    rays = random_rays(scene, 6)
+    rays.directions[:2], rays.directions[2], rays.origins[3] = 0, math.nan, math.nan
+    for occupied in (False, True):
+        occupancy = np.full_like(scene.occupancy, occupied)
+        for step in (scene.step, 1e-12):
+            counts = count_samples(rays, scene.aabb, occupancy, step, scene.mapping)
+            assert (counts <= SAMPLE_LIMIT + 2).all() and (occupied or not counts.any())
 
 
 def test_the_reference_gradient_matches_finite_differences() -> None:

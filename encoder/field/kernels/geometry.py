@@ -11,7 +11,10 @@ from kpc.format.scene.space import FAR
 
 @bare
 def box_span(origin, direction, aabb):
-    """Return the distances at which a ray enters (at least 0) and leaves the box; leaves <= enters where it misses."""
+    """Return the distances at which a ray enters (at least 0) and leaves the box; leaves <= enters where it misses.
+
+    The distances are always finite, so that marching between them ends.
+    """
     near, far = np.float32(0.0), np.float32(np.inf)
     for axis in range(3):
         d = direction[axis]
@@ -23,6 +26,8 @@ def box_span(origin, direction, aabb):
         t1 = (aabb[1, axis] - origin[axis]) / d
         near = max(near, min(t0, t1))
         far = min(far, max(t0, t1))
+    if not far < np.inf:  # a direction of 0 or NaN
+        return np.float32(0.0), np.float32(0.0)
     return near, far
 
 

@@ -9,10 +9,14 @@ from kpc.encoder.field.kernels.arguments import RayBuffers
 from kpc.encoder.field.kernels.compilation import bare, inlined, parallel, plain
 from kpc.encoder.field.kernels.geometry import cell_index, inverse_edges, ray_distance, ray_point, ray_span
 from kpc.encoder.field.kernels.planes import combine_planes, dot, sample_displaced
+from kpc.format.container.scene_layout import SAMPLE_LIMIT
 from kpc.format.scene.scene import LOG_DENSITY_LIMIT, TERMINATION
 
 LIMIT = np.float32(LOG_DENSITY_LIMIT)
 END_TRANSMITTANCE = np.float32(TERMINATION)
+
+# No ray takes more steps, whatever its numbers are, so that every kernel ends and Ctrl-C is heard.
+MOST_STEPS = SAMPLE_LIMIT + 2
 
 # A sample of less weight than this gets no colour: 4096 of them could not make up one and a half 8-bit levels.
 NEGLIGIBLE = np.float32(1e-4)
@@ -69,7 +73,7 @@ def march_ray(planes, density, volume, origin, direction, time, jitter, buffers)
     trans = np.float32(1.0)
     count = 0
     k = 0
-    while count < buffers.weights.size:
+    while count < buffers.weights.size and k < MOST_STEPS:
         s = near + (np.float32(k) + jitter) * volume.step
         k += 1
         if not s < far:
@@ -159,11 +163,11 @@ def collect_ray(volume, origin, direction, time, jitter, start, out):
     occupied = volume.occupancy[min(int(time * slots), slots - 1)]
     inverse = inverse_edges(volume.aabb)
     count, k = 0, 0
-    while True:
+    while k < MOST_STEPS:
         s = near + (np.float32(k) + jitter) * volume.step
         k += 1
         if not s < far:
-            return count
+            break
         t = ray_distance(s, volume.uniform_distance)
         u, v, w, scale = ray_point(origin, direction, t, volume.aabb, inverse, volume.uniform_distance)
         cell = cell_index(occupied, u, v, w)
@@ -175,6 +179,7 @@ def collect_ray(volume, origin, direction, time, jitter, start, out):
             out.s[n], out.density_scale[n] = s, scale
             out.cells[n, 0], out.cells[n, 1], out.cells[n, 2] = cell
         count += 1
+    return count
 
 
 @parallel
