@@ -313,17 +313,25 @@ class Reader:
         if size > length:
             raise FormatError(f"{self.name}: {size - length} bytes follow the end of the file")
         if size < length and not allow_partial:
-            raise FormatError(f"{self.name}: cut off at {size} of {length} bytes; fetch the file again")
+            raise FormatError(f"{self._cut_off(header)}; fetch the file again")
         if max(header.value_count, header.largest_raw) > length * EXPANSION_LIMIT:
             raise FormatError(
                 f"{self.name}: claims {header.value_count:,} values and chunks of {header.largest_raw:,} bytes, "
                 f"more than {length:,} bytes can hold"
             )
 
+    @property
+    def cut_off(self) -> str | None:
+        """How much of the file is there, for messages, if its end is missing; else None."""
+        return self._cut_off(self.header) if self.source.size < self.header.file_length else None
+
+    def _cut_off(self, header: Header) -> str:
+        return f"{self.name}: cut off at {self.source.size:,} of {header.file_length:,} bytes"
+
     def _read_index(self) -> tuple[Entry, ...]:
         header = self.header
         if self.source.size < HEADER.size + header.index_length:
-            raise FormatError(f"{self.name}: cut off within the chunk index; fetch the file again")
+            raise FormatError(f"{self._cut_off(header)}, within the chunk index; fetch the file again")
         index = self.source.read_at(HEADER.size, header.index_length)
         if google_crc32c.value(index) != header.index_crc:
             raise FormatError(f"{self.name}: the chunk index is damaged (its CRC32C differs); fetch the file again")
@@ -359,7 +367,8 @@ class Reader:
         with self._reading:
             body = self.source.read_at(entry.offset, entry.stored_length)
         if len(body) != entry.stored_length:
-            raise FormatError(f"{self.name}: chunk {number} ({entry.kind}) is not there; fetch the file again")
+            cut_off = self._cut_off(self.header)
+            raise FormatError(f"{cut_off}: chunk {number} ({entry.kind}) is not there; fetch the file again")
         if google_crc32c.value(body) != entry.crc:
             is_remote = isinstance(self.source, RemoteSource)
             remedy = (

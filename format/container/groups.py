@@ -257,9 +257,10 @@ class Groups:
         return sliced(source, entry.offset, entry.stored_length, f"{self.name}, group {number}")
 
     def _opened(self, number: int, source: Source) -> SceneReader:
-        return SceneReader(
-            source, memory_budget=self._budget, allow_partial=not self.available(number), in_parts=self._in_parts
-        )
+        is_partial = not self.available(number)
+        if is_partial and source.size < HEADER.size:
+            raise FormatError(f"{self.reader.cut_off}: group {number} is not there; fetch the file again")
+        return SceneReader(source, memory_budget=self._budget, allow_partial=is_partial, in_parts=self._in_parts)
 
     def _check(self, number: int, scene: SceneReader) -> None:
         clip, span = scene.head.clip, self.timeline.spans[number]

@@ -137,6 +137,9 @@ def _play(
         while True:
             window.set_title(f"{Path(stream.source.name).name} - kpplay")
             player = Player(window, stream, settings, resume_from=interrupted, folder=Path(options.folder))
+            if stream.notice is not None and interrupted is None:
+                print(f"kpplay: {stream.notice}", file=sys.stderr)
+                player.state.notify(stream.notice)
             if path is not None:
                 player.state.follower.replace(path)
             path = interrupted = None

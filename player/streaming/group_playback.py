@@ -66,7 +66,7 @@ class GroupPlayback:
         self, source: Source, *, memory: int = DEFAULT_BUDGET, arrived: Callable[[], None] = lambda: None
     ) -> None:
         self.source, self.memory, self._arrived = source, memory, arrived
-        self.groups = Groups(source, memory_budget=memory, in_parts=True)
+        self.groups = Groups(source, memory_budget=memory, allow_partial=True, in_parts=True)
         self.timeline, self.clip = self.groups.timeline, self.groups.clip
         self._group_memory = memory if self.groups.is_single else memory // 2
         self._shown = LoadedGroup(0, Stream(self.groups.open(0), memory=self._group_memory, arrived=arrived))
@@ -88,6 +88,12 @@ class GroupPlayback:
     def stream(self) -> Stream:
         """The stream of the group that is shown."""
         return self._shown.stream
+
+    @property
+    def notice(self) -> str | None:
+        """A line for the user about a file whose end is missing; None if it is whole."""
+        cut_off = self.groups.reader.cut_off
+        return None if cut_off is None else f"{cut_off}; what is there is played"
 
     @property
     def scene(self) -> Scene:

@@ -95,8 +95,10 @@ class Stream:
         self._stored = np.array([self.parts.entry(number).stored_length for number in self.parts.numbers])
         self._requested = np.zeros(len(self._stored), bool)  # fetched or being fetched, and not dropped since
         self._loaded = np.zeros(len(self._stored), bool)  # uploaded, or put into the scene
-        self._head, self._keep = Playhead(), segments_to_keep(self.parts, Playhead(), self._segment_memory)
-        self._exceeds_memory = not self._keep.all()
+        # Segments beyond the end of a file that is cut off are never fetched, nor waited for.
+        self._missing = np.array([not self._reader.available(int(number)) for number in self.parts.numbers])
+        self._head, fitting = Playhead(), segments_to_keep(self.parts, Playhead(), self._segment_memory)
+        self._keep, self._exceeds_memory = fitting & ~self._missing, not fitting.all()
         self._finished: deque[Piece] = deque()
         self._change = threading.Condition()
         self._closed = False
@@ -118,7 +120,7 @@ class Stream:
         with self._change:
             self._head = head
             if self._exceeds_memory:
-                self._keep = segments_to_keep(self.parts, head, self._segment_memory)
+                self._keep = segments_to_keep(self.parts, head, self._segment_memory) & ~self._missing
                 self._drop(self._loaded & ~self._keep)
             if (self._keep & ~self._requested).any():
                 self._change.notify_all()

@@ -13,6 +13,7 @@ import pytest
 
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.images import read_image
+from kpc.format.container.container import Reader
 from kpc.format.container.scene_io import write
 from kpc.tools.cli.serve import Handler, serving
 from scenes import tiny_scene, with_appearances
@@ -145,6 +146,18 @@ def test_a_failing_server_is_reported_in_the_window(scene_file: Path, display: s
         read_image(screenshot).astype(int)[22:38, 250:390] for screenshot in pictures
     )  # where the message is, right of the HUD
     assert failed.max() > 200 > 100 > failed.min() and np.abs(whole - failed).max() > 100
+
+
+def test_a_file_that_is_cut_off_plays_as_far_as_it_goes(scene_file: Path, display: str, tmp_path: Path) -> None:
+    cut, picture = tmp_path / "cut.kpc", tmp_path / "cut.png"
+    reader = Reader(scene_file)
+    cut.write_bytes(scene_file.read_bytes()[: reader.index[-2].offset + 10])
+    done = kpplay(cut, "--size", "400x300", "--frames", 2, "--screenshot", picture, display=display)
+    assert done.returncode == 0 and picture.is_file(), done.stderr
+    assert f"kpplay: {cut}: cut off at " in done.stderr and "; what is there is played" in done.stderr
+    cut.write_bytes(scene_file.read_bytes()[: reader.index[1].offset + 1])
+    done = kpplay(cut, display=display)
+    assert done.returncode == 1 and "cut off at" in done.stderr and "is not there" in done.stderr
 
 
 def test_long_playback_allocates_nothing_on_the_card(scene_file: Path, display: str) -> None:
