@@ -23,11 +23,9 @@ import urllib3
 
 from kpc.format.common.errors import BudgetError, InterruptedRead, NetworkError, UnreachableError
 from kpc.format.common.memory import DEFAULT_BUDGET
-from kpc.format.container.http_address import is_url, printable
+from kpc.format.container.http_address import printable
 from kpc.format.container.http_client import HttpClient, TemporaryFailure, describe_failure
 from kpc.format.container.http_headers import length_of, range_of, retry_after, validator_of
-
-__all__ = ["HttpSource", "is_url", "report_on_stderr"]
 
 # Requested on opening: enough for header and index of 1600 chunks, or for the first coarse picture of a short clip.
 FIRST_BYTES = 1 << 16

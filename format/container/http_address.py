@@ -60,8 +60,12 @@ class Address:
             ) from None
         netloc = (f"[{shown}]" if ":" in shown else shown) + (f":{port}" if port is not None else "")
         name = printable(urlunsplit((parts.scheme, netloc, parts.path, "", "")))
-        if parts.scheme not in SCHEMES or not host:
-            raise NetworkError(f"{name}: no http or https address; check it")
+        if parts.scheme not in SCHEMES:
+            raise NetworkError(
+                f"{name}: no http or https address; other schemes cannot be read, so download it or give its path"
+            )
+        if not host:
+            raise NetworkError(f"{name}: no http or https address, since it names no host; check it")
         netloc = (f"[{host}]" if ":" in host else host) + (f":{port}" if port is not None else "")
         url = urlunsplit((parts.scheme, netloc, _encoded(parts.path), _encoded(parts.query), ""))
         port = DEFAULT_PORTS[parts.scheme] if port is None else port

@@ -2,11 +2,13 @@
 
 import io
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, Protocol, runtime_checkable
 
 from kpc.format.common.memory import DEFAULT_BUDGET
+from kpc.format.container.http_address import Address, is_url
 
 
 @runtime_checkable
@@ -64,20 +66,21 @@ AnySource = str | os.PathLike[str] | bytes | BinaryIO | Source  # what `open_sou
 
 
 def open_source(source: AnySource, *, limit: int = DEFAULT_BUDGET) -> Source:
-    """Open a path, an http or https URL, the bytes themselves, a seekable binary file, or return a `Source` unchanged.
+    """Open a path, an http or https address, bytes, or a seekable binary file; return a `Source` unchanged.
 
     Args:
         limit: bytes of memory that a file may take if its server has no range requests.
 
     Raises:
         OSError: the file cannot be read.
-        NetworkError: the server cannot be reached or does not have the file.
+        NetworkError: the server cannot be reached or does not have the file, or the address has another scheme.
     """
-    if isinstance(source, str) and "://" in source:
-        from kpc.format.container.http import HttpSource, is_url  # imported late: the HTTP client is slow to load
+    if isinstance(source, str) and is_url(source):
+        from kpc.format.container.http import HttpSource  # imported late: the HTTP client is slow to load
 
-        if is_url(source):
-            return HttpSource(source, limit=limit)
+        return HttpSource(source, limit=limit)
+    if isinstance(source, str) and re.match(r"\s*[A-Za-z][A-Za-z0-9+.-]+://", source) and not os.path.exists(source):
+        Address.parse(source)  # raises the error that names the schemes
     if isinstance(source, (str, os.PathLike)):
         return _FileSource(Path(source))
     if isinstance(source, (bytes, bytearray, memoryview)):
