@@ -49,11 +49,21 @@ def run(command: Callable[[list[str]], None], name: str, argv: list[str] | None 
         sys.stderr.close()  # The reader of the output is gone; Python must not complain on exit.
         return 1
     except OSError as error:
-        if error.filename is None and error.errno != errno.ENOSPC:
+        message = message_of(error)
+        if message is None:
             raise
-        where = f"{error.filename}: " if error.filename is not None else ""
-        return _fail(name, f"{where}{error.strerror or error}", 1)
+        return _fail(name, message, 1)
     return 0
+
+
+def message_of(error: KpcError | OSError) -> str | None:
+    """Return what to tell the user about an error; None if it is a bug: an OSError without a file or a full disk."""
+    if isinstance(error, KpcError):
+        return str(error)
+    if error.filename is None and error.errno != errno.ENOSPC:
+        return None
+    where = f"{error.filename}: " if error.filename is not None else ""
+    return f"{where}{error.strerror or error}"
 
 
 def add_version_option(parser: argparse.ArgumentParser) -> None:
@@ -156,9 +166,9 @@ def decibels(text: str) -> float:
 
 
 def byte_count(text: str) -> int:
-    """Parse a size such as "300000", "300KB" (1 KB = 1,000 bytes) or "2MB" into bytes."""
+    """Parse a size such as "300000", "300KB" (1 KB = 1,000 bytes), "2MB" or "1.5GB" into bytes."""
     number = text.upper().removesuffix("B")
-    unit = {"K": 10**3, "M": 10**6}.get(number[-1:], 1)
+    unit = {"K": 10**3, "M": 10**6, "G": 10**9}.get(number[-1:], 1)
     try:
         value = float(number[:-1] if unit > 1 else number) * unit
     except ValueError:

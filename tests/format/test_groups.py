@@ -101,7 +101,7 @@ def test_the_motion_map_and_kpinfo_describe_the_group_shown(clip, scenes, tmp_pa
         assert kprender.main([str(clip), "--dynamic-map", "--time", str(time), *small]) == 0
         capsys.readouterr()
         assert kpinfo.main([str(clip), "--group", str(number), "--json"]) == 0
-        shares = json.loads(capsys.readouterr().out)["static"]
+        shares = json.loads(capsys.readouterr().out)["files"][0]["groups"][number]["scene"]["static"]
         alone, camera = kpc.load(scenes[number]), fit_camera(kpc.load(clip).cameras[0], 24, 18)
         plate = CleanPlates(reference.render).of(alone, camera)
         shown = reference.render(alone, camera, own)
@@ -152,7 +152,7 @@ def test_a_truncated_file_has_the_groups_before_the_cut(clip):
     assert [partial.available(number) for number in range(3)] == [True, False, False]
     assert scene_io.read(partial.open(0)).clip.frame_count == 11
     assert partial.open(1).head.clip.frame_count == 11  # its head is complete
-    with pytest.raises(FormatError):
+    with pytest.raises(FormatError, match=r"cut off at .* group 2 is not there"):
         partial.open(2)
 
 
@@ -227,22 +227,26 @@ def test_files_that_do_not_make_up_a_clip_are_refused(clip, scenes, tmp_path, ca
 def test_kpinfo_lists_the_groups(clip, capsys):
     assert kpinfo.main([str(clip), "--verify"]) == 0
     page = capsys.readouterr().out
-    assert "30 frames at 10 fps, 2.90 s, in 3 groups" in page and "verified" in page
+    assert "30 frames at 10 fps, 3.00 s, in 3 groups" in page and "verified" in page
     assert kpinfo.main([str(clip), "--json"]) == 0
-    info = json.loads(capsys.readouterr().out)
+    (info,) = json.loads(capsys.readouterr().out)["files"]
     assert [group["frames"] for group in info["groups"]] == [[0, 10], [8, 18], [19, 29]]
-    assert [group["shown_s"] for group in info["groups"]] == [[0, 0.9], [0.9, 1.85], [1.85, 2.9]]
+    assert [group["shown_s"] for group in info["groups"]] == [[0, 0.9], [0.9, 1.85], [1.85, 3.0]]
     assert kpinfo.main([str(clip), "--group", "1"]) == 0
-    assert "11 frames at 10 fps" in capsys.readouterr().out
+    assert "group 1     frames 8-18, shown from 0.90 to 1.85 s" in capsys.readouterr().out
     assert kpinfo.main([str(clip), "--group", "3"]) == 2
+    assert "there is no group 3: it has 3 groups, numbered from 0" in capsys.readouterr().err
 
 
 def test_kpinfo_finds_a_damaged_group(clip, tmp_path, capsys):
     data = bytearray(clip.read_bytes())
     data[-5] ^= 1
     (tmp_path / "damaged.kpc").write_bytes(data)
-    assert kpinfo.main([str(tmp_path / "damaged.kpc"), "--verify"]) == 1
-    assert "group 2" in capsys.readouterr().err
+    assert kpinfo.main([str(tmp_path / "damaged.kpc"), "--verify", "--json"]) == 1
+    captured = capsys.readouterr()
+    (info,) = json.loads(captured.out)["files"]
+    assert "group 2" in captured.err and "group 2" in info["error"] and not info["verified"]
+    assert [chunk["group"] for chunk in info["damaged_chunks"]] == [2] and len(info["groups"]) == 3
 
 
 @pytest.mark.parametrize("backend", ["reference", "gl"])

@@ -54,7 +54,7 @@ def test_kpinfo_prints_the_fractions(tmp_path: Path, capsys: pytest.CaptureFixtu
     scene = with_changed_texels(box_of_cells(), "xt", slice(4, 5), slice(6, 7))
     write(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]), tmp_path / "scene.kpc")
     assert kpinfo.main([str(tmp_path / "scene.kpc"), "--json"]) == 0
-    shares = json.loads(capsys.readouterr().out)["static"]
+    shares = json.loads(capsys.readouterr().out)["files"][0]["groups"][0]["scene"]["static"]
     assert shares["identity_share"] == 0.75 and shares["constant_share"] == 0.5 <= shares["motionless_share"] <= 1
     assert kpinfo.main([str(tmp_path / "scene.kpc")]) == 0
     page = capsys.readouterr().out

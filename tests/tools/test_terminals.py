@@ -51,7 +51,7 @@ def test_commands(folder: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
         out, err = (stream.buffer.getvalue().decode("ascii") for stream in streams)
         assert code == 0, (command, err)
         if "--json" in arguments:
-            assert json.loads(out)["file"].endswith("caf\ufffd/scene.kpc")
+            assert json.loads(out)["files"][0]["file"].endswith("caf\ufffd/scene.kpc")
 
 
 def test_a_locale_that_is_not_utf8(folder: bytes) -> None:

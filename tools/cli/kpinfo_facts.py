@@ -1,0 +1,315 @@
+"""What kpinfo says about a .kpc file, as plain data that becomes JSON: docs/kpinfo.schema.json describes it.
+
+Shares are in [0, 1], times in seconds, sizes in bytes. What is not known is None.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.common import cli
+from kpc.format.common.errors import FormatError, KpcError, NetworkError, UsageError
+from kpc.format.container.container import Codec, Entry
+from kpc.format.container.groups import Groups
+from kpc.format.container.http_address import Address
+from kpc.format.container.scene_io import SceneReader, read
+from kpc.format.container.sources import open_source
+from kpc.format.scene.motion import QuantisedMotion
+from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, Clip, HybridDecoder
+from kpc.format.scene.space import FAR, Contraction, SpaceMapping
+from kpc.format.scene.static import constant_fraction, static_fraction
+from kpc.player.cpu.motion_map import motionless_share
+
+# The version of the structure of the JSON; it grows whenever a key is renamed, removed or changes its meaning.
+SCHEMA = 1
+
+CODEC_NAMES = {codec.value: codec.name for codec in Codec}
+
+# Number of damaged chunks that an error names.
+DAMAGED_SHOWN = 10
+
+
+def examine(file: str, *, memory: int, group: int | None, verify: bool, details: bool) -> dict[str, Any]:
+    """Return what there is to say about a file. If it cannot be read, `error` says why.
+
+    Args:
+        file: a path or an http address.
+        memory: bytes that one group may take.
+        group: number of the group of which the scene is described; None: that of a file without groups.
+        verify: whether to check all checksums and decode everything, or the one group.
+        details: whether to describe the scene, which takes decoding it.
+
+    Raises:
+        UsageError: there is no such group.
+    """
+    info: dict[str, Any] = {
+        "file": _shown(file),
+        "error": None,
+        "verified": False,
+        "damaged_chunks": [],
+        "version": None,
+        "size_bytes": None,
+        "expected_bytes": None,
+        "clip": None,
+        "cameras": None,
+        "groups": [],
+    }
+    try:
+        source = open_source(file, limit=memory)
+        info |= {"file": source.name, "size_bytes": source.size}
+        groups = Groups(source, memory_budget=memory, allow_partial=True)
+        if group is not None and not 0 <= group < len(groups):
+            raise UsageError(
+                f"{groups.name}: there is no group {group}: it has {counted(len(groups), 'group')}, numbered from 0"
+            )
+        header, clip = groups.reader.header, groups.clip
+        info |= {"version": header.version, "expected_bytes": header.file_length, "clip": _clip(clip)}
+        info["groups"] = [_group(groups, number) for number in range(len(groups))]
+        info["clip"]["is_dynamic"] = any(one["is_dynamic"] for one in info["groups"])
+        info["cameras"] = len(groups.cameras())
+        if verify:
+            _verify(groups, range(len(groups)) if group is None else [group], info)
+        if details and (group is not None or groups.is_single):
+            reader = groups.open(group or 0)
+            described = describe(reader, read(reader, memory_budget=memory, allow_partial=True))
+            info["groups"][group or 0]["scene"] = described
+    except UsageError:
+        raise
+    except (KpcError, OSError) as error:
+        message = cli.message_of(error)
+        if message is None:
+            raise
+        info["error"] = message
+    return info
+
+
+def totals(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return sums over the files that could be read, as far as they are known."""
+    clips = [info["clip"] for info in files if info["clip"] is not None]
+    return {
+        "files": len(files),
+        "failed": sum(info["error"] is not None for info in files),
+        "size_bytes": sum(info["size_bytes"] or 0 for info in files),
+        "frame_count": sum(clip["frame_count"] for clip in clips),
+        "duration_s": sum(clip["duration_s"] for clip in clips),
+        "groups": sum(len(info["groups"]) for info in files),
+    }
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless it is one."""
+    return f"{count:,} {noun}" + "s" * (count != 1)
+
+
+def _shown(file: str) -> str:
+    """Return a path as it is, and an address without what is secret."""
+    if "://" not in file:
+        return file
+    try:
+        return Address.parse(file).name
+    except NetworkError:
+        return f"{file.partition('://')[0]}://..."
+
+
+def _clip(clip: Clip) -> dict[str, Any]:
+    return {"frame_count": clip.frame_count, "fps": clip.fps, "duration_s": clip.frame_count / clip.fps}
+
+
+def _group(groups: Groups, number: int) -> dict[str, Any]:
+    """Return what header, index and SCNE of a group say; the group of a file without groups is the whole file."""
+    span, clip = groups.timeline.spans[number], groups.clip
+    since, until = (time * clip.duration_s for time in groups.timeline.display_span(number))
+    if number == len(groups) - 1:
+        until = clip.frame_count / clip.fps  # The last frame is shown as long as the others.
+    head = groups.open(number).head if groups.available(number) else None
+    is_complete = head is not None and (not groups.is_single or groups.reader.source.size >= groups.size_bytes[0])
+    return {
+        "number": number,
+        "frames": [span.start, span.last],
+        "shown_s": [round(since, 6), round(until, 6)],
+        "stored_bytes": groups.size_bytes[number],
+        "is_complete": is_complete,
+        "value_count": head.value_count if head else None,
+        "scale_count": len(head.scales) if head else None,
+        "is_dynamic": head.is_dynamic if head else None,
+        "scene": None,
+    }
+
+
+def _verify(groups: Groups, numbers: Sequence[int], info: dict[str, Any]) -> None:
+    """Check the CRC32C of every chunk and decode all chunks of known kinds; set `verified` and `damaged_chunks`.
+
+    Raises:
+        FormatError: chunks are damaged, or the end of the file is missing.
+    """
+    if info["size_bytes"] < info["expected_bytes"]:
+        raise FormatError(
+            f"{groups.name}: cut off at {info['size_bytes']:,} of {info['expected_bytes']:,} bytes; "
+            "fetch the file again"
+        )
+    errors, found = [], info["damaged_chunks"]
+    groups.reader.source.will_read(0, groups.reader.source.size)
+    for number in numbers:
+        damaged = _damaged_chunks(groups.open(number))
+        errors += [error for *_, error in damaged]
+        place = None if groups.is_single else number
+        found += [{"group": place, "chunk": chunk, "kind": kind} for chunk, kind, _ in damaged]
+    if not groups.is_single and not found:  # what lies around and between the groups
+        for chunk, entry in enumerate(groups.reader.index):
+            if entry.kind != "GRUP" or entry.group in numbers:
+                try:
+                    groups.reader.stored(chunk)
+                except FormatError as error:
+                    errors.append(error)
+                    found.append({"group": None, "chunk": chunk, "kind": entry.kind})
+    if len(errors) > 1:
+        named = [
+            f"{one['chunk']} ({one['kind']})" + (f" of group {one['group']}" if one["group"] is not None else "")
+            for one in found
+        ]
+        listed = ", ".join(named[:DAMAGED_SHOWN]) + ", ..." * (len(named) > DAMAGED_SHOWN)
+        raise FormatError(f"{groups.name}: {len(found)} chunks are damaged: {listed}; fetch the file again")
+    if errors:
+        raise errors[0]
+    info["verified"] = True
+
+
+def _damaged_chunks(reader: SceneReader) -> list[tuple[int, str, FormatError]]:
+    """Return the number, kind and error of each damaged chunk of a scene.
+
+    Raises:
+        FormatError: no chunk is damaged, but what they hold is not valid.
+    """
+    damaged = []
+    for number, entry in enumerate(reader.index):
+        try:
+            reader.segment(number) if entry.kind == "PLNE" else reader.stored(number)
+        except FormatError as error:
+            damaged.append((number, entry.kind, error))
+    if not damaged:
+        reader.mapping(), reader.motion(), reader.decoder(), reader.occupancy(), reader.cameras(), reader.appearances()
+    return damaged
+
+
+def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
+    """Return what there is to say about a decoded scene. Shares that chunks which are missing would change are None."""
+    size = reader.header.file_length
+    missing = [not reader.available(number) for number in range(len(reader.index))]
+    is_whole = not any(missing)
+    partial = {
+        (entry.scale, ALL_PLANES[entry.plane])
+        for entry, gone in zip(reader.index, missing, strict=True)
+        if gone and entry.kind == "PLNE"
+    }
+    return {
+        "missing_chunks": sum(missing),
+        "aabb": scene.aabb.tolist(),
+        "step": scene.step,
+        "space": _describe_space(scene.mapping),
+        "motion": _describe_motion(scene.motion),
+        "background": scene.background.tolist(),
+        "scales": [
+            _describe_scale(scale, {name for number, name in partial if number == s})
+            for s, scale in enumerate(scene.scales)
+        ],
+        "decoder": {
+            "kind": "hybrid" if isinstance(scene.decoder, HybridDecoder) else "explicit",
+            "hidden": len(scene.decoder.b1),
+            "features": sum(scale["xy"].symbols.shape[2] for scale in scene.scales),
+        },
+        "occupancy": {
+            "slots": scene.occupancy.shape[0],
+            "cells_zyx": list(scene.occupancy.shape[1:]),
+            "share": float(scene.occupancy.mean()),
+        },
+        "cameras": len(scene.cameras),
+        "camera_box": _camera_box(scene),
+        "appearances": [appearance.name for appearance in scene.appearances],
+        "parameter_count": scene.parameter_count,
+        "bits_per_parameter": 8 * size / scene.parameter_count,
+        "identity_share": scene.identity_share if is_whole else None,
+        "static": _describe_static(scene) if is_whole else None,
+        "uncoded_share": _uncoded_share([scale[name] for scale in scene.scales for name in SPACE_PLANES])
+        if is_whole
+        else None,
+        "overhead_bytes": size - sum(entry.stored_length for entry in reader.index),
+        "chunks": [_describe_chunk(entry, gone, size) for entry, gone in zip(reader.index, missing, strict=True)],
+    }
+
+
+def _describe_motion(motion: QuantisedMotion | None) -> dict[str, Any] | None:
+    if motion is None:
+        return None
+    rows, *nodes_zyx, _ = motion.symbols.shape
+    return {
+        "rows": rows,
+        "nodes_zyx": nodes_zyx,
+        "max_displacement": float(np.abs(motion.dequantise()).max()),
+    }
+
+
+def _describe_static(scene: QuantisedScene) -> dict[str, float]:
+    """Return the shares of occupied space where time planes are 1, where nothing changes, and where little changes."""
+    decoded = scene.dequantise()
+    return {
+        "identity_share": static_fraction(decoded),
+        "constant_share": constant_fraction(decoded),
+        "motionless_share": motionless_share(decoded),
+    }
+
+
+def _describe_space(mapping: SpaceMapping | None) -> dict[str, Any]:
+    if isinstance(mapping, Contraction):
+        return {
+            "mapping": "contracted",
+            "uniform_distance": mapping.uniform_distance,
+            "far": FAR * mapping.uniform_distance,
+        }
+    if mapping is not None:
+        return {"mapping": "ndc", "frame": mapping.frame.tolist(), "near": mapping.near, "baseline": mapping.baseline}
+    return {"mapping": "box"}
+
+
+def _describe_scale(scale: Mapping[str, QuantisedPlane], partial: set[str]) -> dict[str, Any]:
+    return {
+        "channels": scale["xy"].symbols.shape[2],
+        "planes": {
+            name: {
+                "rows": plane.symbols.shape[0],
+                "columns": plane.symbols.shape[1],
+                "coded_share": None if name in partial else float(plane.coded.mean()),
+                "mean_step": float(plane.step.mean()),
+            }
+            for name, plane in scale.items()
+        },
+    }
+
+
+def _describe_chunk(entry: Entry, missing: bool, size: int) -> dict[str, Any]:
+    is_plane = entry.kind == "PLNE"
+    return {
+        "kind": entry.kind,
+        "critical": entry.is_critical,
+        "scale": entry.scale if is_plane else None,
+        "plane": ALL_PLANES[entry.plane] if is_plane else None,
+        "rows": [entry.row_start, entry.row_start + entry.row_count - 1] if is_plane else None,
+        "codec": CODEC_NAMES.get(entry.codec, str(entry.codec)),
+        "offset": entry.offset,
+        "stored_bytes": entry.stored_length,
+        "raw_bytes": entry.raw_length,
+        "share": None if missing else entry.stored_length / size,
+        "missing": missing,
+    }
+
+
+def _camera_box(scene: QuantisedScene) -> list[list[float]] | None:
+    if not scene.cameras:
+        return None
+    positions = np.array([camera.camera_to_world[:3, 3] for camera in scene.cameras])
+    return [positions.min(0).tolist(), positions.max(0).tolist()]
+
+
+def _uncoded_share(planes: Sequence[QuantisedPlane]) -> float:
+    return 1.0 - sum(int(p.coded.sum()) for p in planes) / sum(p.coded.size for p in planes)
