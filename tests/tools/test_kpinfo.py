@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from kpc.format.coding.quantise import quantise_scene
 from kpc.format.container import groups
 from kpc.format.container.container import Reader
 from kpc.format.container.scene_io import write
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.motion import FINEST_STEP
 from kpc.player.app import kpplay
 from kpc.tools.cli import kpinfo, kprender
@@ -160,6 +162,18 @@ def test_a_scene_with_appearances(tmp_path, capsys):
     data[Reader(bytes(data)).index[4].offset + 2] ^= 1
     path.write_bytes(data)
     assert kpinfo.main([str(path), "--verify"]) == 1 and "4 (appe)" in capsys.readouterr().err
+
+
+def test_metadata_are_shown(tmp_path, capsys):
+    metadata = Metadata({"title": "A dance", "author": "M\u00fcller", "notes": {"take": 3}})
+    scene, path = replace(tiny_scene(), metadata=metadata), tmp_path / "named.kpc"
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.02) for scale in scene.scales]), path)
+    assert kpinfo.main([str(path), "--verify"]) == 0
+    page = capsys.readouterr().out
+    assert "  title       A dance\n  author      M\u00fcller\n" in page and "licence" not in page
+    assert kpinfo.main([str(path), "--json"]) == 0
+    (info,) = json_of(capsys)["files"]
+    assert info["metadata"] == metadata.document
 
 
 def test_verify_lists_every_damaged_chunk(scene_file, capsys):

@@ -54,6 +54,7 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         "expected_bytes": None,
         "clip": None,
         "cameras": None,
+        "metadata": None,
         "groups": [],
     }
     try:
@@ -68,7 +69,7 @@ def examine(file: str, *, memory: int, group: int | None, verify: bool, details:
         info |= {"version": header.version, "expected_bytes": header.file_length, "clip": _clip(clip)}
         info["groups"] = [_group(groups, number) for number in range(len(groups))]
         info["clip"]["is_dynamic"] = any(one["is_dynamic"] for one in info["groups"])
-        info["cameras"] = len(groups.cameras())
+        info |= {"cameras": len(groups.cameras()), "metadata": dict(groups.metadata().document)}
         if verify:
             _verify(groups, range(len(groups)) if group is None else [group], info)
         if details and (group is not None or groups.is_single):
@@ -189,7 +190,8 @@ def _damaged_chunks(reader: SceneReader) -> list[tuple[int, str, FormatError]]:
         except FormatError as error:
             damaged.append((number, entry.kind, error))
     if not damaged:
-        reader.mapping(), reader.motion(), reader.decoder(), reader.occupancy(), reader.cameras(), reader.appearances()
+        reader.mapping(), reader.motion(), reader.decoder(), reader.occupancy()
+        reader.cameras(), reader.appearances(), reader.metadata()
     return damaged
 
 
