@@ -183,8 +183,8 @@ def _origin_s(path: str | os.PathLike[str], container: InputContainer, stream: V
         options = {"advanced_editlist": "0", "protocol_whitelist": "file"}
         with av.open(f"file:{Path(path).absolute()}", metadata_errors="replace", options=options) as plain:
             same = next(iter(plain.demux(plain.streams[stream.index])), None)
-            if same is not None and same.pos == packets.first.pos and None not in (same.pts, packets.first.pts):
-                return float((same.pts - packets.first.pts) * stream.time_base)
+            if same is not None and same.pos == packets.first.pos:
+                return float(((same.pts or 0) - (packets.first.pts or 0)) * (stream.time_base or 0))
     if container.format.name in (MP4, MATROSKA):
         return 0.0
     return -(container.start_time or 0) / av.time_base

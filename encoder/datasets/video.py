@@ -165,7 +165,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Vide
     with container:
         films = _films(container)
         if not films:
-            kinds = sorted({stream.type for stream in container.streams}) or ["nothing"]
+            kinds = sorted({str(stream.type) for stream in container.streams}) or ["nothing"]
             raise MediaError(f"{path}: holds no video, only {' and '.join(kinds)}; give a video or remove it")
         if films[0].codec_context is None:
             raise MediaError(f"{path}: no decoder for its codec; convert it to H.264")
@@ -334,7 +334,8 @@ def _display_matrix(path: str | os.PathLike[str], frame: VideoFrame) -> np.ndarr
         MediaError: it turns the picture by other than quarter turns.
     """
     found = frame.side_data.get("DISPLAYMATRIX")
-    matrix = np.eye(2) if found is None else np.frombuffer(bytes(found), np.int32).reshape(3, 3)[:2, :2] / 65536
+    numbers = b"" if found is None else bytes(found)  # type: ignore[call-overload]
+    matrix = np.frombuffer(numbers, np.int32).reshape(3, 3)[:2, :2] / 65536 if numbers else np.eye(2)
     one = np.abs(matrix) > 0.5 * np.abs(matrix).max()
     if np.abs(matrix[~one]).max(initial=0) > 0.01 * np.abs(matrix).max() or one.sum() != 2 or one[0, 0] != one[1, 1]:
         raise MediaError(f"{path}: its rotation is no quarter turn ({frame.rotation} degrees); turn and encode it anew")
