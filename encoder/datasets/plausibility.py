@@ -62,7 +62,8 @@ def _is_flat(dataset: Dataset, number: int, rows: int | None = None) -> bool:
 
 def _equal_pictures(dataset: Dataset) -> Iterator[str]:
     """Doubt test pictures that are training pictures, and cameras in different places that show the same."""
-    pictures, by_content = dataset.pictures, {}
+    pictures = dataset.pictures
+    by_content: dict[tuple[int, int, int], list[int]] = {}
     for number, tile in enumerate(dataset.pixels.tiles):
         by_content.setdefault((tile.crc32c, tile.width, tile.height), []).append(number)
     equal = [numbers for numbers in by_content.values() if len(numbers) > 1]
