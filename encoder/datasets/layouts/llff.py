@@ -7,6 +7,7 @@ Source: https://github.com/Fyusion/LLFF
 """
 
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -130,7 +131,7 @@ def _fit_stretched(
 def _read_poses(file: Path) -> np.ndarray:
     try:
         rows = np.load(file, allow_pickle=False)
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, SyntaxError, TokenError, OverflowError, MemoryError) as error:
         raise DatasetError(f"{file}: not a numpy array ({error}); copy it anew") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.issubdtype(rows.dtype, np.number) or np.iscomplexobj(rows):
         raise DatasetError(f"{file}: holds {rows.dtype} {rows.shape}, not N x 17 numbers; export it anew")
