@@ -139,6 +139,8 @@ def check_outputs(options: Options) -> None:
         raise UsageError(f"{options.output}: is the source, too; write elsewhere with -o")
     for output in filter(None, (options.output, options.keep_checkpoint)):
         _check_writable(output)
+    if options.output.suffix.lower() != ".kpc":
+        raise UsageError(f"{options.output}: kpenc writes .kpc files; end the name in .kpc")
 
 
 def _check_writable(output: Path) -> None:

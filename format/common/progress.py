@@ -1,4 +1,5 @@
-"""Progress on stderr: a bar on a terminal; elsewhere a line after a second, and then every ten seconds."""
+"""Progress on stderr: a bar on a terminal; elsewhere a line after a second, one as soon as the remaining time can be
+estimated, and then one every ten seconds."""
 
 import sys
 import time
@@ -10,7 +11,7 @@ from tqdm import tqdm
 
 T = TypeVar("T")
 
-# Seconds before the first line, and between any two, where stderr is not a terminal.
+# Seconds before the first lines, and between later ones, where stderr is not a terminal.
 FIRST_LINE_S, LINE_EVERY_S = 1.0, 10.0
 
 
@@ -31,7 +32,7 @@ class Progress:
     def __init__(self, label: str, total: float | None = None, unit: str = "", *, shown: bool = True) -> None:
         self.label, self.total, self.unit, self.shown = label, total, unit, shown
         self.done, self.text = 0.0, ""
-        self.reported_at = time.monotonic() + FIRST_LINE_S - LINE_EVERY_S
+        self.reported_at, self.line_after_s = time.monotonic(), FIRST_LINE_S
         # Units done and the time at the first call of `advance`. The remaining time is estimated from there on, since
         # before it kernels are compiled and caches filled.
         self.first: tuple[float, float] | None = None
@@ -46,7 +47,7 @@ class Progress:
         self.first = self.first or (self.done, time.monotonic())
         if self.bar is not None:
             self.bar.update(count)
-        elif self.shown and time.monotonic() - self.reported_at >= LINE_EVERY_S:
+        elif self.shown and time.monotonic() - self.reported_at >= self.line_after_s:
             self._print_line()
 
     def note(self, text: str) -> None:
@@ -67,10 +68,13 @@ class Progress:
     def _print_line(self) -> None:
         self.reported_at = time.monotonic()
         parts = [f"{self.label}: {self.done:.0f}"]
-        if self.total:
+        if not self.total:
+            self.line_after_s = LINE_EVERY_S
+        else:
             parts = [f"{self.label}: {self.done:.0f}/{self.total:.0f} {self.unit}".rstrip()]
             done, when = self.first or (0.0, self.reported_at)
             if self.done > done:
+                self.line_after_s = LINE_EVERY_S
                 parts.append(f"{(self.reported_at - when) * (self.total - self.done) / (self.done - done):.0f} s left")
         print(", ".join(parts + ([self.text] if self.text else [])), file=sys.stderr, flush=True)
 

@@ -596,6 +596,10 @@ def test_outputs_that_cannot_be_written(run: Kpenc, sets: Path, tmp_path: Path) 
     fails(run, tmp_path, sets / "n3dv", str(tmp_path / "no"), "make it first", output=tmp_path / "no" / "x.kpc", code=2)
     (tmp_path / "folder").mkdir()
     fails(run, tmp_path, sets / "n3dv", str(tmp_path / "folder"), "is a folder", output=tmp_path / "folder", code=2)
+    for name in ("scene", "scene.mp4", "scene.kpck"):
+        fails(
+            run, tmp_path, sets / "n3dv", str(tmp_path / name), "end the name in .kpc", output=tmp_path / name, code=2
+        )
     (tmp_path / "plain").write_text("")
     fails(run, tmp_path, sets / "n3dv", str(tmp_path / "plain"), "--work", options=("--work", str(tmp_path / "plain")))
 

@@ -15,6 +15,8 @@ from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
 from kpc.tools.cli import kprender
 from kpc.tools.rendering import content
+from kpc.tools.rendering.options import parser
+from kpc.tools.rendering.shots import shots_of
 from scenes import tiny_scene
 
 SIZE = ("--size", "16x12", "--backend", "reference")
@@ -178,6 +180,20 @@ def test_the_shutter_opens_around_the_frame(run: Run, scene_file: Path, tmp_path
     assert run(scene_file, *words, "-o", tmp_path / "x.png")[0] == 0
     assert len(times) == 8 and np.mean(times) == pytest.approx(0.5)
     assert max(times) - min(times) == pytest.approx(0.05 * 7 / 8)
+
+
+def test_the_camera_of_a_path_moves_while_the_shutter_is_open(scene_file: Path, tmp_path: Path) -> None:
+    first, second = kpc.load(scene_file).cameras
+    path = CameraPath().with_keyframe(first, 0.2).with_keyframe(second, 0.2, 1.0)
+    path.save(tmp_path / "path.json")
+    words = ["x.kpc", "--path", str(tmp_path / "path.json"), "--shutter", "1", "-o", "x"]
+    scene = kpc.load(scene_file)
+    shots = shots_of(scene, scene.clip, parser().parse_args(words), is_film=False)
+    eyes = [camera.camera_to_world[:3, 3] for camera, _ in shots.instants(5)]
+    assert len(shots) == 11 and [time for _, time in shots.instants(5)] == pytest.approx([0.2] * 8)
+    steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
+    whole = np.linalg.norm(shots.camera(6).camera_to_world[:3, 3] - shots.camera(5).camera_to_world[:3, 3])
+    assert (steps > 0).all() and steps.sum() == pytest.approx(whole * 7 / 8, rel=0.05)
 
 
 def test_resuming_skips_whole_pictures_of_this_size(

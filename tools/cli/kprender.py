@@ -118,7 +118,7 @@ def _check(shots: Shots, output: Output, options: argparse.Namespace) -> None:
         raise UsageError(
             f"-o {output.path}: {len(shots)} pictures do not go into one file; give a folder, a film or --time"
         )
-    for number in shots.numbers:
+    for number in shots.numbers if options.cameras else shots.numbers[:1]:
         camera = shots.camera(number)
         if max(camera.width, camera.height) * options.samples > MAX_SIDE:
             raise UsageError(
