@@ -11,6 +11,7 @@ from pytest import approx, raises
 from kpc.encoder.datasets.video import read_video
 from kpc.format.common.errors import DisplayError
 from kpc.format.container.sources import open_source
+from kpc.format.scene.metadata import ViewLimits
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.desktop import glfw, imgui
 from kpc.player.app.input import KEY_BINDINGS
@@ -45,6 +46,7 @@ def main(scene_file: str) -> None:
     keys_of_the_clip(player)
     keys_of_what_is_shown(player)
     keys_and_drags_of_the_camera(player)
+    view_limits(player)
     keys_of_quality_and_panels(player)
     player.press("j")
     assert player.snapshot().notice_is_error and not player.snapshot().follows_path  # there is no path yet
@@ -128,6 +130,35 @@ def keys_and_drags_of_the_camera(player: Player) -> None:
     assert player.snapshot().view.eye == approx(before.eye)
     press(player, "b")
     assert player.snapshot().preset_number == 0 and player.snapshot().view.eye != approx(before.eye)
+
+
+def view_limits(player: Player) -> None:
+    """A view comes back to the limits of the scene until X lets it go; cameras are shown wherever they are."""
+    state = player.state
+    press(player, "x")
+    assert "does not say" in player.snapshot().notice
+    press(player, "r")
+    start = player.snapshot().view
+    ahead, _ = state.rig.compass()
+    state.limits = ViewLimits(
+        start.focus, ahead, state.rig.up, (-3.2, 3.2), (-1.5, 1.5), (start.distance, start.distance), 10.0
+    )
+    player.window.scroll(0, 4)
+    player.frame(seconds=0.0)
+    assert player.snapshot().view.distance == approx(0.9**4 * start.distance)
+    player.frame(seconds=5.0)
+    assert player.snapshot().view.distance == approx(start.distance, rel=1e-3)
+    press(player, "x")
+    player.window.scroll(0, 4)
+    player.frame(seconds=5.0)
+    assert player.snapshot().view.distance == approx(0.9**4 * start.distance)
+    press(player, "x")
+    player.frame(seconds=5.0)
+    assert player.snapshot().view.distance == approx(start.distance, rel=1e-3)
+    press(player, "n")
+    player.frame(seconds=5.0)
+    assert player.snapshot().view.eye == approx(state.rig.cameras[1].camera_to_world[:3, 3])
+    state.limits = None
 
 
 def keys_of_quality_and_panels(player: Player) -> None:

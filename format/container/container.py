@@ -129,6 +129,14 @@ class Chunk:
     raw_length: int | None = None
 
 
+@dataclass(frozen=True)
+class StoredChunk:
+    """One chunk as it lies in a file: its entry, whose offset is of no consequence, and its bytes."""
+
+    entry: Entry
+    body: bytes
+
+
 def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) -> bytes:
     """Return a file of these chunks in their order, each under the codec with which it is smallest.
 
@@ -142,23 +150,35 @@ def pack(chunks: Sequence[Chunk], value_count: int, *, compress: bool = True) ->
     Raises:
         FormatError: the result would break a limit that every reader checks.
     """
-    if len(chunks) > CHUNK_LIMIT:
-        raise FormatError(
-            f"{len(chunks)} chunks are more than the {CHUNK_LIMIT} that a file may have; use fewer and longer segments"
-        )
-    entries, bodies = [], []
-    for chunk in chunks:
-        body, codec, raw_length = min(_encodings(chunk, compress), key=lambda encoding: len(encoding[0]))
-        position = 0, chunk.scale, chunk.plane, chunk.row_start, chunk.row_count
-        entries.append(Entry(chunk.kind, *position, codec, len(body), raw_length, google_crc32c.value(body)))
-        bodies.append(body)
-    data = b"".join([header_and_index(entries, value_count, compress=compress), *bodies])
+    _check_count(len(chunks))
+    return assemble([store(chunk, compress=compress) for chunk in chunks], value_count, compress=compress)
+
+
+def store(chunk: Chunk, *, compress: bool = True) -> StoredChunk:
+    """Return a chunk as `pack` stores it."""
+    body, codec, raw_length = min(_encodings(chunk, compress), key=lambda encoding: len(encoding[0]))
+    position = 0, chunk.scale, chunk.plane, chunk.row_start, chunk.row_count
+    return StoredChunk(Entry(chunk.kind, *position, codec, len(body), raw_length, google_crc32c.value(body)), body)
+
+
+def assemble(stored: Sequence[StoredChunk], value_count: int, *, compress: bool = True) -> bytes:
+    """Return a file of stored chunks in their order; arguments and errors as for `pack`."""
+    _check_count(len(stored))
+    entries = [one.entry for one in stored]
+    data = b"".join([header_and_index(entries, value_count, compress=compress), *(one.body for one in stored)])
     if max(value_count, *(entry.raw_length for entry in entries)) > len(data) * EXPANSION_LIMIT:
         raise FormatError(
             f"the scene is too empty for its size: {value_count:,} values in {len(data):,} bytes; "
             "choose a lower resolution"
         )
     return data
+
+
+def _check_count(count: int) -> None:
+    if count > CHUNK_LIMIT:
+        raise FormatError(
+            f"{count} chunks are more than the {CHUNK_LIMIT} that a file may have; use fewer and longer segments"
+        )
 
 
 def _encodings(chunk: Chunk, compress: bool) -> list[tuple[bytes, Codec, int]]:

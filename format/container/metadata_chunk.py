@@ -14,7 +14,7 @@ import numpy as np
 from kpc.format.common.errors import DatasetError, FormatError
 from kpc.format.container.scene_layout import BOX_LIMIT, CAMERA_LIMIT, NAME_LIMIT
 from kpc.format.scene.cameras import has_unit_axes
-from kpc.format.scene.metadata import Metadata
+from kpc.format.scene.metadata import HISTORY_LIMIT, Metadata
 
 META_LIMIT = 1 << 16  # bytes of the content
 DEPTH_LIMIT = 8  # arrays and objects within each other, the outermost included
@@ -109,7 +109,7 @@ SCHEMA: dict[str, Any] = {
                     },
                 },
                 "coding_loss_db": _NUMBER,
-                "history": {"type": "array", "maxItems": 64, "items": _TEXT},
+                "history": {"type": "array", "maxItems": HISTORY_LIMIT, "items": _TEXT},
             },
         },
     },

@@ -12,6 +12,8 @@ import numpy as np
 
 from kpc.format.scene.cameras import Camera
 
+HISTORY_LIMIT = 64  # entries of the history; the last ones are kept
+
 
 @dataclass(frozen=True)
 class ViewLimits:
@@ -127,12 +129,40 @@ class Metadata:
         return self.with_members(provenance=changed or None)
 
 
-def merged(parts: "list[Metadata]") -> Metadata:
-    """Return the members that all parts agree on, of those that have them; of a clip joined from these parts."""
-    return Metadata(_agreed([part.document for part in parts]))
+def merged(parts: list[Metadata]) -> Metadata:
+    """Return the metadata of a clip that is joined from parts with these.
+
+    They are the members that all parts agree on, of those that have them. The opening view is that of the first part,
+    and view limits around one focus become those that hold in all parts.
+    """
+    documents = [part.document for part in parts]
+    found = _agreed(documents)
+    if parts and "opening" in parts[0].document:
+        found["opening"] = parts[0].document["opening"]
+    limits = _intersection([document.get("view_limits") for document in documents])
+    if limits is not None and "up" in found:
+        found["view_limits"] = limits
+    elif "view_limits" in found:
+        del found["view_limits"]
+    return Metadata(found)
 
 
-def _agreed(documents: "list[Mapping[str, Any]]") -> dict[str, Any]:
+def _intersection(limits: list[dict[str, Any] | None]) -> dict[str, Any] | None:
+    """Return the view limits within all others; None if some lack, lie around another focus or exclude others."""
+    known = [one for one in limits if one is not None]
+    frames = [(one["focus"], one["forward"]) for one in known]
+    if not known or len(known) < len(limits) or any(frame != frames[0] for frame in frames):
+        return None
+    bounds = {
+        name: [max(one[name][0] for one in known), min(one[name][1] for one in known)]
+        for name in ("azimuth", "elevation", "distance")
+    }
+    if any(low > high for low, high in bounds.values()):
+        return None
+    return {**known[0], **bounds, "reach": min(one["reach"] for one in known)}
+
+
+def _agreed(documents: list[Mapping[str, Any]]) -> dict[str, Any]:
     names = dict.fromkeys(name for document in documents for name in document)
     found = {}
     for name in names:

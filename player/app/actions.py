@@ -73,6 +73,21 @@ class Actions:
         self.state.camera_number = number
         self.state.look_from(OrbitView.of(self.state.rig, self.state.rig.cameras[number]))
 
+    def to_opening(self) -> None:
+        """Go to the view that the clip opens with."""
+        self.state.camera_number = 0
+        self.state.look_from(OrbitView.of(self.state.rig, self.state.opening))
+
+    def toggle_limits(self) -> None:
+        """Leave the limits from where the scene holds, or keep them."""
+        state = self.state
+        if state.limits is None:
+            state.notify("this file does not say from where it holds")
+            return
+        state.keeps_limits = not state.keeps_limits
+        state.is_moved = True
+        state.notify("the view keeps to where the scene holds" if state.keeps_limits else "the view is free")
+
     def next_camera(self) -> None:
         """Go to the next camera of the scene."""
         self.to_camera((self.state.camera_number + 1) % len(self.state.rig.cameras))

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Clip, Scene
-from kpc.player.viewpoints import Rig, fit_camera
+from kpc.player.viewpoints import fit_camera
 
 # Orbiting stops at this angle from looking straight up or down, radians.
 MIN_POLAR_ANGLE = math.radians(1.0)

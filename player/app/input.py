@@ -87,9 +87,10 @@ KEY_BINDINGS = (
         elsewhere=(",  .",),
     ),
     KeyBinding("L", "loop on or off", {"l": Actions.toggle_loop}),
-    KeyBinding("R", "back to the first camera", {"r": lambda do: do.to_camera(0)}),
+    KeyBinding("R", "back to the first view", {"r": Actions.to_opening}),
     KeyBinding("N", "next camera of the scene", {"n": Actions.next_camera}),
     KeyBinding("B", "next viewpoint", {"b": Actions.next_preset}),
+    KeyBinding("X", "leave the limits from where the scene holds, or keep them", {"x": Actions.toggle_limits}),
     KeyBinding("V", "next appearance, if the scene has several", {"v": Actions.next_appearance}),
     KeyBinding(
         "1 2 3 4",
@@ -172,11 +173,11 @@ class Input:
         shift = self.window.is_held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT)
         pans = shift or imgui.is_mouse_down(1) or imgui.is_mouse_down(2)
         if (right or down) and pans and any(imgui.is_mouse_down(button) for button in range(3)):
-            state.look_from(state.view.pan(right, -down))
+            state.move_to(state.view.pan(right, -down))
         elif (right or down) and imgui.is_mouse_down(0):
-            state.look_from(state.view.orbit(np.pi * right, -np.pi * down))
+            state.move_to(state.view.orbit(np.pi * right, -np.pi * down))
         if io.mouse_wheel:
-            state.look_from(state.view.zoom(io.mouse_wheel))
+            state.move_to(state.view.zoom(io.mouse_wheel))
 
     def _fly(self, seconds: float) -> None:
         """Move the camera while one of `keyboard.flying_keys` is held."""
@@ -188,4 +189,4 @@ class Input:
         if right or up or forward:
             factor = SHIFT_FACTOR if is_held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT) else 1.0
             distance = factor * seconds * self.state.scene.extent / CROSSING_S
-            self.state.look_from(self.state.view.fly(distance * right, distance * up, distance * forward))
+            self.state.move_to(self.state.view.fly(distance * right, distance * up, distance * forward))

@@ -22,12 +22,12 @@ from kpc.format.common import cli
 from kpc.format.common.errors import ContextLostError, UsageError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.sources import RemoteSource, open_source
+from kpc.format.scene.rig import Rig
 from kpc.player.app import preferences
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.preferences import TARGET_FPS, WINDOW_SIDES, Preferences
 from kpc.player.app.resolution_controller import GPU_FPS
 from kpc.player.quality import LEVELS
-from kpc.player.viewpoints import Rig
 
 if TYPE_CHECKING:
     from kpc.player.streaming.group_playback import GroupPlayback
@@ -135,7 +135,7 @@ def _play(
     interrupted, resets = None, 0
     try:
         while True:
-            window.set_title(f"{Path(stream.source.name).name} - kpplay")
+            window.set_title(f"{stream.metadata.title or Path(stream.source.name).name} - kpplay")
             player = Player(window, stream, settings, resume_from=interrupted, folder=Path(options.folder))
             if stream.notice is not None and interrupted is None:
                 print(f"kpplay: {stream.notice}", file=sys.stderr)

@@ -168,6 +168,7 @@ class Player:
         self._begin_panels(seconds)
         self.input.update(seconds)
         try:
+            self.state.keep_limits(seconds)
             self._advance(seconds)
             self.state.appearance.advance(seconds)
             if self.filming.is_along_path:

@@ -8,16 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpc.format.common.errors import KpcError
+from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.player.app.controls import AppearanceSelection, OrbitView, Playback
 from kpc.player.app.path_follower import PathFollower
 from kpc.player.app.preferences import Preferences
 from kpc.player.app.quality_controller import QualityController
 from kpc.player.app.recording import FILM_FPS
+from kpc.player.app.view_keeper import kept
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.presentation import DisplayMode
 from kpc.player.streaming.group_playback import GroupPlayback
-from kpc.player.viewpoints import Rig, presets
+from kpc.player.viewpoints import presets
 
 # Seconds for which a message and an error message stay on the screen.
 NOTICE_S, ERROR_NOTICE_S = 4.0, 12.0
@@ -94,9 +96,14 @@ class PlayerState:
         quality: chooses quality level and resolution.
 
     Attributes:
+        metadata: of the clip.
+        opening: the camera to begin with.
         rig: the cameras of the scene; presets: named viewpoints.
         camera_number: the camera that was chosen last, from 0; preset_number: likewise, or -1.
         view: the camera that the picture is drawn from.
+        limits: from where the scene holds; None if its file does not say.
+        keeps_limits: whether the user's movements are kept within them.
+        is_moved: whether the user has moved the view since it was chosen by name or number.
         playback: the position in the clip.
         appearance: the appearance embedding that is shown.
         part: the part of the scene that is shown.
@@ -114,9 +121,14 @@ class PlayerState:
         self.target_fps = preferences.target_fps or (1 / quality.target_s if quality.target_s else FILM_FPS)
         self.rig, self.presets = Rig.of(self.scene), presets(self.scene)
         self.camera_number, self.preset_number = 0, -1
-        self.view = OrbitView.of(self.rig, self.rig.cameras[0])
+        self.metadata = stream.metadata
+        self.limits, self.keeps_limits, self.is_moved = self.metadata.view_limits, True, False
+        opening = self.metadata.opening
+        self.opening = self.rig.cameras[0] if opening is None else opening.camera
+        self.view = OrbitView.of(self.rig, self.opening)
         has_duration = stream.clip.duration_s > 0
         self.playback = Playback(stream.clip, playing=has_duration, speed=preferences.speed, loop=preferences.loop)
+        self.playback.seek(0.0 if opening is None else opening.time)
         self.appearance = AppearanceSelection(self.scene)
         self.part, self.display_mode, self.exact = Part.FULL, DisplayMode.COLOUR, False
         self.follower = PathFollower()
@@ -136,6 +148,7 @@ class PlayerState:
             before.view, before.playback, before.part, before.display_mode
         )  # fmt: skip
         self.quality, self.target_fps, self.exact = before.quality, before.target_fps, before.exact
+        self.keeps_limits = before.keeps_limits
         self.follower.replace(before.follower.path)
         self.appearance.select(before.appearance.number)
         self.visible.controls, self.visible.path = before.visible.controls, before.visible.path
@@ -157,7 +170,17 @@ class PlayerState:
 
     def look_from(self, view: OrbitView) -> None:
         """Move the camera at once, and stop following the camera path."""
-        self.view, self.follower.is_active = view, False
+        self.view, self.follower.is_active, self.is_moved = view, False, False
+
+    def move_to(self, view: OrbitView) -> None:
+        """Move the camera as the user does, by hand; `keep_limits` may move it back."""
+        self.look_from(view)
+        self.is_moved = True
+
+    def keep_limits(self, seconds: float) -> None:
+        """Move a view that the user has moved out of the limits towards them."""
+        if self.limits is not None and self.keeps_limits and self.is_moved and not self.follower.is_active:
+            self.view = kept(self.view, self.limits, seconds)
 
     def scrub(self, time: float) -> None:
         """Pause the clip at a time in [0, 1], and stop following the camera path."""

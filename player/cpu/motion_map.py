@@ -11,11 +11,11 @@ that is constant but not 1 moves nothing. So the field itself is compared. A poi
 
 import numpy as np
 
+from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates
 from kpc.player.cpu import reference
 from kpc.player.cpu.reference import SceneAtTime
-from kpc.player.viewpoints import Rig
 
 # Times that are compared with.
 INSTANTS = (np.arange(8) + 0.5) / 8

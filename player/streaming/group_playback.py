@@ -16,11 +16,11 @@ from kpc.format.common.errors import KpcError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.groups import Groups
 from kpc.format.container.sources import RemoteSource, Source
+from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.player.gl.renderer import Renderer
 from kpc.player.streaming.prefetch import Playhead
 from kpc.player.streaming.stream import Stream
-from kpc.player.viewpoints import Rig
 
 # The next group is opened so many seconds before it is shown, even if the one that is shown is still arriving.
 OPEN_AHEAD_S = 5.0
@@ -57,6 +57,7 @@ class GroupPlayback:
         clip: of all groups together.
         timeline: which group is shown when.
         cameras: those of the first group, used for all.
+        metadata: of the clip.
 
     Raises:
         KpcError: as `Groups` and `Stream`.
@@ -70,7 +71,8 @@ class GroupPlayback:
         self.timeline, self.clip = self.groups.timeline, self.groups.clip
         self._group_memory = memory if self.groups.is_single else memory // 2
         self._shown = LoadedGroup(0, Stream(self.groups.open(0), memory=self._group_memory, arrived=arrived))
-        self.cameras = self._shown.stream.scene.cameras
+        self.cameras, self.metadata = self._shown.stream.scene.cameras, self.groups.metadata()
+        self._describe(self._shown.stream)
         self._next: LoadedGroup | None = None
         self._make_renderer: Callable[[Scene], Renderer] | None = None
         self._earlier_versions = 0  # the versions of the groups that were shown before
@@ -335,8 +337,7 @@ class GroupPlayback:
     def _open_in_thread(self, number: int) -> None:
         try:
             stream = Stream(self.groups.open(number, apart=True), memory=self._group_memory, arrived=self._wake)
-            if not stream.scene.cameras:
-                stream.scene = replace(stream.scene, cameras=self.cameras)
+            self._describe(stream)
             self._opened = LoadedGroup(number, stream)
             if self._closed:
                 stream.close()
@@ -345,6 +346,11 @@ class GroupPlayback:
         except BaseException as error:  # unexpected: raised again in the window's thread
             self._bug = error
         self._wake()
+
+    def _describe(self, stream: Stream) -> None:
+        """Give the scene of a group the cameras of the first group if it has none, and the metadata of the clip."""
+        if not stream.scene.cameras or stream.scene.metadata != self.metadata:
+            stream.scene = replace(stream.scene, cameras=stream.scene.cameras or self.cameras, metadata=self.metadata)
 
     def _wake(self) -> None:
         self.arrived()

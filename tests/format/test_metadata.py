@@ -74,7 +74,18 @@ def test_merging_keeps_what_all_agree_on():
     assert "title" not in found.document and found.document["date"] == FULL["date"]
     assert "seed" not in found.provenance and found.provenance["preset"] == "balanced"
     assert found.document["later"] == FULL["later"]
-    assert merged([METADATA, Metadata()]) == METADATA and not merged([Metadata(), Metadata()])
+    assert merged([METADATA, Metadata()]) == METADATA.with_members(view_limits=None)
+    assert not merged([Metadata(), Metadata()])
+
+
+def test_merging_keeps_the_view_limits_that_hold_in_all_parts():
+    limits = FULL["view_limits"]
+    narrower = METADATA.with_members(view_limits={**limits, "azimuth": [-50, 20], "reach": 0.5})
+    found = merged([METADATA, narrower]).document["view_limits"]
+    assert found == {**limits, "azimuth": [-30, 20], "reach": 0.5}
+    for other in ({"focus": [1, 0, 0]}, {"distance": [5, 6]}):
+        moved = METADATA.with_members(view_limits={**limits, **other})
+        assert "view_limits" not in merged([METADATA, moved]).document
 
 
 def test_a_clip_has_its_own_metadata_and_groups_keep_theirs(tmp_path):

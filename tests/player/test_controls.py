@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Clip
 from kpc.player.app.controls import BLEND_S, SPEEDS, AppearanceSelection, OrbitView, Playback
-from kpc.player.viewpoints import Rig
 from scenes import tiny_scene, with_appearances
 
 SCENE = tiny_scene(0)

@@ -16,13 +16,14 @@ from kpc.encoder.rdo.prune import keep_channels
 from kpc.format.common.errors import DisplayError
 from kpc.format.container import scene_io
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu.reference import Part, Rendering, render
 from kpc.player.gl.folding import folded_layout
 from kpc.player.gl.presentation import DisplayMode
 from kpc.player.gl.renderer import Renderer
 from kpc.player.quality import LEVELS, Quality
-from kpc.player.viewpoints import Rig, fit_camera
+from kpc.player.viewpoints import fit_camera
 from scenes import VARIANTS, look_at, tiny_scene, with_appearances, with_contraction, with_hybrid_decoder, with_motion
 
 CENTRE = (0.1, 0.05, 0.05)

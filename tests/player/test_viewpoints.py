@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.rig import Rig, look_at, surround_focus
 from kpc.format.scene.scene import Scene
-from kpc.player.viewpoints import Rig, fit_camera, look_at, orbit, presets, surround_focus
+from kpc.player.viewpoints import fit_camera, orbit, presets
 from scenes import tiny_scene
 
 UP = np.array([0.0, 0.0, 1.0])

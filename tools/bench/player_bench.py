@@ -13,12 +13,13 @@ from kpc.format.common.fidelity import psnr
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.container import scene_io
 from kpc.format.scene.cameras import Camera
+from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
 from kpc.player.gl import offscreen
 from kpc.player.gl.renderer import Renderer, tries_compute
 from kpc.player.quality import LEVELS, Quality
-from kpc.player.viewpoints import Rig, fit_camera, orbit
+from kpc.player.viewpoints import fit_camera, orbit
 from kpc.tools.bench.harness import size_text
 from kpc.tools.bench.machine_limits import texel_rate
 from kpc.tools.bench.records import Record

@@ -21,6 +21,7 @@ from kpc.format.common.fidelity import psnr_from_mse
 from kpc.format.container.partial import PartialScene
 from kpc.format.container.scene_io import SceneReader, encode, read
 from kpc.format.container.sources import open_source
+from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import TIME_PLANES, Clip
 from kpc.player.app.resolution_controller import ResolutionController
 from kpc.player.gl import offscreen
@@ -28,7 +29,7 @@ from kpc.player.gl.renderer import Renderer, is_software
 from kpc.player.quality import Quality
 from kpc.player.streaming.prefetch import Playhead, min_segment_bytes
 from kpc.player.streaming.stream import Stream
-from kpc.player.viewpoints import Rig, fit_camera
+from kpc.player.viewpoints import fit_camera
 
 # Bit rate and latency of the slow link, as options of kpc.tools.cli.serve.
 RATE, DELAY = "10Mbit", "20ms"

@@ -228,6 +228,7 @@ def describe(reader: SceneReader, scene: QuantisedScene) -> dict[str, Any]:
         },
         "cameras": len(scene.cameras),
         "camera_box": _camera_box(scene),
+        "camera_sizes": [[camera.width, camera.height] for camera in scene.cameras],
         "appearances": [appearance.name for appearance in scene.appearances],
         "parameter_count": scene.parameter_count,
         "bits_per_parameter": 8 * size / scene.parameter_count,

@@ -5,14 +5,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from kpc.format.container.http_address import printable
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import TIME_PLANES
 from kpc.player.cpu.motion_map import STILL
 from kpc.tools.cli.kpinfo_facts import counted
+from kpc.tools.cli.kpinfo_metadata import metadata_rows
 
 WIDTH = 80
-
-# Members of the metadata that the page shows; --json has all of them.
-METADATA_SHOWN = ("title", "author", "licence", "date")
 
 # Number of appearances that the page names; --json has all of them.
 NAMES_SHOWN = 8
@@ -24,8 +23,9 @@ def page(info: Mapping[str, Any]) -> str:
     first = f"{_sizes(info)}, format version {info['version']}" + ", verified" * info["verified"]
     lines = [f"{info['file']}:", f"  {first}"] if len(info["file"]) + len(first) > WIDTH - 2 else []
     lines = lines or [f"{info['file']}: {first}"]
-    for label in METADATA_SHOWN:
-        lines += _item(label, printable(str(info["metadata"].get(label, ""))))
+    sizes = described["scene"]["camera_sizes"] if described else []
+    for label, text in metadata_rows(Metadata(info["metadata"]), sizes):
+        lines += _item(label, printable(text))
     if described is None:
         return "\n".join([*lines, *_item("clip", _clip(info)), *_item("cameras", str(info["cameras"])), *_groups(info)])
     if len(info["groups"]) > 1:

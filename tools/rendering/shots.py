@@ -14,9 +14,10 @@ import numpy as np
 
 from kpc.format.common.errors import UsageError
 from kpc.format.scene.cameras import Camera, View, load_views
+from kpc.format.scene.rig import Rig
 from kpc.format.scene.scene import Clip, Scene
 from kpc.player.app.camera_paths import CameraPath
-from kpc.player.viewpoints import Rig, fit_camera, orbit
+from kpc.player.viewpoints import fit_camera, orbit
 
 # Limits of --fps and of the number of pictures.
 MIN_FPS, MAX_FPS = 0.001, 240.0

@@ -1,0 +1,125 @@
+"""kpedit changes what it is asked to, and nothing else."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.container import groups
+from kpc.format.container.container import Reader
+from kpc.format.container.scene_io import read, write
+from kpc.format.scene.cameras import View, save_views
+from kpc.format.scene.rig import Rig
+from kpc.tools.cli import kpedit, kpinfo
+from scenes import tiny_scene
+
+
+def small_scene(**options):
+    return tiny_scene(scales=1, channels=2, resolution=(6, 5, 4), time=3, **options)
+
+
+def save(scene, path: Path) -> Path:
+    write(quantise_scene(scene, [dict.fromkeys(scale, 0.05) for scale in scene.scales]), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Hold `scene.kpc`, a small scene of five cameras, and `clip.kpc`, a clip of two groups of it."""
+    folder = tmp_path_factory.mktemp("kpedit")
+    scene = small_scene()
+    rig = Rig.of(scene)
+    cameras = tuple(rig.camera(azimuth, 0.5, 3.0) for azimuth in (0.0, -0.4, -0.2, 0.2, 0.4))
+    save(replace(scene, cameras=cameras), folder / "scene.kpc")
+    one = groups.GroupInput.of(folder / "scene.kpc", 0)
+    groups.write([one, replace(one, span=groups.Span(11, 11))], folder / "clip.kpc")
+    return folder
+
+
+def edit(folder: Path, *options: str, scene: str = "scene.kpc", code: int = 0) -> Path:
+    assert kpedit.main([str(folder / scene), "-o", str(folder / "out.kpc"), *options]) == code
+    return folder / "out.kpc"
+
+
+def stored(path: Path) -> list[tuple[str, bytes]]:
+    """Return kind and stored bytes of all chunks but the metadata."""
+    reader = Reader(path)
+    return [(e.kind, reader.stored(n)) for n, e in enumerate(reader.index) if e.kind != "meta"]
+
+
+@pytest.mark.parametrize("name", ["scene.kpc", "clip.kpc"])
+def test_texts_are_set_and_removed_and_all_chunks_are_copied(folder, name, capsys):
+    out = edit(folder, "--title", "Tänzer", "--description", "a\\nb", "--date", "2026-11", scene=name)
+    expected = {"title": "Tänzer", "description": "a\nb", "date": "2026-11"}
+    assert groups.Groups(out).metadata().document == expected and stored(out) == stored(folder / name)
+    assert kpinfo.main([str(out)]) == 0
+    assert "title       Tänzer\n  description a\n              b\n" in capsys.readouterr().out
+    again = folder / "again.kpc"
+    assert kpedit.main([str(out), "-o", str(again), "--title", "", "--up", "0,0,2", "--metres-per-unit", "0.5"]) == 0
+    expected = {"description": "a\nb", "date": "2026-11", "up": [0, 0, 2], "metres_per_unit": 0.5}
+    assert groups.Groups(again).metadata().document == expected and stored(again) == stored(folder / name)
+
+
+def test_provenance_comes_from_a_file_and_goes(folder):
+    (folder / "made.json").write_text(json.dumps({"preset": "fast", "seed": 3}))
+    out = edit(folder, "--provenance", str(folder / "made.json"), "--transparent")
+    assert read(out).metadata.document == {"provenance": {"preset": "fast", "seed": 3}, "transparent": True}
+    again = folder / "again.kpc"
+    assert kpedit.main([str(out), "-o", str(again), "--no-provenance", "--no-transparent"]) == 0
+    assert not read(again).metadata and again.read_bytes() == (folder / "scene.kpc").read_bytes()
+
+
+def test_view_limits_are_found_and_set_and_taken_away(folder):
+    found = read(edit(folder, "--view-limits", "auto")).metadata
+    limits = found.view_limits
+    assert limits.azimuth[0] <= 0 <= limits.azimuth[1] and limits.distance[0] < 3 <= limits.distance[1] * 1.001
+    assert found.up == pytest.approx(Rig.of(read(folder / "scene.kpc").dequantise()).up, abs=1e-4)
+    assert found.opening.camera.camera_to_world == pytest.approx(
+        read(folder / "scene.kpc").cameras[0].camera_to_world, abs=1e-5
+    )
+    (folder / "out.kpc").rename(folder / "limited.kpc")
+    changed = read(edit(folder, "--view-limits", "azimuth=-3:4.5,reach=0", scene="limited.kpc")).metadata
+    assert changed.document["view_limits"] == {**found.document["view_limits"], "azimuth": [-3, 4.5], "reach": 0}
+    none = read(edit(folder, "--view-limits", "none", scene="limited.kpc")).metadata
+    assert none == found.with_members(view_limits=None)
+
+
+def test_a_saved_view_opens_the_scene(folder):
+    camera = read(folder / "scene.kpc").cameras[2]
+    save_views(folder / "view.json", [View(camera, 0.25, "a.png")])
+    opening = read(edit(folder, "--open-at", str(folder / "view.json"))).metadata.opening
+    assert opening.time == 0.25 and opening.camera.camera_to_world == pytest.approx(camera.camera_to_world, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "options, code, words",
+    [
+        (["--title", "\x1b[2J"], 2, "control characters"),
+        (["--date", "yesterday"], 2, "date is too long"),
+        (["--up", "0,0,0"], 2, "is not a direction"),
+        (["--view-limits", "azimuth=3"], 2, "is not like azimuth=-30:30"),
+        (["--view-limits", "azimuth=30:-30"], 2, "least value is above the largest"),
+        (["--provenance", "broken.json"], 2, "not JSON"),
+        (["--provenance", "wrong.json"], 1, "seed is no integer"),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(folder, options, code, words, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    Path("broken.json").write_text("{")
+    Path("wrong.json").write_text('{"seed": "seven"}')
+    try:
+        assert kpedit.main(["scene.kpc", "-o", "no.kpc", *options]) == code
+    except SystemExit as exit_:
+        assert exit_.code == code
+    assert words in capsys.readouterr().err.splitlines()[-1] and not Path("no.kpc").exists()
+
+
+def test_the_input_is_not_overwritten_and_two_cameras_give_no_limits(folder, capsys):
+    scene = str(folder / "scene.kpc")
+    assert kpedit.main([scene, "-o", scene, "--title", "a"]) == 2
+    save(small_scene(), folder / "two.kpc")
+    edit(folder, "--view-limits", "auto", scene="two.kpc", code=2)
+    assert "three cameras" in capsys.readouterr().err
+    assert not read(scene).metadata
