@@ -34,6 +34,18 @@ def encode_record(name: str, psnrs: list[float | None], **changes: object) -> Re
     return record | changes
 
 
+def test_printed_tables_fit_a_terminal() -> None:
+    """Six columns of each kind of record, within 100 characters for the records that the documents show."""
+    assert tables.PRINTED.keys() == tables.COLUMNS.keys()
+    for kind, names in tables.PRINTED.items():
+        assert len(names) == 6 and {*names} <= {name for name, _ in tables.COLUMNS[kind]}
+    for path in sorted((Path(__file__).parents[2] / "docs" / "bench").glob("*.json")):
+        records = results.load([path])
+        assert max(map(len, tables.printed(records[0]["kind"], records).splitlines())) <= 100
+    (long,) = tables.printed("encode", [encode_record(60 * "long", [30.0])]).splitlines()[1:]
+    assert long.startswith("longlong") and "…" in long and len(long) <= 100
+
+
 def test_cells_are_medians_of_the_repeats_that_have_a_value() -> None:
     record = encode_record("room", [30.0, None, 32.0, 33.0])
     assert median(record, "test_psnr") == 32.0

@@ -54,7 +54,8 @@ def _command(argv: list[str]) -> None:
                     aside.write_text(as_json(records))
     finally:  # a later failure or Ctrl-C loses nothing that was measured
         if records:
-            print(tables.aligned(tables.cells(records[0]["kind"], records)), file=sys.stderr)
+            print(tables.printed(records[0]["kind"], records), file=sys.stderr)
+            print(f"all figures are in {out or 'the JSON on stdout'}", file=sys.stderr)
             if out is None:
                 print(as_json(records), end="")
 

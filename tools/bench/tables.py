@@ -280,6 +280,23 @@ COLUMNS: dict[str, list[Column]] = {
     ],
 }
 
+# Columns of the table that kpbench prints, which is to fit a terminal; all others are in its JSON.
+PRINTED: dict[str, tuple[str, ...]] = {
+    "encode": ("dataset", "preset", "PSNR dB", "file KB", "training", "total"),
+    "curve": ("dataset", "preset", "PSNR dB", "file KB", "training", "total"),
+    "ablate": ("dataset", "variant", "PSNR dB", "SSIM", "file KB", "training"),
+    "step": ("dataset", "preset", "rays/s", "speedup", "ms per step", "peak MB"),
+    "gpu": ("dataset", "preset", "rays/s", "ms per step", "ratio", "GPU memory GB"),
+    "player": ("scene", "quality", "size", "median ms", "fps", "PSNR to reference dB"),
+    "stream": ("scene", "file KB", "link", "first picture ms", "complete ms", "seek ms"),
+    "steady": ("scene", "window", "frames", "fps", "MB at start", "MB at end"),
+    "window": ("scene", "window", "fps", "p95 ms", "raster", "PSNR to reference dB"),
+    "codec": ("scene", "coder", "KB at 0.15 dB loss", "PSNR loss dB", "encode s", "decode s"),
+    "groups": ("dataset", "groups", "file KB", "PSNR dB", "encoded in s", "peak MB, all"),
+    "entropy": ("scene", "variant", "planes KB", "decoding ms", "file KB", "reading ms"),
+}
+PRINTED_NAME = 22  # characters of a cell that are printed; names of datasets may be longer
+
 TITLES = {
     "encode": "Encoding",
     "curve": "Encoding, quality against time",
@@ -305,8 +322,15 @@ def cells(kind: str, records: Iterable[Record]) -> Table:
     return [[name for name, _ in columns]] + [[cell(record) for _, cell in columns] for record in records]
 
 
+def printed(kind: str, records: Sequence[Record]) -> str:
+    """Return the table of one kind of record with the columns PRINTED, as text for a terminal of 100 characters."""
+    table = list(zip(*cells(kind, records), strict=True))
+    return aligned(list(zip(*(column for column in table if column[0] in PRINTED[kind]), strict=True)))
+
+
 def aligned(table: Sequence[Sequence[str]]) -> str:
-    """Return a table as text for a terminal."""
+    """Return a table as text for a terminal; cells longer than PRINTED_NAME are cut."""
+    table = [[text if len(text) <= PRINTED_NAME else f"{text[: PRINTED_NAME - 1]}…" for text in row] for row in table]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     return "\n".join(
         "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in table
