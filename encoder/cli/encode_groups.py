@@ -25,6 +25,7 @@ from kpc.encoder.rdo.codec_model import load_checkpoint
 from kpc.format.common import cli
 from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.container import groups, scene_io
+from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import Contraction
 
 # Figures that are reported for each group.
@@ -37,7 +38,7 @@ def encode_groups(options: Options) -> dict[str, Any]:
     """Encode all groups of a clip, or the one that `options.only` names; return what was measured."""
     started = time.monotonic()
     setting = prepare_setting(options)
-    work, spans = options.work_dir, split_into_spans(setting.dataset.clip, float(options.group_s or 0))
+    work, spans = options.work_dir, plan_groups(options, setting.dataset.clip)
     numbers = range(len(spans)) if options.only is None else [options.only]
     if numbers[-1] >= len(spans):
         raise UsageError(f"--only {numbers[-1]}: the clip has {len(spans)} groups, numbered from 0")
@@ -67,6 +68,15 @@ def encode_groups(options: Options) -> dict[str, Any]:
     return _combine(found, [spans[number] for number in numbers], size, options) | {
         "encode_s": time.monotonic() - started
     }
+
+
+def plan_groups(options: Options, clip: Clip) -> tuple[groups.Span, ...]:
+    """Split a clip into groups of at most `options.group_s`; log where one holds all of it."""
+    group_s = float(options.group_s or 0)
+    spans = split_into_spans(clip, group_s)
+    if len(spans) == 1:
+        log(f"--group {group_s:g}s: the clip is no longer than {clip.frame_count / clip.fps:.3g} s, one group")
+    return spans
 
 
 def group_path(work: Path, number: int) -> Path:
@@ -114,18 +124,26 @@ def _read_finished(path: Path, options: Options) -> dict[str, Any]:
     """
     try:
         kept = json.loads(path.with_suffix(".json").read_text())
-        if kept["options"] != _fingerprint(options):
-            raise TrainingError(f"{path}: belongs to a run with other settings; give the same ones or drop --resume")
+        before, now = kept["options"], _fingerprint(options)
+        changed = [f"{name} was {before[name]}, is {now[name]}" for name in now if before[name] != now[name]]
+        if changed:
+            raise TrainingError(
+                f"{path}: belongs to a run with other settings ({', '.join(changed)}); give the same ones or drop "
+                "--resume"
+            )
         found: dict[str, Any] = kept["found"]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainingError(f"{path}: its figures cannot be read; delete it to have the group encoded anew") from error
     log(f"{path}: is finished already")
     return found
 
 
-def _fingerprint(options: Options) -> str:
-    """Return all options that the result depends on, as text."""
-    return repr(replace(options, resume=False, keep=False))
+def _fingerprint(options: Options) -> dict[str, str]:
+    """Return all options that the result depends on, by their names on the command line, as text."""
+    without = ("resume", "keep", "preview", "trade")
+    plain = {name: str(value) for name, value in vars(options).items() if name not in without}
+    names = {f"--{name.removesuffix('_s').replace('_', '-')}": value for name, value in plain.items()}
+    return names | {"the target": "{} {:g}".format(*options.trade.bound)}
 
 
 def _join(parts: Sequence[groups.GroupInput], options: Options) -> int:

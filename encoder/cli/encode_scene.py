@@ -19,13 +19,14 @@ from kpc.encoder.cli.transcode import coding_figures
 from kpc.encoder.cli.work_folder import CHECKPOINT, clear_work_folder, save_scene
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.evaluate import Quality, SceneRenderer, evaluate
+from kpc.encoder.evaluation.preview import Preview
 from kpc.encoder.evaluation.testing_time import affordable_pictures, picture_seconds
 from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.occupancy_grid import merge_slots
 from kpc.encoder.rdo.codec_model import CodedModel, Model, code
 from kpc.encoder.rdo.model_checkpoint import save_checkpoint
 from kpc.encoder.rdo.sequential_finetune import steps_per_group
-from kpc.encoder.training.train import Trainer
+from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.common.progress import Progress
 from kpc.format.container import scene_io
@@ -43,9 +44,11 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     """Train on a dataset and write the file; return what was measured."""
     started = time.monotonic()
     trainer = prepare_trainer(options, setting)
+    if options.preview is not None:
+        log(f"preview: {options.preview}, with the box, beside what was filmed")
     dataset, work, checkpoint = trainer.dataset, options.work_dir, options.work_dir / CHECKPOINT
     try:
-        _train(trainer, checkpoint, options.time_budget_s)
+        _train(trainer, checkpoint, options)
     except Abandoned:
         raise
     except KeyboardInterrupt:
@@ -112,12 +115,17 @@ def _code(trainer: Trainer, scene: Scene, options: Options) -> CodedModel:
     if tune_steps is None:
         tune_steps = steps_per_group(trainer.step, scene, trainer.config.tune_steps)
     log(describe_occupancy(scene))
-    tuning = f"fine-tuning by {tune_steps} steps per group of planes, " if tune_steps else ""
-    log(f"writing: choosing quantisation steps, {tuning}rendering held-out views")
-    validation = ValidationRays.from_training_views(trainer.sampler, trainer.background)
+    if tune_steps:
+        log(f"fine-tuning: {tune_steps} steps after each group of planes that is coded")
+    effort = trainer.config.coding_effort(trainer.step)
+    if effort < 1:
+        log(f"coding: at {effort:.0%} of the usual effort, after {trainer.step:,} steps of {options.preset}")
+    validation = ValidationRays.from_training_views(trainer.sampler, trainer.background, effort)
     if options.keep_checkpoint is not None:
         save_checkpoint(options.keep_checkpoint, scene, validation)
-    coded = code(Model(scene, validation), options.trade, trainer.config.prune_share, tune_steps, shown=True)
+    coded = code(
+        Model(scene, validation, shown=True, effort=effort), options.trade, trainer.config.prune_share, tune_steps
+    )
     if coded.pruned is not None:
         log(describe_pruning(scene, coded.pruned, coded.spare_db))
     return coded
@@ -162,7 +170,7 @@ def _select_cameras(dataset: Dataset) -> list[int]:
     return [int(first[central])] + [int(p) for i, p in enumerate(first) if i != central]
 
 
-def _train(trainer: Trainer, checkpoint: Path, time_budget_s: float | None) -> None:
+def _train(trainer: Trainer, checkpoint: Path, options: Options) -> None:
     """Train to the end, or until Ctrl-C, which waits for the current step.
 
     Raises:
@@ -170,17 +178,23 @@ def _train(trainer: Trainer, checkpoint: Path, time_budget_s: float | None) -> N
         KeyboardInterrupt: the step has ended after a Ctrl-C.
     """
     requests: list[int] = []
+    preview = None if options.preview is None else Preview(trainer.dataset, options.preview)
 
     def note(number: int, _: Any) -> None:
         if requests:
             raise Abandoned
         requests.append(number)
 
-    with Progress("train", total=1000, unit="‰") as progress, handle_signals(note):
+    def report(state: Report) -> None:
+        show_progress(progress, state)
+        if preview is not None:
+            preview.update(trainer, state.step)
+
+    with Progress("training", total=100, unit="%") as progress, handle_signals(note):
         trainer.run(
-            lambda report: show_progress(progress, report),
+            report,
             checkpoint,
-            time_budget_s=time_budget_s,
+            time_budget_s=options.time_budget_s,
             interrupted=lambda: bool(requests),
         )
 

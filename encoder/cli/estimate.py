@@ -16,6 +16,7 @@ from kpc.encoder.rdo.prune import max_renderings
 from kpc.encoder.rdo.rate_control import RENDERINGS
 from kpc.encoder.rdo.sequential_finetune import RAYS, steps_per_group, total_steps
 from kpc.encoder.training.train import Trainer
+from kpc.format.common.compiling import MONITOR
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.scene.scene import Scene
 
@@ -69,15 +70,16 @@ def estimate(
     config = trainer.config
     train_s, step_s = _estimate_training(trainer, time_budget_s)
     renderings = RENDERINGS + (max_renderings(trainer.field.layout.features) if config.prunes else 0)
-    rendered = (renderings + 1) * validation_rays
     memory = peak_memory_bytes() + COPIES * 4 * trainer.field.theta.numel()
     scene = trainer.scene()
     coding_s, ray_s = _time_coding(scene), _time_ray(trainer)
-    all_coding_s = RENDERINGS * coding_s + _time_curvature(scene)
+    trained = float(config.steps)
+    if time_budget_s is not None:
+        trained = trainer.step + max(0.0, time_budget_s - trainer.elapsed_s) / max(step_s, 1e-6)
+    effort = config.coding_effort(trained)
+    all_coding_s = RENDERINGS * coding_s + effort * _time_curvature(scene)
+    all_coding_s += effort * (renderings + 1) * validation_rays * ray_s
     if tune_steps is None:
-        trained = float(config.steps)
-        if time_budget_s is not None:
-            trained = trainer.step + max(0.0, time_budget_s - trainer.elapsed_s) / max(step_s, 1e-6)
         tune_steps = steps_per_group(int(trained), scene, config.tune_steps)
     if steps := total_steps(scene, tune_steps):
         trained_ray_s = 1 / trainer.rays_per_second if trainer.rays_per_second else 3 * ray_s
@@ -85,8 +87,7 @@ def estimate(
     picture_s = picture_seconds(SceneRenderer(scene), trainer.dataset)
     held_out = int(trainer.dataset.pictures.is_test.sum())
     tested = min(held_out, affordable_pictures(train_s, picture_s) if test_views is None else test_views)
-    rest_s = spent_s + rendered * ray_s + all_coding_s
-    return Estimate(train_s, tested * picture_s, rest_s, memory, tested, held_out)
+    return Estimate(train_s, tested * picture_s, spent_s + all_coding_s, memory, tested, held_out)
 
 
 def _estimate_training(trainer: Trainer, time_budget_s: float | None) -> tuple[float, float]:
@@ -115,9 +116,9 @@ def _time_step(trainer: Trainer, until: int) -> float:
 def _time_coding(scene: Scene) -> float:
     """Return the seconds of choosing a scene's symbols once."""
     steps = [{name: np.full(plane.shape[-1], 2.0**-6) for name, plane in scale.items()} for scale in scene.scales]
-    started = time.perf_counter()
+    started, compiling_s = time.perf_counter(), MONITOR.spent_s
     quantise_by_cost(scene, steps)
-    return time.perf_counter() - started
+    return time.perf_counter() - started - (MONITOR.spent_s - compiling_s)
 
 
 def _time_curvature(scene: Scene) -> float:

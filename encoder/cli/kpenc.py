@@ -7,10 +7,10 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from kpc.encoder.cli.encode_groups import encode_groups, setting_of_span
+from kpc.encoder.cli.encode_groups import encode_groups, plan_groups, setting_of_span
 from kpc.encoder.cli.encode_scene import encode_scene, handle_signals
 from kpc.encoder.cli.estimate import Estimate, estimate
-from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group, split_into_spans
+from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group
 from kpc.encoder.cli.options import ALL_VIEWS, Options, parse
 from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
 from kpc.encoder.cli.report import print_estimate, print_result
@@ -21,6 +21,7 @@ from kpc.encoder.evaluation.ablations import effective_ablations
 from kpc.encoder.evaluation.profile import profile
 from kpc.encoder.evaluation.validation_rays import VALIDATION_RAYS
 from kpc.format.common import cli
+from kpc.format.common.compiling import MONITOR
 
 __all__ = ["ALL_VIEWS", "Options", "ablations", "dry_run", "encode", "main", "profile_steps"]
 
@@ -33,6 +34,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _command(argv: list[str]) -> None:
     options, only_plan, as_json = parse(argv)
+    MONITOR.announces = True
     if only_plan:
         print_estimate(dry_run(options), options, as_json)
         return
@@ -66,11 +68,11 @@ def dry_run(options: Options) -> Estimate:
 
 
 def _dry_run(options: Options) -> Estimate:
-    started = time.monotonic()
+    started, compiling_s = time.monotonic(), MONITOR.spent_s
     setting = prepare_setting(options)
     groups, effort = 1, 1.0  # effort: in units of the first group
     if options.group_s is not None:
-        spans, number = split_into_spans(setting.dataset.clip, options.group_s), options.only or 0
+        spans, number = plan_groups(options, setting.dataset.clip), options.only or 0
         groups = 1 if options.only is not None else len(spans)
         effort = 1 + LATER_STEPS * (groups - 1)
         options, setting = options_of_group(options, number, spans), setting_of_span(setting, spans[number])
@@ -79,7 +81,7 @@ def _dry_run(options: Options) -> Estimate:
         trainer,
         VALIDATION_RAYS,
         options.test_views,
-        time.monotonic() - started - trainer.elapsed_s,
+        time.monotonic() - started - trainer.elapsed_s - (MONITOR.spent_s - compiling_s),  # compiled once only
         options.time_budget_s,
         options.tune_steps,
     )

@@ -64,6 +64,7 @@ class Options:
     trade: Trade = field(default_factory=Trade)
     keep_checkpoint: Path | None = None
     tune_steps: int | None = None
+    preview: Path | None = None
     ablation: str = BASELINE
 
     @property
@@ -209,6 +210,11 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
         f"permits, at least {FEWEST_PICTURES})",
     )
     parser.add_argument(
+        "--preview",
+        action="store_true",
+        help="while training, keep a small picture of a held-out view beside what was filmed in OUTPUT.preview.png",
+    )
+    parser.add_argument(
         "--keep-checkpoint",
         type=Path,
         metavar="MODEL.kpck",
@@ -317,6 +323,7 @@ def _options_from(given: argparse.Namespace) -> Options:
         trade=Trade(given.max_loss, given.target_size, given.quality, given.lam, given.psnr),
         keep_checkpoint=given.keep_checkpoint,
         tune_steps=given.tune_steps,
+        preview=given.output.with_name(given.output.name + ".preview.png") if given.preview else None,
     )
 
 

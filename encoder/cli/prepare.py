@@ -111,7 +111,7 @@ def trim_with_progress(
     mapping: DeviceCoordinates | None,
 ) -> tuple[np.ndarray, float]:
     """Trim the box to what is occupied, showing progress; return the box and the seconds that took."""
-    with Progress("survey", total=1000, unit="‰") as progress:
+    with Progress("finding the box", total=100, unit="%") as progress:
         return trim_box(
             dataset,
             config,

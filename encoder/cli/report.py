@@ -1,6 +1,5 @@
 """What kpenc prints: log lines on stderr while it runs, and the results on stdout."""
 
-import math
 import sys
 from dataclasses import asdict
 from typing import Any
@@ -33,12 +32,9 @@ def log(text: str) -> None:
 
 
 def show_progress(progress: Progress, report: Report) -> None:
-    """Show step, training PSNR and speed; the bar counts per mille of the work."""
-    progress.note(
-        f"step {report.step}, psnr {report.psnr:.2f}, {report.rays_per_second:,.0f} rays/s, "
-        f"{report.samples_per_ray:.1f} samples/ray, {report.occupied:.1%} occupied"
-    )
-    progress.advance(1000 * min(report.fraction, 1.0) - progress.done)
+    """Show step, training PSNR and speed; the bar counts percents of the work."""
+    progress.note(f"step {report.step:,}, {report.psnr:.1f} dB, {report.rays_per_second:,.0f} rays/s")
+    progress.advance(100 * min(report.fraction, 1.0) - progress.done)
 
 
 def describe_model(trainer: Trainer) -> str:
@@ -58,8 +54,9 @@ def describe_model(trainer: Trainer) -> str:
         motion = f", displaced by a motion grid of {nodes} nodes"
     decoder = "hybrid" if trainer.config.hybrid else "explicit"
     return (
-        f"box {corners}{beyond}; planes {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} "
-        f"channels, {layout.size / 1e6:.2f} M parameters{motion}; {decoder} decoder; on {trainer.device}"
+        f"box: {corners}{beyond}\n"
+        f"planes: {planes} ({'xyzt' if layout.is_dynamic else 'xyz'}) of {layout.channels} channels{motion}\n"
+        f"{layout.size / 1e6:.2f} M parameters, {decoder} decoder, on {trainer.device}"
     )
 
 
@@ -68,13 +65,8 @@ def describe_time_rows(config: TrainConfig, dataset: Dataset, found: TimeResolut
     rows = time_rows(dataset.clip.frame_count, config.frames_per_row)
     text = f"time: {rows} rows, one for {config.frames_per_row:g} of {dataset.clip.frame_count} frames"
     if found is None:
-        return f"{text} (the preset's; it is measured where cameras stand still)"
-    wider = "" if math.isnan(found.next_error) else f", with the next fewer rows {found.next_error:.3f}"
-    return (
-        f"{text} (linear interpolation between rows leaves an error of {found.error:.3f} of the full range in the "
-        f"{found.changing:.1%} of the pixels that change{wider}; {config.time_tolerance:g} allowed; noise "
-        f"{found.noise:.3f})"
-    )
+        return f"{text} (the preset's)"
+    return f"{text}: error {found.error:.3f} between rows, {config.time_tolerance:g} allowed"
 
 
 def describe_occupancy(scene: Scene) -> str:
@@ -92,10 +84,9 @@ def describe_pruning(scene: Scene, pruned: Pruned, spare_db: float) -> str:
     if gain is not None and gain > spare_db:
         text = f"colour: view-dependent, which gains {gain:.3f} dB"
     elif gain is not None:
-        text = f"colour: view-independent, view dependence would gain {gain:.3f} dB"
+        text = f"colour: view-independent, as view dependence would gain only {gain:.3f} dB"
     kept = " + ".join(f"{len(kept)} of {count}" for kept, count in zip(pruned.kept, counts, strict=True))
-    more = "" if math.isinf(pruned.next_loss_db) else f", {pruned.next_loss_db:.3f} dB with one fewer"
-    return f"{text}; channels per scale: {kept}; costs {pruned.loss_db:.3f} dB{more} ({spare_db:.3f} allowed)"
+    return f"{text}\nchannels kept: {kept}, a loss of {pruned.loss_db:.3f} dB, {spare_db:.3f} allowed"
 
 
 def print_result(result: dict[str, Any], options: Options, as_json: bool) -> None:

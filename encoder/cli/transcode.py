@@ -1,6 +1,7 @@
 """Coding a finished checkpoint or a .kpc file anew, without pictures and without training."""
 
 import os
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +18,7 @@ from kpc.format.container import groups, scene_io
 from kpc.format.container.container import MAGIC
 
 # What losses are measured on, of a checkpoint and of a .kpc file.
-JUDGED_BY = ("training views", "views of its own, assumed to be right to 30 dB")
+EVALUATED_ON = ("training views", "views of its own, assumed to be right to 30 dB")
 
 
 def transcode(options: Options) -> dict[str, Any]:
@@ -39,12 +40,12 @@ def transcode(options: Options) -> dict[str, Any]:
         )
     if is_coded and not (clip := groups.Groups(options.source)).is_single:
         return _transcode_groups(options, clip) | {"encode_s": time.monotonic() - started}
-    source = codec_model.load(options.source)
-    coded = codec_model.code(source, options.trade, TrainConfig().prune_share, _tune_steps(options), shown=True)
+    source = replace(codec_model.load(options.source), shown=True)
+    coded = codec_model.code(source, options.trade, TrainConfig().prune_share, _tune_steps(options))
     size = scene_io.save(coded.data, options.output)
     return {
         "file": str(options.output), "source": str(options.source),
-        **coding_figures(coded, size, options.trade, JUDGED_BY[is_coded]),
+        **coding_figures(coded, size, options.trade, EVALUATED_ON[is_coded]),
         "encode_s": time.monotonic() - started,
     }  # fmt: skip
 
@@ -60,11 +61,11 @@ def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]
         trade = options_of_group(options, number, spans).trade
         reader = source.open(number)
         scene = replace(scene_io.read(reader), cameras=reader.cameras() or source.cameras())
-        coded = codec_model.code(
-            codec_model.model_from_file(scene), trade, TrainConfig().prune_share, _tune_steps(options), shown=True
-        )
+        print(f"group {number} of {len(spans)}", file=sys.stderr, flush=True)
+        model = replace(codec_model.model_from_file(scene), shown=True)
+        coded = codec_model.code(model, trade, TrainConfig().prune_share, _tune_steps(options))
         parts.append(groups.GroupInput.of(coded.data, span.start))
-        found.append(coding_figures(coded, coded.size_bytes, trade, JUDGED_BY[1]))
+        found.append(coding_figures(coded, coded.size_bytes, trade, EVALUATED_ON[1]))
     size = groups.write(parts, options.output)
     return {
         "file": str(options.output),
@@ -85,8 +86,8 @@ def combine_figures(
     name, value = trade.bound
     return {
         "trade": name,
-        "asked": value,
-        "judged_by": found[0]["judged_by"],
+        "target": value,
+        "evaluated_on": found[0]["evaluated_on"],
         **means,
         "size_bytes": size,
         "parameters": parameters,
@@ -94,13 +95,13 @@ def combine_figures(
     }
 
 
-def coding_figures(coded: codec_model.CodedModel, size: int, trade: Trade, judged_by: str) -> dict[str, Any]:
+def coding_figures(coded: codec_model.CodedModel, size: int, trade: Trade, evaluated_on: str) -> dict[str, Any]:
     """Return the figures that are reported for every file."""
     name, value = trade.bound
     return {
         "trade": name,
-        "asked": value,
-        "judged_by": judged_by,
+        "target": value,
+        "evaluated_on": evaluated_on,
         "validation_psnr": coded.psnr,
         "validation_loss_db": coded.loss_db,
         "agreement_db": coded.agreement_db,
@@ -113,15 +114,15 @@ def coding_figures(coded: codec_model.CodedModel, size: int, trade: Trade, judge
 
 def describe_outcome(result: dict[str, Any]) -> str:
     """Describe the target, and what was reached, in words."""
-    name, asked = result["trade"], result["asked"]
+    name, bound = result["trade"], result["target"]
     target = {
-        "max_loss_db": f"at most {asked:g} dB of loss",
-        "target_bytes": f"at most {asked:,.0f} bytes",
-        "quality": f"quality {asked:g}",
-        "lam": f"lam {asked:g}",
-        "psnr_db": f"at least {asked:g} dB",
+        "max_loss_db": f"at most {bound:g} dB of loss",
+        "target_bytes": f"at most {bound:,.0f} bytes",
+        "quality": f"quality {bound:g}",
+        "lam": f"lam {bound:g}",
+        "psnr_db": f"at least {bound:g} dB",
     }[name]
-    loss = f"{result['validation_loss_db']:.3f} dB of loss on {result['judged_by']}"
+    loss = f"{result['validation_loss_db']:.3f} dB of loss on {result['evaluated_on']}"
     psnr = f"{result['validation_psnr']:.2f} dB, " if name == "psnr_db" else ""
     return (
         f"asked for {target}; reached {result['size_bytes']:,} bytes, {psnr}{loss}, "

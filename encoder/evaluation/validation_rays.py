@@ -79,9 +79,9 @@ class ValidationRays:
         return self.origins, self.directions, self.times
 
     @staticmethod
-    def from_training_views(sampler: RaySampler, background: np.ndarray) -> "ValidationRays":
-        """Draw random pixels of the training pictures."""
-        batch, targets = sampler.draw(np.random.default_rng(1), VALIDATION_RAYS, background)
+    def from_training_views(sampler: RaySampler, background: np.ndarray, effort: float = 1.0) -> "ValidationRays":
+        """Draw random pixels of the training pictures, a share `effort` of VALIDATION_RAYS."""
+        batch, targets = sampler.draw(np.random.default_rng(1), int(effort * VALIDATION_RAYS), background)
         origins, directions, times = (a.numpy() for a in (batch.origins, batch.directions, batch.times))
         appearances = None if batch.appearances is None else batch.appearances.numpy()
         return ValidationRays(origins, directions, times, appearances, targets.numpy())

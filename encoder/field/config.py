@@ -175,6 +175,8 @@ class TrainConfig:
     # Steps of fine-tuning after each group of planes is quantised (`kpc.encoder.rdo.sequential_finetune`); 0 for none.
     # Room: with 100, files are 2 % smaller at equal error.
     tune_steps: int = 60
+    # Steps of training from which on coding takes its full effort (`coding_effort`); 0 for full effort always.
+    thorough_from: int = 0
 
     def __post_init__(self) -> None:
         positive = (
@@ -227,6 +229,13 @@ class TrainConfig:
             return Variation(self.space_variation, self.transient_variation, 0.0)
         return Variation(self.robust_space_variation, self.transient_variation, self.robust_tv_scale**-2)
 
+    def coding_effort(self, steps: float) -> float:
+        """Return the share of the usual effort that coding takes after so many steps of training, in [1 / 16, 1].
+
+        Otherwise a draft would be coded for longer than it was trained.
+        """
+        return 1.0 if steps >= self.thorough_from else max(steps / self.thorough_from, 1 / 16)
+
     @property
     def prunes(self) -> bool:
         """Whether the model may be pruned, for which its decoder has to be linear, as the explicit one is."""
@@ -267,6 +276,7 @@ PRESETS = {
         steps=1500,
         occupancy_start=64,
         tune_steps=0,
+        thorough_from=6000,
     ),
     "fast": TrainConfig(resolutions=(64, 160), channels=8, samples_across=224, cells_across=80, steps=3000),
     # Two scales of 16 channels rather than three of 8 (measured).

@@ -15,13 +15,14 @@ import numpy as np
 from kpc.encoder.evaluation.validation_rays import Fidelity, Measure, ValidationRays
 from kpc.encoder.rdo.curvature import Curvature, PerPlane, estimate_curvature
 from kpc.encoder.rdo.distortion import PlaneKey
-from kpc.encoder.rdo.mode_decision import quantise_by_cost, requested_step
+from kpc.encoder.rdo.mode_decision import BLOCK_SIDES, quantise_by_cost, requested_step
 from kpc.encoder.rdo.model_checkpoint import CHECKPOINT_MAGIC, read_checkpoint
 from kpc.encoder.rdo.motion_rdo import coarsen_motion
 from kpc.encoder.rdo.occupancy_rdo import flip_errors, optimise_occupancy
-from kpc.encoder.rdo.prune import Pruned, prune
+from kpc.encoder.rdo.prune import Pruned, max_renderings, prune
 from kpc.encoder.rdo.rate_control import (
     DECODER_SHARE,
+    RENDERINGS,
     ROUGH_TOLERANCE,
     SLOTS_SHARE,
     TUNED_ERROR,
@@ -40,11 +41,14 @@ from kpc.encoder.rdo.rate_search import TOLERANCE
 from kpc.encoder.rdo.sequential_finetune import quantise_sequentially, step_factors
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, bfloat16_ceil, round_decoder
 from kpc.format.common.errors import TrainingError, UsageError
+from kpc.format.common.progress import Progress
 from kpc.format.container import scene_io
 from kpc.format.container.container import MAGIC
 from kpc.format.scene.motion import FINEST_STEP
 from kpc.format.scene.scene import Decoder, Scene
 
+QUICK_TOLERANCE = 0.05  # instead of TOLERANCE where coding takes less than its usual effort
+REDUCTIONS = 20  # renderings to decide on slots, cells, motion and the decoder's bits, about
 # For a target size, the loss that it costs is estimated at most MAX_ESTIMATES times: first with the whole model, then
 # with what is selected at the loss found before, as long as the loss falls below ESTIMATE_RATIO of it each time
 # (docs/design/rate-distortion.md, "Rate control").
@@ -59,21 +63,26 @@ class Model:
         scene: as trained, or as decoded from a file.
         validation: rays on which codings are judged.
         coded: the file's quantised scene; None for a scene in full precision.
+        shown: whether to show the progress of measuring and coding it.
+        effort: share of the usual rays on which errors are estimated. Below 1, fewer modes are tried, too, and the
+            target is met less closely.
     """
 
     scene: Scene
     validation: ValidationRays
     coded: QuantisedScene | None = None
+    shown: bool = False
+    effort: float = 1.0
 
     @cached_property
     def curvature(self) -> Curvature:
         """What errors in planes cost (`kpc.encoder.rdo.curvature`)."""
-        return estimate_curvature(self.scene, self.validation)
+        return estimate_curvature(self.scene, self.validation, effort=self.effort, shown=self.shown)
 
     @cached_property
     def flip_errors(self) -> np.ndarray:
         """What flipping a cell of the occupancy costs (`kpc.encoder.rdo.occupancy_rdo`)."""
-        return flip_errors(self.scene, self.validation)
+        return flip_errors(self.scene, self.validation, round(1 / self.effort), self.shown)
 
 
 @dataclass(frozen=True)
@@ -188,7 +197,6 @@ class _Coder:
     prune_share: float
     tune_steps: int
     quantise: QuantiseFunction | None
-    shown: bool
     grids: bool
 
     @cached_property
@@ -216,11 +224,25 @@ class _Coder:
         return chosen
 
     def _reduce(self, whole: Selection, loss_db: float) -> Selection:
-        return whole.reduce(self.model, self.measure, loss_db, self.prune_share, self.grids)
+        features = sum(scale["xy"].shape[2] for scale in whole.scene.scales)
+        total = max_renderings(features) + REDUCTIONS
+        with Progress("pruning", total, "renderings", shown=self.model.shown) as progress:
+
+            def measure(scene: Scene) -> Fidelity:
+                progress.extend(1)
+                found = self.measure(scene)
+                progress.advance()
+                return found
+
+            return whole.reduce(self.model, measure, loss_db, self.prune_share, self.grids)
 
     def meet(self, chosen: Selection, tune_steps: int, tolerance: float) -> Attempt:
         """Quantise a selection so that it meets the target."""
+        planes = sum(map(len, chosen.scene.scales))
+        with Progress("choosing quantisation steps", RENDERINGS * planes, "planes", shown=self.model.shown) as progress:
+            return self._meet(chosen, tune_steps, tolerance, progress)
 
+    def _meet(self, chosen: Selection, tune_steps: int, tolerance: float, progress: Progress) -> Attempt:
         def quantise(
             scene: Scene,
             steps: PerPlane,
@@ -231,7 +253,17 @@ class _Coder:
             if self.quantise is not None:
                 quantised = self.quantise(scene, steps, looked_up, significant)
             else:
-                quantised = quantise_by_cost(scene, steps, looked_up, significant, only, chosen.correlation)
+                progress.extend(sum(map(len, scene.scales)) if only is None else len(only))
+                quantised = quantise_by_cost(
+                    scene,
+                    steps,
+                    looked_up,
+                    significant,
+                    only,
+                    chosen.correlation,
+                    block_sides=BLOCK_SIDES if self.model.effort == 1 else BLOCK_SIDES[:1],
+                    done=progress.advance,
+                )
             return replace(quantised, decoder=round_decoder(quantised.decoder, chosen.bits))
 
         def tune(steps: PerPlane, looked_up: np.ndarray) -> QuantisedScene:
@@ -245,7 +277,7 @@ class _Coder:
             def quantise_group(candidate: Scene, group: Sequence[PlaneKey]) -> QuantisedScene:
                 return quantise(candidate, steps, looked_up, chosen.significant, group)
 
-            return quantise_sequentially(chosen.scene, self.model.scene, quantise_group, tune_steps, self.shown)
+            return quantise_sequentially(chosen.scene, self.model.scene, quantise_group, tune_steps, self.model.shown)
 
         controller = RateController(
             chosen.scene,
@@ -267,7 +299,6 @@ def code(
     prune_share: float,
     tune_steps: int,
     quantise: QuantiseFunction | None = None,
-    shown: bool = False,
     grids: bool = True,
 ) -> CodedModel:
     """Code a model so that it meets a rate-distortion target.
@@ -278,16 +309,16 @@ def code(
         prune_share: share of the loss that pruning may take (`kpc.encoder.rdo.prune`).
         tune_steps: steps of fine-tuning per group of planes (`kpc.encoder.rdo.sequential_finetune`); 0 for none.
         quantise: another way to choose symbols, for comparison.
-        shown: whether to show the progress of fine-tuning.
         grids: whether to choose occupancy and displacements by rate and distortion. Otherwise they are only merged into
             fewer slots and rounded to coarser steps.
 
     Raises:
         TrainingError: no file of this model is as small as the target.
     """
-    coder = _Coder(model, trade, prune_share, tune_steps, quantise, shown, grids)
+    coder = _Coder(model, trade, prune_share, tune_steps, quantise, grids)
     chosen = coder.select()
-    found, pruned = coder.meet(chosen, tune_steps, TOLERANCE), chosen.pruned
+    tolerance = TOLERANCE if model.effort == 1 else QUICK_TOLERANCE
+    found, pruned = coder.meet(chosen, tune_steps, tolerance), chosen.pruned
     if trade.target_bytes is not None and found.size_bytes > trade.target_bytes:
         raise TrainingError(
             f"{found.size_bytes:,} bytes is the smallest size of this model, more than {trade.target_bytes:,}; give "

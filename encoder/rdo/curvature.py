@@ -24,6 +24,7 @@ from kpc.encoder.evaluation.validation_rays import ValidationRays
 from kpc.encoder.field.field import Layout
 from kpc.encoder.field.fused import march_scene
 from kpc.encoder.field.render import shade
+from kpc.format.common.progress import progress
 from kpc.format.scene.scene import Scene
 
 # Figures behind these constants: docs/design/rate-distortion.md, "Curvature".
@@ -51,7 +52,9 @@ class Curvature:
     motion: np.ndarray | None = None
 
 
-def estimate_curvature(scene: Scene, validation: ValidationRays, rays: int | None = None) -> Curvature:
+def estimate_curvature(
+    scene: Scene, validation: ValidationRays, rays: int | None = None, *, effort: float = 1.0, shown: bool = False
+) -> Curvature:
     """Estimate the curvature for a scene's planes.
 
     Uses those validation rays that pass through occupied cells, and fills up with random rays of the scene's cameras.
@@ -61,10 +64,11 @@ def estimate_curvature(scene: Scene, validation: ValidationRays, rays: int | Non
     Args:
         scene: uncoded.
         validation: rays that are used first.
-        rays: number of rays in all; None for RAYS.
+        rays: number of rays in all; None for a share `effort` of RAYS.
+        shown: whether to show progress.
     """
     renderer, rng = SceneRenderer(scene), np.random.default_rng(3)
-    field, rays = renderer.field, RAYS if rays is None else rays
+    field, rays = renderer.field, int(effort * RAYS) if rays is None else rays
     hits = np.flatnonzero(renderer.hits_occupied(*validation.rays))
     validation = validation.subset(rng.permutation(hits)[:rays])
     more = ValidationRays.through_occupied(scene, rays - len(validation.times), seed=2)
@@ -73,19 +77,19 @@ def estimate_curvature(scene: Scene, validation: ValidationRays, rays: int | Non
     products = [
         {name: channel_products(np.zeros_like(plane)) for name, plane in scale.items()} for scale in scene.scales
     ]
-    for part in (validation, more):
-        for batch in part.batches(RAYS_PER_GRADIENT):
-            batch_rays = renderer.batch(*batch.rays)
-            _, composited = march_scene(field, batch_rays, scene)
-            codes = renderer.codes(batch.appearances)
-            colours = shade(field, batch_rays, composited, None if codes is None else torch.from_numpy(codes))
-            signs = torch.from_numpy(rng.choice(np.array([-1, 1], np.float32), tuple(colours.shape)))
-            gradients = torch.autograd.grad((signs * colours).sum(), parameters)
-            for scale, planes in zip(products, _by_plane(field.layout, scene, gradients[0].numpy()), strict=True):
-                for name, plane in planes.items():
-                    scale[name] += channel_products(plane)
-            for total, gradient in zip(squares, gradients, strict=True):
-                total += gradient.square_()
+    batches = [*validation.batches(RAYS_PER_GRADIENT), *more.batches(RAYS_PER_GRADIENT)]
+    for batch in progress(batches, "measuring what errors cost", unit="batches", shown=shown):
+        batch_rays = renderer.batch(*batch.rays)
+        _, composited = march_scene(field, batch_rays, scene)
+        codes = renderer.codes(batch.appearances)
+        colours = shade(field, batch_rays, composited, None if codes is None else torch.from_numpy(codes))
+        signs = torch.from_numpy(rng.choice(np.array([-1, 1], np.float32), tuple(colours.shape)))
+        gradients = torch.autograd.grad((signs * colours).sum(), parameters)
+        for scale, planes in zip(products, _by_plane(field.layout, scene, gradients[0].numpy()), strict=True):
+            for name, plane in planes.items():
+                scale[name] += channel_products(plane)
+        for total, gradient in zip(squares, gradients, strict=True):
+            total += gradient.square_()
     count = max(1, len(validation.times) + len(more.times))
     theta_diagonal, *motion = (total.numpy() / count for total in squares)
     diagonal = [

@@ -7,7 +7,7 @@ levels are 0. What the modes gain: docs/design/rate-distortion.md, "Mode decisio
 """
 
 import os
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -42,7 +42,8 @@ def quantise_by_cost(
     only: Collection[PlaneKey] | None = None,
     correlation: PerPlane | None = None,
     low_rate_bits: float = LOW_RATE_BITS,
-    blocks: bool = True,
+    block_sides: Sequence[int] = BLOCK_SIDES,
+    done: Callable[[], None] = lambda: None,
 ) -> QuantisedScene:
     """Quantise a scene as `quantise_scene` does, with symbols of least cost.
 
@@ -55,7 +56,8 @@ def quantise_by_cost(
         only: planes whose symbols are searched for; others are rounded. None for all.
         correlation: as in `kpc.encoder.rdo.curvature.Curvature`. None for independent channels.
         low_rate_bits: as for `kpc.encoder.rdo.trellis.trellis_quantise`.
-        blocks: whether to try transform blocks.
+        block_sides: sides of transform blocks that are tried; none for the trellis alone.
+        done: called after each plane.
     """
     looked_up = looked_up_cells(scene) if looked_up is None else looked_up
     quantised = quantise_scene(scene, steps, reached=looked_up)
@@ -76,15 +78,18 @@ def quantise_by_cost(
             NO_CORRELATION if correlation is None else correlation[s][name],
             low_rate_bits,
         )
-        if not blocks:
+        if not block_sides:
             return plane.on_trellis()
         needed = needed_texels(looked_up, name, *values.shape[:2])
         if looked_up is scene.occupancy:
-            return cheapest_mode(plane, needed, needed)
-        return cheapest_mode(plane, needed_texels(scene.occupancy, name, *values.shape[:2]), needed)
+            return cheapest_mode(plane, needed, needed, block_sides)
+        return cheapest_mode(plane, needed_texels(scene.occupancy, name, *values.shape[:2]), needed, block_sides)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the searches release the GIL
-        searched = dict(zip(chosen, pool.map(search, chosen), strict=True))
+        searched = {}
+        for key, plane in zip(chosen, pool.map(search, chosen), strict=True):
+            searched[key] = plane
+            done()
     scales = tuple(
         {name: searched.get((s, name), plane) for name, plane in scale.items()}
         for s, scale in enumerate(quantised.scales)
@@ -136,13 +141,16 @@ class Plane:
         )
 
 
-def cheapest_mode(plane: Plane, implied: np.ndarray, needed: np.ndarray) -> QuantisedPlane:
+def cheapest_mode(
+    plane: Plane, implied: np.ndarray, needed: np.ndarray, block_sides: Sequence[int] = BLOCK_SIDES
+) -> QuantisedPlane:
     """Return the plane in the mode of least cost.
 
     Args:
         plane: to be quantised.
         implied: (H, W) bool, texels that the file's occupancy implies to be coded.
         needed: (H, W) bool, texels that are looked up.
+        block_sides: sides of transform blocks that are tried, at least one.
     """
     root = np.sqrt(distortion_weights(plane.significant, plane.nearest.coded)) * needed[..., None]
 
@@ -152,7 +160,7 @@ def cheapest_mode(plane: Plane, implied: np.ndarray, needed: np.ndarray) -> Quan
         return factor * total_distortion(errors, plane.correlation) + DECISION_LAM * 8 * size_bytes
 
     tried = []
-    for side in BLOCK_SIDES:
+    for side in block_sides:
         maps = (None, needed) if plane.identity else (None,)
         found = [one for coded in maps if (one := plane.in_blocks(side, implied, coded)) is not None]
         if not found:

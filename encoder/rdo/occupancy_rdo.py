@@ -21,6 +21,7 @@ from kpc.encoder.evaluation.validation_rays import Measure, ValidationRays
 from kpc.encoder.field.fused import march_scene
 from kpc.format.coding.occupancy_codec import CONTEXTS, NEIGHBOURS
 from kpc.format.common.jit import compiled, inlined
+from kpc.format.common.progress import progress
 from kpc.format.scene.grid import dilate
 from kpc.format.scene.scene import Scene
 
@@ -64,13 +65,14 @@ def optimise_occupancy(scene: Scene, errors: np.ndarray, measure: Measure, mse: 
     return scene
 
 
-def flip_errors(scene: Scene, validation: ValidationRays, ray_divisor: int = 1) -> np.ndarray:
+def flip_errors(scene: Scene, validation: ValidationRays, ray_divisor: int = 1, shown: bool = False) -> np.ndarray:
     """Estimate the MSE of colours that comes of flipping each cell.
 
     Args:
         scene: uncoded.
         validation: rays that are used first; random rays of the scene's cameras follow.
         ray_divisor: use this many times fewer rays.
+        shown: whether to show progress.
 
     Returns:
         (slots, Nz, Ny, Nx) float64, on the 8-bit scale; 0 for cells that are neither occupied nor next to such a cell.
@@ -78,13 +80,13 @@ def flip_errors(scene: Scene, validation: ValidationRays, ray_divisor: int = 1) 
     dilated = replace(scene, occupancy=dilate(scene.occupancy))
     rays = RAYS_PER_CELL * int(np.count_nonzero(scene.occupancy))
     removing, adding = (
-        removal_errors(one, validation, min(rays, most) // ray_divisor)
+        removal_errors(one, validation, min(rays, most) // ray_divisor, shown)
         for one, most in ((scene, RAYS), (dilated, FEWER_RAYS))
     )
     return np.where(scene.occupancy, removing, adding)
 
 
-def removal_errors(scene: Scene, validation: ValidationRays, rays: int) -> np.ndarray:
+def removal_errors(scene: Scene, validation: ValidationRays, rays: int, shown: bool = False) -> np.ndarray:
     """Estimate the MSE of colours that comes of not marching each cell, on validation rays and `rays` random ones.
 
     Returns:
@@ -94,16 +96,16 @@ def removal_errors(scene: Scene, validation: ValidationRays, rays: int) -> np.nd
     validation = validation.subset(np.flatnonzero(renderer.hits_occupied(*validation.rays)))
     more = ValidationRays.through_occupied(scene, rays, seed=5)
     sums = np.zeros(scene.occupancy.size)
-    for part in (validation, more):
-        for batch in part.batches(RAYS_PER_BATCH):
-            with torch.no_grad():
-                samples, composited = march_scene(renderer.field, renderer.batch(*batch.rays), scene)
-            ray, weights = samples.ray.numpy(), composited.weights.numpy().astype(np.float64)
-            slot = np.minimum((batch.times * slots).astype(np.int64), slots - 1)[ray]
-            cell = np.ravel_multi_index((slot, *samples.cell.numpy().T), scene.occupancy.shape)
-            # The first of a ray's consecutive samples in each cell; their weights are added up.
-            first = np.flatnonzero(np.diff(cell, prepend=-1) | np.diff(ray, prepend=-1))
-            sums += np.bincount(cell[first], np.add.reduceat(weights, first) ** 2 if len(first) else None, sums.size)
+    batches = [*validation.batches(RAYS_PER_BATCH), *more.batches(RAYS_PER_BATCH)]
+    for batch in progress(batches, "measuring which cells matter", unit="batches", shown=shown):
+        with torch.no_grad():
+            samples, composited = march_scene(renderer.field, renderer.batch(*batch.rays), scene)
+        ray, weights = samples.ray.numpy(), composited.weights.numpy().astype(np.float64)
+        slot = np.minimum((batch.times * slots).astype(np.int64), slots - 1)[ray]
+        cell = np.ravel_multi_index((slot, *samples.cell.numpy().T), scene.occupancy.shape)
+        # The first of a ray's consecutive samples in each cell; their weights are added up.
+        first = np.flatnonzero(np.diff(cell, prepend=-1) | np.diff(ray, prepend=-1))
+        sums += np.bincount(cell[first], np.add.reduceat(weights, first) ** 2 if len(first) else None, sums.size)
     count = max(1, len(validation.times) + len(more.times))
     error: np.ndarray = 255**2 * CONTRAST * sums.reshape(scene.occupancy.shape) / count
     return error

@@ -108,7 +108,7 @@ def code_sequentially(scene: Scene, teacher: Scene, code_planes: CodePlanes, ste
     """
     renderer, groups = SceneRenderer(teacher), coding_order(scene)
     settled: set[PlaneKey] = set()
-    with Progress("tune", total=total_steps(scene, steps), unit="step", shown=shown) as progress:
+    with Progress("fine-tuning", total=total_steps(scene, steps), unit="steps", shown=shown) as progress:
         for number, group in enumerate(groups):
             decoded = code_planes(scene, group)
             settled |= decoded.keys()

@@ -15,7 +15,7 @@ import torch
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.field.appearances import assign_appearances
 from kpc.encoder.field.bounds import visible_cells
-from kpc.encoder.field.config import TrainConfig
+from kpc.encoder.field.config import PRESETS, TrainConfig
 from kpc.encoder.field.field import (
     Field,
     HybridField,
@@ -32,6 +32,7 @@ from kpc.encoder.training.fused_optimiser import FusedOptimiser
 from kpc.encoder.training.importance import TileWeights, has_static_cameras
 from kpc.encoder.training.sampler import RaySampler
 from kpc.encoder.training.torch_optimiser import TorchOptimiser
+from kpc.format.common.compiling import MONITOR
 from kpc.format.common.errors import TrainingError
 from kpc.format.common.fidelity import psnr_from_mse
 from kpc.format.scene.scene import Scene
@@ -65,7 +66,7 @@ class Trainer:
         field: being trained.
         grid: the occupancy grid.
         step: steps done.
-        elapsed_s: seconds of training, including those spent before on finding the box.
+        elapsed_s: seconds of training, including those spent before on finding the box, but not on compiling kernels.
         timers: seconds by part of a step.
         names: of the appearances.
         slots: time slots of the occupancy grid.
@@ -150,11 +151,11 @@ class Trainer:
         while (fraction := self._fraction(time_budget_s, most_steps)) < 1:
             if interrupted():
                 raise KeyboardInterrupt
-            started = time.monotonic()
+            started, compiling_s = time.monotonic(), MONITOR.spent_s
             squared_error, count = self._step(fraction)
             error, drawn = error + squared_error * count, drawn + count
             now = time.monotonic()
-            self.elapsed_s += now - started
+            self.elapsed_s += now - started - (MONITOR.spent_s - compiling_s)
             if self.step > 2 * config.occupancy_start:
                 self._steady_rays, self._steady_s = self._steady_rays + count, self._steady_s + now - started
             if now - since > 0.5:
@@ -315,6 +316,17 @@ class Trainer:
         }
         save_state(path, state, "give another folder with --work")
 
+    def _changes(self, state: dict[str, Any]) -> str:
+        """Return the settings in which a checkpoint differs from this run, with both values; empty where in none."""
+        before, now = (_named(_comparable(config)) for config in (state["config"], asdict(self.config)))
+        box, mapping = state["aabb"].cpu().numpy().tolist(), state.get("mapping")
+        before |= {"--space": mapping, "--box": box}
+        now |= {"--space": repr(self.mapping), "--box": self.aabb.tolist()}
+        changed = [name for name in now if before.get(name) != now[name]]
+        if before["--preset"] != now["--preset"]:  # which differ in many numbers
+            changed = [name for name in changed if name.startswith("--")]
+        return "; ".join(f"{name} was {before.get(name)}, is {now[name]}" for name in changed)
+
     def _try_to_save(self, path: Path) -> None:
         try:
             self.save(path)
@@ -329,11 +341,9 @@ class Trainer:
         """
         try:
             state = _load(path, self.device)
-            same = _comparable(state["config"]) == _comparable(asdict(self.config))
-            here = np.array_equal(state["aabb"].cpu().numpy(), self.aabb) and state.get("mapping") == repr(self.mapping)
-            if not same or not here:
+            if changed := self._changes(state):
                 raise TrainingError(
-                    f"{path}: belongs to a run with other settings; give the same ones or drop --resume"
+                    f"{path}: belongs to a run with other settings ({changed}); give the same ones or drop --resume"
                 )
             if state["dataset"] != _fingerprint(self.dataset):
                 raise TrainingError(
@@ -350,6 +360,19 @@ class Trainer:
             raise
         except Exception as error:  # a damaged file may raise anything
             raise _unusable(path, error) from error
+
+
+def _named(config: dict[str, Any]) -> dict[str, Any]:
+    """Return the parts of a configuration by the options of kpenc that set them, all others by their own names."""
+    named = {
+        "--preset": min(PRESETS, key=lambda name: len(asdict(PRESETS[name]).items() - config.items())),
+        "--decoder": "hybrid" if config["hybrid"] else "explicit",
+        "--sampling": "proposals" if config["proposals"] else "grid",
+        "--seed": config["seed"],
+        "--appearance": config["appearance"],
+    }
+    own = ("hybrid", "proposals", "seed", "appearance")
+    return named | {name: value for name, value in config.items() if name not in own}
 
 
 def load_checkpoint_box(path: Path) -> np.ndarray:
@@ -381,7 +404,7 @@ def _comparable(config: dict[str, Any]) -> dict[str, Any]:
     return {
         key: tuple(value) if isinstance(value, list) else value
         for key, value in config.items()
-        if key not in ("steps", "prune_share", "tune_steps")
+        if key not in ("steps", "prune_share", "tune_steps", "thorough_from")
     }
 
 

@@ -1,7 +1,7 @@
 """Detection of numba's compilation, to explain the delay when kernels are used for the first time.
 
-Kernels are compiled on first use, about half a minute in all, and numba caches them on disk. Meanwhile a notice is
-printed on terminals.
+Kernels are compiled on first use, a minute or two in all, and numba caches them on disk. Meanwhile a notice is printed
+on terminals, and elsewhere for commands that say so (`CompilationMonitor.announces`).
 """
 
 import sys
@@ -10,7 +10,7 @@ import time
 
 from numba.core import event
 
-NOTICE = "compiling for this processor, which takes about half a minute, once"
+NOTICE = "compiling kernels for this processor, which takes a minute or two, once"
 
 # Seconds of compilation before the notice is due: now and then a single small kernel is missing from the cache.
 NOTICE_AFTER_S = 1.0
@@ -24,6 +24,7 @@ class CompilationMonitor(event.Listener):
         self._depth = 0
         self._begun = self._spent = 0.0
         self._notified = False
+        self.announces = False  # whether to print NOTICE where stderr is no terminal, too
 
     def on_start(self, _: event.Event) -> None:
         """Record that numba begins to compile a function."""
@@ -31,7 +32,8 @@ class CompilationMonitor(event.Listener):
             if self._depth == 0:
                 self._begun = time.monotonic()
             self._depth += 1
-            notify = self.is_compiling and not self._notified and sys.stderr is not None and sys.stderr.isatty()
+            shows = sys.stderr is not None and (self.announces or sys.stderr.isatty())
+            notify = self.is_compiling and not self._notified and shows
             self._notified |= notify
         if notify:
             print(NOTICE, file=sys.stderr)
@@ -44,9 +46,14 @@ class CompilationMonitor(event.Listener):
                 self._spent += time.monotonic() - self._begun
 
     @property
+    def spent_s(self) -> float:
+        """Seconds that this process has spent on compiling."""
+        return self._spent + (time.monotonic() - self._begun if self._depth else 0.0)
+
+    @property
     def is_compiling(self) -> bool:
         """Whether numba is compiling and has spent at least NOTICE_AFTER_S on it so far."""
-        return self._depth > 0 and self._spent + time.monotonic() - self._begun >= NOTICE_AFTER_S
+        return self._depth > 0 and self.spent_s >= NOTICE_AFTER_S
 
 
 # Monitors this process, from the import of `kpc.format.common.jit` on.

@@ -25,7 +25,7 @@ class Progress:
     Args:
         label: name of the task.
         total: units of work in all; None if unknown.
-        unit: name of a unit.
+        unit: name of a unit, or "%" where the total is 100.
         shown: False to report nothing.
     """
 
@@ -38,7 +38,8 @@ class Progress:
         self.first: tuple[float, float] | None = None
         self.bar = None
         if shown and sys.stderr.isatty():
-            layout = "{l_bar}{bar}| {n:.0f}/{total:.0f} [{elapsed}<{remaining}]{postfix}" if total else None
+            count = "" if unit == "%" else " {n:.0f}/{total:.0f}"  # the bar begins with the percentage
+            layout = f"{{l_bar}}{{bar}}|{count} [{{elapsed}}<{{remaining}}]{{postfix}}" if total else None
             self.bar = tqdm(total=total, desc=label, unit=unit or "it", leave=False, file=sys.stderr, bar_format=layout)
 
     def advance(self, count: float = 1) -> None:
@@ -49,6 +50,13 @@ class Progress:
             self.bar.update(count)
         elif self.shown and time.monotonic() - self.reported_at >= self.line_after_s:
             self._print_line()
+
+    def extend(self, count: float) -> None:
+        """Expect at least `count` more units, where the total was a guess."""
+        if self.total is not None and self.done + count > self.total:
+            self.total = self.done + count
+            if self.bar is not None:
+                self.bar.total = self.total
 
     def note(self, text: str) -> None:
         """Set the text shown behind the bar, or at the end of the next line."""
@@ -71,7 +79,8 @@ class Progress:
         if not self.total:
             self.line_after_s = LINE_EVERY_S
         else:
-            parts = [f"{self.label}: {self.done:.0f}/{self.total:.0f} {self.unit}".rstrip()]
+            of = "" if self.unit == "%" else f"/{self.total:.0f}"
+            parts = [f"{self.label}: {self.done:.0f}{of} {self.unit}".rstrip()]
             done, when = self.first or (0.0, self.reported_at)
             if self.done > done:
                 self.line_after_s = LINE_EVERY_S

@@ -151,14 +151,14 @@ def test_the_hybrid_decoder(run: Kpenc, sets: Path, tmp_path: Path, name: str) -
 def test_the_result_is_printed(run: Kpenc, sets: Path) -> None:
     code, out, err = run(sets / "blender")
     assert code == 0 and "displaced by a motion grid of 11x11x11 nodes" in err
-    assert "colour: view-independent, as trained; channels per scale: " in err
+    assert "colour: view-independent, as trained\nchannels kept: " in err
     assert "time: 2 rows, one for 4 of 5 frames (the preset's" in err
     assert all(
         words in out
         for words in (
             "out.kpc: held-out PSNR ",
             " dB, SSIM ",
-            "over 3 pictures",
+            "over 3 of 3 pictures",
             " bytes, ",
             "bits per parameter",
             "exactly at identity: ",
@@ -254,7 +254,7 @@ def test_pruning_is_logged_and_reduces_the_file(
     counts = [scale["xy"].symbols.shape[2] for scale in scene.scales]
     assert code == 0 and json.loads(out)["coding_loss_db"] <= 1
     assert (
-        ("colour: view-independent, view dependence would gain" in err)
+        ("colour: view-independent, as view dependence would gain only" in err)
         == (share > 0)
         == (scene.decoder.w1.shape == (1, 9))
     )
@@ -356,7 +356,8 @@ def test_resume_without_a_checkpoint_starts_afresh(run: Kpenc, sets: Path) -> No
 def test_resume_with_other_settings(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     assert run(sets / "n3dv", "--steps", "2", "--keep", "--box", "-1,-1,-1,1,1,1")[0] == 0
     kept = (tmp_path / "out.kpc").read_bytes()
-    for options, words in ((("--seed", "7"), "other settings"), (("--holdout", "none"), "other pictures")):
+    changed = ("--seed", "7", "--decoder", "hybrid"), "(--decoder was explicit, is hybrid; --seed was 0, is 7)"
+    for options, words in (changed, (("--holdout", "none"), "other pictures")):
         code, _, err = run(sets / "n3dv", "--steps", "3", "--resume", "--box", "-1,-1,-1,1,1,1", *options)
         assert code == 1 and words in err.splitlines()[-1] and CHECKPOINT in err
     (tmp_path / "out.kpc.work" / CHECKPOINT).write_bytes(b"damaged")

@@ -173,7 +173,7 @@ def test_files_keep_symbols_and_requested_steps() -> None:
         scene_io.read(scene_io.encode(forgotten)).scales[0]["xy"].symbols.tobytes()
         == back.scales[0]["xy"].symbols.tobytes()
     )
-    without = quantise_by_cost(scene, steps, blocks=False)
+    without = quantise_by_cost(scene, steps, block_sides=())
     assert {type(plane.side_info) for scale in without.scales for plane in scale.values()} <= {
         PredictionWeights,
         type(None),

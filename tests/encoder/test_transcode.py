@@ -93,8 +93,8 @@ def test_a_checkpoint_gives_the_file_that_training_gave(
     assert (tmp_path / "out.kpc").read_bytes() == (tmp_path / "again.kpc").read_bytes()
     said = (
         "trade",
-        "asked",
-        "judged_by",
+        "target",
+        "evaluated_on",
         "validation_psnr",
         "validation_loss_db",
         "agreement_db",
@@ -216,7 +216,7 @@ def test_a_file_becomes_smaller(scene_file: Path, tmp_path: Path, kpenc_says: Kp
     measured = ValidationRays.from_cameras(before).measure(before)(after)
     assert result["agreement_db"] == pytest.approx(measured.agreement_db) and measured.mse > 0
     lost = 10 * np.log10(1 + measured.mse / 255**2 / ASSUMED_MSE)
-    assert result["validation_loss_db"] == pytest.approx(lost) and "30 dB" in result["judged_by"]
+    assert result["validation_loss_db"] == pytest.approx(lost) and "30 dB" in result["evaluated_on"]
 
 
 def test_a_file_keeps_its_symbols_at_a_loose_target(scene_file: Path, tmp_path: Path, kpenc_says: Kpenc) -> None:

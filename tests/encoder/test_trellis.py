@@ -40,7 +40,7 @@ def trellis_quantised(
     scene: Scene, step: float, significant: list[dict[str, np.ndarray]] | None = None
 ) -> QuantisedScene:
     steps = [{name: np.full(plane.shape[2], step) for name, plane in scale.items()} for scale in scene.scales]
-    return quantise_by_cost(scene, steps, significant=significant, blocks=False)
+    return quantise_by_cost(scene, steps, significant=significant, block_sides=())
 
 
 NO_WEIGHTS = np.zeros((1, WEIGHT_COUNT), np.int8)

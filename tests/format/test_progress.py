@@ -56,6 +56,20 @@ def test_without_a_total(clock: Clock, capsys: pytest.CaptureFixture[str]) -> No
     assert capsys.readouterr().err == "count: 7\n"
 
 
+def test_percent_and_a_total_that_was_a_guess(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress("train", 100, "%") as bar:
+        bar.advance(10)
+        clock.now = 10
+        bar.advance(10)
+    with Progress("search", 4) as bar:
+        bar.extend(3)
+        bar.advance(3)
+        bar.extend(3)
+        clock.now = 20
+        bar.advance(1)
+    assert capsys.readouterr().err.splitlines() == ["train: 20 %, 80 s left", "search: 4/6, 20 s left"]
+
+
 def test_hidden(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     with Progress("decode", 10, shown=False) as bar:
         clock.now = 60

@@ -71,8 +71,8 @@ ABLATIONS: dict[str, QuantiseFunction | None] = {
     "kpc, no fine-tuning": None,
     NO_GRID_RDO: None,
     "kpc, independent channels": quantise_by_cost,
-    "kpc, no transform": partial(quantise_by_cost, blocks=False),
-    "kpc, no transform or prediction": partial(quantise_by_cost, low_rate_bits=0.0, blocks=False),
+    "kpc, no transform": partial(quantise_by_cost, block_sides=()),
+    "kpc, no transform or prediction": partial(quantise_by_cost, low_rate_bits=0.0, block_sides=()),
     "kpc, no trellis": lambda scene, steps, reached, significant: quantise_scene(scene, steps, reached=reached),
     "kpc, uniform weights": lambda scene, steps, reached, significant: quantise_by_cost(scene, steps, reached),
 }
