@@ -8,6 +8,7 @@ import pytest
 
 from kpc.encoder.evaluation.evaluate import SceneRenderer
 from kpc.encoder.evaluation.validation_rays import ValidationRays
+from kpc.encoder.field.config import PRESETS
 from kpc.encoder.rdo import curvature as module
 from kpc.encoder.rdo.curvature import estimate_curvature
 from kpc.format.scene.scene import Scene
@@ -147,3 +148,16 @@ def test_rays_through_empty_space_do_not_count() -> None:
     with_them, without = estimate_curvature(scene, astray, 64), estimate_curvature(scene, validation, 64)
     for name, found in with_them.diagonal[1].items():
         assert found.any() and found.tobytes() == without.diagonal[1][name].tobytes()
+
+
+def test_less_effort_takes_fewer_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drafts are coded with a share of the rays, other presets with all."""
+    monkeypatch.setattr(module, "RAYS", 800)
+    scene = tiny_scene()
+    validation = ValidationRays.from_cameras(scene, 300)
+    less, few = estimate_curvature(scene, validation, effort=0.25), estimate_curvature(scene, validation, 200)
+    for scale, other in zip(less.diagonal, few.diagonal, strict=True):
+        assert all(np.array_equal(scale[name], other[name]) for name in scale)
+    draft, fast = PRESETS["draft"], PRESETS["fast"]
+    assert [draft.coding_effort(steps) for steps in (1, 1500, 6000, 9000)] == [1 / 16, 1 / 4, 1, 1]
+    assert fast.coding_effort(1) == 1

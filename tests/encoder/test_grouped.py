@@ -13,6 +13,7 @@ import torch
 
 import datasets as make
 from kpc.encoder.cli import kpenc
+from kpc.encoder.cli.encode_groups import plan_groups
 from kpc.encoder.cli.estimate import Estimate
 from kpc.encoder.cli.grouped import LATER_STEPS, OVERLAP, initialise_from, options_of_group, split_into_spans
 from kpc.encoder.cli.options import Options
@@ -269,7 +270,20 @@ def test_invalid_options_are_refused(videos, tmp_path, capsys, options, complain
 
 
 def test_a_dry_run_counts_all_groups(videos, tmp_path, monkeypatch):
-    monkeypatch.setattr(kpenc, "estimate", lambda trainer, *rest: Estimate(10.0, 4.0, trainer.dataset.clip.frame_count))
+    def first_group(trainer: Trainer, *_: object) -> Estimate:
+        return Estimate(10.0, 2.0, 4.0, trainer.dataset.clip.frame_count, 6, 8)
+
+    monkeypatch.setattr(kpenc, "estimate", first_group)
     options = Options(videos, tmp_path / "long.kpc", preset="draft", group_s=1.2, device="cpu")
-    assert kpenc.dry_run(options) == Estimate(10 + 20 * LATER_STEPS, 4 + 8 * LATER_STEPS, 8 + OVERLAP)
-    assert kpenc.dry_run(replace(options, only=1)) == Estimate(10.0, 4.0, 9 + 2 * OVERLAP)
+    later = 2 * LATER_STEPS
+    expected = Estimate(10 * (1 + later), 2 * (1 + later), 4 * (1 + later), 8 + OVERLAP, round(6 * (1 + later)), 24)
+    assert kpenc.dry_run(options) == expected
+    assert kpenc.dry_run(replace(options, test_views=6)) == replace(expected, test_s=6.0, test_pictures=18)
+    assert kpenc.dry_run(replace(options, only=1)) == Estimate(10.0, 2.0, 4.0, 9 + 2 * OVERLAP, 6, 8)
+
+
+def test_a_group_that_is_longer_than_the_clip_is_logged(capsys):
+    options = Options(Path("a"), Path("b"), group_s=10.0)
+    assert plan_groups(options, Clip(FRAMES, 8.0)) == (Span(0, FRAMES),)
+    assert "the clip lasts 3.25 s, so it is a single group" in capsys.readouterr().err
+    assert len(plan_groups(replace(options, group_s=1.2), Clip(FRAMES, 8.0))) == 3 and not capsys.readouterr().err
