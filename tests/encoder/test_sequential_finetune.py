@@ -116,7 +116,7 @@ def test_progress_is_shown_on_request(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert capsys.readouterr() == ("", "")
     quantise_sequentially(scene, scene, choose, 4, shown=True)
     out, err = capsys.readouterr()
-    assert out == "" and err.splitlines()[-1].startswith("tune: 10/10 step, 0 s left")
+    assert out == "" and err.splitlines()[-1].startswith("fine-tuning: 10/10 steps, 0 s left")
 
 
 def test_results_are_reproducible() -> None:
