@@ -46,23 +46,30 @@ def predictive_segment(side_info: PredictionWeights | None = None, implied: bool
 WEIGHTS = PredictionWeights(np.int8([[3, -5, 8, 0, 1, -2, 4, 0, 1]]))
 
 
+@pytest.fixture
+def interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run variants in Python, which on small segments is faster than compiling each of them."""
+    monkeypatch.setattr(entropy_ablation, "njit", lambda function: function)
+
+
 @pytest.mark.parametrize("side_info", [None, WEIGHTS], ids=["no side information", "weights"])
 @pytest.mark.parametrize("implied", [False, True])
-def test_without_changes_symbols_take_what_the_coder_takes(side_info: PredictionWeights | None, implied: bool) -> None:
+def test_without_changes_symbols_take_what_the_coder_takes(
+    side_info: PredictionWeights | None, implied: bool, interpreted: None
+) -> None:
     segment = predictive_segment(side_info, implied)
     encode = compile_encoder(predictive, "encode_with_weights", {})
     assert predictive_size(segment, encode, SET_COUNTS) == len(segment.body)
 
 
 @pytest.mark.parametrize("implied", [False, True])
-def test_without_changes_blocks_take_what_the_coder_takes(implied: bool) -> None:
+def test_without_changes_blocks_take_what_the_coder_takes(implied: bool, interpreted: None) -> None:
     segment = transform_segment(implied=implied)
     assert TransformVariant({}).compiled()(segment) == len(segment.body)
 
 
 @pytest.mark.parametrize("name", [name for name, one in VARIANTS.items() if isinstance(one, TransformVariant)])
-def test_changes_of_the_transform_codec_have_an_effect(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(entropy_ablation, "njit", lambda function: function)  # plain Python is faster than compiling
+def test_changes_of_the_transform_codec_have_an_effect(name: str, interpreted: None) -> None:
     segment = transform_segment(rows=60, columns=64, share=1.0)
     assert VARIANTS[name].affects(segment)
     assert VARIANTS[name].compiled()(segment) != len(segment.body)
@@ -71,7 +78,7 @@ def test_changes_of_the_transform_codec_have_an_effect(name: str, monkeypatch: p
 @pytest.mark.parametrize(
     "name", [name for name, one in VARIANTS.items() if isinstance(one, PredictiveVariant) and one.set_counts != (1,)]
 )
-def test_changes_of_the_predictive_codec_have_an_effect(name: str) -> None:
+def test_changes_of_the_predictive_codec_have_an_effect(name: str, interpreted: None) -> None:
     segment = predictive_segment()
     assert VARIANTS[name].affects(segment) and not VARIANTS[name].affects(transform_segment())
     assert VARIANTS[name].compiled()(segment) != len(segment.body)
