@@ -265,7 +265,7 @@ NAMES = [f"images/{k:04d}.png" for k in range(10)]
     [
         (NAMES[2:], NAMES[:2], [], [0, 1], [], None),
         (None, NAMES[:2], [], [0, 1], [], None),
-        ([], [], [], [0, 8], [], None),
+        ([], [], [], [], [], None),
         (NAMES[3:], None, None, [0, 1, 2], [], None),
         (None, NAMES[:2], NAMES[2:4], [2, 3], [0, 1], "2 pictures are in val_filenames beside test_filenames and left"),
         (NAMES[3:8], NAMES[:2], NAMES[2:3], [2], [0, 1, 8, 9], "4 pictures are not in train_filenames nor test_file"),

@@ -18,10 +18,10 @@ def split_of(
 ) -> list[Part]:
     """Return for each image whether it is trained on, held out for testing, or left out.
 
-    Empty lists count as absent. Held out is what `test_filenames` lists, or `val_filenames` without it, or what
-    `train_filenames` does not list, or else every eighth image. Trained on is what `train_filenames` lists, or
-    all the rest, except pictures of `val_filenames`. Names without a frame, pictures in two lists and pictures that are
-    left out are reported in a line each.
+    Held out is what `test_filenames` lists, or `val_filenames` if that is absent or empty, or else what
+    `train_filenames` does not list. Without any list it is every eighth image; with empty lists alone, none. Trained
+    on is what `train_filenames` lists, or all the rest, except pictures of `val_filenames`. Names without a frame,
+    pictures in two lists and pictures that are left out are reported in a line each.
 
     Args:
         root: the dataset's folder.
@@ -36,7 +36,8 @@ def split_of(
     known = {*images, *(_resolved(root, file, name) for name in missing)}
     train, val, test = (_listed(root, file, document, f"{part}_filenames", known) for part in ("train", "val", "test"))
     if not (train or val or test):
-        return ["test" if k % HOLD_OUT_EVERY == 0 else "train" for k in range(len(images))]
+        is_empty = any(document.get(f"{part}_filenames") is not None for part in ("train", "val", "test"))
+        return ["test" if k % HOLD_OUT_EVERY == 0 and not is_empty else "train" for k in range(len(images))]
     held_out = test or val or (set(images) - train)
     if both := [image for image in images if image in held_out and image in train]:
         _report(file, root, both, "in two of its lists and held out, not trained on")
