@@ -45,6 +45,7 @@ class Progress:
     def advance(self, count: float = 1) -> None:
         """Record that `count` more units are done."""
         self.done += count
+        self.extend(0)  # tqdm cannot show more than the total
         self.first = self.first or (self.done, time.monotonic())
         if self.bar is not None:
             self.bar.update(count)

@@ -93,5 +93,6 @@ def test_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, total: int | None) -
     with Progress("decode", total, "frame") as bar:
         bar.note("psnr 30")
         bar.advance(2)
+        bar.advance(2)  # one more than the total
         bar.bar.refresh()
-    assert "decode" in terminal.getvalue() and "psnr 30" in terminal.getvalue() and "2" in terminal.getvalue()
+    assert "decode" in terminal.getvalue() and "psnr 30" in terminal.getvalue() and "4" in terminal.getvalue()
