@@ -82,8 +82,8 @@ def _equal_pictures(dataset: Dataset) -> Iterator[str]:
         if len(cameras) > 1 and not _is_flat(dataset, numbers[0], ROWS):
             pairs.setdefault((cameras[0], cameras[1]), numbers[0])
     if pairs:
-        names = [" and ".join(dataset.camera_names[c] for c in pair) for pair in pairs]
-        yield f"cameras in different places show the same picture: {first_names(names)}; check these files"
+        cameras_named = [" and ".join(dataset.camera_names[c] for c in pair) for pair in pairs]
+        yield f"cameras in different places show the same picture: {first_names(cameras_named)}; check these files"
 
 
 def _cameras(dataset: Dataset) -> Iterator[str]:

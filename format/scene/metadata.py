@@ -192,8 +192,9 @@ def camera_from(document: Mapping[str, Any]) -> Camera:
         DatasetError: it cannot be.
     """
     pose = np.vstack([np.reshape(np.array(document["pose"], float), (3, 4)), [0.0, 0.0, 0.0, 1.0]])
-    return Camera(int(document["width"]), int(document["height"]), *map(float, document["focal"]),
-                  *map(float, document["centre"]), pose)  # fmt: skip
+    (fl_x, fl_y), (cx, cy) = document["focal"], document["centre"]
+    width, height = int(document["width"]), int(document["height"])
+    return Camera(width, height, float(fl_x), float(fl_y), float(cx), float(cy), pose)
 
 
 def limits_document(limits: ViewLimits) -> dict[str, Any]:
