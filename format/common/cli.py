@@ -178,6 +178,17 @@ def byte_count(text: str) -> int:
     return int(value)
 
 
+def join_values(argv: list[str], *options: str) -> list[str]:
+    """Turn `--box -1,...` into `--box=-1,...`, since argparse takes a value that starts with a minus for an option."""
+    joined: list[str] = []
+    for word in argv:
+        if joined and joined[-1] in options:
+            joined[-1] = f"{joined[-1]}={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
 def box_corners(text: str) -> tuple[float, ...]:
     """Parse the corners of a box, "x0,y0,z0,x1,y1,z1", into six numbers."""
     try:

@@ -396,7 +396,7 @@ def write(parts: Sequence[GroupInput], path: str | os.PathLike[str], metadata: M
     if odd is not None:
         raise UsageError(
             f"{odd.source.name}: runs at {odd.fps:g} fps, {parts[0].source.name} at {parts[0].fps:g}; "
-            "encode both at one rate"
+            "join them with kpjoin --fps, or encode both at one rate"
         )
     metadata = merged([part.metadata for part in parts]) if metadata is None else metadata
     beside = [pack_metadata(metadata)] if metadata else []

@@ -6,12 +6,17 @@
     kpedit in.kpc -o out.kpc --open-at view.json       a camera path or camera file; its first view opens the scene
     kpedit in.kpc -o out.kpc --provenance made.json    members of the provenance, for files that do not say
     kpedit in.kpc -o out.kpc --no-provenance           leave out how the file was made
+    kpedit in.kpc -o out.kpc --from 1.5s --to 4s       a part of the clip
+    kpedit in.kpc -o out.kpc --box -1,-1,0,1,1,2       what lies in a box
+    kpedit in.kpc -o out.kpc --scale 0.01 --turn x:-90 --move 0,1,0
+    kpedit in.kpc -o out.kpc --speed 0.5               half as fast; --fps 60 for more frames at the same speed
 
 What does not change is copied byte for byte.
 """
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,14 +26,18 @@ import numpy as np
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
+from kpc.format.common.version import VERSION
 from kpc.format.container.groups import Groups, load
 from kpc.format.container.metadata_chunk import META_LIMIT
 from kpc.format.container.metadata_options import add_metadata_options, members_from, with_view_limits
 from kpc.format.container.rewriting import with_metadata
+from kpc.format.container.scene_io import save
 from kpc.format.scene.cameras import Camera, load_views
-from kpc.format.scene.metadata import Metadata, camera_document
+from kpc.format.scene.metadata import HISTORY_LIMIT, Metadata, camera_document
 from kpc.format.scene.view_limits import find_view, view_members
 from kpc.player.cpu import reference
+from kpc.tools.editing.clips import Edits, edit
+from kpc.tools.editing.placing import Placement, axis_turn
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -37,14 +46,17 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _command(argv: list[str]) -> None:
-    options = _parser().parse_args(argv)
+    options = _parser().parse_args(cli.join_values(argv, "--box", "--move", "--up"))
     if options.output.exists() and options.output.samefile(options.scene):
         raise UsageError(f"{options.output}: is the input, too; choose another output with -o")
+    edits = _edits_from(options)
     metadata = _edited_metadata(Groups(options.scene).metadata(), options)
-    data = with_metadata(options.scene, metadata)
-    with cli.atomic_write(options.output) as aside:
-        aside.write_bytes(data)
-    print(f"{options.output}: {len(data):,} bytes")
+    if not edits.any:
+        size, kept_s = save(with_metadata(options.scene, metadata), options.output), None
+    else:
+        size, kept_s = edit(options.scene, options.output, edits, metadata)
+    part = "" if kept_s is None else f", {kept_s[0]:.3f} to {kept_s[1]:.3f} s of the clip"
+    print(f"{options.output}: {size:,} bytes{part}")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -73,7 +85,58 @@ def _parser() -> argparse.ArgumentParser:
         help="a file with members of the provenance, for scenes that do not hold their own",
     )
     parser.add_argument("--no-provenance", action="store_true", help="leave out how the file was made")
+    _add_edits(parser)
     return parser
+
+
+def _add_edits(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--from", dest="start", type=_time_s, metavar="1.5s", help="keep the clip from then on (default: its start)"
+    )
+    parser.add_argument("--to", dest="end", type=_time_s, metavar="4s", help="keep the clip until then")
+    parser.add_argument(
+        "--box",
+        type=cli.box_corners,
+        metavar="x0,y0,z0,x1,y1,z1",
+        help="keep what lies in the cells that this box touches",
+    )
+    parser.add_argument(
+        "--scale", type=_length, metavar="F", help="multiply all lengths, before the scene is turned and moved"
+    )
+    parser.add_argument(
+        "--turn",
+        type=_turn,
+        action="append",
+        metavar="AXIS:DEGREES",
+        help="turn around an axis of the world, x, y or z, counter-clockwise seen from its tip; may be given again",
+    )
+    parser.add_argument("--move", type=_vector, metavar="X,Y,Z", help="move, after scaling and turning")
+    parser.add_argument("--speed", type=_speed, metavar="F", help="play F times as fast, with the same frames")
+    parser.add_argument(
+        "--fps", type=cli.frame_rate(0.001, 1000.0), metavar="F", help="frames per second, at the same length"
+    )
+
+
+def _edits_from(options: argparse.Namespace) -> Edits:
+    part_s = None
+    if options.start is not None or options.end is not None:
+        part_s = options.start or 0.0, math.inf if options.end is None else options.end
+    placement = None
+    if options.scale is not None or options.turn or options.move is not None:
+        turn = np.eye(3)
+        for axis, degrees in options.turn or ():
+            turn = axis_turn(axis, degrees) @ turn
+        placement = Placement(turn, options.scale or 1.0, np.array(options.move or (0.0, 0.0, 0.0)))
+    box = None if options.box is None else np.reshape(options.box, (2, 3))
+    return Edits(part_s, box, placement, options.speed, options.fps)
+
+
+def _history(options: argparse.Namespace) -> list[str]:
+    """Return what is done with the scene, in words for the history of the file."""
+    given = {"from": options.start, "to": options.end, "box": options.box, "scale": options.scale,
+             "turn": options.turn, "move": options.move, "speed": options.speed, "fps": options.fps}  # fmt: skip
+    words = [f"{name} {value}" for name, value in given.items() if value is not None]
+    return [f"edited by kpc {VERSION}: {', '.join(words)}"[:256]] if words else []
 
 
 def _edited_metadata(metadata: Metadata, options: argparse.Namespace) -> Metadata:
@@ -96,6 +159,11 @@ def _edited_metadata(metadata: Metadata, options: argparse.Namespace) -> Metadat
     if options.open_at is not None:
         view = load_views(options.open_at)[0]
         metadata = metadata.with_members(opening={"camera": camera_document(view.camera), "time": view.time})
+    if options.start is not None or options.end is not None or options.box is not None:
+        metadata = metadata.with_provenance(held_out=None)  # it was measured on the whole
+    if step := _history(options):
+        history = [*metadata.provenance.get("history", []), *step]
+        metadata = metadata.with_provenance(history=history[-HISTORY_LIMIT:])
     if options.provenance is not None:
         metadata = metadata.with_provenance(**_json_object(options.provenance))
     if options.no_provenance:
@@ -137,9 +205,31 @@ def _json_object(path: Path) -> dict[str, Any]:
     return document
 
 
-def _direction(text: str) -> tuple[float, ...]:
+def _vector(text: str) -> tuple[float, ...]:
     numbers = tuple(cli.number_within(number, -1e9, 1e9) for number in text.split(","))
-    if len(numbers) != 3 or not np.linalg.norm(numbers) > 1e-6:
+    if len(numbers) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r} is not three numbers such as 0,0,1")
+    return numbers
+
+
+def _turn(text: str) -> tuple[str, float]:
+    axis, _, degrees = text.partition(":")
+    if axis not in ("x", "y", "z"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a turn such as x:-90")
+    return axis, cli.number_within(degrees, -360, 360)
+
+
+def _time_s(text: str) -> float:
+    return 0.0 if text in ("0", "0s") else cli.duration_s(text)
+
+
+def _speed(text: str) -> float:
+    return cli.number_within(text, 0.001, 1000)
+
+
+def _direction(text: str) -> tuple[float, ...]:
+    numbers = _vector(text)
+    if not np.linalg.norm(numbers) > 1e-6:
         raise argparse.ArgumentTypeError(f"{text!r} is not a direction such as 0,0,1")
     return numbers
 

@@ -2,17 +2,21 @@
 
     kpjoin part0.kpc part1.kpc part2.kpc -o long.kpc    groups of one clip, encoded with `kpenc --group 10s --only N`
     kpjoin first.kpc second.kpc -o both.kpc             one clip after the other
+    kpjoin slow.kpc fast.kpc -o both.kpc --fps 30       clips of different frame rates
 
 Nothing is encoded again: each file becomes a group of the clip, and one group is in memory at a time.
 """
 
 import argparse
 import sys
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from kpc.format.common import cli
 from kpc.format.common.errors import UsageError
 from kpc.format.container import groups
+from kpc.tools.editing.clips import Edits, edit
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -31,16 +35,36 @@ def _command(argv: list[str]) -> None:
     parser.add_argument(
         "-o", "--output", type=cli.output_file(".kpc"), required=True, metavar="FILE", help="the .kpc file to write"
     )
+    parser.add_argument(
+        "--fps",
+        type=cli.frame_rate(0.001, 1000.0),
+        metavar="F",
+        help="frames per second of the clip; files of other rates keep their length, to half a frame",
+    )
     options = parser.parse_args(argv)
     if len(options.scenes) < 2:
         raise UsageError(f"{options.scenes[0]}: a single file cannot be joined; give two or more")
     if options.output.exists() and any(options.output.samefile(scene) for scene in options.scenes):
         raise UsageError(f"{options.output}: is one of the inputs; choose another output with -o")
-    parts = groups.group_inputs(options.scenes)
-    size = groups.write(parts, options.output)
+    with tempfile.TemporaryDirectory(dir=options.output.parent) as folder:
+        scenes = options.scenes if options.fps is None else _at_rate(options.scenes, options.fps, Path(folder))
+        parts = groups.group_inputs(scenes)
+        size = groups.write(parts, options.output)
     clip = groups.Timeline(tuple(part.span for part in parts), parts[0].fps).clip
     duration = f"{clip.frame_count} frames at {clip.fps:g} fps, {clip.duration_s:.2f} s"
     print(f"{options.output}: {size:,} bytes, {len(parts)} groups, {duration}")
+
+
+def _at_rate(scenes: Sequence[Path], fps: float, folder: Path) -> list[Path]:
+    """Return files of one frame rate; those that have another are written to `folder`."""
+    found = []
+    for number, scene in enumerate(scenes):
+        opened = groups.Groups(scene)
+        if opened.clip.fps != fps:
+            edit(scene, folder / f"{number}-{scene.name}", Edits(fps=fps), opened.metadata())
+            scene = folder / f"{number}-{scene.name}"
+        found.append(scene)
+    return found
 
 
 if __name__ == "__main__":

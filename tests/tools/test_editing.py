@@ -1,0 +1,250 @@
+"""Edited scenes show what the originals show, from the corresponding camera at the corresponding time."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kpc.format.coding.quantise import quantise_scene
+from kpc.format.common.errors import UsageError
+from kpc.format.container import groups
+from kpc.format.container.container import Codec, Reader
+from kpc.format.container.scene_io import SceneReader, read, write
+from kpc.format.scene.metadata import Metadata
+from kpc.format.scene.scene import TIME_PLANES
+from kpc.player.cpu import reference
+from kpc.tools.cli import kpedit, kpjoin
+from kpc.tools.editing.cropping import cropped
+from kpc.tools.editing.files import edited
+from kpc.tools.editing.placing import Placement, axis_turn, placed
+from kpc.tools.editing.timing import at_rate, at_speed, common_rows, trimmed
+from kpc.tools.vectors.metadata_vectors import FULL
+from scenes import VARIANTS, tiny_scene
+
+VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "valid"
+MOVED = Placement(np.eye(3), 2.5, np.array([3.0, -1.0, 0.5]))
+QUARTERS = Placement(axis_turn("x", -90) @ axis_turn("z", 180) @ axis_turn("y", 90), 0.5, np.array([1.0, 2.0, -3.0]))
+SKEW = Placement(axis_turn("z", 30) @ axis_turn("x", 20), 1.5, np.array([1.0, 2.0, -3.0]))
+
+
+def quantised(variant="box", time=5, **changes):
+    scene = VARIANTS[variant](tiny_scene(scales=2, channels=4, resolution=(12, 10, 8), time=time))
+    scene = replace(scene, metadata=Metadata(FULL), **changes)
+    return quantise_scene(scene, [dict.fromkeys(scale, 0.05) for scale in scene.scales])
+
+
+def picture(scene, camera, time):
+    seen = reference.render_rays(scene.dequantise(), *camera.resized(16, 12).rays(), time)
+    return seen.rgb, seen.opacity, seen.depth
+
+
+def symbols_of(scene):
+    return [np.sort(plane.symbols, axis=None) for scale in scene.scales for plane in scale.values()]
+
+
+# --- place
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("placement", [MOVED, QUARTERS, SKEW], ids=["moved", "quarters", "skew"])
+def test_a_placed_scene_shows_the_same_to_a_camera_that_moves_along(variant, placement):
+    before = quantised(variant)
+    if placement is SKEW and variant != "ndc":
+        with pytest.raises(UsageError, match="multiples of 90 degrees"):
+            placed(before, placement)
+        return
+    after = placed(before, placement)
+    for camera, time in zip(before.cameras, (0.0, 0.4), strict=True):
+        rgb, opacity, depth = picture(before, camera, time)
+        found = picture(after, placement.camera(camera), time)
+        # float32 samples lie elsewhere by 1e-6; a ray may end a sample earlier, at 1/1024 of its light
+        assert found[0] == pytest.approx(rgb, abs=2e-3) and found[1] == pytest.approx(opacity, abs=2e-3)
+        seen = opacity > 0.5
+        assert found[2][seen] == pytest.approx(placement.factor * depth[seen], rel=2e-3)
+    for one, other in zip(sorted(symbols_of(before), key=len), sorted(symbols_of(after), key=len), strict=True):
+        assert len(one) == len(other)
+    assert np.array_equal(np.sort(np.concatenate(symbols_of(before))), np.sort(np.concatenate(symbols_of(after))))
+
+
+def test_turning_back_gives_the_symbols_of_the_original():
+    before = quantised("displaced")
+    there = Placement(axis_turn("y", 90) @ axis_turn("x", 270), 1.0, np.zeros(3))
+    after = placed(placed(before, there), Placement(there.turn.T, 1.0, np.zeros(3)))
+    for one, other in zip(before.scales, after.scales, strict=True):
+        for name in one:
+            assert np.array_equal(one[name].symbols, other[name].symbols)
+            assert np.array_equal(one[name].coded, other[name].coded)
+    assert np.array_equal(before.motion.symbols, after.motion.symbols)
+    assert np.array_equal(before.occupancy, after.occupancy) and np.array_equal(before.aabb, after.aabb)
+    assert np.array_equal(before.decoder.w1, after.decoder.w1)
+
+
+def test_what_the_file_says_of_itself_moves_along():
+    before, after = quantised(), placed(quantised(), QUARTERS)
+    limits, moved = before.metadata.view_limits, after.metadata.view_limits
+    assert moved.focus == pytest.approx(QUARTERS.points(limits.focus), abs=1e-5)
+    assert moved.forward == pytest.approx(QUARTERS.turn @ limits.forward, abs=1e-5)
+    assert moved.up == pytest.approx(QUARTERS.turn @ limits.up, abs=1e-5)
+    assert moved.distance == pytest.approx((0.25, 2.0)) and moved.azimuth == limits.azimuth
+    eye = before.metadata.opening.camera.camera_to_world[:3, 3]
+    assert after.metadata.opening.camera.camera_to_world[:3, 3] == pytest.approx(QUARTERS.points(eye), abs=1e-5)
+    assert after.metadata.document["metres_per_unit"] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("variant", ["box", "contracted", "ndc", "displaced"])
+def test_moving_and_scaling_copies_planes_decoder_and_occupancy(variant, tmp_path):
+    write(quantised(variant), tmp_path / "in.kpc")
+    reader = SceneReader(tmp_path / "in.kpc")
+    after = Reader(edited(reader, lambda scene: placed(scene, MOVED)))
+    kept = ("PLNE", "DECO", "HYBR", "OCCU", "MOVE", "appe")
+    one, other = (
+        [(e.kind, e.codec, r.stored(n)) for n, e in enumerate(r.index) if e.kind in kept] for r in (reader, after)
+    )
+    assert one == other and len(one) > 12
+
+
+# --- time
+
+
+def test_speed_and_frame_rate_change_the_clip_and_no_symbol(tmp_path):
+    scene = quantised()  # 11 frames at 10 fps
+    assert at_speed(scene, 2.0).clip.duration_s == pytest.approx(0.5)
+    assert (at_rate(scene, 25.0).clip.frame_count, at_rate(scene, 25.0).clip.duration_s) == (26, 1.0)
+    write(scene, tmp_path / "in.kpc")
+    assert kpedit.main([str(tmp_path / "in.kpc"), "-o", str(tmp_path / "out.kpc"), "--speed", "2", "--fps", "40"]) == 0
+    one, other = Reader(tmp_path / "in.kpc"), Reader(tmp_path / "out.kpc")
+    assert [e.crc for e in one.index if e.kind not in ("SCNE", "meta")] == [
+        e.crc for e in other.index if e.kind not in ("SCNE", "meta")
+    ]
+    clip = read(tmp_path / "out.kpc").clip
+    assert (clip.frame_count, clip.fps) == (21, 40.0)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_part_shows_what_the_clip_shows_then(variant):
+    before = quantised(variant, time=9)
+    after, (since, until) = trimmed(before, 0.3, 0.6)
+    assert (since, until) == (0.25, 0.625) and after.clip.duration_s == pytest.approx(until - since)
+    assert all(len(after.scales[0][name].symbols) == 4 for name in TIME_PLANES)
+    for local in (0.0, 0.3, 0.777, 1.0):
+        time = (since + local * (until - since)) / before.clip.duration_s
+        expected = picture(before, before.cameras[0], time)
+        found = picture(after, before.cameras[0], local)
+        assert found[0] == pytest.approx(expected[0], abs=1e-4) and found[1] == pytest.approx(expected[1], abs=1e-4)
+    for name, plane in after.scales[1].items():
+        whole = before.scales[1][name]
+        rows = slice(2, 6) if name in TIME_PLANES else slice(None)
+        assert np.array_equal(plane.symbols, whole.symbols[rows] * plane.coded[..., None])
+
+
+def test_the_whole_clip_stays_as_it_is_and_what_cannot_be_cut_is_refused():
+    scene = quantised(time=5)
+    assert common_rows(scene) == 4
+    assert trimmed(scene, 0.0, 9.0) == (scene, (0.0, 1.0))
+    uneven = replace(scene, motion=quantised("displaced", time=4).motion)
+    assert common_rows(uneven) == 1
+    with pytest.raises(UsageError, match="no rows in common"):
+        trimmed(uneven, 0.2, 0.5)
+    for start, end in ((0.5, 0.5), (1.0, 2.0), (0.6, 0.2)):
+        with pytest.raises(UsageError, match="lasts from 0 to 1 s"):
+            trimmed(scene, start, end)
+    with pytest.raises(UsageError, match="static"):
+        trimmed(quantised_static(), 0.0, 0.5)
+
+
+def quantised_static():
+    scene = tiny_scene(dynamic=False, scales=1, channels=2, resolution=(6, 5, 4))
+    return quantise_scene(scene, [dict.fromkeys(scene.scales[0], 0.1)])
+
+
+# --- boxes
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_cropped_scene_shows_the_cells_of_the_box_as_before(variant):
+    before = quantised(variant)
+    box = np.array([[-0.4, -0.8, -0.6], [0.6, 0.5, 0.4]])
+    after = cropped(before, box)
+    assert after.occupancy.sum() < before.occupancy.sum()
+    alone = replace(before, occupancy=after.occupancy)  # nothing but cells taken away
+    for time in (0.0, 0.6):
+        expected, found = (picture(scene, before.cameras[0], time) for scene in (alone, after))
+        assert found[0] == pytest.approx(expected[0], abs=1e-6) and found[1] == pytest.approx(expected[1], abs=1e-6)
+    coded = [sum(int(p.coded.sum()) for s in scene.scales for p in s.values()) for scene in (before, after)]
+    assert coded[1] < coded[0]
+    for one, other in zip(before.scales, after.scales, strict=True):
+        for name in one:
+            assert np.array_equal(other[name].symbols, one[name].symbols * other[name].coded[..., None])
+            assert not (other[name].coded & ~one[name].coded).any()
+
+
+def test_an_empty_box_is_refused():
+    with pytest.raises(UsageError, match="there is nothing"):
+        cropped(quantised(), np.array([[50.0] * 3, [51.0] * 3]))
+
+
+@pytest.mark.parametrize("name", ["transform", "transform-implied", "predictive-implied", "trellis"])
+def test_files_of_all_codecs_survive_a_crop(name):
+    reader = SceneReader(VECTORS / f"{name}.kpc")
+    before = read(reader)
+    middle = before.aabb.mean(0)
+    data = edited(reader, lambda scene: cropped(scene, np.stack([before.aabb[0], middle])))
+    after = read(data)
+    for one, other in zip(before.scales, after.scales, strict=True):
+        for plane in one:
+            assert np.array_equal(other[plane].symbols, one[plane].symbols * other[plane].coded[..., None])
+    if name.startswith("transform"):  # the levels of its blocks are kept
+        assert {e.codec for e in Reader(data).index if e.kind == "PLNE"} >= {Codec.TRANSFORM}
+
+
+# --- files
+
+
+def test_a_file_that_is_not_changed_comes_back_byte_for_byte(tmp_path):
+    for name in ("metadata-zstd", "unknown-ancillary", "predictive-implied", "hybrid-moved"):
+        reader = SceneReader(VECTORS / f"{name}.kpc")
+        again = Reader(edited(reader, lambda scene: scene))
+        assert sorted((e.kind, reader.stored(n)) for n, e in enumerate(reader.index)) == sorted(
+            (e.kind, again.stored(n)) for n, e in enumerate(again.index)
+        )
+
+
+@pytest.fixture
+def clip(tmp_path):
+    write(quantised(), tmp_path / "one.kpc")
+    parts = [groups.GroupInput.of(tmp_path / "one.kpc", start) for start in (0, 9, 18)]
+    groups.write(parts, tmp_path / "clip.kpc")
+    return tmp_path / "clip.kpc"  # 29 frames at 10 fps; two groups share two frames
+
+
+def test_groups_are_placed_retimed_and_cut(clip):
+    out = clip.with_name("out.kpc")
+    command = ["--from", "1.2s", "--to", "2.5s", "--fps", "20", "--scale", "2", "--box", "-0.4,-0.8,-0.6,0.6,0.5,0.4"]
+    assert kpedit.main([str(clip), "-o", str(out), *command]) == 0
+    opened, whole = groups.Groups(out), groups.Groups(clip)
+    assert [(s.start, s.count) for s in opened.timeline.spans] == [(18, 21), (36, 21)] and opened.clip.fps == 20
+    one = read(opened.open(0))
+    assert one.aabb == pytest.approx(2 * read(whole.open(1)).aabb) and opened.metadata().view_limits.reach == 1.5
+    assert "from 1.2, to 2.5, box" in opened.metadata().provenance["history"][-1]
+    assert "held_out" not in opened.metadata().provenance
+
+
+def test_clips_of_different_rates_are_joined_when_told_to(tmp_path, capsys):
+    write(quantised(), tmp_path / "slow.kpc")
+    write(at_rate(quantised(), 30.0), tmp_path / "fast.kpc")
+    command = [str(tmp_path / "slow.kpc"), str(tmp_path / "fast.kpc"), "-o", str(tmp_path / "both.kpc")]
+    assert kpjoin.main(command) == 2 and "--fps" in capsys.readouterr().err
+    assert kpjoin.main([*command, "--fps", "20"]) == 0
+    joined = groups.Groups(tmp_path / "both.kpc")
+    assert [(s.start, s.count) for s in joined.timeline.spans] == [(0, 21), (21, 21)] and joined.clip.fps == 20
+    for number in range(2):
+        assert symbols_equal(read(joined.open(number)), quantised())
+
+
+def symbols_equal(one, other):
+    return all(
+        np.array_equal(a[name].symbols, b[name].symbols)
+        for a, b in zip(one.scales, other.scales, strict=True)
+        for name in a
+    )

@@ -1,0 +1,126 @@
+"""Edits of a file, a scene or a clip in groups, in the order in which they are made: part, box, place, time."""
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from kpc.format.coding.quantise import QuantisedScene
+from kpc.format.common.errors import UsageError
+from kpc.format.container import groups, scene_io
+from kpc.format.container.rewriting import with_metadata
+from kpc.format.scene.metadata import Metadata
+from kpc.format.scene.scene import Clip
+from kpc.tools.editing.cropping import cropped
+from kpc.tools.editing.files import edited
+from kpc.tools.editing.placing import Placement, placed, placed_metadata
+from kpc.tools.editing.timing import at_rate, at_speed, span_at_rate, trimmed
+
+
+@dataclass(frozen=True)
+class Edits:
+    """What is to be done with a file; None leaves a thing as it is.
+
+    Attributes:
+        part_s: from when to when to keep it, seconds.
+        box: (2, 3) lower and upper corner of what to keep, world units before placing.
+        placement: where to put it.
+        speed: how many times as fast to play it.
+        fps: frames per second to have, after `speed`, at the same length.
+    """
+
+    part_s: tuple[float, float] | None = None
+    box: np.ndarray | None = None
+    placement: Placement | None = None
+    speed: float | None = None
+    fps: float | None = None
+
+    @property
+    def any(self) -> bool:
+        """Whether there is anything to do."""
+        return any(value is not None for value in vars(self).values())
+
+
+def edit(source: Path, output: Path, edits: Edits, metadata: Metadata) -> tuple[int, tuple[float, float] | None]:
+    """Write an edited file.
+
+    Args:
+        source: the file.
+        output: the file to write.
+        edits: what to do.
+        metadata: of the clip, in the world and the time of the source.
+
+    Returns:
+        The size in bytes, and from when to when the result is of the source, seconds; None for all of it.
+
+    Raises:
+        UsageError, FormatError: it cannot be done.
+    """
+    clip = groups.Groups(source)
+    if edits.placement is not None:
+        metadata = placed_metadata(metadata, edits.placement)
+    if not clip.is_single:
+        return _edit_groups(clip, output, edits, metadata)
+    kept: list[tuple[float, float]] = []
+
+    def change(scene: QuantisedScene) -> QuantisedScene:
+        if edits.part_s is not None:
+            scene, span_s = trimmed(scene, *edits.part_s)
+            kept.append(span_s)
+        return _retimed(_changed(scene, edits), edits)
+
+    data = edited(clip.open(0), change)
+    if kept:
+        metadata = _in_part(metadata, kept[0], clip.clip)
+    return scene_io.save(with_metadata(data, metadata), output), kept[0] if kept else None
+
+
+def _edit_groups(
+    clip: groups.Groups, output: os.PathLike[str], edits: Edits, metadata: Metadata
+) -> tuple[int, tuple[float, float] | None]:
+    """Edit a clip in groups, of which whole groups are kept."""
+    numbers, kept = list(range(len(clip))), None
+    duration_s, fps = clip.clip.duration_s, clip.clip.fps
+    if edits.part_s is not None:
+        start_s, end_s = edits.part_s
+        shown = [[time * duration_s for time in clip.timeline.display_span(number)] for number in numbers]
+        numbers = [number for number in numbers if shown[number][0] < end_s and start_s < shown[number][1]]
+        if not numbers or start_s >= end_s:
+            raise UsageError(f"--from {start_s:g}s --to {end_s:g}s: the clip lasts from 0 to {duration_s:g} s")
+        first, last = (clip.timeline.spans[number] for number in (numbers[0], numbers[-1]))
+        kept = tuple((frame - clip.timeline.spans[0].start) / fps for frame in (first.start, last.last))
+        metadata = _in_part(metadata, kept, clip.clip)
+    fps *= edits.speed or 1.0
+    parts = []
+    for number in numbers:
+        span = clip.timeline.spans[number]
+        if edits.fps is not None:
+            span = span_at_rate(span, fps, edits.fps)
+
+        def change(scene: QuantisedScene, span: groups.Span = span) -> QuantisedScene:
+            return replace(_changed(scene, edits), clip=Clip(span.count, edits.fps or fps))
+
+        parts.append(groups.GroupInput.of(edited(clip.open(number), change), span.start))
+    return groups.write(parts, output, metadata), kept
+
+
+def _changed(scene: QuantisedScene, edits: Edits) -> QuantisedScene:
+    if edits.box is not None:
+        scene = cropped(scene, edits.box)
+    return scene if edits.placement is None else placed(scene, edits.placement)
+
+
+def _retimed(scene: QuantisedScene, edits: Edits) -> QuantisedScene:
+    if edits.speed is not None:
+        scene = at_speed(scene, edits.speed)
+    return scene if edits.fps is None else at_rate(scene, edits.fps)
+
+
+def _in_part(metadata: Metadata, kept_s: tuple[float, float], clip: Clip) -> Metadata:
+    """Return metadata whose opening view is within the part of the clip that is kept."""
+    if "opening" not in metadata.document or clip.duration_s == 0:
+        return metadata
+    opening, (since_s, until_s) = metadata.document["opening"], kept_s
+    time = (opening["time"] * clip.duration_s - since_s) / (until_s - since_s)
+    return metadata.with_members(opening={**opening, "time": min(max(time, 0.0), 1.0)})

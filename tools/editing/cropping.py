@@ -1,0 +1,52 @@
+"""A part of a scene: the cells of its occupancy grid outside a box are emptied, and what nothing reads is left out."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+
+from kpc.format.coding.quantise import QuantisedScene
+from kpc.format.common.errors import UsageError
+from kpc.format.scene.scene import Scene
+from kpc.format.scene.space import Contraction, DeviceCoordinates, uncontract
+from kpc.tools.editing.unread import without_unread
+
+
+def cropped(scene: QuantisedScene, box: np.ndarray) -> QuantisedScene:
+    """Return the part of a scene in the cells that a box touches; pictures of these cells stay as they are.
+
+    Args:
+        scene: of any mapping.
+        box: (2, 3) lower and upper corner, world units.
+
+    Raises:
+        UsageError: the box holds nothing.
+    """
+    inside = _touched_cells(scene.dequantise(), box)
+    occupancy = scene.occupancy & inside
+    if not occupancy.any():
+        raise UsageError(f"--box: there is nothing from {box[0].tolist()} to {box[1].tolist()}")
+    return without_unread(replace(scene, occupancy=occupancy), scene.occupancy)
+
+
+def _touched_cells(scene: Scene, box: np.ndarray) -> np.ndarray:
+    """Return (Nz, Ny, Nx) bool: the cells that may have a point in the box.
+
+    The corners of cells are mapped into the world; a cell is kept if the box around its corners touches `box`.
+    """
+    cells = scene.occupancy.shape[1:]
+    aabb = scene.aabb.astype(np.float64)
+    axes = [np.linspace(0.0, 1.0, count + 1) for count in cells]
+    z, y, x = np.meshgrid(*axes, indexing="ij")
+    u = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    if isinstance(scene.mapping, Contraction):
+        points = uncontract(np.clip(u, 1e-6, 1 - 1e-6), aabb)
+    else:
+        points = aabb[0] + u * (aabb[1] - aabb[0])
+        if isinstance(scene.mapping, DeviceCoordinates):
+            points = scene.mapping.to_world(points)
+    grid = points.reshape(*(count + 1 for count in cells), 3)
+    corners = itertools.product((0, 1), repeat=3)
+    shifts = [tuple(slice(k, k + n) for k, n in zip(corner, cells, strict=True)) for corner in corners]
+    low, high = (bound([grid[shift] for shift in shifts], axis=0) for bound in (np.min, np.max))
+    return np.asarray((low <= box[1]).all(-1) & (high >= box[0]).all(-1))

@@ -1,0 +1,112 @@
+"""A clip at another speed or frame rate, and a part of a clip.
+
+Times in a scene are shares of the clip, so a clip of another length or rate has the same planes. A part of it has some
+of their rows: it begins and ends with a row of all planes, at which the picture is that of the whole clip.
+"""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene
+from kpc.format.common.errors import UsageError
+from kpc.format.container.groups import Span
+from kpc.format.container.scene_layout import AXIS_LIMIT
+from kpc.format.scene.motion import QuantisedMotion
+from kpc.format.scene.scene import TIME_PLANES, Clip
+from kpc.tools.editing.unread import without_unread
+
+
+def at_speed(scene: QuantisedScene, factor: float) -> QuantisedScene:
+    """Return a clip that runs `factor` times as fast, with the same frames."""
+    return replace(scene, clip=Clip(scene.clip.frame_count, scene.clip.fps * factor))
+
+
+def at_rate(scene: QuantisedScene, fps: float) -> QuantisedScene:
+    """Return a clip of another frame rate that lasts as long, to half a frame."""
+    return replace(scene, clip=Clip(1 + round(scene.clip.duration_s * fps), fps))
+
+
+def span_at_rate(span: Span, before: float, after: float) -> Span:
+    """Return the frames of a group of a clip whose frame rate changes."""
+    start, last = (round(frame * after / before) for frame in (span.start, span.last))
+    return Span(start, last - start + 1)
+
+
+def common_rows(scene: QuantisedScene) -> int:
+    """Return into how many equal parts the clip can be cut at rows that all planes and the motion grid have."""
+    counts = [len(plane.symbols) - 1 for scale in scene.scales for n, plane in scale.items() if n in TIME_PLANES]
+    if scene.motion is not None:
+        counts.append(len(scene.motion.symbols) - 1)
+    return math.gcd(*counts) if counts else 0
+
+
+def trimmed(scene: QuantisedScene, start_s: float, end_s: float) -> tuple[QuantisedScene, tuple[float, float]]:
+    """Return the part of a clip from one time to another, widened to rows of its planes.
+
+    Symbols of rows that are kept, and of texels that the part still reads, stay as they are.
+
+    Args:
+        scene: a dynamic scene.
+        start_s, end_s: seconds from the first frame.
+
+    Returns:
+        The part, and from when to when it is of the whole clip, seconds.
+
+    Raises:
+        UsageError: the part is empty or outside the clip, or the planes have no rows in common at which to cut.
+    """
+    parts, duration_s = common_rows(scene), scene.clip.duration_s
+    if parts < 1 or duration_s <= 0:
+        raise UsageError("--from, --to: the scene is static; there is nothing to cut")
+    if not 0 <= start_s < min(end_s, duration_s):
+        raise UsageError(f"--from {start_s:g}s --to {end_s:g}s: the clip lasts from 0 to {duration_s:g} s")
+    first = math.floor(start_s / duration_s * parts + 1e-9)
+    last = min(parts, math.ceil(min(end_s, duration_s) / duration_s * parts - 1e-9))
+    if (first, last) == (0, parts):
+        if parts == 1 and (start_s > 0 or end_s < duration_s):
+            raise UsageError("--from, --to: the planes of the clip have no rows in common at which it can be cut")
+        return scene, (0.0, duration_s)
+    since_s, until_s = (row / parts * duration_s for row in (first, last))
+    frames = max(1, round((until_s - since_s) * scene.clip.fps))
+    part = replace(
+        scene,
+        clip=Clip(frames + 1, frames / (until_s - since_s)),
+        scales=tuple(
+            {n: _rows(plane, first, last, parts) if n in TIME_PLANES else plane for n, plane in scale.items()}
+            for scale in scene.scales
+        ),
+        motion=None if scene.motion is None else _motion_rows(scene.motion, first, last, parts),
+        occupancy=_slots(scene.occupancy, first, last, parts),
+    )
+    return without_unread(part, scene.occupancy), (since_s, until_s)
+
+
+def _rows(plane: QuantisedPlane, first: int, last: int, parts: int) -> QuantisedPlane:
+    each = (len(plane.symbols) - 1) // parts
+    rows = slice(first * each, last * each + 1)
+    return QuantisedPlane(plane.symbols[rows], plane.step, plane.offset, plane.coded[rows])
+
+
+def _motion_rows(motion: QuantisedMotion, first: int, last: int, parts: int) -> QuantisedMotion:
+    each = (len(motion.symbols) - 1) // parts
+    return QuantisedMotion(motion.symbols[first * each : last * each + 1], motion.step)
+
+
+def _slots(occupancy: np.ndarray, first: int, last: int, parts: int) -> np.ndarray:
+    """Return the occupancy of a part in as many slots as it takes for their borders to stay where they are.
+
+    Where that would be more than a file may have, each slot holds the cells of all old ones that it touches.
+    """
+    slots = len(occupancy)
+    count = (last - first) * math.lcm(slots, parts) // parts
+    if slots == 1 or count > AXIS_LIMIT:
+        count = 1 if slots == 1 else slots
+    borders = (first + (last - first) * np.arange(count + 1) / count) / parts * slots
+    found = []
+    for low, high in pairwise(borders):
+        since = math.floor(low + 1e-9)
+        found.append(occupancy[since : max(since + 1, math.ceil(high - 1e-9))].any(0))
+    return np.stack(found)
