@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kpc.encoder.datasets.capture import printable
 from kpc.encoder.datasets.masks import Masks
 from kpc.encoder.datasets.pixel_cache import PixelCache
 from kpc.format.common.errors import DatasetError
@@ -205,7 +206,7 @@ class Dataset:
 
     def _held_out(self) -> str:
         names = {self.camera_names[c] for c in self.pictures.camera[self.pictures.is_test]}
-        return f" ({names.pop()})" if len(names) == 1 else ""
+        return f" ({printable(names.pop())})" if len(names) == 1 else ""
 
 
 def _count(number: int, noun: str) -> str:

@@ -18,10 +18,11 @@ from kpc.encoder.datasets.masks import find_masks, load_masks
 from kpc.encoder.datasets.pixel_cache import PixelCache, build_cache, fingerprint_of, open_cache
 from kpc.encoder.datasets.timeline import align
 from kpc.encoder.datasets.video import VideoInfo, read_video
-from kpc.format.common.errors import DatasetError
+from kpc.format.common.errors import DatasetError, MediaError
 from kpc.format.common.images import read_image
 from kpc.format.common.progress import Progress
-from kpc.format.common.text import valid_unicode
+from kpc.format.common.text import one_line, valid_unicode
+from kpc.format.scene.camera_checks import NUMBER_LIMIT
 from kpc.format.scene.scene import Clip
 
 # The first layout that recognises a folder reads it: formats to which a COLMAP model is exported precede COLMAP's own.
@@ -29,6 +30,10 @@ LAYOUTS = (llff, blender, nerfstudio, colmap)
 
 # Frame rate of images with times whose dataset does not give one, frames per second.
 ASSUMED_FPS = 30.0
+
+# Cameras whose positions differ by no more than this share of their coordinates are one, since poses are rounded; so
+# are those that differ by no more than the narrowest box of a .kpc file, 1 / NUMBER_LIMIT.
+STILL = 1e-6
 
 
 def load_dataset(
@@ -69,6 +74,10 @@ def load_dataset(
         raise DatasetError(
             f"{error.filename or root}: no permission to read it; change its permissions or run as its owner"
         ) from error
+    except (DatasetError, MediaError) as error:
+        if str(error).isprintable():
+            raise
+        raise type(error)(one_line(str(error))) from error  # the names of files may hold anything
 
 
 def _recognise(root: Path, holdout: str | None) -> Capture:
@@ -99,7 +108,7 @@ def _check(root: Path, capture: Capture, downscale: int) -> None:
             f"{root}: every picture is held out, none is left to train on; give --holdout none or add cameras"
         )
     centres = np.stack([view.camera_to_world[:3, 3] for view in train])
-    if np.ptp(centres, axis=0).max() <= 1e-6 * max(1.0, np.abs(centres).max()):
+    if np.ptp(centres, axis=0).max() <= max(STILL * np.abs(centres).max(), 1 / NUMBER_LIMIT):
         raise DatasetError(
             f"{root}: a single camera that does not move ({train[0].file.name}): depth cannot be reconstructed from "
             "one viewpoint; add cameras"

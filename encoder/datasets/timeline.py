@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kpc.encoder.datasets.capture import printable
 from kpc.encoder.datasets.video import VideoInfo
 from kpc.format.common.errors import DatasetError
 from kpc.format.scene.scene import Clip
@@ -74,7 +75,9 @@ def align(root: Path, videos: Mapping[str, VideoInfo]) -> Timeline:
     start = min(t[0] for t in shown)
     positions = [_on_frames((t - start) * fps) for t in shown]  # in frames of the clip
     last = max(p[-1] for p in positions)
-    line = _describe(names, rates, starts * fps, positions, [len(t) for t in seconds], frames, fps)
+    line = _describe(
+        list(map(printable, names)), rates, starts * fps, positions, [len(t) for t in seconds], frames, fps
+    )
     if line:
         print(f"{root}: {line}", file=sys.stderr)
     times = tuple(p / max(last, 1e-9) for p in positions)

@@ -33,3 +33,8 @@ def open_text(path: str | os.PathLike[str]) -> TextIO:
 def valid_unicode(text: str | os.PathLike[str]) -> str:
     """Return text with a replacement character (U+FFFD) for each surrogate."""
     return re.sub("[\ud800-\udfff]", "\ufffd", os.fspath(text))
+
+
+def one_line(text: str) -> str:
+    """Return text for a message, with what cannot be printed (line breaks, control codes, surrogates) as escapes."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

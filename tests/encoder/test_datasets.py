@@ -6,6 +6,7 @@ import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -259,6 +260,35 @@ def test_a_file_that_is_not_a_video(tmp_path: Path) -> None:
     fails(tmp_path / "set", "cam01.mp4")
 
 
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_small_and_large_scenes_have_several_cameras(tmp_path: Path, scale: float) -> None:
+    make.write_nerfstudio(tmp_path / "set", images=3)
+
+    def rescale(document: dict[str, Any]) -> None:
+        for frame in document["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= scale
+
+    make.edit_json(tmp_path / "set" / "transforms.json", rescale)
+    assert len(load(tmp_path / "set").camera_names) == 3
+
+
+def test_names_that_cannot_be_printed_are_escaped(tmp_path: Path) -> None:
+    make.write_llff(tmp_path / "set", images=3)
+    folder = tmp_path / "set" / "images"
+    (folder / "view0.png").rename(folder / "a\x1b[31m.png")
+    assert load(tmp_path / "set").describe().isprintable()
+    (folder / "a\x1b[31m.png").write_bytes(b"no image")
+    fails(tmp_path / "set", "a\\x1b[31m.png")
+
+
+def test_images_beside_videos_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make.write_n3dv(tmp_path / "set")
+    write_image(tmp_path / "set" / "poster.png", np.zeros((4, 4, 3), np.uint8))
+    assert "1 file left out" in load(tmp_path / "set").describe()
+    assert "1 of 4 files found" in capsys.readouterr().err
+
+
 def test_a_truncated_video(tmp_path: Path) -> None:
     make.write_n3dv(tmp_path / "set")
     video = tmp_path / "set" / "cam01.mp4"
@@ -291,6 +321,7 @@ def test_a_single_static_camera_is_refused(tmp_path: Path, frames: int) -> None:
         ("train_filenames", 3, "train_filenames"),
         ("test_filenames", [1], "test_filenames"),
         ("fps", 0, "fps"),
+        ("fps", 1001, "fps 1001"),
         ("frames", [{"file_path": "images/0000.png"}], "transform_matrix"),
         ("frames", [7], "frame 0"),
     ],

@@ -49,8 +49,9 @@ def read(path: Path, holdout: str | None) -> Capture:
         DatasetError: there are not as many poses as files, or a pose, focal length or depth range is invalid.
         MediaError: a file cannot be read.
     """
-    found = [file for file in media_in(path) if is_video(file)]
-    files = [file for file in found if file.name.lower().startswith("cam")] or found
+    found = media_in(path)
+    videos = [file for file in found if is_video(file)]
+    files = [file for file in videos if file.name.lower().startswith("cam")] or videos
     layout = "N3DV" if files else NAME
     if not files and (path / "images").is_dir():
         found = media_in(path / "images")

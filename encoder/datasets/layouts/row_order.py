@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from kpc.encoder.datasets.capture import natural_key
+from kpc.encoder.datasets.capture import natural_key, printable
 from kpc.encoder.datasets.video import read_video
 from kpc.format.common.images import read_image
 from kpc.format.common.media_files import is_video
@@ -59,8 +59,8 @@ def in_row_order(table: Path, files: Sequence[Path], centres: np.ndarray, direct
         "natural order of names, by which neighbouring cameras see more alike" if is_natural else "plain order of names"
     )
     print(
-        f"{table}: rows belong to files in the {why}: row {row} to {order[row].name}, not to {other[row].name}; if "
-        "not, rename the files so that their order is that of the rows",
+        f"{table}: rows belong to files in the {why}: row {row} to {printable(order[row].name)}, not to "
+        f"{printable(other[row].name)}; if not, rename the files so that their order is that of the rows",
         file=sys.stderr,
     )
     return order

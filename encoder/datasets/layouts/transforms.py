@@ -30,6 +30,9 @@ from kpc.format.scene.camera_models import HIGHER_ORDERS, check_higher_orders, u
 # Focal lengths that differ by less than this share are the same.
 SAME_FOCAL = 0.02
 
+# Frame rates that are believed, frames per second: from a picture in a quarter of an hour to a high-speed camera.
+LEAST_FPS, GREATEST_FPS = 1e-3, 1e3
+
 # Keys that say the same in other words: a frame that has one of them overrides all of the document.
 _SAME = (("fl_x", "camera_angle_x", "x_fov"), ("fl_y", "camera_angle_y", "y_fov"))
 
@@ -146,8 +149,8 @@ def frame_rate(file: Path, document: dict[str, Any]) -> float | None:
     if document.get("fps") is None:
         return None
     fps = number_of(str(file), document, "fps")
-    if not fps > 0:
-        raise DatasetError(f"{file}: fps {fps:g} must be a positive number; correct it")
+    if not LEAST_FPS <= fps <= GREATEST_FPS:
+        raise DatasetError(f"{file}: fps {fps:g} is not from {LEAST_FPS:g} to {GREATEST_FPS:g}; correct it")
     return fps
 
 
