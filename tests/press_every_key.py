@@ -12,6 +12,7 @@ from kpc.encoder.datasets.video import read_video
 from kpc.format.common.errors import DisplayError
 from kpc.format.container.sources import open_source
 from kpc.format.scene.metadata import ViewLimits
+from kpc.player.app import player as player_module
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.desktop import glfw, imgui
 from kpc.player.app.input import KEY_BINDINGS
@@ -39,7 +40,7 @@ def main(scene_file: str) -> None:
     opening_asks_for_older_opengl()
     window = Window("test", (320, 240))
     stream = GroupPlayback(open_source(scene_file))
-    player = Player(window, stream, Preferences(text_size=0.9, speed=1.0))
+    player = Player(window, stream, Preferences(text_size=0.9))
     while not stream.is_settled:
         player.frame()
 
@@ -81,7 +82,12 @@ def keys_of_the_clip(player: Player) -> None:
     assert player.snapshot().time == approx(before + 0.05 / player.state.playback.clip.duration_s)
     press(player, glfw.KEY_SPACE)
     assert not player.snapshot().playing
-    press(player, glfw.KEY_HOME, glfw.KEY_RIGHT)
+    press(player, "l", glfw.KEY_HOME, glfw.KEY_SPACE)
+    player.frame(seconds=0.0)
+    with replaced(player_module, MAX_ADVANCE_S=0.05):
+        player.frame(seconds=60.0)  # something was compiled: the clip has waited for it
+    assert player.snapshot().playing and 0 < player.snapshot().time < 0.5
+    press(player, "l", glfw.KEY_SPACE, glfw.KEY_HOME, glfw.KEY_RIGHT)
     assert player.snapshot().time == approx(0.1)
     press(player, glfw.KEY_END)
     assert player.snapshot().time == 1.0
@@ -115,7 +121,15 @@ def keys_of_what_is_shown(player: Player) -> None:
 
 def keys_and_drags_of_the_camera(player: Player) -> None:
     before = player.snapshot().view
+    assert player.snapshot().shown == "camera"
+    for is_down in (True, False):  # the pointer has jumped here before the button was pressed
+        player.window.move_pointer(200, 150 + 60 * is_down)
+        player.window.press_button(LEFT, is_down)
+        player.frame()
+        player.frame()
+        assert player.snapshot().view is before
     drag(player, LEFT, 30, 10)
+    assert player.snapshot().shown is None
     turned = player.snapshot().view
     assert turned.focus == approx(before.focus) and not np.allclose(turned.axes, before.axes)
     drag(player, RIGHT, 30, 10)
@@ -125,11 +139,13 @@ def keys_and_drags_of_the_camera(player: Player) -> None:
     player.frame()
     assert player.snapshot().view.distance == approx(0.81 * before.distance)
     press(player, "n")
-    assert player.snapshot().camera_number == 1
-    press(player, "r")
-    assert player.snapshot().view.eye == approx(before.eye)
+    assert player.snapshot().camera_number == 1 and player.snapshot().shown == "camera"
     press(player, "b")
-    assert player.snapshot().preset_number == 0 and player.snapshot().view.eye != approx(before.eye)
+    assert player.snapshot().preset_number == 0 and player.snapshot().shown == "preset"
+    assert player.snapshot().view.eye != approx(before.eye)
+    press(player, "r")
+    assert player.snapshot().view.eye == approx(before.eye) and player.snapshot().shown == "camera"
+    assert player.snapshot().camera_number == 0 and player.snapshot().preset_number == -1
 
 
 def view_limits(player: Player) -> None:
@@ -171,6 +187,10 @@ def keys_of_quality_and_panels(player: Player) -> None:
     assert player.snapshot().target_s == approx(1 / FILM_FPS)
     press(player, "u", "t", "g")
     assert player.snapshot().target_s is None and player.snapshot().panels == {"controls", "planes", "graphs"}
+    press(player, "g", glfw.KEY_TAB)
+    assert player.snapshot().panels == {"planes"}
+    press(player, "g")  # a panel that is asked for appears, and those beside it
+    assert player.snapshot().panels == {"controls", "planes", "graphs"}
     player.state.quality.choose(level)  # the level that U chose depends on the machine
     text_size = player.state.text_size
     player.press(glfw.KEY_EQUAL, glfw.MOD_CONTROL)
@@ -393,7 +413,7 @@ def resized_and_closed(player: Player) -> None:
     press(player, glfw.KEY_TAB, glfw.KEY_ESCAPE)
     assert player.state.should_close
     settings = player.preferences()
-    assert settings == Preferences((200, 260), DEFAULT, None, 2.0, False, False, True, True, player.state.text_size)
+    assert settings == Preferences((200, 260), DEFAULT, None, False, True, True, player.state.text_size)
     player.run()
     press(player, "o")
     recording = player.filming.recording

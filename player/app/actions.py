@@ -9,7 +9,7 @@ from kpc.player.app.output_files import OutputFiles
 from kpc.player.app.preferences import TEXT_SIZES
 from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.scene_view import SceneView
-from kpc.player.app.state import PlayerState
+from kpc.player.app.state import PlayerState, Shown
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.presentation import DisplayMode
 from kpc.player.quality import neighbouring_level
@@ -70,13 +70,12 @@ class Actions:
 
     def to_camera(self, number: int) -> None:
         """Go to a camera of the scene, counted from 0."""
-        self.state.camera_number = number
         self.state.look_from(OrbitView.of(self.state.rig, self.state.rig.cameras[number]))
+        self.state.camera_number, self.state.shown = number, Shown.CAMERA
 
     def to_opening(self) -> None:
         """Go to the view that the clip opens with."""
-        self.state.camera_number = 0
-        self.state.look_from(OrbitView.of(self.state.rig, self.state.opening))
+        self.state.look_from_opening()
 
     def toggle_limits(self) -> None:
         """Leave the limits from where the scene holds, or keep them."""
@@ -94,9 +93,9 @@ class Actions:
 
     def to_preset(self, number: int) -> None:
         """Go to a named viewpoint, counted from 0."""
-        self.state.preset_number = number
         name, camera = list(self.state.presets.items())[number]
         self.state.look_from(OrbitView.of(self.state.rig, camera))
+        self.state.preset_number, self.state.shown = number, Shown.PRESET
         self.state.notify(f"viewpoint: {name}")
 
     def next_preset(self) -> None:
@@ -142,9 +141,15 @@ class Actions:
         self.state.text_size = min(max(size, TEXT_SIZES[0]), TEXT_SIZES[1])
 
     def toggle_panel(self, name: str) -> None:
-        """Show or hide a panel, a field of VisiblePanels. Static scenes have no time planes to show."""
-        if name != "planes" or self.state.scene.is_dynamic:
-            setattr(self.state.visible, name, not getattr(self.state.visible, name))
+        """Show or hide a panel, a field of VisiblePanels; one that Tab has hidden with the controls is shown again."""
+        visible = self.state.visible
+        if name == "planes" and not self.state.scene.is_dynamic:
+            self.state.notify("nothing moves in this scene, so it has no time planes")
+        elif visible.controls or name in ("controls", "keys"):
+            setattr(visible, name, not getattr(visible, name))
+        else:
+            visible.controls = True
+            setattr(visible, name, True)
 
     # --- the camera path
 

@@ -87,7 +87,7 @@ KEY_BINDINGS = (
         elsewhere=(",  .",),
     ),
     KeyBinding("L", "loop on or off", {"l": Actions.toggle_loop}),
-    KeyBinding("R", "back to the first view", {"r": Actions.to_opening}),
+    KeyBinding("R", "back to the view that the file opens with", {"r": Actions.to_opening}),
     KeyBinding("N", "next camera of the scene", {"n": Actions.next_camera}),
     KeyBinding("B", "next viewpoint", {"b": Actions.next_preset}),
     KeyBinding("X", "leave the limits from where the scene holds, or keep them", {"x": Actions.toggle_limits}),
@@ -104,8 +104,8 @@ KEY_BINDINGS = (
     ),
     KeyBinding("C", "show everything, the static part, the dynamic part", {"c": Actions.next_part}),
     KeyBinding("-  =", "lower or higher quality", {"-": _coarser, "=": _finer, "+": _finer}, elsewhere=("-  +",)),
-    KeyBinding("U", "hold the frame rate or the quality", {"u": Actions.toggle_target_rate}),
-    KeyBinding("F", "exact or fast drawing of what moves", {"f": Actions.toggle_exact}),
+    KeyBinding("U", "adapt the quality to keep the frame rate, or keep the quality", {"u": Actions.toggle_target_rate}),
+    KeyBinding("F", "draw what moves exactly and slower, or faster", {"f": Actions.toggle_exact}),
     KeyBinding("K", "add a keyframe to the camera path", {"k": Actions.add_keyframe}),
     KeyBinding("Backspace", "remove the last keyframe", {"Backspace": Actions.remove_last_keyframe}),
     KeyBinding("J", "follow the camera path, or stop", {"j": Actions.follow_or_stop}),
@@ -171,10 +171,11 @@ class Input:
         height = max(self.window.size[1], 1)
         right, down = io.mouse_delta.x / height, io.mouse_delta.y / height
         shift = self.window.is_held(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SHIFT)
-        pans = shift or imgui.is_mouse_down(1) or imgui.is_mouse_down(2)
-        if (right or down) and pans and any(imgui.is_mouse_down(button) for button in range(3)):
+        # In the frame of the press, the motion is that before it.
+        held = [imgui.is_mouse_down(button) and not imgui.is_mouse_clicked(button) for button in range(3)]
+        if (right or down) and (held[1] or held[2] or (shift and held[0])):
             state.move_to(state.view.pan(right, -down))
-        elif (right or down) and imgui.is_mouse_down(0):
+        elif (right or down) and held[0]:
             state.move_to(state.view.orbit(np.pi * right, -np.pi * down))
         if io.mouse_wheel:
             state.move_to(state.view.zoom(io.mouse_wheel))

@@ -10,8 +10,6 @@ kpplay scene.kpc --frames 30 --screenshot out.png      show 30 frames, save the 
 """
 
 import argparse
-import errno
-import os
 import re
 import sys
 from dataclasses import replace
@@ -47,8 +45,7 @@ def _command(argv: list[str]) -> None:
     options = _parser().parse_args(argv)
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames} is not positive")
-    if not Path(options.folder).is_dir():
-        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), options.folder)
+    Path(options.folder).mkdir(parents=True, exist_ok=True)
     path = None if options.path is None else CameraPath.load(options.path)
 
     # Imported here so that errors in the options are reported without OpenGL's libraries.
@@ -102,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
         "--folder",
         default=".",
         metavar="DIR",
-        help="for screenshots, videos and camera paths (default: the working directory)",
+        help="for screenshots, videos and camera paths; it is made (default: the working directory)",
     )
     parser.add_argument(
         "--frames", type=int, metavar="N", help="exit after N frames; settings are neither read nor saved"

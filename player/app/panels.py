@@ -14,7 +14,7 @@ from kpc.player.app.path_panel import PathPanel
 from kpc.player.app.preferences import TARGET_FPS
 from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.scene_view import SceneView
-from kpc.player.app.state import PlayerState
+from kpc.player.app.state import PlayerState, Shown
 from kpc.player.app.time_plane_panel import TimePlanePanel
 from kpc.player.app.widgets import (
     ACCENT,
@@ -129,10 +129,10 @@ class Panels:
         if changed and wanted != number:
             quality.choose(LEVEL_NAMES[wanted])
         imgui.set_item_tooltip("From fastest to exact (key - and = or +)")
-        label("hold")
+        label("adapt to")
         holds = quality.target_s is not None
-        changed, holds = imgui.checkbox("##hold", holds)
-        imgui.set_item_tooltip("Choose the quality automatically to hold this frame rate (U)")
+        changed, holds = imgui.checkbox("##adapt", holds)
+        imgui.set_item_tooltip("Lower and raise the quality so that so many frames come each second (U)")
         imgui.same_line()
         imgui.set_next_item_width((CONTROL_EM - 2) * imgui.get_font_size())
         flags = imgui.SliderFlags_.no_input | imgui.SliderFlags_.logarithmic
@@ -142,20 +142,21 @@ class Panels:
         if changed or (moved and holds):
             quality.hold(state.target_fps if holds else None)
         if state.scene.is_dynamic and LEVELS[quality.level].folded:
-            label("exact")
+            label("exact motion")
             _, state.exact = imgui.checkbox("##exact", state.exact)
-            imgui.set_item_tooltip("Draw what moves exactly, by sampling time planes; slower (F)")
+            imgui.set_item_tooltip("Draw what moves as exactly as what does not, which takes longer (F)")
 
     def _viewpoints(self) -> None:
         """The cameras of the scene, and the named viewpoints."""
         state = self.state
-        cameras = [str(number + 1) for number in range(len(state.rig.cameras))]
-        chosen = choice("camera", state.camera_number, dict(enumerate(cameras)))
-        if chosen != state.camera_number:
-            self.actions.to_camera(chosen)
-        names = ["-", *state.presets]
-        chosen = choice("viewpoint", state.preset_number + 1, dict(enumerate(names)))
-        if chosen not in (0, state.preset_number + 1):
+        cameras = ["-", *(str(number + 1) for number in range(len(state.rig.cameras)))]
+        present = state.camera_number + 1 if state.shown is Shown.CAMERA else 0
+        chosen = choice("camera", present, dict(enumerate(cameras)))
+        if chosen not in (0, present):
+            self.actions.to_camera(chosen - 1)
+        present = state.preset_number + 1 if state.shown is Shown.PRESET else 0
+        chosen = choice("viewpoint", present, dict(enumerate(["-", *state.presets])))
+        if chosen not in (0, present):
             self.actions.to_preset(chosen - 1)
 
     def _transport(self, bottom: float) -> float:

@@ -37,13 +37,12 @@ class PathFollower:
         if from_beginning or not self.path.start_s <= self.position_s < self.path.end_s:
             self.position_s = self.path.start_s
 
-    def position_after(self, seconds: float, loop: bool) -> float:
-        """Return the position after some time, which may end the following; `self.position_s` does not change."""
+    def after(self, seconds: float, loop: bool) -> tuple[float, bool]:
+        """Return the position after some time, and whether the camera still follows the path then."""
         position_s = self.position_s + seconds
         if position_s <= self.path.end_s:
-            return position_s
-        self.is_active = loop
-        return self.path.start_s if loop else self.path.end_s
+            return position_s, True
+        return (self.path.start_s, True) if loop else (self.path.end_s, False)
 
     def append(self, camera: Camera, time: float, playing: bool) -> None:
         """Add a keyframe at the end. While the clip plays, as long after the last one as has passed since.

@@ -28,6 +28,8 @@ from kpc.player.streaming.prefetch import Playhead
 MAX_RETRIES = 3
 # Seconds to wait for events while nothing changes, and while the window is minimised.
 IDLE_S, ICONIFIED_S = 0.05, 0.1
+# Seconds that the clip advances at most in a frame, so that one that compiles for a minute does not skip to its end.
+MAX_ADVANCE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Snapshot:
         time: of the clip, [0, 1].
         playing, speed, loop: of the clip.
         view: the camera.
-        camera_number, preset_number: that were chosen last.
+        camera_number, preset_number: that were chosen last; shown: which of them the view still is, in lower case.
         appearance: its name.
         part, display_mode: names, in lower case.
         folds: whether the picture was drawn with folded time planes.
@@ -58,6 +60,7 @@ class Snapshot:
     view: OrbitView
     camera_number: int
     preset_number: int
+    shown: str | None
     appearance: str
     part: str
     display_mode: str
@@ -236,6 +239,7 @@ class Player:
             view=state.view,
             camera_number=state.camera_number,
             preset_number=state.preset_number,
+            shown=None if state.shown is None else state.shown.name.lower(),
             appearance=state.appearance.name,
             part=state.part.name.lower(),
             display_mode=state.display_mode.name.lower(),
@@ -262,18 +266,22 @@ class Player:
     def _advance(self, seconds: float) -> None:
         """Advance the clip, or the camera along its path, unless what would be shown has not arrived yet."""
         state, follower = self.state, self.state.follower
+        seconds = min(seconds, MAX_ADVANCE_S)
         playback, position_s, view = state.playback.after(seconds), follower.position_s, state.view
+        follows = follower.is_active
         if self.filming.is_along_path:
             playback = replace(playback, time=self.filming.path_time)
         elif follower.is_active:
-            position_s = follower.position_after(seconds, state.playback.loop)
+            position_s, follows = follower.after(seconds, state.playback.loop)
             camera, time = follower.path.at(position_s)
             playback, view = replace(playback, time=time), OrbitView.of(state.rig, camera)
         state.stream.set_playhead(Playhead(playback.time, state.playback.rate, state.playback.loop))
         state.stream.upload()
         state.follow_scene()
         if state.stream.can_show(playback.time, state.playback.rate):
-            state.playback, follower.position_s, state.view = playback, position_s, view
+            state.shown = state.shown if view is state.view else None
+            state.playback, state.view = playback, view
+            follower.position_s, follower.is_active = position_s, follows
 
     def _retry_after(self, error: DisplayError) -> None:
         """Report that drawing failed and lower the quality; give up after MAX_RETRIES."""

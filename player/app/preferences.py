@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from kpc.format.common.cli import atomic_write
-from kpc.player.app.controls import SPEEDS
 from kpc.player.quality import LEVELS
 
 # Bytes of the file that are read.
 MAX_BYTES = 1 << 16
 # Width and height of a window, screen units.
 WINDOW_SIDES = range(64, 16385)
+# The smallest (width, height) that is remembered, screen units.
+MIN_WINDOW = 640, 480
 # Lowest and highest frame rate to hold.
 TARGET_FPS = (1.0, 240.0)
 # Smallest and largest text, relative to the system's text size.
@@ -28,11 +29,10 @@ class Preferences:
     """Settings; the defaults are those of a first run.
 
     Attributes:
-        size: (width, height) of the window, screen units; None: derived from the scene's first camera.
+        size: (width, height) of the window, screen units, at least MIN_WINDOW when it is loaded; None: derived from the
+            scene's first camera.
         quality: name of a quality level; None: the device's default.
         target_fps: frame rate to hold by changing the quality; None: the quality stays.
-        speed: one of SPEEDS.
-        loop: whether the clip begins again at its end.
         controls, graphs, planes: whether these panels are shown.
         text_size: of the panels, 1 for the system's text size.
     """
@@ -40,8 +40,6 @@ class Preferences:
     size: tuple[int, int] | None = None
     quality: str | None = None
     target_fps: float | None = None
-    speed: float = 1.0
-    loop: bool = True
     controls: bool = True
     graphs: bool = False
     planes: bool = False
@@ -64,8 +62,6 @@ _IS_VALID: dict[str, Callable[[Any], bool]] = {
     "size": _is_size,
     "quality": lambda value: isinstance(value, str) and value in LEVELS,
     "target_fps": _is_between(*TARGET_FPS),
-    "speed": lambda value: _is_between(SPEEDS[0], SPEEDS[-1])(value) and value in SPEEDS,
-    "loop": _is_bool,
     "controls": _is_bool,
     "graphs": _is_bool,
     "planes": _is_bool,
@@ -94,7 +90,7 @@ def load(path: Path) -> Preferences:
         return Preferences()
     valid = {name: found[name] for name, is_valid in _IS_VALID.items() if name in found and is_valid(found[name])}
     if "size" in valid:
-        valid["size"] = tuple(valid["size"])
+        valid["size"] = tuple(map(max, valid["size"], MIN_WINDOW))
     return Preferences(**valid)
 
 

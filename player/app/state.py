@@ -4,6 +4,7 @@ import contextlib
 import time as clock
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import Enum, auto
 
 import numpy as np
 
@@ -40,6 +41,13 @@ class Notice:
     text: str = ""
     until: float = 0.0
     is_error: bool = False
+
+
+class Shown(Enum):
+    """What a view is called by."""
+
+    CAMERA = auto()
+    PRESET = auto()
 
 
 @dataclass
@@ -100,6 +108,7 @@ class PlayerState:
         opening: the camera to begin with.
         rig: the cameras of the scene; presets: named viewpoints.
         camera_number: the camera that was chosen last, from 0; preset_number: likewise, or -1.
+        shown: whether the view is still that of this camera or of this preset; None if it is neither.
         view: the camera that the picture is drawn from.
         limits: from where the scene holds; None if its file does not say.
         keeps_limits: whether the user's movements are kept within them.
@@ -121,17 +130,17 @@ class PlayerState:
         self.target_fps = preferences.target_fps or (1 / quality.target_s if quality.target_s else FILM_FPS)
         self.rig, self.presets = Rig.of(self.scene), presets(self.scene)
         self.camera_number, self.preset_number = 0, -1
-        self.metadata = stream.metadata
+        self.shown: Shown | None = None
+        self.metadata, self.follower = stream.metadata, PathFollower()
         self.limits, self.keeps_limits, self.is_moved = self.metadata.view_limits, True, False
         opening = self.metadata.opening
         self.opening = self.rig.cameras[0] if opening is None else opening.camera
-        self.view = OrbitView.of(self.rig, self.opening)
+        self.look_from_opening()
         has_duration = stream.clip.duration_s > 0
-        self.playback = Playback(stream.clip, playing=has_duration, speed=preferences.speed, loop=preferences.loop)
+        self.playback = Playback(stream.clip, playing=has_duration)
         self.playback.seek(0.0 if opening is None else opening.time)
         self.appearance = AppearanceSelection(self.scene)
         self.part, self.display_mode, self.exact = Part.FULL, DisplayMode.COLOUR, False
-        self.follower = PathFollower()
         self.visible = VisiblePanels(preferences.controls, preferences.graphs, preferences.planes)
         self.text_size = preferences.text_size
         self.statistics, self.notice = FrameStatistics(), Notice()
@@ -160,8 +169,6 @@ class PlayerState:
             size=window_size,
             quality=self.quality.chosen_level,
             target_fps=self.target_fps if holds_rate else None,
-            speed=self.playback.speed,
-            loop=self.playback.loop,
             controls=self.visible.controls,
             graphs=self.visible.graphs,
             planes=self.visible.planes,
@@ -170,7 +177,13 @@ class PlayerState:
 
     def look_from(self, view: OrbitView) -> None:
         """Move the camera at once, and stop following the camera path."""
-        self.view, self.follower.is_active, self.is_moved = view, False, False
+        self.view, self.follower.is_active, self.is_moved, self.shown = view, False, False, None
+
+    def look_from_opening(self) -> None:
+        """Move the camera to the view that the clip opens with; nothing else counts as chosen any more."""
+        self.look_from(OrbitView.of(self.rig, self.opening))
+        self.camera_number, self.preset_number = 0, -1
+        self.shown = Shown.CAMERA if self.opening is self.rig.cameras[0] else None
 
     def move_to(self, view: OrbitView) -> None:
         """Move the camera as the user does, by hand; `keep_limits` may move it back."""

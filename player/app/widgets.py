@@ -10,7 +10,7 @@ from kpc.player.app.desktop import imgui
 # Colours of what is active, and of errors.
 ACCENT, ERROR = imgui.ImVec4(0.95, 0.62, 0.25, 1.0), imgui.ImVec4(1.0, 0.45, 0.38, 1.0)
 # Widths of the labels before controls, of the controls, and of the panels on the right, em.
-LABEL_EM, CONTROL_EM, PANEL_EM = 6.0, 9.5, 19.0
+LABEL_EM, CONTROL_EM, PANEL_EM = 6.5, 9.5, 19.0
 # Distances of the panels from the window's edges and from each other, em.
 MARGIN_EM, SPACING_EM = 0.8, 0.4
 # Width of the panels along the lower edge, at most, em.

@@ -22,7 +22,7 @@ class Window:
 
     Args:
         title: of the window.
-        size: (width, height) in screen units.
+        size: (width, height) in screen units; reduced to what the screen has room for.
 
     Attributes:
         handle: glfw's.
@@ -42,6 +42,7 @@ class Window:
         if not self.handle:
             glfw.terminate()
             raise DisplayError(f"cannot open a window with OpenGL 3.3 ({self._last_error}); {REMEDY}")
+        self._fit_screen()
         glfw.make_context_current(self.handle)
         glfw.swap_interval(1)
         self.ctx = self._make_context()
@@ -183,6 +184,15 @@ class Window:
         for hint, value in hints.items():
             glfw.window_hint(hint, value)
         return glfw.create_window(*size, valid_unicode(title), None, None)
+
+    def _fit_screen(self) -> None:
+        """Reduce the window to the part of the screen that the desktop leaves free."""
+        monitor = glfw.get_primary_monitor()
+        if monitor:
+            _, _, *room = glfw.get_monitor_workarea(monitor)
+            width, height = (min(side, most) if most > 0 else side for side, most in zip(self.size, room, strict=True))
+            if (width, height) != self.size:
+                glfw.set_window_size(self.handle, width, height)
 
     def _make_context(self) -> moderngl.Context:
         failures = []

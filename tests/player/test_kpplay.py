@@ -88,11 +88,12 @@ def kpplay(
 
 
 def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> None:
-    screenshot = tmp_path / "screenshot.png"
-    done = kpplay(scene_file, "--size", "400x300", "--frames", 5, "--screenshot", screenshot, display=display)
+    screenshot, folder = tmp_path / "screenshot.png", tmp_path / "new" / "folder"
+    options = ["--size", "400x300", "--frames", 5, "--screenshot", screenshot, "--folder", folder]
+    done = kpplay(scene_file, *options, display=display)
     assert done.returncode == 0 and done.stdout == "" and "Traceback" not in done.stderr, done.stderr
     picture = read_image(screenshot).astype(int)
-    assert picture.shape == (300, 400, 3)
+    assert picture.shape == (300, 400, 3) and folder.is_dir()
     background = np.rint(tiny_scene(4).background * 255)
     assert np.abs(picture[:20, -20:] - background).max() <= 1  # the corner is empty
     assert np.abs(picture[150:170, 260:280] - background).max() > 20  # the scene
@@ -224,7 +225,8 @@ def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
         (["{scene}", "--screenshot", "x.bmp"], 2, "x.bmp"),
         (["{scene}", "--screenshot", "x.jpg"], 2, "x.jpg"),
         (["{scene}", "--screenshot", "x.png/"], 2, "x.png/"),
-        (["{scene}", "--folder", "nowhere"], 1, "nowhere"),
+        (["{scene}", "--folder", "{scene}"], 1, "tiny.kpc"),
+        (["{scene}", "--folder", "{scene}/below"], 1, "tiny.kpc"),
         (["{scene}", "--path", "nowhere.json"], 1, "nowhere.json"),
         (["{scene}", "--path", "{scene}"], 1, "tiny.kpc"),
         (["{scene}", "--quality", "perfect"], 2, "fastest"),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from kpc.player.app.preferences import _IS_VALID, MAX_BYTES, Preferences, load, preferences_path, save
 
-MINE = Preferences((800, 600), "fine", 30.0, 0.5, False, False, True, True, 1.5)
+MINE = Preferences((800, 600), "fine", 30.0, False, True, True, 1.5)
 
 
 def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
@@ -28,8 +28,7 @@ def test_every_field_is_checked() -> None:
     "size": [[1, 1], [1e9, 5], "big", [800], [800.5, 600], [True, True], None],
     "quality": ["perfect", 3, [], None],
     "target_fps": [0, -1, 1e9, "fast", True, float("nan"), float("inf"), [30]],
-    "speed": [3, -1, "1", [], float("nan"), 10**400],
-    "loop": [1, "yes", None],
+    "graphs": [1, "yes", None],
     "text_size": [0, 99, float("nan"), "x"],
 }.items())  # fmt: skip
 def test_an_invalid_value_is_replaced_by_its_default(tmp_path: Path, name: str, values: list[object]) -> None:
@@ -39,7 +38,7 @@ def test_an_invalid_value_is_replaced_by_its_default(tmp_path: Path, name: str, 
         path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
         got = load(path)
         assert getattr(got, name) == getattr(Preferences(), name)
-        assert got.graphs  # the others stay
+        assert got.planes  # the others stay
 
 
 @pytest.mark.parametrize(
