@@ -74,6 +74,7 @@ def keys_of_the_clip(player: Player) -> None:
     stream = player.state.stream
     player.frame()
     assert player.snapshot().playing
+    player.state.playback.seek(0.2)
     before = player.snapshot().time
     with replaced(stream, can_show=lambda *position: False):
         player.frame(seconds=0.05)
@@ -284,9 +285,9 @@ def every_pixel_is_used(player: Player) -> None:
     text_heights: list[float] = []
     build = player.panels.build
 
-    def measuring() -> None:
+    def measuring(asks: bool) -> None:
         text_heights.append(imgui.get_font_size() * io.display_framebuffer_scale.x)
-        build()
+        build(asks)
 
     for units, pixels, scale in (
         ((320, 240), (320, 240), 1.0),
@@ -398,8 +399,12 @@ def dropped_files(player: Player, scene_file: Path) -> None:
     player.window.drop([str(scene_file)])
     player.run()
     assert player.successor is not None and not player.state.should_close
-    player.successor.close()
-    player.actions.successor = None
+    player.actions.stay()
+    press(player, glfw.KEY_PAGE_DOWN)
+    assert "one file" in player.snapshot().notice and player.successor is None
+    player.actions.playlist.files.append("text.kpc")
+    press(player, glfw.KEY_PAGE_UP)
+    assert "text.kpc" in player.snapshot().notice and player.snapshot().notice_is_error
 
 
 def resized_and_closed(player: Player) -> None:
@@ -410,8 +415,15 @@ def resized_and_closed(player: Player) -> None:
     glfw.poll_events()
     player.frame()
     assert player.snapshot().canvas == window.pixels
-    press(player, glfw.KEY_TAB, glfw.KEY_ESCAPE)
-    assert player.state.should_close
+    press(player, glfw.KEY_TAB, "k", glfw.KEY_ESCAPE)
+    assert player.snapshot().asks  # what becomes of the keyframe
+    press(player, glfw.KEY_ESCAPE)
+    assert not player.snapshot().asks and not player.state.should_close
+    glfw.set_window_should_close(window.handle, True)
+    player.frame()
+    assert player.snapshot().asks
+    player.press(glfw.KEY_S, glfw.MOD_CONTROL)
+    assert not player.snapshot().asks and player.state.should_close
     settings = player.preferences()
     assert settings == Preferences((200, 260), DEFAULT, None, False, True, True, player.state.text_size)
     player.run()

@@ -1,11 +1,16 @@
 """What keys and panels can make a player do."""
 
+from pathlib import Path
+
 from kpc.format.common.images import write_image
+from kpc.format.container.http_address import is_url
 from kpc.format.container.sources import open_source
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.app.controls import OrbitView
 from kpc.player.app.filming import Filming
+from kpc.player.app.open_dialog import OpenDialog
 from kpc.player.app.output_files import OutputFiles
+from kpc.player.app.playlist import Playlist
 from kpc.player.app.preferences import TEXT_SIZES
 from kpc.player.app.quality_controller import LEVEL_NAMES
 from kpc.player.app.scene_view import SceneView
@@ -32,12 +37,19 @@ class Actions:
     """The commands of a player.
 
     Attributes:
-        successor: the scene that was opened last, which is to follow the one that is shown.
+        playlist: the files to go through.
+        successor: the scene that was opened last, which is to follow the one that is shown; successor_file: its file.
     """
 
-    def __init__(self, state: PlayerState, scene_view: SceneView, filming: Filming, files: OutputFiles) -> None:
+    def __init__(
+        self, state: PlayerState, scene_view: SceneView, filming: Filming, files: OutputFiles, playlist: Playlist
+    ) -> None:
         self.state, self.scene_view, self.filming, self.files = state, scene_view, filming, files
+        self.playlist = playlist
         self.successor: GroupPlayback | None = None
+        self.successor_file = ""
+        self.dialog = OpenDialog()
+        self._to_open: str | None = None
 
     # --- the clip
 
@@ -208,28 +220,64 @@ class Actions:
             return
         with self.state.reporting_errors(self.files.folder.absolute()):
             path = self.files.next_path("-path.json")
-            self.state.follower.path.save(path)
+            self.state.follower.save(path)
             self.state.notify(f"saved {path}; kprender --path makes a video of it")
 
+    def choose_file(self) -> None:
+        """Show the system's dialog to choose a file."""
+        with self.state.reporting_errors("the dialog"):
+            self.dialog.show(str(Path.cwd()))
+
+    def next_file(self, count: int) -> None:
+        """Open the file that is `count` files further in the playlist."""
+        if len(self.playlist.files) < 2:
+            self.state.notify("there is one file only; Ctrl+O opens another")
+        else:
+            self.open(self.playlist.step(count))
+
     def open(self, file: str) -> None:
-        """Load a camera path (.json), or open another scene, which becomes the successor."""
+        """Load a camera path (.json), or have `open_waiting` open another scene."""
         state = self.state
+        if not file.lower().endswith(".json"):
+            self._to_open = file
+            state.notify(f"opening {Path(file).name if not is_url(file) else 'the address'}")
+            return
         with state.reporting_errors(file):
-            if file.lower().endswith(".json"):
-                state.follower.replace(CameraPath.load(file))
-                state.visible.path = True
-                state.notify(
-                    f"loaded {len(state.follower.path.keyframes)} keyframes from {file}; press J to follow them"
-                )
-                return
+            state.follower.replace(CameraPath.load(file))
+            state.visible.path = True
+            state.notify(f"loaded {len(state.follower.path.keyframes)} keyframes from {file}; press J to follow them")
+
+    @property
+    def is_opening(self) -> bool:
+        """Whether a scene waits for `open_waiting`."""
+        return self._to_open is not None
+
+    def open_waiting(self) -> None:
+        """Open the scene that waits for it, which becomes the successor."""
+        file, self._to_open, state = self._to_open, None, self.state
+        if file is None:
+            return
+        with state.reporting_errors(file):
+            if self.successor is not None:
+                self.successor.close()
             stream = GroupPlayback(open_source(file, limit=state.stream.memory), memory=state.stream.memory)
             try:
                 stream.draw_with(self.scene_view.make_renderer)
-                self.successor = stream
+                self.successor, self.successor_file = stream, file
             except BaseException:
                 stream.close()
                 raise
 
     def quit(self) -> None:
-        """End the player."""
-        self.state.should_close = True
+        """End the player; if it asks about an unsaved camera path, stay."""
+        if self.state.should_close:
+            self.stay()
+        else:
+            self.state.should_close = True
+
+    def stay(self) -> None:
+        """Go on with the scene that is shown, whatever was to follow."""
+        self.state.should_close = False
+        if self.successor is not None:
+            self.successor.close()
+            self.successor = None

@@ -32,8 +32,8 @@ if library := wayland_library(sys.platform, os.environ):
     os.environ.setdefault("PYGLFW_LIBRARY", str(library))
 
 # isort: off
-from imgui_bundle import hello_imgui, imgui  # noqa: E402
+from imgui_bundle import hello_imgui, imgui, portable_file_dialogs  # noqa: E402
 import glfw  # noqa: E402
 # isort: on
 
-__all__ = ["glfw", "hello_imgui", "imgui"]
+__all__ = ["glfw", "hello_imgui", "imgui", "portable_file_dialogs"]

@@ -10,6 +10,8 @@ from kpc.player.app.state import PlayerState
 
 # Seconds that a video may take to be finished after the window was closed.
 FINISH_TIMEOUT_S = 60.0
+# Frames of a camera path after which the time that is left is told.
+MIN_TIMED_FRAMES = 3
 
 
 class Filming:
@@ -36,6 +38,26 @@ class Filming:
         path = self.state.follower.path
         return path.at(path.start_s + self.recording.duration_s)[1]
 
+    @property
+    def path_frames(self) -> int:
+        """The number of frames along the whole camera path."""
+        path = self.state.follower.path
+        return int((path.end_s - path.start_s + 1e-6) * FILM_FPS) + 1
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds that recording the rest of the camera path takes at the rate so far; None before there is one."""
+        taken = 0 if self.recording is None else self.recording.taken
+        if taken < MIN_TIMED_FRAMES:
+            return None
+        return (clock.monotonic() - self._started_at) * (self.path_frames - taken) / taken
+
+    def stop(self) -> None:
+        """End the video that is being written; its file keeps what was recorded, and the camera stays where it is."""
+        if self.recording is not None:
+            self.state.follower.is_active = self.state.follower.is_active and not self._along_path
+            self.recording.end()
+
     def start_or_stop(self, along_path: bool) -> None:
         """Begin a video, or end the one that is being written.
 
@@ -44,7 +66,7 @@ class Filming:
                 used.
         """
         if self.recording is not None:
-            self.recording.end()
+            self.stop()
             return
         follower = self.state.follower
         with self.state.reporting_errors(self.files.folder.absolute()):

@@ -44,6 +44,7 @@ class ImGuiRenderer:
     def __init__(self, ctx: moderngl.Context) -> None:
         self.ctx = ctx
         self._context = imgui.create_context()
+        imgui.set_current_context(self._context)  # there may be another one
         self.io = imgui.get_io()
         self.io.set_ini_filename("")  # write no files
         self.io.backend_flags |= imgui.BackendFlags_.renderer_has_textures
@@ -106,6 +107,10 @@ class ImGuiRenderer:
         framebuffer.scissor = (0, 0, width, height)
         self.ctx.enable_only(moderngl.NOTHING)
 
+    def end(self) -> None:
+        """End a frame that is not drawn."""
+        imgui.end_frame()
+
     def make_texture(self, size: tuple[int, int]) -> moderngl.Texture:
         """Return an RGB texture of (width, height) that widgets can show as `imgui.ImTextureRef(texture.glo)`."""
         texture = self.ctx.texture(size, 3, alignment=1)
@@ -118,6 +123,7 @@ class ImGuiRenderer:
 
     def close(self) -> None:
         """Destroy the ImGui context."""
+        imgui.set_current_context(self._context)
         for texture in imgui.get_platform_io().textures:
             texture.set_tex_id(0)
             texture.status = imgui.ImTextureStatus.destroyed
@@ -182,5 +188,6 @@ def _style() -> None:
     style.set_color_(imgui.Col_.button_hovered, imgui.ImVec4(1.0, 1.0, 1.0, 0.22))
     style.set_color_(imgui.Col_.button_active, ACCENT)
     style.set_color_(imgui.Col_.check_mark, ACCENT)
-    style.set_color_(imgui.Col_.slider_grab, ACCENT)
-    style.set_color_(imgui.Col_.slider_grab_active, ACCENT)
+    # The text of a slider lies over its grab.
+    style.set_color_(imgui.Col_.slider_grab, imgui.ImVec4(ACCENT.x, ACCENT.y, ACCENT.z, 0.40))
+    style.set_color_(imgui.Col_.slider_grab_active, imgui.ImVec4(ACCENT.x, ACCENT.y, ACCENT.z, 0.55))

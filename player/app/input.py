@@ -90,7 +90,7 @@ KEY_BINDINGS = (
     KeyBinding("R", "back to the view that the file opens with", {"r": Actions.to_opening}),
     KeyBinding("N", "next camera of the scene", {"n": Actions.next_camera}),
     KeyBinding("B", "next viewpoint", {"b": Actions.next_preset}),
-    KeyBinding("X", "leave the limits from where the scene holds, or keep them", {"x": Actions.toggle_limits}),
+    KeyBinding("X", "leave or keep the limits from where the scene holds", {"x": Actions.toggle_limits}),
     KeyBinding("V", "next appearance, if the scene has several", {"v": Actions.next_appearance}),
     KeyBinding(
         "1 2 3 4",
@@ -104,12 +104,18 @@ KEY_BINDINGS = (
     ),
     KeyBinding("C", "show everything, the static part, the dynamic part", {"c": Actions.next_part}),
     KeyBinding("-  =", "lower or higher quality", {"-": _coarser, "=": _finer, "+": _finer}, elsewhere=("-  +",)),
-    KeyBinding("U", "adapt the quality to keep the frame rate, or keep the quality", {"u": Actions.toggle_target_rate}),
+    KeyBinding("U", "keep the frame rate, or keep the quality", {"u": Actions.toggle_target_rate}),
     KeyBinding("F", "draw what moves exactly and slower, or faster", {"f": Actions.toggle_exact}),
     KeyBinding("K", "add a keyframe to the camera path", {"k": Actions.add_keyframe}),
     KeyBinding("Backspace", "remove the last keyframe", {"Backspace": Actions.remove_last_keyframe}),
     KeyBinding("J", "follow the camera path, or stop", {"j": Actions.follow_or_stop}),
     KeyBinding("Ctrl+S", "save the camera path", {"Ctrl+s": Actions.save_path}),
+    KeyBinding("Ctrl+O", "open a scene or a camera path", {"Ctrl+o": Actions.choose_file}),
+    KeyBinding(
+        "PageUp, PageDown",
+        "previous or next file of the playlist",
+        {"PageUp": lambda do: do.next_file(-1), "PageDown": lambda do: do.next_file(1)},
+    ),
     KeyBinding("P", "save a screenshot", {"p": Actions.save_picture}),
     KeyBinding("O", "record the window, or stop", {"o": lambda do: do.start_or_stop_filming(along_path=False)}),
     KeyBinding(
@@ -157,7 +163,8 @@ class Input:
         self._fly(min(seconds, MAX_FLY_S))
         for pressed in self.window.take_keys():
             press(self.actions, pressed)
-        for file in self.window.take_dropped_files():
+        chosen = self.actions.dialog.take_chosen()
+        for file in (*self.window.take_dropped_files(), *([] if chosen is None else [chosen])):
             self.actions.open(file)
 
     def _move_pointer(self) -> None:

@@ -18,6 +18,8 @@ KEY_NAMES = {
     glfw.KEY_RIGHT: "Right",
     glfw.KEY_HOME: "Home",
     glfw.KEY_END: "End",
+    glfw.KEY_PAGE_UP: "PageUp",
+    glfw.KEY_PAGE_DOWN: "PageDown",
     glfw.KEY_BACKSPACE: "Backspace",
     glfw.KEY_TAB: "Tab",
     glfw.KEY_ESCAPE: "Esc",

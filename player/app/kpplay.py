@@ -2,6 +2,7 @@
 
 kpplay scene.kpc
 kpplay https://host/scene.kpc                          plays while it arrives
+kpplay one.kpc two.kpc, kpplay folder                  several; Page Up and Page Down go through them
 kpplay scene.kpc --size 1280x720
 kpplay scene.kpc --quality fast                        a quality level, from fastest to reference
 kpplay scene.kpc --target-fps 30                       changes the quality to hold a frame rate
@@ -10,6 +11,7 @@ kpplay scene.kpc --frames 30 --screenshot out.png      show 30 frames, save the 
 """
 
 import argparse
+import os
 import re
 import sys
 from dataclasses import replace
@@ -23,6 +25,8 @@ from kpc.format.container.sources import RemoteSource, open_source
 from kpc.format.scene.rig import Rig
 from kpc.player.app import preferences
 from kpc.player.app.camera_paths import CameraPath
+from kpc.player.app.controls import Playback
+from kpc.player.app.playlist import Playlist
 from kpc.player.app.preferences import TARGET_FPS, WINDOW_SIDES, Preferences
 from kpc.player.app.resolution_controller import GPU_FPS
 from kpc.player.quality import LEVELS
@@ -53,9 +57,10 @@ def _command(argv: list[str]) -> None:
 
     # A run of a fixed number of frames is a test: it neither reads nor writes settings.
     file = preferences.preferences_path() if options.frames is None else None
-    stream = GroupPlayback(open_source(options.scene, limit=options.memory), memory=options.memory)
     settings = _merged(preferences.load(file) if file else Preferences(), options)
-    last_settings = _play(stream, settings, options, path)
+    playlist = Playlist.named(options.scenes, settings.recent)
+    stream = GroupPlayback(open_source(playlist.files[0], limit=options.memory), memory=options.memory)
+    last_settings = _play(stream, settings, options, path, playlist)
     if file is not None:
         try:
             preferences.save(last_settings, file)
@@ -68,7 +73,12 @@ def _parser() -> argparse.ArgumentParser:
         prog="kpplay", description="Play a .kpc scene in a window. Press H there for the list of keys."
     )
     cli.add_version_option(parser)
-    parser.add_argument("scene", help="a .kpc file, or its http address")
+    parser.add_argument(
+        "scenes",
+        nargs="+",
+        metavar="scene",
+        help="a .kpc file, its http address, or a folder of .kpc files; of several, the first one is shown first",
+    )
     parser.add_argument(
         "--size",
         type=_size,
@@ -120,20 +130,31 @@ def _merged(saved: Preferences, options: argparse.Namespace) -> Preferences:
 
 
 def _play(
-    stream: "GroupPlayback", settings: Preferences, options: argparse.Namespace, path: CameraPath | None
+    stream: "GroupPlayback",
+    settings: Preferences,
+    options: argparse.Namespace,
+    path: CameraPath | None,
+    playlist: Playlist,
 ) -> Preferences:
-    """Play the scene and others that are dropped on the window; return the settings to save."""
+    """Play the scene and others that are opened in the window; return the settings to save."""
     # Imported here so that a scene that cannot be read is reported without a display.
     from kpc.player.app.player import Player
     from kpc.player.app.window import Window
     from kpc.player.streaming.group_playback import GroupPlayback
 
     window = Window("kpplay", settings.size or _default_size(stream))
-    interrupted, resets = None, 0
+    interrupted, resets, file = None, 0, playlist.files[0]
+    before: Playback | None = None
     try:
         while True:
             window.set_title(f"{stream.metadata.title or Path(stream.source.name).name} - kpplay")
-            player = Player(window, stream, settings, resume_from=interrupted, folder=Path(options.folder))
+            name, is_remote = stream.source.name, isinstance(stream.source, RemoteSource)
+            playlist.opened(file, name if is_remote else os.path.abspath(name))
+            player = Player(
+                window, stream, settings, resume_from=interrupted, folder=Path(options.folder), playlist=playlist
+            )
+            if before is not None:
+                player.state.play_like(before)
             if stream.notice is not None and interrupted is None:
                 print(f"kpplay: {stream.notice}", file=sys.stderr)
                 player.state.notify(stream.notice)
@@ -162,7 +183,7 @@ def _play(
                 stream = GroupPlayback(source, memory=options.memory)
             elif player.successor is not None:
                 stream.close()
-                stream = player.successor
+                stream, file, before = player.successor, player.actions.successor_file, player.state.playback
             else:
                 return settings
     finally:

@@ -8,8 +8,10 @@ from kpc.format.scene.scene import HybridDecoder
 from kpc.player.app.actions import DISPLAY_MODE_NAMES, PART_NAMES, Actions
 from kpc.player.app.controls import SPEEDS
 from kpc.player.app.desktop import imgui
+from kpc.player.app.files_menu import files_button
 from kpc.player.app.imgui_renderer import ImGuiRenderer
 from kpc.player.app.input import KEY_BINDINGS
+from kpc.player.app.leave_question import ask
 from kpc.player.app.path_panel import PathPanel
 from kpc.player.app.preferences import TARGET_FPS
 from kpc.player.app.quality_controller import LEVEL_NAMES
@@ -39,8 +41,8 @@ from kpc.player.quality import LEVELS
 MIN_MESSAGE_EM = 12.0
 # Frame rates that the slider offers.
 SLIDER_FPS = (5.0, 120.0)
-# Characters of the device's name and of a video's path that are shown.
-DEVICE_CHARACTERS, PATH_CHARACTERS = 32, 60
+# Characters of the device's name that are shown.
+DEVICE_CHARACTERS = 32
 
 
 class Panels:
@@ -52,8 +54,12 @@ class Panels:
         self.state, self.scene_view, self.actions = state, scene_view, actions
         self._time_planes, self._path = TimePlanePanel(imgui_renderer, state), PathPanel(state, actions)
 
-    def build(self) -> None:
-        """Build everything that this frame shows over the scene."""
+    def build(self, asks: bool = False) -> None:
+        """Build everything that this frame shows over the scene.
+
+        Args:
+            asks: whether to ask what becomes of an unsaved camera path.
+        """
         state, visible = self.state, self.state.visible
         width, height = window_size()
         margin, spacing = em(MARGIN_EM), em(SPACING_EM)
@@ -63,14 +69,18 @@ class Panels:
             bottom = self._transport(bottom)
             if visible.planes and state.scene.is_dynamic:
                 bottom = self._time_planes.build(bottom - spacing)
+            bottom = self._filming(bottom)
             right = self._status(bottom - margin - spacing)
             free = (right, width) if width - right > em(MIN_MESSAGE_EM) else across
             top = self._graphs(margin) if visible.graphs else margin
             if visible.path:
                 self._path.build(top, bottom - spacing)
-        self._filming(across)
+        else:
+            bottom = self._filming(bottom)
         if visible.keys:
             self._keys()
+        if asks:
+            ask(self.actions)
         if clock.monotonic() < state.notice.until:
             message("notice", state.notice.text, across, bottom - margin, 1.0, ERROR if state.notice.is_error else None)
         if (text := state.stream.message) is not None:
@@ -94,6 +104,8 @@ class Panels:
                 )
             self._viewpoints()
             imgui.separator()
+            files_button(self.actions)
+            imgui.same_line()
             visible = state.visible
             visible.graphs = toggle("graphs", visible.graphs)
             if stream.scene.is_dynamic:
@@ -108,7 +120,12 @@ class Panels:
     def _statistics(self) -> None:
         """Frame rate, resolution, samples, memory, device, what has arrived."""
         statistics, view, stream = self.state.statistics, self.scene_view, self.state.stream
-        imgui.text(f"{1 / max(statistics.frame_s, 1e-6):.0f} fps   {1e3 * statistics.draw_s:.1f} ms")
+        if statistics.moves and statistics.frame_s:
+            rate = 1 / statistics.frame_s
+            imgui.text(f"{rate:.{1 if rate < 10 else 0}f} frames/s, each {1e3 * statistics.draw_s:.0f} ms")
+        else:
+            imgui.text("still picture" if self.scene_view.is_sharp else "refining the picture")
+        imgui.set_item_tooltip("Frames that come each second, and the time that drawing one takes")
         imgui.text_disabled("{}x{} of {}x{} pixels".format(*view.raster, *view.canvas.size))
         imgui.text_disabled(f"{statistics.samples:.1f} samples per ray, {view.renderer.memory_bytes / 1e6:.0f} MB")
         imgui.text_disabled(view.device.split("(")[0].strip()[:DEVICE_CHARACTERS])
@@ -142,8 +159,8 @@ class Panels:
         if changed or (moved and holds):
             quality.hold(state.target_fps if holds else None)
         if state.scene.is_dynamic and LEVELS[quality.level].folded:
-            label("exact motion")
-            _, state.exact = imgui.checkbox("##exact", state.exact)
+            label("motion")
+            _, state.exact = imgui.checkbox("exact", state.exact)
             imgui.set_item_tooltip("Draw what moves as exactly as what does not, which takes longer (F)")
 
     def _viewpoints(self) -> None:
@@ -210,18 +227,32 @@ class Panels:
                     imgui.get_window_draw_list().add_line(*ends, imgui.get_color_u32(ACCENT))
             return top + imgui.get_window_height() + em(SPACING_EM)
 
-    def _filming(self, across: tuple[float, float]) -> None:
-        """That a video is being written, how long it is, and where."""
+    def _filming(self, bottom: float) -> float:
+        """How far the video is that is being written, and a button to end it, above `bottom`; return the upper edge."""
         filming = self.actions.filming
         recording = filming.recording
         if recording is None:
-            return
-        name = recording.path if len(str(recording.path)) < PATH_CHARACTERS else f".../{recording.path.name}"
-        verb = "finishing" if recording.is_ending else "recording the path" if filming.is_along_path else "recording"
-        path = self.state.follower.path
-        total = f" of {path.end_s - path.start_s:.1f}" if filming.is_along_path else ""
-        text = f"{verb}: {recording.duration_s:.1f}{total} s, {name}"
-        message("film", text, across, 0.06 * window_size()[1], 0.0, ACCENT)
+            return bottom
+        name = recording.path.name
+        place_next(window_size()[0] / 2, bottom - em(SPACING_EM), 0.5, 1.0)
+        with panel("film"):
+            top = bottom - em(SPACING_EM) - imgui.get_window_height()
+            if recording.is_ending:
+                imgui.text_colored(ACCENT, f"finishing {name}")
+                return top
+            if filming.is_along_path:
+                text = f"frame {recording.taken} of {filming.path_frames}{_time_left(filming.left_s)}"
+            else:
+                text = f"{recording.duration_s:.1f} s"
+            imgui.align_text_to_frame_padding()
+            imgui.text_colored(ACCENT, f"recording {name}: {text}")
+            imgui.same_line()
+            if imgui.button("stop"):
+                filming.stop()
+            imgui.set_item_tooltip("End the video here; what was recorded is kept (O)")
+            if filming.is_along_path:
+                imgui.progress_bar(recording.taken / filming.path_frames, imgui.ImVec2(-1, em(0.4)), "")
+            return top
 
     def _keys(self) -> None:
         """The list of keys, in the middle."""
@@ -237,3 +268,10 @@ class Panels:
                     imgui.table_next_column()
                     imgui.text_disabled(binding.help)
                 imgui.end_table()
+
+
+def _time_left(seconds: float | None) -> str:
+    """Return how long something still takes, in words; nothing if that is not known yet."""
+    if seconds is None:
+        return ""
+    return f", {seconds:.0f} s left" if seconds < 90 else f", {seconds / 60:.0f} min left"

@@ -1,6 +1,7 @@
 """The camera path of a player: keyframes that are added while it runs, and the camera that follows it. No window."""
 
 import time as clock
+from pathlib import Path
 
 from kpc.format.scene.cameras import Camera
 from kpc.player.app.camera_paths import GAP_S, CameraPath
@@ -20,6 +21,7 @@ class PathFollower:
 
     def __init__(self) -> None:
         self.path, self.position_s, self.is_active = CameraPath(), 0.0, False
+        self._kept = self.path  # the path that is in a file, or that the user has given up
         self._last_keyframe_at: float | None = None  # time.monotonic(); None unless the clip played then
 
     @property
@@ -27,9 +29,23 @@ class PathFollower:
         """Whether there are no keyframes."""
         return not self.path.keyframes
 
+    @property
+    def is_unsaved(self) -> bool:
+        """Whether there are keyframes that would be lost."""
+        return not self.is_empty and self.path is not self._kept
+
     def replace(self, path: CameraPath) -> None:
-        """Take over another path, and go to its beginning."""
-        self.path, self.position_s = path, 0.0
+        """Take over another path, from a file, and go to its beginning."""
+        self.path, self._kept, self.position_s = path, path, 0.0
+
+    def save(self, file: Path) -> None:
+        """Write the path to a file."""
+        self.path.save(file)
+        self._kept = self.path
+
+    def give_up(self) -> None:
+        """Do without a file of the path as it is."""
+        self._kept = self.path
 
     def start(self, from_beginning: bool = False) -> None:
         """Follow the path, from where the camera left it unless that was its end."""

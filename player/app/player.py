@@ -14,10 +14,12 @@ from kpc.player.app.imgui_renderer import ImGuiRenderer
 from kpc.player.app.input import Input
 from kpc.player.app.output_files import OutputFiles
 from kpc.player.app.panels import Panels
+from kpc.player.app.playlist import Playlist
 from kpc.player.app.preferences import Preferences
 from kpc.player.app.quality_controller import quality_controller_for
 from kpc.player.app.scene_view import SceneView
 from kpc.player.app.state import PlayerState
+from kpc.player.app.widgets import message
 from kpc.player.app.window import Window
 from kpc.player.gl.renderer import is_software
 from kpc.player.quality import neighbouring_level
@@ -28,8 +30,14 @@ from kpc.player.streaming.prefetch import Playhead
 MAX_RETRIES = 3
 # Seconds to wait for events while nothing changes, and while the window is minimised.
 IDLE_S, ICONIFIED_S = 0.05, 0.1
+# Seconds to wait for events once nothing has happened for AWAKE_S.
+SLEEP_S, AWAKE_S = 1.0, 0.6
 # Seconds that the clip advances at most in a frame, so that one that compiles for a minute does not skip to its end.
 MAX_ADVANCE_S = 1.0
+
+# What a window shows until its first picture, and the colour around it.
+OPENING = "Preparing {}. What draws it is compiled the first time, which may take a minute."
+BACKGROUND = 0.06, 0.07, 0.09
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,7 @@ class Snapshot:
         level: name of the quality level; target_s: seconds that a frame may take, if the level follows from that.
         keyframes: of the camera path; follows_path: whether the camera follows it.
         films: whether a video is being written.
+        asks: whether the window asks what becomes of an unsaved camera path.
         panels: names of the panels that are switched on.
         notice, notice_is_error: the last message.
         canvas, raster: (width, height) of the canvas, and of the picture before it was scaled to it.
@@ -70,6 +79,7 @@ class Snapshot:
     keyframes: int
     follows_path: bool
     films: bool
+    asks: bool
     panels: frozenset[str]
     notice: str
     notice_is_error: bool
@@ -87,6 +97,7 @@ class Player:
         preferences: the settings to begin with.
         resume_from: a player of the same scene whose context was lost; this one continues where that one stopped.
         folder: for screenshots, videos and camera paths.
+        playlist: the files to go through; None for this one alone.
 
     Attributes:
         state: what is shown, and how.
@@ -103,22 +114,27 @@ class Player:
         *,
         resume_from: "Player | None" = None,
         folder: Path = Path(),
+        playlist: Playlist | None = None,
     ) -> None:
         self.window = window
-        stream.arrived = glfw.post_empty_event
+        stream.arrived = window.wake
+        self.imgui = ImGuiRenderer(window.ctx)
+        window.io = self.imgui.io
+        self._announce(stream.source.name)
         quality = quality_controller_for(is_software(window.ctx), preferences.quality, preferences.target_fps)
         self.state = PlayerState(stream, preferences, quality)
         if resume_from is not None:
             self.state.resume(resume_from.state)
         self.scene_view = SceneView(window.ctx, self.state, window.pixels)
-        self.imgui = ImGuiRenderer(window.ctx)
-        window.io = self.imgui.io
         self.files = OutputFiles(folder, stream.source.name)
         self.filming = Filming(self.state, self.scene_view, self.files)
-        self.actions = Actions(self.state, self.scene_view, self.filming, self.files)
+        self.actions = Actions(
+            self.state, self.scene_view, self.filming, self.files, playlist or Playlist([stream.source.name])
+        )
         self.input = Input(window, self.state, self.actions)
         self.panels = Panels(self.imgui, self.state, self.scene_view, self.actions)
-        self._retries, self._last_frame_at = 0, clock.monotonic()
+        self._is_still = False  # whether the last frame showed the same scene as that before it
+        self._retries, self._last_frame_at, self._stirred_at = 0, clock.monotonic(), clock.monotonic()
         if resume_from is None:
             self.state.notify("Press H for the list of keys")
         else:
@@ -131,7 +147,7 @@ class Player:
 
     def preferences(self) -> Preferences:
         """Return the settings to remember."""
-        return self.state.preferences(self.window.unscaled_size)
+        return replace(self.state.preferences(self.window.unscaled_size), recent=self.actions.playlist.recent)
 
     def run(self, frames: int | None = None) -> None:
         """Show frames until the window is closed or another scene is opened.
@@ -142,12 +158,27 @@ class Player:
         shown, stream = 0, self.state.stream
         while not self._is_over and (frames is None or shown < frames):
             may_wait = frames is None or not stream.is_settled
-            if may_wait and self.scene_view.is_sharp and self.filming.recording is None:
-                glfw.wait_events_timeout(IDLE_S)  # nothing changes: use next to no time
+            if may_wait and self._is_still:
+                self._wait()
             else:
                 glfw.poll_events()
-            self.frame()
+                self.frame()
             shown += stream.is_settled
+
+    def _wait(self) -> None:
+        """Wait for events; show a frame if there are any, or there were a moment ago, or a message disappears.
+
+        ImGui reacts to an event over several frames, say with a tooltip.
+        """
+        state, now = self.state, clock.monotonic()
+        until_gone = state.notice.until - now
+        if now - self._stirred_at < AWAKE_S or not state.stream.is_settled or self.actions.dialog.is_open:
+            glfw.wait_events_timeout(IDLE_S)
+            self.frame()
+            return
+        glfw.wait_events_timeout(min(until_gone, SLEEP_S) if until_gone > 0 else SLEEP_S)
+        if self.window.is_stirred or 0 < until_gone < SLEEP_S:
+            self.frame()
 
     def frame(self, seconds: float | None = None) -> None:
         """Handle events, advance the clip, draw the scene and the panels over it, and show them.
@@ -159,7 +190,8 @@ class Player:
         if seconds is None:
             seconds = now - self._last_frame_at
         self._last_frame_at = now
-        self.state.statistics.record_interval(seconds)
+        if self.window.is_stirred:
+            self.window.is_stirred, self._stirred_at = False, now
         pixels = self.window.pixels
         if min(pixels) < 1 or self.window.is_iconified:
             glfw.wait_events_timeout(ICONIFIED_S)
@@ -184,19 +216,25 @@ class Player:
         except DisplayError as error:
             self._retry_after(error)
         self.filming.update(now)
-        self.state.statistics.record_frame(seconds)
-        self.panels.build()
+        self._is_still = self.scene_view.is_sharp and not is_timed and self.filming.recording is None
+        self.state.statistics.record_frame(seconds, moves=is_timed or self.filming.is_along_path)
+        self._close_or_ask()
+        self.panels.build(asks=self._asks)
         self._present()
         if is_timed:  # the frame without waiting for the screen, and without measuring statistics
             self.state.quality.record(clock.monotonic() - now - (self.scene_view.measuring_s - measuring_s))
         glfw.swap_buffers(self.window.handle)
         self.window.release_unused()
+        if self.actions.is_opening:
+            self.present_panels()  # it may take a while, and ImGui shows a new message in its second frame
+            glfw.swap_buffers(self.window.handle)
+            self.actions.open_waiting()
 
     def screenshot(self, path: Path) -> None:
         """Save the window with its panels at full resolution as a PNG file."""
         self._begin_panels(1 / 60)
         self.scene_view.draw_still()
-        self.panels.build()
+        self.panels.build(asks=self._asks)
         self.imgui.draw(self.scene_view.canvas)
         write_image(path, self.scene_view.pixels())
         self.scene_view.invalidate()
@@ -221,7 +259,7 @@ class Player:
     def present_panels(self) -> None:
         """Build the panels and show them over the canvas, without drawing the scene or swapping buffers."""
         self._begin_panels(0.0)
-        self.panels.build()
+        self.panels.build(asks=self._asks)
         self._present()
 
     def forget_failures(self) -> None:
@@ -249,6 +287,7 @@ class Player:
             keyframes=len(follower.path.keyframes),
             follows_path=follower.is_active,
             films=self.filming.recording is not None,
+            asks=self._asks,
             panels=frozenset(name for name, is_shown in vars(state.visible).items() if is_shown),
             notice=state.notice.text,
             notice_is_error=state.notice.is_error,
@@ -260,8 +299,21 @@ class Player:
     # --- parts of a frame
 
     @property
+    def _asks(self) -> bool:
+        """Whether the window asks what becomes of an unsaved camera path."""
+        return self.state.follower.is_unsaved and (self.state.should_close or self.successor is not None)
+
+    @property
     def _is_over(self) -> bool:
-        return self.window.should_close or self.state.should_close or self.successor is not None
+        return (self.state.should_close or self.successor is not None) and not self._asks
+
+    def _close_or_ask(self) -> None:
+        """Take over that the user has closed the window; doing so again while it asks closes it."""
+        if self.window.should_close:
+            self.window.keep_open()
+            if self._asks:
+                self.state.follower.give_up()
+            self.state.should_close = True
 
     def _advance(self, seconds: float) -> None:
         """Advance the clip, or the camera along its path, unless what would be shown has not arrived yet."""
@@ -282,6 +334,24 @@ class Player:
             state.shown = state.shown if view is state.view else None
             state.playback, state.view = playback, view
             follower.position_s, follower.is_active = position_s, follows
+
+    def _announce(self, name: str) -> None:
+        """Show at once that the scene is being prepared: compiling what draws it may take a minute the first time."""
+        ctx, pixels, text = self.window.ctx, self.window.pixels, OPENING.format(Path(name).name)
+        if min(pixels) < 1:
+            return
+        ctx.screen.use()
+        ctx.clear(*BACKGROUND, viewport=(0, 0, *pixels))
+        for is_last in (False, True):  # ImGui shows a window that fits its content from the second frame on
+            self.imgui.begin(self.window.size, pixels, self.window.text_scale, 0.0)
+            width, height = self.window.size
+            message("opening", text, (0.0, width), height / 2, 0.5)
+            if is_last:
+                self.imgui.draw(ctx.screen)
+            else:
+                self.imgui.end()
+        glfw.swap_buffers(self.window.handle)
+        glfw.poll_events()
 
     def _retry_after(self, error: DisplayError) -> None:
         """Report that drawing failed and lower the quality; give up after MAX_RETRIES."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from kpc.format.common.cli import atomic_write
+from kpc.player.app.playlist import MAX_RECENT
 from kpc.player.quality import LEVELS
 
 # Bytes of the file that are read.
@@ -35,6 +36,7 @@ class Preferences:
         target_fps: frame rate to hold by changing the quality; None: the quality stays.
         controls, graphs, planes: whether these panels are shown.
         text_size: of the panels, 1 for the system's text size.
+        recent: paths and addresses of the files that were opened lately, the latest first.
     """
 
     size: tuple[int, int] | None = None
@@ -44,6 +46,7 @@ class Preferences:
     graphs: bool = False
     planes: bool = False
     text_size: float = 1.0
+    recent: tuple[str, ...] = ()
 
 
 def _is_between(low: float, high: float) -> Callable[[Any], bool]:
@@ -58,6 +61,10 @@ def _is_size(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(isinstance(n, int) and n in WINDOW_SIDES for n in value)
 
 
+def _is_recent(value: Any) -> bool:
+    return isinstance(value, list) and len(value) <= MAX_RECENT and all(isinstance(n, str) and n for n in value)
+
+
 _IS_VALID: dict[str, Callable[[Any], bool]] = {
     "size": _is_size,
     "quality": lambda value: isinstance(value, str) and value in LEVELS,
@@ -66,6 +73,7 @@ _IS_VALID: dict[str, Callable[[Any], bool]] = {
     "graphs": _is_bool,
     "planes": _is_bool,
     "text_size": _is_between(*TEXT_SIZES),
+    "recent": _is_recent,
 }
 
 
@@ -91,6 +99,8 @@ def load(path: Path) -> Preferences:
     valid = {name: found[name] for name, is_valid in _IS_VALID.items() if name in found and is_valid(found[name])}
     if "size" in valid:
         valid["size"] = tuple(map(max, valid["size"], MIN_WINDOW))
+    if "recent" in valid:
+        valid["recent"] = tuple(valid["recent"])
     return Preferences(**valid)
 
 

@@ -13,7 +13,7 @@ from kpc.player.app.controls import AppearanceSelection
 from kpc.player.app.state import PlayerState
 from kpc.player.cpu.reference import Part
 from kpc.player.gl.renderer import Renderer, is_software
-from kpc.player.quality import LEVELS
+from kpc.player.quality import LEVELS, Quality
 
 # Statistics are measured this often, from a picture of this many pixels.
 STATISTICS_EVERY_S = 0.5
@@ -101,13 +101,8 @@ class SceneView:
         elif wanted != self._drawn:
             self._drawn, self._changed_at, self.is_sharp, self._refined_rows = wanted, now, False, 0
             self.draw(quality.level, quality.resolution.scale)
-            drawn, still = self.renderer.quality, LEVELS[quality.still_level]
-            is_whole = (
-                self.raster == self.canvas.size
-                and not (drawn.reprojection_tolerance or drawn.interpolation_tolerance)
-                and drawn.rays_across == still.rays_across
-            )
-            self.is_sharp = is_whole and quality.level == quality.still_level
+            is_still_quality = self.renderer.quality == self._quality(quality.still_level, still=True)
+            self.is_sharp = self.raster == self.canvas.size and is_still_quality
             return True
         elif not self.is_sharp and now - self._changed_at > REFINE_AFTER_S:
             self._refine()
@@ -125,7 +120,7 @@ class SceneView:
             scale: side of the raster over that of the canvas, (0, 1].
             still: whether to draw as for a picture that does not change.
         """
-        self._set_quality(level, still)
+        self.renderer.quality = self._quality(level, still)
         if clock.monotonic() - self._measured_at > STATISTICS_EVERY_S:
             self._measure()
         width, height = (max(1, round(side * scale)) for side in self.canvas.size)
@@ -135,7 +130,7 @@ class SceneView:
 
     def _refine(self) -> None:
         """Draw the next band of rows of a still, from the top, as many rows as take no longer than `band_s`."""
-        self._set_quality(self.state.quality.still_level, still=True)
+        self.renderer.quality = self._quality(self.state.quality.still_level, still=True)
         width, height = self.canvas.size
         if self._refined_rows == 0:
             whole_s = self.state.statistics.draw_s * width * height / (self.raster[0] * self.raster[1])
@@ -153,18 +148,18 @@ class SceneView:
         if self._refined_rows == height:
             self.is_sharp, self.raster = True, (width, height)
 
-    def _set_quality(self, level: str, still: bool) -> None:
-        """Set the renderer's quality.
+    def _quality(self, level: str, still: bool) -> Quality:
+        """Return the quality to draw at.
 
-        For a still every pixel is marched. While something changes, a processor sends one ray per pixel: a higher
-        resolution shows more.
+        For a still every pixel is marched, as a graphics card always does. While something changes, a processor sends
+        one ray per pixel: a higher resolution shows more.
         """
         quality = LEVELS[level]
-        if still:
+        if still or not is_software(self.ctx):
             quality = replace(quality, reprojection_tolerance=0.0, interpolation_tolerance=0.0)
-        elif is_software(self.ctx):
+        else:
             quality = replace(quality, rays_across=1)
-        self.renderer.quality = replace(quality, folded=quality.folded and not self.state.exact)
+        return replace(quality, folded=quality.folded and not self.state.exact)
 
     def _show(self, target: moderngl.Framebuffer, camera: Camera) -> None:
         """Draw the scene on a target; where two groups overlap, the blend of both."""

@@ -68,7 +68,8 @@ class FrameStatistics:
         history: (2, HISTORY_FRAMES) float32, milliseconds between frames and milliseconds that pictures took; frame n
             is in column n % HISTORY_FRAMES.
         frames: frames so far.
-        frame_s: seconds between two frames, smoothed.
+        frame_s: seconds between two frames while something moves, smoothed.
+        moves: whether the last frame showed something else than that before it.
         draw_s: seconds that the last picture took.
         samples: samples per ray, on average.
         max_samples: samples per ray at the upper end of the colour scale.
@@ -79,18 +80,19 @@ class FrameStatistics:
         self.history = np.zeros((2, HISTORY_FRAMES), np.float32)
         self.frames = 0
         self.frame_s = self.draw_s = 0.0
+        self.moves = False
         self.samples, self.max_samples, self.depth_range = 0.0, 16.0, (0.0, 1.0)
 
-    def record_interval(self, seconds: float) -> None:
-        """Update the smoothed time between frames."""
-        self.frame_s += 0.1 * (seconds - self.frame_s) if self.frame_s else seconds
-
-    def record_frame(self, seconds: float) -> None:
+    def record_frame(self, seconds: float, moves: bool) -> None:
         """Append a frame to the history.
 
         Args:
             seconds: since the frame before.
+            moves: whether it shows something else than that.
         """
+        if moves and self.moves:
+            self.frame_s += 0.1 * (seconds - self.frame_s) if self.frame_s else seconds
+        self.moves = moves
         self.history[:, self.frames % HISTORY_FRAMES] = 1e3 * seconds, 1e3 * self.draw_s
         self.frames += 1
 
@@ -158,7 +160,8 @@ class PlayerState:
         )  # fmt: skip
         self.quality, self.target_fps, self.exact = before.quality, before.target_fps, before.exact
         self.keeps_limits = before.keeps_limits
-        self.follower.replace(before.follower.path)
+        self.follower = before.follower
+        self.follower.is_active = False
         self.appearance.select(before.appearance.number)
         self.visible.controls, self.visible.path = before.visible.controls, before.visible.path
 
@@ -174,6 +177,10 @@ class PlayerState:
             planes=self.visible.planes,
             text_size=self.text_size,
         )
+
+    def play_like(self, before: Playback) -> None:
+        """Keep the speed of another clip, and whether it loops."""
+        self.playback.speed, self.playback.loop = before.speed, before.loop
 
     def look_from(self, view: OrbitView) -> None:
         """Move the camera at once, and stop following the camera path."""

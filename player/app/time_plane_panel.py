@@ -47,7 +47,8 @@ class TimePlanePanel:
             imgui.same_line()
             texture, axis = self._update(planes), planes[self.number][0][0]
             extent = f"{1 - self._high:.0%} to {1 - self._low:.0%} of {axis}"
-            imgui.text_disabled(f"time to the right, {extent} upwards; static parts are grey")
+            imgui.text_disabled(f"time to the right, {extent} upwards")
+            imgui.set_item_tooltip("What moves is a wave; what is static is grey")
             size = imgui.ImVec2(imgui.get_content_region_avail().x, min(em(7), 0.25 * window_size()[1]))
             corner = imgui.get_cursor_screen_pos()
             lower, upper = imgui.ImVec2(0.0, self._low), imgui.ImVec2(1.0, self._high)

@@ -10,7 +10,7 @@ from kpc.player.app.desktop import imgui
 # Colours of what is active, and of errors.
 ACCENT, ERROR = imgui.ImVec4(0.95, 0.62, 0.25, 1.0), imgui.ImVec4(1.0, 0.45, 0.38, 1.0)
 # Widths of the labels before controls, of the controls, and of the panels on the right, em.
-LABEL_EM, CONTROL_EM, PANEL_EM = 6.5, 9.5, 19.0
+LABEL_EM, CONTROL_EM, PANEL_EM = 6.5, 11.1, 19.0
 # Distances of the panels from the window's edges and from each other, em.
 MARGIN_EM, SPACING_EM = 0.8, 0.4
 # Width of the panels along the lower edge, at most, em.
@@ -79,7 +79,9 @@ def message(
         colour: of the text; None for the usual one.
     """
     place_next(sum(across) / 2, y, 0.5, pivot_y)
+    imgui.set_next_window_bg_alpha(0.92)
     with panel(name, imgui.WindowFlags_.no_inputs):
+        imgui.internal.bring_window_to_display_front(imgui.internal.get_current_window())
         imgui.push_text_wrap_pos(MESSAGE_SHARE * (across[1] - across[0]))
         if colour is not None:
             imgui.push_style_color(imgui.Col_.text, colour)

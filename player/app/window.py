@@ -28,6 +28,7 @@ class Window:
         handle: glfw's.
         ctx: the OpenGL context.
         io: where ImGui takes pointer events; None while there is no ImGui context.
+        is_stirred: whether something has happened to the window; who has shown it resets it.
 
     Raises:
         DisplayError: there is no display, or no OpenGL 3.3.
@@ -51,6 +52,7 @@ class Window:
         )
         self._reset_status = reset_status_query()
         self.io: imgui.IO | None = None
+        self.is_stirred = True
         self._keys: list[KeyPress] = []
         self._modifiers = 0
         self._dropped: list[str] = []
@@ -62,36 +64,55 @@ class Window:
         )
         glfw.set_scroll_callback(self.handle, lambda window, x, y: self.scroll(x, y))
         glfw.set_drop_callback(self.handle, self._drop_event)  # type: ignore[arg-type]  # the stub means C's arguments
+        for set_callback in (
+            glfw.set_window_refresh_callback,
+            glfw.set_window_close_callback,
+            glfw.set_framebuffer_size_callback,
+            glfw.set_window_content_scale_callback,
+            glfw.set_window_iconify_callback,
+        ):
+            set_callback(self.handle, self._stir)
 
     # --- events, as the system sends them or as a test does
 
     def press_key(self, key: int, modifiers: int = 0, scancode: int = 0) -> None:
         """Keep a key for `take_keys`."""
+        self._stir()
         self._keys.append(KeyPress(key, key_name(key, scancode), modifiers))
         self._modifiers = modifiers
 
     def type_character(self, character: str, modifiers: int = 0) -> None:
         """Keep a character for `take_keys`. glfw tells of it after the key that types it."""
+        self._stir()
         self._keys.append(KeyPress(None, character, modifiers))
 
     def move_pointer(self, x: float, y: float) -> None:
         """Move the pointer to a position in screen units."""
+        self._stir()
         if self.io:
             self.io.add_mouse_pos_event(x, y)
 
     def press_button(self, button: int, is_down: bool) -> None:
         """Press or release a button of the mouse: 0 left, 1 right, 2 middle."""
+        self._stir()
         if self.io and button < 3:
             self.io.add_mouse_button_event(button, is_down)
 
     def scroll(self, x: float, y: float) -> None:
         """Turn the wheel by so many notches."""
+        self._stir()
         if self.io:
             self.io.add_mouse_wheel_event(x, y)
 
     def drop(self, paths: list[str]) -> None:
         """Keep files for `take_dropped_files`."""
+        self._stir()
         self._dropped += paths
+
+    def wake(self) -> None:
+        """Have the window shown again; any thread may call it."""
+        self._stir()
+        glfw.post_empty_event()
 
     def take_keys(self) -> list[KeyPress]:
         """Return all keys pressed and characters typed since the last call."""
@@ -145,6 +166,10 @@ class Window:
     def should_close(self) -> bool:
         """Whether the user has closed the window."""
         return bool(glfw.window_should_close(self.handle))
+
+    def keep_open(self) -> None:
+        """Take back that the user has closed the window."""
+        glfw.set_window_should_close(self.handle, False)
 
     def set_title(self, title: str) -> None:
         """Change the title."""
@@ -206,6 +231,9 @@ class Window:
         glfw.terminate()
         reasons = "; ".join(failures)
         raise DisplayError(f"no OpenGL 3.3 in the window ({reasons}); update the graphics driver, or {REMEDY}")
+
+    def _stir(self, *_: object) -> None:
+        self.is_stirred = True
 
     def _keep_error(self, code: int, message: bytes | str) -> None:
         self._last_error = message.decode(errors="replace") if isinstance(message, bytes) else message

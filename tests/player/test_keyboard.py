@@ -37,7 +37,7 @@ def display() -> Iterator[str]:
             {
                 "20": "-", "21": "=", "Shift+21": "+", "34": "[", "35": "]", "59": ",", "46": "l", "10": "1",
                 "32": "o", "Shift+32": "Shift+o", "Caps+32": "o", "Shift+46": "l", "Ctrl+39": "Ctrl+s",
-                "Ctrl+20": "Ctrl+-", "65": "Space", "61": None, "Ctrl+32": None, "25": None,
+                "Ctrl+20": "Ctrl+-", "65": "Space", "61": None, "Ctrl+32": "Ctrl+o", "25": None,
             },
             {QUALITY: "-  =", SPEED: "[  ]", FLYING: "W A S D, Q E"},
         ),

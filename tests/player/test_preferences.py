@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from kpc.player.app.preferences import _IS_VALID, MAX_BYTES, Preferences, load, preferences_path, save
 
-MINE = Preferences((800, 600), "fine", 30.0, False, True, True, 1.5)
+MINE = Preferences((800, 600), "fine", 30.0, False, True, True, 1.5, ("a.kpc", "b.kpc"))
 
 
 def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
@@ -30,6 +30,7 @@ def test_every_field_is_checked() -> None:
     "target_fps": [0, -1, 1e9, "fast", True, float("nan"), float("inf"), [30]],
     "graphs": [1, "yes", None],
     "text_size": [0, 99, float("nan"), "x"],
+    "recent": ["a.kpc", [3], [""], 99 * ["a.kpc"], None],
 }.items())  # fmt: skip
 def test_an_invalid_value_is_replaced_by_its_default(tmp_path: Path, name: str, values: list[object]) -> None:
     path = tmp_path / "player.json"
