@@ -40,6 +40,7 @@ def test_a_second_ctrl_c_does_not_wait_for_the_end_of_a_step(tmp_path: Path) -> 
             os.kill(os.getpid(), signal.SIGINT)
             raise AssertionError("the step went on")
 
+    options = Options(tmp_path, tmp_path / "a.kpc")
     with pytest.raises(encode_scene.Abandoned):
-        encode_scene._train(Endless(), tmp_path / CHECKPOINT, Options(tmp_path, tmp_path / "a.kpc", tmp_path))  # type: ignore[arg-type]
+        encode_scene._train(Endless(), tmp_path / CHECKPOINT, options)  # type: ignore[arg-type]
     assert signal.getsignal(signal.SIGINT) is before
