@@ -84,7 +84,7 @@ def kpplay(
         {"DISPLAY": display} if display else {}
     ) | dict(variables)  # fmt: skip
     command = [sys.executable, "-W", "error", "-m", "kpc.player.app.kpplay", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, env=env, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, env=env, timeout=180, check=False)
 
 
 def test_plays_in_a_window(scene_file: Path, display: str, tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ def test_long_playback_allocates_nothing_on_the_card(scene_file: Path, display: 
     (record,) = json.loads(done.stdout)
     (run,) = record["repeats"]
     assert run["gpu_objects_created"] == 0 and run["peak_bytes"] - run["first_bytes"] < 1 << 24 < run["first_bytes"]
-    assert "GPU objects created" in done.stderr and record["renderer"]
+    assert "MB at end" in done.stderr and record["renderer"]
 
 
 def test_kpbench_measures_a_window(scene_file: Path, display: str) -> None:
@@ -205,7 +205,7 @@ def test_kpbench_measures_a_window(scene_file: Path, display: str) -> None:
     assert run["raster"] == "320x240" and run["raster_share"] == 1 and run["psnr"] >= run["psnr_min"] > 30, (
         run
     )  # so small a scene needs no less
-    assert 5 < run["fps"] and "degrees/s" in done.stderr
+    assert 5 < run["fps"] and "PSNR to reference dB" in done.stderr
 
 
 def test_without_a_display_kprender_is_named(scene_file: Path) -> None:
@@ -244,7 +244,7 @@ def test_every_key_and_drag(scene_file: Path, display: str, tmp_path: Path) -> N
     """In a process of its own: with Mesa none can hold both a GLX and an EGL context, and other tests use EGL."""
     command = [sys.executable, "-W", "error", str(Path(__file__).parents[1] / "press_every_key.py"), str(scene_file)]
     env = {**os.environ, "DISPLAY": display, "XDG_CONFIG_HOME": str(tmp_path / "settings")}
-    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, timeout=180, check=False)
     assert done.returncode == 0, done.stderr
     reset, unwritten = done.stderr.splitlines()
     assert reset == "kpplay: the graphics card was reset; restart kpplay, or update the graphics driver"
