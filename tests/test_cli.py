@@ -58,6 +58,7 @@ def test_bugs_keep_their_traceback(error: Exception, cause: Exception | None) ->
         "tools.cli.kprender",
         "tools.cli.kpinfo",
         "tools.cli.kpjoin",
+        "tools.cli.kpexport",
         "tools.bench.kpbench",
     ],
 )

@@ -157,6 +157,11 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * np.power(clipped, 1 / 2.4) - 0.055)
 
 
+def linear_from_srgb(display: np.ndarray) -> np.ndarray:
+    """Apply the inverse of the curve of `srgb_from_linear` to values in [0, 1]."""
+    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+
+
 @contextlib.contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
     """Open an image with the decoders of FORMATS and refuse what would be misread."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from kpc.format.common.errors import UsageError
-from kpc.format.common.images import srgb_from_linear
+from kpc.format.common.images import linear_from_srgb, srgb_from_linear
 from kpc.format.container.groups import GroupedScene
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Scene
@@ -138,7 +138,7 @@ def linear_colours(picture: Rendering, is_transparent: bool) -> np.ndarray:
     """Return colours in linear light by the inverse sRGB curve, (H, W, 3) float64; multiplied by opacity if the
     picture's are."""
     rgb = np.clip(straight_colours(picture) if is_transparent else picture.rgb, 0, 1).astype(np.float64)
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    linear = linear_from_srgb(rgb)
     return linear * picture.opacity[..., None] if is_transparent else linear
 
 

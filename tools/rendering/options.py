@@ -30,7 +30,7 @@ def parser() -> argparse.ArgumentParser:
     cli.add_version_option(made)
     made.add_argument("scene", help="a .kpc file, or its http address")
     _add_cameras(made.add_argument_group("cameras"))
-    _add_times(made.add_argument_group("times"))
+    add_times(made.add_argument_group("times"))
     _add_content(made.add_argument_group("content"))
     _add_output(made.add_argument_group("output"))
     quality = made.add_argument_group("quality")
@@ -49,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
     )
     quality.add_argument(
         "--samples",
-        type=functools.partial(_integer, low=1, high=MAX_SAMPLES),
+        type=functools.partial(integer, low=1, high=MAX_SAMPLES),
         default=1,
         metavar="N",
         help="render N x N samples for each pixel, and take their mean in linear light (default: %(default)s)",
@@ -88,16 +88,17 @@ def _add_cameras(group: argparse._ArgumentGroup) -> None:
     )
     cameras.add_argument(
         "--orbit",
-        type=functools.partial(_integer, low=1, high=MAX_PICTURES),
+        type=functools.partial(integer, low=1, high=MAX_PICTURES),
         metavar="N",
         help="N views along a path around the scene while the clip plays once",
     )
     group.add_argument(
-        "--size", type=_size, metavar="WxH", help="size of the pictures; the vertical field of view stays the same"
+        "--size", type=size, metavar="WxH", help="size of the pictures; the vertical field of view stays the same"
     )
 
 
-def _add_times(group: argparse._ArgumentGroup) -> None:
+def add_times(group: argparse._ArgumentGroup) -> None:
+    """Add the options that choose frames, which `shots.shots_of` reads."""
     group.add_argument(
         "--time",
         type=functools.partial(cli.number_within, low=0.0, high=1.0, name="a number"),
@@ -118,7 +119,7 @@ def _add_times(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--step",
-        type=functools.partial(_integer, low=1, high=MAX_PICTURES),
+        type=functools.partial(integer, low=1, high=MAX_PICTURES),
         default=1,
         metavar="N",
         help="render every Nth frame; a film still lasts as long (default: %(default)s)",
@@ -189,7 +190,7 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
         help="codec of a film (default: h264 in .mp4 and .mkv, prores in .mov, vp9 in .webm)",
     )
     group.add_argument(
-        "--crf", type=functools.partial(_integer, low=0, high=63), metavar="N",
+        "--crf", type=functools.partial(integer, low=0, high=63), metavar="N",
         help="constant rate factor of a film: lower is better and larger (default: "
         + ", ".join(f"{name} {codec.crf[2]}" for name, codec in CODECS.items() if codec.crf)
         + ")",
@@ -197,7 +198,8 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--bits", type=int, choices=(8, 10), help="bits per channel of a film (default: 8; prores: 10)")
 
 
-def _integer(text: str, low: int, high: int) -> int:
+def integer(text: str, low: int, high: int) -> int:
+    """Parse a whole number from `low` to `high`."""
     if not (text.isascii() and text.isdecimal()) or len(text) > 9 or not low <= int(text) <= high:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {low} to {high}")
     return int(text)
@@ -210,7 +212,8 @@ def _range(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2] or match[1])
 
 
-def _size(text: str) -> tuple[int, int]:
+def size(text: str) -> tuple[int, int]:
+    """Parse a size of pictures such as "640x480"."""
     match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
     if match is None or not all(1 <= int(n) <= MAX_SIDE for n in match.groups()):
         raise argparse.ArgumentTypeError(f"{text!r} is not a size like 640x480, at most {MAX_SIDE} per side")

@@ -1,0 +1,166 @@
+"""Cameras of kpexport to glTF and USD, and back."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_kpexport import save
+
+from kpc.format.scene.cameras import View, load_views, save_views
+from kpc.format.scene.metadata import Metadata
+from kpc.player.app.camera_paths import CameraPath
+from kpc.tools.cli import kpexport
+from kpc.tools.exchange.gltf import GltfReader
+from scenes import look_at, tiny_scene
+
+TOLERANCE = 1e-6
+EYES = [(2.4, 1.0, 2.2), (-1.8, 1.4, 2.6), (0.3, -0.7, -3.1)]
+FORMATS = ["path.gltf", "path.usda", "path.usdc"]
+
+
+def views(has_path: bool, centre: tuple[float, float] = (24.0, 18.0)) -> list[View]:
+    cameras = [replace(look_at(eye, (0.1, 0.0, 0.2), 48, 36, 55.0), cx=centre[0], cy=centre[1]) for eye in EYES]
+    cameras = [replace(camera, fl_y=50.0) for camera in cameras]
+    ats = [0.5, 1.5, 4.0] if has_path else [None] * 3
+    return [View(c, 0.3 * n, f"eye{n}.png", at) for n, (c, at) in enumerate(zip(cameras, ats, strict=True))]
+
+
+def exchange(tmp_path: Path, name: str, *options: str, back: tuple[str, ...] = ()) -> list[View]:
+    """Write tmp_path/in.json in a format of another program, and read it back."""
+    if not name.endswith(".gltf"):
+        pytest.importorskip("pxr", reason="usd-core is not installed, which reads and writes USD")
+    assert kpexport.main([str(tmp_path / "in.json"), "-o", str(tmp_path / name), *options]) == 0
+    assert kpexport.main([str(tmp_path / name), "-o", str(tmp_path / "out.json"), *back]) == 0
+    return load_views(tmp_path / "out.json")
+
+
+def assert_same(found: list[View], wanted: list[View]) -> None:
+    assert len(found) == len(wanted)
+    for one, other in zip(found, wanted, strict=True):
+        a, b = one.camera, other.camera
+        assert (a.width, a.height) == (b.width, b.height)
+        assert np.abs(a.camera_to_world - b.camera_to_world).max() < TOLERANCE
+        assert math.isclose(a.fl_x, b.fl_x, rel_tol=TOLERANCE) and math.isclose(a.fl_y, b.fl_y, rel_tol=TOLERANCE)
+        assert max(abs(a.cx - b.cx) / a.width, abs(a.cy - b.cy) / a.height) < TOLERANCE
+        assert abs(one.time - other.time) < TOLERANCE
+        assert (one.at_s is None) == (other.at_s is None)
+        assert abs((one.at_s or 0.0) - (other.at_s or 0.0)) < TOLERANCE
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("has_path", [False, True])
+def test_views_and_keyframes_come_back(tmp_path: Path, name: str, has_path: bool) -> None:
+    save_views(tmp_path / "in.json", views(has_path, centre=(25.5, 16.0)))
+    assert_same(exchange(tmp_path, name, *(["--keyframes"] if has_path else [])), views(has_path, centre=(25.5, 16.0)))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_path_is_sampled_along_its_smooth_course(tmp_path: Path, name: str) -> None:
+    save_views(tmp_path / "in.json", views(True))
+    path = CameraPath.load(tmp_path / "in.json")
+    instants = [0.5 + n / 8 for n in range(29)]
+    wanted = [View(*path.at(at_s), "", at_s) for at_s in instants]
+    assert_same(exchange(tmp_path, name, "--fps", "8"), wanted)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_scene_places_cameras_both_ways(tmp_path: Path, name: str) -> None:
+    scene = replace(tiny_scene(4), metadata=Metadata({"up": [0, 0, 1], "metres_per_unit": 0.25}))
+    file = str(save(scene, tmp_path / "scene.kpc"))
+    save_views(tmp_path / "in.json", views(False))
+    assert_same(exchange(tmp_path, name, "--scene", file, back=("--scene", file)), views(False))
+    placed = exchange(tmp_path, name, "--scene", file)[0].camera.camera_to_world
+    x, y, z = EYES[0]
+    assert np.abs(placed[:3, 3] - 0.25 * np.array([x, z, -y])).max() < TOLERANCE
+
+
+def test_a_gltf_camera_is_valid_and_can_be_edited(tmp_path: Path) -> None:
+    save_views(tmp_path / "in.json", views(True))
+    out = tmp_path / "path.gltf"
+    assert kpexport.main([str(tmp_path / "in.json"), "-o", str(out), "--fps", "4"]) == 0
+    document = json.loads(out.read_text())
+    reader = GltfReader(out)
+    for number, accessor in enumerate(document["accessors"]):
+        values = reader.floats(number, accessor["type"]).reshape(accessor["count"], -1)
+        assert accessor["min"] == values.min(0).tolist() and accessor["max"] == values.max(0).tolist()
+    ends = [view["byteOffset"] + view["byteLength"] for view in document["bufferViews"]]
+    assert max(ends) == document["buffers"][0]["byteLength"]
+    # as another program writes it: no extras, a parent that turns and scales, no animation
+    del document["animations"]
+    node = document["nodes"][0]
+    del node["extras"]
+    document["nodes"].append({"children": [0], "scale": [2, 2, 2], "rotation": [0, 0, 0, 1], "translation": [1, 0, 0]})
+    out.write_text(json.dumps(document))
+    assert kpexport.main([str(out), "-o", str(tmp_path / "out.json"), "--size", "480x360"]) == 0
+    (view,) = load_views(tmp_path / "out.json")
+    assert view.at_s is None and (view.camera.width, view.camera.height) == (480, 360)
+    assert np.abs(view.camera.camera_to_world[:3, 3] - (2 * np.array(EYES[0]) + [1, 0, 0])).max() < TOLERANCE
+    assert math.isclose(view.camera.fl_x, 550, rel_tol=TOLERANCE) and math.isclose(view.camera.fl_y, 500)
+
+
+def test_usd_of_other_programs_is_turned_and_scaled(tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed, which reads and writes USD")
+    (tmp_path / "z.usda").write_text(
+        '#usda 1.0\n(\n    metersPerUnit = 0.01\n    upAxis = "Z"\n)\n'
+        'def Camera "cam"\n{\n    float focalLength = 50\n    float horizontalAperture = 25\n'
+        "    float verticalAperture = 12.5\n    double3 xformOp:translate = (100, 200, 300)\n"
+        '    uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n'
+    )
+    assert kpexport.main([str(tmp_path / "z.usda"), "-o", str(tmp_path / "out.json")]) == 0
+    (view,) = load_views(tmp_path / "out.json")
+    assert (view.camera.width, view.camera.height) == (1920, 960)
+    assert math.isclose(view.camera.fl_x, 3840) and math.isclose(view.camera.fl_y, 3840)
+    pose = view.camera.camera_to_world
+    assert np.allclose(pose[:3, 3], [1, 3, -2]) and np.allclose(pose[:3, 2], [0, 1, 0])  # it looked down
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [
+        (lambda d: d["accessors"][0].update(count=10**6), "outside its buffer"),
+        (lambda d: d["accessors"][0].update(bufferView=-1), "no entry"),
+        (lambda d: d["buffers"][0].update(uri="../secret.bin"), "no plain file"),
+        (lambda d: d["nodes"][0].update(children=[0]), "is its own"),
+        (lambda d: d["cameras"][0]["perspective"].update(yfov=math.nan), "yfov"),
+        (lambda d: d["cameras"][0]["perspective"].update(aspectRatio=0), "focal length"),
+        (lambda d: d["animations"][0]["samplers"][0].update(interpolation="CUBICSPLINE"), "every frame"),
+        (lambda d: d["animations"][0]["channels"][0]["target"].update(node=7), "no entry"),
+        (lambda d: d.update(nodes={}), "not a list"),
+        (lambda d: d.pop("asset"), "not glTF 2.0"),
+    ],
+)
+def test_damaged_gltf_is_refused_in_one_line(
+    tmp_path: Path, edit, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_views(tmp_path / "in.json", views(True))
+    out = tmp_path / "path.gltf"
+    kpexport.main([str(tmp_path / "in.json"), "-o", str(out), "--keyframes"])
+    document = json.loads(out.read_text())
+    edit(document)
+    out.write_text(json.dumps(document))
+    capsys.readouterr()
+    assert kpexport.main([str(out), "-o", str(tmp_path / "out.json")]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith(f"kpexport: {out}") and reason in error
+    assert not (tmp_path / "out.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("no usd", "not USD"),
+        ("#usda 1.0\n(\n    subLayers = [@other.usda@]\n)\n", "refers to other files"),
+        ('#usda 1.0\ndef Camera "c"\n{\n    float focalLength = -1\n}\n', "must be positive"),
+        ("#usda 1.0\n", "no perspective camera"),
+    ],
+)
+def test_damaged_usd_is_refused_in_one_line(
+    tmp_path: Path, text: str, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed, which reads and writes USD")
+    (tmp_path / "in.usda").write_text(text)
+    assert kpexport.main([str(tmp_path / "in.usda"), "-o", str(tmp_path / "out.json")]) == 1
+    assert reason in capsys.readouterr().err.splitlines()[-1]

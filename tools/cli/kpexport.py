@@ -1,0 +1,179 @@
+"""kpexport: exchange points, meshes and cameras with Blender, Houdini, Unreal, Nuke and other programs.
+
+    kpexport scene.kpc -o points.ply --time 0.5          surfaces as coloured points
+    kpexport scene.kpc -o frames/ --format glb --step 5  a file for every fifth frame
+    kpexport scene.kpc -o mesh.glb --mesh --time 0       an isosurface of the density
+    kpexport path.json -o path.usda --scene scene.kpc    a camera path of the player, or a camera file
+    kpexport path.gltf -o path.json --scene scene.kpc    and back
+
+What is written is y-up and in metres: it is turned and scaled by the up and the length of a unit in the scene's
+metadata, if there are any.
+"""
+
+import argparse
+import errno
+import os
+import sys
+import time as clock
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+import kpc
+from kpc.format.common import cli
+from kpc.format.common.errors import KpcError, UsageError
+from kpc.format.common.progress import progress
+from kpc.format.container.groups import GroupedScene, Groups
+from kpc.format.scene.cameras import save_views
+from kpc.format.scene.rig import Rig
+from kpc.format.scene.scene import Scene
+from kpc.player.cpu.reference import Part
+from kpc.player.viewpoints import fit_camera
+from kpc.tools.exchange import gltf_cameras
+from kpc.tools.exchange.camera_tracks import load_tracks, placed, views_of
+from kpc.tools.exchange.geometry_files import write_geometry
+from kpc.tools.exchange.mesh import Mesh, surface_mesh
+from kpc.tools.exchange.options import DENSITY, PATH_FPS, RESOLUTION, SPACING_PARTS, USD_SUFFIXES, Task, parser, task_of
+from kpc.tools.exchange.placement import Placement
+from kpc.tools.exchange.points import MAX_CELLS, Cloud, is_clipped, normals_of, surface_points
+from kpc.tools.rendering.content import Render, renderer_of
+from kpc.tools.rendering.shots import Shots, shots_of
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    return cli.run(_command, "kpexport", argv)
+
+
+def _command(argv: list[str]) -> None:
+    options = parser().parse_args(argv)
+    task = task_of(options)
+    parent = Path(options.output).absolute().parent
+    if not parent.is_dir() and not task.is_folder:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(parent))
+    if task.kind == "geometry":
+        _export_geometry(task, options)
+    else:
+        _exchange_cameras(task, options)
+
+
+def _export_geometry(task: Task, options: argparse.Namespace) -> None:
+    """Write the points or the mesh of each frame."""
+    if options.mesh:
+        _needed("skimage", "scikit-image")
+    loaded = kpc.load(options.input)
+    scene, _ = loaded.at(0.0)
+    shots = _shots(scene, loaded, options)
+    if not task.is_folder and len(shots) != 1:
+        raise UsageError(f"-o {options.output}: {len(shots)} frames do not go into one file; give a folder or --time")
+    placement = Placement.of(scene.metadata)
+    if not placement.is_identity:
+        _say("turned and scaled by the up and the unit of the scene: y is up, in metres")
+    if is_clipped(scene):
+        _say("the scene goes on beyond its box; only what lies in the box is exported")
+    render = None if options.mesh else _renderer(loaded, options)
+    output = Path(options.output)
+    if task.is_folder:
+        output.mkdir(parents=True, exist_ok=True)
+    started, count = clock.monotonic(), 0
+    for number in progress(shots.numbers, "export", unit="files"):
+        time = shots.time(number)
+        shape = _mesh(loaded, time, options) if render is None else _points(loaded, render, time, options)
+        path = output / f"{shots.name(number)}{task.suffix}" if task.is_folder else output
+        write_geometry(path, shape, placement)
+        count += len(shape.points)
+    what = "vertices" if options.mesh else "points"
+    files = f"{len(shots)} files, " if task.is_folder else ""
+    print(f"{output}: {files}{count:,} {what}, in {clock.monotonic() - started:.1f} s")
+
+
+def _shots(scene: Scene, loaded: Scene | GroupedScene, options: argparse.Namespace) -> Shots:
+    """Return the frames to export, as kprender chooses them."""
+    wanted = {"time", "fps", "start_s", "end_s", "frames", "step"}
+    times = {name: value for name, value in vars(options).items() if name in wanted}
+    fixed = {"path": None, "cameras": None, "orbit": None, "camera": None, "size": None, "shutter": 0.0}
+    return shots_of(scene, loaded.clip, argparse.Namespace(**times, **fixed), is_film=False)
+
+
+def _renderer(loaded: Scene | GroupedScene, options: argparse.Namespace) -> Render:
+    """Return a function that renders the scene over black."""
+    black = {"content": None, "part": Part.FULL, "background": np.zeros(3, np.float32)}
+    chosen = {name: getattr(options, name) for name in ("backend", "quality", "appearance")}
+    render, name = renderer_of(loaded, argparse.Namespace(**black, **chosen))
+    _say(name)
+    return render
+
+
+def _points(loaded: Scene | GroupedScene, render: Render, time: float, options: argparse.Namespace) -> Cloud:
+    scene, local_time = loaded.at(time)
+    bounds = scene.bounds
+    longest = float((bounds[1] - bounds[0]).max())
+    spacing = options.spacing or longest / SPACING_PARTS
+    if longest / spacing > MAX_CELLS:
+        raise UsageError(f"--spacing {spacing:g}: a box of {longest:g} needs {longest / MAX_CELLS:.3g} or more")
+    cameras = Rig.of(scene).cameras
+    if options.size is not None:
+        cameras = tuple(fit_camera(camera, *options.size) for camera in cameras)
+    cloud = surface_points(((camera, render(camera, time)) for camera in cameras), bounds, spacing)
+    if not len(cloud.points):
+        raise KpcError(f"{options.input}: its cameras see no surface at time {time:g}; choose another --time")
+    normals = normals_of(scene, local_time, cloud.points) if options.normals else None
+    return Cloud(cloud.points, cloud.colours, normals)
+
+
+def _mesh(loaded: Scene | GroupedScene, time: float, options: argparse.Namespace) -> Mesh:
+    scene, local_time = loaded.at(time)
+    return surface_mesh(scene, local_time, options.resolution or RESOLUTION, options.density or DENSITY)
+
+
+def _exchange_cameras(task: Task, options: argparse.Namespace) -> None:
+    """Write cameras of the player for other programs, or the reverse."""
+    placement = Placement.of(None if options.scene is None else Groups(options.scene).metadata())
+    if options.scene is None:
+        _say("without --scene, coordinates are kept: y counts as up and a unit as a metre")
+    source, output = Path(options.input), Path(options.output)
+    if task.kind == "to":
+        fps = float(options.fps or PATH_FPS)
+        tracks = placed(load_tracks(source, None if options.keyframes else fps), placement)
+        if task.suffix in USD_SUFFIXES:
+            _usd().write_usd_cameras(output, tracks, fps)
+            notes = []
+        else:
+            notes = gltf_cameras.write_gltf_cameras(output, tracks)
+        count = sum(len(track.views) for track in tracks)
+        what = f"a path of {count} instants" if tracks[0].is_moving else f"{count} camera{'s' * (count != 1)}"
+    else:
+        is_usd = source.suffix.lower() in USD_SUFFIXES
+        read = _usd().read_usd_cameras if is_usd else gltf_cameras.read_gltf_cameras
+        found, notes = read(source, options.size)
+        views = views_of(options.input, placed(found, placement.inverse), options.camera)
+        save_views(output, views)
+        what = f"{len(views)} view{'s' * (len(views) != 1)}"
+    for note in notes:
+        _say(note)
+    print(f"{output}: {what}")
+
+
+def _usd() -> ModuleType:
+    """Return the module for USD, which needs usd-core."""
+    _needed("pxr", "usd-core")
+    from kpc.tools.exchange import usd_cameras
+
+    return usd_cameras
+
+
+def _needed(module: str, package: str) -> None:
+    """Refuse to go on without a package of the extra."""
+    try:
+        __import__(module)
+    except ImportError as error:
+        raise KpcError(f'{package} is not installed; pip install -c constraints.txt ".[exchange]"') from error
+
+
+def _say(text: str) -> None:
+    print(f"kpexport: {text}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""Cameras between `cameras.json` and the files of other programs: still cameras, or one that moves along a path."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from kpc.format.common.errors import DatasetError, UsageError
+from kpc.format.scene.cameras import MAX_SIDE, View, load_views
+from kpc.player.app.camera_paths import CameraPath
+from kpc.tools.exchange.placement import Placement
+
+# The most cameras, and the most instants of a moving one, that are written or read.
+MAX_VIEWS = 100_000
+# The width of a picture where a file does not say.
+DEFAULT_WIDTH = 1920
+
+
+@dataclass(frozen=True)
+class Track:
+    """A camera of a file.
+
+    Attributes:
+        name: of the camera.
+        views: one without `at_s` if the camera stands still; else with increasing `at_s`, between which programs
+            interpolate linearly.
+    """
+
+    name: str
+    views: tuple[View, ...]
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the camera has instants."""
+        return self.views[0].at_s is not None
+
+
+def load_tracks(path: str | os.PathLike[str], fps: float | None) -> list[Track]:
+    """Read a `cameras.json`: a path, sampled at `fps`, if its frames have `at`; else its views as still cameras.
+
+    Args:
+        path: of the file.
+        fps: instants per second of a path; None for its keyframes alone.
+
+    Raises:
+        DatasetError: the file cannot be used.
+        UsageError: there are too many instants.
+    """
+    views = load_views(path)
+    if all(view.at_s is None for view in views):
+        return [Track(view.file.rsplit(".", 1)[0], (view,)) for view in views]
+    course = CameraPath.load(path)
+    keyframes = course.keyframes
+    if fps is None:
+        first = keyframes[0].camera
+        return [Track("path", tuple(_resized(view, first.width, first.height) for view in keyframes))]
+    count = int((course.end_s - course.start_s) * fps + 1e-6) + 1
+    if count > MAX_VIEWS:
+        raise UsageError(f"{path}: {count} instants are more than {MAX_VIEWS}; choose a lower --fps")
+    instants = [course.start_s + number / fps for number in range(count)]
+    return [Track("path", tuple(View(*course.at(at_s), f"{n:04d}.png", at_s) for n, at_s in enumerate(instants)))]
+
+
+def views_of(path: str, tracks: Sequence[Track], name: str | None) -> list[View]:
+    """Return the views of a `cameras.json`: those of all still cameras, or of the one that moves.
+
+    Args:
+        path: of the file that was read, which begins messages.
+        tracks: its cameras.
+        name: of the camera to take; None for all.
+
+    Raises:
+        DatasetError: the file has no camera.
+        UsageError: there is no such camera, or a moving one is not alone.
+    """
+    if not tracks:
+        raise DatasetError(f"{path}: holds no perspective camera; export with cameras")
+    names = ", ".join(track.name for track in tracks[:8]) + (", ..." if len(tracks) > 8 else "")
+    if name is not None:
+        tracks = [track for track in tracks if track.name == name]
+        if len(tracks) != 1:
+            raise UsageError(f"--camera {name}: {path} has {len(tracks)} cameras of that name; it has {names}")
+    if len(tracks) > 1 and any(track.is_moving for track in tracks):
+        raise UsageError(f"{path}: has several cameras, of which some move; choose one with --camera: {names}")
+    return [view for track in tracks for view in track.views]
+
+
+def placed(tracks: Sequence[Track], placement: Placement) -> list[Track]:
+    """Return tracks with their cameras placed."""
+    return [
+        replace(track, views=tuple(replace(v, camera=placement.camera(v.camera)) for v in track.views))
+        for track in tracks
+    ]
+
+
+def size_for(where: str, aspect: float, stored: object, size: tuple[int, int] | None) -> tuple[int, int]:
+    """Return the size of a camera's pictures: `size`, else the one that the file stores, else one of its shape.
+
+    Args:
+        where: the camera, which begins messages.
+        aspect: width over height of the pictures, with square pixels.
+        stored: what the file holds as the size, a list of two integers; anything else counts as none.
+        size: the one asked for.
+
+    Raises:
+        DatasetError: the aspect is none of pictures.
+    """
+    if size is not None:
+        return size
+    if isinstance(stored, list) and len(stored) == 2 and all(_is_side(side) for side in stored):
+        return int(stored[0]), int(stored[1])
+    if not 1e-3 <= aspect <= 1e3:
+        raise DatasetError(f"{where}: an aspect ratio of {aspect:g} is that of no picture; correct the camera")
+    height = round(DEFAULT_WIDTH / aspect)
+    if height > MAX_SIDE or height < 1:
+        raise DatasetError(f"{where}: an aspect ratio of {aspect:g} needs --size")
+    return DEFAULT_WIDTH, height
+
+
+def _is_side(side: object) -> bool:
+    return isinstance(side, int) and not isinstance(side, bool) and 1 <= side <= MAX_SIDE
+
+
+def _resized(view: View, width: int, height: int) -> View:
+    return replace(view, camera=view.camera.resized(width, height))
