@@ -36,7 +36,7 @@ def densities(scene: Scene, moment: SceneAtTime, coordinates: np.ndarray) -> np.
     cells = np.array(moment.occupied.shape[::-1])
     for start in range(0, len(coordinates), BLOCK):
         u = coordinates[start : start + BLOCK].astype(np.float32)
-        inside = ((u >= 0) & (u <= 1)).all(axis=1)
+        inside = np.all((u >= 0) & (u <= 1), axis=1)
         x, y, z = np.clip((np.where(inside[:, None], u, 0) * cells).astype(np.int64), 0, cells - 1).T
         chosen = np.flatnonzero(inside & moment.occupied[z, y, x])
         if len(chosen):

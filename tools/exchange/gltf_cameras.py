@@ -74,7 +74,8 @@ def read_gltf_cameras(path: Path, size: tuple[int, int] | None) -> tuple[list[Tr
     nodes = reader.objects("nodes")
     parents = _parents(reader, nodes)
     channels = _channels(reader)
-    tracks, guessed = [], set[str]()
+    tracks: list[Track] = []
+    guessed = set[str]()
     for number, node in enumerate(nodes):
         if "camera" not in node:
             continue
@@ -134,7 +135,8 @@ def _channels(reader: GltfReader) -> _Channels:
             at = channel.get("sampler")
             if not isinstance(at, int) or not 0 <= at < len(samplers) or not isinstance(samplers[at], Mapping):
                 raise reader.error("an animation has no such sampler")
-            node, name, sampler = target.get("node"), str(target["path"]), samplers[at]
+            node: Any = target.get("node")
+            name, sampler = str(target["path"]), samplers[at]
             reader.entry("nodes", node)
             how = sampler.get("interpolation", "LINEAR")
             if how not in ("LINEAR", "STEP"):
@@ -183,7 +185,7 @@ def _track(
     instants = np.unique(np.concatenate(animated)) if animated else np.zeros(1)
     if len(instants) > MAX_VIEWS:
         raise reader.error(f"camera {name[:40]!r} has more than {MAX_VIEWS} instants")
-    times = stored.get("time")
+    times: Any = stored.get("time")
     if not _are_times(times, len(instants)):
         times = np.linspace(0, 1, len(instants)).tolist()
         guessed.add("there are no times of the clip: it plays once along the path" if animated else "all times are 0")

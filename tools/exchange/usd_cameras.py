@@ -79,7 +79,8 @@ def read_usd_cameras(path: Path, size: tuple[int, int] | None) -> tuple[list[Tra
         raise DatasetError(f"{path}: not USD ({str(error)[:200]}); export it anew") from error
     if stage is None:
         raise DatasetError(f"{path}: not USD; export it anew")
-    tracks, guessed = [], set[str]()
+    tracks: list[Track] = []
+    guessed = set[str]()
     for prim in stage.Traverse():
         if not prim.IsA(UsdGeom.Camera):
             continue
