@@ -16,6 +16,7 @@ import numpy as np
 
 from kpc.encoder.cli.encode_scene import encode_scene
 from kpc.encoder.cli.grouped import LATER_STEPS, options_of_group, split_into_spans
+from kpc.encoder.cli.metadata import clip_metadata, hash_dataset
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import Setting, prepare_setting, trim_with_progress
 from kpc.encoder.cli.report import log
@@ -25,6 +26,7 @@ from kpc.encoder.rdo.codec_model import load_checkpoint
 from kpc.format.common import cli
 from kpc.format.common.errors import TrainingError, UsageError
 from kpc.format.container import groups, scene_io
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Clip
 from kpc.format.scene.space import Contraction
 
@@ -38,6 +40,7 @@ def encode_groups(options: Options) -> dict[str, Any]:
     """Encode all groups of a clip, or the one that `options.only` names; return what was measured."""
     started = time.monotonic()
     setting = prepare_setting(options)
+    setting = replace(setting, dataset_sha256=hash_dataset(setting.dataset))
     work, spans = options.work_dir, plan_groups(options, setting.dataset.clip)
     numbers = range(len(spans)) if options.only is None else [options.only]
     if numbers[-1] >= len(spans):
@@ -62,7 +65,9 @@ def encode_groups(options: Options) -> dict[str, Any]:
         else:
             before = None if number == numbers[0] else group_path(work, number - 1).with_suffix(".kpck")
             found.append(_encode_group(group_options, setting_of_span(setting, span), before))
-    size = _join([groups.GroupInput.of(group_path(work, number), spans[number].start) for number in numbers], options)
+    parts = [groups.GroupInput.of(group_path(work, number), spans[number].start) for number in numbers]
+    figures = _combine(found, [spans[number] for number in numbers], 0, options)
+    size = _join(parts, clip_metadata([part.metadata for part in parts], figures), options)
     if not options.keep:
         clear_work_folder(work)
     return _combine(found, [spans[number] for number in numbers], size, options) | {
@@ -146,9 +151,9 @@ def _fingerprint(options: Options) -> dict[str, str]:
     return names | {"the target": "{} {:g}".format(*options.trade.bound)}
 
 
-def _join(parts: Sequence[groups.GroupInput], options: Options) -> int:
+def _join(parts: Sequence[groups.GroupInput], metadata: Metadata, options: Options) -> int:
     try:
-        return groups.write(parts, options.output)
+        return groups.write(parts, options.output, metadata)
     except OSError as error:
         kept = f"or give another -o with --work {options.work_dir} --resume to keep what is done"
         raise TrainingError(f"{options.output}: {error.strerror}; make room there, {kept}") from error

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from kpc.encoder.cli.metadata import describe, hash_dataset, reserve_figures, with_figures
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import Setting, prepare_trainer
 from kpc.encoder.cli.report import SPACES, describe_occupancy, describe_pruning, log, show_progress
@@ -30,6 +31,7 @@ from kpc.encoder.training.train import Report, Trainer
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.common.progress import Progress
 from kpc.format.container import scene_io
+from kpc.format.container.rewriting import with_metadata
 from kpc.format.scene.scene import Scene
 
 MAX_CAMERAS = 32  # cameras of the dataset that the file holds
@@ -58,13 +60,21 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
 
     if trainer.config.summed:
         return _evaluate_unwritable(trainer, options, started)
-    scene = to_scene(trainer)
-    coded = _code(trainer, scene, options)
-    size = save_scene(coded.data, options.output, work)
+    scene, pictures = to_scene(trainer), _select_cameras(dataset)
+    metadata = describe(options, dataset, scene, pictures, setting.dataset_sha256 or hash_dataset(dataset))
+    scene = replace(scene, metadata=metadata)
+    coded = _code(trainer, scene, reserve_figures(options))
+    save_scene(coded.data, options.output, work)
     decoded = scene_io.read(options.output).dequantise()
     most = _most_tested(options, SceneRenderer(decoded), trainer)
     test = evaluate(decoded, dataset, most=most, label="testing the coded file")
     uncoded = evaluate(scene, dataset, most=most, label="testing the model")
+    figures = {
+        **_test_figures(test, dataset),
+        "coding_loss_db": uncoded.psnr - test.psnr if test and uncoded else coded.loss_db,
+    }
+    data = with_metadata(coded.data, with_figures(metadata, figures))
+    size = save_scene(data, options.output, work)
     if not options.keep:
         clear_work_folder(work)
     return {
@@ -78,8 +88,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         "space": SPACES[type(trainer.mapping)][0],
         "appearance": trainer.config.appearance,
         "appearances": len(trainer.names),
-        **_test_figures(test, dataset),
-        "coding_loss_db": uncoded.psnr - test.psnr if test and uncoded else coded.loss_db,
+        **figures,
         **coding_figures(coded, size, options.trade, "training views"),
         "steps": trainer.step,
         "train_s": trainer.elapsed_s,

@@ -24,6 +24,7 @@ from kpc.format.scene.scene import TIME_PLANES, Clip, Scene
 OVERLAP = 2
 LATER_STEPS = 0.5  # training steps of a group that starts where another ended, as a share of those of the first
 MIN_FRAMES = 8  # of a group
+CLIP_BYTES = 1536  # that the metadata of a clip may take beside its groups, without the texts that are given
 
 
 def split_into_spans(clip: Clip, group_s: float) -> tuple[Span, ...]:
@@ -54,7 +55,9 @@ def options_of_group(options: Options, number: int, spans: Sequence[Span]) -> Op
     trade, budget_s = options.trade, options.time_budget_s
     if trade.target_bytes is not None:
         share = frames[number] / frames.sum()
-        trade = Trade(target_bytes=int(share * (trade.target_bytes - HEADER.size - ENTRY.size * len(spans))))
+        texts = sum(len(text.encode()) for text in options.members.values())
+        beside = ENTRY.size * (len(spans) + 1) + CLIP_BYTES + texts
+        trade = Trade(target_bytes=int(share * max(1, trade.target_bytes - HEADER.size - beside)))
     if budget_s is not None:
         budget_s *= float(effort[number] / effort.sum())
     return replace(options, trade=trade, time_budget_s=budget_s)

@@ -2,8 +2,10 @@
 
 import argparse
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from kpc.encoder.datasets import Dataset
 from kpc.encoder.evaluation.ablations import ABLATIONS, BASELINE
@@ -12,6 +14,7 @@ from kpc.encoder.field.appearances import choose_appearance
 from kpc.encoder.field.config import APPEARANCES, PRESETS, PROGRESSIVE_SCALE_DROPOUT, TrainConfig
 from kpc.encoder.rdo.rate_control import DEFAULT_LOSS_DB, Trade
 from kpc.format.common import cli
+from kpc.format.container.metadata_options import TEXTS, add_metadata_options, members_from
 
 # `Options.test_views` for all held-out pictures.
 ALL_VIEWS = sys.maxsize
@@ -27,6 +30,8 @@ TRANSCODE_OPTIONS = {
     "psnr",
     "tune_steps",
     "json",
+    "view_limits",
+    *TEXTS,
 }
 
 
@@ -37,6 +42,9 @@ class Options:
     Attributes:
         test_views: the most held-out pictures that are tested; None for as many as a share of the training time permits
             (`kpc.encoder.evaluation.testing_time`), ALL_VIEWS for all.
+        members: of the file's metadata: title, description, author, licence and date.
+        view_limits: "auto", "none", or members of the view limits (`kpc.format.container.metadata_options`); None for
+            "auto", or where nothing is trained for those of the source.
         ablation: one of `kpc.encoder.evaluation.ablations`; not an option of the command line.
     """
 
@@ -65,6 +73,8 @@ class Options:
     keep_checkpoint: Path | None = None
     tune_steps: int | None = None
     preview: Path | None = None
+    members: Mapping[str, str] = field(default_factory=dict)
+    view_limits: str | Mapping[str, Any] | None = None
     ablation: str = BASELINE
 
     @property
@@ -121,7 +131,8 @@ def parse(argv: list[str]) -> tuple[Options, bool, bool]:
     _add_dataset_options(parser)
     _add_run_options(parser)
     _add_coding_options(parser)
-    given = parser.parse_args(_join_box(argv))
+    add_metadata_options(parser)
+    given = parser.parse_args(cli.join_values(argv, "--box"))
     if given.output is None and given.dry_run:
         given.output = Path(given.source.resolve().name + ".kpc")
     _check(parser, given)
@@ -324,6 +335,8 @@ def _options_from(given: argparse.Namespace) -> Options:
         keep_checkpoint=given.keep_checkpoint,
         tune_steps=given.tune_steps,
         preview=given.output.with_name(given.output.name + ".preview.png") if given.preview else None,
+        members=members_from(given),
+        view_limits=given.view_limits,
     )
 
 
@@ -358,14 +371,3 @@ def _seed(text: str) -> int:
     if not 0 <= value < 1 << 63:
         raise argparse.ArgumentTypeError(f"{text} is not a whole number from 0 to 2^63 - 1")
     return value
-
-
-def _join_box(argv: list[str]) -> list[str]:
-    """Turn `--box -1,...` into `--box=-1,...`, since argparse takes a value that starts with a minus for an option."""
-    joined: list[str] = []
-    for word in argv:
-        if joined and joined[-1] == "--box":
-            joined[-1] = f"--box={word}"
-        else:
-            joined.append(word)
-    return joined

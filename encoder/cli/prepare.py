@@ -41,6 +41,7 @@ class Setting:
         mapping: how space beyond the box is held; None for a box with nothing outside it.
         is_final: whether the box is not to be trimmed any more.
         before: the scene to start from, whose last picture is about the first of this dataset; None to start afresh.
+        dataset_sha256: of the dataset of which this is a part; None if it is a whole.
     """
 
     dataset: Dataset
@@ -48,6 +49,7 @@ class Setting:
     mapping: SpaceMapping | None
     is_final: bool
     before: Scene | None = None
+    dataset_sha256: str | None = None
 
 
 def prepare_setting(options: Options) -> Setting:

@@ -14,8 +14,12 @@ from kpc.encoder.field.config import TrainConfig
 from kpc.encoder.rdo import codec_model
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.common.errors import TrainingError, UsageError
+from kpc.format.common.version import VERSION
 from kpc.format.container import groups, scene_io
 from kpc.format.container.container import MAGIC
+from kpc.format.container.metadata_options import with_view_limits
+from kpc.format.container.rewriting import with_metadata
+from kpc.format.scene.metadata import HISTORY_LIMIT, Metadata
 
 # What losses are measured on, of a checkpoint and of a .kpc file.
 EVALUATED_ON = ("training views", "views of its own, assumed to be right to 30 dB")
@@ -41,13 +45,31 @@ def transcode(options: Options) -> dict[str, Any]:
     if is_coded and not (clip := groups.Groups(options.source)).is_single:
         return _transcode_groups(options, clip) | {"encode_s": time.monotonic() - started}
     source = replace(codec_model.load(options.source), shown=True)
+    before, metadata = source.scene.metadata, _with_history(source.scene.metadata, options)
+    source = replace(
+        source,
+        scene=replace(source.scene, metadata=metadata),
+        coded=None if source.coded is None else replace(source.coded, metadata=metadata),
+    )
     coded = codec_model.code(source, options.trade, TrainConfig().prune_share, _tune_steps(options))
-    size = scene_io.save(coded.data, options.output)
+    data = coded.data
+    if coded.scene is source.coded:  # nothing was coded anew, and what was measured of the file holds
+        data = with_metadata(data, before.with_members(**options.members))
+    size = scene_io.save(data, options.output)
     return {
         "file": str(options.output), "source": str(options.source),
         **coding_figures(coded, size, options.trade, EVALUATED_ON[is_coded]),
         "encode_s": time.monotonic() - started,
     }  # fmt: skip
+
+
+def _with_history(metadata: Metadata, options: Options) -> Metadata:
+    """Return the metadata of what is coded anew: figures that were measured do not hold any more."""
+    name, value = options.trade.bound
+    history = [*metadata.provenance.get("history", []), f"coded anew by kpc {VERSION}: {name} {value:g}"]
+    changed = metadata.with_members(**options.members)
+    changed = changed.with_provenance(held_out=None, coding_loss_db=None, history=history[-HISTORY_LIMIT:])
+    return changed if options.view_limits is None else with_view_limits(changed, options.view_limits)
 
 
 def _tune_steps(options: Options) -> int:
@@ -57,16 +79,18 @@ def _tune_steps(options: Options) -> int:
 def _transcode_groups(options: Options, source: groups.Groups) -> dict[str, Any]:
     """Code each group on its own. All coded groups are in memory together."""
     spans, parts, found = source.timeline.spans, [], []
+    clip = _with_history(source.metadata(), options)
     for number, span in enumerate(spans):
         trade = options_of_group(options, number, spans).trade
         reader = source.open(number)
-        scene = replace(scene_io.read(reader), cameras=reader.cameras() or source.cameras())
+        metadata = _with_history(reader.metadata(), options)
+        scene = replace(scene_io.read(reader), cameras=reader.cameras() or source.cameras(), metadata=metadata)
         print(f"group {number} of {len(spans)}", file=sys.stderr, flush=True)
         model = replace(codec_model.model_from_file(scene), shown=True)
         coded = codec_model.code(model, trade, TrainConfig().prune_share, _tune_steps(options))
         parts.append(groups.GroupInput.of(coded.data, span.start))
         found.append(coding_figures(coded, coded.size_bytes, trade, EVALUATED_ON[1]))
-    size = groups.write(parts, options.output)
+    size = groups.write(parts, options.output, clip)
     return {
         "file": str(options.output),
         "source": str(options.source),

@@ -16,6 +16,7 @@ from kpc.encoder.training.checkpoint import save_state
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import FormatError, TrainingError
 from kpc.format.container import scene_io
+from kpc.format.container.metadata_chunk import pack_metadata, parse_metadata
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.scene import Appearance, Clip, Decoder, HybridDecoder, Scene
 from kpc.format.scene.space import Contraction, DeviceCoordinates, SpaceMapping
@@ -45,6 +46,7 @@ def save_checkpoint(path: Path, scene: Scene, validation: ValidationRays) -> Non
         "cameras": np.array([_camera_to_array(camera) for camera in scene.cameras]).reshape(-1, 22),
         "mapping": _mapping_to_dict(scene.mapping),
         "motion": scene.motion,
+        "metadata": pack_metadata(scene.metadata).decode(),
         "names": [appearance.name for appearance in scene.appearances],
         "codes": [appearance.code for appearance in scene.appearances],
         "validation_rays": vars(validation),
@@ -102,6 +104,7 @@ def _scene_from_state(state: Mapping[str, Any]) -> Scene:
         _mapping_from_dict(state["mapping"]),
         state["motion"],
         tuple(Appearance(name, code) for name, code in zip(state["names"], state["codes"], strict=True)),
+        parse_metadata(state.get("metadata", "{}").encode()),
     )
 
 

@@ -15,7 +15,14 @@ import datasets as make
 from kpc.encoder.cli import kpenc
 from kpc.encoder.cli.encode_groups import plan_groups
 from kpc.encoder.cli.estimate import Estimate
-from kpc.encoder.cli.grouped import LATER_STEPS, OVERLAP, initialise_from, options_of_group, split_into_spans
+from kpc.encoder.cli.grouped import (
+    CLIP_BYTES,
+    LATER_STEPS,
+    OVERLAP,
+    initialise_from,
+    options_of_group,
+    split_into_spans,
+)
 from kpc.encoder.cli.options import Options
 from kpc.encoder.cli.prepare import prepare_setting, prepare_trainer
 from kpc.encoder.datasets import Dataset, load_dataset
@@ -81,7 +88,7 @@ def test_size_and_time_are_divided_among_groups():
     options = Options(Path("a"), Path("b"), time_budget_s=100.0, trade=Trade(target_bytes=100_000))
     shares = [options_of_group(options, number, spans) for number in range(4)]
     assert sum(share.trade.target_bytes for share in shares) == pytest.approx(
-        100_000 - HEADER.size - 4 * ENTRY.size, abs=4
+        100_000 - HEADER.size - 5 * ENTRY.size - CLIP_BYTES, abs=4
     )
     assert sum(share.time_budget_s for share in shares) == pytest.approx(100)
     assert shares[1].time_budget_s / shares[0].time_budget_s == pytest.approx(LATER_STEPS * 29 / 27)
@@ -187,7 +194,8 @@ def test_a_long_clip_becomes_a_file_of_groups(videos, tmp_path, capsys):
 
 
 def test_an_interrupted_run_resumes_in_its_group_to_the_same_file(videos, tmp_path, monkeypatch, capsys):
-    assert encode(videos, tmp_path / "whole.kpc") == 0
+    every = "--test-views", "all"  # the file says what was measured, and how many are tested depends on the time
+    assert encode(videos, tmp_path / "whole.kpc", *every) == 0
     begun: list[Trainer] = []
     make_trainer = Trainer.__init__
 
@@ -206,12 +214,12 @@ def test_an_interrupted_run_resumes_in_its_group_to_the_same_file(videos, tmp_pa
     output = tmp_path / "long.kpc"
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "__init__", init)
-        assert encode(videos, output) == 130
+        assert encode(videos, output, *every) == 130
     err = capsys.readouterr().err
     assert "stopped at step 4" in err and "group-0001" in err and not output.exists()
-    assert encode(videos, output, "--resume", "--seed", "5") == 1
+    assert encode(videos, output, *every, "--resume", "--seed", "5") == 1
     assert "other settings (--seed was 0, is 5)" in capsys.readouterr().err
-    assert encode(videos, output, "--resume") == 0
+    assert encode(videos, output, *every, "--resume") == 0
     err = capsys.readouterr().err
     assert "group-0000.kpc: is finished already" in err and "resumed at step 4" in err
     assert output.read_bytes() == (tmp_path / "whole.kpc").read_bytes()

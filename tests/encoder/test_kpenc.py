@@ -121,12 +121,7 @@ def test_a_folder_becomes_a_file(
     code, out, err = run(sets / name, "--json")
     assert code == 0
     result, output = json.loads(out), tmp_path / "out.kpc"
-    assert (result["layout"], result["dynamic"], result["steps"], result["file"]) == (
-        layout,
-        dynamic,
-        steps,
-        str(output),
-    )
+    assert [result[key] for key in ("layout", "dynamic", "steps", "file")] == [layout, dynamic, steps, str(output)]
     assert result["size_bytes"] == output.stat().st_size
     assert 5 < result["test_psnr"] < 60 and -1 < result["test_ssim"] <= 1 and result["test_pictures"] > 0
     assert (result["identity_share"] is not None) == dynamic
@@ -134,6 +129,11 @@ def test_a_folder_becomes_a_file(
     scene = scene_io.read(output).dequantise()
     assert scene.is_dynamic == dynamic and scene.cameras and scene.parameter_count == result["parameters"]
     np.testing.assert_array_equal(scene.aabb, np.float32(result["box"]))
+    provenance = scene.metadata.provenance
+    assert (provenance["layout"], provenance["preset"]) == (layout, "draft") and len(provenance["dataset_sha256"]) == 64
+    assert provenance["held_out"]["pictures"] == result["test_pictures"]
+    assert provenance["held_out"]["psnr_db"] == pytest.approx(result["test_psnr"], rel=1e-6)
+    assert len(scene.metadata.camera_names) == len(scene.cameras)
     assert layout in err and "box" in err and ("dynamic, " if dynamic else "static") in err
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc"}
 
@@ -271,7 +271,7 @@ def test_a_time_budget(run: Kpenc, sets: Path) -> None:
 def test_a_seed_gives_the_same_bytes(run: Kpenc, sets: Path, tmp_path: Path) -> None:
     written = []
     for seed in ("4", "4", "5"):
-        assert run(sets / "nerfstudio", "--seed", seed, "--steps", "10")[0] == 0
+        assert run(sets / "nerfstudio", "--seed", seed, "--steps", "10", "--test-views", "all")[0] == 0
         written.append((tmp_path / "out.kpc").read_bytes())
     assert written[0] == written[1] != written[2]
 
@@ -293,13 +293,13 @@ def test_durations() -> None:
 def test_an_interrupted_run_resumes_to_the_same_file(
     run: Kpenc, sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert run(sets / "blender")[0] == 0
+    assert run(sets / "blender", "--test-views", "all")[0] == 0
     output = tmp_path / "out.kpc"
     whole = output.read_bytes()
     output.write_bytes(b"an earlier scene")
     with monkeypatch.context() as patched:
         _signal_at_step(patched, 13, signal.SIGINT)
-        code, out, err = run(sets / "blender")
+        code, out, err = run(sets / "blender", "--test-views", "all")
     assert (
         code == 130
         and out == ""
@@ -309,7 +309,7 @@ def test_an_interrupted_run_resumes_to_the_same_file(
     )
     assert output.read_bytes() == b"an earlier scene"
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc", "out.kpc.work"}
-    code, _, err = run(sets / "blender", "--resume")
+    code, _, err = run(sets / "blender", "--test-views", "all", "--resume")
     assert code == 0 and "resumed at step 13" in err
     assert output.read_bytes() == whole
     assert {p.name for p in tmp_path.iterdir()} == {"out.kpc"}

@@ -22,7 +22,8 @@ from kpc.encoder.rdo.mode_decision import requested_step
 from kpc.encoder.rdo.rate_control import Trade
 from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.errors import TrainingError
-from kpc.format.container import scene_io
+from kpc.format.container import rewriting, scene_io
+from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import Scene
 from kpc.player.cpu import reference
 from scenes import VARIANTS, tiny_scene, with_appearances
@@ -90,7 +91,8 @@ def test_a_checkpoint_gives_the_file_that_training_gave(
     keep = ("--keep-checkpoint", str(tmp_path / "model.kpck"))
     trained = kpenc_says(tmp_path / "set", tmp_path / "out.kpc", "--preset", "draft", *keep, *trade)
     again = kpenc_says(tmp_path / "model.kpck", tmp_path / "again.kpc", *trade)
-    assert (tmp_path / "out.kpc").read_bytes() == (tmp_path / "again.kpc").read_bytes()
+    files = [rewriting.with_metadata(tmp_path / name, Metadata()) for name in ("out.kpc", "again.kpc")]
+    assert files[0] == files[1]
     said = (
         "trade",
         "target",
@@ -98,7 +100,6 @@ def test_a_checkpoint_gives_the_file_that_training_gave(
         "validation_psnr",
         "validation_loss_db",
         "agreement_db",
-        "size_bytes",
         "parameters",
         "identity_share",
     )
