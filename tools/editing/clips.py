@@ -80,7 +80,8 @@ def _edit_groups(
     clip: groups.Groups, output: os.PathLike[str], edits: Edits, metadata: Metadata
 ) -> tuple[int, tuple[float, float] | None]:
     """Edit a clip in groups, of which whole groups are kept."""
-    numbers, kept = list(range(len(clip))), None
+    numbers = list(range(len(clip)))
+    kept: tuple[float, float] | None = None
     duration_s, fps = clip.clip.duration_s, clip.clip.fps
     if edits.part_s is not None:
         start_s, end_s = edits.part_s
@@ -89,7 +90,8 @@ def _edit_groups(
         if not numbers or start_s >= end_s:
             raise UsageError(f"--from {start_s:g}s --to {end_s:g}s: the clip lasts from 0 to {duration_s:g} s")
         first, last = (clip.timeline.spans[number] for number in (numbers[0], numbers[-1]))
-        kept = tuple((frame - clip.timeline.spans[0].start) / fps for frame in (first.start, last.last))
+        origin = clip.timeline.spans[0].start
+        kept = (first.start - origin) / fps, (last.last - origin) / fps
         metadata = _in_part(metadata, kept, clip.clip)
     fps *= edits.speed or 1.0
     parts = []

@@ -56,7 +56,5 @@ def _reads_the_same_map(reader: SceneReader, number: int, before: QuantisedScene
     if entry.codec not in (Codec.PREDICTIVE, Codec.TRANSFORM) or not needs_occupancy(reader.stored(number)):
         return True
     name = ALL_PLANES[entry.plane]
-    maps = [
-        needed_texels(scene.occupancy, name, *scene.scales[entry.scale][name].coded.shape) for scene in (before, after)
-    ]
-    return np.array_equal(*maps)
+    shape = before.scales[entry.scale][name].coded.shape
+    return np.array_equal(needed_texels(before.occupancy, name, *shape), needed_texels(after.occupancy, name, *shape))

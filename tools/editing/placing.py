@@ -146,7 +146,7 @@ def _turned(scene: QuantisedScene, turn: np.ndarray) -> QuantisedScene:
 
 def _turned_plane(scale: Any, name: str, source: np.ndarray, sign: np.ndarray) -> QuantisedPlane:
     """Return the plane of a name after turning; its symbols are those of an old plane, transposed and mirrored."""
-    across, down = name
+    across, down = name[0], name[1]
     column = source[AXES.index(across)]
     flips = [slice(None, None, int(sign[AXES.index(axis)])) if axis in AXES else slice(None) for axis in (down, across)]
     if name in TIME_PLANES:
