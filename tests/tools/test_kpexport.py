@@ -12,11 +12,13 @@ from kpc.format.common.images import linear_from_srgb, srgb_from_linear
 from kpc.format.container.scene_io import write
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.scene import SPACE_PLANES, Clip, Decoder, Scene
+from kpc.player.cpu.reference import SceneAtTime
 from kpc.tools.cli import kpexport
+from kpc.tools.exchange.field import box_points, densities, density_grid, plane_coordinates
 from kpc.tools.exchange.gltf import GltfReader
 from kpc.tools.exchange.options import DENSITY
 from kpc.tools.exchange.placement import rotation_to_y
-from scenes import look_at, tiny_scene, with_contraction
+from scenes import VARIANTS, look_at, tiny_scene, with_contraction
 
 trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed, which reads what kpexport writes")
 
@@ -202,3 +204,25 @@ def test_what_is_not_possible_is_a_usage_error(run: Run, arguments: list[str], p
 def test_the_curve_of_srgb_and_its_inverse_fit() -> None:
     values = np.linspace(0, 1, 33)
     assert np.abs(srgb_from_linear(linear_from_srgb(values)) - values).max() < 1e-7
+
+
+@pytest.mark.parametrize("variant", ["box", "contracted", "ndc"])
+def test_the_grid_of_a_mesh_covers_the_box(variant: str) -> None:
+    scene = VARIANTS[variant](tiny_scene(4))
+    moment = SceneAtTime.of(scene, 0.5)
+    counts = (6, 4, 4)  # no point inside lies where two cells of the occupancy grid meet
+    grid = density_grid(scene, moment, counts)[1:-1, 1:-1, 1:-1]
+    inside = (np.linspace(0, 1, count)[1:-1] for count in counts)
+    shares = np.stack(np.meshgrid(*inside, indexing="ij"), axis=-1).reshape(-1, 3)
+    there = densities(scene, moment, plane_coordinates(scene, box_points(scene, shares)))
+    assert (grid > 0).any() and np.allclose(there, grid.ravel(), rtol=1e-3)
+
+
+def test_scenes_in_device_coordinates_become_meshes(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("skimage", reason="scikit-image is not installed, which makes meshes")
+    scene = save(VARIANTS["ndc"](tiny_scene(4)), tmp_path / "scene.kpc")
+    out = tmp_path / "mesh.ply"
+    code, _, error = run(scene, "-o", out, "--mesh", "--resolution", 16, "--density", 1, "--time", 0.5)
+    assert code == 0, error
+    mesh = trimesh.load(out, process=False)
+    assert np.isfinite(mesh.vertices).all() and mesh.volume > 0
