@@ -132,6 +132,7 @@ class PlayerState:
         self.target_fps = preferences.target_fps or (1 / quality.target_s if quality.target_s else FILM_FPS)
         self.rig, self.presets = Rig.of(self.scene), presets(self.scene)
         self.camera_number, self.preset_number = 0, -1
+        self.view: OrbitView  # `look_from_opening` sets it
         self.shown: Shown | None = None
         self.metadata, self.follower = stream.metadata, PathFollower()
         self.limits, self.keeps_limits, self.is_moved = self.metadata.view_limits, True, False
@@ -155,9 +156,8 @@ class PlayerState:
 
     def resume(self, before: "PlayerState") -> None:
         """Continue where another player of the same scene stopped."""
-        self.view, self.playback, self.part, self.display_mode = (
-            before.view, before.playback, before.part, before.display_mode
-        )  # fmt: skip
+        self.view, self.playback = before.view, before.playback
+        self.part, self.display_mode = before.part, before.display_mode
         self.quality, self.target_fps, self.exact = before.quality, before.target_fps, before.exact
         self.keeps_limits = before.keeps_limits
         self.follower = before.follower
