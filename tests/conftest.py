@@ -1,6 +1,8 @@
 """Fixtures and settings that all tests share."""
 
 import os
+import signal
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import pytest
@@ -28,6 +30,14 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Evaluate on few validation rays, which suffice for tiny scenes."""
     monkeypatch.setattr("kpc.encoder.evaluation.validation_rays.VALIDATION_RAYS", 512)
     monkeypatch.setattr("kpc.encoder.rdo.curvature.RAYS", 1 << 13)
+
+
+@pytest.fixture
+def heeded_signals() -> Iterator[None]:
+    """Restore the default of Ctrl-C, which the parent of these tests may ignore: kpenc leaves ignored signals alone."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")

@@ -27,7 +27,7 @@ def test_ctrl_c_while_loading_ends_in_one_line(
     assert capsys.readouterr() == ("", "kpenc: interrupted\n")
 
 
-def test_a_second_ctrl_c_does_not_wait_for_the_end_of_a_step(tmp_path: Path) -> None:
+def test_a_second_ctrl_c_does_not_wait_for_the_end_of_a_step(tmp_path: Path, heeded_signals: None) -> None:
     before = signal.getsignal(signal.SIGINT)
 
     class Endless:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,14 +32,6 @@ from kpc.format.scene.space import DeviceCoordinates
 from training_runs import TINY
 
 pytestmark = pytest.mark.usefixtures("one_thread", "few_rays", "tiny", "heeded_signals")
-
-
-@pytest.fixture
-def heeded_signals() -> Iterator[None]:
-    """Restore the default of Ctrl-C, which the parent of these tests may ignore: kpenc leaves ignored signals alone."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture
