@@ -151,7 +151,7 @@ def test_the_command(few: None, scene_file: Path, tmp_path: Path, capsys: pytest
         assert found["planes_bytes"] == pytest.approx(of_planes * found["size_bytes"])
     assert halves["bd_rate_planes"] < halves["bd_rate"] < 0
     assert all(record["settings"]["evaluated_on"] == "its own validation rays" for record in records)
-    assert "kpc is smaller by" in output.err and "Coding, beside general-purpose codecs" in tables.markdown(records)
+    assert "KB at 0.15 dB loss" in output.err and "Coding, beside general-purpose codecs" in tables.markdown(records)
     with (tmp_path / "codec.csv").open() as table:
         rows = list(csv.DictReader(table))
     assert len(rows) == 6 + 7 * 4 + 6 + 5 and [len(one["points"]) for one in without] == [4] * 7
