@@ -110,7 +110,8 @@ def test_an_empty_scene_is_not_fine_tuned() -> None:
 
 
 def test_progress_is_shown_on_request(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("kpc.format.common.progress.LINE_EVERY_S", 0.0)
+    for name in ("FIRST_LINE_S", "LINE_EVERY_S"):
+        monkeypatch.setattr(f"kpc.format.common.progress.{name}", 0.0)
     scene = tiny_scene(scales=1, dynamic=False)
     quantise_sequentially(scene, scene, choose, 4)
     assert capsys.readouterr() == ("", "")
