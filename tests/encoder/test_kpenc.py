@@ -416,7 +416,7 @@ def test_different_frame_counts_are_logged(run: Kpenc, sets: Path, tmp_path: Pat
     make.write_n3dv(other, cameras=4, frames=3)
     shutil.copy(other / "cam02.mp4", folder / "cam02.mp4")
     code, _, err = run(folder, "--steps", "2")
-    assert code == 0 and "cam02.mp4" in err and "first 3" in err and (tmp_path / "out.kpc").exists()
+    assert code == 0 and "cam02.mp4" in err and "3 (cam02.mp4) to 4 frames" in err and (tmp_path / "out.kpc").exists()
 
 
 @pytest.mark.parametrize("column, value, words", [(3, np.nan, "NaN"), (14, 0.0, "focal length"), (15, -1.0, "near")])
