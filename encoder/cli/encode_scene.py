@@ -39,7 +39,7 @@ MAX_SLOTS = 8  # time slots of the occupancy, before they are merged
 
 
 class Abandoned(KeyboardInterrupt):
-    """The user pressed Ctrl-C again within a training step, whose half-made changes are not worth saving."""
+    """The user pressed Ctrl-C again within a training step, whose incomplete changes are not to be saved."""
 
 
 def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from kpc.format.scene.space import DeviceCoordinates
 SIDE = 320  # pixels of the longer side of either picture, at most
 EVERY_S, AT_MOST_S = 10.0, 60.0  # seconds between two previews, at least and at most
 SHARE = 0.05  # of the time that previews may take, within these bounds
-MEDIAN_PICTURES = 31  # of a camera, at most, whose median over time tells what moves
+MEDIAN_PICTURES = 31  # of a camera, at most, whose median over time shows what moves
 MOVING = 0.04  # difference from the median, as a share of the range in one channel, from which on a pixel moves
 GROWTH = 3  # pixels by which moving regions are grown
 CAPTION_HEIGHT = 14

@@ -10,7 +10,7 @@ from kpc.player.app.state import PlayerState
 
 # Seconds that a video may take to be finished after the window was closed.
 FINISH_TIMEOUT_S = 60.0
-# Frames of a camera path after which the time that is left is told.
+# Frames of a camera path after which the time that is left is shown.
 MIN_TIMED_FRAMES = 3
 
 

@@ -82,7 +82,7 @@ class Window:
         self._modifiers = modifiers
 
     def type_character(self, character: str, modifiers: int = 0) -> None:
-        """Keep a character for `take_keys`. glfw tells of it after the key that types it."""
+        """Keep a character for `take_keys`. glfw reports it after the key that types it."""
         self._stir()
         self._keys.append(KeyPress(None, character, modifiers))
 
