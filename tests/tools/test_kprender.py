@@ -2,7 +2,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,31 +20,9 @@ from kpc.format.scene.cameras import load_views
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
 from kpc.player.gl import offscreen
-from kpc.tools.cli import kprender
 from kpc.tools.cli.depth_images import NO_SURFACE
 from kpc.tools.rendering import pictures
 from scenes import tiny_scene, with_appearances, with_contraction
-
-
-@pytest.fixture(scope="module")
-def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("scene") / "tiny.kpc"
-    scene = tiny_scene(4)
-    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), path)
-    return path
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Iterator[object]:
-    def call(*arguments: object) -> tuple[int, str, str]:
-        try:
-            code = kprender.main([str(a) for a in arguments])
-        except SystemExit as error:  # argparse
-            code = int(error.code or 0)
-        output = capsys.readouterr()
-        return code, output.out, output.err
-
-    yield call
 
 
 def cameras_json(path: Path, files: list[str]) -> Path:

@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 
 import kpc
-from kpc.format.coding.quantise import quantise_scene
 from kpc.format.common.images import read_image
-from kpc.format.container.scene_io import write
 from kpc.player.app.camera_paths import CameraPath
 from kpc.player.cpu import reference
-from kpc.tools.cli import kprender
 from kpc.tools.rendering import content
 from kpc.tools.rendering.options import parser
 from kpc.tools.rendering.shots import shots_of
@@ -21,28 +18,6 @@ from scenes import tiny_scene
 
 SIZE = ("--size", "16x12", "--backend", "reference")
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture(scope="module")
-def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A clip of 11 frames at 10 frames per second."""
-    path = tmp_path_factory.mktemp("scene") / "tiny.kpc"
-    scene = tiny_scene(4)
-    write(quantise_scene(scene, [dict.fromkeys(scale, 0.01) for scale in scene.scales]), path)
-    return path
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    def call(*arguments: object) -> tuple[int, str, str]:
-        try:
-            code = kprender.main([str(a) for a in arguments])
-        except SystemExit as error:  # argparse
-            code = int(error.code or 0)
-        output = capsys.readouterr()
-        return code, output.out, output.err
-
-    return call
 
 
 @pytest.fixture
