@@ -36,8 +36,8 @@ def split_of(
     known = {*images, *(_resolved(root, file, name) for name in missing)}
     train, val, test = (_listed(root, file, document, f"{part}_filenames", known) for part in ("train", "val", "test"))
     if not (train or val or test):
-        is_empty = any(document.get(f"{part}_filenames") is not None for part in ("train", "val", "test"))
-        return ["test" if k % HOLD_OUT_EVERY == 0 and not is_empty else "train" for k in range(len(images))]
+        has_empty_lists = any(document.get(f"{part}_filenames") is not None for part in ("train", "val", "test"))
+        return ["test" if k % HOLD_OUT_EVERY == 0 and not has_empty_lists else "train" for k in range(len(images))]
     held_out = test or val or (set(images) - train)
     if both := [image for image in images if image in held_out and image in train]:
         _report(file, root, both, "in two of its lists and held out, not trained on")
