@@ -165,8 +165,9 @@ def _combine(
     """Combine the figures of all groups: sums, means over frames or pictures, and those of each group."""
 
     def mean(name: str, weights: Sequence[float]) -> float | None:
-        values = [one[name] for one in found]
-        return None if None in values or not sum(weights) else float(np.average(values, weights=weights))
+        known = [(one[name], weight) for one, weight in zip(found, weights, strict=True) if one.get(name) is not None]
+        values, shares = [value for value, _ in known], [weight for _, weight in known]
+        return float(np.average(values, weights=shares)) if sum(shares) else None
 
     pictures = [one["test_pictures"] for one in found]
     return (
@@ -176,6 +177,8 @@ def _combine(
             "file": str(options.output),
             "test_psnr": mean("test_psnr", pictures),
             "test_ssim": mean("test_ssim", pictures),
+            "test_psnr_moving": mean("test_psnr_moving", pictures),
+            "test_psnr_still": mean("test_psnr_still", pictures),
             "coding_loss_db": mean("coding_loss_db", [span.count for span in spans]),
             **{key: sum(one[key] for one in found) for key in SUMMED_FIGURES},
             "rays_per_s": mean("rays_per_s", [one["train_s"] for one in found]),

@@ -67,7 +67,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     save_scene(coded.data, options.output, work)
     decoded = scene_io.read(options.output).dequantise()
     most = _most_tested(options, SceneRenderer(decoded), trainer)
-    test = evaluate(decoded, dataset, most=most, label="testing the coded file")
+    test = evaluate(decoded, dataset, most=most, label="testing the coded file", parts=True)
     uncoded = evaluate(scene, dataset, most=most, label="testing the model")
     figures = {
         **_test_figures(test, dataset),
@@ -113,6 +113,8 @@ def _test_figures(test: Quality | None, dataset: Dataset) -> dict[str, Any]:
     return {
         "test_psnr": test and test.psnr,
         "test_ssim": test and test.ssim,
+        "test_psnr_moving": test and test.moving_psnr,
+        "test_psnr_still": test and test.still_psnr,
         "test_pictures": test.pictures if test else 0,
         "held_out_pictures": int(dataset.pictures.is_test.sum()),
     }
@@ -144,7 +146,7 @@ def _evaluate_unwritable(trainer: Trainer, options: Options, started: float) -> 
     """Return what was measured on a model that no file can hold; fewer figures than `encode_scene` returns."""
     scene = to_scene(trainer)
     most = _most_tested(options, SceneRenderer(scene, trainer.field), trainer)
-    test = evaluate(scene, trainer.dataset, most=most, field=trainer.field, label="testing the model")
+    test = evaluate(scene, trainer.dataset, most=most, field=trainer.field, label="testing the model", parts=True)
     if not options.keep:
         clear_work_folder(options.work_dir)
     return {
