@@ -28,6 +28,7 @@ from kpc.encoder.rdo.codec_model import CodedModel, Model, code
 from kpc.encoder.rdo.model_checkpoint import save_checkpoint
 from kpc.encoder.rdo.sequential_finetune import steps_per_group
 from kpc.encoder.training.train import Report, Trainer
+from kpc.format.common.compiling import working_s
 from kpc.format.common.memory import peak_memory_bytes
 from kpc.format.common.progress import Progress
 from kpc.format.container import scene_io
@@ -63,7 +64,9 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
     scene, pictures = to_scene(trainer), _select_cameras(dataset)
     metadata = describe(options, dataset, scene, pictures, setting.dataset_sha256 or hash_dataset(dataset))
     scene = replace(scene, metadata=metadata)
+    coding_from_s = working_s()
     coded = _code(trainer, scene, reserve_figures(options))
+    coding_s = working_s() - coding_from_s
     save_scene(coded.data, options.output, work)
     decoded = scene_io.read(options.output).dequantise()
     most = _most_tested(options, SceneRenderer(decoded), trainer)
@@ -92,6 +95,7 @@ def encode_scene(options: Options, setting: Setting) -> dict[str, Any]:
         **coding_figures(coded, size, options.trade, "training views"),
         "steps": trainer.step,
         "train_s": trainer.elapsed_s,
+        "coding_s": coding_s,
         "encode_s": time.monotonic() - started,
         "rays_per_s": trainer.rays_per_second,
         "peak_memory_bytes": peak_memory_bytes(),

@@ -120,8 +120,12 @@ def _print_encode(result: dict[str, Any], options: Options) -> None:
     if len(result.get("groups", [])) > 1:
         print(f"{len(result['groups'])} groups: " + ", ".join(_describe_group(group) for group in result["groups"]))
     print(
-        f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps)"
+        f"encoded in {result['encode_s']:.0f} s, of which training {result['train_s']:.0f} s ({result['steps']} steps) "
+        f"and coding {result['coding_s']:.0f} s"
     )
+    if result["coding_s"] > result["train_s"]:
+        parameters = f"{result['parameters']:,} parameters"
+        print(f"coding took longer than training: however few the steps are, all {parameters} are coded")
 
 
 def _describe_parts(result: dict[str, Any]) -> str:

@@ -156,7 +156,7 @@ def test_the_result_is_printed(run: Kpenc, sets: Path) -> None:
             "bits per parameter",
             "exactly at identity: ",
             "encoded in ",
-            "72 steps",
+            "(72 steps) and coding ",
         )
     )
 
