@@ -17,12 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from kpc.format.coding.motion_codec import decode_motion
-from kpc.format.coding.occupancy_codec import decode_occupancy
-from kpc.format.coding.poses import decode_poses
 from kpc.format.coding.quantise import VALUE_LIMIT, QuantisedScene
-from kpc.format.coding.weights import decode_weights
 from kpc.format.common.errors import DatasetError, FormatError
+from kpc.format.core.decoding import decode_motion, decode_occupancy, decode_poses, decode_weights
 from kpc.format.scene.cameras import Camera, has_unit_axes
 from kpc.format.scene.motion import DISPLACEMENT_LIMIT, QuantisedMotion
 from kpc.format.scene.scene import ALL_PLANES, SPACE_PLANES, Appearance, Clip, Decoder, HybridDecoder
@@ -270,11 +267,10 @@ def parse_motion(raw: bytes, dynamic: bool) -> QuantisedMotion:
 
 def parse_coded_motion(body: bytes, raw_length: int, dynamic: bool) -> QuantisedMotion:
     """Read the MOVE chunk under MOTION."""
-    cursor = Cursor(body, "MOVE")
-    sizes, step = _parse_motion_head(cursor, dynamic)
+    sizes, _ = _parse_motion_head(Cursor(body, "MOVE"), dynamic)
     if raw_length != MOTION_STRUCT.size + 6 * math.prod(sizes):
         raise FormatError(f"MOVE: claims {raw_length:,} bytes, not those of a grid of {sizes} nodes")
-    return QuantisedMotion(decode_motion(cursor.rest(), (*sizes, 3)), step)
+    return parse_motion(decode_motion(body, raw_length), dynamic)
 
 
 def _parse_motion_head(cursor: Cursor, dynamic: bool) -> tuple[list[int], float]:
@@ -359,7 +355,8 @@ def parse_coded_weights(
     """Read weights under WEIGHTS, of which `raw_length` bytes are claimed."""
     if raw_length != 2 * sum(map(math.prod, shapes.values())):
         raise FormatError(f"{cursor.kind}: claims {raw_length:,} bytes of weights, not those of its sizes")
-    return dict(zip(shapes, decode_weights(cursor.rest(), list(shapes.values())), strict=True))
+    raw = decode_weights(cursor.kind == "HYBR", cursor.raw, cursor.position + raw_length)
+    return parse_half_weights(Cursor(raw[cursor.position :], cursor.kind), shapes)
 
 
 # --- OCCU
@@ -386,11 +383,10 @@ def parse_occupancy(raw: bytes) -> np.ndarray:
 
 def parse_coded_occupancy(body: bytes, raw_length: int) -> np.ndarray:
     """Read the OCCU chunk under OCCUPANCY: (slots, Nz, Ny, Nx) bool."""
-    cursor = Cursor(body, "OCCU")
-    shape = _parse_occupancy_shape(cursor)
+    shape = _parse_occupancy_shape(Cursor(body, "OCCU"))
     if raw_length != OCCUPANCY_STRUCT.size + -(-math.prod(shape) // 8):
         raise FormatError(f"OCCU: claims {raw_length:,} bytes, not those of a grid of {shape} cells")
-    return decode_occupancy(cursor.rest(), shape)
+    return parse_occupancy(decode_occupancy(body, raw_length))
 
 
 def _parse_occupancy_shape(cursor: Cursor) -> tuple[int, ...]:
@@ -424,10 +420,7 @@ def parse_cameras(raw: bytes) -> tuple[Camera, ...]:
 
 def parse_coded_cameras(body: bytes, raw_length: int) -> tuple[Camera, ...]:
     """Read the came chunk under POSES."""
-    decoded = decode_poses(body, CAMERA_LIMIT)
-    if raw_length != 2 + len(decoded) * CAMERA_STRUCT.size:
-        raise FormatError(f"came: claims {raw_length:,} bytes, not those of {len(decoded)} cameras")
-    return tuple(_make_camera(number, numbers) for number, numbers in enumerate(decoded))
+    return parse_cameras(decode_poses(body, raw_length))
 
 
 def _make_camera(number: int, numbers: tuple[Any, ...]) -> Camera:

@@ -11,7 +11,6 @@ from typing import TypeVar
 import numpy as np
 
 from kpc.format.coding.quantise import QuantisedPlane, QuantisedScene, needed_rows, project_occupancy
-from kpc.format.coding.raw_planes import decode_raw_segment
 from kpc.format.common.errors import BudgetError, FormatError
 from kpc.format.common.memory import DEFAULT_BUDGET
 from kpc.format.container.container import Codec, Entry, Reader
@@ -47,12 +46,12 @@ from kpc.format.container.scene_layout import (
 )
 from kpc.format.container.segments import (
     SegmentSideInfo,
-    decode_segment,
     merge_side_info,
     needs_occupancy,
     side_info_of,
 )
 from kpc.format.container.sources import AnySource, open_source
+from kpc.format.core.decoding import decode_segment
 from kpc.format.scene.cameras import Camera
 from kpc.format.scene.metadata import Metadata
 from kpc.format.scene.motion import QuantisedMotion
@@ -201,9 +200,10 @@ class SceneReader(Reader):
         entry = self.index[number]
         plane = self.head.scales[entry.scale][ALL_PLANES[entry.plane]]
         texels, shape = entry.row_count * plane.columns, (entry.row_count, plane.columns, plane.channels)
+        limit = self.memory_budget
         if entry.codec not in (Codec.PREDICTIVE, Codec.TRANSFORM):
             payload = self.chunk(number, 1 + -(-texels // 8) + plane.channels * texels)
-            return *self._parsed(lambda raw: decode_raw_segment(raw, *shape), payload), None
+            return *self._parsed(lambda raw: decode_segment(Codec.RAW, raw, *shape, None, limit), payload), None
         if entry.raw_length != texels * plane.channels:
             raise FormatError(
                 f"{self.name}: chunk {number} (PLNE) claims {entry.raw_length:,} symbols, not the "
@@ -215,7 +215,7 @@ class SceneReader(Reader):
             implied = needed_rows(self._projection(ALL_PLANES[entry.plane]), plane.rows, plane.columns, rows)
         return self._parsed(
             lambda body: (
-                *decode_segment(entry.codec, body, *shape, implied),
+                *decode_segment(entry.codec, body, *shape, implied, limit),
                 side_info_of(entry.codec, body),
             ),
             body,
@@ -341,6 +341,8 @@ class SceneReader(Reader):
         """Parse, with the name of the file in errors."""
         try:
             return parse(raw)
+        except BudgetError as error:
+            raise BudgetError(f"{self.name}: {error}") from error
         except FormatError as error:
             raise FormatError(f"{self.name}: {error}") from error
 

@@ -1,0 +1,195 @@
+/**
+ * The outer structure of a .kpc file: header, chunk index, chunks (section 4 of spec/kpc-format.md). It does not know
+ * what a scene is.
+ */
+
+import { crc32c } from './crc32c.js';
+import { FormatError } from './errors.js';
+import { unpackFrame } from './zstd.js';
+
+export const MAGIC = [0x89, 0x4b, 0x50, 0x43, 0x0d, 0x0a, 0x1a, 0x0a];
+export const VERSION = 1;
+export const HEADER_LENGTH = 48;
+export const ENTRY_LENGTH = 30;
+export const EXPANSION_LIMIT = 32768;
+export const CHUNK_LIMIT = 1 << 16;
+export const CODEC = { RAW: 0, ZSTD: 1, PREDICTIVE: 2, TRANSFORM: 3, MOTION: 4, OCCUPANCY: 5, WEIGHTS: 6, POSES: 7 };
+
+/**
+ * @typedef {object} Entry a chunk, as the index lists it; `offset` is its position in the file
+ * @property {string} kind
+ * @property {number} group
+ * @property {number} scale
+ * @property {number} plane
+ * @property {number} rowStart
+ * @property {number} rowCount
+ * @property {number} codec
+ * @property {number} storedLength
+ * @property {number} rawLength
+ * @property {number} crc
+ * @property {number} offset
+ */
+
+/** Whether a reader must know the kind of a chunk (section 4.3). */
+export const isCritical = (/** @type {Entry} */ entry) => entry.kind[0] < 'a';
+
+/** Random access to the chunks of a file that is in memory, whole or, if `allowPartial`, its beginning. */
+export class Container {
+  /**
+   * @param {Uint8Array} bytes
+   * @param {{allowPartial?: boolean}} [options]
+   */
+  constructor(bytes, { allowPartial = false } = {}) {
+    this.bytes = bytes;
+    this.header = readHeader(bytes, allowPartial);
+    /** @type {Entry[]} */
+    this.index = readIndex(bytes, this.header);
+  }
+
+  /** Whether all bytes of a chunk are there. */
+  available(/** @type {number} */ number) {
+    const entry = this.index[number];
+    return entry.offset + entry.storedLength <= this.bytes.length;
+  }
+
+  /** Return a chunk as it lies in the file, its CRC32C verified. */
+  stored(/** @type {number} */ number) {
+    const entry = this.index[number];
+    if (!this.available(number)) throw new FormatError(`cut off: ${this.label(number)} is not there`);
+    const body = this.bytes.subarray(entry.offset, entry.offset + entry.storedLength);
+    if (crc32c(body) !== entry.crc) {
+      throw new FormatError(`${this.label(number)} is damaged (its CRC32C differs); fetch the file again`);
+    }
+    return body;
+  }
+
+  /** Return the content of a chunk under RAW or ZSTD, of at most `limit` bytes. */
+  content(/** @type {number} */ number, limit = Infinity) {
+    const entry = this.index[number];
+    if (entry.rawLength > limit) {
+      throw new FormatError(`${this.label(number)} claims ${entry.rawLength} bytes where at most ${limit} make sense`);
+    }
+    let content = this.stored(number);
+    if (entry.codec === CODEC.ZSTD) content = unpackFrame(content, entry.rawLength, this.label(number));
+    else if (entry.codec !== CODEC.RAW) {
+      throw new FormatError(`${this.label(number)} uses codec ${entry.codec}, unknown to this reader; update kpc`);
+    }
+    if (content.length !== entry.rawLength) {
+      throw new FormatError(`${this.label(number)} holds ${content.length} bytes, not the ${entry.rawLength} it claims`);
+    }
+    return content;
+  }
+
+  /** Return a chunk under one of the codecs from PREDICTIVE on as it is stored, if it may hold what it claims. */
+  coded(/** @type {number} */ number) {
+    const entry = this.index[number];
+    if (entry.rawLength > entry.storedLength * EXPANSION_LIMIT) {
+      throw new FormatError(
+        `${this.label(number)} claims a length of ${entry.rawLength}, more than ${entry.storedLength} bytes can hold`,
+      );
+    }
+    return this.stored(number);
+  }
+
+  /** Return the name of a chunk in messages. */
+  label(/** @type {number} */ number) {
+    return `chunk ${number} (${this.index[number].kind})`;
+  }
+}
+
+/** Read and check the header (section 4.1). */
+function readHeader(/** @type {Uint8Array} */ bytes, /** @type {boolean} */ allowPartial) {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
+  if (bytes.length === 0 || MAGIC.some((byte, k) => k < bytes.length && bytes[k] !== byte)) {
+    throw new FormatError('not a .kpc file');
+  }
+  if (bytes.length >= 12) {
+    if (view.getUint16(10, true) === 0) throw new FormatError('a draft of the format; encode it again');
+    const version = view.getUint16(8, true);
+    if (version !== VERSION) {
+      throw new FormatError(`format version ${version}, this reader knows ${VERSION}; update kpc`);
+    }
+  }
+  if (bytes.length < HEADER_LENGTH) throw new FormatError('cut off within the header; fetch the file again');
+  if (crc32c(bytes.subarray(0, 44)) !== view.getUint32(44, true)) {
+    throw new FormatError('the header is damaged (its CRC32C differs); fetch the file again');
+  }
+  if (view.getUint16(10, true) !== HEADER_LENGTH) {
+    throw new FormatError(`the header claims ${view.getUint16(10, true)} bytes, not ${HEADER_LENGTH}`);
+  }
+  const header = {
+    chunkCount: view.getUint32(12, true),
+    indexLength: view.getUint32(16, true),
+    indexCrc: view.getUint32(20, true),
+    fileLength: Number(view.getBigUint64(24, true)),
+    valueCount: Number(view.getBigUint64(32, true)),
+    largestRaw: view.getUint32(40, true),
+  };
+  checkSizes(header, bytes.length, allowPartial);
+  return header;
+}
+
+function checkSizes(
+  /** @type {{chunkCount: number, indexLength: number, fileLength: number, valueCount: number, largestRaw: number}} */
+  { chunkCount, indexLength, fileLength, valueCount, largestRaw },
+  /** @type {number} */ size,
+  /** @type {boolean} */ allowPartial,
+) {
+  const least = HEADER_LENGTH + Math.max(indexLength, 8 * chunkCount);
+  const countFits = chunkCount > 0 && chunkCount <= CHUNK_LIMIT;
+  if (!countFits || indexLength === 0 || indexLength > 64 + 40 * chunkCount || fileLength < least) {
+    throw new FormatError(
+      `the header claims ${chunkCount} chunks and ${indexLength} bytes of index in a file of ${fileLength} bytes`,
+    );
+  }
+  if (size > fileLength) throw new FormatError(`${size - fileLength} bytes follow the end of the file`);
+  if (size < fileLength && !allowPartial) throw new FormatError(`cut off at ${size} of ${fileLength} bytes`);
+  if (Math.max(valueCount, largestRaw) > fileLength * EXPANSION_LIMIT) {
+    throw new FormatError(
+      `claims ${valueCount} values and chunks of ${largestRaw} bytes, more than ${fileLength} bytes can hold`,
+    );
+  }
+}
+
+/** Read and check the index (section 4.2). */
+function readIndex(
+  /** @type {Uint8Array} */ bytes,
+  /** @type {{chunkCount: number, indexLength: number, indexCrc: number, fileLength: number, largestRaw: number}} */
+  { chunkCount, indexLength, indexCrc, fileLength, largestRaw },
+) {
+  if (bytes.length < HEADER_LENGTH + indexLength) throw new FormatError('cut off within the chunk index');
+  const index = bytes.subarray(HEADER_LENGTH, HEADER_LENGTH + indexLength);
+  if (crc32c(index) !== indexCrc) {
+    throw new FormatError('the chunk index is damaged (its CRC32C differs); fetch the file again');
+  }
+  const table = unpackFrame(index, ENTRY_LENGTH * chunkCount, 'chunk index');
+  const row = new Uint8Array(ENTRY_LENGTH);
+  const view = new DataView(row.buffer);
+  const entries = [];
+  let offset = HEADER_LENGTH + indexLength;
+  for (let number = 0; number < chunkCount; number++) {
+    for (let k = 0; k < ENTRY_LENGTH; k++) row[k] = table[k * chunkCount + number];
+    const kind = String.fromCharCode(...row.subarray(0, 4));
+    if (!/^[A-Za-z]{4}$/.test(kind)) throw new FormatError(`chunk ${number} has a kind that is not four letters`);
+    const entry = {
+      kind,
+      group: view.getUint16(4, true),
+      scale: row[6],
+      plane: row[7],
+      rowStart: view.getUint32(8, true),
+      rowCount: view.getUint32(12, true),
+      codec: view.getUint16(16, true),
+      storedLength: view.getUint32(18, true),
+      rawLength: view.getUint32(22, true),
+      crc: view.getUint32(26, true),
+      offset,
+    };
+    if (entry.rawLength > largestRaw) {
+      throw new FormatError(`chunk ${number} claims ${entry.rawLength} bytes, more than the header's limit`);
+    }
+    entries.push(entry);
+    offset += entry.storedLength;
+  }
+  if (offset !== fileLength) throw new FormatError(`the chunks end at byte ${offset} of ${fileLength}`);
+  return entries;
+}

@@ -1,0 +1,278 @@
+/** A scene in a .kpc file: which chunks it needs, and what they hold (sections 4.3, 6, 7 and 10 of the spec). */
+
+import { CODEC, Container, isCritical } from './container.js';
+import { BudgetError, FormatError } from './errors.js';
+import { META_LIMIT, parseMetadata } from './metadata.js';
+import {
+  Cursor,
+  LIMIT,
+  PLANES,
+  isTimePlane,
+  parseAppearances,
+  parseCameras,
+  parseDecoder,
+  parseDecoderHead,
+  parseHead,
+  parseMapping,
+  parseMotion,
+  parseMotionHead,
+  parseOccupancy,
+  parseOccupancyHead,
+} from './scene_chunks.js';
+
+/** @typedef {import('./container.js').Entry} Entry */
+/** @typedef {import('./core.js').Core} Core */
+
+const KNOWN_KINDS = ['SCNE', 'WARP', 'MOVE', 'DECO', 'HYBR', 'OCCU', 'came', 'appe', 'meta', 'PLNE'];
+const HEAD_LIMIT = 58 + LIMIT.SCALE * (10 + 9 * 4 * LIMIT.CHANNEL);
+const AXIS_OF = { t: 0, z: 1, y: 2, x: 3 };
+
+/** Random access to the parts of a scene. Opening one checks that the index lists all that a scene needs. */
+export class Scene {
+  /** @type {Map<string, any>} */
+  #decoded = new Map();
+
+  /**
+   * @param {Uint8Array} bytes of the file
+   * @param {Core} core
+   * @param {{allowPartial?: boolean, memoryBudget?: number}} [options]
+   */
+  constructor(bytes, core, { allowPartial = false, memoryBudget = 2 ** 31 } = {}) {
+    this.container = new Container(bytes, { allowPartial });
+    this.core = core;
+    this.#checkKinds();
+    this.head = parseHead(this.container.content(this.#only('SCNE'), HEAD_LIMIT));
+    const { valueCount } = this.container.header;
+    if (this.head.valueCount !== valueCount) {
+      throw new FormatError(`the header claims ${valueCount} values, the scene ${this.head.valueCount}`);
+    }
+    this.memoryBudget = memoryBudget;
+    this.#afford(0, 'its planes');
+    this.#checkSegments();
+    this.#decoderNumber();
+    this.#only('OCCU');
+  }
+
+  /** The mapping of space; null if the box bounds the scene. */
+  get mapping() {
+    return this.#once('WARP', (number) => parseMapping(this.container.content(number, 116), this.head));
+  }
+
+  /** The motion grid; null if there is none. */
+  get motion() {
+    return this.#once('MOVE', (number, entry) => {
+      this.#afford(8 * entry.rawLength, 'its motion grid');
+      if (entry.codec !== CODEC.MOTION) return parseMotion(this.container.content(number), this.head.isDynamic);
+      const body = this.container.coded(number);
+      const { count } = parseMotionHead(new Cursor(body, 'MOVE'), this.head.isDynamic);
+      this.#checkClaim('MOVE', entry, 12 + 2 * count);
+      return parseMotion(this.core.motion(body, entry.rawLength), this.head.isDynamic);
+    });
+  }
+
+  /** The occupancy grid. */
+  get occupancy() {
+    return this.#once('OCCU', (number, entry) => {
+      this.#afford(8 * entry.rawLength, 'its occupancy grid');
+      if (entry.codec !== CODEC.OCCUPANCY) return parseOccupancy(this.container.content(number));
+      const body = this.container.coded(number);
+      const { cells } = parseOccupancyHead(new Cursor(body, 'OCCU'));
+      this.#checkClaim('OCCU', entry, 8 + Math.ceil(cells / 8));
+      return parseOccupancy(this.core.occupancy(body, entry.rawLength));
+    });
+  }
+
+  /** The weights of the decoder, DECO or HYBR. */
+  get decoder() {
+    const kind = this.container.index[this.#decoderNumber()].kind;
+    return this.#once(kind, (number, entry) => {
+      if (entry.codec !== CODEC.WEIGHTS) {
+        const most = 10 + 2 * (LIMIT.HIDDEN + 3) * (4 * this.head.features + 2 * LIMIT.HIDDEN + 16);
+        return parseDecoder(this.container.content(number, most), kind, this.head.features);
+      }
+      const body = this.container.coded(number);
+      const { isHybrid, rawLength } = parseDecoderHead(new Cursor(body, kind), this.head.features);
+      if (entry.rawLength !== rawLength) {
+        throw new FormatError(`${kind}: claims ${entry.rawLength} bytes of weights, not those of its sizes`);
+      }
+      return parseDecoder(this.core.weights(isHybrid, body, rawLength), kind, this.head.features);
+    });
+  }
+
+  /** The cameras; none if the file has, or has yet, no such chunk. */
+  get cameras() {
+    const found = this.#once('came', (number, entry) => {
+      if (entry.codec !== CODEC.POSES) return parseCameras(this.container.content(number, 2 + 68 * LIMIT.CAMERA));
+      return parseCameras(this.core.poses(this.container.coded(number), entry.rawLength));
+    });
+    return found ?? [];
+  }
+
+  /** The appearances; none if the file has, or has yet, no such chunk. */
+  get appearances() {
+    const found = this.#once('appe', (number, entry) => {
+      const { hidden } = this.decoder;
+      this.#afford(4 * entry.rawLength, 'its appearances');
+      const most = 4 + LIMIT.APPEARANCE * (2 * hidden + 1 + LIMIT.NAME);
+      return parseAppearances(this.container.content(number, most), hidden);
+    });
+    return found ?? [];
+  }
+
+  /** The metadata; an empty object if the file has, or has yet, no such chunk. */
+  get metadata() {
+    return this.#once('meta', (number) => parseMetadata(this.container.content(number, META_LIMIT))) ?? {};
+  }
+
+  /** Return what SCNE says of the plane that a PLNE chunk is a segment of, and the name of the plane. */
+  planeOf(/** @type {Entry} */ entry) {
+    const name = PLANES[entry.plane];
+    return { name, plane: this.head.scales[entry.scale][name] };
+  }
+
+  /** Decode a PLNE chunk: symbols and coded texels of its rows. */
+  segment(/** @type {number} */ number) {
+    const entry = this.container.index[number];
+    const { name, plane } = this.planeOf(entry);
+    const { rows, columns, channels } = plane;
+    const texels = entry.rowCount * columns;
+    const sizes = [entry.rowCount, columns, channels];
+    if (entry.codec !== CODEC.PREDICTIVE && entry.codec !== CODEC.TRANSFORM) {
+      const content = this.container.content(number, 1 + Math.ceil(texels / 8) + channels * texels);
+      return this.core.segment(CODEC.RAW, content, ...sizes);
+    }
+    if (entry.rawLength !== texels * channels) {
+      const label = this.container.label(number);
+      throw new FormatError(`${label} claims ${entry.rawLength} symbols, not the ${texels * channels} of its rows`);
+    }
+    const body = this.container.coded(number);
+    const isImplied = body.length > 1 && (body[1] & 3) === 2;
+    const map = isImplied ? this.#impliedMap(name, rows, columns, entry) : null;
+    return this.core.segment(entry.codec, body, ...sizes, map);
+  }
+
+  /**
+   * Decode all planes, of which rows that are not there count as section 10 says.
+   * @returns {Record<string, {head: any, symbols: Int8Array, coded: Uint8Array, offset: Float32Array}>[]}
+   */
+  planes() {
+    const found = this.head.scales.map((scale) =>
+      Object.fromEntries(
+        Object.entries(scale).map(([name, head]) => {
+          const texels = head.rows * head.columns;
+          const offset = isTimePlane(name) ? head.offset : new Float32Array(head.channels);
+          return [name, { head, symbols: new Int8Array(texels * head.channels), coded: new Uint8Array(texels), offset }];
+        }),
+      ),
+    );
+    for (const [number, entry] of this.container.index.entries()) {
+      if (entry.kind !== 'PLNE' || !this.container.available(number)) continue;
+      const { name, plane } = this.planeOf(entry);
+      const { symbols, coded } = this.segment(number);
+      const first = entry.rowStart * plane.columns;
+      found[entry.scale][name].symbols.set(symbols, first * plane.channels);
+      found[entry.scale][name].coded.set(coded, first);
+      found[entry.scale][name].offset = plane.offset;
+    }
+    return found;
+  }
+
+  #impliedMap(name, rows, columns, entry) {
+    const { sizes, content } = this.occupancy;
+    const cells = [sizes[AXIS_OF[name[1]]], sizes[AXIS_OF[name[0]]]];
+    if (!this.#decoded.has(name)) {
+      this.#decoded.set(name, this.core.project(content, entry.plane, cells[0] * cells[1]));
+    }
+    return this.core.impliedMap(this.#decoded.get(name), cells, rows, columns, entry.rowStart, entry.rowCount);
+  }
+
+  /** Return what `parse` makes of the one chunk of a kind, the first time; null if there is none, or not yet. */
+  #once(/** @type {string} */ kind, /** @type {(number: number, entry: Entry) => any} */ parse) {
+    if (!this.#decoded.has(kind)) {
+      const number = this.container.index.some((entry) => entry.kind === kind) ? this.#only(kind) : -1;
+      const isHeld = number >= 0 && (kind[0] < 'a' || this.container.available(number));
+      this.#decoded.set(kind, isHeld ? parse(number, this.container.index[number]) : null);
+    }
+    return this.#decoded.get(kind);
+  }
+
+  #checkClaim(kind, entry, length) {
+    if (entry.rawLength !== length) {
+      throw new FormatError(`${kind}: claims ${entry.rawLength} bytes, not those of its sizes`);
+    }
+  }
+
+  #afford(/** @type {number} */ more, /** @type {string} */ what) {
+    const needed = 5 * this.head.valueCount + more;
+    if (needed > this.memoryBudget) {
+      throw new BudgetError(`needs ${needed} bytes of memory with ${what}, more than the budget of ${this.memoryBudget}`);
+    }
+  }
+
+  /** Return the number of the one chunk of a kind. */
+  #only(/** @type {string} */ kind) {
+    const found = [...this.container.index.keys()].filter((number) => this.container.index[number].kind === kind);
+    if (found.length !== 1) throw new FormatError(`holds ${found.length} ${kind} chunks, not one`);
+    return found[0];
+  }
+
+  #decoderNumber() {
+    const kinds = this.container.index.map((entry) => entry.kind);
+    if (kinds.includes('DECO') && kinds.includes('HYBR')) throw new FormatError('holds two decoders, DECO and HYBR');
+    return this.#only(kinds.includes('HYBR') ? 'HYBR' : 'DECO');
+  }
+
+  #checkKinds() {
+    const { index } = this.container;
+    if (index.some((entry) => entry.kind === 'GRUP')) {
+      throw new FormatError('a clip in groups, where a single scene is wanted');
+    }
+    const unknown = index.findIndex((entry) => isCritical(entry) && !KNOWN_KINDS.includes(entry.kind));
+    if (unknown >= 0) {
+      const { kind } = index[unknown];
+      throw new FormatError(`chunk ${unknown} is of the critical kind ${kind}, unknown to this reader; update kpc`);
+    }
+  }
+
+  /** Check that every plane is listed whole: its segments neither overlap nor leave a gap. */
+  #checkSegments() {
+    const names = this.head.isDynamic ? PLANES : PLANES.slice(0, 3);
+    /** @type {Map<string, Entry[]>} */
+    const found = new Map(this.head.scales.flatMap((_, s) => names.map((__, p) => [`${s} ${p}`, []])));
+    for (const [number, entry] of this.container.index.entries()) {
+      const { group, scale, plane, rowStart, rowCount } = entry;
+      if (entry.kind === 'PLNE') {
+        const segments = found.get(`${scale} ${plane}`);
+        if (group !== 0 || segments === undefined) {
+          throw new FormatError(`chunk ${number} belongs to group ${group}, scale ${scale}, plane ${plane}, which is not`);
+        }
+        segments.push(entry);
+      } else if (KNOWN_KINDS.includes(entry.kind) && (group || scale || plane || rowStart || rowCount)) {
+        throw new FormatError(`${this.container.label(number)} claims a position among the planes`);
+      }
+    }
+    for (const [key, segments] of found) {
+      const [scale, plane] = key.split(' ').map(Number);
+      checkRows(segments, this.head.scales[scale][names[plane]].rows, `scale ${scale}, plane ${names[plane]}`, plane < 3);
+    }
+  }
+}
+
+function checkRows(
+  /** @type {Entry[]} */ segments,
+  /** @type {number} */ rows,
+  /** @type {string} */ where,
+  /** @type {boolean} */ isSpacePlane,
+) {
+  if (isSpacePlane && segments.length > 1) {
+    throw new FormatError(`${where}: a space plane is one segment, not ${segments.length}`);
+  }
+  let row = 0;
+  for (const entry of segments.sort((a, b) => a.rowStart - b.rowStart)) {
+    if (entry.rowStart !== row || entry.rowCount < 1) {
+      throw new FormatError(`${where}: no segment starts at row ${row}, or two do`);
+    }
+    row += entry.rowCount;
+  }
+  if (row !== rows) throw new FormatError(`${where}: its segments hold ${row} rows, not ${rows}`);
+}
